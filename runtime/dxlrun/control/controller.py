@@ -1,0 +1,127 @@
+"""Controller: the contract between dxlrun and whoever writes the law of motion."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict
+
+from dxlrun.interfaces import CommandName, Commands, Floats, States
+
+CONTRACT_VERSION = 1
+"""Grows when a controller written for the version before would misbehave."""
+
+
+class ParametersModel(BaseModel):
+    """Base of a controller's parameters: frozen, unknown keys refused, finite numbers only."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class CommandModel(BaseModel):
+    """Base of a typed command: frozen, unknown keys refused, finite numbers only."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+P = TypeVar("P", bound=ParametersModel)
+
+
+@dataclass(frozen=True, slots=True)
+class Interfaces:
+    """What a controller asks of the robot, decided by its parameters.
+
+    `command` interfaces are claimed on every joint of `joints`: no other active controller may have one of
+    the same joint. `state` lists nothing that must be claimed, so everybody sees every state.
+    """
+
+    joints: tuple[str, ...]
+    command: tuple[CommandName, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class JointLimits:
+    """Limits of the controller's joints, shape (joints,); NaN or +-inf where there is none."""
+
+    lower: Floats
+    upper: Floats
+    velocity: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Context:
+    """What a controller gets when it is configured; the arrays are its own, in the order of its joints."""
+
+    name: str
+    joints: tuple[str, ...]
+    period_ns: int
+    """The nominal period of this controller, ns."""
+    limits: JointLimits
+    states: States
+    """Gathered by the manager before each update."""
+    goals: Commands
+    """What was last sent to the servos, gathered before each update and before on_activate."""
+    commands: Commands
+    """To be written by update; the manager takes only the claimed interfaces, NaN = not yet commanded."""
+    say: Callable[[str], None]
+    """Leave a sentence in the log (event CONTROLLER_SAYS); for rare things."""
+    publish: Callable[[], None]
+    """Mark this cycle for the topics of `publishes`."""
+
+
+class Controller(ABC, Generic[P]):
+    """A law of motion: states in, commands out, once a period.
+
+    Life: `on_configure` (before real time: may allocate and do I/O) -> `on_activate` -> `update` ... ->
+    `on_deactivate`. `update`, `on_activate`, `on_command` and `on_deactivate` are in the loop: bounded, no
+    I/O, no lock, no growing allocation. What they raise ends the controller, not the process.
+    """
+
+    Parameters: ClassVar[type[ParametersModel]] = ParametersModel
+    """The model of the controller's keys in the robot file (all but type, active and rate)."""
+    Commands: ClassVar[Mapping[str, type[CommandModel]]] = {}
+    """The typed commands it takes, by name."""
+    publishes: ClassVar[tuple[str, ...]] = ()
+    """Topics of the log that are written in the cycles it marks: `/joint_states`."""
+
+    def __init__(self, parameters: P) -> None:
+        self.parameters = parameters
+
+    @classmethod
+    @abstractmethod
+    def interfaces(cls, parameters: P, joints: tuple[str, ...]) -> Interfaces:
+        """Say which joints and command interfaces it wants; `joints` are all joints of the robot."""
+
+    @classmethod
+    def prepare(cls, kind: str, command: CommandModel, parameters: P) -> NDArray[np.float64]:
+        """Turn a typed command into one flat array, outside the loop's process; a pure function.
+
+        Raises ValueError with one sentence when the command does not fit the parameters.
+        """
+        raise ValueError(f"{cls.__name__} takes no command {kind!r}")
+
+    def on_configure(self, context: Context) -> None:
+        """Prepare for real time; keep `context`."""
+        self.context = context
+
+    def on_activate(self, time_ns: int) -> None:
+        """Take over the claimed joints; `context.states` and `context.goals` are fresh."""
+
+    def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
+        """Take a prepared command at the start of a cycle; `data` stays as it is until the run ends."""
+
+    @abstractmethod
+    def update(self, time_ns: int, period_ns: int) -> None:
+        """Write `context.commands` from `context.states`.
+
+        `time_ns`: time of this cycle since the loop started. `period_ns`: since this controller's last
+        update, the true one, capped.
+        """
+
+    def on_deactivate(self, time_ns: int) -> None:
+        """Let go of the joints."""

@@ -1,0 +1,76 @@
+"""What the loop executes: period, scheduler wishes, controllers, commands by time; JSON in the log."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+Policy = Literal["other", "fifo", "round_robin"]
+
+
+@dataclass(frozen=True, slots=True)
+class SchedulerPlan:
+    """Wishes to the operating system; what was granted is said by `realtime`."""
+
+    policy: Policy
+    priority: int
+    lock_memory: bool
+
+
+@dataclass(frozen=True, slots=True)
+class JointPlan:
+    """One joint as the loop and the gate see it; rows of all arrays are in the order of the plan's joints."""
+
+    name: str
+    lower: float
+    """rad; the tighter one of the file's limit and the servo's reach"""
+    upper: float
+    velocity: float | None
+    """rad/s; None: no limit in the file"""
+
+
+@dataclass(frozen=True, slots=True)
+class ControllerPlan:
+    """One controller of the robot file."""
+
+    name: str
+    type: str
+    distribution: str
+    """Who published the plug-in: `name version`."""
+    parameters: str
+    """JSON that `Parameters` accepts"""
+    joints: tuple[str, ...]
+    command: tuple[str, ...]
+    """Claimed command interfaces."""
+    publishes: tuple[str, ...]
+    active: bool
+    every: int
+    """Updated every n-th cycle."""
+
+
+@dataclass(frozen=True, slots=True)
+class ScheduledCommand:
+    """A prepared command that the loop hands to a controller at a time."""
+
+    at_ns: int
+    """Since the loop's first deadline."""
+    controller: str
+    kind: str
+    data: bytes
+    """Little-endian float64"""
+    origin: str
+    """Who asked: `three_parts.yaml:7:5`."""
+
+
+@dataclass(frozen=True, slots=True)
+class LoopPlan:
+    """Everything the loop needs beside hardware."""
+
+    period_ns: int
+    scheduler: SchedulerPlan
+    joints: tuple[JointPlan, ...]
+    controllers: tuple[ControllerPlan, ...]
+    commands: tuple[ScheduledCommand, ...]
+    """Sorted by time."""
+    end_ns: int | None
+    """Stop by itself at this time since the first deadline; None: run until told."""

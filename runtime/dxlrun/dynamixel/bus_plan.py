@@ -1,0 +1,68 @@
+"""What the bus executes: prepared transactions, reply layouts, units; made before a port opens."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from dxlrun.dynamixel.transaction import Transaction
+
+
+@dataclass(frozen=True, slots=True)
+class ServoPlan:
+    """One servo and the joint that it moves: q = direction * (theta - reference)."""
+
+    joint: str
+    row: int
+    """Row of the joint in the state and goal arrays of the whole robot."""
+    servo_id: int
+    model: str
+    model_number: int
+    reference: float
+    """rad, counted from the servo's raw 0"""
+    direction: int
+    rad_per_tick: float
+    max_tick: int
+    rad_s_per_tick: float
+    max_speed_tick: int
+
+
+@dataclass(frozen=True, slots=True)
+class Budget:
+    """What one cycle costs on one bus, ns (protocol.md, Time budget)."""
+
+    request_bytes: int
+    reply_bytes: int
+    wire_ns: int
+    return_delay_ns: int
+    latency_ns: int
+
+    @property
+    def total_ns(self) -> int:
+        """Time of one read-and-write exchange, ns."""
+        return self.wire_ns + self.return_delay_ns + self.latency_ns
+
+    @property
+    def highest_rate_hz(self) -> float:
+        """The rate at which the bus would do nothing else, Hz."""
+        return 1e9 / self.total_ns
+
+
+@dataclass(frozen=True, slots=True)
+class BusPlan:
+    """One serial line: its servos, its prepared packets, its budget."""
+
+    name: str
+    port: str
+    """Device path, or `sim`."""
+    protocol: float
+    baud_rate: int
+    latency_ns: int
+    return_delay_ns: int
+    servos: tuple[ServoPlan, ...]
+    reads: tuple[Transaction, ...]
+    """One state read a servo, in the order of `servos`."""
+    limp: tuple[Transaction, ...]
+    """Torque off, as anybody may send it at any moment: broadcast first, then servo by servo, acknowledged."""
+    torque_reads: tuple[Transaction, ...]
+    """Read torque enable, in the order of `servos`."""
+    budget: Budget
