@@ -1,0 +1,1 @@
+"""The standard controllers of dxlrun."""
