@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
 from enum import IntEnum, unique
 from typing import Protocol
+
+from dxlrun.clock import Clock
+from dxlrun.ring import RING_SECONDS, Appender, Payload
 
 
 @unique
@@ -61,3 +67,97 @@ class EventSink(Protocol):
     def emit(self, code: EventCode, severity: Severity, source: str, text: str) -> None:
         """Record that `source` (a joint, a controller, a process) has something to tell."""
         ...
+
+
+EVENT_SLOT = 240
+"""Bytes of one slot of an events' ring; a longer text takes several slots."""
+
+_MOST_PARTS = 32
+_HEADER = struct.Struct("<qHBBBxH")
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """One thing that happened."""
+
+    t_ns: int
+    """ns of the run's clock"""
+    code: int
+    """An EventCode; a plain number where a log was written by a newer version."""
+    severity: int
+    source: str
+    """A joint, a controller, a process."""
+    text: str
+    part: int = 0
+    """0 for an event; 1, 2 ... for the pieces of a text that did not fit one slot."""
+
+    @property
+    def name(self) -> str:
+        """The name of the code, in lower case."""
+        known = _known(self.code)
+        return known.name.lower() if isinstance(known, EventCode) else f"code_{self.code}"
+
+
+class EventRing:
+    """Takes events of one process and appends them to its ring; never blocks, never raises.
+
+    A text longer than a slot becomes several records (`part`); beyond 32 slots it is cut.
+    """
+
+    __slots__ = ("_clock", "_writer")
+
+    def __init__(self, writer: Appender, clock: Clock) -> None:
+        self._writer = writer
+        self._clock = clock
+
+    def emit(self, code: EventCode, severity: Severity, source: str, text: str) -> None:
+        """Record that `source` (a joint, a controller, a process) has something to tell, now."""
+        t_ns = self._clock.now_ns()
+        name = source.encode(errors="replace")[:64]
+        room = min(self._writer.slot_size, EVENT_SLOT) - _HEADER.size - len(name)
+        for part, piece in enumerate(_pieces(text.encode(errors="replace"), room)):
+            if part == _MOST_PARTS:
+                break
+            header = _HEADER.pack(t_ns, code, severity, part, len(name), len(piece))
+            self._writer.append(header + name + piece)
+
+
+def _pieces(text: bytes, room: int) -> Iterator[bytes]:
+    """Cut UTF-8 into pieces of at most `room` bytes, never inside a character; at least one piece."""
+    start = 0
+    while True:
+        end = min(start + room, len(text))
+        while end < len(text) and text[end] & 0xC0 == 0x80:
+            end -= 1
+        yield text[start:end]
+        start = end
+        if start == len(text):
+            return
+
+
+def _known(code: int) -> int:
+    try:
+        return EventCode(code)
+    except ValueError:
+        return code
+
+
+def decode_event(payload: Payload) -> Event:
+    """Return the event, or the piece of one, of one record. Raises ValueError when it is not one."""
+    try:
+        t_ns, code, severity, part, name_length, text_length = _HEADER.unpack_from(payload)
+    except struct.error as error:
+        raise ValueError(f"an event ends inside its header: {error}") from error
+    data = bytes(payload[_HEADER.size :])
+    if len(data) != name_length + text_length:
+        raise ValueError("an event is not as long as it says")
+    name = data[:name_length].decode(errors="replace")
+    return Event(t_ns, _known(code), severity, name, data[name_length:].decode(errors="replace"), part)
+
+
+def event_slots(period_ns: int, servos: int) -> int:
+    """Return how many slots hold 10 s of the worst storm: in each cycle one event a servo, and four more.
+
+    That is what a robot says whose servos all fail and recover in turn; a row of misses is one event.
+    """
+    return max(1024, RING_SECONDS * 1_000_000_000 // period_ns * (servos + 4))

@@ -1,0 +1,138 @@
+"""Packets as the log keeps them: every byte on every bus, with the times at which it was seen."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from enum import IntEnum, unique
+from typing import Protocol
+
+from dxlrun.ring import RING_SECONDS, Appender, Payload
+
+PACKET_SLOT = 2048
+"""Bytes of one slot of the packets' ring: a batch, usually the packets of one cycle."""
+
+_HEADER = struct.Struct("<BBBxI qq")
+
+
+@unique
+class PacketKind(IntEnum):
+    """What a run of bytes was; the number is in the log."""
+
+    INSTRUCTION = 1
+    STATUS = 2
+    NOISE = 3
+    """Bytes from the line that belong to no intact packet."""
+
+
+@dataclass(frozen=True, slots=True)
+class LoggedPacket:
+    """One packet, or one run of noise, on one bus.
+
+    An instruction's times: before and after the write() that sent it. A status packet's: after the read()
+    that brought its first and its last byte. ns of the run's clock.
+    """
+
+    bus: int
+    """Index in the plan's buses."""
+    kind: PacketKind
+    servo_id: int
+    """Who is addressed or who answers; 254 is everybody, and noise of nobody known."""
+    first_ns: int
+    last_ns: int
+    data: bytes
+
+
+class PacketSink(Protocol):
+    """Takes packets; never blocks, never raises."""
+
+    def packet(  # noqa: PLR0917  called for every packet in the loop: positional is quickest
+        self, bus: int, kind: PacketKind, servo_id: int, first_ns: int, last_ns: int, data: Payload
+    ) -> None:
+        """Record bytes that were sent or received; `data` is copied before the call returns."""
+        ...
+
+
+class PacketBatch:
+    """Collects packets in a buffer made before real time; one `commit` a cycle hands them on together.
+
+    A full buffer commits by itself. Bytes that are longer than a slot (noise only) become several records.
+    """
+
+    __slots__ = ("_buffer", "_room", "_used", "_writer")
+
+    def __init__(self, writer: Appender) -> None:
+        self._writer = writer
+        self._buffer = memoryview(bytearray(min(writer.slot_size, 1 << 16)))
+        self._room = len(self._buffer)
+        self._used = 0
+        if self._room <= _HEADER.size:
+            raise ValueError(f"a slot of {self._room} bytes holds no packet")
+
+    def packet(  # noqa: PLR0917  called for every packet in the loop: positional is quickest
+        self, bus: int, kind: PacketKind, servo_id: int, first_ns: int, last_ns: int, data: Payload
+    ) -> None:
+        """Record bytes that were sent or received; times in ns of the run's clock."""
+        length = len(data)
+        start = self._used
+        end = start + _HEADER.size + length
+        if end > self._room:
+            self._overfull((bus, kind, servo_id, first_ns, last_ns), data)
+            return
+        _HEADER.pack_into(self._buffer, start, bus, kind, servo_id, length, first_ns, last_ns)
+        self._buffer[start + _HEADER.size : end] = data
+        self._used = end
+
+    def _overfull(self, head: tuple[int, PacketKind, int, int, int], data: Payload) -> None:
+        self.commit()
+        most = self._room - _HEADER.size
+        for start in range(0, len(data), most):
+            self.packet(*head, data[start : start + most])
+
+    def commit(self) -> None:
+        """Hand on what was collected; without packets nothing happens."""
+        if self._used:
+            self._writer.append(self._buffer[: self._used])
+            self._used = 0
+
+
+class NoPackets:
+    """Takes packets and forgets them: a run without a log."""
+
+    __slots__ = ()
+
+    def packet(  # noqa: PLR0917  called for every packet in the loop: positional is quickest
+        self, bus: int, kind: PacketKind, servo_id: int, first_ns: int, last_ns: int, data: Payload
+    ) -> None:
+        """Forget it."""
+
+    def commit(self) -> None:
+        """Nothing to hand on."""
+
+
+def decode_packets(payload: Payload) -> list[LoggedPacket]:
+    """Return the packets of one committed batch, oldest first. Raises ValueError when it is not one."""
+    packets: list[LoggedPacket] = []
+    start = 0
+    while start < len(payload):
+        try:
+            bus, kind, servo_id, length, first_ns, last_ns = _HEADER.unpack_from(payload, start)
+        except struct.error as error:
+            raise ValueError(f"a batch of packets ends inside a header: {error}") from error
+        start += _HEADER.size
+        data = bytes(payload[start : start + length])
+        if len(data) != length:
+            raise ValueError("a batch of packets ends inside a packet")
+        packets.append(LoggedPacket(bus, PacketKind(kind), servo_id, first_ns, last_ns, data))
+        start += length
+    return packets
+
+
+def packet_slots(period_ns: int, servos: int) -> int:
+    """Return how many slots of PACKET_SLOT hold 10 s of a robot with `servos` servos in all.
+
+    Per cycle: one instruction and one status a servo (Protocol 1.0 reads), goals, one probe, at most 40
+    bytes each beside the header; plus the unfinished slot of each commit.
+    """
+    per_cycle = (2 * servos + 4) * (_HEADER.size + 40)
+    return max(256, RING_SECONDS * 1_000_000_000 // period_ns * (1 + -(-per_cycle // PACKET_SLOT)))
