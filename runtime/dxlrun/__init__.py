@@ -1,1 +1,97 @@
-"""dxlrun."""
+"""dxlrun: what a plug-in's author needs, and nothing else.
+
+`import dxlrun` is light: each name is imported when it is first used, so that neither numpy nor pydantic is
+loaded for a command line that only prints its help.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from dxlrun.control.controller import (
+        CONTRACT_VERSION,
+        CommandModel,
+        Context,
+        Controller,
+        Interfaces,
+        JointLimits,
+        ParametersModel,
+    )
+    from dxlrun.control.hookspecs import hookimpl
+    from dxlrun.description.units import Angle, AngularVelocity, Duration
+    from dxlrun.errors import (
+        ControllerFault,
+        DxlrunError,
+        InputError,
+        LogError,
+        PlugInError,
+        PortError,
+        ProcessFault,
+        StartUpError,
+    )
+    from dxlrun.interfaces import Commands, Floats, States
+
+__all__ = [
+    "CONTRACT_VERSION",
+    "Angle",
+    "AngularVelocity",
+    "CommandModel",
+    "Commands",
+    "Context",
+    "Controller",
+    "ControllerFault",
+    "Duration",
+    "DxlrunError",
+    "Floats",
+    "InputError",
+    "Interfaces",
+    "JointLimits",
+    "LogError",
+    "ParametersModel",
+    "PlugInError",
+    "PortError",
+    "ProcessFault",
+    "StartUpError",
+    "States",
+    "hookimpl",
+]
+
+_ROOMS = {
+    "dxlrun.control.controller": (
+        "CONTRACT_VERSION",
+        "CommandModel",
+        "Context",
+        "Controller",
+        "Interfaces",
+        "JointLimits",
+        "ParametersModel",
+    ),
+    "dxlrun.control.hookspecs": ("hookimpl",),
+    "dxlrun.description.units": ("Angle", "AngularVelocity", "Duration"),
+    "dxlrun.errors": (
+        "ControllerFault",
+        "DxlrunError",
+        "InputError",
+        "LogError",
+        "PlugInError",
+        "PortError",
+        "ProcessFault",
+        "StartUpError",
+    ),
+    "dxlrun.interfaces": ("Commands", "Floats", "States"),
+}
+_HOME = {name: room for room, names in _ROOMS.items() for name in names}
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOME:
+        raise AttributeError(f"module 'dxlrun' has no attribute {name!r}")
+    value: object = getattr(import_module(_HOME[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

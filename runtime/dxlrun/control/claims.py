@@ -1,0 +1,56 @@
+"""Claims: which controller may command which joint; one active controller a joint."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Protocol
+
+
+class Claimant(Protocol):
+    """Somebody that may claim joints; a ControllerPlan is one."""
+
+    @property
+    def name(self) -> str:
+        """The controller's name in the robot file."""
+        ...
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """The joints it works on."""
+        ...
+
+    @property
+    def command(self) -> tuple[str, ...]:
+        """The command interfaces that it claims on each of them; empty: it only looks."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Conflict:
+    """Two controllers that want the same joint."""
+
+    joint: str
+    holder: str
+    other: str
+
+    def __str__(self) -> str:
+        return f"controllers {self.holder} and {self.other} both command joint {self.joint}"
+
+
+def conflicts(claimants: Iterable[Claimant]) -> tuple[Conflict, ...]:
+    """Return every joint that a later controller claims although an earlier one has it.
+
+    A claim of one interface of a joint keeps all others of the joint away too: position and speed of a servo
+    belong together, and a stale speed of another controller is how a robot surprises its people.
+    """
+    holders: dict[str, str] = {}
+    found: list[Conflict] = []
+    for claimant in claimants:
+        if not claimant.command:
+            continue
+        for joint in claimant.joints:
+            holder = holders.setdefault(joint, claimant.name)
+            if holder != claimant.name:
+                found.append(Conflict(joint, holder, claimant.name))
+    return tuple(found)

@@ -1,0 +1,137 @@
+"""Gate: the last hand on every command before it becomes a goal; vectorised over the joints."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.control.loop_plan import LoopPlan
+from dxlrun.cycle import Clamp, CycleRecord
+from dxlrun.events import EventCode, EventSink, Severity
+from dxlrun.interfaces import Commands, Floats
+
+SLOW_SPEED = 1.0
+"""rad/s; a goal moves no faster in the first second after torque was switched on. About 60 deg/s: a person
+beside the robot can step back, and a joint held by a hand does not tear it along."""
+SLOW_START_NS = 1_000_000_000
+"""How long after `ease_in` the slow speed holds (failures: limit violation)."""
+
+_WHAT = {
+    Clamp.LOWER: "raised to the lower position limit",
+    Clamp.UPPER: "lowered to the upper position limit",
+    Clamp.STEP: "held to the step limit",
+    Clamp.VELOCITY: "held to the velocity limit",
+    Clamp.NOT_FINITE: "was not finite, the last goal is kept",
+}
+_NOT_FINITE = np.uint8(Clamp.NOT_FINITE)
+
+
+class Gate:
+    """Turns merged commands into goals that are finite, inside the limits, and near the last goal.
+
+    - A position of NaN was not commanded: the last goal, position and speed, is kept. Infinity too, and is
+      flagged.
+    - Positions are clamped to the joint's limits. A goal that starts outside of them (the present position of
+      a joint that hangs there) may stay or move toward them, never further out.
+    - The step from the last goal is at most `limits.velocity * dt` where the file gives a velocity, and in
+      the first second after `ease_in` at most SLOW_SPEED * dt.
+    - The commanded speed is taken as a magnitude and clamped to `limits.velocity`; NaN stays NaN: as fast as
+      the servo can. No speed outlives the command that it came with.
+
+    `record.clamped` tells what was done, bits of Clamp; an event tells when it begins. `counts`, shape
+    (joints, 5), counts cycles by joint and bit.
+    """
+
+    def __init__(self, plan: LoopPlan, record: CycleRecord, events: EventSink) -> None:
+        count = len(plan.joints)
+        self.counts = np.zeros((count, len(_WHAT)), dtype=np.int64)
+        self._plan = plan
+        self._record = record
+        self._events = events
+        self._lower = np.array([joint.lower for joint in plan.joints], dtype=np.float64)
+        self._upper = np.array([joint.upper for joint in plan.joints], dtype=np.float64)
+        self._speed = np.array(
+            [np.inf if joint.velocity is None else joint.velocity for joint in plan.joints], dtype=np.float64
+        )
+        self._slow = np.minimum(self._speed, SLOW_SPEED)
+        self._slow_ns = SLOW_START_NS
+        self._before = np.zeros(count, dtype=np.uint8)
+        self._flags = np.zeros(count, dtype=np.uint8)
+        self._wanted, self._inside, self._step, self._low, self._high = (np.empty(count) for _ in range(5))
+        self._finite, self._mask = (np.empty(count, dtype=np.bool_) for _ in range(2))
+
+    def ease_in(self) -> None:
+        """Limit the steps of the coming second to SLOW_SPEED: torque was just switched on."""
+        self._slow_ns = SLOW_START_NS
+
+    def apply(self, commands: Commands, goals: Commands, dt_ns: int) -> None:
+        """Move `goals` toward `commands` in place; `dt_ns` is the time since the cycle before."""
+        flags = self._flags
+        np.bitwise_and(self._record.clamped, _NOT_FINITE, out=flags)  # what the manager found
+        self._position(commands.position, goals.position, dt_ns)
+        self._velocity(commands.velocity, goals.velocity)
+        np.copyto(self._record.clamped, flags)
+        if flags.any():
+            self._note(flags & ~self._before)
+        np.copyto(self._before, flags)
+
+    def _position(self, wanted: Floats, goal: Floats, dt_ns: int) -> None:
+        finite, inside, step, low, high = self._finite, self._inside, self._step, self._low, self._high
+        np.isfinite(wanted, out=finite)
+        np.isinf(wanted, out=self._mask)
+        self._flag(Clamp.NOT_FINITE)
+        np.copyto(self._wanted, goal)
+        np.copyto(self._wanted, wanted, where=finite)
+        np.fmin(self._lower, goal, out=low)  # a goal that is NaN has no say
+        np.fmax(self._upper, goal, out=high)
+        np.less(self._wanted, low, out=self._mask)
+        self._flag(Clamp.LOWER)
+        np.greater(self._wanted, high, out=self._mask)
+        self._flag(Clamp.UPPER)
+        np.clip(self._wanted, low, high, out=inside)
+        np.multiply(self._speed if self._slow_ns <= 0 else self._slow, max(dt_ns, 1) * 1e-9, out=step)
+        self._slow_ns = max(0, self._slow_ns - dt_ns)
+        np.subtract(goal, step, out=low)
+        np.add(goal, step, out=high)
+        np.less(inside, low, out=self._mask)
+        self._flag(Clamp.STEP)
+        np.greater(inside, high, out=self._mask)
+        self._flag(Clamp.STEP)
+        np.fmax(inside, low, out=inside)
+        np.fmin(inside, high, out=inside)
+        np.copyto(goal, inside, where=finite)
+
+    def _velocity(self, wanted: Floats, goal: Floats) -> None:
+        """A speed belongs to the position that it was commanded with: both are kept, or both are new."""
+        speed = self._wanted
+        np.abs(wanted, out=speed)
+        np.isinf(speed, out=self._mask)
+        np.logical_and(self._mask, self._finite, out=self._mask)
+        self._flag(Clamp.NOT_FINITE)
+        np.copyto(speed, np.nan, where=self._mask)
+        np.greater(speed, self._speed, out=self._mask)
+        np.logical_and(self._mask, self._finite, out=self._mask)
+        self._flag(Clamp.VELOCITY)
+        np.minimum(speed, self._speed, out=speed)
+        np.copyto(goal, speed, where=self._finite)
+
+    def _flag(self, bit: Clamp) -> None:
+        if self._mask.any():
+            self._flags[self._mask] |= np.uint8(bit)
+
+    def _note(self, begun: NDArray[np.uint8]) -> None:
+        for column, (bit, what) in enumerate(_WHAT.items()):
+            self.counts[:, column] += (self._flags & np.uint8(bit)) != 0
+            for row in np.flatnonzero(begun & np.uint8(bit)):
+                self._tell(int(row), what)
+
+    def _tell(self, row: int, what: str) -> None:
+        name = self._plan.joints[row].name
+        self._events.emit(EventCode.GATE, Severity.WARNING, name, f"{name}, {self._owner(name)}: {what}")
+
+    def _owner(self, joint: str) -> str:
+        active = self._record.active
+        for index, controller in enumerate(self._plan.controllers):
+            if active >> index & 1 and controller.command and joint in controller.joints:
+                return f"controller {controller.name}"
+        return "no controller"

@@ -1,0 +1,159 @@
+"""One controller under the manager: its private arrays, its rows of the robot's arrays, its rules."""
+
+from __future__ import annotations
+
+import traceback
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.control.controller import Context, Controller
+from dxlrun.control.loop_plan import ControllerPlan
+from dxlrun.cycle import Clamp, CycleRecord
+from dxlrun.errors import ControllerFault
+from dxlrun.interfaces import Commands, Floats
+
+PERIOD_CAP = 5
+"""A controller is never told a period longer than this many nominal ones: a law that integrates would jump.
+The guardian ends a loop that stands still for as long."""
+
+_TRACEBACK = 6000
+
+
+class Managed:
+    """A configured controller; gathers before its update, checks and scatters after it."""
+
+    def __init__(
+        self,
+        plan: ControllerPlan,
+        controller: Controller[Any],
+        context: Context,
+        rows: NDArray[np.intp],
+        record: CycleRecord,
+    ) -> None:
+        self.plan = plan
+        self.active = False
+        self._controller = controller
+        self._context = context
+        self._rows = rows
+        self._record = record
+        self._nominal_ns = context.period_ns
+        self._last_ns = -1
+        self._last_number = -1
+        self._finite = np.zeros(len(rows), dtype=np.bool_)
+        self._claimed = tuple(
+            _Claim(name, _array(context.commands, name), _array(record.commands, name), len(rows))
+            for name in plan.command
+        )
+
+    def activate(self, time_ns: int) -> None:
+        """Let the controller take over its joints. Raises ControllerFault."""
+        for claim in self._claimed:
+            claim.forget()
+        self.gather()
+        try:
+            self._controller.on_activate(time_ns)
+        except (Exception, SystemExit) as error:  # foreign code: it must not take the loop along
+            raise self._fault("on_activate", error) from error
+        self._last_ns = -1
+        self._last_number = -1
+        self.active = True
+
+    def deactivate(self, time_ns: int) -> None:
+        """Let the controller let go. Raises ControllerFault; its joints are released all the same."""
+        self.release()
+        try:
+            self._controller.on_deactivate(time_ns)
+        except (Exception, SystemExit) as error:  # see activate
+            raise self._fault("on_deactivate", error) from error
+
+    def release(self) -> None:
+        """Take its commands out of the robot's: the gate holds what it last let through."""
+        self.active = False
+        for claim in self._claimed:
+            claim.merged[self._rows] = np.nan
+
+    def command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
+        """Hand over a prepared command. Raises ControllerFault."""
+        self.gather()
+        try:
+            self._controller.on_command(kind, data, time_ns)
+        except (Exception, SystemExit) as error:  # see activate
+            raise self._fault(f"on_command ({kind})", error) from error
+
+    def due(self, number: int) -> bool:
+        """Say whether the controller is updated in this period; a skipped turn is made up in the next one."""
+        return number // self.plan.every > self._last_number // self.plan.every
+
+    def update(self, number: int, time_ns: int) -> None:
+        """Update and merge its commands into the robot's. Raises ControllerFault."""
+        period_ns = self._nominal_ns if self._last_ns < 0 else time_ns - self._last_ns
+        self._last_ns, self._last_number = time_ns, number
+        self.gather()
+        try:
+            self._controller.update(time_ns, min(period_ns, PERIOD_CAP * self._nominal_ns))
+        except (Exception, SystemExit) as error:  # see activate
+            raise self._fault("update", error) from error
+        for claim in self._claimed:
+            np.isfinite(claim.own, out=self._finite)
+            if self._finite.all():
+                claim.seen.fill(True)
+            else:
+                self._judge(claim)
+        for claim in self._claimed:
+            claim.merged[self._rows] = claim.own
+
+    def gather(self) -> None:
+        """Copy the robot's states and goals into the controller's own arrays."""
+        rows, record, context = self._rows, self._record, self._context
+        states, own = record.states, context.states
+        states.position.take(rows, out=own.position, mode="clip")
+        states.velocity.take(rows, out=own.velocity, mode="clip")
+        states.effort.take(rows, out=own.effort, mode="clip")
+        states.valid.take(rows, out=own.valid, mode="clip")
+        states.age_ns.take(rows, out=own.age_ns, mode="clip")
+        record.goals.position.take(rows, out=context.goals.position, mode="clip")
+        record.goals.velocity.take(rows, out=context.goals.velocity, mode="clip")
+
+    def _judge(self, claim: _Claim) -> None:
+        """Accept NaN where nothing was commanded yet. Raises ControllerFault for everything else."""
+        wrong = ~self._finite & (claim.seen | np.isinf(claim.own))
+        if wrong.any():
+            self._record.clamped[self._rows[wrong]] |= np.uint8(Clamp.NOT_FINITE)
+            first = int(np.flatnonzero(wrong)[0])
+            after = " after a finite value" if claim.seen[first] else ""
+            raise ControllerFault(
+                f"controller {self.plan.name} commanded {self.plan.joints[first]}/{claim.interface} = "
+                f"{claim.own[first]}{after}"
+            )
+        claim.seen |= self._finite
+
+    def _fault(self, where: str, error: BaseException) -> ControllerFault:
+        fault = ControllerFault(
+            f"controller {self.plan.name} raised in {where}: "
+            + " ".join(f"{type(error).__name__}: {error}".split())
+        )
+        fault.add_note("".join(traceback.format_exception(error))[-_TRACEBACK:])
+        return fault
+
+
+class _Claim:
+    """A claimed interface: the controller's own array, the robot's, and where it was ever finite."""
+
+    __slots__ = ("interface", "merged", "own", "seen")
+
+    def __init__(self, interface: str, own: Floats, merged: Floats, joints: int) -> None:
+        self.interface = interface
+        self.own = own
+        self.merged = merged
+        self.seen = np.zeros(joints, dtype=np.bool_)
+
+    def forget(self) -> None:
+        """Begin anew: nothing was commanded yet."""
+        self.own.fill(np.nan)
+        self.seen.fill(False)
+
+
+def _array(commands: Commands, interface: str) -> Floats:
+    return commands.position if interface == "position" else commands.velocity

@@ -1,0 +1,144 @@
+"""Plug-ins: finds the packages that offer controllers, one by one; a broken one never takes others along."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+import pluggy
+
+from dxlrun.control.controller import CONTRACT_VERSION, Controller
+from dxlrun.control.hookspecs import GROUP, HookSpecs
+from dxlrun.errors import PlugInError
+
+ControllerClass = type[Controller[Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class Offer:
+    """A controller that a plug-in offers."""
+
+    type: str
+    """The robot file's name for it."""
+    controller: ControllerClass
+    distribution: str
+    """Who published it: `name version`."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlugIns:
+    """All controllers that are installed, and why others are not to be had."""
+
+    controllers: Mapping[str, Offer]
+    """By type."""
+    broken: Mapping[str, str]
+    """One sentence a plug-in that could not be used, by its entry point's name, and one a type that two
+    plug-ins offer, by the type's name."""
+
+
+def load_plugins(after_each: Callable[[str], None] | None = None) -> PlugIns:
+    """Import every entry point of the group `dxlrun` and ask it for its controllers.
+
+    `after_each` is called with the plug-in's name and distribution after its import, broken or not; what it
+    raises passes through: the loop's process counts its threads there. Itself raises nothing.
+    """
+    offers: dict[str, Offer] = {}
+    broken: dict[str, str] = {}
+    ambiguous: dict[str, str] = {}
+    for entry_point in sorted(entry_points(group=GROUP), key=_order):
+        publisher = _publisher(entry_point)
+        try:
+            found = _load(entry_point, publisher)
+        except PlugInError as error:
+            broken[_free_key(entry_point.name, publisher, broken)] = str(error)
+            found = ()
+        if after_each is not None:
+            after_each(f"{entry_point.name} ({publisher})")
+        for offer in found:
+            first = offers.setdefault(offer.type, offer)
+            if first is not offer:
+                ambiguous[offer.type] = (
+                    f"{first.distribution} and {offer.distribution} both offer a controller of type "
+                    f"{offer.type}; neither is used: uninstall one of them, or ask an author for another name"
+                )
+    usable = {name: offer for name, offer in offers.items() if name not in ambiguous}
+    return PlugIns(controllers=usable, broken=broken | ambiguous)
+
+
+def _order(entry_point: EntryPoint) -> tuple[str, str]:
+    """The order must not depend on the file system, because two runs are to say the same."""
+    return _publisher(entry_point), entry_point.name
+
+
+def _publisher(entry_point: EntryPoint) -> str:
+    distribution = entry_point.dist
+    return f"{distribution.name} {distribution.version}" if distribution else "an unknown distribution"
+
+
+def _told(error: BaseException) -> str:
+    """Return an error in one line."""
+    return " ".join(f"{type(error).__name__}: {error}".split())
+
+
+def _free_key(name: str, publisher: str, taken: Mapping[str, str]) -> str:
+    return name if name not in taken else f"{name} ({publisher})"
+
+
+def _load(entry_point: EntryPoint, publisher: str) -> tuple[Offer, ...]:
+    """Return what one plug-in offers. Raises PlugInError with one sentence that names its distribution."""
+
+    def refuse(what: str, mend: str) -> PlugInError:
+        return PlugInError(f"plug-in {entry_point.name} of {publisher} {what}; {mend}")
+
+    try:
+        module = entry_point.load()
+    except (Exception, SystemExit) as error:  # foreign code: whatever it does on import is its fault alone
+        raise refuse(f"cannot be imported ({_told(error)})", "reinstall it, or tell its author") from error
+    manager = pluggy.PluginManager(GROUP)
+    manager.add_hookspecs(HookSpecs)
+    try:
+        manager.register(module, entry_point.name)
+        manager.check_pending()
+    except pluggy.PluginValidationError as error:
+        raise refuse(
+            f"has a wrong hook ({_told(error)})",
+            "its signatures must be those of dxlrun.control.hookspecs",
+        ) from error
+    try:
+        contracts = manager.hook.dxlrun_contract()
+        mappings = manager.hook.dxlrun_controllers()
+    except (Exception, SystemExit) as error:  # foreign code, see above
+        raise refuse(f"raised in a hook ({_told(error)})", "tell its author") from error
+    if not contracts:
+        raise refuse("does not say for which contract it was written", "it must implement dxlrun_contract")
+    if contracts != [CONTRACT_VERSION]:
+        raise refuse(
+            f"was written for contract {contracts[0]!r}, this dxlrun has contract {CONTRACT_VERSION}",
+            "install a version of it that fits",
+        )
+    return tuple(
+        _offer(name, controller, publisher, refuse)
+        for mapping in mappings
+        for name, controller in _items(mapping, refuse)
+    )
+
+
+def _items(mapping: object, refuse: Callable[[str, str], PlugInError]) -> list[tuple[object, object]]:
+    if not isinstance(mapping, Mapping):
+        raise refuse("does not return a mapping from dxlrun_controllers", "return {type: class}")
+    return list(mapping.items())
+
+
+def _offer(
+    name: object, controller: object, publisher: str, refuse: Callable[[str, str], PlugInError]
+) -> Offer:
+    if not isinstance(name, str):
+        raise refuse(f"offers a controller under {name!r}", "the type must be a string")
+    if not (isinstance(controller, type) and issubclass(controller, Controller)):
+        raise refuse(
+            f"offers {controller!r} as {name}, which is no controller",
+            "derive a class from dxlrun.Controller",
+        )
+    return Offer(name, controller, publisher)
