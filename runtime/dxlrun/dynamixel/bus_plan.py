@@ -24,6 +24,12 @@ class ServoPlan:
     max_tick: int
     rad_s_per_tick: float
     max_speed_tick: int
+    effort_per_tick: float = 1 / 1023
+    """Fraction of the maximum per tick of present load."""
+    lower_tick: int = 0
+    """Lowest goal that the joint's limits allow, as the servo counts."""
+    upper_tick: int = 1023
+    """Highest goal that the joint's limits allow, as the servo counts."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,134 @@
+"""Receiver: bytes of one serial line in, intact Protocol 1.0 packets out; finds its way through noise.
+
+One preallocated buffer, no growth. Each byte leaves it exactly once: inside an intact packet, or as noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from dxlrun.dynamixel.protocol1 import HEADER, LONGEST
+from dxlrun.dynamixel.port import Port
+
+Taker = Callable[[memoryview, int, int], None]
+"""Takes bytes with the times (ns) of the read() calls that brought the first and the last of them.
+
+The view is only good during the call.
+"""
+
+_CAPACITY = 1024
+"""Room for one unfinished packet and a good read beside it."""
+
+
+class Receiver:
+    """Takes packets out of a stream; decides on a header only when its whole packet is there.
+
+    A false header in noise can announce up to 259 bytes and so hold back what follows it; `flush` ends that
+    when a deadline has passed.
+    """
+
+    __slots__ = ("_buffer", "_end", "_ends", "_noise", "_packet", "_times", "_view")
+
+    def __init__(self, packet: Taker, noise: Taker) -> None:
+        self._buffer = bytearray(_CAPACITY)
+        self._view = memoryview(self._buffer)
+        self._end = 0
+        self._ends: list[int] = []  # where each read() ended in the buffer; as many as unfinished reads
+        self._times: list[int] = []
+        self._packet = packet
+        self._noise = noise
+
+    @property
+    def pending(self) -> int:
+        """Number of bytes that are neither packet nor noise yet."""
+        return self._end
+
+    def read_from(self, port: Port, now_ns: Callable[[], int]) -> int:
+        """Take what the port has, deliver what became whole; return the number of bytes taken.
+
+        Raises PortError when the adapter is gone.
+        """
+        count = port.read_into(self._view[self._end :])
+        if count:
+            self._accept(count, now_ns())
+        return count
+
+    def feed(self, data: bytes, now_ns: int) -> None:
+        """Take bytes that arrived at `now_ns`, deliver what became whole."""
+        for start in range(0, len(data), _CAPACITY - LONGEST):
+            chunk = data[start : start + _CAPACITY - LONGEST]
+            self._view[self._end : self._end + len(chunk)] = chunk
+            self._accept(len(chunk), now_ns)
+
+    def flush(self) -> None:
+        """Give up waiting for the rest of an unfinished packet: scan again behind its header."""
+        while self._end:
+            if self._buffer.startswith(HEADER) and self._end > 1:
+                self._forget(self._scan(1))
+            else:
+                self._emit(self._noise, 0, self._end)
+                self._forget(self._end)
+
+    def _accept(self, count: int, at_ns: int) -> None:
+        self._end += count
+        self._ends.append(self._end)
+        self._times.append(at_ns)
+        self._forget(self._scan(0))
+
+    def _emit(self, taker: Taker, start: int, stop: int) -> None:
+        times = self._times
+        if len(times) == 1:
+            taker(self._view[start:stop], times[0], times[0])
+            return
+        ends = self._ends
+        first = next(i for i, end in enumerate(ends) if end > start)
+        last = next(i for i, end in enumerate(ends) if end >= stop)
+        taker(self._view[start:stop], times[first], times[last])
+
+    def _scan(self, search: int) -> int:
+        """Deliver what is whole, looking for headers from `search` on; return the start of what is not."""
+        buffer, end = self._buffer, self._end
+        done = 0  # everything before it was delivered
+        while True:
+            start = buffer.find(HEADER, search, end)
+            if start < 0:
+                # the last byte may be the first half of a header
+                start = end - 1 if end > search and buffer[end - 1] == 0xFF else end
+                break
+            if end - start < 4:
+                if end - start == 3 and buffer[start + 2] == 0xFF:
+                    search = start + 1
+                    continue
+                break
+            length = buffer[start + 3]
+            if buffer[start + 2] == 0xFF or length < 2:
+                search = start + 1
+                continue
+            stop = start + 4 + length
+            if stop > end:
+                break
+            if ~sum(buffer[start + 2 : stop - 1]) & 0xFF != buffer[stop - 1]:
+                search = start + 1
+                continue
+            if start > done:
+                self._emit(self._noise, done, start)
+            self._emit(self._packet, start, stop)
+            done = search = stop
+        if start > done:
+            self._emit(self._noise, done, start)
+        return start
+
+    def _forget(self, count: int) -> None:
+        """Drop the first `count` bytes."""
+        if count == self._end:
+            self._end = 0
+            self._ends.clear()
+            self._times.clear()
+        elif count:
+            rest = self._end - count
+            self._buffer[:rest] = self._buffer[count : self._end]
+            while self._ends[0] <= count:
+                del self._ends[0], self._times[0]
+            for i, end in enumerate(self._ends):
+                self._ends[i] = end - count
+            self._end = rest

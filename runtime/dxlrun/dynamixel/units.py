@@ -1,0 +1,31 @@
+"""Units of one servo: ticks of the wire <-> rad and rad/s of its joint; the same rules as the arrays.
+
+q = direction * (theta - reference), theta = raw * rad_per_tick, counter-clockwise positive (thesis of M.
+Amarante Araujo, 2017, JointID; e-Manual AX-12A, Goal Position (30): 300/1023 deg a tick).
+"""
+
+from __future__ import annotations
+
+from dxlrun.dynamixel.bus_plan import ServoPlan
+
+
+def joint_position(servo: ServoPlan, raw: int) -> float:
+    """Return the joint's angle, rad, of a present or goal position in ticks."""
+    return servo.direction * (raw * servo.rad_per_tick - servo.reference)
+
+
+def goal_ticks(servo: ServoPlan, position: float) -> int:
+    """Return the goal position in ticks of a joint angle, rad; to the nearest, inside 0..max, never wraps."""
+    theta = servo.direction * position + servo.reference
+    return min(max(round(theta / servo.rad_per_tick), 0), servo.max_tick)
+
+
+def speed_ticks(servo: ServoPlan, velocity: float) -> int:
+    """Return the moving speed in ticks of a speed, rad/s.
+
+    Its magnitude counts. NaN gives 0, which is the maximum in joint mode; 0 rad/s therefore gives 1 tick.
+    """
+    if velocity != velocity:
+        return 0
+    most = servo.max_speed_tick
+    return min(max(round(min(abs(velocity) / servo.rad_s_per_tick, most)), 1), most)
