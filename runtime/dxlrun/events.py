@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from enum import IntEnum, unique
 from typing import Protocol
 
-from dxlrun.clock import Clock
 from dxlrun.ring import RING_SECONDS, Appender, Payload
 
 
@@ -98,6 +97,14 @@ class Event:
         return known.name.lower() if isinstance(known, EventCode) else f"code_{self.code}"
 
 
+class _Now(Protocol):
+    """The part of a Clock that an event needs."""
+
+    def now_ns(self) -> int:
+        """Return the time of the run's clock, ns."""
+        ...
+
+
 class EventRing:
     """Takes events of one process and appends them to its ring; never blocks, never raises.
 
@@ -106,7 +113,7 @@ class EventRing:
 
     __slots__ = ("_clock", "_writer")
 
-    def __init__(self, writer: Appender, clock: Clock) -> None:
+    def __init__(self, writer: Appender, clock: _Now) -> None:
         self._writer = writer
         self._clock = clock
 

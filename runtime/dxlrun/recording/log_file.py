@@ -1,0 +1,45 @@
+"""The file under a log: never overwrites, writes all or says why not, can go back to the last whole chunk."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+
+class LogFile:
+    """Unbuffered bytes on a disk; every method raises OSError when the disk does not take them."""
+
+    __slots__ = ("_descriptor", "_size")
+
+    def __init__(self, path: Path) -> None:
+        self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        self._size = 0
+
+    def write(self, data: bytes | bytearray | memoryview) -> int:
+        """Write all of `data`; the kernel may take it in pieces, and the last piece tells of a full disk."""
+        rest = memoryview(data)
+        while rest:
+            rest = rest[os.write(self._descriptor, rest) :]
+        self._size += len(data)
+        return len(data)
+
+    def tell(self) -> int:
+        """Return how many bytes were written whole."""
+        return self._size
+
+    def flush(self) -> None:
+        """Nothing is held back here."""
+
+    def sync(self) -> None:
+        """Wait until the disk has what was written."""
+        os.fdatasync(self._descriptor)
+
+    def truncate(self, size: int) -> None:
+        """Cut what lies behind `size`."""
+        os.ftruncate(self._descriptor, size)
+        os.lseek(self._descriptor, size, os.SEEK_SET)
+        self._size = size
+
+    def close(self) -> None:
+        """Let go of the file."""
+        os.close(self._descriptor)

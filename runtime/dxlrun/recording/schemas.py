@@ -1,0 +1,131 @@
+"""Topics and messages of the log: the one place that knows them.
+
+Messages are ROS 2 definitions (`ros2msg`), encoded as CDR little-endian, so that rosbag2, Foxglove,
+PlotJuggler and Rerun open a log without conversion. Every channel carries the RIHS01 hash of its type (REP
+2016); the hashes of our own messages are constants here, and a test computes them anew.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from dxlrun.cycle import SCALARS, SEQUENCES
+
+PROFILE = "ros2"
+ENCODING = "cdr"
+SCHEMA_ENCODING = "ros2msg"
+
+CYCLE_TOPIC = "/cycle"
+EVENT_TOPIC = "/events"
+ROSOUT_TOPIC = "/rosout"
+JOINT_STATES_TOPIC = "/joint_states"
+JOINT_COMMANDS_TOPIC = "/joint_commands"
+BUS_PREFIX = "/bus/"
+
+METADATA_NAME = "dxlrun"
+"""The metadata record that makes an MCAP file a log of dxlrun."""
+SUMMARY_NAME = "dxlrun_summary"
+"""The metadata record that a finished log ends with."""
+HEADER_ATTACHMENT = "header.json"
+FORMAT = "1"
+"""Grows when a reader of the version before would misread a log."""
+
+_RULE = "=" * 80
+
+
+@dataclass(frozen=True, slots=True)
+class MessageType:
+    """A message: its full name, its definition with all it depends on, its RIHS01 hash."""
+
+    name: str
+    text: str
+    type_hash: str
+
+
+def bus_topic(bus: str) -> str:
+    """Return the topic of a bus' packets."""
+    return f"{BUS_PREFIX}{bus}"
+
+
+_TIME = f"""
+{_RULE}
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+"""
+
+JOINT_STATE = MessageType(
+    "sensor_msgs/msg/JointState",
+    f"""std_msgs/Header header
+string[] name
+float64[] position
+float64[] velocity
+float64[] effort
+{_RULE}
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+{_TIME.strip()}
+""",
+    "RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e",
+)
+
+ROS_LOG = MessageType(
+    "rcl_interfaces/msg/Log",
+    f"""builtin_interfaces/Time stamp
+uint8 level
+string name
+string msg
+string file
+string function
+uint32 line
+{_TIME.strip()}
+""",
+    "RIHS01_e28ce254ca8abc06abf92773b74602cdbf116ed34fbaf294fb9f81da9f318eac",
+)
+
+
+def _cycle_text() -> str:
+    lines = [
+        "# One cycle of the loop. Times: ns of the run's clock; wall time = that + epoch_offset_ns",
+        "# of the metadata. Rows: in the order of the metadata's joints and controllers; rad, rad/s;",
+        "# NaN = not known or not commanded. active, published: bit i is controller i. clamped:",
+        "# 1 lower, 2 upper, 4 step, 8 velocity, 16 not finite. Records + skipped = elapsed periods.",
+    ]
+    lines += [f"{kind} {name}" for name, kind in SCALARS]
+    lines += [f"{kind}[] {name}" for name, kind, _ in SEQUENCES]
+    return "\n".join(lines) + "\n"
+
+
+CYCLE = MessageType(
+    "dxlrun_msgs/msg/Cycle",
+    _cycle_text(),
+    "RIHS01_72c5439dcf2ac631fb4b21e3253cd0c483d39ff8d7dfffa1906ed8aa53ab1c32",
+)
+
+BUS_PACKET = MessageType(
+    "dxlrun_msgs/msg/BusPacket",
+    """# Bytes on a bus. kind: 1 instruction, 2 status, 3 noise. Times, ns of the run's clock: of an
+# instruction before and after its write(); else after the read() that brought the first and the last byte.
+int64 first_ns
+int64 last_ns
+uint8 kind
+uint8 servo_id
+uint8[] data
+""",
+    "RIHS01_a1803896530c41f5f48b1dbd1edaf11340e05121807c1416d4514e70af7f50f8",
+)
+
+EVENT = MessageType(
+    "dxlrun_msgs/msg/Event",
+    """# Something that happened beside the regular cycle. part: 0; 1, 2 ... for what follows of a long text.
+int64 t_ns
+uint16 code
+uint8 severity
+uint8 part
+string name
+string source
+string text
+""",
+    "RIHS01_52b75cd08e34ca10ea5c06c64fbfeb30f3e85c73af0478f1ca6c1b3aafb5d98e",
+)
