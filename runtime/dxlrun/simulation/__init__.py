@@ -1,1 +1,20 @@
-"""dxlrun."""
+"""Simulated servos on simulated buses, with packet code of their own; they share only the control tables."""
+
+from __future__ import annotations
+
+from dxlrun.simulation.bus import BusConfig, SimulatedBus
+from dxlrun.simulation.ledger import Ledger, LedgerEntry, read_ledger
+from dxlrun.simulation.servo import ServoConfig, SimulatedServo
+from dxlrun.simulation.virtual import VirtualPort, VirtualPorts
+
+__all__ = [
+    "BusConfig",
+    "Ledger",
+    "LedgerEntry",
+    "ServoConfig",
+    "SimulatedBus",
+    "SimulatedServo",
+    "VirtualPort",
+    "VirtualPorts",
+    "read_ledger",
+]

@@ -1,0 +1,106 @@
+"""The ledger of a simulated bus: every byte in and out with its time; the runtime cannot edit it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Literal
+
+from dxlrun.errors import LogError
+
+Direction = Literal["in", "out", "note"]
+
+FLUSH_NS = 500_000_000
+"""A ledger file is never further behind than this."""
+
+
+@dataclass(frozen=True, slots=True)
+class LedgerEntry:
+    """Bytes that passed the wire together, or a note about something that was done to the bus."""
+
+    t_ns: int
+    """`in`: when the host handed them over; `out`: when the last of them had passed the wire."""
+    bus: str
+    direction: Direction
+    """Seen from the servos: `in` came from the host, `out` went to it."""
+    data: bytes
+    note: str
+
+
+class Ledger:
+    """Keeps entries in memory, in a JSON-lines file, or both; `keep=False` bounds the memory of long runs."""
+
+    def __init__(self, path: Path | None = None, *, keep: bool = True) -> None:
+        self.entries: list[LedgerEntry] = []
+        self._keep = keep
+        self._file: IO[str] | None = None if path is None else path.open("w", encoding="ascii")
+        self._unflushed_ns: int | None = None
+
+    def add(self, t_ns: int, bus: str, direction: Direction, data: bytes = b"", note: str = "") -> None:
+        """Enter bytes or a note; a file is flushed by `flush_if_due` and at the end."""
+        if self._keep:
+            self.entries.append(LedgerEntry(t_ns, bus, direction, data, note))
+        if self._file is not None:
+            line = {"t_ns": t_ns, "bus": bus, "direction": direction, "bytes": data.hex(), "note": note}
+            self._file.write(json.dumps(line) + "\n")
+            if self._unflushed_ns is None:
+                self._unflushed_ns = t_ns
+
+    def flush_due_ns(self) -> int | None:
+        """Return when the file must be flushed, ns on the clock of the entries; None: all is written."""
+        return None if self._unflushed_ns is None else self._unflushed_ns + FLUSH_NS
+
+    def flush_if_due(self, now_ns: int) -> None:
+        """Write the file out when its oldest unwritten entry is half a second old."""
+        due = self.flush_due_ns()
+        if due is not None and now_ns >= due:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write the file out."""
+        if self._file is not None:
+            self._file.flush()
+        self._unflushed_ns = None
+
+    def close(self) -> None:
+        """Write the file out and close it; the entries in memory stay."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+        self._unflushed_ns = None
+
+    def __enter__(self) -> Ledger:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def read_ledger(path: Path) -> tuple[LedgerEntry, ...]:
+    """Return the entries of a ledger file; a last line that was cut off in writing is left out.
+
+    Raises LogError when another line is not an entry, OSError when the file cannot be read.
+    """
+    lines = path.read_text(encoding="ascii").split("\n")
+    complete = lines[:-1]  # what follows the last newline is empty, or was cut off
+    try:
+        return tuple(_entry(json.loads(line)) for line in complete)
+    except (ValueError, KeyError, TypeError) as error:
+        raise LogError(f"{path} is not a ledger of a simulated bus: {error}") from error
+
+
+def _entry(line: dict[str, str | int]) -> LedgerEntry:
+    direction = str(line["direction"])
+    if direction not in ("in", "out", "note"):
+        raise ValueError(f"unknown direction {direction!r}")
+    return LedgerEntry(
+        t_ns=int(line["t_ns"]),
+        bus=str(line["bus"]),
+        direction="in" if direction == "in" else "out" if direction == "out" else "note",
+        data=bytes.fromhex(str(line["bytes"])),
+        note=str(line["note"]),
+    )

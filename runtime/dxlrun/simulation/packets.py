@@ -1,0 +1,126 @@
+"""Protocol 1.0 as a servo sees it: bytes of the line -> instructions, replies -> bytes.
+
+Written from the protocol alone (ROBOTIS e-Manual, "Protocol 1.0"), without the host's packet code: one codec for both sides
+would agree with its own mistakes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum, IntFlag, unique
+
+HEADER = b"\xff\xff"
+BROADCAST = 0xFE
+LONGEST = 4 + 255
+"""Bytes of the longest packet: header, ID, a length byte of 255 and what it counts."""
+
+
+@unique
+class Instruction(IntEnum):
+    """Instruction byte (e-Manual, Protocol 1.0, "Instruction")."""
+
+    PING = 0x01
+    READ = 0x02
+    WRITE = 0x03
+    REG_WRITE = 0x04
+    ACTION = 0x05
+    FACTORY_RESET = 0x06
+    SYNC_WRITE = 0x83
+    BULK_READ = 0x92
+
+
+class ErrorBit(IntFlag):
+    """Error byte of a status packet (e-Manual, Protocol 1.0, "Error")."""
+
+    VOLTAGE = 0x01
+    ANGLE_LIMIT = 0x02
+    OVERHEATING = 0x04
+    RANGE = 0x08
+    CHECKSUM = 0x10
+    OVERLOAD = 0x20
+    INSTRUCTION = 0x40
+
+
+@dataclass(frozen=True, slots=True)
+class InstructionPacket:
+    """One packet that stood on the line."""
+
+    servo_id: int
+    instruction: int
+    parameters: bytes
+    intact: bool
+    """False when the checksum is wrong: then nothing else of it can be trusted."""
+    end: int
+    """Index behind its last byte, in the bytes that completed it."""
+
+
+def checksum(body: bytes | bytearray) -> int:
+    """Return the checksum of everything between header and checksum."""
+    return ~sum(body) & 0xFF
+
+
+def status_packet(servo_id: int, error: int, parameters: bytes = b"") -> bytes:
+    """Return the bytes of a status packet."""
+    body = bytes((servo_id, len(parameters) + 2, error)) + parameters
+    return HEADER + body + bytes((checksum(body),))
+
+
+class InstructionReceiver:
+    """Finds instruction packets in the bytes of a line, noise or not; holds at most one packet."""
+
+    __slots__ = ("_buffer",)
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+
+    @property
+    def pending(self) -> int:
+        """Number of bytes of a packet that is not complete."""
+        return len(self._buffer)
+
+    def forget(self) -> None:
+        """Drop a packet that was not completed in time."""
+        self._buffer.clear()
+
+    def feed(self, data: bytes | bytearray | memoryview, start: int = 0) -> InstructionPacket | None:
+        """Take bytes of `data` from `start` on until a packet is complete, and return it; None: all were taken.
+
+        A packet with a wrong checksum is one too. Go on at `packet.end`.
+        """
+        for index in range(start, len(data)):
+            self._buffer.append(data[index])
+            self._drop_noise()
+            packet = self._complete(index + 1)
+            if packet is not None:
+                self._buffer.clear()
+                return packet
+        return None
+
+    def _drop_noise(self) -> None:
+        """Shorten the buffer from the front until it may be the begin of a packet."""
+        buffer = self._buffer
+        while buffer and not _may_begin(buffer):
+            del buffer[0]
+
+    def _complete(self, end: int) -> InstructionPacket | None:
+        buffer = self._buffer
+        if len(buffer) < 4 or len(buffer) < 4 + buffer[3]:
+            return None
+        return InstructionPacket(
+            servo_id=buffer[2],
+            instruction=buffer[4],
+            parameters=bytes(buffer[5:-1]),
+            intact=buffer[-1] == checksum(buffer[2:-1]),
+            end=end,
+        )
+
+
+def _may_begin(buffer: bytearray) -> bool:
+    """Return whether a packet can begin so: header, an ID that is none of 0xFF, a length of at least 2."""
+    size = len(buffer)
+    return (
+        buffer[0] == 0xFF
+        and (size < 2 or buffer[1] == 0xFF)
+        and (size < 3 or buffer[2] != 0xFF)
+        and (size < 4 or buffer[3] >= 2)
+    )

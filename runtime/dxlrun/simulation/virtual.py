@@ -1,0 +1,71 @@
+"""Ports of simulated buses on virtual time: no process, no terminal, no waiting."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from dxlrun.clock import VirtualClock
+from dxlrun.errors import PortError
+from dxlrun.simulation.bus import SimulatedBus
+
+
+class VirtualPort:
+    """The host's end of one simulated bus; a Port of the dynamixel package by its form."""
+
+    def __init__(self, clock: VirtualClock, bus: SimulatedBus) -> None:
+        self._clock = clock
+        self._bus = bus
+        self._arrived = bytearray()
+        self._gone = False
+
+    def write(self, data: bytes | bytearray | memoryview) -> None:
+        """Hand bytes to the line now; raises PortError when the adapter was unplugged."""
+        self._check()
+        self._bus.receive(data, self._clock.now_ns())
+
+    def read_into(self, buffer: memoryview) -> int:
+        """Copy what has arrived by now; return the number of bytes; raises PortError when unplugged."""
+        self._check()
+        self.collect()
+        size = min(len(buffer), len(self._arrived))
+        buffer[:size] = self._arrived[:size]
+        del self._arrived[:size]
+        return size
+
+    def collect(self) -> bool:
+        """Take what has passed the wire by now; return whether something waits, or the adapter is gone."""
+        self._arrived += self._bus.take(self._clock.now_ns())
+        return bool(self._arrived) or self._gone
+
+    def unplug(self) -> None:
+        """Pull the adapter: every later use raises PortError."""
+        self._bus.note("adapter unplugged")
+        self._gone = True
+
+    def _check(self) -> None:
+        if self._gone:
+            raise PortError(f"the adapter of bus {self._bus.name} is gone")
+
+
+class VirtualPorts:
+    """All simulated lines of a robot, waited for together; a Ports of the dynamixel package by its form."""
+
+    def __init__(self, clock: VirtualClock, buses: Sequence[SimulatedBus]) -> None:
+        self._clock = clock
+        self._buses = tuple(buses)
+        self._ports = tuple(VirtualPort(clock, bus) for bus in buses)
+
+    @property
+    def ports(self) -> Sequence[VirtualPort]:
+        """The lines, in the order of the buses."""
+        return self._ports
+
+    def wait(self, deadline_ns: int) -> Sequence[int]:
+        """Let virtual time pass until bytes arrive or `deadline_ns`; return the indices of lines with bytes."""
+        while True:
+            ready = [index for index, port in enumerate(self._ports) if port.collect()]
+            now_ns = self._clock.now_ns()
+            if ready or now_ns >= deadline_ns:
+                return ready
+            due = [due_ns for bus in self._buses if (due_ns := bus.next_due_ns()) is not None]
+            self._clock.wait_until(min([deadline_ns, *due]))
