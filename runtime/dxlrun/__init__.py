@@ -20,7 +20,7 @@ if TYPE_CHECKING:
         ParametersModel,
     )
     from dxlrun.control.hookspecs import hookimpl
-    from dxlrun.description.units import Angle, AngularVelocity, Duration
+    from dxlrun.description.units import Angle, AngularAcceleration, AngularVelocity, Duration
     from dxlrun.errors import (
         ControllerFault,
         DxlrunError,
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 __all__ = [
     "CONTRACT_VERSION",
     "Angle",
+    "AngularAcceleration",
     "AngularVelocity",
     "CommandModel",
     "Commands",
@@ -69,7 +70,7 @@ _ROOMS = {
         "ParametersModel",
     ),
     "dxlrun.control.hookspecs": ("hookimpl",),
-    "dxlrun.description.units": ("Angle", "AngularVelocity", "Duration"),
+    "dxlrun.description.units": ("Angle", "AngularAcceleration", "AngularVelocity", "Duration"),
     "dxlrun.errors": (
         "ControllerFault",
         "DxlrunError",

@@ -1,0 +1,159 @@
+"""joint_trajectory_controller: moves joints along a trajectory, sampled by time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun import Angle, CommandModel, Context, Controller, Duration, Floats, Interfaces, ParametersModel
+from dxlrun_controllers.group import JointNames, hold
+from dxlrun_controllers.spline import Sample, Trajectory
+from dxlrun_controllers.trajectory_command import TrajectoryCommand, flat_trajectory
+
+CLOSING_SPEED = 0.5
+"""rad/s, posvel at the end of a trajectory: with the wanted speed of 0 a servo that lags would creep the rest
+of its way at one tick (0.012 rad/s)."""
+
+
+class Tolerances(ParametersModel):
+    """How far a joint may be off; what is left out is not watched."""
+
+    path: Angle | None = None
+    """On the way: beyond it the trajectory is aborted and the joints hold where they were wanted last."""
+    goal: Angle | None = None
+    """At the end: the goal counts as reached when every joint is nearer than this."""
+    goal_time: Duration = 0
+    """How long after the end the goal may still be reached."""
+
+
+class TrajectoryParameters(ParametersModel):
+    """Keys of a joint_trajectory_controller in the robot file."""
+
+    joints: JointNames
+    """The joints, in the order in which points name them."""
+    command_interface: Literal["position", "posvel"] = "position"
+    """`posvel` commands the magnitude of the wanted velocity beside the position."""
+    tolerances: Tolerances = Tolerances()
+
+
+class JointTrajectoryController(Controller[TrajectoryParameters]):
+    """Plays one trajectory at a time; a new one takes over from what is wanted then, without a jump.
+
+    Time decides what is wanted, never the number of updates: a late cycle shortens nothing.
+    """
+
+    Parameters = TrajectoryParameters
+    Commands: ClassVar[Mapping[str, type[CommandModel]]] = {"trajectory": TrajectoryCommand}
+
+    @classmethod
+    def interfaces(cls, parameters: TrajectoryParameters, joints: tuple[str, ...]) -> Interfaces:
+        """Claim position, or position and velocity, of the parameters' joints."""
+        if parameters.command_interface == "position":
+            return Interfaces(parameters.joints, ("position",))
+        return Interfaces(parameters.joints, ("position", "velocity"))
+
+    @classmethod
+    def prepare(
+        cls, kind: str, command: CommandModel, parameters: TrajectoryParameters
+    ) -> NDArray[np.float64]:
+        """Return the trajectory's splines as one flat array (spline.flatten).
+
+        Raises ValueError for a wrong size or times that do not grow.
+        """
+        if not isinstance(command, TrajectoryCommand):
+            return super().prepare(kind, command, parameters)
+        return flat_trajectory(command, parameters.joints)
+
+    def on_configure(self, context: Context) -> None:
+        """Make room for everything that the loop will need."""
+        super().on_configure(context)
+        joints = len(context.joints)
+        self._wanted = Sample(joints)
+        self._trajectory = Trajectory(joints)
+        self._error = np.zeros(joints)
+        self._start_ns = 0
+        self._moving = False
+        self._settling = False
+        speed = context.limits.velocity
+        self._closing = np.where(np.isfinite(speed), np.minimum(speed, CLOSING_SPEED), CLOSING_SPEED)
+
+    def on_activate(self, time_ns: int) -> None:
+        """Hold where the joints are."""
+        hold(self.context)
+        self._moving = self._settling = False
+        self._rest(self.context.commands.position)
+
+    def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
+        """Begin a trajectory from what is wanted now."""
+        if self._moving:
+            self._trajectory.sample(self._elapsed(time_ns), self._wanted)
+            self.context.say(f"trajectory preempted after {self._elapsed(time_ns):.3f} s")
+        self._trajectory.load(data, self._wanted)
+        self._start_ns = time_ns
+        self._moving, self._settling = True, False
+
+    def update(self, time_ns: int, period_ns: int) -> None:
+        """Command what the trajectory wants at `time_ns`; hold when there is none."""
+        if self._moving:
+            self._follow(self._elapsed(time_ns))
+        elif self._settling:
+            self._settle(self._elapsed(time_ns))
+
+    def _elapsed(self, time_ns: int) -> float:
+        return (time_ns - self._start_ns) * 1e-9
+
+    def _follow(self, elapsed: float) -> None:
+        commands, wanted = self.context.commands, self._wanted
+        self._trajectory.sample(elapsed, wanted)
+        np.copyto(commands.position, wanted.position)
+        if elapsed >= self._trajectory.duration_s:
+            self._moving, self._settling = False, True
+            self._close_in()
+            self._settle(elapsed)
+            return
+        if self.parameters.command_interface == "posvel":
+            np.abs(wanted.velocity, out=commands.velocity)
+        path = self.parameters.tolerances.path
+        if path is not None and self._worst(silent=0.0) > path:
+            self._moving = False
+            self._rest(wanted.position)
+            self._close_in()
+            self.context.say(f"trajectory aborted after {elapsed:.3f} s: {self._off()}, holding")
+
+    def _settle(self, elapsed: float) -> None:
+        """Say whether the goal was reached, once."""
+        tolerances = self.parameters.tolerances
+        if tolerances.goal is None or self._worst(silent=np.inf) <= tolerances.goal:
+            self._settling = False
+            self.context.say(f"trajectory reached its goal after {elapsed:.3f} s")
+        elif elapsed >= self._trajectory.duration_s + tolerances.goal_time * 1e-9:
+            self._settling = False
+            self.context.say(f"trajectory missed its goal after {elapsed:.3f} s: {self._off()}, holding")
+
+    def _rest(self, position: Floats) -> None:
+        """Want `position`, at rest."""
+        np.copyto(self._wanted.position, position)
+        self._wanted.velocity.fill(0.0)
+        self._wanted.acceleration.fill(0.0)
+
+    def _close_in(self) -> None:
+        """Let servos that lag go the rest of their way."""
+        if self.parameters.command_interface == "posvel":
+            np.copyto(self.context.commands.velocity, self._closing)
+
+    def _worst(self, silent: float) -> float:
+        """Return the largest distance from what is wanted, rad; `silent` stands in for a joint without reply."""
+        states, error = self.context.states, self._error
+        np.subtract(states.position, self._wanted.position, out=error)
+        np.abs(error, out=error)
+        np.copyto(error, silent, where=~states.valid)
+        return float(error.max())
+
+    def _off(self) -> str:
+        row = int(self._error.argmax())
+        if np.isinf(self._error[row]):
+            return f"joint {self.context.joints[row]} does not answer"
+        return f"joint {self.context.joints[row]} is {self._error[row]:.4f} rad off"

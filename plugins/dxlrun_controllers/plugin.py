@@ -1,0 +1,28 @@
+"""The standard controllers' door: the same hooks as anybody's."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from dxlrun import CONTRACT_VERSION, Controller, hookimpl
+from dxlrun_controllers.group import JointGroupPositionController, JointGroupPosVelController
+from dxlrun_controllers.joint_state_broadcaster import JointStateBroadcaster
+from dxlrun_controllers.joint_trajectory_controller import JointTrajectoryController
+
+
+@hookimpl
+def dxlrun_contract() -> int:
+    """Return the contract that these controllers were written for: the one they are published with."""
+    return CONTRACT_VERSION
+
+
+@hookimpl
+def dxlrun_controllers() -> Mapping[str, type[Controller[Any]]]:
+    """Return the standard controllers by their type in the robot file."""
+    return {
+        "joint_group_position_controller": JointGroupPositionController,
+        "joint_group_posvel_controller": JointGroupPosVelController,
+        "joint_state_broadcaster": JointStateBroadcaster,
+        "joint_trajectory_controller": JointTrajectoryController,
+    }

@@ -1,0 +1,135 @@
+"""Splines through the points of a trajectory: linear, cubic or quintic pieces, sampled by time.
+
+A piece is sum(c[k] * t**k), t from its start. Coefficients as in Biagiotti and Melchiorri, Trajectory
+Planning for Automatic Machines and Robots (2008), section 2.1. They are our own because the loop needs them
+without growing memory, and scipy takes two seconds to import; the tests compare the two.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from dxlrun import Floats
+
+LINEAR, CUBIC, QUINTIC = 2, 4, 6
+"""Number of coefficients of a piece."""
+
+_HEAD = 4
+
+
+class Sample:
+    """What is wanted of the joints at one time; shape (joints,) each: rad, rad/s, rad/s^2."""
+
+    __slots__ = ("acceleration", "position", "velocity")
+
+    def __init__(self, joints: int) -> None:
+        self.position = np.zeros(joints)
+        self.velocity = np.zeros(joints)
+        self.acceleration = np.zeros(joints)
+
+
+def solve(
+    order: int, duration: float, start: Sequence[Floats] | Floats, end: Sequence[Floats] | Floats, out: Floats
+) -> None:
+    """Write the piece from `start` to `end` (position, velocity, acceleration) into `out`.
+
+    `duration` in s, above 0; `out` has the shape (order, joints). A linear piece looks only at positions, a
+    cubic one not at accelerations.
+    """
+    way, t = end[0] - start[0], duration
+    out[0] = start[0]
+    if order == LINEAR:
+        out[1] = way / t
+        return
+    v0, v1 = start[1], end[1]
+    out[1] = v0
+    if order == CUBIC:
+        out[2] = (3 * way - (2 * v0 + v1) * t) / t**2
+        out[3] = (-2 * way + (v0 + v1) * t) / t**3
+        return
+    a0, a1 = start[2], end[2]
+    out[2] = a0 / 2
+    out[3] = (20 * way - (8 * v1 + 12 * v0) * t - (3 * a0 - a1) * t**2) / (2 * t**3)
+    out[4] = (-30 * way + (14 * v1 + 16 * v0) * t + (3 * a0 - 2 * a1) * t**2) / (2 * t**4)
+    out[5] = (12 * way - 6 * (v1 + v0) * t + (a1 - a0) * t**2) / (2 * t**5)
+
+
+def evaluate(piece: Floats, t: float, sample: Sample) -> None:
+    """Write the piece's value and derivatives at `t` s into `sample` (Horner's scheme)."""
+    position, velocity, acceleration = sample.position, sample.velocity, sample.acceleration
+    position.fill(0.0)
+    velocity.fill(0.0)
+    acceleration.fill(0.0)
+    for coefficients in piece[::-1]:
+        acceleration *= t
+        acceleration += velocity
+        velocity *= t
+        velocity += position
+        position *= t
+        position += coefficients
+    acceleration *= 2.0
+
+
+def flatten(order: int, times: Floats, points: Floats, start_in: float) -> Floats:
+    """Return a trajectory as the one flat array that `Trajectory.load` takes.
+
+    `times` in s, shape (points,), growing; `points` has the shape (points, 3, joints): position, velocity,
+    acceleration; `start_in` in s.
+    """
+    count, _, joints = points.shape
+    pieces = np.empty((count - 1, order, joints))
+    for index in range(count - 1):
+        solve(order, float(times[index + 1] - times[index]), points[index], points[index + 1], pieces[index])
+    head = np.array([count, joints, order, start_in])
+    return np.concatenate([head, times, points[0].ravel(), points[-1].ravel(), pieces.ravel()])
+
+
+class Trajectory:
+    """A trajectory that is being played: a bridge from where the joints are to its first point, then pieces.
+
+    `load` takes views of the flat array, so that nothing grows in the loop.
+    """
+
+    __slots__ = ("_bridge", "_bridge_s", "_first", "_last", "_pieces", "_start_in", "_times", "duration_s")
+
+    def __init__(self, joints: int) -> None:
+        self._bridge = np.zeros((QUINTIC, joints))
+        self._bridge_s = 0.0
+        self._start_in = 0.0
+        self._times = np.zeros(1)
+        self._first = self._last = np.zeros((3, joints))
+        self._pieces = np.zeros((0, LINEAR, joints))
+        self.duration_s = 0.0
+        """From `load` to the last point, s."""
+
+    def load(self, data: Floats, now: Sample) -> None:
+        """Begin a flat trajectory from the sample `now`; time counts from here."""
+        count, joints, order = int(data[0]), int(data[1]), int(data[2])
+        ends = _HEAD + count
+        body = ends + 6 * joints
+        self._start_in = float(data[3])
+        self._times = data[_HEAD:ends]
+        self._first = data[ends : ends + 3 * joints].reshape(3, joints)
+        self._last = data[ends + 3 * joints : body].reshape(3, joints)
+        self._pieces = data[body:].reshape(count - 1, order, joints)
+        self._bridge_s = self._start_in + float(self._times[0])
+        self.duration_s = self._start_in + float(self._times[-1])
+        self._bridge.fill(0.0)
+        if self._bridge_s > 0:
+            start = (now.position, now.velocity, now.acceleration)
+            solve(order, self._bridge_s, start, self._first, self._bridge[:order])
+
+    def sample(self, t: float, sample: Sample) -> None:
+        """Write what is wanted `t` s after `load`; after the end: the last position, at rest."""
+        if t < self._bridge_s:
+            evaluate(self._bridge, max(t, 0.0), sample)
+        elif t >= self.duration_s:
+            np.copyto(sample.position, self._last[0])
+            sample.velocity.fill(0.0)
+            sample.acceleration.fill(0.0)
+        else:
+            t -= self._start_in
+            index = min(int(self._times.searchsorted(t, side="right")), len(self._pieces)) - 1
+            evaluate(self._pieces[max(index, 0)], t - float(self._times[max(index, 0)]), sample)
