@@ -1,0 +1,107 @@
+"""Motion: the form of a motion file: parts for controllers, each of listed points or of formulas of time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, ClassVar, Self
+
+from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
+
+from dxlrun.description.robot import Form, Name, refuse
+from dxlrun.description.units import Angle, AngularAcceleration, AngularVelocity, Duration
+
+
+def _expression(value: object) -> object:
+    # a constant is a formula too, and YAML has read it as a number
+    return repr(value) if isinstance(value, int | float) and not isinstance(value, bool) else value
+
+
+Expression = Annotated[
+    str, BeforeValidator(_expression, json_schema_input_type=str | float), Field(min_length=1)
+]
+"""A formula of t, s since the part's start; `compile` reads it."""
+
+
+class Target(Form):
+    """Where a joint shall be at a point's time, and how it moves there."""
+
+    position: Angle | None = Field(default=None, description="Angle of the joint.", examples=["30 deg"])
+    velocity: AngularVelocity | None = Field(default=None, description="Speed there.", examples=["1 rad/s"])
+    acceleration: AngularAcceleration | None = Field(
+        default=None, description="Acceleration there.", examples=["0 rad/s^2"]
+    )
+
+    @model_validator(mode="after")
+    def _says_something(self) -> Self:
+        if self.position is None and self.velocity is None and self.acceleration is None:
+            raise refuse("the target says nothing", "give it a position, as in {position: 30 deg}")
+        return self
+
+
+class Point(Form):
+    """One moment of a part."""
+
+    time: Duration = Field(description="Since the part's start.", examples=["1 s"])
+    joints: dict[Name, Target] = Field(
+        min_length=1, description="Targets by joint.", examples=["{head_joint: {position: 30 deg}}"]
+    )
+
+
+class Formula(Form):
+    """The motion of one joint as formulas of t, s."""
+
+    position: Expression = Field(description="rad", examples=["0.5 * sin(2 * t)"])
+    velocity: Expression | None = Field(default=None, description="rad/s", examples=["cos(2 * t)"])
+    acceleration: Expression | None = Field(default=None, description="rad/s^2", examples=["-2 * sin(2 * t)"])
+
+
+class PointsPart(Form):
+    """What one controller shall do, point by point."""
+
+    refused: ClassVar[Mapping[str, str]] = dict.fromkeys(
+        ("duration", "samples", "joints"),
+        "a part has either points, or duration, samples and joints; take one of the two out",
+    )
+
+    controller: str = Field(min_length=1, description="Name of the controller.", examples=["head"])
+    start: Duration = Field(default=0, description="Since the loop's first deadline.", examples=["1 s"])
+    points: Annotated[tuple[Point, ...], Field(strict=False)] = Field(
+        min_length=1, description="Points in order of time.", examples=["[{time: 0 s, joints: ...}]"]
+    )
+
+
+class FormulaPart(Form):
+    """What one controller shall do, as formulas that are sampled before the loop starts."""
+
+    controller: str = Field(min_length=1, description="Name of the controller.", examples=["head"])
+    start: Duration = Field(default=0, description="Since the loop's first deadline.", examples=["1 s"])
+    duration: Annotated[Duration, Field(gt=0)] = Field(description="Length of the part.", examples=["20 s"])
+    samples: int = Field(
+        ge=2,
+        le=1_000_000,
+        description="Points, the first at the start, the last at the end.",
+        examples=["500"],
+    )
+    joints: dict[Name, Formula] = Field(
+        min_length=1, description="Formulas by joint.", examples=["{head_joint: {position: sin(t)}}"]
+    )
+
+
+def _kind(part: object) -> str:
+    points = not isinstance(part, dict | FormulaPart) or (isinstance(part, dict) and "points" in part)
+    return "<points>" if points else "<formulas>"  # no key of a file, so that an error's location is clear
+
+
+Part = Annotated[
+    Annotated[PointsPart, Tag("<points>")] | Annotated[FormulaPart, Tag("<formulas>")], Discriminator(_kind)
+]
+"""Either listed points or formulas."""
+
+
+class Motion(Form):
+    """A motion file."""
+
+    name: Name = Field(description="Name of the motion.", examples=["three_parts"])
+    motions: Annotated[tuple[Part, ...], Field(strict=False)] = Field(
+        min_length=1, description="What each controller does.", examples=["[{controller: head, ...}]"]
+    )

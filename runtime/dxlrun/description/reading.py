@@ -1,0 +1,81 @@
+"""Reading: a file -> a frozen description, or every problem of the file at once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from dxlrun.description.arguments import COMMAND_LINE, Arguments, refuse_arguments
+from dxlrun.description.marks import Marks
+from dxlrun.description.motion import Motion
+from dxlrun.description.problems import problems_of
+from dxlrun.description.robot import Robot
+from dxlrun.description.syntax import parse, read_text
+from dxlrun.description.tree import grow, literal
+from dxlrun.errors import InputError, Problem
+
+
+@dataclass(frozen=True, slots=True)
+class Description:
+    """A robot file whose form is right, with the place of everything in it."""
+
+    robot: Robot
+    marks: Marks
+    path: Path
+    text: str
+    """As it was read."""
+    arguments: dict[str, str]
+    """All its arguments, with the values of this run."""
+
+
+@dataclass(frozen=True, slots=True)
+class MotionDescription:
+    """A motion file whose form is right, with the place of everything in it."""
+
+    motion: Motion
+    marks: Marks
+    path: Path
+    text: str
+    """As it was read."""
+
+
+def read_robot(path: Path, arguments: Mapping[str, str]) -> Description:
+    """Read a robot file with the values of `name:=value`; raises InputError with all problems of its form."""
+    text, file = read_text(path), str(path)
+    tree = parse(text, file)
+    declared = grow(tree, file, literal)  # once without arguments, to learn which there are
+    run = Arguments(declared.data.get("arguments"), arguments, declared.marks)
+    grown = grow(tree, file, run.fill)
+    problems = [*run.problems, *grown.problems]
+    grown.data.pop("arguments", None)
+    try:
+        robot = Robot.model_validate(grown.data)
+    except ValidationError as error:
+        problems += problems_of(error, grown.marks, model=Robot, unknown=grown.unknown)
+        raise InputError(_in_order(problems)) from None
+    if problems:
+        raise InputError(_in_order(problems))
+    return Description(robot, grown.marks, path, text, run.texts)
+
+
+def read_motion(path: Path) -> MotionDescription:
+    """Read a motion file; raises InputError with all problems of its form."""
+    text, file = read_text(path), str(path)
+    grown = grow(parse(text, file), file, refuse_arguments)
+    problems = [*grown.problems]
+    try:
+        motion = Motion.model_validate(grown.data)
+    except ValidationError as error:
+        problems += problems_of(error, grown.marks, model=Motion, unknown=grown.unknown)
+        raise InputError(_in_order(problems)) from None
+    if problems:
+        raise InputError(_in_order(problems))
+    return MotionDescription(motion, grown.marks, path, text)
+
+
+def _in_order(problems: Iterable[Problem]) -> list[Problem]:
+    """Return the problems as a person meets them: first what was typed, then the file from its top."""
+    return sorted(problems, key=lambda problem: (problem.mark.file != COMMAND_LINE, problem.mark))

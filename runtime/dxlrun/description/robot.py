@@ -1,0 +1,224 @@
+"""Robot: the form of a robot file; what its parts mean together is checked by `compile`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic_core import PydanticCustomError
+
+from dxlrun.description.units import Angle, AngularVelocity, Duration
+
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*", re.ASCII)
+
+
+def refuse(what: str, mend: str) -> PydanticCustomError:
+    """Return the error of a validator that says what is wrong, and apart from it how to mend it."""
+    return PydanticCustomError("dxlrun", "{what}; {mend}", {"what": what, "mend": mend})
+
+
+def _name(value: str) -> str:
+    # names become topics of the log and interfaces `<joint>/<interface>`
+    if not _NAME.fullmatch(value):
+        raise refuse(f"{value!r} is no name", "start with a letter, and use letters, digits and _ only")
+    return value
+
+
+def _protocol(value: float) -> float:
+    if value == 2.0:
+        raise refuse("this version does not speak Protocol 2.0 yet", "use servos of Protocol 1.0")
+    if value != 1.0:
+        raise refuse(f"there is no Protocol {value:g}", "write 1.0")
+    return value
+
+
+def _whole(value: object) -> object:
+    # True and 1.0 are equal to 1 in Python, but not what a person means by a direction
+    if isinstance(value, bool | float):
+        raise refuse("a direction is 1 or -1", "write 1 when the angle grows as the servo's does, else -1")
+    return value
+
+
+def _ordered(value: tuple[float, float]) -> tuple[float, float]:
+    if not value[0] < value[1]:
+        raise refuse("the lower limit is not below the upper one", "write [lower, upper]")
+    return value
+
+
+Name = Annotated[str, AfterValidator(_name)]
+"""Letters, digits and _, first a letter."""
+
+
+class Form(BaseModel):
+    """Base of all parts: frozen, unknown keys refused, finite numbers only, no number made from text."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+
+class Adapter(Form):
+    """The USB adapter of a bus."""
+
+    latency: Duration = Field(
+        default=16_000_000,
+        description="How long it may keep bytes back before it hands them over.",
+        examples=["1 ms"],
+    )
+
+
+class Bus(Form):
+    """One serial line with its servos."""
+
+    port: str = Field(min_length=1, description="Device of the adapter, or sim.", examples=["/dev/ttyUSB0"])
+    protocol: Annotated[float, AfterValidator(_protocol)] = Field(
+        description="Protocol of all servos on the bus.", examples=["1.0"]
+    )
+    baud_rate: int = Field(gt=0, le=10_000_000, description="Bits per second.", examples=["1_000_000"])
+    adapter: Adapter = Field(default=Adapter(), description="The adapter.", examples=["{latency: 1 ms}"])
+    return_delay_time: Duration = Field(
+        default=500_000, description="How long a servo waits before it answers.", examples=["500 us"]
+    )
+
+
+class Scheduler(Form):
+    """What the loop asks of the operating system."""
+
+    policy: Literal["other", "fifo", "round_robin"] = Field(
+        default="other", description="Scheduling policy.", examples=["round_robin"]
+    )
+    priority: int = Field(
+        default=31,
+        ge=1,
+        le=99,
+        description="Real-time priority; only for fifo and round_robin.",
+        examples=["31"],
+    )
+    lock_memory: bool = Field(default=False, description="Keep all memory in RAM.", examples=["true"])
+
+
+class Loop(Form):
+    """The control loop."""
+
+    rate: float = Field(gt=0, le=100_000, description="Cycles per second, Hz.", examples=["50"])
+    scheduler: Scheduler = Field(
+        default=Scheduler(), description="Real-time wishes.", examples=["{policy: round_robin}"]
+    )
+    overrun: Literal["skip"] = Field(
+        default="skip", description="After a late cycle, whole periods are skipped.", examples=["skip"]
+    )
+
+
+class Limits(Form):
+    """Where a joint may go, and how fast; the last gate before the bus holds it there."""
+
+    position: Annotated[tuple[Angle, Angle], Field(strict=False), AfterValidator(_ordered)] | None = Field(
+        default=None,
+        description="Lower and upper limit of the joint's angle.",
+        examples=["[-90 deg, 90 deg]"],
+    )
+    velocity: Annotated[AngularVelocity, Field(gt=0)] | None = Field(
+        default=None, description="Highest speed.", examples=["2 rad/s"]
+    )
+
+
+class Joint(Form):
+    """One joint and its servo: q = direction * (theta - reference)."""
+
+    bus: str = Field(description="Name of its bus.", examples=["main"])
+    id: int = Field(ge=0, le=253, description="ID of its servo.", examples=["1"])
+    model: str = Field(min_length=1, description="Model of its servo.", examples=["AX-12A"])
+    reference: Angle = Field(
+        description="Angle of the servo, from its zero, where the joint's is zero.", examples=["150 deg"]
+    )
+    direction: Annotated[Literal[1, -1], BeforeValidator(_whole)] = Field(
+        description="1: the joint's angle grows as the servo's does, -1: against it.", examples=["1"]
+    )
+    limits: Limits = Field(
+        default=Limits(),
+        description="Where it may go, and how fast.",
+        examples=["{position: [-90 deg, 90 deg]}"],
+    )
+
+
+class ControllerEntry(Form):
+    """One controller; the keys beside type, active and rate are its own parameters."""
+
+    type: str = Field(
+        min_length=1, description="Type that a plug-in offers.", examples=["joint_group_position_controller"]
+    )
+    active: bool = Field(default=True, description="Active from the start.", examples=["false"])
+    rate: float | None = Field(
+        default=None, gt=0, description="Updates per second, Hz; the loop's when absent.", examples=["50"]
+    )
+    parameters: dict[str, object] = Field(
+        default={}, description="All other keys of the entry; the controller's type says which there are."
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _gather_parameters(cls, entry: object) -> object:
+        if not isinstance(entry, dict):
+            return entry
+        own = {key: value for key, value in entry.items() if key in ("type", "active", "rate")}
+        return {**own, "parameters": {key: value for key, value in entry.items() if key not in own}}
+
+
+class Policies(Form):
+    """What happens when something does not go on as planned."""
+
+    on_exit: Literal["limp"] = Field(default="limp", description="At the end of a run.", examples=["limp"])
+    on_fault: Literal["limp"] = Field(
+        default="limp", description="When the loop or the bus failed.", examples=["limp"]
+    )
+    on_lost_servo: Literal["hold"] = Field(
+        default="hold", description="The other joints, when a servo stopped answering.", examples=["hold"]
+    )
+    on_stale_command: Literal["hold"] = Field(
+        default="hold", description="A joint that nobody commands any more.", examples=["hold"]
+    )
+    exit_timeout: Duration = Field(
+        default=2_000_000_000, gt=0, description="Longest orderly end of a run.", examples=["2 s"]
+    )
+
+
+class Recording(Form):
+    """The log."""
+
+    directory: str = Field(
+        default="logs",
+        min_length=1,
+        description="Where logs are written, from the working directory.",
+        examples=["logs"],
+    )
+
+
+class Robot(Form):
+    """A robot file, without its arguments."""
+
+    refused: ClassVar[Mapping[str, str]] = {
+        "sensors": "this version has no sensors yet; take the block out",
+        "include": "this version includes no other files yet; copy their content here",
+        "processes": "this version starts no gateway and no view yet; take the block out",
+        "model": "this version reads no URDF yet; take the block out",
+    }
+
+    name: Name = Field(description="Name of the robot.", examples=["bioloid_torso"])
+    buses: dict[Name, Bus] = Field(
+        min_length=1, description="Serial lines by name.", examples=["{main: {port: sim, ...}}"]
+    )
+    loop: Loop = Field(description="The control loop.", examples=["{rate: 50}"])
+    joints: dict[Name, Joint] = Field(
+        min_length=1, description="Joints by name.", examples=["{head_joint: {bus: main, id: 1, ...}}"]
+    )
+    controllers: dict[Name, ControllerEntry] = Field(
+        default={},
+        description="Controllers by name, updated in this order.",
+        examples=["{head: {type: ...}}"],
+    )
+    policies: Policies = Field(
+        default=Policies(),
+        description="What happens on faults and at the end.",
+        examples=["{exit_timeout: 2 s}"],
+    )
+    recording: Recording = Field(default=Recording(), description="The log.", examples=["{directory: logs}"])

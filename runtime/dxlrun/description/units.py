@@ -1,0 +1,132 @@
+"""Units: angles, speeds and times as a person writes them, `60 deg` or `500 us`, held in SI.
+
+Use `Angle`, `AngularVelocity`, `AngularAcceleration` and `Duration` as types of a model's fields. They take
+text with a unit; a bare number is an error, because nobody can see whether `60` was meant in deg or rad. In
+JSON they are written back as text that they read to the same value.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from fractions import Fraction
+from typing import Annotated
+
+from pydantic import BeforeValidator, Field, PlainSerializer, WithJsonSchema
+from pydantic_core import PydanticCustomError
+
+# at most two digits of exponent: Fraction("1e-999999999") would fill the memory
+_QUANTITY = re.compile(
+    r"([-+]?(?:\d+(?:_\d+)*)?(?:\.\d*)?(?:[eE][-+]?\d{1,2})?)\s*([A-Za-z/^0-9]*)", re.ASCII
+)
+_LONGEST = 64
+_REV = 2 * math.pi
+
+_ANGLE: Mapping[str, float] = {"deg": math.pi / 180, "rad": 1.0}
+_ANGULAR_VELOCITY: Mapping[str, float] = {"rad/s": 1.0, "deg/s": math.pi / 180, "rpm": _REV / 60}
+_ANGULAR_ACCELERATION: Mapping[str, float] = {"rad/s^2": 1.0, "deg/s^2": math.pi / 180}
+_DURATION_NS: Mapping[str, int] = {
+    "ns": 1,
+    "us": 1_000,
+    "ms": 1_000_000,
+    "s": 1_000_000_000,
+    "min": 60_000_000_000,
+    "h": 3_600_000_000_000,
+}
+_LONGEST_NS = 10**9 * _DURATION_NS["s"]  # 31 years; stays inside 64 bits when a few are added
+
+
+def angle(text: str) -> float:
+    """Return an angle, rad, from `60 deg` or `1.05 rad`; raises ValueError that says how to write one."""
+    return _si(text, "an angle", _ANGLE, "60 deg or 1.05 rad")
+
+
+def angular_velocity(text: str) -> float:
+    """Return a speed, rad/s, from `2 rad/s`, `30 deg/s` or `5 rpm`; raises ValueError that says how."""
+    return _si(text, "an angular velocity", _ANGULAR_VELOCITY, "2 rad/s, 30 deg/s or 5 rpm")
+
+
+def angular_acceleration(text: str) -> float:
+    """Return an acceleration, rad/s^2, from `10 rad/s^2` or `90 deg/s^2`; raises ValueError that says how."""
+    return _si(text, "an angular acceleration", _ANGULAR_ACCELERATION, "10 rad/s^2 or 90 deg/s^2")
+
+
+def duration(text: str) -> int:
+    """Return a time, ns, from `500 us`, `1 ms`, `2 s` or `1 min`; raises ValueError that says how."""
+    written = "500 us, 1 ms, 2 s or 1 min"
+    number, unit = _split(text, "a duration", _DURATION_NS, written)
+    value = round(Fraction(number) * _DURATION_NS[unit])  # exact: 0.1 ms is 100000 ns
+    if not 0 <= value <= _LONGEST_NS:
+        raise _refusal(f"{text!r} is no duration from 0 s to 31 years", f"write one such as {written}")
+    return value
+
+
+def _si(text: str, what: str, units: Mapping[str, float], written: str) -> float:
+    number, unit = _split(text, what, units, written)
+    return float(number) * units[unit]
+
+
+def _split(text: object, what: str, units: Mapping[str, object], written: str) -> tuple[str, str]:
+    """Return number and unit of a quantity; both are known to be right."""
+    if isinstance(text, int | float) and not isinstance(text, bool):
+        raise _refusal(f"{text} has no unit", f"write {what} with its unit, such as {written}")
+    if not isinstance(text, str):
+        raise _refusal(f"this is not {what}", f"write {what} such as {written}")
+    match = _QUANTITY.fullmatch(text.strip()) if len(text) <= _LONGEST else None
+    number = match[1].replace("_", "") if match else ""
+    if match is None or not any(character.isdigit() for character in number.split("e")[0].split("E")[0]):
+        raise _refusal(f"{text[:_LONGEST]!r} is not {what}", f"write {what} such as {written}")
+    if not match[2]:
+        raise _refusal(f"{text!r} has no unit", f"write {what} with its unit, such as {written}")
+    if match[2] not in units:
+        raise _refusal(
+            f"{text!r} has the unit {match[2]}, which is not one of {what}", f"write it as {written}"
+        )
+    return number, match[2]
+
+
+def _refusal(what: str, mend: str) -> PydanticCustomError:
+    # a ValueError too; what and how to mend it travel apart, so that reports can place them
+    return PydanticCustomError("dxlrun", "{what}; {mend}", {"what": what, "mend": mend})
+
+
+def _text_schema(example: str, units: Mapping[str, object]) -> WithJsonSchema:
+    pattern = rf"^\s*[-+]?[0-9_.]+([eE][-+]?[0-9]+)?\s*({'|'.join(map(re.escape, units))})\s*$"
+    return WithJsonSchema({"type": "string", "pattern": pattern, "examples": [example]})
+
+
+Angle = Annotated[
+    float,
+    BeforeValidator(angle),
+    PlainSerializer(lambda value: f"{value!r} rad", return_type=str, when_used="json"),
+    _text_schema("60 deg", _ANGLE),
+]
+"""rad, from `60 deg` or `1.05 rad`."""
+
+AngularVelocity = Annotated[
+    float,
+    BeforeValidator(angular_velocity),
+    PlainSerializer(lambda value: f"{value!r} rad/s", return_type=str, when_used="json"),
+    _text_schema("2 rad/s", _ANGULAR_VELOCITY),
+]
+"""rad/s, from `2 rad/s`, `30 deg/s` or `5 rpm`."""
+
+AngularAcceleration = Annotated[
+    float,
+    BeforeValidator(angular_acceleration),
+    PlainSerializer(lambda value: f"{value!r} rad/s^2", return_type=str, when_used="json"),
+    _text_schema("10 rad/s^2", _ANGULAR_ACCELERATION),
+]
+"""rad/s^2, from `10 rad/s^2` or `90 deg/s^2`."""
+
+Duration = Annotated[
+    int,
+    BeforeValidator(duration),
+    PlainSerializer(lambda value: f"{value} ns", return_type=str, when_used="json"),
+    _text_schema("500 us", _DURATION_NS),
+]
+"""ns, never negative, from `500 us`, `1 ms`, `2 s` or `1 min`."""
+
+Angles = Annotated[tuple[Angle, ...], Field(strict=False)]
+"""Several angles, rad, from `[60 deg, 1 rad]`; shape (written ones,)."""
