@@ -1,12 +1,13 @@
-"""A simulated bus: bytes in -> timed bytes out; one half-duplex line with its servos, its faults and its ledger.
+"""A simulated bus: bytes in -> timed bytes out; one half-duplex line, its servos, faults and ledger.
 
 The rules of the line:
 
-- A byte takes 10 bits. An instruction acts when its last byte has passed; a reply starts after the servo's return delay, and
-  the host gets it when its last byte has passed.
-- Who talks does not listen. Where the host talks into a reply, its bytes arrive as 0, and the reply is lost from there on.
-- Servos that talk at once (a broadcast ping, two servos with one ID) give one reply of their bytes ANDed, as drivers
-  that both pull a line low would [i].
+- A byte takes 10 bits. An instruction acts when its last byte has passed; a reply starts after the servo's
+  return delay, and the host gets it when its last byte has passed.
+- Who talks does not listen. Where the host talks into a reply, its bytes arrive as 0, and the reply is lost
+  from there on.
+- Servos that talk at once (a broadcast ping, two servos with one ID) give one reply of their bytes ANDed, as
+  drivers that both pull a line low would [i].
 - A pause of more than 100 ms inside an instruction ends it.
 - A servo at another baud rate hears nothing.
 """
@@ -20,7 +21,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from dxlrun.simulation.ledger import Ledger
-from dxlrun.simulation.packets import InstructionPacket, InstructionReceiver, status_packet
+from dxlrun.simulation.packets import BROADCAST, InstructionPacket, InstructionReceiver, status_packet
 from dxlrun.simulation.servo import Reply, ServoConfig, SimulatedServo
 
 LONGEST_PAUSE_NS = 100_000_000
@@ -85,7 +86,7 @@ class SimulatedBus:
     # The line
 
     def receive(self, data: bytes | bytearray | memoryview, at_ns: int) -> None:
-        """Take bytes that the host hands to its adapter at `at_ns`; they follow those that are still on the wire."""
+        """Take bytes that the host hands to its adapter at `at_ns`; they follow those still on the wire."""
         self._pass_time(at_ns)
         heard = bytearray(data)
         self.ledger.add(at_ns, self.name, "in", bytes(heard))
@@ -96,7 +97,8 @@ class SimulatedBus:
         self._host_free_ns = start_ns + self._wire_ns(len(heard))
         position = 0
         while position < len(heard):
-            self._collide(heard, position, start_ns)
+            if self._pending:
+                self._collide(heard, position, start_ns)
             packet = self._receiver.feed(heard, position)
             if packet is None:
                 break
@@ -107,7 +109,7 @@ class SimulatedBus:
             self._pending.sort(key=_due)
 
     def next_due_ns(self) -> int | None:
-        """Return when the next bytes can be taken, or the next planned fault happens; None: nothing is on its way."""
+        """Return when the next bytes can be taken or the next planned fault happens; None: nothing will."""
         times = [self._pending[0].due_ns] if self._pending else []
         if self._agenda:
             times.append(self._agenda[0][0])
@@ -187,7 +189,7 @@ class SimulatedBus:
 
     def _execute(self, packet: InstructionPacket, end_ns: int) -> None:
         for servo in self.servos:
-            if not self._hears(servo):
+            if packet.servo_id not in (servo.servo_id, BROADCAST) or not self._hears(servo):
                 continue
             reply = servo.execute(packet, end_ns)
             if reply is not None:
@@ -233,7 +235,7 @@ class SimulatedBus:
         return _Chunk(early.first_ns, early.first_ns + self._wire_ns(len(mixed)), bytes(mixed), "collision")
 
     def _collide(self, heard: bytearray, position: int, start_ns: int) -> None:
-        """Spoil what the host sends from `position` on while a servo talks, and what the servo says meanwhile."""
+        """Spoil what the host sends from `position` on while a servo talks, and the rest of what it says."""
         byte_ns = self._wire_ns(1)
         begin_ns, end_ns = start_ns + self._wire_ns(position), start_ns + self._wire_ns(len(heard))
         for chunk in [each for each in self._pending if _overlap(each, begin_ns, end_ns)]:

@@ -1,10 +1,10 @@
 """How a simulated servo moves: at goal speed with bounded acceleration, braking to rest at the goal.
 
-In closed form: a motion is a few pieces of constant acceleration, made when something is commanded and evaluated
-when somebody looks. There is no time step, so a minute of eight servos costs as much as its commands, and two runs
-agree to the last bit.
+In closed form: a motion is a few pieces of constant acceleration, made when something is commanded and
+evaluated when somebody looks. There is no time step, so a minute of eight servos costs as much as its
+commands, and two runs agree to the last bit.
 
-Not modelled: gravity, inertia of what hangs on the servo, friction, compliance, and the spread between servos.
+Not modelled: gravity, the inertia of what hangs on the servo, friction, compliance.
 """
 
 from __future__ import annotations
@@ -59,13 +59,13 @@ def rest(now_ns: int, angle: float) -> Motion:
 
 
 def move_to(
-    now_ns: int, angle: float, velocity: float, goal: float, speed: float, acceleration: float
+    now_ns: int, angle: float, velocity: float, goal: float, *, speed: float, acceleration: float
 ) -> Motion:
     """Return the fastest motion to `goal` (rad) with at most `speed` (rad/s) and `acceleration` (rad/s^2).
 
-    A servo that is too fast to stop in time brakes past the goal and comes back; one that is faster than `speed`
-    brakes down to it first. Textbook trapezoid of velocity: a peak speed v_p is reached and left with the same
-    acceleration a, so that x = (v_p^2 - v^2) / 2a + v_p^2 / 2a.
+    A servo that is too fast to stop in time brakes past the goal and comes back; one that is faster than
+    `speed` brakes down to it first. Textbook trapezoid of velocity: a peak speed v_p is reached and left with
+    the same acceleration a, so that x = (v_p^2 - v^2) / 2a + v_p^2 / 2a.
     """
     brake = velocity * abs(velocity) / (2 * acceleration)
     rest_of_way = goal - angle - brake

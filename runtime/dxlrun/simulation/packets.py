@@ -1,7 +1,7 @@
 """Protocol 1.0 as a servo sees it: bytes of the line -> instructions, replies -> bytes.
 
-Written from the protocol alone (ROBOTIS e-Manual, "Protocol 1.0"), without the host's packet code: one codec for both sides
-would agree with its own mistakes.
+Written from the protocol alone (ROBOTIS e-Manual, "Protocol 1.0"), without the host's packet code: one codec
+for both sides would agree with its own mistakes.
 """
 
 from __future__ import annotations
@@ -82,45 +82,52 @@ class InstructionReceiver:
         """Drop a packet that was not completed in time."""
         self._buffer.clear()
 
-    def feed(self, data: bytes | bytearray | memoryview, start: int = 0) -> InstructionPacket | None:
-        """Take bytes of `data` from `start` on until a packet is complete, and return it; None: all were taken.
+    def feed(self, data: bytes | bytearray, start: int = 0) -> InstructionPacket | None:
+        """Take bytes of `data` from `start` on until a packet is complete, and return it.
 
-        A packet with a wrong checksum is one too. Go on at `packet.end`.
+        None: all were taken, and no packet is complete. One with a wrong checksum is a packet too. Go on at
+        `packet.end`.
         """
+        if not self._buffer:
+            packet = _packet_at(data, start)
+            if packet is not None:  # the usual case: a host hands over whole packets
+                return packet
         for index in range(start, len(data)):
             self._buffer.append(data[index])
-            self._drop_noise()
-            packet = self._complete(index + 1)
-            if packet is not None:
+            while self._buffer and not _may_begin(self._buffer):
+                del self._buffer[0]
+            if len(self._buffer) >= 4 and len(self._buffer) == 4 + self._buffer[3]:
+                packet = _packet(self._buffer, index + 1)
                 self._buffer.clear()
                 return packet
         return None
 
-    def _drop_noise(self) -> None:
-        """Shorten the buffer from the front until it may be the begin of a packet."""
-        buffer = self._buffer
-        while buffer and not _may_begin(buffer):
-            del buffer[0]
 
-    def _complete(self, end: int) -> InstructionPacket | None:
-        buffer = self._buffer
-        if len(buffer) < 4 or len(buffer) < 4 + buffer[3]:
-            return None
-        return InstructionPacket(
-            servo_id=buffer[2],
-            instruction=buffer[4],
-            parameters=bytes(buffer[5:-1]),
-            intact=buffer[-1] == checksum(buffer[2:-1]),
-            end=end,
-        )
+def _packet(data: bytes | bytearray, end: int) -> InstructionPacket:
+    return InstructionPacket(
+        servo_id=data[2],
+        instruction=data[4],
+        parameters=bytes(data[5:-1]),
+        intact=data[-1] == checksum(data[2:-1]),
+        end=end,
+    )
 
 
-def _may_begin(buffer: bytearray) -> bool:
-    """Return whether a packet can begin so: header, an ID that is none of 0xFF, a length of at least 2."""
-    size = len(buffer)
+def _packet_at(data: bytes | bytearray, start: int) -> InstructionPacket | None:
+    """Return the packet that stands whole at `start`, None when there is none."""
+    head = data[start : start + 4]
+    if len(head) < 4 or not _may_begin(head):
+        return None
+    end = start + 4 + head[3]
+    return _packet(data[start:end], end) if end <= len(data) else None
+
+
+def _may_begin(data: bytes | bytearray) -> bool:
+    """Return whether a packet can begin so: header, an ID that is not 0xFF, a length of at least 2."""
+    size = len(data)
     return (
-        buffer[0] == 0xFF
-        and (size < 2 or buffer[1] == 0xFF)
-        and (size < 3 or buffer[2] != 0xFF)
-        and (size < 4 or buffer[3] >= 2)
+        data[0] == 0xFF
+        and (size < 2 or data[1] == 0xFF)
+        and (size < 3 or data[2] != 0xFF)
+        and (size < 4 or data[3] >= 2)
     )

@@ -5,8 +5,6 @@ Where the e-Manual says nothing, `[i]` marks what was inferred.
 
 from __future__ import annotations
 
-import struct
-
 from dxlrun.control_table import ControlItem, ControlTable
 from dxlrun.simulation.packets import ErrorBit
 
@@ -20,6 +18,7 @@ class Registers:
     def __init__(self, table: ControlTable) -> None:
         self.table = table
         self._memory = bytearray(table.size)
+        self._values: dict[str, int] = {}  # the same as in the bytes: looked up far more often than written
         self._item_at: dict[int, ControlItem] = {
             address: item
             for item in table.items.values()
@@ -41,22 +40,17 @@ class Registers:
         self["torque_limit"] = self["max_torque"]  # e-Manual, Torque Limit (34)
 
     def __getitem__(self, name: str) -> int:
-        item = self.table.items[name]
-        return int.from_bytes(self._memory[item.address : item.address + item.size], "little")
+        return self._values[name]
 
     def __setitem__(self, name: str, wire: int) -> None:
         item = self.table.items[name]
         self._memory[item.address : item.address + item.size] = wire.to_bytes(item.size, "little")
+        self._values[name] = wire
 
     def ticks(self, name: str) -> int:
         """Return the signed number of ticks of an item."""
         item = self.table.items[name]
         return item.decode(self._memory[item.address : item.address + item.size])
-
-    def set_present(self, position: int, speed: int, load: int) -> None:
-        """Write the block Present Position (36), Speed (38), Load (40); integers of the wire."""
-        start = self.table.items["present_position"].address
-        struct.pack_into("<HHH", self._memory, start, position, speed, load)
 
     def read(self, address: int, length: int) -> bytes | None:
         """Return bytes of the table, None where it has none."""
@@ -64,56 +58,60 @@ class Registers:
             return None
         return bytes(self._memory[address : address + length])
 
-    def refusal(self, address: int, data: bytes) -> ErrorBit:
-        """Return why a write would be refused; no bit when it would not.
+    def refusal(self, address: int, data: bytes) -> int:
+        """Return the error bits with which a write would be refused; 0 when it would not.
 
-        A write is refused as a whole [i]. A cell that no item owns, a read-only item, a locked one and a value out of
-        its range are each a range error [i]; a goal outside the angle limits is an angle limit error (e-Manual).
+        A write is refused as a whole [i]. A cell that no item owns, a read-only item, a locked one and a
+        value out of its range are each a range error [i]; a goal outside the angle limits is an angle limit error
+        (e-Manual, Goal Position (30)).
         """
-        if not data:
-            return ErrorBit.RANGE
         names = self._names(address, len(data))
-        if names is None:
+        if not names:
             return ErrorBit.RANGE
         new = self._memory[:]
         new[address : address + len(data)] = data
-        error = ErrorBit(0)
+        error = 0
         for name in names:
             item = self.table.items[name]
             wire = int.from_bytes(new[item.address : item.address + item.size], "little")
             error |= self._refusal_of(item, wire)
         return error
 
-    def write(self, address: int, data: bytes) -> frozenset[str]:
+    def write(self, address: int, data: bytes) -> tuple[str, ...]:
         """Write bytes that were not refused; return the names of the items that they touch."""
+        names = self._names(address, len(data))
         self._memory[address : address + len(data)] = data
-        return frozenset(self._names(address, len(data)) or ())
+        for name in names:
+            item = self.table.items[name]
+            self._values[name] = int.from_bytes(
+                self._memory[item.address : item.address + item.size], "little"
+            )
+        return names
 
     @property
     def wheel_mode(self) -> bool:
         """True when both angle limits are 0 (e-Manual, CW/CCW Angle Limit (6, 8))."""
         return self["cw_angle_limit"] == 0 and self["ccw_angle_limit"] == 0
 
-    def _names(self, address: int, length: int) -> list[str] | None:
-        names: list[str] = []
+    def _names(self, address: int, length: int) -> tuple[str, ...]:
+        """Return the items of some cells, none when a cell belongs to no item."""
+        names: dict[str, None] = {}
         for cell in range(address, address + length):
             item = self._item_at.get(cell)
             if item is None:
-                return None
-            if not names or names[-1] != item.name:
-                names.append(item.name)
-        return names
+                return ()
+            names[item.name] = None
+        return tuple(names)
 
-    def _refusal_of(self, item: ControlItem, wire: int) -> ErrorBit:
+    def _refusal_of(self, item: ControlItem, wire: int) -> int:
         if item.access == "R" or not item.minimum <= wire <= item.maximum:
             return ErrorBit.RANGE
-        locked = self["lock"] == 1
-        if locked and (item.area == "EEPROM" or (item.name == "lock" and wire == 0)):
+        if self["lock"] == 1 and (item.area == "EEPROM" or (item.name == "lock" and wire == 0)):
             return ErrorBit.RANGE
         if self.wheel_mode:
-            return ErrorBit(0)
+            return 0
         if item.name == "moving_speed" and wire > self.table.max_speed_tick:
             return ErrorBit.RANGE  # the direction bit belongs to wheel mode: "0 ~ 1,023 can be used"
         if item.name == "goal_position" and not self["cw_angle_limit"] <= wire <= self["ccw_angle_limit"]:
             return ErrorBit.ANGLE_LIMIT
-        return ErrorBit(0)
+        return 0

@@ -1,12 +1,12 @@
 """A simulated servo of Protocol 1.0: a control table, what it answers, and a shaft that moves.
 
-Where the e-Manual says nothing, `[i]` marks what was inferred; nothing here was compared with a real servo yet.
+Where the e-Manual says nothing, `[i]` marks what was inferred; nothing here was compared with a servo yet.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from dxlrun.control_table import control_table
@@ -15,7 +15,7 @@ from dxlrun.simulation.packets import BROADCAST, ErrorBit, Instruction, Instruct
 from dxlrun.simulation.registers import Registers
 
 ACCELERATION = 100.0
-"""rad/s^2. The manual names none: stall torque 1.5 Nm over some 0.015 kg m^2 of rotor, gear and a light link [i]."""
+"""rad/s^2. The manual names none: 1.5 Nm of stall torque on 0.015 kg m^2 of gear and a light link [i]."""
 
 _MOTION_ITEMS = frozenset(
     ("torque_enable", "goal_position", "moving_speed", "torque_limit", "cw_angle_limit", "ccw_angle_limit")
@@ -79,7 +79,7 @@ class SimulatedServo:
 
     @property
     def baud_rate(self) -> int:
-        """The rate at which it listens, bit/s; values beside the manual's list by its formula 2e6 / (value + 1)."""
+        """The rate at which it listens, bit/s: the manual's list, or its formula 2e6 / (value + 1)."""
         value = self.registers["baud_rate"]
         return self.registers.table.baud_rates.get(value, 2_000_000 // (value + 1))
 
@@ -89,27 +89,22 @@ class SimulatedServo:
         self._refresh()
 
     def execute(self, packet: InstructionPacket, now_ns: int) -> Reply | None:
-        """Obey an instruction whose last byte arrived at `now_ns`; return the reply, None when it is silent."""
-        own, everybody = packet.servo_id == self.servo_id, packet.servo_id == BROADCAST
-        if self._silent or not (own or everybody):
-            return None
-        self.advance(now_ns)
+        """Obey an instruction whose last byte arrived at `now_ns`; return the reply, None for silence."""
         servo_id = self.servo_id  # a write of ID (3) is still answered under the old one [i]
-        if not packet.intact:
-            error, parameters, level = ErrorBit.CHECKSUM, b"", 2
-        else:
-            error, parameters, level = self._obey(packet)
+        own = packet.servo_id == servo_id
+        if self._silent or not (own or packet.servo_id == BROADCAST):
+            return None
+        self._now_ns = max(self._now_ns, now_ns)
+        error, parameters = self._obey(packet) if packet.intact else (ErrorBit.CHECKSUM, b"")
         if error:
-            self._note(
-                f"servo {servo_id} refuses {packet.instruction:#04x} {packet.parameters.hex(' ')}: {error!r}"
-            )
+            said = packet.parameters.hex(" ")
+            self._note(f"servo {servo_id} refuses {packet.instruction:#04x} {said}: {ErrorBit(error)!r}")
             self._shut_down_on(error)
-        answered = own or packet.instruction == Instruction.PING
-        if not answered or (everybody and not packet.intact) or level > self.registers["status_return_level"]:
+        if not self._answers(packet, own):
             return None
         return Reply(
             servo_id=servo_id,
-            error=int(error | self._state()),
+            error=error | self._state(),
             parameters=parameters,
             delay_ns=self.registers["return_delay_time"] * 2000,
         )
@@ -145,7 +140,7 @@ class SimulatedServo:
         """Set a control item as if it had been so before; the integer of the wire, no refusal."""
         self._note(f"servo {self.servo_id}: {name} set to {wire}")
         self.registers[name] = wire
-        self._plan(frozenset((name,)))
+        self._plan((name,))
 
     def trigger_overload(self) -> None:
         """Load the shaft beyond the torque; ends with a write of Torque Limit (34), or a power cycle."""
@@ -174,36 +169,43 @@ class SimulatedServo:
 
     # Instructions
 
-    def _obey(self, packet: InstructionPacket) -> tuple[ErrorBit, bytes, int]:
-        """Return error, parameters of the reply, and the status return level from which on it is answered."""
-        instruction, parameters = packet.instruction, packet.parameters
-        if instruction == Instruction.PING:
-            return ErrorBit(0), b"", 0
-        if instruction == Instruction.READ and len(parameters) == 2:
-            data = self.registers.read(*parameters)
-            return (ErrorBit.RANGE, b"", 1) if data is None else (ErrorBit(0), data, 1)
-        if instruction == Instruction.WRITE and len(parameters) >= 2:
-            return self._write(parameters[0], parameters[1:]), b"", 2
-        if instruction == Instruction.REG_WRITE and len(parameters) >= 2:
-            return self._register(parameters[0], parameters[1:]), b"", 2
-        if instruction == Instruction.ACTION and self._registered is not None:
-            address, data = self._registered
-            self._registered = None
-            self.registers["registered"] = 0
-            return self._write(address, data), b"", 2
-        if instruction == Instruction.FACTORY_RESET:
-            self.registers.restore_factory_values()
-            self._power_up()
-            return ErrorBit(0), b"", 2
-        if instruction == Instruction.SYNC_WRITE and packet.servo_id == BROADCAST:
-            return self._sync_write(parameters), b"", 2
-        return (
-            ErrorBit.INSTRUCTION,
-            b"",
-            2,
-        )  # also bulk read, which an AX does not know, and a wrong length [i]
+    def _answers(self, packet: InstructionPacket, own: bool) -> bool:
+        """Return whether a status packet follows (Status Return Level (16)); of broadcasts only to a ping."""
+        if packet.intact and packet.instruction == Instruction.PING:
+            return True
+        level = 1 if packet.intact and packet.instruction == Instruction.READ else 2
+        return own and level <= self.registers["status_return_level"]
 
-    def _write(self, address: int, data: bytes) -> ErrorBit:
+    def _obey(self, packet: InstructionPacket) -> tuple[int, bytes]:
+        """Return error bits and parameters of the reply."""
+        parameters = packet.parameters
+        match packet.instruction:
+            case Instruction.PING:
+                answer: tuple[int, bytes] = (0, b"")
+            case Instruction.READ if len(parameters) == 2:
+                answer = self._read(*parameters)
+            case Instruction.WRITE if len(parameters) >= 2:
+                answer = self._write(parameters[0], parameters[1:]), b""
+            case Instruction.REG_WRITE if len(parameters) >= 2:
+                answer = self._register(parameters[0], parameters[1:]), b""
+            case Instruction.ACTION if self._registered is not None:
+                answer = self._write_registered(*self._registered), b""
+            case Instruction.FACTORY_RESET:
+                self.registers.restore_factory_values()
+                self._power_up()
+                answer = 0, b""
+            case Instruction.SYNC_WRITE if packet.servo_id == BROADCAST:
+                answer = self._sync_write(parameters), b""
+            case _:  # also bulk read, which an AX does not know, and a wrong number of parameters [i]
+                answer = ErrorBit.INSTRUCTION, b""
+        return answer
+
+    def _read(self, address: int, length: int) -> tuple[int, bytes]:
+        self._refresh()
+        data = self.registers.read(address, length)
+        return (ErrorBit.RANGE, b"") if data is None else (0, data)
+
+    def _write(self, address: int, data: bytes) -> int:
         error = self.registers.refusal(address, data)
         if not error:
             names = self.registers.write(address, data)
@@ -212,23 +214,27 @@ class SimulatedServo:
             if "torque_limit" in names and self.registers["torque_limit"] > 0:
                 self._overload = False
             self._plan(names)
-            self._refresh()
         return error
 
-    def _register(self, address: int, data: bytes) -> ErrorBit:
+    def _register(self, address: int, data: bytes) -> int:
         error = self.registers.refusal(address, data)
         if not error:
             self._registered = (address, data)
             self.registers["registered"] = 1
         return error
 
-    def _sync_write(self, parameters: bytes) -> ErrorBit:
+    def _write_registered(self, address: int, data: bytes) -> int:
+        self._registered = None
+        self.registers["registered"] = 0
+        return self._write(address, data)
+
+    def _sync_write(self, parameters: bytes) -> int:
         if len(parameters) < 2 or parameters[1] == 0 or (len(parameters) - 2) % (parameters[1] + 1):
             return ErrorBit.INSTRUCTION
-        address, length = parameters[0], parameters[1]
-        error = ErrorBit(0)
+        address, length, servo_id = parameters[0], parameters[1], self.servo_id
+        error = 0
         for start in range(2, len(parameters), length + 1):
-            if parameters[start] == self.servo_id:
+            if parameters[start] == servo_id:
                 error |= self._write(address, parameters[start + 1 : start + 1 + length])
         return error
 
@@ -245,26 +251,26 @@ class SimulatedServo:
         self._shut_down_on(self._state())
         self._refresh()
 
-    def _state(self) -> ErrorBit:
+    def _state(self) -> int:
         """Return the error bits that last as long as their cause."""
         registers = self.registers
-        error = ErrorBit.OVERLOAD if self._overload else ErrorBit(0)
+        error = int(ErrorBit.OVERLOAD) if self._overload else 0
         if not registers["min_voltage_limit"] <= round(self._voltage * 10) <= registers["max_voltage_limit"]:
             error |= ErrorBit.VOLTAGE
         if self._temperature > registers["temperature_limit"]:
             error |= ErrorBit.OVERHEATING
         return error
 
-    def _shut_down_on(self, error: ErrorBit) -> None:
+    def _shut_down_on(self, error: int) -> None:
         """Take the torque away when Shutdown (18) lists the error; Torque Enable (24) stays as it is."""
         if error & self.registers["shutdown"] and self.registers["torque_limit"]:
-            self._note(f"servo {self.servo_id}: shutdown, torque limit 0: {error!r}")
+            self._note(f"servo {self.servo_id}: shutdown, torque limit 0: {ErrorBit(error)!r}")
             self.registers["torque_limit"] = 0
-            self._plan(_MOTION_ITEMS)
+            self._plan(("torque_limit",))
 
-    def _plan(self, written: frozenset[str]) -> None:
+    def _plan(self, written: Iterable[str]) -> None:
         """Start another motion when what was written asks for one."""
-        if not written & _MOTION_ITEMS:
+        if _MOTION_ITEMS.isdisjoint(written):
             return
         drive = self._wanted()
         if drive == self._drive:
@@ -279,7 +285,9 @@ class SimulatedServo:
             angle = (
                 angle if 0 <= angle < math.tau else angle % math.tau
             )  # turns of wheel mode are not counted
-            self._motion = motion.move_to(self._now_ns, angle, velocity, drive[0], drive[1], ACCELERATION)
+            self._motion = motion.move_to(
+                self._now_ns, angle, velocity, drive[0], speed=drive[1], acceleration=ACCELERATION
+            )
 
     def _wanted(self) -> tuple[float, ...]:
         """Return nothing (limp), a speed (wheel mode, rad/s), or goal (rad) and speed (rad/s)."""
@@ -300,17 +308,15 @@ class SimulatedServo:
         # No mechanics stand behind the load: some for the speed, some for the change of it [i].
         load = 0.1 * velocity / table.max_speed + 0.4 * acceleration / ACCELERATION
         limit = registers["torque_limit"]
-        registers.set_present(
-            position=self._position_tick(angle),
-            speed=_sign_magnitude(velocity / unit, table.max_speed_tick),
-            load=_sign_magnitude(load / table.effort_per_tick, limit),
-        )
+        registers["present_position"] = self._position_tick(angle)
+        registers["present_speed"] = _sign_magnitude(velocity / unit, table.max_speed_tick)
+        registers["present_load"] = _sign_magnitude(load / table.effort_per_tick, limit)
         registers["present_voltage"] = max(0, min(255, round(self._voltage * 10)))
         registers["present_temperature"] = max(0, min(255, round(self._temperature)))
         registers["moving"] = int(velocity != 0.0 or acceleration != 0.0)
 
     def _position_tick(self, angle: float) -> int:
-        """Return what Present Position (36) shows; beyond the reach the nearest end (undefined in the manual)."""
+        """Return what Present Position (36) shows; beyond the reach the nearest end [i]."""
         table = self.registers.table
         if not 0 <= angle < math.tau:
             angle %= math.tau

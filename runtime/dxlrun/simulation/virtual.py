@@ -61,7 +61,7 @@ class VirtualPorts:
         return self._ports
 
     def wait(self, deadline_ns: int) -> Sequence[int]:
-        """Let virtual time pass until bytes arrive or `deadline_ns`; return the indices of lines with bytes."""
+        """Let virtual time pass until bytes arrive or `deadline_ns`; return the lines with bytes."""
         while True:
             ready = [index for index, port in enumerate(self._ports) if port.collect()]
             now_ns = self._clock.now_ns()

@@ -1,0 +1,107 @@
+"""The process of the simulated buses: one pseudo-terminal a bus, in real time, until its starter hangs up."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import select
+import signal
+import socket
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+
+from dxlrun.simulation.bus import BusConfig, SimulatedBus
+from dxlrun.simulation.ledger import Ledger
+from dxlrun.simulation.pseudo_terminal import PseudoTerminal
+
+POLL_NS = 80_000
+"""A sleep wakes some 50 us late on a stock kernel: this much before a reply is due the clock is polled instead."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Serve the buses of a configuration until the control socket ends or SIGTERM comes; return 0."""
+    parser = argparse.ArgumentParser(
+        prog="dxlrun.simulation", description="Simulated buses on pseudo-terminals."
+    )
+    parser.add_argument("--config-fd", type=int, required=True, help="a JSON list of buses; read to its end")
+    parser.add_argument(
+        "--control-fd", type=int, required=True, help="socket: told the ports, its end ends the run"
+    )
+    parser.add_argument(
+        "--ledger", type=Path, default=None, help="JSON-lines file of every byte on the buses"
+    )
+    options = parser.parse_args(arguments)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # only the front process takes it
+    with os.fdopen(options.config_fd, "rb") as file:
+        buses = decode_config(file.read())
+    with socket.socket(fileno=options.control_fd) as control, Ledger(options.ledger, keep=False) as ledger:
+        Server(buses, ledger, control).run()
+    return 0
+
+
+def encode_config(buses: Sequence[BusConfig]) -> bytes:
+    """Return what `--config-fd` takes."""
+    return msgspec.json.encode(list(buses))
+
+
+def decode_config(data: bytes) -> tuple[BusConfig, ...]:
+    """Return the buses of `encode_config`; raises msgspec.ValidationError."""
+    return msgspec.json.decode(data, type=tuple[BusConfig, ...])
+
+
+class Server:
+    """Pumps pseudo-terminals and buses; one thread, one select."""
+
+    def __init__(self, buses: Sequence[BusConfig], ledger: Ledger, control: socket.socket) -> None:
+        start_ns = time.monotonic_ns()
+        self._ledger = ledger
+        self._control = control
+        self._terminals = tuple(PseudoTerminal(SimulatedBus(bus, ledger, start_ns)) for bus in buses)
+        self._stopped = False
+
+    def run(self) -> None:
+        """Tell the ports, then serve until the control socket ends or SIGTERM comes."""
+        with _wake_on_sigterm() as wake:
+            ports = {terminal.bus.name: terminal.path for terminal in self._terminals}
+            self._control.sendall(json.dumps({"ports": ports}).encode() + b"\n")
+            while not self._stopped:
+                self._turn(wake)
+        for terminal in self._terminals:
+            terminal.close()
+
+    def _turn(self, wake: socket.socket) -> None:
+        readable, _, _ = select.select([*self._terminals, self._control, wake], [], [], self._patience())
+        # What was due before the host wrote goes out first: the host could have read it.
+        now_ns = time.monotonic_ns()
+        for terminal in self._terminals:
+            terminal.deliver(now_ns)
+            if terminal in readable:
+                terminal.receive(now_ns)
+        if wake in readable or (self._control in readable and not self._control.recv(4096)):
+            self._stopped = True
+        self._ledger.flush_if_due(now_ns)
+
+    def _patience(self) -> float | None:
+        """Return for how long nothing happens by itself, s; 0 shortly before a reply is due; None: for ever."""
+        times = [
+            due_ns - POLL_NS for each in self._terminals if (due_ns := each.bus.next_due_ns()) is not None
+        ]
+        flush_ns = self._ledger.flush_due_ns()
+        if flush_ns is not None:
+            times.append(flush_ns)
+        if not times:
+            return None
+        return max(0, min(times) - time.monotonic_ns()) * 1e-9
+
+
+def _wake_on_sigterm() -> socket.socket:
+    """Return a socket that becomes readable when SIGTERM comes."""
+    wake, signalled = socket.socketpair()
+    signalled.setblocking(False)
+    signal.signal(signal.SIGTERM, lambda number, frame: None)
+    signal.set_wakeup_fd(signalled.detach())
+    return wake
