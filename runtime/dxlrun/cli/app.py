@@ -1,0 +1,78 @@
+"""The application: which commands there are, and what becomes of what they raise."""
+
+from __future__ import annotations
+
+import os
+import sys
+import traceback
+from collections.abc import Sequence
+from importlib import metadata
+
+from cyclopts import App, CycloptsError
+
+from dxlrun.cli.analyze import analyze
+from dxlrun.cli.check import check
+from dxlrun.cli.run import run
+from dxlrun.cli.terminal import say_error, say_warning
+from dxlrun.errors import DxlrunError, InputError
+
+INTERRUPTED = 130
+"""128 + SIGINT, as shells say it."""
+
+HELP = """Run a robot of Dynamixel servos from one YAML file.
+
+`dxlrun ROBOT.yaml` runs it, `dxlrun check ROBOT.yaml` looks at it without touching hardware,
+`dxlrun analyze LOG` says what happened in a run."""
+
+EPILOGUE = """`--debug` with any command prints the traceback of an error.
+Exit codes: 0 good, 1 the robot or the run failed, 2 the input is wrong, 130 interrupted."""
+
+
+def build() -> App:
+    """Return the application with all its commands."""
+    app = App(name="dxlrun", help=HELP, help_epilogue=EPILOGUE, version=lambda: metadata.version("dxlrun"))
+    app.default(run)
+    app.command(check)
+    app.command(analyze)
+    return app
+
+
+def run_tokens(tokens: Sequence[str], *, debug: bool) -> int:
+    """Run one command line and return its exit code; nothing leaves here as a traceback unless `debug`."""
+    app = build()
+    try:
+        if not tokens:
+            app.help_print([])
+            return InputError.exit_code
+        code = app(list(tokens), exit_on_error=False, print_error=False, result_action="return_value")
+    except KeyboardInterrupt:
+        say_error("interrupted")
+        return INTERRUPTED
+    except BrokenPipeError:
+        # the reader went away (`dxlrun check ... | head`): nothing is left to say, not even at exit
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except Exception as error:
+        if debug:
+            traceback.print_exc()
+        return _explain(error)
+    return code if isinstance(code, int) else 0
+
+
+def _explain(error: Exception) -> int:
+    """Say an error in one line a problem; return the exit code."""
+    if isinstance(error, InputError) and error.problems:
+        for problem in error.problems:
+            (say_error if problem.severity == "error" else say_warning)(str(problem))
+        return error.exit_code
+    if isinstance(error, DxlrunError):
+        for line in str(error).splitlines() or [type(error).__name__]:
+            say_error(f"dxlrun: {line}")
+        return error.exit_code
+    if isinstance(error, CycloptsError):
+        say_error(f"dxlrun: {' '.join(str(error).split())}; `dxlrun --help` shows the usage")
+        return InputError.exit_code
+    say_error(
+        f"dxlrun: internal error: {type(error).__name__}: {error}; please report it, with what --debug prints"
+    )
+    return 1

@@ -1,0 +1,62 @@
+"""Robot file, arguments and motions from the command line to a compiled robot."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dxlrun.errors import InputError
+
+if TYPE_CHECKING:
+    from dxlrun.compile import Compiled
+
+COMMANDS = ("analyze", "check")
+
+
+def compiled(
+    robot: Path, assignments: Sequence[str], play: Sequence[Path], duration: float | None
+) -> Compiled:
+    """Read and compile; raises InputError with everything that is wrong with the file, or with the line."""
+    from dxlrun.compile import compile_files
+
+    _known_file(robot)
+    arguments = parse_assignments(assignments)
+    duration_ns = None
+    if duration is not None:
+        if not (math.isfinite(duration) and duration > 0):
+            raise InputError(f"--duration {duration:g} is no time to run; give a number of seconds above 0")
+        duration_ns = round(duration * 1e9)
+    return compile_files(robot, arguments, play, duration_ns)
+
+
+def parse_assignments(assignments: Sequence[str]) -> dict[str, str]:
+    """Return the arguments of `name:=value` words; raises InputError for a word that is none."""
+    arguments: dict[str, str] = {}
+    for word in assignments:
+        name, sign, value = word.partition(":=")
+        if not sign or not name:
+            mend = (
+                "a motion needs its own --play" if word.endswith((".yaml", ".yml")) else "write name:=value"
+            )
+            raise InputError(f"{word!r} is no argument of the robot file; {mend}")
+        if name in arguments:
+            raise InputError(f"argument {name} is given twice; give it once")
+        arguments[name] = value
+    return arguments
+
+
+def _known_file(robot: Path) -> None:
+    """Refuse a word that is neither a command nor a file with one sentence that helps."""
+    if robot.is_file():
+        return
+    word = str(robot)
+    if robot.is_dir():
+        raise InputError(f"{word} is a directory; give the robot file in it")
+    if robot.suffix in (".yaml", ".yml") or len(robot.parts) > 1:
+        raise InputError(f"there is no robot file {word}; check the path")
+    close = difflib.get_close_matches(word, COMMANDS, n=1)
+    hint = f"did you mean {close[0]}?" if close else f"the commands are {', '.join(COMMANDS)}"
+    raise InputError(f"{word!r} is neither a command nor a robot file; {hint}")

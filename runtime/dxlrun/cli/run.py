@@ -1,0 +1,75 @@
+"""`dxlrun ROBOT.yaml`: run a robot."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from dxlrun.cli.inputs import compiled
+from dxlrun.cli.terminal import out, say_error, say_warning
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from dxlrun.run_summary import RunSummary
+
+
+def run(
+    robot: Path,
+    /,
+    *assignments: Annotated[str, Parameter(name="arg:=value")],
+    duration: float | None = None,
+    play: Annotated[tuple[Path, ...], Parameter(negative=())] = (),
+    no_record: Annotated[bool, Parameter(negative=())] = False,
+    take_over: Annotated[bool, Parameter(negative=())] = False,
+    virtual: Annotated[bool, Parameter(negative=())] = False,
+) -> int:
+    """Run a robot until its motions have ended, or until Ctrl-C.
+
+    Parameters
+    ----------
+    robot
+        The robot file, for example robots/bioloid_torso.yaml.
+    assignments
+        Arguments of the robot file, for example port:=/dev/ttyUSB0.
+    duration
+        Stop after this many seconds.
+    play
+        Play this motion file; may be given several times.
+    no_record
+        Write no log.
+    take_over
+        Start although a servo has its torque on already.
+    virtual
+        Run on virtual time, as fast as the processor can; only with simulated buses.
+    """
+    result = compiled(robot, assignments, play, duration)
+    for warning in result.warnings:
+        say_warning(str(warning))
+    from dxlrun.run_summary import RunOptions
+    from dxlrun.supervisor import run_robot
+
+    options = RunOptions(record=not no_record, take_over=take_over)
+    console = out()
+    summary = run_robot(result.plan, options, console)
+    show(summary, result.plan.robot, console)
+    return summary.exit_code
+
+
+def show(summary: RunSummary, robot: str, console: Console) -> None:
+    """Print how the run went: what failed and what was not granted to stderr, the rest to stdout."""
+    for remark in summary.remarks:
+        say_warning(f"{robot}: {remark}")
+    for sentence in summary.sentences:
+        say_error(f"{robot}: {sentence}")
+    verdict = {0: "good", 130: "interrupted"}.get(summary.exit_code, "failed")
+    console.print(
+        f"{robot}: {verdict}. {summary.elapsed_s:.1f} s, {summary.cycles} cycles, "
+        f"{summary.skipped} periods skipped",
+        soft_wrap=True,
+    )
+    if summary.log is not None:
+        console.print(f"log: {summary.log} ({summary.messages} messages)", markup=False, soft_wrap=True)
+        console.print(f"next: dxlrun analyze {summary.log}", markup=False, soft_wrap=True)

@@ -1,0 +1,140 @@
+"""Buses of the robot file: ports, prepared packets, and their time budget against the loop's rate."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from dxlrun.compile.joints import CompiledJoint
+from dxlrun.compile.problems import Problems
+from dxlrun.description import Description
+from dxlrun.dynamixel.bus_plan import Budget, BusPlan
+from dxlrun.dynamixel.plan import Wiring, bus_plan
+
+SIMULATED = "sim"
+FAST_LATENCY_NS = 1_000_000
+"""The shortest latency timer of an FTDI adapter (protocol.md, Time budget)."""
+_COMFORTABLE = 0.9
+"""Share of the period above which controllers and the operating system have too little left."""
+
+
+def compile_buses(
+    description: Description, joints: Mapping[str, CompiledJoint], problems: Problems
+) -> list[BusPlan]:
+    """Return the plans of the buses that have joints, in the order of the file."""
+    _own_ports(description, problems)
+    plans: list[BusPlan] = []
+    rows = {name: row for row, name in enumerate(joints)}
+    for name, bus in description.robot.buses.items():
+        mark = description.marks.key("buses", name)
+        if not any(joint.bus == name for joint in description.robot.joints.values()):
+            problems.warning(mark, f"no joint stands on bus {name}", "it will not be opened; take it out")
+        wirings = [_wiring(joint, rows) for joint in joints.values() if joint.described.bus == name]
+        if not wirings:
+            continue
+        try:
+            plan = bus_plan(
+                name=name,
+                port=bus.port,
+                baud_rate=bus.baud_rate,
+                latency_ns=0 if bus.port == SIMULATED else bus.adapter.latency,
+                return_delay_ns=bus.return_delay_time,
+                joints=wirings,
+            )
+        except ValueError as error:
+            problems.error(mark, str(error), "change the joints of this bus")
+            continue
+        _check_ticks(description, plan, problems)
+        _check_budget(description, plan, problems)
+        plans.append(plan)
+    return plans
+
+
+def _own_ports(description: Description, problems: Problems) -> None:
+    owners: dict[str, str] = {}
+    for name, bus in description.robot.buses.items():
+        owner = owners.setdefault(bus.port, name)
+        if owner != name and bus.port != SIMULATED:
+            problems.error(
+                description.marks.value("buses", name, "port"),
+                f"port {bus.port} of bus {name} belongs to bus {owner} already",
+                "one port is one bus",
+            )
+
+
+def _wiring(joint: CompiledJoint, rows: Mapping[str, int]) -> Wiring:
+    return Wiring(
+        joint=joint.plan.name,
+        row=rows[joint.plan.name],
+        servo_id=joint.described.id,
+        table=joint.table,
+        reference=joint.described.reference,
+        direction=joint.described.direction,
+        lower=joint.plan.lower,
+        upper=joint.plan.upper,
+    )
+
+
+def _check_ticks(description: Description, plan: BusPlan, problems: Problems) -> None:
+    for servo in plan.servos:
+        if servo.lower_tick > servo.upper_tick:
+            problems.error(
+                description.marks.value("joints", servo.joint, "limits", "position"),
+                f"no position of an {servo.model} lies within the limits of {servo.joint}",
+                f"make them wider than one tick ({math.degrees(servo.rad_per_tick):.2f} deg)",
+            )
+
+
+def _check_budget(description: Description, plan: BusPlan, problems: Problems) -> None:
+    rate = description.robot.loop.rate
+    budget = plan.budget
+    share = budget.total_ns * 1e-9 * rate
+    mark = description.marks.value("loop", "rate")
+    cycle = f"one cycle on bus {plan.name} takes {budget.total_ns * 1e-6:.1f} ms"
+    if share > 1.0:
+        problems.error(
+            mark,
+            f"{cycle}, but {rate:g} Hz leave {1e3 / rate:.3g} ms; the highest possible rate is "
+            f"{_floor(budget.highest_rate_hz)} Hz",
+            "; ".join(["lower the rate", *_what_would_help(plan)]),
+        )
+    elif share > _COMFORTABLE:
+        problems.warning(
+            mark,
+            f"{cycle}, {share:.0%} of the period; what is left is short for controllers and the system",
+            "; ".join(["expect skipped periods, or lower the rate", *_what_would_help(plan)]),
+        )
+
+
+def _what_would_help(plan: BusPlan) -> list[str]:
+    """Say what each change alone would allow."""
+    budget = plan.budget
+    found: list[str] = []
+    if plan.latency_ns > FAST_LATENCY_NS:
+        latency_ns = budget.latency_ns * FAST_LATENCY_NS // plan.latency_ns
+        rate = _rate(budget, latency_ns=latency_ns)
+        found.append(
+            f"an adapter latency of 1 ms instead of {plan.latency_ns * 1e-6:g} ms would allow {rate} Hz"
+        )
+    if plan.return_delay_ns > 0:
+        rate = _rate(budget, return_delay_ns=0)
+        found.append(
+            f"a return delay time of 0 us instead of {plan.return_delay_ns * 1e-3:g} us would allow {rate} Hz"
+        )
+    if len(plan.servos) > 1:
+        found.append("a second bus would share the servos")
+    return found
+
+
+def _rate(budget: Budget, *, latency_ns: int | None = None, return_delay_ns: int | None = None) -> str:
+    total = (
+        budget.wire_ns
+        + (budget.latency_ns if latency_ns is None else latency_ns)
+        + (budget.return_delay_ns if return_delay_ns is None else return_delay_ns)
+    )
+    return _floor(1e9 / total)
+
+
+def _floor(rate: float) -> str:
+    """Write a rate that is certainly possible, Hz, with two digits at least."""
+    return str(math.floor(rate)) if rate >= 10 else f"{math.floor(rate * 10) / 10:g}"

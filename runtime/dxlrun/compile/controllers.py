@@ -1,0 +1,166 @@
+"""Controllers of the robot file against plug-ins, joints, claims and the loop's rate."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+
+from pydantic import ValidationError
+
+from dxlrun.compile.problems import Problems, suggestion
+from dxlrun.control.claims import conflicts
+from dxlrun.control.controller import Interfaces, ParametersModel
+from dxlrun.control.loop_plan import ControllerPlan
+from dxlrun.control.plugins import Offer, PlugIns
+from dxlrun.description import Description, problems_of
+from dxlrun.errors import Mark
+
+_RATE_TOLERANCE = 1e-6
+"""Relative; a loop rate of 33.3 Hz is three times 11.1 Hz."""
+
+
+@dataclass(frozen=True, slots=True)
+class CompiledController:
+    """A controller whose type is known and whose parameters are valid."""
+
+    plan: ControllerPlan
+    offer: Offer
+    parameters: ParametersModel
+
+
+def compile_controllers(
+    description: Description, plugins: PlugIns, problems: Problems
+) -> dict[str, CompiledController]:
+    """Return the controllers that could be compiled, by name, in the order of the file."""
+    compiled: dict[str, CompiledController] = {}
+    for name, entry in description.robot.controllers.items():
+        every = _every(description, name, entry.rate, problems)
+        offer = _offer(description, name, entry.type, plugins, problems)
+        if offer is None:
+            continue
+        parameters = _parameters(description, name, offer, problems)
+        if parameters is None:
+            continue
+        interfaces = _interfaces(description, name, offer, parameters, problems)
+        if interfaces is None:
+            continue
+        plan = ControllerPlan(
+            name=name,
+            type=entry.type,
+            distribution=offer.distribution,
+            parameters=json.dumps(entry.parameters),  # as written: `60 deg` is what the model accepts
+            joints=interfaces.joints,
+            command=interfaces.command,
+            publishes=offer.controller.publishes,
+            active=entry.active,
+            every=every,
+        )
+        compiled[name] = CompiledController(plan, offer, parameters)
+    _exclusive_claims(description, compiled, problems)
+    return compiled
+
+
+def _every(description: Description, name: str, rate: float | None, problems: Problems) -> int:
+    """Return of how many cycles the controller is updated in one."""
+    loop = description.robot.loop.rate
+    if rate is None:
+        return 1
+    mark = description.marks.value("controllers", name, "rate")
+    if rate > loop * (1 + _RATE_TOLERANCE):
+        problems.error(
+            mark,
+            f"rate {rate:g} Hz of {name} is above the loop's {loop:g} Hz",
+            f"the nearest possible is {loop:g}",
+        )
+        return 1
+    every = max(1, round(loop / rate))
+    if abs(every * rate - loop) > _RATE_TOLERANCE * loop:
+        problems.error(
+            mark,
+            f"rate {rate:g} Hz of {name} does not divide the loop's {loop:g} Hz",
+            f"the nearest possible is {loop / every:.6g}",
+        )
+    return every
+
+
+def _offer(
+    description: Description, name: str, type_name: str, plugins: PlugIns, problems: Problems
+) -> Offer | None:
+    offer = plugins.controllers.get(type_name)
+    if offer is None:
+        mend = suggestion(type_name, tuple(plugins.controllers))
+        if plugins.broken:
+            broken = "; ".join(f"{plugin}: {reason}" for plugin, reason in plugins.broken.items())
+            mend += f" (plug-ins that could not be loaded: {broken})"
+        problems.error(
+            description.marks.value("controllers", name, "type"),
+            f"no plug-in offers the controller type {type_name} of {name}",
+            mend,
+        )
+    return offer
+
+
+def _parameters(
+    description: Description, name: str, offer: Offer, problems: Problems
+) -> ParametersModel | None:
+    entry = description.robot.controllers[name]
+    try:
+        return offer.controller.Parameters.model_validate(entry.parameters)
+    except ValidationError as error:
+        model = offer.controller.Parameters
+        problems.extend(problems_of(error, description.marks, ("controllers", name), model=model))
+    return None
+
+
+def _interfaces(
+    description: Description, name: str, offer: Offer, parameters: ParametersModel, problems: Problems
+) -> Interfaces | None:
+    """Ask the controller what it wants; it is anybody's code, so what it raises is a problem of the file."""
+    joints = tuple(description.robot.joints)
+    try:
+        interfaces = offer.controller.interfaces(parameters, joints)
+    except Exception as error:
+        problems.error(
+            description.marks.key("controllers", name),
+            f"controller {name} ({offer.distribution}) cannot say what it needs: "
+            f"{type(error).__name__}: {error}",
+            "correct its parameters, or its plug-in",
+        )
+        return None
+    seen: set[str] = set()
+    good = True
+    for joint in interfaces.joints:
+        mark = joint_mark(description, name, joint)
+        if joint not in joints:
+            problems.error(
+                mark, f"{name} wants joint {joint}, which the file does not have", suggestion(joint, joints)
+            )
+            good = False
+        elif joint in seen:
+            problems.error(mark, f"{name} names joint {joint} twice", "name it once")
+            good = False
+        seen.add(joint)
+    return interfaces if good else None
+
+
+def _exclusive_claims(
+    description: Description, compiled: dict[str, CompiledController], problems: Problems
+) -> None:
+    taken: dict[tuple[str, str], list[str]] = {}
+    for conflict in conflicts(c.plan for c in compiled.values() if c.plan.active):
+        taken.setdefault((conflict.holder, conflict.other), []).append(conflict.joint)
+    for (holder, other), joints in taken.items():
+        problems.error(
+            joint_mark(description, other, joints[0]),
+            f"{other} and {holder} are both active and both claim {', '.join(joints)}",
+            f"write active: false in one of the two, or take the joint{'s' * (len(joints) > 1)} out",
+        )
+
+
+def joint_mark(description: Description, controller: str, joint: str) -> Mark:
+    """Return where a controller of the file names a joint; the controller's own place when it does not."""
+    listed = description.robot.controllers[controller].parameters.get("joints")
+    if isinstance(listed, list) and joint in listed:
+        positions = [index for index, name in enumerate(listed) if name == joint]
+        return description.marks.value("controllers", controller, "joints", positions[-1])
+    return description.marks.key("controllers", controller)

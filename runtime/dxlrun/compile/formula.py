@@ -1,0 +1,136 @@
+"""Formulas: expressions of time in a motion file, evaluated by simpleeval inside narrow bounds."""
+
+from __future__ import annotations
+
+import ast
+import math
+import warnings
+from collections.abc import Callable, Mapping
+
+from simpleeval import (  # type: ignore[import-untyped]  # no type information is published
+    InvalidExpression,
+    SimpleEval,
+)
+
+LONGEST_FORMULA = 1000
+"""Characters; bounds parsing and evaluation together with the list of operations."""
+DEEPEST_FORMULA = 100
+"""Levels of operations; a sum of n terms has n. Keeps the evaluator away from Python's recursion limit."""
+
+FUNCTIONS: Mapping[str, Callable[..., float]] = {
+    "sin": math.sin,
+    "cos": math.cos,
+    "tan": math.tan,
+    "asin": math.asin,
+    "acos": math.acos,
+    "atan": math.atan,
+    "atan2": math.atan2,
+    "sinh": math.sinh,
+    "cosh": math.cosh,
+    "tanh": math.tanh,
+    "sqrt": math.sqrt,
+    "exp": math.exp,
+    "log": math.log,
+    "abs": abs,
+    "min": min,
+    "max": max,
+}
+
+_NODES = (ast.BinOp, ast.UnaryOp, ast.Constant, ast.Name, ast.Load, ast.Call)
+
+
+def _power(base: float, exponent: float) -> float:
+    # floats overflow at once, where integers would grow for minutes: 9**9**9
+    return math.pow(base, exponent)
+
+
+_OPERATORS: Mapping[type[ast.AST], Callable[..., float]] = {
+    ast.Add: lambda a, b: float(a) + float(b),
+    ast.Sub: lambda a, b: float(a) - float(b),
+    ast.Mult: lambda a, b: float(a) * float(b),
+    ast.Div: lambda a, b: float(a) / float(b),
+    ast.Mod: lambda a, b: float(a) % float(b),
+    ast.Pow: _power,
+    ast.USub: lambda a: -float(a),
+    ast.UAdd: lambda a: +float(a),
+}
+
+
+class Formula:
+    """An expression of `t`, s; knows pi, sin, cos, tan, sqrt, exp, abs and a few more, and nothing else.
+
+    Raises ValueError with one sentence when the text is not such an expression.
+    """
+
+    __slots__ = ("_evaluator", "_tree", "text")
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+        self._tree = _parse(text)
+        self._evaluator = SimpleEval(operators=dict(_OPERATORS), functions=dict(FUNCTIONS), names={})
+
+    def at(self, t: float) -> float:
+        """Return the value at `t` s; raises ValueError with one sentence where there is none."""
+        self._evaluator.names = {"t": t, "pi": math.pi}
+        try:
+            value = float(self._evaluator.eval(self.text, previously_parsed=self._tree))
+        except ZeroDivisionError:
+            raise ValueError("division by zero") from None
+        except OverflowError:
+            raise ValueError("the value is too large") from None
+        except InvalidExpression as error:
+            raise ValueError(str(error)) from None
+        except TypeError as error:
+            raise ValueError(f"a function has the wrong number of arguments ({error})") from None
+        except ValueError:
+            raise ValueError(
+                "a function is not defined there (root or logarithm of a negative number)"
+            ) from None
+        if not math.isfinite(value):
+            raise ValueError("the value is not finite")
+        return value
+
+
+def _parse(text: str) -> ast.expr:
+    if len(text) > LONGEST_FORMULA:
+        raise ValueError(f"it has {len(text)} characters, at most {LONGEST_FORMULA} are allowed")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Python warns of "2(t)", which is refused below
+            tree = ast.parse(text.strip(), mode="eval").body
+    except (SyntaxError, ValueError, RecursionError, MemoryError):
+        raise ValueError("it is not an expression, or a bracket or sign is missing") from None
+    if _depth(tree) > DEEPEST_FORMULA:
+        raise ValueError(f"more than {DEEPEST_FORMULA} operations stand inside each other; group long sums")
+    called = {id(node.func) for node in ast.walk(tree) if isinstance(node, ast.Call)}
+    for node in ast.walk(tree):
+        if id(node) not in called or not isinstance(node, ast.Name):
+            _check(node)
+    return tree
+
+
+def _depth(tree: ast.AST) -> int:
+    level, depth = [tree], 0
+    while level:
+        level, depth = [child for node in level for child in ast.iter_child_nodes(node)], depth + 1
+    return depth
+
+
+def _check(node: ast.AST) -> None:
+    if isinstance(node, ast.operator | ast.unaryop):
+        if type(node) not in _OPERATORS:
+            raise ValueError(f"it uses an operation that formulas do not have ({type(node).__name__})")
+    elif not isinstance(node, _NODES):
+        raise ValueError(f"it uses something that formulas do not have ({type(node).__name__})")
+    elif isinstance(node, ast.Constant):
+        if isinstance(node.value, bool) or not isinstance(node.value, int | float):
+            raise ValueError(f"{node.value!r} is not a real number")
+    elif isinstance(node, ast.Call):
+        if not isinstance(node.func, ast.Name):
+            raise ValueError("only a function's name may stand before a bracket; write 2 * (t), not 2(t)")
+        if node.func.id not in FUNCTIONS:
+            raise ValueError(f"unknown function {node.func.id}; there are {', '.join(sorted(FUNCTIONS))}")
+        if node.keywords:
+            raise ValueError("functions take no named arguments")
+    elif isinstance(node, ast.Name) and node.id not in ("t", "pi"):
+        raise ValueError(f"unknown name {node.id}; there are t (seconds) and pi")

@@ -1,0 +1,124 @@
+"""Joints of the robot file against buses, models and reach."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from dxlrun.compile.problems import Problems, suggestion
+from dxlrun.compile.reach import Interval, degrees, joint_reach
+from dxlrun.control.loop_plan import JointPlan
+from dxlrun.control_table import ControlTable, control_table, model_names
+from dxlrun.description import Description
+from dxlrun.description.robot import Joint
+
+
+@dataclass(frozen=True, slots=True)
+class CompiledJoint:
+    """A joint that stands on a known bus and a known model."""
+
+    plan: JointPlan
+    described: Joint
+    table: ControlTable
+    reach: Interval
+    """rad, in the joint's coordinate"""
+
+
+def compile_joints(description: Description, problems: Problems) -> dict[str, CompiledJoint]:
+    """Return the joints that could be compiled, by name, in the order of the file."""
+    _unique_ids(description, problems)
+    compiled: dict[str, CompiledJoint] = {}
+    for name, joint in description.robot.joints.items():
+        known_bus = _known_bus(description, name, joint, problems)
+        table = _table(description, name, joint, problems)
+        if table is None:
+            continue
+        reach = joint_reach(table.max_tick * table.rad_per_tick, joint.reference, joint.direction)
+        _check_reference(description, name, joint, table, problems)
+        allowed = _allowed(description, name, joint, reach, problems)
+        if known_bus and allowed is not None:
+            plan = JointPlan(name, allowed.lower, allowed.upper, joint.limits.velocity)
+            compiled[name] = CompiledJoint(plan, joint, table, reach)
+    return compiled
+
+
+def _unique_ids(description: Description, problems: Problems) -> None:
+    owners: dict[tuple[str, int], str] = {}
+    for name, joint in description.robot.joints.items():
+        owner = owners.setdefault((joint.bus, joint.id), name)
+        if owner != name:
+            problems.error(
+                description.marks.value("joints", name, "id"),
+                f"servo ID {joint.id} of {name} is taken by {owner} on bus {joint.bus}",
+                "give every servo of a bus its own ID",
+            )
+
+
+def _known_bus(description: Description, name: str, joint: Joint, problems: Problems) -> bool:
+    buses = description.robot.buses
+    if joint.bus in buses:
+        return True
+    problems.error(
+        description.marks.value("joints", name, "bus"),
+        f"{name} stands on bus {joint.bus}, which the file does not have",
+        suggestion(joint.bus, tuple(buses)),
+    )
+    return False
+
+
+def _table(description: Description, name: str, joint: Joint, problems: Problems) -> ControlTable | None:
+    mark = description.marks.value("joints", name, "model")
+    try:
+        table = control_table(joint.model)
+    except LookupError:
+        problems.error(
+            mark,
+            f"no control table for model {joint.model} of {name}",
+            suggestion(joint.model, model_names()),
+        )
+        return None
+    bus = description.robot.buses.get(joint.bus)
+    if bus is not None and table.protocol != bus.protocol:
+        problems.error(
+            mark,
+            f"{joint.model} of {name} speaks Protocol {table.protocol}, "
+            f"bus {joint.bus} Protocol {bus.protocol}",
+            "put it on a bus of its own protocol; a bus cannot be mixed",
+        )
+    return table
+
+
+def _check_reference(
+    description: Description, name: str, joint: Joint, table: ControlTable, problems: Problems
+) -> None:
+    travel = table.max_tick * table.rad_per_tick
+    if not 0.0 <= joint.reference <= travel:
+        problems.warning(
+            description.marks.value("joints", name, "reference"),
+            f"reference {degrees(joint.reference)} deg of {name} lies outside the travel of an {joint.model} "
+            f"(0..{degrees(travel)} deg), so the joint can never be at 0",
+            "check the reference: it is the servo's angle where the joint's is 0",
+        )
+
+
+def _allowed(
+    description: Description, name: str, joint: Joint, reach: Interval, problems: Problems
+) -> Interval | None:
+    """Return the limits that the gate keeps: the file's, cut to the reach."""
+    if joint.limits.position is None:
+        return reach
+    mark = description.marks.value("joints", name, "limits", "position")
+    wanted = Interval(*joint.limits.position)
+    allowed = wanted.meet(reach)
+    if allowed is None:
+        problems.error(
+            mark,
+            f"limits {wanted} of {name} have nothing in common with the reach of its {joint.model}, {reach}",
+            "check limits, reference and direction",
+        )
+    elif not reach.contains(wanted):
+        problems.warning(
+            mark,
+            f"limits {wanted} of {name} go beyond the reach of its {joint.model}, {reach}",
+            f"the joint will keep {allowed}; write that, or check reference and direction",
+        )
+    return allowed

@@ -1,0 +1,45 @@
+"""Reach: what angles a servo can take, seen in the coordinate of its joint."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+_TOLERANCE = 1e-6
+"""rad; far below a tick (5e-3 rad on an AX-12), far above the rounding of degrees."""
+
+
+@dataclass(frozen=True, slots=True)
+class Interval:
+    """Closed interval of joint angles, rad."""
+
+    lower: float
+    upper: float
+
+    def contains(self, other: Interval) -> bool:
+        """Say whether `other` lies inside, but for rounding."""
+        return other.lower >= self.lower - _TOLERANCE and other.upper <= self.upper + _TOLERANCE
+
+    def meet(self, other: Interval) -> Interval | None:
+        """Return what both have in common; None when that is not more than a point."""
+        lower, upper = max(self.lower, other.lower), min(self.upper, other.upper)
+        return Interval(lower, upper) if lower < upper else None
+
+    def __str__(self) -> str:
+        return f"{degrees(self.lower, signed=True)}..{degrees(self.upper, signed=True)} deg"
+
+
+def joint_reach(travel: float, reference: float, direction: int) -> Interval:
+    """Return the reach of a joint, rad, of a servo that turns from 0 to `travel` rad.
+
+    q = direction * (theta - reference), theta in 0..travel (thesis of M. Amarante Araujo, 2017, JointID).
+    """
+    ends = (direction * -reference, direction * (travel - reference))
+    return Interval(min(ends), max(ends))
+
+
+def degrees(angle: float, *, signed: bool = False) -> str:
+    """Write an angle of `angle` rad in degrees, with as many digits as it needs, at most two."""
+    value = round(math.degrees(angle), 2) + 0.0  # + 0.0: no minus sign before zero
+    text = f"{value:.2f}".rstrip("0").rstrip(".")
+    return f"+{text}" if signed and value > 0 else text

@@ -1,0 +1,176 @@
+"""What `dxlrun check` shows of a compiled robot: rows in plain numbers, ready for a table or for JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from dxlrun.compile.controllers import CompiledController
+from dxlrun.compile.joints import CompiledJoint
+from dxlrun.compile.motions import CompiledPart
+from dxlrun.description import Description
+from dxlrun.dynamixel.bus_plan import BusPlan
+
+
+@dataclass(frozen=True, slots=True)
+class Checked:
+    """Everything that passed the checks, before it becomes a plan."""
+
+    description: Description
+    joints: Mapping[str, CompiledJoint]
+    buses: Sequence[BusPlan]
+    controllers: Mapping[str, CompiledController]
+    parts: Sequence[CompiledPart]
+    end_ns: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class JointRow:
+    """One joint; angles in rad, in the joint's own coordinate but for `reference` (servo's, from raw 0)."""
+
+    name: str
+    bus: str
+    id: int
+    model: str
+    reference: float
+    direction: int
+    lower: float
+    """The limit that the gate keeps: the file's, cut to the reach."""
+    upper: float
+    velocity: float | None
+    """rad/s; None: no limit in the file."""
+    reach_lower: float
+    reach_upper: float
+
+
+@dataclass(frozen=True, slots=True)
+class ControllerRow:
+    """One controller; `rate` in Hz."""
+
+    name: str
+    type: str
+    distribution: str
+    joints: tuple[str, ...]
+    command: tuple[str, ...]
+    active: bool
+    rate: float
+
+
+@dataclass(frozen=True, slots=True)
+class BusRow:
+    """What one cycle costs on one bus; times in s (protocol.md, Time budget)."""
+
+    name: str
+    port: str
+    baud_rate: int
+    servos: int
+    request_bytes: int
+    reply_bytes: int
+    wire: float
+    return_delay: float
+    latency: float
+    total: float
+    highest_rate: float
+    """Hz"""
+    share: float
+    """Of the loop's period; 1 = all of it."""
+
+
+@dataclass(frozen=True, slots=True)
+class MotionRow:
+    """One part of a motion file; times in s since the loop's first deadline."""
+
+    file: str
+    controller: str
+    start: float
+    end: float
+    commands: int
+    points: int
+
+
+@dataclass(frozen=True, slots=True)
+class CheckReport:
+    """Everything that was decided for a robot before a port opens."""
+
+    robot: str
+    rate: float
+    """Hz"""
+    joints: tuple[JointRow, ...]
+    controllers: tuple[ControllerRow, ...]
+    buses: tuple[BusRow, ...]
+    motions: tuple[MotionRow, ...]
+    duration: float | None
+    """s; None: the run goes on until it is told to stop."""
+
+
+def check_report(checked: Checked) -> CheckReport:
+    """Return the rows of what was checked."""
+    rate = checked.description.robot.loop.rate
+    return CheckReport(
+        robot=checked.description.robot.name,
+        rate=rate,
+        joints=tuple(_joint_row(joint) for joint in checked.joints.values()),
+        controllers=tuple(_controller_row(controller, rate) for controller in checked.controllers.values()),
+        buses=tuple(_bus_row(bus, rate) for bus in checked.buses),
+        motions=tuple(_motion_row(part) for part in checked.parts),
+        duration=None if checked.end_ns is None else checked.end_ns * 1e-9,
+    )
+
+
+def _joint_row(joint: CompiledJoint) -> JointRow:
+    described = joint.described
+    return JointRow(
+        name=joint.plan.name,
+        bus=described.bus,
+        id=described.id,
+        model=described.model,
+        reference=described.reference,
+        direction=described.direction,
+        lower=joint.plan.lower,
+        upper=joint.plan.upper,
+        velocity=joint.plan.velocity,
+        reach_lower=joint.reach.lower,
+        reach_upper=joint.reach.upper,
+    )
+
+
+def _controller_row(controller: CompiledController, rate: float) -> ControllerRow:
+    plan = controller.plan
+    return ControllerRow(
+        name=plan.name,
+        type=plan.type,
+        distribution=plan.distribution,
+        joints=plan.joints,
+        command=plan.command,
+        active=plan.active,
+        rate=rate / plan.every,
+    )
+
+
+def _bus_row(bus: BusPlan, rate: float) -> BusRow:
+    budget = bus.budget
+    return BusRow(
+        name=bus.name,
+        port=bus.port,
+        baud_rate=bus.baud_rate,
+        servos=len(bus.servos),
+        request_bytes=budget.request_bytes,
+        reply_bytes=budget.reply_bytes,
+        wire=budget.wire_ns * 1e-9,
+        return_delay=budget.return_delay_ns * 1e-9,
+        latency=budget.latency_ns * 1e-9,
+        total=budget.total_ns * 1e-9,
+        highest_rate=budget.highest_rate_hz,
+        share=budget.total_ns * 1e-9 * rate,
+    )
+
+
+def _motion_row(part: CompiledPart) -> MotionRow:
+    return MotionRow(
+        file=part.file,
+        controller=part.controller,
+        start=part.start_ns * 1e-9,
+        end=part.end_ns * 1e-9,
+        commands=len(part.commands),
+        points=part.points,
+    )

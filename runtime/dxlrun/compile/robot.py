@@ -1,0 +1,111 @@
+"""The compiler: every check in turn, all problems at once, then the plan."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from dxlrun.compile.buses import compile_buses
+from dxlrun.compile.controllers import compile_controllers
+from dxlrun.compile.joints import compile_joints
+from dxlrun.compile.motions import compile_motion
+from dxlrun.compile.plan import Plan
+from dxlrun.compile.problems import Problems
+from dxlrun.compile.report import Checked, CheckReport, check_report
+from dxlrun.compile.twins import check_twins
+from dxlrun.control.loop_plan import LoopPlan, SchedulerPlan
+from dxlrun.control.plugins import load_plugins
+from dxlrun.description import Description, MotionDescription, read_motion, read_robot
+from dxlrun.errors import InputError, Problem
+
+
+@dataclass(frozen=True, slots=True)
+class Compiled:
+    """A plan that can be run, and what a person should know about it."""
+
+    plan: Plan
+    warnings: tuple[Problem, ...]
+    report: CheckReport
+
+
+def compile_files(
+    robot: Path, arguments: Mapping[str, str], motions: Sequence[Path], duration_ns: int | None = None
+) -> Compiled:
+    """Read robot file and motion files and compile them; raises InputError with the problems of all files."""
+    description: Description | None = None
+    read: list[MotionDescription] = []
+    problems: list[Problem] = []
+    try:
+        description = read_robot(robot, arguments)
+    except InputError as error:
+        problems += _placed(error)
+    for path in motions:
+        try:
+            read.append(read_motion(path))
+        except InputError as error:
+            problems += _placed(error)
+    if description is not None and problems:
+        try:
+            compile_robot(description, read, duration_ns)
+        except InputError as error:
+            problems += _placed(error)
+    if problems or description is None:
+        raise InputError(problems)
+    return compile_robot(description, read, duration_ns)
+
+
+def _placed(error: InputError) -> tuple[Problem, ...]:
+    """Return the problems of an error; an error that names no place cannot be listed and is raised again."""
+    if not error.problems:
+        raise error
+    return error.problems
+
+
+def compile_robot(
+    description: Description, motions: Sequence[MotionDescription], duration_ns: int | None = None
+) -> Compiled:
+    """Turn a description and motions into a plan.
+
+    The run ends by itself after `duration_ns`, else when the last motion has ended, else when it is told to.
+    Raises InputError with every problem of the robot file and the motions.
+    """
+    problems = Problems()
+    joints = compile_joints(description, problems)
+    check_twins(description, {name: joint.table for name, joint in joints.items()}, problems)
+    buses = compile_buses(description, joints, problems)
+    controllers = compile_controllers(description, load_plugins(), problems)
+    names = tuple(description.robot.controllers)
+    parts = [
+        part for motion in motions for part in compile_motion(motion, controllers, names, joints, problems)
+    ]
+    problems.refuse()
+    end_ns = duration_ns
+    if end_ns is None and parts:
+        end_ns = max(part.end_ns for part in parts)
+    checked = Checked(description, joints, buses, controllers, parts, end_ns)
+    return Compiled(_plan(checked), problems.warnings, check_report(checked))
+
+
+def _plan(checked: Checked) -> Plan:
+    description, robot = checked.description, checked.description.robot
+    scheduler = robot.loop.scheduler
+    commands = [command for part in checked.parts for command in part.commands]
+    loop = LoopPlan(
+        period_ns=round(1e9 / robot.loop.rate),
+        scheduler=SchedulerPlan(scheduler.policy, scheduler.priority, scheduler.lock_memory),
+        joints=tuple(joint.plan for joint in checked.joints.values()),
+        controllers=tuple(controller.plan for controller in checked.controllers.values()),
+        commands=tuple(sorted(commands, key=lambda command: command.at_ns)),
+        end_ns=checked.end_ns,
+    )
+    return Plan(
+        robot=robot.name,
+        loop=loop,
+        buses=tuple(checked.buses),
+        exit_timeout_ns=robot.policies.exit_timeout,
+        recording_directory=robot.recording.directory,
+        source_file=str(description.path),
+        source_text=description.text,
+        arguments=dict(description.arguments),
+    )

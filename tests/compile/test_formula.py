@@ -1,0 +1,87 @@
+import math
+import re
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dxlrun.compile.formula import LONGEST_FORMULA, Formula
+
+
+@settings(max_examples=50, deadline=None)
+@given(t=st.floats(0, 100))
+def test_the_formulas_of_the_thesis_have_the_values_of_python(t: float):
+    left = Formula("0.2 * (sin(2 * t) - sin(4 * t)) - 0.4")
+    right = Formula("0.2 * (sin(2*t) - cos(1.5*t)) - 0.4")
+
+    assert left.at(t) == pytest.approx(0.2 * (math.sin(2 * t) - math.sin(4 * t)) - 0.4, abs=1e-12)
+    assert right.at(t) == pytest.approx(0.2 * (math.sin(2 * t) - math.cos(1.5 * t)) - 0.4, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("t", 3.0),
+        ("-t ** 2", -9.0),
+        ("2 * pi", 2 * math.pi),
+        ("sqrt(abs(-16)) + exp(0) - tan(0)", 5.0),
+        ("min(t, 1) + max(t, 5)", 6.0),
+        ("7 % 4 / 2", 1.5),
+    ],
+)
+def test_operations(text: str, value: float):
+    assert Formula(text).at(3.0) == pytest.approx(value)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("sin(x)", "unknown name x"),
+        ("sinus(t)", "unknown function sinus"),
+        ("__import__('os').getcwd()", "only a function's name"),
+        ("t.real", "Attribute"),
+        ("'a' * 9", "not a real number"),
+        ("1j * t", "not a real number"),
+        ("True", "not a real number"),
+        ("[t for t in (1,)]", "ListComp"),
+        ("t if t > 1 else 0", "IfExp"),
+        ("1 << 9", "LShift"),
+        ("2(t)", "write 2 * (t)"),
+        ("t = 1", "not an expression"),
+        ("sin(t", "not an expression"),
+        ("", "not an expression"),
+        ("sin + t", "unknown name sin"),
+        ("(" * 500 + "t" + ")" * 500, "at most"),
+        ("(" * 450 + "t" + ")" * 450, "not an expression"),
+    ],
+)
+def test_what_is_no_formula_is_refused_with_a_sentence(text: str, says: str):
+    with pytest.raises(ValueError, match=re.escape(says)):
+        Formula(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("1 / t", "division by zero"),
+        ("t % 0", "division by zero"),
+        ("sqrt(t - 1)", "not defined"),
+        ("(t - 1) ** 0.5", "not defined"),
+        ("exp(1000)", "too large"),
+        ("9 ** 9 ** 9", "too large"),
+        ("abs(" + "9" * 400 + ")", "too large"),
+        ("1e308 * 10", "not finite"),
+        ("sin(t, t)", "wrong number of arguments"),
+    ],
+)
+def test_where_a_formula_has_no_value_it_says_why(text: str, says: str):
+    with pytest.raises(ValueError, match=says):
+        Formula(text).at(0.0)
+
+
+def test_a_long_sum_is_evaluated_and_a_longer_one_refused():
+    assert Formula("t" + "+t" * 90).at(1.0) == 91
+    with pytest.raises(ValueError, match="group long sums"):
+        Formula("t" + "+t" * 300)
+    with pytest.raises(ValueError, match="at most"):
+        Formula("t" + "+t" * LONGEST_FORMULA)
