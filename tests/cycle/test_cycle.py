@@ -1,0 +1,92 @@
+"""The cycle record: one memory for the loop's arrays, the ring and the log's message."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dxlrun.cycle import SCALARS, SEQUENCES, CycleLayout, CycleRecord, cycle_slots
+
+SHAPES = [(0, 0), (1, 0), (3, 1), (8, 2), (18, 5)]
+
+
+def layout_of(joints: int, controllers: int) -> CycleLayout:
+    return CycleLayout([f"j{i}" for i in range(joints)], [f"c{i}" for i in range(controllers)])
+
+
+@pytest.mark.parametrize(("joints", "controllers"), SHAPES)
+def test_what_is_written_to_the_arrays_is_in_the_bytes(joints: int, controllers: int) -> None:
+    layout = layout_of(joints, controllers)
+    record = CycleRecord(layout)
+    for number, (name, _) in enumerate(SCALARS):
+        setattr(record, name, 1000 + number)
+    rows = np.arange(joints)
+    record.states.position[:] = rows + 0.5
+    record.states.velocity[:] = rows + 0.25
+    record.states.effort[:] = -rows
+    record.age_ns[:] = rows * 10
+    record.valid[:] = rows % 2 == 0
+    record.commands.position[:] = rows + 1
+    record.goals.velocity[:] = rows + 2
+    record.clamped[:] = rows
+    record.controller_ns[:] = 7
+    read = np.frombuffer(bytes(record.raw), dtype=layout.dtype)[0]
+    assert [int(read[name]) for name, _ in SCALARS] == [1000 + n for n in range(len(SCALARS))]
+    assert [getattr(record, name) for name, _ in SCALARS] == [1000 + n for n in range(len(SCALARS))]
+    np.testing.assert_array_equal(read["position"], rows + 0.5)
+    np.testing.assert_array_equal(read["velocity"], rows + 0.25)
+    np.testing.assert_array_equal(read["effort"], -rows)
+    np.testing.assert_array_equal(read["age_ns"], rows * 10)
+    np.testing.assert_array_equal(read["valid"], rows % 2 == 0)
+    np.testing.assert_array_equal(read["command_position"], rows + 1)
+    assert np.isnan(read["command_velocity"]).all()
+    assert np.isnan(read["goal_position"]).all()
+    np.testing.assert_array_equal(read["goal_velocity"], rows + 2)
+    np.testing.assert_array_equal(read["clamped"], rows)
+    np.testing.assert_array_equal(read["controller_ns"], np.full(controllers, 7))
+
+
+@pytest.mark.parametrize(("joints", "controllers"), SHAPES)
+def test_no_two_fields_share_a_byte_and_lengths_are_set(joints: int, controllers: int) -> None:
+    layout = layout_of(joints, controllers)
+    used = np.zeros(layout.size, dtype=int)
+    fields = layout.dtype.fields
+    assert fields is not None
+    for kind, offset, *_ in fields.values():
+        used[offset : offset + kind.itemsize] += 1
+    assert used.max() == 1
+    record = np.frombuffer(bytes(CycleRecord(layout).raw), dtype=layout.dtype)[0]
+    for name, _, per in SEQUENCES:
+        assert record[f"{name}_length"] == {"joints": joints, "controllers": controllers}[per]
+        assert len(record[name]) == record[f"{name}_length"]
+
+
+def test_the_raw_bytes_are_a_view_and_the_size_of_a_slot() -> None:
+    layout = layout_of(8, 2)
+    record = CycleRecord(layout)
+    before = bytes(record.raw)
+    record.cycle = 3
+    assert len(record.raw) == layout.size
+    assert record.raw.format == "B"
+    assert bytes(record.raw) != before
+
+
+def test_before_the_first_reply_nothing_is_known() -> None:
+    states = CycleRecord(layout_of(2, 1)).states
+    assert np.isnan(states.position).all()
+    assert not states.valid.any()
+    assert (states.age_ns == -1).all()
+
+
+def test_the_mask_of_controllers_has_an_end() -> None:
+    record = CycleRecord(layout_of(1, 63))
+    record.active = 1 << 62
+    read = np.frombuffer(bytes(record.raw), dtype=record.layout.dtype)[0]
+    assert int(read["active"]) == 1 << 62
+    with pytest.raises(ValueError, match="at most 63"):
+        layout_of(1, 64)
+
+
+@pytest.mark.parametrize("rate", [50, 320, 1000])
+def test_the_ring_holds_ten_seconds(rate: int) -> None:
+    assert cycle_slots(1_000_000_000 // rate) >= 10 * rate
