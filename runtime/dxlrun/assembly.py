@@ -1,0 +1,110 @@
+"""Assembly: a plan, ports and a clock become hardware, manager, gate and loop; the same on both clocks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from dxlrun.clock import Clock
+from dxlrun.compile.plan import Plan
+from dxlrun.control.gate import Gate
+from dxlrun.control.loop import CycleSink, Loop, StopFlag
+from dxlrun.control.manager import Manager
+from dxlrun.control.plugins import PlugIns
+from dxlrun.cycle import CycleLayout, CycleRecord
+from dxlrun.dynamixel.hardware import DynamixelHardware
+from dxlrun.dynamixel.port import Ports
+from dxlrun.events import EventSink
+from dxlrun.packets import PacketSink
+from dxlrun.simulation import BusConfig, ServoConfig
+
+
+class Sinks(CycleSink, Protocol):
+    """Where cycles, packets and events go."""
+
+    @property
+    def packets(self) -> PacketSink:
+        """Takes every packet that goes over a line."""
+        ...
+
+    @property
+    def events(self) -> EventSink:
+        """Takes what happens beside the cycle."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Robot:
+    """A robot, ready to be started."""
+
+    hardware: DynamixelHardware
+    manager: Manager
+    loop: Loop
+    record: CycleRecord
+
+
+def cycle_layout(plan: Plan) -> CycleLayout:
+    """Return the layout of the plan's cycles."""
+    return CycleLayout(
+        joints=tuple(joint.name for joint in plan.loop.joints),
+        controllers=tuple(controller.name for controller in plan.loop.controllers),
+    )
+
+
+def assemble(
+    plan: Plan,
+    plugins: PlugIns,
+    *,
+    ports: Ports,
+    clock: Clock,
+    sinks: Sinks,
+    beat: Callable[[], None],
+    stop: StopFlag,
+    take_over: bool = False,
+) -> Robot:
+    """Build everything between the ports and the log; configures the controllers, sends nothing."""
+    record = CycleRecord(cycle_layout(plan))
+    hardware = DynamixelHardware(
+        plan.buses,
+        ports,
+        clock,
+        record.states,
+        record.goals,
+        sinks.packets,
+        sinks.events,
+        beat,
+        take_over=take_over,
+    )
+    manager = Manager(plan.loop, plugins, record, sinks.events, clock)
+    gate = Gate(plan.loop, record, sinks.events)
+    loop = Loop(
+        clock=clock,
+        hardware=hardware,
+        manager=manager,
+        gate=gate,
+        record=record,
+        sink=sinks,
+        events=sinks.events,
+        plan=plan.loop,
+        beat=beat,
+        stop=stop,
+    )
+    manager.configure()
+    return Robot(hardware, manager, loop, record)
+
+
+def simulated_buses(plan: Plan) -> tuple[BusConfig, ...]:
+    """Return the simulated lines of a plan: the servos that it expects, each at its reference (q = 0)."""
+    return tuple(
+        BusConfig(
+            name=bus.name,
+            baud_rate=bus.baud_rate,
+            servos=tuple(
+                ServoConfig(servo.servo_id, servo.model, servo.reference, bus.return_delay_ns)
+                for servo in bus.servos
+            ),
+        )
+        for bus in plan.buses
+        if bus.port == "sim"
+    )

@@ -1,0 +1,167 @@
+"""The loop's process: plug-ins, set-up on the bus, real time, the loop, torque off.
+
+One thread, executed afresh (no fork), on descriptors that the guardian opened. It learns of a wish to stop
+by SIGTERM, which the guardian sends, or the kernel when the guardian is gone.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import sys
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import msgspec
+
+from dxlrun import process
+from dxlrun.assembly import assemble
+from dxlrun.clock import MonotonicClock
+from dxlrun.compile.plan import Plan, from_json
+from dxlrun.control import realtime
+from dxlrun.control.loop import StopFlag
+from dxlrun.control.plugins import load_plugins
+from dxlrun.cycle import CycleRecord
+from dxlrun.dynamixel.port import SerialPort, SerialPorts
+from dxlrun.errors import DxlrunError, PlugInError
+from dxlrun.events import EventCode, EventRing, Severity
+from dxlrun.heartbeat import Heartbeat, Phase
+from dxlrun.packets import PacketBatch
+from dxlrun.ring import RingWriter
+
+_PR_SET_PDEATHSIG = 1
+
+
+@dataclass(frozen=True, slots=True)
+class LoopJob:
+    """The descriptors that the loop's process inherits."""
+
+    plan: int
+    heartbeat: int
+    cycles: int
+    packets: int
+    events: int
+    result: int
+    take_over: bool
+    ports: tuple[int, ...] = ()
+    """Filled in by the guardian."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What the loop's process leaves behind for the terminal."""
+
+    reason: str
+    """ended, stopped, fault, start-up"""
+    cycles: int = 0
+    skipped: int = 0
+    sentences: tuple[str, ...] = ()
+    """What a person must know, one sentence each."""
+    grants: tuple[str, ...] = ()
+    """What the operating system did not grant."""
+    traceback: str = ""
+
+
+@dataclass(slots=True)
+class RingSinks:
+    """The rings of the loop's process; a cycle takes the packets of its exchange with it."""
+
+    cycles: RingWriter
+    packets: PacketBatch
+    events: EventRing
+    heartbeat: Heartbeat
+    _count: int = field(default=0, init=False)
+    _skipped: int = field(default=0, init=False)
+
+    def append(self, record: CycleRecord) -> None:
+        """Put one finished cycle, and the packets since the one before, into the rings."""
+        self.packets.commit()
+        self.cycles.append(record.raw)
+        self._count += 1
+        self._skipped += record.skipped
+        self.heartbeat.cycle(self._count, self._skipped)
+
+
+def _refuse_threads() -> Callable[[str], None]:
+    """Return the check that no plug-in brought a thread into the loop's process."""
+
+    def check(name: str) -> None:
+        count = realtime.thread_count()
+        if count != 1:
+            raise PlugInError(
+                f"plug-in {name} started {count - 1} more thread(s) in the loop's process; "
+                "CPython would hand the interpreter over to them in the middle of a cycle: "
+                "let it work in on_configure without threads, or in a process of its own"
+            )
+
+    return check
+
+
+def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: RingSinks) -> Outcome:
+    """Execute the plan from plug-ins to torque off."""
+    stop = StopFlag()
+    signal.signal(signal.SIGTERM, lambda *_: stop.request())
+    ports = SerialPorts(
+        [SerialPort(descriptor, bus.port) for descriptor, bus in zip(job.ports, plan.buses, strict=True)]
+    )
+    robot = assemble(
+        plan,
+        load_plugins(_refuse_threads()),
+        ports=ports,
+        clock=MonotonicClock(),
+        sinks=sinks,
+        beat=heartbeat.beat,
+        stop=stop,
+        take_over=job.take_over,
+    )
+    heartbeat.enter(Phase.SETUP)
+    robot.hardware.start()
+    refused: tuple[str, ...] = ()
+    try:
+        grants = realtime.apply(plan.loop.scheduler)
+        for grant in grants:
+            severity = Severity.INFO if grant.granted else Severity.WARNING
+            sinks.events.emit(EventCode.SCHEDULER, severity, "loop", grant.sentence)
+        refused = tuple(grant.sentence for grant in grants if not grant.granted)
+        heartbeat.beat()
+        heartbeat.enter(Phase.RUNNING)
+        result = robot.loop.run()
+    finally:
+        heartbeat.enter(Phase.STOPPING)
+        failures = robot.hardware.stop()
+    detail = (result.detail,) if result.detail else ()
+    return Outcome(result.reason, result.cycles, result.skipped, (*detail, *failures), refused)
+
+
+def main() -> None:
+    """Run the loop's process: `--job JSON`."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    guardian = os.getppid()
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    job = msgspec.json.decode(sys.argv[2], type=LoopJob)
+    clock = MonotonicClock()
+    heartbeat = Heartbeat(job.heartbeat)
+    events = EventRing(RingWriter(job.events), clock)
+    sinks = RingSinks(RingWriter(job.cycles), PacketBatch(RingWriter(job.packets)), events, heartbeat)
+    try:
+        if os.getppid() != guardian:
+            sys.exit(1)  # the guardian was gone before its death could be signalled
+        outcome = _run(from_json(process.whole(job.plan)), job, heartbeat, sinks)
+    except DxlrunError as error:
+        outcome = Outcome("start-up", sentences=tuple(str(error).splitlines()))
+        events.emit(EventCode.SETUP, Severity.ERROR, "loop", str(error))
+    except Exception as error:  # the last resort: the run ends with a sentence and the log has the traceback
+        sentence = f"dxlrun itself failed: {type(error).__name__}: {error}; --debug shows where"
+        outcome = Outcome("fault", sentences=(sentence,), traceback=traceback.format_exc())
+        events.emit(EventCode.LOOP_STOPPED, Severity.FATAL, "loop", outcome.traceback)
+    sinks.packets.commit()
+    os.pwrite(job.result, msgspec.json.encode(outcome), 0)
+    if not outcome.traceback:
+        heartbeat.enter(Phase.DONE)
+    sys.exit(0 if outcome.reason in ("ended", "stopped") and not outcome.sentences else 1)
+
+
+if __name__ == "__main__":
+    main()

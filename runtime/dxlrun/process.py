@@ -1,0 +1,88 @@
+"""Starting dxlrun's own processes, and talking to them in lines of JSON over a socket pair."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+
+import msgspec
+
+_ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+"""Importing numpy alone starts a thread for each core otherwise."""
+_LINE_LIMIT = 1 << 20
+
+
+def start(
+    module: str, arguments: Sequence[str], descriptors: Iterable[int], errors: int
+) -> subprocess.Popen[bytes]:
+    """Execute `python -m module` in a session of its own, so that a terminal's Ctrl-C does not reach it.
+
+    `descriptors` are inherited; `errors` takes its standard error. `-P` keeps the working directory out of
+    the import path: a student's `numpy.py` beside the robot file must not be imported.
+    """
+    return subprocess.Popen(
+        [sys.executable, "-P", "-m", module, *arguments],
+        pass_fds=tuple(descriptors),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=errors,
+        start_new_session=True,
+        env=os.environ | _ONE_THREAD,
+    )
+
+
+def memory_file(name: str, content: bytes = b"") -> int:
+    """Return the descriptor of a nameless file (memfd) with `content`."""
+    descriptor = os.memfd_create(name)
+    os.pwrite(descriptor, content, 0)
+    return descriptor
+
+
+def whole(descriptor: int) -> bytes:
+    """Return everything in a nameless file, wherever its offset stands."""
+    return os.pread(descriptor, os.fstat(descriptor).st_size, 0)
+
+
+class Line:
+    """One end of a conversation between two processes: JSON objects, one a line."""
+
+    def __init__(self, end: socket.socket) -> None:
+        self._socket = end
+        self._pending = b""
+        self.closed = False
+        """True after the other end was closed."""
+
+    def fileno(self) -> int:
+        """Return the descriptor, for select."""
+        return self._socket.fileno()
+
+    def send(self, message: Mapping[str, object]) -> None:
+        """Send one object; a closed other end is noticed by the next receive, not here."""
+        try:
+            self._socket.sendall(msgspec.json.encode(message) + b"\n")
+        except OSError:
+            self.closed = True
+
+    def receive(self) -> list[dict[str, object]]:
+        """Return the objects that arrive in one read; waits for one read, sets `closed` at its end."""
+        try:
+            chunk = self._socket.recv(65536)
+        except OSError:
+            chunk = b""
+        if not chunk or len(self._pending) > _LINE_LIMIT:
+            self.closed = True
+        *lines, self._pending = (self._pending + chunk).split(b"\n")
+        return [msgspec.json.decode(line, type=dict[str, object]) for line in lines]
+
+    def close(self) -> None:
+        """Close this end."""
+        self._socket.close()
+
+
+def line_pair() -> tuple[Line, socket.socket]:
+    """Return our end, and the other one to be inherited by a child (close it here after the start)."""
+    ours, theirs = socket.socketpair()
+    return Line(ours), theirs

@@ -1,0 +1,196 @@
+"""The processes of one run: simulated bus, recorder, guardian and, through it, the loop; in order."""
+
+from __future__ import annotations
+
+import os
+import select
+import subprocess
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+
+from dxlrun import heartbeat, process, ring
+from dxlrun.assembly import cycle_layout, simulated_buses
+from dxlrun.compile.plan import Plan, to_json
+from dxlrun.cycle import cycle_slots
+from dxlrun.errors import PortError, ProcessFault
+from dxlrun.events import EVENT_SLOT, event_slots
+from dxlrun.guardian import GuardianJob
+from dxlrun.loop_process import LoopJob, Outcome
+from dxlrun.packets import PACKET_SLOT, packet_slots
+from dxlrun.recording.header import LogHeader
+
+START_TIMEOUT_S = 20.0
+"""A child that says nothing for so long will say nothing more; a cold import of numpy takes a second."""
+END_TIMEOUT_S = 10.0
+_GUARDIAN_SLOTS = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class Memory:
+    """Descriptors of everything that the processes of a run share; nameless, gone with the last of them."""
+
+    plan: int
+    heartbeat: int
+    cycles: int
+    packets: int
+    events: int
+    guardian_packets: int
+    guardian_events: int
+    result: int
+    stderr: int
+
+    @classmethod
+    def create(cls, plan: Plan) -> Memory:
+        """Create it all, rings sized for ten seconds of this robot."""
+        servos = sum(len(bus.servos) for bus in plan.buses)
+        period = plan.loop.period_ns
+        return cls(
+            plan=process.memory_file("dxlrun-plan", to_json(plan)),
+            heartbeat=heartbeat.create(),
+            cycles=ring.create("cycles", cycle_layout(plan).size, cycle_slots(period)),
+            packets=ring.create("packets", PACKET_SLOT, packet_slots(period, servos)),
+            events=ring.create("events", EVENT_SLOT, event_slots(period, servos)),
+            guardian_packets=ring.create("guardian-packets", PACKET_SLOT, _GUARDIAN_SLOTS),
+            guardian_events=ring.create("guardian-events", EVENT_SLOT, _GUARDIAN_SLOTS),
+            result=process.memory_file("dxlrun-result"),
+            stderr=process.memory_file("dxlrun-stderr"),
+        )
+
+    def outcome(self) -> Outcome | None:
+        """Return what the loop's process left behind; None when it did not get to it."""
+        content = process.whole(self.result)
+        return msgspec.json.decode(content, type=Outcome) if content else None
+
+    def rings(self) -> list[dict[str, object]]:
+        """Return what the recorder reads, and from whom."""
+        return [
+            {"kind": "cycles", "fd": self.cycles, "source": "loop"},
+            {"kind": "packets", "fd": self.packets, "source": "loop"},
+            {"kind": "events", "fd": self.events, "source": "loop"},
+            {"kind": "packets", "fd": self.guardian_packets, "source": "guardian"},
+            {"kind": "events", "fd": self.guardian_events, "source": "guardian"},
+        ]
+
+
+class Child:
+    """One process of the run, and the line to it."""
+
+    def __init__(
+        self, name: str, module: str, arguments: list[str], descriptors: list[int], stderr: int
+    ) -> None:
+        self.name = name
+        self.line, theirs = process.line_pair()
+        control = ["--control-fd", str(theirs.fileno())]
+        self.process: subprocess.Popen[bytes] = process.start(
+            module, [*arguments, *control], [*descriptors, theirs.fileno()], stderr
+        )
+        theirs.close()
+        self.began = False
+        """True after it said that it is ready."""
+        self._messages: deque[Mapping[str, object]] = deque()
+
+    def message(self, timeout_s: float) -> Mapping[str, object] | None:
+        """Return what it says next; None when its end of the line is closed.
+
+        Raises ProcessFault when it says nothing in time.
+        """
+        while not self._messages and not self.line.closed:
+            ready, _, _ = select.select([self.line], [], [], timeout_s)
+            if not ready:
+                raise ProcessFault(f"the {self.name} said nothing for {timeout_s:.0f} s")
+            self._messages.extend(self.line.receive())
+        return self._messages.popleft() if self._messages else None
+
+    def poll(self, timeout_s: float) -> Mapping[str, object] | None:
+        """Return what it says within `timeout_s`; None when it says nothing."""
+        if not self._messages:
+            ready, _, _ = select.select([self.line], [], [], timeout_s)
+            if ready:
+                self._messages.extend(self.line.receive())
+        return self._messages.popleft() if self._messages else None
+
+    def ready(self) -> Mapping[str, object]:
+        """Return its first message; raises ProcessFault when it ends before, PortError for an `error`."""
+        message = self.message(START_TIMEOUT_S)
+        if message is None:
+            code = self.process.wait(END_TIMEOUT_S)
+            raise ProcessFault(f"the {self.name} ended while it started (exit code {code}); try --debug")
+        if "error" in message:
+            raise PortError(str(message["error"]))
+        self.began = True
+        return message
+
+    def end(self) -> None:
+        """Close the line, which asks it to end in order; kill it when it does not."""
+        self.line.close()
+        try:
+            self.process.wait(END_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+
+
+def start_simulation(plan: Plan, ledger: Path | None, memory: Memory) -> tuple[Child, dict[str, str]]:
+    """Start the simulated servos; return the process and the pseudo-terminal of each simulated bus."""
+    config = process.memory_file("dxlrun-simulation", msgspec.json.encode(simulated_buses(plan)))
+    arguments = ["--config-fd", str(config)] + (["--ledger", str(ledger)] if ledger else [])
+    child = Child("simulated bus", "dxlrun.simulation", arguments, [config], memory.stderr)
+    os.close(config)
+    return child, msgspec.convert(child.ready()["ports"], type=dict[str, str])
+
+
+def start_recorder(log: Path, header: LogHeader, memory: Memory) -> Child:
+    """Start the recorder and wait until the log is open."""
+    job = {"path": str(log), "header": header, "rings": memory.rings()}
+    descriptor = process.memory_file("dxlrun-recorder", msgspec.json.encode(job))
+    descriptors = [descriptor, *(int(str(one["fd"])) for one in memory.rings())]
+    child = Child("recorder", "dxlrun.recording", ["--job-fd", str(descriptor)], descriptors, memory.stderr)
+    os.close(descriptor)
+    child.ready()
+    return child
+
+
+def start_guardian(plan: Plan, ports: Mapping[str, str], memory: Memory, *, take_over: bool) -> Child:
+    """Start the guardian and wait until it holds the ports and has executed the loop.
+
+    Raises PortError when a port is missing, busy or forbidden.
+    """
+    loop = LoopJob(
+        memory.plan,
+        memory.heartbeat,
+        memory.cycles,
+        memory.packets,
+        memory.events,
+        memory.result,
+        take_over,
+    )
+    scheduler = plan.loop.scheduler
+    job = GuardianJob(
+        buses=plan.buses,
+        ports=tuple(ports.get(bus.name, bus.port) for bus in plan.buses),
+        period_ns=plan.loop.period_ns,
+        priority=0 if scheduler.policy == "other" else min(scheduler.priority + 1, 99),
+        heartbeat=memory.heartbeat,
+        packets=memory.guardian_packets,
+        events=memory.guardian_events,
+        stderr=memory.stderr,
+        loop=msgspec.to_builtins(loop),
+        loop_descriptors=(
+            memory.plan,
+            memory.heartbeat,
+            memory.cycles,
+            memory.packets,
+            memory.events,
+            memory.result,
+            memory.stderr,
+        ),
+    )
+    descriptor = process.memory_file("dxlrun-guardian", msgspec.json.encode(job))
+    inherited = [descriptor, memory.guardian_packets, memory.guardian_events, *job.loop_descriptors]
+    child = Child("guardian", "dxlrun.guardian", ["--job-fd", str(descriptor)], inherited, memory.stderr)
+    os.close(descriptor)
+    return child

@@ -1,0 +1,146 @@
+"""A run on virtual time: the same loop, hardware and log, with simulated servos, in one process."""
+
+from __future__ import annotations
+
+import sys
+import time
+import traceback
+from dataclasses import dataclass
+from pathlib import Path
+
+from dxlrun.assembly import assemble, simulated_buses
+from dxlrun.clock import VirtualClock
+from dxlrun.compile.plan import Plan
+from dxlrun.control.loop import LoopResult, StopFlag
+from dxlrun.control.plugins import load_plugins
+from dxlrun.cycle import CycleRecord
+from dxlrun.errors import DxlrunError, InputError
+from dxlrun.events import EventCode, EventRing, Severity
+from dxlrun.packets import NoPackets, PacketBatch
+from dxlrun.recording.log_writer import LogWriter
+from dxlrun.ring import Handover
+from dxlrun.run_log import log_header, new_log
+from dxlrun.run_summary import RunOptions, RunSummary
+from dxlrun.simulation import Ledger, SimulatedBus, VirtualPorts
+
+
+@dataclass(slots=True)
+class _LogSinks:
+    """Hand each cycle, its packets and all events straight to the log."""
+
+    writer: LogWriter
+    packets: PacketBatch
+    events: EventRing
+
+    def append(self, record: CycleRecord) -> None:
+        """Write one finished cycle and the packets since the one before."""
+        self.packets.commit()
+        self.writer.cycle(record.raw)
+
+
+@dataclass(slots=True)
+class _NoSinks:
+    """A run without a log."""
+
+    packets: NoPackets
+    events: EventRing
+
+    def append(self, record: CycleRecord) -> None:
+        """Forget it."""
+
+
+class VirtualRobot:
+    """A robot and its simulated servos on virtual time; two of them from one plan do exactly the same.
+
+    `log`: where the log goes, None for no log. Every bus of the plan is simulated, whatever its port says.
+    Raises InputError when the plan has a bus that is not `sim`.
+    """
+
+    def __init__(self, plan: Plan, *, log: Path | None = None, take_over: bool = False) -> None:
+        real = [bus.name for bus in plan.buses if bus.port != "sim"]
+        if real:
+            raise InputError(
+                f"virtual time needs simulated servos, but bus {', '.join(real)} has a real port: "
+                "give the argument port:=sim"
+            )
+        self.plan = plan
+        self.clock = VirtualClock()
+        self.ledger = Ledger()
+        """Every byte that the simulated servos received and sent."""
+        self.buses = tuple(SimulatedBus(config, self.ledger, 0) for config in simulated_buses(plan))
+        """The simulated lines, in the order of the plan's buses; faults are injected here."""
+        self.stop = StopFlag()
+        self.result: LoopResult | None = None
+        self.failures: tuple[str, ...] = ()
+        """What could not be switched off at the end, one sentence each."""
+        self.messages = 0
+        self._writer = LogWriter(log, log_header(plan, 0, virtual=True)) if log else None
+        self._sinks = self._sinks_for(self._writer)
+        self.robot = assemble(
+            plan,
+            load_plugins(),
+            ports=VirtualPorts(self.clock, self.buses),
+            clock=self.clock,
+            sinks=self._sinks,
+            beat=lambda: None,
+            stop=self.stop,
+            take_over=take_over,
+        )
+
+    def _sinks_for(self, writer: LogWriter | None) -> _LogSinks | _NoSinks:
+        if writer is None:
+            return _NoSinks(NoPackets(), EventRing(Handover(lambda _: None), self.clock))
+        return _LogSinks(
+            writer,
+            PacketBatch(Handover(writer.packets)),
+            EventRing(Handover(writer.event), self.clock),
+        )
+
+    @property
+    def record(self) -> CycleRecord:
+        """The memory of the cycle that ran last."""
+        return self.robot.record
+
+    def run(self) -> LoopResult:
+        """Set up, run to the plan's end or a fault, switch torque off, close the log.
+
+        Raises StartUpError; a controller's fault is in the result.
+        """
+        try:
+            self.robot.hardware.start()
+            try:
+                self.result = self.robot.loop.run()
+            finally:
+                self.failures = self.robot.hardware.stop()
+        except DxlrunError as error:
+            self._sinks.events.emit(EventCode.SETUP, Severity.ERROR, "loop", str(error))
+            raise
+        finally:
+            self._sinks.packets.commit()
+            if self._writer:
+                self.messages = self._writer.close().messages
+        return self.result
+
+
+def run_virtual(plan: Plan, options: RunOptions) -> RunSummary:
+    """Run a plan on virtual time for the command line; the log has the times of the virtual clock."""
+    log = new_log(Path(plan.recording_directory), plan.robot) if options.record else None
+    robot = VirtualRobot(plan, log=log, take_over=options.take_over)
+    began = time.monotonic()
+    try:
+        result = robot.run()
+    except DxlrunError as error:
+        if options.debug:
+            sys.stderr.write(traceback.format_exc())
+        result = LoopResult(0, 0, "fault", str(error))
+    sentences = (*((result.detail,) if result.detail else ()), *robot.failures)
+    return RunSummary(
+        exit_code=1 if sentences or result.reason == "fault" else 0,
+        reason=result.reason,
+        cycles=result.cycles,
+        skipped=result.skipped,
+        elapsed_s=time.monotonic() - began,
+        sentences=sentences,
+        log=str(log) if log else None,
+        messages=robot.messages,
+    )
