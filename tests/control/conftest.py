@@ -1,0 +1,208 @@
+"""A robot of a few joints without servos, whose controllers are written in the tests."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pytest
+from dxlrun.clock import VirtualClock
+from dxlrun.control.controller import Controller, Interfaces, ParametersModel
+from dxlrun.control.gate import Gate
+from dxlrun.control.loop import Loop, StopFlag
+from dxlrun.control.loop_plan import (
+    ControllerPlan,
+    JointPlan,
+    LoopPlan,
+    ScheduledCommand,
+    SchedulerPlan,
+)
+from dxlrun.control.manager import Manager
+from dxlrun.control.plugins import Offer, PlugIns
+from dxlrun.cycle import CycleLayout, CycleRecord
+from dxlrun.events import EventCode, Severity
+
+PERIOD_NS = 20_000_000
+
+
+@dataclass
+class Events:
+    seen: list[tuple[EventCode, Severity, str, str]] = field(default_factory=list)
+
+    def emit(self, code: EventCode, severity: Severity, source: str, text: str) -> None:
+        self.seen.append((code, severity, source, text))
+
+    def of(self, code: EventCode) -> list[tuple[str, str]]:
+        return [(source, text) for seen, _, source, text in self.seen if seen == code]
+
+
+class Scripted(Controller[ParametersModel]):
+    """Does in each step what the test wants."""
+
+    Parameters = ParametersModel
+    act: Callable[[Scripted, str, int, Any], None]
+
+    @classmethod
+    def interfaces(cls, parameters: ParametersModel, joints: tuple[str, ...]) -> Interfaces:
+        return Interfaces(joints, ("position", "velocity"))
+
+    def on_activate(self, time_ns: int) -> None:
+        self.act("activate", time_ns, None)
+
+    def on_command(self, kind: str, data: Any, time_ns: int) -> None:
+        self.act("command", time_ns, data)
+
+    def on_deactivate(self, time_ns: int) -> None:
+        self.act("deactivate", time_ns, None)
+
+    def update(self, time_ns: int, period_ns: int) -> None:
+        self.act("update", time_ns, period_ns)
+
+
+@dataclass
+class Hardware:
+    """Servos that are always where they were sent; `work_ns` is how long each read takes."""
+
+    record: CycleRecord
+    clock: VirtualClock
+    work_ns: Callable[[], int] = lambda: 0
+    written: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
+    keep: bool = True
+
+    def start(self) -> None:
+        self.record.states.position[:] = 0.25
+        self.record.states.valid[:] = True
+        self.record.goals.position[:] = self.record.states.position
+
+    def read(self) -> None:
+        self.record.states.position[:] = self.record.goals.position
+        self.clock.wait_until(self.clock.now_ns() + self.work_ns())
+
+    def write(self) -> None:
+        if self.keep:
+            goals = self.record.goals
+            self.written.append((goals.position.copy(), goals.velocity.copy()))
+
+    def idle(self, until_ns: int) -> None:
+        pass
+
+    def stop(self) -> tuple[str, ...]:
+        return ()
+
+
+@dataclass
+class Sink:
+    cycles: list[dict[str, Any]] = field(default_factory=list)
+    keep: bool = True
+
+    def append(self, record: CycleRecord) -> None:
+        if self.keep:
+            names = ("cycle", "scheduled_ns", "woken_ns", "period_ns", "skipped", "active", "published")
+            cycle = {name: getattr(record, name) for name in (*names, "command_count")}
+            arrays = {
+                "position": record.commands.position,
+                "velocity": record.commands.velocity,
+                "clamped": record.clamped,
+                "controller_ns": record.controller_ns,
+            }
+            self.cycles.append(cycle | {name: array.copy() for name, array in arrays.items()})
+
+
+class Robot:
+    """Plan, manager, gate and loop of a robot; controllers are added before `build`."""
+
+    def __init__(self, joints: int = 2, velocity: float | None = None) -> None:
+        self.joints = tuple(JointPlan(f"j{row}", -1.0, 1.0, velocity) for row in range(joints))
+        self.names = tuple(joint.name for joint in self.joints)
+        self.events = Events()
+        self.clock = VirtualClock(5_000)
+        self.sink = Sink()
+        self.stop = StopFlag()
+        self.beats = 0
+        self._controllers: list[ControllerPlan] = []
+        self._offers: dict[str, Offer] = {}
+        self.commands: list[ScheduledCommand] = []
+
+    def add(
+        self,
+        name: str,
+        controller: type[Controller[Any]],
+        *,
+        joints: tuple[str, ...] | None = None,
+        command: tuple[str, ...] = ("position", "velocity"),
+        active: bool = True,
+        every: int = 1,
+        parameters: str = "{}",
+    ) -> None:
+        plan = ControllerPlan(
+            name=name,
+            type=name,
+            distribution="tests 1",
+            parameters=parameters,
+            joints=self.names if joints is None else joints,
+            command=command,
+            publishes=(),
+            active=active,
+            every=every,
+        )
+        self._controllers.append(plan)
+        self._offers[name] = Offer(name, controller, "tests 1")
+
+    def script(
+        self, name: str, act: Callable[[Scripted, str, int, Any], None], **options: Any
+    ) -> None:
+        """Add a controller that calls `act(controller, step, time_ns, period or data)`."""
+        self.add(name, type("OneScript", (Scripted,), {"act": act}), **options)
+
+    def send(self, at_ns: int, controller: str, kind: str, *values: float) -> None:
+        data = np.array(values, dtype="<f8").tobytes()
+        self.commands.append(ScheduledCommand(at_ns, controller, kind, data, "motion.yaml:7:5"))
+
+    def build(self, end_ns: int | None = None) -> None:
+        self.plan = LoopPlan(
+            period_ns=PERIOD_NS,
+            scheduler=SchedulerPlan("other", 31, False),
+            joints=self.joints,
+            controllers=tuple(self._controllers),
+            commands=tuple(self.commands),
+            end_ns=end_ns,
+        )
+        layout = CycleLayout(self.names, tuple(plan.name for plan in self._controllers))
+        self.record = CycleRecord(layout)
+        self.hardware = Hardware(self.record, self.clock)
+        plugins = PlugIns(self._offers, {"broken_one": "plug-in broken_one of x 1 cannot be imported"})
+        self.manager = Manager(self.plan, plugins, self.record, self.events, self.clock)
+        self.gate = Gate(self.plan, self.record, self.events)
+        self.loop = Loop(
+            clock=self.clock,
+            hardware=self.hardware,
+            manager=self.manager,
+            gate=self.gate,
+            record=self.record,
+            sink=self.sink,
+            events=self.events,
+            plan=self.plan,
+            beat=self._beat,
+            stop=self.stop,
+        )
+        self.manager.configure()
+        self.hardware.start()
+
+    @staticmethod
+    def scripted() -> type[Scripted]:
+        return Scripted
+
+    def _beat(self) -> None:
+        self.beats += 1
+
+
+@pytest.fixture
+def robot() -> Robot:
+    return Robot()
+
+
+@pytest.fixture
+def make_robot() -> type[Robot]:
+    return Robot

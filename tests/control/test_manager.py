@@ -1,0 +1,268 @@
+"""Claims, hand-over of commands, rates, and what happens to a controller that breaks its contract."""
+
+import numpy as np
+import pytest
+from dxlrun.control.claims import Conflict, conflicts
+from dxlrun.errors import ControllerFault, PlugInError
+from dxlrun.events import EventCode
+
+PERIOD_NS = 20_000_000
+
+
+def writes(position, velocity=np.nan):
+    def act(self, step, time_ns, _):
+        if step == "update":
+            self.context.commands.position[:] = position
+            self.context.commands.velocity[:] = velocity
+
+    return act
+
+
+def idle(self, step, time_ns, _):
+    pass
+
+
+def run(robot, cycles):
+    robot.build(end_ns=cycles * PERIOD_NS)
+    return robot.loop.run()
+
+
+def test_two_active_controllers_cannot_have_one_joint(robot):
+    robot.script("first", idle, joints=("j0", "j1"), command=("position",))
+    robot.script("second", idle, joints=("j1",), command=("velocity",))
+    with pytest.raises(ControllerFault, match="first and second both command joint j1"):
+        robot.build()
+
+
+def test_an_inactive_controller_and_one_that_only_looks_may_share_joints(robot):
+    robot.script("first", idle)
+    robot.script("spare", idle, active=False)
+    robot.script("viewer", idle, command=())
+    robot.build()
+    assert [conflict for conflict in conflicts(robot.plan.controllers)] == [
+        Conflict("j0", "first", "spare"),
+        Conflict("j1", "first", "spare"),
+    ]
+
+
+def test_commands_of_several_controllers_are_merged_by_joint(robot):
+    robot.script("left", writes(0.3), joints=("j0",), command=("position",))
+    robot.script("right", writes(0.2, 0.5), joints=("j1",))
+    run(robot, 3)
+    np.testing.assert_array_equal(robot.sink.cycles[-1]["position"], [0.3, 0.2])
+    np.testing.assert_array_equal(robot.sink.cycles[-1]["velocity"], [np.nan, 0.5])
+
+
+def test_a_controller_sees_its_joints_in_its_own_order(robot):
+    seen = []
+
+    def act(self, step, time_ns, _):
+        if step in ("activate", "update"):
+            seen.append((self.context.states.position.copy(), self.context.goals.position.copy()))
+
+    robot.script("turned", act, joints=("j1", "j0"), command=("position",))
+    robot.build(end_ns=PERIOD_NS)
+    robot.record.goals.position[:] = [0.1, 0.2]
+    robot.loop.run()
+    for states, goals in seen[1:]:
+        np.testing.assert_array_equal(states, [0.2, 0.1])
+        np.testing.assert_array_equal(goals, [0.2, 0.1])
+    np.testing.assert_array_equal(seen[0][1], [0.2, 0.1])
+
+
+def test_an_unclaimed_interface_is_not_taken(robot):
+    robot.script("position_only", writes(0.3, 0.7), command=("position",))
+    run(robot, 2)
+    np.testing.assert_array_equal(robot.sink.cycles[-1]["position"], 0.3)
+    assert np.isnan(robot.sink.cycles[-1]["velocity"]).all()
+
+
+def test_nan_before_the_first_finite_value_is_held(robot):
+    robot.script("silent", idle)
+    result = run(robot, 5)
+    assert result.reason == "ended"
+    for position, _ in robot.hardware.written:
+        np.testing.assert_array_equal(position, 0.25)
+
+
+@pytest.mark.parametrize(
+    ("bad", "what"), [(np.nan, "j1/velocity = nan after a finite value"), (np.inf, "j1/velocity = inf")]
+)
+def test_a_value_that_stops_being_finite_is_the_controllers_fault(robot, bad, what):
+    def act(self, step, time_ns, _):
+        if step == "update":
+            self.context.commands.position[:] = 0.26
+            self.context.commands.velocity[:] = 0.5
+            if time_ns >= 2 * PERIOD_NS:
+                self.context.commands.velocity[1] = bad
+                self.context.commands.position[:] = 0.9
+
+    robot.script("failing", act)
+    result = run(robot, 9)
+    assert (result.reason, result.cycles) == ("fault", 3)
+    assert what in result.detail
+    np.testing.assert_array_equal(robot.record.clamped, [0, 16])
+    np.testing.assert_array_equal(robot.record.goals.position, 0.26)
+    np.testing.assert_array_equal(robot.record.goals.velocity, 0.5)
+
+
+def test_infinity_is_a_fault_from_the_first_cycle(robot):
+    robot.script("wild", writes(-np.inf))
+    result = run(robot, 9)
+    assert (result.reason, result.cycles) == ("fault", 1)
+    np.testing.assert_array_equal(robot.record.goals.position, 0.25)
+
+
+def test_nan_is_accepted_per_joint_and_interface(robot):
+    def act(self, step, time_ns, _):
+        if step == "update":
+            self.context.commands.position[0] = 0.3
+            if time_ns >= PERIOD_NS:
+                self.context.commands.position[1] = 0.2
+
+    robot.script("late", act)
+    assert run(robot, 4).reason == "ended"
+    np.testing.assert_array_equal(robot.sink.cycles[-1]["position"], [0.3, 0.2])
+
+
+@pytest.mark.parametrize("step", ["activate", "update", "command", "deactivate"])
+@pytest.mark.parametrize("raised", [ZeroDivisionError("oh"), SystemExit(3)])
+def test_what_a_controller_raises_ends_it_alone(robot, step, raised):
+    updates = []
+
+    def act(self, now, time_ns, _):
+        if now == step:
+            raise raised
+
+    def other(self, now, time_ns, _):
+        updates.append(now)
+        self.context.commands.position[:] = 0.27
+
+    robot.script("failing", act, joints=("j0",))
+    robot.script("healthy", other, joints=("j1",))
+    robot.send(0, "failing", "anything")
+    result = run(robot, 4)
+    assert result.reason == "fault"
+    assert f"controller failing raised in on_{step}".replace("on_update", "update") in result.detail
+    ((source, text),) = robot.events.of(EventCode.CONTROLLER_FAULT)
+    assert source == "failing"
+    assert "Traceback" in text
+    assert "raise raised" in text
+    assert updates[-1] == "deactivate"
+    assert robot.record.active == 0
+    if step in ("update", "command"):
+        assert updates == ["activate", "update", "deactivate"]
+        np.testing.assert_array_equal(robot.record.goals.position, [0.25, 0.27])
+
+
+def test_a_wrong_shape_is_the_controllers_fault(robot):
+    def act(self, step, time_ns, _):
+        self.context.commands.position[:] = np.zeros(3)
+
+    robot.script("misshapen", act)
+    assert "could not broadcast" in run(robot, 3).detail
+
+
+def test_commands_come_at_the_first_cycle_that_is_not_too_early(robot):
+    taken = []
+
+    def act(self, step, time_ns, data):
+        if step == "command":
+            taken.append((time_ns, list(data), self.context.goals.position.copy()))
+
+    robot.script("listener", act)
+    robot.send(PERIOD_NS, "listener", "go", 1.0, 2.0)
+    robot.send(PERIOD_NS + 1, "listener", "go", 3.0)
+    run(robot, 4)
+    assert [(time, data) for time, data, _ in taken] == [(PERIOD_NS, [1.0, 2.0]), (2 * PERIOD_NS, [3.0])]
+    np.testing.assert_array_equal(taken[0][2], 0.25)
+    assert robot.events.of(EventCode.COMMAND) == [("listener", "go from motion.yaml:7:5")] * 2
+    assert [cycle["command_count"] for cycle in robot.sink.cycles] == [0, 1, 1, 0]
+
+
+def test_commands_to_nobody_are_refused_in_words(robot):
+    robot.script("asleep", idle, active=False)
+    robot.send(0, "asleep", "go")
+    robot.send(0, "unknown", "go")
+    assert run(robot, 2).reason == "ended"
+    assert robot.events.of(EventCode.COMMAND_REFUSED) == [
+        ("asleep", "go from motion.yaml:7:5 refused: the controller is not active"),
+        ("unknown", "go from motion.yaml:7:5 refused: there is no such controller"),
+    ]
+
+
+def test_a_slower_controller_is_updated_at_its_own_rate_with_its_true_period(robot):
+    periods = []
+
+    def act(self, step, time_ns, period_ns):
+        if step == "update":
+            periods.append((time_ns // PERIOD_NS, period_ns // PERIOD_NS))
+
+    robot.script("slow", act, every=3)
+    robot.build(end_ns=20 * PERIOD_NS)
+    work = iter([0, 0, 0, 0, int(3.5 * PERIOD_NS)])
+    robot.hardware.work_ns = lambda: next(work, 0)
+    robot.loop.run()
+    assert periods == [(0, 3), (3, 3), (8, 5), (9, 1), (12, 3), (15, 3), (18, 3)]
+
+
+def test_the_period_that_a_controller_sees_is_capped(robot):
+    periods = []
+
+    def act(self, step, time_ns, period_ns):
+        if step == "update":
+            periods.append(period_ns)
+
+    robot.script("patient", act)
+    robot.build(end_ns=60 * PERIOD_NS)
+    work = iter([0, 50 * PERIOD_NS])
+    robot.hardware.work_ns = lambda: next(work, 0)
+    robot.loop.run()
+    assert max(periods) == 5 * PERIOD_NS
+
+
+def test_masks_show_who_is_active_and_who_publishes(robot):
+    def act(self, step, time_ns, _):
+        if step == "update" and time_ns == PERIOD_NS:
+            self.context.publish()
+
+    robot.script("quiet", idle, active=False)
+    robot.script("speaker", act, command=())
+    run(robot, 3)
+    assert [(cycle["active"], cycle["published"]) for cycle in robot.sink.cycles] == [(2, 0), (2, 2), (2, 0)]
+    assert robot.events.of(EventCode.CONTROLLER_ACTIVATED) == [("speaker", "active")]
+    assert robot.events.of(EventCode.CONTROLLER_DEACTIVATED) == [("speaker", "inactive")]
+
+
+def test_the_duration_of_each_update_is_recorded(robot):
+    def act(self, step, time_ns, _):
+        if step == "update":
+            robot.clock.wait_until(robot.clock.now_ns() + 700)
+
+    robot.script("quick", idle, joints=("j0",))
+    robot.script("thinker", act, joints=("j1",))
+    run(robot, 1)
+    np.testing.assert_array_equal(robot.record.controller_ns, [0, 700])
+
+
+def test_a_type_that_nobody_offers_is_named_with_the_broken_plugins(robot):
+    robot.script("present", idle)
+    robot._offers.clear()
+    with pytest.raises(PlugInError, match=r"type present of controller present .*broken_one of x 1"):
+        robot.build()
+
+
+def test_parameters_that_do_not_fit_are_refused(robot):
+    robot.add("strict", type(robot).scripted(), parameters='{"surplus": 1}')
+    with pytest.raises(PlugInError, match="strict.*\n.*surplus"):
+        robot.build()
+
+
+def test_what_is_raised_while_configuring_becomes_one_sentence(robot):
+    class Unready(type(robot).scripted()):
+        def on_configure(self, context):
+            raise OSError("no file")
+
+    robot.add("unready", Unready)
+    with pytest.raises(ControllerFault, match="controller unready raised in on_configure: OSError: no file"):
+        robot.build()
