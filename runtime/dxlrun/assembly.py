@@ -17,7 +17,6 @@ from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.port import Ports
 from dxlrun.events import EventSink
 from dxlrun.packets import PacketSink
-from dxlrun.simulation import BusConfig, ServoConfig
 
 
 class Sinks(CycleSink, Protocol):
@@ -92,19 +91,3 @@ def assemble(
     )
     manager.configure()
     return Robot(hardware, manager, loop, record)
-
-
-def simulated_buses(plan: Plan) -> tuple[BusConfig, ...]:
-    """Return the simulated lines of a plan: the servos that it expects, each at its reference (q = 0)."""
-    return tuple(
-        BusConfig(
-            name=bus.name,
-            baud_rate=bus.baud_rate,
-            servos=tuple(
-                ServoConfig(servo.servo_id, servo.model, servo.reference, bus.return_delay_ns)
-                for servo in bus.servos
-            ),
-        )
-        for bus in plan.buses
-        if bus.port == "sim"
-    )

@@ -13,8 +13,9 @@ from pathlib import Path
 import msgspec
 
 from dxlrun import heartbeat, process, ring
-from dxlrun.assembly import cycle_layout, simulated_buses
+from dxlrun.assembly import cycle_layout
 from dxlrun.compile.plan import Plan, to_json
+from dxlrun.compile.simulated import simulated_buses
 from dxlrun.cycle import cycle_slots
 from dxlrun.errors import PortError, ProcessFault
 from dxlrun.events import EVENT_SLOT, event_slots

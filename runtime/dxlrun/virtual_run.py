@@ -8,9 +8,10 @@ import traceback
 from dataclasses import dataclass
 from pathlib import Path
 
-from dxlrun.assembly import assemble, simulated_buses
+from dxlrun.assembly import assemble
 from dxlrun.clock import VirtualClock
 from dxlrun.compile.plan import Plan
+from dxlrun.compile.simulated import simulated_buses
 from dxlrun.control.loop import LoopResult, StopFlag
 from dxlrun.control.plugins import load_plugins
 from dxlrun.cycle import CycleRecord
