@@ -13,7 +13,7 @@ from typing import IO, cast
 import numpy as np
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Footer, McapRecord, Metadata
+from mcap.records import Attachment, Channel, Chunk, McapRecord, Metadata
 from mcap.stream_reader import CRCValidationError, StreamReader, get_chunk_data_stream
 from numpy.typing import NDArray
 from zstandard import ZstdError
@@ -52,7 +52,7 @@ class Log:
     path: Path
     header: LogHeader
     cycles: NDArray[np.void]
-    """Shape (cycles,), fields as in `cycle.CycleLayout`: scalars, and rows of joints or controllers."""
+    """Shape (cycles,), read-only; fields of CycleLayout: scalars, and rows of joints or controllers."""
     events: tuple[Event, ...]
     attachments: dict[str, bytes]
     metadata: dict[str, dict[str, str]]
@@ -141,8 +141,8 @@ def _cycles(layout: CycleLayout, messages: list[bytes]) -> NDArray[np.void]:
     size = len(ENCAPSULATION) + layout.size
     if any(len(message) != size for message in messages):
         raise ValueError("the messages of /cycle are not as long as joints and controllers ask")
-    whole = np.dtype([("encapsulation", "V4"), ("cycle", layout.dtype)])
-    array: NDArray[np.void] = np.frombuffer(b"".join(messages), dtype=whole)["cycle"].copy()
+    bodies = b"".join(message[len(ENCAPSULATION) :] for message in messages)
+    array: NDArray[np.void] = np.frombuffer(bodies, dtype=layout.dtype)
     return array
 
 
@@ -188,6 +188,7 @@ def _walk(stream: IO[bytes], size: int) -> _Found:
                 found.damage.append(f"what lies behind byte {at} cannot be read: {_said(error)}")
             return found
         if record is None:
+            found.finished = True  # the footer and the magic bytes behind it were read
             return found
         _take(record, found)
 
@@ -205,8 +206,6 @@ def _take(record: McapRecord, found: _Found) -> None:
         found.metadata[record.name] = record.metadata
     elif isinstance(record, Channel):
         found.channels[record.id] = record.topic
-    elif isinstance(record, Footer):
-        found.finished = True
 
 
 def _split(data: bytes, found: _Found) -> None:

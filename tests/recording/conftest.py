@@ -1,0 +1,80 @@
+"""A small robot's records, made as the loop makes them, and two foreign decoders."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from dxlrun.cycle import CycleLayout, CycleRecord
+from dxlrun.recording import schemas
+from dxlrun.recording.header import LoggedController, LogHeader
+from dxlrun.recording.log_writer import LogWriter
+
+PERIOD_NS = 20_000_000
+JOINTS = ("left_elbow_joint", "head_pitch_joint", "head_yaw_joint")
+
+
+@pytest.fixture
+def header() -> LogHeader:
+    return LogHeader(
+        robot="torso",
+        joints=JOINTS,
+        buses=("main", "second"),
+        controllers=(
+            LoggedController("joint_state_broadcaster", JOINTS[1:], ("/joint_states",)),
+            LoggedController("head", JOINTS[1:], ()),
+        ),
+        period_ns=PERIOD_NS,
+        epoch_offset_ns=1_700_000_000_123_456_789,
+        attachments={"robot.yaml": b"name: torso\n", "plan.json": b"{}"},
+        metadata={"versions": {"dxlrun": "0.1.0"}},
+    )
+
+
+@pytest.fixture
+def layout(header: LogHeader) -> CycleLayout:
+    return CycleLayout(header.joints, [controller.name for controller in header.controllers])
+
+
+@pytest.fixture
+def cycle(layout: CycleLayout) -> Callable[[int], bytes]:
+    """Return the bytes of cycle `number`: published in even ones, joint 1 invalid in every third."""
+    record = CycleRecord(layout)
+
+    def make(number: int) -> bytes:
+        start = 1_000_000_000 + number * PERIOD_NS
+        record.cycle, record.scheduled_ns, record.woken_ns = number, start, start + 60_000
+        record.read_ns, record.updated_ns = start + 5_000_000, start + 5_100_000
+        record.written_ns, record.period_ns = start + 5_400_000, PERIOD_NS
+        record.active, record.published = 0b11, int(number % 2 == 0)
+        record.states.position[:] = np.array([0.1, 0.2, 0.3]) + number
+        record.states.velocity[:] = [1.0, 2.0, 3.0]
+        record.states.effort[:] = [-0.5, 0.0, 0.5]
+        record.valid[:] = [True, number % 3 != 0, True]
+        record.age_ns[:] = 1000 * number
+        record.goals.position[:] = [0.0, 0.25, -0.0]
+        record.goals.velocity[:] = [np.nan, 1.5, 2.5]
+        record.clamped[:] = [0, 2, 4]
+        record.controller_ns[:] = [40_000, 50_000]
+        return bytes(record.raw)
+
+    return make
+
+
+@pytest.fixture
+def log(tmp_path: Path, header: LogHeader) -> LogWriter:
+    return LogWriter(tmp_path / "run.mcap", header)
+
+
+@pytest.fixture(scope="session")
+def typestore() -> Typestore:
+    """Rosbags with our messages; the standard ones are its own, so that our texts are judged."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    for message in (schemas.CYCLE, schemas.BUS_PACKET, schemas.EVENT):
+        store.register(get_types_from_msg(message.text, message.name))
+    return store

@@ -1,0 +1,276 @@
+"""The log: what goes in comes out, for us and for other people's tools."""
+
+from __future__ import annotations
+
+import os
+import resource
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.typesys.store import Typestore
+
+from dxlrun.clock import VirtualClock
+from dxlrun.cycle import CycleLayout
+from dxlrun.errors import LogError
+from dxlrun.events import Event, EventCode, EventRing, Severity
+from dxlrun.packets import LoggedPacket, PacketBatch, PacketKind
+from dxlrun.recording.header import LogHeader, LogSummary, to_metadata
+from dxlrun.recording.log_writer import LogWriter
+from dxlrun.recording.reader import read_log
+from dxlrun.ring import Handover
+
+Cycle = Callable[[int], bytes]
+PACKETS = [
+    LoggedPacket(0, PacketKind.INSTRUCTION, 1, 10, 11, bytes.fromhex("ffff0104022406ce")),
+    LoggedPacket(0, PacketKind.STATUS, 1, 600_000, 600_001, bytes.fromhex("ffff01080000020000000000f4")),
+    LoggedPacket(1, PacketKind.NOISE, 254, 5, 5, b"\xff"),
+]
+SAID = [
+    (EventCode.LOOP_STARTED, Severity.INFO, "loop", "50 Hz"),
+    (EventCode.CONTROLLER_FAULT, Severity.ERROR, "head", "Traceback\n" + "ä" * 600),
+]
+
+
+def fill(log: LogWriter, cycle: Cycle, cycles: int = 10) -> LogSummary:
+    for number in range(cycles):
+        log.cycle(cycle(number))
+    batch = PacketBatch(Handover(log.packets))
+    for packet in PACKETS:
+        batch.packet(packet.bus, packet.kind, packet.servo_id, packet.first_ns, packet.last_ns, packet.data)
+    batch.commit()
+    events = EventRing(Handover(log.event), VirtualClock(7_000))
+    for code, severity, source, text in SAID:
+        events.emit(code, severity, source, text)
+    return log.close()
+
+
+def test_everything_comes_back_as_it_was(
+    log: LogWriter, tmp_path: Path, header: LogHeader, layout: CycleLayout, cycle: Cycle
+) -> None:
+    summary = fill(log, cycle)
+    read = read_log(tmp_path / "run.mcap")
+    assert read.cycles.tobytes() == b"".join(cycle(number) for number in range(10))
+    assert read.cycles.dtype == layout.dtype
+    assert list(read.packets) == PACKETS
+    assert list(read.events) == [Event(7_000, *said) for said in SAID]
+    assert (read.joints, read.buses, read.controllers) == (header.joints, header.buses, header.controllers)
+    assert (read.period_ns, read.header.epoch_offset_ns) == (header.period_ns, header.epoch_offset_ns)
+    assert read.attachments["robot.yaml"] == b"name: torso\n"
+    assert set(read.attachments) == {"robot.yaml", "plan.json", "header.json"}
+    assert read.metadata["versions"] == {"dxlrun": "0.1.0"}
+    assert (read.complete, read.damage) == (True, ())
+    assert summary == LogSummary(summary.messages, (tmp_path / "run.mcap").stat().st_size, 0)
+    assert log.close() is summary
+
+
+def test_mcap_ros2_support_decodes_every_topic(
+    log: LogWriter, tmp_path: Path, header: LogHeader, cycle: Cycle
+) -> None:
+    summary = fill(log, cycle)
+    by_topic: dict[str, list[object]] = {}
+    with (tmp_path / "run.mcap").open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        assert reader.get_header().profile == "ros2"
+        for schema, channel, message, decoded in reader.iter_decoded_messages():
+            assert schema is not None
+            assert schema.encoding == "ros2msg"
+            assert channel.message_encoding == "cdr"
+            assert channel.metadata["topic_type_hash"].startswith("RIHS01_")
+            assert message.log_time == message.publish_time
+            by_topic.setdefault(channel.topic, []).append(decoded)
+    assert {topic: len(messages) for topic, messages in by_topic.items()} == {
+        "/cycle": 10,
+        "/joint_commands": 10,
+        "/joint_states": 5,
+        "/bus/main": 2,
+        "/bus/second": 1,
+        "/events": len(by_topic["/events"]),
+        "/rosout": len(by_topic["/events"]),
+    }
+    assert sum(len(messages) for messages in by_topic.values()) == summary.messages
+    state = by_topic["/joint_states"][1]  # cycle 2
+    assert list(state.name) == list(header.joints[1:])  # type: ignore[attr-defined]  # made at run time
+    assert list(state.position) == [2.2, 2.3]  # type: ignore[attr-defined]  # made at run time
+    assert bytes(by_topic["/bus/main"][1].data) == PACKETS[1].data  # type: ignore[attr-defined]  # the same
+
+
+def test_rosbags_decodes_every_topic(
+    log: LogWriter, tmp_path: Path, header: LogHeader, cycle: Cycle, typestore: Typestore
+) -> None:
+    fill(log, cycle)
+    topics = set()
+    with (tmp_path / "run.mcap").open("rb") as stream:
+        for schema, channel, message in make_reader(stream).iter_messages():
+            assert schema is not None
+            decoded = typestore.deserialize_cdr(message.data, schema.name)
+            assert bytes(typestore.serialize_cdr(decoded, schema.name)) == message.data
+            assert typestore.hash_rihs01(schema.name) == channel.metadata["topic_type_hash"]
+            topics.add(channel.topic)
+            if channel.topic == "/rosout" and decoded.level == 20:
+                assert (decoded.name, decoded.msg) == ("loop", "50 Hz")
+                stamp = decoded.stamp.sec * 1_000_000_000 + decoded.stamp.nanosec
+                assert stamp == message.log_time == 7_000 + header.epoch_offset_ns
+    assert len(topics) == 7
+
+
+def test_states_that_are_not_valid_are_not_a_number(
+    log: LogWriter, tmp_path: Path, header: LogHeader, cycle: Cycle, typestore: Typestore
+) -> None:
+    fill(log, cycle)
+    with (tmp_path / "run.mcap").open("rb") as stream:
+        for _, _, message in make_reader(stream).iter_messages("/joint_states"):
+            state = typestore.deserialize_cdr(message.data, "sensor_msgs/msg/JointState")
+            number = (message.log_time - header.epoch_offset_ns - 1_005_000_000) // header.period_ns
+            for values in (state.position, state.velocity, state.effort):
+                assert list(np.isnan(values)) == [number % 3 == 0, False]
+
+
+def test_two_writers_of_the_same_records_write_the_same_bytes(
+    tmp_path: Path, header: LogHeader, cycle: Cycle
+) -> None:
+    for name in ("a", "b"):
+        fill(LogWriter(tmp_path / name, header), cycle)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_a_gap_is_an_event_and_counted(log: LogWriter, tmp_path: Path, cycle: Cycle) -> None:
+    log.cycle(cycle(0))
+    log.gap("loop/packets", 17)
+    assert log.close().gaps == 17
+    (event,) = read_log(tmp_path / "run.mcap").events
+    assert (event.code, event.severity) == (EventCode.RECORDER_GAP, Severity.ERROR)
+    assert "17 records of loop/packets" in event.text
+    assert read_log(tmp_path / "run.mcap").metadata["dxlrun_summary"]["gaps"] == "17"
+
+
+def test_a_log_is_readable_up_to_the_last_flush(log: LogWriter, tmp_path: Path, cycle: Cycle) -> None:
+    log.cycle(cycle(0))
+    log.flush(sync=True)
+    log.cycle(cycle(1))
+    read = read_log(tmp_path / "run.mcap")
+    assert len(read.cycles) == 1
+    assert not read.complete
+    assert "no end" in read.damage[0]
+    log.close()
+    assert read_log(tmp_path / "run.mcap").complete
+
+
+@pytest.mark.parametrize("missing", [1, 8, 30, 500])
+def test_a_cut_log_is_readable_and_says_so(
+    log: LogWriter, tmp_path: Path, cycle: Cycle, missing: int
+) -> None:
+    log.cycle(cycle(0))
+    log.flush()
+    log.cycle(cycle(1))
+    fill(log, cycle)
+    path = tmp_path / "run.mcap"
+    os.truncate(path, path.stat().st_size - missing)
+    read = read_log(path)
+    assert not read.complete
+    assert len(read.cycles) == 12
+
+
+def test_a_damaged_chunk_is_left_out_and_said(log: LogWriter, tmp_path: Path, cycle: Cycle) -> None:
+    path = tmp_path / "run.mcap"
+    log.cycle(cycle(0))
+    log.flush()
+    begin = path.stat().st_size
+    for number in range(1, 5):
+        log.cycle(cycle(number))
+    log.flush()
+    log.cycle(cycle(5))
+    log.close()
+    data = bytearray(path.read_bytes())
+    data[begin + 120] ^= 0x55
+    path.write_bytes(data)
+    read = read_log(path)
+    assert [int(number) for number in read.cycles["cycle"]] == [0, 5]
+    assert not read.complete
+    assert "damaged" in read.damage[0]
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        (b"", "the file is empty"),
+        (b"name: torso\n", "no MCAP file"),
+        (b"\x89MCAP0\r\n", "not written by dxlrun"),
+    ],
+)
+def test_what_is_no_log_is_refused_with_a_sentence(tmp_path: Path, content: bytes, sentence: str) -> None:
+    path = tmp_path / "x.mcap"
+    path.write_bytes(content)
+    with pytest.raises(LogError, match=sentence):
+        read_log(path)
+
+
+def test_a_missing_log_and_a_directory_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match="No such file"):
+        read_log(tmp_path / "none.mcap")
+    with pytest.raises(LogError, match="Is a directory"):
+        read_log(tmp_path)
+
+
+def test_a_log_of_another_format_is_refused(
+    tmp_path: Path, header: LogHeader, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "dxlrun.recording.log_writer.to_metadata", lambda header: {**to_metadata(header), "format": "99"}
+    )
+    LogWriter(tmp_path / "x", header).close()
+    with pytest.raises(LogError, match="format '99'"):
+        read_log(tmp_path / "x")
+
+
+def test_a_log_is_never_overwritten(log: LogWriter, tmp_path: Path, header: LogHeader) -> None:
+    log.close()
+    before = (tmp_path / "run.mcap").read_bytes()
+    with pytest.raises(FileExistsError):
+        LogWriter(tmp_path / "run.mcap", header)
+    assert (tmp_path / "run.mcap").read_bytes() == before
+
+
+@contextmanager
+def files_of_at_most(size: int) -> Iterator[None]:
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_a_full_disk_stops_the_writing_and_leaves_a_readable_log(
+    log: LogWriter, tmp_path: Path, cycle: Cycle
+) -> None:
+    path = tmp_path / "run.mcap"
+    log.cycle(cycle(0))
+    log.flush()
+    whole = path.stat().st_size
+    with files_of_at_most(whole + 100):
+        log.cycle(cycle(1))
+        log.flush()
+        assert log.error is not None
+        log.cycle(cycle(2))
+        log.flush()
+        summary = log.close()
+    assert path.stat().st_size == whole == summary.bytes
+    assert summary.error is not None
+    assert summary.messages == 3  # cycle, states, commands of the first
+    assert summary.unwritten > 2
+    read = read_log(path)
+    assert len(read.cycles) == 1
+    assert not read.complete
+
+
+def test_a_disk_that_is_full_at_the_end_is_said(log: LogWriter, tmp_path: Path, cycle: Cycle) -> None:
+    log.cycle(cycle(0))
+    with files_of_at_most((tmp_path / "run.mcap").stat().st_size):
+        summary = log.close()
+    assert summary.error is not None
+    assert summary.messages == 0

@@ -1,0 +1,232 @@
+"""The recorder's process: what the rings carry is in the log, whatever happens to it."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from dxlrun import ring
+from dxlrun.clock import VirtualClock
+from dxlrun.cycle import CycleLayout
+from dxlrun.events import EVENT_SLOT, EventCode, EventRing, Severity
+from dxlrun.packets import PACKET_SLOT, PacketBatch, PacketKind
+from dxlrun.recording.header import LogHeader
+from dxlrun.recording.reader import read_log
+from dxlrun.recording.recorder import RecordedRing, RecorderJob
+from dxlrun.ring import RingWriter
+
+Cycle = Callable[[int], bytes]
+
+
+@dataclass
+class Recording:
+    """A recorder at work, and the writers' ends of its rings."""
+
+    path: Path
+    process: subprocess.Popen[bytes]
+    control: socket.socket
+    cycles: RingWriter
+    packets: PacketBatch
+    events: EventRing
+    lines: Iterator[dict[str, Any]] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.lines = (json.loads(line) for line in self.control.makefile("rb"))
+
+    def finish(self) -> dict[str, Any]:
+        self.control.sendall(b'{"finish": true}\n')
+        return self.summary()
+
+    def summary(self) -> dict[str, Any]:
+        summary: dict[str, Any] = next(line["summary"] for line in self.lines if "summary" in line)
+        return summary
+
+
+Start = Callable[..., Recording]
+
+
+@pytest.fixture
+def start(tmp_path: Path, header: LogHeader, layout: CycleLayout) -> Iterator[Start]:
+    descriptors: list[int] = []
+    started: list[Recording] = []
+
+    def make(
+        path: Path | None = None, cycle_slots: int = 64, before: Callable[[RingWriter], None] | None = None
+    ) -> Recording:
+        path = path or tmp_path / "run.mcap"
+        rings = {
+            "cycles": ring.create("cycles", layout.size, cycle_slots),
+            "packets": ring.create("packets", PACKET_SLOT, 64),
+            "events": ring.create("events", EVENT_SLOT, 64),
+        }
+        job_fd = os.memfd_create("job")
+        ours, theirs = socket.socketpair()
+        ours.settimeout(20)
+        job = RecorderJob(
+            str(path),
+            header,
+            tuple(RecordedRing(kind, fd, "loop") for kind, fd in rings.items()),  # type: ignore[arg-type]  # the three literals
+        )
+        os.write(job_fd, msgspec.json.encode(job))
+        os.lseek(job_fd, 0, os.SEEK_SET)
+        descriptors.extend([*rings.values(), job_fd])
+        cycles = RingWriter(rings["cycles"])
+        if before is not None:
+            before(cycles)
+        process = subprocess.Popen(
+            [
+                sys.executable,
+                "-m",
+                "dxlrun.recording",
+                "--job-fd",
+                str(job_fd),
+                "--control-fd",
+                str(theirs.fileno()),
+            ],
+            pass_fds=[*rings.values(), job_fd, theirs.fileno()],
+        )
+        theirs.close()
+        recording = Recording(
+            path,
+            process,
+            ours,
+            cycles,
+            PacketBatch(RingWriter(rings["packets"])),
+            EventRing(RingWriter(rings["events"]), VirtualClock(5)),
+        )
+        started.append(recording)
+        return recording
+
+    yield make
+    for recording in started:
+        recording.process.kill()
+        recording.process.wait()
+        recording.control.close()
+    for descriptor in descriptors:
+        os.close(descriptor)
+
+
+def test_what_the_rings_carry_is_in_the_log_byte_for_byte(start: Start, cycle: Cycle) -> None:
+    recording = start()
+    assert next(recording.lines) == {"ready": True}
+    sent = [bytes([255, 255, number]) for number in range(30)]
+    for number in range(30):
+        recording.cycles.append(cycle(number))
+        recording.packets.packet(0, PacketKind.STATUS, 1, number, number + 1, sent[number])
+        recording.packets.commit()
+    recording.events.emit(EventCode.TORQUE_OFF, Severity.INFO, "loop", "every servo is limp")
+    summary = recording.finish()
+    assert recording.process.wait(20) == 0
+    log = read_log(recording.path)
+    assert log.cycles.tobytes() == b"".join(cycle(number) for number in range(30))
+    assert [packet.data for packet in log.packets] == sent
+    assert [event.text for event in log.events] == ["every servo is limp"]
+    assert log.complete
+    assert summary["gaps"] == 0
+    assert summary["bytes"] == recording.path.stat().st_size
+
+
+def test_records_from_before_it_was_ready_are_recorded(start: Start, cycle: Cycle) -> None:
+    recording = start(before=lambda cycles: cycles.append(cycle(0)))
+    recording.finish()
+    assert len(read_log(recording.path).cycles) == 1
+
+
+def test_what_was_overwritten_is_declared_and_counted(start: Start, cycle: Cycle) -> None:
+    def storm(cycles: RingWriter) -> None:
+        for number in range(100):
+            cycles.append(cycle(number))
+
+    recording = start(cycle_slots=10, before=storm)
+    summary = recording.finish()
+    log = read_log(recording.path)
+    assert summary["gaps"] + len(log.cycles) == 100
+    assert summary["gaps"] == 91
+    (event,) = log.events
+    assert event.code == EventCode.RECORDER_GAP
+    assert "91 records of loop/cycles" in event.text
+    assert recording.process.wait(20) == 1
+
+
+def test_a_record_of_another_robot_is_declared_not_written(start: Start, cycle: Cycle) -> None:
+    recording = start()
+    recording.cycles.append(b"short")
+    recording.cycles.append(cycle(1))
+    assert recording.finish()["gaps"] == 1
+    assert read_log(recording.path).cycles["cycle"] == [1]
+
+
+def test_after_a_kill_the_log_is_readable_up_to_the_last_flush(start: Start, cycle: Cycle) -> None:
+    recording = start()
+    assert next(recording.lines) == {"ready": True}
+    for number in range(20):
+        recording.cycles.append(cycle(number))
+    while len(read_log(recording.path).cycles) < 20:  # until a flush, which needs no help from here
+        assert recording.process.poll() is None
+    recording.process.send_signal(signal.SIGKILL)
+    recording.process.wait()
+    log = read_log(recording.path)
+    assert not log.complete
+    assert log.cycles.tobytes() == b"".join(cycle(number) for number in range(20))
+
+
+def test_it_ignores_ctrl_c_and_ends_well_on_sigterm(start: Start, cycle: Cycle) -> None:
+    recording = start()
+    assert next(recording.lines) == {"ready": True}
+    recording.process.send_signal(signal.SIGINT)
+    recording.cycles.append(cycle(0))
+    recording.process.send_signal(signal.SIGTERM)
+    assert recording.summary()["gaps"] == 0
+    assert recording.process.wait(20) == 0
+    assert read_log(recording.path).complete
+
+
+def test_it_finishes_when_the_supervisor_is_gone(start: Start, cycle: Cycle) -> None:
+    recording = start()
+    assert next(recording.lines) == {"ready": True}
+    recording.cycles.append(cycle(0))
+    recording.control.shutdown(socket.SHUT_RDWR)
+    assert recording.process.wait(20) == 0
+    log = read_log(recording.path)
+    assert (len(log.cycles), log.complete) == (1, True)
+
+
+def test_a_full_disk_is_reported_once_and_the_rings_are_drained_on(start: Start, cycle: Cycle) -> None:
+    recording = start()
+    assert next(recording.lines) == {"ready": True}
+    resource.prlimit(
+        recording.process.pid, resource.RLIMIT_FSIZE, (recording.path.stat().st_size, resource.RLIM_INFINITY)
+    )
+    recording.cycles.append(cycle(0))
+    error = next(recording.lines)
+    assert "writing the log stopped" in error["error"]
+    for number in range(500):  # many times the ring
+        recording.cycles.append(cycle(number))
+    summary = recording.finish()
+    assert summary["error"] == error["error"]
+    assert summary["messages"] == 0
+    assert summary["unwritten"] > 0
+    assert next(recording.lines, None) is None
+    assert recording.process.wait(20) == 1
+    assert not read_log(recording.path).complete
+
+
+def test_a_log_that_cannot_be_created_is_reported(start: Start, tmp_path: Path) -> None:
+    path = tmp_path / "there"
+    path.write_bytes(b"precious")
+    recording = start(path=path)
+    assert "cannot be written" in next(recording.lines)["error"]
+    assert recording.process.wait(20) == 1
+    assert path.read_bytes() == b"precious"
