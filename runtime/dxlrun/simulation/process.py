@@ -19,7 +19,7 @@ from dxlrun.simulation.ledger import Ledger
 from dxlrun.simulation.pseudo_terminal import PseudoTerminal
 
 POLL_NS = 80_000
-"""A sleep wakes some 50 us late on a stock kernel: this much before a reply is due the clock is polled instead."""
+"""A sleep wakes some 50 us late on a stock kernel: so long before a reply is due the clock is polled."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -74,7 +74,8 @@ class Server:
             terminal.close()
 
     def _turn(self, wake: socket.socket) -> None:
-        readable, _, _ = select.select([*self._terminals, self._control, wake], [], [], self._patience())
+        sources: list[PseudoTerminal | socket.socket] = [*self._terminals, self._control, wake]
+        readable, _, _ = select.select(sources, [], [], self._patience())
         # What was due before the host wrote goes out first: the host could have read it.
         now_ns = time.monotonic_ns()
         for terminal in self._terminals:
@@ -86,7 +87,7 @@ class Server:
         self._ledger.flush_if_due(now_ns)
 
     def _patience(self) -> float | None:
-        """Return for how long nothing happens by itself, s; 0 shortly before a reply is due; None: for ever."""
+        """Return for how long nothing happens by itself, s: 0 shortly before a reply, None for ever."""
         times = [
             due_ns - POLL_NS for each in self._terminals if (due_ns := each.bus.next_due_ns()) is not None
         ]

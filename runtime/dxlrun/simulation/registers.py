@@ -62,8 +62,8 @@ class Registers:
         """Return the error bits with which a write would be refused; 0 when it would not.
 
         A write is refused as a whole [i]. A cell that no item owns, a read-only item, a locked one and a
-        value out of its range are each a range error [i]; a goal outside the angle limits is an angle limit error
-        (e-Manual, Goal Position (30)).
+        value out of its range are each a range error [i]; a goal outside the angle limits is an angle limit
+        error (e-Manual, Goal Position (30)).
         """
         names = self._names(address, len(data))
         if not names:

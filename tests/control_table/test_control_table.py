@@ -1,0 +1,128 @@
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+from pathlib import Path
+
+import pytest
+import rustypot
+from hypothesis import given
+from hypothesis import strategies as st
+
+import dxlrun.control_table
+from dxlrun.control_table import ControlItem, control_table, model_names, read_control_table
+
+AX = control_table("AX-12A")
+AX_TEXT = (Path(dxlrun.control_table.__file__).parent / "control_tables" / "AX-12A.toml").read_text("utf-8")
+FOREIGN_NAMES = {"baudrate": "baud_rate"}
+
+
+def test_every_item_of_a_foreign_list_stands_at_the_same_place() -> None:
+    foreign = {FOREIGN_NAMES.get(each.name, each.name): each for each in rustypot.AxPyController.registers()}
+    assert {
+        name: (each.addr, each.size, each.access == rustypot.RegisterAccess.ReadWrite)
+        for name, each in foreign.items()
+    } == {name: (item.address, item.size, item.access == "RW") for name, item in AX.items.items()}
+
+
+def test_the_model_number_is_that_of_a_foreign_list() -> None:
+    assert AX.model_number in rustypot.AxPyController.models().values()
+    assert AX.items["model_number"].initial == AX.model_number
+
+
+def test_position_unit_is_exact_and_not_the_rounded_one_of_the_manual() -> None:
+    assert math.degrees(AX.rad_per_tick) == pytest.approx(300 / 1023, rel=1e-15)
+    assert math.degrees(AX.rad_per_tick * AX.max_tick) == pytest.approx(300, rel=1e-15)
+
+
+def test_units_of_speed_load_voltage_temperature_and_delay() -> None:
+    assert AX.rad_s_per_tick == pytest.approx(0.111 * 2 * math.pi / 60, rel=1e-15)
+    assert AX.max_speed == pytest.approx(59 * 2 * math.pi / 60, rel=1e-15)
+    assert AX.effort_per_tick == 1 / 1023
+    units = {name: (AX.items[name].unit, AX.items[name].scale) for name in AX.items}
+    assert units["present_voltage"] == ("V", 0.1)
+    assert units["present_temperature"] == ("degC", 1.0)
+    assert units["return_delay_time"] == ("s", 2e-6)
+    assert units["goal_position"] == ("rad", AX.rad_per_tick)
+    assert units["torque_enable"] == ("", 1.0)
+
+
+def test_speed_at_the_highest_tick_is_what_the_manual_prints() -> None:
+    rpm = AX.max_speed_tick * AX.rad_s_per_tick * 60 / (2 * math.pi)
+    assert round(rpm) == 114  # e-Manual, Moving Speed (32): "If it is 1023, it is about 114rpm"
+
+
+def test_baud_rates_follow_the_formula_of_the_manual_within_its_margin() -> None:
+    for value, rate in AX.baud_rates.items():
+        assert Fraction(2_000_000, value + 1) == pytest.approx(rate, rel=0.03)
+
+
+def test_the_aliases_name_the_same_table() -> None:
+    assert model_names() == tuple(sorted(model_names()))
+    assert {"AX-12", "AX-12+", "AX-12A"} <= set(model_names())
+    assert control_table("AX-12") is AX
+    assert control_table("AX-12+").model == "AX-12A"
+
+
+def test_an_unknown_model_is_named_with_those_that_are_known() -> None:
+    with pytest.raises(LookupError, match=r"'AX-13'.*AX-12A"):
+        control_table("AX-13")
+
+
+@pytest.mark.parametrize(
+    ("ticks", "data"),
+    [(0, "0000"), (1, "0100"), (1023, "ff03"), (-1, "0104"), (-1023, "ff07")],
+)
+def test_direction_is_bit_10(ticks: int, data: str) -> None:
+    assert AX.items["present_speed"].encode(ticks) == bytes.fromhex(data)
+    assert AX.items["present_speed"].decode(bytes.fromhex(data)) == ticks
+
+
+def test_a_zero_with_direction_is_zero() -> None:
+    assert AX.items["present_load"].decode(b"\x00\x04") == 0  # e-Manual: "1024 is equal to 0"
+
+
+@given(st.sampled_from(sorted(AX.items)), st.data())
+def test_every_item_decodes_what_it_encodes(name: str, data: st.DataObject) -> None:
+    item = AX.items[name]
+    high = 1023 if item.encoding == "sign_magnitude" else 256**item.size - 1
+    low = -high if item.encoding == "sign_magnitude" else 0
+    ticks = data.draw(st.integers(low, high))
+    encoded = item.encode(ticks)
+    assert len(encoded) == item.size
+    assert item.decode(encoded) == ticks
+
+
+@given(st.integers(-(2**31), 2**31 - 1))
+def test_twos_complement_of_four_bytes(ticks: int) -> None:
+    item = ControlItem("x", 0, 4, "RW", "RAM", 0, 1, None, "twos_complement", "", 1.0, "")
+    assert item.decode(item.encode(ticks)) == ticks
+
+
+@pytest.mark.parametrize(("name", "ticks"), [("goal_position", -1), ("id", 256), ("present_speed", 1024)])
+def test_a_value_that_does_not_fit_is_refused_by_name(name: str, ticks: int) -> None:
+    with pytest.raises(ValueError, match=name):
+        AX.items[name].encode(ticks)
+
+
+def test_a_reply_of_the_wrong_length_is_refused() -> None:
+    with pytest.raises(ValueError, match="2 bytes are needed, 1 were given"):
+        AX.items["goal_position"].decode(b"\x00")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "complaint"),
+    [
+        ("address = 3\n", "address = 2\n", "id: address 2 lies in the item before it"),
+        ("maximum = 253", "maximum = 256", "id: 0..256 does not fit"),
+        ("initial = 250", "initial = 255", "return_delay_time: the initial value 255"),
+        ('encoding = "unsigned"', 'encoding = "gray"', "model_number: encoding is none of"),
+        ("address = 5", 'address = "5"', "return_delay_time: address is not a whole number"),
+        ("size = 2", "size = 3", "model_number: an item has 1, 2 or 4 bytes"),
+        ("59 rpm", "59 turns", "the unit is none of"),
+    ],
+)
+def test_a_broken_data_file_is_refused(old: str, new: str, complaint: str) -> None:
+    assert old in AX_TEXT
+    with pytest.raises(ValueError, match=complaint):
+        read_control_table(AX_TEXT.replace(old, new, 1))
