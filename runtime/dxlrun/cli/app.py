@@ -70,7 +70,7 @@ def _explain(error: Exception) -> int:
             say_error(f"dxlrun: {line}")
         return error.exit_code
     if isinstance(error, CycloptsError):
-        say_error(f"dxlrun: {' '.join(str(error).split())}; `dxlrun --help` shows the usage")
+        say_error(f"dxlrun: {' '.join(str(error).split()).removesuffix('.')}; `dxlrun --help` shows the usage")
         return InputError.exit_code
     say_error(
         f"dxlrun: internal error: {type(error).__name__}: {error}; please report it, with what --debug prints"

@@ -21,7 +21,7 @@ def check(
     robot: Path,
     /,
     *assignments: Annotated[str, Parameter(name="arg:=value")],
-    play: Annotated[tuple[Path, ...], Parameter(negative=())] = (),
+    play: Annotated[tuple[Path, ...], Parameter(negative=(), show_default=False)] = (),
     duration: float | None = None,
     as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
 ) -> int:

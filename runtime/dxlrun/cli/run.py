@@ -21,7 +21,7 @@ def run(
     /,
     *assignments: Annotated[str, Parameter(name="arg:=value")],
     duration: float | None = None,
-    play: Annotated[tuple[Path, ...], Parameter(negative=())] = (),
+    play: Annotated[tuple[Path, ...], Parameter(negative=(), show_default=False)] = (),
     no_record: Annotated[bool, Parameter(negative=())] = False,
     take_over: Annotated[bool, Parameter(negative=())] = False,
     virtual: Annotated[bool, Parameter(negative=())] = False,

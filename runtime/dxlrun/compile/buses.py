@@ -90,11 +90,13 @@ def _check_budget(description: Description, plan: BusPlan, problems: Problems) -
     budget = plan.budget
     share = budget.total_ns * 1e-9 * rate
     mark = description.marks.value("loop", "rate")
+    origin = description.marks.origins.get(("loop", "rate"))
+    given = f" (argument {origin})" if origin else ""
     cycle = f"one cycle on bus {plan.name} takes {budget.total_ns * 1e-6:.1f} ms"
     if share > 1.0:
         problems.error(
             mark,
-            f"{cycle}, but {rate:g} Hz leave {1e3 / rate:.3g} ms; the highest possible rate is "
+            f"{cycle}, but {rate:g} Hz{given} leave {1e3 / rate:.3g} ms; the highest possible rate is "
             f"{_floor(budget.highest_rate_hz)} Hz",
             "; ".join(["lower the rate", *_what_would_help(plan)]),
         )
