@@ -68,7 +68,7 @@ class BusPlan:
     reads: tuple[Transaction, ...]
     """One state read a servo, in the order of `servos`."""
     limp: tuple[Transaction, ...]
-    """Torque off, as anybody may send it at any moment: broadcast first, then servo by servo, acknowledged."""
+    """Torque off, to be sent at any moment: broadcast first, then servo by servo, acknowledged."""
     torque_reads: tuple[Transaction, ...]
     """Read torque enable, in the order of `servos`."""
     budget: Budget

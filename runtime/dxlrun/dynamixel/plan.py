@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -122,7 +123,7 @@ def _check_layout(table: ControlTable) -> None:
     """Make sure that the items of one packet stand side by side, as the cycle decodes them."""
     for names in (STATE_ITEMS, GOAL_ITEMS):
         items = [table.items[name] for name in names]
-        for before, item in zip(items, items[1:], strict=False):
+        for before, item in itertools.pairwise(items):
             if item.address != before.address + 2 or before.size != 2 or item.size != 2:
                 raise ValueError(f"{table.model}: {' and '.join(names)} do not stand side by side")
     if table.items["goal_position"].address != 30:

@@ -2,8 +2,16 @@
 
 from __future__ import annotations
 
+import os
+import select
+import time
 from collections.abc import Sequence
 from typing import Protocol
+
+from dxlrun.errors import PortError
+
+_WRITE_PATIENCE_NS = 20_000_000
+"""A goal packet for 50 servos takes 2.6 ms at 1 Mbit/s; a line that does not take it in 20 ms is stuck."""
 
 
 class Port(Protocol):
@@ -33,3 +41,91 @@ class Ports(Protocol):
         Clock; a deadline in the past only looks.
         """
         ...
+
+
+class SerialPort:
+    """A serial line by its descriptor, made non-blocking; opened, locked and set up by somebody else."""
+
+    __slots__ = ("_announced", "descriptor", "name")
+
+    def __init__(self, descriptor: int, name: str) -> None:
+        os.set_blocking(descriptor, False)
+        self.descriptor = descriptor
+        self.name = name
+        """Device path, for messages."""
+        self._announced = False
+
+    def write(self, data: bytes | bytearray | memoryview) -> None:
+        """Hand one whole packet to the line; raises PortError when the adapter is gone."""
+        try:
+            count = os.write(self.descriptor, data)
+            if count != len(data):
+                self._write_rest(memoryview(data)[count:])
+        except BlockingIOError:
+            self._write_rest(memoryview(data))
+        except OSError as error:
+            raise self._gone(error) from error
+
+    def _write_rest(self, data: memoryview) -> None:
+        """Wait for room in the output queue; packets are short, so a full queue is stuck."""
+        deadline = time.monotonic_ns() + _WRITE_PATIENCE_NS
+        while data:
+            left = deadline - time.monotonic_ns()
+            if left <= 0:
+                raise PortError(f"{self.name} takes no more bytes: is the adapter stuck, or the line held?")
+            try:
+                select.select([], [self.descriptor], [], left * 1e-9)
+                data = data[os.write(self.descriptor, data) :]
+            except BlockingIOError:
+                continue
+            except OSError as error:
+                raise self._gone(error) from error
+
+    def read_into(self, buffer: memoryview) -> int:
+        """Copy what has arrived into `buffer`; raises PortError when the adapter is gone."""
+        announced, self._announced = self._announced, False
+        try:
+            count = os.readv(self.descriptor, [buffer])
+        except BlockingIOError:
+            return 0
+        except OSError as error:
+            raise self._gone(error) from error
+        if count == 0 and announced:  # ready to be read, and nothing there: the other side hung up
+            raise self._gone(None)
+        return count
+
+    def announce(self) -> None:
+        """Note that the line was said to have bytes: to find none then means that it is gone."""
+        self._announced = True
+
+    def _gone(self, error: OSError | None) -> PortError:
+        why = f" ({error.strerror})" if error is not None else ""
+        return PortError(f"{self.name} is gone{why}: was the adapter unplugged?")
+
+
+class SerialPorts:
+    """The serial lines of a robot on the machine's monotonic time."""
+
+    __slots__ = ("_descriptors", "_index", "_ports")
+
+    def __init__(self, ports: Sequence[SerialPort]) -> None:
+        self._ports = tuple(ports)
+        self._descriptors = [port.descriptor for port in ports]
+        self._index = {port.descriptor: index for index, port in enumerate(ports)}
+
+    @property
+    def ports(self) -> Sequence[SerialPort]:
+        """The lines, in the order of the plan's buses."""
+        return self._ports
+
+    def wait(self, deadline_ns: int) -> Sequence[int]:
+        """Wait for bytes on any line until `deadline_ns` of CLOCK_MONOTONIC; a past deadline only looks."""
+        left = (deadline_ns - time.monotonic_ns()) * 1e-9
+        # select and not epoll: its time-out has microseconds
+        ready, _, _ = select.select(self._descriptors, [], [], max(left, 0.0))
+        if not ready:
+            return ()
+        indices = [self._index[descriptor] for descriptor in ready]
+        for index in indices:
+            self._ports[index].announce()
+        return indices

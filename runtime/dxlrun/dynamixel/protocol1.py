@@ -52,7 +52,7 @@ REFUSALS = StatusError.RANGE | StatusError.CHECKSUM | StatusError.INSTRUCTION
 """The bits that say that the servo did not do what the instruction asked."""
 
 _SENTENCES: Mapping[StatusError, str] = {
-    StatusError.INPUT_VOLTAGE: "input voltage error: the applied voltage is out of the range of the control table",
+    StatusError.INPUT_VOLTAGE: "input voltage error: the voltage is out of the range of the control table",
     StatusError.ANGLE_LIMIT: "angle limit error: the goal position is outside the CW and CCW angle limits",
     StatusError.OVERHEATING: "overheating error: the temperature is out of the range of the control table",
     StatusError.RANGE: "range error: a written value is out of its range of use",

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from dxlrun.dynamixel.protocol1 import HEADER, LONGEST
 from dxlrun.dynamixel.port import Port
+from dxlrun.dynamixel.protocol1 import HEADER, LONGEST
 
 Taker = Callable[[memoryview, int, int], None]
 """Takes bytes with the times (ns) of the read() calls that brought the first and the last of them.

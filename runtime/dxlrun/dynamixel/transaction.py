@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Generator
+from dataclasses import dataclass, replace
+from enum import IntEnum, unique
+from typing import Generic, Protocol, TypeAlias, TypeVar
+
+Result = TypeVar("Result")
 
 BROADCAST_ID = 0xFE
 
@@ -17,6 +22,83 @@ class Transaction:
     reply_length: int
     """Number of parameter bytes of the awaited status packet; -1: none is awaited."""
     due_ns: int
-    """From the start of the write to the last byte of the reply, by the wire; without reply: the wire time."""
+    """From the start of the write to the reply's last byte, by the wire; without reply: the wire time."""
     timeout_ns: int
     """From the start of the write to giving up; 0 without reply."""
+
+
+@unique
+class Outcome(IntEnum):
+    """What came of a transaction; a lost packet is data, not an exception."""
+
+    SENT = 0
+    """No reply was awaited."""
+    OK = 1
+    TIMEOUT = 2
+    """Not one byte came."""
+    GARBLED = 3
+    """Bytes came, but not the awaited packet."""
+    REFUSED = 4
+    """The servo answered with an error and without the data."""
+
+
+@dataclass(slots=True)
+class Reply:
+    """What came of a transaction.
+
+    A bus reuses one object for all its transactions, so a job takes what it needs before it goes on;
+    programs get their own.
+    """
+
+    outcome: Outcome
+    error: int
+    """Error byte of the status packet: bits of StatusError"""
+    parameters: bytes | memoryview
+    last_ns: int
+    """Time of the read() that brought the last byte of the status packet."""
+    strays: int
+    """Intact packets that nobody awaited, and bytes of noise, since the transaction before."""
+    echoed: bool
+    """True when the instruction itself came back: the adapter echoes."""
+
+    @property
+    def answered(self) -> bool:
+        """True when the awaited status packet came."""
+        return self.outcome is Outcome.OK
+
+    def word(self, size: int = 2, offset: int = 0) -> int:
+        """Return a little-endian item out of the parameters."""
+        return int.from_bytes(self.parameters[offset : offset + size], "little")
+
+
+Program: TypeAlias = Generator[Transaction, Reply, Result]
+"""A sequence of transactions that decides as it goes: yields each one, is sent what came of it."""
+
+
+class Job(Protocol):
+    """What a bus executes: transactions one after the other."""
+
+    def advance(self, reply: Reply | None) -> Transaction | None:
+        """Take what came of the transaction before (None at the start), return the next; None: finished."""
+        ...
+
+
+class ProgramJob(Generic[Result]):
+    """Executes a program; for set-up, probes and shutdown, where a few objects a transaction do no harm."""
+
+    __slots__ = ("_program", "result")
+
+    def __init__(self, program: Program[Result]) -> None:
+        self._program = program
+        self.result: Result | None = None
+        """What the program returned; None until it did."""
+
+    def advance(self, reply: Reply | None) -> Transaction | None:
+        """Resume the program."""
+        try:
+            if reply is None:
+                return next(self._program)
+            return self._program.send(replace(reply, parameters=bytes(reply.parameters)))
+        except StopIteration as end:
+            self.result = end.value
+            return None

@@ -6,6 +6,8 @@ Amarante Araujo, 2017, JointID; e-Manual AX-12A, Goal Position (30): 300/1023 de
 
 from __future__ import annotations
 
+import math
+
 from dxlrun.dynamixel.bus_plan import ServoPlan
 
 
@@ -25,7 +27,7 @@ def speed_ticks(servo: ServoPlan, velocity: float) -> int:
 
     Its magnitude counts. NaN gives 0, which is the maximum in joint mode; 0 rad/s therefore gives 1 tick.
     """
-    if velocity != velocity:
+    if math.isnan(velocity):
         return 0
     most = servo.max_speed_tick
     return min(max(round(min(abs(velocity) / servo.rad_s_per_tick, most)), 1), most)

@@ -1,0 +1,287 @@
+"""Bus: one resumable transaction machine per serial line, and the one wait that pumps all of them.
+
+A machine never waits: it writes an instruction, is fed the bytes that arrive, and is told the time. Whoever
+pumps it decides when: read, write, or the gap before the next deadline.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from dxlrun.clock import Clock
+from dxlrun.dynamixel.bus_plan import BusPlan
+from dxlrun.dynamixel.line import BITS_PER_BYTE
+from dxlrun.dynamixel.port import Port, Ports
+from dxlrun.dynamixel.protocol1 import OVERHEAD, REFUSALS
+from dxlrun.dynamixel.receiver import Receiver
+from dxlrun.dynamixel.transaction import (
+    BROADCAST_ID,
+    Job,
+    Outcome,
+    Program,
+    ProgramJob,
+    Reply,
+    Result,
+    Transaction,
+)
+from dxlrun.errors import PortError
+from dxlrun.packets import PacketKind, PacketSink
+
+NEVER = 1 << 62
+QUIET_BYTES = 20
+"""A line that was silent for so many byte times is silent (protocol.md: drain until it is)."""
+LEAST_QUIET_NS = 200_000
+DRAIN_LIMIT_NS = 5_000_000
+"""A line that babbles longer than this is not waited for."""
+
+_READY, _AWAITING, _RESTING, _DRAINING = range(4)
+
+
+class Bus:
+    """Executes transactions on one line; every byte that goes over it is reported to the packet sink.
+
+    A reply counts only when ID and length are exact and when it comes no sooner than the wire allows. After
+    a timeout the line is drained until it is silent, and what comes then is stray.
+    """
+
+    __slots__ = (
+        "_awaited",
+        "_byte_ns",
+        "_deadline_ns",
+        "_drain_end_ns",
+        "_earliest_ns",
+        "_free_ns",
+        "_index",
+        "_job",
+        "_last_byte_ns",
+        "_now_ns",
+        "_parameters",
+        "_port",
+        "_quiet_ns",
+        "_receiver",
+        "_reply",
+        "_sink",
+        "_started_ns",
+        "_state",
+        "_views",
+        "failure",
+        "name",
+        "noise_bytes",
+        "stray_packets",
+    )
+
+    def __init__(self, index: int, plan: BusPlan, port: Port, clock: Clock, packets: PacketSink) -> None:
+        self.name = plan.name
+        self.failure: PortError | None = None
+        """Why the line is gone; a bus with a failure does nothing more."""
+        self.noise_bytes = 0
+        """Bytes that belonged to no intact packet, since the start."""
+        self.stray_packets = 0
+        """Intact packets that nobody awaited, since the start."""
+        self._index = index
+        self._port = port
+        self._now_ns = clock.now_ns
+        self._sink = packets
+        self._byte_ns = BITS_PER_BYTE * 1_000_000_000 // plan.baud_rate
+        self._quiet_ns = max(QUIET_BYTES * self._byte_ns, LEAST_QUIET_NS) + plan.latency_ns
+        self._receiver = Receiver(self._status, self._noise)
+        self._parameters = memoryview(bytearray(256))
+        self._views: dict[int, memoryview] = {}
+        self._reply = Reply(Outcome.SENT, 0, b"", 0, 0, False)
+        self._job: Job | None = None
+        self._awaited: Transaction | None = None
+        self._state = _READY
+        self._started_ns = self._earliest_ns = self._deadline_ns = self._free_ns = 0
+        self._drain_end_ns = 0
+        self._last_byte_ns = -NEVER
+
+    @property
+    def busy(self) -> bool:
+        """True while a job is under way."""
+        return self._job is not None
+
+    def load(self, job: Job) -> None:
+        """Take a job; the next `step` begins it. What an aborted job left behind is forgotten."""
+        self._awaited = None
+        self._state = _READY
+        self.receive()  # what came since the last job belongs to nobody
+        if self.failure is not None:
+            return
+        self._job = job
+        self._reply.strays = 0
+
+    def send(self, packet: bytes | bytearray | memoryview) -> None:
+        """Send a prepared packet that nobody answers, between two jobs; does not wait.
+
+        The next transaction starts when the packet is off the wire. Raises PortError when the line is gone.
+        """
+        if self.failure is None:
+            try:
+                self._write(packet, BROADCAST_ID)
+            except PortError as error:
+                self._fail(error)
+        if self.failure is not None:
+            raise self.failure
+
+    def receive(self) -> None:
+        """Take what the line has; called when it has bytes."""
+        if self.failure is None:
+            try:
+                if self._receiver.read_from(self._port, self._now_ns):
+                    self._last_byte_ns = self._now_ns()
+            except PortError as error:
+                self._fail(error)
+
+    def step(self, now_ns: int) -> int:
+        """Do what is due; return when to come back at the latest, NEVER when there is nothing to do."""
+        try:
+            while self._job is not None:
+                if self._state == _READY:
+                    if now_ns < self._free_ns:
+                        return self._free_ns
+                    self._begin(self._job)
+                    now_ns = self._now_ns()
+                    continue
+                if now_ns < self._deadline_ns:
+                    return self._deadline_ns
+                # bytes may have come while this process was not running: look before giving up
+                self.receive()
+                if self._state == _AWAITING:
+                    self._give_up(now_ns)
+                elif self._state == _DRAINING and self._quiet_at() > now_ns:
+                    self._deadline_ns = self._quiet_at()
+                elif self._state in (_RESTING, _DRAINING):
+                    self._receiver.flush()
+                    self._state = _READY
+        except PortError as error:
+            self._fail(error)
+        return NEVER
+
+    def _fail(self, error: PortError) -> None:
+        self.failure = error
+        self._job = None
+
+    def _begin(self, job: Job) -> None:
+        """Hand the reply to the job and start its next transaction."""
+        reply = self._reply
+        first = self._awaited is None
+        transaction = job.advance(None if first else reply)
+        self._awaited = transaction
+        if transaction is None:
+            self._job = None
+            return
+        if self._receiver.pending:
+            self._receiver.flush()
+        reply.parameters = b""
+        reply.error = reply.strays = 0
+        reply.echoed = False
+        if transaction.packet:
+            self._write(transaction.packet, transaction.servo_id)
+        else:
+            self._started_ns = self._now_ns()
+        if transaction.reply_length < 0:
+            reply.outcome = Outcome.SENT
+            self._deadline_ns = self._started_ns + transaction.due_ns
+            self._state = _RESTING
+        else:
+            reply.outcome = Outcome.TIMEOUT
+            count = len(transaction.packet) + OVERHEAD
+            self._earliest_ns = self._started_ns + count * self._byte_ns
+            self._deadline_ns = self._started_ns + transaction.timeout_ns
+            self._state = _AWAITING
+
+    def _write(self, packet: bytes | bytearray | memoryview, servo_id: int) -> None:
+        before = self._now_ns()
+        self._port.write(packet)
+        self._sink.packet(self._index, PacketKind.INSTRUCTION, servo_id, before, self._now_ns(), packet)
+        self._started_ns = before
+        self._free_ns = before + len(packet) * self._byte_ns
+
+    def _give_up(self, now_ns: int) -> None:
+        """End a transaction whose reply did not come in time."""
+        self._receiver.flush()  # the reply may stand behind a false header
+        if self._state != _AWAITING:
+            return
+        if self._last_byte_ns >= self._started_ns:
+            self._reply.outcome = Outcome.GARBLED
+        self._drain_end_ns = now_ns + DRAIN_LIMIT_NS
+        self._deadline_ns = self._quiet_at()
+        self._state = _DRAINING if self._deadline_ns > now_ns else _READY
+
+    def _quiet_at(self) -> int:
+        return min(self._last_byte_ns + self._quiet_ns, self._drain_end_ns)
+
+    def _noise(self, data: memoryview, first_ns: int, last_ns: int) -> None:
+        self.noise_bytes += len(data)
+        self._reply.strays += 1
+        self._sink.packet(self._index, PacketKind.NOISE, BROADCAST_ID, first_ns, last_ns, data)
+
+    def _status(self, packet: memoryview, first_ns: int, last_ns: int) -> None:
+        self._sink.packet(self._index, PacketKind.STATUS, packet[2], first_ns, last_ns, packet)
+        awaited = self._awaited
+        reply = self._reply
+        if self._state != _AWAITING or awaited is None or packet[2] != awaited.servo_id:
+            self._stray(packet)
+            return
+        length = len(packet) - OVERHEAD
+        if length == awaited.reply_length:
+            outcome = Outcome.OK
+        elif length == 0 and packet[4] & REFUSALS:
+            outcome = Outcome.REFUSED
+        else:
+            self._stray(packet)
+            return
+        if last_ns < self._earliest_ns + length * self._byte_ns:  # an echo, or left over from before
+            self._stray(packet)
+            return
+        view = self._views.get(length)
+        if view is None:
+            view = self._views[length] = self._parameters[:length]
+        view[:] = packet[5:-1]
+        reply.outcome = outcome
+        reply.error = packet[4]
+        reply.parameters = view
+        reply.last_ns = last_ns
+        self._state = _READY
+
+    def _stray(self, packet: memoryview) -> None:
+        self.stray_packets += 1
+        self._reply.strays += 1
+        if self._awaited is not None and packet == self._awaited.packet:
+            self._reply.echoed = True
+
+
+def pump(buses: Sequence[Bus], ports: Ports, now_ns: Callable[[], int], beat: Callable[[], None]) -> None:
+    """Execute the jobs of all buses side by side: one wait over all ports, until every job is finished.
+
+    `beat` is called at least once a transaction. Raises nothing: a line that is gone has its `failure`, and
+    the others go on.
+    """
+    while True:
+        now = now_ns()
+        deadline = NEVER
+        for bus in buses:
+            deadline = min(deadline, bus.step(now))
+        beat()
+        if deadline == NEVER:
+            return
+        for index in ports.wait(deadline):
+            buses[index].receive()
+
+
+def run(
+    programs: Sequence[Program[Result]],
+    buses: Sequence[Bus],
+    ports: Ports,
+    clock: Clock,
+    beat: Callable[[], None] = lambda: None,
+) -> list[Result | None]:
+    """Run one program a bus to its end, blocking, side by side; for set-up and tools, never in the loop.
+
+    Returns what each program returned; None where the line is gone, and the bus' `failure` says why.
+    """
+    jobs = [ProgramJob(program) for program in programs]
+    for bus, job in zip(buses, jobs, strict=True):
+        bus.load(job)
+    pump(buses, ports, clock.now_ns, beat)
+    return [job.result for job in jobs]

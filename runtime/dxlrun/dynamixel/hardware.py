@@ -1,0 +1,181 @@
+"""Dynamixel hardware: joints on serial lines of Protocol 1.0, all lines at once in one thread."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from dxlrun.clock import Clock
+from dxlrun.dynamixel import startup
+from dxlrun.dynamixel.bus import Bus, pump, run
+from dxlrun.dynamixel.bus_plan import BusPlan
+from dxlrun.dynamixel.health import Servos
+from dxlrun.dynamixel.limp import LimpOutcome, limp_buses
+from dxlrun.dynamixel.port import Ports
+from dxlrun.dynamixel.units import joint_position
+from dxlrun.errors import PortError, StartUpError
+from dxlrun.events import EventCode, EventSink, Severity
+from dxlrun.interfaces import Commands, States
+from dxlrun.packets import PacketSink
+
+STOP_LIMIT_NS = 1_000_000_000
+"""Retries of torque off end here; half of the default exit timeout."""
+FIRST_READS = 3
+"""The first states must all be fresh; noise may spoil a reading or two."""
+IDLE_MARGIN_NS = 300_000
+"""The gap is left so long before the deadline: a stock kernel wakes some 50-100 us late."""
+
+
+class DynamixelHardware:
+    """Reads all servos, writes all goals, once a cycle; see `dxlrun.hardware.Hardware` for the contract.
+
+    States and goals are the robot's arrays, one row a joint. A row whose reply was lost is invalid and keeps
+    its values while its age grows. A servo that missed a read, or whose torque enable was not read as 1, gets
+    no goal until it was, because writing a goal switches torque on (protocol.md).
+    """
+
+    def __init__(  # noqa: PLR0917  the order is the contract of the composition roots
+        self,
+        plans: Sequence[BusPlan],
+        ports: Ports,
+        clock: Clock,
+        states: States,
+        goals: Commands,
+        packets: PacketSink,
+        events: EventSink,
+        beat: Callable[[], None],
+        take_over: bool = False,
+    ) -> None:
+        self._plans = tuple(plans)
+        self._ports = ports
+        self._clock = clock
+        self._states = states
+        self._goals = goals
+        self._events = events
+        self._beat = beat
+        self._take_over = take_over
+        self._buses = tuple(
+            Bus(index, plan, port, clock, packets)
+            for index, (plan, port) in enumerate(zip(self._plans, ports.ports, strict=True))
+        )
+        self._servos = tuple(
+            Servos(plan, bus, events) for plan, bus in zip(self._plans, self._buses, strict=True)
+        )
+
+    def start(self) -> None:
+        """Look at every servo, hold each where it stands, fill the first states and goals.
+
+        Raises StartUpError with every problem of every servo, PortError when a line is gone; torque that was
+        given is taken back.
+        """
+        self._survey()
+        try:
+            self._engage()
+            self._first_states()
+        except BaseException:  # also an interrupt: nothing may leave here with torque on
+            self._limp()
+            raise
+
+    def read(self) -> None:
+        """Read every servo once, on all lines at once. Raises PortError when a line is gone."""
+        for bus, servos in zip(self._buses, self._servos, strict=True):
+            servos.reads.begin()
+            bus.load(servos.reads)
+        pump(self._buses, self._ports, self._clock.now_ns, self._beat)
+        now = self._clock.now_ns()
+        for servos in self._servos:
+            servos.settle(self._states, now)
+        self._raise_failures()
+
+    def write(self) -> None:
+        """Send the goals, one sync write a line. Raises PortError when a line is gone."""
+        for bus, servos in zip(self._buses, self._servos, strict=True):
+            packet = servos.goals.packet(self._goals, servos.torqued)
+            if packet is not None and bus.failure is None:
+                bus.send(packet)
+        self._raise_failures()
+
+    def idle(self, until_ns: int) -> None:
+        """Read torque enable of one servo a line that is left out of the goals, if there is time for it."""
+        latest = until_ns - IDLE_MARGIN_NS
+        probing = [
+            servos.probe(bus, latest - self._clock.now_ns())
+            for bus, servos in zip(self._buses, self._servos, strict=True)
+        ]
+        if any(probing):
+            pump(self._buses, self._ports, self._clock.now_ns, self._beat)
+            for servos in self._servos:
+                servos.probed()
+
+    def stop(self) -> tuple[str, ...]:
+        """Switch torque off on every servo, read it back; return a sentence per servo without confirmation."""
+        failures = tuple(f"{one}" for one in self._limp() if not one.confirmed)
+        for sentence in failures:
+            self._events.emit(EventCode.SHUTDOWN_FAILED, Severity.ERROR, "hardware", sentence)
+        if not failures:
+            count = sum(len(plan.servos) for plan in self._plans)
+            self._events.emit(
+                EventCode.TORQUE_OFF, Severity.INFO, "hardware", f"torque is off on all {count} servos"
+            )
+        return failures
+
+    def _limp(self) -> tuple[LimpOutcome, ...]:
+        for bus, servos in zip(self._buses, self._servos, strict=True):
+            servos.torqued[:] = False
+            bus.failure = None  # a line that is back, or was only stuck, gets its chance
+        deadline = self._clock.now_ns() + STOP_LIMIT_NS
+        return limp_buses(
+            self._plans, self._buses, self._ports, self._clock, deadline_ns=deadline, beat=self._beat
+        )
+
+    def _survey(self) -> None:
+        programs = [startup.survey(plan, self._take_over) for plan in self._plans]
+        found = run(programs, self._buses, self._ports, self._clock, self._beat)
+        self._raise_failures()
+        problems: list[str] = []
+        for survey in found:
+            if survey is not None:
+                problems += survey.problems
+                for joint, text in survey.servos:
+                    self._events.emit(EventCode.SETUP, Severity.INFO, joint, text)
+                for joint, text in survey.differences:
+                    self._events.emit(EventCode.REGISTER_DIFFERS, Severity.WARNING, joint, text)
+        if problems:
+            raise StartUpError("\n".join(problems))
+
+    def _engage(self) -> None:
+        programs = [startup.engage(plan) for plan in self._plans]
+        engaged = run(programs, self._buses, self._ports, self._clock, self._beat)
+        self._raise_failures()
+        problems = [problem for one in engaged if one is not None for problem in one.problems]
+        if problems:
+            raise StartUpError("\n".join([*problems, "torque was switched off again on every servo"]))
+        for plan, servos, one in zip(self._plans, self._servos, engaged, strict=True):
+            assert one is not None  # noqa: S101  no line has failed
+            servos.torqued[:] = True
+            for servo, raw in zip(plan.servos, one.goals, strict=True):
+                self._goals.position[servo.row] = joint_position(servo, raw)
+            names = ", ".join(servo.joint for servo in plan.servos)
+            self._events.emit(EventCode.TORQUE_ON, Severity.INFO, plan.name, f"torque is on: {names}")
+
+    def _first_states(self) -> None:
+        for _ in range(FIRST_READS):
+            self.read()
+            if all(servos.all_fresh for servos in self._servos):
+                break
+        silent = [name for servos in self._servos for name in servos.silent]
+        if silent:
+            raise StartUpError(
+                f"{', '.join(silent)} did not answer after torque was switched on: check cable and power; "
+                "torque was switched off again on every servo"
+            )
+        for servos in self._servos:
+            servos.torqued[:] = True
+        # goal = present: none of the goals has a speed yet
+        self._goals.velocity[:] = float("nan")
+
+    def _raise_failures(self) -> None:
+        for plan, bus, servos in zip(self._plans, self._buses, self._servos, strict=True):
+            if bus.failure is not None:
+                text = f"bus {plan.name} on {plan.port}: {bus.failure}"
+                servos.lost(text)
+                raise PortError(text) from bus.failure

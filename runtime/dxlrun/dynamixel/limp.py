@@ -1,0 +1,114 @@
+"""Limp: torque off on every servo, acknowledged and read back; the last thing that is sent on every way out.
+
+Needs neither numpy nor the loop: the guardian does it after the loop died.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from dxlrun.clock import Clock
+from dxlrun.dynamixel.bus import Bus, run
+from dxlrun.dynamixel.bus_plan import BusPlan, ServoPlan
+from dxlrun.dynamixel.line import listen
+from dxlrun.dynamixel.port import Ports
+from dxlrun.dynamixel.transaction import Outcome, Program, Reply
+from dxlrun.packets import PacketSink
+
+ATTEMPTS = 3
+"""A write and its read-back are tried so often; noise rarely hits three times, a cut cable always does."""
+SETTLE_NS = 500_000
+"""Time that a half-sent reply may still take: it would collide with the broadcast."""
+
+
+@dataclass(frozen=True, slots=True)
+class LimpOutcome:
+    """What came of torque off for one servo."""
+
+    bus: str
+    joint: str
+    servo_id: int
+    confirmed: bool
+    """True when torque enable was read back as 0."""
+    detail: str
+    """Why it was not confirmed."""
+
+    def __str__(self) -> str:
+        return f"{self.joint} (ID {self.servo_id} on bus {self.bus}): {self.detail}"
+
+
+def torque_off(
+    plan: BusPlan, now_ns: Callable[[], int], deadline_ns: int
+) -> Program[tuple[LimpOutcome, ...]]:
+    """Switch torque off everywhere on one bus: broadcast first, then servo by servo with read-back.
+
+    After `deadline_ns` nobody is tried again, but everybody once.
+    """
+    yield listen(SETTLE_NS)
+    broadcast, *writes = plan.limp
+    yield broadcast
+    outcomes = []
+    for servo, write, read in zip(plan.servos, writes, plan.torque_reads, strict=True):
+        detail = "it was not tried"
+        for attempt in range(ATTEMPTS):
+            if attempt and now_ns() >= deadline_ns:
+                break
+            acknowledged = yield write
+            back = yield read
+            detail = _detail(acknowledged, back)
+            if not detail:
+                break
+        outcomes.append(_outcome(plan, servo, detail))
+    return tuple(outcomes)
+
+
+def _detail(acknowledged: Reply, back: Reply) -> str:
+    if back.answered:
+        enabled = back.parameters[0]
+        return "" if enabled == 0 else f"torque enable reads {enabled} after torque off was written"
+    if acknowledged.answered:
+        return "torque off was acknowledged, but the read-back got no answer"
+    if Outcome.GARBLED in (acknowledged.outcome, back.outcome):
+        return "torque off was sent, but only garbled bytes came back"
+    return "torque off was sent, but the servo does not answer"
+
+
+def _outcome(plan: BusPlan, servo: ServoPlan, detail: str) -> LimpOutcome:
+    return LimpOutcome(plan.name, servo.joint, servo.servo_id, not detail, detail)
+
+
+def limp_buses(
+    plans: Sequence[BusPlan],
+    buses: Sequence[Bus],
+    ports: Ports,
+    clock: Clock,
+    *,
+    deadline_ns: int,
+    beat: Callable[[], None] = lambda: None,
+) -> tuple[LimpOutcome, ...]:
+    """Switch torque off on all lines at once and return what came of it, per servo; raises nothing."""
+    results = run([torque_off(plan, clock.now_ns, deadline_ns) for plan in plans], buses, ports, clock, beat)
+    outcomes: list[LimpOutcome] = []
+    for plan, bus, result in zip(plans, buses, results, strict=True):
+        gone = f"torque off could not be sent: {bus.failure}"
+        outcomes += result if result is not None else (_outcome(plan, servo, gone) for servo in plan.servos)
+    return tuple(outcomes)
+
+
+def limp(
+    plans: Sequence[BusPlan],
+    ports: Ports,
+    clock: Clock,
+    packets: PacketSink,
+    limit_ns: int = 1_000_000_000,
+) -> tuple[LimpOutcome, ...]:
+    """Drain the lines and switch torque off on every servo; for somebody who just took the ports over.
+
+    `limit_ns` bounds the retries, counted from now. Raises nothing: a line that is gone is in the outcome.
+    """
+    buses = [
+        Bus(index, plan, port, clock, packets)
+        for index, (plan, port) in enumerate(zip(plans, ports.ports, strict=True))
+    ]
+    return limp_buses(plans, buses, ports, clock, deadline_ns=clock.now_ns() + limit_ns)

@@ -1,0 +1,102 @@
+"""Opening a serial line for one process alone; the guardian does it, the loop inherits the descriptor."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import termios
+from collections.abc import Iterable
+from pathlib import Path
+
+import serial
+
+from dxlrun.errors import PortError
+
+
+def open_serial(path: str, baud_rate: int) -> serial.Serial:
+    """Open a device at `baud_rate`, 8N1, exclusively (flock and TIOCEXCL); also a pseudo-terminal.
+
+    Keep what is returned: closing it lets go of the line. Raises PortError with one sentence: there is no
+    such device, this user may not open it, somebody else has it, or it cannot do the baud rate.
+    """
+    try:
+        # exclusive=True: pyserial takes the lock that other pyserial programs respect
+        port = serial.Serial(path, baud_rate, timeout=0, write_timeout=0, exclusive=True)
+    except ValueError as error:
+        raise PortError(f"{path} cannot run at {baud_rate} bit/s: {error}") from error
+    except (OSError, termios.error) as error:  # serial.SerialException is an OSError
+        raise PortError(_sentence(path, baud_rate, error)) from error
+    # and the lock that every program meets, but for root's
+    fcntl.ioctl(port.fileno(), termios.TIOCEXCL)
+    return port
+
+
+def _sentence(path: str, baud_rate: int, error: Exception) -> str:
+    number = error.errno if isinstance(error, OSError) else error.args[0] if error.args else None
+    if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
+        return f"there is no {path}; {_what_exists()}"
+    if number in (errno.EACCES, errno.EPERM) and not os.access(path, os.R_OK | os.W_OK):
+        return (
+            f"this user may not open {path}: join its group with `sudo usermod -aG {_group(path)} $USER` "
+            "and log in again"
+        )
+    if number in (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK):
+        return f"{path} is in use by {_holder(path)}; stop that first"
+    if number == errno.ENOTTY:
+        return f"{path} is no serial line"
+    if number == errno.EINVAL:
+        return f"{path} cannot run at {baud_rate} bit/s: {error}"
+    return f"{path} cannot be opened: {error}"
+
+
+def serial_devices() -> tuple[str, ...]:
+    """Return the paths of the serial adapters that this machine has, the lasting names first."""
+    names: list[str] = []
+    for folder, pattern in (("/dev/serial/by-id", "*"), ("/dev", "ttyUSB*"), ("/dev", "ttyACM*")):
+        names += sorted(str(path) for path in Path(folder).glob(pattern))
+    return tuple(names)
+
+
+def _what_exists() -> str:
+    devices = serial_devices()
+    if not devices:
+        return "this machine has no serial adapter now: is it plugged in?"
+    return f"there are: {', '.join(devices)}"
+
+
+def _group(path: str) -> str:
+    try:
+        return Path(path).group()
+    except (OSError, KeyError):
+        return "dialout"
+
+
+def _holder(path: str) -> str:
+    """Name the other processes that have the device open, as far as this user may see them."""
+    device = os.path.realpath(path)
+    found = [
+        f"{_command(process)} (process {process.name})"
+        for process in _processes()
+        if process.name != str(os.getpid()) and _has_open(process, device)
+    ]
+    return " and ".join(found) or "another process, which this user may not see"
+
+
+def _processes() -> Iterable[Path]:
+    return (path for path in sorted(Path("/proc").iterdir()) if path.name.isdigit())
+
+
+def _has_open(process: Path, device: str) -> bool:
+    try:
+        return any(os.readlink(descriptor) == device for descriptor in (process / "fd").iterdir())
+    except OSError:
+        return False
+
+
+def _command(process: Path) -> str:
+    try:
+        words = (process / "cmdline").read_bytes().split(b"\0")
+        return b" ".join(words[:3]).decode(errors="replace").strip() or "a process"
+    except OSError:
+        return "a process"
