@@ -24,107 +24,107 @@ def test_a_right_file_has_no_problem(problems_in: Find, robot_text: str):
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "at", "severity", "what", "mend"),
+    ("change", "at", "says"),
     [
-        ("id: 2", "id: 1", "1\n", "error", "ID 1 of right_arm_joint is taken by left_arm_joint", "its own ID"),
         (
-            "    bus: main\n    id: 2",
-            "    bus: mian\n    id: 2",
+            ("id: 2", "id: 1"),
+            "1\n",
+            ("error", "ID 1 of right_arm_joint is taken by left_arm_joint", "its own ID"),
+        ),
+        (
+            ("    bus: main\n    id: 2", "    bus: mian\n    id: 2"),
             "mian",
-            "error",
-            "bus mian, which the file does not have",
-            "did you mean main?",
+            ("error", "bus mian, which the file does not have", "did you mean main?"),
         ),
         (
-            "    id: 2\n    model: AX-12A",
-            "    id: 2\n    model: AX-12AX",
+            ("    id: 2\n    model: AX-12A", "    id: 2\n    model: AX-12AX"),
             "AX-12AX",
-            "error",
-            "no control table for model AX-12AX of right_arm_joint",
-            "did you mean AX-12A?",
+            ("error", "no control table for model AX-12AX of right_arm_joint", "did you mean AX-12A?"),
         ),
         (
-            "joint_group_posvel_controller",
+            ("joint_group_posvel_controller", "joint_group_posvle_controller"),
             "joint_group_posvle_controller",
-            "joint_group_posvle_controller",
-            "error",
-            "no plug-in offers the controller type joint_group_posvle_controller of arms",
-            "did you mean joint_group_posvel_controller?",
+            (
+                "error",
+                "no plug-in offers the controller type joint_group_posvle_controller of arms",
+                "did you mean joint_group_posvel_controller?",
+            ),
         ),
         (
-            "posvel_controller\n    joints: [left_arm_joint, right_arm_joint]",
-            "posvel_controller\n    joints: [left_arm_joint, right_arm_jiont]",
+            (
+                "posvel_controller\n    joints: [left_arm_joint, right_arm_joint]",
+                "posvel_controller\n    joints: [left_arm_joint, right_arm_jiont]",
+            ),
             "right_arm_jiont",
-            "error",
-            "arms wants joint right_arm_jiont",
-            "did you mean right_arm_joint?",
+            ("error", "arms wants joint right_arm_jiont", "did you mean right_arm_joint?"),
         ),
         (
-            "posvel_controller\n    joints: [left_arm_joint, right_arm_joint]",
-            "posvel_controller\n    joints: [left_arm_joint, left_arm_joint]",
+            (
+                "posvel_controller\n    joints: [left_arm_joint, right_arm_joint]",
+                "posvel_controller\n    joints: [left_arm_joint, left_arm_joint]",
+            ),
             "left_arm_joint]",
-            "error",
-            "arms names joint left_arm_joint twice",
-            "once",
+            ("error", "arms names joint left_arm_joint twice", "once"),
         ),
         (
-            "active: false\n    joints: [left_arm_joint, right_arm_joint]",
-            "active: true\n    joints: [ right_arm_joint]",
+            (
+                "active: false\n    joints: [left_arm_joint, right_arm_joint]",
+                "active: true\n    joints: [ right_arm_joint]",
+            ),
             "[ right_arm_joint]",
-            "error",
-            "spare and arms are both active and both claim right_arm_joint",
-            "active: false",
+            ("error", "spare and arms are both active and both claim right_arm_joint", "active: false"),
         ),
-        ("rate: 25", "rate: 20", "20}", "error", "does not divide the loop's 50 Hz", "the nearest possible is 25"),
-        ("rate: 25", "rate: 100", "100}", "error", "above the loop's 50 Hz", "the nearest possible is 50"),
         (
-            "[-90 deg, 60 deg]",
-            "[-90 deg, 90 deg]",
+            ("rate: 25", "rate: 20"),
+            "20}",
+            ("error", "does not divide the loop's 50 Hz", "the nearest possible is 25"),
+        ),
+        (
+            ("rate: 25", "rate: 100"),
+            "100}",
+            ("error", "above the loop's 50 Hz", "the nearest possible is 50"),
+        ),
+        (
+            ("[-90 deg, 60 deg]", "[-90 deg, 90 deg]"),
             "[-90 deg",
-            "warning",
-            "beyond the reach of its AX-12A, -240..+60 deg",
-            "the joint will keep -90..+60 deg",
+            ("warning", "beyond the reach of its AX-12A, -240..+60 deg", "the joint will keep -90..+60 deg"),
         ),
         (
-            "[-90 deg, 60 deg]",
-            "[70 deg, 90 deg]",
+            ("[-90 deg, 60 deg]", "[70 deg, 90 deg]"),
             "[70 deg",
-            "error",
-            "nothing in common with the reach of its AX-12A, -240..+60 deg",
-            "check limits",
+            ("error", "nothing in common with the reach of its AX-12A, -240..+60 deg", "check limits"),
         ),
         (
-            "[-90 deg, 60 deg]",
-            "[0.05 deg, 0.1 deg]",
+            ("[-90 deg, 60 deg]", "[0.05 deg, 0.1 deg]"),
             "[0.05 deg",
-            "error",
-            "no position of an AX-12A lies within the limits",
-            "wider than one tick (0.29 deg)",
+            ("error", "no position of an AX-12A lies within the limits", "wider than one tick (0.29 deg)"),
         ),
         (
-            "reference: 240 deg",
-            "reference: 150 deg",
+            ("reference: 240 deg", "reference: 150 deg"),
             "150 deg",
-            "warning",
-            "right_arm_joint is no mirror image of left_arm_joint: its reference is 150 deg, "
-            "mirrored it would be 240 deg",
-            "not symmetric",
+            (
+                "warning",
+                "right_arm_joint is no mirror image of left_arm_joint: its reference is 150 deg, mirrored it would be 240 deg",
+                "not symmetric",
+            ),
         ),
-        ("latency: 1 ms", "latency: 16 ms", "50}", "error", "takes 33.6 ms, but 50 Hz leave 20 ms", "1 ms"),
         (
-            "  main: {",
-            "  other: {port: sim, protocol: 1.0, baud_rate: 57600}\n  main: {",
+            ("latency: 1 ms", "latency: 16 ms"),
+            "50}",
+            ("error", "takes 33.6 ms, but 50 Hz leave 20 ms", "1 ms"),
+        ),
+        (
+            ("  main: {", "  other: {port: sim, protocol: 1.0, baud_rate: 57600}\n  main: {"),
             "other",
-            "warning",
-            "no joint stands on bus other",
-            "take it out",
+            ("warning", "no joint stands on bus other", "take it out"),
         ),
     ],
 )
 def test_one_mistake_is_one_problem_with_its_place(
-    problems_in: Find, robot_text: str, old: str, new: str, at: str, severity: str, what: str, mend: str
+    problems_in: Find, robot_text: str, change: tuple[str, str], at: str, says: tuple[str, str, str]
 ):
-    text = broken(robot_text, old, new)
+    text = broken(robot_text, *change)
+    severity, what, mend = says
 
     (problem,) = [p for p in problems_in(text) if p.severity == severity]
 
@@ -168,7 +168,9 @@ def test_twins_that_turn_the_same_way_are_pointed_out(problems_in: Find, robot_t
 
 def test_two_buses_cannot_share_a_port(problems_in: Find, robot_text: str):
     text = broken(
-        robot_text, "  main: {", "  other: {port: /dev/ttyUSB0, protocol: 1.0, baud_rate: 1_000_000}\n  main: {"
+        robot_text,
+        "  main: {",
+        "  other: {port: /dev/ttyUSB0, protocol: 1.0, baud_rate: 1_000_000}\n  main: {",
     )
 
     assert any("port /dev/ttyUSB0 of bus main belongs to bus other" in p.what for p in problems_in(text))

@@ -13,8 +13,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     0 good, 1 the robot or the run failed, 2 the input is wrong, 130 interrupted.
     """
-    tokens = list(sys.argv[1:] if arguments is None else arguments)
-    debug = "--debug" in tokens
     from dxlrun.cli.app import run_tokens  # not above: importing the package must cost nothing
 
-    return run_tokens([token for token in tokens if token != "--debug"], debug=debug)  # noqa: S105  # no secret
+    return run_tokens(tuple(sys.argv[1:] if arguments is None else arguments))

@@ -24,8 +24,7 @@ HELP = """Run a robot of Dynamixel servos from one YAML file.
 `dxlrun ROBOT.yaml` runs it, `dxlrun check ROBOT.yaml` looks at it without touching hardware,
 `dxlrun analyze LOG` says what happened in a run."""
 
-EPILOGUE = """`--debug` with any command prints the traceback of an error.
-Exit codes: 0 good, 1 the robot or the run failed, 2 the input is wrong, 130 interrupted."""
+EPILOGUE = """Exit codes: 0 good, 1 the robot or the run failed, 2 the input is wrong, 130 interrupted."""
 
 
 def build() -> App:
@@ -37,8 +36,8 @@ def build() -> App:
     return app
 
 
-def run_tokens(tokens: Sequence[str], *, debug: bool) -> int:
-    """Run one command line and return its exit code; nothing leaves here as a traceback unless `debug`."""
+def run_tokens(tokens: Sequence[str]) -> int:
+    """Run one command line and return its exit code; nothing leaves here as a traceback but with --debug."""
     app = build()
     try:
         if not tokens:
@@ -53,7 +52,7 @@ def run_tokens(tokens: Sequence[str], *, debug: bool) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except Exception as error:
-        if debug:
+        if "--debug" in tokens:
             traceback.print_exc()
         return _explain(error)
     return code if isinstance(code, int) else 0
@@ -70,7 +69,9 @@ def _explain(error: Exception) -> int:
             say_error(f"dxlrun: {line}")
         return error.exit_code
     if isinstance(error, CycloptsError):
-        say_error(f"dxlrun: {' '.join(str(error).split()).removesuffix('.')}; `dxlrun --help` shows the usage")
+        say_error(
+            f"dxlrun: {' '.join(str(error).split()).removesuffix('.')}; `dxlrun --help` shows the usage"
+        )
         return InputError.exit_code
     say_error(
         f"dxlrun: internal error: {type(error).__name__}: {error}; please report it, with what --debug prints"

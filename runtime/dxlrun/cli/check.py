@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
+from dxlrun.cli.flags import Flag, JsonFlag, Motions
 from dxlrun.cli.inputs import compiled
 from dxlrun.cli.terminal import out, say_warning
 from dxlrun.errors import InputError, Problem
@@ -21,9 +22,10 @@ def check(
     robot: Path,
     /,
     *assignments: Annotated[str, Parameter(name="arg:=value")],
-    play: Annotated[tuple[Path, ...], Parameter(negative=(), show_default=False)] = (),
+    play: Motions = (),
     duration: float | None = None,
-    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+    as_json: JsonFlag = False,
+    debug: Flag = False,
 ) -> int:
     """Check a robot file: joints, reach, controllers, claims, the time budget of each bus.
 
@@ -41,6 +43,8 @@ def check(
         As for a run: stop after this many seconds.
     as_json
         Print the result as JSON.
+    debug
+        Print the traceback of an error.
     """
     try:
         result = compiled(robot, assignments, play, duration)

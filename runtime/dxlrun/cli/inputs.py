@@ -58,5 +58,9 @@ def _known_file(robot: Path) -> None:
     if robot.suffix in (".yaml", ".yml") or len(robot.parts) > 1:
         raise InputError(f"there is no robot file {word}; check the path")
     close = difflib.get_close_matches(word, COMMANDS, n=1)
-    hint = f"did you mean {close[0]}?" if close else f"a robot is run by `dxlrun ROBOT.yaml`, the commands are {', '.join(COMMANDS)}"
+    hint = (
+        f"did you mean {close[0]}?"
+        if close
+        else f"a robot is run by `dxlrun ROBOT.yaml`, the commands are {', '.join(COMMANDS)}"
+    )
     raise InputError(f"{word!r} is neither a command nor a robot file; {hint}")

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
+from dxlrun.cli.flags import Flag, Motions
 from dxlrun.cli.inputs import compiled
 from dxlrun.cli.terminal import out, say_error, say_warning
 
@@ -21,10 +22,11 @@ def run(
     /,
     *assignments: Annotated[str, Parameter(name="arg:=value")],
     duration: float | None = None,
-    play: Annotated[tuple[Path, ...], Parameter(negative=(), show_default=False)] = (),
-    no_record: Annotated[bool, Parameter(negative=())] = False,
-    take_over: Annotated[bool, Parameter(negative=())] = False,
-    virtual: Annotated[bool, Parameter(negative=())] = False,
+    play: Motions = (),
+    no_record: Flag = False,
+    take_over: Flag = False,
+    virtual: Flag = False,
+    debug: Flag = False,
 ) -> int:
     """Run a robot until its motions have ended, or until Ctrl-C.
 
@@ -44,16 +46,24 @@ def run(
         Start although a servo has its torque on already.
     virtual
         Run on virtual time, as fast as the processor can; only with simulated buses.
+    debug
+        Print the traceback of an error, and what the processes said.
     """
     result = compiled(robot, assignments, play, duration)
     for warning in result.warnings:
         say_warning(str(warning))
     from dxlrun.run_summary import RunOptions
-    from dxlrun.supervisor import run_robot
 
-    options = RunOptions(record=not no_record, take_over=take_over)
+    options = RunOptions(record=not no_record, take_over=take_over, debug=debug)
     console = out()
-    summary = run_robot(result.plan, options, console)
+    if virtual:
+        from dxlrun.virtual_run import run_virtual
+
+        summary = run_virtual(result.plan, options)
+    else:
+        from dxlrun.supervisor import run_robot
+
+        summary = run_robot(result.plan, options, console)
     show(summary, result.plan.robot, console)
     return summary.exit_code
 

@@ -1,0 +1,223 @@
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dxlrun.compile import Compiled
+from dxlrun.errors import Problem
+
+Find = Callable[..., tuple[Problem, ...]]
+Compile = Callable[..., Compiled]
+
+POSVEL = """\
+name: wave
+motions:
+  - controller: arms
+    start: 2 s
+    points:
+      - time: 0 s
+        joints:
+          left_arm_joint: {position: 10 deg, velocity: 1 rad/s}
+          right_arm_joint: {position: 20 deg, velocity: 2 rad/s}
+      - time: 1500 ms
+        joints:
+          right_arm_joint: {position: 30 deg, velocity: 3 rad/s}
+"""
+TRAJECTORY = """\
+name: swing
+motions:
+  - controller: spare
+    start: 3 s
+    duration: 4 s
+    samples: 5
+    joints:
+      left_arm_joint: {position: 0.5 * sin(t), velocity: 0.5 * cos(t)}
+      right_arm_joint: {position: t / 10, velocity: 0.1}
+"""
+
+
+@pytest.fixture
+def trajectory_robot(robot_text: str) -> str:
+    return robot_text.replace("active: false", "active: true").replace(
+        "    type: joint_group_posvel_controller\n",
+        "    type: joint_group_posvel_controller\n    active: false\n",
+    )
+
+
+def floats(data: bytes) -> list[float]:
+    return list(np.frombuffer(data, dtype="<f8"))
+
+
+def test_points_for_a_group_controller_become_one_command_each(compile_text: Compile, robot_text: str):
+    plan = compile_text(robot_text, POSVEL).plan.loop
+
+    first, second = plan.commands
+    assert (first.at_ns, second.at_ns) == (2_000_000_000, 3_500_000_000)
+    assert (first.controller, first.kind) == ("arms", "posvel")
+    assert floats(first.data) == pytest.approx([math.radians(10), math.radians(20), 1.0, 2.0])
+    # what the second point does not name keeps its target
+    assert floats(second.data) == pytest.approx([math.radians(10), math.radians(30), 1.0, 3.0])
+    assert second.origin.endswith("motion0.yaml:10:9")
+    assert plan.end_ns == 4_500_000_000  # 1 s to settle
+
+
+def test_formulas_for_a_group_controller_become_one_command_a_sample(compile_text: Compile, robot_text: str):
+    motion = TRAJECTORY.replace("spare", "arms")
+
+    commands = compile_text(robot_text, motion).plan.loop.commands
+
+    assert [c.at_ns for c in commands] == [3_000_000_000 + i * 1_000_000_000 for i in range(5)]
+    for t, command in enumerate(commands):
+        expected = [0.5 * math.sin(t), t / 10, 0.5 * math.cos(t), 0.1]
+        assert floats(command.data) == pytest.approx(expected)
+
+
+def test_formulas_for_a_trajectory_controller_become_one_trajectory(
+    compile_text: Compile, trajectory_robot: str
+):
+    from dxlrun_controllers.spline import Sample, Trajectory
+
+    compiled = compile_text(trajectory_robot, TRAJECTORY)
+
+    (command,) = compiled.plan.loop.commands
+    assert (command.at_ns, command.kind) == (3_000_000_000, "trajectory")
+    trajectory, sample = Trajectory(2), Sample(2)
+    trajectory.load(np.frombuffer(command.data, dtype="<f8"), Sample(2))
+    for t in range(5):
+        trajectory.sample(1.0 + t, sample)  # it begins 1 s after it was handed over
+        assert sample.position == pytest.approx([0.5 * math.sin(t), t / 10])
+        if t < 4:  # at its end it rests
+            assert sample.velocity == pytest.approx([0.5 * math.cos(t), 0.1])
+    # 3 s start, 1 s lead, 4 s long, 1 s to settle
+    assert compiled.plan.loop.end_ns == 9_000_000_000
+    assert compiled.report.motions[0].points == 5
+
+
+def test_a_trajectory_that_begins_later_than_zero_needs_no_lead(compile_text: Compile, trajectory_robot: str):
+    motion = """\
+    name: later
+    motions:
+      - controller: spare
+        points:
+          - {time: 2 s, joints: {left_arm_joint: {position: 0 rad}, right_arm_joint: {position: 0 rad}}}
+    """
+
+    assert compile_text(trajectory_robot, motion).plan.loop.end_ns == 3_000_000_000
+
+
+def test_the_goal_time_of_the_controller_ends_the_part(compile_text: Compile, trajectory_robot: str):
+    text = trajectory_robot.replace("active: true\n", "active: true\n    tolerances: {goal_time: 5 s}\n")
+
+    assert compile_text(text, TRAJECTORY).plan.loop.end_ns == 13_000_000_000
+
+
+def test_duration_overrules_the_end_of_the_motions(compile_text: Compile, robot_text: str):
+    assert compile_text(robot_text, POSVEL, duration_ns=7).plan.loop.end_ns == 7
+    assert compile_text(robot_text).plan.loop.end_ns is None
+
+
+def test_commands_of_several_files_are_sorted_by_time(compile_text: Compile, robot_text: str):
+    early = POSVEL.replace("start: 2 s", "start: 1 s")
+
+    times = [c.at_ns for c in compile_text(robot_text, POSVEL, early).plan.loop.commands]
+
+    assert times == sorted(times)
+    assert len(times) == 4
+
+
+@pytest.mark.parametrize(
+    ("change", "at", "says"),
+    [
+        (("controller: arms", "controller: arm"), (3, 17), ("no controller arm", "did you mean arms?")),
+        (
+            ("controller: arms", "controller: spare"),
+            (3, 17),
+            ("spare is not active at start", "active: true"),
+        ),
+        (
+            ("controller: arms", "controller: states"),
+            (3, 17),
+            ("takes no commands", "choose a group controller"),
+        ),
+        (("time: 1500 ms", "time: 0 ms"), (10, 15), ("not after", "sort")),
+        (
+            ("joints:\n          right_arm_joint", "joints:\n          right_arm_jiont"),
+            (12, 11),
+            ("arms does not move right_arm_jiont", "did you mean right_arm_joint?"),
+        ),
+        (
+            ("          left_arm_joint: {position: 10 deg, velocity: 1 rad/s}\n", ""),
+            (6, 9),
+            ("left_arm_joint has no target position at 0 s", "give it one"),
+        ),
+        (
+            (", velocity: 3 rad/s", ""),
+            (12, 11),
+            ("right_arm_joint has no target velocity at 1.5 s", "give it one"),
+        ),
+        (
+            ("velocity: 3 rad/s", "velocity: 3 rad/s, acceleration: 1 rad/s^2"),
+            (12, 11),
+            ("target acceleration, which this controller does not take", "take the acceleration out"),
+        ),
+    ],
+)
+def test_one_mistake_in_points_is_one_error(
+    problems_in: Find, robot_text: str, change: tuple[str, str], at: tuple[int, int], says: tuple[str, str]
+):
+    assert POSVEL.count(change[0]) == 1
+
+    (problem,) = problems_in(robot_text, POSVEL.replace(*change))
+
+    assert problem.severity == "error"
+    assert problem.mark.file.endswith("motion0.yaml")
+    assert (problem.mark.line, problem.mark.column) == at
+    assert says[0] in problem.what
+    assert says[1] in problem.mend
+
+
+@pytest.mark.parametrize(
+    ("formula", "what"),
+    [
+        ("1 / (t - 2)", "formula '1 / (t - 2)' has no value at t = 2 s: division by zero"),
+        ("sin(x)", "formula 'sin(x)' cannot be read: unknown name x"),
+        ("sqrt(1 - t)", "formula 'sqrt(1 - t)' has no value at t = 2 s"),
+    ],
+)
+def test_a_formula_without_a_value_is_named_with_its_time(
+    problems_in: Find, robot_text: str, formula: str, what: str
+):
+    motion = TRAJECTORY.replace("spare", "arms").replace("t / 10", formula)
+
+    (problem,) = problems_in(robot_text, motion)
+
+    assert (problem.mark.line, problem.mark.column) == (9, 35)
+    assert problem.what.startswith(what)
+
+
+def test_a_target_outside_the_limits_is_a_warning_with_joint_time_and_value(
+    problems_in: Find, robot_text: str
+):
+    motion = POSVEL.replace("30 deg", "75 deg")
+
+    (problem,) = problems_in(robot_text, motion)
+
+    assert problem.severity == "warning"
+    assert problem.what == "right_arm_joint is sent to 75 deg at 3.500 s, outside its limits -90..+60 deg"
+    assert (problem.mark.line, problem.mark.column) == (12, 11)
+
+
+def test_the_worst_sample_of_a_formula_is_named(problems_in: Find, robot_text: str):
+    motion = TRAJECTORY.replace("spare", "arms").replace("t / 10", "t")
+
+    (problem,) = problems_in(robot_text, motion)
+
+    assert "right_arm_joint is sent to 229.18 deg at 7.000 s" in problem.what
+
+
+def test_problems_of_robot_and_motion_files_come_together(problems_in: Find, robot_text: str):
+    found = problems_in(robot_text.replace("id: 2", "id: 1"), POSVEL + "x: 1\n")
+
+    assert sorted(Path(p.mark.file).name for p in found) == ["motion0.yaml", "robot.yaml"]

@@ -1,0 +1,109 @@
+from collections.abc import Callable
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+from dxlrun import CommandModel, Controller, Interfaces, ParametersModel
+from dxlrun.compile import Compiled, robot
+from dxlrun.control.plugins import Offer, PlugIns, load_plugins
+from dxlrun.errors import Problem
+
+Find = Callable[..., tuple[Problem, ...]]
+
+
+class Goals(CommandModel):
+    positions: tuple[float, ...]
+
+
+class Foreign(Controller[ParametersModel]):
+    Commands: ClassVar = {"goals": Goals}
+
+    @classmethod
+    def interfaces(cls, parameters, joints):
+        return Interfaces(joints, ("position",))
+
+    @classmethod
+    def prepare(cls, kind, command, parameters):
+        if command.positions[0] > 1:
+            raise ValueError("more than one is too much")
+        return np.array(command.positions)
+
+    def update(self, time_ns, period_ns):
+        pass
+
+
+class Raising(Foreign):
+    @classmethod
+    def interfaces(cls, parameters, joints):
+        raise RuntimeError("not today")
+
+
+@pytest.fixture
+def foreign_plugins(monkeypatch: pytest.MonkeyPatch):
+    offers = dict(load_plugins().controllers)
+    offers["foreign"] = Offer("foreign", Foreign, "elsewhere 2.1")
+    offers["raising"] = Offer("raising", Raising, "elsewhere 2.1")
+    plugins = PlugIns(offers, {"sad": "plug-in sad of sad-robots 0.3 cannot be imported; reinstall it"})
+    monkeypatch.setattr(robot, "load_plugins", lambda: plugins)
+
+
+@pytest.fixture
+def text(robot_text: str) -> str:
+    head = robot_text.partition("controllers:")[0]
+    return head + "controllers:\n  mine: {type: foreign}\n"
+
+
+MOTION = """\
+name: m
+motions:
+  - controller: mine
+    points: [{time: 0 s, joints: {left_arm_joint: {position: 1 rad}, right_arm_joint: {position: 0 rad}}}]
+"""
+
+
+@pytest.mark.usefixtures("foreign_plugins")
+def test_a_controller_of_another_package_is_compiled_and_played(
+    compile_text: Callable[..., Compiled], text: str
+):
+    plan = compile_text(text, MOTION).plan.loop
+
+    (controller,) = plan.controllers
+    assert (controller.distribution, controller.command) == ("elsewhere 2.1", ("position",))
+    assert controller.joints == ("left_arm_joint", "right_arm_joint")
+    assert list(np.frombuffer(plan.commands[0].data)) == [1.0, 0.0]
+
+
+@pytest.mark.usefixtures("foreign_plugins")
+def test_what_its_prepare_refuses_is_an_error_of_the_motion(problems_in: Find, text: str):
+    (problem,) = problems_in(text, MOTION.replace("1 rad", "1.04 rad"))
+
+    assert problem.what == "mine refuses this: more than one is too much"
+    assert (problem.mark.line, problem.mark.column) == (4, 14)
+
+
+@pytest.mark.usefixtures("foreign_plugins")
+def test_what_its_interfaces_raise_is_an_error_of_the_file(problems_in: Find, text: str):
+    (problem,) = problems_in(text.replace("foreign", "raising"))
+
+    assert "controller mine (elsewhere 2.1) cannot say what it needs: RuntimeError: not today" in problem.what
+    assert (problem.mark.line, problem.mark.column) == (20, 3)
+
+
+@pytest.mark.usefixtures("foreign_plugins")
+def test_an_unknown_type_names_the_broken_plug_ins(problems_in: Find, text: str):
+    (problem,) = problems_in(text.replace("foreign", "sad_controller"))
+
+    assert "sad of sad-robots 0.3 cannot be imported" in problem.mend
+
+
+@pytest.mark.usefixtures("foreign_plugins")
+def test_parameters_travel_as_they_were_written(compile_text: Callable[..., Compiled], robot_text: str):
+    text = robot_text.replace("    active: false\n", "    active: false\n    tolerances: {goal: 5 deg}\n")
+
+    spare = compile_text(text).plan.loop.controllers[2]
+
+    offer = load_plugins().controllers[spare.type].controller
+    assert offer.Parameters.model_validate_json(spare.parameters).tolerances.goal == pytest.approx(
+        np.radians(5)
+    )
