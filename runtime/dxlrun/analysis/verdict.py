@@ -1,0 +1,133 @@
+"""The verdict: what a person wants to know first, in sentences.
+
+Thresholds: the loop *kept* its rate when no period was skipped and none is unaccounted for; wake-ups are
+*rough* when more than 1 % are later than 150 us (M. A. Araujo, UFU 2017, measured at 1 kHz under stress 1.74 %
+on a stock kernel and none on a real-time kernel); a servo is *named* when a single reply of it is missing or carries an error bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from dxlrun.analysis.bus import Servo
+from dxlrun.analysis.latency import Latency, Periods
+from dxlrun.events import Event, Severity
+from dxlrun.recording.reader import Log
+
+ROUGH_SHARE = 0.01
+_MOST_NAMED = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Sentences for a person; `good` when there is nothing to look into."""
+
+    good: bool
+    sentences: tuple[str, ...]
+
+
+def verdict(
+    account: Periods, wake_ups: Latency | None, servos: Sequence[Servo], log: Log, lost: int
+) -> Verdict:
+    """Return the sentences: loop, servos, events, log; each says what is good as plainly as what is not."""
+    findings = [
+        _loop(account, wake_ups),
+        _rough(wake_ups),
+        _silent(servos),
+        _errors(servos),
+        _events(log.events),
+        _log(account, log, lost),
+    ]
+    said = [finding for finding in findings if finding is not None]
+    return Verdict(all(good for good, _ in said), tuple(sentence for _, sentence in said))
+
+
+Finding = tuple[bool, str]
+
+
+def _loop(account: Periods, wake_ups: Latency | None) -> Finding:
+    if wake_ups is None:
+        return False, "The loop never ran a cycle."
+    good = account.skipped == 0
+    kept = "kept" if good else "did not keep"
+    return good, (
+        f"The loop {kept} {account.rate_hz:g} Hz: {account.skipped} of {account.elapsed} periods skipped"
+        f"{'' if good else f' ({account.skipped / account.elapsed:.2%})'}, "
+        f"worst wake-up {microseconds(wake_ups.max_us)} late."
+    )
+
+
+def _rough(wake_ups: Latency | None) -> Finding | None:
+    if wake_ups is None or wake_ups.share_over_150_us <= ROUGH_SHARE:
+        return None
+    return False, (
+        f"Wake-ups are rough: {wake_ups.share_over_150_us:.1%} came later than 150 us; "
+        "a real-time kernel and a real-time scheduler help."
+    )
+
+
+def _silent(servos: Sequence[Servo]) -> Finding | None:
+    asked = [servo for servo in servos if servo.asked]
+    if not asked:
+        return None
+    losers = sorted((servo for servo in asked if servo.lost), key=lambda servo: -servo.lost)
+    if not losers:
+        return True, f"{_all(len(asked))} answered every time."
+    named = ", ".join(
+        f"{_name(servo)} {servo.lost} of {servo.asked} times ({servo.lost / servo.asked:.2%})"
+        for servo in losers[:_MOST_NAMED]
+    )
+    more = f", and {len(losers) - _MOST_NAMED} more servos" if len(losers) > _MOST_NAMED else ""
+    return (
+        False,
+        f"Replies are missing: {named}{more}; the other {len(asked) - len(losers)} answered every time.",
+    )
+
+
+def _all(count: int) -> str:
+    return "The servo" if count == 1 else f"All {count} servos"
+
+
+def _errors(servos: Sequence[Servo]) -> Finding | None:
+    troubled = [servo for servo in servos if servo.errors]
+    if not troubled:
+        return None
+    named = "; ".join(
+        f"{_name(servo)}: {', '.join(servo.error_names) or 'unknown bit'} in {servo.errors} replies"
+        for servo in troubled[:_MOST_NAMED]
+    )
+    more = f"; and {len(troubled) - _MOST_NAMED} more servos" if len(troubled) > _MOST_NAMED else ""
+    return False, f"Servos reported errors: {named}{more}."
+
+
+def _name(servo: Servo) -> str:
+    return f"servo {servo.servo_id} ({servo.joint or servo.bus})"
+
+
+def _events(events: Sequence[Event]) -> Finding | None:
+    grave = [event for event in events if event.severity >= Severity.ERROR]
+    if not grave:
+        return None
+    first = grave[0]
+    line = first.text.strip().splitlines()[-1] if first.text.strip() else first.name
+    number = "One error was" if len(grave) == 1 else f"{len(grave)} errors were"
+    return False, f"{number} logged; the first, of {first.source}: {line}"
+
+
+def _log(account: Periods, log: Log, lost: int) -> Finding | None:
+    faults = list(log.damage)
+    if lost:
+        faults.append(f"{lost} records were lost on the way to the recorder")
+    if not account.agree:
+        faults.append(f"{account.missing} periods are neither recorded nor declared skipped")
+    if not faults:
+        return None
+    return False, f"The log is not whole: {'; '.join(faults)}."
+
+
+def microseconds(value: float) -> str:
+    """Return a time in us as a person writes it: us, ms or s."""
+    if value >= 1e6:
+        return f"{value / 1e6:.2f} s"
+    return f"{value / 1e3:.2f} ms" if value >= 1e4 else f"{value:.0f} us"
