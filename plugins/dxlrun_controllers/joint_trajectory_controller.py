@@ -145,7 +145,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             np.copyto(self.context.commands.velocity, self._closing)
 
     def _worst(self, silent: float) -> float:
-        """Return the largest distance from what is wanted, rad; `silent` stands in for a joint without reply."""
+        """Return the largest distance from what is wanted, rad; `silent` for a joint without reply."""
         states, error = self.context.states, self._error
         np.subtract(states.position, self._wanted.position, out=error)
         np.abs(error, out=error)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+
 from dxlrun.clock import VirtualClock
 from dxlrun.control.controller import Controller, Interfaces, ParametersModel
 from dxlrun.control.gate import Gate
@@ -150,9 +151,7 @@ class Robot:
         self._controllers.append(plan)
         self._offers[name] = Offer(name, controller, "tests 1")
 
-    def script(
-        self, name: str, act: Callable[[Scripted, str, int, Any], None], **options: Any
-    ) -> None:
+    def script(self, name: str, act: Callable[[Scripted, str, int, Any], None], **options: Any) -> None:
         """Add a controller that calls `act(controller, step, time_ns, period or data)`."""
         self.add(name, type("OneScript", (Scripted,), {"act": act}), **options)
 

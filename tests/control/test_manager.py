@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from dxlrun.control.claims import Conflict, conflicts
 from dxlrun.errors import ControllerFault, PlugInError
 from dxlrun.events import EventCode
@@ -39,7 +40,7 @@ def test_an_inactive_controller_and_one_that_only_looks_may_share_joints(robot):
     robot.script("spare", idle, active=False)
     robot.script("viewer", idle, command=())
     robot.build()
-    assert [conflict for conflict in conflicts(robot.plan.controllers)] == [
+    assert list(conflicts(robot.plan.controllers)) == [
         Conflict("j0", "first", "spare"),
         Conflict("j1", "first", "spare"),
     ]
@@ -254,7 +255,7 @@ def test_a_type_that_nobody_offers_is_named_with_the_broken_plugins(robot):
 
 def test_parameters_that_do_not_fit_are_refused(robot):
     robot.add("strict", type(robot).scripted(), parameters='{"surplus": 1}')
-    with pytest.raises(PlugInError, match="strict.*\n.*surplus"):
+    with pytest.raises(PlugInError, match=r"strict.*\n.*surplus"):
         robot.build()
 
 

@@ -71,7 +71,7 @@ class Gate:
         self._position(commands.position, goals.position, dt_ns)
         self._velocity(commands.velocity, goals.velocity)
         np.copyto(self._record.clamped, flags)
-        if flags.any():
+        if np.count_nonzero(flags):
             self._note(flags & ~self._before)
         np.copyto(self._before, flags)
 
@@ -88,7 +88,8 @@ class Gate:
         self._flag(Clamp.LOWER)
         np.greater(self._wanted, high, out=self._mask)
         self._flag(Clamp.UPPER)
-        np.clip(self._wanted, low, high, out=inside)
+        np.maximum(self._wanted, low, out=inside)
+        np.minimum(inside, high, out=inside)
         np.multiply(self._speed if self._slow_ns <= 0 else self._slow, max(dt_ns, 1) * 1e-9, out=step)
         self._slow_ns = max(0, self._slow_ns - dt_ns)
         np.subtract(goal, step, out=low)
@@ -116,7 +117,7 @@ class Gate:
         np.copyto(goal, speed, where=self._finite)
 
     def _flag(self, bit: Clamp) -> None:
-        if self._mask.any():
+        if np.count_nonzero(self._mask):  # a tenth of the time of any()
             self._flags[self._mask] |= np.uint8(bit)
 
     def _note(self, begun: NDArray[np.uint8]) -> None:

@@ -1,0 +1,30 @@
+"""The face of the package: sorted, complete, and light."""
+
+import subprocess
+import sys
+
+import pytest
+
+import dxlrun
+
+
+def test_every_name_is_there_and_constants_come_first():
+    assert list(dxlrun.__all__) == sorted(dxlrun.__all__, key=lambda name: (not name.isupper(), name))
+    for name in dxlrun.__all__:
+        assert getattr(dxlrun, name) is not None
+    assert set(dxlrun.__all__) <= set(dir(dxlrun))
+    assert set(dxlrun._HOME) == set(dxlrun.__all__)
+
+
+def test_an_unknown_name_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="'dxlrun' has no attribute 'nonsense'"):
+        dxlrun.nonsense  # noqa: B018  # the access is what is tested
+
+
+@pytest.mark.parametrize("module", ["dxlrun", "dxlrun.control.realtime"])
+def test_importing_it_loads_neither_numpy_nor_pydantic(module):
+    script = f"import sys, {module}; print([m for m in ('numpy', 'pydantic', 'pluggy') if m in sys.modules])"
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert done.stdout.strip() == "[]"

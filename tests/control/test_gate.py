@@ -1,0 +1,175 @@
+"""The last gate: whatever comes in, what goes out is finite, inside the limits and near the last goal."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dxlrun.control.gate import SLOW_SPEED, SLOW_START_NS, Gate
+from dxlrun.control.loop_plan import ControllerPlan, JointPlan, LoopPlan, SchedulerPlan
+from dxlrun.cycle import Clamp, CycleLayout, CycleRecord
+from dxlrun.events import EventCode
+
+DT_NS = 20_000_000
+DT = DT_NS * 1e-9
+
+
+class Rig:
+    def __init__(self, lower=-1.0, upper=1.0, velocity=None, *, start=0.0, joints=1, eased=True):
+        names = tuple(f"j{row}" for row in range(joints))
+        controllers = tuple(
+            ControllerPlan(name, "t", "d 1", "{}", names, ("position",), (), True, 1) for name in ("a", "b")
+        )
+        plan = LoopPlan(
+            DT_NS,
+            SchedulerPlan("other", 31, False),
+            tuple(JointPlan(name, lower, upper, velocity) for name in names),
+            controllers,
+            (),
+            None,
+        )
+        self.record = CycleRecord(CycleLayout(names, ("a", "b")))
+        self.record.active = 2
+        self.record.goals.position[:] = start
+        self.events = []
+        self.gate = Gate(plan, self.record, self)
+        if eased:
+            self.wait(SLOW_START_NS)
+
+    def emit(self, code, severity, source, text):
+        assert code == EventCode.GATE
+        self.events.append((source, text))
+
+    def wait(self, duration_ns):
+        self.record.commands.position[:] = np.nan
+        self.gate.apply(self.record.commands, self.record.goals, duration_ns)
+
+    def apply(self, position, velocity=np.nan):
+        self.record.commands.position[:] = position
+        self.record.commands.velocity[:] = velocity
+        self.gate.apply(self.record.commands, self.record.goals, DT_NS)
+        return (
+            self.record.goals.position[0],
+            self.record.goals.velocity[0],
+            Clamp(int(self.record.clamped[0])),
+        )
+
+
+any_float = st.floats(allow_nan=True, allow_infinity=True, width=64)
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    limits=st.tuples(st.floats(-4, 0), st.floats(0.001, 4)),
+    velocity=st.none() | st.floats(0.01, 20),
+    start=st.floats(0, 1),
+    commands=st.lists(st.tuples(any_float, any_float), min_size=1, max_size=12),
+    eased=st.booleans(),
+)
+def test_goals_are_finite_inside_the_limits_and_near_the_last_goal(limits, velocity, start, commands, eased):
+    lower, upper = limits
+    last = min(max(lower + start * (upper - lower), lower), upper)
+    rig = Rig(lower, upper, velocity, start=last, eased=eased)
+    speed = min(velocity or np.inf, np.inf if eased else SLOW_SPEED)
+    for position, wanted in commands:
+        goal, goal_velocity, _ = rig.apply(position, wanted)
+        assert lower <= goal <= upper
+        assert abs(goal - last) <= speed * DT * (1 + 1e-9) + 1e-15
+        assert np.isnan(goal_velocity) or 0 <= goal_velocity <= (velocity or np.inf)
+        assert not np.isinf(goal_velocity)
+        last = goal
+
+
+@settings(max_examples=100, deadline=None)
+@given(start=st.floats(-6, 6), commands=st.lists(any_float, min_size=1, max_size=12))
+def test_a_goal_that_starts_outside_never_moves_further_out(start, commands):
+    rig = Rig(start=start)
+    outside = max(0.0, abs(start) - 1.0)
+    for position in commands:
+        goal, _, _ = rig.apply(position)
+        assert abs(goal) - 1.0 <= outside
+        outside = max(0.0, abs(goal) - 1.0)
+
+
+@settings(max_examples=100, deadline=None)
+@given(position=st.floats(-1, 1), velocity=st.floats(-5, 5) | st.just(np.nan))
+def test_what_is_inside_all_limits_passes_unchanged(position, velocity):
+    rig = Rig(velocity=None)
+    goal, goal_velocity, clamped = rig.apply(position, velocity)
+    assert (goal, clamped) == (position, Clamp(0))
+    np.testing.assert_equal(goal_velocity, abs(velocity))
+    assert rig.events == []
+
+
+def test_a_joint_that_hangs_outside_its_limits_may_be_held_there():
+    rig = Rig(start=1.2)
+    assert rig.apply(1.2) == (1.2, pytest.approx(np.nan, nan_ok=True), Clamp(0))
+    assert rig.apply(1.1)[0] == 1.1
+    assert rig.apply(1.2)[0] == 1.1
+    assert rig.apply(0.5)[0] == 0.5
+
+
+@pytest.mark.parametrize(
+    ("command", "goal", "clamp", "words"),
+    [
+        ((-3.0, 0.5), (-1.0, 0.5), Clamp.LOWER, "raised to the lower position limit"),
+        ((3.0, 0.5), (1.0, 0.5), Clamp.UPPER, "lowered to the upper position limit"),
+        ((0.01, 9.0), (0.01, 200.0 / 25), Clamp.VELOCITY, "held to the velocity limit"),
+        ((np.inf, 0.5), (0.0, np.nan), Clamp.NOT_FINITE, "was not finite, the last goal is kept"),
+        ((0.01, np.inf), (0.01, np.nan), Clamp.NOT_FINITE, "was not finite, the last goal is kept"),
+    ],
+)
+def test_each_clamping_is_flagged_told_and_counted(command, goal, clamp, words):
+    rig = Rig(velocity=8.0 if clamp == Clamp.VELOCITY else None)
+    *found, flags = rig.apply(*command)
+    np.testing.assert_allclose(found, goal)
+    assert flags == clamp
+    assert rig.events == [("j0", f"j0, controller b: {words}")]
+    assert rig.gate.counts.sum() == 1
+
+
+def test_a_step_beyond_the_velocity_limit_is_walked_in_steps():
+    rig = Rig(velocity=2.0)
+    goals = [rig.apply(0.1) for _ in range(4)]
+    np.testing.assert_allclose([goal for goal, _, _ in goals], [0.04, 0.08, 0.1, 0.1])
+    assert [flags for *_, flags in goals] == [Clamp.STEP, Clamp.STEP, Clamp(0), Clamp(0)]
+    assert rig.events == [("j0", "j0, controller b: held to the step limit")]
+
+
+def test_each_beginning_of_a_clamping_is_told_once():
+    rig = Rig()
+    for position in (3.0, 3.0, 0.0, 3.0, -3.0):
+        rig.apply(position)
+    assert [text.split()[3] for _, text in rig.events] == ["lowered", "lowered", "raised"]
+    assert rig.gate.counts[0].tolist() == [1, 3, 0, 0, 0]
+
+
+def test_the_first_second_is_slow_even_without_a_velocity_limit():
+    rig = Rig(eased=False)
+    for number in range(1, 51):
+        goal, _, _ = rig.apply(1.0)
+        np.testing.assert_allclose(goal, min(1.0, number * SLOW_SPEED * DT))
+    rig = Rig(eased=False)
+    rig.wait(SLOW_START_NS)
+    assert rig.apply(1.0)[0] == 1.0
+    rig.gate.ease_in()
+    assert rig.apply(-1.0)[0] == pytest.approx(1.0 - SLOW_SPEED * DT)
+
+
+def test_a_position_only_command_inherits_no_speed():
+    rig = Rig()
+    assert rig.apply(0.1, 0.5)[1] == 0.5
+    assert np.isnan(rig.apply(0.2)[1])
+
+
+def test_an_uncommanded_joint_keeps_position_and_speed():
+    rig = Rig()
+    rig.apply(0.1, 0.5)
+    assert rig.apply(np.nan, 0.9) == (0.1, 0.5, Clamp(0))
+
+
+def test_what_the_manager_found_not_finite_stays_flagged():
+    rig = Rig(joints=2)
+    rig.record.clamped[1] = Clamp.NOT_FINITE | Clamp.STEP
+    rig.apply(np.nan)
+    assert rig.record.clamped.tolist() == [0, Clamp.NOT_FINITE]

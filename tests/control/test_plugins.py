@@ -1,0 +1,132 @@
+"""Plug-ins are found one by one; a broken one is named, and never takes the others along."""
+
+import sys
+
+import pytest
+
+from dxlrun.control.plugins import load_plugins
+
+GOOD = """
+from dxlrun import Controller, Interfaces, hookimpl
+
+class Mine(Controller):
+    @classmethod
+    def interfaces(cls, parameters, joints):
+        return Interfaces(joints)
+    def update(self, time_ns, period_ns):
+        pass
+
+@hookimpl
+def dxlrun_contract():
+    return 1
+
+@hookimpl
+def dxlrun_controllers():
+    return {"TYPE": Mine}
+"""
+
+
+@pytest.fixture
+def install(tmp_path, monkeypatch):
+    """Return a function that installs a distribution with one plug-in, as pip would leave it."""
+    monkeypatch.syspath_prepend(tmp_path)
+    modules = set(sys.modules)
+
+    def put(distribution, module, source, version="2.5"):
+        (tmp_path / f"{module}.py").write_text(source)
+        info = tmp_path / f"{distribution.replace('-', '_')}-{version}.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {distribution}\nVersion: {version}\n")
+        (info / "entry_points.txt").write_text(f"[dxlrun]\n{module}_entry = {module}\n")
+
+    yield put
+    for name in set(sys.modules) - modules:
+        if getattr(sys.modules[name], "__file__", None) and str(tmp_path) in str(sys.modules[name].__file__):
+            del sys.modules[name]
+
+
+STANDARD = {
+    "joint_group_position_controller",
+    "joint_group_posvel_controller",
+    "joint_state_broadcaster",
+    "joint_trajectory_controller",
+}
+
+
+def test_the_standard_controllers_enter_by_the_same_door():
+    found = load_plugins()
+    assert set(found.controllers) >= STANDARD
+    assert found.controllers["joint_state_broadcaster"].distribution.startswith("dxlrun ")
+
+
+def test_a_foreign_plugin_is_offered_with_its_publisher(install):
+    install("my-robotics", "my_plugin", GOOD.replace("TYPE", "my_type"))
+    offer = load_plugins().controllers["my_type"]
+    assert (offer.type, offer.controller.__name__, offer.distribution) == (
+        "my_type",
+        "Mine",
+        "my-robotics 2.5",
+    )
+
+
+BROKEN = {
+    "cannot be imported (ModuleNotFoundError: No module named 'no_such_thing')": "import no_such_thing",
+    "cannot be imported (SyntaxError": "def",
+    "cannot be imported (SystemExit: 3)": "import sys; sys.exit(3)",
+    "does not say for which contract": GOOD.replace("def dxlrun_contract", "def contract").replace(
+        "@hookimpl\ndef contract", "def contract"
+    ),
+    "was written for contract 7, this dxlrun has contract 1": GOOD.replace("return 1", "return 7"),
+    "has a wrong hook": GOOD.replace("def dxlrun_controllers()", "def dxlrun_controllers(robot)"),
+    "dxlrun_sensors": GOOD + "\n@hookimpl\ndef dxlrun_sensors():\n    pass\n",
+    "raised in a hook (ZeroDivisionError: division by zero)": GOOD.replace('{"TYPE": Mine}', "1 / 0"),
+    "does not return a mapping": GOOD.replace('{"TYPE": Mine}', "[Mine]"),
+    "which is no controller": GOOD.replace('{"TYPE": Mine}', '{"odd": dict}'),
+    "the type must be a string": GOOD.replace('{"TYPE": Mine}', "{5: Mine}"),
+}
+
+
+@pytest.mark.parametrize(("sentence", "source"), BROKEN.items(), ids=range(len(BROKEN)))
+def test_a_broken_plugin_is_named_and_the_others_work(install, sentence, source):
+    install("broken-one", "broken_plugin", source)
+    install("my-robotics", "my_plugin", GOOD.replace("TYPE", "my_type"))
+    found = load_plugins()
+    assert set(found.broken) == {"broken_plugin_entry"}
+    told = found.broken["broken_plugin_entry"]
+    assert "plug-in broken_plugin_entry of broken-one 2.5" in told
+    assert sentence in told
+    assert "\n" not in told
+    assert set(found.controllers) >= {"my_type", *STANDARD}
+
+
+def test_a_type_that_two_plugins_offer_is_nobodys(install):
+    install("my-robotics", "my_plugin", GOOD.replace("TYPE", "joint_state_broadcaster"))
+    found = load_plugins()
+    assert set(found.controllers) >= STANDARD - {"joint_state_broadcaster"}
+    assert "joint_state_broadcaster" not in found.controllers
+    told = found.broken["joint_state_broadcaster"]
+    assert "dxlrun 0" in told
+    assert "my-robotics 2.5" in told
+
+
+def test_each_load_is_told_before_the_next_one(install):
+    install("a-first", "first_plugin", "import second_plugin_was_not_there")
+    install("b-second", "second_plugin", GOOD)
+    told = []
+
+    def after_each(name):
+        told.append((name, "second_plugin" in sys.modules))
+
+    load_plugins(after_each)
+    assert told[:2] == [
+        ("first_plugin_entry (a-first 2.5)", False),
+        ("second_plugin_entry (b-second 2.5)", True),
+    ]
+
+
+def test_what_the_check_after_a_load_raises_passes_through():
+    def refuse(name):
+        raise RuntimeError(name)
+
+    with pytest.raises(RuntimeError, match=r"standard_controllers \(dxlrun"):
+        load_plugins(refuse)

@@ -1,0 +1,94 @@
+"""Group controllers and the broadcaster: hold first, then forward what was sent."""
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from dxlrun_controllers.group import JointGroupPositionController, JointGroupPosVelController
+from dxlrun_controllers.joint_state_broadcaster import JointStateBroadcaster
+
+TWO = {"joints": ["a", "b"]}
+
+
+def test_what_they_claim():
+    position = JointGroupPositionController.Parameters.model_validate(TWO)
+    both = JointGroupPosVelController.interfaces(position, ("a", "b", "c"))
+    assert (both.joints, both.command) == (("a", "b"), ("position", "velocity"))
+    one = JointGroupPositionController.interfaces(position, ("a", "b", "c"))
+    assert (one.joints, one.command) == (("a", "b"), ("position",))
+    looks = JointStateBroadcaster.interfaces(JointStateBroadcaster.Parameters(), ("a", "b", "c"))
+    assert (looks.joints, looks.command) == (("a", "b", "c"), ())
+
+
+@pytest.mark.parametrize("group", [JointGroupPositionController, JointGroupPosVelController])
+def test_they_start_by_holding_the_present_goal_and_never_drive_to_zero(stage, group):
+    robot = stage(group, TWO)
+    robot.context.states.position[:] = 0.31, -0.19
+    robot.controller.on_activate(0)
+    np.testing.assert_array_equal(robot.update(0.0), [0.3, -0.2])
+    assert np.isnan(robot.context.commands.velocity).all()
+
+
+def test_where_nothing_was_sent_yet_the_present_position_is_held(stage):
+    robot = stage(JointGroupPositionController, TWO)
+    robot.context.goals.position[1] = np.nan
+    robot.controller.on_activate(0)
+    np.testing.assert_array_equal(robot.update(0.0), [0.3, -0.2])
+
+
+def test_positions_are_forwarded_until_the_next_ones(stage):
+    robot = stage(JointGroupPositionController, TWO)
+    robot.controller.on_activate(0)
+    robot.send(0.0, "positions", positions=[0.5, 0.6])
+    for time in (0.0, 0.02, 0.04):
+        np.testing.assert_array_equal(robot.update(time), [0.5, 0.6])
+    robot.send(0.06, "positions", positions=[0.1, 0.2])
+    np.testing.assert_array_equal(robot.update(0.06), [0.1, 0.2])
+
+
+def test_positions_and_velocities_are_forwarded_together(stage):
+    robot = stage(JointGroupPosVelController, TWO)
+    robot.controller.on_activate(0)
+    robot.send(0.0, "posvel", positions=[0.5, 0.6], velocities=[1.0, -2.0])
+    np.testing.assert_array_equal(robot.update(0.0), [0.5, 0.6])
+    np.testing.assert_array_equal(robot.context.commands.velocity, [1.0, -2.0])
+
+
+def test_a_wrong_size_is_refused_in_words(stage):
+    robot = stage(JointGroupPositionController, TWO)
+    with pytest.raises(ValueError, match=r"3 positions for 2 joints \(a, b\)"):
+        robot.prepare("positions", positions=[1, 2, 3])
+    robot = stage(JointGroupPosVelController, TWO)
+    with pytest.raises(ValueError, match="1 velocities for 2 joints"):
+        robot.prepare("posvel", positions=[1, 2], velocities=[3])
+
+
+def test_a_command_of_another_kind_is_refused(stage):
+    robot = stage(JointGroupPositionController, TWO)
+    other = JointGroupPosVelController.Commands["posvel"].model_validate(
+        {"positions": [1], "velocities": [1]}
+    )
+    with pytest.raises(ValueError, match="takes no command 'posvel'"):
+        JointGroupPositionController.prepare("posvel", other, robot.model)
+
+
+@pytest.mark.parametrize("wrong", [{}, {"joints": []}, {"joints": ["a"], "surplus": 1}])
+def test_wrong_parameters_are_refused(wrong):
+    with pytest.raises(ValidationError):
+        JointGroupPositionController.Parameters.model_validate(wrong)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_a_command_that_is_not_finite_is_refused(stage, value):
+    with pytest.raises(ValidationError, match="finite"):
+        stage(JointGroupPositionController, TWO).prepare("positions", positions=[0.0, value])
+
+
+def test_the_broadcaster_publishes_each_update(stage):
+    robot = stage(JointStateBroadcaster, {})
+    assert JointStateBroadcaster.publishes == ("/joint_states",)
+    robot.controller.on_activate(0)
+    for time in range(3):
+        robot.update(time)
+    assert robot.published == 3
+    assert np.isnan(robot.context.commands.position).all()

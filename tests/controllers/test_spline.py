@@ -1,0 +1,104 @@
+"""Our coefficients against scipy's, and against what a spline must keep."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.interpolate import BPoly, CubicHermiteSpline
+
+from dxlrun_controllers.spline import CUBIC, LINEAR, QUINTIC, Sample, Trajectory, evaluate, flatten, solve
+
+values = st.floats(-10, 10)
+boundary = st.tuples(values, values, values)
+
+
+@settings(max_examples=80, deadline=None)
+@given(start=boundary, end=boundary, duration=st.floats(0.01, 10), share=st.floats(0, 1))
+def test_a_quintic_piece_is_scipys(start, end, duration, share):
+    piece = np.empty((QUINTIC, 1))
+    solve(QUINTIC, duration, np.array(start)[:, None], np.array(end)[:, None], piece)
+    theirs = BPoly.from_derivatives([0, duration], [start, end])
+    scale = max(1.0, *np.abs(start), *np.abs(end)) * max(1.0, duration**2)
+    found = Sample(1)
+    evaluate(piece, share * duration, found)
+    at = share * duration
+    assert found.position[0] == pytest.approx(float(theirs(at)), abs=1e-12 * scale)
+    assert found.velocity[0] == pytest.approx(float(theirs(at, 1)), abs=1e-11 * scale / duration)
+    assert found.acceleration[0] == pytest.approx(float(theirs(at, 2)), abs=1e-10 * scale / duration**2)
+
+
+@settings(max_examples=80, deadline=None)
+@given(start=boundary, end=boundary, duration=st.floats(0.01, 10), share=st.floats(0, 1))
+def test_a_cubic_piece_is_scipys(start, end, duration, share):
+    piece = np.empty((CUBIC, 1))
+    solve(CUBIC, duration, np.array(start)[:, None], np.array(end)[:, None], piece)
+    theirs = CubicHermiteSpline([0, duration], [start[0], end[0]], [start[1], end[1]])
+    scale = max(1.0, *np.abs(start), *np.abs(end)) * max(1.0, duration)
+    found = Sample(1)
+    evaluate(piece, share * duration, found)
+    at = share * duration
+    assert found.position[0] == pytest.approx(float(theirs(at)), abs=1e-12 * scale)
+    assert found.velocity[0] == pytest.approx(float(theirs(at, 1)), abs=1e-11 * scale / duration)
+    assert found.acceleration[0] == pytest.approx(float(theirs(at, 2)), abs=1e-10 * scale / duration**2)
+
+
+def loaded(order, times, points, start_in=0.0, now=None):
+    trajectory = Trajectory(points.shape[2])
+    trajectory.load(flatten(order, times, points, start_in), now or Sample(points.shape[2]))
+    return trajectory
+
+
+def sampled(trajectory, times, joints):
+    sample, found = Sample(joints), []
+    for time in times:
+        trajectory.sample(time, sample)
+        found.append((sample.position.copy(), sample.velocity.copy(), sample.acceleration.copy()))
+    return np.array(found)
+
+
+@pytest.mark.parametrize("order", [LINEAR, CUBIC, QUINTIC])
+def test_a_whole_trajectory_is_scipys_between_its_points(order):
+    random = np.random.default_rng(3)
+    times = np.cumsum(random.uniform(0.1, 1, 9))
+    points = random.uniform(-1, 1, (9, 3, 2))
+    trajectory = loaded(order, times, points)
+    at = np.linspace(times[0], times[-1], 200)[:-1]
+    found = sampled(trajectory, at, 2)
+    if order == LINEAR:
+        theirs = np.column_stack([np.interp(at, times, points[:, 0, joint]) for joint in range(2)])
+    else:
+        theirs = BPoly.from_derivatives(times, points[:, : order // 2])(at)
+    np.testing.assert_allclose(found[:, 0], theirs, atol=1e-12)
+
+
+@pytest.mark.parametrize("order", [LINEAR, CUBIC, QUINTIC])
+@pytest.mark.parametrize("start_in", [0.0, 0.7])
+def test_the_bridge_leads_from_now_to_the_first_point(order, start_in):
+    now = Sample(1)
+    now.position[:], now.velocity[:], now.acceleration[:] = 0.4, -0.3, 0.9
+    points = np.array([[[1.0], [0.5], [0.2]], [[2.0], [0.1], [0.0]]])
+    trajectory = loaded(order, np.array([0.5, 1.5]), points, start_in, now)
+    end = start_in + 0.5
+    (first, before, after) = sampled(trajectory, [0.0, end - 1e-9, end], 1)[:, : order // 2, 0]
+    np.testing.assert_allclose(first, [0.4, -0.3, 0.9][: order // 2])
+    np.testing.assert_allclose(before, [1.0, 0.5, 0.2][: order // 2], atol=1e-6)
+    np.testing.assert_allclose(after, [1.0, 0.5, 0.2][: order // 2], atol=1e-12)
+    assert trajectory.duration_s == start_in + 1.5
+
+
+def test_a_first_point_now_is_wanted_now():
+    points = np.array([[[1.0], [0.0], [0.0]], [[2.0], [0.0], [0.0]]])
+    trajectory = loaded(LINEAR, np.array([0.0, 1.0]), points)
+    np.testing.assert_allclose(sampled(trajectory, [0.0, 0.5], 1)[:, 0, 0], [1.0, 1.5])
+
+
+def test_after_the_end_the_last_position_is_held_at_rest():
+    points = np.array([[[1.0], [0.7], [0.2]], [[2.0], [0.6], [0.3]]])
+    trajectory = loaded(QUINTIC, np.array([0.5, 1.0]), points)
+    for time in (1.0, 1.5, 1e6):
+        np.testing.assert_array_equal(sampled(trajectory, [time], 1)[0, :, 0], [2.0, 0.0, 0.0])
+
+
+def test_one_point_is_a_trajectory():
+    trajectory = loaded(CUBIC, np.array([2.0]), np.array([[[1.0], [0.0], [0.0]]]))
+    np.testing.assert_allclose(sampled(trajectory, [0, 1, 2, 3], 1)[:, 0, 0], [0, 0.5, 1, 1])
