@@ -10,7 +10,14 @@ if TYPE_CHECKING:
     from dxlrun.description.marks import KeyPath, Marks
     from dxlrun.description.motion import Motion
     from dxlrun.description.problems import problems_of
-    from dxlrun.description.reading import Description, MotionDescription, read_motion, read_robot
+    from dxlrun.description.reading import (
+        Description,
+        MotionDescription,
+        Survey,
+        read_motion,
+        read_robot,
+        survey_robot,
+    )
     from dxlrun.description.robot import Robot
 
 __all__ = [
@@ -20,9 +27,11 @@ __all__ = [
     "Motion",
     "MotionDescription",
     "Robot",
+    "Survey",
     "problems_of",
     "read_motion",
     "read_robot",
+    "survey_robot",
     "units",
 ]
 
@@ -33,9 +42,11 @@ _HOMES = {
     "Motion": "motion",
     "MotionDescription": "reading",
     "Robot": "robot",
+    "Survey": "reading",
     "problems_of": "problems",
     "read_motion": "reading",
     "read_robot": "reading",
+    "survey_robot": "reading",
 }
 
 

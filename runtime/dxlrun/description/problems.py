@@ -38,6 +38,11 @@ def problems_of(
     return sorted(problems, key=lambda problem: problem.mark)
 
 
+def places_of(error: ValidationError, marks: Marks) -> list[KeyPath]:
+    """Return every place that a model refused."""
+    return [_Complaint(details, marks, (), None).path for details in error.errors(include_url=False)]
+
+
 class _Complaint:
     """One error of pydantic, and the place in the file that it is about."""
 
@@ -169,9 +174,13 @@ _REMEDIES: Mapping[str, str] = {
 def _wanted(complaint: _Complaint) -> str | None:
     """Return what the value must be, when that is all there is to say."""
     if complaint.kind in _BOUNDS:
-        plain = {key: str(value).replace("'", "") for key, value in complaint.context.items()}
+        plain = {key: _bound(value) for key, value in complaint.context.items()}
         return _BOUNDS[complaint.kind].format(**plain)
     return _WANTED.get(complaint.kind)
+
+
+def _bound(value: object) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value).replace("'", "")
 
 
 def _remedy(complaint: _Complaint) -> str:

@@ -9,9 +9,10 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from dxlrun.description.arguments import COMMAND_LINE, Arguments, refuse_arguments
-from dxlrun.description.marks import Marks
+from dxlrun.description.marks import KeyPath, Marks
 from dxlrun.description.motion import Motion
-from dxlrun.description.problems import problems_of
+from dxlrun.description.problems import places_of, problems_of
+from dxlrun.description.pruning import prune
 from dxlrun.description.robot import Robot
 from dxlrun.description.syntax import parse, read_text
 from dxlrun.description.tree import grow, literal
@@ -29,6 +30,17 @@ class Description:
     """As it was read."""
     arguments: dict[str, str]
     """All its arguments, with the values of this run."""
+    left_out: frozenset[KeyPath] = frozenset()
+    """`("joints", "head")`, `("loop", "rate")`: what the file has, but in a wrong form; only in a survey."""
+
+
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """A robot file that may be wrong: what can be checked further, and what is wrong with its form."""
+
+    description: Description | None
+    """The parts whose form is right; None when too few are left."""
+    problems: tuple[Problem, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,21 +56,41 @@ class MotionDescription:
 
 def read_robot(path: Path, arguments: Mapping[str, str]) -> Description:
     """Read a robot file with the values of `name:=value`; raises InputError with all problems of its form."""
+    survey = survey_robot(path, arguments)
+    if survey.problems or survey.description is None:
+        raise InputError(survey.problems)
+    return survey.description
+
+
+def survey_robot(path: Path, arguments: Mapping[str, str]) -> Survey:
+    """Read as much of a robot file as its form allows; raises InputError only when it is no YAML at all."""
     text, file = read_text(path), str(path)
     tree = parse(text, file)
     declared = grow(tree, file, literal)  # once without arguments, to learn which there are
     run = Arguments(declared.data.get("arguments"), arguments, declared.marks)
     grown = grow(tree, file, run.fill)
     problems = [*run.problems, *grown.problems]
-    grown.data.pop("arguments", None)
-    try:
-        robot = Robot.model_validate(grown.data)
-    except ValidationError as error:
+    data = grown.data
+    data.pop("arguments", None)
+    wrong = [path for path in grown.unknown if path[0] != "arguments"]
+    robot, error = _validated(data)
+    if error is not None:
         problems += problems_of(error, grown.marks, model=Robot, unknown=grown.unknown)
-        raise InputError(_in_order(problems)) from None
-    if problems:
-        raise InputError(_in_order(problems))
-    return Description(robot, grown.marks, path, text, run.texts)
+        wrong += places_of(error, grown.marks)
+    left_out = prune(data, wrong)
+    if wrong:
+        robot, _ = _validated(data)
+    description = (
+        Description(robot, grown.marks, path, text, run.texts, left_out) if robot is not None else None
+    )
+    return Survey(description, tuple(_in_order(problems)))
+
+
+def _validated(data: dict[str, object]) -> tuple[Robot | None, ValidationError | None]:
+    try:
+        return Robot.model_validate(data), None
+    except ValidationError as error:
+        return None, error
 
 
 def read_motion(path: Path) -> MotionDescription:

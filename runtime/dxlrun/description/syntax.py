@@ -175,6 +175,7 @@ _WORDS = (
         "there is a ':' where none can be",
         "indent the keys of a mapping alike, and put a text with ': ' in quotes",
     ),
+    ("unexpected ':'", "a ':' stands where none can be", "write `key: value` with a space behind the ':'"),
     ("entries are not allowed", "a list cannot start here", "start it on a new line, or write [a, b]"),
     ("unexpected end of stream", "a quote is opened here and never closed", "close it"),
     ("expected ',' or", "a comma is missing, or a bracket{since} is not closed", "add it"),

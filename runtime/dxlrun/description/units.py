@@ -16,9 +16,9 @@ from typing import Annotated
 from pydantic import BeforeValidator, Field, PlainSerializer, WithJsonSchema
 from pydantic_core import PydanticCustomError
 
-# at most two digits of exponent: Fraction("1e-999999999") would fill the memory
+# at most three digits of exponent: Fraction("1e-999999999") would fill the memory
 _QUANTITY = re.compile(
-    r"([-+]?(?:\d+(?:_\d+)*)?(?:\.\d*)?(?:[eE][-+]?\d{1,2})?)\s*([A-Za-z/^0-9]*)", re.ASCII
+    r"([-+]?(?:\d+(?:_\d+)*)?(?:\.\d*)?(?:[eE][-+]?\d{1,3})?)\s*([A-Za-z/^0-9]*)", re.ASCII
 )
 _LONGEST = 64
 _REV = 2 * math.pi
@@ -64,7 +64,10 @@ def duration(text: str) -> int:
 
 def _si(text: str, what: str, units: Mapping[str, float], written: str) -> float:
     number, unit = _split(text, what, units, written)
-    return float(number) * units[unit]
+    value = float(number) * units[unit]
+    if not math.isfinite(value):
+        raise _refusal(f"{text!r} is too large", f"write {what} such as {written}")
+    return value
 
 
 def _split(text: object, what: str, units: Mapping[str, object], written: str) -> tuple[str, str]:

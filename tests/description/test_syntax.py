@@ -1,0 +1,185 @@
+# ruff: noqa: E501 (a mistake and its sentence are read best side by side)
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dxlrun.description import read_robot, syntax
+from dxlrun.description.scalars import plain_value
+from dxlrun.description.tree import grow, literal
+from dxlrun.errors import InputError, Mark
+
+WRONG = [
+    (
+        "a: {port: ${port}, x: 1}\n",
+        "1:12: ${...} stands inside { } or [ ] without quotes",
+        'quotes: "${name}"',
+    ),
+    ("a:\n\tb: 1\n", "2:1: there is a tab", "spaces"),
+    ("a: b: c\n", "1:5: there is a ':' where none can be", "quotes"),
+    ("a: [1, 2\nb: 3\n", "2:2: a comma is missing, or a bracket (opened in line 1) is not closed", "add"),
+    ("a: 1\nb: 'x\nc: 1\n", "2:4: a quote is opened here and never closed", "close"),
+    ("a: *x\n", "1:4: this alias names no anchor", "value"),
+    ("a: @x\n", "1:4: a value cannot start with @", "quotes"),
+    ("- a\nb: 1\n", "2:1: this line", "indent it"),
+    ("a:\n  - 1\n 2\n", "3:2: this line is indented", "indent"),
+    ("a: }\n", "1:4: a value is missing", "write one"),
+    ("a: - b\n", "1:4: a list cannot start here", "new line"),
+    ("a: 1\n---\nb: 1\n", "2:1: a second document", "one document"),
+    ("", "1:1: the file is empty", "describe"),
+    ("# nothing\n", "1:1: the file is empty", "describe"),
+    ("- a\n", "1:1: the file is not a mapping", "key: value"),
+    ("a: >5x\n", "1:6: this is not YAML (", "correct"),
+]
+
+
+@pytest.fixture(params=["CSafeLoader", "SafeLoader"])
+def loader(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    # where PyYAML was built without libyaml, the same file must give the same answer
+    monkeypatch.setattr(syntax, "_Loader", getattr(yaml, request.param))
+
+
+@pytest.mark.usefixtures("loader")
+@pytest.mark.parametrize(("text", "what", "mend"), WRONG)
+def test_a_syntax_error_is_one_problem_in_plain_words(desk: Any, text: str, what: str, mend: str) -> None:
+    (problem,) = desk.refusals(text)
+    assert problem.startswith(f"robot.yaml:{what}")
+    assert mend in problem.split("; ", 1)[1]
+
+
+@pytest.mark.usefixtures("loader")
+def test_quotes_decide_between_text_and_number() -> None:
+    tree = syntax.parse("a: 5\nb: '5'\nc: \"5\"\nd: |\n  5\n", "f")
+    assert grow(tree, "f", literal).data == {"a": 5, "b": "5", "c": "5", "d": "5\n"}
+
+
+def test_a_missing_file_a_directory_and_a_pipe_are_refused(desk: Any) -> None:
+    pipe = desk.folder / "pipe"
+    os.mkfifo(pipe)
+    for path, what in (
+        (desk.folder / "none.yaml", "there is no such file"),
+        (desk.folder, "this is a directory"),
+        (pipe, "this is not a regular file"),
+        (Path("\0"), "cannot be read"),
+        (desk.folder / ("x" * 300), "cannot be read"),
+    ):
+        (problem,) = desk.caught(lambda path=path: read_robot(path, {}))
+        assert what in problem
+
+
+def test_other_encodings_and_control_characters_are_refused_where_they_stand(desk: Any) -> None:
+    assert desk.refusals("a: 1\nb: é\n".encode("latin-1")) == [
+        "robot.yaml:2:4: the byte 0xe9 is no UTF-8; save the file as UTF-8"
+    ]
+    assert desk.refusals("é: 1\nb: x\0\n") == [
+        "robot.yaml:2:5: the character U+0000 cannot stand in YAML; take it out"
+    ]
+
+
+def test_a_byte_order_mark_and_other_line_ends_are_read(desk: Any, robot_text: str) -> None:
+    path = desk.write(b"\xef\xbb\xbf" + robot_text.replace("\n", "\r\n").encode())
+    description = read_robot(path, {})
+    assert description.marks.value("joints", "elbow", "id") == Mark(str(path), 12, 26)
+
+
+def test_a_tag_is_refused_and_the_rest_still_checked(desk: Any, robot_text: str) -> None:
+    text = robot_text.replace("name: torso", "name: !!python/object/apply:os.system [ls]").replace(
+        "id: 5", "id: 500"
+    )
+    assert [problem.split("; ")[0] for problem in desk.refusals(text)] == [
+        "robot.yaml:1:7: the tag !!python/object/apply:os.system is refused",
+        "robot.yaml:12:26: joints.elbow.id is 500, but must be at most 253",
+    ]
+
+
+def test_duplicate_merge_empty_and_compound_keys_are_refused_together(desk: Any, robot_text: str) -> None:
+    text = robot_text + "recording: {}\n<<: {a: 1}\n? [a, b]\n: 1\n'': 2\n${rate}: 3\n'<<': 4\n"
+    assert desk.refusals(text) == [
+        "robot.yaml:18:1: recording was already given in line 17; keep one of the two",
+        "robot.yaml:19:1: the merge key << is not YAML 1.2; write the keys out",
+        "robot.yaml:20:3: a mapping or a list cannot be a key; write a word before the ':'",
+        "robot.yaml:22:1: a key is empty; write a word before the ':'",
+        "robot.yaml:23:1: arguments are not put into keys; write the key out",
+        "robot.yaml:24:1: the file has an unknown key '<<'; take it out; known keys: name, buses, loop, joints,"
+        " controllers, policies, recording",
+    ]
+
+
+def test_an_anchor_may_be_used_and_stands_where_it_was_written() -> None:
+    grown = grow(syntax.parse("a: &x {b: 1}\nc: *x\n", "f"), "f", literal)
+    assert grown.data == {"a": {"b": 1}, "c": {"b": 1}}
+    assert grown.marks.value("c", "b") == Mark("f", 1, 11)
+
+
+@pytest.mark.usefixtures("loader")
+def test_an_anchor_bomb_is_refused_before_it_grows(desk: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dxlrun.description.tree.MOST_NODES", 10_000)  # the true limit takes seconds to reach
+    lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
+    lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 20)]
+    (problem,) = desk.refusals("\n".join(lines))
+    assert "when its anchors are put in" in problem
+
+
+@pytest.mark.usefixtures("loader")
+def test_an_endless_anchor_is_refused(desk: Any) -> None:
+    (problem,) = desk.refusals("a: &x [*x]\n")
+    assert "an anchor contains itself" in problem
+
+
+@pytest.mark.usefixtures("loader")
+@pytest.mark.parametrize(
+    "text", ["[" * 500_000, "a: " + "{x: " * 40, "\n".join(" " * i + "x:" for i in range(500))]
+)
+def test_depth_is_limited_before_anything_recurses(desk: Any, text: str) -> None:
+    (problem,) = desk.refusals(text)
+    assert "nested deeper than 32 levels" in problem
+
+
+def test_size_and_number_of_values_are_limited(desk: Any) -> None:
+    (large,) = desk.refusals("#" * (1 << 20) + "\n")
+    assert "larger than 1024 KiB" in large
+    (many,) = desk.refusals("a: [" + "1, " * 210_000 + "]")
+    assert "more than 200000 values" in many
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.text(alphabet="ab:-[]{}&*!'\"|>#%@ \n\t,?${}<01~.", max_size=60))
+def test_any_text_gives_a_tree_or_one_refusal(text: str) -> None:
+    try:
+        grown = grow(syntax.parse(text, "f"), "f", literal)
+    except InputError as error:
+        refused = error.problems
+    else:
+        refused = ()
+    if refused:
+        assert [problem.mark.file for problem in refused] == ["f"]
+        return
+    lines = text.split("\n")
+    for mark in (*grown.marks.values.values(), *grown.marks.keys.values()):
+        assert 1 <= mark.line <= len(lines) + 1
+        assert mark.column >= 1
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.dictionaries(st.from_regex(r"[a-z]{1,8}", fullmatch=True), st.recursive(
+    st.one_of(st.booleans(), st.integers(-999, 999), st.text("xyz ", max_size=5)),
+    lambda inner: st.one_of(st.lists(inner, max_size=3), st.dictionaries(st.text("abc", min_size=1), inner, max_size=3)),
+    max_leaves=10), min_size=1, max_size=4))  # fmt: skip
+def test_what_a_foreign_writer_wrote_reads_back_with_marks_at_the_values(data: dict[str, object]) -> None:
+    text = yaml.safe_dump(data)
+    grown = grow(syntax.parse(text, "f"), "f", literal)
+    assert grown.data == data
+    lines = text.split("\n")
+    for path, mark in grown.marks.values.items():
+        value: object = data
+        for step in path:
+            value = value[step]  # type: ignore[index]  # the path exists, as the values are equal
+        if isinstance(value, int):
+            assert plain_value(lines[mark.line - 1][mark.column - 1 :].split(",")[0].strip("]} ")) == value

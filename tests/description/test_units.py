@@ -1,0 +1,144 @@
+# ruff: noqa: E501 (a mistake and its sentence are read best side by side)
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import BaseModel, ValidationError
+
+from dxlrun.description.units import (
+    Angle,
+    Angles,
+    AngularAcceleration,
+    AngularVelocity,
+    Duration,
+    angle,
+    angular_acceleration,
+    angular_velocity,
+    duration,
+)
+
+
+class Quantities(BaseModel):
+    """Parameters as a plug-in would write them."""
+
+    reach: Angle
+    speed: AngularVelocity
+    gain: AngularAcceleration
+    wait: Duration
+    several: Angles = ()
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("180 deg", math.pi),
+        ("-90deg", -math.pi / 2),
+        ("1.05 rad", 1.05),
+        ("+1e-2 rad", 0.01),
+        (".5 rad", 0.5),
+        ("1_000 rad", 1000.0),
+        (" 0 deg ", 0.0),
+    ],
+)
+def test_angle_is_in_rad(text: str, expected: float) -> None:
+    assert angle(text) == pytest.approx(expected, rel=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [("2 rad/s", 2.0), ("180 deg/s", math.pi), ("60 rpm", 2 * math.pi), ("-1 rad/s", -1.0)],
+)
+def test_velocity_is_in_rad_per_second(text: str, expected: float) -> None:
+    assert angular_velocity(text) == pytest.approx(expected, rel=1e-15)
+
+
+def test_acceleration_is_in_rad_per_square_second() -> None:
+    assert angular_acceleration("10 rad/s^2") == 10.0
+    assert angular_acceleration("180 deg/s^2") == pytest.approx(math.pi)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("500 us", 500_000),
+        ("1 ms", 1_000_000),
+        ("0.1 ms", 100_000),
+        ("0.3 us", 300),
+        ("2 s", 2_000_000_000),
+        ("1 min", 60_000_000_000),
+        ("1 h", 3_600_000_000_000),
+        ("7 ns", 7),
+        ("0 s", 0),
+    ],
+)
+def test_duration_is_in_exact_nanoseconds(text: str, expected: int) -> None:
+    assert duration(text) == expected
+
+
+@pytest.mark.parametrize("read", [angle, angular_velocity, angular_acceleration, duration])
+@pytest.mark.parametrize(
+    "text",
+    ["", "deg", "60", "sixty deg", "6 0 deg", "1,5 rad", ". rad", "e5 rad", "1e rad", "nan rad", "inf s", "60 grad",
+     "1 rad rad", "1e999999999 s", "9e999 rad", "9e999 s", "1e-999999999 s", "1" * 100 + " s", "٣ s", "1 m\ns"],
+)  # fmt: skip
+def test_what_is_no_quantity_is_refused_with_an_example(read: object, text: str) -> None:
+    assert callable(read)
+    with pytest.raises(ValueError, match="write") as caught:
+        read(text)
+    assert len(str(caught.value)) < 300
+
+
+@pytest.mark.parametrize("value", [60, 1.05, True, None, ["1 rad"], {}])
+def test_a_value_without_unit_is_refused(value: object) -> None:
+    with pytest.raises(ValidationError) as caught:
+        Quantities.model_validate({"reach": value, "speed": value, "gain": value, "wait": value})
+    assert {error["loc"][0] for error in caught.value.errors()} == {"reach", "speed", "gain", "wait"}
+
+
+@pytest.mark.parametrize("text", ["-1 ns", "1e20 s", "40 h e"])
+def test_a_time_that_cannot_be_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="duration"):
+        duration(text)
+
+
+def test_the_wrong_kind_of_unit_is_named() -> None:
+    with pytest.raises(ValueError, match="unit ms, which is not one of an angle"):
+        angle("5 ms")
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    st.floats(allow_nan=False, allow_infinity=False, min_value=-1e6, max_value=1e6),
+    st.integers(min_value=0, max_value=10**18),
+)
+def test_json_reads_back_to_the_same_value(number: float, nanoseconds: int) -> None:
+    # the plan keeps parameters as JSON; a digit lost there would move the robot
+    before = Quantities.model_validate(
+        {"reach": f"{number!r} rad", "speed": "1 rpm", "gain": "3 deg/s^2", "wait": f"{nanoseconds} ns"}
+        | {"several": [f"{number!r} deg"]}
+    )
+    assert before.reach == number
+    assert before.wait == nanoseconds
+    assert Quantities.model_validate_json(before.model_dump_json()) == before
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.text(max_size=80))
+def test_any_text_is_read_or_refused_in_words(text: str) -> None:
+    for read in (angle, duration):
+        try:
+            value, refusal = read(text), ""
+        except ValueError as error:
+            value, refusal = 0, str(error)
+        assert math.isfinite(value)
+        assert not refusal or "write" in refusal
+
+
+def test_the_schema_of_a_quantity_is_text() -> None:
+    schema = Quantities.model_json_schema()["properties"]
+    assert schema["reach"]["type"] == "string"
+    assert schema["wait"]["examples"] == ["500 us"]
