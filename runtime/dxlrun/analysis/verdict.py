@@ -1,8 +1,8 @@
 """The verdict: what a person wants to know first, in sentences.
 
-Thresholds: the loop *kept* its rate when no period was skipped and none is unaccounted for; wake-ups are
-*rough* when more than 1 % are later than 150 us (M. A. Araujo, UFU 2017, measured at 1 kHz under stress 1.74 %
-on a stock kernel and none on a real-time kernel); a servo is *named* when a single reply of it is missing or carries an error bit.
+Thresholds: the loop *kept* its rate when it skipped no period; wake-ups are *rough* when more than 1 % are
+later than 150 us (M. A. Araujo, UFU 2017, measured 1.74 % at 1 kHz under stress on a stock kernel, none on a
+real-time kernel); a servo is *named* when a single reply of it is missing or carries an error bit.
 """
 
 from __future__ import annotations
@@ -79,10 +79,9 @@ def _silent(servos: Sequence[Servo]) -> Finding | None:
         for servo in losers[:_MOST_NAMED]
     )
     more = f", and {len(losers) - _MOST_NAMED} more servos" if len(losers) > _MOST_NAMED else ""
-    return (
-        False,
-        f"Replies are missing: {named}{more}; the other {len(asked) - len(losers)} answered every time.",
-    )
+    rest = len(asked) - len(losers)
+    others = f"; {rest} of {len(asked)} servos answered every time" if rest else ""
+    return False, f"Replies are missing: {named}{more}{others}."
 
 
 def _all(count: int) -> str:

@@ -1,0 +1,241 @@
+"""Analysis: runs that are known to the last number, and what is said of them."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from dxlrun.analysis.report import Report, analyze_log, to_json
+from dxlrun.analysis.tables import render
+from dxlrun.analysis.verdict import microseconds
+from dxlrun.errors import LogError
+from dxlrun.events import EventCode, Severity
+from dxlrun.packets import PacketKind
+
+Make = Callable[..., Any]
+ASK_5 = bytes.fromhex("ffff0504022406ca")
+ASK_21 = bytes.fromhex("ffff1504022406ba")
+ANSWER = bytes.fromhex("ffff05080000020000000000f0")
+GOALS = bytes.fromhex("fffffe0483")
+
+
+def shown(report: Report) -> str:
+    console = Console(file=io.StringIO(), width=160)
+    console.print(render(report))
+    text: str = console.file.getvalue()  # type: ignore[attr-defined]  # a StringIO, given above
+    return text
+
+
+def asked_and_answered(wire: Make, at: int, error: int = 0) -> list[Any]:
+    answer = bytearray(ANSWER)
+    answer[4] = error
+    return [
+        wire(PacketKind.INSTRUCTION, 5, at, ASK_5, at + 10),
+        wire(PacketKind.STATUS, 5, at + 600, bytes(answer), at + 640),
+    ]
+
+
+def test_a_good_run_is_said_to_be_good(write: Make, cycle: Make, wire: Make) -> None:
+    packets = [packet for at in (0, 20_000) for packet in asked_and_answered(wire, at)]
+    report = analyze_log(
+        write([cycle(number, late=83 if number == 7 else 60) for number in range(50)], packets)
+    )
+    assert report.verdict.good
+    assert report.verdict.sentences == (
+        "The loop kept 50 Hz: 0 of 50 periods skipped, worst wake-up 83 us late.",
+        "The servo answered every time.",
+    )
+
+
+def test_the_wake_up_latency_is_that_of_the_records(write: Make, cycle: Make) -> None:
+    late = [4, 4, 4, 62, 151, 1001, 20_001, 3]
+    latency = analyze_log(write([cycle(number, late=us) for number, us in enumerate(late)])).latency
+    assert latency is not None
+    mean = sum(late) / 8
+    assert latency.max_us == 20_001
+    assert latency.mean_us == pytest.approx(mean)
+    assert latency.deviation_us == pytest.approx((sum((us - mean) ** 2 for us in late) / 8) ** 0.5)
+    assert latency.mode_us == 4
+    assert (latency.share_over_150_us, latency.share_over_1_ms, latency.share_over_period) == (
+        3 / 8,
+        2 / 8,
+        1 / 8,
+    )
+
+
+def test_the_steps_take_what_the_records_say(write: Make, cycle: Make) -> None:
+    cycles = [
+        cycle(number, late=50, read=5000 + number, update=100, write=300 - number) for number in range(101)
+    ]
+    report = analyze_log(write(cycles))
+    steps = {step.name: (step.median_us, step.p99_us, step.max_us) for step in report.steps}
+    assert steps["read"] == pytest.approx((5050, 5099, 5100))
+    assert steps["update"] == pytest.approx((100, 100, 100))
+    assert steps["write"] == pytest.approx((250, 299, 300))
+    assert steps["cycle"] == pytest.approx((5400, 5400, 5400))
+    head, idle = report.controllers
+    assert (head.name, head.cycles, head.max_us) == ("head", 101, 50)
+    assert (idle.name, idle.cycles) == ("idle", 0)
+
+
+def test_periods_that_were_skipped_are_accounted_for(write: Make, cycle: Make) -> None:
+    report = analyze_log(write([cycle(0), cycle(1), cycle(5, skipped=3), cycle(6)]))
+    assert (report.periods.elapsed, report.periods.records, report.periods.skipped) == (7, 4, 3)
+    assert (report.periods.missing, report.periods.agree) == (0, True)
+    assert not report.verdict.good
+    assert "did not keep 50 Hz: 3 of 7 periods skipped (42.86%)" in report.verdict.sentences[0]
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [[(0, 0), (1, 0), (4, 0)], [(0, 0), (3, 1)], [(0, 0), (3, 0), (4, 2)], [(2, 0)]],
+    ids=["undeclared", "half declared", "declared late", "no beginning"],
+)
+def test_periods_that_vanished_are_told(write: Make, cycle: Make, numbers: list[tuple[int, int]]) -> None:
+    report = analyze_log(write([cycle(number, skipped=skipped) for number, skipped in numbers]))
+    assert not report.periods.agree
+    assert "neither recorded nor declared skipped" in report.verdict.sentences[-1]
+
+
+def test_a_servo_that_was_silent_is_named(write: Make, cycle: Make, wire: Make) -> None:
+    packets = asked_and_answered(wire, 0)
+    packets += [
+        wire(PacketKind.INSTRUCTION, 21, 1000, ASK_21),
+        wire(PacketKind.NOISE, 254, 1500, b"\xff\x00\xff"),
+        wire(PacketKind.INSTRUCTION, 254, 2000, GOALS),
+        wire(PacketKind.INSTRUCTION, 21, 3000, ASK_21),
+    ]
+    report = analyze_log(write([cycle(0)], packets))
+    elbow, head = report.servos
+    assert (elbow.servo_id, elbow.joint, elbow.asked, elbow.lost, elbow.replies) == (
+        5,
+        "left_elbow_joint",
+        1,
+        0,
+        1,
+    )
+    assert (elbow.reply_median_us, elbow.reply_max_us) == (640, 640)
+    assert (head.servo_id, head.joint, head.asked, head.lost, head.replies) == (21, "head_yaw_joint", 2, 2, 0)
+    (bus,) = report.buses
+    assert (bus.instructions, bus.broadcasts, bus.replies, bus.noise_bytes) == (4, 1, 1, 3)
+    assert (bus.bytes_out, bus.bytes_in) == (3 * 8 + 5, len(ANSWER) + 3)
+    assert report.verdict.sentences[1] == (
+        "Replies are missing: servo 21 (head_yaw_joint) 2 of 2 times (100.00%); "
+        "1 of 2 servos answered every time."
+    )
+
+
+def test_a_late_reply_of_another_servo_is_nobodys_answer(write: Make, wire: Make) -> None:
+    packets = [wire(PacketKind.INSTRUCTION, 21, 0, ASK_21), wire(PacketKind.STATUS, 5, 500, ANSWER)]
+    elbow, head = analyze_log(write([], packets)).servos
+    assert (elbow.replies, elbow.lost) == (1, 0)
+    assert head.lost == 1
+
+
+def test_packets_of_two_rings_are_paired_by_time(write: Make, wire: Make) -> None:
+    packets = [*asked_and_answered(wire, 20_000), *asked_and_answered(wire, 0)]
+    (servo,) = analyze_log(write([], [packets[0], packets[2], packets[1], packets[3]])).servos
+    assert (servo.asked, servo.lost, servo.reply_max_us) == (2, 0, 640)
+
+
+def test_error_bits_are_named(write: Make, cycle: Make, wire: Make) -> None:
+    packets = [*asked_and_answered(wire, 0), *asked_and_answered(wire, 20_000, error=0x24)]
+    report = analyze_log(write([cycle(0)], packets))
+    assert report.servos[0].error_names == ("overheating", "overload")
+    assert (
+        "Servos reported errors: servo 5 (left_elbow_joint): overheating, overload in 1 replies."
+        in report.verdict.sentences
+    )
+    assert not report.verdict.good
+
+
+def test_tracking_compares_with_the_goal_of_the_cycle_before(write: Make, cycle: Make) -> None:
+    cycles = [
+        cycle(0, position=0.0, goal=0.5),
+        cycle(1, position=0.4, goal=0.7, clamped=2),
+        cycle(2, position=9.9, goal=0.7, valid=False),
+        cycle(3, position=0.9, goal=0.0),
+    ]
+    elbow, head = analyze_log(write(cycles)).joints
+    assert elbow.rms_rad == pytest.approx(((0.1**2 + 0.2**2) / 2) ** 0.5)
+    assert elbow.worst_rad == pytest.approx(0.2)
+    assert (elbow.invalid, elbow.oldest_ms, elbow.clamped) == (1, 20.0, 1)
+    assert (head.rms_rad, head.invalid) == (None, 0)
+
+
+def test_rough_wake_ups_are_said(write: Make, cycle: Make) -> None:
+    report = analyze_log(write([cycle(number, late=200 if number < 3 else 10) for number in range(100)]))
+    assert "3.0% came later than 150 us" in report.verdict.sentences[1]
+
+
+def test_errors_gaps_and_a_log_without_end_are_said(write: Make, cycle: Make, said: Make) -> None:
+    events = [
+        said(EventCode.LOOP_STARTED, Severity.INFO, "50 Hz"),
+        said(EventCode.CONTROLLER_FAULT, Severity.ERROR, "Traceback\nValueError: no"),
+    ]
+    report = analyze_log(write([cycle(0)], events=events, gaps=17, close=False))
+    assert (report.gaps, report.complete) == (17, False)
+    assert report.verdict.sentences[1] == "2 errors were logged; the first, of head: ValueError: no"
+    assert "no end" in report.verdict.sentences[2]
+    assert "17 records were lost" in report.verdict.sentences[2]
+    assert [(event.name, event.count) for event in report.events] == [
+        ("controller_fault", 1),
+        ("recorder_gap", 1),
+        ("loop_started", 1),
+    ]
+
+
+def test_a_finished_log_with_gaps_counts_them(write: Make, cycle: Make) -> None:
+    report = analyze_log(write([cycle(0)], gaps=4))
+    assert (report.gaps, report.complete) == (4, True)
+
+
+def test_a_run_without_a_cycle_is_said_to_be_one(write: Make) -> None:
+    report = analyze_log(write())
+    assert report.verdict.sentences == ("The loop never ran a cycle.",)
+    assert (report.latency, report.steps) == (None, ())
+    assert "torso" in shown(report)
+
+
+def test_the_terminal_says_the_verdict_first_and_every_number_after(
+    write: Make, cycle: Make, wire: Make
+) -> None:
+    report = analyze_log(
+        write([cycle(number, late=60) for number in range(50)], asked_and_answered(wire, 0, 0x20))
+    )
+    text = shown(report)
+    assert text.startswith("The loop kept 50 Hz")
+    for words in ("recorded + skipped = elapsed", "left_elbow_joint", "overload", "read", "head", "640 us"):
+        assert words in text
+
+
+def test_json_carries_the_whole_report(write: Make, cycle: Make) -> None:
+    read = json.loads(to_json(analyze_log(write([cycle(0)]))))
+    assert read["verdict"]["good"] is True
+    assert read["periods"] == {
+        "elapsed": 1,
+        "records": 1,
+        "skipped": 0,
+        "missing": 0,
+        "agree": True,
+        "rate_hz": 50.0,
+        "seconds": 0.02,
+    }
+    assert read["joints"][0]["name"] == "left_elbow_joint"
+
+
+def test_what_is_no_log_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "robot.yaml").write_text("name: torso\n")
+    with pytest.raises(LogError, match="no MCAP file"):
+        analyze_log(tmp_path / "robot.yaml")
+
+
+@pytest.mark.parametrize(("value", "text"), [(83.4, "83 us"), (16_949.0, "16.95 ms"), (2.5e6, "2.50 s")])
+def test_times_are_written_as_a_person_writes_them(value: float, text: str) -> None:
+    assert microseconds(value) == text
