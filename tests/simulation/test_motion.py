@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 import math
 
 import pytest
@@ -54,7 +55,7 @@ def test_from_any_speed_angle_and_velocity_stay_continuous(
         if one.end_ns < 2_000_000_000
         else [one.at(t * step) for t in range(500)]
     )
-    for (angle0, velocity0, _), (angle1, velocity1, _) in zip(seen, seen[1:], strict=False):
+    for (angle0, velocity0, _), (angle1, velocity1, _) in itertools.pairwise(seen):
         assert abs(velocity1) <= bound
         assert abs(velocity1 - velocity0) <= ACCELERATION * step * 1e-9 + 1e-6
         assert abs(angle1 - angle0) <= bound * step * 1e-9 + 1e-6

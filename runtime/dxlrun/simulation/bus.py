@@ -27,8 +27,8 @@ from dxlrun.simulation.servo import Reply, ServoConfig, SimulatedServo
 LONGEST_PAUSE_NS = 100_000_000
 """Longest gap inside an instruction (e-Manual, Protocol 1.0)."""
 
-UNREAD_LIMIT = 65536
-"""Bytes that wait for a host that does not take them; more are lost, as in an adapter."""
+UNREAD_LIMIT = 4096
+"""Bytes that wait for a host that does not take them; more are lost, as in the kernel's terminal buffer."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,65 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from dxlrun.errors import LogError
+from dxlrun.simulation import Ledger, LedgerEntry, read_ledger
+from dxlrun.simulation.ledger import FLUSH_NS
+
+ENTRIES = (
+    LedgerEntry(5, "main", "in", b"\xff\xff\x01", ""),
+    LedgerEntry(7, "arm", "out", b"", "echo"),
+    LedgerEntry(9, "main", "note", b"", 'a "note", and more\n'),
+)
+
+
+def fill(ledger: Ledger) -> None:
+    for each in ENTRIES:
+        ledger.add(each.t_ns, each.bus, each.direction, each.data, each.note)
+
+
+def test_a_file_gives_back_what_was_entered(tmp_path: Path) -> None:
+    with Ledger(tmp_path / "bus.jsonl", keep=False) as ledger:
+        fill(ledger)
+        assert ledger.entries == []
+    assert read_ledger(tmp_path / "bus.jsonl") == ENTRIES
+
+
+def test_memory_holds_the_same(tmp_path: Path) -> None:
+    ledger = Ledger()
+    fill(ledger)
+    ledger.close()
+    assert tuple(ledger.entries) == ENTRIES
+
+
+def test_it_is_written_out_half_a_second_after_the_oldest_entry(tmp_path: Path) -> None:
+    path = tmp_path / "bus.jsonl"
+    with Ledger(path) as ledger:
+        assert ledger.flush_due_ns() is None
+        fill(ledger)
+        assert ledger.flush_due_ns() == 5 + FLUSH_NS
+        ledger.flush_if_due(5 + FLUSH_NS - 1)
+        assert path.read_bytes() == b""
+        ledger.flush_if_due(5 + FLUSH_NS)
+        assert ledger.flush_due_ns() is None
+        assert read_ledger(path) == ENTRIES
+
+
+def test_a_line_that_was_cut_off_is_left_out(tmp_path: Path) -> None:
+    path = tmp_path / "bus.jsonl"
+    with Ledger(path) as ledger:
+        fill(ledger)
+    path.write_bytes(path.read_bytes()[:-3])
+    assert read_ledger(path) == ENTRIES[:2]
+
+
+@pytest.mark.parametrize(
+    "line", ["{", "[]", '{"t_ns": 1}', '{"t_ns":1,"bus":"m","direction":"up","bytes":"","note":""}']
+)
+def test_another_file_is_refused_by_name(tmp_path: Path, line: str) -> None:
+    path = tmp_path / "other.jsonl"
+    path.write_text(line + "\n")
+    with pytest.raises(LogError, match=r"other\.jsonl is not a ledger"):
+        read_ledger(path)

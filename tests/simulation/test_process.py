@@ -1,0 +1,198 @@
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+import pytest
+import rustypot
+
+from dxlrun.control_table import control_table
+from dxlrun.simulation import BusConfig, Ledger, LedgerEntry, ServoConfig, SimulatedBus, read_ledger
+from dxlrun.simulation.process import decode_config, encode_config
+from dxlrun.simulation.pseudo_terminal import PseudoTerminal
+
+PING_1 = bytes.fromhex("ff ff 01 02 01 fb")
+PONG_1 = bytes.fromhex("ff ff 01 02 00 fc")
+READ_1 = bytes.fromhex("ff ff 01 04 02 24 06 ce")
+PATIENCE_S = 20.0
+"""How long a test waits for what must come; it decides nothing but when to give up."""
+
+BUSES = (
+    BusConfig("main", 1_000_000, tuple(ServoConfig(each, "AX-12A", 2.0) for each in (1, 2))),
+    BusConfig("arm", 57_600, (ServoConfig(1, "AX-12A", 1.0, 0),)),
+)
+
+
+@dataclass
+class Running:
+    child: subprocess.Popen[bytes]
+    control: socket.socket
+    said: IO[bytes]
+    ports: dict[str, str]
+    path: Path
+
+    def hang_up(self) -> int:
+        self.said.close()
+        self.control.close()
+        return self.child.wait(PATIENCE_S)
+
+    def ledger(self) -> tuple[LedgerEntry, ...]:
+        return read_ledger(self.path)
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Callable[[], Running]]:
+    with contextlib.ExitStack() as stack:
+
+        def run() -> Running:
+            ours, theirs = socket.socketpair()
+            stack.callback(ours.close)
+            ours.settimeout(PATIENCE_S)
+            reader, writer = os.pipe()
+            os.write(writer, encode_config(BUSES))
+            os.close(writer)
+            path = tmp_path / "bus.jsonl"
+            with theirs:
+                command = [sys.executable, "-m", "dxlrun.simulation", "--config-fd", str(reader)]
+                command += ["--control-fd", str(theirs.fileno()), "--ledger", str(path)]
+                child = subprocess.Popen(
+                    command,
+                    pass_fds=(reader, theirs.fileno()),
+                    start_new_session=True,
+                )
+            os.close(reader)
+            stack.callback(child.wait)
+            stack.callback(child.kill)
+            said = stack.enter_context(ours.makefile("rb"))
+            return Running(child, ours, said, json.loads(said.readline())["ports"], path)
+
+        yield run
+
+
+@contextlib.contextmanager
+def opened(path: str) -> Iterator[int]:
+    port = os.open(path, os.O_RDWR | os.O_NOCTTY)
+    try:
+        yield port
+    finally:
+        os.close(port)
+
+
+def hear(port: int, size: int) -> bytes:
+    heard = b""
+    while len(heard) < size:
+        assert select.select([port], [], [], PATIENCE_S)[0], f"only {heard.hex(' ')} came"
+        heard += os.read(port, 256)
+    return heard
+
+
+def test_it_answers_as_a_servo_on_a_serial_port(start: Callable[[], Running]) -> None:
+    running = start()
+    assert sorted(running.ports) == ["arm", "main"]
+    with opened(running.ports["main"]) as main, opened(running.ports["arm"]) as arm:
+        os.write(main, PING_1)
+        os.write(arm, PING_1)
+        assert hear(main, 6) == PONG_1
+        assert hear(arm, 6) == PONG_1
+    assert running.hang_up() == 0
+
+
+def test_the_ledger_holds_exactly_what_passed_and_no_reply_is_early(start: Callable[[], Running]) -> None:
+    running = start()
+    heard = b""
+    with opened(running.ports["main"]) as port:
+        for _ in range(20):
+            os.write(port, READ_1)
+            heard += hear(port, 12)
+    assert running.hang_up() == 0
+    entries = running.ledger()
+    assert [entry.direction for entry in entries] == ["in", "out"] * 20
+    assert b"".join(entry.data for entry in entries if entry.direction == "in") == READ_1 * 20
+    assert b"".join(entry.data for entry in entries if entry.direction == "out") == heard
+    for asked, answered in zip(entries[::2], entries[1::2], strict=True):
+        assert answered.t_ns - asked.t_ns == 700_000  # 8 bytes, 500 us, 12 bytes; on the bus' own clock
+    for answered, asked in zip(entries[1::2], entries[2::2], strict=False):
+        assert asked.t_ns >= answered.t_ns  # the host got it before it asked again
+
+
+def test_hosts_may_come_and_go(start: Callable[[], Running]) -> None:
+    running = start()
+    for _ in range(3):
+        with opened(running.ports["main"]) as port:
+            os.write(port, PING_1)
+            assert hear(port, 6) == PONG_1
+    assert running.hang_up() == 0
+
+
+def test_interrupt_is_left_to_the_front_process_and_sigterm_ends_in_order(
+    start: Callable[[], Running],
+) -> None:
+    running = start()
+    with opened(running.ports["main"]) as port:
+        os.kill(running.child.pid, signal.SIGINT)
+        os.write(port, PING_1)
+        assert hear(port, 6) == PONG_1
+    os.kill(running.child.pid, signal.SIGTERM)
+    assert running.child.wait(PATIENCE_S) == 0
+    assert [entry.data for entry in running.ledger()] == [PING_1, PONG_1]
+
+
+def test_a_host_that_never_reads_does_not_stop_it(start: Callable[[], Running]) -> None:
+    running = start()
+    with opened(running.ports["main"]) as port:
+        for _ in range(3000):
+            os.write(port, READ_1)
+    with opened(running.ports["arm"]) as port:
+        os.write(port, PING_1)
+        assert hear(port, 6) == PONG_1
+    assert running.hang_up() == 0
+
+
+def test_what_does_not_fit_into_the_terminal_is_lost_and_noted() -> None:
+    bus = SimulatedBus(BUSES[0], Ledger(), 0)
+    terminal = PseudoTerminal(bus)
+    for now in range(10**9, 10**11, 10**9):  # 400 kB, and nobody reads
+        bus.inject_noise(bytes(4000), now - 10**8)
+        terminal.deliver(now)
+    assert any("it does not read" in entry.note for entry in bus.ledger.entries)
+    terminal.receive(10**11)  # the host has said nothing
+    terminal.close()
+    assert not [entry for entry in bus.ledger.entries if entry.direction == "in"]
+
+
+def test_configurations_pass_as_they_are() -> None:
+    assert decode_config(encode_config(BUSES)) == BUSES
+
+
+def test_a_foreign_driver_finds_every_item_where_the_servo_holds_it(start: Callable[[], Running]) -> None:
+    """rustypot, written by others in Rust, talks to our servo: its addresses, its packets, its units."""
+    running = start()
+    table = control_table("AX-12A")
+    foreign = rustypot.AxPyController(running.ports["main"], 1_000_000, PATIENCE_S)
+    values = {"id": 1, "baud_rate": 1, "cw_angle_limit": 10, "moving_speed": 300, "punch": 40, "led": 1}
+    for name, wire in values.items():
+        foreign.write_register(1, {"baud_rate": "baudrate"}.get(name, name), wire)
+    for item in table.items.values():
+        name = {"baud_rate": "baudrate"}.get(item.name, item.name)
+        ours = int.from_bytes(bytes(foreign.read_raw_data(1, item.address, item.size)), "little")
+        assert foreign.read_register(1, name) == ours
+        if item.name in values:
+            assert ours == values[item.name]
+    assert foreign.ping(2)
+    foreign.sync_write_raw_goal_position([1, 2], [600, 400])
+    assert foreign.read_raw_goal_position(1) == [600]
+    foreign.close()
+    assert running.hang_up() == 0
+    assert not [
+        entry.note for entry in running.ledger() if entry.note
+    ]  # nothing was refused, nothing collided
