@@ -81,16 +81,22 @@ def parse(message: MessageType) -> dict[str, tuple[Field, ...]]:
 
 
 class Codec:
-    """Packs and unpacks one message; made once from its definition."""
+    """Packs and unpacks one message; made once from its definition.
 
-    __slots__ = ("_read", "_write", "fields", "message")
+    The numbers that a message begins with lie at fixed places: they are packed in one go.
+    """
+
+    __slots__ = ("_lead", "_lead_count", "_read", "_rest", "fields", "message")
 
     def __init__(self, message: MessageType) -> None:
         self.message = message
         definitions = parse(message)
         top = message.name.replace("/msg/", "/")
         self.fields: tuple[str, ...] = tuple(field.name for field in definitions[top])
-        self._write, self._read = _nested(top, definitions)
+        self._lead, self._lead_count = _lead(definitions[top])
+        rest = definitions[top][self._lead_count :]
+        self._rest: list[Write] = [_field(field, definitions)[0] for field in rest]
+        _, self._read = _nested(top, definitions)
 
     def pack(self, *values: Value) -> bytes:
         """Return the message with these values, in the order of its fields; nested messages as tuples.
@@ -98,8 +104,13 @@ class Codec:
         Sequences of numbers are numpy arrays of the right type, or bytes. Raises struct.error or ValueError
         when a value does not fit its field.
         """
+        if len(values) != len(self.fields):
+            raise ValueError(f"{self.message.name} has the fields {', '.join(self.fields)}")
+        count = self._lead_count
         buffer = bytearray(ENCAPSULATION)
-        self._write(buffer, values)
+        buffer += self._lead.pack(*values[:count])
+        for write, value in zip(self._rest, values[count:], strict=True):
+            write(buffer, value)
         return bytes(buffer)
 
     def unpack(self, data: bytes | memoryview) -> Mapping[str, Value]:
@@ -116,6 +127,20 @@ class Codec:
         if not isinstance(value, Mapping):
             raise TypeError("a message is read as a mapping")
         return value
+
+
+def _lead(fields: Sequence[Field]) -> tuple[struct.Struct, int]:
+    """Return the layout of the numbers that a message begins with, padding included, and their count."""
+    form, at, count = "<", 0, 0
+    for field in fields:
+        if field.sequence or field.kind not in _PRIMITIVES:
+            break
+        code = _PRIMITIVES[field.kind]
+        size = struct.calcsize("<" + code)
+        form += f"{-at % size}x{code}"
+        at += -at % size + size
+        count += 1
+    return struct.Struct(form), count
 
 
 def _align(buffer: bytearray, size: int) -> None:
