@@ -1,0 +1,85 @@
+# ruff: noqa: E501 (what is written and what is read stand side by side)
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dxlrun.description.motion import Formula, FormulaPart, Motion, Point, PointsPart, Target
+from dxlrun.description.robot import (
+    Adapter,
+    Bus,
+    ControllerEntry,
+    Form,
+    Joint,
+    Limits,
+    Loop,
+    Policies,
+    Recording,
+    Robot,
+    Scheduler,
+)
+
+PAGE = (Path(__file__).parents[2] / "docs" / "robot-file.md").read_text()
+EXAMPLES = re.findall(r"^```yaml\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
+ROWS = {
+    row[0]: row
+    for row in (
+        [cell.strip().strip("`") for cell in line.strip("|").split("|")]
+        for line in PAGE.splitlines()
+        if line.startswith("| `")
+    )
+}
+
+
+def test_the_examples_of_the_page_are_read(desk: Any) -> None:
+    robot, motion = EXAMPLES
+    assert set(desk.robot(robot, {"port": "/dev/ttyUSB0"}).robot.joints) == {
+        "head_pitch_joint",
+        "head_yaw_joint",
+    }
+    assert len(desk.motion(motion).motion.motions) == 2
+
+
+@pytest.mark.parametrize(
+    ("prefix", "part"),
+    [("", Robot), ("", Bus), ("adapter.", Adapter), ("", Joint), ("limits.", Limits), ("", Loop), ("", Policies),
+     ("scheduler.", Scheduler), ("", ControllerEntry), ("", Recording), ("", Motion), ("", PointsPart),
+     ("", FormulaPart), ("points[].", Point)],
+)  # fmt: skip
+def test_every_key_is_on_the_page(prefix: str, part: type[Form]) -> None:
+    for key, field in part.model_fields.items():
+        if key == "parameters" or (isinstance(field.default, Form) and key != "adapter"):
+            continue  # parts of their own, whose keys are on the page
+        assert prefix + key in ROWS
+
+
+@pytest.mark.parametrize(
+    ("row", "text"),
+    [("adapter.latency", "{{adapter: {{latency: {}}}}}"), ("return_delay_time", "{{return_delay_time: {}}}")],
+)
+def test_the_defaults_of_a_bus_are_the_pages(desk: Any, row: str, text: str) -> None:
+    def bus(more: str) -> object:
+        return desk.robot(
+            f"name: x\nbuses:\n  m: &m {{port: sim, protocol: 1.0, baud_rate: 57600{more}}}\nloop: {{rate: 1}}\n"
+            "joints: {j: {bus: m, id: 1, model: A, reference: 0 deg, direction: 1}}\n"
+        ).robot.buses["m"]
+
+    written = text.format(ROWS[row][2])[1:-1]
+    assert bus(f", {written}") == bus("")
+
+
+@pytest.mark.parametrize("row", ["on_exit", "on_fault", "on_lost_servo", "on_stale_command", "exit_timeout"])
+def test_the_defaults_of_the_policies_are_the_pages(desk: Any, robot_text: str, row: str) -> None:
+    head = robot_text[: robot_text.index("policies:")]
+    assert (
+        desk.robot(head + f"policies: {{{row}: {ROWS[row][2]}}}\n").robot.policies
+        == desk.robot(head).robot.policies
+    )
+
+
+def test_targets_and_formulas_have_the_same_three_quantities() -> None:
+    assert set(Target.model_fields) == set(Formula.model_fields) == {"position", "velocity", "acceleration"}
