@@ -104,7 +104,8 @@ def test_a_right_file_has_no_problem(problems_in: Find, robot_text: str):
             "150 deg",
             (
                 "warning",
-                "right_arm_joint is no mirror image of left_arm_joint: its reference is 150 deg, mirrored it would be 240 deg",
+                "right_arm_joint is no mirror image of left_arm_joint: its reference is 150 deg, "
+                "mirrored it would be 240 deg",
                 "not symmetric",
             ),
         ),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from dxlrun.cli.flags import Flag, JsonFlag
+from dxlrun.cli.terminal import out
 from dxlrun.errors import InputError
 
 
@@ -22,4 +23,13 @@ def analyze(log: Path, /, *, as_json: JsonFlag = False, debug: Flag = False) -> 
     """
     if not log.is_file():
         raise InputError(f"there is no log {log}; a run says at its end where its log is")
-    raise NotImplementedError
+    from dxlrun.analysis.report import analyze_log, to_json
+    from dxlrun.analysis.tables import render
+
+    report = analyze_log(log)
+    console = out()
+    if as_json:
+        console.file.write(to_json(report).decode() + "\n")
+    else:
+        console.print(render(report))
+    return 0

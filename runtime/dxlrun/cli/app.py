@@ -29,7 +29,13 @@ EPILOGUE = """Exit codes: 0 good, 1 the robot or the run failed, 2 the input is 
 
 def build() -> App:
     """Return the application with all its commands."""
-    app = App(name="dxlrun", help=HELP, help_epilogue=EPILOGUE, version=lambda: metadata.version("dxlrun"))
+    app = App(
+        name="dxlrun",
+        help=HELP,
+        help_epilogue=EPILOGUE,
+        version=lambda: metadata.version("dxlrun"),
+        suppress_keyboard_interrupt=False,  # an interrupt is said by us, like everything else
+    )
     app.default(run)
     app.command(check)
     app.command(analyze)
@@ -44,6 +50,7 @@ def run_tokens(tokens: Sequence[str]) -> int:
             app.help_print([])
             return InputError.exit_code
         code = app(list(tokens), exit_on_error=False, print_error=False, result_action="return_value")
+        sys.stdout.flush()  # a reader that went away is noticed here, not when the interpreter ends
     except KeyboardInterrupt:
         say_error("interrupted")
         return INTERRUPTED

@@ -20,8 +20,6 @@ def compiled(
     robot: Path, assignments: Sequence[str], play: Sequence[Path], duration: float | None
 ) -> Compiled:
     """Read and compile; raises InputError with everything that is wrong with the file, or with the line."""
-    from dxlrun.compile import compile_files
-
     _known_file(robot)
     arguments = parse_assignments(assignments)
     duration_ns = None
@@ -29,6 +27,8 @@ def compiled(
         if not (math.isfinite(duration) and duration > 0):
             raise InputError(f"--duration {duration:g} is no time to run; give a number of seconds above 0")
         duration_ns = round(duration * 1e9)
+    from dxlrun.compile import compile_files  # not above: a wrong word needs neither numpy nor pydantic
+
     return compile_files(robot, arguments, play, duration_ns)
 
 

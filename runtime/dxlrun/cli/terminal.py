@@ -33,4 +33,4 @@ def _say(line: str, style: str) -> None:
 
 
 def _console(terminal: bool, *, stderr: bool) -> Console:
-    return Console(stderr=stderr, highlight=False, width=None if terminal else 200)
+    return Console(stderr=stderr, highlight=False, force_terminal=terminal, width=None if terminal else 200)

@@ -111,18 +111,15 @@ def _check_budget(description: Description, plan: BusPlan, problems: Problems) -
 def _what_would_help(plan: BusPlan) -> list[str]:
     """Say what each change alone would allow."""
     budget = plan.budget
+    now = _floor(budget.highest_rate_hz)
     found: list[str] = []
     if plan.latency_ns > FAST_LATENCY_NS:
-        latency_ns = budget.latency_ns * FAST_LATENCY_NS // plan.latency_ns
-        rate = _rate(budget, latency_ns=latency_ns)
-        found.append(
-            f"an adapter latency of 1 ms instead of {plan.latency_ns * 1e-6:g} ms would allow {rate} Hz"
-        )
-    if plan.return_delay_ns > 0:
-        rate = _rate(budget, return_delay_ns=0)
-        found.append(
-            f"a return delay time of 0 us instead of {plan.return_delay_ns * 1e-3:g} us would allow {rate} Hz"
-        )
+        rate = _rate(budget, latency_ns=budget.latency_ns * FAST_LATENCY_NS // plan.latency_ns)
+        old = f"{plan.latency_ns * 1e-6:g} ms"
+        found.append(f"an adapter latency of 1 ms instead of {old} would allow {rate} Hz")
+    if (rate := _rate(budget, return_delay_ns=0)) != now:
+        old = f"{plan.return_delay_ns * 1e-3:g} us"
+        found.append(f"a return delay time of 0 us instead of {old} would allow {rate} Hz")
     if len(plan.servos) > 1:
         found.append("a second bus would share the servos")
     return found

@@ -1,0 +1,169 @@
+import os
+import re
+import subprocess
+import sys
+from importlib import metadata
+
+import pytest
+
+from dxlrun.cli import inputs
+from dxlrun.errors import DxlrunError, InputError, Mark, PortError, Problem
+
+
+def loaded_by(*words: str) -> tuple[int, set[str]]:
+    """Exit code and imported packages of a command line in a fresh interpreter."""
+    code = (
+        "import sys; from dxlrun.cli import main; code = main(sys.argv[1:]); "
+        "print('modules', code, *sorted({name.partition('.')[0] for name in sys.modules}))"
+    )
+    run = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=True)
+    words_out = run.stdout.splitlines()[-1].split()
+    assert words_out[0] == "modules"
+    return int(words_out[1]), set(words_out[2:])
+
+
+@pytest.mark.parametrize("words", [("--help",), ("check", "--help"), ("--version",), ("no_such_verb",)])
+def test_what_needs_no_robot_imports_neither_numpy_nor_pydantic(words: tuple[str, ...]):
+    _, modules = loaded_by(*words)
+
+    assert "cyclopts" in modules
+    assert modules.isdisjoint({"numpy", "pydantic", "yaml", "mcap", "serial"})
+
+
+def test_the_version_is_that_of_the_package(dxlrun):
+    said = dxlrun("--version")
+
+    assert (said.code, said.out.strip()) == (0, metadata.version("dxlrun"))
+
+
+def test_help_names_every_command_and_option(dxlrun):
+    said = dxlrun("--help")
+
+    assert said.code == 0
+    for word in (
+        "check",
+        "analyze",
+        "--play",
+        "--duration",
+        "--no-record",
+        "--take-over",
+        "--virtual",
+        "--debug",
+    ):
+        assert word in said.out
+
+
+def test_nothing_to_do_shows_the_help_and_is_wrong_input(dxlrun):
+    said = dxlrun()
+
+    assert said.code == 2
+    assert "Usage: dxlrun" in said.out
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["chekc"], "'chekc' is neither a command nor a robot file; did you mean check?"),
+        (["dance"], "'dance' is neither a command nor a robot file; a robot is run by `dxlrun ROBOT.yaml`"),
+        (["missing/robot.yaml"], "there is no robot file missing/robot.yaml; check the path"),
+        (["."], ". is a directory"),
+        (["check"], "requires an argument"),
+        (["--no-such-option"], "no-such-option"),
+        (["check", "x.yaml", "--duration", "soon"], "soon"),
+        (["analyze", "missing.mcap"], "there is no log missing.mcap"),
+    ],
+)
+def test_wrong_words_are_one_sentence_and_exit_code_two(dxlrun, words: list[str], says: str):
+    said = dxlrun(*words)
+
+    assert said.code == 2
+    assert said.out == ""
+    assert len(said.errors) == 1
+    assert says in said.err
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["port=sim"], "'port=sim' is no argument of the robot file; write name:=value"),
+        ([":=sim"], "write name:=value"),
+        (["port:=sim", "port:=sim"], "argument port is given twice"),
+        (["--play", "a.yaml", "b.yaml"], "a motion needs its own --play"),
+        (["speed:=3"], "no argument 'speed'"),
+        (["--duration", "0"], "--duration 0 is no time to run"),
+        (["--duration", "nan"], "--duration nan is no time to run"),
+        (["--play", "missing.yaml"], "there is no such file"),
+    ],
+)
+def test_wrong_arguments_of_a_robot(dxlrun, torso, words: list[str], says: str):
+    said = dxlrun("check", torso, *words)
+
+    assert said.code == 2
+    assert says in said.errors[0]
+
+
+def test_a_value_may_hold_the_sign(torso):
+    assert inputs.parse_assignments(["port:=a:=b"]) == {"port": "a:=b"}
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "says"),
+    [
+        (PortError("port /dev/ttyUSB0 is held by minicom (4711)"), 1, "dxlrun: port /dev/ttyUSB0 is held"),
+        (DxlrunError("first\nsecond"), 1, "dxlrun: first\ndxlrun: second"),
+        (InputError("no"), 2, "dxlrun: no"),
+        (InputError([Problem(Mark("f.yaml", 3, 7), "bad", "mend")]), 2, "f.yaml:3:7: bad; mend"),
+        (
+            InputError([Problem(Mark("a\nb\x1b[31m", 3, 7), "bad", "mend")]),
+            2,
+            "a\ufffdb\ufffd[31m:3:7: bad; mend",
+        ),
+        (KeyboardInterrupt(), 130, "interrupted"),
+        (ZeroDivisionError("oops"), 1, "dxlrun: internal error: ZeroDivisionError: oops"),
+    ],
+)
+def test_every_error_is_a_sentence_and_an_exit_code(
+    dxlrun, monkeypatch: pytest.MonkeyPatch, error: BaseException, code: int, says: str
+):
+    def fail(*_: object):
+        raise error
+
+    monkeypatch.setattr("dxlrun.cli.check.compiled", fail)
+
+    said = dxlrun("check", "robot.yaml")
+
+    assert said.code == code
+    assert said.err.startswith(says)
+    assert "Traceback" not in said.err
+    assert not re.search("\x1b", said.out + said.err)
+
+
+def test_debug_shows_the_traceback(dxlrun, torso, monkeypatch: pytest.MonkeyPatch):
+    def fail(*_: object):
+        raise PortError("gone")
+
+    monkeypatch.setattr("dxlrun.cli.check.compiled", fail)
+
+    said = dxlrun("check", torso, "--debug")
+
+    assert said.code == 1
+    assert "Traceback" in said.err
+    assert said.errors[-1] == "dxlrun: gone"
+
+
+def test_a_reader_that_goes_away_is_no_traceback(torso):
+    code = "import sys; from dxlrun.cli import main; sys.exit(main(sys.argv[1:]))"
+    read_end, write_end = os.pipe()
+    os.close(read_end)
+    try:
+        run = subprocess.run(
+            [sys.executable, "-c", code, "check", str(torso), "--json"],
+            stdout=write_end,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+    finally:
+        os.close(write_end)
+
+    assert (run.returncode, run.stderr) == (1, "")
