@@ -63,3 +63,28 @@ def test_another_file_is_refused_by_name(tmp_path: Path, line: str) -> None:
     path.write_text(line + "\n")
     with pytest.raises(LogError, match=r"other\.jsonl is not a ledger"):
         read_ledger(path)
+
+
+def test_a_full_disk_ends_the_file_and_not_the_simulation() -> None:
+    with Ledger(Path("/dev/full")) as ledger:
+        fill(ledger)
+        assert ledger.error is None
+        ledger.flush_if_due(5 + FLUSH_NS)
+        assert "No space left" in str(ledger.error)
+        ledger.add(10, "main", "in", b"more")
+        assert ledger.flush_due_ns() is None
+    assert tuple(ledger.entries[:-1]) == ENTRIES
+
+
+def test_a_disk_that_fills_while_entries_are_added_ends_the_file_too() -> None:
+    with Ledger(Path("/dev/full"), keep=False) as ledger:
+        for t_ns in range(1000):  # beyond the buffer of the file
+            ledger.add(t_ns, "main", "in", bytes(100))
+        assert "No space left" in str(ledger.error)
+
+
+def test_what_does_not_fit_at_the_end_is_told() -> None:
+    ledger = Ledger(Path("/dev/full"))
+    fill(ledger)
+    ledger.close()
+    assert "No space left" in str(ledger.error)

@@ -196,3 +196,40 @@ def test_a_foreign_driver_finds_every_item_where_the_servo_holds_it(start: Calla
     assert not [
         entry.note for entry in running.ledger() if entry.note
     ]  # nothing was refused, nothing collided
+
+
+@contextlib.contextmanager
+def bare(path: Path, *options: str) -> Iterator[tuple[subprocess.Popen[bytes], socket.socket]]:
+    """Start it from a file; give the process and our end of the control socket."""
+    path.write_bytes(encode_config(BUSES))
+    ours, theirs = socket.socketpair()
+    with ours, theirs, path.open("rb") as config:
+        command = [sys.executable, "-m", "dxlrun.simulation", "--config-fd", str(config.fileno())]
+        command += ["--control-fd", str(theirs.fileno()), *options]
+        child = subprocess.Popen(
+            command,
+            pass_fds=(config.fileno(), theirs.fileno()),
+            stderr=subprocess.PIPE,
+            start_new_session=True,
+        )
+        theirs.close()
+        with child:
+            yield child, ours
+
+
+def test_a_starter_that_ends_before_it_has_read_the_ports_ends_it(tmp_path: Path) -> None:
+    with bare(tmp_path / "config") as (child, control):
+        assert select.select([control], [], [], PATIENCE_S)[0]
+        control.close()  # with the ports unread: the other end sees a reset, not an end
+        assert child.communicate(timeout=PATIENCE_S)[1] == b""
+        assert child.returncode == 0
+
+
+def test_a_full_disk_does_not_stop_it_and_is_told_at_the_end(tmp_path: Path) -> None:
+    with bare(tmp_path / "config", "--ledger", "/dev/full") as (child, control):
+        with control.makefile("rb") as said, opened(json.loads(said.readline())["ports"]["main"]) as port:
+            os.write(port, PING_1)
+            assert hear(port, 6) == PONG_1
+        control.close()
+        assert b"No space left" in child.communicate(timeout=PATIENCE_S)[1]
+        assert child.returncode == 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,10 +31,15 @@ class LedgerEntry:
 
 
 class Ledger:
-    """Keeps entries in memory, in a JSON-lines file, or both; `keep=False` bounds the memory of long runs."""
+    """Keeps entries in memory, in a JSON-lines file, or both; `keep=False` bounds the memory of long runs.
+
+    A full disk ends the file, never the simulation.
+    """
 
     def __init__(self, path: Path | None = None, *, keep: bool = True) -> None:
         self.entries: list[LedgerEntry] = []
+        self.error: str | None = None
+        """Why the file is not complete; None: it is."""
         self._keep = keep
         self._file: IO[str] | None = None if path is None else path.open("w", encoding="ascii")
         self._unflushed_ns: int | None = None
@@ -44,9 +50,12 @@ class Ledger:
             self.entries.append(LedgerEntry(t_ns, bus, direction, data, note))
         if self._file is not None:
             line = {"t_ns": t_ns, "bus": bus, "direction": direction, "bytes": data.hex(), "note": note}
-            self._file.write(json.dumps(line) + "\n")
             if self._unflushed_ns is None:
                 self._unflushed_ns = t_ns
+            try:
+                self._file.write(json.dumps(line) + "\n")
+            except OSError as error:
+                self._give_up(error)
 
     def flush_due_ns(self) -> int | None:
         """Return when the file must be flushed, ns on the clock of the entries; None: all is written."""
@@ -60,16 +69,27 @@ class Ledger:
 
     def flush(self) -> None:
         """Write the file out."""
-        if self._file is not None:
-            self._file.flush()
         self._unflushed_ns = None
+        if self._file is not None:
+            try:
+                self._file.flush()
+            except OSError as error:
+                self._give_up(error)
 
     def close(self) -> None:
         """Write the file out and close it; the entries in memory stay."""
+        self.flush()
         if self._file is not None:
             self._file.close()
             self._file = None
+
+    def _give_up(self, error: OSError) -> None:
+        self.error = f"the ledger is not complete: {error}"
         self._unflushed_ns = None
+        if self._file is not None:
+            with contextlib.suppress(OSError):  # it tries once more to write what does not fit
+                self._file.close()
+            self._file = None
 
     def __enter__(self) -> Ledger:
         return self

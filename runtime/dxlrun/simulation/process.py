@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import select
 import signal
 import socket
+import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,7 +25,10 @@ POLL_NS = 80_000
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Serve the buses of a configuration until the control socket ends or SIGTERM comes; return 0."""
+    """Serve the buses of a configuration until the control socket ends or SIGTERM comes.
+
+    Return 0, or 1 when the ledger could not be written.
+    """
     parser = argparse.ArgumentParser(
         prog="dxlrun.simulation", description="Simulated buses on pseudo-terminals."
     )
@@ -40,7 +45,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         buses = decode_config(file.read())
     with socket.socket(fileno=options.control_fd) as control, Ledger(options.ledger, keep=False) as ledger:
         Server(buses, ledger, control).run()
-    return 0
+    if ledger.error is None:
+        return 0
+    print(ledger.error, file=sys.stderr)
+    return 1
 
 
 def encode_config(buses: Sequence[BusConfig]) -> bytes:
@@ -66,8 +74,7 @@ class Server:
     def run(self) -> None:
         """Tell the ports, then serve until the control socket ends or SIGTERM comes."""
         with _wake_on_sigterm() as wake:
-            ports = {terminal.bus.name: terminal.path for terminal in self._terminals}
-            self._control.sendall(json.dumps({"ports": ports}).encode() + b"\n")
+            self._tell_ports()
             while not self._stopped:
                 self._turn(wake)
         for terminal in self._terminals:
@@ -82,9 +89,20 @@ class Server:
             terminal.deliver(now_ns)
             if terminal in readable:
                 terminal.receive(now_ns)
-        if wake in readable or (self._control in readable and not self._control.recv(4096)):
+        if wake in readable or (self._control in readable and self._hung_up()):
             self._stopped = True
         self._ledger.flush_if_due(now_ns)
+
+    def _tell_ports(self) -> None:
+        ports = {terminal.bus.name: terminal.path for terminal in self._terminals}
+        with contextlib.suppress(OSError):  # nobody listens any more: the first turn sees it
+            self._control.sendall(json.dumps({"ports": ports}).encode() + b"\n")
+
+    def _hung_up(self) -> bool:
+        try:
+            return not self._control.recv(4096)
+        except OSError:  # the starter ended without having read the ports
+            return True
 
     def _patience(self) -> float | None:
         """Return for how long nothing happens by itself, s: 0 shortly before a reply, None for ever."""
