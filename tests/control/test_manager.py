@@ -267,3 +267,17 @@ def test_what_is_raised_while_configuring_becomes_one_sentence(robot):
     robot.add("unready", Unready)
     with pytest.raises(ControllerFault, match="controller unready raised in on_configure: OSError: no file"):
         robot.build()
+
+
+def test_joints_of_a_faulty_controller_stop_where_the_gate_last_let_them(make_robot):
+    robot = make_robot(velocity=1.0)
+
+    def act(self, step, time_ns, _):
+        if step == "update":
+            self.context.commands.position[:] = 0.9
+            assert time_ns < 2 * PERIOD_NS
+
+    robot.script("failing", act)
+    assert run(robot, 9).cycles == 3
+    np.testing.assert_allclose([position[0] for position, _ in robot.hardware.written], [0.27, 0.29, 0.29])
+    assert np.isnan(robot.sink.cycles[-1]["position"]).all()

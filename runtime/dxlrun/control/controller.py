@@ -67,7 +67,11 @@ class Context:
     goals: Commands
     """What was last sent to the servos, gathered before each update and before on_activate."""
     commands: Commands
-    """To be written by update; the manager takes only the claimed interfaces, NaN = not yet commanded."""
+    """To be written by update; the manager takes only the claimed interfaces, NaN = not yet commanded.
+
+    All NaN before on_activate; what is not written keeps its value. A joint's interface that was once finite
+    and is NaN again, or is ever infinite, is the controller's fault.
+    """
     say: Callable[[str], None]
     """Leave a sentence in the log (event CONTROLLER_SAYS); for rare things."""
     publish: Callable[[], None]
@@ -95,7 +99,10 @@ class Controller(ABC, Generic[P]):
     @classmethod
     @abstractmethod
     def interfaces(cls, parameters: P, joints: tuple[str, ...]) -> Interfaces:
-        """Say which joints and command interfaces it wants; `joints` are all joints of the robot."""
+        """Say which joints and command interfaces it wants; `joints` are all joints of the robot.
+
+        Joints that the robot does not have, and joints named twice, are refused by whoever asks.
+        """
 
     @classmethod
     def prepare(cls, kind: str, command: CommandModel, parameters: P) -> NDArray[np.float64]:
@@ -124,4 +131,4 @@ class Controller(ABC, Generic[P]):
         """
 
     def on_deactivate(self, time_ns: int) -> None:
-        """Let go of the joints."""
+        """Let go of the joints; not called for a controller that was ended by a fault."""

@@ -136,4 +136,11 @@ def _libc() -> ctypes.CDLL:
 
 
 def _user() -> str:
-    return os.environ.get("USER") or f"#{os.getuid()}"
+    """Return this user as limits.conf(5) names one."""
+    import pwd
+
+    user = os.getuid()
+    try:
+        return pwd.getpwuid(user).pw_name
+    except KeyError:
+        return f"{user}:{user}"
