@@ -11,8 +11,8 @@ from dxlrun.events import EventCode, EventSink, Severity
 from dxlrun.interfaces import Commands, Floats
 
 SLOW_SPEED = 1.5
-"""rad/s; a goal moves no faster in the first second after torque was switched on. A quarter of an AX-12's full
-speed: a person beside the robot can step back, and the thesis' motions still begin on time."""
+"""rad/s; a goal moves no faster in the first second after torque was switched on. A quarter of an AX-12's
+full speed: a person beside the robot can step back, and the thesis' motions still begin on time."""
 SLOW_START_NS = 1_000_000_000
 """How long after `ease_in` the slow speed holds (failures: limit violation)."""
 
