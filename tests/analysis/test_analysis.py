@@ -169,6 +169,13 @@ def test_tracking_compares_with_the_goal_of_the_cycle_before(write: Make, cycle:
     assert (head.rms_rad, head.invalid) == (None, 0)
 
 
+def test_a_cycle_longer_than_its_period_is_said_with_the_step_that_made_it(write: Make, cycle: Make) -> None:
+    sentences = analyze_log(write([cycle(0), cycle(1, read=23_000)])).verdict.sentences
+    assert sentences[1] == (
+        "A cycle took up to 23.40 ms, longer than its period of 20.00 ms; the longest read took 23.00 ms."
+    )
+
+
 def test_rough_wake_ups_are_said(write: Make, cycle: Make) -> None:
     report = analyze_log(write([cycle(number, late=200 if number < 3 else 10) for number in range(100)]))
     assert "3.0% came later than 150 us" in report.verdict.sentences[1]

@@ -20,7 +20,7 @@ from dxlrun.analysis.latency import (
     periods,
 )
 from dxlrun.analysis.tracking import Joint, tracking
-from dxlrun.analysis.verdict import Verdict, verdict
+from dxlrun.analysis.verdict import Timing, Verdict, verdict
 from dxlrun.events import EventCode
 from dxlrun.recording.reader import Log, read_log
 from dxlrun.recording.schemas import SUMMARY_NAME
@@ -67,14 +67,14 @@ def analyze_log(path: str | Path) -> Report:
 def analyze(log: Log) -> Report:
     """Analyze a log that was read. Raises LogError when a packet in it cannot be read."""
     servos, buses = traffic(log)
-    account, wake_ups, lost = periods(log), latency(log), _gaps(log)
+    timing, lost = Timing(periods(log), latency(log), durations(log)), _gaps(log)
     return Report(
         log=str(log.path),
         robot=log.header.robot,
-        verdict=verdict(account, wake_ups, servos, log, lost),
-        periods=account,
-        latency=wake_ups,
-        steps=durations(log),
+        verdict=verdict(timing, servos, log, lost),
+        periods=timing.periods,
+        latency=timing.latency,
+        steps=tuple(timing.steps),
         controllers=controller_durations(log),
         servos=servos,
         buses=buses,

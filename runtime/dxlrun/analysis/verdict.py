@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from dxlrun.analysis.bus import Servo
-from dxlrun.analysis.latency import Latency, Periods
+from dxlrun.analysis.latency import Duration, Latency, Periods
 from dxlrun.events import Event, Severity
 from dxlrun.recording.reader import Log
 
@@ -27,17 +27,28 @@ class Verdict:
     sentences: tuple[str, ...]
 
 
-def verdict(
-    account: Periods, wake_ups: Latency | None, servos: Sequence[Servo], log: Log, lost: int
-) -> Verdict:
-    """Return the sentences: loop, servos, events, log; each says what is good as plainly as what is not."""
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """How the loop kept its time: what the first sentences are about."""
+
+    periods: Periods
+    latency: Latency | None
+    steps: Sequence[Duration]
+
+
+def verdict(timing: Timing, servos: Sequence[Servo], log: Log, lost: int) -> Verdict:
+    """Return the sentences: loop, servos, events, log; each says what is good as plainly as what is not.
+
+    `lost`: records that the recorder did not get.
+    """
     findings = [
-        _loop(account, wake_ups),
-        _rough(wake_ups),
+        _loop(timing.periods, timing.latency),
+        _slow(timing.steps, log.period_ns),
+        _rough(timing.latency),
         _silent(servos),
         _errors(servos),
         _events(log.events),
-        _log(account, log, lost),
+        _log(timing.periods, log, lost),
     ]
     said = [finding for finding in findings if finding is not None]
     return Verdict(all(good for good, _ in said), tuple(sentence for _, sentence in said))
@@ -55,6 +66,18 @@ def _loop(account: Periods, wake_ups: Latency | None) -> Finding:
         f"The loop {kept} {account.rate_hz:g} Hz: {account.skipped} of {account.elapsed} periods skipped"
         f"{'' if good else f' ({account.skipped / account.elapsed:.2%})'}, "
         f"worst wake-up {microseconds(wake_ups.max_us)} late."
+    )
+
+
+def _slow(steps: Sequence[Duration], period_ns: int) -> Finding | None:
+    """Say which step made a cycle longer than the period; `steps` ends with the whole cycle."""
+    if not steps or steps[-1].max_us * 1000 <= period_ns:
+        return None
+    *parts, whole = steps
+    longest = max(parts, key=lambda step: step.max_us)
+    return False, (
+        f"A cycle took up to {microseconds(whole.max_us)}, longer than its period of "
+        f"{microseconds(period_ns / 1e3)}; the longest {longest.name} took {microseconds(longest.max_us)}."
     )
 
 
