@@ -29,7 +29,7 @@ from dxlrun.dynamixel.serial_open import open_serial
 from dxlrun.errors import PortError
 from dxlrun.events import EventCode, EventRing, Severity
 from dxlrun.heartbeat import Heartbeat, Phase
-from dxlrun.packets import PacketBatch
+from dxlrun.packets import PacketBatch, salvage
 from dxlrun.ring import RingWriter
 
 SILENT_PERIODS = 5
@@ -54,6 +54,8 @@ class GuardianJob:
     """Real-time priority of the guardian; 0: none."""
     heartbeat: int
     packets: int
+    desk: int
+    """The loop's unfinished batch of packets."""
     events: int
     stderr: int
     loop: dict[str, object]
@@ -69,7 +71,8 @@ class Guardian:
         self._control = control
         self._clock = MonotonicClock()
         self._heartbeat = Heartbeat(job.heartbeat)
-        self._packets = PacketBatch(RingWriter(job.packets))
+        self._ring = RingWriter(job.packets)
+        self._packets = PacketBatch(self._ring)
         self._events = EventRing(RingWriter(job.events), self._clock)
         self._patience_ns = max(SILENT_PERIODS * job.period_ns, LEAST_PATIENCE_NS)
 
@@ -144,6 +147,7 @@ class Guardian:
 
     def _make_limp(self, loop: subprocess.Popen[bytes], ending: Ending, ports: SerialPorts) -> None:
         """Send torque off to every servo, and tell the log and the terminal what came of it."""
+        salvage(process.shared_memory(self._job.desk), self._ring)
         outcome = limp(self._job.buses, ports, self._clock, self._packets)
         self._packets.commit()
         how = {

@@ -42,6 +42,8 @@ class LoopJob:
     heartbeat: int
     cycles: int
     packets: int
+    desk: int
+    """Where the packets of the unfinished cycle lie."""
     events: int
     result: int
     take_over: bool
@@ -144,7 +146,8 @@ def main() -> None:
     clock = MonotonicClock()
     heartbeat = Heartbeat(job.heartbeat)
     events = EventRing(RingWriter(job.events), clock)
-    sinks = RingSinks(RingWriter(job.cycles), PacketBatch(RingWriter(job.packets)), events, heartbeat)
+    batch = PacketBatch(RingWriter(job.packets), process.shared_memory(job.desk))
+    sinks = RingSinks(RingWriter(job.cycles), batch, events, heartbeat)
     try:
         if os.getppid() != guardian:
             sys.exit(1)  # the guardian was gone before its death could be signalled

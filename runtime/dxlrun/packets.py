@@ -13,6 +13,7 @@ PACKET_SLOT = 2048
 """Bytes of one slot of the packets' ring: a batch, usually the packets of one cycle."""
 
 _HEADER = struct.Struct("<BBBxI qq")
+_USED = struct.Struct("<Q")
 
 
 @unique
@@ -57,15 +58,21 @@ class PacketBatch:
     """Collects packets in a buffer made before real time; one `commit` a cycle hands them on together.
 
     A full buffer commits by itself. Bytes that are longer than a slot (noise only) become several records.
+
+    `desk` is memory of `desk_size(writer)` bytes where the unfinished batch lies; shared memory lets whoever
+    outlives this process take it up with `salvage`, so that a loop that dies in the middle of a cycle does
+    not take that cycle's packets with it.
     """
 
-    __slots__ = ("_buffer", "_room", "_used", "_writer")
+    __slots__ = ("_buffer", "_desk", "_room", "_used", "_writer")
 
-    def __init__(self, writer: Appender) -> None:
+    def __init__(self, writer: Appender, desk: memoryview | None = None) -> None:
         self._writer = writer
-        self._buffer = memoryview(bytearray(min(writer.slot_size, 1 << 16)))
+        self._desk = memoryview(bytearray(desk_size(writer))) if desk is None else desk
+        self._buffer = self._desk[_USED.size : desk_size(writer)]  # shared memory may be larger
         self._room = len(self._buffer)
         self._used = 0
+        _USED.pack_into(self._desk, 0, 0)
         if self._room <= _HEADER.size:
             raise ValueError(f"a slot of {self._room} bytes holds no packet")
 
@@ -82,6 +89,7 @@ class PacketBatch:
         _HEADER.pack_into(self._buffer, start, bus, kind, servo_id, length, first_ns, last_ns)
         self._buffer[start + _HEADER.size : end] = data
         self._used = end
+        _USED.pack_into(self._desk, 0, end)
 
     def _overfull(self, head: tuple[int, PacketKind, int, int, int], data: Payload) -> None:
         self.commit()
@@ -94,6 +102,19 @@ class PacketBatch:
         if self._used:
             self._writer.append(self._buffer[: self._used])
             self._used = 0
+            _USED.pack_into(self._desk, 0, 0)
+
+
+def desk_size(writer: Appender) -> int:
+    """Return how many bytes of memory the unfinished batch of a writer needs."""
+    return _USED.size + min(writer.slot_size, 1 << 16)
+
+
+def salvage(desk: memoryview, writer: Appender) -> None:
+    """Append the batch that a process left unfinished when it died; call it when that process is gone."""
+    used: int = _USED.unpack_from(desk)[0]
+    if 0 < used <= min(len(desk) - _USED.size, writer.slot_size):
+        writer.append(desk[_USED.size : _USED.size + used])
 
 
 class NoPackets:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mmap
 import os
 import socket
 import subprocess
@@ -39,6 +40,11 @@ def memory_file(name: str, content: bytes = b"") -> int:
     descriptor = os.memfd_create(name)
     os.pwrite(descriptor, content, 0)
     return descriptor
+
+
+def shared_memory(descriptor: int) -> memoryview:
+    """Map a nameless file to be written by one process and read by others."""
+    return memoryview(mmap.mmap(descriptor, 0))
 
 
 def whole(descriptor: int) -> bytes:

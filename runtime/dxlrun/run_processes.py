@@ -6,7 +6,7 @@ import os
 import select
 import subprocess
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,6 +38,7 @@ class Memory:
     heartbeat: int
     cycles: int
     packets: int
+    desk: int
     events: int
     guardian_packets: int
     guardian_events: int
@@ -54,6 +55,7 @@ class Memory:
             heartbeat=heartbeat.create(),
             cycles=ring.create("cycles", cycle_layout(plan).size, cycle_slots(period)),
             packets=ring.create("packets", PACKET_SLOT, packet_slots(period, servos)),
+            desk=process.memory_file("dxlrun-desk", bytes(PACKET_SLOT + 64)),
             events=ring.create("events", EVENT_SLOT, event_slots(period, servos)),
             guardian_packets=ring.create("guardian-packets", PACKET_SLOT, _GUARDIAN_SLOTS),
             guardian_events=ring.create("guardian-events", EVENT_SLOT, _GUARDIAN_SLOTS),
@@ -155,16 +157,20 @@ def start_recorder(log: Path, header: LogHeader, memory: Memory) -> Child:
     return child
 
 
-def start_guardian(plan: Plan, ports: Mapping[str, str], memory: Memory, *, take_over: bool) -> Child:
-    """Start the guardian and wait until it holds the ports and has executed the loop.
+def start_guardian(
+    plan: Plan, ports: Mapping[str, str], memory: Memory, others: Sequence[Child], *, take_over: bool
+) -> Child:
+    """Start the guardian; `ready` then waits until it holds the ports and has executed the loop.
 
-    Raises PortError when a port is missing, busy or forbidden.
+    It inherits our ends of the lines to `others`: should this process die, the simulated bus and the recorder
+    see the end of their lines only after the guardian has made the robot limp.
     """
     loop = LoopJob(
         memory.plan,
         memory.heartbeat,
         memory.cycles,
         memory.packets,
+        memory.desk,
         memory.events,
         memory.result,
         take_over,
@@ -177,6 +183,7 @@ def start_guardian(plan: Plan, ports: Mapping[str, str], memory: Memory, *, take
         priority=0 if scheduler.policy == "other" else min(scheduler.priority + 1, 99),
         heartbeat=memory.heartbeat,
         packets=memory.guardian_packets,
+        desk=memory.desk,
         events=memory.guardian_events,
         stderr=memory.stderr,
         loop=msgspec.to_builtins(loop),
@@ -185,6 +192,7 @@ def start_guardian(plan: Plan, ports: Mapping[str, str], memory: Memory, *, take
             memory.heartbeat,
             memory.cycles,
             memory.packets,
+            memory.desk,
             memory.events,
             memory.result,
             memory.stderr,
@@ -192,6 +200,7 @@ def start_guardian(plan: Plan, ports: Mapping[str, str], memory: Memory, *, take
     )
     descriptor = process.memory_file("dxlrun-guardian", msgspec.json.encode(job))
     inherited = [descriptor, memory.guardian_packets, memory.guardian_events, *job.loop_descriptors]
+    inherited += [other.line.fileno() for other in others]
     child = Child("guardian", "dxlrun.guardian", ["--job-fd", str(descriptor)], inherited, memory.stderr)
     os.close(descriptor)
     return child

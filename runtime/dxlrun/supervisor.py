@@ -78,7 +78,10 @@ class _Run:
         if self.log:
             header = log_header(self.plan, epoch_offset_ns(), virtual=False)
             self.recorder = start_recorder(self.log, header, self.memory)
-        self.guardian = start_guardian(self.plan, ports, self.memory, take_over=self.options.take_over)
+        others = [child for child in (self.simulation, self.recorder) if child]
+        self.guardian = start_guardian(
+            self.plan, ports, self.memory, others, take_over=self.options.take_over
+        )
         self.guardian.ready()
         return self.guardian
 
@@ -198,7 +201,7 @@ def _summary(run: _Run, elapsed_s: float) -> RunSummary:
     heartbeat = Heartbeat(run.memory.heartbeat)
     sentences: list[str] = []
     if outcome is None:
-        outcome = Outcome("fault", heartbeat.cycles, heartbeat.skipped)
+        outcome = Outcome("fault", heartbeat.cycles, heartbeat.skipped, _last_words(run.memory))
     sentences += outcome.sentences
     if run.ended is not None and run.ended["ended"] != "done":
         sentences += [str(sentence) for sentence in _list(run.ended["outcome"])]
@@ -216,6 +219,12 @@ def _summary(run: _Run, elapsed_s: float) -> RunSummary:
         log=str(run.log) if run.log else None,
         messages=run.messages,
     )
+
+
+def _last_words(memory: Memory) -> tuple[str, ...]:
+    """Return what a child that ended without a report printed last, if it printed anything."""
+    lines = process.whole(memory.stderr).decode(errors="replace").strip().splitlines()
+    return (f"the loop's process said last: {lines[-1]} (--debug shows all)",) if lines else ()
 
 
 def _list(value: object) -> list[object]:

@@ -1,0 +1,211 @@
+"""`dxlrun` as a person starts it; two independent judges: the ledger's bytes, and what they did to torque."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import pytest
+
+from dxlrun.packets import PacketKind
+from dxlrun.recording.reader import Log, read_log
+from dxlrun.simulation import LedgerEntry, read_ledger
+
+DXLRUN = Path(sys.executable).with_name("dxlrun")
+ROBOT = """\
+name: pair
+arguments:
+  port: {default: sim, help: "serial port"}
+  type: {default: joint_state_broadcaster, help: "type of the first controller"}
+buses:
+  main:
+    port: "${port}"
+    protocol: 1.0
+    baud_rate: 1_000_000
+    return_delay_time: 100 us
+    adapter: {latency: 1 ms}
+loop: {rate: 50, scheduler: {policy: round_robin, priority: 31}}
+joints:
+  pan: {bus: main, id: 3, model: AX-12A, reference: 150 deg, direction: 1}
+  tilt: {bus: main, id: 7, model: AX-12A, reference: 150 deg, direction: -1}
+controllers:
+  states: {type: "${type}"}
+  hold: {type: joint_group_position_controller, joints: [pan, tilt]}
+"""
+DEADLINE_S = 30.0
+T = TypeVar("T")
+
+
+def await_truth(look: Callable[[], T | None], what: str) -> T:
+    """Return what `look` finds; fails when it finds nothing for half a minute."""
+    tick = threading.Event()
+    give_up = time.monotonic() + DEADLINE_S
+    while time.monotonic() < give_up:
+        found = look()
+        if found:
+            return found
+        tick.wait(0.02)
+    raise AssertionError(f"waited {DEADLINE_S} s for {what}")
+
+
+def packets_in(data: bytes) -> list[tuple[int, int, bytes]]:
+    """Cut the host's bytes into (ID, instruction, parameters); the host must send nothing else."""
+    found = []
+    while data:
+        assert data[:2] == b"\xff\xff", f"not a packet: {data[:16].hex()}"
+        length = data[3]
+        body, check = data[2 : 3 + length], data[3 + length]
+        assert check == ~sum(body) & 0xFF
+        found.append((data[2], data[4], data[5 : 3 + length]))
+        data = data[4 + length :]
+    return found
+
+
+def torque(ledger: tuple[LedgerEntry, ...], ids: tuple[int, ...]) -> dict[int, bool]:
+    """Follow what the bytes on the wire did to torque: address 24, and a goal position switches it on."""
+    state = dict.fromkeys(ids, False)
+    sent = b"".join(entry.data for entry in ledger if entry.direction == "in")
+    for servo_id, instruction, parameters in packets_in(sent):
+        writes: list[tuple[int, int, bytes]] = []
+        if instruction == 0x03:
+            targets = ids if servo_id == 0xFE else (servo_id,)
+            writes = [(target, parameters[0], parameters[1:]) for target in targets]
+        elif instruction == 0x83:
+            size = parameters[1]
+            rows = [parameters[at : at + size + 1] for at in range(2, len(parameters), size + 1)]
+            writes = [(row[0], parameters[0], row[1:]) for row in rows]
+        for target, address, data in writes:
+            if address <= 24 < address + len(data):
+                state[target] = bool(data[24 - address])
+            elif address <= 30 < address + len(data):
+                state[target] = True
+    return state
+
+
+@dataclass
+class Running:
+    """One `dxlrun` and what it leaves behind."""
+
+    process: subprocess.Popen[str]
+    directory: Path
+
+    def one(self, pattern: str) -> Path | None:
+        """Return the file of the logs directory that matches, once there is one."""
+        return next(iter((self.directory / "logs").glob(pattern)), None)
+
+    def ledger(self) -> tuple[LedgerEntry, ...]:
+        path = self.one("*.ledger.jsonl")
+        return read_ledger(path) if path else ()
+
+    def log(self) -> Log:
+        path = self.one("*.mcap")
+        assert path is not None
+        return read_log(path)
+
+    def wait_until_moving(self) -> None:
+        """Wait until the loop has sent goals."""
+
+        def goals() -> bool:
+            sent = (entry.data for entry in self.ledger() if entry.direction == "in")
+            return sum(data[4:5] == b"\x83" for data in sent) >= 10
+
+        await_truth(goals, "goals in the ledger")
+
+    def child(self, module: str) -> int:
+        """Return the process ID of one of dxlrun's own processes."""
+
+        def look() -> int | None:
+            for path in Path("/proc").glob("[0-9]*"):
+                try:
+                    command = (path / "cmdline").read_bytes().split(b"\0")
+                    family = _ancestors(int(path.name))
+                except (OSError, ValueError):
+                    continue
+                if module.encode() in command and self.process.pid in family:
+                    return int(path.name)
+            return None
+
+        return await_truth(look, module)
+
+    def signal(self, number: signal.Signals) -> None:
+        self.process.send_signal(number)
+
+    def finish(self) -> tuple[int, str, str]:
+        """Return exit code, standard output, standard error."""
+        out, err = self.process.communicate(timeout=DEADLINE_S + 30)
+        return self.process.returncode, out, err
+
+
+def _ancestors(pid: int) -> set[int]:
+    family: set[int] = set()
+    while pid > 1:
+        fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+        pid = int(fields[1])
+        family.add(pid)
+    return family
+
+
+Start = Callable[..., Running]
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Start]:
+    """Start `dxlrun` on the robot `pair` (or another file) in a directory of its own."""
+    (tmp_path / "pair.yaml").write_text(ROBOT)
+    started: list[Running] = []
+
+    def begin(*arguments: str, path: Path | None = None, robot: Path | None = None) -> Running:
+        environment = os.environ | ({"PYTHONPATH": str(path)} if path else {})
+        command = [str(DXLRUN), str(robot or tmp_path / "pair.yaml"), *arguments]
+        process = subprocess.Popen(
+            command, cwd=tmp_path, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        )
+        started.append(Running(process, tmp_path))
+        return started[-1]
+
+    yield begin
+    for running in started:
+        if running.process.poll() is None:
+            running.process.kill()
+        running.process.communicate()
+
+
+@pytest.fixture
+def all_limp() -> Callable[[Running], bool]:
+    """Judge by the ledger alone that no servo of `pair` was left with torque, and that both had it once."""
+
+    def judge(running: Running) -> bool:
+        return torque(running.ledger(), (3, 7)) == {3: False, 7: False}
+
+    return judge
+
+
+@pytest.fixture
+def wire_equals_log() -> Callable[[Running], None]:
+    """Compare the log with the ledger byte for byte, each direction by itself."""
+
+    def compare(running: Running) -> None:
+        ledger, packets = running.ledger(), running.log().packets
+        for direction, kinds in (
+            ("in", {PacketKind.INSTRUCTION}),
+            ("out", {PacketKind.STATUS, PacketKind.NOISE}),
+        ):
+            wire = b"".join(entry.data for entry in ledger if entry.direction == direction)
+            ours = sorted((one for one in packets if one.kind in kinds), key=lambda one: one.first_ns)
+            assert b"".join(one.data for one in ours) == wire
+
+    return compare
+
+
+@pytest.fixture
+def wait_for() -> Callable[[Callable[[], T | None], str], T]:
+    """Wait until something is true."""
+    return await_truth

@@ -1,0 +1,210 @@
+"""A whole run through all processes, and every way out of it; judged by the simulated bus' own ledger."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import pty
+import select
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dxlrun.events import EventCode
+
+ROBOTS = Path(__file__).parents[2] / "robots"
+Running = Any
+Start = Callable[..., Any]
+
+
+def test_a_run_ends_by_itself_and_its_log_is_the_wire(
+    start: Start, all_limp: Callable[[Running], bool], wire_equals_log: Callable[[Running], None]
+) -> None:
+    run = start("--duration", "1.5")
+    code, out, err = run.finish()
+    assert (code, err) == (0, ""), out + err
+    log = run.log()
+    assert log.complete
+    assert len(log.cycles) + log.cycles["skipped"].sum() == 75
+    assert log.cycles["valid"].all()
+    assert str(run.one("*.mcap").name) in out.replace("\n", "")
+    assert all_limp(run)
+    wire_equals_log(run)
+
+
+def test_no_record_leaves_no_files(start: Start) -> None:
+    run = start("--duration", "0.2", "--no-record")
+    assert run.finish()[0] == 0
+    assert not (run.directory / "logs").exists()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_stops_in_order(
+    start: Start,
+    number: signal.Signals,
+    all_limp: Callable[[Running], bool],
+    wire_equals_log: Callable[[Running], None],
+) -> None:
+    run = start()
+    run.wait_until_moving()
+    run.signal(number)
+    code, _, err = run.finish()
+    assert code == 130
+    assert "Traceback" not in err
+    assert run.log().complete
+    assert all_limp(run)
+    wire_equals_log(run)
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_the_guardian_makes_the_robot_limp_when_the_loop_is_gone(
+    start: Start,
+    number: signal.Signals,
+    all_limp: Callable[[Running], bool],
+    wire_equals_log: Callable[[Running], None],
+) -> None:
+    run = start()
+    run.wait_until_moving()
+    os.kill(run.child("dxlrun.loop_process"), number)
+    code, out, err = run.finish()
+    assert code == 1, out + err
+    assert "torque off was confirmed by all 2 servos" in err
+    assert "Traceback" not in err
+    assert all_limp(run)
+    wire_equals_log(run)
+    assert [event.source for event in run.log().events if event.code == EventCode.GUARDIAN] == ["guardian"]
+
+
+def test_without_a_guardian_the_loop_stops_by_itself(
+    start: Start, all_limp: Callable[[Running], bool]
+) -> None:
+    run = start()
+    run.wait_until_moving()
+    os.kill(run.child("dxlrun.guardian"), signal.SIGKILL)
+    code, _, err = run.finish()
+    assert code == 1
+    assert "guardian ended" in err
+    assert all_limp(run)
+
+
+def test_without_a_terminal_the_robot_becomes_limp(start: Start, all_limp: Callable[[Running], bool]) -> None:
+    run = start()
+    run.wait_until_moving()
+    simulation = os.pidfd_open(run.child("dxlrun.simulation"))
+    guardian = os.pidfd_open(run.child("dxlrun.guardian"))
+    run.signal(signal.SIGKILL)
+    run.finish()
+    for descriptor in (guardian, simulation):
+        assert select.select([descriptor], [], [], 30.0)[0]
+        os.close(descriptor)
+    assert all_limp(run)
+
+
+def test_killing_the_recorder_does_not_stop_the_robot(
+    start: Start, all_limp: Callable[[Running], bool], wait_for: Callable[..., Any]
+) -> None:
+    run = start("--duration", "3")
+    wait_for(lambda: len(run.log().cycles) if run.one("*.mcap") else None, "cycles in the log")
+    os.kill(run.child("dxlrun.recording"), signal.SIGKILL)
+    code, out, err = run.finish()
+    assert code == 1
+    assert "recorder" in err
+    goals = [one for one in run.ledger() if one.direction == "in" and one.data[4:5] == b"\x83"]
+    assert len(goals) == 150, out
+    assert all_limp(run)
+    assert len(run.log().cycles) > 0
+
+
+def test_the_loops_process_has_one_thread(start: Start) -> None:
+    run = start("--duration", "2")
+    run.wait_until_moving()
+    assert len(list(Path(f"/proc/{run.child('dxlrun.loop_process')}/task").iterdir())) == 1
+    run.finish()
+
+
+def test_a_missing_port_is_one_sentence(start: Start) -> None:
+    run = start("port:=/dev/ttyNowhere")
+    code, _, err = run.finish()
+    assert code == 1
+    assert len(err.strip().splitlines()) == 1
+    assert "/dev/ttyNowhere" in err
+    assert run.one("*") is None
+
+
+def test_a_busy_port_is_one_sentence_that_names_the_holder(start: Start) -> None:
+    master, slave = pty.openpty()
+    fcntl.flock(slave, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    run = start(f"port:={os.ttyname(slave)}")
+    code, _, err = run.finish()
+    os.close(master)
+    os.close(slave)
+    assert code == 1
+    assert len(err.strip().splitlines()) == 1
+    assert str(os.getpid()) in err
+
+
+def plugin(directory: Path, update: str) -> Path:
+    """Write a package with one controller, as pip would install it."""
+    (directory / "bad_controllers.py").write_text(
+        "import dxlrun\n"
+        "class Bad(dxlrun.Controller):\n"
+        "    @classmethod\n"
+        "    def interfaces(cls, parameters, joints):\n"
+        "        return dxlrun.Interfaces(joints=())\n"
+        "    def update(self, time_ns, period_ns):\n"
+        f"        {update}\n"
+        "@dxlrun.hookimpl\n"
+        "def dxlrun_contract():\n"
+        "    return dxlrun.CONTRACT_VERSION\n"
+        "@dxlrun.hookimpl\n"
+        "def dxlrun_controllers():\n"
+        "    return {'bad': Bad}\n"
+    )
+    info = directory / "bad_controllers-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: bad-controllers\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[dxlrun]\nbad = bad_controllers\n")
+    return directory
+
+
+def test_a_controller_that_raises_ends_the_run(
+    start: Start,
+    tmp_path: Path,
+    all_limp: Callable[[Running], bool],
+    wire_equals_log: Callable[[Running], None],
+) -> None:
+    (tmp_path / "plugins").mkdir()
+    path = plugin(tmp_path / "plugins", "if time_ns > 5e8: raise RuntimeError('out of ideas')")
+    run = start("type:=bad", path=path)
+    code, _, err = run.finish()
+    assert code == 1
+    assert len(err.strip().splitlines()) == 1
+    assert "states" in err
+    assert "out of ideas" in err
+    assert all_limp(run)
+    wire_equals_log(run)
+    log = run.log()
+    assert log.complete
+    faults = [event for event in log.events if event.code == EventCode.CONTROLLER_FAULT]
+    assert len(faults) == 1
+    assert "Traceback" in faults[0].text
+
+
+def test_an_endless_update_is_ended_by_the_guardian(
+    start: Start,
+    tmp_path: Path,
+    all_limp: Callable[[Running], bool],
+    wire_equals_log: Callable[[Running], None],
+) -> None:
+    (tmp_path / "plugins").mkdir()
+    path = plugin(tmp_path / "plugins", "\n        while time_ns > 5e8: pass")
+    run = start("type:=bad", path=path)
+    code, _, err = run.finish()
+    assert code == 1
+    assert "stood still" in err
+    assert all_limp(run)
+    wire_equals_log(run)
+    assert len(run.log().cycles) >= 25
