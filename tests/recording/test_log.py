@@ -7,6 +7,7 @@ import resource
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -72,7 +73,7 @@ def test_mcap_ros2_support_decodes_every_topic(
     log: LogWriter, tmp_path: Path, header: LogHeader, cycle: Cycle
 ) -> None:
     summary = fill(log, cycle)
-    by_topic: dict[str, list[object]] = {}
+    by_topic: dict[str, list[Any]] = {}
     with (tmp_path / "run.mcap").open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
         assert reader.get_header().profile == "ros2"
@@ -94,9 +95,9 @@ def test_mcap_ros2_support_decodes_every_topic(
     }
     assert sum(len(messages) for messages in by_topic.values()) == summary.messages
     state = by_topic["/joint_states"][1]  # cycle 2
-    assert list(state.name) == list(header.joints[1:])  # type: ignore[attr-defined]  # made at run time
-    assert list(state.position) == [2.2, 2.3]  # type: ignore[attr-defined]  # made at run time
-    assert bytes(by_topic["/bus/main"][1].data) == PACKETS[1].data  # type: ignore[attr-defined]  # the same
+    assert list(state.name) == list(header.joints[1:])
+    assert list(state.position) == [2.2, 2.3]
+    assert bytes(by_topic["/bus/main"][1].data) == PACKETS[1].data
 
 
 def test_rosbags_decodes_every_topic(
@@ -107,7 +108,7 @@ def test_rosbags_decodes_every_topic(
     with (tmp_path / "run.mcap").open("rb") as stream:
         for schema, channel, message in make_reader(stream).iter_messages():
             assert schema is not None
-            decoded = typestore.deserialize_cdr(message.data, schema.name)
+            decoded: Any = typestore.deserialize_cdr(message.data, schema.name)
             assert bytes(typestore.serialize_cdr(decoded, schema.name)) == message.data
             assert typestore.hash_rihs01(schema.name) == channel.metadata["topic_type_hash"]
             topics.add(channel.topic)
@@ -124,7 +125,7 @@ def test_states_that_are_not_valid_are_not_a_number(
     fill(log, cycle)
     with (tmp_path / "run.mcap").open("rb") as stream:
         for _, _, message in make_reader(stream).iter_messages("/joint_states"):
-            state = typestore.deserialize_cdr(message.data, "sensor_msgs/msg/JointState")
+            state: Any = typestore.deserialize_cdr(message.data, "sensor_msgs/msg/JointState")
             number = (message.log_time - header.epoch_offset_ns - 1_005_000_000) // header.period_ns
             for values in (state.position, state.velocity, state.effort):
                 assert list(np.isnan(values)) == [number % 3 == 0, False]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -48,7 +50,7 @@ def test_joint_states_are_read_by_rosbags(
     data = Codec(schemas.JOINT_STATE).pack(
         (stamp, frame), names, np.array(position), np.zeros(0), np.array(effort)
     )
-    message = store.deserialize_cdr(data, schemas.JOINT_STATE.name)
+    message: Any = store.deserialize_cdr(data, schemas.JOINT_STATE.name)
     assert (message.header.stamp.sec, message.header.stamp.nanosec) == stamp
     assert message.header.frame_id == frame
     assert message.name == names
@@ -78,7 +80,7 @@ def test_an_event_is_the_same_for_us_and_for_rosbags(
 def test_a_bus_packet_is_read_by_rosbags(data: bytes, servo_id: int) -> None:
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(schemas.BUS_PACKET.text, schemas.BUS_PACKET.name))
-    message = store.deserialize_cdr(
+    message: Any = store.deserialize_cdr(
         Codec(schemas.BUS_PACKET).pack(1, 2, 3, servo_id, data), schemas.BUS_PACKET.name
     )
     assert (message.first_ns, message.last_ns, message.kind, message.servo_id) == (1, 2, 3, servo_id)
