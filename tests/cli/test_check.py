@@ -15,7 +15,7 @@ joints:
   head_joint: {bus: main, id: 254, model: AX-12A, reference: 150, direction: 1}
   neck_joint: {bus: main, id: 2, model: AX-12A, reference: 150 deg, direction: 2}
   neck_joint: {bus: main, id: 3, model: AX-12A, reference: 150 deg, direction: 1}
-  tail: {bus: main, id: 4, model: AX-12, reference: 150 grad, direction: 1, limits: {position: [2 rad, 0 rad]}}
+  tail: {bus: main, id: 4, model: AX-12, reference: 150 grad, direction: 1, limits: {position: [2 rad,0 rad]}}
 colour: red
 """
 
@@ -43,7 +43,7 @@ joints:
   neck_joint: {bus: mian, id: 2, model: AX-12A, reference: 150 deg, direction: 1}
   back_joint: {bus: main, id: 1, model: AX-12A, reference: 150 deg, direction: 1}
   tail: {bus: main, id: 4, model: AX-21X, reference: 150 deg, direction: 1}
-  nose: {bus: main, id: 5, model: AX-12A, reference: 0 deg, direction: 1, limits: {position: [-9 deg, -8 deg]}}
+  nose: {bus: main, id: 5, model: AX-12A, reference: 0 deg, direction: 1, limits: {position: [-9 deg,-8 deg]}}
 controllers:
   states: {type: joint_state_broadcaster, rate: 150}
   head: {type: joint_group_position_controller, joints: [left_joint, neck_jiont]}

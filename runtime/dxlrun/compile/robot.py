@@ -9,6 +9,7 @@ from pathlib import Path
 from dxlrun.compile.buses import compile_buses
 from dxlrun.compile.controllers import compile_controllers
 from dxlrun.compile.joints import compile_joints
+from dxlrun.compile.left_out import left_out_names, still_true
 from dxlrun.compile.motions import compile_motion
 from dxlrun.compile.plan import Plan
 from dxlrun.compile.problems import Problems
@@ -16,7 +17,7 @@ from dxlrun.compile.report import Checked, CheckReport, check_report
 from dxlrun.compile.twins import check_twins
 from dxlrun.control.loop_plan import LoopPlan, SchedulerPlan
 from dxlrun.control.plugins import load_plugins
-from dxlrun.description import Description, MotionDescription, read_motion, read_robot
+from dxlrun.description import Description, MotionDescription, read_motion, survey_robot
 from dxlrun.errors import InputError, Problem
 
 
@@ -33,11 +34,13 @@ def compile_files(
     robot: Path, arguments: Mapping[str, str], motions: Sequence[Path], duration_ns: int | None = None
 ) -> Compiled:
     """Read robot file and motion files and compile them; raises InputError with the problems of all files."""
-    description: Description | None = None
     read: list[MotionDescription] = []
+    description: Description | None = None
     problems: list[Problem] = []
     try:
-        description = read_robot(robot, arguments)
+        survey = survey_robot(robot, arguments)
+        description = survey.description
+        problems += survey.problems
     except InputError as error:
         problems += _placed(error)
     for path in motions:
@@ -45,14 +48,14 @@ def compile_files(
             read.append(read_motion(path))
         except InputError as error:
             problems += _placed(error)
-    if description is not None and problems:
+    if not problems and description is not None:
+        return compile_robot(description, read, duration_ns)
+    if description is not None:
         try:
             compile_robot(description, read, duration_ns)
         except InputError as error:
-            problems += _placed(error)
-    if problems or description is None:
-        raise InputError(problems)
-    return compile_robot(description, read, duration_ns)
+            problems += still_true(description, _placed(error))
+    raise InputError(sorted(problems, key=lambda problem: (problem.severity, problem.mark)))
 
 
 def _placed(error: InputError) -> tuple[Problem, ...]:
@@ -75,7 +78,7 @@ def compile_robot(
     check_twins(description, {name: joint.table for name, joint in joints.items()}, problems)
     buses = compile_buses(description, joints, problems)
     controllers = compile_controllers(description, load_plugins(), problems)
-    names = tuple(description.robot.controllers)
+    names = (*description.robot.controllers, *left_out_names(description, "controllers"))
     parts = [
         part for motion in motions for part in compile_motion(motion, controllers, names, joints, problems)
     ]

@@ -1,0 +1,51 @@
+"""Left out: what cross checks may say of a robot file of which some parts have a wrong form.
+
+Those parts were reported already and are left out of the description, so that mistakes of form and of meaning
+come together. Whatever points at a part that was left out is not said again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+from dxlrun.description import Description, KeyPath
+from dxlrun.errors import Mark, Problem
+
+
+def left_out_names(description: Description, section: str) -> tuple[str, ...]:
+    """Return the names of the entries of a section (buses, joints, controllers) that were left out."""
+    return tuple(str(path[1]) for path in description.left_out if len(path) == 2 and path[0] == section)
+
+
+def still_true(description: Description, problems: Iterable[Problem]) -> tuple[Problem, ...]:
+    """Return the errors that have nothing to do with what was left out."""
+    silent = set(_silent(description))
+    return tuple(p for p in problems if p.severity == "error" and p.mark not in silent)
+
+
+def _silent(description: Description) -> Iterator[Mark]:
+    robot, marks = description.robot, description.marks
+    buses, joints = left_out_names(description, "buses"), left_out_names(description, "joints")
+    for name, joint in robot.joints.items():
+        if joint.bus in buses or ("buses",) in description.left_out:
+            yield marks.value("joints", name, "bus")
+    for name, controller in robot.controllers.items():
+        for path, text in _texts(controller.parameters, ("controllers", name)):
+            if text in joints:
+                yield marks.value(*path)
+    if any(path[0] == "loop" for path in description.left_out):
+        # how fast the buses must be, and what divides the rate, is unknown
+        yield marks.value("loop", "rate")
+        yield from (marks.value("controllers", name, "rate") for name in robot.controllers)
+
+
+def _texts(value: object, path: KeyPath) -> Iterator[tuple[KeyPath, str]]:
+    """Yield every text of a tree with its path."""
+    if isinstance(value, str):
+        yield path, value
+    elif isinstance(value, dict):
+        for key, item in value.items():
+            yield from _texts(item, (*path, str(key)))
+    elif isinstance(value, list):
+        for index, item in enumerate(value):
+            yield from _texts(item, (*path, index))
