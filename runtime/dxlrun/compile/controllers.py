@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 from pydantic import ValidationError
 
+from dxlrun.compile.places import joint_mark
 from dxlrun.compile.problems import Problems, suggestion
 from dxlrun.control.claims import conflicts
 from dxlrun.control.controller import Interfaces, ParametersModel
 from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.control.plugins import Offer, PlugIns
 from dxlrun.description import Description, problems_of
-from dxlrun.errors import Mark
 
 _RATE_TOLERANCE = 1e-6
 """Relative; a loop rate of 33.3 Hz is three times 11.1 Hz."""
@@ -155,12 +155,3 @@ def _exclusive_claims(
             f"{other} and {holder} are both active and both claim {', '.join(joints)}",
             f"write active: false in one of the two, or take the joint{'s' * (len(joints) > 1)} out",
         )
-
-
-def joint_mark(description: Description, controller: str, joint: str) -> Mark:
-    """Return where a controller of the file names a joint; the controller's own place when it does not."""
-    listed = description.robot.controllers[controller].parameters.get("joints")
-    if isinstance(listed, list) and joint in listed:
-        positions = [index for index, name in enumerate(listed) if name == joint]
-        return description.marks.value("controllers", controller, "joints", positions[-1])
-    return description.marks.key("controllers", controller)

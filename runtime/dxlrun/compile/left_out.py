@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-from dxlrun.description import Description, KeyPath
+from dxlrun.compile.places import texts
+from dxlrun.description import Description
 from dxlrun.errors import Mark, Problem
 
 
@@ -30,22 +31,10 @@ def _silent(description: Description) -> Iterator[Mark]:
         if joint.bus in buses or ("buses",) in description.left_out:
             yield marks.value("joints", name, "bus")
     for name, controller in robot.controllers.items():
-        for path, text in _texts(controller.parameters, ("controllers", name)):
+        for path, text in texts(controller.parameters, ("controllers", name)):
             if text in joints:
                 yield marks.value(*path)
     if any(path[0] == "loop" for path in description.left_out):
         # how fast the buses must be, and what divides the rate, is unknown
         yield marks.value("loop", "rate")
         yield from (marks.value("controllers", name, "rate") for name in robot.controllers)
-
-
-def _texts(value: object, path: KeyPath) -> Iterator[tuple[KeyPath, str]]:
-    """Yield every text of a tree with its path."""
-    if isinstance(value, str):
-        yield path, value
-    elif isinstance(value, dict):
-        for key, item in value.items():
-            yield from _texts(item, (*path, str(key)))
-    elif isinstance(value, list):
-        for index, item in enumerate(value):
-            yield from _texts(item, (*path, index))
