@@ -92,7 +92,9 @@ def hear(port: int, size: int) -> bytes:
     heard = b""
     while len(heard) < size:
         assert select.select([port], [], [], PATIENCE_S)[0], f"only {heard.hex(' ')} came"
-        heard += os.read(port, 256)
+        arrived = os.read(port, 256)
+        assert arrived, f"the terminal is gone after {heard.hex(' ')}"
+        heard += arrived
     return heard
 
 
