@@ -1,0 +1,151 @@
+"""The torso on virtual time: the thesis' three parts follow their formulas, and two runs are one."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from math import cos, pi, sin
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dxlrun.errors import InputError
+from dxlrun.packets import PacketKind
+from dxlrun.recording.reader import read_log
+from dxlrun.testing import plan_of, simulated_robot
+from dxlrun.virtual_run import VirtualRobot
+
+ROBOTS = Path(__file__).parents[2] / "robots"
+TORSO = ROBOTS / "bioloid_torso.yaml"
+THREE_PARTS = ROBOTS / "motions/three_parts.yaml"
+LAG_S = 0.1
+"""A command goes out in one cycle, moves the servo in the next, and is read in the one after: 60 ms at 50 Hz;
+the servo's bounded acceleration adds the rest."""
+
+
+@pytest.fixture(scope="module")
+def log_of_three_parts(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("logs") / "three_parts.mcap"
+    result = simulated_robot(TORSO, play=[THREE_PARTS], log=path).run()
+    assert (result.reason, result.skipped, result.detail) == ("ended", 0, "")
+    return path
+
+
+def left(t: float) -> float:
+    return 0.2 * (sin(2 * t) - sin(4 * t)) - 0.4
+
+
+def right(joint: str, t: float) -> float:
+    return {
+        "right_shoulder_swing_joint": 0.2 * (cos(t) - sin(2 * t)) - 0.4,
+        "right_shoulder_lateral_joint": 0.2 * (sin(2 * t) - cos(1.5 * t)) - 0.4,
+        "right_elbow_joint": 0.2 * (sin(2 * t) - sin(t)) - 0.4,
+    }[joint]
+
+
+@pytest.mark.parametrize(
+    ("joint", "begin_s", "duration_s"),
+    [
+        (f"left_{part}", 4.0, 30.0)
+        for part in ("shoulder_swing_joint", "shoulder_lateral_joint", "elbow_joint")
+    ]
+    + [
+        (f"right_{part}", 2.0, 20.0)
+        for part in ("shoulder_swing_joint", "shoulder_lateral_joint", "elbow_joint")
+    ],
+)
+def test_each_arm_follows_its_formula(
+    log_of_three_parts: Path, joint: str, begin_s: float, duration_s: float
+) -> None:
+    log = read_log(log_of_three_parts)
+    row = log.joints.index(joint)
+    seconds = (log.cycles["woken_ns"] - log.cycles["scheduled_ns"][0]) * 1e-9 - begin_s
+    during = (seconds >= 0) & (seconds <= duration_s)
+
+    def wanted(t: float) -> float:
+        return left(t) if joint.startswith("left") else right(joint, t)
+
+    goal = log.cycles["goal_position"][during, row]
+    assert goal == pytest.approx(
+        [wanted(t) for t in seconds[during]], abs=0.002
+    )  # between 500 samples: linear
+    settled = (seconds >= LAG_S) & (seconds <= duration_s)
+    read = log.cycles["position"][settled, row]
+    band = np.array([[wanted(t - lag) for lag in np.linspace(0.0, LAG_S, 21)] for t in seconds[settled]])
+    tick = 300 / 1023 * pi / 180
+    assert (read >= band.min(axis=1) - tick).all()
+    assert (read <= band.max(axis=1) + tick).all()
+
+
+def test_the_head_obeys_its_commands(log_of_three_parts: Path) -> None:
+    log = read_log(log_of_three_parts)
+    yaw, pitch = log.joints.index("head_yaw_joint"), log.joints.index("head_pitch_joint")
+    seconds = (log.cycles["scheduled_ns"] - log.cycles["scheduled_ns"][0]) * 1e-9
+    for t, row, degrees in (
+        (5.9, yaw, 45),
+        (11.9, yaw, -45),
+        (11.9, pitch, 20),
+        (15.9, pitch, -20),
+        (30, yaw, 0),
+    ):
+        at = int(np.searchsorted(seconds, t))
+        assert log.cycles["position"][at, row] == pytest.approx(degrees * pi / 180, abs=0.01)
+    moving = (seconds > 6.5) & (seconds < 8.5)
+    speed = np.diff(log.cycles["position"][moving, yaw]).mean() * 50
+    assert speed == pytest.approx(-30 * pi / 180, rel=0.03)
+
+
+def test_two_runs_write_identical_logs(log_of_three_parts: Path, tmp_path: Path) -> None:
+    again = tmp_path / "again.mcap"
+    simulated_robot(TORSO, play=[THREE_PARTS], log=again).run()
+    assert again.read_bytes() == log_of_three_parts.read_bytes()
+
+
+def test_the_log_is_the_wire(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    robot = simulated_robot(TORSO, duration_s=1.0, log=path)
+    robot.run()
+    packets = read_log(path).packets
+    for direction, kinds in (
+        ("in", {PacketKind.INSTRUCTION}),
+        ("out", {PacketKind.STATUS, PacketKind.NOISE}),
+    ):
+        wire = b"".join(entry.data for entry in robot.ledger.entries if entry.direction == direction)
+        assert b"".join(packet.data for packet in packets if packet.kind in kinds) == wire
+
+
+def test_a_silent_servo_is_invalid_with_an_age_and_nobody_else_is(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    robot = simulated_robot(TORSO, duration_s=2.0, log=path)
+    robot.buses[0].at(1_000_000_000, lambda: robot.buses[0].servo(5).silence(True))
+    robot.run()
+    log = read_log(path)
+    elbow = log.joints.index("left_elbow_joint")
+    silent = log.cycles["woken_ns"] > 1_020_000_000
+    assert silent.sum() > 20
+    assert not log.cycles["valid"][silent, elbow].any()
+    assert (np.diff(log.cycles["age_ns"][silent, elbow]) > 15_000_000).all()
+    others = [row for row in range(8) if row != elbow]
+    assert log.cycles["valid"][:, others].all()
+    assert any("left_elbow_joint" in failure and "ID 5" in failure for failure in robot.failures)
+
+
+def test_virtual_time_refuses_a_real_port() -> None:
+    plan = plan_of(TORSO, arguments={"port": "/dev/ttyUSB0"}, duration_s=1.0)
+    with pytest.raises(InputError, match="port:=sim"):
+        VirtualRobot(plan)
+
+
+def test_the_command_line_runs_on_virtual_time(tmp_path: Path) -> None:
+    dxlrun = Path(sys.executable).with_name("dxlrun")
+    done = subprocess.run(
+        [dxlrun, TORSO, "--virtual", "--duration", "60"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    log = read_log(next((tmp_path / "logs").glob("*.mcap")))
+    assert len(log.cycles) == 3000
