@@ -84,7 +84,8 @@ class GoalArrays:
     """Builds the sync write of one bus in a buffer that is made once.
 
     Position: to the nearest tick, inside the joint's limits and so inside 0..max, never wraps. Speed:
-    magnitude; 0 rad/s is 1 tick, because 0 ticks mean the maximum in joint mode; NaN is 0 ticks; too fast is the highest tick.
+    magnitude; 0 rad/s is 1 tick, because 0 ticks mean the maximum in joint mode; NaN is 0 ticks; too
+    fast is the highest tick.
     """
 
     __slots__ = (

@@ -34,6 +34,9 @@ LEAST_QUIET_NS = 200_000
 DRAIN_LIMIT_NS = 5_000_000
 """A line that babbles longer than this is not waited for."""
 
+LOST_LINE_STEP_NS = 200_000
+"""How often the other lines are looked at while one is gone."""
+
 _READY, _AWAITING, _RESTING, _DRAINING = range(4)
 
 
@@ -60,6 +63,7 @@ class Bus:
         "_quiet_ns",
         "_receiver",
         "_reply",
+        "_reply_size",
         "_sink",
         "_started_ns",
         "_state",
@@ -93,6 +97,7 @@ class Bus:
         self._state = _READY
         self._started_ns = self._earliest_ns = self._deadline_ns = self._free_ns = 0
         self._drain_end_ns = 0
+        self._reply_size = OVERHEAD
         self._last_byte_ns = -NEVER
 
     @property
@@ -129,6 +134,9 @@ class Bus:
             try:
                 if self._receiver.read_from(self._port, self._now_ns):
                     self._last_byte_ns = self._now_ns()
+                # as many bytes as the awaited reply has, and it is not whole: its header is a false one
+                while self._state == _AWAITING and self._receiver.pending >= self._reply_size:
+                    self._receiver.skip_header()
             except PortError as error:
                 self._fail(error)
 
@@ -188,6 +196,7 @@ class Bus:
             count = len(transaction.packet) + OVERHEAD
             self._earliest_ns = self._started_ns + count * self._byte_ns
             self._deadline_ns = self._started_ns + transaction.timeout_ns
+            self._reply_size = OVERHEAD + transaction.reply_length
             self._state = _AWAITING
 
     def _write(self, packet: bytes | bytearray | memoryview, servo_id: int) -> None:
@@ -251,21 +260,26 @@ class Bus:
             self._reply.echoed = True
 
 
-def pump(buses: Sequence[Bus], ports: Ports, now_ns: Callable[[], int], beat: Callable[[], None]) -> None:
+def pump(buses: Sequence[Bus], ports: Ports, clock: Clock, beat: Callable[[], None]) -> None:
     """Execute the jobs of all buses side by side: one wait over all ports, until every job is finished.
 
     `beat` is called at least once a transaction. Raises nothing: a line that is gone has its `failure`, and
     the others go on.
     """
     while True:
-        now = now_ns()
+        now = clock.now_ns()
         deadline = NEVER
         for bus in buses:
             deadline = min(deadline, bus.step(now))
         beat()
         if deadline == NEVER:
             return
-        for index in ports.wait(deadline):
+        ready = ports.wait(deadline)
+        if ready and all(buses[index].failure is not None for index in ready):
+            # a line that is gone is ready for ever: look at the others now and then instead of waiting
+            clock.wait_until(min(deadline, now + LOST_LINE_STEP_NS))
+            ready = range(len(buses))
+        for index in ready:
             buses[index].receive()
 
 
@@ -283,5 +297,5 @@ def run(
     jobs = [ProgramJob(program) for program in programs]
     for bus, job in zip(buses, jobs, strict=True):
         bus.load(job)
-    pump(buses, ports, clock.now_ns, beat)
+    pump(buses, ports, clock, beat)
     return [job.result for job in jobs]

@@ -80,7 +80,7 @@ class DynamixelHardware:
         for bus, servos in zip(self._buses, self._servos, strict=True):
             servos.reads.begin()
             bus.load(servos.reads)
-        pump(self._buses, self._ports, self._clock.now_ns, self._beat)
+        pump(self._buses, self._ports, self._clock, self._beat)
         now = self._clock.now_ns()
         for servos in self._servos:
             servos.settle(self._states, now)
@@ -102,12 +102,12 @@ class DynamixelHardware:
             for bus, servos in zip(self._buses, self._servos, strict=True)
         ]
         if any(probing):
-            pump(self._buses, self._ports, self._clock.now_ns, self._beat)
+            pump(self._buses, self._ports, self._clock, self._beat)
             for servos in self._servos:
                 servos.probed()
 
     def stop(self) -> tuple[str, ...]:
-        """Switch torque off on every servo, read it back; return a sentence per servo without confirmation."""
+        """Switch torque off on every servo, and read it back; return a sentence per failure."""
         failures = tuple(f"{one}" for one in self._limp() if not one.confirmed)
         for sentence in failures:
             self._events.emit(EventCode.SHUTDOWN_FAILED, Severity.ERROR, "hardware", sentence)

@@ -60,6 +60,11 @@ class Receiver:
             self._view[self._end : self._end + len(chunk)] = chunk
             self._accept(len(chunk), now_ns)
 
+    def skip_header(self) -> None:
+        """Give up the header that is being waited for, as false; what follows it gets its chance."""
+        if self._end:
+            self._forget(self._scan(1))
+
     def flush(self) -> None:
         """Give up waiting for the rest of an unfinished packet: scan again behind its header."""
         while self._end:

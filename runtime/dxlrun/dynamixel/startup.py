@@ -170,7 +170,9 @@ class _Surveyor:
         elif reply.outcome is Outcome.REFUSED:
             self._problem(servo, f"refuses to be read: {describe_error(reply.error)}")
         else:
-            self._problem(servo, "answers reads garbled: check cable, ground and other servos of the same ID")
+            self._problem(
+                servo, "answers reads garbled: do two servos have its ID? If not, check cable and ground"
+            )
 
     def _identity(self, servo: ServoPlan, block: Reply) -> None:
         number, firmware = block.word(), block.parameters[2]

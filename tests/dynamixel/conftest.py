@@ -1,0 +1,172 @@
+"""A torso of AX-12 servos on virtual time, with everything it said kept in lists."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import pytest
+
+from dxlrun.clock import VirtualClock
+from dxlrun.control_table import control_table
+from dxlrun.dynamixel.bus_plan import BusPlan
+from dxlrun.dynamixel.hardware import DynamixelHardware
+from dxlrun.dynamixel.plan import Wiring, bus_plan
+from dxlrun.events import EventCode, Severity
+from dxlrun.interfaces import Commands, States
+from dxlrun.packets import LoggedPacket, PacketKind
+from dxlrun.simulation import BusConfig, Ledger, ServoConfig, SimulatedBus, VirtualPorts
+
+MIDDLE = math.radians(150)
+
+
+@dataclass
+class Packets:
+    """Takes packets and keeps them."""
+
+    list: list[LoggedPacket] = field(default_factory=list)
+
+    def packet(self, bus, kind, servo_id, first_ns, last_ns, data):  # noqa: PLR0917  the contract of PacketSink
+        self.list.append(LoggedPacket(bus, kind, servo_id, first_ns, last_ns, bytes(data)))
+
+    def sent(self, bus=0):
+        return [p.data for p in self.list if p.bus == bus and p.kind is PacketKind.INSTRUCTION]
+
+    def received(self, bus=0):
+        return b"".join(p.data for p in self.list if p.bus == bus and p.kind is not PacketKind.INSTRUCTION)
+
+
+@dataclass
+class Events:
+    """Takes events and keeps them."""
+
+    list: list[tuple[EventCode, Severity, str, str]] = field(default_factory=list)
+
+    def emit(self, code, severity, source, text):
+        self.list.append((code, severity, source, text))
+
+    def of(self, code):
+        return [(source, text) for kind, _, source, text in self.list if kind == code]
+
+
+@dataclass
+class Rig:
+    """Hardware on simulated buses; `cycle` runs one exchange and lets the period pass."""
+
+    plans: Sequence[BusPlan]
+    ledger: Ledger
+    clock: VirtualClock
+    buses: Sequence[SimulatedBus]
+    ports: VirtualPorts
+    states: States
+    goals: Commands
+    packets: Packets
+    events: Events
+    hardware: DynamixelHardware
+    beats: list[int]
+    period_ns: int = 20_000_000
+
+    def cycle(self, *, idle=True):
+        start = self.clock.now_ns()
+        self.hardware.read()
+        self.hardware.write()
+        deadline = start + self.period_ns
+        if idle:
+            self.hardware.idle(deadline)
+        assert self.clock.now_ns() <= deadline or not idle
+        self.clock.wait_until(deadline)
+
+    def into_bus(self, index=0):
+        name = self.plans[index].name
+        return [entry.data for entry in self.ledger.entries if entry.bus == name and entry.direction == "in"]
+
+    def out_of_bus(self, index=0):
+        name = self.plans[index].name
+        return b"".join(e.data for e in self.ledger.entries if e.bus == name and e.direction == "out")
+
+    def torque(self, index=0):
+        for bus in self.buses:
+            bus.advance(self.clock.now_ns())
+        return [servo.torque_on for servo in self.buses[index].servos]
+
+
+def _plan(
+    ids=(1, 3, 5, 6, 2, 4, 20, 21),
+    *,
+    name="main",
+    first_row=0,
+    latency_ns=0,
+    return_delay_ns=500_000,
+    **change,
+):
+    """Return a plan of AX-12; references in the middle, directions -1, +1, -1, ..."""
+    table = control_table("AX-12A")
+    names = change.get("joints", [f"{name}_{servo_id}_joint" for servo_id in ids])
+    wiring = [
+        Wiring(
+            joint=names[index],
+            row=first_row + index,
+            servo_id=servo_id,
+            table=table,
+            reference=change.get("reference", MIDDLE),
+            direction=1 if index % 2 else -1,
+            lower=change.get("lower", -MIDDLE),
+            upper=change.get("upper", MIDDLE),
+        )
+        for index, servo_id in enumerate(ids)
+    ]
+    return bus_plan(
+        name=name,
+        port="sim",
+        baud_rate=1_000_000,
+        latency_ns=latency_ns,
+        return_delay_ns=return_delay_ns,
+        joints=wiring,
+    )
+
+
+@pytest.fixture
+def make_plan() -> Callable[..., BusPlan]:
+    return _plan
+
+
+@pytest.fixture(scope="session")
+def module_plan() -> BusPlan:
+    return _plan()
+
+
+@pytest.fixture
+def make_rig(make_plan) -> Callable[..., Rig]:
+    def build(*plans, take_over=False, extra=(), position=None):
+        plans = plans or (make_plan(),)
+        ledger = Ledger()
+        clock = VirtualClock(1_000_000_000)
+        buses = []
+        for plan in plans:
+            servos = tuple(
+                ServoConfig(
+                    servo.servo_id, servo.model, position or 2.0 + 0.1 * servo.row, plan.return_delay_ns
+                )
+                for servo in plan.servos
+            )
+            config = BusConfig(plan.name, plan.baud_rate, servos + tuple(extra))
+            buses.append(SimulatedBus(config, ledger, clock.now_ns()))
+        ports = VirtualPorts(clock, buses)
+        rows = sum(len(plan.servos) for plan in plans)
+        states, goals, packets, events = States.empty(rows), Commands.empty(rows), Packets(), Events()
+        beats: list[int] = []
+        hardware = DynamixelHardware(
+            plans,
+            ports,
+            clock,
+            states,
+            goals,
+            packets,
+            events,
+            lambda: beats.append(clock.now_ns()),
+            take_over=take_over,
+        )
+        return Rig(plans, ledger, clock, buses, ports, states, goals, packets, events, hardware, beats)
+
+    return build

@@ -1,0 +1,310 @@
+import numpy as np
+import pytest
+
+from dxlrun.dynamixel import protocol1
+from dxlrun.dynamixel.units import goal_ticks, joint_position
+from dxlrun.errors import PortError
+from dxlrun.events import EventCode
+from dxlrun.simulation import ServoConfig
+
+
+def torque_on_packets(packets):
+    """Return the packets that would switch torque on: a goal or torque enable written."""
+    found = []
+    for packet in packets:
+        kind, address = packet[4], packet[5:6]
+        if kind in (3, 4) and (address in (b"\x1e", b"\x20") or (address == b"\x18" and packet[6])):
+            found.append(packet)
+        if kind == 0x83:
+            found.append(packet)
+    return found
+
+
+def position_replies(rig, cycle_start):
+    """Return raw position by ID, as the servos sent it since `cycle_start` (ledger)."""
+    found = {}
+    for entry in rig.ledger.entries:
+        if entry.direction == "out" and entry.t_ns >= cycle_start and len(entry.data) == 12:
+            found[entry.data[2]] = int.from_bytes(entry.data[5:7], "little")
+    return found
+
+
+@pytest.fixture
+def started(make_rig):
+    rig = make_rig()
+    rig.hardware.start()
+    return rig
+
+
+def test_start_holds_every_servo_where_it_stands(started):
+    assert started.torque() == [True] * 8
+    assert started.states.valid.all()
+    assert not np.isnan(started.goals.position).any()
+    assert np.isnan(started.goals.velocity).all()
+    assert started.goals.position == pytest.approx(started.states.position, abs=1e-9)
+    before = [servo.position for servo in started.buses[0].servos]
+    for _ in range(10):
+        started.cycle()
+    assert [servo.position for servo in started.buses[0].servos] == pytest.approx(before, abs=0.006)
+    assert len(started.events.of(EventCode.SETUP)) == 8
+    assert len(started.events.of(EventCode.TORQUE_ON)) == 1
+    assert started.events.of(EventCode.REGISTER_DIFFERS) == []
+
+
+def test_a_cycle_is_eight_reads_and_one_sync_write(started):
+    count = len(started.into_bus())
+    started.goals.position[:] = np.linspace(-0.5, 0.5, 8)
+    started.goals.velocity[:] = 1.0
+    start = started.clock.now_ns()
+    started.cycle()
+    expected = [read.packet for read in started.plans[0].reads]
+    goals = {
+        servo.servo_id: goal_ticks(servo, started.goals.position[servo.row]).to_bytes(2, "little")
+        + b"\x56\x00"
+        for servo in started.plans[0].servos
+    }
+    assert started.into_bus()[count:] == [*expected, protocol1.sync_write(30, 4, goals)]
+    sent = position_replies(started, start)
+    shown = [joint_position(servo, sent[servo.servo_id]) for servo in started.plans[0].servos]
+    assert started.states.position == pytest.approx(shown, abs=1e-12)
+
+
+def test_the_exchange_takes_what_the_budget_says(make_rig, make_plan):
+    rig = make_rig()
+    rig.hardware.start()
+    rig.cycle()
+    start = rig.clock.now_ns()
+    rig.hardware.read()
+    budget = rig.plans[0].budget
+    assert rig.clock.now_ns() - start == budget.total_ns - 480_000
+
+
+def test_goals_move_the_servos(started):
+    started.goals.position[:] = 0.3
+    for _ in range(60):
+        started.cycle()
+    assert started.states.position == pytest.approx(0.3, abs=0.01)
+    assert started.events.of(EventCode.READ_LOST) == []
+
+
+def test_what_is_recorded_is_what_the_ledger_has(started):
+    started.goals.position[:] = 0.2
+    started.buses[0].inject_noise(b"\x12\xff\xff\x03noise\xff", started.clock.now_ns() + 100_000)
+    started.buses[0].corrupt_next(5)
+    for _ in range(5):
+        started.cycle()
+    started.hardware.stop()
+    started.hardware.idle(started.clock.now_ns() + 10_000_000)
+    assert started.packets.sent() == started.into_bus()
+    assert started.packets.received() == started.out_of_bus()
+    assert started.events.of(EventCode.BUS_NOISE) != []
+
+
+def test_a_silent_servo_is_invalid_and_ages_and_the_others_go_on(started):
+    started.cycle()
+    silent = started.states.position[2]
+    others = started.states.position.copy()
+    started.buses[0].servo(5).silence()
+    started.goals.position[:] += 0.2
+    for _ in range(10):
+        started.cycle()
+    assert started.states.valid.tolist() == [True, True, False, True, True, True, True, True]
+    assert started.states.position[2] == silent
+    assert started.states.age_ns[2] > 10 * started.period_ns
+    assert (started.states.age_ns[started.states.valid] < started.period_ns).all()
+    moved = np.delete(started.states.position - others, 2)
+    assert (moved > 0.1).all()
+    assert [source for source, _ in started.events.of(EventCode.READ_LOST)] == ["main_5_joint"]
+
+
+def test_a_silent_servo_gets_no_goal_until_its_torque_was_read(started):
+    servo = started.buses[0].servo(5)
+    servo.silence()
+    started.cycle()
+    started.cycle()
+    servo.silence(False)
+    for _ in range(4):
+        started.cycle()
+    writes = [packet for packet in started.into_bus() if packet[4] == 0x83]
+    named = [5 in packet[7:-1:5] for packet in writes]
+    probes = [packet for packet in started.into_bus() if packet == started.plans[0].torque_reads[2].packet]
+    assert named == [False, False, False, True, True, True]
+    assert len(probes) == 1
+    (event,) = started.events.of(EventCode.READ_BACK)
+    assert "2 replies" in event[1]
+
+
+def test_a_servo_that_was_reset_stays_out_and_gets_no_torque(started):
+    servo = started.buses[0].servo(5)
+    servo.silence()
+    started.cycle()
+    servo.reset()
+    servo.silence(False)
+    for _ in range(10):
+        started.cycle()
+    assert started.torque() == [True, True, False, True, True, True, True, True]
+    assert started.states.valid.all()
+    assert [source for source, _ in started.events.of(EventCode.SERVO_LIMP)] == ["main_5_joint"]
+
+
+def test_a_corrupted_reply_is_not_a_value(started):
+    started.cycle()
+    held = started.states.position[4]
+    started.buses[0].corrupt_next(2, index=5, flip=0x40)
+    started.cycle()
+    assert not started.states.valid[4]
+    assert started.states.position[4] == held
+    (event,) = started.events.of(EventCode.READ_LOST)
+    assert "garbled" in event[1]
+    started.cycle()
+    assert started.states.valid.all()
+
+
+@pytest.mark.parametrize("late_ms", [11.5, 12.5, 14.0, 20.2, 20.7, 21.5, 27.0, 33.3, 40.5, 41.0])
+def test_a_late_reply_is_never_taken_as_current(started, late_ms):
+    started.goals.position[:] = 0.8
+    started.goals.velocity[:] = 1.0
+    started.cycle()
+    started.buses[0].delay_next(1, int(late_ms * 1e6))
+    late = 0
+    for _ in range(6):
+        start = started.clock.now_ns()
+        started.cycle()
+        late += not started.states.valid[0]
+        for servo in started.plans[0].servos:
+            if started.states.valid[servo.row]:
+                asked = [
+                    entry.t_ns
+                    for entry in started.ledger.entries
+                    if entry.direction == "in" and entry.data[2:6] == bytes((servo.servo_id, 4, 2, 36))
+                ][-1]
+                replies = [
+                    entry.data
+                    for entry in started.ledger.entries
+                    if entry.direction == "out"
+                    and asked < entry.t_ns < asked + 3_000_000
+                    and entry.data[2] == servo.servo_id
+                    and len(entry.data) > 7
+                ]
+                values = {joint_position(servo, int.from_bytes(data[5:7], "little")) for data in replies}
+                assert started.states.position[servo.row] in values
+                assert start <= asked
+    assert late >= 1
+    assert started.packets.received() == started.out_of_bus()
+
+
+def test_a_changed_error_byte_is_told_in_the_manuals_words(started):
+    started.cycle()
+    started.buses[0].servo(6).set_temperature(85.0)
+    started.cycle()
+    started.cycle()
+    (event,) = started.events.of(EventCode.SERVO_ERROR)
+    assert event[0] == "main_6_joint"
+    assert "overheating" in event[1]
+    assert "ID 6 on bus main" in event[1]
+    assert started.states.valid[3]
+
+
+def test_nan_goals_are_not_sent(started):
+    started.goals.position[3] = np.nan
+    started.cycle()
+    last = [packet for packet in started.into_bus() if packet[4] == 0x83][-1]
+    assert list(last[7:-1:5]) == [1, 3, 5, 2, 4, 20, 21]
+
+
+def test_nothing_gives_torque_without_start(make_rig):
+    rig = make_rig()
+    rig.goals.position[:] = 0.0
+    for _ in range(5):
+        rig.cycle()
+    assert torque_on_packets(rig.into_bus()) == []
+    assert rig.torque() == [False] * 8
+
+
+def test_two_buses_are_read_side_by_side(make_rig, make_plan):
+    rig = make_rig(make_plan((1, 2), name="left"), make_plan((1, 7), name="right", first_row=2))
+    rig.hardware.start()
+    rig.goals.position[:] = [0.1, 0.2, 0.3, 0.4]
+    start = rig.clock.now_ns()
+    rig.hardware.read()
+    assert rig.clock.now_ns() - start == 2 * 700_000
+    for _ in range(60):
+        rig.cycle()
+    assert rig.states.position == pytest.approx([0.1, 0.2, 0.3, 0.4], abs=0.01)
+    rig.buses[1].servo(7).silence()
+    rig.cycle()
+    assert rig.states.valid.tolist() == [True, True, True, False]
+    rig.hardware.stop()
+    for bus in (0, 1):
+        assert rig.packets.sent(bus) == rig.into_bus(bus)
+        assert rig.packets.received(bus) == rig.out_of_bus(bus)
+
+
+def test_all_servos_silent_at_once_costs_less_than_the_guardians_patience(started):
+    started.cycle()
+    for servo in started.buses[0].servos:
+        servo.silence()
+    start = started.clock.now_ns()
+    started.hardware.read()
+    assert started.clock.now_ns() - start < 30_000_000
+    start = started.clock.now_ns()
+    started.hardware.read()
+    assert started.clock.now_ns() - start < 20_000_000
+    assert not started.states.valid.any()
+
+
+def test_the_heart_beats_once_a_transaction(started):
+    gaps = np.diff(started.beats)
+    assert gaps.max() <= 20_000_000  # the pause between two groups
+    assert len(started.beats) >= len(started.into_bus())
+
+
+def test_an_unplugged_adapter_is_a_port_error_and_stop_still_speaks(make_rig, make_plan):
+    rig = make_rig(make_plan((1, 2), name="left"), make_plan((1, 7), name="right", first_row=2))
+    rig.hardware.start()
+    rig.ports.ports[0].unplug()
+    with pytest.raises(PortError, match="bus left on sim"):
+        rig.hardware.read()
+    with pytest.raises(PortError, match="bus left"):
+        rig.hardware.write()
+    assert len(rig.events.of(EventCode.PORT_LOST)) == 1
+    failures = rig.hardware.stop()
+    assert len(failures) == 2
+    assert all("bus left" in failure for failure in failures)
+    assert rig.torque(1) == [False, False]
+
+
+def test_stop_limps_everybody(started):
+    started.cycle()
+    assert started.hardware.stop() == ()
+    assert started.torque() == [False] * 8
+    assert len(started.events.of(EventCode.TORQUE_OFF)) == 1
+    count = len(torque_on_packets(started.into_bus()))
+    started.cycle()
+    assert len(torque_on_packets(started.into_bus())) == count
+
+
+def test_stop_with_a_silent_servo_limps_the_others_and_names_it(started):
+    started.buses[0].servo(4).silence()
+    start = started.clock.now_ns()
+    (failure,) = started.hardware.stop()
+    assert "ID 4 on bus main" in failure
+    assert "does not answer" in failure
+    assert started.torque() == [servo.servo_id == 4 for servo in started.buses[0].servos]
+    assert started.clock.now_ns() - start < 200_000_000
+    assert len(started.events.of(EventCode.SHUTDOWN_FAILED)) == 1
+
+
+def test_stop_in_noise_tries_again(started):
+    for servo in started.plans[0].servos:
+        started.buses[0].corrupt_next(servo.servo_id)
+        started.buses[0].truncate_next(servo.servo_id, 3)
+    assert started.hardware.stop() == ()
+    assert started.torque() == [False] * 8
+
+
+def test_extra_servos_on_the_line_are_left_alone(make_rig):
+    rig = make_rig(extra=(ServoConfig(99, "AX-12A", 1.0),))
+    rig.hardware.start()
+    rig.cycle()
+    assert rig.torque() == [True] * 8 + [False]

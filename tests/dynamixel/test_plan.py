@@ -1,0 +1,83 @@
+import msgspec
+import pytest
+
+from dxlrun.dynamixel.bus_plan import BusPlan
+from dxlrun.dynamixel.line import LONGEST_RETURN_DELAY_NS, PATIENCE_NS
+from dxlrun.dynamixel.units import goal_ticks, joint_position, speed_ticks
+
+
+def test_the_budget_of_protocol_md_at_one_millisecond_of_latency(make_plan):
+    budget = make_plan(latency_ns=1_000_000).budget
+    assert budget.wire_ns == 1_600_000 + 480_000
+    assert budget.return_delay_ns == 4_000_000
+    assert budget.latency_ns == 8_000_000
+    assert budget.total_ns / 1e6 == pytest.approx(14.1, abs=0.05)
+    assert round(budget.highest_rate_hz) == 71
+
+
+def test_the_budget_of_protocol_md_at_the_default_latency_timer(make_plan):
+    budget = make_plan(latency_ns=16_000_000).budget
+    assert budget.total_ns / 1e6 == pytest.approx(134, abs=0.1)
+    assert round(budget.highest_rate_hz) == 7
+
+
+def test_reads_are_six_bytes_from_present_position_on(make_plan):
+    plan = make_plan()
+    assert [read.packet[4:7].hex() for read in plan.reads] == ["022406"] * 8
+    assert [read.servo_id for read in plan.reads] == [1, 3, 5, 6, 2, 4, 20, 21]
+    assert {read.reply_length for read in plan.reads} == {6}
+    assert {read.due_ns for read in plan.reads} == {200_000 + 500_000}
+
+
+def test_patience_covers_return_delay_and_latency(make_plan):
+    plan = make_plan(latency_ns=16_000_000, return_delay_ns=LONGEST_RETURN_DELAY_NS)
+    assert {read.timeout_ns for read in plan.reads} == {200_000 + 508_000 + 16_000_000 + PATIENCE_NS}
+
+
+def test_limp_is_a_broadcast_and_then_every_servo_acknowledged(make_plan):
+    plan = make_plan((1, 7))
+    assert [one.packet.hex(" ") for one in plan.limp] == [
+        "ff ff fe 04 03 18 00 e2",
+        "ff ff 01 04 03 18 00 df",
+        "ff ff 07 04 03 18 00 d9",
+    ]
+    assert [one.reply_length for one in plan.limp] == [-1, 0, 0]
+
+
+def test_limits_become_ticks_inside_them(make_plan):
+    plan = make_plan((1, 2), lower=-1.0, upper=0.5)
+    for servo in plan.servos:
+        ends = sorted((joint_position(servo, servo.lower_tick), joint_position(servo, servo.upper_tick)))
+        assert ends[0] >= -1.0
+        assert ends[1] <= 0.5
+        assert ends[1] - ends[0] > 1.5 - 2 * servo.rad_per_tick
+
+
+def test_a_plan_survives_json(make_plan):
+    plan = make_plan()
+    assert msgspec.json.decode(msgspec.json.encode(plan), type=BusPlan) == plan
+
+
+def test_too_many_servos_for_one_sync_write_are_refused(make_plan):
+    with pytest.raises(ValueError, match="second bus"):
+        make_plan(tuple(range(51)))
+
+
+def test_the_middle_of_an_ax_is_exact(make_plan):
+    servo = make_plan((1,)).servos[0]
+    assert joint_position(servo, 1023) == pytest.approx(-2.6179938779914944)
+    assert goal_ticks(servo, 0.0) in (511, 512)
+
+
+@pytest.mark.parametrize("angle", [-1e9, -3.0, 3.0, 1e9])
+def test_goals_never_wrap(make_plan, angle):
+    servo = make_plan((1,)).servos[0]
+    assert goal_ticks(servo, angle) == (1023 if angle < 0 else 0)
+
+
+def test_speed_zero_is_not_the_maximum(make_plan):
+    servo = make_plan((1,)).servos[0]
+    assert speed_ticks(servo, 0.0) == 1
+    assert speed_ticks(servo, float("nan")) == 0
+    assert speed_ticks(servo, float("inf")) == 1023
+    assert speed_ticks(servo, -1.0) == speed_ticks(servo, 1.0) == 86

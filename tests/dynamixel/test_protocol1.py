@@ -1,0 +1,87 @@
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dxlrun.dynamixel import protocol1
+from dxlrun.dynamixel.protocol1 import Status, StatusError
+
+ids = st.integers(0, protocol1.HIGHEST_ID)
+
+
+def test_the_manuals_instruction_packets():
+    assert protocol1.ping(1).hex(" ") == "ff ff 01 02 01 fb"
+    assert protocol1.read(1, 0x2B, 1).hex(" ") == "ff ff 01 04 02 2b 01 cc"
+    assert protocol1.write(0xFE, 3, b"\x01").hex(" ") == "ff ff fe 04 03 03 01 f6"
+    assert protocol1.reg_write(1, 30, b"\xf4\x01").hex(" ") == "ff ff 01 05 04 1e f4 01 e2"
+    assert protocol1.action().hex(" ") == "ff ff fe 02 05 fa"
+    assert protocol1.factory_reset(0).hex(" ") == "ff ff 00 02 06 f7"
+
+
+def test_the_manuals_sync_write():
+    goals = {
+        0: bytes.fromhex("10 00 50 01"),
+        1: bytes.fromhex("20 02 60 03"),
+        2: bytes.fromhex("30 00 70 01"),
+        3: bytes.fromhex("20 02 80 03"),
+    }
+    assert protocol1.sync_write(30, 4, goals).hex(" ") == (
+        "ff ff fe 18 83 1e 04 00 10 00 50 01 01 20 02 60 03 02 30 00 70 01 03 20 02 80 03 12"
+    )
+
+
+def test_the_manuals_status_packets():
+    assert protocol1.parse_status(bytes.fromhex("ff ff 01 02 00 fc")) == Status(1, 0, b"")
+    assert protocol1.parse_status(bytes.fromhex("ff ff 01 03 00 20 db")) == Status(1, 0, b"\x20")
+    error = protocol1.parse_status(bytes.fromhex("ff ff 01 02 24 d8"))
+    assert StatusError(error.error) == StatusError.OVERHEATING | StatusError.OVERLOAD
+
+
+@given(ids, st.binary(max_size=40), st.integers(0, 255))
+@settings(max_examples=100, deadline=None)
+def test_a_status_comes_back_as_it_was_made(servo_id, parameters, error):
+    packet = protocol1.status_packet(servo_id, error, parameters)
+    assert protocol1.parse_status(packet) == Status(servo_id, error, parameters)
+
+
+@given(ids, st.binary(max_size=20), st.data())
+@settings(max_examples=100, deadline=None)
+def test_one_changed_byte_is_always_noticed(servo_id, parameters, data):
+    packet = bytearray(protocol1.status_packet(servo_id, 0, parameters))
+    packet[data.draw(st.integers(0, len(packet) - 1))] ^= data.draw(st.integers(1, 255))
+    with pytest.raises(ValueError, match=r"no status packet|length|checksum"):
+        protocol1.parse_status(packet)
+
+
+def test_an_echoed_instruction_parses_as_a_status():
+    assert protocol1.parse_status(protocol1.read(5, 36, 6)) == Status(5, 2, bytes((36, 6)))
+
+
+def test_the_error_byte_in_words():
+    assert protocol1.describe_error(0) == "no error"
+    words = protocol1.describe_error(0xFF)
+    for bit in (
+        "voltage",
+        "angle limit",
+        "overheating",
+        "range",
+        "checksum",
+        "overload",
+        "instruction",
+        "bit 7",
+    ):
+        assert bit in words
+
+
+@pytest.mark.parametrize(
+    "build",
+    [
+        lambda: protocol1.ping(255),
+        lambda: protocol1.ping(-1),
+        lambda: protocol1.write(1, 0, bytes(253)),
+        lambda: protocol1.sync_write(30, 4, {1: b"\0\0"}),
+        lambda: protocol1.sync_write(30, 4, {i: bytes(4) for i in range(51)}),
+    ],
+)
+def test_what_cannot_be_said_is_refused(build):
+    with pytest.raises(ValueError, match=r"no ID|fit|announced"):
+        build()

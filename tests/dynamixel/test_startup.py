@@ -1,0 +1,160 @@
+import itertools
+
+import pytest
+
+from dxlrun.errors import PortError, StartUpError
+from dxlrun.events import EventCode
+from dxlrun.simulation import ServoConfig
+
+
+def refusal(rig):
+    """Return what start says when it refuses; nobody may have torque then, and no register was written."""
+    with pytest.raises(StartUpError) as caught:
+        rig.hardware.start()
+    written = [packet for packet in rig.into_bus() if packet[4] not in (1, 2)]
+    assert written == []
+    return str(caught.value).splitlines()
+
+
+def test_a_servo_that_is_not_there_is_named_with_all_the_others(make_rig):
+    rig = make_rig()
+    rig.buses[0].servo(3).silence()
+    rig.buses[0].servo(20).silence()
+    problems = refusal(rig)
+    assert len(problems) == 2
+    assert "main_3_joint (ID 3 on bus main) does not answer" in problems[0]
+    assert "1000000 bit/s" in problems[0]
+    assert "ID 20" in problems[1]
+
+
+@pytest.mark.parametrize(
+    ("register", "value", "said"),
+    [
+        ("model_number", 29, "is model number 29, not a AX-12A"),
+        ("status_return_level", 1, "Status Return Level (16) = 1"),
+        ("status_return_level", 0, "Status Return Level (16) is 0"),
+        ("ccw_angle_limit", 800, "angle limits 0..800"),
+        ("torque_limit", 0, "Torque Limit (34) = 0"),
+        ("torque_enable", 1, "holds torque already"),
+    ],
+)
+def test_a_register_that_does_not_fit(make_rig, register, value, said):
+    rig = make_rig()
+    rig.buses[0].servo(6).poke(register, value)
+    (problem,) = refusal(rig)
+    assert "ID 6 on bus main" in problem
+    assert said in problem
+
+
+def test_wheel_mode_is_refused(make_rig):
+    rig = make_rig()
+    rig.buses[0].servo(6).poke("cw_angle_limit", 0)
+    rig.buses[0].servo(6).poke("ccw_angle_limit", 0)
+    (problem,) = refusal(rig)
+    assert "wheel mode" in problem
+
+
+def test_one_servo_may_have_several_problems(make_rig):
+    rig = make_rig()
+    rig.buses[0].servo(6).poke("model_number", 29)
+    rig.buses[0].servo(6).poke("torque_enable", 1)
+    rig.buses[0].servo(2).poke("ccw_angle_limit", 3)
+    assert len(refusal(rig)) == 3
+
+
+@pytest.mark.parametrize("delay_ns", [500_000, 440_000, 200_000])
+def test_two_servos_of_one_id_are_named(make_rig, delay_ns):
+    rig = make_rig(extra=(ServoConfig(5, "AX-12A", 0.7, delay_ns),))
+    problems = refusal(rig)
+    assert all("ID 5" in problem for problem in problems)
+    assert "do two servos have its ID?" in problems[0] or "two servos of one ID" in problems[0]
+
+
+def test_an_adapter_that_echoes_is_named(make_rig):
+    rig = make_rig()
+    rig.buses[0].echo = True
+    (problem,) = refusal(rig)
+    assert "echoes" in problem
+
+
+def test_a_return_delay_beside_the_plan_is_told_with_its_consequence(make_rig):
+    rig = make_rig()
+    rig.buses[0].servo(1).poke("return_delay_time", 0)
+    rig.hardware.start()
+    ((joint, text),) = rig.events.of(EventCode.REGISTER_DIFFERS)
+    assert joint == "main_1_joint"
+    assert "Return Delay Time (5) is 0" in text
+    assert "takes 2.1 ms instead of 6.1 ms" in text
+
+
+def test_a_joint_outside_its_limits_is_not_moved(make_rig, make_plan):
+    rig = make_rig(make_plan((1, 2), lower=-1.0, upper=1.0), position=4.5)
+    problems = refusal(rig)
+    assert len(problems) == 2
+    assert "move the joint inside by hand" in problems[0]
+
+
+def test_an_overheated_servo_gets_no_torque(make_rig):
+    rig = make_rig()
+    rig.buses[0].servo(6).set_temperature(90.0)
+    problems = refusal(rig)
+    assert any("overheating" in problem for problem in problems)
+
+
+def test_take_over_accepts_torque(make_rig):
+    rig = make_rig(take_over=True)
+    rig.buses[0].servo(6).poke("torque_enable", 1)
+    rig.hardware.start()
+    assert rig.torque() == [True] * 8
+
+
+def test_a_start_that_fails_half_way_takes_the_torque_back(make_rig):
+    rig = make_rig()
+    seen = []
+
+    def cut():
+        if not seen and sum(rig.torque()) >= 4:
+            seen.append(rig.torque())
+            rig.buses[0].servo(21).silence()
+
+    for step in range(4000):
+        rig.buses[0].at(rig.clock.now_ns() + step * 100_000, cut)
+    with pytest.raises(StartUpError, match="ID 21"):
+        rig.hardware.start()
+    assert seen != []
+    assert rig.torque() == [False] * 8
+
+
+def test_one_lost_packet_does_not_stop_the_start(make_rig):
+    rig = make_rig()
+    for servo in rig.plans[0].servos:
+        rig.buses[0].corrupt_next(servo.servo_id)
+    rig.hardware.start()
+    assert rig.torque() == [True] * 8
+    assert rig.packets.received() == rig.out_of_bus()
+
+
+def test_no_port_no_start(make_rig):
+    rig = make_rig()
+    rig.ports.ports[0].unplug()
+    with pytest.raises(PortError, match="bus main on sim"):
+        rig.hardware.start()
+
+
+def test_torque_comes_in_groups(make_rig):
+    rig = make_rig()
+    rig.hardware.start()
+    times = [e.t_ns for e in rig.ledger.entries if e.direction == "in" and e.data[4:7] == b"\x03\x18\x01"]
+    assert len(times) == 8
+    pauses = [b - a > 20_000_000 for a, b in itertools.pairwise(times)]
+    assert pauses == [False, False, True, False, False, True, False]
+
+
+def test_goal_comes_before_torque_and_is_where_the_servo_stands(make_rig):
+    rig = make_rig()
+    rig.hardware.start()
+    writes = [packet for packet in rig.into_bus() if packet[4] == 3]
+    for goal, torque in zip(writes[::2], writes[1::2], strict=True):
+        assert goal[2] == torque[2]
+        assert goal[5] == 30
+        assert torque[5:7] == b"\x18\x01"
