@@ -1,0 +1,113 @@
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from dxlrun.compile.plan import Plan
+from dxlrun.errors import PortError
+from dxlrun.run_summary import RunOptions, RunSummary
+
+GOOD = RunSummary(0, "ended", 100, 2, 2.03, (), log="logs/torso.mcap", messages=17)
+
+
+class Runs:
+    """Stands in for the supervisor; remembers what it was asked."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[Plan, RunOptions]] = []
+        self.answer: RunSummary | Exception = GOOD
+
+    def run(self, plan: Plan, options: RunOptions, out: Console) -> RunSummary:
+        self.asked.append((plan, options))
+        if isinstance(self.answer, Exception):
+            raise self.answer
+        return self.answer
+
+
+@pytest.fixture
+def runs(monkeypatch: pytest.MonkeyPatch) -> Runs:
+    runs = Runs()
+    monkeypatch.setattr("dxlrun.supervisor.run_robot", runs.run)
+    return runs
+
+
+def test_options_reach_plan_and_run(dxlrun: Callable, runs: Runs, torso: Path, three_parts: Path):
+    said = dxlrun(torso, "rate:=25", "--play", three_parts, "--duration", "1.5", "--no-record", "--take-over")
+
+    assert said.code == 0
+    ((plan, options),) = runs.asked
+    assert options == RunOptions(record=False, take_over=True, debug=False)
+    assert plan.loop.period_ns == 40_000_000
+    assert plan.loop.end_ns == 1_500_000_000
+    assert {c.controller for c in plan.loop.commands} == {"head", "left_arm", "right_arm"}
+
+
+def test_a_good_run_says_where_its_log_is(dxlrun: Callable, runs: Runs, torso: Path):
+    said = dxlrun(torso)
+
+    assert said.code == 0
+    assert said.out.splitlines() == [
+        "bioloid_torso: good. 2.0 s, 100 cycles, 2 periods skipped",
+        "log: logs/torso.mcap (17 messages)",
+        "next: dxlrun analyze logs/torso.mcap",
+    ]
+
+
+@pytest.mark.parametrize(("code", "word"), [(1, "failed"), (130, "interrupted")])
+def test_a_bad_run_says_why_on_stderr(dxlrun: Callable, runs: Runs, torso: Path, code: int, word: str):
+    runs.answer = RunSummary(
+        code, "fault", 5, 0, 0.1, ("servo 3 does not answer",), remarks=("no real-time priority",)
+    )
+
+    said = dxlrun(torso)
+
+    assert said.code == code
+    assert said.out.startswith(f"bioloid_torso: {word}.")
+    assert said.errors[1:] == [
+        "bioloid_torso: no real-time priority",
+        "bioloid_torso: servo 3 does not answer",
+    ]
+
+
+def test_a_port_that_cannot_be_opened_is_one_sentence(dxlrun: Callable, runs: Runs, torso: Path):
+    runs.answer = PortError("port /dev/ttyUSB7 does not exist; plug the adapter in")
+
+    said = dxlrun(torso, "port:=/dev/ttyUSB7")
+
+    assert said.code == 1
+    assert said.errors[1:] == ["dxlrun: port /dev/ttyUSB7 does not exist; plug the adapter in"]
+
+
+def test_virtual_time_runs_in_this_process(
+    dxlrun: Callable, torso: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(tmp_path)
+
+    said = dxlrun(torso, "--virtual", "--duration", "1")
+
+    assert said.code == 0
+    assert "50 cycles, 0 periods skipped" in said.out
+    (log,) = (tmp_path / "logs").glob("*.mcap")
+
+    analyzed = dxlrun("analyze", log)
+    assert analyzed.code == 0
+    assert "50" in analyzed.out
+    assert dxlrun("analyze", log, "--json").out.startswith("{")
+
+
+def test_virtual_time_refuses_a_real_port(dxlrun: Callable, torso: Path):
+    said = dxlrun(torso, "port:=/dev/ttyUSB0", "--virtual")
+
+    assert said.code == 2
+    assert "port:=sim" in said.err
+
+
+def test_what_is_no_log_is_one_sentence(dxlrun: Callable, tmp_path: Path):
+    file = tmp_path / "no.mcap"
+    file.write_text("this is no log")
+
+    said = dxlrun("analyze", file)
+
+    assert said.code == 1
+    assert len(said.errors) == 1
