@@ -19,6 +19,9 @@ class Registers:
         self.table = table
         self._memory = bytearray(table.size)
         self._values: dict[str, int] = {}  # the same as in the bytes: looked up far more often than written
+        self._names_at: dict[
+            tuple[int, int], tuple[str, ...]
+        ] = {}  # hosts write the same cells again and again
         self._item_at: dict[int, ControlItem] = {
             address: item
             for item in table.items.values()
@@ -43,6 +46,8 @@ class Registers:
         return self._values[name]
 
     def __setitem__(self, name: str, wire: int) -> None:
+        if self._values.get(name) == wire:
+            return
         item = self.table.items[name]
         self._memory[item.address : item.address + item.size] = wire.to_bytes(item.size, "little")
         self._values[name] = wire
@@ -95,13 +100,13 @@ class Registers:
 
     def _names(self, address: int, length: int) -> tuple[str, ...]:
         """Return the items of some cells, none when a cell belongs to no item."""
-        names: dict[str, None] = {}
-        for cell in range(address, address + length):
-            item = self._item_at.get(cell)
-            if item is None:
-                return ()
-            names[item.name] = None
-        return tuple(names)
+        names = self._names_at.get((address, length))
+        if names is None:
+            items = [self._item_at.get(cell) for cell in range(address, address + length)]
+            owned = [item.name for item in items if item is not None]
+            names = tuple(dict.fromkeys(owned)) if len(owned) == length else ()
+            self._names_at[address, length] = names
+        return names
 
     def _refusal_of(self, item: ControlItem, wire: int) -> int:
         if item.access == "R" or not item.minimum <= wire <= item.maximum:
