@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from dxlrun.clock import VirtualClock
@@ -22,6 +22,8 @@ TEXT = st.text(st.characters(exclude_categories=["Cs"]), max_size=600)
 
 
 @settings(max_examples=100, deadline=None)
+@example(EventCode.GATE, Severity.INFO, "ä" * 600)
+@example(EventCode.GATE, Severity.INFO, "x" + "€" * 600)
 @given(st.sampled_from(EventCode), st.sampled_from(Severity), TEXT)
 def test_an_event_comes_out_as_it_went_in(code: EventCode, severity: Severity, text: str) -> None:
     slots = emitted(code, severity, "head_yaw_joint", text)

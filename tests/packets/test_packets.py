@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from dxlrun.packets import (
@@ -13,7 +13,9 @@ from dxlrun.packets import (
     PacketBatch,
     PacketKind,
     decode_packets,
+    desk_size,
     packet_slots,
+    salvage,
 )
 from dxlrun.ring import Handover
 
@@ -45,8 +47,9 @@ def test_packets_come_out_as_they_went_in(steps: list[LoggedPacket | None]) -> N
     assert all(0 < len(slot) <= 128 for slot in slots)
 
 
-@given(st.binary(min_size=1, max_size=400))
 @settings(max_examples=30, deadline=None)
+@example(bytes(range(256)))
+@given(st.binary(min_size=1, max_size=400))
 def test_noise_longer_than_a_slot_is_cut_and_nothing_of_it_lost(noise: bytes) -> None:
     slots: list[bytes] = []
     batch = PacketBatch(Handover(lambda payload: slots.append(bytes(payload)), slot_size=64))
@@ -95,3 +98,41 @@ def test_without_a_log_packets_are_taken_and_forgotten() -> None:
     sink = NoPackets()
     sink.packet(0, PacketKind.NOISE, 1, 2, 3, b"abc")
     sink.commit()
+
+
+def collected() -> tuple[list[bytes], Handover]:
+    slots: list[bytes] = []
+    return slots, Handover(lambda payload: slots.append(bytes(payload)), slot_size=128)
+
+
+def test_what_a_dead_process_left_on_its_desk_is_taken_up_once() -> None:
+    slots, writer = collected()
+    desk = memoryview(bytearray(desk_size(writer)))
+    batch = PacketBatch(writer, desk)
+    batch.packet(0, PacketKind.INSTRUCTION, 1, 2, 3, b"committed")
+    batch.commit()
+    batch.packet(0, PacketKind.STATUS, 4, 5, 6, b"left")
+    taken, guardian = collected()
+    salvage(desk, guardian)
+    assert [packet.data for slot in slots for packet in decode_packets(slot)] == [b"committed"]
+    assert [packet.data for slot in taken for packet in decode_packets(slot)] == [b"left"]
+
+
+def test_an_empty_or_a_scribbled_desk_gives_nothing() -> None:
+    taken, guardian = collected()
+    desk = memoryview(bytearray(desk_size(guardian)))
+    PacketBatch(guardian, desk).commit()
+    salvage(desk, guardian)
+    desk[:8] = b"\xff" * 8
+    salvage(desk, guardian)
+    assert taken == []
+
+
+def test_a_desk_larger_than_a_slot_does_not_make_batches_larger() -> None:
+    slots, writer = collected()
+    batch = PacketBatch(writer, memoryview(bytearray(4096)))
+    for _ in range(20):
+        batch.packet(0, PacketKind.STATUS, 1, 2, 3, bytes(10))
+    batch.commit()
+    assert sum(len(decode_packets(slot)) for slot in slots) == 20
+    assert max(len(slot) for slot in slots) <= 128
