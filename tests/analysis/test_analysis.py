@@ -191,6 +191,7 @@ def test_errors_gaps_and_a_log_without_end_are_said(write: Make, cycle: Make, sa
     assert report.verdict.sentences[1] == "2 errors were logged; the first, of head: ValueError: no"
     assert "no end" in report.verdict.sentences[2]
     assert "17 records were lost" in report.verdict.sentences[2]
+    assert "ValueError: no" in shown(report)
     assert [(event.name, event.count) for event in report.events] == [
         ("controller_fault", 1),
         ("recorder_gap", 1),

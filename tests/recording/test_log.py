@@ -228,6 +228,17 @@ def test_a_log_of_another_format_is_refused(
         read_log(tmp_path / "x")
 
 
+def test_a_log_whose_metadata_is_wrong_is_refused(
+    tmp_path: Path, header: LogHeader, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "dxlrun.recording.log_writer.to_metadata", lambda header: {**to_metadata(header), "joints": "{"}
+    )
+    LogWriter(tmp_path / "x", header).close()
+    with pytest.raises(LogError, match="cannot read"):
+        read_log(tmp_path / "x")
+
+
 def test_a_log_is_never_overwritten(log: LogWriter, tmp_path: Path, header: LogHeader) -> None:
     log.close()
     before = (tmp_path / "run.mcap").read_bytes()
