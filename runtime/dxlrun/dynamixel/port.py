@@ -59,12 +59,12 @@ class SerialPort:
         """Hand one whole packet to the line; raises PortError when the adapter is gone."""
         try:
             count = os.write(self.descriptor, data)
-            if count != len(data):
-                self._write_rest(memoryview(data)[count:])
         except BlockingIOError:
-            self._write_rest(memoryview(data))
+            count = 0
         except OSError as error:
             raise self._gone(error) from error
+        if count != len(data):
+            self._write_rest(memoryview(data)[count:])
 
     def _write_rest(self, data: memoryview) -> None:
         """Wait for room in the output queue; packets are short, so a full queue is stuck."""

@@ -33,7 +33,7 @@ def open_serial(path: str, baud_rate: int) -> serial.Serial:
 
 
 def _sentence(path: str, baud_rate: int, error: Exception) -> str:
-    number = error.errno if isinstance(error, OSError) else error.args[0] if error.args else None
+    number = _number(error)
     if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
         return f"there is no {path}; {_what_exists()}"
     if number in (errno.EACCES, errno.EPERM) and not os.access(path, os.R_OK | os.W_OK):
@@ -48,6 +48,17 @@ def _sentence(path: str, baud_rate: int, error: Exception) -> str:
     if number == errno.EINVAL:
         return f"{path} cannot run at {baud_rate} bit/s: {error}"
     return f"{path} cannot be opened: {error}"
+
+
+def _number(error: BaseException | None) -> int | None:
+    """Return the error number; pyserial hides some in the exception that it came from."""
+    while error is not None:
+        if isinstance(error, OSError) and error.errno is not None:
+            return error.errno
+        if isinstance(error, termios.error) and error.args:
+            return int(error.args[0])
+        error = error.__context__
+    return None
 
 
 def serial_devices() -> tuple[str, ...]:

@@ -1,0 +1,75 @@
+import subprocess
+import sys
+
+from dxlrun.dynamixel.limp import limp
+
+
+def test_a_robot_whose_loop_died_becomes_limp(make_rig):
+    rig = make_rig()
+    rig.hardware.start()
+    rig.hardware.read()
+    recorded = len(rig.packets.sent())
+    outcomes = limp(rig.plans, rig.ports, rig.clock, rig.packets)
+    assert [one.confirmed for one in outcomes] == [True] * 8
+    assert rig.torque() == [False] * 8
+    assert rig.packets.sent()[recorded:][0] == rig.plans[0].limp[0].packet
+    assert rig.packets.sent() == rig.into_bus()
+    assert rig.packets.received() == rig.out_of_bus()
+
+
+def test_it_works_after_a_half_sent_instruction_and_a_half_read_reply(make_rig):
+    rig = make_rig()
+    rig.hardware.start()
+    port = rig.ports.ports[0]
+    port.write(rig.plans[0].reads[0].packet)
+    rig.clock.wait_until(rig.clock.now_ns() + 650_000)
+    port.write(b"\xff\xff\xfe\x2c\x83\x1e\x04\x01")
+    outcomes = limp(rig.plans, rig.ports, rig.clock, rig.packets)
+    assert all(one.confirmed for one in outcomes)
+    assert rig.torque() == [False] * 8
+
+
+def test_a_silent_servo_is_named_and_time_is_bounded(make_rig):
+    rig = make_rig()
+    rig.hardware.start()
+    for servo_id in (1, 3, 5, 6):
+        rig.buses[0].servo(servo_id).silence()
+    start = rig.clock.now_ns()
+    outcomes = limp(rig.plans, rig.ports, rig.clock, rig.packets, limit_ns=50_000_000)
+    assert rig.clock.now_ns() - start < 200_000_000
+    assert [one.servo_id for one in outcomes if not one.confirmed] == [1, 3, 5, 6]
+    assert "does not answer" in str(outcomes[0])
+    assert rig.torque()[4:] == [False] * 4
+
+
+def test_a_line_that_is_gone_does_not_keep_the_other_one(make_rig, make_plan):
+    rig = make_rig(make_plan((1, 2), name="left"), make_plan((1, 7), name="right", first_row=2))
+    rig.hardware.start()
+    rig.ports.ports[0].unplug()
+    outcomes = limp(rig.plans, rig.ports, rig.clock, rig.packets)
+    assert [one.confirmed for one in outcomes] == [False, False, True, True]
+    assert "could not be sent" in outcomes[0].detail
+    assert rig.torque(1) == [False, False]
+
+
+def test_a_babbling_line_does_not_hold_it_up(make_rig):
+    rig = make_rig()
+    rig.hardware.start()
+    start = rig.clock.now_ns()
+    for step in range(400):
+        rig.buses[0].inject_noise(b"\xff\xff\x01", start + step * 100_000)
+    outcomes = limp(rig.plans, rig.ports, rig.clock, rig.packets)
+    first = next(e.t_ns for e in rig.ledger.entries if e.t_ns >= start and e.direction == "in")
+    assert first - start < 1_000_000
+    assert all(one.confirmed for one in outcomes)
+
+
+def test_the_guardians_path_imports_no_numpy():
+    code = "import sys, dxlrun.dynamixel.limp, dxlrun.dynamixel.port; print('numpy' in sys.modules)"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "False"
+
+
+def test_nobody_to_limp(make_rig, make_plan):
+    rig = make_rig(make_plan(()))
+    assert limp(rig.plans, rig.ports, rig.clock, rig.packets) == ()

@@ -1,0 +1,160 @@
+import fcntl
+import json
+import os
+import pty
+import select
+import socket
+import subprocess
+import sys
+import termios
+import time
+
+import pytest
+
+from dxlrun.clock import MonotonicClock
+from dxlrun.dynamixel.hardware import DynamixelHardware
+from dxlrun.dynamixel.port import SerialPort, SerialPorts
+from dxlrun.dynamixel.serial_open import open_serial
+from dxlrun.errors import PortError
+from dxlrun.interfaces import Commands, States
+from dxlrun.simulation import BusConfig, ServoConfig, read_ledger
+from dxlrun.simulation.process import encode_config
+
+
+@pytest.fixture
+def terminal():
+    master, slave = pty.openpty()
+    yield master, os.ttyname(slave), slave
+    for descriptor in (master, slave):
+        try:
+            os.close(descriptor)
+        except OSError:
+            continue
+
+
+@pytest.fixture
+def opened(terminal):
+    master, path, _ = terminal
+    with open_serial(path, 1_000_000) as line:
+        yield master, SerialPort(line.fileno(), path), path
+
+
+def test_bytes_go_out_and_come_in_unchanged(opened):
+    master, port, _ = opened
+    everything = bytes(range(256))
+    port.write(everything)
+    assert os.read(master, 1000) == everything
+    ports = SerialPorts([port])
+    os.write(master, everything)
+    buffer = memoryview(bytearray(1000))
+    assert ports.wait(time.monotonic_ns() + 5_000_000_000) == [0]
+    assert bytes(buffer[: port.read_into(buffer)]) == everything
+    assert ports.wait(time.monotonic_ns()) == ()
+    assert port.read_into(buffer) == 0
+
+
+def test_an_adapter_that_is_gone_is_a_port_error(opened):
+    master, port, path = opened
+    os.close(master)
+    ports = SerialPorts([port])
+    assert ports.wait(time.monotonic_ns() + 5_000_000_000) == [0]
+    with pytest.raises(PortError, match=f"{path} is gone"):
+        port.read_into(memoryview(bytearray(10)))
+    with pytest.raises(PortError, match=f"{path} is gone"):
+        port.write(b"x")
+
+
+def test_a_line_that_takes_nothing_is_a_port_error(opened):
+    _, port, _ = opened
+    while select.select([], [port.descriptor], [], 0)[1]:
+        os.write(port.descriptor, bytes(1000))
+    with pytest.raises(PortError, match="takes no more bytes"):
+        port.write(bytes(100_000))
+
+
+def test_a_missing_device_is_named():
+    with pytest.raises(PortError, match=r"there is no /dev/ttyNOPE; (there are: /dev|this machine has no)"):
+        open_serial("/dev/ttyNOPE", 1_000_000)
+
+
+def test_a_file_is_no_serial_line(tmp_path):
+    path = tmp_path / "file"
+    path.touch()
+    with pytest.raises(PortError, match="is no serial line"):
+        open_serial(str(path), 1_000_000)
+
+
+def test_the_process_that_has_the_line_is_named(opened):
+    _, _, path = opened
+    code = (
+        "import sys\n"
+        "from dxlrun.dynamixel.serial_open import open_serial\n"
+        "from dxlrun.errors import PortError\n"
+        "try:\n    open_serial(sys.argv[1], 1_000_000)\n"
+        "except PortError as error:\n    print(error)\n"
+    )
+    command = [sys.executable, "-c", code, path]
+    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert f"{path} is in use by" in said
+    assert f"(process {os.getpid()})" in said
+
+
+def test_the_line_is_locked_against_every_program(opened):
+    _, port, _ = opened
+    assert fcntl.ioctl(port.descriptor, 0x80045440, b"\0\0\0\0") == b"\1\0\0\0"  # TIOCGEXCL of asm-generic
+    fcntl.ioctl(port.descriptor, termios.TIOCNXCL)
+
+
+@pytest.fixture
+def simulated_line(tmp_path):
+    """Run the simulated bus as a run does; yield its pseudo-terminal and what ends it."""
+    ours, theirs = socket.socketpair()
+    reader, writer = os.pipe()
+    ids = (1, 3, 5, 6, 2, 4, 20, 21)
+    os.write(
+        writer,
+        encode_config((BusConfig("main", 1_000_000, tuple(ServoConfig(i, "AX-12A", 2.0) for i in ids)),)),
+    )
+    os.close(writer)
+    ledger = tmp_path / "ledger.jsonl"
+    command = [sys.executable, "-m", "dxlrun.simulation", "--config-fd", str(reader)]
+    command += ["--control-fd", str(theirs.fileno()), "--ledger", str(ledger)]
+    child = subprocess.Popen(command, pass_fds=(reader, theirs.fileno()), start_new_session=True)
+    os.close(reader)
+    theirs.close()
+    ours.settimeout(20)
+
+    def finish():
+        ours.close()
+        assert child.wait(20) == 0
+        return read_ledger(ledger)
+
+    try:
+        yield json.loads(ours.recv(4096))["ports"]["main"], finish
+    finally:
+        child.kill()
+        child.wait()
+        ours.close()
+
+
+def test_the_same_code_drives_the_simulated_process(simulated_line, make_plan, make_rig):
+    path, finish = simulated_line
+    rig = make_rig()  # for its sinks only
+    states, goals, clock = States.empty(8), Commands.empty(8), MonotonicClock(0)
+    with open_serial(path, 1_000_000) as line:
+        ports = SerialPorts([SerialPort(line.fileno(), path)])
+        hardware = DynamixelHardware(
+            [make_plan()], ports, clock, states, goals, rig.packets, rig.events, lambda: None
+        )
+        hardware.start()
+        assert states.valid.all()
+        for _ in range(5):
+            hardware.read()
+            hardware.write()
+        assert hardware.stop() == ()
+        ports.wait(clock.now_ns() + 5_000_000)
+    ledger = finish()
+    recorded = rig.packets
+    assert recorded.received() == b"".join(entry.data for entry in ledger if entry.direction == "out")
+    assert b"".join(recorded.sent()) == b"".join(entry.data for entry in ledger if entry.direction == "in")
+    assert any(packet[4] == 0x83 for packet in recorded.sent())
