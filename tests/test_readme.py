@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from dxlrun.compile import compile_files
 from dxlrun.testing import simulated_robot
 
 ROOT = Path(__file__).parents[1]
@@ -39,7 +40,7 @@ def clone(tmp_path: Path) -> Path:
 
 
 def test_the_first_screen_has_two_commands() -> None:
-    first_screen = "\n".join(README.splitlines()[:16])
+    first_screen = "\n".join(README.splitlines()[:20])
     assert len([line for line in first_screen.splitlines() if line.startswith("    python3")]) == 2
 
 
@@ -98,5 +99,15 @@ def test_the_controller_moves_the_robot(tmp_path: Path, monkeypatch: pytest.Monk
     path = tmp_path / "waving.yaml"
     path.write_text(text)
     robot = simulated_robot(path, duration_s=1.6)
-    robot.run()
+    assert robot.run().detail == ""
     assert robot.record.states.position == pytest.approx([0.52, 0.52], abs=0.02)
+
+
+def test_the_motion_fits_the_robot(tmp_path: Path) -> None:
+    robot_text, motion_text = blocks("yaml")
+    robot, motion = tmp_path / "robot.yaml", tmp_path / "motion.yaml"
+    robot.write_text(robot_text)
+    motion.write_text(motion_text)
+    compiled = compile_files(robot, {}, [motion])
+    assert compiled.warnings == ()
+    assert len(compiled.plan.loop.commands) == 300
