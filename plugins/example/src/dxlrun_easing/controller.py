@@ -1,0 +1,89 @@
+"""Easing: joints go to their goals fast while they are far away, and arrive slowly."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from dxlrun import (
+    AngularVelocity,
+    CommandModel,
+    Context,
+    Controller,
+    Duration,
+    Interfaces,
+    ParametersModel,
+)
+
+
+class EasingParameters(ParametersModel):
+    """Keys of the controller in the robot file."""
+
+    joints: Annotated[tuple[str, ...], Field(min_length=1)]
+    """The joints, in the order in which commands name them."""
+    time_constant: Annotated[Duration, Field(gt=0)] = 200_000_000
+    """ns; in each of it, two thirds of what is left of the way are done"""
+    speed: Annotated[AngularVelocity, Field(gt=0)] = math.pi / 2
+    """rad/s; never faster than this"""
+
+
+class PositionsCommand(CommandModel):
+    """One goal a joint."""
+
+    positions: tuple[float, ...]
+    """rad, shape (joints,)"""
+
+
+class Easing(Controller[EasingParameters]):
+    """Leads joints to commanded positions along an exponential with a top speed."""
+
+    Parameters = EasingParameters
+    Commands: ClassVar[Mapping[str, type[CommandModel]]] = {"positions": PositionsCommand}
+
+    @classmethod
+    def interfaces(cls, parameters: EasingParameters, joints: tuple[str, ...]) -> Interfaces:
+        """Claim the position of the parameters' joints."""
+        return Interfaces(parameters.joints, ("position",))
+
+    @classmethod
+    def prepare(cls, kind: str, command: CommandModel, parameters: EasingParameters) -> NDArray[np.float64]:
+        """Return the goals, rad, shape (joints,). Raises ValueError for a wrong number of them."""
+        if not isinstance(command, PositionsCommand):
+            return super().prepare(kind, command, parameters)
+        found, wanted = len(command.positions), len(parameters.joints)
+        if found != wanted:
+            raise ValueError(f"{found} positions for {wanted} joints ({', '.join(parameters.joints)})")
+        return np.array(command.positions, dtype=np.float64)
+
+    def on_configure(self, context: Context) -> None:
+        """Make all arrays here: `update` is in the loop, and fills them."""
+        super().on_configure(context)
+        self._goal = np.zeros(len(context.joints))
+        self._step = np.zeros(len(context.joints))
+
+    def on_activate(self, time_ns: int) -> None:
+        """Stay where the joints are: at what was last sent, or where nothing was sent, at what is read."""
+        context = self.context
+        sent = context.goals.position
+        np.copyto(self._goal, sent)
+        np.copyto(self._goal, context.states.position, where=np.isnan(sent))
+        np.copyto(context.commands.position, self._goal)
+
+    def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
+        """Take new goals."""
+        np.copyto(self._goal, data)
+
+    def update(self, time_ns: int, period_ns: int) -> None:
+        """Come nearer: by the true period, so that a late cycle makes a longer step."""
+        position = self.context.commands.position
+        share = -math.expm1(-period_ns / self.parameters.time_constant)
+        longest = self.parameters.speed * period_ns * 1e-9
+        np.subtract(self._goal, position, out=self._step)
+        np.multiply(self._step, share, out=self._step)
+        np.clip(self._step, -longest, longest, out=self._step)
+        np.add(position, self._step, out=position)

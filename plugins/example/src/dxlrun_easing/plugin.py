@@ -1,0 +1,21 @@
+"""The door: what dxlrun finds by the entry point in pyproject.toml."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from dxlrun import Controller, hookimpl
+from dxlrun_easing.controller import Easing
+
+
+@hookimpl
+def dxlrun_contract() -> int:
+    """Return the contract that this package was written for: a number, not dxlrun's CONTRACT_VERSION."""
+    return 1
+
+
+@hookimpl
+def dxlrun_controllers() -> Mapping[str, type[Controller[Any]]]:
+    """Return the controllers by their type in the robot file."""
+    return {"easing_position_controller": Easing}
