@@ -20,6 +20,7 @@ from dxlrun.description.robot import (
     Policies,
     Recording,
     Robot,
+    RobotModel,
     Scheduler,
 )
 
@@ -36,18 +37,20 @@ ROWS = {
 
 
 def test_the_examples_of_the_page_are_read(desk: Any) -> None:
-    robot, motion = EXAMPLES
+    robot, variant, motion = EXAMPLES
     assert set(desk.robot(robot, {"port": "/dev/ttyUSB0"}).robot.joints) == {
         "head_pitch_joint",
         "head_yaw_joint",
     }
+    desk.write(robot, "two_joints.yaml")
+    assert (desk.robot(variant).robot.name, desk.robot(variant).robot.loop.rate) == ("two_joints_slow", 10)
     assert len(desk.motion(motion).motion.motions) == 2
 
 
 @pytest.mark.parametrize(
     ("prefix", "part"),
     [("", Robot), ("", Bus), ("adapter.", Adapter), ("", Joint), ("limits.", Limits), ("", Loop), ("", Policies),
-     ("scheduler.", Scheduler), ("", ControllerEntry), ("", Recording), ("", Motion), ("", PointsPart),
+     ("scheduler.", Scheduler), ("", ControllerEntry), ("", Recording), ("", RobotModel), ("", Motion), ("", PointsPart),
      ("", FormulaPart), ("points[].", Point)],
 )  # fmt: skip
 def test_every_key_is_on_the_page(prefix: str, part: type[Form]) -> None:
@@ -55,6 +58,8 @@ def test_every_key_is_on_the_page(prefix: str, part: type[Form]) -> None:
         if key == "parameters" or (isinstance(field.default, Form) and key != "adapter"):
             continue  # parts of their own, whose keys are on the page
         assert prefix + key in ROWS
+    for key in Robot.read_before:
+        assert key in ROWS
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,13 @@ class Refusing(Protocol):
     """Key -> how to go on without it."""
 
 
+@runtime_checkable
+class ReadBefore(Protocol):
+    """A model of a file that has keys which were taken out before the model sees it."""
+
+    read_before: ClassVar[tuple[str, ...]]
+
+
 @dataclass(frozen=True, slots=True)
 class Field:
     """What a model says about one key."""
@@ -47,7 +54,8 @@ def keys_at(
     if owner is None:
         return (), {}
     refused: Mapping[str, str] = owner.refused if isinstance(owner, Refusing) else {}
-    return tuple(owner.model_fields), refused
+    before = owner.read_before if isinstance(owner, ReadBefore) else ()
+    return (*owner.model_fields, *before), refused
 
 
 def _follow(model: type[BaseModel], location: tuple[str | int, ...]) -> type[BaseModel] | None:

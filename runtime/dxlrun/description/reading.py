@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from pydantic import ValidationError
 
 from dxlrun.description.arguments import COMMAND_LINE, Arguments, refuse_arguments
+from dxlrun.description.including import merged, read_sources
 from dxlrun.description.marks import KeyPath, Marks
 from dxlrun.description.motion import Motion
 from dxlrun.description.problems import places_of, problems_of
 from dxlrun.description.pruning import prune
 from dxlrun.description.robot import Robot
 from dxlrun.description.syntax import parse, read_text
-from dxlrun.description.tree import grow, literal
+from dxlrun.description.tree import grow
 from dxlrun.errors import InputError, Problem
 
 
@@ -32,6 +33,8 @@ class Description:
     """All its arguments, with the values of this run."""
     left_out: frozenset[KeyPath] = frozenset()
     """`("joints", "head")`, `("loop", "rate")`: what the file has, but in a wrong form; only in a survey."""
+    included: Mapping[str, str] = field(default_factory=dict)
+    """The text of each file that it includes, by name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,16 +66,19 @@ def read_robot(path: Path, arguments: Mapping[str, str]) -> Description:
 
 
 def survey_robot(path: Path, arguments: Mapping[str, str]) -> Survey:
-    """Read as much of a robot file as its form allows; raises InputError only when it is no YAML at all."""
-    text, file = read_text(path), str(path)
-    tree = parse(text, file)
-    declared = grow(tree, file, literal)  # once without arguments, to learn which there are
+    """Read as much of a robot file as its form allows.
+
+    Raises InputError only when it, or a file that it includes, cannot be read or is no YAML at all.
+    """
+    sources = read_sources(path)
+    declared = merged(source.declared for source in sources)  # without arguments, to learn which there are
     run = Arguments(declared.data.get("arguments"), arguments, declared.marks)
-    grown = grow(tree, file, run.fill)
+    grown = merged(source.grown(run.fill) for source in sources)
     problems = [*run.problems, *grown.problems]
     data = grown.data
-    data.pop("arguments", None)
-    wrong = [path for path in grown.unknown if path[0] != "arguments"]
+    for key in Robot.read_before:
+        data.pop(key, None)
+    wrong = [path for path in grown.unknown if path[0] not in Robot.read_before]
     robot, error = _validated(data)
     if error is not None:
         problems += problems_of(error, grown.marks, model=Robot, unknown=grown.unknown)
@@ -80,9 +86,10 @@ def survey_robot(path: Path, arguments: Mapping[str, str]) -> Survey:
     left_out = prune(data, wrong)
     if wrong:
         robot, _ = _validated(data)
-    description = (
-        Description(robot, grown.marks, path, text, run.texts, left_out) if robot is not None else None
-    )
+    description = None
+    if robot is not None:
+        included = {str(source.path): source.text for source in sources[:-1]}
+        description = Description(robot, grown.marks, path, sources[-1].text, run.texts, left_out, included)
     return Survey(description, tuple(_in_order(problems)))
 
 

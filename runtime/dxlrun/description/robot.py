@@ -27,10 +27,8 @@ def _name(value: str) -> str:
 
 
 def _protocol(value: float) -> float:
-    if value == 2.0:
-        raise refuse("this version does not speak Protocol 2.0 yet", "use servos of Protocol 1.0")
-    if value != 1.0:
-        raise refuse(f"there is no Protocol {value:g}", "write 1.0")
+    if value not in (1.0, 2.0):
+        raise refuse(f"there is no Protocol {value:g}", "write 1.0 or 2.0")
     return value
 
 
@@ -127,7 +125,9 @@ class Joint(Form):
 
     bus: str = Field(description="Name of its bus.", examples=["main"])
     id: int = Field(ge=0, le=253, description="ID of its servo.", examples=["1"])
-    model: str = Field(min_length=1, description="Model of its servo.", examples=["AX-12A"])
+    model: str = Field(
+        min_length=1, description="Model of its servo, or auto: it is asked.", examples=["AX-12A"]
+    )
     reference: Angle = Field(
         description="Angle of the servo, from its zero, where the joint's is zero.", examples=["150 deg"]
     )
@@ -193,15 +193,25 @@ class Recording(Form):
     )
 
 
+class RobotModel(Form):
+    """The robot's body."""
+
+    urdf: str = Field(
+        min_length=1,
+        description="Its URDF, from the folder of the file that says it; goes into the log.",
+        examples=["torso.urdf"],
+    )
+
+
 class Robot(Form):
     """A robot file, without its arguments."""
 
     refused: ClassVar[Mapping[str, str]] = {
         "sensors": "this version has no sensors yet; take the block out",
-        "include": "this version includes no other files yet; copy their content here",
         "processes": "this version starts no gateway and no view yet; take the block out",
-        "model": "this version reads no URDF yet; take the block out",
     }
+    read_before: ClassVar[tuple[str, ...]] = ("arguments", "include")
+    """Keys of the file that are taken out of it before the model sees it."""
 
     name: Name = Field(description="Name of the robot.", examples=["bioloid_torso"])
     buses: dict[Name, Bus] = Field(
@@ -222,3 +232,6 @@ class Robot(Form):
         examples=["{exit_timeout: 2 s}"],
     )
     recording: Recording = Field(default=Recording(), description="The log.", examples=["{directory: logs}"])
+    model: RobotModel | None = Field(
+        default=None, description="The robot's body.", examples=["{urdf: torso.urdf}"]
+    )

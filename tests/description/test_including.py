@@ -1,0 +1,188 @@
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dxlrun.description.including import MOST_FILES, MOST_LEVELS
+from dxlrun.errors import Mark
+
+HEAD = """\
+arguments:
+  speed: {default: 1 rad/s, help: of the head}
+  port: {default: /dev/ttyUSB9, help: "of the fragment"}
+joints:
+  yaw: {bus: main, id: 21, model: AX-12A, reference: 150 deg, direction: 1, limits: {velocity: "${speed}"}}
+controllers:
+  head: {type: joint_group_position_controller, joints: [yaw]}
+"""
+
+
+@pytest.fixture
+def including(desk: Any, robot_text: str) -> str:
+    (desk.folder / "fragments").mkdir()
+    desk.write(HEAD, "fragments/head.yaml")
+    return f"include: [fragments/head.yaml]\n{robot_text}"
+
+
+def test_a_fragment_adds_its_keys_before_those_of_the_file(desk: Any, including: str) -> None:
+    robot = desk.robot(including).robot
+
+    assert list(robot.joints) == ["yaw", "swing", "elbow"]
+    assert list(robot.controllers) == ["head", "broadcaster", "arm"]
+    assert robot.joints["yaw"].limits.velocity == 1.0
+
+
+def test_arguments_of_fragments_are_arguments_of_the_robot(desk: Any, including: str) -> None:
+    description = desk.robot(including, {"speed": "2 rad/s"})
+
+    assert description.robot.joints["yaw"].limits.velocity == 2.0
+    assert description.arguments == {"speed": "2 rad/s", "port": "sim", "rate": "50"}
+    assert description.robot.buses["main"].port == "sim"  # the including file's default counts
+
+
+def test_the_including_file_wins_at_every_depth(desk: Any, including: str) -> None:
+    text = including.replace("joints:\n", "joints:\n  yaw: {id: 7, limits: {position: [-1 rad, 1 rad]}}\n", 1)
+    joint = desk.robot(text).robot.joints["yaw"]
+
+    assert (joint.id, joint.bus, joint.model) == (7, "main", "AX-12A")
+    assert (joint.limits.position, joint.limits.velocity) == ((-1.0, 1.0), 1.0)
+
+
+def test_a_list_is_replaced_not_merged(desk: Any, including: str) -> None:
+    text = including.replace("controllers:\n", "controllers:\n  head: {joints: [swing]}\n")
+
+    assert desk.robot(text).robot.controllers["head"].parameters == {"joints": ["swing"]}
+
+
+def test_each_mark_points_into_the_file_that_has_the_value(desk: Any, including: str) -> None:
+    text = including.replace("joints:\n", "joints:\n  yaw: {id: 7}\n", 1)
+    marks = desk.robot(text).marks
+    main, fragment = str(desk.folder / "robot.yaml"), str(desk.folder / "fragments/head.yaml")
+
+    assert marks.value("joints", "yaw", "id") == Mark(main, 12, 13)
+    assert marks.value("joints", "yaw", "model") == Mark(fragment, 5, 35)
+    assert marks.key("controllers", "head") == Mark(fragment, 7, 3)
+    assert marks.origins["joints", "yaw", "limits", "velocity"] == "speed:=1 rad/s"
+
+
+def test_marks_of_what_was_replaced_are_gone(desk: Any, including: str) -> None:
+    text = including.replace("controllers:\n", "controllers:\n  head: {joints: 5}\n")
+    marks = desk.robot(text).marks
+
+    assert marks.value("controllers", "head", "joints", 0) == marks.key("controllers", "head", "joints")
+
+
+def test_mistakes_are_said_where_they_stand_and_all_at_once(desk: Any, including: str) -> None:
+    desk.write(HEAD.replace("id: 21", "id: x").replace("${speed}", "${sped}"), "fragments/head.yaml")
+
+    assert desk.refusals(including.replace("direction: 1}", "direction: 2}")) == [
+        "fragments/head.yaml:5:24: joints.yaw.id is the text 'x', but must be a whole number; "
+        "write for example `id: 1`",
+        "fragments/head.yaml:5:95: there is no argument 'sped'; did you mean speed?",
+        "robot.yaml:13:75: joints.elbow.direction is 2, but must be 1 or -1; write it so",
+    ]
+
+
+def test_what_the_fragment_got_wrong_and_the_file_replaced_is_no_mistake_of_form(
+    desk: Any, including: str
+) -> None:
+    desk.write(HEAD.replace("id: 21", "id: x"), "fragments/head.yaml")
+
+    robot = desk.robot(including.replace("joints:\n", "joints:\n  yaw: {id: 7}\n", 1)).robot
+    assert robot.joints["yaw"].id == 7
+
+
+def test_a_key_that_no_file_has_is_missing_where_the_mapping_stands(desk: Any, including: str) -> None:
+    desk.write(HEAD.replace("bus: main, ", ""), "fragments/head.yaml")
+
+    assert desk.refusals(including) == ["fragments/head.yaml:5:3: joints.yaw has no bus; add `bus: main`"]
+
+
+def test_fragments_include_relative_to_themselves_and_later_ones_win(desk: Any, robot_text: str) -> None:
+    (desk.folder / "a").mkdir()
+    desk.write("loop: {rate: 10}\ninclude: [b.yaml]\n", "a/a.yaml")
+    desk.write("loop: {rate: 20, scheduler: {priority: 5}}\n", "a/b.yaml")
+    desk.write("recording: {directory: c}\n", "c.yaml")
+    text = (
+        robot_text.split("loop:", maxsplit=1)[0]
+        + "include: [a/a.yaml, c.yaml]\njoints:"
+        + robot_text.split("joints:", 1)[1]
+    )
+    text = text.replace("recording: {directory: elsewhere}\n", "")
+    description = desk.robot(text.replace("rate: 25", "rate: 5"))
+
+    assert (description.robot.loop.rate, description.robot.loop.scheduler.priority) == (10, 5)
+    assert description.robot.recording.directory == "c"
+    assert [Path(name).name for name in description.included] == ["b.yaml", "a.yaml", "c.yaml"]
+
+
+def test_a_fragment_that_two_files_include_counts_below_both(desk: Any, robot_text: str) -> None:
+    desk.write("recording: {directory: shared}\n", "shared.yaml")
+    desk.write("include: [shared.yaml]\nrecording: {directory: left}\n", "left.yaml")
+    desk.write("include: [shared.yaml]\n", "right.yaml")
+    text = robot_text.replace("recording: {directory: elsewhere}", "include: [left.yaml, right.yaml]")
+
+    assert desk.robot(text).robot.recording.directory == "left"
+
+
+def test_a_cycle_is_refused_with_its_way(desk: Any, robot_text: str) -> None:
+    desk.write("include: [b.yaml]\n", "a.yaml")
+    desk.write("include: [./a.yaml]\n", "b.yaml")
+
+    assert desk.refusals(f"include: [a.yaml]\n{robot_text}") == [
+        "b.yaml:1:11: ./a.yaml includes itself (a.yaml -> b.yaml -> a.yaml); take one of these includes out"
+    ]
+
+
+def test_a_file_that_includes_itself_is_refused(desk: Any, robot_text: str) -> None:
+    (problem,) = desk.refusals(f"include: [robot.yaml]\n{robot_text}")
+    assert problem.startswith("robot.yaml:1:11: robot.yaml includes itself")
+
+
+def test_depth_number_and_size_are_bounded(desk: Any, robot_text: str) -> None:
+    for number in range(MOST_LEVELS + 1):
+        desk.write(f"include: [deep{number + 1}.yaml]\n", f"deep{number}.yaml")
+    desk.write("{}", f"deep{MOST_LEVELS + 1}.yaml")
+    names = [f"wide{number}.yaml" for number in range(MOST_FILES + 1)]
+    for name in names:
+        desk.write("{}", name)
+    for name in ("large1.yaml", "large2.yaml"):
+        desk.write("#" * 600_000 + "\n{}", name)
+
+    for includes, expected in (
+        (["deep0.yaml"], f"includes go deeper than {MOST_LEVELS} files; include it further up"),
+        (names, f"more than {MOST_FILES} files are included; put some of them together"),
+        (["large1.yaml", "large2.yaml"], "with large2.yaml the robot has more than 1024 KiB; thin it out"),
+    ):
+        problems = desk.refusals(f"include: [{', '.join(includes)}]\n{robot_text}")
+        assert any(problem.endswith(expected) for problem in problems), problems
+
+
+def test_fragments_that_cannot_be_read_are_named_at_the_include(desk: Any, robot_text: str) -> None:
+    desk.write("a: [1\n", "broken.yaml")
+    (desk.folder / "folder.yaml").mkdir()
+
+    assert desk.refusals(f"include: [gone.yaml, broken.yaml, folder.yaml]\n{robot_text}") == [
+        "robot.yaml:1:11: there is no file gone.yaml; "
+        "check the name, which counts from the folder of this file",
+        "broken.yaml:2:1: a comma is missing, or a bracket (opened in line 1) is not closed; add it",
+        "robot.yaml:1:35: folder.yaml: this is a directory; name a YAML file",
+    ]
+
+
+def test_a_key_given_twice_inside_one_file_is_still_a_mistake(desk: Any, including: str) -> None:
+    desk.write(HEAD + "controllers: {}\n", "fragments/head.yaml")
+
+    assert desk.refusals(including) == [
+        "fragments/head.yaml:8:1: controllers was already given in line 6; keep one of the two"
+    ]
+
+
+def test_a_motion_includes_nothing(desk: Any) -> None:
+    (problem,) = desk.motion_refusals(
+        "name: m\ninclude: []\nmotions: [{controller: c, points: [{time: 0 s, joints: {j: "
+        "{position: 1 rad}}}]}]\n"
+    )
+    assert problem.startswith("motion.yaml:2:1: the file has an unknown key 'include'; take it out")
