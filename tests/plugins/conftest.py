@@ -1,0 +1,53 @@
+"""A fresh environment with dxlrun and the example, as a stranger gets them from an index."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import venv
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+EXAMPLE = ROOT / "plugins" / "example"
+Shell = Callable[..., "subprocess.CompletedProcess[str]"]
+
+
+def bash(line: str, directory: Path, path: Path) -> subprocess.CompletedProcess[str]:
+    """Run one line with `path` before all other programs, far from this interpreter's own settings."""
+    outside = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "COV_"))}
+    environment = outside | {"PATH": f"{path}:{os.environ['PATH']}", "PIP_DISABLE_PIP_VERSION_CHECK": "1"}
+    return subprocess.run(
+        ["/bin/bash", "-c", line], cwd=directory, env=environment, capture_output=True, text=True, check=False
+    )
+
+
+@pytest.fixture(scope="session")
+def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A directory with the wheels of dxlrun and of the example."""
+    directory = tmp_path_factory.mktemp("wheels")
+    built = bash(
+        f"{sys.executable} -m pip wheel --quiet --no-deps --wheel-dir . {ROOT} {EXAMPLE}",
+        directory,
+        Path(sys.executable).parent,
+    )
+    assert built.returncode == 0, built.stderr
+    return directory
+
+
+@pytest.fixture(scope="session")
+def fresh(wheels: Path, tmp_path_factory: pytest.TempPathFactory) -> Shell:
+    """Return a function that runs a line in an environment that knows only the two wheels and pytest."""
+    environment = tmp_path_factory.mktemp("fresh") / "venv"
+    venv.create(environment, with_pip=True)
+
+    def shell(line: str, directory: Path) -> subprocess.CompletedProcess[str]:
+        return bash(line, directory, environment / "bin")
+
+    ours, theirs = next(wheels.glob("dxlrun-*.whl")), next(wheels.glob("dxlrun_easing-*.whl"))
+    installed = shell(f"pip install --quiet --no-compile {ours} '{theirs}[test]'", wheels)
+    assert installed.returncode == 0, installed.stderr
+    return shell

@@ -1,0 +1,82 @@
+"""A stranger's package works beside dxlrun in an environment that has never seen this repository."""
+
+from __future__ import annotations
+
+import ast
+import re
+import shutil
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+EXAMPLE = ROOT / "plugins" / "example"
+README = (EXAMPLE / "README.md").read_text()
+COMMANDS = [line.strip() for line in README.splitlines() if line.startswith("    dxlrun")]
+Shell = Callable[..., Any]
+
+
+@pytest.fixture
+def copy(tmp_path: Path) -> Path:
+    """The example's directory without its sources: what is imported there comes from the wheel."""
+    return Path(shutil.copytree(EXAMPLE, tmp_path / "copy", ignore=shutil.ignore_patterns("src", "logs")))
+
+
+def test_the_wheels_do_not_share_a_file(wheels: Path) -> None:
+    ours, theirs = (
+        set(zipfile.ZipFile(next(wheels.glob(name))).namelist()) for name in ("dxlrun-*", "dxlrun_e*")
+    )
+    assert not ours & theirs
+    assert {"dxlrun_easing/controller.py", "dxlrun_easing/py.typed"} <= theirs
+    assert any(name.endswith("licenses/LICENSE") for name in theirs)
+
+
+def test_its_own_test_passes(fresh: Shell, copy: Path) -> None:
+    told = fresh("python -m pytest -q -p no:cacheprovider", copy)
+    assert told.returncode == 0, told.stdout + told.stderr
+    assert " passed" in told.stdout
+
+
+@pytest.mark.parametrize("line", COMMANDS)
+def test_the_readmes_commands_end_well(fresh: Shell, copy: Path, line: str) -> None:
+    told = fresh(line, copy)
+    assert (told.returncode, told.stderr) == (0, "")
+    assert "easing_example: good" in told.stdout
+
+
+def test_the_robot_file_runs_for_the_time_it_was_given(fresh: Shell, copy: Path) -> None:
+    told = fresh("dxlrun example.yaml --virtual --duration 1", copy)
+    assert "50 cycles, 0 periods skipped" in told.stdout
+
+
+def test_the_check_names_the_publisher(fresh: Shell, copy: Path) -> None:
+    told = fresh("dxlrun check example.yaml", copy)
+    assert re.search(r"easing_position_controller +dxlrun-easing 0\.1\.0 ", told.stdout)
+
+
+def test_the_whole_run_through_all_processes_ends_well(fresh: Shell, copy: Path) -> None:
+    told = fresh("dxlrun example.yaml --duration 0.5", copy)
+    assert told.returncode == 0, told.stderr
+    assert "easing_example: good" in told.stdout
+
+
+def test_every_parameter_of_the_readme_is_one_of_the_model() -> None:
+    tree = ast.parse((EXAMPLE / "src/dxlrun_easing/controller.py").read_text())
+    model = next(
+        node for node in ast.walk(tree) if isinstance(node, ast.ClassDef) and node.name.endswith("Parameters")
+    )
+    fields = [node.target.id for node in model.body if isinstance(node, ast.AnnAssign)]
+    assert re.findall(r"^\| `(\w+)`", README, re.MULTILINE) == fields
+
+
+def test_it_imports_the_public_face_alone() -> None:
+    imported = {
+        node.module
+        for path in EXAMPLE.rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.ImportFrom) and str(node.module).startswith("dxlrun")
+    }
+    assert imported <= {"dxlrun", "dxlrun.testing", "dxlrun_easing", "dxlrun_easing.controller"}
