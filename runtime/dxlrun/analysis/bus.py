@@ -8,24 +8,9 @@ from dataclasses import dataclass, field
 import msgspec
 import numpy as np
 
+from dxlrun.analysis.wire import BROADCAST_ID, Question, Reply, error_names, question, replies
 from dxlrun.packets import LoggedPacket, PacketKind
 from dxlrun.recording.reader import Log
-
-_BROADCAST_ID = 0xFE
-_PING, _READ = 0x01, 0x02
-_SERVO_CODE = 4
-"""Index of the instruction, or of the error byte, in a Protocol 1.0 packet: FF FF ID LEN it."""
-
-ERROR_BITS = {
-    0x01: "voltage",
-    0x02: "angle limit",
-    0x04: "overheating",
-    0x08: "range",
-    0x10: "checksum",
-    0x20: "overload",
-    0x40: "instruction",
-}
-"""Bits of the error byte (ROBOTIS e-Manual, Protocol 1.0, Status Packet)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +24,8 @@ class Servo:
     instructions: int
     """Addressed to it alone."""
     asked: int
-    """Pings and reads: those it has to answer at every status return level."""
+    """Pings and reads, also those of several servos at once: what it has to answer at every status return
+    level."""
     lost: int
     """Of `asked`, without a status packet of this servo before the bus' next instruction."""
     replies: int
@@ -48,7 +34,8 @@ class Servo:
     """Replies with any error bit."""
     error_names: tuple[str, ...]
     reply_median_us: float
-    """From before the write() of a ping or read to after the read() of the reply's last byte."""
+    """From before the write() of a ping or read to after the read() of the reply's last byte; in a read of
+    several servos at once, those that answer later have the replies before theirs in it."""
     reply_max_us: float
 
 
@@ -73,8 +60,49 @@ class _Count:
     lost: int = 0
     replies: int = 0
     errors: int = 0
-    bits: int = 0
+    protocol: int = 1
+    error_bytes: set[int] = field(default_factory=set)
     reply_ns: list[int] = field(default_factory=list)
+
+
+@dataclass(slots=True)
+class _Pairing:
+    """Pairs instructions with replies on one bus: a reply counts until the bus' next instruction."""
+
+    counts: dict[int, _Count] = field(default_factory=dict)
+    asked: Question = field(default_factory=Question)
+    open: set[int] = field(default_factory=set)
+    """Servos that have not answered yet."""
+    asked_ns: int = 0
+
+    def count(self, servo_id: int) -> _Count:
+        return self.counts.setdefault(servo_id, _Count())
+
+    def instruct(self, packet: LoggedPacket) -> None:
+        self.miss()
+        if packet.servo_id != BROADCAST_ID:
+            self.count(packet.servo_id).instructions += 1
+        self.asked = question(packet.data)
+        self.asked_ns = packet.first_ns
+        self.open = set(self.asked.servo_ids)
+        for servo_id in self.open:
+            self.count(servo_id).asked += 1
+
+    def answer(self, reply: Reply, at_ns: int) -> None:
+        count = self.count(reply.servo_id)
+        count.replies += 1
+        count.protocol = reply.protocol
+        if reply.error:
+            count.errors += 1
+            count.error_bytes.add(reply.error)
+        if reply.servo_id in self.open:
+            self.open.remove(reply.servo_id)
+            count.reply_ns.append(at_ns - self.asked_ns)
+
+    def miss(self) -> None:
+        for servo_id in self.open:
+            self.counts[servo_id].lost += 1
+        self.open = set()
 
 
 def traffic(log: Log) -> tuple[tuple[Servo, ...], tuple[BusTraffic, ...]]:
@@ -92,36 +120,16 @@ def traffic(log: Log) -> tuple[tuple[Servo, ...], tuple[BusTraffic, ...]]:
 
 
 def _count(packets: Iterable[LoggedPacket]) -> dict[int, _Count]:
-    """Pair instructions with replies; `packets` of one bus, in order of time."""
-    counts: dict[int, _Count] = {}
-    asked: LoggedPacket | None = None
+    """Count what each servo was asked and answered; `packets` of one bus, in order of time."""
+    pairing = _Pairing()
     for packet in packets:
         if packet.kind == PacketKind.INSTRUCTION:
-            _miss(asked, counts)
-            asked = None
-        if packet.kind == PacketKind.NOISE or packet.servo_id == _BROADCAST_ID:
-            continue
-        count = counts.setdefault(packet.servo_id, _Count())
-        code = packet.data[_SERVO_CODE] if len(packet.data) > _SERVO_CODE else 0
-        if packet.kind == PacketKind.INSTRUCTION:
-            count.instructions += 1
-            if code in (_PING, _READ):
-                count.asked += 1
-                asked = packet
-            continue
-        count.replies += 1
-        count.errors += code != 0
-        count.bits |= code
-        if asked is not None and asked.servo_id == packet.servo_id:
-            count.reply_ns.append(packet.last_ns - asked.first_ns)
-            asked = None
-    _miss(asked, counts)
-    return counts
-
-
-def _miss(asked: LoggedPacket | None, counts: dict[int, _Count]) -> None:
-    if asked is not None:
-        counts[asked.servo_id].lost += 1
+            pairing.instruct(packet)
+        elif packet.kind == PacketKind.STATUS:
+            for reply in replies(packet.servo_id, packet.data, pairing.asked):
+                pairing.answer(reply, packet.last_ns)
+    pairing.miss()
+    return pairing.counts
 
 
 def _servo(bus: str, servo_id: int, joint: str, count: _Count) -> Servo:
@@ -135,7 +143,7 @@ def _servo(bus: str, servo_id: int, joint: str, count: _Count) -> Servo:
         lost=count.lost,
         replies=count.replies,
         errors=count.errors,
-        error_names=tuple(name for bit, name in ERROR_BITS.items() if count.bits & bit),
+        error_names=error_names(count.protocol, count.error_bytes),
         reply_median_us=float(np.median(times)),
         reply_max_us=float(times.max()),
     )
@@ -148,7 +156,7 @@ def _bus(name: str, packets: Iterable[LoggedPacket]) -> BusTraffic:
     for packet in packets:
         number[packet.kind] += 1
         size[packet.kind] += len(packet.data)
-        broadcasts += packet.kind == PacketKind.INSTRUCTION and packet.servo_id == _BROADCAST_ID
+        broadcasts += packet.kind == PacketKind.INSTRUCTION and packet.servo_id == BROADCAST_ID
     return BusTraffic(
         name=name,
         instructions=number[PacketKind.INSTRUCTION],

@@ -1,0 +1,94 @@
+"""Analysis: reads of several servos, and Protocol 2.0, judged by packets made by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from dxlrun.analysis.report import analyze_log
+from dxlrun.packets import PacketKind
+
+Make = Callable[..., Any]
+SYNC_READ = bytes.fromhex("fffffd00fe090082840004000102cefa")
+"""e-Manual, Protocol 2.0, sync read: present position of servos 1 and 2."""
+FAST_SYNC_READ = bytes.fromhex("fffffd00fe0a008a84000400030704fab5")
+"""Servos 3, 7 and 4; the log is not asked whether the CRC is right."""
+BULK_READ_1 = bytes.fromhex("fffffe0992000201240102241b")
+
+
+def asks(wire: Make, at: int, data: bytes, servo_id: int = 254) -> Any:
+    return wire(PacketKind.INSTRUCTION, servo_id, at, data)
+
+
+def answers(wire: Make, at: int, servo_id: int, data: bytes) -> Any:
+    return wire(PacketKind.STATUS, servo_id, at, data)
+
+
+def status(servo_id: int, error: int = 0) -> bytes:
+    return bytes([0xFF, 0xFF, 0xFD, 0, servo_id, 8, 0, 0x55, error, 1, 2, 3, 4, 0, 0])
+
+
+def test_a_sync_read_asks_each_servo_of_its_list(write: Make, wire: Make) -> None:
+    packets = [
+        asks(wire, 0, SYNC_READ),
+        answers(wire, 400, 1, status(1)),
+        answers(wire, 700, 2, status(2)),
+        asks(wire, 20_000, SYNC_READ),
+        answers(wire, 20_500, 1, status(1)),
+    ]
+    report = analyze_log(write([], packets))
+    first, second = report.servos
+    assert (first.servo_id, first.asked, first.lost, first.replies, first.instructions) == (1, 2, 0, 2, 0)
+    assert (second.servo_id, second.asked, second.lost, second.replies) == (2, 2, 1, 1)
+    assert (first.reply_max_us, second.reply_max_us) == (500, 700)
+    assert "servo 2 (main) 1 of 2 times (50.00%)" in report.verdict.sentences[1]
+
+
+def test_one_fast_status_answers_for_all(write: Make, wire: Make) -> None:
+    blocks = bytes([0, 3, 166, 0, 0, 0, 0x2E, 0x90, 0x80, 7, 1, 0, 0, 0, 0x11, 0x22])
+    whole = bytes([0xFF, 0xFF, 0xFD, 0, 0xFE, 1 + len(blocks), 0, 0x55]) + blocks
+    packets = [asks(wire, 0, FAST_SYNC_READ), answers(wire, 300, 254, whole)]
+    third, fourth, seventh = analyze_log(write([], packets)).servos
+    assert (third.asked, third.lost, third.replies, third.errors) == (1, 0, 1, 0)
+    assert (seventh.replies, seventh.errors, seventh.error_names) == (1, 1, ("alert",))
+    assert (fourth.asked, fourth.lost) == (1, 1)
+
+
+def test_a_bulk_read_of_protocol_1_asks_each_servo_of_its_list(write: Make, wire: Make) -> None:
+    answer = bytes.fromhex("ffff01040000000000")
+    first, second = analyze_log(write([], [asks(wire, 0, BULK_READ_1), answers(wire, 600, 1, answer)])).servos
+    assert (first.servo_id, first.asked, first.lost, first.replies) == (1, 1, 0, 1)
+    assert (second.servo_id, second.asked, second.lost, second.replies) == (2, 1, 1, 0)
+
+
+def test_a_stuffed_list_is_read_as_it_was_meant(write: Make, wire: Make) -> None:
+    # a sync read of 253 bytes at address 65535: no table has it, but FF FF FD lies in the list
+    stuffed = bytes.fromhex("fffffd00fe0a0082fffffdfd0005cefa")
+    (servo,) = analyze_log(write([], [asks(wire, 0, stuffed)])).servos
+    assert (servo.servo_id, servo.asked, servo.lost) == (5, 1, 1)
+
+
+def test_errors_of_protocol_2_are_numbers_and_the_alert_a_bit(write: Make, wire: Make) -> None:
+    packets = [
+        answers(wire, 0, 1, status(1, 7)),
+        answers(wire, 10, 1, status(1, 0x84)),
+        answers(wire, 20, 2, status(2)),
+    ]
+    first, second = analyze_log(write([], packets)).servos
+    assert (first.errors, first.error_names) == (2, ("range", "access", "alert"))
+    assert (second.errors, second.error_names) == (0, ())
+
+
+def test_a_broadcast_ping_asks_nobody_in_particular(write: Make, wire: Make) -> None:
+    ping = bytes.fromhex("fffffd00fe0300013142")
+    (servo,) = analyze_log(write([], [asks(wire, 0, ping), answers(wire, 500, 1, status(1))])).servos
+    assert (servo.asked, servo.lost, servo.replies) == (0, 0, 1)
+
+
+def test_a_read_of_one_servo_by_protocol_2_is_paired(write: Make, wire: Make) -> None:
+    read = bytes.fromhex("fffffd0001070002840004001d15")
+    packets = [asks(wire, 0, read, 1), answers(wire, 640, 1, status(1)), asks(wire, 900, read, 1)]
+    report = analyze_log(write([], packets))
+    (servo,) = report.servos
+    assert (servo.instructions, servo.asked, servo.lost, servo.reply_max_us) == (2, 2, 1, 640)
+    assert report.buses[0].broadcasts == 0
