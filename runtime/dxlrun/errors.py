@@ -51,6 +51,11 @@ class DxlrunError(Exception):
 
     exit_code = 1
 
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What a person is told: the message, line by line, and the notes that were added on the way."""
+        return (*str(self).splitlines(), *getattr(self, "__notes__", ()))
+
 
 class InputError(DxlrunError, ValueError):
     """A file, an argument or a plug-in is wrong; carries every problem that was found, in file order."""

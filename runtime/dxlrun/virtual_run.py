@@ -114,7 +114,7 @@ class VirtualRobot:
             finally:
                 self.failures = self.robot.hardware.stop()
         except DxlrunError as error:
-            self._sinks.events.emit(EventCode.SETUP, Severity.ERROR, "loop", str(error))
+            self._sinks.events.emit(EventCode.SETUP, Severity.ERROR, "loop", "\n".join(error.sentences))
             raise
         finally:
             self._sinks.packets.commit()
@@ -128,13 +128,14 @@ def run_virtual(plan: Plan, options: RunOptions) -> RunSummary:
     log = new_log(Path(plan.recording_directory), plan.robot) if options.record else None
     robot = VirtualRobot(plan, log=log, take_over=options.take_over)
     began = time.monotonic()
+    refused: tuple[str, ...] = ()
     try:
         result = robot.run()
     except DxlrunError as error:
         if options.debug:
             sys.stderr.write(traceback.format_exc())
-        result = LoopResult(0, 0, "fault", str(error))
-    sentences = (*((result.detail,) if result.detail else ()), *robot.failures)
+        result, refused = LoopResult(0, 0, "fault"), error.sentences
+    sentences = (*refused, *((result.detail,) if result.detail else ()), *robot.failures)
     return RunSummary(
         exit_code=1 if sentences or result.reason == "fault" else 0,
         reason=result.reason,

@@ -3,7 +3,7 @@ import pytest
 
 from dxlrun.dynamixel import protocol1
 from dxlrun.dynamixel.units import goal_ticks, joint_position
-from dxlrun.errors import PortError
+from dxlrun.errors import PortError, StartUpError
 from dxlrun.events import EventCode
 from dxlrun.simulation import ServoConfig
 
@@ -311,3 +311,21 @@ def test_extra_servos_on_the_line_are_left_alone(make_rig):
     rig.hardware.start()
     rig.cycle()
     assert rig.torque() == [True] * 8 + [False]
+
+
+def test_a_start_that_fails_says_whose_torque_was_not_confirmed_off(make_rig, monkeypatch):
+    """A servo that falls silent once it has torque: nobody may claim that it is limp."""
+    rig = make_rig()
+    emit = rig.events.emit
+
+    def unplug(code, *rest):
+        if code is EventCode.TORQUE_ON:
+            rig.buses[0].servo(4).silence()
+        emit(code, *rest)
+
+    monkeypatch.setattr(rig.events, "emit", unplug)
+    with pytest.raises(StartUpError) as caught:
+        rig.hardware.start()
+    assert len(caught.value.sentences) == 2
+    assert "ID 4 on bus main): torque off was sent, but the servo does not answer" in caught.value.sentences[1]
+    assert rig.torque() == [servo.servo_id == 4 for servo in rig.buses[0].servos]

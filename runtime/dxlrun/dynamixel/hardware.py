@@ -65,14 +65,15 @@ class DynamixelHardware:
         """Look at every servo, hold each where it stands, fill the first states and goals.
 
         Raises StartUpError with every problem of every servo, PortError when a line is gone; torque that was
-        given is taken back.
+        given is taken back, and a note of the exception says whether every servo confirmed that.
         """
         self._survey()
         try:
             self._engage()
             self._first_states()
-        except BaseException:  # also an interrupt: nothing may leave here with torque on
-            self._limp()
+        except BaseException as error:  # also an interrupt: nothing may leave here with torque on
+            for sentence in self.stop() or ("torque was switched off again on every servo",):
+                error.add_note(sentence)
             raise
 
     def read(self) -> None:
@@ -148,7 +149,7 @@ class DynamixelHardware:
         self._raise_failures()
         problems = [problem for one in engaged if one is not None for problem in one.problems]
         if problems:
-            raise StartUpError("\n".join([*problems, "torque was switched off again on every servo"]))
+            raise StartUpError("\n".join(problems))
         for plan, servos, one in zip(self._plans, self._servos, engaged, strict=True):
             assert one is not None  # noqa: S101  no line has failed
             servos.torqued[:] = True
@@ -165,8 +166,7 @@ class DynamixelHardware:
         silent = [name for servos in self._servos for name in servos.silent]
         if silent:
             raise StartUpError(
-                f"{', '.join(silent)} did not answer after torque was switched on: check cable and power; "
-                "torque was switched off again on every servo"
+                f"{', '.join(silent)} did not answer after torque was switched on: check cable and power"
             )
         for servos in self._servos:
             servos.torqued[:] = True

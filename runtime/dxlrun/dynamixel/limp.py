@@ -102,13 +102,15 @@ def limp(
     clock: Clock,
     packets: PacketSink,
     limit_ns: int = 1_000_000_000,
+    beat: Callable[[], None] = lambda: None,
 ) -> tuple[LimpOutcome, ...]:
     """Drain the lines and switch torque off on every servo; for somebody who just took the ports over.
 
-    `limit_ns` bounds the retries, counted from now. Raises nothing: a line that is gone is in the outcome.
+    `limit_ns` bounds the retries, counted from now; `beat` is called once a transaction. Raises nothing: a
+    line that is gone is in the outcome.
     """
     buses = [
         Bus(index, plan, port, clock, packets)
         for index, (plan, port) in enumerate(zip(plans, ports.ports, strict=True))
     ]
-    return limp_buses(plans, buses, ports, clock, deadline_ns=clock.now_ns() + limit_ns)
+    return limp_buses(plans, buses, ports, clock, deadline_ns=clock.now_ns() + limit_ns, beat=beat)
