@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from dxlrun.compile.problems import Problems, suggestion
@@ -10,6 +11,11 @@ from dxlrun.control.loop_plan import JointPlan
 from dxlrun.control_table import ControlTable, control_table, model_names
 from dxlrun.description import Description
 from dxlrun.description.robot import Joint
+
+AUTO = "auto"
+"""Instead of a model: the servo is asked."""
+_USUAL = {1.0: "AX-12A", 2.0: "XM430-W350"}
+"""What stands in for a model that is not known, by protocol."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,18 +29,26 @@ class CompiledJoint:
     """rad, in the joint's coordinate"""
 
 
-def compile_joints(description: Description, problems: Problems) -> dict[str, CompiledJoint]:
-    """Return the joints that could be compiled, by name, in the order of the file."""
+def compile_joints(
+    description: Description, problems: Problems, models: Mapping[str, str]
+) -> dict[str, CompiledJoint]:
+    """Return the joints that could be compiled, by name, in the order of the file.
+
+    `models`: what the servos of joints with `model: auto` said that they are.
+    """
     _unique_ids(description, problems)
     compiled: dict[str, CompiledJoint] = {}
     for name, joint in description.robot.joints.items():
         known_bus = _known_bus(description, name, joint, problems)
-        table = _table(description, name, joint, problems)
+        model = joint.model if joint.model != AUTO else models.get(name)
+        if model is None:
+            model = _assumed_model(description, name, joint, problems)
+        table = _table(description, name, joint, model, problems)
         if table is None:
             continue
         reach = joint_reach(table.max_tick * table.rad_per_tick, joint.reference, joint.direction)
         _check_reference(description, name, joint, table, problems)
-        allowed = _allowed(description, name, joint, reach, problems)
+        allowed = _allowed(description, name, reach, table.model, problems)
         if known_bus and allowed is not None:
             plan = JointPlan(name, allowed.lower, allowed.upper, joint.limits.velocity)
             compiled[name] = CompiledJoint(plan, joint, table, reach)
@@ -65,23 +79,39 @@ def _known_bus(description: Description, name: str, joint: Joint, problems: Prob
     return False
 
 
-def _table(description: Description, name: str, joint: Joint, problems: Problems) -> ControlTable | None:
+def _assumed_model(description: Description, name: str, joint: Joint, problems: Problems) -> str:
+    """Return what a servo that cannot be asked now may be: like its neighbours, else the usual one."""
+    robot = description.robot
+    neighbours = [each.model for each in robot.joints.values() if each.bus == joint.bus]
+    known = [model for model in neighbours if model != AUTO]
+    bus = robot.buses.get(joint.bus)
+    model = known[0] if known else _USUAL[1.0 if bus is None else bus.protocol]
+    problems.warning(
+        description.marks.value("joints", name, "model"),
+        f"the servo of {name} is asked for its model at the start; until then it is taken for an {model}",
+        "write its model to have reach and time checked for certain",
+    )
+    return model
+
+
+def _table(
+    description: Description, name: str, joint: Joint, model: str, problems: Problems
+) -> ControlTable | None:
     mark = description.marks.value("joints", name, "model")
     try:
-        table = control_table(joint.model)
+        table = control_table(model)
     except LookupError:
         problems.error(
             mark,
-            f"no control table for model {joint.model} of {name}",
-            suggestion(joint.model, model_names()),
+            f"no control table for model {model} of {name}",
+            suggestion(model, model_names()),
         )
         return None
     bus = description.robot.buses.get(joint.bus)
     if bus is not None and table.protocol != bus.protocol:
         problems.error(
             mark,
-            f"{joint.model} of {name} speaks Protocol {table.protocol}, "
-            f"bus {joint.bus} Protocol {bus.protocol}",
+            f"{model} of {name} speaks Protocol {table.protocol}, bus {joint.bus} Protocol {bus.protocol}",
             "put it on a bus of its own protocol; a bus cannot be mixed",
         )
     return table
@@ -94,31 +124,32 @@ def _check_reference(
     if not 0.0 <= joint.reference <= travel:
         problems.warning(
             description.marks.value("joints", name, "reference"),
-            f"reference {degrees(joint.reference)} deg of {name} lies outside the travel of an {joint.model} "
+            f"reference {degrees(joint.reference)} deg of {name} lies outside the travel of an {table.model} "
             f"(0..{degrees(travel)} deg), so the joint can never be at 0",
             "check the reference: it is the servo's angle where the joint's is 0",
         )
 
 
 def _allowed(
-    description: Description, name: str, joint: Joint, reach: Interval, problems: Problems
+    description: Description, name: str, reach: Interval, model: str, problems: Problems
 ) -> Interval | None:
     """Return the limits that the gate keeps: the file's, cut to the reach."""
-    if joint.limits.position is None:
+    limits = description.robot.joints[name].limits.position
+    if limits is None:
         return reach
     mark = description.marks.value("joints", name, "limits", "position")
-    wanted = Interval(*joint.limits.position)
+    wanted = Interval(*limits)
     allowed = wanted.meet(reach)
     if allowed is None:
         problems.error(
             mark,
-            f"limits {wanted} of {name} have nothing in common with the reach of its {joint.model}, {reach}",
+            f"limits {wanted} of {name} have nothing in common with the reach of its {model}, {reach}",
             "check limits, reference and direction",
         )
     elif not reach.contains(wanted):
         problems.warning(
             mark,
-            f"limits {wanted} of {name} go beyond the reach of its {joint.model}, {reach}",
+            f"limits {wanted} of {name} go beyond the reach of its {model}, {reach}",
             f"the joint will keep {allowed}; write that, or check reference and direction",
         )
     return allowed

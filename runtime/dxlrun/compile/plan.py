@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import msgspec
 
@@ -24,6 +24,10 @@ class Plan:
     """The robot file as it was read."""
     arguments: dict[str, str]
     """The arguments of the robot file as this run took them."""
+    included: dict[str, str] = field(default_factory=dict)
+    """Text of each file that the robot file includes, by its name seen from there."""
+    urdf: str | None = None
+    """The robot's URDF as it was read."""
 
     @property
     def simulated(self) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from dxlrun.compile.plan import Plan
 from dxlrun.compile.problems import Problems
 from dxlrun.compile.report import Checked, CheckReport, check_report
 from dxlrun.compile.twins import check_twins
+from dxlrun.compile.urdf import compile_urdf
 from dxlrun.control.loop_plan import LoopPlan, SchedulerPlan
 from dxlrun.control.plugins import load_plugins
 from dxlrun.description import Description, MotionDescription, read_motion, survey_robot
@@ -66,17 +68,22 @@ def _placed(error: InputError) -> tuple[Problem, ...]:
 
 
 def compile_robot(
-    description: Description, motions: Sequence[MotionDescription], duration_ns: int | None = None
+    description: Description,
+    motions: Sequence[MotionDescription],
+    duration_ns: int | None = None,
+    models: Mapping[str, str] | None = None,
 ) -> Compiled:
     """Turn a description and motions into a plan.
 
     The run ends by itself after `duration_ns`, else when the last motion has ended, else when it is told to.
+    `models` are those that the servos of joints with `model: auto` gave when they were asked, by joint.
     Raises InputError with every problem of the robot file and the motions.
     """
     problems = Problems()
-    joints = compile_joints(description, problems)
+    joints = compile_joints(description, problems, models or {})
     check_twins(description, {name: joint.table for name, joint in joints.items()}, problems)
     buses = compile_buses(description, joints, problems)
+    urdf = compile_urdf(description, joints, problems)
     controllers = compile_controllers(description, load_plugins(), problems)
     names = (*description.robot.controllers, *left_out_names(description, "controllers"))
     parts = [
@@ -87,10 +94,10 @@ def compile_robot(
     if end_ns is None and parts:
         end_ns = max(part.end_ns for part in parts)
     checked = Checked(description, joints, buses, controllers, parts, end_ns)
-    return Compiled(_plan(checked), problems.warnings, check_report(checked))
+    return Compiled(_plan(checked, urdf), problems.warnings, check_report(checked))
 
 
-def _plan(checked: Checked) -> Plan:
+def _plan(checked: Checked, urdf: str | None) -> Plan:
     description, robot = checked.description, checked.description.robot
     scheduler = robot.loop.scheduler
     commands = [command for part in checked.parts for command in part.commands]
@@ -111,4 +118,9 @@ def _plan(checked: Checked) -> Plan:
         source_file=str(description.path),
         source_text=description.text,
         arguments=dict(description.arguments),
+        included={
+            os.path.relpath(file, description.path.parent): text
+            for file, text in description.included.items()
+        },
+        urdf=urdf,
     )

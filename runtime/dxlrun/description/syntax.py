@@ -44,8 +44,11 @@ class Tree:
     problems: tuple[Problem, ...]
 
 
-def read_text(path: Path) -> str:
-    """Return the text of a file; raises InputError when it is missing, too large, or no UTF-8."""
+def read_text(path: Path, language: str = "YAML") -> str:
+    """Return the text of a file; raises InputError when it is missing, too large, or no UTF-8.
+
+    `language` is what the problems call it.
+    """
     file = str(path)
     try:
         mode = path.stat().st_mode
@@ -62,15 +65,15 @@ def read_text(path: Path) -> str:
         ) from None
     if not stat.S_ISREG(mode):
         kind = "a directory" if stat.S_ISDIR(mode) else "not a regular file"
-        raise refusal(Mark(file), f"this is {kind}", "name a YAML file")
+        raise refusal(Mark(file), f"this is {kind}", f"name a {language} file")
     if len(data) > LARGEST_FILE:
         raise refusal(
             Mark(file), f"the file is larger than {LARGEST_FILE // 1024} KiB", "split it, or thin it out"
         )
-    return _decoded(data, file)
+    return _decoded(data, file, language)
 
 
-def _decoded(data: bytes, file: str) -> str:
+def _decoded(data: bytes, file: str, language: str) -> str:
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -78,7 +81,7 @@ def _decoded(data: bytes, file: str) -> str:
         what = f"the byte 0x{error.object[error.start]:02x} is no UTF-8"
         raise refusal(_mark_at(before, len(before), file), what, "save the file as UTF-8") from None
     if found := Reader.NON_PRINTABLE.search(text):
-        what = f"the character U+{ord(found[0]):04X} cannot stand in YAML"
+        what = f"the character U+{ord(found[0]):04X} cannot stand in {language}"
         raise refusal(_mark_at(text, found.start(), file), what, "take it out")
     return text
 

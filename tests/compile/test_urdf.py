@@ -1,0 +1,117 @@
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from dxlrun.compile import Compiled
+from dxlrun.errors import InputError, Mark, Problem
+
+Problems = Callable[..., tuple[Problem, ...]]
+URDF = """\
+<?xml version="1.0"?>
+<robot name="pair">
+  <link name="body"/>
+  <joint name="left_arm_joint" type="revolute"><limit lower="-4.2" upper="1.05" velocity="1"/></joint>
+  <joint name="right_arm_joint" type="continuous"/>
+</robot>
+"""
+
+
+@pytest.fixture
+def with_urdf(tmp_path: Path, robot_text: str) -> Callable[[str], str]:
+    """Return a robot file that names a URDF of this text."""
+
+    def with_urdf(text: str) -> str:
+        (tmp_path / "pair.urdf").write_text(text, encoding="utf-8")
+        return robot_text + "model: {urdf: pair.urdf}\n"
+
+    return with_urdf
+
+
+def test_a_urdf_that_fits_is_part_of_the_plan(
+    compile_text: Callable[..., Compiled], with_urdf: Callable[[str], str]
+):
+    compiled = compile_text(with_urdf(URDF))
+
+    assert compiled.plan.urdf == URDF
+    assert [warning for warning in compiled.warnings if "URDF" in warning.what] == []
+
+
+def test_a_robot_without_one_has_none(compile_text: Callable[..., Compiled], robot_text: str):
+    assert compile_text(robot_text).plan.urdf is None
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "expected"),
+    [
+        ("right_arm_joint", "other_joint", "the URDF has no joint right_arm_joint"),
+        ("continuous", "fixed", "the URDF does not let right_arm_joint turn"),
+        (
+            "-4.2",
+            "-1",
+            "left_arm_joint may move -240..+60 deg, beyond its limits in the URDF, -57.3..+60.16 deg",
+        ),
+    ],
+)
+def test_what_does_not_fit_is_a_warning(
+    problems_in: Problems, with_urdf: Callable[[str], str], right: str, wrong: str, expected: str
+):
+    (warning,) = [each for each in problems_in(with_urdf(URDF.replace(right, wrong))) if "URDF" in each.what]
+
+    assert (warning.what, warning.severity) == (expected, "warning")
+
+
+def test_a_speed_above_that_of_the_urdf_is_a_warning(problems_in: Problems, with_urdf: Callable[[str], str]):
+    text = with_urdf(URDF).replace("direction: -1", "direction: -1\n    limits: {velocity: 2 rad/s}")
+    (warning,) = [each for each in problems_in(text) if "URDF" in each.what]
+
+    assert warning.what == "left_arm_joint may move at 2 rad/s, faster than in the URDF, 1 rad/s"
+
+
+@pytest.mark.parametrize(
+    ("text", "place", "expected"),
+    [
+        ("<robot>\n  <link></robot>", (2, 11), "this is not XML (mismatched tag); correct it"),
+        ("", (1, 1), "this is not XML (no element found); correct it"),
+        ("<model/>", (1, 1), "the top element is model, not robot; name a URDF file"),
+        (
+            '<?xml version="1.0"?>\n <!DOCTYPE r [<!ENTITY e SYSTEM "file:///etc/passwd">]><robot>&e;</robot>',
+            (2, 2),
+            "a DOCTYPE is refused; take it out",
+        ),
+        ("<robot>\x01</robot>", (1, 8), "the character U+0001 cannot stand in URDF; take it out"),
+    ],
+)
+def test_what_is_no_urdf_is_an_error_at_its_place(
+    problems_in: Problems, with_urdf: Callable[[str], str], text: str, place: tuple[int, int], expected: str
+):
+    (error,) = [each for each in problems_in(with_urdf(text)) if each.severity == "error"]
+
+    assert Path(error.mark.file).name == "pair.urdf"
+    assert (error.mark.line, error.mark.column) == place
+    assert f"{error.what}; {error.mend}" == expected
+
+
+def test_a_missing_urdf_is_an_error_in_the_file_that_names_it(
+    compile_text: Callable[..., Compiled], robot_text: str, tmp_path: Path
+):
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "sub" / "look.yaml").write_text("model: {urdf: gone.urdf}\n")
+    with pytest.raises(InputError) as caught:
+        compile_text(f"include: [sub/look.yaml]\n{robot_text}")
+
+    (error,) = [each for each in caught.value.problems if each.severity == "error"]
+    assert error.mark == Mark(str(tmp_path / "sub" / "look.yaml"), 1, 15)
+    assert error.what == "there is no URDF gone.urdf"
+
+
+def test_the_urdf_of_a_fragment_lies_beside_the_fragment(
+    compile_text: Callable[..., Compiled], robot_text: str, tmp_path: Path
+):
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "sub" / "look.yaml").write_text("model: {urdf: pair.urdf}\n")
+    (tmp_path / "sub" / "pair.urdf").write_text(URDF)
+    plan = compile_text(f"include: [sub/look.yaml]\n{robot_text}").plan
+
+    assert plan.urdf == URDF
+    assert plan.included == {"sub/look.yaml": "model: {urdf: pair.urdf}\n"}
