@@ -31,7 +31,12 @@ def log_header(plan: Plan, epoch_offset_ns: int, *, virtual: bool) -> LogHeader:
         ),
         period_ns=plan.loop.period_ns,
         epoch_offset_ns=epoch_offset_ns,
-        attachments={"robot.yaml": plan.source_text.encode(), "plan.json": to_json(plan)},
+        attachments={
+            "robot.yaml": plan.source_text.encode(),
+            "plan.json": to_json(plan),
+            **{f"included/{name}": text.encode() for name, text in plan.included.items()},
+        },
+        robot_description=plan.urdf,
         metadata={
             "run": {
                 "robot_file": plan.source_file,

@@ -16,7 +16,14 @@ from dxlrun.recording import schemas
 from dxlrun.recording.cdr import ENCAPSULATION, Codec, parse
 from dxlrun.recording.schemas import MessageType
 
-MESSAGES = [schemas.JOINT_STATE, schemas.ROS_LOG, schemas.CYCLE, schemas.BUS_PACKET, schemas.EVENT]
+MESSAGES = [
+    schemas.JOINT_STATE,
+    schemas.ROS_LOG,
+    schemas.CYCLE,
+    schemas.BUS_PACKET,
+    schemas.EVENT,
+    schemas.STRING,
+]
 TEXT = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=20)
 FLOATS = st.lists(st.floats(width=64), max_size=5)
 
@@ -28,7 +35,9 @@ def test_the_hash_is_that_of_the_text(message: MessageType) -> None:
     assert store.hash_rihs01(message.name) == message.type_hash
 
 
-@pytest.mark.parametrize("message", [schemas.JOINT_STATE, schemas.ROS_LOG], ids=lambda message: message.name)
+@pytest.mark.parametrize(
+    "message", [schemas.JOINT_STATE, schemas.ROS_LOG, schemas.STRING], ids=lambda message: message.name
+)
 def test_the_text_of_a_standard_message_is_the_standard_one(
     message: MessageType, typestore: Typestore
 ) -> None:

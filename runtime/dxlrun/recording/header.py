@@ -34,6 +34,8 @@ class LogHeader:
     """Robot file, plan: by name."""
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     """Versions, kernel, scheduler: records of text by name."""
+    robot_description: str | None = None
+    """The robot's URDF."""
 
 
 @dataclass(frozen=True, slots=True)

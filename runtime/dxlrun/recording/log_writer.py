@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import IO, cast
 
@@ -43,6 +43,7 @@ class LogWriter:
         self._messages = self._lost = self._unwritten = self._last_ns = 0
         self._whole_bytes = self._whole_messages = 0
         self._summary: LogSummary | None = None
+        self._first: tuple[int, bytes] | None = None
         self._writer = Writer(
             cast("IO[bytes]", self._file), chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD
         )
@@ -86,20 +87,32 @@ class LogWriter:
             for index, controller in enumerate(header.controllers)
             if schemas.JOINT_STATES_TOPIC in controller.publishes
         ]
+        if header.robot_description is not None:
+            latched = {"offered_qos_profiles": schemas.LATCHED}
+            channel = self._channel(known, schemas.ROBOT_DESCRIPTION_TOPIC, schemas.STRING, latched)
+            self._first = (channel, Codec(schemas.STRING).pack(header.robot_description))
         self._mark_whole()
 
-    def _channel(self, known: dict[str, int], topic: str, message: MessageType) -> int:
+    def _channel(
+        self, known: dict[str, int], topic: str, message: MessageType, more: Mapping[str, str] | None = None
+    ) -> int:
         if message.name not in known:
             known[message.name] = self._writer.register_schema(
                 message.name, schemas.SCHEMA_ENCODING, message.text.encode()
             )
         channel = self._writer.register_channel(
-            topic, schemas.ENCODING, known[message.name], {"topic_type_hash": message.type_hash}
+            topic,
+            schemas.ENCODING,
+            known[message.name],
+            {"topic_type_hash": message.type_hash, **(more or {})},
         )
         self._sequences[channel] = 0
         return channel
 
     def _add(self, channel: int, t_ns: int, data: bytes) -> None:
+        if self._first is not None:  # the run begins with its first record, not when the log is opened
+            first, self._first = self._first, None
+            self._add(first[0], t_ns, first[1])
         wall_ns = max(0, t_ns + self.header.epoch_offset_ns)
         sequence = self._sequences[channel]
         self._sequences[channel] = sequence + 1

@@ -20,6 +20,7 @@ EVENT_TOPIC = "/events"
 ROSOUT_TOPIC = "/rosout"
 JOINT_STATES_TOPIC = "/joint_states"
 JOINT_COMMANDS_TOPIC = "/joint_commands"
+ROBOT_DESCRIPTION_TOPIC = "/robot_description"
 BUS_PREFIX = "/bus/"
 
 METADATA_NAME = "dxlrun"
@@ -83,6 +84,29 @@ uint32 line
 """,
     "RIHS01_e28ce254ca8abc06abf92773b74602cdbf116ed34fbaf294fb9f81da9f318eac",
 )
+
+
+STRING = MessageType(
+    "std_msgs/msg/String",
+    "string data\n",
+    "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
+)
+
+_FOREVER = "sec: 9223372036\n    nsec: 854775807"
+LATCHED = f"""- history: 1
+  depth: 1
+  reliability: 1
+  durability: 1
+  deadline:
+    {_FOREVER}
+  lifespan:
+    {_FOREVER}
+  liveliness: 1
+  liveliness_lease_duration:
+    {_FOREVER}
+  avoid_ros_namespace_conventions: false"""
+"""Quality of service as rosbag2 writes it: keep last, reliable, transient local, so that who comes later gets
+the message too. The integers are those of rmw/types.h; older rosbag2 reads no words here."""
 
 
 def _cycle_text() -> str:
