@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 
 from dxlrun.analysis.report import Report, analyze_log, to_json
-from dxlrun.analysis.tables import render
+from dxlrun.analysis.terminal import render
 from dxlrun.analysis.verdict import microseconds
 from dxlrun.errors import LogError
 from dxlrun.events import EventCode, Severity

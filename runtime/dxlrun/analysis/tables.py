@@ -1,140 +1,193 @@
-"""A report for the terminal: the verdict first, then tables."""
+"""The tables of a report, as text: a terminal and a page show the same numbers, each in its own way."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-
-from rich.console import Group, RenderableType
-from rich.table import Table
-from rich.text import Text
+from dataclasses import dataclass
+from typing import Literal
 
 from dxlrun.analysis.latency import Duration
-from dxlrun.analysis.report import Report
+from dxlrun.analysis.report import EventCount, Report
 from dxlrun.analysis.verdict import microseconds
 from dxlrun.events import Severity
 
-
-def render(report: Report) -> RenderableType:
-    """Return what a terminal shows of a report: sentences, then one table a subject that has something."""
-    style = "green" if report.verdict.good else "yellow"
-    parts: list[RenderableType] = [Text(sentence, style=style) for sentence in report.verdict.sentences]
-    parts.append(Text(""))
-    parts.append(_loop(report))
-    if report.steps:
-        parts.append(_durations("Steps of a cycle", "step", report.steps))
-    if report.controllers:
-        parts.append(_durations("Controllers", "update of", report.controllers))
-    if report.servos:
-        parts.append(_servos(report))
-    if report.buses:
-        parts.append(_buses(report))
-    if report.joints:
-        parts.append(_joints(report))
-    if report.events:
-        parts.append(_events(report))
-    return Group(*parts)
+Tone = Literal["plain", "warning", "error"]
 
 
-def _table(title: str, columns: Iterable[str]) -> Table:
-    table = Table(title=title, title_justify="left", title_style="bold", header_style="")
-    for number, column in enumerate(columns):
-        table.add_column(column, justify="right" if number else "left")
-    return table
+@dataclass(frozen=True, slots=True)
+class Column:
+    """One column; `detail` is left out where there is no room for it."""
+
+    name: str
+    kind: Literal["name", "number", "text"] = "number"
+    detail: bool = False
 
 
-def _loop(report: Report) -> Table:
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One cell; its tone draws the eye to what is not as it should be."""
+
+    text: str
+    tone: Tone = "plain"
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Rows of cells under columns."""
+
+    title: str
+    columns: tuple[Column, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+
+
+def tables(report: Report) -> tuple[Table, ...]:
+    """Return every table that has something to say, in the order of the report."""
+    found = (
+        loop_table(report),
+        steps_table(report),
+        controllers_table(report),
+        servos_table(report),
+        buses_table(report),
+        joints_table(report),
+        events_table(report.events),
+    )
+    return tuple(table for table in found if table.rows)
+
+
+def loop_table(report: Report) -> Table:
+    """Return the account of the periods and the statistics of the wake-ups."""
     account, late = report.periods, report.latency
-    table = _table(f"{report.robot}, {account.rate_hz:g} Hz, {account.seconds:.1f} s", ["loop", ""])
-    agree = "yes" if account.agree else f"no, {account.missing} missing"
-    rows = [
+    rows: list[tuple[str | Cell, ...]] = [
         ("periods elapsed", str(account.elapsed)),
         ("cycles recorded", str(account.records)),
-        ("periods skipped", str(account.skipped)),
-        ("recorded + skipped = elapsed", agree),
+        ("periods skipped", Cell(str(account.skipped), "warning" if account.skipped else "plain")),
+        ("recorded + skipped = elapsed", "yes" if account.agree else f"no, {account.missing} missing"),
     ]
     if late is not None:
         rows += [
             ("wake-up latency, maximum", microseconds(late.max_us)),
-            ("mean", f"{late.mean_us:.2f} us"),
-            ("standard deviation", f"{late.deviation_us:.2f} us"),
-            ("mode", f"{late.mode_us} us"),
-            ("later than 150 us", f"{late.share_over_150_us:.3%}"),
-            ("later than 1 ms", f"{late.share_over_1_ms:.3%}"),
-            ("later than one period", f"{late.share_over_period:.3%}"),
+            ("  mean", f"{late.mean_us:.2f} us"),
+            ("  standard deviation", f"{late.deviation_us:.2f} us"),
+            ("  mode", f"{late.mode_us} us"),
+            ("  later than 150 us", f"{late.share_over_150_us:.3%}"),
+            ("  later than 1 ms", f"{late.share_over_1_ms:.3%}"),
+            ("  later than one period", f"{late.share_over_period:.3%}"),
         ]
     rows += [("records lost", str(report.gaps)), ("log complete", "yes" if report.complete else "no")]
-    for row in rows:
-        table.add_row(*row)
-    return table
+    title = f"{report.robot}, {account.rate_hz:g} Hz, {account.seconds:.1f} s"
+    return _table(title, [Column("loop", "name"), Column("")], rows)
+
+
+def steps_table(report: Report) -> Table:
+    """Return how long each step of a cycle took."""
+    return _durations("Steps of a cycle", "step", report.steps)
+
+
+def controllers_table(report: Report) -> Table:
+    """Return how long each controller's update took."""
+    return _durations("Controllers", "update of", report.controllers)
 
 
 def _durations(title: str, what: str, durations: Iterable[Duration]) -> Table:
-    table = _table(title, [what, "cycles", "median", "99 %", "maximum"])
+    columns = [Column(what, "name"), *(Column(name) for name in ("cycles", "median", "99 %", "maximum"))]
+    rows = []
     for item in durations:
-        times = (microseconds(value) for value in (item.median_us, item.p99_us, item.max_us))
-        table.add_row(item.name, str(item.cycles), *times)
-    return table
+        values = (item.median_us, item.p99_us, item.max_us)
+        times = (microseconds(value) if item.cycles else "-" for value in values)
+        rows.append((item.name, str(item.cycles), *times))
+    return _table(title, columns, rows)
 
 
-def _servos(report: Report) -> Table:
-    columns = ["servo", "joint", "instructions", "asked", "lost", "replies", "errors", "reply", "slowest"]
-    table = _table("Servos", columns)
-    for servo in report.servos:
-        errors = f"{servo.errors} {', '.join(servo.error_names)}".strip()
-        table.add_row(
+def servos_table(report: Report) -> Table:
+    """Return packets and errors of each servo."""
+    columns = [
+        Column("servo", "name"),
+        Column("joint", "name"),
+        Column("instructions", detail=True),
+        Column("asked"),
+        Column("lost"),
+        Column("replies", detail=True),
+        Column("errors"),
+        Column("reply"),
+        Column("slowest"),
+    ]
+    rows = [
+        (
             f"{servo.bus} {servo.servo_id}",
-            servo.joint,
+            servo.joint or "-",
             str(servo.instructions),
             str(servo.asked),
-            Text(str(servo.lost), style="yellow" if servo.lost else ""),
+            Cell(str(servo.lost), "warning" if servo.lost else "plain"),
             str(servo.replies),
-            Text(errors, style="yellow" if servo.errors else ""),
+            Cell(
+                f"{servo.errors} {', '.join(servo.error_names)}".strip(),
+                "warning" if servo.errors else "plain",
+            ),
             microseconds(servo.reply_median_us),
             microseconds(servo.reply_max_us),
         )
-    return table
+        for servo in report.servos
+    ]
+    return _table("Servos", columns, rows)
 
 
-def _buses(report: Report) -> Table:
-    table = _table("Buses", ["bus", "instructions", "broadcasts", "replies", "noise", "out", "in"])
+def buses_table(report: Report) -> Table:
+    """Return packets and bytes of each bus."""
+    names = ("instructions", "broadcasts", "replies", "noise", "out", "in")
+    rows: list[tuple[str | Cell, ...]] = []
     for bus in report.buses:
         numbers = (bus.instructions, bus.broadcasts, bus.replies)
-        sizes = (f"{size} B" for size in (bus.noise_bytes, bus.bytes_out, bus.bytes_in))
-        table.add_row(bus.name, *(str(number) for number in numbers), *sizes)
-    return table
+        noise = Cell(f"{bus.noise_bytes} B", "warning" if bus.noise_bytes else "plain")
+        counts = (str(number) for number in numbers)
+        rows.append((bus.name, *counts, noise, f"{bus.bytes_out} B", f"{bus.bytes_in} B"))
+    return _table("Buses", [Column("bus", "name"), *(Column(name) for name in names)], rows)
 
 
-def _joints(report: Report) -> Table:
-    columns = ["joint", "invalid", "oldest", "clamped", "rms error", "worst error"]
-    table = _table("Joints (position minus the goal of the cycle before)", columns)
-    for joint in report.joints:
-        table.add_row(
+def joints_table(report: Report) -> Table:
+    """Return how fresh each joint's states were, and how it followed its goals."""
+    names = ("invalid", "oldest", "clamped", "rms, rad", "worst, rad")
+    rows = [
+        (
             joint.name,
-            str(joint.invalid),
+            Cell(str(joint.invalid), "warning" if joint.invalid else "plain"),
             f"{joint.oldest_ms:.1f} ms",
-            str(joint.clamped),
+            Cell(str(joint.clamped), "warning" if joint.clamped else "plain"),
             _radians(joint.rms_rad),
             _radians(joint.worst_rad),
         )
-    return table
+        for joint in report.joints
+    ]
+    title = "Joints (error: position minus the goal of the cycle before)"
+    return _table(title, [Column("joint", "name"), *(Column(name) for name in names)], rows)
 
 
 def _radians(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4f} rad"
+    return "-" if value is None else f"{value:.4f}"
 
 
-def _events(report: Report) -> Table:
-    table = Table(title="Events", title_justify="left", title_style="bold", header_style="")
-    table.add_column("event")
-    table.add_column("count", justify="right")
-    table.add_column("first", overflow="fold")
-    for event in report.events:
-        style = (
-            "red"
-            if event.severity >= Severity.ERROR
-            else "yellow"
-            if event.severity >= Severity.WARNING
-            else ""
-        )
-        table.add_row(Text(event.name, style=style), str(event.count), Text(event.first))
-    return table
+def events_table(events: Iterable[EventCount]) -> Table:
+    """Return the kinds of events, the grave ones first."""
+    columns = [Column("event", "name"), Column("count"), Column("the first", "text")]
+    rows = [
+        (Cell(event.name, tone_of(event.severity)), str(event.count), _once(event.first)) for event in events
+    ]
+    return _table("Events", columns, rows)
+
+
+def tone_of(severity: int) -> Tone:
+    """Return the tone in which an event of this severity is shown."""
+    if severity >= Severity.ERROR:
+        return "error"
+    return "warning" if severity >= Severity.WARNING else "plain"
+
+
+def _once(text: str) -> str:
+    """Drop a source that its own text names again, and the lines of a traceback but the last."""
+    source, _, said = text.partition(": ")
+    line = said.strip().splitlines()[-1].strip() if said.strip() else ""
+    return line if line.startswith(source) else f"{source}: {line}"
+
+
+def _table(title: str, columns: Iterable[Column], rows: Iterable[Iterable[str | Cell]]) -> Table:
+    cells = (tuple(cell if isinstance(cell, Cell) else Cell(cell) for cell in row) for row in rows)
+    return Table(title, tuple(columns), tuple(cells))

@@ -24,7 +24,7 @@ def analyze(log: Path, /, *, as_json: JsonFlag = False, debug: Flag = False) -> 
     if not log.is_file():
         raise InputError(f"there is no log {log}; a run says at its end where its log is")
     from dxlrun.analysis.report import analyze_log, to_json
-    from dxlrun.analysis.tables import render
+    from dxlrun.analysis.terminal import render
 
     report = analyze_log(log)
     console = out()

@@ -1,0 +1,56 @@
+"""Analysis: what a terminal shows, however narrow it is."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from dxlrun.analysis.report import Report, analyze_log
+from dxlrun.analysis.terminal import render
+from dxlrun.events import EventCode, Severity
+from dxlrun.packets import PacketKind
+
+Make = Callable[..., Any]
+
+
+def lines(report: Report, width: int) -> list[str]:
+    file = io.StringIO()
+    Console(file=file, width=width).print(render(report))
+    return file.getvalue().splitlines()
+
+
+@pytest.fixture
+def report(write: Make, cycle: Make, wire: Make, said: Make) -> Report:
+    ask, answer = bytes.fromhex("ffff0504022406ca"), bytes.fromhex("ffff05080000020000000000f0")
+    packets = [wire(PacketKind.INSTRUCTION, 5, 0, ask), wire(PacketKind.STATUS, 5, 640, answer)]
+    text = "torque is on: " + ", ".join(f"joint_number_{number}" for number in range(30))
+    events = [
+        said(EventCode.TORQUE_ON, Severity.INFO, text),
+        said(EventCode.READ_LOST, Severity.WARNING, "head (ID 21) did not answer"),
+    ]
+    return analyze_log(write([cycle(0), cycle(1, position=0.25)], packets, events))
+
+
+@pytest.mark.parametrize("width", [80, 100, 200])
+def test_no_line_is_longer_than_the_terminal_or_than_a_person_reads(report: Report, width: int) -> None:
+    assert max(len(line) for line in lines(report, width)) <= min(width, 120)
+
+
+def test_a_narrow_terminal_shows_each_servo_on_one_line(report: Report) -> None:
+    (servo,) = (line for line in lines(report, 80) if line.startswith("main 5"))
+    assert servo.split() == ["main", "5", "left_elbow_joint", "1", "0", "0", "640", "us", "640", "us"]
+
+
+def test_a_wide_terminal_shows_the_details(report: Report) -> None:
+    assert any("instructions" in line and "slowest" in line for line in lines(report, 120))
+    assert not any("instructions" in line and "slowest" in line for line in lines(report, 80))
+
+
+def test_an_event_says_its_source_once(report: Report) -> None:
+    text = "\n".join(lines(report, 120))
+    assert "head (ID 21) did not answer" in text
+    assert "head: head (ID 21)" not in text
