@@ -73,12 +73,15 @@ BROKEN = {
     "cannot be imported (ModuleNotFoundError: No module named 'no_such_thing')": "import no_such_thing",
     "cannot be imported (SyntaxError": "def",
     "cannot be imported (SystemExit: 3)": "import sys; sys.exit(3)",
-    "does not say for which contract": GOOD.replace("def dxlrun_contract", "def contract").replace(
-        "@hookimpl\ndef contract", "def contract"
-    ),
+    "does not say for which contract": GOOD.replace("@hookimpl\ndef dxlrun_contract", "def contract"),
     "was written for contract 7, this dxlrun has contract 1": GOOD.replace("return 1", "return 7"),
-    "has a wrong hook": GOOD.replace("def dxlrun_controllers()", "def dxlrun_controllers(robot)"),
-    "dxlrun_sensors": GOOD + "\n@hookimpl\ndef dxlrun_sensors():\n    pass\n",
+    "implements dxlrun_controllers(robot), but the hook is dxlrun_controllers()": GOOD.replace(
+        "def dxlrun_controllers()", "def dxlrun_controllers(robot)"
+    ),
+    "is not marked as a hook": GOOD.replace("@hookimpl\ndef dxlrun_controllers", "def dxlrun_controllers"),
+    "which has no method update": GOOD.replace("update", "renew"),
+    "implements a hook dxlrun_sensors that dxlrun does not have": GOOD
+    + "\n@hookimpl\ndef dxlrun_sensors():\n    pass\n",
     "raised in a hook (ZeroDivisionError: division by zero)": GOOD.replace('{"TYPE": Mine}', "1 / 0"),
     "does not return a mapping": GOOD.replace('{"TYPE": Mine}', "[Mine]"),
     "which is no controller": GOOD.replace('{"TYPE": Mine}', '{"odd": dict}'),

@@ -10,6 +10,7 @@ from pydantic import ValidationError
 from dxlrun.compile.places import joint_mark
 from dxlrun.compile.problems import Problems, suggestion
 from dxlrun.control.claims import conflicts
+from dxlrun.control.contract import interfaces_breach
 from dxlrun.control.controller import Interfaces, ParametersModel
 from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.control.plugins import Offer, PlugIns
@@ -88,28 +89,53 @@ def _offer(
 ) -> Offer | None:
     offer = plugins.controllers.get(type_name)
     if offer is None:
-        mend = suggestion(type_name, tuple(plugins.controllers))
-        if plugins.broken:
-            broken = "; ".join(f"{plugin}: {reason}" for plugin, reason in plugins.broken.items())
-            mend += f" (plug-ins that could not be loaded: {broken})"
+        what = f"no plug-in offers the controller type {type_name} of {name}"
         problems.error(
-            description.marks.value("controllers", name, "type"),
-            f"no plug-in offers the controller type {type_name} of {name}",
-            mend,
+            description.marks.value("controllers", name, "type"), what, _where_to_get(type_name, plugins)
         )
     return offer
+
+
+def _where_to_get(type_name: str, plugins: PlugIns) -> str:
+    """Return how to come by a type: another spelling, another package, or mending a broken one."""
+    if type_name in plugins.broken:  # two plug-ins offer it
+        return plugins.broken[type_name]
+    known = tuple(plugins.controllers)
+    close = suggestion(type_name, known)
+    if not plugins.broken:
+        return (
+            close if close.endswith("?") else f"install the package that offers it, or take another ({close})"
+        )
+    broken = "; ".join(plugins.broken.values())
+    return f"{close} If not: {broken}" if close.endswith("?") else broken
 
 
 def _parameters(
     description: Description, name: str, offer: Offer, problems: Problems
 ) -> ParametersModel | None:
     entry = description.robot.controllers[name]
+    model = offer.controller.Parameters
     try:
-        return offer.controller.Parameters.model_validate(entry.parameters)
+        return model.model_validate(entry.parameters)
     except ValidationError as error:
-        model = offer.controller.Parameters
         problems.extend(problems_of(error, description.marks, ("controllers", name), model=model))
+    except Exception as error:  # a validator of the model is anybody's code
+        _at_fault(description, name, offer, _raised("check its parameters", error), problems)
     return None
+
+
+def _at_fault(
+    description: Description, name: str, offer: Offer, breach: tuple[str, str], problems: Problems
+) -> None:
+    """Add what the plug-in of a controller did wrong, and how to mend it."""
+    what, mend = breach
+    text = f"controller {name} ({offer.distribution}) {what}"
+    problems.error(description.marks.key("controllers", name), text, mend)
+
+
+def _raised(what: str, error: Exception) -> tuple[str, str]:
+    told = " ".join(f"{type(error).__name__}: {error}".split())
+    return f"cannot {what}: {told}", "correct its parameters, or its plug-in"
 
 
 def _interfaces(
@@ -120,12 +146,12 @@ def _interfaces(
     try:
         interfaces = offer.controller.interfaces(parameters, joints)
     except Exception as error:
-        problems.error(
-            description.marks.key("controllers", name),
-            f"controller {name} ({offer.distribution}) cannot say what it needs: "
-            f"{type(error).__name__}: {error}",
-            "correct its parameters, or its plug-in",
-        )
+        _at_fault(description, name, offer, _raised("say what it needs", error), problems)
+        return None
+    breach = interfaces_breach(interfaces)
+    if breach is not None:
+        what, mend = breach
+        _at_fault(description, name, offer, (what, f"tell its author: {mend}"), problems)
         return None
     seen: set[str] = set()
     good = True

@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any
+from typing import cast
 
 import pluggy
 
-from dxlrun.control.controller import CONTRACT_VERSION, Controller
+from dxlrun.control.contract import ControllerClass, controller_breach, hook_breach
+from dxlrun.control.controller import CONTRACT_VERSION
 from dxlrun.control.hookspecs import GROUP, HookSpecs
 from dxlrun.errors import PlugInError
-
-ControllerClass = type[Controller[Any]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,20 +98,23 @@ def _load(entry_point: EntryPoint, publisher: str) -> tuple[Offer, ...]:
     manager = pluggy.PluginManager(GROUP)
     manager.add_hookspecs(HookSpecs)
     try:
-        manager.register(module, entry_point.name)
-        manager.check_pending()
-    except pluggy.PluginValidationError as error:
-        raise refuse(
-            f"has a wrong hook ({_told(error)})",
-            "its signatures must be those of dxlrun.control.hookspecs",
-        ) from error
+        breach = hook_breach(module, manager)
+        if breach is None:
+            manager.register(module, entry_point.name)
+            manager.check_pending()
+    except Exception as error:  # foreign code, see above: looking at an object may run its code
+        raise refuse(f"has a wrong hook ({_told(error)})", "tell its author") from error
+    if breach is not None:
+        raise refuse(*breach)
     try:
         contracts = manager.hook.dxlrun_contract()
         mappings = manager.hook.dxlrun_controllers()
     except (Exception, SystemExit) as error:  # foreign code, see above
         raise refuse(f"raised in a hook ({_told(error)})", "tell its author") from error
     if not contracts:
-        raise refuse("does not say for which contract it was written", "it must implement dxlrun_contract")
+        raise refuse(
+            "does not say for which contract it was written", "it must implement the hook dxlrun_contract"
+        )
     if contracts != [CONTRACT_VERSION]:
         raise refuse(
             f"was written for contract {contracts[0]!r}, this dxlrun has contract {CONTRACT_VERSION}",
@@ -136,9 +138,9 @@ def _offer(
 ) -> Offer:
     if not isinstance(name, str):
         raise refuse(f"offers a controller under {name!r}", "the type must be a string")
-    if not (isinstance(controller, type) and issubclass(controller, Controller)):
-        raise refuse(
-            f"offers {controller!r} as {name}, which is no controller",
-            "derive a class from dxlrun.Controller",
-        )
-    return Offer(name, controller, publisher)
+    breach = controller_breach(controller)
+    if breach is not None:
+        what, mend = breach
+        shown = controller.__qualname__ if isinstance(controller, type) else repr(controller)
+        raise refuse(f"offers {shown} as {name}, {what}", mend)
+    return Offer(name, cast("ControllerClass", controller), publisher)

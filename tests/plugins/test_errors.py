@@ -1,0 +1,158 @@
+"""A plug-in that is missing or wrong: one sentence each, with its place in the robot file."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+EXAMPLE = Path(__file__).parents[2] / "plugins" / "example"
+TYPE_MARK = "example.yaml:12:16: "
+NAME_MARK = "example.yaml:12:3: "
+WHO = "plug-in easing of dxlrun-easing 0.1.0"
+NOT_OFFERED = "no plug-in offers the controller type easing_position_controller of head; "
+CONTROLLER = (EXAMPLE / "src/dxlrun_easing/controller.py").read_text()
+PLUGIN = (EXAMPLE / "src/dxlrun_easing/plugin.py").read_text()
+
+Told = Callable[..., list[str]]
+
+
+@pytest.fixture
+def told(tmp_path: Path) -> Told:
+    """Install the example with some text replaced, check its robot file, return the lines of the errors."""
+
+    def told(old: str = "", new: str = "", *, install: bool = True) -> list[str]:
+        assert not old or (old in CONTROLLER) != (old in PLUGIN)
+        package = tmp_path / "dxlrun_easing"
+        package.mkdir()
+        (package / "__init__.py").touch()
+        (package / "controller.py").write_text(
+            CONTROLLER.replace(old, new) if old in CONTROLLER else CONTROLLER
+        )
+        (package / "plugin.py").write_text(PLUGIN.replace(old, new) if old in PLUGIN else PLUGIN)
+        if install:
+            info = tmp_path / "dxlrun_easing-0.1.0.dist-info"
+            info.mkdir()
+            (info / "METADATA").write_text("Metadata-Version: 2.1\nName: dxlrun-easing\nVersion: 0.1.0\n")
+            (info / "entry_points.txt").write_text("[dxlrun]\neasing = dxlrun_easing.plugin\n")
+        (tmp_path / "example.yaml").write_text((EXAMPLE / "example.yaml").read_text())
+        run = check(tmp_path)
+        assert run.stdout == ""
+        assert run.returncode == (2 if run.stderr else 0)
+        return run.stderr.splitlines()
+
+    return told
+
+
+def check(directory: Path, *options: str) -> subprocess.CompletedProcess[str]:
+    path = os.pathsep.join(filter(None, [str(directory), os.environ.get("PYTHONPATH")]))
+    code = "import sys; from dxlrun.cli import main; sys.exit(main(sys.argv[1:]))"
+    return subprocess.run(
+        [sys.executable, "-P", "-c", code, "check", "example.yaml", *options],
+        cwd=directory,
+        env=os.environ | {"PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_a_plugin_that_is_not_installed(told: Told) -> None:
+    (line,) = told(install=False)
+    assert line.startswith(TYPE_MARK + NOT_OFFERED)
+    assert line.endswith("?") or "install the package that offers it" in line
+
+
+WRONG = {
+    "import math": (
+        "import no_such_thing",
+        f"{WHO} cannot be imported (ModuleNotFoundError: No module named 'no_such_thing'); "
+        "reinstall it, or tell its author",
+    ),
+    "return 1": (
+        "return 7",
+        f"{WHO} was written for contract 7, this dxlrun has contract 1; install a version of it that fits",
+    ),
+    "def dxlrun_controllers()": (
+        "def dxlrun_controllers(robot)",
+        f"{WHO} implements dxlrun_controllers(robot), but the hook is dxlrun_controllers(); "
+        "take the other arguments out",
+    ),
+    "@hookimpl\ndef dxlrun_controllers": (
+        "def dxlrun_controllers",
+        f"{WHO} has a function dxlrun_controllers that is not marked as a hook; "
+        "put @dxlrun.hookimpl above it",
+    ),
+    "def update(self, time_ns: int, period_ns: int)": (
+        "def update(self, period_ns: int)",
+        f"{WHO} offers Easing as easing_position_controller, whose update(period_ns) cannot be called as "
+        "update(time_ns, period_ns); give it these arguments",
+    ),
+    "    def update(": (
+        "    def renew(",
+        f"{WHO} offers Easing as easing_position_controller, which has no method update; write it",
+    ),
+    "class EasingParameters(ParametersModel)": (
+        "class EasingParameters",
+        f"{WHO} offers Easing as easing_position_controller, whose Parameters is no model of parameters; "
+        "derive it from dxlrun.ParametersModel",
+    ),
+    '{"positions": PositionsCommand}': (
+        "(PositionsCommand,)",
+        f"{WHO} offers Easing as easing_position_controller, whose Commands is no mapping of names to "
+        "models; write {name: class of dxlrun.CommandModel}",
+    ),
+}
+
+
+@pytest.mark.parametrize("old", WRONG, ids=range(len(WRONG)))
+def test_a_plugin_that_is_wrong(told: Told, old: str) -> None:
+    new, sentence = WRONG[old]
+    (line,) = told(old, new)
+    head, _, tail = line.partition(WHO)
+    assert head.startswith(TYPE_MARK + NOT_OFFERED)
+    assert WHO + tail == sentence
+
+
+ASKED = {
+    'Interfaces(parameters.joints, ("position",))': (
+        "None",
+        "returns None from interfaces; tell its author: return dxlrun.Interfaces(joints, command)",
+    ),
+    'parameters.joints, ("position",)': (
+        'list(parameters.joints), ("position",)',
+        "asks for joints ['pan_joint', 'tilt_joint']; "
+        "tell its author: joints of dxlrun.Interfaces is a tuple of names",
+    ),
+    '("position",))': (
+        '("torque",))',
+        "asks for the command interface torque; tell its author: command interfaces are position, velocity",
+    ),
+}
+
+
+@pytest.mark.parametrize("old", ASKED, ids=range(len(ASKED)))
+def test_a_controller_that_asks_for_nonsense(told: Told, old: str) -> None:
+    new, says = ASKED[old]
+    assert told(old, new) == [f"{NAME_MARK}controller head (dxlrun-easing 0.1.0) {says}"]
+
+
+def test_parameters_whose_model_raises(told: Told) -> None:
+    (line,) = told(
+        "from pydantic import Field",
+        "from pydantic import AfterValidator\nField = lambda **_: AfterValidator(lambda value: 1 / 0)",
+    )
+    assert line.startswith(
+        f"{NAME_MARK}controller head (dxlrun-easing 0.1.0) cannot check its parameters: ZeroDivision"
+    )
+
+
+def test_the_same_for_programs(told: Told, tmp_path: Path) -> None:
+    told("return 1", "return 7")
+    (error,) = json.loads(check(tmp_path, "--json").stdout)["errors"]
+    assert (error["file"], error["line"], error["column"]) == ("example.yaml", 12, 16)
