@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from dxlrun.clock import Clock
+from dxlrun.commands import CommandSink
 from dxlrun.compile.plan import Plan
 from dxlrun.control.gate import Gate
 from dxlrun.control.loop import CycleSink, Loop, StopFlag
@@ -30,6 +31,11 @@ class Sinks(CycleSink, Protocol):
     @property
     def events(self) -> EventSink:
         """Takes what happens beside the cycle."""
+        ...
+
+    @property
+    def commands(self) -> CommandSink:
+        """Takes what controllers were handed."""
         ...
 
 
@@ -75,7 +81,7 @@ def assemble(
         beat,
         take_over=take_over,
     )
-    manager = Manager(plan.loop, plugins, record, sinks.events, clock)
+    manager = Manager(plan.loop, plugins, record, sinks.events, clock, commands=sinks.commands)
     gate = Gate(plan.loop, record, sinks.events)
     loop = Loop(
         clock=clock,

@@ -19,6 +19,7 @@ import msgspec
 from dxlrun import process
 from dxlrun.assembly import assemble
 from dxlrun.clock import MonotonicClock
+from dxlrun.commands import CommandRing
 from dxlrun.compile.plan import Plan, from_json
 from dxlrun.control import realtime
 from dxlrun.control.loop import StopFlag
@@ -45,6 +46,7 @@ class LoopJob:
     desk: int
     """Where the packets of the unfinished cycle lie."""
     events: int
+    commands: int
     result: int
     take_over: bool
     ports: tuple[int, ...] = ()
@@ -73,9 +75,15 @@ class RingSinks:
     cycles: RingWriter
     packets: PacketBatch
     events: EventRing
+    commands: CommandRing
     heartbeat: Heartbeat
     _count: int = field(default=0, init=False)
     _skipped: int = field(default=0, init=False)
+
+    def begin(self, record: CycleRecord) -> None:
+        """Put the packets of the start-up and what the controllers are activated with into the rings."""
+        self.packets.commit()
+        self.cycles.append(record.raw)
 
     def append(self, record: CycleRecord) -> None:
         """Put one finished cycle, and the packets since the one before, into the rings."""
@@ -147,7 +155,7 @@ def main() -> None:
     heartbeat = Heartbeat(job.heartbeat)
     events = EventRing(RingWriter(job.events), clock)
     batch = PacketBatch(RingWriter(job.packets), process.shared_memory(job.desk))
-    sinks = RingSinks(RingWriter(job.cycles), batch, events, heartbeat)
+    sinks = RingSinks(RingWriter(job.cycles), batch, events, CommandRing(RingWriter(job.commands)), heartbeat)
     try:
         if os.getppid() != guardian:
             sys.exit(1)  # the guardian was gone before its death could be signalled

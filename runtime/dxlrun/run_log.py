@@ -9,6 +9,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from dxlrun.compile.plan import Plan, to_json
+from dxlrun.control.controller import CONTRACT_VERSION
 from dxlrun.recording.header import LoggedController, LogHeader
 
 _LIBRARIES = ("dxlrun", "mcap", "msgspec", "numpy", "pluggy", "pydantic", "pyserial")
@@ -44,7 +45,8 @@ def log_header(plan: Plan, epoch_offset_ns: int, *, virtual: bool) -> LogHeader:
                 "epoch_offset_ns": str(epoch_offset_ns),
                 **{f"argument {name}": value for name, value in plan.arguments.items()},
             },
-            "versions": {"python": sys.version.split()[0]} | {name: version(name) for name in _LIBRARIES},
+            "versions": {"python": sys.version.split()[0], "contract": str(CONTRACT_VERSION)}
+            | {name: version(name) for name in _LIBRARIES},
             "plugins": {controller.type: controller.distribution for controller in plan.loop.controllers},
             "kernel": {"system": machine.system, "release": machine.release, "version": machine.version}
             | {"machine": machine.machine},

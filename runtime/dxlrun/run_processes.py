@@ -14,6 +14,7 @@ import msgspec
 
 from dxlrun import heartbeat, process, ring
 from dxlrun.assembly import cycle_layout
+from dxlrun.commands import COMMAND_SLOT, command_slots
 from dxlrun.compile.plan import Plan, to_json
 from dxlrun.compile.simulated import simulated_buses
 from dxlrun.cycle import cycle_slots
@@ -40,6 +41,7 @@ class Memory:
     packets: int
     desk: int
     events: int
+    commands: int
     guardian_packets: int
     guardian_events: int
     result: int
@@ -57,6 +59,7 @@ class Memory:
             packets=ring.create("packets", PACKET_SLOT, packet_slots(period, servos)),
             desk=process.memory_file("dxlrun-desk", bytes(PACKET_SLOT + 64)),
             events=ring.create("events", EVENT_SLOT, event_slots(period, servos)),
+            commands=ring.create("commands", COMMAND_SLOT, command_slots(period, len(plan.loop.controllers))),
             guardian_packets=ring.create("guardian-packets", PACKET_SLOT, _GUARDIAN_SLOTS),
             guardian_events=ring.create("guardian-events", EVENT_SLOT, _GUARDIAN_SLOTS),
             result=process.memory_file("dxlrun-result"),
@@ -74,6 +77,7 @@ class Memory:
             {"kind": "cycles", "fd": self.cycles, "source": "loop"},
             {"kind": "packets", "fd": self.packets, "source": "loop"},
             {"kind": "events", "fd": self.events, "source": "loop"},
+            {"kind": "commands", "fd": self.commands, "source": "loop"},
             {"kind": "packets", "fd": self.guardian_packets, "source": "guardian"},
             {"kind": "events", "fd": self.guardian_events, "source": "guardian"},
         ]
@@ -172,6 +176,7 @@ def start_guardian(
         memory.packets,
         memory.desk,
         memory.events,
+        memory.commands,
         memory.result,
         take_over,
     )
@@ -194,6 +199,7 @@ def start_guardian(
             memory.packets,
             memory.desk,
             memory.events,
+            memory.commands,
             memory.result,
             memory.stderr,
         ),

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from dxlrun.assembly import assemble
 from dxlrun.clock import VirtualClock
+from dxlrun.commands import CommandRing, NoCommands
 from dxlrun.compile.plan import Plan
 from dxlrun.compile.simulated import simulated_buses
 from dxlrun.control.loop import LoopResult, StopFlag
@@ -32,6 +33,11 @@ class _LogSinks:
     writer: LogWriter
     packets: PacketBatch
     events: EventRing
+    commands: CommandRing
+
+    def begin(self, record: CycleRecord) -> None:
+        """Write the packets of the start-up and what the controllers are activated with."""
+        self.append(record)
 
     def append(self, record: CycleRecord) -> None:
         """Write one finished cycle and the packets since the one before."""
@@ -45,6 +51,10 @@ class _NoSinks:
 
     packets: NoPackets
     events: EventRing
+    commands: NoCommands
+
+    def begin(self, record: CycleRecord) -> None:
+        """Forget it."""
 
     def append(self, record: CycleRecord) -> None:
         """Forget it."""
@@ -90,11 +100,12 @@ class VirtualRobot:
 
     def _sinks_for(self, writer: LogWriter | None) -> _LogSinks | _NoSinks:
         if writer is None:
-            return _NoSinks(NoPackets(), EventRing(Handover(lambda _: None), self.clock))
+            return _NoSinks(NoPackets(), EventRing(Handover(lambda _: None), self.clock), NoCommands())
         return _LogSinks(
             writer,
             PacketBatch(Handover(writer.packets)),
             EventRing(Handover(writer.event), self.clock),
+            CommandRing(Handover(writer.command)),
         )
 
     @property

@@ -97,6 +97,10 @@ class Hardware:
 class Sink:
     cycles: list[dict[str, Any]] = field(default_factory=list)
     keep: bool = True
+    begun: list[int] = field(default_factory=list)
+
+    def begin(self, record: CycleRecord) -> None:
+        self.begun.append(record.cycle)
 
     def append(self, record: CycleRecord) -> None:
         if self.keep:

@@ -35,6 +35,10 @@ class CycleSink(Protocol):
         """Keep a copy of the record; its memory is filled again in the next cycle."""
         ...
 
+    def begin(self, record: CycleRecord) -> None:
+        """Keep a copy of the record before the first cycle: the states and goals of the activation."""
+        ...
+
 
 @dataclass(frozen=True, slots=True)
 class LoopResult:
@@ -86,6 +90,7 @@ class Loop:
             EventCode.LOOP_STARTED, Severity.INFO, "loop", f"loop started, period {period_ns / 1e6:g} ms"
         )
         self.gate.ease_in()
+        self._tell_start()
         self.manager.activate(0)
         try:
             reason, detail = self._cycle_until_end()
@@ -154,6 +159,14 @@ class Loop:
             )
         self._late = bool(skipped)
         return following
+
+    def _tell_start(self) -> None:
+        """Leave in the log what the controllers are activated with: nothing else tells it."""
+        record = self.record
+        record.cycle = -1
+        record.scheduled_ns = self._start_ns
+        record.woken_ns = record.read_ns = record.updated_ns = record.written_ns = self.clock.now_ns()
+        self.sink.begin(record)
 
     def _tell_end(self, reason: str, detail: str) -> None:
         severity = Severity.FATAL if reason == "fault" else Severity.INFO

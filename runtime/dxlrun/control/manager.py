@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from dxlrun.clock import Clock
+from dxlrun.commands import CommandSink, NoCommands, TakenCommand
 from dxlrun.control.claims import conflicts
 from dxlrun.control.controller import Context, Controller, JointLimits
 from dxlrun.control.loop_plan import ControllerPlan, LoopPlan, ScheduledCommand
@@ -28,7 +29,14 @@ class Manager:
     """
 
     def __init__(
-        self, plan: LoopPlan, plugins: PlugIns, record: CycleRecord, events: EventSink, clock: Clock
+        self,
+        plan: LoopPlan,
+        plugins: PlugIns,
+        record: CycleRecord,
+        events: EventSink,
+        clock: Clock,
+        *,
+        commands: CommandSink | None = None,
     ) -> None:
         self.fault: str | None = None
         self._plan = plan
@@ -36,6 +44,7 @@ class Manager:
         self._record = record
         self._events = events
         self._clock = clock
+        self._taken = commands or NoCommands()
         self._rows = {joint.name: row for row, joint in enumerate(plan.joints)}
         self._managed: tuple[Managed, ...] = ()
         self._commands: tuple[tuple[ScheduledCommand, NDArray[np.float64]], ...] = ()
@@ -108,9 +117,18 @@ class Manager:
         taken = 0
         while self._next < len(self._commands) and self._commands[self._next][0].at_ns <= time_ns:
             command, data = self._commands[self._next]
+            self._tell_taken(self._next, command)
             self._next += 1
             taken += self._hand(command, data, time_ns)
         return taken
+
+    def _tell_taken(self, planned: int, command: ScheduledCommand) -> None:
+        record = self._record
+        self._taken.take(
+            TakenCommand(
+                record.woken_ns, record.cycle, planned, command.controller, command.kind, command.origin, b""
+            )
+        )
 
     def _hand(self, command: ScheduledCommand, data: NDArray[np.float64], time_ns: int) -> bool:
         what = f"{command.kind} from {command.origin}"

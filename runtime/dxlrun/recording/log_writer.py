@@ -11,6 +11,7 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
+from dxlrun.commands import CommandPieces
 from dxlrun.cycle import CycleLayout
 from dxlrun.events import Event, EventCode, Severity, decode_event
 from dxlrun.packets import decode_packets
@@ -48,9 +49,16 @@ class LogWriter:
             cast("IO[bytes]", self._file), chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD
         )
         self._sequences: dict[int, int] = {}
-        self._packet, self._event, self._ros_log, self._joint_state = (
+        self._pieces = CommandPieces()
+        self._packet, self._event, self._ros_log, self._joint_state, self._command = (
             Codec(message)
-            for message in (schemas.BUS_PACKET, schemas.EVENT, schemas.ROS_LOG, schemas.JOINT_STATE)
+            for message in (
+                schemas.BUS_PACKET,
+                schemas.EVENT,
+                schemas.ROS_LOG,
+                schemas.JOINT_STATE,
+                schemas.COMMAND,
+            )
         )
         try:
             self._begin()
@@ -71,6 +79,8 @@ class LogWriter:
             self._writer.add_attachment(at_ns, at_ns, name, media, data)
         known: dict[str, int] = {}
         self._cycle_channel = self._channel(known, schemas.CYCLE_TOPIC, schemas.CYCLE)
+        self._activation_channel = self._channel(known, schemas.ACTIVATION_TOPIC, schemas.CYCLE)
+        self._taken_channel = self._channel(known, schemas.COMMANDS_TOPIC, schemas.COMMAND)
         self._states_channel = self._channel(known, schemas.JOINT_STATES_TOPIC, schemas.JOINT_STATE)
         self._commands_channel = self._channel(known, schemas.JOINT_COMMANDS_TOPIC, schemas.JOINT_STATE)
         self._event_channel = self._channel(known, schemas.EVENT_TOPIC, schemas.EVENT)
@@ -144,13 +154,19 @@ class LogWriter:
             return  # what lies behind the last whole chunk stays; a reader stops there
 
     def cycle(self, payload: Payload) -> None:
-        """Write one cycle record: /cycle, the goals, and the states that controllers marked."""
+        """Write one cycle record: /cycle, the goals, and the states that controllers marked.
+
+        The record before the first cycle goes to /activation.
+        """
         self._guarded(lambda: self._cycle(payload))
 
     def _cycle(self, payload: Payload) -> None:
         data = bytes(payload)
         record = np.frombuffer(data, dtype=self._layout.dtype)[0]
         written_ns, read_ns = int(record["written_ns"]), int(record["read_ns"])
+        if int(record["cycle"]) < 0:
+            self._add(self._activation_channel, written_ns, ENCAPSULATION + data)
+            return
         self._add(self._cycle_channel, written_ns, ENCAPSULATION + data)
         published = int(record["published"])
         for bit, joints, rows in self._publishers:
@@ -190,6 +206,25 @@ class LogWriter:
                 packet.first_ns, packet.last_ns, packet.kind, packet.servo_id, packet.data
             )
             self._add(self._bus_channels[packet.bus], packet.last_ns, data)
+
+    def command(self, payload: Payload) -> None:
+        """Write one command that a controller was handed, when its last piece is there.
+
+        Raises ValueError for a piece whose predecessors were lost.
+        """
+        command = self._pieces.add(payload)
+        if command is None:
+            return
+        data = self._command.pack(
+            command.t_ns,
+            command.cycle,
+            command.planned,
+            command.controller,
+            command.kind,
+            command.origin,
+            np.frombuffer(command.data, dtype="<f8"),
+        )
+        self._guarded(lambda: self._add(self._taken_channel, command.t_ns, data))
 
     def event(self, payload: Payload) -> None:
         """Write one event, to /events and /rosout."""

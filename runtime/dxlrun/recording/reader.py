@@ -18,6 +18,7 @@ from mcap.stream_reader import CRCValidationError, StreamReader, get_chunk_data_
 from numpy.typing import NDArray
 from zstandard import ZstdError
 
+from dxlrun.commands import TakenCommand
 from dxlrun.cycle import CycleLayout
 from dxlrun.errors import LogError
 from dxlrun.events import Event
@@ -62,6 +63,10 @@ class Log:
     """A sentence for each thing that is missing or could not be read."""
     packet_messages: tuple[tuple[int, tuple[bytes, ...]], ...]
     """Undecoded packets by index of the bus; see `packets`."""
+    activation: NDArray[np.void] | None = None
+    """Shape (1,), as `cycles`: states and goals when the controllers were activated; None: not in the log."""
+    commands: tuple[TakenCommand, ...] = ()
+    """What was handed to controllers, in order."""
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -122,6 +127,7 @@ def _log(path: Path, header: LogHeader, found: _Found) -> Log:
     packets = tuple(
         (index, tuple(by_topic.get(schemas.bus_topic(bus), ()))) for index, bus in enumerate(header.buses)
     )
+    activation = by_topic.get(schemas.ACTIVATION_TOPIC, [])[:1]
     if not found.finished:
         found.damage.append("the file has no end: its recorder was killed, or could write no more")
     return Log(
@@ -134,6 +140,8 @@ def _log(path: Path, header: LogHeader, found: _Found) -> Log:
         complete=not found.damage,
         damage=tuple(found.damage),
         packet_messages=packets,
+        activation=_cycles(layout, activation) if activation else None,
+        commands=_commands(by_topic.get(schemas.COMMANDS_TOPIC, [])),
     )
 
 
@@ -151,6 +159,22 @@ def _packet(bus: int, data: bytes) -> LoggedPacket:
     first_ns, last_ns, kind, servo_id, length = _PACKET.unpack_from(data, head)
     start = head + _PACKET.size
     return LoggedPacket(bus, PacketKind(kind), servo_id, first_ns, last_ns, data[start : start + length])
+
+
+def _commands(messages: list[bytes]) -> tuple[TakenCommand, ...]:
+    codec = Codec(schemas.COMMAND)
+    return tuple(
+        TakenCommand(
+            t_ns=cast("int", values["t_ns"]),
+            cycle=cast("int", values["cycle"]),
+            planned=cast("int", values["planned"]),
+            controller=str(values["controller"]),
+            kind=str(values["kind"]),
+            origin=str(values["origin"]),
+            data=cast("NDArray[np.float64]", values["data"]).tobytes(),
+        )
+        for values in map(codec.unpack, messages)
+    )
 
 
 def _events(messages: list[bytes]) -> tuple[Event, ...]:

@@ -22,7 +22,7 @@ FLUSH_S = 0.5
 SYNC_S = 2.0
 _MOST_PER_TURN = 2000
 
-RingKind: TypeAlias = Literal["cycles", "packets", "events"]
+RingKind: TypeAlias = Literal["cycles", "packets", "events", "commands"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +57,7 @@ class _Tap:
             "cycles": log.cycle,
             "packets": log.packets,
             "events": log.event,
+            "commands": log.command,
         }
         self.take = takers[ring.kind]
 

@@ -16,6 +16,9 @@ ENCODING = "cdr"
 SCHEMA_ENCODING = "ros2msg"
 
 CYCLE_TOPIC = "/cycle"
+ACTIVATION_TOPIC = "/activation"
+"""One message of the type of /cycle: the states and goals with which the controllers were activated."""
+COMMANDS_TOPIC = "/commands"
 EVENT_TOPIC = "/events"
 ROSOUT_TOPIC = "/rosout"
 JOINT_STATES_TOPIC = "/joint_states"
@@ -152,4 +155,19 @@ string source
 string text
 """,
     "RIHS01_52b75cd08e34ca10ea5c06c64fbfeb30f3e85c73af0478f1ca6c1b3aafb5d98e",
+)
+
+COMMAND = MessageType(
+    "dxlrun_msgs/msg/Command",
+    """# A command that a cycle took for a controller. t_ns: of the cycle's wake-up. planned: its number in
+# the commands of plan.json, whose array it is; -1: the array is data.
+int64 t_ns
+int64 cycle
+int64 planned
+string controller
+string kind
+string origin
+float64[] data
+""",
+    "RIHS01_c36bb4c117379590a595107b90a16e31448d4a4f2b4485d41f5744d08de0a47b",
 )
