@@ -1,0 +1,103 @@
+"""All models: those of our data files, those of the SDK, and those that plug-ins add."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from types import MappingProxyType
+
+from dxlrun.control_table.protocol1 import protocol1_listings
+from dxlrun.control_table.protocol2 import protocol2_listings
+from dxlrun.control_table.sources import Listing, read_control_table
+from dxlrun.control_table.table import ControlTable
+
+_ADDED: dict[float, list[Listing]] = {1.0: [], 2.0: []}
+"""Tables of plug-ins; they are added while a process starts, before its first robot is compiled."""
+
+
+def control_table(model: str, protocol: float | None = None) -> ControlTable:
+    """Return the control table of a model or of one of its aliases.
+
+    MX servos carry one name with two firmwares: `protocol` then decides. Raises LookupError when the model is
+    unknown, does not speak the protocol, or speaks both and none was given.
+    """
+    if protocol is not None and (table := _table(model, protocol)) is not None:
+        return table
+    found = [table for each in (1.0, 2.0) if (table := _table(model, each)) is not None]
+    if not found:
+        raise LookupError(
+            f"no control table of the model {model!r}; known models: {', '.join(model_names())}"
+        )
+    if protocol is not None:
+        raise LookupError(f"{model} speaks Protocol {found[0].protocol}, not Protocol {protocol}")
+    if len(found) > 1:
+        raise LookupError(f"{model} exists with Protocol 1.0 and with Protocol 2.0: say which one")
+    return found[0]
+
+
+def model_names(protocol: float | None = None) -> tuple[str, ...]:
+    """Return every name that `control_table` knows (of one protocol if given), aliases too, sorted."""
+    return tuple(sorted({name for each in (1.0, 2.0) if protocol in (None, each) for name in _index(each)}))
+
+
+def all_tables() -> tuple[ControlTable, ...]:
+    """Return every control table once, by protocol, then model number, then firmware."""
+    tables = [listing.build() for listing in (*_listings(1.0), *_listings(2.0))]
+    return tuple(sorted(tables, key=lambda each: (each.protocol, each.model_number, each.firmware)))
+
+
+def models_by_number(number: int, protocol: float) -> tuple[ControlTable, ...]:
+    """Return the tables of a model number that a servo of this protocol answers, newest firmware first.
+
+    It is empty when the number is unknown; it has several when the table depends on the firmware.
+    """
+    found = [listing.build() for listing in _listings(protocol) if listing.model_number == number]
+    return tuple(sorted(found, key=lambda each: -each.firmware))
+
+
+def add_control_table(text: str) -> ControlTable:
+    """Add a plug-in's control table, the TOML text of a data file; return it.
+
+    Raises ValueError when the text is no control table, or when one of its names or its number is taken.
+    """
+    try:
+        table = read_control_table(text)
+    except KeyError as error:
+        raise ValueError(f"the entry {error} is missing") from error
+    names = (table.model, *table.aliases)
+    for listing in _listings(table.protocol):
+        if listing.build() == table:
+            return table
+        if listing.model_number == table.model_number or set(names) & set(listing.names):
+            raise ValueError(
+                f"{table.model} with model number {table.model_number} has a name or the number of the "
+                f"{listing.names[0]}, which is known already"
+            )
+    _ADDED[table.protocol].append(Listing(names, table.model_number, table.firmware, lambda: table))
+    return table
+
+
+def _table(name: str, protocol: float) -> ControlTable | None:
+    listing = _index(protocol).get(name)
+    return None if listing is None else listing.build()
+
+
+def _index(protocol: float) -> Mapping[str, Listing]:
+    return {**_shipped(protocol), **{name: each for each in _ADDED.get(protocol, ()) for name in each.names}}
+
+
+def _listings(protocol: float) -> tuple[Listing, ...]:
+    return tuple({listing.names[0]: listing for listing in _index(protocol).values()}.values())
+
+
+@functools.cache
+def _shipped(protocol: float) -> Mapping[str, Listing]:
+    """The models of one protocol by name: the other one's are not looked at when nobody asks for them."""
+    found: dict[str, Listing] = {}
+    listings = {1.0: protocol1_listings, 2.0: protocol2_listings}.get(protocol)
+    for listing in listings() if listings is not None else ():
+        for name in listing.names:
+            if name in found:
+                raise ValueError(f"the model {name!r} stands in two control tables")
+            found[name] = listing
+    return MappingProxyType(found)
