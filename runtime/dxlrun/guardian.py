@@ -14,6 +14,7 @@ import signal
 import socket
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -28,10 +29,11 @@ from dxlrun.dynamixel.port import SerialPort, SerialPorts
 from dxlrun.dynamixel.serial_open import open_serial
 from dxlrun.errors import PortError
 from dxlrun.events import EventCode, EventRing, Severity
-from dxlrun.heartbeat import Heartbeat, Phase
+from dxlrun.heartbeat import Heartbeat, Phase, Standstill
 from dxlrun.packets import PacketBatch, salvage
-from dxlrun.ring import RingWriter
+from dxlrun.ring import RingReader, RingWriter
 
+_NEVER = 1 << 62
 SILENT_PERIODS = 5
 """A running loop whose counter stands still this long hangs."""
 LEAST_PATIENCE_NS = 50_000_000
@@ -39,7 +41,11 @@ LEAST_PATIENCE_NS = 50_000_000
 SETUP_PATIENCE_NS = 1_000_000_000
 """Set-up and shutdown beat once a transaction; a transaction ends within milliseconds."""
 
-Ending = Literal["done", "died", "hung", "cut"]
+LONGEST_LOOK_NS = 20_000_000
+"""One look of the guardian counts for at most this: when it was not running, the loop may not have been."""
+
+Ending = Literal["done", "unused", "died", "hung", "late", "cut"]
+"""done: by itself, torque off; unused: before a byte was sent; the others leave torque off to us."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,17 +56,55 @@ class GuardianJob:
     ports: tuple[str, ...]
     """Device paths, in the order of `buses`; a simulated bus has its pseudo-terminal here."""
     period_ns: int
+    exit_timeout_ns: int
+    """How long the loop may take to stop when it is asked to."""
     priority: int
     """Real-time priority of the guardian; 0: none."""
     heartbeat: int
     packets: int
+    events: int
+    loop_packets: int
+    """The loop's ring of packets: says whether the batch on the desk is in it."""
     desk: int
     """The loop's unfinished batch of packets."""
-    events: int
     stderr: int
     loop: dict[str, object]
-    """The loop's job, but for its port descriptors."""
+    """The loop's job, but for its port descriptors and its guardian."""
     loop_descriptors: tuple[int, ...]
+
+
+class LastHand:
+    """Switches torque off in the place of a loop that is gone, and tells log and terminal what came of it."""
+
+    def __init__(self, job: GuardianJob) -> None:
+        self._job = job
+        self._clock = MonotonicClock()
+        self._heartbeat = Heartbeat(job.heartbeat)
+        self._ring = RingWriter(job.packets)
+        self._events = EventRing(RingWriter(job.events), self._clock)
+
+    def limp(self, descriptors: Sequence[int], how: str, severity: Severity) -> list[str]:
+        """Send torque off to every servo; return `how` it came to that, and the result, as sentences."""
+        job = self._job
+        salvage(process.shared_memory(job.desk), RingReader(job.loop_packets).head, self._ring)
+        ports = SerialPorts(
+            [SerialPort(descriptor, path) for descriptor, path in zip(descriptors, job.ports, strict=True)]
+        )
+        packets = PacketBatch(self._ring)
+        outcome = limp(job.buses, ports, self._clock, packets, beat=self._heartbeat.look)
+        packets.commit()
+        silent = [str(one) for one in outcome if not one.confirmed]
+        result = (
+            f"torque off was confirmed by all {len(outcome)} servos"
+            if not silent
+            else f"torque off was sent, but not confirmed by {', '.join(silent)}"
+        )
+        self.tell(f"{how}; {result}", Severity.ERROR if silent else severity)
+        return [how, result]
+
+    def tell(self, text: str, severity: Severity) -> None:
+        """Put a sentence into the log."""
+        self._events.emit(EventCode.GUARDIAN, severity, "guardian", text)
 
 
 class Guardian:
@@ -71,10 +115,9 @@ class Guardian:
         self._control = control
         self._clock = MonotonicClock()
         self._heartbeat = Heartbeat(job.heartbeat)
-        self._ring = RingWriter(job.packets)
-        self._packets = PacketBatch(self._ring)
-        self._events = EventRing(RingWriter(job.events), self._clock)
-        self._patience_ns = max(SILENT_PERIODS * job.period_ns, LEAST_PATIENCE_NS)
+        self._hand = LastHand(job)
+        self._still = Standstill(LONGEST_LOOK_NS, self._clock.now_ns())
+        self._stop_by_ns = _NEVER
 
     def run(self) -> None:
         """Open the ports, execute the loop, watch it, and see that the robot is limp when it is gone."""
@@ -83,88 +126,93 @@ class Guardian:
             for path, bus in zip(self._job.ports, self._job.buses, strict=True)
         ]
         descriptors = [port.fileno() for port in opened]
-        job = self._job.loop | {"ports": descriptors}
-        loop = process.start(
+        loop = self._execute(descriptors)
+        # whoever asked gets the ports too: should this process die, they are still held, and still open
+        self._control.send({"loop": loop.pid}, descriptors)
+        if self._job.priority:
+            set_policy("round_robin", self._job.priority)
+        ending = self._watch(loop)
+        outcome: list[str] = []
+        if ending == "unused":
+            outcome = [f"{self._how(ending, loop)}; nothing had been sent to the robot"]
+            self._hand.tell(outcome[0], Severity.ERROR)
+        elif ending != "done":
+            severity = Severity.WARNING if ending == "cut" else Severity.ERROR
+            outcome = self._hand.limp(descriptors, self._how(ending, loop), severity)
+        self._control.send({"ended": ending, "outcome": outcome})
+
+    def _execute(self, descriptors: list[int]) -> subprocess.Popen[bytes]:
+        job = self._job.loop | {"ports": descriptors, "guardian": os.getpid()}
+        return process.start(
             "dxlrun.loop_process",
             ["--job", msgspec.json.encode(job).decode()],
             [*self._job.loop_descriptors, *descriptors],
             self._job.stderr,
         )
-        self._control.send({"loop": loop.pid})
-        if self._job.priority:
-            set_policy("round_robin", self._job.priority)
-        ending = self._watch(loop)
-        if ending == "done":
-            self._control.send({"ended": ending, "outcome": []})
-            return
-        ports = SerialPorts(
-            [
-                SerialPort(descriptor, path)
-                for descriptor, path in zip(descriptors, self._job.ports, strict=True)
-            ]
-        )
-        self._make_limp(loop, ending, ports)
 
     def _watch(self, loop: subprocess.Popen[bytes]) -> Ending:
         """Return how the loop ended; it is dead and reaped then."""
         watched = os.pidfd_open(loop.pid)
         nap = min(self._job.period_ns, 10_000_000) * 1e-9
-        beats, since = self._heartbeat.beats, self._clock.now_ns()
-        ending: Ending = "died"
+        killed: Ending | None = None
         while True:
             ready, _, _ = select.select(self._watched(watched), [], [], nap)
+            self._heartbeat.look()
             if watched in ready:
-                code = loop.wait()
-                return "done" if self._heartbeat.phase is Phase.DONE and code in (0, 1) else ending
-            if self._control.fileno() in ready and self._obey(loop):
-                ending = "cut"
-            now = self._clock.now_ns()
-            if self._heartbeat.beats != beats:
-                beats, since = self._heartbeat.beats, now
-            elif now - since > self._patience(self._heartbeat.phase) and ending == "died":
-                ending = "hung"
+                return self._ending(loop.wait(), killed)
+            wish = self._wish() if self._control.fileno() in ready else None
+            if wish == "stop":
+                self._stop_by_ns = min(self._stop_by_ns, self._clock.now_ns() + self._job.exit_timeout_ns)
+                loop.send_signal(signal.SIGTERM)
+            reason = "cut" if wish == "cut" else self._impatience()
+            if reason and not killed:
+                killed = reason
                 loop.kill()
+
+    def _ending(self, code: int, killed: Ending | None) -> Ending:
+        """Say how a loop ended that was killed for a reason, or ended by itself."""
+        phase = self._heartbeat.phase
+        if phase is Phase.DONE and code in (0, 1):
+            return "done"
+        if killed:
+            return killed
+        if phase is Phase.LOADING:
+            return "done" if code == -signal.SIGTERM and self._stop_by_ns < _NEVER else "unused"
+        return "died"
 
     def _watched(self, pidfd: int) -> list[int]:
         """Return what can wake the guardian; a terminal that is gone would wake it for ever."""
         return [pidfd] if self._control.closed else [pidfd, self._control.fileno()]
 
-    def _patience(self, phase: Phase) -> float:
-        """Return how long the counter may stand still, ns."""
-        if phase is Phase.RUNNING:
-            return self._patience_ns
-        return SETUP_PATIENCE_NS if phase in (Phase.SETUP, Phase.STOPPING) else float("inf")
+    def _impatience(self) -> Literal["hung", "late"] | None:
+        """Return why the loop is not waited for any longer, if it is not."""
+        now_ns, phase = self._clock.now_ns(), self._heartbeat.phase
+        still_ns = self._still.ns((phase, self._heartbeat.beats), now_ns)
+        if still_ns > patience_ns(phase, self._job.period_ns):
+            return "hung"
+        return "late" if now_ns > self._stop_by_ns else None
 
-    def _obey(self, loop: subprocess.Popen[bytes]) -> bool:
-        """Carry out what the terminal asks; return True when torque is to be cut at once."""
+    def _wish(self) -> Literal["stop", "cut"] | None:
+        """Return what the terminal asks; one that is gone cannot ask any more: stop in order."""
         messages = self._control.receive()
         if any("cut" in message for message in messages):
-            loop.kill()
-            return True
-        if messages or self._control.closed:  # a terminal that is gone cannot ask any more: stop in order
-            loop.send_signal(signal.SIGTERM)
-        return False
+            return "cut"
+        return "stop" if messages or self._control.closed else None
 
-    def _make_limp(self, loop: subprocess.Popen[bytes], ending: Ending, ports: SerialPorts) -> None:
-        """Send torque off to every servo, and tell the log and the terminal what came of it."""
-        salvage(process.shared_memory(self._job.desk), self._ring)
-        outcome = limp(self._job.buses, ports, self._clock, self._packets)
-        self._packets.commit()
-        how = {
-            "died": f"the loop's process ended by itself ({_manner(loop.returncode)})",
-            "hung": f"the loop stood still for more than {self._patience_ns / 1e6:.0f} ms and was killed",
+    def _how(self, ending: Ending, loop: subprocess.Popen[bytes]) -> str:
+        still_ms = patience_ns(self._heartbeat.phase, self._job.period_ns) / 1e6
+        return {
+            "hung": f"the loop stood still for more than {still_ms:.0f} ms and was killed",
+            "late": f"the loop did not stop within {self._job.exit_timeout_ns / 1e9:g} s and was killed",
             "cut": "torque was cut on request",
-            "done": "",
-        }[ending]
-        silent = [str(one) for one in outcome if not one.confirmed]
-        result = (
-            f"torque off was confirmed by all {len(outcome)} servos"
-            if not silent
-            else f"torque off was sent, but not confirmed by {', '.join(silent)}"
-        )
-        severity = Severity.ERROR if silent or ending != "cut" else Severity.WARNING
-        self._events.emit(EventCode.GUARDIAN, severity, "guardian", f"{how}; {result}")
-        self._control.send({"ended": ending, "outcome": [how, result]})
+        }.get(ending, f"the loop's process ended by itself ({_manner(loop.returncode)})")
+
+
+def patience_ns(phase: Phase, period_ns: int) -> float:
+    """Return how long the loop's counter may stand still, ns."""
+    if phase is Phase.RUNNING:
+        return max(SILENT_PERIODS * period_ns, LEAST_PATIENCE_NS)
+    return SETUP_PATIENCE_NS if phase in (Phase.SETUP, Phase.STOPPING) else float("inf")
 
 
 def _manner(code: int | None) -> str:

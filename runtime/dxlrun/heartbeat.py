@@ -1,19 +1,19 @@
 """Heartbeat: one page of shared memory by which the guardian and the terminal see that the loop lives.
 
-Single writer (the loop's process). Each field is one aligned 64-bit store, which x86-64 makes whole; that is
-where it was tested. On other machines a reader may see a field torn.
+A single writer a field: the loop's process, and for `looks` the guardian. Each field is one aligned 64-bit
+store through a cast memoryview, which x86-64 makes whole; that is where it was tested. (`struct.pack_into`
+would not do: it clears its target first, and a process killed in between would seem never to have begun.) On
+other machines a reader may see a field torn.
 """
 
 from __future__ import annotations
 
 import mmap
 import os
-import struct
 from enum import IntEnum, unique
 
 _SIZE = 4096
-_FIELD = struct.Struct("<Q")
-_PHASE, _BEATS, _CYCLE, _SKIPPED = 0, 8, 16, 24
+_PHASE, _BEATS, _CYCLE, _SKIPPED, _LOOKS = range(5)
 
 
 @unique
@@ -39,46 +39,75 @@ def create() -> int:
 class Heartbeat:
     """The page, mapped; the loop writes, everybody else only reads."""
 
-    __slots__ = ("_beats", "_page")
+    __slots__ = ("_beats", "_words")
 
     def __init__(self, descriptor: int) -> None:
-        self._page = mmap.mmap(descriptor, _SIZE)
+        self._words = memoryview(mmap.mmap(descriptor, _SIZE)).cast("Q")
         self._beats = 0
 
     def beat(self) -> None:
         """Show that the loop goes on; called once a cycle, and once a transaction outside the loop."""
         self._beats += 1
-        _FIELD.pack_into(self._page, _BEATS, self._beats)
+        self._words[_BEATS] = self._beats
 
     def cycle(self, cycle: int, skipped: int) -> None:
         """Show how many cycles ran, and how many periods were skipped."""
-        _FIELD.pack_into(self._page, _CYCLE, cycle)
-        _FIELD.pack_into(self._page, _SKIPPED, skipped)
+        self._words[_CYCLE] = cycle
+        self._words[_SKIPPED] = skipped
 
     def enter(self, phase: Phase) -> None:
         """Show that a phase begins."""
-        _FIELD.pack_into(self._page, _PHASE, phase)
+        self._words[_PHASE] = phase
 
-    def _read(self, offset: int) -> int:
-        value: int = _FIELD.unpack_from(self._page, offset)[0]
-        return value
+    def look(self) -> None:
+        """Show that the guardian watches; called by the guardian alone."""
+        self._words[_LOOKS] += 1
+
+    @property
+    def looks(self) -> int:
+        """Number of times that the guardian has looked at the loop."""
+        return self._words[_LOOKS]
 
     @property
     def phase(self) -> Phase:
         """The phase that was entered last."""
-        return Phase(self._read(_PHASE))
+        return Phase(self._words[_PHASE])
 
     @property
     def beats(self) -> int:
         """Number of beats."""
-        return self._read(_BEATS)
+        return self._words[_BEATS]
 
     @property
     def cycles(self) -> int:
         """Number of cycles that ran."""
-        return self._read(_CYCLE)
+        return self._words[_CYCLE]
 
     @property
     def skipped(self) -> int:
         """Number of periods that were skipped."""
-        return self._read(_SKIPPED)
+        return self._words[_SKIPPED]
+
+
+class Standstill:
+    """How long something that should change has stood still, while the watcher itself was awake to see it.
+
+    A machine that was suspended, a virtual machine that was paused, or a watcher that had to wait for a
+    processor: the watched had no chance to move either, so one look counts for at most `longest_ns`.
+    """
+
+    __slots__ = ("_longest_ns", "_looked_ns", "_seen", "_still_ns")
+
+    def __init__(self, longest_ns: int, now_ns: int) -> None:
+        self._longest_ns = longest_ns
+        self._looked_ns = now_ns
+        self._still_ns = 0
+        self._seen: object = None
+
+    def ns(self, seen: object, now_ns: int) -> int:
+        """Look: return for how long it has been what it is now, ns."""
+        step = min(now_ns - self._looked_ns, self._longest_ns)
+        self._looked_ns = now_ns
+        self._still_ns = self._still_ns + step if seen == self._seen else 0
+        self._seen = seen
+        return self._still_ns

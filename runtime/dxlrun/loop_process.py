@@ -25,6 +25,7 @@ from dxlrun.control import realtime
 from dxlrun.control.loop import StopFlag
 from dxlrun.control.plugins import load_plugins
 from dxlrun.cycle import CycleRecord
+from dxlrun.dynamixel.hardware import TAKEN_BACK
 from dxlrun.dynamixel.port import SerialPort, SerialPorts
 from dxlrun.errors import DxlrunError, PlugInError
 from dxlrun.events import EventCode, EventRing, Severity
@@ -50,7 +51,8 @@ class LoopJob:
     result: int
     take_over: bool
     ports: tuple[int, ...] = ()
-    """Filled in by the guardian."""
+    guardian: int = 0
+    """Process ID. Filled in by the guardian, like the ports."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +111,25 @@ def _refuse_threads() -> Callable[[str], None]:
     return check
 
 
+class _AskedToStop(Exception):
+    """Somebody asked to stop before the robot ran: no torque may be switched on any more."""
+
+
+@dataclass(slots=True)
+class _Pulse:
+    """What is called once a transaction, and once a cycle: beats, and gives a set-up up that is to stop."""
+
+    heartbeat: Heartbeat
+    stop: StopFlag
+
+    def __call__(self) -> None:
+        """Beat. Raises _AskedToStop, once, and only in the set-up: the loop looks at the flag itself."""
+        self.heartbeat.beat()
+        if self.stop.requested and self.heartbeat.phase is Phase.SETUP:
+            self.heartbeat.enter(Phase.STOPPING)
+            raise _AskedToStop
+
+
 def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: RingSinks) -> Outcome:
     """Execute the plan from plug-ins to torque off."""
     stop = StopFlag()
@@ -122,12 +143,17 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: RingSinks) -> Ou
         ports=ports,
         clock=MonotonicClock(),
         sinks=sinks,
-        beat=heartbeat.beat,
+        beat=_Pulse(heartbeat, stop),
         stop=stop,
         take_over=job.take_over,
     )
     heartbeat.enter(Phase.SETUP)
-    robot.hardware.start()
+    try:
+        robot.hardware.start()
+    except _AskedToStop as asked:
+        sinks.events.emit(EventCode.SETUP, Severity.INFO, "loop", "the set-up was given up on request")
+        notes: list[str] = getattr(asked, "__notes__", [])
+        return Outcome("stopped", sentences=tuple(note for note in notes if note != TAKEN_BACK))
     refused: tuple[str, ...] = ()
     try:
         grants = realtime.apply(plan.loop.scheduler)
@@ -148,7 +174,7 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: RingSinks) -> Ou
 def main() -> None:
     """Run the loop's process: `--job JSON`."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    guardian = os.getppid()
+    sys.stdout = sys.stderr = process.Printed(sys.stderr.fileno())
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     job = msgspec.json.decode(sys.argv[2], type=LoopJob)
     clock = MonotonicClock()
@@ -157,15 +183,16 @@ def main() -> None:
     batch = PacketBatch(RingWriter(job.packets), process.shared_memory(job.desk))
     sinks = RingSinks(RingWriter(job.cycles), batch, events, CommandRing(RingWriter(job.commands)), heartbeat)
     try:
-        if os.getppid() != guardian:
+        if os.getppid() != job.guardian:
             sys.exit(1)  # the guardian was gone before its death could be signalled
         outcome = _run(from_json(process.whole(job.plan)), job, heartbeat, sinks)
     except DxlrunError as error:
-        outcome = Outcome("start-up", sentences=tuple(str(error).splitlines()))
-        events.emit(EventCode.SETUP, Severity.ERROR, "loop", str(error))
+        outcome = Outcome("start-up", sentences=error.sentences)
+        events.emit(EventCode.SETUP, Severity.ERROR, "loop", "\n".join(error.sentences))
     except Exception as error:  # the last resort: the run ends with a sentence and the log has the traceback
         sentence = f"dxlrun itself failed: {type(error).__name__}: {error}; --debug shows where"
         outcome = Outcome("fault", sentences=(sentence,), traceback=traceback.format_exc())
+        sys.stderr.write(outcome.traceback)
         events.emit(EventCode.LOOP_STOPPED, Severity.FATAL, "loop", outcome.traceback)
     sinks.packets.commit()
     os.pwrite(job.result, msgspec.json.encode(outcome), 0)

@@ -13,7 +13,9 @@ PACKET_SLOT = 2048
 """Bytes of one slot of the packets' ring: a batch, usually the packets of one cycle."""
 
 _HEADER = struct.Struct("<BBBxI qq")
-_USED = struct.Struct("<Q")
+_USED, _NUMBER = 0, 1
+_WORDS = 2
+_DESK_HEADER = 8 * _WORDS
 
 
 @unique
@@ -61,18 +63,21 @@ class PacketBatch:
 
     `desk` is memory of `desk_size(writer)` bytes where the unfinished batch lies; shared memory lets whoever
     outlives this process take it up with `salvage`, so that a loop that dies in the middle of a cycle does
-    not take that cycle's packets with it.
+    not take that cycle's packets with it. Two 64-bit words lead it: bytes used, and the number that the batch
+    gets in its ring. Each is one store, because a process may be killed between any two.
     """
 
-    __slots__ = ("_buffer", "_desk", "_room", "_used", "_writer")
+    __slots__ = ("_buffer", "_room", "_used", "_words", "_writer")
 
     def __init__(self, writer: Appender, desk: memoryview | None = None) -> None:
         self._writer = writer
-        self._desk = memoryview(bytearray(desk_size(writer))) if desk is None else desk
-        self._buffer = self._desk[_USED.size : desk_size(writer)]  # shared memory may be larger
+        if desk is None:
+            desk = memoryview(bytearray(desk_size(writer)))
+        self._words = desk[:_DESK_HEADER].cast("Q")
+        self._buffer = desk[_DESK_HEADER : desk_size(writer)]  # shared memory may be larger
         self._room = len(self._buffer)
-        self._used = 0
-        _USED.pack_into(self._desk, 0, 0)
+        self._used = self._words[_USED] = 0
+        self._words[_NUMBER] = writer.head
         if self._room <= _HEADER.size:
             raise ValueError(f"a slot of {self._room} bytes holds no packet")
 
@@ -88,8 +93,7 @@ class PacketBatch:
             return
         _HEADER.pack_into(self._buffer, start, bus, kind, servo_id, length, first_ns, last_ns)
         self._buffer[start + _HEADER.size : end] = data
-        self._used = end
-        _USED.pack_into(self._desk, 0, end)
+        self._used = self._words[_USED] = end
 
     def _overfull(self, head: tuple[int, PacketKind, int, int, int], data: Payload) -> None:
         self.commit()
@@ -100,21 +104,27 @@ class PacketBatch:
     def commit(self) -> None:
         """Hand on what was collected; without packets nothing happens."""
         if self._used:
-            self._writer.append(self._buffer[: self._used])
-            self._used = 0
-            _USED.pack_into(self._desk, 0, 0)
+            number = self._writer.append(self._buffer[: self._used])
+            self._used = self._words[_USED] = 0
+            self._words[_NUMBER] = number + 1
 
 
 def desk_size(writer: Appender) -> int:
     """Return how many bytes of memory the unfinished batch of a writer needs."""
-    return _USED.size + min(writer.slot_size, 1 << 16)
+    return _DESK_HEADER + min(writer.slot_size, 1 << 16)
 
 
-def salvage(desk: memoryview, writer: Appender) -> None:
-    """Append the batch that a process left unfinished when it died; call it when that process is gone."""
-    used: int = _USED.unpack_from(desk)[0]
-    if 0 < used <= min(len(desk) - _USED.size, writer.slot_size):
-        writer.append(desk[_USED.size : _USED.size + used])
+def salvage(desk: memoryview, committed: int, writer: Appender) -> None:
+    """Append the batch that a process left unfinished when it died; call it when that process is gone.
+
+    `committed`: how many batches its ring has (`head`). A process that died after it had appended the batch,
+    and before it had cleared the desk, left nothing unfinished.
+    """
+    words = desk[:_DESK_HEADER].cast("Q")
+    used = words[_USED]
+    if words[_NUMBER] == committed and 0 < used <= min(len(desk) - _DESK_HEADER, writer.slot_size):
+        writer.append(desk[_DESK_HEADER : _DESK_HEADER + used])
+        words[_USED] = 0
 
 
 class NoPackets:

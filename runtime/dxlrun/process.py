@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import io
 import mmap
 import os
 import socket
 import subprocess
 import sys
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 
 import msgspec
 
 _ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 """Importing numpy alone starts a thread for each core otherwise."""
 _LINE_LIMIT = 1 << 20
+_MOST_DESCRIPTORS = 64
 
 
 def start(
@@ -21,14 +24,15 @@ def start(
 ) -> subprocess.Popen[bytes]:
     """Execute `python -m module` in a session of its own, so that a terminal's Ctrl-C does not reach it.
 
-    `descriptors` are inherited; `errors` takes its standard error. `-P` keeps the working directory out of
-    the import path: a student's `numpy.py` beside the robot file must not be imported.
+    `descriptors` are inherited; `errors` takes what it prints, which only --debug shows. `-P` keeps the
+    working directory out of the import path: a student's `numpy.py` beside the robot file must not be
+    imported.
     """
     return subprocess.Popen(
         [sys.executable, "-P", "-m", module, *arguments],
         pass_fds=tuple(descriptors),
         stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
+        stdout=errors,
         stderr=errors,
         start_new_session=True,
         env=os.environ | _ONE_THREAD,
@@ -52,6 +56,36 @@ def whole(descriptor: int) -> bytes:
     return os.pread(descriptor, os.fstat(descriptor).st_size, 0)
 
 
+class Printed(io.TextIOBase):
+    """Takes what plug-ins print, unbuffered and bounded: a controller that prints each cycle fills no memory.
+
+    `descriptor` is the nameless file that `start` made the process' output; --debug shows it.
+    """
+
+    def __init__(self, descriptor: int, most: int = 1 << 20) -> None:
+        super().__init__()
+        self._descriptor = descriptor
+        self._room = most
+
+    def writable(self) -> bool:
+        """Say that it can be written."""
+        return True
+
+    def fileno(self) -> int:
+        """Return the descriptor behind it."""
+        return self._descriptor
+
+    def write(self, text: str, /) -> int:
+        """Keep the text, as long as there is room; never raises."""
+        data = text.encode(errors="replace")[: self._room]
+        self._room -= len(data)
+        with suppress(OSError):
+            os.write(self._descriptor, data)
+            if data and not self._room:
+                os.write(self._descriptor, b"\n(what was printed after this is left out)\n")
+        return len(text)
+
+
 class Line:
     """One end of a conversation between two processes: JSON objects, one a line."""
 
@@ -59,23 +93,31 @@ class Line:
         self._socket = end
         self._pending = b""
         self.closed = False
-        """True after the other end was closed."""
+        """True after the end of what the other end sent was read."""
+        self.descriptors: list[int] = []
+        """What the other end handed over."""
 
     def fileno(self) -> int:
         """Return the descriptor, for select."""
         return self._socket.fileno()
 
-    def send(self, message: Mapping[str, object]) -> None:
-        """Send one object; a closed other end is noticed by the next receive, not here."""
-        try:
-            self._socket.sendall(msgspec.json.encode(message) + b"\n")
-        except OSError:
-            self.closed = True
+    def send(self, message: Mapping[str, object], descriptors: Sequence[int] = ()) -> None:
+        """Send one object, and open descriptors with it; never raises.
+
+        An end that is gone is noticed by the next receive, not here: what it said last is still to be read.
+        """
+        data = msgspec.json.encode(message) + b"\n"
+        with suppress(OSError):
+            if descriptors:
+                socket.send_fds(self._socket, [data], descriptors)
+            else:
+                self._socket.sendall(data)
 
     def receive(self) -> list[dict[str, object]]:
         """Return the objects that arrive in one read; waits for one read, sets `closed` at its end."""
         try:
-            chunk = self._socket.recv(65536)
+            chunk, descriptors, _, _ = socket.recv_fds(self._socket, 65536, _MOST_DESCRIPTORS)
+            self.descriptors += descriptors
         except OSError:
             chunk = b""
         if not chunk or len(self._pending) > _LINE_LIMIT:

@@ -56,6 +56,11 @@ class Appender(Protocol):
         """The longest record, bytes."""
         ...
 
+    @property
+    def head(self) -> int:
+        """Records appended so far: the number that the next one gets."""
+        ...
+
     def append(self, payload: Payload) -> int:
         """Take one record; return its number, counted from 0."""
         ...
@@ -119,6 +124,11 @@ class RingWriter:
         self.slot_size = self._mapping.slot_size
         self._next = self._words[_HEAD]
 
+    @property
+    def head(self) -> int:
+        """Records appended so far: the number that the next one gets."""
+        return self._next
+
     def append(self, payload: Payload) -> int:
         """Copy one record into the next slot; return its number. Raises ValueError when it is too long."""
         length = len(payload)
@@ -154,6 +164,11 @@ class RingReader:
         self._slots, self._stride = self._mapping.slots, self._mapping.stride
         self.slot_size = self._mapping.slot_size
         self._next = 0
+
+    @property
+    def head(self) -> int:
+        """Records that the writer has appended so far; one that it left unfinished does not count."""
+        return self._words[_HEAD]
 
     def read(self) -> bytes | Gap | None:
         """Return the next record, a Gap where records were lost, or None when there is nothing new."""
@@ -198,6 +213,11 @@ class Handover:
         self._take = take
         self.slot_size = slot_size
         self._count = 0
+
+    @property
+    def head(self) -> int:
+        """Records handed over so far."""
+        return self._count
 
     def append(self, payload: Payload) -> int:
         """Hand over one record; it is valid only during the call. Returns its number."""

@@ -28,6 +28,7 @@ from dxlrun.recording.header import LogHeader
 START_TIMEOUT_S = 20.0
 """A child that says nothing for so long will say nothing more; a cold import of numpy takes a second."""
 END_TIMEOUT_S = 10.0
+"""Also for a recorder on a slow disk, which says after each step that it goes on."""
 _GUARDIAN_SLOTS = 1024
 
 
@@ -68,8 +69,10 @@ class Memory:
 
     def outcome(self) -> Outcome | None:
         """Return what the loop's process left behind; None when it did not get to it."""
-        content = process.whole(self.result)
-        return msgspec.json.decode(content, type=Outcome) if content else None
+        try:
+            return msgspec.json.decode(process.whole(self.result), type=Outcome)
+        except msgspec.MsgspecError:  # nothing, or what was cut short
+            return None
 
     def rings(self) -> list[dict[str, object]]:
         """Return what the recorder reads, and from whom."""
@@ -131,14 +134,28 @@ class Child:
         self.began = True
         return message
 
+    def kill(self) -> None:
+        """End it at once, whatever it does."""
+        self.process.kill()
+        self.process.wait()
+        self.line.close()
+
     def end(self) -> None:
         """Close the line, which asks it to end in order; kill it when it does not."""
         self.line.close()
         try:
             self.process.wait(END_TIMEOUT_S)
         except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
+            self.kill()
+
+
+def _ready(child: Child) -> Mapping[str, object]:
+    """Return what a child says when it is ready; one that says something else does not outlive that."""
+    try:
+        return child.ready()
+    except BaseException:
+        child.kill()
+        raise
 
 
 def start_simulation(plan: Plan, ledger: Path | None, memory: Memory) -> tuple[Child, dict[str, str]]:
@@ -147,7 +164,7 @@ def start_simulation(plan: Plan, ledger: Path | None, memory: Memory) -> tuple[C
     arguments = ["--config-fd", str(config)] + (["--ledger", str(ledger)] if ledger else [])
     child = Child("simulated bus", "dxlrun.simulation", arguments, [config], memory.stderr)
     os.close(config)
-    return child, msgspec.convert(child.ready()["ports"], type=dict[str, str])
+    return child, msgspec.convert(_ready(child)["ports"], type=dict[str, str])
 
 
 def start_recorder(log: Path, header: LogHeader, memory: Memory) -> Child:
@@ -157,18 +174,12 @@ def start_recorder(log: Path, header: LogHeader, memory: Memory) -> Child:
     descriptors = [descriptor, *(int(str(one["fd"])) for one in memory.rings())]
     child = Child("recorder", "dxlrun.recording", ["--job-fd", str(descriptor)], descriptors, memory.stderr)
     os.close(descriptor)
-    child.ready()
+    _ready(child)
     return child
 
 
-def start_guardian(
-    plan: Plan, ports: Mapping[str, str], memory: Memory, others: Sequence[Child], *, take_over: bool
-) -> Child:
-    """Start the guardian; `ready` then waits until it holds the ports and has executed the loop.
-
-    It inherits our ends of the lines to `others`: should this process die, the simulated bus and the recorder
-    see the end of their lines only after the guardian has made the robot limp.
-    """
+def guardian_job(plan: Plan, ports: Mapping[str, str], memory: Memory, *, take_over: bool) -> GuardianJob:
+    """Return what the guardian is to do, and through it the loop."""
     loop = LoopJob(
         memory.plan,
         memory.heartbeat,
@@ -181,15 +192,17 @@ def start_guardian(
         take_over,
     )
     scheduler = plan.loop.scheduler
-    job = GuardianJob(
+    return GuardianJob(
         buses=plan.buses,
         ports=tuple(ports.get(bus.name, bus.port) for bus in plan.buses),
         period_ns=plan.loop.period_ns,
+        exit_timeout_ns=plan.exit_timeout_ns,
         priority=0 if scheduler.policy == "other" else min(scheduler.priority + 1, 99),
         heartbeat=memory.heartbeat,
         packets=memory.guardian_packets,
-        desk=memory.desk,
         events=memory.guardian_events,
+        loop_packets=memory.packets,
+        desk=memory.desk,
         stderr=memory.stderr,
         loop=msgspec.to_builtins(loop),
         loop_descriptors=(
@@ -204,9 +217,17 @@ def start_guardian(
             memory.stderr,
         ),
     )
+
+
+def start_guardian(job: GuardianJob, others: Sequence[Child]) -> Child:
+    """Start the guardian; `ready` then waits until it holds the ports and has executed the loop.
+
+    It inherits our ends of the lines to `others`: should this process die, the simulated bus and the recorder
+    see the end of their lines only after the guardian has made the robot limp.
+    """
     descriptor = process.memory_file("dxlrun-guardian", msgspec.json.encode(job))
-    inherited = [descriptor, memory.guardian_packets, memory.guardian_events, *job.loop_descriptors]
+    inherited = [descriptor, job.packets, job.events, *job.loop_descriptors]
     inherited += [other.line.fileno() for other in others]
-    child = Child("guardian", "dxlrun.guardian", ["--job-fd", str(descriptor)], inherited, memory.stderr)
+    child = Child("guardian", "dxlrun.guardian", ["--job-fd", str(descriptor)], inherited, job.stderr)
     os.close(descriptor)
     return child

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import select
 import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -17,15 +19,26 @@ from rich.status import Status
 from dxlrun import process
 from dxlrun.compile.plan import Plan
 from dxlrun.errors import ProcessFault
-from dxlrun.heartbeat import Heartbeat, Phase
+from dxlrun.events import Severity
+from dxlrun.guardian import GuardianJob, LastHand
+from dxlrun.heartbeat import Heartbeat, Phase, Standstill
 from dxlrun.loop_process import Outcome
 from dxlrun.run_log import epoch_offset_ns, log_header, new_log
-from dxlrun.run_processes import Child, Memory, start_guardian, start_recorder, start_simulation
+from dxlrun.run_processes import (
+    END_TIMEOUT_S,
+    Child,
+    Memory,
+    guardian_job,
+    start_guardian,
+    start_recorder,
+    start_simulation,
+)
 from dxlrun.run_summary import RunOptions, RunSummary
 
 _POLL_S = 0.1
-_GRACE_S = 1.0
-"""Beyond `exit_timeout`, before torque is cut: the loop beats at least once a second or the guardian acts."""
+_LOOK_NS = 500_000_000
+_GUARDIAN_PATIENCE_NS = 5_000_000_000
+"""The guardian looks at the loop at least every 10 ms, and counts each transaction of its own."""
 
 
 @dataclass(slots=True)
@@ -60,6 +73,9 @@ class _Run:
     simulation: Child | None = None
     recorder: Child | None = None
     guardian: Child | None = None
+    job: GuardianJob | None = None
+    loop: int | None = None
+    """A pidfd of the loop's process; None before there is one, and after it was seen to be gone."""
     log: Path | None = None
     sentences: list[str] = field(default_factory=list)
     ended: Mapping[str, object] | None = None
@@ -79,10 +95,11 @@ class _Run:
             header = log_header(self.plan, epoch_offset_ns(), virtual=False)
             self.recorder = start_recorder(self.log, header, self.memory)
         others = [child for child in (self.simulation, self.recorder) if child]
-        self.guardian = start_guardian(
-            self.plan, ports, self.memory, others, take_over=self.options.take_over
-        )
-        self.guardian.ready()
+        self.job = guardian_job(self.plan, ports, self.memory, take_over=self.options.take_over)
+        self.guardian = start_guardian(self.job, others)
+        loop = self.guardian.ready()["loop"]
+        with suppress(ProcessLookupError):  # the guardian has reaped it already, and knows what to do
+            self.loop = os.pidfd_open(int(str(loop)))
         return self.guardian
 
     def discard(self) -> None:
@@ -95,38 +112,45 @@ class _Run:
     def watch(self, guardian: Child, show: Callable[[Heartbeat], None]) -> None:
         """Wait for the guardian's last word; pass on what the signals ask."""
         heartbeat = Heartbeat(self.memory.heartbeat)
-        asked, cut_at = 0, float("inf")
+        still = Standstill(_LOOK_NS, time.monotonic_ns())
+        asked = 0
         while self.ended is None and not guardian.line.closed:
             if self.signals.count > asked:
                 asked = self.signals.count
                 guardian.line.send({"stop": True} if asked == 1 else {"cut": True})
-                cut_at = time.monotonic() + self.plan.exit_timeout_ns * 1e-9 + _GRACE_S
-            if time.monotonic() > cut_at:
-                guardian.line.send({"cut": True})
-                cut_at = float("inf")
             show(heartbeat)
             message = guardian.poll(_POLL_S)
             if message and "ended" in message:
                 self.ended = message
-        if self.ended is None:
-            self._without_guardian(heartbeat)
+            elif still.ns(heartbeat.looks, time.monotonic_ns()) > _GUARDIAN_PATIENCE_NS:
+                self.sentences.append("the guardian did not look after the loop any more and was killed")
+                guardian.kill()
+                break
 
-    def _without_guardian(self, heartbeat: Heartbeat) -> None:
-        """The guardian is gone: the kernel told the loop to stop; wait until it has switched torque off."""
-        deadline = time.monotonic() + self.plan.exit_timeout_ns * 1e-9 + _GRACE_S
-        while heartbeat.phase is not Phase.DONE and time.monotonic() < deadline:
-            time.sleep(_POLL_S)
-        limp = (
-            "the loop stopped and switched torque off"
-            if heartbeat.phase is Phase.DONE
-            else "nobody confirmed torque off: cut the robot's power"
-        )
-        self.sentences.append(f"the guardian ended in the middle of the run; {limp}")
+    def _without_guardian(self, loop: int, guardian: Child, job: GuardianJob) -> None:
+        """The guardian is gone: the kernel told the loop to stop; see that it does, or cut torque here."""
+        asked = self.signals.count
+        give_up = time.monotonic() + self.plan.exit_timeout_ns * 1e-9
+        while not (gone := bool(select.select([loop], [], [], _POLL_S)[0])):
+            if time.monotonic() > give_up or self.signals.count > max(asked, 1):
+                signal.pidfd_send_signal(loop, signal.SIGKILL)
+                select.select([loop], [], [])
+                break
+        phase = Heartbeat(self.memory.heartbeat).phase
+        self.sentences.append("the guardian ended in the middle of the run")
+        if phase is Phase.DONE:
+            self.sentences.append("the loop stopped and switched torque off")
+        elif phase is not Phase.LOADING:
+            how = "the loop ended too" if gone else "the loop did not stop and was killed"
+            self.sentences += LastHand(job).limp(guardian.line.descriptors, how, Severity.ERROR)
 
     def end(self) -> None:
         """End what is left, in order: guardian, recorder, simulated bus."""
         if self.guardian:
             self.guardian.end()
+            if self.loop is not None and self.ended is None and self.job is not None:
+                self._without_guardian(self.loop, self.guardian, self.job)
+            self.loop = None
         if self.recorder:
             self._end_recorder(self.recorder)
         if self.simulation:
@@ -135,21 +159,24 @@ class _Run:
     def _end_recorder(self, recorder: Child) -> None:
         """Let the recorder drain the rings and close the log; say so when it could not."""
         recorder.line.send({"finish": True})
+        closed = False
         try:
-            while (message := recorder.message(60.0)) is not None:
+            while (message := recorder.message(END_TIMEOUT_S)) is not None:
                 if "error" in message:
                     self.sentences.append(f"the log is incomplete: {message['error']}")
                 summary = message.get("summary")
                 if isinstance(summary, dict):
+                    closed = True
                     self.messages = summary["messages"]
                     if summary["gaps"]:
                         self.sentences.append(
                             f"the log has {summary['gaps']} declared gap(s): the recorder was too slow"
                         )
+            recorder.end()
         except ProcessFault as fault:
-            self.sentences.append(str(fault))
-        recorder.end()
-        if not self.messages:
+            self.sentences.append(f"{fault} and was killed")
+            recorder.kill()
+        if not closed:
             self.sentences.append(
                 f"the recorder ended before the run did; {self.log} is readable up to its last second"
             )
@@ -200,7 +227,9 @@ def _summary(run: _Run, elapsed_s: float) -> RunSummary:
     outcome = run.memory.outcome()
     heartbeat = Heartbeat(run.memory.heartbeat)
     sentences: list[str] = []
-    if outcome is None:
+    if outcome is None and run.ended is not None and run.ended["ended"] == "done":
+        outcome = Outcome("stopped")  # while it was still loading: no byte had been sent
+    elif outcome is None:
         outcome = Outcome("fault", heartbeat.cycles, heartbeat.skipped, _last_words(run.memory))
     sentences += outcome.sentences
     if run.ended is not None and run.ended["ended"] != "done":
@@ -222,9 +251,9 @@ def _summary(run: _Run, elapsed_s: float) -> RunSummary:
 
 
 def _last_words(memory: Memory) -> tuple[str, ...]:
-    """Return what a child that ended without a report printed last, if it printed anything."""
+    """Return what was printed last, by whichever process, if anything was: one of them ended early."""
     lines = process.whole(memory.stderr).decode(errors="replace").strip().splitlines()
-    return (f"the loop's process said last: {lines[-1]} (--debug shows all)",) if lines else ()
+    return (f"the run's processes printed last: {lines[-1]} (--debug shows all)",) if lines else ()
 
 
 def _list(value: object) -> list[object]:

@@ -17,7 +17,7 @@ from dxlrun.packets import (
     packet_slots,
     salvage,
 )
-from dxlrun.ring import Handover
+from dxlrun.ring import Handover, Payload
 
 TIMES = st.integers(-(2**63), 2**63 - 1)
 PACKETS = st.builds(
@@ -113,18 +113,44 @@ def test_what_a_dead_process_left_on_its_desk_is_taken_up_once() -> None:
     batch.commit()
     batch.packet(0, PacketKind.STATUS, 4, 5, 6, b"left")
     taken, guardian = collected()
-    salvage(desk, guardian)
+    salvage(desk, writer.head, guardian)
+    salvage(desk, writer.head, guardian)
     assert [packet.data for slot in slots for packet in decode_packets(slot)] == [b"committed"]
     assert [packet.data for slot in taken for packet in decode_packets(slot)] == [b"left"]
+
+
+class Killed(BaseException):
+    """Stands for SIGKILL: nothing after it runs."""
+
+
+class DyingWriter(Handover):
+    """Dies after the record is in the ring, before its writer hears of it."""
+
+    def append(self, payload: Payload) -> int:
+        super().append(payload)
+        raise Killed
+
+
+def test_a_process_that_dies_between_append_and_clearing_leaves_nothing_twice() -> None:
+    slots: list[bytes] = []
+    writer = DyingWriter(lambda payload: slots.append(bytes(payload)), slot_size=128)
+    desk = memoryview(bytearray(desk_size(writer)))
+    batch = PacketBatch(writer, desk)
+    batch.packet(0, PacketKind.INSTRUCTION, 1, 2, 3, b"once")
+    with pytest.raises(Killed):
+        batch.commit()
+    taken, guardian = collected()
+    salvage(desk, writer.head, guardian)
+    assert (len(slots), len(taken)) == (1, 0)
 
 
 def test_an_empty_or_a_scribbled_desk_gives_nothing() -> None:
     taken, guardian = collected()
     desk = memoryview(bytearray(desk_size(guardian)))
     PacketBatch(guardian, desk).commit()
-    salvage(desk, guardian)
+    salvage(desk, guardian.head, guardian)
     desk[:8] = b"\xff" * 8
-    salvage(desk, guardian)
+    salvage(desk, guardian.head, guardian)
     assert taken == []
 
 

@@ -153,6 +153,10 @@ def _ancestors(pid: int) -> set[int]:
     return family
 
 
+def _python_path() -> list[str]:
+    return [path for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path]
+
+
 Start = Callable[..., Running]
 
 
@@ -163,7 +167,8 @@ def start(tmp_path: Path) -> Iterator[Start]:
     started: list[Running] = []
 
     def begin(*arguments: str, path: Path | None = None, robot: Path | None = None) -> Running:
-        environment = os.environ | ({"PYTHONPATH": str(path)} if path else {})
+        paths = [str(path)] if path else []
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join([*paths, *_python_path()])}
         command = [str(DXLRUN), str(robot or tmp_path / "pair.yaml"), *arguments]
         process = subprocess.Popen(
             command, cwd=tmp_path, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE

@@ -19,6 +19,8 @@ from dxlrun.packets import PacketSink
 
 STOP_LIMIT_NS = 1_000_000_000
 """Retries of torque off end here; half of the default exit timeout."""
+TAKEN_BACK = "torque was switched off again on every servo"
+"""Note of what `start` raises when every servo confirmed that."""
 FIRST_READS = 3
 """The first states must all be fresh; noise may spoil a reading or two."""
 IDLE_MARGIN_NS = 300_000
@@ -72,7 +74,7 @@ class DynamixelHardware:
             self._engage()
             self._first_states()
         except BaseException as error:  # also an interrupt: nothing may leave here with torque on
-            for sentence in self.stop() or ("torque was switched off again on every servo",):
+            for sentence in self.stop() or (TAKEN_BACK,):
                 error.add_note(sentence)
             raise
 

@@ -96,7 +96,7 @@ def limp_buses(
     return tuple(outcomes)
 
 
-def limp(
+def limp(  # noqa: PLR0917  four things to work with, two that bound and show the work
     plans: Sequence[BusPlan],
     ports: Ports,
     clock: Clock,

@@ -116,7 +116,7 @@ class Recorder:
             else:
                 self._control.wait(0)
         while self._turn():
-            pass
+            self._control.say({"draining": True})
         summary = self._log.close()
         self._report()
         return summary
