@@ -7,8 +7,8 @@ import pytest
 
 from dxlrun.control_table import control_table
 from dxlrun.simulation import ServoConfig, SimulatedServo
-from dxlrun.simulation.packets import ErrorBit
-from dxlrun.simulation.registers import Registers
+from dxlrun.simulation.memory import Memory
+from dxlrun.simulation.protocol1 import ErrorBit
 
 PING, READ, WRITE, REG_WRITE, ACTION, FACTORY_RESET, SYNC_WRITE, BULK_READ = 1, 2, 3, 4, 5, 6, 0x83, 0x92
 BROADCAST = 0xFE
@@ -363,7 +363,7 @@ def test_a_baud_rate_that_no_servo_has_is_refused() -> None:
 
 def test_values_and_bytes_of_the_registers_never_differ() -> None:
     table = control_table("AX-12A")
-    registers = Registers(table)
+    registers = Memory(table, 24)
     registers.write(26, bytes((5, 6, 7, 8, 0x23, 0x01)))
     registers["moving_speed"] = 77
     for item in table.items.values():

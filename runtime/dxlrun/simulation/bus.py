@@ -8,7 +8,8 @@ The rules of the line:
   from there on.
 - Servos that talk at once (a broadcast ping, two servos with one ID) give one reply of their bytes ANDed, as
   drivers that both pull a line low would [i].
-- A pause of more than 100 ms inside an instruction ends it.
+- A pause inside an instruction ends it: more than 100 ms (Protocol 1.0), more than 1.5 ms (Protocol 2.0).
+- Servos that are read in turn answer one after the other, each its return delay after the one before it.
 - A servo at another baud rate hears nothing.
 """
 
@@ -20,12 +21,10 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from dxlrun.simulation import protocol1, protocol2
 from dxlrun.simulation.ledger import Ledger
-from dxlrun.simulation.packets import BROADCAST, InstructionPacket, InstructionReceiver, status_packet
-from dxlrun.simulation.servo import Reply, ServoConfig, SimulatedServo
-
-LONGEST_PAUSE_NS = 100_000_000
-"""Longest gap inside an instruction (e-Manual, Protocol 1.0)."""
+from dxlrun.simulation.packets import BROADCAST, Codec, InstructionPacket, ReadInTurn, Reply
+from dxlrun.simulation.servo import ServoConfig, SimulatedServo
 
 UNREAD_LIMIT = 4096
 """Bytes that wait for a host that does not take them; more are lost, as in the kernel's terminal buffer."""
@@ -39,6 +38,8 @@ class BusConfig:
     baud_rate: int
     """bit/s, of the host and, at the start, of every servo"""
     servos: tuple[ServoConfig, ...]
+    protocol: float = 1.0
+    """1.0 or 2.0: one bus speaks one protocol"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,16 +72,20 @@ class SimulatedBus:
         """The host's rate, bit/s."""
         self.echo = False
         """True: the adapter gives the host its own bytes back."""
+        self.skips_absent = False
+        """Protocol 2.0, a listed servo is absent: True: those after it answer later; False: never [?]."""
         self.ledger = ledger
         self._now_ns = start_ns
         self._host_free_ns = start_ns
-        self._receiver = InstructionReceiver()
+        self._codec: Codec = protocol2 if config.protocol == 2.0 else protocol1
+        self._receiver = self._codec.receiver()
         self._pending: list[_Chunk] = []
         self._faults: dict[int, deque[_Fault]] = {}
         self._agenda: list[tuple[int, int, Callable[[], None]]] = []
         self._order = itertools.count()
         self.servos = tuple(
-            SimulatedServo(servo, config.baud_rate, start_ns, self.note) for servo in config.servos
+            SimulatedServo(servo, config.baud_rate, start_ns, self.note, config.protocol)
+            for servo in config.servos
         )
 
     # The line
@@ -91,7 +96,7 @@ class SimulatedBus:
         heard = bytearray(data)
         self.ledger.add(at_ns, self.name, "in", bytes(heard))
         start_ns = max(at_ns, self._host_free_ns)
-        if self._receiver.pending and start_ns - self._host_free_ns > LONGEST_PAUSE_NS:
+        if self._receiver.pending and start_ns - self._host_free_ns > self._codec.LONGEST_PAUSE_NS:
             self.note(f"an instruction of {self._receiver.pending} bytes was broken off")
             self._receiver.forget()
         self._host_free_ns = start_ns + self._wire_ns(len(heard))
@@ -188,28 +193,61 @@ class SimulatedBus:
         return size * 10_000_000_000 // self.baud_rate
 
     def _execute(self, packet: InstructionPacket, end_ns: int) -> None:
+        reading = self._codec.read_in_turn(packet)
+        if reading is not None:
+            self._read_in_turn(reading, end_ns)
+            return
         for servo in self.servos:
             if packet.servo_id not in (servo.servo_id, BROADCAST) or not self._hears(servo):
                 continue
             reply = servo.execute(packet, end_ns)
             if reply is not None:
-                self._answer(reply, end_ns)
+                data = self._codec.status_packet(reply.servo_id, reply.error, reply.parameters)
+                self._answer(reply, data, end_ns)
+
+    def _read_in_turn(self, reading: ReadInTurn, end_ns: int) -> None:
+        """Let the listed servos answer, each when the one before it has ended."""
+        fast = (
+            self._codec.fast_status(tuple(each.length for each in reading.entries)) if reading.fast else None
+        )
+        free_ns, first = end_ns, True
+        for entry in reading.entries:
+            servo = next((each for each in self.servos if each.servo_id == entry.servo_id), None)
+            reply = None
+            if servo is not None and self._hears(servo):
+                reply = servo.answer_in_turn(reading, entry, end_ns)
+            if reply is None:
+                if not (reading.has_slots and self.skips_absent) or fast is not None:
+                    self.note(f"servo {entry.servo_id} does not answer: those after it wait for it in vain")
+                    return
+                free_ns += self._wire_ns(len(self._codec.status_packet(0, 0, bytes(entry.length))))
+                continue
+            if fast is not None:
+                delay_ns = reply.delay_ns if first else 0
+                data = fast.part(reply)
+                reply = Reply(reply.servo_id, reply.error, reply.parameters, delay_ns)
+            else:
+                data = self._codec.status_packet(reply.servo_id, reply.error, reply.parameters)
+            free_ns = self._answer(reply, data, free_ns)
+            first = False
 
     def _hears(self, servo: SimulatedServo) -> bool:
         """Return whether the rates differ by less than 3 % (e-Manual, Baud Rate (4))."""
         return abs(servo.baud_rate - self.baud_rate) < 0.03 * self.baud_rate
 
-    def _answer(self, reply: Reply, end_ns: int) -> None:
-        data = status_packet(reply.servo_id, reply.error, reply.parameters)
-        first_ns = end_ns + reply.delay_ns
+    def _answer(self, reply: Reply, data: bytes, free_ns: int) -> int:
+        """Send a servo's bytes, faults and all, a delay after the line is free; return when they have passed."""
+        first_ns = free_ns + reply.delay_ns
         faults = self._faults.get(reply.servo_id)
         if faults:
             fault = faults.popleft()
             self.note(f"servo {reply.servo_id}: {fault.text}")
             data = fault.change(data)
             first_ns += fault.delay_ns
+        end_ns = first_ns + self._wire_ns(len(data))
         if data:
-            self._send(_Chunk(first_ns, first_ns + self._wire_ns(len(data)), data))
+            self._send(_Chunk(first_ns, end_ns, data))
+        return end_ns
 
     def _plan_fault(self, servo_id: int, fault: _Fault) -> None:
         self._faults.setdefault(servo_id, deque()).append(fault)

@@ -1,0 +1,121 @@
+"""Which writes a simulated servo refuses, and with which error; `[i]` marks what no manual says.
+
+A write is refused as a whole [i].
+"""
+
+from __future__ import annotations
+
+from dxlrun.control_table import ControlItem
+from dxlrun.simulation.memory import Memory, in_range
+from dxlrun.simulation.protocol1 import ErrorBit
+from dxlrun.simulation.protocol2 import ErrorNumber
+
+_LIMITS_OF_GOALS = {
+    "goal_pwm": "pwm_limit",
+    "goal_current": "current_limit",
+    "goal_torque": "torque_limit",
+    "goal_velocity": "velocity_limit",
+}
+_GOALS = frozenset(("goal_pwm", "goal_current", "goal_velocity", "goal_position"))
+_SINGLE_TURN = (3,)
+"""Operating modes in which the position limits hold (e-Manual, Min/Max Position Limit (48, 52))."""
+
+WATCHDOG_ERROR = 0xFF
+"""Bus Watchdog (98) after its time ran out: -1."""
+
+
+class LockRules:
+    """Protocol 1.0: Lock (47) closes the EEPROM until the power is cut."""
+
+    def __init__(self, memory: Memory) -> None:
+        self._memory = memory
+
+    def refusal(self, address: int, data: bytes) -> int:
+        """Return the error bits with which a write would be refused; 0 when it would not.
+
+        A cell that no item owns, a read-only item, a locked one and a value out of its range are each a range
+        error [i]; a goal outside the angle limits is an angle limit error (e-Manual, Goal Position (30)).
+        """
+        after = self._memory.would_be(address, data)
+        if not after:
+            return ErrorBit.RANGE
+        error = 0
+        for name, wire in after.items():
+            error |= self._refusal_of(self._memory.table.items[name], wire)
+        return error
+
+    def _refusal_of(self, item: ControlItem, wire: int) -> int:
+        memory = self._memory
+        if item.access == "R" or not in_range(item, wire):
+            return ErrorBit.RANGE
+        if memory.get("lock") == 1 and (item.area == "EEPROM" or (item.name == "lock" and wire == 0)):
+            return ErrorBit.RANGE
+        if wheel_mode(memory):
+            return 0
+        if item.name == "moving_speed" and wire > memory.table.max_speed_tick:
+            return ErrorBit.RANGE  # the direction bit belongs to wheel mode: "0 ~ 1,023 can be used"
+        return ErrorBit.ANGLE_LIMIT if _beyond_angle_limits(memory, item.name, wire) else 0
+
+
+class TorqueRules:
+    """Protocol 2.0: the EEPROM is closed while Torque Enable is 1."""
+
+    def __init__(self, memory: Memory) -> None:
+        self._memory = memory
+
+    def refusal(self, address: int, data: bytes) -> int:
+        """Return the error number with which a write would be refused; 0 when it would not.
+
+        Part of an item is a length error (e-Manual, Protocol 2.0, "Error": Data Length Error). Where several
+        items are refused, the error is that of the first [i].
+        """
+        memory = self._memory
+        after = memory.would_be(address, data)
+        if not after:
+            return ErrorNumber.ACCESS
+        items = [memory.table.items[name] for name in after]
+        for item in items:
+            if item.access == "R" or (item.area == "EEPROM" and memory.get("torque_enable")):
+                return ErrorNumber.ACCESS
+        if items[0].address < address or items[-1].address + items[-1].size > address + len(data):
+            return ErrorNumber.DATA_LENGTH
+        return next((error for item in items if (error := self._refusal_of(item, after[item.name]))), 0)
+
+    def _refusal_of(self, item: ControlItem, wire: int) -> int:
+        memory = self._memory
+        if not in_range(item, wire):
+            return ErrorNumber.DATA_RANGE
+        if item.name in _GOALS and memory.get("bus_watchdog") == WATCHDOG_ERROR:
+            return ErrorNumber.DATA_RANGE
+        if self._beyond_limit(item, wire):
+            return ErrorNumber.DATA_LIMIT
+        return 0
+
+    def _beyond_limit(self, item: ControlItem, wire: int) -> bool:
+        memory = self._memory
+        value = item.decode(wire.to_bytes(item.size, "little"))
+        limit = _LIMITS_OF_GOALS.get(item.name)
+        if limit is not None and limit in memory:
+            return abs(value) > memory[limit]
+        if item.name != "goal_position":
+            return False
+        if "max_position_limit" in memory and memory.get("operating_mode") in _SINGLE_TURN:
+            lowest, highest = memory.ticks("min_position_limit"), memory.ticks("max_position_limit")
+            return not lowest <= value <= highest
+        return not wheel_mode(memory) and _beyond_angle_limits(memory, item.name, wire)
+
+
+def wheel_mode(memory: Memory) -> bool:
+    """Return whether a servo with angle limits turns without end (e-Manual, CW/CCW Angle Limit (6, 8)).
+
+    Both limits are 0, or, where the model has it, Control Mode (11) is 1 (XL-320).
+    """
+    if "control_mode" in memory:
+        return memory["control_mode"] == 1
+    return memory.get("cw_angle_limit") == 0 and memory.get("ccw_angle_limit") == 0
+
+
+def _beyond_angle_limits(memory: Memory, name: str, wire: int) -> bool:
+    if name != "goal_position" or "cw_angle_limit" not in memory:
+        return False
+    return not memory["cw_angle_limit"] <= wire <= memory["ccw_angle_limit"]

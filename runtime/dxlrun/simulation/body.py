@@ -1,0 +1,146 @@
+"""What a simulated servo is without its line: memory, shaft, what surrounds it, and what goes wrong with it.
+
+`Body` is what both protocols share; `LockBody` and `TorqueBody` add how each protects itself.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable
+
+from dxlrun.simulation.memory import Memory
+from dxlrun.simulation.shaft import Shaft
+
+BOOT_NS = 100_000_000
+"""How long a servo hears nothing after a reboot; no manual names it [i]."""
+
+
+class Body(ABC):
+    """One servo as its own instructions and its surroundings act on it."""
+
+    def __init__(self, memory: Memory, shaft: Shaft, note: Callable[[str], None]) -> None:
+        self.memory = memory
+        self.shaft = shaft
+        self.note = note
+        self.voltage = _supply(memory)
+        """V"""
+        self.temperature = 30.0
+        """degrees C"""
+        self.overload = False
+        """True while the shaft is loaded beyond the torque."""
+        self.wakes_on_goal = True
+        """Protocol 1.0: writing Goal Position (30) while Torque Enable (24) is 0 sets it to 1 [i]."""
+        self.boot_ns = BOOT_NS
+        """How long a reboot or a factory reset by an instruction takes: Protocol 2.0."""
+        self.deaf_until_ns = shaft.now_ns
+        """Until then it boots and hears nothing."""
+        self._registered: tuple[int, bytes] | None = None
+
+    @property
+    def servo_id(self) -> int:
+        """ID (3 or 7)."""
+        return self.memory["id"]
+
+    def advance(self, now_ns: int) -> None:
+        """Let time pass."""
+        self.shaft.advance(now_ns)
+
+    def hear(self, now_ns: int) -> None:
+        """Take note of an instruction on the line at a time."""
+        self.advance(now_ns)
+
+    def power_up(self) -> None:
+        """Start: RAM is as it is at power-up, the shaft stays where it is."""
+        self._registered = None
+        self.overload = False
+        self.memory.restore_ram()
+        self.shaft.power_up()
+        self._start_up()
+        self.protect()
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Bring all that can be read to the time."""
+        self.shaft.refresh()
+        memory = self.memory
+        memory.show("present_temperature", round(self.temperature))
+        memory.show("present_voltage", round(self.voltage * 10))
+        memory.show("present_input_voltage", round(self.voltage * 10))
+
+    # Instructions that both protocols have
+
+    def read(self, address: int, length: int) -> bytes | None:
+        """Return bytes of the table, None where it has none."""
+        self.refresh()
+        return self.memory.read(address, length)
+
+    def write(self, address: int, data: bytes) -> int:
+        """Write, or return the error with which it is refused; 0 when it is not."""
+        runs = self.memory.runs(address, data)
+        for run in runs:
+            if error := self.refusal(*run):
+                return error
+        for run in runs:
+            names = self.memory.write(*run)
+            self._obey(names)
+            self.shaft.plan(names)
+        return 0
+
+    def register(self, address: int, data: bytes) -> int:
+        """Keep a write for `act`, or return the error with which it is refused."""
+        for run in self.memory.runs(address, data):
+            if error := self.refusal(*run):
+                return error
+        self._registered = (address, data)
+        self._show_registered(1)
+        return 0
+
+    @property
+    def has_registered(self) -> bool:
+        """True when a registered write waits."""
+        return self._registered is not None
+
+    def act(self) -> int:
+        """Do the registered write; return its error."""
+        if self._registered is None:
+            return 0
+        address, data = self._registered
+        self._registered = None
+        self._show_registered(0)
+        return self.write(address, data)
+
+    def poke(self, name: str, wire: int) -> None:
+        """Set a control item as if it had been so before, with nothing refused."""
+        self.memory[name] = wire
+        self.shaft.plan((name,))
+
+    # What the protocols do differently
+
+    @abstractmethod
+    def refusal(self, address: int, data: bytes) -> int:
+        """Return the error of a write, 0 when it is allowed."""
+
+    @abstractmethod
+    def state(self) -> int:
+        """Return the bits of every reply's error that tell the servo's state."""
+
+    @abstractmethod
+    def protect(self, refused: int = 0) -> None:
+        """Take the torque away when something is wrong for which Shutdown asks."""
+
+    @abstractmethod
+    def _start_up(self) -> None: ...
+
+    @abstractmethod
+    def _obey(self, names: Iterable[str]) -> None:
+        """Do what the writing of some items does beside changing them."""
+
+    def _show_registered(self, value: int) -> None:
+        self.memory.show("registered", value)
+        self.memory.show("registered_instruction", value)
+
+
+def _supply(memory: Memory) -> float:
+    """Return the voltage at which a servo is tried: 12 V, or the middle of its limits, V."""
+    lowest, highest = memory.get("min_voltage_limit", 0), memory.get("max_voltage_limit", 999)
+    return 12.0 if lowest <= 120 <= highest else (lowest + highest) / 20

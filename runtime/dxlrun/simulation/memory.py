@@ -1,0 +1,168 @@
+"""The memory of a simulated servo: the control items of its table as bytes and as integers of the wire."""
+
+from __future__ import annotations
+
+import re
+
+from dxlrun.control_table import ControlItem, ControlTable
+
+_INDIRECT = re.compile(r"indirect_address_(\d+)")
+
+Run = tuple[int, bytes]
+"""Address and bytes that belong there."""
+
+
+class Memory:
+    """Bytes of a control table; `memory[name]` is the integer of the wire, never negative.
+
+    Cells of Indirect Data stand for the cells whose addresses the Indirect Addresses hold.
+    """
+
+    def __init__(self, table: ControlTable, firmware: int) -> None:
+        self.table = table
+        self.firmware = firmware
+        self._memory = bytearray(table.size)
+        self._values: dict[str, int] = {}  # the same as in the bytes: looked up far more often than written
+        self._names_at: dict[
+            tuple[int, int], tuple[str, ...]
+        ] = {}  # hosts write the same cells again and again
+        self._item_at: dict[int, ControlItem] = {
+            address: item
+            for item in table.items.values()
+            for address in range(item.address, item.address + item.size)
+        }
+        self._indirect = _indirect_cells(table)
+        self.restore_factory_values()
+
+    def restore_factory_values(self, keep: tuple[str, ...] = ()) -> None:
+        """Set every item but those of `keep` to its initial value, and those without one to 0."""
+        for item in self.table.items.values():
+            if item.name not in keep:
+                self[item.name] = self._initial(item)
+        self["model_number"] = self.table.model_number
+        self["firmware_version"] = self.firmware
+
+    def restore_ram(self) -> None:
+        """Set the items of the RAM area to what they are at power-up; the EEPROM area stays."""
+        for item in self.table.items.values():
+            if item.area == "RAM":
+                self[item.name] = self._initial(item)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._values
+
+    def __getitem__(self, name: str) -> int:
+        return self._values[name]
+
+    def __setitem__(self, name: str, wire: int) -> None:
+        if self._values.get(name) == wire:
+            return
+        item = self.table.items[name]
+        wire &= (1 << 8 * item.size) - 1
+        self._memory[item.address : item.address + item.size] = wire.to_bytes(item.size, "little")
+        self._values[name] = wire
+
+    def get(self, name: str, otherwise: int = 0) -> int:
+        """Return the integer of an item, or another one when the model has no such item."""
+        return self._values.get(name, otherwise)
+
+    def show(self, name: str, wire: int) -> None:
+        """Set an item if the model has it; what does not fit ends at its highest or lowest value."""
+        item = self.table.items.get(name)
+        if item is None:
+            return
+        bits = 8 * item.size - (item.encoding == "twos_complement")
+        lowest = -1 << bits if item.encoding == "twos_complement" else 0
+        self[name] = max(lowest, min((1 << bits) - 1, wire))
+
+    def ticks(self, name: str) -> int:
+        """Return the signed number of ticks of an item."""
+        item = self.table.items[name]
+        return item.decode(self._memory[item.address : item.address + item.size])
+
+    def data(self, name: str) -> bytes:
+        """Return the bytes of an item."""
+        item = self.table.items[name]
+        return bytes(self._memory[item.address : item.address + item.size])
+
+    def read(self, address: int, length: int) -> bytes | None:
+        """Return bytes of the table, None where it has none; cells between items are 0 [i]."""
+        if length < 1 or address + length > len(self._memory):
+            return None
+        data = self._memory[address : address + length]
+        for cell in self._indirect.keys() & range(address, address + length) if self._indirect else ():
+            target = self[self._indirect[cell]]
+            data[cell - address] = self._memory[target] if target < len(self._memory) else 0
+        return bytes(data)
+
+    def runs(self, address: int, data: bytes) -> tuple[Run, ...]:
+        """Return where bytes really go: as they are, or to the cells behind Indirect Data."""
+        if not self._indirect or self._indirect.keys().isdisjoint(range(address, address + len(data))):
+            return ((address, data),)
+        runs: list[Run] = []
+        for cell, byte in enumerate(data, start=address):
+            name = self._indirect.get(cell)
+            target = cell if name is None else self[name]
+            if runs and runs[-1][0] + len(runs[-1][1]) == target:
+                runs[-1] = runs[-1][0], runs[-1][1] + bytes((byte,))
+            else:
+                runs.append((target, bytes((byte,))))
+        return tuple(runs)
+
+    def names(self, address: int, length: int) -> tuple[str, ...]:
+        """Return the items of some cells, none when a cell belongs to no item."""
+        names = self._names_at.get((address, length))
+        if names is None:
+            items = [self._item_at.get(cell) for cell in range(address, address + length)]
+            owned = [item.name for item in items if item is not None]
+            names = tuple(dict.fromkeys(owned)) if len(owned) == length else ()
+            self._names_at[address, length] = names
+        return names
+
+    def touches(self, address: int, length: int) -> bool:
+        """Return whether any of some cells belongs to an item."""
+        return any(cell in self._item_at for cell in range(address, address + length))
+
+    def would_be(self, address: int, data: bytes) -> dict[str, int]:
+        """Return the integers of the items that a write touches, as they would be after it."""
+        after = self._memory[:]
+        after[address : address + len(data)] = data
+        items = [self.table.items[name] for name in self.names(address, len(data))]
+        return {
+            item.name: int.from_bytes(after[item.address : item.address + item.size], "little")
+            for item in items
+        }
+
+    def write(self, address: int, data: bytes) -> tuple[str, ...]:
+        """Write bytes that were not refused; return the names of the items that they touch."""
+        after = self.would_be(address, data)
+        self._memory[address : address + len(data)] = data
+        self._values.update(after)
+        return tuple(after)
+
+    def backup(self) -> dict[str, int]:
+        """Return the integers of all items that can be written."""
+        return {name: self[name] for name, item in self.table.items.items() if item.access == "RW"}
+
+    @staticmethod
+    def _initial(item: ControlItem) -> int:
+        if item.initial is not None:
+            return item.initial
+        return max(0, item.minimum) if item.access == "RW" else 0
+
+
+def in_range(item: ControlItem, wire: int) -> bool:
+    """Return whether an integer of the wire lies in an item's range."""
+    if item.minimum < 0 and wire >> (8 * item.size - 1):
+        wire -= 1 << 8 * item.size
+    return item.minimum <= wire <= item.maximum
+
+
+def _indirect_cells(table: ControlTable) -> dict[int, str]:
+    """Return for each cell of Indirect Data the item that holds the address behind it."""
+    cells = {}
+    for name in table.items:
+        match = _INDIRECT.fullmatch(name)
+        if match and (data := table.items.get(f"indirect_data_{match[1]}")) is not None:
+            cells[data.address] = name
+    return cells

@@ -1,0 +1,231 @@
+"""Protocol 2.0 as a servo sees it: bytes of the line -> instructions, replies -> bytes.
+
+Written from the protocol alone (ROBOTIS e-Manual, "DYNAMIXEL Protocol 2.0"), without the host's packet code:
+one codec for both sides would agree with its own mistakes.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum, unique
+
+from dxlrun.simulation.packets import BROADCAST, InstructionPacket, ReadEntry, ReadInTurn, Reply
+
+LONGEST_PAUSE_NS = 1_500_000
+"""Longest gap inside an instruction."""
+
+HEADER = b"\xff\xff\xfd"
+RESERVED = 0x00
+STATUS = 0x55
+ALERT = 0x80
+"""Bit of a status packet's error: look at Hardware Error Status. It does not say that anything failed."""
+
+_OVERHEAD = 7
+"""Bytes that the length does not count: header, reserved byte, ID, length."""
+_STUFFED = HEADER + b"\xfd"
+
+
+@unique
+class Instruction(IntEnum):
+    """Instruction byte (e-Manual, Protocol 2.0, "Instruction")."""
+
+    PING = 0x01
+    READ = 0x02
+    WRITE = 0x03
+    REG_WRITE = 0x04
+    ACTION = 0x05
+    FACTORY_RESET = 0x06
+    REBOOT = 0x08
+    CLEAR = 0x10
+    CONTROL_TABLE_BACKUP = 0x20
+    SYNC_READ = 0x82
+    SYNC_WRITE = 0x83
+    FAST_SYNC_READ = 0x8A
+    BULK_READ = 0x92
+    BULK_WRITE = 0x93
+    FAST_BULK_READ = 0x9A
+
+
+@unique
+class ErrorNumber(IntEnum):
+    """Number in bits 0..6 of a status packet's error (e-Manual, Protocol 2.0, "Error")."""
+
+    NONE = 0
+    RESULT_FAIL = 1
+    INSTRUCTION = 2
+    CRC = 3
+    DATA_RANGE = 4
+    DATA_LENGTH = 5
+    DATA_LIMIT = 6
+    ACCESS = 7
+
+
+def _crc_table() -> tuple[int, ...]:
+    table = []
+    for value in range(256):
+        crc = value << 8
+        for _ in range(8):
+            crc = (crc << 1) ^ (0x8005 if crc & 0x8000 else 0)
+        table.append(crc & 0xFFFF)
+    return tuple(table)
+
+
+_CRC = _crc_table()
+
+
+def crc16(data: bytes | bytearray, crc: int = 0) -> int:
+    """Return the CRC-16 of some bytes: polynomial 8005 (hex), not reflected; `crc` is that of those before."""
+    for byte in data:
+        crc = (crc << 8 & 0xFFFF) ^ _CRC[(crc >> 8) ^ byte]
+    return crc
+
+
+def stuffed(body: bytes) -> bytes:
+    """Return instruction and parameters as they stand on the line: no header can be seen in them."""
+    return body.replace(HEADER, _STUFFED)
+
+
+def unstuffed(body: bytes) -> bytes:
+    """Return instruction and parameters as they were meant."""
+    return body.replace(_STUFFED, HEADER)
+
+
+def status_packet(servo_id: int, error: int, parameters: bytes = b"") -> bytes:
+    """Return the bytes of a status packet."""
+    body = stuffed(bytes((STATUS, error)) + parameters)
+    packet = _head(servo_id, len(body) + 2) + body
+    return packet + crc16(packet).to_bytes(2, "little")
+
+
+class FastStatusPacket:
+    """The one status packet of a fast sync or bulk read: each servo adds error, ID, data and CRC.
+
+    Nothing in it is stuffed. Each CRC is over everything before it, earlier CRCs included.
+    """
+
+    def __init__(self, lengths: tuple[int, ...]) -> None:
+        self._head = _head(BROADCAST, 1 + sum(length + 4 for length in lengths)) + bytes((STATUS,))
+        self._crc = 0
+
+    def part(self, reply: Reply) -> bytes:
+        """Return the bytes that the next servo adds; the first one also sends the header."""
+        data = self._head + bytes((reply.error, reply.servo_id)) + reply.parameters
+        self._head = b""
+        crc = crc16(data, self._crc)
+        data += crc.to_bytes(2, "little")
+        self._crc = crc16(data[-2:], crc)
+        return data
+
+
+def fast_status(lengths: tuple[int, ...]) -> FastStatusPacket:
+    """Return an empty status packet for so many bytes of so many servos."""
+    return FastStatusPacket(lengths)
+
+
+def read_in_turn(packet: InstructionPacket) -> ReadInTurn | None:
+    """Return what a sync or bulk read asks for; None: it is none, or its parameters are wrong."""
+    if not packet.intact or packet.servo_id != BROADCAST:
+        return None
+    match packet.instruction:
+        case Instruction.SYNC_READ | Instruction.FAST_SYNC_READ:
+            entries = _sync_entries(packet.parameters)
+        case Instruction.BULK_READ | Instruction.FAST_BULK_READ:
+            entries = _bulk_entries(packet.parameters)
+        case _:
+            return None
+    if not entries:
+        return None
+    fast = packet.instruction in (Instruction.FAST_SYNC_READ, Instruction.FAST_BULK_READ)
+    return ReadInTurn(packet.instruction, entries, fast=fast, has_slots=True)
+
+
+def _sync_entries(parameters: bytes) -> tuple[ReadEntry, ...]:
+    address, length = _word(parameters, 0), _word(parameters, 2)
+    return tuple(ReadEntry(servo_id, address, length) for servo_id in parameters[4:])
+
+
+def _bulk_entries(parameters: bytes) -> tuple[ReadEntry, ...]:
+    if len(parameters) % 5:
+        return ()
+    return tuple(
+        ReadEntry(parameters[start], _word(parameters, start + 1), _word(parameters, start + 3))
+        for start in range(0, len(parameters), 5)
+    )
+
+
+class InstructionReceiver:
+    """Finds instruction packets in the bytes of a line, noise or not; holds at most one packet."""
+
+    __slots__ = ("_buffer",)
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+
+    @property
+    def pending(self) -> int:
+        """Number of bytes of a packet that is not complete."""
+        return len(self._buffer)
+
+    def forget(self) -> None:
+        """Drop a packet that was not completed in time."""
+        self._buffer.clear()
+
+    def feed(self, data: bytes | bytearray, start: int = 0) -> InstructionPacket | None:
+        """Take bytes of `data` from `start` on until a packet is complete, and return it.
+
+        None: all were taken, and no packet is complete. One with a wrong CRC is a packet too. Go on at
+        `packet.end`.
+        """
+        buffer = self._buffer
+        index = start
+        while index < len(data):
+            wanted = max(1, _size(buffer) - len(buffer)) if len(buffer) >= _OVERHEAD else 1
+            buffer += data[index : index + wanted]
+            index = min(len(data), index + wanted)
+            while buffer and not _may_begin(buffer):
+                del buffer[0]
+            if len(buffer) >= _OVERHEAD and len(buffer) == _size(buffer):
+                packet = _packet(bytes(buffer), index)
+                buffer.clear()
+                return packet
+        return None
+
+
+def receiver() -> InstructionReceiver:
+    """Return a receiver for one line."""
+    return InstructionReceiver()
+
+
+def _head(servo_id: int, length: int) -> bytes:
+    return HEADER + bytes((RESERVED, servo_id)) + length.to_bytes(2, "little")
+
+
+def _word(data: bytes | bytearray, index: int) -> int:
+    return int.from_bytes(data[index : index + 2], "little")
+
+
+def _size(data: bytes | bytearray) -> int:
+    return _OVERHEAD + _word(data, 5)
+
+
+def _packet(data: bytes, end: int) -> InstructionPacket:
+    body = unstuffed(data[_OVERHEAD:-2])
+    return InstructionPacket(
+        servo_id=data[4],
+        instruction=body[0],
+        parameters=body[1:],
+        intact=_word(data, len(data) - 2) == crc16(data[:-2]),
+        end=end,
+    )
+
+
+def _may_begin(data: bytes | bytearray) -> bool:
+    """Return whether a packet can begin so: header, reserved 0, an ID that can be, a length of at least 3."""
+    size = len(data)
+    return (
+        data[0] == 0xFF
+        and (size < 2 or data[1] == 0xFF)
+        and (size < 3 or data[2] == 0xFD)
+        and (size < 4 or data[3] == RESERVED)
+        and (size < 5 or data[4] not in (0xFD, 0xFF))
+        and (size < _OVERHEAD or _word(data, 5) >= 3)
+    )
