@@ -236,7 +236,7 @@ class SimulatedBus:
         return abs(servo.baud_rate - self.baud_rate) < 0.03 * self.baud_rate
 
     def _answer(self, reply: Reply, data: bytes, free_ns: int) -> int:
-        """Send a servo's bytes, faults and all, a delay after the line is free; return when they have passed."""
+        """Send a servo's bytes, faults and all, some time after the line is free; return when they end."""
         first_ns = free_ns + reply.delay_ns
         faults = self._faults.get(reply.servo_id)
         if faults:

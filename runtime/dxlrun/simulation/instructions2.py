@@ -34,7 +34,7 @@ class Instructions2:
         return own and level <= self._body.memory["status_return_level"]
 
     def delay_ns(self, packet: InstructionPacket, byte_ns: int) -> int:
-        """Return how long the servo waits: Return Delay Time, and after a broadcast ping for its slot by ID."""
+        """Return how long the servo waits: Return Delay Time, after a broadcast ping also for its slot."""
         delay = self._body.memory["return_delay_time"] * 2000
         if packet.servo_id == BROADCAST and packet.instruction == Instruction.PING:
             delay += self._body.servo_id * (_PING_REPLY * byte_ns + SLOT_NS)

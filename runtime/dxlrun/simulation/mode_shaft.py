@@ -121,7 +121,7 @@ class ModeShaft(Shaft):
         return goal, min(speed, table.max_speed), acceleration
 
     def _timed(self, goal: float, duration: float, ramp: float) -> Drive:
-        """Return the move that takes a duration in all, and a time to come to speed, both in s; 0: the least."""
+        """Return the move that takes a duration, s, and a time to come to speed, s; 0: the least."""
         distance, highest = abs(goal - self.angle), self.memory.table.max_speed
         if duration <= 0.0 or distance == 0.0:
             return goal, highest, ACCELERATION

@@ -73,7 +73,7 @@ _CRC = _crc_table()
 
 
 def crc16(data: bytes | bytearray, crc: int = 0) -> int:
-    """Return the CRC-16 of some bytes: polynomial 8005 (hex), not reflected; `crc` is that of those before."""
+    """Return the CRC-16 of some bytes: polynomial 8005 (hex), not reflected; `crc` is that so far."""
     for byte in data:
         crc = (crc << 8 & 0xFFFF) ^ _CRC[(crc >> 8) ^ byte]
     return crc

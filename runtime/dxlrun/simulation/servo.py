@@ -159,7 +159,7 @@ class SimulatedServo:
     def trigger_overload(self) -> None:
         """Load the shaft beyond the torque.
 
-        It ends with a power cycle, with a reboot (Protocol 2.0), or a write of Torque Limit (34, Protocol 1.0).
+        It ends with a power cycle, a reboot (Protocol 2.0), a write of Torque Limit (34, Protocol 1.0).
         """
         self._body.overload = True
         self._note(f"servo {self.servo_id}: overload")

@@ -117,7 +117,7 @@ class TorqueBody(Body):
         return 0
 
     def restore_backup(self) -> int:
-        """Take the control table that was kept; return the error: the torque must be off, one must be kept."""
+        """Take the control table that was kept; return the error: torque must be off, one be kept."""
         if self.memory.get("torque_enable") or not self._backup:
             return ErrorNumber.RESULT_FAIL
         for name, wire in self._backup.items():
