@@ -19,17 +19,14 @@ speeds = st.floats(-100, 100) | st.sampled_from([float("nan"), 0.0, -0.0])
 def test_the_sync_write_is_what_the_units_of_one_servo_say(plan8, positions, velocities):
     goals = Commands(np.array(positions), np.array(velocities))
     included = np.array([True, False] + [True] * 6)
-    packet = GoalArrays(plan8).packet(goals, included)
+    packets = GoalArrays(plan8).packets(goals, included)
     expected = {
         servo.servo_id: goal_ticks(servo, positions[servo.row]).to_bytes(2, "little")
         + speed_ticks(servo, velocities[servo.row]).to_bytes(2, "little")
         for index, servo in enumerate(plan8.servos)
         if included[index] and positions[servo.row] == positions[servo.row]
     }
-    if expected:
-        assert packet == protocol1.sync_write(30, 4, expected)
-    else:
-        assert packet is None
+    assert packets == ([protocol1.sync_write(30, 4, expected)] if expected else [])
 
 
 @pytest.fixture(scope="module")
@@ -39,9 +36,9 @@ def plan8(module_plan):
 
 def test_a_smaller_packet_after_a_bigger_one_is_whole(plan8):
     arrays, goals = GoalArrays(plan8), Commands(np.zeros(8), np.ones(8))
-    everybody = bytes(arrays.packet(goals, np.ones(8, dtype=bool)))
-    one = bytes(arrays.packet(goals, np.arange(8) == 7))
-    again = bytes(arrays.packet(goals, np.ones(8, dtype=bool)))
+    (everybody,) = arrays.packets(goals, np.ones(8, dtype=bool))
+    (one,) = arrays.packets(goals, np.arange(8) == 7)
+    (again,) = arrays.packets(goals, np.ones(8, dtype=bool))
     assert protocol1.parse_status(one).parameters[:3] == bytes((30, 4, 21))
     assert len(one) == 13
     assert again == everybody

@@ -327,5 +327,7 @@ def test_a_start_that_fails_says_whose_torque_was_not_confirmed_off(make_rig, mo
     with pytest.raises(StartUpError) as caught:
         rig.hardware.start()
     assert len(caught.value.sentences) == 2
-    assert "ID 4 on bus main): torque off was sent, but the servo does not answer" in caught.value.sentences[1]
+    assert (
+        "ID 4 on bus main): torque off was sent, but the servo does not answer" in caught.value.sentences[1]
+    )
     assert rig.torque() == [servo.servo_id == 4 for servo in rig.buses[0].servos]

@@ -10,7 +10,7 @@ class Heard:
 
     def __init__(self):
         self.parts = []
-        self.receiver = Receiver(self._taker("packet"), self._taker("noise"))
+        self.receiver = Receiver(self._taker("packet"), self._taker("noise"), protocol1)
 
     def _taker(self, kind):
         return lambda data, first, last: self.parts.append((kind, bytes(data), first, last))

@@ -40,6 +40,7 @@ def compile_buses(
                 latency_ns=0 if bus.port == SIMULATED else bus.adapter.latency,
                 return_delay_ns=bus.return_delay_time,
                 joints=wirings,
+                protocol=bus.protocol,
             )
         except ValueError as error:
             problems.error(mark, str(error), "change the joints of this bus")

@@ -10,9 +10,9 @@ from collections.abc import Callable, Sequence
 
 from dxlrun.clock import Clock
 from dxlrun.dynamixel.bus_plan import BusPlan
+from dxlrun.dynamixel.dialect import dialect_of
 from dxlrun.dynamixel.line import BITS_PER_BYTE
 from dxlrun.dynamixel.port import Port, Ports
-from dxlrun.dynamixel.protocol1 import OVERHEAD, REFUSALS
 from dxlrun.dynamixel.receiver import Receiver
 from dxlrun.dynamixel.transaction import (
     BROADCAST_ID,
@@ -22,6 +22,7 @@ from dxlrun.dynamixel.transaction import (
     ProgramJob,
     Reply,
     Result,
+    Status,
     Transaction,
 )
 from dxlrun.errors import PortError
@@ -43,14 +44,16 @@ _READY, _AWAITING, _RESTING, _DRAINING = range(4)
 class Bus:
     """Executes transactions on one line; every byte that goes over it is reported to the packet sink.
 
-    A reply counts only when ID and length are exact and when it comes no sooner than the wire allows. After
-    a timeout the line is drained until it is silent, and what comes then is stray.
+    A reply counts only when ID and length are exact and when it comes no sooner than the wire allows. Of
+    several replies to one instruction each counts by itself, whatever became of the others. After a timeout
+    the line is drained until it is silent, and what comes then is stray.
     """
 
     __slots__ = (
         "_awaited",
         "_byte_ns",
         "_deadline_ns",
+        "_dialect",
         "_drain_end_ns",
         "_earliest_ns",
         "_free_ns",
@@ -58,10 +61,13 @@ class Bus:
         "_job",
         "_last_byte_ns",
         "_now_ns",
+        "_open",
+        "_opened",
         "_parameters",
         "_port",
         "_quiet_ns",
         "_receiver",
+        "_refused",
         "_reply",
         "_reply_size",
         "_sink",
@@ -88,8 +94,10 @@ class Bus:
         self._sink = packets
         self._byte_ns = BITS_PER_BYTE * 1_000_000_000 // plan.baud_rate
         self._quiet_ns = max(QUIET_BYTES * self._byte_ns, LEAST_QUIET_NS) + plan.latency_ns
-        self._receiver = Receiver(self._status, self._noise)
-        self._parameters = memoryview(bytearray(256))
+        self._dialect = dialect_of(plan.protocol)
+        self._opened = self._dialect.opened
+        self._receiver = Receiver(self._status, self._noise, self._dialect)
+        self._parameters = memoryview(bytearray(self._dialect.LONGEST))
         self._views: dict[int, memoryview] = {}
         self._reply = Reply(Outcome.SENT, 0, b"", 0, 0, False)
         self._job: Job | None = None
@@ -97,7 +105,9 @@ class Bus:
         self._state = _READY
         self._started_ns = self._earliest_ns = self._deadline_ns = self._free_ns = 0
         self._drain_end_ns = 0
-        self._reply_size = OVERHEAD
+        self._reply_size = 0
+        self._open = 0  # a bit for each status that is still awaited
+        self._refused = False
         self._last_byte_ns = -NEVER
 
     @property
@@ -134,7 +144,7 @@ class Bus:
             try:
                 if self._receiver.read_from(self._port, self._now_ns):
                     self._last_byte_ns = self._now_ns()
-                # as many bytes as the awaited reply has, and it is not whole: its header is a false one
+                # as many bytes as an awaited reply has, and it is not whole: its header is a false one
                 while self._state == _AWAITING and self._receiver.pending >= self._reply_size:
                     self._receiver.skip_header()
             except PortError as error:
@@ -187,16 +197,18 @@ class Bus:
             self._write(transaction.packet, transaction.servo_id)
         else:
             self._started_ns = self._now_ns()
-        if transaction.reply_length < 0:
+        if not transaction.awaited:
             reply.outcome = Outcome.SENT
             self._deadline_ns = self._started_ns + transaction.due_ns
             self._state = _RESTING
         else:
             reply.outcome = Outcome.TIMEOUT
-            count = len(transaction.packet) + OVERHEAD
+            count = len(transaction.packet) + self._dialect.OVERHEAD
             self._earliest_ns = self._started_ns + count * self._byte_ns
             self._deadline_ns = self._started_ns + transaction.timeout_ns
-            self._reply_size = OVERHEAD + transaction.reply_length
+            self._reply_size = self._dialect.widest(max(one.length for one in transaction.awaited))
+            self._open = (1 << len(transaction.awaited)) - 1
+            self._refused = False
             self._state = _AWAITING
 
     def _write(self, packet: bytes | bytearray | memoryview, servo_id: int) -> None:
@@ -204,15 +216,15 @@ class Bus:
         self._port.write(packet)
         self._sink.packet(self._index, PacketKind.INSTRUCTION, servo_id, before, self._now_ns(), packet)
         self._started_ns = before
-        self._free_ns = before + len(packet) * self._byte_ns
+        # a second packet waits in the adapter until the first is off the wire
+        self._free_ns = max(self._free_ns, before) + len(packet) * self._byte_ns
 
     def _give_up(self, now_ns: int) -> None:
-        """End a transaction whose reply did not come in time."""
+        """End a transaction of which not every reply came in time."""
         self._receiver.flush()  # the reply may stand behind a false header
         if self._state != _AWAITING:
             return
-        if self._last_byte_ns >= self._started_ns:
-            self._reply.outcome = Outcome.GARBLED
+        self._reply.outcome = Outcome.GARBLED if self._reply.strays else Outcome.TIMEOUT
         self._drain_end_ns = now_ns + DRAIN_LIMIT_NS
         self._deadline_ns = self._quiet_at()
         self._state = _DRAINING if self._deadline_ns > now_ns else _READY
@@ -226,32 +238,42 @@ class Bus:
         self._sink.packet(self._index, PacketKind.NOISE, BROADCAST_ID, first_ns, last_ns, data)
 
     def _status(self, packet: memoryview, first_ns: int, last_ns: int) -> None:
-        self._sink.packet(self._index, PacketKind.STATUS, packet[2], first_ns, last_ns, packet)
-        awaited = self._awaited
-        reply = self._reply
-        if self._state != _AWAITING or awaited is None or packet[2] != awaited.servo_id:
+        servo_id = self._dialect.servo_id(packet)
+        self._sink.packet(self._index, PacketKind.STATUS, servo_id, first_ns, last_ns, packet)
+        status = self._opened(packet) if self._state == _AWAITING else None
+        index = -1 if status is None else self._turn(status, last_ns)
+        if status is None or index < 0 or self._job is None or self._awaited is None:
             self._stray(packet)
             return
-        length = len(packet) - OVERHEAD
-        if length == awaited.reply_length:
-            outcome = Outcome.OK
-        elif length == 0 and packet[4] & REFUSALS:
-            outcome = Outcome.REFUSED
-        else:
-            self._stray(packet)
-            return
-        if last_ns < self._earliest_ns + length * self._byte_ns:  # an echo, or left over from before
-            self._stray(packet)
-            return
+        length = len(status.parameters)
         view = self._views.get(length)
         if view is None:
             view = self._views[length] = self._parameters[:length]
-        view[:] = packet[5:-1]
-        reply.outcome = outcome
-        reply.error = packet[4]
+        view[:] = status.parameters
+        reply = self._reply
+        reply.error = status.error
         reply.parameters = view
         reply.last_ns = last_ns
-        self._state = _READY
+        self._open &= ~(1 << index)
+        if self._dialect.refused(status.error, length, self._awaited.awaited[index].length):
+            self._refused = True
+        else:
+            self._job.status(index, reply)
+        if not self._open:
+            reply.outcome = Outcome.REFUSED if self._refused else Outcome.OK
+            self._state = _READY
+
+    def _turn(self, status: Status, last_ns: int) -> int:
+        """Return which of the awaited statuses this is; -1 when it is none of them."""
+        length = len(status.parameters)
+        # an echo, or left over from before, comes sooner than the wire allows
+        if self._awaited is None or last_ns < self._earliest_ns + length * self._byte_ns:
+            return -1
+        for index, one in enumerate(self._awaited.awaited):
+            if one.servo_id == status.servo_id and self._open >> index & 1:
+                fits = length == one.length or self._dialect.refused(status.error, length, one.length)
+                return index if fits else -1
+        return -1
 
     def _stray(self, packet: memoryview) -> None:
         self.stray_packets += 1

@@ -3,8 +3,43 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from dxlrun.dynamixel.transaction import Transaction
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """One item inside a block of bytes, little-endian."""
+
+    offset: int
+    size: int
+    """1, 2 or 4"""
+    encoding: Literal["unsigned", "sign_magnitude", "twos_complement"]
+
+
+@dataclass(frozen=True, slots=True)
+class StateLayout:
+    """The block that is read of a servo each cycle."""
+
+    address: int
+    length: int
+    position: Field
+    velocity: Field
+    effort: Field
+    spare: int
+    """Bytes behind the block that can be read with it, see `exchange`."""
+
+
+@dataclass(frozen=True, slots=True)
+class GoalLayout:
+    """The block that is written to a servo each cycle."""
+
+    address: int
+    length: int
+    position: Field
+    speed: Field | None
+    """None: the model has no speed beside its goal position."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,12 +59,18 @@ class ServoPlan:
     max_tick: int
     rad_s_per_tick: float
     max_speed_tick: int
-    effort_per_tick: float = 1 / 1023
-    """Fraction of the maximum per tick of present load."""
-    lower_tick: int = 0
+    effort_per_tick: float
+    """Nm, A, or the fraction of the maximum per tick of present load or current."""
+    lower_tick: int
     """Lowest goal that the joint's limits allow, as the servo counts."""
-    upper_tick: int = 1023
+    upper_tick: int
     """Highest goal that the joint's limits allow, as the servo counts."""
+    state: StateLayout
+    goal: GoalLayout
+    torque_address: int
+    """Where torque enable stands, one byte."""
+    hardware_error_address: int | None
+    """Where hardware error status stands, one byte; None where the model has none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,10 +106,12 @@ class BusPlan:
     latency_ns: int
     return_delay_ns: int
     servos: tuple[ServoPlan, ...]
+    groups: tuple[tuple[int, ...], ...]
+    """Who is read by one instruction: indices into `servos`; a group of one is read by itself."""
     reads: tuple[Transaction, ...]
-    """One state read a servo, in the order of `servos`."""
+    """The state read of each group, when all its servos answer."""
     limp: tuple[Transaction, ...]
-    """Torque off, to be sent at any moment: broadcast first, then servo by servo, acknowledged."""
+    """Torque off, to be sent at any moment: to everybody first, then servo by servo, acknowledged."""
     torque_reads: tuple[Transaction, ...]
     """Read torque enable, in the order of `servos`."""
     budget: Budget

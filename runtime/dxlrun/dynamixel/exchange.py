@@ -1,7 +1,11 @@
-"""Exchange: the cyclic reads of one bus as a prepared list, and what each servo's silence means.
+"""Exchange: the cyclic reads of one bus as prepared transactions, and what each servo's silence means.
+
+Servos that can answer in turn are read by one instruction. Who misses its turn is asked by itself from the
+next cycle on, until it answers: in Protocol 1.0 an absent servo ends the chain, in 2.0 it may, so it must not
+stay in it.
 
 A status carries no sequence number, so a reply that comes cycles late would look current. Replies come in the
-order of their requests, though, and the length of one is known: after a lost reply, a servo is asked for one
+order of their requests, though, and the length of one is known: after a lost reply, a group is asked for one
 more byte (then two, then none again). A late reply then has the wrong length.
 """
 
@@ -13,23 +17,45 @@ from dataclasses import replace
 import numpy as np
 
 from dxlrun.dynamixel.bus_plan import BusPlan
-from dxlrun.dynamixel.line import PATIENCE_NS, SHORT_PATIENCE_NS, Line
-from dxlrun.dynamixel.plan import STATE_LENGTH
+from dxlrun.dynamixel.line import PATIENCE_NS, SHORT_PATIENCE_NS
+from dxlrun.dynamixel.plan import plan_line, state_read
 from dxlrun.dynamixel.transaction import Outcome, Reply, Transaction
 
-SHAPES = 3
+MOST_CHAINS = 64
+"""Chains without this or that servo are kept; on a line that loses others every cycle they are made anew."""
+
+
+class _Request:
+    """One read of servos of one group: in each length, patient and short."""
+
+    __slots__ = ("group", "indices", "patient", "short")
+
+    def __init__(self, plan: BusPlan, group: int, indices: tuple[int, ...]) -> None:
+        line = plan_line(plan)
+        servos = [plan.servos[index] for index in indices]
+        self.group = group
+        self.indices = indices
+        self.patient = [state_read(line, servos, more) for more in range(1 + servos[0].state.spare)]
+        self.short = [
+            replace(read, timeout_ns=read.timeout_ns - PATIENCE_NS + SHORT_PATIENCE_NS)
+            for read in self.patient
+        ]
 
 
 class CyclicReads:
     """The job that reads the state of every servo of one bus once."""
 
     __slots__ = (
-        "_index",
+        "_current",
+        "_groups",
+        "_made",
         "_patient",
-        "_patient_reads",
+        "_plan",
+        "_position",
+        "_queue",
+        "_queue_of",
         "_replies",
         "_shape",
-        "_short_reads",
         "arrived_ns",
         "errors",
         "fresh",
@@ -48,51 +74,75 @@ class CyclicReads:
         """Error byte of the newest reply."""
         self.garbled = [False] * count
         """True when the newest loss had bytes."""
+        self._plan = plan
+        self._groups = plan.groups
         self._replies = tuple(replies)
-        self._patient_reads = [_shapes(plan, read) for read in plan.reads]
-        self._short_reads = [tuple(_short(read) for read in shapes) for shapes in self._patient_reads]
-        self._shape = [0] * count
-        self._index = 0
+        self._made: dict[tuple[int, ...], _Request] = {}
+        self._shape = [0] * len(self._groups)
+        self._queue: list[_Request] = []
+        self._queue_of: tuple[bool, ...] | None = None
+        self._current: _Request | None = None
+        self._position = 0
         self._patient = True
+        self.begin()
 
     def begin(self) -> None:
         """Prepare for the next cycle."""
         self.fresh[:] = False
         self._patient = True
+        silent = tuple(map(bool, self.missed))
+        if silent != self._queue_of:
+            self._queue_of = silent
+            self._queue = [
+                self._request(number, indices)
+                for number, group in enumerate(self._groups)
+                for indices in _turns(group, silent)
+            ]
 
     def advance(self, reply: Reply | None) -> Transaction | None:
-        """Keep a reply, return the next read."""
+        """Judge what came of a read, return the next."""
         if reply is None:
-            index = 0
+            self._position = 0
         else:
-            self._take(self._index, reply)
-            index = self._index + 1
-        if index == len(self.missed):
+            self._position += 1
+            if reply.outcome is not Outcome.OK:
+                self._count_out(reply.outcome)
+        if self._position == len(self._queue):
             return None
-        self._index = index
+        request = self._current = self._queue[self._position]
         # the first silence of a cycle has cost its patience: the others keep their time
-        reads = self._patient_reads if self._patient and not self.missed[index] else self._short_reads
-        return reads[index][self._shape[index]]
+        reads = request.patient if self._patient and not self.missed[request.indices[0]] else request.short
+        return reads[self._shape[request.group] % len(reads)]
 
-    def _take(self, index: int, reply: Reply) -> None:
-        if reply.outcome is Outcome.OK:
-            self._replies[index][:] = reply.parameters[:STATE_LENGTH]
-            self.fresh[index] = True
-            self.arrived_ns[index] = reply.last_ns
-            self.errors[index] = reply.error
-            return
+    def status(self, index: int, reply: Reply) -> None:
+        """Keep the state of one servo of the current read."""
+        assert self._current is not None  # noqa: S101  a status belongs to a read
+        servo = self._current.indices[index]
+        state = self._replies[servo]
+        state[:] = reply.parameters[: len(state)]
+        self.fresh[servo] = True
+        self.arrived_ns[servo] = reply.last_ns
+        self.errors[servo] = reply.error
+
+    def _count_out(self, outcome: Outcome) -> None:
+        assert self._current is not None  # noqa: S101  something was read
         self._patient = False
-        self.garbled[index] = reply.outcome is not Outcome.TIMEOUT
-        self._shape[index] = (self._shape[index] + 1) % SHAPES
+        self._shape[self._current.group] += 1
+        for servo in self._current.indices:
+            if not self.fresh[servo]:
+                self.garbled[servo] = outcome is not Outcome.TIMEOUT
+
+    def _request(self, group: int, indices: tuple[int, ...]) -> _Request:
+        request = self._made.get(indices)
+        if request is None:
+            if len(self._made) >= MOST_CHAINS:
+                self._made.clear()
+            request = self._made[indices] = _Request(self._plan, group, indices)
+        return request
 
 
-def _shapes(plan: BusPlan, read: Transaction) -> tuple[Transaction, ...]:
-    """Return the read and its longer forms: voltage and temperature stand behind the load."""
-    line = Line(plan.baud_rate, plan.latency_ns, plan.return_delay_ns)
-    address = read.packet[5]
-    longer = (line.read(read.servo_id, address, STATE_LENGTH + more) for more in range(1, SHAPES))
-    return (read, *longer)
-
-
-def _short(read: Transaction) -> Transaction:
-    return replace(read, timeout_ns=read.timeout_ns - PATIENCE_NS + SHORT_PATIENCE_NS)
+def _turns(group: tuple[int, ...], silent: Sequence[bool]) -> list[tuple[int, ...]]:
+    """Return who is read together: all that answered last time, and then each silent one by itself."""
+    together = tuple(index for index in group if not silent[index])
+    alone: list[tuple[int, ...]] = [(index,) for index in group if silent[index]]
+    return [together, *alone] if together else alone

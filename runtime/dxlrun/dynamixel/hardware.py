@@ -1,4 +1,4 @@
-"""Dynamixel hardware: joints on serial lines of Protocol 1.0, all lines at once in one thread."""
+"""Dynamixel hardware: joints on serial lines of either protocol, all lines at once in one thread."""
 
 from __future__ import annotations
 
@@ -90,15 +90,15 @@ class DynamixelHardware:
         self._raise_failures()
 
     def write(self) -> None:
-        """Send the goals, one sync write a line. Raises PortError when a line is gone."""
+        """Send the goals, one sync write a line and layout. Raises PortError when a line is gone."""
         for bus, servos in zip(self._buses, self._servos, strict=True):
-            packet = servos.goals.packet(self._goals, servos.torqued)
-            if packet is not None and bus.failure is None:
-                bus.send(packet)
+            for packet in servos.goals.packets(self._goals, servos.torqued):
+                if bus.failure is None:
+                    bus.send(packet)
         self._raise_failures()
 
     def idle(self, until_ns: int) -> None:
-        """Read torque enable of one servo a line that is left out of the goals, if there is time for it."""
+        """Ask one servo a line what its cyclic reads do not tell, if there is time and need for it."""
         latest = until_ns - IDLE_MARGIN_NS
         probing = [
             servos.probe(bus, latest - self._clock.now_ns())

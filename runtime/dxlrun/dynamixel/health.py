@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from dxlrun.dynamixel.arrays import GoalArrays, StateArrays
 from dxlrun.dynamixel.bus import Bus
 from dxlrun.dynamixel.bus_plan import BusPlan
+from dxlrun.dynamixel.dialect import dialect_of
 from dxlrun.dynamixel.exchange import CyclicReads
 from dxlrun.dynamixel.line import SHORT_PATIENCE_NS
-from dxlrun.dynamixel.protocol1 import describe_error
+from dxlrun.dynamixel.plan import plan_line
+from dxlrun.dynamixel.protocol2 import describe_hardware_error
 from dxlrun.dynamixel.transaction import Program, ProgramJob, Reply, Transaction
 from dxlrun.events import EventCode, EventSink, Severity
 from dxlrun.interfaces import States
@@ -20,11 +24,21 @@ NOISE_EVENT_NS = 1_000_000_000
 """A noisy line has at most one event in this time."""
 
 
+class _Question(NamedTuple):
+    """What one servo is asked in a gap, and who takes the answer."""
+
+    servo: int
+    read: Transaction
+    take: Callable[[int, Reply], None]
+
+
 class Servos:
     """The servos of one bus: their cyclic reads, their goals, and who may get a goal."""
 
     __slots__ = (
+        "_alerts",
         "_bus",
+        "_dialect",
         "_events",
         "_limp",
         "_lost",
@@ -34,6 +48,7 @@ class Servos:
         "_plan",
         "_probe",
         "_probed",
+        "_question",
         "_said_errors",
         "_states",
         "goals",
@@ -56,7 +71,10 @@ class Servos:
         self._limp = [False] * count
         self._missed = self.reads.missed
         self._said_errors = [0] * count
+        self._dialect = dialect_of(plan.protocol)
+        self._alerts: list[int] = []  # who has a hardware error that was not read yet
         self._probe: ProgramJob[Reply] | None = None
+        self._question: _Question | None = None
         self._probed = 0
         self._noise_seen = 0
         self._noise_at_ns = -NOISE_EVENT_NS
@@ -88,44 +106,68 @@ class Servos:
             )
 
     def probe(self, bus: Bus, left_ns: int) -> bool:
-        """Load the read of torque enable of one servo that waits for its goals; False when there is none.
+        """Load the one read that a servo is owed beside its cyclic ones; False when there is none.
 
-        `left_ns`: how long the probe may take. Only a servo that answers is asked; a limp one is not.
+        That is torque enable of a servo that waits for its goals, or the hardware error status of one that
+        raised an alert. `left_ns`: how long it may take. Only a servo that answers is asked; of a limp one
+        the torque is known.
         """
-        if self.torqued.all():
+        question = self._owed()
+        if question is None:
             return False
+        timeout = question.read.due_ns + self._plan.latency_ns + SHORT_PATIENCE_NS
+        if timeout > left_ns:
+            return False
+        self._question, self._probed = question, question.servo
+        self._probe = ProgramJob(_once(replace(question.read, timeout_ns=timeout)))
+        bus.load(self._probe)
+        return True
+
+    def probed(self) -> None:
+        """Take what came of the probe."""
+        reply = None if self._probe is None else self._probe.result
+        question, self._probe, self._question = self._question, None, None
+        if question is not None and reply is not None and reply.answered:
+            question.take(question.servo, reply)
+
+    def _owed(self) -> _Question | None:
+        for index in self._alerts:
+            address = self._plan.servos[index].hardware_error_address
+            if address is not None and self.reads.fresh[index]:
+                read = plan_line(self._plan).read(self._plan.servos[index].servo_id, address, 1)
+                return _Question(index, read, self._take_hardware_error)
+        if self.torqued.all():
+            return None
         count = len(self._plan.servos)
         for offset in range(1, count + 1):
             index = (self._probed + offset) % count
-            if self.torqued[index] or self._limp[index] or not self.reads.fresh[index]:
-                continue
-            read = self._plan.torque_reads[index]
-            timeout = read.due_ns + self._plan.latency_ns + SHORT_PATIENCE_NS
-            if timeout > left_ns:
-                return False
-            self._probe, self._probed = ProgramJob(_once(replace(read, timeout_ns=timeout))), index
-            bus.load(self._probe)
-            return True
-        return False
+            if not (self.torqued[index] or self._limp[index]) and self.reads.fresh[index]:
+                return _Question(index, self._plan.torque_reads[index], self._take_torque)
+        return None
 
-    def probed(self) -> None:
-        """Take what came of the probe: a servo with torque gets goals again, one without stays out."""
-        reply = None if self._probe is None else self._probe.result
-        self._probe = None
-        if reply is None or not reply.answered:
-            return
-        index = self._probed
+    def _take_torque(self, index: int, reply: Reply) -> None:
+        """Give goals again to a servo with torque, leave one without out."""
         if reply.parameters[0] == 1:
             self.torqued[index] = True
             return
         self._limp[index] = True
+        servo = self._plan.servos[index]
         self._emit(
             EventCode.SERVO_LIMP,
             Severity.ERROR,
-            self._plan.servos[index].joint,
-            f"{self._who(index)} has Torque Enable (24) = {reply.parameters[0]}: it was reset or its "
-            "torque was cut; it gets no more goals in this run",
+            servo.joint,
+            f"{self._who(index)} has Torque Enable ({servo.torque_address}) = {reply.parameters[0]}: it was "
+            "reset or its torque was cut; it gets no more goals in this run",
         )
+
+    def _take_hardware_error(self, index: int, reply: Reply) -> None:
+        self._alerts.remove(index)
+        address = self._plan.servos[index].hardware_error_address
+        words = describe_hardware_error(reply.parameters[0])
+        # shutdown may have cut the torque: no goal until it was read
+        self.torqued[index] = False
+        text = f"has Hardware Error Status ({address}) = {reply.parameters[0]}: {words}"
+        self._say(EventCode.SERVO_ERROR, Severity.ERROR, index, text)
 
     def lost(self, text: str) -> None:
         """Tell once that the line is gone."""
@@ -149,9 +191,13 @@ class Servos:
     def _say_errors(self) -> None:
         for index, error in enumerate(self.reads.errors):
             if error != self._said_errors[index]:
+                if error & ~self._said_errors[index] & self._dialect.ALERT and index not in self._alerts:
+                    self._alerts.append(index)
                 self._said_errors[index] = error
                 severity = Severity.ERROR if error else Severity.INFO
-                self._say(EventCode.SERVO_ERROR, severity, index, f"reports {describe_error(error)}")
+                self._say(
+                    EventCode.SERVO_ERROR, severity, index, f"reports {self._dialect.describe_error(error)}"
+                )
 
     def _say(self, code: EventCode, severity: Severity, index: int, text: str) -> None:
         self._emit(code, severity, self._plan.servos[index].joint, f"{self._who(index)} {text}")

@@ -41,13 +41,15 @@ class LimpOutcome:
 def torque_off(
     plan: BusPlan, now_ns: Callable[[], int], deadline_ns: int
 ) -> Program[tuple[LimpOutcome, ...]]:
-    """Switch torque off everywhere on one bus: broadcast first, then servo by servo with read-back.
+    """Switch torque off everywhere on one bus: all at once first, then servo by servo with read-back.
 
     After `deadline_ns` nobody is tried again, but everybody once.
     """
     yield listen(SETTLE_NS)
-    broadcast, *writes = plan.limp
-    yield broadcast
+    for everybody in plan.limp:
+        if not everybody.awaited:
+            yield everybody
+    writes = [write for write in plan.limp if write.awaited]
     outcomes = []
     for servo, write, read in zip(plan.servos, writes, plan.torque_reads, strict=True):
         detail = "it was not tried"
@@ -96,11 +98,12 @@ def limp_buses(
     return tuple(outcomes)
 
 
-def limp(  # noqa: PLR0917  four things to work with, two that bound and show the work
+def limp(
     plans: Sequence[BusPlan],
     ports: Ports,
     clock: Clock,
     packets: PacketSink,
+    *,
     limit_ns: int = 1_000_000_000,
     beat: Callable[[], None] = lambda: None,
 ) -> tuple[LimpOutcome, ...]:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from dxlrun.dynamixel import protocol1
-from dxlrun.dynamixel.transaction import BROADCAST_ID, Transaction
+from dxlrun.dynamixel.dialect import Dialect
+from dxlrun.dynamixel.transaction import BROADCAST_ID, Awaited, Transaction
 
 BITS_PER_BYTE = 10
 """8N1: start bit, eight bits, stop bit (protocol.md, Line)."""
@@ -32,6 +34,7 @@ class Line:
     latency_ns: int
     """Of the adapter, once per request."""
     return_delay_ns: int
+    dialect: Dialect = protocol1
 
     def wire_ns(self, count: int) -> int:
         """Return the time that `count` bytes take on the wire, ns."""
@@ -39,29 +42,39 @@ class Line:
 
     def ping(self, servo_id: int) -> Transaction:
         """Return a ping."""
-        return self._with_reply(protocol1.ping(servo_id), servo_id, 0)
+        length = self.dialect.PING_LENGTH
+        return self._answered(self.dialect.ping(servo_id), servo_id, Awaited(servo_id, length))
 
     def read(self, servo_id: int, address: int, length: int) -> Transaction:
         """Return a read of `length` bytes from `address` on."""
-        return self._with_reply(protocol1.read(servo_id, address, length), servo_id, length)
+        packet = self.dialect.read(servo_id, address, length)
+        return self._answered(packet, servo_id, Awaited(servo_id, length))
+
+    def read_many(self, requests: Sequence[tuple[int, int, int]]) -> Transaction:
+        """Return the read of several servos, each by (ID, address, length); of one alone a plain read."""
+        if len(requests) == 1:
+            return self.read(*requests[0])
+        awaited = [Awaited(servo_id, length) for servo_id, _, length in requests]
+        return self._answered(self.dialect.read_many(requests), BROADCAST_ID, *awaited)
 
     def write(self, servo_id: int, address: int, data: bytes) -> Transaction:
         """Return a write that the servo acknowledges; to everybody: without reply."""
-        packet = protocol1.write(servo_id, address, data)
+        packet = self.dialect.write(servo_id, address, data)
         if servo_id == BROADCAST_ID:
             return self.unanswered(packet)
-        return self._with_reply(packet, servo_id, 0)
+        return self._answered(packet, servo_id, Awaited(servo_id, 0))
 
     def unanswered(self, packet: bytes) -> Transaction:
         """Return a transaction without reply."""
-        return Transaction(packet, BROADCAST_ID, -1, self.wire_ns(len(packet)), 0)
+        return Transaction(packet, BROADCAST_ID, (), self.wire_ns(len(packet)), 0)
 
-    def _with_reply(self, packet: bytes, servo_id: int, reply_length: int) -> Transaction:
-        wire_ns = self.wire_ns(len(packet) + protocol1.OVERHEAD + reply_length)
-        due_ns = wire_ns + self.return_delay_ns
-        return Transaction(packet, servo_id, reply_length, due_ns, due_ns + self.latency_ns + PATIENCE_NS)
+    def _answered(self, packet: bytes, servo_id: int, *awaited: Awaited) -> Transaction:
+        """Return a transaction whose replies come one after the other, each after a return delay."""
+        replies = sum(self.dialect.OVERHEAD + one.length for one in awaited)
+        due_ns = self.wire_ns(len(packet) + replies) + len(awaited) * self.return_delay_ns
+        return Transaction(packet, servo_id, awaited, due_ns, due_ns + self.latency_ns + PATIENCE_NS)
 
 
 def listen(duration_ns: int) -> Transaction:
     """Return a transaction that sends nothing and hears what arrives unasked for `duration_ns`."""
-    return Transaction(b"", BROADCAST_ID, -1, duration_ns, 0)
+    return Transaction(b"", BROADCAST_ID, (), duration_ns, 0)

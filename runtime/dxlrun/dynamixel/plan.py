@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
-from dxlrun.control_table import ControlTable
-from dxlrun.dynamixel import protocol1
-from dxlrun.dynamixel.bus_plan import Budget, BusPlan, ServoPlan
+from dxlrun.control_table import ControlItem, ControlTable
+from dxlrun.dynamixel.bus_plan import Budget, BusPlan, Field, GoalLayout, ServoPlan, StateLayout
+from dxlrun.dynamixel.dialect import dialect_of
 from dxlrun.dynamixel.line import Line
-from dxlrun.dynamixel.transaction import BROADCAST_ID
+from dxlrun.dynamixel.transaction import BROADCAST_ID, Transaction
 
-STATE_ITEMS = ("present_position", "present_speed", "present_load")
-"""Read together each cycle: 36..41, six bytes."""
-GOAL_ITEMS = ("goal_position", "moving_speed")
-"""Written together each cycle: 30..33, four bytes."""
-STATE_LENGTH = 6
-GOAL_LENGTH = 4
-MOST_SERVOS = (0xFF - 4) // (GOAL_LENGTH + 1)
-"""One sync write holds the goals of 50 servos: LEN is one byte."""
+CHAIN = MappingProxyType({1.0: "bulk_read", 2.0: "sync_read"})
+"""Protocol -> the capability by which several servos answer one instruction in turn."""
+MOST_SPARE = 2
+"""Two longer forms of a read tell its late replies from the newest (`exchange`)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,41 +45,97 @@ def bus_plan(
     latency_ns: int,
     return_delay_ns: int,
     joints: Sequence[Wiring],
+    protocol: float = 1.0,
 ) -> BusPlan:
-    """Prepare everything that goes over one serial line of Protocol 1.0.
+    """Prepare everything that goes over one serial line.
 
     `latency_ns` is what the adapter adds to each request, `return_delay_ns` what each servo waits before it
     answers. Raises ValueError when the servos cannot share one cycle.
     """
-    if len(joints) > MOST_SERVOS:
-        raise ValueError(
-            f"bus {name} has {len(joints)} servos; the goals of {MOST_SERVOS} fit one sync write: "
-            "put the others on a second bus"
-        )
-    line = Line(baud_rate, latency_ns, return_delay_ns)
+    line = Line(baud_rate, latency_ns, return_delay_ns, dialect_of(protocol))
     servos = tuple(_servo(joint) for joint in joints)
-    for joint in joints:
-        _check_layout(joint.table)
-    reads = tuple(
-        line.read(joint.servo_id, joint.table.items["present_position"].address, STATE_LENGTH)
-        for joint in joints
-    )
+    groups = _groups(joints, servos, CHAIN[protocol])
+    reads = tuple(state_read(line, [servos[index] for index in group]) for group in groups)
+    goals = [_empty_goals(name, line, layout, servos) for layout in goal_layouts(servos)]
     return BusPlan(
         name=name,
         port=port,
-        protocol=1.0,
+        protocol=protocol,
         baud_rate=baud_rate,
         latency_ns=latency_ns,
         return_delay_ns=return_delay_ns,
         servos=servos,
+        groups=groups,
         reads=reads,
         limp=(
-            line.write(BROADCAST_ID, _torque_address(joints), b"\0"),
-            *(line.write(joint.servo_id, _torque_address(joints), b"\0") for joint in joints),
+            *_torque_off(line, servos),
+            *(line.write(servo.servo_id, servo.torque_address, b"\0") for servo in servos),
         ),
-        torque_reads=tuple(line.read(joint.servo_id, _torque_address(joints), 1) for joint in joints),
-        budget=_budget(line, sum(len(read.packet) for read in reads), len(joints)),
+        torque_reads=tuple(line.read(servo.servo_id, servo.torque_address, 1) for servo in servos),
+        budget=_budget(line, reads, goals),
     )
+
+
+def plan_line(plan: BusPlan) -> Line:
+    """Return the line of a plan, as the robot file assumes it."""
+    return Line(plan.baud_rate, plan.latency_ns, plan.return_delay_ns, dialect_of(plan.protocol))
+
+
+def readable(table: ControlTable, start: int, end: int) -> bool:
+    """Say whether the addresses from `start` up to before `end` all belong to items."""
+    items = table.items.values()
+    known = {address for item in items for address in range(item.address, item.address + item.size)}
+    return known.issuperset(range(start, end))
+
+
+def state_read(line: Line, servos: Sequence[ServoPlan], more: int = 0) -> Transaction:
+    """Return the one read of several servos' states, each `more` bytes longer than needed."""
+    return line.read_many(
+        [(servo.servo_id, servo.state.address, servo.state.length + more) for servo in servos]
+    )
+
+
+def goal_layouts(servos: Sequence[ServoPlan]) -> tuple[GoalLayout, ...]:
+    """Return the different goal layouts of servos; each needs a sync write of its own."""
+    return tuple(dict.fromkeys(servo.goal for servo in servos))
+
+
+def _groups(joints: Sequence[Wiring], servos: Sequence[ServoPlan], chain: str) -> tuple[tuple[int, ...], ...]:
+    """Return who is read by one instruction: servos that can answer in turn and have one layout."""
+    groups: dict[object, list[int]] = {}
+    for index, (joint, servo) in enumerate(zip(joints, servos, strict=True)):
+        groups.setdefault(servo.state if chain in joint.table.capabilities else index, []).append(index)
+    return tuple(tuple(group) for group in groups.values())
+
+
+def _empty_goals(name: str, line: Line, layout: GoalLayout, servos: Sequence[ServoPlan]) -> bytes:
+    """Return a sync write of zeros to everybody of one layout, to know its size; it is never sent."""
+    count = sum(servo.goal == layout for servo in servos)
+    most = line.dialect.MOST_GOAL_BYTES // (layout.length + 1)
+    if count > most:
+        raise ValueError(
+            f"bus {name} has {count} servos; the goals of {most} fit one sync write: "
+            "put the others on a second bus"
+        )
+    return line.dialect.sync_write_records(layout.address, layout.length, bytes((layout.length + 1) * count))
+
+
+def _torque_off(line: Line, servos: Sequence[ServoPlan]) -> list[Transaction]:
+    """Return torque off for everybody at once; nobody answers.
+
+    Where torque enable stands at several addresses nobody may be told to write at another's.
+    """
+    addresses = dict.fromkeys(servo.torque_address for servo in servos)
+    if len(addresses) == 1:
+        return [line.write(BROADCAST_ID, address, b"\0") for address in addresses]
+    return [
+        line.unanswered(
+            line.dialect.sync_write_records(
+                address, 1, b"".join(bytes((s.servo_id, 0)) for s in servos if s.torque_address == address)
+            )
+        )
+        for address in addresses
+    ]
 
 
 def _servo(joint: Wiring) -> ServoPlan:
@@ -94,6 +146,7 @@ def _servo(joint: Wiring) -> ServoPlan:
     )
     # inwards, so that no goal is outside; 1e-6 ticks forgive the rounding of degrees
     lower, upper = math.ceil(ends[0] - 1e-6), math.floor(ends[1] + 1e-6)
+    hardware_error = table.items.get("hardware_error_status")
     return ServoPlan(
         joint=joint.joint,
         row=joint.row,
@@ -107,37 +160,56 @@ def _servo(joint: Wiring) -> ServoPlan:
         rad_s_per_tick=table.rad_s_per_tick,
         max_speed_tick=table.max_speed_tick,
         effort_per_tick=table.effort_per_tick,
-        lower_tick=max(0, lower),
+        lower_tick=max(table.min_tick, lower),
         upper_tick=min(table.max_tick, upper),
+        state=_state_layout(table),
+        goal=_goal_layout(table),
+        torque_address=table.items["torque_enable"].address,
+        hardware_error_address=None if hardware_error is None else hardware_error.address,
     )
 
 
-def _torque_address(joints: Sequence[Wiring]) -> int:
-    addresses = {joint.table.items["torque_enable"].address for joint in joints}
-    if len(addresses) > 1:
-        raise ValueError("the servos of one bus must have torque enable at one address")
-    return addresses.pop() if addresses else 24
+def _state_layout(table: ControlTable) -> StateLayout:
+    """Return the one block that holds position, speed and load or current.
+
+    Raises ValueError when they do not stand together: an address without an item cannot be read.
+    """
+    names = ("present_position", table.present_speed_item, table.effort_item)
+    items = [table.items[name] for name in names]
+    start = min(item.address for item in items)
+    end = max(item.address + item.size for item in items)
+    if not readable(table, start, end):
+        raise ValueError(f"{table.model}: {', '.join(names)} do not stand in one block, so no read gets all")
+    position, velocity, effort = (_field(item, start) for item in items)
+    spare = 0
+    while spare < MOST_SPARE and readable(table, start, end + spare + 1):
+        spare += 1
+    return StateLayout(start, end - start, position, velocity, effort, spare)
 
 
-def _check_layout(table: ControlTable) -> None:
-    """Make sure that the items of one packet stand side by side, as the cycle decodes them."""
-    for names in (STATE_ITEMS, GOAL_ITEMS):
-        items = [table.items[name] for name in names]
-        for before, item in itertools.pairwise(items):
-            if item.address != before.address + 2 or before.size != 2 or item.size != 2:
-                raise ValueError(f"{table.model}: {' and '.join(names)} do not stand side by side")
-    if table.items["goal_position"].address != 30:
-        raise ValueError(f"{table.model}: goal position stands at another address than 30")
+def _goal_layout(table: ControlTable) -> GoalLayout:
+    """Return the block of goal position and, when it stands beside it, of the speed toward it."""
+    position, speed = table.items["goal_position"], table.items[table.goal_speed_item]
+    start = min(position.address, speed.address)
+    if abs(position.address - speed.address) != (speed.size if start == speed.address else position.size):
+        return GoalLayout(position.address, position.size, _field(position, position.address), None)
+    length = position.size + speed.size
+    return GoalLayout(start, length, _field(position, start), _field(speed, start))
 
 
-def _budget(line: Line, request_bytes: int, servos: int) -> Budget:
-    """Cost of one cycle (protocol.md, Time budget): the sync write has no reply, so no latency counts."""
-    goals = protocol1.OVERHEAD + 2 + servos * (GOAL_LENGTH + 1)
-    replies = servos * (protocol1.OVERHEAD + STATE_LENGTH)
+def _field(item: ControlItem, start: int) -> Field:
+    return Field(item.address - start, item.size, item.encoding)
+
+
+def _budget(line: Line, reads: Sequence[Transaction], goals: Sequence[bytes]) -> Budget:
+    """Cost of one cycle (protocol.md, Time budget): a sync write has no reply, so no latency counts."""
+    awaited = [one for read in reads for one in read.awaited]
+    request_bytes = sum(len(read.packet) for read in reads) + sum(map(len, goals))
+    reply_bytes = sum(line.dialect.OVERHEAD + one.length for one in awaited)
     return Budget(
-        request_bytes=request_bytes + goals,
-        reply_bytes=replies,
-        wire_ns=line.wire_ns(request_bytes + goals + replies),
-        return_delay_ns=servos * line.return_delay_ns,
-        latency_ns=servos * line.latency_ns,
+        request_bytes=request_bytes,
+        reply_bytes=reply_bytes,
+        wire_ns=line.wire_ns(request_bytes + reply_bytes),
+        return_delay_ns=len(awaited) * line.return_delay_ns,
+        latency_ns=len(reads) * line.latency_ns,
     )

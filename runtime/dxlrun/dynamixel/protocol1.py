@@ -7,18 +7,26 @@ A status carries no mark that tells it from an instruction: an echoed instructio
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from enum import IntEnum, IntFlag, unique
 
-from dxlrun.dynamixel.transaction import BROADCAST_ID
+from dxlrun.dynamixel.transaction import BROADCAST_ID, Status
 
+Bytes = bytes | bytearray | memoryview
+
+PROTOCOL = 1.0
 HEADER = b"\xff\xff"
 OVERHEAD = 6
 """Bytes of a packet beside its parameters."""
 LONGEST = 0xFF + 4
 """Bytes of the longest packet: LEN is one byte and counts everything behind itself."""
 HIGHEST_ID = 0xFD
+PING_LENGTH = 0
+"""Parameters of the answer to a ping: the model number must be read."""
+MOST_GOAL_BYTES = 0xFF - 4
+"""Parameters of a sync write behind address and length: LEN is one byte."""
+ALERT = 0
+"""No bit of the error byte asks to read more: it says everything itself."""
 _MOST_PARAMETERS = 0xFF - 2
 
 
@@ -33,6 +41,8 @@ class Instruction(IntEnum):
     ACTION = 0x05
     FACTORY_RESET = 0x06
     SYNC_WRITE = 0x83
+    BULK_READ = 0x92
+    """MX only."""
 
 
 @unique
@@ -70,17 +80,46 @@ def describe_error(error: int) -> str:
     return "; ".join(words) or "no error"
 
 
-@dataclass(frozen=True, slots=True)
-class Status:
-    """An intact status packet, taken apart."""
+def refused(error: int, length: int, awaited: int) -> bool:
+    """Say whether a status of `length` parameters, where `awaited` were due, is a refusal.
 
-    servo_id: int
-    error: int
-    """Bits of StatusError"""
-    parameters: bytes
+    The bits are the servo's state and come with good data; without it they tell why there is none.
+    """
+    return length == 0 != awaited and error & REFUSALS != 0
 
 
-def checksum(body: bytes | bytearray | memoryview) -> int:
+def widest(length: int) -> int:
+    """Return the most bytes that a status packet of `length` parameters has on the line."""
+    return OVERHEAD + length
+
+
+def size_at(buffer: Bytes, start: int, end: int) -> int:
+    """Return the size of the packet whose header is at `start`: 0 is not known yet, -1 a false header."""
+    known = end - start
+    if known > 2 and buffer[start + 2] == 0xFF:
+        return -1
+    if known < 4:
+        return 0
+    length = buffer[start + 3]
+    return length + 4 if length >= 2 else -1
+
+
+def intact(packet: memoryview) -> bool:
+    """Say whether the checksum of a whole packet is right."""
+    return ~sum(packet[2:-1]) & 0xFF == packet[-1]
+
+
+def servo_id(packet: Bytes) -> int:
+    """Return whom a whole packet names: who is addressed, or who answers."""
+    return packet[2]
+
+
+def opened(packet: memoryview) -> Status | None:
+    """Take an intact packet apart; an echoed instruction looks like a status, too."""
+    return Status(packet[2], packet[4], packet[5:-1])
+
+
+def checksum(body: Bytes) -> int:
     """Return the checksum of the bytes between the header and the checksum itself."""
     return ~sum(body) & 0xFF
 
@@ -137,21 +176,39 @@ def factory_reset(servo_id: int) -> bytes:
     return instruction_packet(servo_id, Instruction.FACTORY_RESET)
 
 
+def bulk_read(requests: Sequence[tuple[int, int, int]]) -> bytes:
+    """Return the packet that asks two or more MX servos, each by (ID, address, length); they answer in turn.
+
+    Each waits for the status of the one before it, so an absent servo ends the chain.
+    """
+    parameters = b"\0" + b"".join(bytes((length, one, address)) for one, address, length in requests)
+    return instruction_packet(BROADCAST_ID, Instruction.BULK_READ, parameters)
+
+
+read_many = bulk_read
+"""The one packet that asks several servos, as every protocol has one."""
+
+
+def sync_write_records(address: int, length: int, records: Bytes) -> bytes:
+    """Return the broadcast packet that writes `length` bytes from `address` on; no reply.
+
+    `records`: ID and data of each servo, one behind the other. Raises ValueError when they do not fit.
+    """
+    return instruction_packet(BROADCAST_ID, Instruction.SYNC_WRITE, bytes((address, length)) + bytes(records))
+
+
 def sync_write(address: int, length: int, data: Mapping[int, bytes]) -> bytes:
     """Return the broadcast packet that writes `length` bytes from `address` on, per servo ID; no reply.
 
     Raises ValueError when a servo's data is not `length` bytes long, or the packet would be too long.
     """
-    parameters = bytearray((address, length))
-    for servo_id, chunk in data.items():
+    for one, chunk in data.items():
         if len(chunk) != length:
-            raise ValueError(f"servo {servo_id} gets {len(chunk)} bytes where {length} are announced")
-        parameters.append(servo_id)
-        parameters += chunk
-    return instruction_packet(BROADCAST_ID, Instruction.SYNC_WRITE, bytes(parameters))
+            raise ValueError(f"servo {one} gets {len(chunk)} bytes where {length} are announced")
+    return sync_write_records(address, length, b"".join(bytes((one,)) + chunk for one, chunk in data.items()))
 
 
-def parse_status(packet: bytes | bytearray | memoryview) -> Status:
+def parse_status(packet: Bytes) -> Status:
     """Take one whole status packet apart.
 
     Raises ValueError when header, length or checksum are wrong.
@@ -163,4 +220,4 @@ def parse_status(packet: bytes | bytearray | memoryview) -> Status:
         raise ValueError(f"length {data[3]} in a packet of {len(data)} bytes: {data.hex(' ')}")
     if data[-1] != checksum(data[2:-1]):
         raise ValueError(f"checksum {data[-1]:02x} where {checksum(data[2:-1]):02x} was due: {data.hex(' ')}")
-    return Status(servo_id=data[2], error=data[4], parameters=data[5:-1])
+    return Status(data[2], data[4], data[5:-1])

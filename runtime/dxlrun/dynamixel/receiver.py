@@ -1,4 +1,4 @@
-"""Receiver: bytes of one serial line in, intact Protocol 1.0 packets out; finds its way through noise.
+"""Receiver: bytes of one serial line in, intact packets of its protocol out; finds its way through noise.
 
 One preallocated buffer, no growth. Each byte leaves it exactly once: inside an intact packet, or as noise.
 """
@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from dxlrun.dynamixel.dialect import Dialect
 from dxlrun.dynamixel.port import Port
-from dxlrun.dynamixel.protocol1 import HEADER, LONGEST
 
 Taker = Callable[[memoryview, int, int], None]
 """Takes bytes with the times (ns) of the read() calls that brought the first and the last of them.
@@ -16,21 +16,38 @@ Taker = Callable[[memoryview, int, int], None]
 The view is only good during the call.
 """
 
-_CAPACITY = 1024
-"""Room for one unfinished packet and a good read beside it."""
+_GOOD_READ = 765
+"""Bytes that one read may bring beside an unfinished packet."""
 
 
 class Receiver:
     """Takes packets out of a stream; decides on a header only when its whole packet is there.
 
-    A false header in noise can announce up to 259 bytes and so hold back what follows it; `flush` ends that
-    when a deadline has passed.
+    A false header in noise can announce up to the protocol's longest packet and so hold back what follows
+    it; `flush` ends that when a deadline has passed.
     """
 
-    __slots__ = ("_buffer", "_end", "_ends", "_noise", "_packet", "_times", "_view")
+    __slots__ = (
+        "_beginnings",
+        "_buffer",
+        "_end",
+        "_ends",
+        "_header",
+        "_intact",
+        "_noise",
+        "_packet",
+        "_size_at",
+        "_times",
+        "_view",
+    )
 
-    def __init__(self, packet: Taker, noise: Taker) -> None:
-        self._buffer = bytearray(_CAPACITY)
+    def __init__(self, packet: Taker, noise: Taker, dialect: Dialect) -> None:
+        header = dialect.HEADER
+        self._header = header
+        self._beginnings = tuple(header[:count] for count in range(len(header) - 1, 0, -1))
+        self._size_at = dialect.size_at
+        self._intact = dialect.intact
+        self._buffer = bytearray(dialect.LONGEST + _GOOD_READ)
         self._view = memoryview(self._buffer)
         self._end = 0
         self._ends: list[int] = []  # where each read() ended in the buffer; as many as unfinished reads
@@ -55,8 +72,8 @@ class Receiver:
 
     def feed(self, data: bytes, now_ns: int) -> None:
         """Take bytes that arrived at `now_ns`, deliver what became whole."""
-        for start in range(0, len(data), _CAPACITY - LONGEST):
-            chunk = data[start : start + _CAPACITY - LONGEST]
+        for start in range(0, len(data), _GOOD_READ):
+            chunk = data[start : start + _GOOD_READ]
             self._view[self._end : self._end + len(chunk)] = chunk
             self._accept(len(chunk), now_ns)
 
@@ -68,7 +85,7 @@ class Receiver:
     def flush(self) -> None:
         """Give up waiting for the rest of an unfinished packet: scan again behind its header."""
         while self._end:
-            if self._buffer.startswith(HEADER) and self._end > 1:
+            if self._buffer.startswith(self._header, 0, self._end):
                 self._forget(self._scan(1))
             else:
                 self._emit(self._noise, 0, self._end)
@@ -95,24 +112,18 @@ class Receiver:
         buffer, end = self._buffer, self._end
         done = 0  # everything before it was delivered
         while True:
-            start = buffer.find(HEADER, search, end)
+            start = buffer.find(self._header, search, end)
             if start < 0:
-                # the last byte may be the first half of a header
-                start = end - 1 if end > search and buffer[end - 1] == 0xFF else end
+                start = self._beginning(search)
                 break
-            if end - start < 4:
-                if end - start == 3 and buffer[start + 2] == 0xFF:
-                    search = start + 1
-                    continue
-                break
-            length = buffer[start + 3]
-            if buffer[start + 2] == 0xFF or length < 2:
+            size = self._size_at(buffer, start, end)
+            stop = start + size
+            if size < 0:
                 search = start + 1
                 continue
-            stop = start + 4 + length
-            if stop > end:
+            if size == 0 or stop > end:
                 break
-            if ~sum(buffer[start + 2 : stop - 1]) & 0xFF != buffer[stop - 1]:
+            if not self._intact(self._view[start:stop]):
                 search = start + 1
                 continue
             if start > done:
@@ -122,6 +133,13 @@ class Receiver:
         if start > done:
             self._emit(self._noise, done, start)
         return start
+
+    def _beginning(self, search: int) -> int:
+        """Return where the last bytes may be the beginning of a header; their end when they cannot."""
+        for beginning in self._beginnings:
+            if self._buffer.endswith(beginning, search, self._end):
+                return self._end - len(beginning)
+        return self._end
 
     def _forget(self, count: int) -> None:
         """Drop the first `count` bytes."""

@@ -5,24 +5,42 @@ from __future__ import annotations
 from collections.abc import Generator
 from dataclasses import dataclass, replace
 from enum import IntEnum, unique
-from typing import Generic, Protocol, TypeAlias, TypeVar
+from typing import Generic, NamedTuple, Protocol, TypeAlias, TypeVar
 
 Result = TypeVar("Result")
 
 BROADCAST_ID = 0xFE
 
 
+class Status(NamedTuple):
+    """An intact status packet, taken apart; a tuple, because the loop makes one for every reply."""
+
+    servo_id: int
+    error: int
+    """What it means is the protocol's: `describe_error` has the words."""
+    parameters: bytes | memoryview
+
+
+@dataclass(frozen=True, slots=True)
+class Awaited:
+    """One status packet that is due after an instruction."""
+
+    servo_id: int
+    length: int
+    """Number of its parameter bytes, without stuffing."""
+
+
 @dataclass(frozen=True, slots=True)
 class Transaction:
-    """One instruction packet and the shape of its reply."""
+    """One instruction packet and the shape of its replies."""
 
     packet: bytes
     servo_id: int
-    """Who answers; `BROADCAST_ID`: nobody does."""
-    reply_length: int
-    """Number of parameter bytes of the awaited status packet; -1: none is awaited."""
+    """Whom the instruction addresses."""
+    awaited: tuple[Awaited, ...]
+    """Who answers, in the order of their turns; empty: nobody does."""
     due_ns: int
-    """From the start of the write to the reply's last byte, by the wire; without reply: the wire time."""
+    """From the start of the write to the last byte of all replies, by the wire; without: the wire time."""
     timeout_ns: int
     """From the start of the write to giving up; 0 without reply."""
 
@@ -34,17 +52,18 @@ class Outcome(IntEnum):
     SENT = 0
     """No reply was awaited."""
     OK = 1
+    """Everything that was awaited came."""
     TIMEOUT = 2
-    """Not one byte came."""
+    """Something awaited did not come, and nothing else did."""
     GARBLED = 3
-    """Bytes came, but not the awaited packet."""
+    """Bytes came, but not what was awaited."""
     REFUSED = 4
     """The servo answered with an error and without the data."""
 
 
 @dataclass(slots=True)
 class Reply:
-    """What came of a transaction.
+    """What came of a transaction; of several statuses it shows the newest.
 
     A bus reuses one object for all its transactions, so a job takes what it needs before it goes on;
     programs get their own.
@@ -52,7 +71,7 @@ class Reply:
 
     outcome: Outcome
     error: int
-    """Error byte of the status packet: bits of StatusError"""
+    """Error byte of the status packet"""
     parameters: bytes | memoryview
     last_ns: int
     """Time of the read() that brought the last byte of the status packet."""
@@ -82,6 +101,10 @@ class Job(Protocol):
         """Take what came of the transaction before (None at the start), return the next; None: finished."""
         ...
 
+    def status(self, index: int, reply: Reply) -> None:
+        """Take the status that the transaction awaits at `index`; the reply is good during the call."""
+        ...
+
 
 class ProgramJob(Generic[Result]):
     """Executes a program; for set-up, probes and shutdown, where a few objects a transaction do no harm."""
@@ -92,6 +115,9 @@ class ProgramJob(Generic[Result]):
         self._program = program
         self.result: Result | None = None
         """What the program returned; None until it did."""
+
+    def status(self, index: int, reply: Reply) -> None:
+        """Wait for the end of the transaction: a program awaits one status at a time."""
 
     def advance(self, reply: Reply | None) -> Transaction | None:
         """Resume the program."""

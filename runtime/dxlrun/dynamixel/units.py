@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from dxlrun.dynamixel.bus_plan import ServoPlan
+from dxlrun.dynamixel.bus_plan import Field, ServoPlan
 
 
 def joint_position(servo: ServoPlan, raw: int) -> float:
@@ -31,3 +31,22 @@ def speed_ticks(servo: ServoPlan, velocity: float) -> int:
         return 0
     most = servo.max_speed_tick
     return min(max(round(min(abs(velocity) / servo.rad_s_per_tick, most)), 1), most)
+
+
+def ticks_in(place: Field, data: bytes | memoryview) -> int:
+    """Return the ticks of an unsigned or two's complement item out of a block's bytes."""
+    raw = data[place.offset : place.offset + place.size]
+    return int.from_bytes(raw, "little", signed=place.encoding == "twos_complement")
+
+
+def goal_bytes(servo: ServoPlan, position: int, speed: int) -> bytes:
+    """Return the goal block of a servo, both in ticks; without a place for a speed, of the position alone."""
+    layout = servo.goal
+    block = bytearray(layout.length)
+    for place, ticks in ((layout.position, position), (layout.speed, speed)):
+        if place is not None:
+            signed = place.encoding == "twos_complement"
+            block[place.offset : place.offset + place.size] = ticks.to_bytes(
+                place.size, "little", signed=signed
+            )
+    return bytes(block)

@@ -1,0 +1,122 @@
+"""Inspection of a servo of Protocol 2.0: X, P, PRO, XL-320, and MX with new firmware.
+
+Models differ in what they have, so each register is read by itself, where the control table names it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+from dxlrun.dynamixel.bus_plan import ServoPlan
+from dxlrun.dynamixel.inspection import Inspector, called, persist
+from dxlrun.dynamixel.protocol2 import describe_hardware_error
+from dxlrun.dynamixel.transaction import Program
+
+ITEMS = (
+    "model_number",
+    "firmware_version",
+    "return_delay_time",
+    "drive_mode",
+    "operating_mode",
+    "control_mode",
+    "homing_offset",
+    "min_position_limit",
+    "max_position_limit",
+    "cw_angle_limit",
+    "ccw_angle_limit",
+    "startup_configuration",
+    "torque_enable",
+    "status_return_level",
+    "hardware_error_status",
+    "bus_watchdog",
+)
+"""What is looked at, where a model has it."""
+_POSITION_MODES: Mapping[str, int] = MappingProxyType({"operating_mode": 3, "control_mode": 2})
+"""Position control (e-Manual XM430-W350, Operating Mode (11)); joint mode (XL-320, Control Mode (11))."""
+_DRIVE_BITS: Mapping[int, str] = MappingProxyType(
+    {
+        0x01: "turns the other way round",
+        0x02: "follows another servo",
+        0x04: "takes profiles for times",
+        0x08: "switches torque on by every goal",
+    }
+)
+"""e-Manual XM430-W350, XM540, Drive Mode (10)"""
+_WATCHDOG_STOPPED = (-1, 0xFF)
+
+
+class Inspector2(Inspector):
+    """Reads a servo's registers one by one."""
+
+    def registers(self, servo: ServoPlan) -> Program[bool]:
+        """Read what must fit the plan; return False when the servo cannot be read."""
+        items = self.table(servo).items
+        found: dict[str, int] = {}
+        for name in ITEMS:
+            if (item := items.get(name)) is None:
+                continue
+            reply = yield from persist(self.line.read(servo.servo_id, item.address, item.size))
+            if not reply.answered:
+                self.unreadable(servo, reply)
+                return False
+            found[name] = item.decode(reply.parameters)
+        self.identity(servo, found["model_number"], found["firmware_version"])
+        self.return_delay(servo, found["return_delay_time"])
+        self.return_level(servo, found["status_return_level"])
+        self._modes(servo, found)
+        self._limits(servo, found)
+        self._start_up(servo, found.get("startup_configuration", 0))
+        self._state(servo, found)
+        self.torque(servo, found["torque_enable"])
+        return True
+
+    def _modes(self, servo: ServoPlan, found: Mapping[str, int]) -> None:
+        items = self.table(servo).items
+        for name, wanted in _POSITION_MODES.items():
+            if name in found:
+                self.neutral(servo, items[name], found[name], wanted, "which is not position control")
+        drive = found.get("drive_mode", 0)
+        if drive:
+            what = " and ".join(words for bit, words in _DRIVE_BITS.items() if drive & bit) or "is unknown"
+            self.neutral(servo, items["drive_mode"], drive, 0, f"so it {what}")
+        if "homing_offset" in found:
+            offset = found["homing_offset"]
+            self.neutral(servo, items["homing_offset"], offset, 0, "which shifts every position")
+
+    def _limits(self, servo: ServoPlan, found: Mapping[str, int]) -> None:
+        for low, high, names in (
+            ("min_position_limit", "max_position_limit", "position limits"),
+            ("cw_angle_limit", "ccw_angle_limit", "angle limits"),
+        ):
+            if low in found and high in found:
+                self.limits(servo, found[low], found[high], names)
+
+    def _start_up(self, servo: ServoPlan, raw: int) -> None:
+        if raw & 0x01:
+            item = self.table(servo).items["startup_configuration"]
+            self.problem(
+                servo,
+                f"has {called(item)} = {raw}, so it switches torque on by itself at power-up: clear bit 0",
+            )
+        if raw & 0x02:
+            self.found.differences.append(
+                (servo.joint, "Startup Configuration bit 1 is set: RAM comes from the backup at power-up")
+            )
+
+    def _state(self, servo: ServoPlan, found: Mapping[str, int]) -> None:
+        items = self.table(servo).items
+        if error := found.get("hardware_error_status", 0):
+            self.problem(
+                servo,
+                f"reports in {called(items['hardware_error_status'])}: {describe_hardware_error(error)}; "
+                "find the cause, then reboot it",
+            )
+        watchdog = found.get("bus_watchdog", 0)
+        if watchdog in _WATCHDOG_STOPPED:
+            item = called(items["bus_watchdog"])
+            self.problem(servo, f"was stopped by its {item} and refuses goals: write 0 there")
+        elif watchdog:
+            item = called(items["bus_watchdog"])
+            text = f"{item} is {watchdog}: it stops after {watchdog * 20} ms without an instruction"
+            self.found.differences.append((servo.joint, text))
