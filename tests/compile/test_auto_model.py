@@ -1,8 +1,13 @@
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
+
 from dxlrun.compile import Compiled, compile_robot
+from dxlrun.compile.joints import compile_joints
+from dxlrun.compile.problems import Problems
 from dxlrun.description import read_robot
+from dxlrun.errors import InputError
 
 
 def test_a_servo_that_is_not_asked_yet_is_taken_for_its_neighbour(
@@ -32,3 +37,25 @@ def test_the_answer_of_the_servo_counts(robot_text: str, tmp_path: Path):
     compiled = compile_robot(read_robot(path, {}), [], None, models)
 
     assert [each for each in compiled.warnings if "model" in each.what] == []
+
+
+@pytest.mark.parametrize(("protocol", "number"), [(2.0, 30)])
+def test_of_a_model_with_two_firmwares_the_one_of_the_bus_is_taken(
+    robot_text: str, tmp_path: Path, protocol: float, number: int
+):
+    path = tmp_path / "robot.yaml"
+    path.write_text(robot_text.replace("AX-12A", "MX-28").replace("protocol: 1.0", f"protocol: {protocol}"))
+    joints = compile_joints(read_robot(path, {}), Problems(), {})
+
+    assert {joint.table.model_number for joint in joints.values()} == {number}
+
+
+def test_an_id_of_protocol_1_only_is_refused_on_a_bus_of_protocol_2(robot_text: str, tmp_path: Path):
+    text = robot_text.replace("AX-12A", "XM430-W350").replace("protocol: 1.0", "protocol: 2.0")
+    path = tmp_path / "robot.yaml"
+    path.write_text(text.replace("id: 2", "id: 253"))
+    problems = Problems()
+    compile_joints(read_robot(path, {}), problems, {})
+
+    with pytest.raises(InputError, match="servo ID 253 of right_arm_joint is none of Protocol"):
+        problems.refuse()

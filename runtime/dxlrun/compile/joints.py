@@ -14,6 +14,8 @@ from dxlrun.description.robot import Joint
 
 AUTO = "auto"
 """Instead of a model: the servo is asked."""
+_HIGHEST_ID_OF_PROTOCOL_2 = 252
+"""0xFD stands in the header of each packet (e-Manual, Protocol 2.0, Packet ID)."""
 _USUAL = {1.0: "AX-12A", 2.0: "XM430-W350"}
 """What stands in for a model that is not known, by protocol."""
 
@@ -70,6 +72,12 @@ def _unique_ids(description: Description, problems: Problems) -> None:
 def _known_bus(description: Description, name: str, joint: Joint, problems: Problems) -> bool:
     buses = description.robot.buses
     if joint.bus in buses:
+        if buses[joint.bus].protocol == 2.0 and joint.id > _HIGHEST_ID_OF_PROTOCOL_2:
+            problems.error(
+                description.marks.value("joints", name, "id"),
+                f"servo ID {joint.id} of {name} is none of Protocol 2.0",
+                f"give it one from 0 to {_HIGHEST_ID_OF_PROTOCOL_2}",
+            )
         return True
     problems.error(
         description.marks.value("joints", name, "bus"),
@@ -98,23 +106,24 @@ def _table(
     description: Description, name: str, joint: Joint, model: str, problems: Problems
 ) -> ControlTable | None:
     mark = description.marks.value("joints", name, "model")
+    bus = description.robot.buses.get(joint.bus)
+    wanted = None if bus is None else bus.protocol
     try:
-        table = control_table(model)
+        return control_table(model, wanted)
     except LookupError:
+        spoken = [protocol for protocol in _USUAL if model in model_names(protocol)]
+    if not spoken:
         problems.error(
-            mark,
-            f"no control table for model {model} of {name}",
-            suggestion(model, model_names()),
+            mark, f"no control table for model {model} of {name}", suggestion(model, model_names(wanted))
         )
         return None
-    bus = description.robot.buses.get(joint.bus)
-    if bus is not None and table.protocol != bus.protocol:
+    if bus is not None:
         problems.error(
             mark,
-            f"{model} of {name} speaks Protocol {table.protocol}, bus {joint.bus} Protocol {bus.protocol}",
+            f"{model} of {name} speaks Protocol {spoken[0]}, bus {joint.bus} Protocol {bus.protocol}",
             "put it on a bus of its own protocol; a bus cannot be mixed",
         )
-    return table
+    return control_table(model, spoken[0])
 
 
 def _check_reference(
