@@ -1,0 +1,110 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import dxlrun.control_table.models
+from dxlrun.control_table import add_control_table, control_table, model_names, models_by_number
+from dxlrun.control_table.protocol1 import resolve
+
+MINE = {'model = "AX-12A"': 'model = "Mine-1"', 'aliases = ["AX-12", "AX-12+"]': "aliases = []"}
+
+
+@pytest.fixture
+def forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dxlrun.control_table.models, "_ADDED", {1.0: [], 2.0: []})
+
+
+@pytest.fixture
+def mine(data_files: Path) -> str:
+    """The table of a servo that a plug-in brings along."""
+    text = (data_files / "protocol1" / "AX-12A.toml").read_text("utf-8")
+    for old, new in MINE.items():
+        assert old in text
+        text = text.replace(old, new)
+    return text.replace("model_number = 12\n", "model_number = 60001\n").replace(
+        "initial = 12\n", "initial = 60001\n"
+    )
+
+
+def test_a_model_of_both_protocols_is_chosen_by_the_protocol() -> None:
+    assert control_table("MX-28", 1.0).model_number == 29
+    assert control_table("MX-28", 2.0).model_number == 30
+    assert control_table("MX-28(2.0)").model_number == 30
+    with pytest.raises(LookupError, match=r"Protocol 1\.0 and with Protocol 2\.0: say which"):
+        control_table("MX-28")
+
+
+def test_a_protocol_that_a_model_does_not_speak_is_named() -> None:
+    with pytest.raises(LookupError, match=r"AX-12A speaks Protocol 1\.0, not Protocol 2\.0"):
+        control_table("AX-12A", 2.0)
+    with pytest.raises(LookupError, match="no control table of the model 'AX-12B'"):
+        control_table("AX-12B", 1.0)
+
+
+def test_names_by_protocol_are_all_names() -> None:
+    assert set(model_names(1.0)) | set(model_names(2.0)) == set(model_names())
+    assert "AX-12A" in model_names(1.0)
+    assert "AX-12A" not in model_names(2.0)
+    assert {"XM430-W350", "PH54-200-S500-R", "RH-P12-RN(A)", "2XL430-W250"} <= set(model_names(2.0))
+
+
+@pytest.mark.usefixtures("forgotten")
+def test_a_table_of_a_plug_in_is_found_by_name_and_number(mine: str) -> None:
+    table = add_control_table(mine)
+    assert control_table("Mine-1") is table
+    assert models_by_number(60001, 1.0) == (table,)
+    assert "Mine-1" in model_names()
+    assert add_control_table(mine) == table, "the same table twice is no contradiction"
+
+
+@pytest.mark.usefixtures("forgotten")
+@pytest.mark.parametrize(
+    ("old", "new", "complaint"),
+    [
+        ('model = "Mine-1"', 'model = "AX-12+"', "name or the number of the AX-12A"),
+        ("model_number = 60001\n", "model_number = 12\n", "name or the number of the AX-12A"),
+        ("model_number = 60001\n", "", "the entry 'model_number' is missing"),
+        ("protocol = 1.0\n", "protocol = 3.0\n", "protocol is 1.0 or 2.0, not 3.0"),
+        ('capabilities = ["sync_write"]', 'capabilities = ["telepathy"]', "cannot name: telepathy"),
+        (
+            'tick = "1/1023 fraction"\npage = "Present Load',
+            'tick = "1 V"\npage = "Present Load',
+            "present_load: its unit",
+        ),
+    ],
+)
+def test_a_table_of_a_plug_in_that_cannot_be_used_is_refused(
+    mine: str, old: str, new: str, complaint: str
+) -> None:
+    assert old in mine
+    with pytest.raises(ValueError, match=complaint):
+        add_control_table(mine.replace(old, new))
+
+
+def test_a_file_takes_over_what_it_does_not_say() -> None:
+    entries = {
+        "a": {
+            "model": "A",
+            "speed": 1,
+            "items": {"x": {"address": 4, "size": 1}, "y": {"address": 6, "size": 1}},
+        },
+        "b": {
+            "extends": "a",
+            "model": "B",
+            "left_out": ["y"],
+            "items": {"x": {"size": 2}, "z": {"address": 0}},
+        },
+    }
+    merged = resolve("b", entries)
+    assert (merged["model"], merged["speed"]) == ("B", 1)
+    assert merged["items"] == {"z": {"address": 0}, "x": {"address": 4, "size": 2}}
+    assert list(merged["items"]) == ["z", "x"], "in the order of addresses"
+    assert entries["a"]["items"] == {"x": {"address": 4, "size": 1}, "y": {"address": 6, "size": 1}}
+
+
+@pytest.mark.parametrize("entries", [{"a": {"extends": "b"}}, {"a": {"extends": "b"}, "b": {"extends": "a"}}])
+def test_a_file_that_extends_nothing_or_itself_is_refused(entries: dict[str, dict[str, str]]) -> None:
+    with pytest.raises(ValueError, match="cannot extend"):
+        resolve("a", entries)

@@ -1,0 +1,205 @@
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dxlrun.control_table import CAPABILITIES, ControlTable, all_tables, control_table, models_by_number
+
+TABLES = all_tables()
+PROTOCOL1 = {
+    "AX-12A": 12, "AX-18A": 18, "RX-24F": 24, "RX-28": 28, "MX-28": 29, "RX-64": 64, "MX-12W": 104,
+    "EX-106+": 107, "DX-113": 113, "DX-116": 116, "DX-117": 117, "AX-12W": 300, "MX-64": 310, "MX-106": 320,
+}  # fmt: skip
+
+
+def _id(table: ControlTable) -> str:
+    return f"{table.model} {table.protocol}"
+
+
+every_table = pytest.mark.parametrize("table", TABLES, ids=_id)
+
+
+def test_the_models_of_protocol_1_are_all_there() -> None:
+    assert {table.model: table.model_number for table in TABLES if table.protocol == 1.0} == PROTOCOL1
+
+
+@every_table
+def test_no_two_items_share_a_byte(table: ControlTable) -> None:
+    cells = [cell for item in table.items.values() for cell in range(item.address, item.address + item.size)]
+    assert len(cells) == len(set(cells))
+    assert max(cells) + 1 == table.size
+
+
+@every_table
+def test_every_end_of_a_range_and_initial_value_can_be_written_and_read_back(table: ControlTable) -> None:
+    for item in table.items.values():
+        ends = (item.minimum, item.maximum) if item.encoding != "sign_magnitude" else (0, 1023, -1023)
+        for ticks in ends:
+            assert item.decode(item.encode(ticks)) == ticks, item.name
+        if item.initial is not None:
+            assert item.minimum <= item.initial <= item.maximum, item.name
+            assert item.decode(item.encode(item.initial)) == item.initial, item.name
+
+
+@every_table
+def test_what_the_loop_needs_is_there_and_of_the_right_kind(table: ControlTable) -> None:
+    items = table.items
+    assert {"model_number", "firmware_version", "id", "torque_enable", "status_return_level"} <= items.keys()
+    assert {"return_delay_time", "goal_position", "present_position"} <= items.keys()
+    assert [items[name].access for name in ("goal_position", table.goal_speed_item)] == ["RW", "RW"]
+    assert [items[name].access for name in (table.present_speed_item, table.effort_item)] == ["R", "R"]
+    assert items["present_position"].access == items["model_number"].access == "R"
+    assert items["goal_position"].unit == items["present_position"].unit == "rad"
+    assert items[table.present_speed_item].unit == items[table.goal_speed_item].unit == "rad/s"
+    assert items[table.effort_item].unit == table.effort_unit
+    assert items["goal_position"].scale == items["present_position"].scale == table.rad_per_tick
+    assert items["torque_enable"].area == "RAM"
+    assert items["id"].area == items["model_number"].area == "EEPROM"
+    assert all(item.page for item in items.values())
+
+
+@every_table
+def test_the_units_are_those_of_a_servo(table: ControlTable) -> None:
+    assert table.zero_tick == 0
+    assert table.min_tick <= 0 < table.max_tick
+    travel = math.degrees((table.max_tick - table.min_tick) * table.rad_per_tick)
+    assert 100 < travel < 360.01
+    assert 0.1 < table.max_speed < 600
+    assert table.max_speed_tick * table.rad_s_per_tick > 0.8 * table.max_speed
+    assert 0 < table.effort_per_tick < 0.02
+    assert table.stall_torque >= 0
+    assert table.capabilities <= CAPABILITIES.keys()
+    assert "sync_write" in table.capabilities
+    assert ("fast_sync_read" in table.capabilities) == (table.fast_sync_read_firmware is not None)
+
+
+@every_table
+def test_the_factory_baud_rate_is_one_of_the_list(table: ControlTable) -> None:
+    name = "baud_rate" if "baud_rate" in table.items else "baud_rate_bus"
+    assert table.items[name].initial in table.baud_rates
+    assert all(value <= table.items[name].maximum for value in table.baud_rates)
+
+
+def test_a_model_number_belongs_to_one_model_of_a_protocol() -> None:
+    for table in TABLES:
+        same = models_by_number(table.model_number, table.protocol)
+        assert table in same
+        assert len({each.firmware for each in same}) == len(same), "told apart by the firmware alone"
+    assert models_by_number(12, 2.0) == ()
+    assert models_by_number(9999, 1.0) == ()
+
+
+def test_the_newest_firmware_comes_first_and_has_the_plain_name() -> None:
+    newest, older = models_by_number(1200, 2.0)
+    assert (newest.model, newest.firmware) == ("XL330-M288", 52)
+    assert (older.model, older.firmware) == ("XL330-M288-FW51", 0)
+    assert newest.items["indirect_data_1"].address == 208
+    assert older.items["indirect_data_1"].address == 224
+
+
+@pytest.mark.parametrize("table", [each for each in TABLES if each.protocol == 1.0], ids=_id)
+def test_protocol_1_baud_rates_follow_the_formula_of_the_manual(table: ControlTable) -> None:
+    for value, rate in table.baud_rates.items():
+        if value < 250:
+            assert Fraction(2_000_000, value + 1) == pytest.approx(rate, rel=0.03)
+    assert table.items["model_number"].initial == table.model_number
+
+
+@pytest.mark.parametrize("table", [each for each in TABLES if each.protocol == 1.0], ids=_id)
+def test_only_mx_has_bulk_read_in_protocol_1(table: ControlTable) -> None:
+    assert ("bulk_read" in table.capabilities) == table.model.startswith("MX-")
+    assert "sync_read" not in table.capabilities
+    assert {"posvel", "state_block"} <= table.capabilities
+    assert table.effort_unit == "1"
+
+
+@pytest.mark.parametrize(
+    ("model", "protocol", "degrees", "ticks"),
+    [
+        ("AX-18A", 1.0, 300, 1023),
+        ("RX-28", 1.0, 300, 1023),
+        ("DX-117", 1.0, 300, 1023),
+        ("EX-106+", 1.0, 250.92, 4095),
+        ("MX-64", 1.0, 360, 4096),
+        ("MX-64", 2.0, 360, 4096),
+        ("XM430-W350", 2.0, 360, 4096),
+        ("XL-320", 2.0, 300, 1023),
+        ("PH54-200-S500", 2.0, 360, 1_003_846),
+        ("YM070-210-M001", 2.0, 360, 524_288),
+        ("YM070-210-R051", 2.0, 360, 26_738_688),
+    ],
+)
+def test_degrees_a_tick(model: str, protocol: float, degrees: float, ticks: int) -> None:
+    assert math.degrees(control_table(model, protocol).rad_per_tick) == pytest.approx(
+        degrees / ticks, rel=1e-8
+    )
+
+
+@pytest.mark.parametrize(
+    ("model", "protocol", "item", "tick", "si"),
+    [
+        (
+            "MX-64",
+            1.0,
+            "moving_speed",
+            300,
+            34.2 * 2 * math.pi / 60,
+        ),  # "if it is set to 300, it is about 34.2 rpm"
+        ("MX-12W", 1.0, "moving_speed", 300, 274.8 * 2 * math.pi / 60),
+        ("MX-28", 1.0, "goal_acceleration", 254, math.radians(2180)),
+        ("MX-28", 1.0, "return_delay_time", 250, 500e-6),
+        ("EX-106+", 1.0, "sensed_current", 100, 1.0),
+        ("XM430-W350", 2.0, "present_current", 1000, 2.69),
+        ("MX-106", 2.0, "goal_current", 1000, 3.36),
+        ("XL330-M288", 2.0, "current_limit", 1750, 1.75),
+        ("XL430-W250", 2.0, "present_load", 1000, 1.0),
+        ("XM430-W350", 2.0, "present_input_voltage", 120, 12.0),
+        ("XM430-W350", 2.0, "bus_watchdog", 5, 0.1),
+        ("XM430-W350", 2.0, "profile_velocity", 100, 22.9 * 2 * math.pi / 60),
+        ("XM430-W350", 2.0, "profile_acceleration", 1, 214.577 * 2 * math.pi / 3600),
+        ("PH54-200-S500", 2.0, "velocity_limit", 2900, 29.0 * 2 * math.pi / 60),
+        ("YM070-210-M001", 2.0, "present_current", 100, 1.0),
+    ],
+)
+def test_units_by_examples_of_the_manual(
+    model: str, protocol: float, item: str, tick: int, si: float
+) -> None:
+    assert control_table(model, protocol).items[item].scale * tick == pytest.approx(si, rel=1e-3)
+
+
+def test_the_block_of_an_x_servo_is_that_of_the_manual() -> None:
+    table = control_table("XM430-W350")
+    assert (table.effort_item, table.present_speed_item) == ("present_current", "present_velocity")
+    assert [table.items[name].address for name in (table.effort_item, table.present_speed_item)] == [126, 128]
+    assert table.items["present_position"].address == 132
+    assert [table.items[name].address for name in (table.goal_speed_item, "goal_position")] == [112, 116]
+    assert {"sync_read", "posvel", "state_block", "operating_mode", "hardware_error"} <= table.capabilities
+    assert table.items["shutdown"].area == "EEPROM"
+    assert table.items["torque_enable"].address == 64
+
+
+def test_indirect_items_are_numbered_through_both_blocks() -> None:
+    items = control_table("XM430-W350").items
+    assert [items[f"indirect_address_{number}"].address for number in (1, 28, 29, 56)] == [168, 222, 578, 632]
+    assert [items[f"indirect_data_{number}"].address for number in (1, 28, 29, 56)] == [224, 251, 634, 661]
+    assert [items[f"indirect_address_{number}"].initial for number in (1, 28, 29, 56)] == [224, 251, 634, 661]
+    last = control_table("PH54-200-S500").items["indirect_address_128"]
+    assert (last.address, last.initial, last.area) == (422, 761, "EEPROM")
+
+
+def test_present_position_may_leave_the_turn_but_the_goal_may_not() -> None:
+    items = control_table("XM430-W350").items
+    assert items["present_position"].minimum == -(2**31)
+    assert (items["goal_position"].minimum, items["goal_position"].maximum) == (0, 4095)
+
+
+@given(st.sampled_from(TABLES), st.data())
+def test_every_item_of_every_model_decodes_what_it_encodes(table: ControlTable, data: st.DataObject) -> None:
+    item = table.items[data.draw(st.sampled_from(sorted(table.items)))]
+    low, high = (-1023, 1023) if item.encoding == "sign_magnitude" else (item.minimum, item.maximum)
+    ticks = data.draw(st.integers(low, high))
+    assert item.decode(item.encode(ticks)) == ticks
