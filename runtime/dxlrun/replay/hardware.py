@@ -1,0 +1,93 @@
+"""Recorded hardware and clock: the two seams of the loop, fed from a log instead of a bus and a processor."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.control.loop import StopFlag
+from dxlrun.cycle import CycleRecord
+
+_STATES = ("position", "velocity", "effort", "valid", "age_ns")
+
+
+class RecordedClock:
+    """Time as the loop read it in the recorded run, at each place where it matters to controllers."""
+
+    __slots__ = ("_now_ns", "wake_ns")
+
+    def __init__(self, now_ns: int) -> None:
+        self._now_ns = now_ns
+        self.wake_ns = now_ns
+        """When the next wait ends."""
+
+    def now_ns(self) -> int:
+        """Return recorded time, ns."""
+        return self._now_ns
+
+    def wait_until(self, deadline_ns: int) -> int:
+        """Return when the loop woke then, ns."""
+        self._now_ns = self.wake_ns
+        return self._now_ns
+
+    def move(self, now_ns: int) -> None:
+        """Let it be `now_ns`."""
+        self._now_ns = now_ns
+
+
+class RecordedHardware:
+    """Servos that say what they said then, bit for bit, and take no goals; see `dxlrun.hardware.Hardware`.
+
+    After each cycle it moves the clock to the deadline of the next recorded one, so that the loop skips the
+    periods that were skipped; after the last one it asks the loop to stop.
+    """
+
+    def __init__(
+        self,
+        cycles: NDArray[np.void],
+        activation: np.void,
+        record: CycleRecord,
+        clock: RecordedClock,
+        stop: StopFlag,
+    ) -> None:
+        self._states = {name: np.ascontiguousarray(cycles[name]) for name in _STATES}
+        self._due, self._woken, self._read, self._written = (
+            cycles[name].tolist() for name in ("scheduled_ns", "woken_ns", "read_ns", "written_ns")
+        )
+        self._activation = activation
+        self._record = record
+        self._clock = clock
+        self._stop = stop
+        self._index = 0
+
+    def start(self) -> None:
+        """Fill states and goals with those of the activation."""
+        record = self._record
+        for name in _STATES:
+            np.copyto(getattr(record.states, name), self._activation[name])
+        np.copyto(record.goals.position, self._activation["goal_position"])
+        np.copyto(record.goals.velocity, self._activation["goal_velocity"])
+
+    def idle(self, until_ns: int) -> None:
+        """Let the coming wait end when it ended then."""
+        self._clock.wake_ns = self._woken[self._index]
+
+    def read(self) -> None:
+        """Fill the states of this cycle."""
+        for name in _STATES:
+            np.copyto(getattr(self._record.states, name), self._states[name][self._index])
+        self._clock.move(self._read[self._index])
+
+    def write(self) -> None:
+        """Take no goals: go to where the next cycle was due."""
+        following = self._index + 1
+        if following < len(self._due):
+            self._clock.move(self._due[following])
+        else:
+            self._clock.move(self._written[self._index])
+            self._stop.request()
+        self._index = following
+
+    def stop(self) -> tuple[str, ...]:
+        """Do nothing: no servo has torque."""
+        return ()

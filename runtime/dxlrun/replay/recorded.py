@@ -1,0 +1,190 @@
+"""Recorded: what a log gives a replay, judged: the plan, each cycle's inputs, and where they end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from importlib import metadata
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.commands import TakenCommand
+from dxlrun.control.controller import CONTRACT_VERSION
+from dxlrun.control.loop_plan import LoopPlan, ScheduledCommand
+from dxlrun.control.plugins import PlugIns
+from dxlrun.errors import LogError
+from dxlrun.events import EventCode
+from dxlrun.recording.reader import Log
+
+PLAN = "plan.json"
+_LIBRARIES = ("dxlrun", "numpy")
+"""Whose version may change a command."""
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedPlan:
+    """The part of the plan in a log that a replay needs; how the buses were driven is none of it."""
+
+    robot: str
+    loop: LoopPlan
+    source_file: str
+    source_text: str
+    arguments: dict[str, str]
+    included: dict[str, str] = field(default_factory=dict)
+    urdf: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """The inputs of one run."""
+
+    log: Path
+    plan: RecordedPlan
+    loop: LoopPlan
+    """The plan's loop with the commands that the cycles really took; it has no end of its own."""
+    activation: np.void
+    """States and goals when the controllers were activated."""
+    start_ns: int
+    """Deadline of cycle 0."""
+    cycles: NDArray[np.void]
+    """Those that can be compared: from cycle 0 to the first that is missing."""
+    in_log: int
+    """All cycles that the log has."""
+    stopped: str
+    """Why those behind the last of `cycles` cannot be compared; empty when there are none."""
+    remarks: tuple[str, ...]
+
+
+def recorded(log: Log) -> Recorded:
+    """Return the inputs that a log holds. Raises LogError when it does not hold them from the start."""
+    plan = _plan(log)
+    cycles, path = log.cycles, log.path
+    if not len(cycles):
+        raise LogError(
+            f"{path}: there is nothing to replay: the loop finished no cycle, or the log lost them"
+        )
+    if log.activation is None:
+        raise LogError(
+            f"{path}: the log does not say with which states and goals the controllers began: "
+            "that message is lost, or its run was made by an older dxlrun"
+        )
+    activation = log.activation[0]
+    start_ns = int(activation["scheduled_ns"])
+    if int(cycles["cycle"][0]) != int(cycles["skipped"][0]):
+        raise LogError(
+            f"{path}: the log begins with cycle {int(cycles['cycle'][0])}: what the controllers did before "
+            "is lost, so nothing can be compared"
+        )
+    _check_times(log, start_ns, plan.loop.period_ns)
+    usable, stopped = _until_gap(log)
+    loop = replace(plan.loop, commands=_commands(log, plan.loop, start_ns), end_ns=None)
+    remarks = () if log.complete else log.damage
+    return Recorded(path, plan, loop, activation, start_ns, cycles[:usable], len(cycles), stopped, remarks)
+
+
+def version_remarks(log: Log, loop: LoopPlan, plugins: PlugIns) -> tuple[str, ...]:
+    """Return a sentence for each part that has another version than in the recorded run."""
+    then = log.metadata.get("versions", {})
+    sentences = []
+    for name in _LIBRARIES:
+        now = metadata.version(name)
+        if then.get(name, now) != now:
+            sentences.append(f"{name} was {then[name]} in the run and is {now} in the replay")
+    for was in sorted({(plan.type, plan.distribution) for plan in loop.controllers}):
+        offer = plugins.controllers.get(was[0])
+        if offer is not None and offer.distribution != was[1]:
+            sentences.append(
+                f"the controller type {was[0]} came from {was[1]} in the run and comes from "
+                f"{offer.distribution} in the replay"
+            )
+    return tuple(sentences)
+
+
+def _plan(log: Log) -> RecordedPlan:
+    contract = log.metadata.get("versions", {}).get("contract", str(CONTRACT_VERSION))
+    if contract != str(CONTRACT_VERSION):
+        raise LogError(
+            f"{log.path}: the run's controllers were made for contract {contract}, this dxlrun has contract "
+            f"{CONTRACT_VERSION}: replay it with the dxlrun that made it, {_version(log)}"
+        )
+    data = log.attachments.get(PLAN)
+    if data is None:
+        raise LogError(f"{log.path}: the log has no attachment {PLAN}, so nobody knows its controllers")
+    try:
+        plan = msgspec.json.decode(data, type=RecordedPlan)
+    except msgspec.MsgspecError as error:
+        raise LogError(
+            f"{log.path}: the plan in the log is not one of this dxlrun ({error}): replay it with the dxlrun "
+            f"that made it, {_version(log)}"
+        ) from error
+    if tuple(joint.name for joint in plan.loop.joints) != log.joints:
+        raise LogError(f"{log.path}: the plan in the log has other joints than its cycles")
+    if tuple(controller.name for controller in plan.loop.controllers) != tuple(
+        controller.name for controller in log.controllers
+    ):
+        raise LogError(f"{log.path}: the plan in the log has other controllers than its cycles")
+    return plan
+
+
+def _version(log: Log) -> str:
+    return f"version {log.metadata.get('versions', {}).get('dxlrun', 'unknown')}"
+
+
+def _check_times(log: Log, start_ns: int, period_ns: int) -> None:
+    """Refuse times that no loop can have had; a replay would follow them without an end."""
+    cycles = log.cycles
+    number, due, woken = cycles["cycle"], cycles["scheduled_ns"], cycles["woken_ns"]
+    wrong = (due - start_ns != number * period_ns) | (woken < due) | (cycles["read_ns"] < woken)
+    wrong[1:] |= np.diff(number) <= 0
+    if wrong.any():
+        raise LogError(
+            f"{log.path}: the times of cycle {int(number[int(np.argmax(wrong))])} contradict its number: "
+            "the log is damaged"
+        )
+
+
+def _until_gap(log: Log) -> tuple[int, str]:
+    """Return how many cycles can be compared, and a sentence on why not more."""
+    cycles = log.cycles
+    number = cycles["cycle"]
+    usable, stopped = len(cycles), ""
+    lost = np.flatnonzero(number[1:] != number[:-1] + 1 + cycles["skipped"][1:])
+    if len(lost):
+        usable = int(lost[0]) + 1
+        first, last = int(number[usable - 1]) + 1, int(number[usable]) - 1
+        stopped = f"the log misses cycles between {first} and {last}"
+    held = np.zeros(len(cycles), dtype=np.int64)
+    at = {int(cycle): index for index, cycle in enumerate(number)}
+    for command in log.commands:
+        if command.cycle in at:
+            held[at[command.cycle]] += 1
+    short = np.flatnonzero(held < cycles["command_count"])
+    if len(short) and int(short[0]) < usable:
+        usable = int(short[0])
+        stopped = f"the log misses a command that cycle {int(number[usable])} took"
+    if stopped:
+        gaps = [event.text for event in log.events if event.code == EventCode.RECORDER_GAP]
+        because = f" ({gaps[0]})" if gaps else ""
+        stopped += (
+            f"{because}; what the controllers knew after that is lost, so from cycle "
+            f"{int(number[usable])} on nothing is compared"
+        )
+    if not usable:
+        raise LogError(f"{log.path}: {stopped}")
+    return usable, stopped
+
+
+def _commands(log: Log, loop: LoopPlan, start_ns: int) -> tuple[ScheduledCommand, ...]:
+    """Return what the cycles took, due at the very time at which its cycle woke."""
+    return tuple(_command(log, loop, command, start_ns) for command in log.commands)
+
+
+def _command(log: Log, loop: LoopPlan, command: TakenCommand, start_ns: int) -> ScheduledCommand:
+    at_ns = command.t_ns - start_ns
+    if command.planned < 0:
+        return ScheduledCommand(at_ns, command.controller, command.kind, command.data, command.origin)
+    if command.planned >= len(loop.commands):
+        raise LogError(f"{log.path}: cycle {command.cycle} took a command that the plan in the log has not")
+    return replace(loop.commands[command.planned], at_ns=at_ns)
