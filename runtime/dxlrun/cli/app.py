@@ -13,6 +13,7 @@ from cyclopts import App, CycloptsError
 from dxlrun.cli.analyze import analyze
 from dxlrun.cli.check import check
 from dxlrun.cli.run import run
+from dxlrun.cli.schema import schema
 from dxlrun.cli.terminal import say_error, say_warning
 from dxlrun.errors import DxlrunError, InputError
 
@@ -39,6 +40,7 @@ def build() -> App:
     app.default(run)
     app.command(check)
     app.command(analyze)
+    app.command(schema)
     return app
 
 

@@ -13,7 +13,7 @@ from dxlrun.errors import InputError
 if TYPE_CHECKING:
     from dxlrun.compile import Compiled
 
-COMMANDS = ("analyze", "check")
+COMMANDS = ("analyze", "check", "schema")
 
 
 def compiled(

@@ -6,7 +6,15 @@ import re
 from collections.abc import Mapping
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    WithJsonSchema,
+    model_validator,
+)
 from pydantic_core import PydanticCustomError
 
 from dxlrun.description.units import Angle, AngularVelocity, Duration
@@ -45,7 +53,11 @@ def _ordered(value: tuple[float, float]) -> tuple[float, float]:
     return value
 
 
-Name = Annotated[str, AfterValidator(_name)]
+Name = Annotated[
+    str,
+    AfterValidator(_name),
+    WithJsonSchema({"type": "string", "pattern": f"^{_NAME.pattern}$"}),
+]
 """Letters, digits and _, first a letter."""
 
 
@@ -70,7 +82,9 @@ class Bus(Form):
 
     port: str = Field(min_length=1, description="Device of the adapter, or sim.", examples=["/dev/ttyUSB0"])
     protocol: Annotated[float, AfterValidator(_protocol)] = Field(
-        description="Protocol of all servos on the bus.", examples=["1.0"]
+        description="Protocol of all servos on the bus.",
+        examples=["1.0"],
+        json_schema_extra={"enum": [1.0, 2.0]},
     )
     baud_rate: int = Field(gt=0, le=10_000_000, description="Bits per second.", examples=["1_000_000"])
     adapter: Adapter = Field(default=Adapter(), description="The adapter.", examples=["{latency: 1 ms}"])

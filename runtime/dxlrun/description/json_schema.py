@@ -1,0 +1,253 @@
+"""JSON Schema of robot and motion files, so that an editor completes keys and underlines mistakes.
+
+Pydantic's schema of the models is reshaped to what may stand in a file: `${name}` wherever a scalar stands
+(robot files only), numbers with groups of digits (1_000_000 is text in YAML 1.2), and the parameters of each
+controller type among the keys of its entry. Keys that a robot must have are asked for apart, because a file
+that includes others need not have them itself. What only the whole file shows (claims, reach, time) is for
+`dxlrun check`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from pydantic import BaseModel
+
+from dxlrun.description.arguments import Argument
+from dxlrun.description.including import KEY as INCLUDE
+from dxlrun.description.including import MOST_FILES
+from dxlrun.description.motion import Motion
+from dxlrun.description.robot import Robot
+from dxlrun.description.scalars import plain_value
+
+Schema = dict[str, Any]
+"""A JSON Schema: values are whatever JSON has, so nothing narrower than Any is true."""
+
+DIALECT = "https://json-schema.org/draft/2020-12/schema"
+_ARGUMENT: Schema = {
+    "type": "string",
+    "pattern": r"\$\{\s*[A-Za-z_][A-Za-z0-9_]*\s*\}",
+    "description": "The value of an argument.",
+}
+_GROUPED: Schema = {
+    "type": "string",
+    "pattern": r"^[-+]?[0-9]+(_[0-9]+)+$",
+    "description": "A whole number with its digits in groups.",
+}
+_SCALARS = ("string", "integer", "number", "boolean")
+_ABOUT = ("description", "default", "examples")
+
+
+def robot_schema(parameters: Mapping[str, type[BaseModel]]) -> Schema:
+    """Return the schema of robot files; `parameters` are the models of the controllers' types."""
+    lenient = fragment_schema(parameters)
+    needed = _Needs(_robot(parameters)).of_root()
+    return {**lenient, "title": "dxlrun robot file", "if": {"required": [INCLUDE]}, "else": needed}
+
+
+def fragment_schema(parameters: Mapping[str, type[BaseModel]]) -> Schema:
+    """Return the schema of files that a robot file includes: any part of one."""
+    return {**_without_required(_robot(parameters)), "title": "dxlrun fragment of a robot file"}
+
+
+def motion_schema() -> Schema:
+    """Return the schema of motion files."""
+    schema = Motion.model_json_schema()
+    shaped = _Shaper(arguments=False)
+    definitions = {name: shaped.node(node) for name, node in schema.pop("$defs").items()}
+    top = shaped.node(schema)
+    return {"$schema": DIALECT, **top, "title": "dxlrun motion file", "$defs": definitions | shaped.used}
+
+
+def _robot(parameters: Mapping[str, type[BaseModel]]) -> Schema:
+    """Return the schema of a robot file that includes nothing."""
+    schema = Robot.model_json_schema()
+    shaped = _Shaper(arguments=True)
+    definitions = {name: shaped.node(node) for name, node in schema.pop("$defs").items()}
+    top = shaped.node(schema)
+    own = top["properties"]
+    top.pop("description")
+    top["properties"] = {"name": own.pop("name"), "arguments": _arguments(), INCLUDE: _include(), **own}
+    entry = definitions["ControllerEntry"]
+    entry["properties"].pop("parameters")
+    for kind, model in sorted(parameters.items()):
+        own = model.model_json_schema(ref_template=f"#/$defs/{kind}.{{model}}")
+        for name, node in own.pop("$defs", {}).items():
+            definitions[f"{kind}.{name}"] = shaped.node(node)
+        definitions[kind] = _entry_of(kind, entry, shaped.node(own))
+    definitions["ControllerEntry"] = _any_entry(entry, sorted(parameters))
+    return {"$schema": DIALECT, **top, "$defs": definitions | shaped.used}
+
+
+def _arguments() -> Schema:
+    about = {key: field.description for key, field in Argument.model_fields.items()}
+    return {
+        "description": "What may be given on the command line as name:=value, and is put in by ${name}.",
+        "type": "object",
+        "propertyNames": {"pattern": "^[A-Za-z_][A-Za-z0-9_]*$"},
+        "additionalProperties": {
+            "type": "object",
+            "additionalProperties": False,
+            "properties": {
+                "default": {"type": [*_SCALARS, "null"], "description": about["default"]},
+                "help": {"type": "string", "description": about["help"]},
+            },
+        },
+    }
+
+
+def _include() -> Schema:
+    return {
+        "description": "Files that are merged below this one; names count from its folder.",
+        "type": "array",
+        "maxItems": MOST_FILES,
+        "items": {"type": "string", "minLength": 1, "not": {"pattern": r"\$\{"}},
+    }
+
+
+def _entry_of(kind: str, entry: Schema, parameters: Schema) -> Schema:
+    """Return the schema of an entry of one type: the common keys and its own."""
+    return {
+        **parameters,
+        "properties": {**entry["properties"], "type": {"const": kind}, **parameters.get("properties", {})},
+        "required": ["type", *parameters.get("required", [])],
+        "additionalProperties": parameters.get("additionalProperties", False),
+    }
+
+
+def _any_entry(entry: Schema, kinds: list[str]) -> Schema:
+    """Return the schema of an entry that each type adds to; a type that stands elsewhere says nothing."""
+    written = {
+        "description": entry["properties"]["type"]["description"],
+        "anyOf": [{"enum": kinds}, {"$ref": "#/$defs/argument"}],
+    }
+    branches = [
+        {
+            "if": {"properties": {"type": {"const": kind}}, "required": ["type"]},
+            "then": {"$ref": f"#/$defs/{kind}"},
+        }
+        for kind in kinds
+    ]
+    shown = {key: value for key, value in entry.items() if key != "additionalProperties"}
+    return {**shown, "properties": {**entry["properties"], "type": written}, "allOf": branches}
+
+
+class _Shaper:
+    """Turns nodes of pydantic's schema into nodes of ours; `used` are the definitions that these name."""
+
+    def __init__(self, *, arguments: bool) -> None:
+        self._arguments = arguments
+        self.used: dict[str, Schema] = {}
+
+    def node(self, node: Schema) -> Schema:
+        """Return a node, and all below it, as a file may be written."""
+        shaped = {key: value for key, value in node.items() if key != "title"}
+        if "patternProperties" in shaped:  # pydantic's keys must match: in its own words other keys pass
+            ((pattern, values),) = shaped.pop("patternProperties").items()
+            shaped |= {"propertyNames": {"pattern": pattern}, "additionalProperties": values}
+        for key in ("items", "additionalProperties"):
+            if isinstance(shaped.get(key), dict):
+                shaped[key] = self.node(shaped[key])
+        for key in ("prefixItems", "oneOf"):
+            if key in shaped:
+                shaped[key] = [self.node(each) for each in shaped[key]]
+        if "properties" in shaped:
+            shaped["properties"] = {key: self.node(each) for key, each in shaped["properties"].items()}
+        if "anyOf" in shaped or shaped.get("type") in _SCALARS:
+            return self._alternatives(shaped)
+        return {key: value for key, value in shaped.items() if key not in ("default", "examples")}
+
+    def _alternatives(self, shaped: Schema) -> Schema:
+        """Return what may stand at one place: as the model says, or an argument, or a grouped number."""
+        about = {key: shaped.pop(key) for key in _ABOUT if key in shaped}
+        arms: list[Schema] = []
+        for arm in shaped.pop("anyOf", [None]):
+            inner = self.node(arm) if arm is not None else shaped
+            arms += inner["anyOf"] if set(inner) == {"anyOf"} else [inner]
+        kinds = {arm.get("type") for arm in arms}
+        if any(arm.get("type") in ("integer", "number") and "enum" not in arm for arm in arms):
+            arms.append(self._use("grouped", _GROUPED))
+        free = any(set(arm) <= {"type", "minLength"} and arm.get("type") == "string" for arm in arms)
+        if self._arguments and kinds & set(_SCALARS) and not free:
+            arms.append(self._use("argument", _ARGUMENT))
+        single: list[Schema] = []
+        for arm in arms:
+            if arm not in single:
+                single.append(arm)
+        about = _readable(about, kinds)
+        return about | (single[0] if len(single) == 1 else {"anyOf": single})
+
+    def _use(self, name: str, definition: Schema) -> Schema:
+        self.used[name] = definition
+        return {"$ref": f"#/$defs/{name}"}
+
+
+def _readable(about: Schema, kinds: set[str | None]) -> Schema:
+    """Return description, default and examples as they are written in a file.
+
+    A default of a quantity is held in SI, and None means that a key is left out: neither can be written.
+    """
+    told = dict(about)
+    text = kinds <= {"string", "null"}
+    scalar = kinds <= {*_SCALARS, "null"}
+    default = told.pop("default", None)
+    if scalar and default is not None and (isinstance(default, str) or not text):
+        told["default"] = default
+    examples = told.pop("examples", None)
+    if scalar and examples:
+        told["examples"] = examples if text else [plain_value(str(each)) for each in examples]
+    return told
+
+
+def _without_required(node: Any) -> Any:  # noqa: ANN401 (any part of a JSON document)
+    """Return a schema that asks for no key, but for those by which an `if` decides."""
+    if isinstance(node, list):
+        return [_without_required(each) for each in node]
+    if not isinstance(node, dict):
+        return node
+    return {
+        key: value if key == "if" else _without_required(value)
+        for key, value in node.items()
+        if key != "required" or not isinstance(value, list)
+    }
+
+
+class _Needs:
+    """Collects which keys a schema asks for, and nothing else of it."""
+
+    def __init__(self, schema: Schema) -> None:
+        self._schema = schema
+        self._above: list[str] = []
+
+    def of_root(self) -> Schema:
+        """Return the schema's own needs."""
+        return self._of(self._schema)
+
+    def _of(self, node: object) -> Schema:
+        if not isinstance(node, dict):
+            return {}
+        if "$ref" in node:
+            return self._behind(node["$ref"])
+        arms = [arm for arm in node.get("anyOf", ()) if arm.get("type") != "null"]
+        if len(arms) == 1:
+            return self._of(arms[0])
+        needs: Schema = {"required": node["required"]} if node.get("required") else {}
+        below = {key: self._of(each) for key, each in node.get("properties", {}).items()}
+        if below := {key: each for key, each in below.items() if each}:
+            needs["properties"] = below
+        for key in ("items", "additionalProperties"):
+            if inner := self._of(node.get(key)):
+                needs[key] = inner
+        branches = [(each["if"], self._of(each["then"])) for each in node.get("allOf", ()) if "if" in each]
+        if branches := [(condition, inner) for condition, inner in branches if inner]:
+            needs["allOf"] = [{"if": condition, "then": inner} for condition, inner in branches]
+        return needs
+
+    def _behind(self, reference: str) -> Schema:
+        if reference in self._above:  # a model of a plug-in that contains itself
+            return {}
+        self._above.append(reference)
+        needs = self._of(self._schema["$defs"][reference.removeprefix("#/$defs/")])
+        self._above.pop()
+        return needs

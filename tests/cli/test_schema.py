@@ -1,0 +1,183 @@
+"""`dxlrun schema`: what an editor is told agrees with what dxlrun reads."""
+
+from __future__ import annotations
+
+import functools
+import json
+from pathlib import Path
+from typing import Any, Literal
+
+import pytest
+from jsonschema import Draft202012Validator
+from pydantic import BaseModel
+
+from dxlrun.cli.app import run_tokens
+from dxlrun.cli.schema import schema_text
+from dxlrun.description.json_schema import robot_schema
+from dxlrun.description.syntax import parse
+from dxlrun.description.tree import grow, literal
+
+ROBOTS = Path(__file__).parents[2] / "robots"
+ROBOT = """\
+name: pair
+arguments: {port: {default: sim, help: "port or sim"}, rate: {default: 50}}
+buses:
+  main: {port: "${port}", protocol: 1.0, baud_rate: 1_000_000, adapter: {latency: "${late}"}}
+loop: {rate: "${rate}", scheduler: {policy: fifo, priority: 31, lock_memory: "${lock}"}}
+joints:
+  pan:
+    {bus: main, id: 1, model: AX-12A, reference: 150 deg, direction: 1, limits: {position: ["-${x}", 1 rad]}}
+  tilt: {bus: "${bus}", id: "${id}", model: "${model}", reference: "${zero}", direction: "${sign}"}
+controllers:
+  states: {type: joint_state_broadcaster, rate: 25}
+  head: {type: joint_trajectory_controller, active: "${on}", joints: [pan, tilt], tolerances: {goal: 2 deg}}
+  other: {type: "${kind}", whatever: 5}
+policies: {exit_timeout: 2 s}
+recording: {directory: logs}
+model: {urdf: pair.urdf}
+"""
+
+
+def data_of(text: str) -> dict[str, object]:
+    return grow(parse(text, "file"), "file", literal).data
+
+
+def wrong(kind: Literal["robot", "motion", "fragment"], text: str) -> list[str]:
+    """Return the places that a schema refuses."""
+    errors = validator_of(kind).iter_errors(data_of(text))
+    return sorted("/".join(map(str, error.absolute_path)) for error in errors)
+
+
+@functools.cache
+def validator_of(kind: Literal["robot", "motion", "fragment"]) -> Draft202012Validator:
+    return Draft202012Validator(json.loads(schema_text(kind)))
+
+
+@pytest.mark.parametrize("kind", ["robot", "motion", "fragment"])
+def test_each_schema_is_one(kind: Literal["robot", "motion", "fragment"]) -> None:
+    Draft202012Validator.check_schema(json.loads(schema_text(kind)))
+
+
+@pytest.mark.parametrize("path", sorted(ROBOTS.glob("*.yaml")), ids=lambda path: path.stem)
+def test_every_robot_is_right(path: Path) -> None:
+    text = path.read_text()
+    assert wrong("robot", text) == []
+    assert text.startswith("# yaml-language-server: $schema=robot.schema.json\n")
+
+
+@pytest.mark.parametrize("path", sorted(ROBOTS.glob("motions/*.yaml")), ids=lambda path: path.stem)
+def test_every_motion_is_right(path: Path) -> None:
+    text = path.read_text()
+    assert wrong("motion", text) == []
+    assert text.startswith("# yaml-language-server: $schema=motion.schema.json\n")
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"), [("robot", "robot.schema.json"), ("motion", "motions/motion.schema.json")]
+)
+def test_the_schemas_beside_the_robots_are_those_of_the_code(
+    kind: Literal["robot", "motion"], name: str
+) -> None:
+    # the standard controllers only: who has others installed writes a schema of his own
+    assert (ROBOTS / name).read_text() == schema_text(kind, only="dxlrun ")
+
+
+def test_arguments_may_stand_for_every_scalar() -> None:
+    assert wrong("robot", ROBOT) == []
+
+
+MISTAKES = [
+    ("name: pair\n", "", ""),
+    ("name: pair", "name: 2pair", "name"),
+    ("loop: {rate", "loops: {rate", ""),
+    ("protocol: 1.0", "protocol: 3", "buses/main/protocol"),
+    ("protocol: 1.0, ", "", "buses/main"),
+    ("baud_rate: 1_000_000", "baud_rate: fast", "buses/main/baud_rate"),
+    ('latency: "${late}"', "latency: 1", "buses/main/adapter/latency"),
+    ('latency: "${late}"', "latency: 1 deg", "buses/main/adapter/latency"),
+    ("adapter: {", "adaptor: {", "buses/main"),
+    ("policy: fifo", "policy: rr", "loop/scheduler/policy"),
+    ("priority: 31", "priority: 100", "loop/scheduler/priority"),
+    ("id: 1,", "id: 1.5,", "joints/pan/id"),
+    ("reference: 150 deg", "reference: 150", "joints/pan/reference"),
+    ("direction: 1,", "direction: 2,", "joints/pan/direction"),
+    ("1 rad]", "1 rad, 2 rad]", "joints/pan/limits/position"),
+    ("type: joint_state_broadcaster", "type: joint_state", "controllers/states/type"),
+    ("type: joint_state_broadcaster, rate: 25", "rate: 25", "controllers/states"),
+    ("rate: 25", "rate: 0", "controllers/states/rate"),
+    ("rate: 25", "rates: 25", "controllers/states"),
+    ("joints: [pan, tilt], ", "", "controllers/head"),
+    ("goal: 2 deg", "goal: 2", "controllers/head/tolerances/goal"),
+    ("tolerances: {goal", "tolerances: {goals", "controllers/head/tolerances"),
+    ("urdf: pair.urdf", "{}", "model"),
+    ("model: {urdf: pair.urdf}", "include: x.yaml", "include"),
+    ("model: {urdf: pair.urdf}", "sensors: {}", ""),
+    ("  pan:", "  pan joint:", "joints"),
+]
+
+
+@pytest.mark.parametrize(("right", "mistake", "place"), MISTAKES)
+def test_each_mistake_is_found_at_its_place(right: str, mistake: str, place: str) -> None:
+    assert right in ROBOT
+    assert set(wrong("robot", ROBOT.replace(right, mistake))) == {place}
+
+
+def test_who_includes_others_need_not_have_everything() -> None:
+    part = "joints: {pan: {id: 5}}\ncontrollers: {head: {active: false}}\n"
+
+    assert wrong("robot", f"include: [pair.yaml]\n{part}") == []
+    assert wrong("fragment", part) == []
+    assert set(wrong("robot", part)) == {"", "joints/pan", "controllers/head"}
+    assert wrong("fragment", part.replace("id: 5", "id: x")) == ["joints/pan/id"]
+
+
+def test_a_motion_takes_no_arguments() -> None:
+    text = (
+        "name: m\nmotions:\n"
+        "- {controller: c, duration: 1 s, samples: 5, joints: {j: {position: 0, velocity: cos(t)}}}\n"
+    )
+
+    assert wrong("motion", text) == []
+    assert wrong("motion", text.replace("5", '"${n}"')) != []
+    assert wrong("motion", text.replace("1 s", "1")) != []
+    assert wrong("motion", text.replace("samples: 5, ", "")) != []
+
+
+class Tree(BaseModel):
+    name: str
+    below: list[Tree] = []
+
+
+def test_the_parameters_of_any_controller_are_in_it() -> None:
+    """Also when its model contains itself."""
+    schema = robot_schema({"gardener": type("Parameters", (BaseModel,), {"__annotations__": {"tree": Tree}})})
+    good = data_of(
+        ROBOT.split("controllers:", maxsplit=1)[0] + "controllers: {g: {type: gardener, tree: {name: oak}}}\n"
+    )
+    validator = Draft202012Validator(schema)
+
+    assert list(validator.iter_errors(good)) == []
+    bad: Any = data_of("controllers: {g: {type: gardener, tree: {below: [{name: ash}]}}}")
+    assert [list(error.path) for error in validator.iter_errors({**good, **bad})] == [
+        ["controllers", "g", "tree"]
+    ]
+
+
+def test_the_command_prints_it_or_writes_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_tokens(["schema"]) == 0
+    printed = capsys.readouterr().out
+    assert printed == schema_text("robot")
+    assert run_tokens(["schema", "motion", "--output", str(tmp_path / "m.json")]) == 0
+    assert (tmp_path / "m.json").read_text() == schema_text("motion")
+    assert run_tokens(["schema", "fragment"]) == 0
+    assert json.loads(capsys.readouterr().out)["title"] == "dxlrun fragment of a robot file"
+
+
+@pytest.mark.parametrize("tokens", [["schema", "robots"], ["schema", "--output", "/proc/none/x.json"]])
+def test_what_cannot_be_done_is_one_line_and_exit_code_2(
+    tokens: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run_tokens(tokens) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert len(captured.err.splitlines()) == 1
