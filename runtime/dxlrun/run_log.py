@@ -10,6 +10,7 @@ from pathlib import Path
 
 from dxlrun.compile.plan import Plan, to_json
 from dxlrun.control.controller import CONTRACT_VERSION
+from dxlrun.errors import InputError
 from dxlrun.recording.header import LoggedController, LogHeader
 
 _LIBRARIES = ("dxlrun", "mcap", "msgspec", "numpy", "pluggy", "pydantic", "pyserial")
@@ -65,8 +66,17 @@ def epoch_offset_ns() -> int:
 
 
 def new_log(directory: Path, robot: str) -> Path:
-    """Return the path of a log that does not exist yet: `<robot>_<date>_<time>.mcap`."""
-    directory.mkdir(parents=True, exist_ok=True)
+    """Return the path of a log that does not exist yet: `<robot>_<date>_<time>.mcap`.
+
+    Raises InputError when there is no such directory and none can be made.
+    """
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"the log's directory {directory} cannot be made: {error.strerror or error}; write another under "
+            "`recording: {directory: ...}` or give --no-record"
+        ) from error
     stem = f"{robot}_{time.strftime('%Y%m%d_%H%M%S')}"
     path = directory / f"{stem}.mcap"
     number = 2

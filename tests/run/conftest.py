@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -96,6 +97,28 @@ class Running:
 
     process: subprocess.Popen[str]
     directory: Path
+    mark: str
+    """In the environment of every process of this run, also of those whose parent is dead."""
+
+    def processes(self) -> dict[str, int]:
+        """Return the process IDs that live, by module; "dxlrun" is the terminal's."""
+        found = {}
+        for path in Path("/proc").glob("[0-9]*"):
+            try:
+                if self.mark.encode() not in (path / "environ").read_bytes():
+                    continue
+                command = (path / "cmdline").read_bytes().split(b"\0")
+                state = (path / "stat").read_text().rsplit(")", 1)[1].split()[0]
+            except OSError:
+                continue
+            if state not in "ZX" and command != [b""]:
+                modules = [word.decode() for word in command if word.startswith(b"dxlrun.")]
+                found[modules[0].removeprefix("dxlrun.") if modules else "dxlrun"] = int(path.name)
+        return found
+
+    def gone(self) -> bool:
+        """Say whether no process of this run is left."""
+        return not self.processes()
 
     def one(self, pattern: str) -> Path | None:
         """Return the file of the logs directory that matches, once there is one."""
@@ -120,20 +143,8 @@ class Running:
         await_truth(goals, "goals in the ledger")
 
     def child(self, module: str) -> int:
-        """Return the process ID of one of dxlrun's own processes."""
-
-        def look() -> int | None:
-            for path in Path("/proc").glob("[0-9]*"):
-                try:
-                    command = (path / "cmdline").read_bytes().split(b"\0")
-                    family = _ancestors(int(path.name))
-                except (OSError, ValueError):
-                    continue
-                if module.encode() in command and self.process.pid in family:
-                    return int(path.name)
-            return None
-
-        return await_truth(look, module)
+        """Return the process ID of one of dxlrun's own processes, once it is there."""
+        return await_truth(lambda: self.processes().get(module.removeprefix("dxlrun.")), module)
 
     def signal(self, number: signal.Signals) -> None:
         self.process.send_signal(number)
@@ -142,15 +153,6 @@ class Running:
         """Return exit code, standard output, standard error."""
         out, err = self.process.communicate(timeout=DEADLINE_S + 30)
         return self.process.returncode, out, err
-
-
-def _ancestors(pid: int) -> set[int]:
-    family: set[int] = set()
-    while pid > 1:
-        fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
-        pid = int(fields[1])
-        family.add(pid)
-    return family
 
 
 def _python_path() -> list[str]:
@@ -166,14 +168,24 @@ def start(tmp_path: Path) -> Iterator[Start]:
     (tmp_path / "pair.yaml").write_text(ROBOT)
     started: list[Running] = []
 
-    def begin(*arguments: str, path: Path | None = None, robot: Path | None = None) -> Running:
+    def begin(
+        *arguments: str, path: Path | None = None, robot: Path | None = None, closed: bool = False
+    ) -> Running:
         paths = [str(path)] if path else []
+        mark = f"DXLRUN_TEST={tmp_path}/{len(started)}"
         environment = os.environ | {"PYTHONPATH": os.pathsep.join([*paths, *_python_path()])}
+        environment |= dict([mark.split("=")])
         command = [str(DXLRUN), str(robot or tmp_path / "pair.yaml"), *arguments]
+        close = f"exec >&- 2>&- <&-; exec {shlex.join(command)}"
         process = subprocess.Popen(
-            command, cwd=tmp_path, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+            ["/bin/sh", "-c", close] if closed else command,
+            cwd=tmp_path,
+            env=environment,
+            text=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
         )
-        started.append(Running(process, tmp_path))
+        started.append(Running(process, tmp_path, mark))
         return started[-1]
 
     yield begin
@@ -181,6 +193,8 @@ def start(tmp_path: Path) -> Iterator[Start]:
         if running.process.poll() is None:
             running.process.kill()
         running.process.communicate()
+    for running in started:
+        await_truth(running.gone, "the end of every process of the run")
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 
@@ -13,6 +14,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     0 good, 1 the robot or the run failed, 2 the input is wrong, 130 interrupted.
     """
+    _open_standard_streams()
     from dxlrun.cli.app import run_tokens  # not above: importing the package must cost nothing
 
     return run_tokens(tuple(sys.argv[1:] if arguments is None else arguments))
+
+
+def _open_standard_streams() -> None:
+    """Open /dev/null where the caller closed a standard stream: the next file would take its number.
+
+    A run's shared memory would do so, and then be replaced by the output of the first child.
+    """
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            descriptor = os.open(os.devnull, os.O_RDWR)
+            os.dup2(descriptor, number)
+            setattr(sys, name, os.fdopen(number, "w" if number else "r"))

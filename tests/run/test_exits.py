@@ -1,0 +1,250 @@
+"""Ways out of a run in which more than one thing goes wrong; judged by the ledger, and by who is left."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dxlrun.events import EventCode
+
+Running = Any
+Start = Callable[..., Any]
+Limp = Callable[[Running], bool]
+PLUGIN = """\
+import dxlrun, os, signal, sys, time
+class Odd(dxlrun.Controller):
+    @classmethod
+    def interfaces(cls, parameters, joints):
+        return dxlrun.Interfaces(joints=())
+    def on_configure(self, context):
+        {configure}
+    def update(self, time_ns, period_ns):
+        {update}
+@dxlrun.hookimpl
+def dxlrun_contract():
+    return dxlrun.CONTRACT_VERSION
+@dxlrun.hookimpl
+def dxlrun_controllers():
+    return {{'odd': Odd}}
+"""
+
+
+@pytest.fixture
+def odd(start: Start, tmp_path: Path) -> Callable[..., Running]:
+    """Start the robot with a controller of these two lines, as pip would install it."""
+
+    def begin(*arguments: str, configure: str = "pass", update: str = "pass") -> Running:
+        directory = tmp_path / "plugins"
+        info = directory / "odd_controllers-1.0.dist-info"
+        info.mkdir(parents=True)
+        (directory / "odd_controllers.py").write_text(PLUGIN.format(configure=configure, update=update))
+        (info / "METADATA").write_text("Metadata-Version: 2.1\nName: odd-controllers\nVersion: 1.0\n")
+        (info / "entry_points.txt").write_text("[dxlrun]\nodd = odd_controllers\n")
+        return start("type:=odd", *arguments, path=directory)
+
+    return begin
+
+
+def sent(run: Running) -> bytes:
+    return b"".join(entry.data for entry in run.ledger() if entry.direction == "in")
+
+
+def guardians_word(run: Running) -> str:
+    """Return what the guardian told the log."""
+    return " ".join(event.text for event in run.log().events if event.code == EventCode.GUARDIAN)
+
+
+def test_a_second_interrupt_cuts_torque_at_once(
+    start: Start, tmp_path: Path, all_limp: Limp, wait_for: Callable[..., Any]
+) -> None:
+    """At one cycle in two seconds the first interrupt is obeyed too late for anybody's patience."""
+    robot = tmp_path / "slow.yaml"
+    robot.write_text((tmp_path / "pair.yaml").read_text().replace("rate: 50", "rate: 0.5"))
+    run = start(robot=robot)
+    wait_for(lambda: sent(run).count(b"\xff\xff\xfe") or None, "the first goals")
+    run.signal(signal.SIGINT)
+    run.signal(signal.SIGTERM)  # another one, because two of a kind at once may arrive as one
+    code, _, err = run.finish()
+    assert code == 130, err
+    assert "torque was cut on request; torque off was confirmed by all 2 servos" in guardians_word(run)
+    assert all_limp(run)
+    assert run.log().complete
+
+
+def test_a_plug_in_that_hides_the_wish_to_stop_is_ended_after_exit_timeout(
+    odd: Callable[..., Running], all_limp: Limp
+) -> None:
+    run = odd(configure="signal.signal(signal.SIGTERM, signal.SIG_IGN)")
+    run.wait_until_moving()
+    run.signal(signal.SIGINT)
+    code, _, err = run.finish()
+    assert code == 130
+    assert "did not stop within 2 s" in err
+    assert all_limp(run)
+
+
+def test_a_stop_before_the_set_up_gives_no_torque(odd: Callable[..., Running], all_limp: Limp) -> None:
+    run = odd(configure="os.kill(os.getpid(), signal.SIGTERM)")
+    run.finish()
+    assert bytes((24, 1)) not in sent(run)
+    assert b"\x83" not in sent(run)
+    assert all_limp(run)
+    assert "given up on request" in " ".join(event.text for event in run.log().events)
+
+
+def test_an_interrupt_while_plug_ins_load_touches_no_servo(odd: Callable[..., Running]) -> None:
+    run = odd(configure="signal.signal(signal.SIGTERM, signal.SIG_DFL); time.sleep(60)")
+    run.child("dxlrun.loop_process")
+    run.signal(signal.SIGINT)
+    code, _, err = run.finish()
+    assert (code, err) == (130, "")
+    assert sent(run) == b""
+
+
+def test_a_guardian_that_dies_while_the_loop_loads_takes_it_along(start: Start) -> None:
+    run = start()
+    run.child("dxlrun.loop_process")
+    os.kill(run.child("dxlrun.guardian"), signal.SIGKILL)
+    code, _, err = run.finish()
+    assert code == 1
+    assert "guardian ended" in err
+    assert sent(run) == b""
+
+
+def test_a_terminal_that_dies_while_the_guardian_starts_is_noticed(
+    start: Start, wait_for: Callable[..., Any], all_limp: Limp
+) -> None:
+    run = start()
+    run.child("dxlrun.guardian")
+    run.signal(signal.SIGKILL)
+    run.process.wait()
+    wait_for(run.gone, "the end of every process")
+    assert all_limp(run)
+
+
+def test_a_hung_loop_without_a_guardian_is_ended_by_the_terminal(
+    start: Start, all_limp: Limp, wire_equals_log: Callable[[Running], None]
+) -> None:
+    run = start()
+    run.wait_until_moving()
+    guardian, loop = run.child("dxlrun.guardian"), run.child("dxlrun.loop_process")
+    os.kill(guardian, signal.SIGSTOP)
+    os.kill(loop, signal.SIGSTOP)
+    os.kill(guardian, signal.SIGKILL)
+    code, _, err = run.finish()
+    assert code == 1
+    assert "the loop did not stop and was killed" in err
+    assert "torque off was confirmed by all 2 servos" in err
+    assert all_limp(run)
+    wire_equals_log(run)
+
+
+def test_guardian_and_loop_killed_together(start: Start, all_limp: Limp) -> None:
+    run = start()
+    run.wait_until_moving()
+    guardian, loop = run.child("dxlrun.guardian"), run.child("dxlrun.loop_process")
+    os.kill(guardian, signal.SIGSTOP)
+    for one in (loop, guardian):
+        os.kill(one, signal.SIGKILL)
+    code, _, err = run.finish()
+    assert code == 1
+    assert "torque off was confirmed by all 2 servos" in err
+    assert all_limp(run)
+
+
+def test_a_guardian_that_stands_still_ends_the_run(start: Start, all_limp: Limp) -> None:
+    run = start()
+    run.wait_until_moving()
+    os.kill(run.child("dxlrun.guardian"), signal.SIGSTOP)
+    code, _, err = run.finish()
+    assert code == 1
+    assert "did not look after the loop" in err
+    assert all_limp(run)
+    assert run.log().complete
+
+
+def test_a_recorder_that_stands_still_does_not_stop_the_robot_and_is_said(
+    start: Start, all_limp: Limp
+) -> None:
+    run = start("--duration", "1")
+    run.wait_until_moving()
+    os.kill(run.child("dxlrun.recording"), signal.SIGSTOP)
+    code, _, err = run.finish()
+    assert code == 1
+    assert "the recorder said nothing for 10 s and was killed" in err
+    assert "Traceback" not in err
+    assert all_limp(run)
+    assert run.log().cycles is not None
+
+
+def test_the_loop_holds_nobodys_lines(start: Start) -> None:
+    run = start("--duration", "2")
+    run.wait_until_moving()
+    held = Path(f"/proc/{run.child('dxlrun.loop_process')}/fd")
+    targets = sorted(os.readlink(one) for one in held.iterdir())
+    assert not [target for target in targets if target.startswith(("socket:", "pipe:", "anon_inode:"))]
+    assert sum(target.startswith("/dev/pts/") for target in targets) == 1
+    run.finish()
+
+
+def test_what_a_plug_in_prints_is_for_debug_only(odd: Callable[..., Running]) -> None:
+    run = odd("--duration", "0.3", configure="print('to out'); print('to err', file=sys.stderr)")
+    code, out, err = run.finish()
+    assert (code, err) == (0, "")
+    assert "to out" not in out
+
+
+def test_debug_shows_what_a_plug_in_prints_within_bounds(odd: Callable[..., Running]) -> None:
+    run = odd("--duration", "0.3", "--debug", configure="print('to out' * 1_000_000)")
+    code, _, err = run.finish()
+    assert code == 0
+    assert "to out" in err
+    assert len(err) < 2_000_000
+    assert "left out" in err
+
+
+@pytest.mark.parametrize("flags", [(), ("--debug",)])
+def test_a_fault_of_dxlrun_itself_is_a_sentence_and_a_traceback_only_for_debug(
+    odd: Callable[..., Running], all_limp: Limp, flags: tuple[str, ...]
+) -> None:
+    breaks = "import dxlrun.control.loop as loop; loop.Loop._next = None"
+    run = odd(*flags, configure=breaks)
+    code, _, err = run.finish()
+    assert code == 1
+    assert "dxlrun itself failed: TypeError" in err
+    assert ("Traceback" in err) == bool(flags)
+    assert all_limp(run)
+    fatal = [event.text for event in run.log().events if event.code == EventCode.LOOP_STOPPED]
+    assert "Traceback" in fatal[-1]
+
+
+def test_a_directory_that_takes_no_log_is_one_sentence(start: Start, tmp_path: Path) -> None:
+    (tmp_path / "logs").write_text("a file where the directory should be")
+    code, _, err = start().finish()
+    assert code == 2
+    assert len(err.splitlines()) == 1
+    assert "logs" in err
+    assert "internal" not in err
+
+
+def test_a_closed_terminal_does_not_matter_to_the_robot(start: Start, all_limp: Limp) -> None:
+    run = start("--duration", "0.5")
+    assert run.process.stdout is not None
+    run.process.stdout.close()
+    run.process.stdout = None  # finish reads only standard error then
+    _, _, err = run.finish()
+    assert "Traceback" not in err
+    assert all_limp(run)
+    assert run.log().complete
+
+
+def test_without_any_standard_stream_the_robot_runs(start: Start, all_limp: Limp) -> None:
+    run = start("--duration", "0.5", closed=True)
+    assert run.finish() == (0, "", "")
+    assert all_limp(run)
+    assert len(run.log().cycles) > 0
