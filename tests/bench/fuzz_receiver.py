@@ -33,7 +33,7 @@ class Tally:
     intact: int = 0
     delivered: int = 0
     accidents: int = 0
-    """Damaged or random bytes that happened to be a packet with a right checksum."""
+    """Packets with a right checksum among damaged bytes: by chance, or the damage lies beside them."""
     swallowed: int = 0
     """Intact packets of which such an accident took a part."""
     noise_bytes: int = 0

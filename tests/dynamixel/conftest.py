@@ -100,15 +100,16 @@ def _plan(
     return_delay_ns=500_000,
     **change,
 ):
-    """Return a plan of AX-12; references in the middle, directions -1, +1, -1, ..."""
-    table = control_table("AX-12A")
+    """Return a plan; references in the middle, directions -1, +1, -1, ...; AX-12 if nothing else is said."""
+    protocol = change.get("protocol", 1.0)
+    models = change.get("models") or [change.get("model", "AX-12A")] * len(ids)
     names = change.get("joints", [f"{name}_{servo_id}_joint" for servo_id in ids])
     wiring = [
         Wiring(
             joint=names[index],
             row=first_row + index,
             servo_id=servo_id,
-            table=table,
+            table=control_table(models[index], protocol),
             reference=change.get("reference", MIDDLE),
             direction=1 if index % 2 else -1,
             lower=change.get("lower", -MIDDLE),
@@ -123,6 +124,7 @@ def _plan(
         latency_ns=latency_ns,
         return_delay_ns=return_delay_ns,
         joints=wiring,
+        protocol=protocol,
     )
 
 
@@ -150,7 +152,7 @@ def make_rig(make_plan) -> Callable[..., Rig]:
                 )
                 for servo in plan.servos
             )
-            config = BusConfig(plan.name, plan.baud_rate, servos + tuple(extra))
+            config = BusConfig(plan.name, plan.baud_rate, servos + tuple(extra), plan.protocol)
             buses.append(SimulatedBus(config, ledger, clock.now_ns()))
         ports = VirtualPorts(clock, buses)
         rows = sum(len(plan.servos) for plan in plans)

@@ -16,6 +16,7 @@ def simulated_buses(plan: Plan) -> tuple[BusConfig, ...]:
                 ServoConfig(servo.servo_id, servo.model, servo.reference, bus.return_delay_ns)
                 for servo in bus.servos
             ),
+            protocol=bus.protocol,
         )
         for bus in plan.buses
         if bus.port == "sim"

@@ -1,0 +1,86 @@
+"""MX servos with old firmware: one bulk read for two or more of them, beside AX on the same line."""
+
+import math
+
+import pytest
+
+from dxlrun.dynamixel import protocol1
+from dxlrun.events import EventCode
+
+MIXED = ("AX-12A", "MX-64", "MX-28", "AX-12A", "MX-64")
+
+
+@pytest.fixture
+def started(make_rig, make_plan):
+    plan = make_plan((1, 2, 3, 4, 5), models=MIXED, reference=math.radians(150), lower=-2.0, upper=2.0)
+    rig = make_rig(plan)
+    rig.hardware.start()
+    return rig
+
+
+def test_mx_are_read_together_and_ax_one_by_one(started):
+    count = len(started.into_bus())
+    started.cycle()
+    *reads, goals = started.into_bus()[count:]
+    assert reads == [
+        protocol1.read(1, 36, 6),
+        protocol1.bulk_read([(2, 36, 6), (3, 36, 6), (5, 36, 6)]),
+        protocol1.read(4, 36, 6),
+    ]
+    assert goals[4:7] == bytes((0x83, 30, 4))
+    assert started.states.valid.all()
+
+
+def test_goals_move_the_servos(started):
+    started.goals.position[:] = [0.3, -0.3, 0.2, -0.2, 0.5]
+    for _ in range(100):
+        started.cycle()
+    assert started.states.position == pytest.approx([0.3, -0.3, 0.2, -0.2, 0.5], abs=0.01)
+    assert started.events.of(EventCode.READ_LOST) == []
+    assert started.packets.received() == started.out_of_bus()
+    assert started.hardware.stop() == ()
+    assert started.torque() == [False] * 5
+
+
+def test_one_mx_alone_is_read_plainly(make_plan):
+    plan = make_plan((1, 2), models=("AX-12A", "MX-64"))
+    assert [read.packet for read in plan.reads] == [protocol1.read(1, 36, 6), protocol1.read(2, 36, 6)]
+
+
+def test_an_absent_servo_breaks_the_chain_for_one_cycle(started):
+    started.cycle()
+    started.buses[0].servo(3).silence()
+    started.cycle()
+    assert started.states.valid.tolist() == [True, True, False, True, False]
+    for _ in range(3):
+        started.cycle()
+        assert started.states.valid.tolist() == [True, True, False, True, True]
+    started.buses[0].servo(3).silence(False)
+    started.cycle()
+    started.cycle()
+    assert started.states.valid.all()
+
+
+def test_a_cut_reply_in_a_chain_is_lost_alone(started):
+    started.cycle()
+    held = started.states.position[1]
+    started.buses[0].corrupt_next(2, index=6)
+    started.cycle()
+    assert started.states.position[1] == held
+    assert not started.states.valid[1]
+    started.cycle()
+    assert started.states.valid.all()
+
+
+def test_an_mx_with_an_offset_is_refused(make_rig, make_plan):
+    rig = make_rig(make_plan((1, 2), models=("AX-12A", "MX-64")))
+    rig.buses[0].servo(2).poke("multi_turn_offset", 100)
+    with pytest.raises(RuntimeError, match="Multi Turn Offset"):
+        rig.hardware.start()
+
+
+def test_the_budget_counts_one_latency_a_request(make_plan):
+    budget = make_plan((1, 2, 3, 4, 5), models=MIXED, latency_ns=1_000_000).budget
+    assert budget.latency_ns == 3_000_000
+    assert budget.reply_bytes == 5 * 12
+    assert budget.request_bytes == 2 * 8 + (7 + 3 * 3) + (8 + 5 * 5)

@@ -1,0 +1,268 @@
+import math
+
+import numpy as np
+import pytest
+
+from dxlrun.dynamixel import protocol2
+from dxlrun.dynamixel.receiver import Receiver
+from dxlrun.dynamixel.units import goal_bytes, goal_ticks, joint_position, speed_ticks
+from dxlrun.errors import StartUpError
+from dxlrun.events import EventCode
+
+X_IDS = (11, 12, 13, 14, 15, 16, 17, 18)
+
+
+def packets_in(stream):
+    found = []
+    receiver = Receiver(lambda data, *_: found.append(bytes(data)), lambda *_: None, protocol2)
+    receiver.feed(stream, 0)
+    receiver.flush()
+    return found
+
+
+@pytest.fixture
+def make_x(make_plan):
+    def make(ids=X_IDS, **change):
+        return make_plan(
+            ids,
+            **{
+                "name": "arm",
+                "protocol": 2.0,
+                "model": "XM430-W350",
+                "reference": math.pi,
+                "lower": -2.5,
+                "upper": 2.5,
+                "return_delay_ns": 0,
+            }
+            | change,
+        )
+
+    return make
+
+
+@pytest.fixture
+def started(make_rig, make_x):
+    rig = make_rig(make_x())
+    rig.hardware.start()
+    return rig
+
+
+def test_start_holds_every_servo_where_it_stands(started):
+    assert started.torque() == [True] * 8
+    assert started.states.valid.all()
+    assert started.goals.position == pytest.approx(started.states.position, abs=0.002)
+    before = [servo.position for servo in started.buses[0].servos]
+    for _ in range(10):
+        started.cycle()
+    assert [servo.position for servo in started.buses[0].servos] == pytest.approx(before, abs=0.002)
+    assert started.events.of(EventCode.REGISTER_DIFFERS) == []
+
+
+def test_a_cycle_is_one_sync_read_and_one_sync_write(started):
+    count = len(started.into_bus())
+    started.goals.position[:] = np.linspace(-0.5, 0.5, 8)
+    started.goals.velocity[:] = 1.0
+    started.cycle()
+    goals = {
+        servo.servo_id: goal_bytes(
+            servo, goal_ticks(servo, started.goals.position[servo.row]), speed_ticks(servo, 1.0)
+        )
+        for servo in started.plans[0].servos
+    }
+    assert started.into_bus()[count:] == [
+        protocol2.sync_read(126, 10, X_IDS),
+        protocol2.sync_write(112, 8, goals),
+    ]
+
+
+def test_the_exchange_takes_what_protocol_md_says(started):
+    start = started.clock.now_ns()
+    started.hardware.read()
+    assert started.clock.now_ns() - start == 220_000 + 8 * 210_000
+
+
+def test_goals_move_the_servos_both_ways(started):
+    for goal in (0.3, -0.4):
+        started.goals.position[:] = goal
+        for _ in range(80):
+            started.cycle()
+        assert started.states.position == pytest.approx(goal, abs=0.01)
+    assert started.events.of(EventCode.READ_LOST) == []
+    assert started.packets.sent() == started.into_bus()
+    assert started.packets.received() == started.out_of_bus()
+
+
+def test_velocity_has_the_joints_sign(started):
+    started.goals.position[:] = [2.3, -2.3] * 4
+    started.goals.velocity[:] = 1.0
+    standing = started.states.position.copy()
+    for _ in range(7):
+        started.cycle()
+    assert started.states.velocity == pytest.approx(np.sign(started.goals.position - standing), abs=0.1)
+
+
+@pytest.mark.parametrize("others_answer", [False, True])
+def test_an_absent_servo_costs_the_others_one_cycle_at_most(started, others_answer):
+    started.buses[0].skips_absent = others_answer
+    started.cycle()
+    started.buses[0].servo(13).silence()
+    started.cycle()
+    assert started.states.valid.tolist() == [row < 2 or (others_answer and row > 2) for row in range(8)]
+    started.cycle()
+    assert started.states.valid.tolist() == [row != 2 for row in range(8)]
+    start = started.clock.now_ns()
+    started.hardware.read()
+    assert started.clock.now_ns() - start < 5_000_000
+    started.cycle()
+    started.buses[0].servo(13).silence(False)
+    for _ in range(3):
+        started.cycle()
+    assert started.states.valid.all()
+    lost = {source for source, _ in started.events.of(EventCode.READ_LOST)}
+    assert "arm_13_joint" in lost
+    assert len(lost) == (1 if others_answer else 6)
+    for _ in range(10):  # whoever missed a turn is asked for its torque before it gets goals again
+        started.cycle()
+    goals = [packet for packet in started.into_bus() if packet[7] == 0x83][-1]
+    assert list(goals[12:-2:9]) == list(X_IDS)
+
+
+def test_a_servo_that_rebooted_stays_out_of_the_goals(started):
+    servo = started.buses[0].servo(13)
+    servo.silence()
+    started.cycle()
+    servo.reset()
+    servo.silence(False)
+    for _ in range(20):
+        started.cycle()
+    assert started.torque() == [servo_id != 13 for servo_id in X_IDS]
+    ((source, text),) = started.events.of(EventCode.SERVO_LIMP)
+    assert source == "arm_13_joint"
+    assert "Torque Enable (64)" in text
+
+
+def test_stop_limps_everybody(started):
+    assert started.hardware.stop() == ()
+    assert started.torque() == [False] * 8
+
+
+@pytest.mark.parametrize(
+    ("register", "value", "said"),
+    [
+        ("model_number", 1030, "is model number 1030, not a XM430-W350"),
+        ("status_return_level", 1, "Status Return Level (68) = 1"),
+        ("status_return_level", 0, "Status Return Level (68) is 0"),
+        ("operating_mode", 1, "Operating Mode (11) = 1, which is not position control: write 3"),
+        ("operating_mode", 4, "Operating Mode (11) = 4"),
+        ("drive_mode", 1, "Drive Mode (10) = 1, so it turns the other way round: write 0"),
+        ("drive_mode", 4, "takes profiles for times"),
+        ("homing_offset", -100, "Homing Offset (20) = -100, which shifts every position: write 0"),
+        ("max_position_limit", 2100, "has position limits 0..2100, narrower than the joint's"),
+        ("startup_configuration", 1, "switches torque on by itself at power-up"),
+        ("hardware_error_status", 0x20, "Hardware Error Status (70): overload error"),
+        ("torque_enable", 1, "holds torque already"),
+    ],
+)
+def test_a_register_that_does_not_fit(make_rig, make_x, register, value, said):
+    model = "XL330-M288" if register == "startup_configuration" else "XM430-W350"
+    rig = make_rig(make_x((11, 12), model=model))
+    rig.buses[0].servo(12).poke(register, value)
+    with pytest.raises(StartUpError) as caught:
+        rig.hardware.start()
+    assert [packet for packet in rig.into_bus() if packet[7] not in (1, 2)] == []
+    problem = str(caught.value).splitlines()[0]
+    assert "arm_12_joint (ID 12 on bus arm)" in problem
+    assert said in problem
+
+
+def test_take_over_accepts_torque(make_rig, make_x):
+    rig = make_rig(make_x((11, 12)), take_over=True)
+    rig.buses[0].servo(12).poke("torque_enable", 1)
+    rig.hardware.start()
+    assert rig.torque() == [True, True]
+
+
+def test_two_buses_of_different_protocols_are_read_side_by_side(make_rig, make_plan, make_x):
+    rig = make_rig(make_plan((1, 2), name="head"), make_x((11, 12), first_row=2))
+    rig.hardware.start()
+    rig.goals.position[:] = [0.1, 0.2, 0.3, -0.4]
+    start = rig.clock.now_ns()
+    rig.hardware.read()
+    assert rig.clock.now_ns() - start == 2 * 700_000
+    for _ in range(80):
+        rig.cycle()
+    assert rig.states.position == pytest.approx([0.1, 0.2, 0.3, -0.4], abs=0.01)
+    rig.buses[0].servo(2).silence()
+    rig.cycle()
+    assert rig.states.valid.tolist() == [True, False, True, True]
+    assert rig.hardware.stop() != ()
+    for bus in (0, 1):
+        assert rig.packets.sent(bus) == rig.into_bus(bus)
+        assert rig.packets.received(bus) == rig.out_of_bus(bus)
+    assert rig.torque(1) == [False, False]
+
+
+def test_joint_position_of_an_x(make_x):
+    servo = make_x((11,)).servos[0]
+    assert joint_position(servo, 2048) == pytest.approx(0.0, abs=0.002)
+
+
+def test_an_alert_is_read_once_and_told_in_the_manuals_words(started):
+    started.cycle()
+    started.buses[0].servo(14).poke("hardware_error_status", 0x20)
+    for _ in range(4):
+        started.cycle()
+    told = [text for source, text in started.events.of(EventCode.SERVO_ERROR) if source == "arm_14_joint"]
+    assert len(told) == 2
+    assert "alert" in told[0]
+    assert "Hardware Error Status (70) = 32: overload error" in told[1]
+    assert started.states.valid.all()
+    reads = [packet for packet in started.into_bus() if packet == protocol2.read(14, 70, 1)]
+    assert len(reads) == 2  # one at the start, one for the alert
+
+
+@pytest.mark.parametrize("late_ms", [12.5, 19.8, 20.1, 20.6, 21.3, 33.3, 40.5, 60.2])
+def test_a_late_reply_is_never_taken_as_current(started, late_ms):
+    started.goals.position[:] = [-2.0, 2.0] * 4
+    started.goals.velocity[:] = 1.0
+    started.cycle()
+    started.buses[0].delay_next(11, int(late_ms * 1e6))
+    missed = 0
+    for _ in range(8):
+        asked = started.clock.now_ns()
+        started.cycle()
+        missed += not started.states.valid[0]
+        entries = [entry for entry in started.ledger.entries if asked <= entry.t_ns < asked + 5_000_000]
+        asking = [e.data for e in entries if e.direction == "in" and e.data[8] == 126]
+        length = next(data[10] for data in asking if data[4] == 11 or 11 in data[12:-2])
+        sent = packets_in(b"".join(e.data for e in entries if e.direction == "out"))
+        mine = [packet for packet in sent if packet[4] == 11 and len(packet) == 11 + length]
+        if started.states.valid[0]:
+            newest = int.from_bytes(mine[-1][15:19], "little", signed=True)
+            assert started.states.position[0] == joint_position(started.plans[0].servos[0], newest)
+    assert missed >= 1
+    assert started.packets.received() == started.out_of_bus()
+
+
+def test_servos_of_several_layouts_share_a_bus(make_rig, make_plan):
+    rig = make_rig(
+        make_plan(
+            (1, 2, 3, 4),
+            protocol=2.0,
+            models=["XM430-W350", "XL-320", "XM430-W350", "XL-320"],
+            reference=math.radians(150),
+            lower=-2.0,
+            upper=2.0,
+        )
+    )
+    assert rig.plans[0].groups == ((0, 2), (1, 3))
+    rig.hardware.start()
+    rig.goals.position[:] = [0.3, -0.3, 0.2, -0.2]
+    for _ in range(80):
+        rig.cycle()
+    assert rig.states.position == pytest.approx([0.3, -0.3, 0.2, -0.2], abs=0.01)
+    assert rig.events.of(EventCode.READ_LOST) == []
+    assert rig.hardware.stop() == ()
+    assert rig.torque() == [False] * 4
+    # nobody was told to write at the address where the other model has its torque enable
+    assert [packet for packet in rig.into_bus() if packet[4] == 254 and packet[7] == 3] == []
