@@ -113,8 +113,3 @@ def test_the_parts_start_one_after_the_other_and_end_after_35_seconds(torso: Com
 
     assert starts == {"head": 0, "right_arm": 1_000_000_000, "left_arm": 3_000_000_000}
     assert torso.plan.loop.end_ns == 35_000_000_000
-
-
-@pytest.mark.parametrize("path", sorted(ROBOTS.glob("*.yaml")), ids=lambda path: path.stem)
-def test_every_robot_file_compiles(path: Path):
-    assert compile_files(path, {}, []).plan.loop.joints

@@ -1,0 +1,61 @@
+"""Each robot file with each of its motions: it compiles, it runs, it is where the motion wants it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dxlrun.compile import compile_files
+
+ROBOTS = Path(__file__).parents[2] / "robots"
+MOTIONS = sorted(ROBOTS.glob("motions/*.yaml"))
+LONGEST_S = 8.0
+ODD_TWIN = "right_shoulder_lateral_joint is no mirror image"
+
+
+@pytest.mark.parametrize("path", sorted(ROBOTS.glob("*.yaml")), ids=lambda path: path.stem)
+def test_every_robot_compiles_and_has_motions(path: Path, command_of: Callable[[Path], Any]) -> None:
+    compiled = compile_files(path, {}, [])
+
+    assert [w.what for w in compiled.warnings if not w.what.startswith(ODD_TWIN)] == []
+    assert path in {command_of(motion).robot for motion in MOTIONS}
+
+
+@pytest.mark.parametrize("path", MOTIONS, ids=lambda path: path.stem)
+def test_every_motion_runs_by_the_command_that_it_names(
+    path: Path, command_of: Callable[[Path], Any], played: Callable[..., Any]
+) -> None:
+    command = command_of(path)
+    assert command.motion == path
+    plan = compile_files(command.robot, command.arguments, [path]).plan
+    assert plan.loop.end_ns is not None
+    run = played(command, min(LONGEST_S, plan.loop.end_ns * 1e-9))
+
+    result, cycles = run.robot.result, run.log.cycles
+    assert (result.reason, result.detail, result.skipped, run.robot.failures) == ("ended", "", 0, ())
+    assert cycles["valid"].all()
+    ends = {command.controller: command for command in plan.loop.commands}
+    assert ends
+    for controller in plan.loop.controllers:
+        rows = [run.log.joints.index(joint) for joint in controller.joints if controller.name in ends]
+        travel = np.ptp(cycles["position"][:, rows], axis=0)
+        assert not rows or travel.max() > 0.3  # rad: each controller that is played moves something
+    for bus, servos in zip(run.robot.buses, plan.buses, strict=True):
+        for servo in servos.servos:
+            assert not bus.servo(servo.servo_id).torque_on
+    # a limit of the position, never of the step in the first second, would be a mistake of the motion
+    assert not (cycles["clamped"] & 0b11).any()
+
+
+def test_the_torso_is_described_in_its_log(
+    command_of: Callable[[Path], Any], played: Callable[..., Any]
+) -> None:
+    run = played(command_of(ROBOTS / "motions" / "whole_body_position.yaml"), 0.1)
+
+    assert json.loads(run.log.attachments["plan.json"])["urdf"].startswith("<?xml")
+    assert run.log.attachments["included/bioloid_torso.yaml"] == (ROBOTS / "bioloid_torso.yaml").read_bytes()

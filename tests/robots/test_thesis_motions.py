@@ -1,0 +1,71 @@
+"""The thesis' experiments on virtual time: steps of Figures 19 and 20, and the tracking motion."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dxlrun.control_table import control_table
+
+MOTIONS = Path(__file__).parents[2] / "robots" / "motions"
+STEP_S = 3.0
+CASES = [("single_joint_step", "joint", "MX-64"), ("whole_body", "head_yaw_joint", "AX-12A")]
+
+
+def step(run: Any, joint: str) -> tuple[Any, Any, Any]:
+    """Return time since the step, s, position, rad, and speed, rad/s, of a joint from the step on."""
+    cycles, row = run.log.cycles, run.log.joints.index(joint)
+    t = (cycles["read_ns"] - cycles["scheduled_ns"][0]) * 1e-9 - STEP_S
+    after = (t >= 0) & (t < STEP_S)
+    return t[after], cycles["position"][after, row], cycles["velocity"][after, row]
+
+
+@pytest.mark.parametrize(("name", "joint", "model"), CASES)
+def test_a_step_of_the_position_alone_is_as_fast_as_the_servo_can(
+    name: str, joint: str, model: str, command_of: Callable[[Path], Any], played: Callable[..., Any]
+) -> None:
+    t, q, speed = step(played(command_of(MOTIONS / f"{name}_position.yaml")), joint)
+    table = control_table(model, 1.0)
+
+    assert (q[0], q[-1]) == pytest.approx((-1.0, 1.0), abs=2 * table.rad_per_tick)
+    on_the_way = (q > -0.5) & (q < 0.5)
+    assert np.polyfit(t[on_the_way], q[on_the_way], 1)[0] == pytest.approx(table.max_speed, rel=0.03)
+    assert speed.max() == pytest.approx(table.max_speed, rel=0.03)
+
+
+@pytest.mark.parametrize(("name", "joint", "model"), CASES)
+def test_a_step_with_a_speed_has_that_speed_all_the_way(
+    name: str, joint: str, model: str, command_of: Callable[[Path], Any], played: Callable[..., Any]
+) -> None:
+    t, q, speed = step(played(command_of(MOTIONS / f"{name}_posvel.yaml")), joint)
+    table = control_table(model, 1.0)
+
+    assert (q[0], q[-1]) == pytest.approx((-1.0, 1.0), abs=2 * table.rad_per_tick)
+    on_the_way = (q > -0.9) & (q < 0.9)
+    assert np.polyfit(t[on_the_way], q[on_the_way], 1)[0] == pytest.approx(1.0, rel=0.02)
+    assert speed[on_the_way] == pytest.approx(1.0, abs=2 * table.rad_s_per_tick)
+
+
+def test_the_tracking_motion_keeps_its_time(
+    command_of: Callable[[Path], Any], played: Callable[..., Any]
+) -> None:
+    """A motion that is sent by number, not by time, stretches: the thesis' old library by 5 s in 30 s."""
+    run = played(command_of(MOTIONS / "single_joint_tracking.yaml"), 10.0)
+    cycles = run.log.cycles
+    t = (cycles["read_ns"] - cycles["scheduled_ns"][0]) * 1e-9 - 1.0
+    moving = t > 0.5
+
+    def wanted(delay: float) -> Any:
+        return 0.5 * (np.sin(2 * (t - delay)) - np.sin(4 * (t - delay)))
+
+    def error(delay: float) -> float:
+        return float(np.sqrt(np.mean((cycles["position"][:, 0] - wanted(delay))[moving] ** 2)))
+
+    assert error(0.0) < 0.05
+    assert min(np.arange(0.0, 0.1, 0.005), key=error) < 0.04
+    late = t > 8.0
+    assert np.abs(cycles["position"][late, 0] - wanted(0.0)[late]).max() < 0.08
