@@ -92,6 +92,9 @@ def test_wrong_words_are_one_sentence_and_exit_code_two(dxlrun, words: list[str]
         (["speed:=3"], "no argument 'speed'"),
         (["--duration", "0"], "--duration 0 is no time to run"),
         (["--duration", "nan"], "--duration nan is no time to run"),
+        (["--duration", "-1"], "--duration -1 is no time to run"),
+        (["--duration", "1e300"], "give a number of seconds from 1e-06 to 1e+09"),
+        (["--duration", "1e-12"], "--duration 1e-12 is no time to run"),
         (["--play", "missing.yaml"], "there is no such file"),
     ],
 )
@@ -119,6 +122,11 @@ def test_a_value_may_hold_the_sign(torso):
             "a\ufffdb\ufffd[31m:3:7: bad; mend",
         ),
         (KeyboardInterrupt(), 130, "interrupted"),
+        (
+            FileNotFoundError(2, "No such file or directory", "x"),
+            1,
+            "dxlrun: x: No such file or directory; --debug",
+        ),
         (ZeroDivisionError("oops"), 1, "dxlrun: internal error: ZeroDivisionError: oops"),
     ],
 )

@@ -15,9 +15,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     0 good, 1 the robot or the run failed, 2 the input is wrong, 130 interrupted.
     """
     _open_standard_streams()
-    from dxlrun.cli.app import run_tokens  # not above: importing the package must cost nothing
+    try:
+        from dxlrun.cli.app import run_tokens  # not above: importing the package must cost nothing
 
-    return run_tokens(tuple(sys.argv[1:] if arguments is None else arguments))
+        return run_tokens(tuple(sys.argv[1:] if arguments is None else arguments))
+    except KeyboardInterrupt:  # while that was being imported, or an error being told
+        sys.stderr.write("interrupted\n")
+        return 130
 
 
 def _open_standard_streams() -> None:

@@ -82,6 +82,10 @@ def _explain(error: Exception) -> int:
             f"dxlrun: {' '.join(str(error).split()).removesuffix('.')}; `dxlrun --help` shows the usage"
         )
         return InputError.exit_code
+    if isinstance(error, OSError):
+        where = f"{error.filename}: " if error.filename else ""
+        say_error(f"dxlrun: {where}{error.strerror or error}; --debug shows what was being done")
+        return 1
     say_error(
         f"dxlrun: internal error: {type(error).__name__}: {error}; please report it, with what --debug prints"
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,6 +15,10 @@ if TYPE_CHECKING:
 COMMANDS = ("analyze", "check", "schema")
 
 
+SHORTEST_S, LONGEST_S = 1e-6, 1e9
+"""Of a run, s; 31 years are nearly for ever, and still fit into the log's nanoseconds."""
+
+
 def compiled(
     robot: Path, assignments: Sequence[str], play: Sequence[Path], duration: float | None
 ) -> Compiled:
@@ -24,8 +27,11 @@ def compiled(
     arguments = parse_assignments(assignments)
     duration_ns = None
     if duration is not None:
-        if not (math.isfinite(duration) and duration > 0):
-            raise InputError(f"--duration {duration:g} is no time to run; give a number of seconds above 0")
+        if not SHORTEST_S <= duration <= LONGEST_S:  # false for nan too
+            raise InputError(
+                f"--duration {duration:g} is no time to run; "
+                f"give a number of seconds from {SHORTEST_S:g} to {LONGEST_S:g}"
+            )
         duration_ns = round(duration * 1e9)
     from dxlrun.compile import compile_files  # not above: a wrong word needs neither numpy nor pydantic
 

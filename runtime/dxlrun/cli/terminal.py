@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import suppress
 
 from rich.console import Console
 from rich.text import Text
@@ -29,7 +30,8 @@ def _say(line: str, style: str) -> None:
         character if character.isprintable() else "\N{REPLACEMENT CHARACTER}" for character in line
     )
     console = _console(sys.stderr.isatty(), stderr=True)
-    console.print(Text(safe, style=style), soft_wrap=True)
+    with suppress(OSError):  # full, or gone: there is nobody left to tell, and the exit code says it too
+        console.print(Text(safe, style=style), soft_wrap=True)
 
 
 def _console(terminal: bool, *, stderr: bool) -> Console:
