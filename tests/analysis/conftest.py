@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -68,42 +69,50 @@ class Said:
 Write = Callable[..., Path]
 
 
+@pytest.fixture(scope="session")
+def write_to() -> Write:
+    """Write a log of these cycles, packets and events into a directory; return its path."""
+    return make_log
+
+
 @pytest.fixture
 def write(tmp_path: Path) -> Write:
     """Write a log of these cycles, packets and events; return its path."""
+    return partial(make_log, tmp_path)
 
-    def make(
-        cycles: Sequence[Cycle] = (),
-        wires: Sequence[Wire] = (),
-        events: Sequence[Said] = (),
-        gaps: int = 0,
-        close: bool = True,
-    ) -> Path:
-        path = tmp_path / "run.mcap"
-        controllers = (LoggedController("head", JOINTS[1:], ()), LoggedController("idle", (), ()))
-        attachments = {"plan.json": json.dumps(PLAN).encode()}
-        log = LogWriter(path, LogHeader("torso", JOINTS, ("main",), controllers, PERIOD_NS, 0, attachments))
-        record = CycleRecord(CycleLayout(JOINTS, ["head", "idle"]))
-        for cycle in cycles:
-            fill(record, cycle)
-            log.cycle(record.raw)
-        batch = PacketBatch(Handover(log.packets))
-        for wire in wires:
-            last = wire.at if wire.last is None else wire.last
-            batch.packet(0, wire.kind, wire.servo_id, wire.at * 1000, last * 1000, wire.data)
-        batch.commit()
-        ring = EventRing(Handover(log.event), VirtualClock(9))
-        for said in events:
-            ring.emit(said.code, said.severity, "head", said.text)
-        if gaps:
-            log.gap("loop/packets", gaps)
-        if close:
-            log.close()
-        else:
-            log.flush()
-        return path
 
-    return make
+def make_log(
+    directory: Path,
+    cycles: Sequence[Cycle] = (),
+    wires: Sequence[Wire] = (),
+    events: Sequence[Said] = (),
+    *,
+    gaps: int = 0,
+    close: bool = True,
+) -> Path:
+    path = directory / "run.mcap"
+    controllers = (LoggedController("head", JOINTS[1:], ()), LoggedController("idle", (), ()))
+    attachments = {"plan.json": json.dumps(PLAN).encode()}
+    log = LogWriter(path, LogHeader("torso", JOINTS, ("main",), controllers, PERIOD_NS, 0, attachments))
+    record = CycleRecord(CycleLayout(JOINTS, ["head", "idle"]))
+    for cycle in cycles:
+        fill(record, cycle)
+        log.cycle(record.raw)
+    batch = PacketBatch(Handover(log.packets))
+    for wire in wires:
+        last = wire.at if wire.last is None else wire.last
+        batch.packet(0, wire.kind, wire.servo_id, wire.at * 1000, last * 1000, wire.data)
+    batch.commit()
+    ring = EventRing(Handover(log.event), VirtualClock(9))
+    for said in events:
+        ring.emit(said.code, said.severity, "head", said.text)
+    if gaps:
+        log.gap("loop/packets", gaps)
+    if close:
+        log.close()
+    else:
+        log.flush()
+    return path
 
 
 def fill(record: CycleRecord, cycle: Cycle) -> None:
@@ -121,16 +130,16 @@ def fill(record: CycleRecord, cycle: Cycle) -> None:
     record.controller_ns[:] = [cycle.update * 500, 0]
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def cycle() -> type[Cycle]:
     return Cycle
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def wire() -> type[Wire]:
     return Wire
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def said() -> type[Said]:
     return Said

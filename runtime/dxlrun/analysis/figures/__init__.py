@@ -1,0 +1,1 @@
+"""The figures of a report; each module draws one subject from a log."""

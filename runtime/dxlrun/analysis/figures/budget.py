@@ -1,0 +1,162 @@
+"""Where the time of a cycle goes: wake-up, read, update and write, stacked against the period."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from dxlrun.analysis.envelope import Columns
+from dxlrun.analysis.figures.drawing import (
+    BLUE,
+    DASHED,
+    ERROR,
+    GREEN,
+    INK,
+    MUTED,
+    ORANGE,
+    PAPER,
+    PURPLE,
+    Drawing,
+    Words,
+    draw,
+    time_axis,
+)
+from dxlrun.analysis.figures.run_time import run_time_s
+from dxlrun.analysis.verdict import microseconds
+from dxlrun.recording.reader import Log
+
+_STEPS = (
+    ("wake-up", "scheduled_ns", "woken_ns", PURPLE),
+    ("read", "woken_ns", "read_ns", BLUE),
+    ("update", "read_ns", "updated_ns", GREEN),
+    ("write", "updated_ns", "written_ns", ORANGE),
+)
+_MOST_PERIODS = 2.5
+"""The axis ends here: one cycle of a second would flatten all others. What is beyond is marked and said."""
+
+_Rows = NDArray[np.float64]
+"""Shape (steps, cycles), ms."""
+
+
+def budget_drawings(log: Log) -> tuple[Drawing, ...]:
+    """Return the figures of the cycle's budget; `log` has at least one cycle."""
+    cycles = log.cycles
+    steps = np.stack(
+        [(cycles[end] - cycles[begin]) / 1e6 for _, begin, end, _ in _STEPS]
+    )  # (steps, cycles), ms
+    return _typical(log, steps), _over_time(log, steps)
+
+
+def _typical(log: Log, steps: _Rows) -> Drawing:
+    period = log.period_ns / 1e6
+    worst = steps[:, int(steps.sum(axis=0).argmax())]
+    bars = (
+        ("longest cycle", worst),
+        ("99 % of each step", np.percentile(steps, 99, axis=1)),
+        ("median of each step", np.median(steps, axis=1)),
+    )
+    end = _end(period, [float(values.sum()) for _, values in bars])
+
+    def fill(figure: Figure) -> None:
+        axes = figure.subplots()
+        for row, (_, values) in enumerate(bars):
+            left = 0.0
+            for (_, _, _, colour), value in zip(_STEPS, values, strict=True):
+                axes.barh(row, value, left=left, height=0.55, color=colour, linewidth=0)
+                left += float(value)
+            beyond = left > end
+            axes.annotate(
+                f"goes on to {microseconds(left * 1e3)}" if beyond else microseconds(left * 1e3),
+                xy=(min(left, end), row),
+                xytext=(-4 if beyond else 4, 0),
+                textcoords="offset points",
+                ha="right" if beyond else "left",
+                va="center",
+                color=PAPER if beyond else INK,
+            )
+        axes.set_yticks(range(len(bars)), [name for name, _ in bars])
+        axes.grid(visible=False, axis="y")
+        axes.set_xlim(0, end)
+        axes.set_xlabel("time since the cycle's deadline, ms")
+        _period(axes, period, vertical=True)
+        _legend(axes)
+
+    said = "; ".join(f"{name}: {microseconds(float(values.sum()) * 1e3)}" for name, values in reversed(bars))
+    words = Words(
+        "budget-typical",
+        "Budget of a cycle",
+        f"Stacked bars of wake-up, read, update and write in ms against the period of {period:g} ms. {said}.",
+        f"{said[0].upper()}{said[1:]}. The dashed line is the period, {period:g} ms; what is left of it is "
+        "idle. The steps' 99 % need not come in the same cycle.",
+    )
+    return draw(words, 1.9, fill)
+
+
+def _over_time(log: Log, steps: _Rows) -> Drawing:
+    period = log.period_ns / 1e6
+    total = steps.sum(axis=0)
+    columns = Columns(steps.shape[1])
+    picked = columns.largest(total)
+    end = _end(period, [float(total.max())])
+    beyond = picked[total[picked] > end]
+    times = run_time_s(log)
+
+    def fill(figure: Figure) -> None:
+        axes = figure.subplots()
+        below = np.zeros(len(picked))
+        for (_, _, _, colour), values in zip(_STEPS, steps, strict=True):
+            above = below + values[picked]
+            axes.fill_between(times[picked], below, above, color=colour, linewidth=0, step="mid")
+            below = above
+        axes.plot(
+            times[beyond],
+            np.full(len(beyond), end * 0.985),
+            "^",
+            color=ERROR,
+            markersize=5,
+            markeredgewidth=0,
+        )
+        axes.set_ylim(0, end)
+        axes.set_ylabel("time since the\ncycle's deadline, ms")
+        _period(axes, period, vertical=False)
+        time_axis(axes)
+        _legend(axes)
+
+    over = int(np.count_nonzero(total > period))
+    told = (
+        f"{over} of {len(total)} cycles ended later than one period after their deadline."
+        if over
+        else "Every cycle fits its period."
+    )
+    cut = (
+        f" Triangles: {np.count_nonzero(total > end)} cycles go beyond the figure, the longest to "
+        f"{microseconds(float(total.max()) * 1e3)}."
+        if len(beyond)
+        else ""
+    )
+    words = Words(
+        "budget-time",
+        "Duration of the steps over the run",
+        f"Stacked areas of wake-up, read, update and write in ms over the time of the run in s. {told}{cut}",
+        f"{told}{cut} {columns.said('its longest cycle')}".strip(),
+    )
+    return draw(words, 2.6, fill)
+
+
+def _end(period: float, values: list[float]) -> float:
+    """Return where the axis ends, ms: the period in sight, and never more than a few of it."""
+    return min(max(*values, period) * 1.12, _MOST_PERIODS * period)
+
+
+def _period(axes: Axes, period: float, *, vertical: bool) -> None:
+    line = axes.axvline if vertical else axes.axhline
+    line(period, color=ERROR, linewidth=0.9, linestyle=DASHED)
+
+
+def _legend(axes: Axes) -> None:
+    for name, _, _, colour in _STEPS:
+        axes.fill_between([], [], [], color=colour, linewidth=0, label=name)
+    axes.plot([], [], color=ERROR, linewidth=0.9, linestyle=DASHED, label="period")
+    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=5, borderaxespad=0.2, labelcolor=MUTED)

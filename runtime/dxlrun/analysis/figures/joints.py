@@ -1,0 +1,135 @@
+"""One figure a joint: position as it was wanted, sent and read, velocity, and the cycles that stand out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from dxlrun.analysis.envelope import Columns
+from dxlrun.analysis.figures.drawing import (
+    BLUE,
+    ERROR,
+    GREEN,
+    INK,
+    MUTED,
+    ORANGE,
+    PURPLE,
+    WARNING,
+    Drawing,
+    Words,
+    draw,
+    time_axis,
+)
+from dxlrun.analysis.figures.run_time import Marks, run_time_s
+from dxlrun.analysis.tracking import Joint
+from dxlrun.interfaces import Floats
+from dxlrun.recording.reader import Log
+
+_FEW = 60
+"""So few samples are drawn with a dot each."""
+_DESIRED: dict[str, object] = {"color": GREEN, "linewidth": 2.8, "alpha": 0.55}
+_SENT: dict[str, object] = {"color": ORANGE, "linewidth": 1.3, "linestyle": (0, (4, 2))}
+_READ: dict[str, object] = {"color": BLUE, "linewidth": 1.1}
+
+
+def joint_drawings(log: Log, joints: tuple[Joint, ...]) -> tuple[Drawing, ...]:
+    """Return a figure for each joint, in the order of the log; `log` has at least one cycle."""
+    times, columns = run_time_s(log), Columns(len(log.cycles))
+    return tuple(
+        _JointPlot(log, row, joint, times, columns, Marks.of(log, row)).drawing()
+        for row, joint in enumerate(joints)
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _JointPlot:
+    """The figure of one joint."""
+
+    log: Log
+    row: int
+    joint: Joint
+    times: Floats
+    columns: Columns
+    marks: Marks
+
+    def drawing(self) -> Drawing:
+        """Return the figure and what is said about it."""
+        joint = self.joint
+        error = "No goal was sent, or no position was read."
+        if joint.rms_rad is not None and joint.worst_rad is not None:
+            error = (
+                f"Error rms {joint.rms_rad:.4f} rad, worst {joint.worst_rad:.4f} rad (position minus the "
+                "goal of the cycle before)."
+            )
+        told = ", ".join(f"{name} {np.count_nonzero(flags)}" for name, flags, _ in self._reasons())
+        words = Words(
+            f"joint-{self.row}",
+            joint.name,
+            "Position in rad (wanted by the controller, sent to the servo, read) and velocity in rad/s of "
+            f"{joint.name} over the time of the run in s. {error} Cycles: {told}.",
+            f"{error} Cycles: {told}. {self.columns.said('the smallest and the largest value')}".strip(),
+        )
+        return draw(words, 3.9, self._fill)
+
+    def _reasons(self) -> tuple[tuple[str, NDArray[np.bool_], str], ...]:
+        """Return the reasons to read a cycle with care: name, cycles, colour."""
+        marks = self.marks
+        return (
+            ("late", marks.late, ORANGE),
+            ("skipped", marks.skipped, ERROR),
+            ("no reply", marks.silent, WARNING),
+            ("clamped", marks.clamped, PURPLE),
+        )
+
+    def _fill(self, figure: Figure) -> None:
+        position, velocity, strip = figure.subplots(
+            3, 1, sharex=True, gridspec_kw={"height_ratios": [3.0, 1.9, 1.05]}
+        )
+        self._lines(position, "position")
+        position.set_ylabel("position, rad")
+        self._lines(velocity, "velocity")
+        velocity.set_ylabel("velocity, rad/s")
+        for axes in (position, velocity):
+            for time in self.times[self.columns.marked(self.marks.skipped)]:
+                axes.axvline(time, color=ERROR, linewidth=0.7, alpha=0.45)
+        self._strip(strip)
+        time_axis(strip)
+
+    def _lines(self, axes: Axes, what: str) -> None:
+        """Draw what was wanted, sent and read; a cycle without a reply is a gap in what was read."""
+        cycles, row = self.log.cycles, self.row
+        read = np.where(cycles["valid"][:, row], cycles[what][:, row], np.nan)
+        series: tuple[tuple[str, Floats, dict[str, object]], ...] = (
+            ("desired (command)", cycles[f"command_{what}"][:, row], _DESIRED),
+            ("sent (goal)", cycles[f"goal_{what}"][:, row], _SENT),
+            ("read", read, _READ),
+        )
+        marker = "." if len(self.times) <= _FEW else ""
+        drawn = False
+        for name, values, style in series:
+            if np.isfinite(values).any():
+                held = "steps-post" if self.columns.whole and name != "read" else "default"
+                x, y = self.columns.envelope(self.times, np.where(np.isfinite(values), values, np.nan))
+                axes.plot(x, y, label=name, drawstyle=held, marker=marker, markersize=4, **style)  # type: ignore[arg-type]  # one dictionary for all keys
+                drawn = True
+        if drawn:
+            axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=3, borderaxespad=0.2, labelcolor=MUTED)
+        else:
+            axes.text(
+                0.5, 0.5, "nothing was read or sent", transform=axes.transAxes, ha="center", color=MUTED
+            )
+
+    def _strip(self, axes: Axes) -> None:
+        """Draw a row of ticks for each reason to read a cycle with care."""
+        reasons = self._reasons()
+        for number, (_, flags, colour) in enumerate(reasons):
+            at = self.times[self.columns.marked(flags)]
+            axes.vlines(at, number - 0.38, number + 0.38, color=colour, linewidth=1.0)
+        axes.set_yticks(range(len(reasons)), [name for name, _, _ in reasons])
+        axes.tick_params(axis="y", labelsize=7, length=0, labelcolor=INK)
+        axes.set_ylim(len(reasons) - 0.5, -0.5)
+        axes.grid(visible=False, axis="x")

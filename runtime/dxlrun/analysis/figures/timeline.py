@@ -1,0 +1,66 @@
+"""When events happened."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from dxlrun.analysis.envelope import COLUMNS
+from dxlrun.analysis.figures.drawing import BLUE, ERROR, WARNING, Drawing, Words, draw, time_axis
+from dxlrun.analysis.figures.run_time import first_deadline_ns
+from dxlrun.events import Severity
+from dxlrun.interfaces import Floats
+from dxlrun.recording.reader import Log
+
+_SHAPES = (
+    ("information", Severity.INFO, "o", BLUE, 3.5),
+    ("warning", Severity.WARNING, "^", WARNING, 5.0),
+    ("error", Severity.ERROR, "X", ERROR, 6.0),
+)
+
+
+def events_drawing(log: Log) -> Drawing | None:
+    """Return the timeline of the events, one row a kind; None without events."""
+    if not log.events:
+        return None
+    start = first_deadline_ns(log)
+    kinds = list(dict.fromkeys(event.name for event in sorted(log.events, key=lambda event: event.t_ns)))
+    times = np.array([(event.t_ns - start) / 1e9 for event in log.events])
+    rows = np.array([kinds.index(event.name) for event in log.events], dtype=np.float64)
+    grades = np.array([_grade(event.severity) for event in log.events])
+
+    def fill(figure: Figure) -> None:
+        axes = figure.subplots()
+        for grade, (name, _, shape, colour, size) in enumerate(_SHAPES):
+            chosen = grades == grade
+            if chosen.any():
+                x, y = _apart(times[chosen], rows[chosen])
+                axes.plot(x, y, shape, color=colour, markersize=size, markeredgewidth=0, label=name)
+        axes.set_yticks(range(len(kinds)), [kind.replace("_", " ") for kind in kinds])
+        axes.set_ylim(len(kinds) - 0.5, -0.5)
+        time_axis(axes)
+        axes.margins(x=0.03)
+        axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=3, borderaxespad=0.2)
+
+    counts = ", ".join(
+        f"{int(np.count_nonzero(grades == grade))} of {name}" for grade, (name, *_) in enumerate(_SHAPES)
+    )
+    words = Words(
+        "events-timeline",
+        "Events over the run",
+        f"Events over the time of the run in s, one row a kind. {len(log.events)} events: {counts}.",
+        f"{len(log.events)} events: {counts}. Before 0 s the servos are set up.",
+    )
+    return draw(words, 0.9 + 0.17 * len(kinds), fill)
+
+
+def _grade(severity: int) -> int:
+    return (severity >= Severity.WARNING) + (severity >= Severity.ERROR)
+
+
+def _apart(times: Floats, rows: Floats) -> tuple[Floats, Floats]:
+    """Drop events of a kind that would be drawn on the very same spot."""
+    span = float(np.ptp(times)) or 1.0
+    spots = np.stack([rows, np.round((times - times.min()) / span * COLUMNS)], axis=1)
+    _, first = np.unique(spots, axis=0, return_index=True)
+    return times[first], rows[first]

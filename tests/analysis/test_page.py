@@ -1,0 +1,241 @@
+"""Analysis: the page of a report is well-formed, self-contained, complete, and says the report's numbers."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dxlrun.analysis.page import page
+from dxlrun.analysis.report import analyze, to_json
+from dxlrun.analysis.tables import tables
+from dxlrun.events import EventCode, Severity
+from dxlrun.packets import PacketKind
+from dxlrun.recording.reader import read_log
+
+Make = Callable[..., Any]
+_VOID = {"meta", "br", "img", "input", "link", "hr"}
+
+
+class Reader(HTMLParser):
+    """Reads a page; fails where an element is not closed in order."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.ids: list[str] = []
+        self.attributes: list[tuple[str, str, str]] = []
+        self.texts: dict[str, list[str]] = {}
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.attributes += [(tag, key, value or "") for key, value in attrs]
+        self.ids += [value or "" for key, value in attrs if key == "id"]
+        if tag not in _VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.texts.setdefault(self.open[-1] if self.open else "", []).append(data)
+
+    def words(self, *tags: str) -> list[str]:
+        return [text for tag in tags for text in self.texts.get(tag, [])]
+
+
+Made = tuple[str, Reader]
+
+
+def made(path: Path) -> Made:
+    log = read_log(path)
+    text = page(log, analyze(log))
+    return text, Reader(text)
+
+
+@pytest.fixture(scope="module")
+def run(
+    tmp_path_factory: pytest.TempPathFactory, write_to: Make, cycle: Make, wire: Make, said: Make
+) -> Path:
+    """A run with everything in it: late and skipped cycles, a lost reply, an error, a clamp, a fault."""
+    rng = np.random.default_rng(3)
+    cycles = [
+        cycle(number, late=int(rng.exponential(8)), position=0.3 * np.sin(number / 20), goal=0.31)
+        for number in range(200)
+    ]
+    cycles += [cycle(203, skipped=3, late=900, read=23_000, valid=False, clamped=2)]
+    ask, answer = bytes.fromhex("ffff0504022406ca"), bytes.fromhex("ffff05082000020000000000f0")
+    packets = [
+        wire(PacketKind.INSTRUCTION, 5, 0, ask),
+        wire(PacketKind.STATUS, 5, 640, answer),
+        wire(PacketKind.INSTRUCTION, 5, 1000, ask),
+    ]
+    events = [
+        said(EventCode.SCHEDULER, Severity.INFO, "timer slack 1 ns"),
+        said(EventCode.SCHEDULER, Severity.WARNING, "scheduler fifo 31 was refused"),
+        said(EventCode.CONTROLLER_FAULT, Severity.ERROR, "</script><b>ValueError</b> & \x1b[31m"),
+    ]
+    written: Path = write_to(tmp_path_factory.mktemp("run"), cycles, packets, events)
+    return written
+
+
+@pytest.fixture(scope="module")
+def whole(run: Path) -> Made:
+    return made(run)
+
+
+def test_the_page_is_well_formed_and_loads_nothing(whole: Made) -> None:
+    text, reader = whole
+    assert text.startswith("<!DOCTYPE html>")
+    assert "http://" not in text.replace('"http://www.w3.org', "")
+    assert "https://" not in text
+    loading = {"src", "srcset", "data", "action", "poster", "background"}
+    assert not [(tag, key) for tag, key, _ in reader.attributes if key in loading]
+    assert all(value.startswith("#") for _, key, value in reader.attributes if key.endswith("href"))
+    assert not re.search(r"@import|url\((?!#)", text)
+    assert "link" not in {tag for tag, _, _ in reader.attributes}
+
+
+def test_references_inside_the_page_find_exactly_one_place(whole: Made) -> None:
+    text, reader = whole
+    assert len(reader.ids) == len(set(reader.ids))
+    wanted = set(re.findall(r"url\(#([^)]+)\)", text))
+    wanted |= {value[1:] for _, key, value in reader.attributes if key.endswith("href")}
+    assert wanted
+    assert wanted <= set(reader.ids)
+
+
+def test_each_figure_has_a_title_and_a_description(whole: Made) -> None:
+    _, reader = whole
+    described = [value.split() for tag, key, value in reader.attributes if key == "aria-labelledby"]
+    assert len(described) >= 8
+    assert all(name in reader.ids for names in described for name in names)
+    assert all(len(text) > 40 for text in reader.words("desc"))
+
+
+def test_each_joint_has_its_figure_with_units(run: Path, whole: Made) -> None:
+    _, reader = whole
+    log = read_log(run)
+    assert [text for text in reader.words("h3") if text in log.joints] == list(log.joints)
+    labels = reader.words("text")
+    for label in ("position, rad", "velocity, rad/s", "late", "skipped", "no reply", "clamped"):
+        assert labels.count(label) == len(log.joints)
+
+
+def test_the_thesis_plots_are_there(whole: Made) -> None:
+    _, reader = whole
+    titles = reader.words("h3")
+    for title in ("Delay of each iteration", "Histogram of the delays up to 150 us"):
+        assert title in titles
+    assert {"Cumulative distribution of the delays", "Budget of a cycle", "Events over the run"} <= set(
+        titles
+    )
+    assert "99 %" in reader.words("text")
+
+
+def test_the_numbers_are_those_of_the_report(run: Path, whole: Made) -> None:
+    text, reader = whole
+    report = analyze(read_log(run))
+    inside = re.search(r'<script type="application/json" id="report">(.*?)</script>', text, re.DOTALL)
+    assert inside is not None
+    assert json.loads(inside[1]) == json.loads(to_json(report))
+    shown = reader.words("td", "th")
+    for table in tables(report):
+        assert table.title in reader.words("caption")
+        for row in table.rows:
+            for cell in row:
+                assert cell.text.strip().replace("\x1b", "\N{REPLACEMENT CHARACTER}") in shown
+    for sentence in report.verdict.sentences:
+        assert sentence.replace("\x1b", "\N{REPLACEMENT CHARACTER}") in reader.words("p")
+
+
+def test_what_was_asked_of_the_system_and_granted_is_told(whole: Made) -> None:
+    _, reader = whole
+    cells = reader.words("th", "td")
+    assert cells.count("granted") == 1
+    assert cells.count("not granted") == 1
+    assert "scheduler fifo 31 was refused" in cells
+
+
+def test_a_text_from_the_log_stays_a_text(whole: Made) -> None:
+    text, reader = whole
+    assert "<b>" not in text
+    assert "\x1b" not in text
+    assert "</script><b>ValueError</b> & \N{REPLACEMENT CHARACTER}[31m" in reader.words("td")
+
+
+def test_colours_come_from_the_page_so_that_it_can_be_dark(whole: Made) -> None:
+    text, _ = whole
+    figures = "".join(re.findall(r"<svg.*?</svg>", text, re.DOTALL))
+    assert re.findall(r"#[0-9a-f]{6}\b", figures) == []
+    used = set(re.findall(r"var\((--\w+)\)", figures))
+    style = text[: text.index("</style>")]
+    dark = style[style.index("prefers-color-scheme: dark") :]
+    assert all(f"{name}:" in dark for name in used)
+
+
+def test_the_same_log_gives_the_same_page(run: Path, whole: Made) -> None:
+    assert made(run)[0] == whole[0]
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_a_log_with_hardly_a_cycle_gives_a_page(write: Make, cycle: Make, count: int) -> None:
+    text, reader = made(write([cycle(number) for number in range(count)], close=False))
+    assert "has no end" in text
+    assert ("left_elbow_joint" in reader.words("h3")) == (count > 0)
+
+
+def test_a_log_of_nothing_but_nan_gives_a_page(write: Make, cycle: Make) -> None:
+    nan = float("nan")
+    _, reader = made(write([cycle(n, position=nan, goal=nan, valid=False) for n in range(3)]))
+    assert "nothing was read or sent" in reader.words("text")
+
+
+def test_a_cut_log_gives_a_page(run: Path, tmp_path: Path) -> None:
+    data = run.read_bytes()
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(data[: len(data) * 2 // 3])
+    _, reader = made(cut)
+    assert any("has no end" in text or "cannot be read" in text for text in reader.words("p"))
+
+
+def test_a_single_late_wake_up_among_many_is_drawn(write: Make, cycle: Make) -> None:
+    late = [3 + number % 2 for number in range(5000)]
+    late[3141] = 7777
+    _, reader = made(write([cycle(number, late=us) for number, us in enumerate(late)]))
+    captions = " ".join(reader.words("figcaption"))
+    assert "maximum 7777 us" in captions
+    assert "1 of 5000 wake-ups (0.020%) are later than 150 us" in captions
+    assert "stands for 6 cycles" in captions
+
+
+def test_no_display_is_needed_and_nothing_is_warned_of(run: Path) -> None:
+    code = (
+        "import sys; from dxlrun.analysis.page import page; from dxlrun.analysis.report import analyze;"
+        "from dxlrun.recording.reader import read_log; log = read_log(sys.argv[1]);"
+        "print(len(page(log, analyze(log)))); assert 'matplotlib.pyplot' not in sys.modules"
+    )
+    environment = {
+        key: value for key, value in os.environ.items() if key not in {"DISPLAY", "WAYLAND_DISPLAY"}
+    }
+    ran = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code, str(run)],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+    assert (ran.returncode, ran.stderr) == (0, "")
+    assert int(ran.stdout) > 100_000
