@@ -12,6 +12,7 @@ from cyclopts import App, CycloptsError
 
 from dxlrun.cli.analyze import analyze
 from dxlrun.cli.check import check
+from dxlrun.cli.replay import replay
 from dxlrun.cli.run import run
 from dxlrun.cli.schema import schema
 from dxlrun.cli.terminal import say_error, say_warning
@@ -40,6 +41,7 @@ def build() -> App:
     app.default(run)
     app.command(check)
     app.command(analyze)
+    app.command(replay)
     app.command(schema)
     return app
 

@@ -12,7 +12,7 @@ from dxlrun.errors import InputError
 if TYPE_CHECKING:
     from dxlrun.compile import Compiled
 
-COMMANDS = ("analyze", "check", "schema")
+COMMANDS = ("analyze", "check", "replay", "schema")
 
 
 SHORTEST_S, LONGEST_S = 1e-6, 1e9

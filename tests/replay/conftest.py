@@ -1,0 +1,190 @@
+"""A small robot whose plug-in depends on every input, its log, and logs that were changed afterwards."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from dxlrun.commands import CommandRing, TakenCommand
+from dxlrun.recording.log_writer import LogWriter
+from dxlrun.recording.reader import Log, read_log
+from dxlrun.ring import Handover
+from dxlrun.testing import VirtualRobot, simulated_robot
+
+ROBOT = """\
+name: pair
+arguments:
+  port: {default: sim, help: "serial port"}
+  rate: {default: 50, help: "loop rate, Hz"}
+  speed: {default: 6 rad/s, help: "velocity limit of the pan joint"}
+buses:
+  main:
+    port: "${port}"
+    protocol: 1.0
+    baud_rate: 1_000_000
+    return_delay_time: 100 us
+    adapter: {latency: 1 ms}
+loop: {rate: "${rate}"}
+joints:
+  pan: {bus: main, id: 3, model: AX-12A, reference: 150 deg, direction: 1, limits: {velocity: "${speed}"}}
+  tilt: {bus: main, id: 7, model: AX-12A, reference: 150 deg, direction: -1}
+  nod: {bus: main, id: 8, model: AX-12A, reference: 150 deg, direction: -1}
+controllers:
+  states: {type: joint_state_broadcaster}
+  head: {type: joint_trajectory_controller, command_interface: posvel, joints: [pan], rate: 25}
+  all_inputs: {type: all_inputs, joints: [tilt, nod]}
+"""
+MOTION = """\
+name: look
+motions:
+  - controller: head
+    start: 200 ms
+    points:
+      - {time: 0 s, joints: {pan: {position: 0.6 rad}}}
+      - {time: 400 ms, joints: {pan: {position: 0.9 rad}}}
+      - {time: 600 ms, joints: {pan: {position: 0.8 rad}}}
+"""
+PLUGIN = '''\
+"""A controller whose command depends on every input that it ever had."""
+import numpy as np
+from dxlrun import CONTRACT_VERSION, Controller, Interfaces, ParametersModel, hookimpl
+
+
+class AllInputsParameters(ParametersModel):
+    joints: tuple[str, ...]
+    gain: float = 1e-6
+    give_up_after: float | None = None
+
+
+class AllInputs(Controller[AllInputsParameters]):
+    Parameters = AllInputsParameters
+
+    @classmethod
+    def interfaces(cls, parameters, joints):
+        return Interfaces(parameters.joints, ("position", "velocity"))
+
+    def on_activate(self, time_ns):
+        self.sum = np.zeros(len(self.context.joints))
+        self.take(time_ns, 0)
+
+    def take(self, time_ns, period_ns):
+        states, goals = self.context.states, self.context.goals
+        for values in (states.position, states.velocity, states.effort, states.valid, states.age_ns * 1e-7):
+            self.sum = self.sum * 0.99 + values
+        self.sum += goals.position + np.nan_to_num(goals.velocity) + time_ns * 1e-9 + period_ns * 1e-7
+
+    def update(self, time_ns, period_ns):
+        if self.parameters.give_up_after is not None and time_ns * 1e-9 > self.parameters.give_up_after:
+            raise RuntimeError("out of ideas")
+        self.take(time_ns, period_ns)
+        self.context.commands.position[:] = np.sin(self.sum) * 0.1 + self.parameters.gain
+        self.context.commands.velocity[1] = 1.0 + np.cos(self.sum[1])
+
+
+@hookimpl
+def dxlrun_contract():
+    return CONTRACT_VERSION
+
+
+@hookimpl
+def dxlrun_controllers():
+    return {"all_inputs": AllInputs}
+'''
+
+
+@pytest.fixture(scope="session")
+def plugin(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A directory with the plug-in, as pip would install it."""
+    directory = tmp_path_factory.mktemp("plugin")
+    (directory / "all_inputs.py").write_text(PLUGIN)
+    info = directory / "all_inputs-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: all-inputs\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[dxlrun]\nall_inputs = all_inputs\n")
+    return directory
+
+
+@pytest.fixture(autouse=True)
+def _installed(plugin: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(plugin)
+
+
+@pytest.fixture(scope="session")
+def robot_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("robot") / "pair.yaml"
+    path.write_text(ROBOT)
+    path.with_name("look.yaml").write_text(MOTION)
+    return path
+
+
+@pytest.fixture
+def run(robot_file: Path, tmp_path: Path) -> Callable[..., Path]:
+    """Run the robot for a second on virtual time, return its log; `before` sees the robot before it runs."""
+
+    def begin(before: Callable[[VirtualRobot], None] | None = None, robot: Path = robot_file) -> Path:
+        path = tmp_path / "run.mcap"
+        one = simulated_robot(robot, play=[robot_file.with_name("look.yaml")], duration_s=1.0, log=path)
+        if before:
+            before(one)
+        one.run()
+        return path
+
+    return begin
+
+
+@dataclass
+class Changed:
+    """What a log has, to be changed before it is written anew."""
+
+    cycles: NDArray[np.void]
+    commands: list[TakenCommand]
+    attachments: dict[str, bytes]
+    metadata: dict[str, dict[str, str]]
+    activation: bool = True
+    gaps: list[tuple[str, int]] = field(default_factory=list)
+
+
+@pytest.fixture
+def changed(tmp_path: Path) -> Callable[[Path, Callable[[Changed], None]], Path]:
+    """Write a log anew as `change` wants it; everything else stays as it was, bit for bit."""
+
+    def write(path: Path, change: Callable[[Changed], None]) -> Path:
+        log: Log = read_log(path)
+        metadata = {k: v for k, v in log.metadata.items() if k not in ("dxlrun", "dxlrun_summary")}
+        attachments = {k: v for k, v in log.attachments.items() if k != "header.json"}
+        content = Changed(log.cycles.copy(), list(log.commands), attachments, metadata)
+        change(content)
+        new = tmp_path / "changed.mcap"
+        new.unlink(missing_ok=True)
+        header = replace(log.header, attachments=content.attachments, metadata=content.metadata)
+        writer = LogWriter(new, header)
+        if content.activation:
+            assert log.activation is not None
+            writer.cycle(log.activation.tobytes())
+        ring = CommandRing(Handover(writer.command))
+        for command in content.commands:
+            ring.take(command)
+        for row in range(len(content.cycles)):
+            writer.cycle(content.cycles[row : row + 1].tobytes())
+        for source, lost in content.gaps:
+            writer.gap(source, lost)
+        writer.close()
+        return new
+
+    return write
+
+
+@pytest.fixture(scope="session")
+def pair_log(plugin: Path, robot_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The log of the robot's second, made once."""
+    path = tmp_path_factory.mktemp("pair") / "run.mcap"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(plugin)
+        motion = robot_file.with_name("look.yaml")
+        simulated_robot(robot_file, play=[motion], duration_s=1.0, log=path).run()
+    return path

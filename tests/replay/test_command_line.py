@@ -1,0 +1,94 @@
+"""`dxlrun replay` as a person types it, and docs/replay.md as it stands."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dxlrun.cli import main
+
+ROOT = Path(__file__).parents[2]
+TEXT = (ROOT / "docs/replay.md").read_text()
+COMMANDS = [line.strip() for line in TEXT.splitlines() if line.startswith("    dxlrun ")]
+OUTPUTS = re.findall(r"```\n(.*?)```", TEXT, re.DOTALL)
+
+
+def words(text: str) -> list[str]:
+    return text.split()
+
+
+def test_the_document_says_what_comes_out(tmp_path: Path) -> None:
+    (tmp_path / "robots").symlink_to(ROOT / "robots")
+    environment = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+    told = [
+        subprocess.run(
+            ["/bin/bash", "-c", line],
+            cwd=tmp_path,
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        for line in COMMANDS
+    ]
+    assert [one.returncode for one in told] == [0, 0, 1], told
+    assert [words(one.stdout) for one in told[1:]] == [words(output) for output in OUTPUTS]
+    assert [one.stderr for one in told[1:]] == ["", ""]
+
+
+def test_json_is_for_programs(pair_log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["replay", str(pair_log), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert (report["same"], report["compared"], report["first"]) == (True, 50, None)
+    code = main(["replay", str(pair_log), "--json", "--set", "all_inputs.gain=0.5"])
+    report = json.loads(capsys.readouterr().out)
+    assert (code, report["same"]) == (1, False)
+    assert (report["first"]["cycle"], report["first"]["joint"]) == (0, "tilt")
+    assert len(report["joints"]) == 2
+
+
+def test_remarks_go_to_stderr(
+    pair_log: Path, changed: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    def change(content: Any) -> None:
+        content.metadata["versions"]["numpy"] = "1.0"
+        content.commands.clear()
+        content.cycles["active"][2] = 0
+
+    assert main(["replay", str(changed(pair_log, change))]) == 1
+    said = capsys.readouterr()
+    assert said.out.splitlines() == [
+        "pair: 1 of 10 replayed cycles differ",
+        "first: cycle 2, 0.040 s, controller states: recorded not active, replayed active",
+    ]
+    version, gap = said.err.splitlines()
+    assert version.startswith("pair: numpy was 1.0 in the run and is ")
+    assert gap.startswith("pair: the log misses a command that cycle 10 took")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "says"),
+    [
+        (["missing.mcap"], 2, "there is no log missing.mcap"),
+        ([__file__], 1, "this is no MCAP file"),
+        (["{log}", "fast"], 2, "'fast' is no argument of the robot file"),
+        (["{log}", "--set", "neck.gain=1"], 2, "the log has no such controller"),
+        (["{log}", "rate:=100"], 2, "change the loop's period"),
+    ],
+)
+def test_wrong_words_are_one_sentence(
+    pair_log: Path, arguments: list[str], code: int, says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["replay", *(word.format(log=pair_log) for word in arguments)]) == code
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert says in said.err
+    assert len(said.err.splitlines()) == 1

@@ -1,0 +1,132 @@
+"""A replay of what was not changed has no difference, whatever happened in the run."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dxlrun.compile import compile_files
+from dxlrun.errors import InputError
+from dxlrun.recording.reader import read_log
+from dxlrun.replay import replay_log
+from dxlrun.testing import VirtualRobot, simulated_robot
+
+ROBOTS = Path(__file__).parents[2] / "robots"
+DXLRUN = Path(sys.executable).with_name("dxlrun")
+
+
+def motions_for(robot: Path) -> list[Path]:
+    """Return the motion that fits a robot, if there is one."""
+    for motion in sorted((ROBOTS / "motions").glob("*.yaml")):
+        try:
+            compile_files(robot, {}, [motion])
+        except InputError:
+            continue
+        return [motion]
+    return []
+
+
+@pytest.mark.parametrize("robot", sorted(ROBOTS.glob("*.yaml")), ids=lambda path: path.stem)
+def test_a_minute_of_each_robot(robot: Path, tmp_path: Path) -> None:
+    log = tmp_path / "run.mcap"
+    simulated_robot(robot, play=motions_for(robot), duration_s=60.0, log=log).run()
+    cycles = read_log(log).cycles
+    report = replay_log(log)
+    assert (report.compared, report.different, report.first) == (len(cycles), 0, None)
+    assert report.same
+    assert (report.fault, report.stopped, report.remarks) == ("", "", ())
+    assert len(cycles) + cycles["skipped"].sum() == round(60e9 / read_log(log).period_ns)
+
+
+def test_the_small_robot_shows_every_kind_of_value(pair_log: Path) -> None:
+    cycles = read_log(pair_log).cycles
+    assert np.isnan(cycles["command_velocity"]).any()
+    assert np.isfinite(cycles["command_velocity"][:, 2]).all()
+    assert len(np.unique(cycles["command_position"][:, 2])) == len(cycles) == 50
+    report = replay_log(pair_log)
+    assert (report.compared, report.different) == (50, 0)
+    assert report.sentence == "pair: 50 cycles replayed, 0 differences"
+
+
+def test_a_silent_servo_and_periods_that_were_skipped(
+    run: Callable[..., Path], robot_file: Path, tmp_path: Path
+) -> None:
+    def silence(robot: VirtualRobot) -> None:
+        bus = robot.buses[0]
+        bus.at(300_000_000, lambda: [bus.servo(one).silence(True) for one in (3, 7, 8)])
+        bus.at(600_000_000, lambda: [bus.servo(one).silence(False) for one in (3, 7, 8)])
+
+    robot = tmp_path / "fast.yaml"
+    robot.write_text(robot_file.read_text().replace("default: 50,", "default: 200,").replace("25}", "50}"))
+    log = run(silence, robot)
+    cycles = read_log(log).cycles
+    assert cycles["skipped"].sum() > 0
+    assert not cycles["valid"].all()
+    assert cycles["valid"][-1].all()
+    assert replay_log(log).same
+
+
+def test_a_run_that_ended_by_a_fault(tmp_path: Path, robot_file: Path) -> None:
+    robot = tmp_path / "faulty.yaml"
+    robot.write_text(robot_file.read_text().replace("[tilt, nod]", "[tilt, nod], give_up_after: 0.5"))
+    log = tmp_path / "run.mcap"
+    result = simulated_robot(robot, duration_s=1.0, log=log).run()
+    assert (result.reason, result.cycles) == ("fault", 27)
+    report = replay_log(log)
+    assert (report.compared, report.same) == (27, True)
+
+
+def test_commands_from_outside_come_from_the_log(
+    pair_log: Path, changed: Callable[..., Path], tmp_path: Path
+) -> None:
+    arrays = {command.at_ns: command.data for command in _plan_commands(pair_log)}
+    assert arrays
+
+    def by_value(content: Any) -> None:
+        (data,) = arrays.values()
+        content.commands = [replace(one, planned=-1, data=data) for one in content.commands]
+
+    assert replay_log(changed(pair_log, by_value)).same
+
+    def other_data(content: Any) -> None:
+        by_value(content)
+        content.commands = [
+            replace(one, data=(np.frombuffer(one.data) * 1.01).tobytes()) for one in content.commands
+        ]
+
+    report = replay_log(changed(pair_log, other_data))
+    assert report.first is not None
+    assert report.first.joint == "pan"
+
+
+def test_a_run_in_real_time(tmp_path: Path, robot_file: Path, plugin: Path) -> None:
+    environment = os.environ | {"PYTHONPATH": f"{plugin}:{os.environ.get('PYTHONPATH', '')}"}
+
+    def dxlrun(*words: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [DXLRUN, *words], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+        )
+
+    motion = robot_file.with_name("look.yaml")
+    ran = dxlrun(str(robot_file), "--play", str(motion), "--duration", "1.5")
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    (log,) = (tmp_path / "logs").glob("*.mcap")
+    cycles = read_log(log).cycles
+    assert len(cycles) > 10
+    told = dxlrun("replay", str(log))
+    assert told.returncode == 0, told.stdout + told.stderr
+    assert told.stdout == f"pair: {len(cycles)} cycles replayed, 0 differences\n"
+
+
+def _plan_commands(log: Path) -> Any:
+    from dxlrun.replay.recorded import recorded
+
+    return recorded(read_log(log)).plan.loop.commands
