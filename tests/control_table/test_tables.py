@@ -53,6 +53,7 @@ def test_what_the_loop_needs_is_there_and_of_the_right_kind(table: ControlTable)
     assert [items[name].access for name in ("goal_position", table.goal_speed_item)] == ["RW", "RW"]
     assert [items[name].access for name in (table.present_speed_item, table.effort_item)] == ["R", "R"]
     assert items["present_position"].access == items["model_number"].access == "R"
+    assert items["model_number"].initial == table.model_number
     assert items["goal_position"].unit == items["present_position"].unit == "rad"
     assert items[table.present_speed_item].unit == items[table.goal_speed_item].unit == "rad/s"
     assert items[table.effort_item].unit == table.effort_unit
@@ -106,7 +107,6 @@ def test_protocol_1_baud_rates_follow_the_formula_of_the_manual(table: ControlTa
     for value, rate in table.baud_rates.items():
         if value < 250:
             assert Fraction(2_000_000, value + 1) == pytest.approx(rate, rel=0.03)
-    assert table.items["model_number"].initial == table.model_number
 
 
 @pytest.mark.parametrize("table", [each for each in TABLES if each.protocol == 1.0], ids=_id)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dxlrun.compile.plan import Plan
+from dxlrun.control_table import added_control_tables
 from dxlrun.simulation import BusConfig, ServoConfig
 
 
@@ -17,6 +18,7 @@ def simulated_buses(plan: Plan) -> tuple[BusConfig, ...]:
                 for servo in bus.servos
             ),
             protocol=bus.protocol,
+            control_tables=added_control_tables(servo.model for servo in bus.servos),
         )
         for bus in plan.buses
         if bus.port == "sim"

@@ -11,7 +11,8 @@ the loop's process loads its controllers, never in the loop.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import pluggy
@@ -34,3 +35,11 @@ class HookSpecs:
     @hookspec
     def dxlrun_controllers(self) -> Mapping[str, type[Controller[Any]]]:  # type: ignore[empty-body]  # a signature
         """Return the controllers that the robot file can name by `type`."""
+
+    @hookspec
+    def dxlrun_servo_models(self) -> Sequence[str | Path]:  # type: ignore[empty-body]  # a signature
+        """Return control tables of servos that dxlrun does not know: each a TOML text, or the path of a file.
+
+        The form is that of dxlrun's own files (runtime/dxlrun/control_tables/protocol1), without `extends`;
+        the robot file then names the model. A name or a model number that is taken already is an error.
+        """

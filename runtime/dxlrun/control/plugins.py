@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
 from typing import cast
 
 import pluggy
@@ -12,6 +13,7 @@ import pluggy
 from dxlrun.control.contract import ControllerClass, controller_breach, hook_breach
 from dxlrun.control.controller import CONTRACT_VERSION
 from dxlrun.control.hookspecs import GROUP, HookSpecs
+from dxlrun.control_table import add_control_table
 from dxlrun.errors import PlugInError
 
 
@@ -38,7 +40,7 @@ class PlugIns:
 
 
 def load_plugins(after_each: Callable[[str], None] | None = None) -> PlugIns:
-    """Import every entry point of the group `dxlrun` and ask it for its controllers.
+    """Import every entry point of the group `dxlrun` and ask it for its controllers and servo models.
 
     `after_each` is called with the plug-in's name and distribution after its import, broken or not; what it
     raises passes through: the loop's process counts its threads there. Itself raises nothing.
@@ -109,6 +111,7 @@ def _load(entry_point: EntryPoint, publisher: str) -> tuple[Offer, ...]:
     try:
         contracts = manager.hook.dxlrun_contract()
         mappings = manager.hook.dxlrun_controllers()
+        servo_models = manager.hook.dxlrun_servo_models()
     except (Exception, SystemExit) as error:  # foreign code, see above
         raise refuse(f"raised in a hook ({_told(error)})", "tell its author") from error
     if not contracts:
@@ -120,11 +123,32 @@ def _load(entry_point: EntryPoint, publisher: str) -> tuple[Offer, ...]:
             f"was written for contract {contracts[0]!r}, this dxlrun has contract {CONTRACT_VERSION}",
             "install a version of it that fits",
         )
-    return tuple(
+    offers = tuple(
         _offer(name, controller, publisher, refuse)
         for mapping in mappings
         for name, controller in _items(mapping, refuse)
     )
+    for models in servo_models:
+        _add_servo_models(models, refuse)
+    return offers
+
+
+def _add_servo_models(models: object, refuse: Callable[[str, str], PlugInError]) -> None:
+    """Make the control tables of a plug-in known to this process."""
+    if not isinstance(models, Sequence) or isinstance(models, str | bytes):
+        raise refuse(
+            "does not return a list from dxlrun_servo_models", "return TOML texts, or paths of TOML files"
+        )
+    for model in models:
+        if not isinstance(model, str | Path):
+            raise refuse(f"offers the servo model {model!r}", "it must be a TOML text or the path of a file")
+        where = f"({model}) " if isinstance(model, Path) else ""
+        try:
+            add_control_table(model if isinstance(model, str) else model.read_text("utf-8"))
+        except (OSError, ValueError) as error:
+            raise refuse(
+                f"offers a servo model {where}that cannot be used ({_told(error)})", "tell its author"
+            ) from error
 
 
 def _items(mapping: object, refuse: Callable[[str, str], PlugInError]) -> list[tuple[object, object]]:

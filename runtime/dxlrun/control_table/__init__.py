@@ -7,6 +7,7 @@ Protocol 1.0 tables are data files of ours, Protocol 2.0 tables the maker's, cor
 from dxlrun.control_table.item import SIGN_BIT, Access, Area, ControlItem, Encoding
 from dxlrun.control_table.models import (
     add_control_table,
+    added_control_tables,
     all_tables,
     control_table,
     model_names,
@@ -25,6 +26,7 @@ __all__ = [
     "EffortUnit",
     "Encoding",
     "add_control_table",
+    "added_control_tables",
     "all_tables",
     "control_table",
     "model_names",

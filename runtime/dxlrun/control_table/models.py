@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 
 from dxlrun.control_table.protocol1 import protocol1_listings
@@ -13,6 +13,8 @@ from dxlrun.control_table.table import ControlTable
 
 _ADDED: dict[float, list[Listing]] = {1.0: [], 2.0: []}
 """Tables of plug-ins; they are added while a process starts, before its first robot is compiled."""
+_TEXTS: dict[str, str] = {}
+"""Name -> TOML text of the tables that were added."""
 
 
 def control_table(model: str, protocol: float | None = None) -> ControlTable:
@@ -66,15 +68,24 @@ def add_control_table(text: str) -> ControlTable:
         raise ValueError(f"the entry {error} is missing") from error
     names = (table.model, *table.aliases)
     for listing in _listings(table.protocol):
-        if listing.build() == table:
-            return table
         if listing.model_number == table.model_number or set(names) & set(listing.names):
+            if listing.build() == table:
+                return table  # a process may load its plug-ins twice
             raise ValueError(
                 f"{table.model} with model number {table.model_number} has a name or the number of the "
                 f"{listing.names[0]}, which is known already"
             )
     _ADDED[table.protocol].append(Listing(names, table.model_number, table.firmware, lambda: table))
+    _TEXTS.update(dict.fromkeys(names, text))
     return table
+
+
+def added_control_tables(models: Iterable[str]) -> tuple[str, ...]:
+    """Return the texts of the tables that were added for some models; models of our own have none.
+
+    They are for a process that loads no plug-ins itself.
+    """
+    return tuple(dict.fromkeys(_TEXTS[model] for model in models if model in _TEXTS))
 
 
 def _table(name: str, protocol: float) -> ControlTable | None:

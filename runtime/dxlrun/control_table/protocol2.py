@@ -138,6 +138,7 @@ def _table(path: Path, data: Mapping[str, object]) -> ControlTable:
     _apply_units(items, facts)
     for layer in _layers_of(path.stem):
         _lay(layer, items)
+    items["model_number"]["initial"] = data["model_number"]
     try:
         _complete(items, whole(data, "eeprom_end"))
         return build_table({**data, "items": in_order(items)})

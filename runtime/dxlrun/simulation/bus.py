@@ -40,6 +40,8 @@ class BusConfig:
     servos: tuple[ServoConfig, ...]
     protocol: float = 1.0
     """1.0 or 2.0: one bus speaks one protocol"""
+    control_tables: tuple[str, ...] = ()
+    """Texts of the control tables that plug-ins brought along: this process loads no plug-ins."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import msgspec
 
+from dxlrun.control_table import add_control_table
 from dxlrun.simulation.bus import BusConfig, SimulatedBus
 from dxlrun.simulation.ledger import Ledger
 from dxlrun.simulation.pseudo_terminal import PseudoTerminal
@@ -43,6 +44,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # only the front process takes it
     with os.fdopen(options.config_fd, "rb") as file:
         buses = decode_config(file.read())
+    for text in dict.fromkeys(text for bus in buses for text in bus.control_tables):
+        add_control_table(text)
     with socket.socket(fileno=options.control_fd) as control, Ledger(options.ledger, keep=False) as ledger:
         Server(buses, ledger, control).run()
     if ledger.error is None:

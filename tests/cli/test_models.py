@@ -1,0 +1,113 @@
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from dxlrun.cli.models_tables import runs, unit_of
+from dxlrun.control_table import all_tables, control_table
+
+
+def test_without_a_name_all_models_are_listed(dxlrun):
+    said = dxlrun("models")
+
+    assert (said.code, said.err) == (0, "")
+    for table in all_tables():
+        assert f" {table.model} " in said.out
+    (line,) = (line for line in said.out.splitlines() if " XM430-W350 " in line)
+    assert line.split() == [
+        *("XM430-W350", "1020", "2.0", "0.0879", "deg", "0..359.9", "deg", "46", "rpm", "4.1", "Nm"),
+        *("present", "current", "in", "A"),
+    ]
+
+
+def test_a_protocol_can_be_chosen(dxlrun):
+    said = dxlrun("models", "--protocol", "1.0")
+
+    assert said.code == 0
+    assert " AX-12A " in said.out
+    assert "XM430" not in said.out
+
+
+def test_a_name_prints_its_control_table(dxlrun):
+    said = dxlrun("models", "AX-12A")
+
+    assert said.code == 0
+    assert said.out.startswith("AX-12A (AX-12, AX-12+): model number 12, Protocol 1.0\n")
+    rows = {line.split()[0]: line.split() for line in said.out.splitlines() if line.strip()}
+    assert rows["goal_position"] == [
+        *("goal_position", "30", "2", "RW", "RAM", "0.2933", "deg", "0..1023", "Goal", "Position", "(30)"),
+    ]
+    assert rows["return_delay_time"][:9] == [
+        *("return_delay_time", "5", "1", "RW", "EEPROM", "0.002", "ms", "0..254", "250"),
+    ]
+    assert set(control_table("AX-12A").items) <= rows.keys()
+
+
+def test_a_name_of_both_protocols_prints_both_tables(dxlrun):
+    both = dxlrun("models", "MX-28")
+    second = dxlrun("models", "MX-28", "--protocol", "2")
+
+    assert "model number 29, Protocol 1.0" in both.out
+    assert "model number 30, Protocol 2.0" in both.out
+    assert second.out in both.out
+    assert second.out.startswith("MX-28 (MX-28(2.0), ")
+
+
+def test_items_that_repeat_themselves_share_a_line(dxlrun):
+    said = dxlrun("models", "XM430-W350")
+
+    (line,) = (line for line in said.out.splitlines() if line.split()[:1] == ["indirect_address_1..28"])
+    assert "168..222" in line
+    assert "224..251" in line
+    names = [item.name for run in runs(tuple(control_table("XM430-W350").items.values())) for item in run]
+    assert names == list(control_table("XM430-W350").items)
+
+
+def test_json_of_one_model_holds_all_that_the_table_knows(dxlrun):
+    (told,) = json.loads(dxlrun("models", "XM430-W350", "--json").out)
+
+    table = control_table("XM430-W350")
+    assert told["rad_per_tick"] == table.rad_per_tick
+    assert told["capabilities"] == sorted(table.capabilities)
+    assert told["baud_rates"]["3"] == 1_000_000
+    items = {item["name"]: item for item in told["items"]}
+    assert list(items) == list(table.items)
+    assert items["id"] == {
+        "name": "id", "address": 7, "size": 1, "access": "RW", "area": "EEPROM", "minimum": 0, "maximum": 252,
+        "initial": 1, "encoding": "unsigned", "unit": "", "scale": 1.0, "page": "ID (7)",
+    }  # fmt: skip
+
+
+def test_json_of_all_models_has_no_items(dxlrun):
+    told = json.loads(dxlrun("models", "--json").out)
+
+    assert [(each["model"], each["protocol"]) for each in told] == [
+        (table.model, table.protocol) for table in all_tables()
+    ]
+    assert all("items" not in each for each in told)
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("XM430-W305",), "there is no model XM430-W305; did you mean XM430-W350?"),
+        (("xm430-w350",), "there is no model xm430-w350; did you mean XM430-W350?"),
+        (("toaster",), "there is no model toaster; `dxlrun models` lists all"),
+        (("AX-12A", "--protocol", "2.0"), "there is no model AX-12A of Protocol 2.0; "),
+        (("AX-12A", "--protocol", "3"), "there is no Protocol 3; --protocol is 1.0 or 2.0"),
+    ],
+)
+def test_a_model_that_is_not_there_is_wrong_input(dxlrun, words, sentence):
+    said = dxlrun("models", *words)
+
+    assert (said.code, said.out) == (2, "")
+    assert said.errors[0].startswith(f"dxlrun: {sentence}")
+
+
+@pytest.mark.parametrize(
+    ("item", "unit"),
+    [("goal_position", "0.08789 deg"), ("goal_pwm", "0.113 %"), ("present_current", "2.69 mA"), ("led", "")],
+)
+def test_units_are_those_that_people_read(item, unit):
+    assert unit_of(control_table("XM430-W350").items[item]) == unit

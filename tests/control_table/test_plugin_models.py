@@ -1,0 +1,138 @@
+"""Servo models that a plug-in brings along: found by every process of a run, refused in one sentence."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+import dxlrun.control_table.models
+from dxlrun.control.plugins import load_plugins
+from dxlrun.control_table import added_control_tables, control_table
+
+PLUGIN = """
+from pathlib import Path
+from dxlrun import hookimpl
+
+@hookimpl
+def dxlrun_contract():
+    return 1
+
+@hookimpl
+def dxlrun_servo_models():
+    return OFFER
+"""
+
+ROBOT = """\
+name: foreign_servo
+buses:
+  main: {port: sim, protocol: 1.0, baud_rate: 1_000_000, adapter: {latency: 0 ms}}
+loop: {rate: 50}
+joints:
+  elbow: {bus: main, id: 1, model: Mine-1, reference: 150 deg, direction: 1}
+controllers:
+  states: {type: joint_state_broadcaster}
+"""
+
+MAIN = "import sys; from dxlrun.cli import main; sys.exit(main(sys.argv[1:]))"
+
+
+@pytest.fixture
+def table(data_files: Path, tmp_path: Path) -> Path:
+    """The data file of a servo that dxlrun does not know."""
+    text = (data_files / "protocol1" / "AX-12A.toml").read_text("utf-8")
+    text = text.replace('model = "AX-12A"', 'model = "Mine-1"').replace('["AX-12", "AX-12+"]', "[]")
+    text = text.replace("model_number = 12\n", "model_number = 60001\n")
+    path = tmp_path / "mine.toml"
+    path.write_text(text.replace("initial = 12\n", "initial = 60001\n"))
+    return path
+
+
+@pytest.fixture
+def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], None]]:
+    """Return a function that installs a plug-in which returns an expression as its servo models."""
+    monkeypatch.setattr(dxlrun.control_table.models, "_ADDED", {1.0: [], 2.0: []})
+    monkeypatch.setattr(dxlrun.control_table.models, "_TEXTS", {})
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def put(offer: str) -> None:
+        (tmp_path / "my_servos.py").write_text(PLUGIN.replace("OFFER", offer))
+        info = tmp_path / "my_servos-1.0.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my-servos\nVersion: 1.0\n")
+        (info / "entry_points.txt").write_text("[dxlrun]\nmy_servos = my_servos\n")
+
+    yield put
+    sys.modules.pop("my_servos", None)
+
+
+def test_a_table_is_taken_as_a_path_or_as_a_text(install: Callable[[str], None], table: Path) -> None:
+    install(f"[Path({str(table)!r})]")
+    assert load_plugins().broken == {}
+    assert control_table("Mine-1").model_number == 60001
+    assert added_control_tables(["AX-12A", "Mine-1", "Mine-1"]) == (table.read_text(),)
+    assert load_plugins().broken == {}, "a process may load its plug-ins twice"
+
+
+def test_a_text_is_a_table_too(install: Callable[[str], None], table: Path) -> None:
+    install(f"[{table.read_text()!r}]")
+    assert load_plugins().broken == {}
+    assert control_table("Mine-1", 1.0).max_tick == 1023
+
+
+@pytest.mark.parametrize(
+    ("offer", "told"),
+    [
+        ('"model = 1"', "does not return a list from dxlrun_servo_models"),
+        ("[5]", "offers the servo model 5; it must be a TOML text or the path of a file"),
+        ('[Path("/nowhere.toml")]', "a servo model (/nowhere.toml) that cannot be used (FileNotFoundError"),
+        ('["model = "]', "that cannot be used (TOMLDecodeError"),
+        ('["model = 1"]', "that cannot be used (ValueError: the entry 'items' is missing)"),
+        ("[TAKEN]", "has a name or the number of the AX-12A, which is known already"),
+    ],
+)  # fmt: skip
+def test_a_servo_model_that_cannot_be_used_is_told_in_one_sentence(
+    install: Callable[[str], None], table: Path, offer: str, told: str
+) -> None:
+    taken = repr(table.read_text().replace("model_number = 60001", "model_number = 12"))
+    install(offer.replace("TAKEN", taken))
+    sentence = load_plugins().broken["my_servos"]
+    assert sentence.startswith("plug-in my_servos of my-servos 1.0 ")
+    assert told in sentence
+    assert "\n" not in sentence
+
+
+@pytest.mark.parametrize("words", [[], ["--virtual"]], ids=["processes", "virtual"])
+def test_a_robot_of_foreign_servos_runs_in_simulation(
+    install: Callable[[str], None], table: Path, tmp_path: Path, words: list[str]
+) -> None:
+    install(f"[Path({str(table)!r})]")
+    robot = tmp_path / "robot.yaml"
+    robot.write_text(ROBOT)
+    run = subprocess.run(
+        [sys.executable, "-c", MAIN, str(robot), "--duration", "0.2", "--no-record", *words],
+        env=os.environ | {"PYTHONPATH": str(tmp_path)},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert run.returncode == 0, run.stdout + run.stderr
+
+
+def test_models_lists_it(install: Callable[[str], None], table: Path, tmp_path: Path) -> None:
+    install(f"[Path({str(table)!r})]")
+    run = subprocess.run(
+        [sys.executable, "-c", MAIN, "models", "Mine-1", "--json"],
+        env=os.environ | {"PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    (told,) = json.loads(run.stdout)
+    assert told["model_number"] == 60001
