@@ -12,6 +12,7 @@ from cyclopts import App, CycloptsError
 
 from dxlrun.cli.analyze import analyze
 from dxlrun.cli.check import check
+from dxlrun.cli.models import models
 from dxlrun.cli.replay import replay
 from dxlrun.cli.run import run
 from dxlrun.cli.schema import schema
@@ -43,6 +44,7 @@ def build() -> App:
     app.command(analyze)
     app.command(replay)
     app.command(schema)
+    app.command(models)
     return app
 
 
