@@ -80,11 +80,12 @@ def compile_robot(
     Raises InputError with every problem of the robot file and the motions.
     """
     problems = Problems()
+    plugins = load_plugins()  # first, as they may bring the servo models of joints along
     joints = compile_joints(description, problems, models or {})
     check_twins(description, {name: joint.table for name, joint in joints.items()}, problems)
     buses = compile_buses(description, joints, problems)
     urdf = compile_urdf(description, joints, problems)
-    controllers = compile_controllers(description, load_plugins(), problems)
+    controllers = compile_controllers(description, plugins, problems)
     names = (*description.robot.controllers, *left_out_names(description, "controllers"))
     parts = [
         part for motion in motions for part in compile_motion(motion, controllers, names, joints, problems)
