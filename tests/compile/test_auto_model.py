@@ -39,7 +39,7 @@ def test_the_answer_of_the_servo_counts(robot_text: str, tmp_path: Path):
     assert [each for each in compiled.warnings if "model" in each.what] == []
 
 
-@pytest.mark.parametrize(("protocol", "number"), [(2.0, 30)])
+@pytest.mark.parametrize(("protocol", "number"), [(1.0, 29), (2.0, 30)])
 def test_of_a_model_with_two_firmwares_the_one_of_the_bus_is_taken(
     robot_text: str, tmp_path: Path, protocol: float, number: int
 ):

@@ -1,11 +1,18 @@
 from __future__ import annotations
 
+import functools
+import json
 from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from dxlrun.description.including import MOST_FILES, MOST_LEVELS
+from dxlrun.description.including import MOST_FILES, MOST_LEVELS, merged
+from dxlrun.description.marks import KeyPath
+from dxlrun.description.syntax import parse
+from dxlrun.description.tree import grow, literal
 from dxlrun.errors import Mark
 
 HEAD = """\
@@ -186,3 +193,40 @@ def test_a_motion_includes_nothing(desk: Any) -> None:
         "{position: 1 rad}}}]}]\n"
     )
     assert problem.startswith("motion.yaml:2:1: the file has an unknown key 'include'; take it out")
+
+
+KEYS = st.sampled_from(["a", "b", "c"])
+DOCUMENTS = st.dictionaries(
+    KEYS, st.recursive(st.integers(0, 9), lambda below: st.dictionaries(KEYS, below), max_leaves=6)
+)
+
+
+def laid_over(low: dict[str, Any], high: dict[str, Any]) -> dict[str, Any]:
+    both = {
+        key: laid_over(low[key], high[key])
+        for key in low.keys() & high.keys()
+        if isinstance(low[key], dict) and isinstance(high[key], dict)
+    }
+    return low | high | both
+
+
+def leaves(value: object, path: KeyPath = ()) -> dict[KeyPath, object]:
+    if not isinstance(value, dict):
+        return {path: value}
+    return {k: v for key, below in value.items() for k, v in leaves(below, (*path, key)).items()}
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.lists(DOCUMENTS, min_size=1, max_size=4))
+def test_merging_is_deep_and_each_value_keeps_the_mark_of_its_file(documents: list[dict[str, Any]]) -> None:
+    grown = [grow(parse(json.dumps(each), str(n)), str(n), literal) for n, each in enumerate(documents)]
+    result = merged(grown)
+
+    assert result.data == functools.reduce(laid_over, documents)
+    for path, value in leaves(result.data).items():
+        file = int(result.marks.value(*path).file)
+        assert leaves(documents[file])[path] == value
+        assert not any(path in leaves(later) for later in documents[file + 1 :])
+    places = {path[:end] for path in result.marks.values for end in range(len(path) + 1)}
+    assert places == set(result.marks.values)  # no mark without its parents
+    assert set(result.marks.keys) == set(result.marks.values) - {()}
