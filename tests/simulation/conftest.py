@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 
@@ -21,6 +21,23 @@ class Answer(NamedTuple):
 def packet(servo_id: int, instruction: int, *parameters: int) -> bytes:
     body = bytes((servo_id, len(parameters) + 2, instruction, *parameters))
     return b"\xff\xff" + body + bytes((~sum(body) & 0xFF,))
+
+
+def crc(data: bytes) -> int:
+    """Return the CRC-16 of Protocol 2.0 bit by bit, as a textbook has it."""
+    value = 0
+    for byte in data:
+        value ^= byte << 8
+        for _ in range(8):
+            value = value << 1 ^ (0x18005 if value & 0x8000 else 0)
+    return value
+
+
+def packet2(servo_id: int, instruction: int, parameters: bytes = b"") -> bytes:
+    body = bytes((instruction,)) + parameters
+    assert b"\xff\xff\xfd" not in body, "this host stuffs nothing"
+    head = b"\xff\xff\xfd\x00" + bytes((servo_id,)) + (len(body) + 2).to_bytes(2, "little")
+    return head + body + crc(head + body).to_bytes(2, "little")
 
 
 @dataclass
@@ -75,28 +92,105 @@ class Line:
         return self.bus.servo(servo_id)
 
 
+class Line2(Line):
+    """One bus of Protocol 2.0."""
+
+    def tell(self, servo_id: int, instruction: int, parameters: bytes = b"") -> None:
+        self.ports.ports[0].write(packet2(servo_id, instruction, parameters))
+
+    def statuses(self, wait_ns: int = 10_000_000) -> list[Answer]:
+        """Return the status packets that arrive in a time; nothing else may."""
+        heard, answers = self.hear(wait_ns), []
+        while heard:
+            assert heard[:4] == b"\xff\xff\xfd\x00"
+            size = 7 + int.from_bytes(heard[5:7], "little")
+            status, heard = heard[:size], heard[size:]
+            assert status[7] == 0x55
+            assert crc(status[:-2]) == int.from_bytes(status[-2:], "little")
+            parameters = status[9:-2].replace(b"\xff\xff\xfd\xfd", b"\xff\xff\xfd")
+            answers.append(Answer(status[4], status[8], parameters))
+        return answers
+
+    def request(self, servo_id: int, instruction: int, parameters: bytes = b"") -> Answer | None:
+        """Send an instruction; return the one status packet that answers it, None for silence."""
+        self.tell(servo_id, instruction, parameters)
+        answers = self.statuses()
+        assert len(answers) < 2
+        return answers[0] if answers else None
+
+    def write_bytes(self, servo_id: int, address: int, data: bytes) -> int:
+        """Write bytes and return the error of the answer."""
+        answer = self.request(servo_id, 0x03, address.to_bytes(2, "little") + data)
+        assert answer is not None
+        return answer.error
+
+    def read_bytes(self, servo_id: int, address: int, size: int) -> bytes:
+        answer = self.request(servo_id, 0x02, address.to_bytes(2, "little") + size.to_bytes(2, "little"))
+        assert answer is not None
+        assert not answer.error & 0x7F
+        return answer.parameters
+
+    def set(self, name: str, value: int, servo_id: int = 1) -> int:
+        """Write an item by name, in ticks; return the error."""
+        item = self.bus.servo(servo_id).registers.table.items[name]
+        return self.write_bytes(servo_id, item.address, item.encode(value))
+
+    def get(self, name: str, servo_id: int = 1) -> int:
+        """Read an item by name, in ticks."""
+        item = self.bus.servo(servo_id).registers.table.items[name]
+        return item.decode(self.read_bytes(servo_id, item.address, item.size))
+
+    def wait(self, seconds: float) -> None:
+        self.clock.wait_until(self.clock.now_ns() + round(seconds * 1e9))
+
+
+@pytest.fixture
+def make_packet2() -> Callable[..., bytes]:
+    return packet2
+
+
 @pytest.fixture
 def make_packet() -> Callable[..., bytes]:
     return packet
 
 
+def build_line(
+    kind: type[Line],
+    protocol: float,
+    ids: tuple[int, ...],
+    model: str,
+    *,
+    baud_rate: int = 1_000_000,
+    position: float = 2.0,
+    return_delay_ns: int = 500_000,
+    start_ns: int = 0,
+) -> Line:
+    clock = VirtualClock(start_ns)
+    ledger = Ledger()
+    servos = tuple(ServoConfig(servo_id, model, position, return_delay_ns) for servo_id in ids)
+    bus = SimulatedBus(BusConfig("main", baud_rate, servos, protocol), ledger, start_ns)
+    return kind(clock, bus, ledger, VirtualPorts(clock, (bus,)))
+
+
 @pytest.fixture
 def make_line() -> Callable[..., Line]:
-    def make(
-        ids: tuple[int, ...] = (1, 2),
-        *,
-        baud_rate: int = 1_000_000,
-        position: float = 2.0,
-        return_delay_ns: int = 500_000,
-        start_ns: int = 0,
-    ) -> Line:
-        clock = VirtualClock(start_ns)
-        ledger = Ledger()
-        servos = tuple(ServoConfig(servo_id, "AX-12A", position, return_delay_ns) for servo_id in ids)
-        bus = SimulatedBus(BusConfig("main", baud_rate, servos), ledger, start_ns)
-        return Line(clock, bus, ledger, VirtualPorts(clock, (bus,)))
+    def make(ids: tuple[int, ...] = (1, 2), model: str = "AX-12A", **settings: Any) -> Line:
+        return build_line(Line, 1.0, ids, model, **settings)
 
     return make
+
+
+@pytest.fixture
+def make_line2() -> Callable[..., Line]:
+    def make(ids: tuple[int, ...] = (1, 2), model: str = "XM430-W350", **settings: Any) -> Line:
+        return build_line(Line2, 2.0, ids, model, **settings)
+
+    return make
+
+
+@pytest.fixture
+def line2(make_line2: Callable[..., Line]) -> Line:
+    return make_line2()
 
 
 @pytest.fixture

@@ -5,6 +5,9 @@ A write is refused as a whole [i].
 
 from __future__ import annotations
 
+import math
+from enum import IntEnum, unique
+
 from dxlrun.control_table import ControlItem
 from dxlrun.simulation.memory import Memory, in_range
 from dxlrun.simulation.protocol1 import ErrorBit
@@ -17,11 +20,18 @@ _LIMITS_OF_GOALS = {
     "goal_velocity": "velocity_limit",
 }
 _GOALS = frozenset(("goal_pwm", "goal_current", "goal_velocity", "goal_position"))
-_SINGLE_TURN = (3,)
-"""Operating modes in which the position limits hold (e-Manual, Min/Max Position Limit (48, 52))."""
+_TURNS = 256
+"""Reach of extended position control to either side (e-Manual, X series, Goal Position (116): 1,048,575)."""
 
-WATCHDOG_ERROR = 0xFF
-"""Bus Watchdog (98) after its time ran out: -1."""
+
+@unique
+class OperatingMode(IntEnum):
+    """Operating Mode (11) where the shaft moves; the position limits hold in POSITION."""
+
+    VELOCITY = 1
+    POSITION = 3
+    EXTENDED_POSITION = 4
+    CURRENT_BASED_POSITION = 5
 
 
 class LockRules:
@@ -83,13 +93,30 @@ class TorqueRules:
 
     def _refusal_of(self, item: ControlItem, wire: int) -> int:
         memory = self._memory
-        if not in_range(item, wire):
+        if not self._in_range(item, wire):
             return ErrorNumber.DATA_RANGE
-        if item.name in _GOALS and memory.get("bus_watchdog") == WATCHDOG_ERROR:
+        if item.name in _GOALS and watchdog_expired(memory):
             return ErrorNumber.DATA_RANGE
         if self._beyond_limit(item, wire):
             return ErrorNumber.DATA_LIMIT
         return 0
+
+    def _in_range(self, item: ControlItem, wire: int) -> bool:
+        """Return whether a value may be: a goal of many turns where the mode is not that of one turn."""
+        memory = self._memory
+        if item.name != "goal_position" or self._one_turn(item):
+            return in_range(item, wire)
+        highest = round(_TURNS * math.tau / memory.table.rad_per_tick) - 1
+        return abs(item.decode(wire.to_bytes(item.size, "little"))) <= max(highest, item.maximum)
+
+    def _one_turn(self, goal: ControlItem) -> bool:
+        """Return whether the goal stays within a turn: by the operating mode, or as a gripper has no more."""
+        memory = self._memory
+        reach = (goal.maximum - goal.minimum + 1) * memory.table.rad_per_tick
+        return (
+            memory.get("operating_mode", OperatingMode.POSITION) == OperatingMode.POSITION
+            or reach < 0.99 * math.tau
+        )
 
     def _beyond_limit(self, item: ControlItem, wire: int) -> bool:
         memory = self._memory
@@ -99,10 +126,16 @@ class TorqueRules:
             return abs(value) > memory[limit]
         if item.name != "goal_position":
             return False
-        if "max_position_limit" in memory and memory.get("operating_mode") in _SINGLE_TURN:
+        if "max_position_limit" in memory and self._one_turn(item):
             lowest, highest = memory.ticks("min_position_limit"), memory.ticks("max_position_limit")
             return not lowest <= value <= highest
         return not wheel_mode(memory) and _beyond_angle_limits(memory, item.name, wire)
+
+
+def watchdog_expired(memory: Memory) -> bool:
+    """Return whether Bus Watchdog (98) shows that its time ran out: -1, which nobody can write."""
+    item = memory.table.items.get("bus_watchdog")
+    return item is not None and memory["bus_watchdog"] > item.maximum
 
 
 def wheel_mode(memory: Memory) -> bool:

@@ -17,7 +17,7 @@ _PING_REPLY = 14
 _CLEAR_TURNS = bytes.fromhex("01 44 58 4c 22")
 _BACK_UP = bytes.fromhex("01 43 54 52 4c")
 _RESTORE = bytes.fromhex("02 43 54 52 4c")
-_KEPT_BY_RESET = {0xFF: (), 0x01: ("id",), 0x02: ("id", "baud_rate")}
+_KEPT_BY_RESET = {0xFF: (), 0x01: ("id",), 0x02: ("id", "baud_rate", "baud_rate_bus")}
 
 
 class Instructions2:

@@ -8,22 +8,10 @@ written and the shaft stays where it is.
 from __future__ import annotations
 
 import math
-from enum import IntEnum, unique
 from typing import ClassVar
 
-from dxlrun.simulation.access import WATCHDOG_ERROR
+from dxlrun.simulation.access import OperatingMode, watchdog_expired
 from dxlrun.simulation.shaft import ACCELERATION, Drive, Shaft, in_turn
-
-
-@unique
-class OperatingMode(IntEnum):
-    """Operating Mode (11) where the shaft moves."""
-
-    VELOCITY = 1
-    POSITION = 3
-    EXTENDED_POSITION = 4
-    CURRENT_BASED_POSITION = 5
-
 
 REVERSE, TIME_BASED = 0x01, 0x04
 """Bits of Drive Mode (10): clockwise is positive; Profile Velocity and Acceleration are durations in ms."""
@@ -90,7 +78,7 @@ class ModeShaft(Shaft):
 
     def _wanted(self) -> Drive:
         memory = self.memory
-        if not self.torque_on or memory.get("bus_watchdog") == WATCHDOG_ERROR:
+        if not self.torque_on or watchdog_expired(memory):
             return ()
         match memory["operating_mode"]:
             case OperatingMode.VELOCITY:

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from enum import IntFlag, unique
 
-from dxlrun.simulation.access import WATCHDOG_ERROR, TorqueRules
+from dxlrun.simulation.access import OperatingMode, TorqueRules, watchdog_expired
 from dxlrun.simulation.body import Body
 from dxlrun.simulation.memory import Memory
-from dxlrun.simulation.mode_shaft import OperatingMode
 from dxlrun.simulation.protocol2 import ALERT, ErrorNumber
 from dxlrun.simulation.shaft import Shaft
 
@@ -50,12 +49,12 @@ class TorqueBody(Body):
     def advance(self, now_ns: int) -> None:
         """Let time pass, and stop where the Bus Watchdog's time runs out."""
         units = self.memory.get("bus_watchdog")
-        if 0 < units < WATCHDOG_ERROR and self.memory.get("torque_enable"):
+        if units and self.memory.get("torque_enable") and not watchdog_expired(self.memory):
             end_ns = self._heard_ns + units * WATCHDOG_UNIT_NS
             if now_ns > end_ns:
                 self.shaft.advance(end_ns)
                 self.note(f"servo {self.servo_id}: bus watchdog after {units * 20} ms")
-                self.poke("bus_watchdog", WATCHDOG_ERROR)
+                self.poke("bus_watchdog", -1)
         super().advance(now_ns)
 
     def hear(self, now_ns: int) -> None:

@@ -1,0 +1,166 @@
+"""How a servo with operating modes moves, judged by what it tells."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+
+TICK = math.tau / 4096
+RPM = math.tau / 60
+CLEAR_TURNS = bytes.fromhex("01 44584c22")
+
+
+def move(line: Any, goal: int, seconds: float = 3.0) -> int:
+    assert line.set("torque_enable", 1) == 0
+    assert line.set("goal_position", goal) == 0
+    line.wait(seconds)
+    return int(line.get("present_position"))
+
+
+def test_without_torque_it_stays_whatever_the_goal(line2: Any) -> None:
+    assert line2.set("goal_position", 3000) == 0
+    line2.wait(1)
+    assert line2.get("present_position") == round(2.0 / TICK)
+    assert line2.get("torque_enable") == 0
+
+
+def test_position_control_goes_there_and_rests(line2: Any) -> None:
+    assert move(line2, 3000) == 3000
+    assert line2.get("present_velocity") == 0
+    assert line2.get("moving") == 0
+    assert line2.servo().position == pytest.approx(3000 * TICK)
+
+
+def test_profile_velocity_is_the_speed(line2: Any) -> None:
+    line2.set("profile_velocity", 50)
+    assert move(line2, 0, 0.3) < round(2.0 / TICK)
+    assert line2.servo().velocity == pytest.approx(-50 * 0.229 * RPM, rel=1e-3)
+    assert line2.get("present_velocity") == -50
+    assert line2.get("moving") == 1
+
+
+def test_profile_velocity_0_is_as_fast_as_it_can(line2: Any) -> None:
+    move(line2, 4095, 0.1)
+    assert line2.servo().velocity == pytest.approx(line2.servo().registers.table.max_speed)
+
+
+def test_profile_acceleration_is_the_slope(line2: Any) -> None:
+    line2.set("profile_acceleration", 10)
+    line2.set("torque_enable", 1)
+    line2.set("goal_position", 4095)
+    first, start_ns = line2.servo().velocity, line2.clock.now_ns()
+    line2.wait(0.1)
+    slope = (line2.servo().velocity - first) / ((line2.clock.now_ns() - start_ns) * 1e-9)
+    assert slope == pytest.approx(10 * 214.577 * math.tau / 3600)
+
+
+def test_a_time_based_profile_takes_its_time(line2: Any) -> None:
+    line2.set("drive_mode", 4)
+    line2.set("profile_velocity", 2000)  # ms
+    line2.set("profile_acceleration", 500)
+    line2.set("torque_enable", 1)
+    line2.set("goal_position", 2304)
+    line2.wait(1.9)
+    assert line2.get("moving") == 1
+    line2.wait(0.2)
+    assert line2.get("moving") == 0
+    assert line2.get("present_position") == 2304
+
+
+def test_velocity_control_turns_on_and_on(line2: Any) -> None:
+    line2.set("operating_mode", 1)
+    line2.set("torque_enable", 1)
+    line2.set("goal_velocity", -100)
+    line2.wait(10)
+    assert line2.get("present_velocity") == -100
+    assert line2.get("present_position") < -4096
+    line2.set("goal_velocity", 0)
+    line2.wait(1)
+    assert line2.get("present_velocity") == 0
+
+
+def test_extended_position_control_counts_turns(line2: Any) -> None:
+    line2.set("operating_mode", 4)
+    assert move(line2, -3 * 4096, 20) == -3 * 4096
+    assert line2.set("goal_position", 1_048_575) == 0
+    assert line2.set("goal_position", 1_048_576) == 4
+
+
+def test_clear_brings_the_turns_back_when_it_rests(line2: Any) -> None:
+    line2.set("operating_mode", 4)
+    line2.set("torque_enable", 1)
+    line2.set("goal_position", 4096 * 2 + 77)
+    assert line2.request(1, 0x10, CLEAR_TURNS).error == 1
+    line2.wait(20)
+    line2.set("torque_enable", 0)
+    assert line2.request(1, 0x10, CLEAR_TURNS) == (1, 0, b"")
+    assert line2.get("present_position") == 77
+
+
+def test_position_control_knows_one_turn(line2: Any) -> None:
+    line2.set("operating_mode", 4)
+    move(line2, 5000, 5)
+    line2.set("torque_enable", 0)
+    line2.set("operating_mode", 3)
+    assert line2.get("present_position") == 5000 - 4096
+    assert line2.get("goal_position") == 5000 - 4096
+
+
+def test_homing_offset_shifts_what_is_told_and_wanted(line2: Any) -> None:
+    line2.set("homing_offset", 100)
+    assert line2.get("present_position") == round(2.0 / TICK) + 100
+    assert move(line2, 1100) == 1100
+    assert line2.servo().position == pytest.approx(1000 * TICK)
+
+
+def test_reverse_mode_turns_the_direction(line2: Any) -> None:
+    line2.set("drive_mode", 1)
+    line2.servo().reset()
+    before = line2.get("present_position")
+    assert before == 4096 - round(2.0 / TICK)
+    assert move(line2, before + 100) == before + 100
+    assert line2.servo().position - (2.0 - math.tau) == pytest.approx(-100 * TICK, abs=TICK)
+
+
+@pytest.mark.parametrize("mode", [0, 16])
+def test_modes_that_are_not_modelled_take_their_goals_and_stay(line2: Any, mode: int) -> None:
+    assert line2.set("operating_mode", mode) == 0
+    assert line2.set("torque_enable", 1) == 0
+    assert line2.set("goal_current", 100) == 0
+    assert line2.set("goal_pwm", 100) == 0
+    line2.wait(1)
+    assert line2.get("present_position") == round(2.0 / TICK)
+
+
+def test_a_goal_wakes_it_only_where_drive_mode_says_so(line2: Any) -> None:
+    line2.set("drive_mode", 8)
+    line2.set("goal_position", 3000)
+    assert line2.get("torque_enable") == 1
+    line2.wait(2)
+    assert line2.get("present_position") == 3000
+
+
+def test_a_servo_around_0_finds_itself_around_0(make_line2: Any) -> None:
+    line = make_line2((1,), "PH54-200-S500", position=-0.5)
+    tick = line.servo().registers.table.rad_per_tick
+    assert line.get("present_position") == round(-0.5 / tick)
+    assert move(line, 1000) == 1000
+
+
+def test_an_xl320_moves_by_its_own_items(make_line2: Any) -> None:
+    line = make_line2((1,), "XL-320", position=2.0)
+    assert line.get("present_position") == round(2.0 / math.radians(300) * 1023)
+    assert move(line, 800) == 800
+    line.set("torque_enable", 0)
+    assert line.set("control_mode", 1) == 0
+    line.set("torque_enable", 1)
+    assert line.set("moving_speed", 500) == 0
+    line.wait(1)
+    assert line.servo().velocity > 0
+
+
+def test_an_rh_p12_closes(make_line2: Any) -> None:
+    line = make_line2((1,), "RH-P12-RN(A)", position=0.0)
+    assert move(line, 740) == 740

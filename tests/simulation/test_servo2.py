@@ -1,0 +1,352 @@
+"""A servo of Protocol 2.0: instructions, errors, protection, start-up."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+
+from dxlrun.simulation import ServoConfig, SimulatedServo
+from dxlrun.simulation.protocol2 import ErrorNumber
+from dxlrun.simulation.torque_body import HardwareError
+
+PING, READ, WRITE, REG_WRITE, ACTION, RESET, REBOOT, CLEAR, BACKUP = 1, 2, 3, 4, 5, 6, 8, 0x10, 0x20
+SYNC_WRITE, BULK_WRITE = 0x83, 0x93
+BROADCAST = 0xFE
+ALERT = 0x80
+TICK = math.tau / 4096
+CLEAR_TURNS = bytes.fromhex("01 44584c22")
+
+
+def test_ping_tells_model_and_firmware(line2: Any) -> None:
+    line2.servo().poke("firmware_version", 0x26)
+    assert line2.request(1, PING) == (1, 0, (1020).to_bytes(2, "little") + b"\x26")
+
+
+def test_a_broadcast_ping_is_answered_in_slots_by_id(make_line2: Any) -> None:
+    line = make_line2((7, 1, 30))
+    line.tell(BROADCAST, PING)
+    assert [each.servo_id for each in line.statuses(400_000_000)] == [1, 7, 30]
+    assert not any("collision" in note for note in line.notes())
+
+
+def test_nobody_answers_for_an_id_that_is_not_there(line2: Any) -> None:
+    assert line2.request(9, PING) is None
+
+
+def test_packets_of_the_manual_go_in_and_come_out(make_line2: Any) -> None:
+    line = make_line2((1,), "XM430-W210", position=166 * TICK)
+    line.servo().poke("firmware_version", 0x26)
+    talk = [
+        ("fffffd00 01 0300 01 194e", "fffffd00 01 0700 55 00 060426 655d"),
+        ("fffffd00 01 0700 02 84000400 1d15", "fffffd00 01 0800 55 00 a6000000 8cc0"),
+        ("fffffd00 01 0900 03 740000020000 ca89", "fffffd00 01 0400 55 00 a10c"),
+        ("fffffd00 01 0900 04 6800c8000000 ae8e", "fffffd00 01 0400 55 00 a10c"),
+        ("fffffd00 01 0300 05 02ce", "fffffd00 01 0400 55 00 a10c"),
+        ("fffffd00 01 0800 10 0144584c22 b1dc", "fffffd00 01 0400 55 00 a10c"),
+        ("fffffd00 01 0400 06 01 a1e6", "fffffd00 01 0400 55 00 a10c"),
+    ]
+    for heard, said in talk:
+        line.ports.ports[0].write(bytes.fromhex(heard))
+        assert line.hear() == bytes.fromhex(said)
+    line.wait(1)
+    line.bus.baud_rate = 57_600  # the factory's, which reset option 1 does not keep
+    line.ports.ports[0].write(bytes.fromhex("fffffd00 01 0300 08 2f4e"))
+    assert line.hear() == bytes.fromhex("fffffd00 01 0400 55 00 a10c")
+
+
+@pytest.mark.parametrize(
+    ("instruction", "parameters", "error"),
+    [
+        (0x07, b"", ErrorNumber.INSTRUCTION),
+        (READ, b"\x84\x00\x04", ErrorNumber.INSTRUCTION),
+        (WRITE, b"\x40\x00", ErrorNumber.INSTRUCTION),
+        (ACTION, b"", ErrorNumber.INSTRUCTION),
+        (RESET, b"\x03", ErrorNumber.INSTRUCTION),
+        (CLEAR, b"\x01\x44\x58\x4c\x23", ErrorNumber.INSTRUCTION),
+        (SYNC_WRITE, b"\x41\x00\x01\x00\x01\x01", ErrorNumber.INSTRUCTION),  # not to all
+        (READ, b"\x00\x03\x01\x00", ErrorNumber.ACCESS),
+        (READ, b"\x84\x00\x00\x00", ErrorNumber.ACCESS),
+        (WRITE, b"\x0f\x00\x01", ErrorNumber.ACCESS),  # no item
+        (WRITE, b"\x84\x00\x00\x00\x00\x00", ErrorNumber.ACCESS),  # read-only
+        (WRITE, b"\x40\x00\x02", ErrorNumber.DATA_RANGE),
+        (WRITE, b"\x74\x00\x00\x10\x00\x00", ErrorNumber.DATA_RANGE),  # goal 4096
+        (WRITE, b"\x74\x00\x00\x00", ErrorNumber.DATA_LENGTH),
+        (WRITE, b"\x75\x00\x00\x00\x00", ErrorNumber.DATA_LENGTH),
+        (WRITE, b"\x41\x00\x01\x00\x00", ErrorNumber.ACCESS),  # LED, then cells of no item
+    ],
+)
+def test_errors_of_the_manual(line2: Any, instruction: int, parameters: bytes, error: int) -> None:
+    before = line2.read_bytes(1, 0, 147 - 27)
+    assert line2.request(1, instruction, parameters) == (1, error, b"")
+    assert line2.read_bytes(1, 0, 147 - 27) == before
+    assert any("refuses" in note for note in line2.notes())
+
+
+def test_a_wrong_crc_is_answered_as_such_and_not_obeyed(line2: Any) -> None:
+    line2.ports.ports[0].write(bytes.fromhex("fffffd00 01 0600 03 410001 0000"))
+    assert line2.statuses() == [(1, ErrorNumber.CRC, b"")]
+    assert line2.get("led") == 0
+
+
+def test_goals_beyond_a_limit_are_limit_errors(line2: Any) -> None:
+    assert line2.set("max_position_limit", 3000) == 0
+    assert line2.set("min_position_limit", 1000) == 0
+    assert [line2.set("goal_position", each) for each in (999, 1000, 3000, 3001)] == [6, 0, 0, 6]
+    assert line2.set("velocity_limit", 100) == 0
+    assert [line2.set("goal_velocity", each) for each in (-101, -100, 100, 101)] == [6, 0, 0, 6]
+    assert line2.set("pwm_limit", 500) == 0
+    assert line2.set("goal_pwm", 501) == ErrorNumber.DATA_LIMIT
+
+
+def test_torque_locks_the_eeprom_and_nothing_else(line2: Any) -> None:
+    assert line2.set("torque_enable", 1) == 0
+    assert line2.set("return_delay_time", 0) == ErrorNumber.ACCESS
+    assert line2.set("led", 1) == 0
+    assert line2.set("torque_enable", 0) == 0
+    assert line2.set("return_delay_time", 0) == 0
+
+
+@pytest.mark.parametrize(
+    ("level", "ping", "read", "write"),
+    [(0, True, False, False), (1, True, True, False), (2, True, True, True)],
+)
+def test_status_return_level(line2: Any, level: int, ping: bool, read: bool, write: bool) -> None:
+    line2.request(1, WRITE, bytes((68, 0, level)))
+    assert (line2.request(1, PING) is not None) == ping
+    assert (line2.request(1, READ, b"\x84\x00\x04\x00") is not None) == read
+    assert (line2.request(1, WRITE, b"\x41\x00\x01") is not None) == write
+    assert line2.servo().registers["led"] == 1
+
+
+def test_reg_write_waits_for_action(line2: Any) -> None:
+    for servo_id in (1, 2):
+        assert line2.request(servo_id, REG_WRITE, b"\x41\x00\x01") == (servo_id, 0, b"")
+        assert line2.get("registered_instruction", servo_id) == 1
+    line2.tell(BROADCAST, ACTION)
+    assert line2.statuses() == []
+    assert [line2.get("led", each) for each in (1, 2)] == [1, 1]
+    assert [line2.get("registered_instruction", each) for each in (1, 2)] == [0, 0]
+    assert line2.request(1, REG_WRITE, b"\x40\x00\x02").error == ErrorNumber.DATA_RANGE
+
+
+def test_sync_write_and_bulk_write_give_each_its_own(line2: Any) -> None:
+    line2.tell(BROADCAST, SYNC_WRITE, bytes.fromhex("74000400 01 96000000 02 aa000000"))
+    assert [line2.get("goal_position", each) for each in (1, 2)] == [150, 170]
+    line2.tell(BROADCAST, BULK_WRITE, bytes.fromhex("01 20000200 9b00 02 1f000100 46"))
+    assert line2.get("max_voltage_limit", 1) == 155
+    assert line2.get("temperature_limit", 2) == 70
+    assert line2.statuses() == []
+
+
+@pytest.mark.parametrize(
+    ("instruction", "parameters"),
+    [
+        (SYNC_WRITE, "41000100 01 01 02"),
+        (SYNC_WRITE, "41000000 01"),
+        (BULK_WRITE, "01 41000100 01 02 41000100"),
+        (BULK_WRITE, "01 4100"),
+    ],
+)
+def test_writes_to_many_of_a_wrong_length_change_nothing(
+    line2: Any, instruction: int, parameters: str
+) -> None:
+    line2.tell(BROADCAST, instruction, bytes.fromhex(parameters))
+    assert line2.statuses() == []
+    assert line2.get("led") == 0
+    assert any("INSTRUCTION" in note for note in line2.notes())
+
+
+@pytest.mark.parametrize(
+    ("option", "servo_id", "baud_rate"), [(0xFF, 1, 57_600), (0x01, 7, 57_600), (0x02, 7, 1_000_000)]
+)
+def test_factory_reset_keeps_what_is_asked_for(
+    make_line2: Any, option: int, servo_id: int, baud_rate: int
+) -> None:
+    line = make_line2((7,), return_delay_ns=0)
+    line.set("drive_mode", 1, 7)
+    assert line.request(7, RESET, bytes((option,))) == (7, 0, b"")
+    servo = line.bus.servos[0]
+    assert (servo.servo_id, servo.baud_rate) == (servo_id, baud_rate)
+    assert (servo.registers["drive_mode"], servo.registers["return_delay_time"]) == (0, 250)
+    assert line.request(servo_id, PING) is None  # it boots, or listens at another rate
+
+
+def test_a_reset_of_everything_is_not_for_all(line2: Any) -> None:
+    line2.set("drive_mode", 1)
+    line2.tell(BROADCAST, RESET, b"\xff")
+    assert line2.statuses() == []
+    assert line2.get("drive_mode") == 1
+
+
+def test_reboot_loses_ram_turns_and_the_time(line2: Any) -> None:
+    line2.set("operating_mode", 4)
+    line2.set("torque_enable", 1)
+    line2.set("goal_position", 4096 * 3 + 100)
+    line2.wait(10)
+    assert line2.get("present_position") == 4096 * 3 + 100
+    before = line2.get("realtime_tick")
+    assert line2.request(1, REBOOT) == (1, 0, b"")
+    assert line2.request(1, PING) is None  # it takes its time
+    line2.wait(0.2)
+    assert line2.get("realtime_tick") < 300 < before
+    assert line2.get("torque_enable") == 0
+    assert line2.get("operating_mode") == 4
+    assert line2.get("present_position") == 100
+    assert not line2.servo().torque_on
+
+
+def test_realtime_tick_counts_milliseconds_modulo_32768(line2: Any) -> None:
+    first = line2.get("realtime_tick")
+    asked_ns = line2.clock.now_ns()
+    line2.wait(1.234)
+    line2.get("led")
+    second = line2.get("realtime_tick")
+    assert second - first == pytest.approx(1234 + 20, abs=1)  # each answer is waited for 10 ms
+    line2.clock.wait_until(asked_ns + 32_768_000_000 - 10_000_000)
+    assert line2.get("realtime_tick") == pytest.approx(first, abs=1)
+
+
+def test_startup_configuration_switches_the_torque_on(make_line2: Any) -> None:
+    line2 = make_line2((1,), "XL330-M288")
+    line2.set("startup_configuration", 1)
+    line2.servo().reset()
+    assert line2.get("torque_enable") == 1
+    assert line2.servo().torque_on
+
+
+def test_ram_comes_back_from_a_backup(make_line2: Any) -> None:
+    line2 = make_line2((1,), "XL330-M288")
+    line2.set("profile_velocity", 123)
+    line2.set("startup_configuration", 2)
+    assert line2.request(1, BACKUP, bytes.fromhex("01 4354524c")) == (1, 0, b"")
+    line2.set("profile_velocity", 5)
+    line2.servo().reset()
+    assert line2.get("profile_velocity") == 123
+    line2.set("profile_velocity", 5)
+    assert line2.request(1, BACKUP, bytes.fromhex("02 4354524c")) == (1, 0, b"")
+    assert line2.get("profile_velocity") == 123
+
+
+def test_no_backup_with_torque_and_no_restoring_of_none(line2: Any) -> None:
+    assert line2.request(1, BACKUP, bytes.fromhex("02 4354524c")).error == ErrorNumber.RESULT_FAIL
+    line2.set("torque_enable", 1)
+    assert line2.request(1, BACKUP, bytes.fromhex("01 4354524c")).error == ErrorNumber.RESULT_FAIL
+
+
+# Protection
+
+
+def test_overload_latches_until_a_reboot(line2: Any) -> None:
+    line2.set("torque_enable", 1)
+    line2.servo().trigger_overload()
+    answer = line2.request(1, READ, b"\x46\x00\x01\x00")
+    assert answer == (1, ALERT, bytes((HardwareError.OVERLOAD,)))
+    assert line2.get("torque_enable") == 0
+    assert line2.set("torque_enable", 1) == ALERT | ErrorNumber.RESULT_FAIL
+    line2.request(1, REBOOT)
+    line2.wait(0.2)
+    assert line2.set("torque_enable", 1) == 0
+    assert line2.get("hardware_error_status") == 0
+
+
+def test_an_alert_is_no_failed_transaction(line2: Any) -> None:
+    line2.servo().trigger_overload()
+    assert line2.request(1, WRITE, b"\x41\x00\x01") == (1, ALERT, b"")
+    assert line2.get("led") == 1
+
+
+def test_what_shutdown_does_not_list_is_only_told(line2: Any) -> None:
+    line2.set("shutdown", 0)
+    line2.set("torque_enable", 1)
+    line2.servo().set_temperature(81)
+    assert line2.request(1, PING).error == ALERT
+    assert line2.get("hardware_error_status") == HardwareError.OVERHEATING
+    assert line2.get("torque_enable") == 1
+    line2.servo().set_temperature(40)
+    assert line2.request(1, PING).error == 0
+
+
+def test_voltage_is_watched_and_shown(line2: Any) -> None:
+    line2.servo().set_voltage(9.0)
+    assert line2.get("present_input_voltage") == 90
+    assert line2.get("hardware_error_status") == HardwareError.VOLTAGE
+
+
+def test_an_xl320_orders_its_hardware_errors_otherwise(make_line2: Any) -> None:
+    line = make_line2((1,), "XL-320")
+    line.servo().trigger_overload()
+    assert line.get("hardware_error_status") == 1
+    assert line.get("torque_enable") == 0
+
+
+def test_bus_watchdog_stops_and_closes_the_goals(line2: Any) -> None:
+    line2.set("operating_mode", 1)
+    line2.set("torque_enable", 1)
+    line2.set("goal_velocity", 50)
+    assert line2.set("bus_watchdog", 100) == 0
+    line2.wait(1.9)
+    assert line2.get("goal_velocity") == 50
+    assert line2.servo().velocity > 0
+    line2.wait(2.5)
+    assert line2.servo().velocity == 0
+    assert line2.get("bus_watchdog") == 0xFF
+    assert line2.set("goal_velocity", 150) == ErrorNumber.DATA_RANGE
+    assert line2.set("goal_position", 150) == ErrorNumber.DATA_RANGE
+    assert line2.set("bus_watchdog", 0) == 0
+    assert line2.set("goal_velocity", 150) == 0
+    line2.wait(0.5)
+    assert line2.servo().velocity > 0
+
+
+def test_the_watchdog_s_stop_is_at_its_time(line2: Any) -> None:
+    line2.set("operating_mode", 1)
+    line2.set("torque_enable", 1)
+    line2.set("goal_velocity", 100)
+    line2.set("bus_watchdog", 5)
+    heard_ns = next(e.t_ns for e in reversed(line2.ledger.entries) if e.direction == "in")
+    line2.wait(3)
+    speed = 100 * 0.229 * math.tau / 60
+    turned = line2.servo().position - 2.0
+    assert turned == pytest.approx(speed * (heard_ns * 1e-9 + 0.1), rel=0.3)
+
+
+# Indirect addresses
+
+
+def test_indirect_data_is_read_and_written_through(line2: Any) -> None:
+    for index, address in enumerate((132, 133, 134, 135, 65)):
+        assert line2.set(f"indirect_address_{index + 1}", address) == 0
+    position, led = line2.read_bytes(1, 132, 4), b"\x00"
+    assert line2.read_bytes(1, 224, 5) == position + led
+    assert line2.write_bytes(1, 228, b"\x01") == 0
+    assert line2.get("led") == 1
+    assert line2.write_bytes(1, 224, b"\x00") == ErrorNumber.ACCESS  # present position is read-only
+
+
+def test_a_goal_may_go_through_indirect_data(line2: Any) -> None:
+    line2.set("torque_enable", 1)
+    for index in range(4):
+        line2.set(f"indirect_address_{index + 1}", 116 + index)
+    assert line2.write_bytes(1, 224, (3000).to_bytes(4, "little")) == 0
+    line2.wait(2)
+    assert line2.get("present_position") == 3000
+    assert line2.write_bytes(1, 224, b"\x00\x00") == ErrorNumber.DATA_LENGTH
+
+
+def test_a_reboot_gives_indirect_data_another_meaning(line2: Any) -> None:
+    line2.set("indirect_address_1", 132)
+    line2.servo().reset()
+    assert line2.get("indirect_address_1") == 224
+    assert len(line2.read_bytes(1, 224, 1)) == 1
+
+
+@pytest.mark.parametrize("rate", [9_600, 57_600, 1_000_000, 4_500_000])
+def test_baud_rates_of_the_manual(rate: int) -> None:
+    assert SimulatedServo(ServoConfig(1, "XM430-W350", 0.0), rate, 0, protocol=2.0).baud_rate == rate
+
+
+def test_a_baud_rate_that_no_servo_has_is_refused() -> None:
+    with pytest.raises(ValueError, match="no baud rate near 500000"):
+        SimulatedServo(ServoConfig(1, "XM430-W350", 0.0), 500_000, 0, protocol=2.0)
