@@ -70,9 +70,8 @@ def packets_in(data: bytes) -> list[tuple[int, int, bytes]]:
     return found
 
 
-def torque(ledger: tuple[LedgerEntry, ...], ids: tuple[int, ...]) -> dict[int, bool]:
+def torque_changes(ledger: tuple[LedgerEntry, ...], ids: tuple[int, ...]) -> Iterator[tuple[int, bool]]:
     """Follow what the bytes on the wire did to torque: address 24, and a goal position switches it on."""
-    state = dict.fromkeys(ids, False)
     sent = b"".join(entry.data for entry in ledger if entry.direction == "in")
     for servo_id, instruction, parameters in packets_in(sent):
         writes: list[tuple[int, int, bytes]] = []
@@ -85,10 +84,9 @@ def torque(ledger: tuple[LedgerEntry, ...], ids: tuple[int, ...]) -> dict[int, b
             writes = [(row[0], parameters[0], row[1:]) for row in rows]
         for target, address, data in writes:
             if address <= 24 < address + len(data):
-                state[target] = bool(data[24 - address])
+                yield target, bool(data[24 - address])
             elif address <= 30 < address + len(data):
-                state[target] = True
-    return state
+                yield target, True
 
 
 @dataclass
@@ -199,10 +197,22 @@ def start(tmp_path: Path) -> Iterator[Start]:
 
 @pytest.fixture
 def all_limp() -> Callable[[Running], bool]:
-    """Judge by the ledger alone that no servo of `pair` was left with torque, and that both had it once."""
+    """Judge by the ledger alone that no servo of `pair` was left with torque."""
 
     def judge(running: Running) -> bool:
-        return torque(running.ledger(), (3, 7)) == {3: False, 7: False}
+        state = {3: False, 7: False} | dict(torque_changes(running.ledger(), (3, 7)))
+        return state == {3: False, 7: False}
+
+    return judge
+
+
+@pytest.fixture
+def never_on_again() -> Callable[[Running], bool]:
+    """Judge by the ledger alone that nothing switched torque on after anything had switched it off."""
+
+    def judge(running: Running) -> bool:
+        steps = [on for _, on in torque_changes(running.ledger(), (3, 7))]
+        return not any(steps[steps.index(False) :]) if False in steps else not steps
 
     return judge
 

@@ -1,0 +1,90 @@
+"""Campaign: kill -9 of a process of a run at a random moment, set-up and shutdown included; never the servos.
+
+Judged by the simulated bus' ledger alone: every byte sent is a legal instruction, torque ends off on all
+servos, nothing switches it on again once it was cut. And: the log can be read, no process is left.
+
+CI runs 3 kills from a fixed seed. The full campaign before a release:
+
+    DXLRUN_KILLS=60 python -m pytest tests/run/test_kills.py -q -rA
+
+`DXLRUN_KILLS` is the number of kills, `DXLRUN_KILL_SEED` (default 1) what they are drawn from; each test's
+name tells victim and moment, and one kill runs again by that name.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+VICTIMS = ("loop_process", "guardian", "recording", "dxlrun")
+"""The terminal's own process is "dxlrun"."""
+LATEST_S = {"process": 1.8, "wire": 0.5}
+"""Half of the moments are counted from the start of the victim's process: loading, set-up, running and the
+end take about so long. The others from the first byte on the wire, which a slow wire keeps busy with the
+set-up."""
+Start = Callable[..., Any]
+
+
+def kills() -> list[Any]:
+    """Return victims in turn, moments at random."""
+    chance = random.Random(int(os.environ.get("DXLRUN_KILL_SEED", "1")))
+    count = int(os.environ.get("DXLRUN_KILLS", "3"))
+    drawn = []
+    for index in range(count):
+        since = chance.choice(tuple(LATEST_S))
+        drawn.append((VICTIMS[index % len(VICTIMS)], since, round(chance.uniform(0.0, LATEST_S[since]), 3)))
+    return [pytest.param(*one, id=f"{one[0]}-{one[2]}s-after-{one[1]}-{n}") for n, one in enumerate(drawn)]
+
+
+def stage(run: Any) -> str:
+    """Say by the ledger how far the robot had come."""
+    wire = b"".join(entry.data for entry in run.ledger() if entry.direction == "in")
+    if not wire:
+        return "before the first byte"
+    if b"\x83\x1e" in wire:
+        return "after the first goals"
+    return "in the set-up, torque on" if bytes((24, 1)) in wire else "in the set-up, before torque"
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize(("victim", "since", "after_s"), kills())
+def test_a_kill_leaves_the_robot_limp(  # noqa: PLR0917  fixtures
+    start: Start,
+    tmp_path: Path,
+    victim: str,
+    since: str,
+    after_s: float,
+    wait_for: Callable[..., Any],
+    all_limp: Callable[[Any], bool],
+    never_on_again: Callable[[Any], bool],
+) -> None:
+    robot = tmp_path / "slow.yaml"
+    text = (tmp_path / "pair.yaml").read_text()
+    robot.write_text(text.replace("1_000_000", "19_230").replace("rate: 50", "rate: 20"))
+    run = start("--duration", "0.6", robot=robot)
+    wait_for(lambda: run.processes().get(victim) or run.process.poll() is not None, f"the {victim}")
+    if since == "wire":
+        wait_for(lambda: run.ledger() or run.process.poll() is not None, "the first byte")
+    threading.Event().wait(after_s)
+    process = run.processes().get(victim)  # a run may be over before a late kill: that is judged the same
+    if process is not None:
+        os.kill(process, signal.SIGKILL)
+    code, _, err = run.finish()
+    wait_for(run.gone, "the end of every process")
+    assert "Traceback" not in err
+    assert all_limp(run)
+    assert never_on_again(run)
+    if victim != "dxlrun":
+        assert code in (0, 1)
+    if code == 0:
+        assert err == ""
+    if run.one("*.mcap") is not None and run.ledger():
+        run.log()
+    print(f"{victim} killed {'after the end' if process is None else stage(run)}")
