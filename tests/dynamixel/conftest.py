@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import math
+import os
+import socket
+import subprocess
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -16,7 +21,8 @@ from dxlrun.dynamixel.plan import Wiring, bus_plan
 from dxlrun.events import EventCode, Severity
 from dxlrun.interfaces import Commands, States
 from dxlrun.packets import LoggedPacket, PacketKind
-from dxlrun.simulation import BusConfig, Ledger, ServoConfig, SimulatedBus, VirtualPorts
+from dxlrun.simulation import BusConfig, Ledger, ServoConfig, SimulatedBus, VirtualPorts, read_ledger
+from dxlrun.simulation.process import encode_config
 
 MIDDLE = math.radians(150)
 
@@ -172,3 +178,36 @@ def make_rig(make_plan) -> Callable[..., Rig]:
         return Rig(plans, ledger, clock, buses, ports, states, goals, packets, events, hardware, beats)
 
     return build
+
+
+@pytest.fixture
+def simulated_line(tmp_path):
+    """Run a simulated bus as a run does; gives its pseudo-terminal, and what ends it and has the ledger."""
+    children = []
+
+    def start(bus):
+        ours, theirs = socket.socketpair()
+        reader, writer = os.pipe()
+        os.write(writer, encode_config((bus,)))
+        os.close(writer)
+        ledger = tmp_path / f"ledger{len(children)}.jsonl"
+        command = [sys.executable, "-m", "dxlrun.simulation", "--config-fd", str(reader)]
+        command += ["--control-fd", str(theirs.fileno()), "--ledger", str(ledger)]
+        child = subprocess.Popen(command, pass_fds=(reader, theirs.fileno()), start_new_session=True)
+        children.append((child, ours))
+        os.close(reader)
+        theirs.close()
+        ours.settimeout(20)
+
+        def finish():
+            ours.close()
+            assert child.wait(20) == 0
+            return read_ledger(ledger)
+
+        return json.loads(ours.recv(4096))["ports"][bus.name], finish
+
+    yield start
+    for child, ours in children:
+        child.kill()
+        child.wait()
+        ours.close()

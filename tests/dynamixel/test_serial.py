@@ -1,9 +1,7 @@
 import fcntl
-import json
 import os
 import pty
 import select
-import socket
 import subprocess
 import sys
 import termios
@@ -17,8 +15,7 @@ from dxlrun.dynamixel.port import SerialPort, SerialPorts
 from dxlrun.dynamixel.serial_open import open_serial
 from dxlrun.errors import PortError
 from dxlrun.interfaces import Commands, States
-from dxlrun.simulation import BusConfig, ServoConfig, read_ledger
-from dxlrun.simulation.process import encode_config
+from dxlrun.simulation import BusConfig, ServoConfig
 
 
 @pytest.fixture
@@ -105,40 +102,10 @@ def test_the_line_is_locked_against_every_program(opened):
     fcntl.ioctl(port.descriptor, termios.TIOCNXCL)
 
 
-@pytest.fixture
-def simulated_line(tmp_path):
-    """Run the simulated bus as a run does; yield its pseudo-terminal and what ends it."""
-    ours, theirs = socket.socketpair()
-    reader, writer = os.pipe()
-    ids = (1, 3, 5, 6, 2, 4, 20, 21)
-    os.write(
-        writer,
-        encode_config((BusConfig("main", 1_000_000, tuple(ServoConfig(i, "AX-12A", 2.0) for i in ids)),)),
-    )
-    os.close(writer)
-    ledger = tmp_path / "ledger.jsonl"
-    command = [sys.executable, "-m", "dxlrun.simulation", "--config-fd", str(reader)]
-    command += ["--control-fd", str(theirs.fileno()), "--ledger", str(ledger)]
-    child = subprocess.Popen(command, pass_fds=(reader, theirs.fileno()), start_new_session=True)
-    os.close(reader)
-    theirs.close()
-    ours.settimeout(20)
-
-    def finish():
-        ours.close()
-        assert child.wait(20) == 0
-        return read_ledger(ledger)
-
-    try:
-        yield json.loads(ours.recv(4096))["ports"]["main"], finish
-    finally:
-        child.kill()
-        child.wait()
-        ours.close()
-
-
 def test_the_same_code_drives_the_simulated_process(simulated_line, make_plan, make_rig):
-    path, finish = simulated_line
+    ids = (1, 3, 5, 6, 2, 4, 20, 21)
+    servos = tuple(ServoConfig(servo_id, "AX-12A", 2.0) for servo_id in ids)
+    path, finish = simulated_line(BusConfig("main", 1_000_000, servos))
     rig = make_rig()  # for its sinks only
     states, goals, clock = States.empty(8), Commands.empty(8), MonotonicClock(0)
     with open_serial(path, 1_000_000) as line:

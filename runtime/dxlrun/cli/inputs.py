@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from dxlrun.errors import InputError
 
 if TYPE_CHECKING:
-    from dxlrun.compile import Compiled
+    from dxlrun.compile import Ask, Compiled
 
 COMMANDS = ("analyze", "check", "replay", "schema")
 
@@ -20,7 +20,11 @@ SHORTEST_S, LONGEST_S = 1e-6, 1e9
 
 
 def compiled(
-    robot: Path, assignments: Sequence[str], play: Sequence[Path], duration: float | None
+    robot: Path,
+    assignments: Sequence[str],
+    play: Sequence[Path],
+    duration: float | None,
+    ask: Ask | None = None,
 ) -> Compiled:
     """Read and compile; raises InputError with everything that is wrong with the file, or with the line."""
     _known_file(robot)
@@ -35,7 +39,7 @@ def compiled(
         duration_ns = round(duration * 1e9)
     from dxlrun.compile import compile_files  # not above: a wrong word needs neither numpy nor pydantic
 
-    return compile_files(robot, arguments, play, duration_ns)
+    return compile_files(robot, arguments, play, duration_ns, ask)
 
 
 def parse_assignments(assignments: Sequence[str]) -> dict[str, str]:

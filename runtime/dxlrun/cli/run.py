@@ -12,8 +12,11 @@ from dxlrun.cli.inputs import compiled
 from dxlrun.cli.terminal import out, say_error, say_warning
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
     from rich.console import Console
 
+    from dxlrun.dynamixel.bus_plan import BusPlan
     from dxlrun.run_summary import RunSummary
 
 
@@ -49,7 +52,7 @@ def run(
     debug
         Print the traceback of an error, and what the processes said.
     """
-    result = compiled(robot, assignments, play, duration)
+    result = compiled(robot, assignments, play, duration, None if virtual else _ask_servos)
     for warning in result.warnings:
         say_warning(str(warning))
     from dxlrun.run_summary import RunOptions
@@ -66,6 +69,13 @@ def run(
         summary = run_robot(result.plan, options, console)
     show(summary, result.plan.robot, console)
     return summary.exit_code
+
+
+def _ask_servos(buses: Sequence[BusPlan], joints: Sequence[str]) -> Mapping[str, str]:
+    """Ask for the models of joints that say `model: auto`; most robots have none, so it is imported late."""
+    from dxlrun.identification import ask_servos
+
+    return ask_servos(buses, joints)
 
 
 def show(summary: RunSummary, robot: str, console: Console) -> None:

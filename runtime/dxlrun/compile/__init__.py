@@ -9,9 +9,9 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from dxlrun.compile.robot import Compiled, compile_files, compile_robot
+    from dxlrun.compile.robot import Ask, Compiled, compile_files, compile_robot
 
-__all__ = ["Compiled", "compile_files", "compile_robot"]
+__all__ = ["Ask", "Compiled", "compile_files", "compile_robot"]
 
 
 def __getattr__(name: str) -> object:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
-from dxlrun.compile.buses import compile_buses
+from dxlrun.compile.buses import SIMULATED, compile_buses
 from dxlrun.compile.controllers import compile_controllers
-from dxlrun.compile.joints import compile_joints
+from dxlrun.compile.joints import AUTO, compile_joints
 from dxlrun.compile.left_out import left_out_names, still_true
 from dxlrun.compile.motions import compile_motion
 from dxlrun.compile.plan import Plan
@@ -20,7 +21,11 @@ from dxlrun.compile.urdf import compile_urdf
 from dxlrun.control.loop_plan import LoopPlan, SchedulerPlan
 from dxlrun.control.plugins import load_plugins
 from dxlrun.description import Description, MotionDescription, read_motion, survey_robot
+from dxlrun.dynamixel.bus_plan import BusPlan
 from dxlrun.errors import InputError, Problem
+
+Ask: TypeAlias = Callable[[Sequence[BusPlan], Sequence[str]], Mapping[str, str]]
+"""Asks the servos of joints for their models: takes the buses and the joints, returns models by joint."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,9 +38,17 @@ class Compiled:
 
 
 def compile_files(
-    robot: Path, arguments: Mapping[str, str], motions: Sequence[Path], duration_ns: int | None = None
+    robot: Path,
+    arguments: Mapping[str, str],
+    motions: Sequence[Path],
+    duration_ns: int | None = None,
+    ask: Ask | None = None,
 ) -> Compiled:
-    """Read robot file and motion files and compile them; raises InputError with the problems of all files."""
+    """Read robot file and motion files and compile them; raises InputError with the problems of all files.
+
+    Only when nothing is wrong, servos on real ports whose joints say `model: auto` are asked, if `ask` is
+    given; what it raises goes on.
+    """
     read: list[MotionDescription] = []
     description: Description | None = None
     problems: list[Problem] = []
@@ -51,13 +64,27 @@ def compile_files(
         except InputError as error:
             problems += _placed(error)
     if not problems and description is not None:
-        return compile_robot(description, read, duration_ns)
+        compiled = compile_robot(description, read, duration_ns)
+        unknown = _unknown(description)
+        if ask is None or not unknown:
+            return compiled
+        return compile_robot(description, read, duration_ns, ask(compiled.plan.buses, unknown))
     if description is not None:
         try:
             compile_robot(description, read, duration_ns)
         except InputError as error:
             problems += still_true(description, _placed(error))
     raise InputError(sorted(problems, key=lambda problem: (problem.severity, problem.mark)))
+
+
+def _unknown(description: Description) -> list[str]:
+    """Return the joints whose servos must be asked for their models, and can be."""
+    robot = description.robot
+    return [
+        name
+        for name, joint in robot.joints.items()
+        if joint.model == AUTO and robot.buses[joint.bus].port != SIMULATED
+    ]
 
 
 def _placed(error: InputError) -> tuple[Problem, ...]:

@@ -1,0 +1,115 @@
+import math
+
+import pytest
+
+from dxlrun.clock import VirtualClock
+from dxlrun.compile import compile_files
+from dxlrun.dynamixel.identify import identify
+from dxlrun.errors import PortError, StartUpError
+from dxlrun.identification import ask_servos
+from dxlrun.simulation import BusConfig, Ledger, ServoConfig, SimulatedBus, VirtualPorts
+
+ROBOT = """
+name: arm
+buses:
+  main: {port: PORT, protocol: 2.0, baud_rate: 1_000_000, return_delay_time: 0 us}
+loop: {rate: 20}
+joints:
+  shoulder: {bus: main, id: 1, model: auto, reference: 180 deg, direction: 1}
+  elbow: {bus: main, id: 2, model: XM430-W350, reference: 180 deg, direction: 1}
+controllers:
+  joint_state_broadcaster: {type: joint_state_broadcaster}
+"""
+
+
+class Line:
+    """Simulated lines, and what they heard."""
+
+    def __init__(self, *buses):
+        self.clock, self.ledger = VirtualClock(1_000_000), Ledger()
+        self.buses = [SimulatedBus(bus, self.ledger, 0) for bus in buses]
+        self.ports = VirtualPorts(self.clock, self.buses)
+
+    def asked(self, plans, joints):
+        return identify(plans, joints, self.ports, self.clock)
+
+
+def servos(*models):
+    return tuple(ServoConfig(number + 1, model, 2.0) for number, model in enumerate(models))
+
+
+def test_every_servo_says_what_it_is_on_both_protocols(make_plan):
+    line = Line(
+        BusConfig("head", 1_000_000, servos("AX-12A", "MX-64")),
+        BusConfig("arm", 1_000_000, servos("XM430-W350", "XL-320", "MX-64"), 2.0),
+    )
+    plans = [
+        make_plan((1, 2), name="head", joints=("a", "b")),
+        make_plan((1, 2, 3), name="arm", protocol=2.0, model="XM430-W350", joints=("c", "d", "e")),
+    ]
+    found = line.asked(plans, "abcde")
+    assert {joint: one.model for joint, one in found.items()} == {
+        "a": "AX-12A",
+        "b": "MX-64",
+        "c": "XM430-W350",
+        "d": "XL-320",
+        "e": "MX-64",
+    }
+    assert [one.problem for one in found.values()] == [""] * 5
+    heard = [entry.data for entry in line.ledger.entries if entry.direction == "in"]
+    assert {data[4] if data[2] != 0xFD else data[7] for data in heard} == {1, 2}  # pings and reads alone
+
+
+def test_only_who_is_asked_for_is_asked(make_plan):
+    line = Line(BusConfig("arm", 1_000_000, servos("AX-12A", "AX-18A")))
+    found = line.asked([make_plan((1, 2), name="arm", joints=("a", "b"))], ["b"])
+    assert list(found) == ["b"]
+    assert found["b"].model == "AX-18A"
+    assert all(e.data[2] == 2 for e in line.ledger.entries if e.direction == "in")
+
+
+def test_a_silent_servo_and_an_unknown_one_are_named(make_plan):
+    line = Line(BusConfig("arm", 1_000_000, servos("AX-12A", "AX-12A")))
+    line.buses[0].servo(1).silence()
+    line.buses[0].servo(2).poke("model_number", 999)
+    found = line.asked([make_plan((1, 2), name="arm", joints=("a", "b"))], "ab")
+    assert "a (ID 1 on bus arm) does not answer at 1000000 bit/s" in found["a"].problem
+    assert "b (ID 2 on bus arm) is model number 999" in found["b"].problem
+    assert [one.model for one in found.values()] == ["", ""]
+
+
+def test_a_line_that_is_gone(make_plan):
+    line = Line(BusConfig("arm", 1_000_000, servos("AX-12A")))
+    line.ports.ports[0].unplug()
+    with pytest.raises(PortError):
+        line.asked([make_plan((1,), name="arm", joints=("a",))], "a")
+
+
+def test_a_robot_file_is_compiled_with_what_the_servo_says(simulated_line, tmp_path):
+    config = BusConfig("main", 1_000_000, servos("XL-320", "XM430-W350"), 2.0)
+    path, _ = simulated_line(config)
+    robot = tmp_path / "robot.yaml"
+    robot.write_text(ROBOT.replace("PORT", path))
+    checked = compile_files(robot, {}, [])
+    assert [servo.model for servo in checked.plan.buses[0].servos] == ["XM430-W350"] * 2
+    assert [problem.severity for problem in checked.warnings if "is asked for its model" in problem.what]
+    compiled = compile_files(robot, {}, [], None, ask_servos)
+    assert [servo.model for servo in compiled.plan.buses[0].servos] == ["XL-320", "XM430-W350"]
+    assert [problem for problem in compiled.warnings if "is asked for its model" in problem.what] == []
+    assert compiled.plan.buses[0].servos[0].rad_per_tick == pytest.approx(math.radians(300) / 1023)
+
+
+def test_a_simulated_servo_is_not_asked(tmp_path):
+    robot = tmp_path / "robot.yaml"
+    robot.write_text(ROBOT.replace("PORT", "sim"))
+    compiled = compile_files(robot, {}, [], None, ask_servos)
+    assert compiled.plan.buses[0].servos[0].model == "XM430-W350"
+
+
+def test_who_does_not_answer_is_said_before_the_run(simulated_line, tmp_path):
+    path, finish = simulated_line(BusConfig("main", 1_000_000, servos("XL-320")[:0], 2.0))
+    robot = tmp_path / "robot.yaml"
+    robot.write_text(ROBOT.replace("PORT", path))
+    with pytest.raises(StartUpError, match=r"shoulder \(ID 1 on bus main\) does not answer"):
+        compile_files(robot, {}, [], None, ask_servos)
+    assert finish() != ()
