@@ -65,3 +65,9 @@ def test_a_motion_for_a_controller_of_a_wrong_form_is_not_blamed(problems_in: Fi
     assert "formula 't +' cannot be read" in found[0] + found[1]
     assert "no controller amrs" in found[0] + found[1]
     assert "active is the text 'maybe'" in found[2]
+
+
+def test_a_part_of_which_nothing_is_left_does_not_hide_the_other_mistakes(problems_in: Find, robot_text: str):
+    text = robot_text.replace("rate: 25", "rate: 20") + "model: {urdf: 5}\n"
+
+    assert [p.mark.line for p in problems_in(text)] == [20, 28]

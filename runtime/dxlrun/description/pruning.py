@@ -28,6 +28,8 @@ def prune(data: dict[str, object], wrong: Iterable[KeyPath]) -> frozenset[KeyPat
             left_out.add(path[:1])
         else:
             section.pop(path[1], None)
+            if not section:  # what is left says nothing, and may need what was wrong
+                del data[str(path[0])]
             left_out.add(path[:2])
     for key, value in _PLACEHOLDERS.items():
         data.setdefault(key, value)
