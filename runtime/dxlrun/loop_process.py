@@ -111,23 +111,23 @@ def _refuse_threads() -> Callable[[str], None]:
     return check
 
 
-class _AskedToStop(Exception):
+class AskedToStop(Exception):
     """Somebody asked to stop before the robot ran: no torque may be switched on any more."""
 
 
 @dataclass(slots=True)
-class _Pulse:
+class Pulse:
     """What is called once a transaction, and once a cycle: beats, and gives a set-up up that is to stop."""
 
     heartbeat: Heartbeat
     stop: StopFlag
 
     def __call__(self) -> None:
-        """Beat. Raises _AskedToStop, once, and only in the set-up: the loop looks at the flag itself."""
+        """Beat. Raises AskedToStop, once, and only in the set-up: the loop looks at the flag itself."""
         self.heartbeat.beat()
         if self.stop.requested and self.heartbeat.phase is Phase.SETUP:
             self.heartbeat.enter(Phase.STOPPING)
-            raise _AskedToStop
+            raise AskedToStop
 
 
 def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: RingSinks) -> Outcome:
@@ -143,14 +143,14 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: RingSinks) -> Ou
         ports=ports,
         clock=MonotonicClock(),
         sinks=sinks,
-        beat=_Pulse(heartbeat, stop),
+        beat=Pulse(heartbeat, stop),
         stop=stop,
         take_over=job.take_over,
     )
     heartbeat.enter(Phase.SETUP)
     try:
         robot.hardware.start()
-    except _AskedToStop as asked:
+    except AskedToStop as asked:
         sinks.events.emit(EventCode.SETUP, Severity.INFO, "loop", "the set-up was given up on request")
         notes: list[str] = getattr(asked, "__notes__", [])
         return Outcome("stopped", sentences=tuple(note for note in notes if note != TAKEN_BACK))

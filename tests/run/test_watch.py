@@ -1,0 +1,135 @@
+"""The rules of watching, without processes: what counts as standing still, and what a wish to stop does."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from dxlrun import heartbeat, process
+from dxlrun.clock import VirtualClock
+from dxlrun.compile import compile_robot
+from dxlrun.compile.simulated import simulated_buses
+from dxlrun.control.loop import StopFlag
+from dxlrun.description import read_robot
+from dxlrun.dynamixel.hardware import DynamixelHardware
+from dxlrun.events import EventRing
+from dxlrun.guardian import LEAST_PATIENCE_NS, LONGEST_LOOK_NS, patience_ns
+from dxlrun.heartbeat import Heartbeat, Phase, Standstill
+from dxlrun.interfaces import Commands, States
+from dxlrun.loop_process import AskedToStop, Pulse
+from dxlrun.packets import NoPackets
+from dxlrun.ring import Handover
+from dxlrun.simulation import Ledger, SimulatedBus, VirtualPorts
+
+MS = 1_000_000
+
+
+@pytest.fixture
+def page() -> Heartbeat:
+    descriptor = heartbeat.create()
+    made = Heartbeat(descriptor)
+    os.close(descriptor)
+    return made
+
+
+def test_standing_still_counts_while_the_watcher_is_awake() -> None:
+    still = Standstill(LONGEST_LOOK_NS, 0)
+    assert [still.ns("same", at * MS) for at in (0, 10, 20, 30)] == [0, 10 * MS, 20 * MS, 30 * MS]
+    assert still.ns("other", 40 * MS) == 0
+
+
+def test_a_machine_that_slept_is_no_hung_loop() -> None:
+    """Suspended, paused or starved: the loop could not run either."""
+    still = Standstill(LONGEST_LOOK_NS, 0)
+    still.ns("same", 0)
+    assert still.ns("same", 3_600_000 * MS) == LONGEST_LOOK_NS
+
+
+def test_a_hung_loop_is_found_by_a_watcher_that_is_always_late() -> None:
+    still = Standstill(LONGEST_LOOK_NS, 0)
+    looks = [still.ns("same", at * 200 * MS) for at in range(10)]
+    assert looks[-1] > LEAST_PATIENCE_NS
+
+
+@pytest.mark.parametrize(
+    ("phase", "rate", "patience"),
+    [(Phase.RUNNING, 50, 100 * MS), (Phase.RUNNING, 1000, 50 * MS), (Phase.SETUP, 50, 1000 * MS)],
+)
+def test_patience(phase: Phase, rate: int, patience: int) -> None:
+    assert patience_ns(phase, 1_000_000_000 // rate) == patience
+
+
+def test_only_a_set_up_is_given_up_and_only_once(page: Heartbeat) -> None:
+    stop = StopFlag(requested=True)
+    beat = Pulse(page, stop)
+    for phase in (Phase.LOADING, Phase.RUNNING, Phase.STOPPING):
+        page.enter(phase)
+        beat()
+    page.enter(Phase.SETUP)
+    with pytest.raises(AskedToStop):
+        beat()
+    beat()  # torque off goes on beating
+    assert page.phase is Phase.STOPPING
+    assert page.beats == 5
+
+
+def test_a_stop_anywhere_in_the_set_up_leaves_nobody_with_torque(start: object, tmp_path: Path) -> None:
+    """Ask to stop at the first transaction, at the second ...: until one set-up is through without us."""
+    given = []
+    while (found := set_up(tmp_path, len(given) + 1)) is not None:
+        given.append(found)
+    assert len(given) > 20
+    assert any(given)
+    assert not all(given)
+
+
+def set_up(tmp_path: Path, transactions: int) -> bool | None:
+    """Ask to stop after so many; return whether torque had been given, None when the set-up was through."""
+    descriptor = heartbeat.create()
+    page = Heartbeat(descriptor)
+    os.close(descriptor)
+    plan = compile_robot(read_robot(tmp_path / "pair.yaml", {}), [], None).plan
+    stop = StopFlag()
+    pulse = Pulse(page, stop)
+    count = 0
+
+    def beat() -> None:
+        nonlocal count
+        count += 1
+        stop.requested = count >= transactions
+        pulse()
+
+    clock, ledger = VirtualClock(), Ledger()
+    buses = [SimulatedBus(config, ledger, 0) for config in simulated_buses(plan)]
+    events = EventRing(Handover(lambda _: None), clock)
+    hardware = DynamixelHardware(
+        plan.buses,
+        VirtualPorts(clock, buses),
+        clock,
+        States.empty(2),
+        Commands.empty(2),
+        NoPackets(),
+        events,
+        beat,
+    )
+    page.enter(Phase.SETUP)
+    try:
+        hardware.start()
+    except AskedToStop:
+        assert [servo.torque_on for servo in buses[0].servos] == [False, False]
+        return any(bytes((24, 1)) in entry.data for entry in ledger.entries if entry.direction == "in")
+    return None
+
+
+def test_a_line_whose_other_end_is_gone_still_gives_what_it_said_last() -> None:
+    ours, theirs = process.line_pair()
+    theirs.sendall(b'{"ended": "done"}\n')
+    theirs.close()
+    ours.send({"stop": True})
+    assert not ours.closed
+    assert ours.receive() == [{"ended": "done"}]
+    assert ours.receive() == []
+    assert ours.closed
+    ours.close()
