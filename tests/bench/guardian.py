@@ -35,7 +35,8 @@ def loop_of(directory: Path) -> int:
             continue
         for path in Path("/proc").glob("[0-9]*"):
             try:
-                if b"dxlrun.loop_process" in (path / "cmdline").read_bytes():
+                ours = os.readlink(path / "cwd") == str(directory)  # others may run robots of theirs
+                if ours and b"dxlrun.loop_process" in (path / "cmdline").read_bytes():
                     return int(path.name)
             except OSError:
                 continue
@@ -45,7 +46,7 @@ def loop_of(directory: Path) -> int:
 def measure(number: signal.Signals, chance: random.Random) -> float:
     """Return milliseconds from the loop's last byte to the guardian's first."""
     with tempfile.TemporaryDirectory() as name:
-        directory = Path(name)
+        directory = Path(name).resolve()
         run = subprocess.Popen(
             [DXLRUN, TORSO], cwd=directory, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
