@@ -66,21 +66,43 @@ def epoch_offset_ns() -> int:
 
 
 def new_log(directory: Path, robot: str) -> Path:
-    """Return the path of a log that does not exist yet: `<robot>_<date>_<time>.mcap`.
+    """Create an empty file for a log and return its path: `<robot>_<date>_<time>.mcap`.
 
-    Raises InputError when there is no such directory and none can be made.
+    It is created here, so that two runs which start in the same second cannot take the same name.
+    A directory of `~/logs` is in the user's home. Raises InputError when nothing can be created there.
     """
     try:
+        directory = directory.expanduser()
         directory.mkdir(parents=True, exist_ok=True)
+    except RuntimeError as error:
+        raise InputError(f"the log's directory {directory}: {error}; write its whole path") from error
     except OSError as error:
         raise InputError(
             f"the log's directory {directory} cannot be made: {error.strerror or error}; write another under "
             "`recording: {directory: ...}` or give --no-record"
         ) from error
-    stem = f"{robot}_{time.strftime('%Y%m%d_%H%M%S')}"
-    path = directory / f"{stem}.mcap"
-    number = 2
-    while path.exists():
-        path = directory / f"{stem}_{number}.mcap"
-        number += 1
-    return path
+    stem, number = f"{robot}_{time.strftime('%Y%m%d_%H%M%S')}", 1
+    while True:
+        path = directory / f"{stem}{f'_{number}' * (number > 1)}.mcap"
+        try:
+            path.touch(exist_ok=False)
+        except FileExistsError:
+            number += 1
+        except OSError as error:
+            raise InputError(
+                f"no log can be written in {directory}: {error.strerror or error}; write another directory "
+                "under `recording: {directory: ...}` or give --no-record"
+            ) from error
+        else:
+            return path
+
+
+def ledger_of(log: Path) -> Path:
+    """Return where the simulated buses leave what they saw and said."""
+    return log.with_suffix(".ledger.jsonl")
+
+
+def discard_log(log: Path) -> None:
+    """Remove the log of a run that never came to the robot."""
+    log.unlink(missing_ok=True)
+    ledger_of(log).unlink(missing_ok=True)

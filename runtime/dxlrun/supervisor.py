@@ -23,7 +23,7 @@ from dxlrun.events import Severity
 from dxlrun.guardian import GuardianJob, LastHand
 from dxlrun.heartbeat import Heartbeat, Phase, Standstill
 from dxlrun.loop_process import Outcome
-from dxlrun.run_log import epoch_offset_ns, log_header, new_log
+from dxlrun.run_log import discard_log, epoch_offset_ns, ledger_of, log_header, new_log
 from dxlrun.run_processes import (
     END_TIMEOUT_S,
     Child,
@@ -87,7 +87,7 @@ class _Run:
         ledger = None
         if self.options.record:
             self.log = new_log(Path(self.plan.recording_directory), self.plan.robot)
-            ledger = self.log.with_suffix(".ledger.jsonl")
+            ledger = ledger_of(self.log)
         ports: dict[str, str] = {}
         if self.plan.simulated:
             self.simulation, ports = start_simulation(self.plan, ledger, self.memory)
@@ -105,8 +105,7 @@ class _Run:
     def discard(self) -> None:
         """Remove the log of a run that never came to the robot."""
         if self.log:
-            self.log.unlink(missing_ok=True)
-            self.log.with_suffix(".ledger.jsonl").unlink(missing_ok=True)
+            discard_log(self.log)
             self.log = None
 
     def watch(self, guardian: Child, show: Callable[[Heartbeat], None]) -> None:

@@ -21,7 +21,7 @@ from dxlrun.events import EventCode, EventRing, Severity
 from dxlrun.packets import NoPackets, PacketBatch
 from dxlrun.recording.log_writer import LogWriter
 from dxlrun.ring import Handover
-from dxlrun.run_log import log_header, new_log
+from dxlrun.run_log import discard_log, log_header, new_log
 from dxlrun.run_summary import RunOptions, RunSummary
 from dxlrun.simulation import Ledger, SimulatedBus, VirtualPorts
 
@@ -137,7 +137,12 @@ class VirtualRobot:
 def run_virtual(plan: Plan, options: RunOptions) -> RunSummary:
     """Run a plan on virtual time for the command line; the log has the times of the virtual clock."""
     log = new_log(Path(plan.recording_directory), plan.robot) if options.record else None
-    robot = VirtualRobot(plan, log=log, take_over=options.take_over)
+    try:
+        robot = VirtualRobot(plan, log=log, take_over=options.take_over)
+    except BaseException:
+        if log:
+            discard_log(log)
+        raise
     began = time.monotonic()
     refused: tuple[str, ...] = ()
     try:

@@ -1,0 +1,76 @@
+"""The name of a log is taken before anybody writes: two runs in one second, and directories that refuse."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dxlrun.errors import InputError
+from dxlrun.recording.log_file import LogFile
+from dxlrun.run_log import discard_log, ledger_of, new_log
+
+Start = Callable[..., Any]
+
+
+@pytest.fixture
+def one_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("time.strftime", lambda _: "20261121_120000")
+
+
+@pytest.mark.usefixtures("one_second")
+def test_a_name_is_taken_once(tmp_path: Path) -> None:
+    names = [new_log(tmp_path, "pair").name for _ in range(3)]
+    assert names == [f"pair_20261121_120000{number}.mcap" for number in ("", "_2", "_3")]
+
+
+@pytest.mark.usefixtures("one_second")
+def test_discarding_leaves_the_other_runs_log(tmp_path: Path) -> None:
+    ours, other = new_log(tmp_path, "pair"), new_log(tmp_path, "pair")
+    ledger_of(ours).touch()
+    ledger_of(other).touch()
+    discard_log(ours)
+    assert {path.name for path in tmp_path.iterdir()} == {other.name, ledger_of(other).name}
+
+
+def test_a_log_with_something_in_it_is_never_written_over(tmp_path: Path) -> None:
+    path = tmp_path / "old.mcap"
+    path.write_bytes(b"old")
+    with pytest.raises(FileExistsError):
+        LogFile(path)
+    assert path.read_bytes() == b"old"
+
+
+def test_a_directory_that_takes_no_file_is_an_input_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path, *, exist_ok: bool) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "touch", refuse)
+    with pytest.raises(InputError, match=r"no log can be written in .*: Permission denied; .*--no-record"):
+        new_log(tmp_path, "pair")
+
+
+def test_a_name_too_long_is_an_input_error(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="File name too long"):
+        new_log(tmp_path, "a" * 300)
+
+
+def test_the_home_directory_is_meant_by_a_tilde(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert new_log(Path("~/logs"), "pair").parent == tmp_path / "logs"
+    with pytest.raises(InputError, match="write its whole path"):
+        new_log(Path("~nobody_of_this_name/logs"), "pair")
+
+
+def test_runs_that_start_together_all_have_their_log(start: Start, tmp_path: Path) -> None:
+    runs = [start("--duration", "0.3") for _ in range(3)]
+    ends = [run.finish() for run in runs]
+    assert [(code, err) for code, _, err in ends] == [(0, "")] * 3
+    assert len(list((tmp_path / "logs").glob("*.mcap"))) == 3
+    assert len(list((tmp_path / "logs").glob("*.ledger.jsonl"))) == 3
+    assert all(path.stat().st_size for path in (tmp_path / "logs").iterdir())
