@@ -1,10 +1,14 @@
 from __future__ import annotations
 
 import json
+import re
+from pathlib import Path
 
 import pytest
 
+import dxlrun as dxlrun_package
 from dxlrun.cli.models_tables import runs, unit_of
+from dxlrun.control.hookspecs import HookSpecs
 from dxlrun.control_table import all_tables, control_table
 
 
@@ -111,3 +115,28 @@ def test_a_model_that_is_not_there_is_wrong_input(dxlrun, words, sentence):
 )
 def test_units_are_those_that_people_read(item, unit):
     assert unit_of(control_table("XM430-W350").items[item]) == unit
+
+
+PAGE = (Path(__file__).parents[2] / "docs" / "models.md").read_text()
+
+
+@pytest.mark.parametrize("line", re.findall(r"^    (dxlrun .+)$", PAGE, re.MULTILINE))
+def test_each_command_of_the_page_works(dxlrun, line):
+    said = dxlrun(*line.split()[1:])
+
+    assert (said.code, said.err) == (0, "")
+    assert said.out
+
+
+def test_the_page_shows_hooks_that_there_are():
+    (code,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+    hooks = re.findall(r"^@hookimpl\ndef (\w+)\(\) -> (.+):$", code, re.MULTILINE)
+    assert [name for name, _ in hooks] == ["dxlrun_contract", "dxlrun_servo_models"]
+    assert all(hasattr(HookSpecs, name) for name, _ in hooks)
+    compile(code, "docs/models.md", "exec")
+
+
+def test_the_page_names_files_that_there_are():
+    folder = Path(dxlrun_package.__file__).parent / "control_tables"
+    for name in re.findall(r"`(\w[\w-]*\.toml)`", PAGE):
+        assert list(folder.rglob(name)), name
