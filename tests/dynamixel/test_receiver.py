@@ -1,16 +1,16 @@
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dxlrun.dynamixel import protocol1
+from dxlrun.dynamixel import protocol1, protocol2
 from dxlrun.dynamixel.receiver import Receiver
 
 
 class Heard:
     """Everything a receiver delivered, in order."""
 
-    def __init__(self):
+    def __init__(self, dialect=protocol1):
         self.parts = []
-        self.receiver = Receiver(self._taker("packet"), self._taker("noise"), protocol1)
+        self.receiver = Receiver(self._taker("packet"), self._taker("noise"), dialect)
 
     def _taker(self, kind):
         return lambda data, first, last: self.parts.append((kind, bytes(data), first, last))
@@ -122,3 +122,52 @@ def test_memory_is_bounded_and_nothing_is_lost_in_a_flood():
     assert heard.receiver.pending < protocol1.LONGEST
     heard.receiver.flush()
     assert heard.all_bytes == stream
+
+
+header_bytes = st.lists(st.sampled_from([0xFF, 0xFF, 0xFD, 0xFD, 0x00, 0x55]), max_size=20).map(bytes)
+statuses2 = st.builds(
+    protocol2.status_packet, st.integers(0, 252), st.integers(0, 255), header_bytes | st.binary(max_size=20)
+)
+quiet_noise2 = (header_bytes | st.binary(max_size=30)).map(
+    lambda noise: noise.replace(b"\xfd\x00", b"\xfd\x01")
+)
+
+
+@given(st.lists(st.tuples(quiet_noise2, statuses2), max_size=8), st.lists(st.integers(0, 300), max_size=20))
+@settings(max_examples=80, deadline=None)
+def test_protocol_2_packets_between_noise_are_delivered_once_however_they_are_split(parts, cuts):
+    stream = b"".join(noise + packet for noise, packet in parts)
+    heard = Heard(protocol2)
+    feed_in_pieces(heard.receiver, stream, cuts)
+    assert heard.packets == [packet for _, packet in parts]
+    assert heard.all_bytes == stream
+    assert heard.receiver.pending == 0
+
+
+@given(header_bytes | st.binary(max_size=600), st.lists(st.integers(0, 600), max_size=20))
+@settings(max_examples=80, deadline=None)
+def test_any_bytes_of_protocol_2_leave_once_and_in_order(stream, cuts):
+    whole, pieces = Heard(protocol2), Heard(protocol2)
+    whole.receiver.feed(stream, 0)
+    feed_in_pieces(pieces.receiver, stream, cuts)
+    whole.receiver.flush()
+    pieces.receiver.flush()
+    assert whole.all_bytes == pieces.all_bytes == stream
+
+
+def test_a_status_of_a_fast_form_is_framed_by_its_length_alone():
+    # servo 3 has FF FF FD 00 in its data, and fast forms are not stuffed
+    body = protocol2.HEADER + bytes((254, 1 + 2 * 8, 0, 0x55)) + bytes((0, 3)) + protocol2.HEADER
+    body += protocol2.crc(body).to_bytes(2, "little") + bytes((0, 4)) + bytes(4)
+    packet = body + protocol2.crc(body).to_bytes(2, "little")
+    heard = Heard(protocol2)
+    heard.receiver.feed(packet + protocol2.status_packet(5), 0)
+    assert heard.packets == [packet, protocol2.status_packet(5)]
+    assert protocol2.fast_answers(packet, (4, 4)) == [(3, 0, protocol2.HEADER), (4, 0, bytes(4))]
+
+
+def test_a_header_that_announces_more_than_anybody_says_holds_nothing_back():
+    packet = protocol2.status_packet(1, 0, b"\x20")
+    heard = Heard(protocol2)
+    heard.receiver.feed(protocol2.HEADER + b"\x01\xff\xff" + packet, 0)
+    assert heard.packets == [packet]
