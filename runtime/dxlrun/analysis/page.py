@@ -196,7 +196,7 @@ def _each_event(log: Log) -> list[Element]:
 
 def _footer(log: Log) -> Element:
     footer = Element("footer")
-    version = log.metadata.get("versions", {}).get("dxlrun", "?")
+    version = log.metadata.get("versions", {}).get("dxlrun", "of an unknown version")
     footer.append(
         paragraph(
             f"Made by dxlrun analyze from {log.path.name}, which dxlrun {version} recorded. The numbers "

@@ -110,6 +110,9 @@ def _over_time(log: Log, steps: _Rows) -> Drawing:
             above = below + values[picked]
             axes.fill_between(times[picked], below, above, color=colour, linewidth=0, step="mid")
             below = above
+        if not columns.whole:
+            middle = columns.bounds(total)[1]
+            axes.plot(times[picked], middle, color=INK, linewidth=1.0, label="median cycle")
         axes.plot(
             times[beyond],
             np.full(len(beyond), end * 0.985),
@@ -140,7 +143,7 @@ def _over_time(log: Log, steps: _Rows) -> Drawing:
         "budget-time",
         "Duration of the steps over the run",
         f"Stacked areas of wake-up, read, update and write in ms over the time of the run in s. {told}{cut}",
-        f"{told}{cut} {columns.said('its longest cycle')}".strip(),
+        f"{told}{cut} {columns.said('its longest cycle, and the median as a line')}".strip(),
     )
     return draw(words, 2.6, fill)
 
@@ -159,4 +162,4 @@ def _legend(axes: Axes) -> None:
     for name, _, _, colour in _STEPS:
         axes.fill_between([], [], [], color=colour, linewidth=0, label=name)
     axes.plot([], [], color=ERROR, linewidth=0.9, linestyle=DASHED, label="period")
-    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=5, borderaxespad=0.2, labelcolor=MUTED)
+    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=6, borderaxespad=0.2, labelcolor=MUTED)

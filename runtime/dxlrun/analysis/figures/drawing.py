@@ -49,6 +49,7 @@ _STYLE: dict[str, object] = {
     "axes.spines.right": False,
     "axes.spines.top": False,
     "axes.titlecolor": INK,
+    "axes.xmargin": 0.01,
     "axes.titlelocation": "left",
     "axes.titlesize": 8.5,
     "figure.facecolor": "none",
@@ -144,9 +145,8 @@ def _named(key: str, value: str, name: str) -> str:
 
 
 def time_axis(axes: Axes) -> None:
-    """Label the time of the run, and leave no room beside it."""
+    """Label the time of the run."""
     axes.set_xlabel("time since the loop's first deadline, s")
-    axes.margins(x=0.01)
 
 
 def duration_ticks(axes: Axes, which: str) -> None:

@@ -30,7 +30,7 @@ from dxlrun.interfaces import Floats
 from dxlrun.recording.reader import Log
 
 _FEW = 60
-"""So few samples are drawn with a dot each."""
+"""So few samples are drawn with a dot each, so few skipped cycles with a line through the figure."""
 _DESIRED: dict[str, object] = {"color": GREEN, "linewidth": 2.8, "alpha": 0.55}
 _SENT: dict[str, object] = {"color": ORANGE, "linewidth": 1.3, "linestyle": (0, (4, 2))}
 _READ: dict[str, object] = {"color": BLUE, "linewidth": 1.1}
@@ -93,8 +93,9 @@ class _JointPlot:
         position.set_ylabel("position, rad")
         self._lines(velocity, "velocity")
         velocity.set_ylabel("velocity, rad/s")
+        skipped = self.times[self.marks.skipped]
         for axes in (position, velocity):
-            for time in self.times[self.columns.marked(self.marks.skipped)]:
+            for time in skipped if len(skipped) <= _FEW else ():  # more would bury the curves
                 axes.axvline(time, color=ERROR, linewidth=0.7, alpha=0.45)
         self._strip(strip)
         time_axis(strip)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
 
 from dxlrun.analysis.envelope import Columns
 from dxlrun.analysis.figures import drawing
@@ -70,7 +70,8 @@ def _per_iteration(log: Log, late: Floats, summary: str) -> Drawing:
         axes.set_xlabel("iteration (period since the loop's first deadline)")
         axes.set_ylabel("wake-up latency")
         drawing.duration_ticks(axes, "y")
-        axes.margins(x=0.01)
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
+        axes.xaxis.set_major_locator(MaxNLocator(nbins=8, integer=True))
 
     words = Words(
         "latency-iterations",
