@@ -145,7 +145,7 @@ class Changed:
     commands: list[TakenCommand]
     attachments: dict[str, bytes]
     metadata: dict[str, dict[str, str]]
-    activation: bool = True
+    activation: NDArray[np.void] | None
     gaps: list[tuple[str, int]] = field(default_factory=list)
 
 
@@ -157,15 +157,15 @@ def changed(tmp_path: Path) -> Callable[[Path, Callable[[Changed], None]], Path]
         log: Log = read_log(path)
         metadata = {k: v for k, v in log.metadata.items() if k not in ("dxlrun", "dxlrun_summary")}
         attachments = {k: v for k, v in log.attachments.items() if k != "header.json"}
-        content = Changed(log.cycles.copy(), list(log.commands), attachments, metadata)
+        activation = None if log.activation is None else log.activation.copy()
+        content = Changed(log.cycles.copy(), list(log.commands), attachments, metadata, activation)
         change(content)
         new = tmp_path / "changed.mcap"
         new.unlink(missing_ok=True)
         header = replace(log.header, attachments=content.attachments, metadata=content.metadata)
         writer = LogWriter(new, header)
-        if content.activation:
-            assert log.activation is not None
-            writer.cycle(log.activation.tobytes())
+        if content.activation is not None:
+            writer.cycle(content.activation.tobytes())
         ring = CommandRing(Handover(writer.command))
         for command in content.commands:
             ring.take(command)

@@ -93,6 +93,16 @@ def test_every_recorded_state_is_an_input(pair_log: Path, changed: Change, state
     assert report.different >= 10
 
 
+@pytest.mark.parametrize("values", ["position", "velocity", "effort", "goal_position", "goal_velocity"])
+def test_what_the_controllers_began_with_is_an_input(pair_log: Path, changed: Change, values: str) -> None:
+    def change(content: Any) -> None:
+        content.activation[values][0, 2] = 1.25
+
+    report = replay_log(changed(pair_log, change))
+    assert report.first is not None
+    assert (report.first.cycle, report.first.joint) == (0, "nod")
+
+
 def test_who_was_active_counts(pair_log: Path, changed: Change) -> None:
     def change(content: Any) -> None:
         content.cycles["active"][9] = 0b110

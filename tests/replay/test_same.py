@@ -57,7 +57,7 @@ def test_the_small_robot_shows_every_kind_of_value(pair_log: Path) -> None:
 
 
 def test_a_silent_servo_and_periods_that_were_skipped(
-    run: Callable[..., Path], robot_file: Path, tmp_path: Path
+    run: Callable[..., Path], changed: Callable[..., Path], robot_file: Path, tmp_path: Path
 ) -> None:
     def silence(robot: VirtualRobot) -> None:
         bus = robot.buses[0]
@@ -72,6 +72,11 @@ def test_a_silent_servo_and_periods_that_were_skipped(
     assert not cycles["valid"].all()
     assert cycles["valid"][-1].all()
     assert replay_log(log).same
+
+    def late_after_the_read(content: Any) -> None:
+        content.cycles["read_ns"] = content.cycles["woken_ns"]
+
+    assert replay_log(changed(log, late_after_the_read)).same
 
 
 def test_a_run_that_ended_by_a_fault(tmp_path: Path, robot_file: Path) -> None:

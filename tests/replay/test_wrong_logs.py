@@ -55,7 +55,7 @@ def test_a_log_without_its_beginning(pair_log: Path, changed: Change) -> None:
     assert "the log begins with cycle 3" in refused(changed(pair_log, no_first_cycles))
 
     def no_activation(content: Any) -> None:
-        content.activation = False
+        content.activation = None
 
     assert "with which states and goals the controllers began" in refused(changed(pair_log, no_activation))
 
