@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from dxlrun.dynamixel import protocol2
+from dxlrun.dynamixel.limp import limp
 from dxlrun.dynamixel.receiver import Receiver
 from dxlrun.dynamixel.units import goal_bytes, goal_ticks, joint_position, speed_ticks
 from dxlrun.errors import StartUpError
@@ -144,6 +145,26 @@ def test_a_servo_that_rebooted_stays_out_of_the_goals(started):
 def test_stop_limps_everybody(started):
     assert started.hardware.stop() == ()
     assert started.torque() == [False] * 8
+
+
+def test_a_robot_whose_loop_died_becomes_limp(started):
+    recorded = len(started.packets.sent())
+    outcomes = limp(started.plans, started.ports, started.clock, started.packets)
+    assert [one.confirmed for one in outcomes] == [True] * 8
+    assert started.torque() == [False] * 8
+    assert started.packets.sent()[recorded] == protocol2.write(254, 64, b"\0")
+
+
+def test_an_overload_cuts_the_torque_and_the_servo_gets_no_more_goals(started):
+    started.cycle()
+    started.buses[0].servo(14).trigger_overload()
+    for _ in range(6):
+        started.cycle()
+    assert started.torque()[3] is False
+    assert any("overload error" in text for _, text in started.events.of(EventCode.SERVO_ERROR))
+    assert [source for source, _ in started.events.of(EventCode.SERVO_LIMP)] == ["arm_14_joint"]
+    goals = [packet for packet in started.into_bus() if packet[7] == 0x83][-1]
+    assert list(goals[12:-2:9]) == [servo_id for servo_id in X_IDS if servo_id != 14]
 
 
 @pytest.mark.parametrize(

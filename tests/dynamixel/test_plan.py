@@ -1,6 +1,7 @@
 import msgspec
 import pytest
 
+from dxlrun.control_table import control_table, model_names
 from dxlrun.dynamixel.bus_plan import BusPlan
 from dxlrun.dynamixel.line import LONGEST_RETURN_DELAY_NS, PATIENCE_NS
 from dxlrun.dynamixel.units import goal_ticks, joint_position, speed_ticks
@@ -19,6 +20,26 @@ def test_the_budget_of_protocol_md_at_the_default_latency_timer(make_plan):
     budget = make_plan(latency_ns=16_000_000).budget
     assert budget.total_ns / 1e6 == pytest.approx(134, abs=0.1)
     assert round(budget.highest_rate_hz) == 7
+
+
+def test_the_budget_of_protocol_md_for_eight_x_servos(make_plan):
+    budget = make_plan(protocol=2.0, model="XM430-W350", latency_ns=1_000_000).budget
+    goals = 14 + 8 * 9
+    assert budget.request_bytes == 22 + goals
+    assert budget.wire_ns == 220_000 + 8 * 210_000 + goals * 10_000
+    assert budget.return_delay_ns == 8 * 500_000
+    assert budget.latency_ns == 1_000_000
+
+
+@pytest.mark.parametrize("protocol", [1.0, 2.0])
+def test_every_model_has_a_plan(make_plan, protocol):
+    for model in model_names(protocol):
+        plan = make_plan((1, 2), model=model, protocol=protocol, reference=0.0, lower=-9.0, upper=9.0)
+        layout = plan.servos[0].state
+        items = control_table(model, protocol).items
+        assert layout.address + layout.position.offset == items["present_position"].address
+        assert len(plan.groups) == (1 if "bulk_read" in control_table(model, protocol).capabilities else 2)
+        assert len(plan.limp) == 3
 
 
 def test_reads_are_six_bytes_from_present_position_on(make_plan):
@@ -53,8 +74,9 @@ def test_limits_become_ticks_inside_them(make_plan):
         assert ends[1] - ends[0] > 1.5 - 2 * servo.rad_per_tick
 
 
-def test_a_plan_survives_json(make_plan):
-    plan = make_plan()
+@pytest.mark.parametrize(("model", "protocol"), [("AX-12A", 1.0), ("MX-64", 1.0), ("XM430-W350", 2.0)])
+def test_a_plan_survives_json(make_plan, model, protocol):
+    plan = make_plan(model=model, protocol=protocol)
     assert msgspec.json.decode(msgspec.json.encode(plan), type=BusPlan) == plan
 
 

@@ -147,12 +147,12 @@ def crc(data: Bytes) -> int:
 
 def stuffed(body: bytes) -> bytes:
     """Return the bytes from INST to the last parameter as they go over the line."""
-    return body.replace(_PATTERN, _STUFFED) if _PATTERN in body else body
+    return body.replace(_PATTERN, _STUFFED)
 
 
 def unstuffed(body: bytes) -> bytes:
     """Return the bytes from INST to the last parameter without stuffing; the inverse of `stuffed`."""
-    return body.replace(_STUFFED, _PATTERN) if _STUFFED in body else body
+    return body.replace(_STUFFED, _PATTERN)
 
 
 def widest(length: int) -> int:
