@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from dxlrun.events import EventCode
+from dxlrun.events import EventCode, Severity
 
 Running = Any
 Start = Callable[..., Any]
@@ -248,3 +248,20 @@ def test_without_any_standard_stream_the_robot_runs(start: Start, all_limp: Limp
     assert run.finish() == (0, "", "")
     assert all_limp(run)
     assert len(run.log().cycles) > 0
+
+
+def test_a_start_that_is_refused_is_in_the_log_to_the_last_packet(
+    start: Start, tmp_path: Path, all_limp: Limp, wire_equals_log: Callable[[Running], None]
+) -> None:
+    robot = tmp_path / "outside.yaml"
+    text = (tmp_path / "pair.yaml").read_text()
+    robot.write_text(text.replace("direction: -1}", "direction: -1, limits: {position: [20 deg, 60 deg]}}"))
+    run = start(robot=robot)
+    code, _, err = run.finish()
+    assert code == 1
+    assert len(err.splitlines()) == 1
+    assert "tilt (ID 7 on bus main) stands at" in err
+    assert bytes((24, 1)) not in sent(run)
+    assert all_limp(run)
+    wire_equals_log(run)
+    assert [event.text for event in run.log().events if event.severity == Severity.ERROR]
