@@ -265,3 +265,23 @@ def test_a_start_that_is_refused_is_in_the_log_to_the_last_packet(
     assert all_limp(run)
     wire_equals_log(run)
     assert [event.text for event in run.log().events if event.severity == Severity.ERROR]
+
+
+def test_the_loop_grows_no_memory_and_collects_no_garbage(
+    odd: Callable[..., Running], wait_for: Callable[..., Any]
+) -> None:
+    tell = "import gc; print('collector', gc.isenabled(), [one['collections'] for one in gc.get_stats()])"
+    run = odd("--duration", "4", "--debug", update=tell)
+
+    def resident_kb(goals: int) -> int:
+        wait_for(lambda: sent(run).count(b"\x83\x1e") >= goals, f"{goals} goals")
+        status = Path(f"/proc/{run.child('dxlrun.loop_process')}/status").read_text()
+        return int(status.split("VmRSS:")[1].split()[0])
+
+    before = resident_kb(30)
+    after = resident_kb(130)
+    assert after - before <= 64  # a new object of 100 bytes a cycle would be 10 kB: whole pages, and a margin
+    _, _, err = run.finish()
+    told = {line for line in err.splitlines() if line.startswith("collector")}
+    assert len(told) == 1
+    assert "False" in told.pop()
