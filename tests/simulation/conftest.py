@@ -2,14 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+import json
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import IO, Any, NamedTuple
 
 import pytest
 
 from dxlrun.clock import VirtualClock
-from dxlrun.simulation import BusConfig, Ledger, ServoConfig, SimulatedBus, SimulatedServo, VirtualPorts
+from dxlrun.simulation import (
+    BusConfig,
+    Ledger,
+    LedgerEntry,
+    ServoConfig,
+    SimulatedBus,
+    SimulatedServo,
+    VirtualPorts,
+    read_ledger,
+)
+from dxlrun.simulation.process import encode_config
+
+PATIENCE_S = 20.0
+"""How long a test waits for what must come; it decides nothing but when to give up."""
 
 
 class Answer(NamedTuple):
@@ -196,3 +216,50 @@ def line2(make_line2: Callable[..., Line]) -> Line:
 @pytest.fixture
 def line(make_line: Callable[..., Line]) -> Line:
     return make_line()
+
+
+@dataclass
+class Running:
+    child: subprocess.Popen[bytes]
+    control: socket.socket
+    said: IO[bytes]
+    ports: dict[str, str]
+    path: Path
+
+    def hang_up(self) -> int:
+        self.said.close()
+        self.control.close()
+        return self.child.wait(PATIENCE_S)
+
+    def ledger(self) -> tuple[LedgerEntry, ...]:
+        return read_ledger(self.path)
+
+
+@pytest.fixture
+def start_buses(tmp_path: Path) -> Iterator[Callable[[Sequence[BusConfig]], Running]]:
+    """Start the process of simulated buses, as often as it is called; all are ended with the test."""
+    with contextlib.ExitStack() as stack:
+
+        def run(buses: Sequence[BusConfig]) -> Running:
+            ours, theirs = socket.socketpair()
+            stack.callback(ours.close)
+            ours.settimeout(PATIENCE_S)
+            reader, writer = os.pipe()
+            os.write(writer, encode_config(buses))
+            os.close(writer)
+            path = tmp_path / "bus.jsonl"
+            with theirs:
+                command = [sys.executable, "-m", "dxlrun.simulation", "--config-fd", str(reader)]
+                command += ["--control-fd", str(theirs.fileno()), "--ledger", str(path)]
+                child = subprocess.Popen(
+                    command,
+                    pass_fds=(reader, theirs.fileno()),
+                    start_new_session=True,
+                )
+            os.close(reader)
+            stack.callback(child.wait)
+            stack.callback(child.kill)
+            said = stack.enter_context(ours.makefile("rb"))
+            return Running(child, ours, said, json.loads(said.readline())["ports"], path)
+
+        yield run

@@ -9,15 +9,14 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
+from typing import Any
 
 import pytest
 import rustypot
 
 from dxlrun.control_table import control_table
-from dxlrun.simulation import BusConfig, Ledger, LedgerEntry, ServoConfig, SimulatedBus, read_ledger
+from dxlrun.simulation import BusConfig, Ledger, ServoConfig, SimulatedBus
 from dxlrun.simulation.process import decode_config, encode_config
 from dxlrun.simulation.pseudo_terminal import PseudoTerminal
 
@@ -33,50 +32,9 @@ BUSES = (
 )
 
 
-@dataclass
-class Running:
-    child: subprocess.Popen[bytes]
-    control: socket.socket
-    said: IO[bytes]
-    ports: dict[str, str]
-    path: Path
-
-    def hang_up(self) -> int:
-        self.said.close()
-        self.control.close()
-        return self.child.wait(PATIENCE_S)
-
-    def ledger(self) -> tuple[LedgerEntry, ...]:
-        return read_ledger(self.path)
-
-
 @pytest.fixture
-def start(tmp_path: Path) -> Iterator[Callable[[], Running]]:
-    with contextlib.ExitStack() as stack:
-
-        def run() -> Running:
-            ours, theirs = socket.socketpair()
-            stack.callback(ours.close)
-            ours.settimeout(PATIENCE_S)
-            reader, writer = os.pipe()
-            os.write(writer, encode_config(BUSES))
-            os.close(writer)
-            path = tmp_path / "bus.jsonl"
-            with theirs:
-                command = [sys.executable, "-m", "dxlrun.simulation", "--config-fd", str(reader)]
-                command += ["--control-fd", str(theirs.fileno()), "--ledger", str(path)]
-                child = subprocess.Popen(
-                    command,
-                    pass_fds=(reader, theirs.fileno()),
-                    start_new_session=True,
-                )
-            os.close(reader)
-            stack.callback(child.wait)
-            stack.callback(child.kill)
-            said = stack.enter_context(ours.makefile("rb"))
-            return Running(child, ours, said, json.loads(said.readline())["ports"], path)
-
-        yield run
+def start(start_buses: Callable[..., Any]) -> Callable[[], Any]:
+    return lambda: start_buses(BUSES)
 
 
 @contextlib.contextmanager
@@ -98,7 +56,7 @@ def hear(port: int, size: int) -> bytes:
     return heard
 
 
-def test_it_answers_as_a_servo_on_a_serial_port(start: Callable[[], Running]) -> None:
+def test_it_answers_as_a_servo_on_a_serial_port(start: Callable[[], Any]) -> None:
     running = start()
     assert sorted(running.ports) == ["arm", "main"]
     with opened(running.ports["main"]) as main, opened(running.ports["arm"]) as arm:
@@ -109,7 +67,7 @@ def test_it_answers_as_a_servo_on_a_serial_port(start: Callable[[], Running]) ->
     assert running.hang_up() == 0
 
 
-def test_the_ledger_holds_exactly_what_passed_and_no_reply_is_early(start: Callable[[], Running]) -> None:
+def test_the_ledger_holds_exactly_what_passed_and_no_reply_is_early(start: Callable[[], Any]) -> None:
     running = start()
     heard = b""
     with opened(running.ports["main"]) as port:
@@ -127,7 +85,7 @@ def test_the_ledger_holds_exactly_what_passed_and_no_reply_is_early(start: Calla
         assert asked.t_ns >= answered.t_ns  # the host got it before it asked again
 
 
-def test_hosts_may_come_and_go(start: Callable[[], Running]) -> None:
+def test_hosts_may_come_and_go(start: Callable[[], Any]) -> None:
     running = start()
     for _ in range(3):
         with opened(running.ports["main"]) as port:
@@ -137,7 +95,7 @@ def test_hosts_may_come_and_go(start: Callable[[], Running]) -> None:
 
 
 def test_interrupt_is_left_to_the_front_process_and_sigterm_ends_in_order(
-    start: Callable[[], Running],
+    start: Callable[[], Any],
 ) -> None:
     running = start()
     with opened(running.ports["main"]) as port:
@@ -149,7 +107,7 @@ def test_interrupt_is_left_to_the_front_process_and_sigterm_ends_in_order(
     assert [entry.data for entry in running.ledger()] == [PING_1, PONG_1]
 
 
-def test_a_host_that_never_reads_does_not_stop_it(start: Callable[[], Running]) -> None:
+def test_a_host_that_never_reads_does_not_stop_it(start: Callable[[], Any]) -> None:
     running = start()
     with opened(running.ports["main"]) as port:
         for _ in range(3000):
@@ -176,7 +134,7 @@ def test_configurations_pass_as_they_are() -> None:
     assert decode_config(encode_config(BUSES)) == BUSES
 
 
-def test_a_foreign_driver_finds_every_item_where_the_servo_holds_it(start: Callable[[], Running]) -> None:
+def test_a_foreign_driver_finds_every_item_where_the_servo_holds_it(start: Callable[[], Any]) -> None:
     """rustypot, written by others in Rust, talks to our servo: its addresses, its packets, its units."""
     running = start()
     table = control_table("AX-12A")

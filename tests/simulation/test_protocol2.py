@@ -180,7 +180,7 @@ def test_fast_status_is_not_stuffed() -> None:
 )
 def test_reads_in_turn(instruction: int, parameters: str, fast: bool, entries: tuple[ReadEntry, ...]) -> None:
     packet = InstructionPacket(0xFE, instruction, bytes.fromhex(parameters), intact=True, end=0)
-    assert read_in_turn(packet) == ReadInTurn(instruction, entries, fast=fast, has_slots=True)
+    assert read_in_turn(packet) == ReadInTurn(instruction, entries, fast=fast, has_slots=not fast)
 
 
 @pytest.mark.parametrize(

@@ -19,12 +19,15 @@ import heapq
 import itertools
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from dxlrun.simulation import protocol1, protocol2
 from dxlrun.simulation.ledger import Ledger
-from dxlrun.simulation.packets import BROADCAST, Codec, InstructionPacket, ReadInTurn, Reply
+from dxlrun.simulation.packets import BROADCAST, Codec, InstructionPacket, ReadEntry, ReadInTurn, Reply
 from dxlrun.simulation.servo import ServoConfig, SimulatedServo
+
+STATUS_BYTES = 11
+"""Bytes of a status packet of Protocol 2.0 without data: the slot of an absent servo is as long [i]."""
 
 UNREAD_LIMIT = 4096
 """Bytes that wait for a host that does not take them; more are lost, as in the kernel's terminal buffer."""
@@ -204,34 +207,34 @@ class SimulatedBus:
                 continue
             reply = servo.execute(packet, end_ns)
             if reply is not None:
-                data = self._codec.status_packet(reply.servo_id, reply.error, reply.parameters)
-                self._answer(reply, data, end_ns)
+                self._answer(reply, self._status(reply), end_ns)
 
     def _read_in_turn(self, reading: ReadInTurn, end_ns: int) -> None:
         """Let the listed servos answer, each when the one before it has ended."""
-        fast = (
-            self._codec.fast_status(tuple(each.length for each in reading.entries)) if reading.fast else None
-        )
-        free_ns, first = end_ns, True
+        fast = self._codec.fast_status(reading.lengths) if reading.fast else None
+        free_ns = end_ns
         for entry in reading.entries:
-            servo = next((each for each in self.servos if each.servo_id == entry.servo_id), None)
-            reply = None
-            if servo is not None and self._hears(servo):
-                reply = servo.answer_in_turn(reading, entry, end_ns)
-            if reply is None:
-                if not (reading.has_slots and self.skips_absent) or fast is not None:
-                    self.note(f"servo {entry.servo_id} does not answer: those after it wait for it in vain")
-                    return
-                free_ns += self._wire_ns(len(self._codec.status_packet(0, 0, bytes(entry.length))))
-                continue
-            if fast is not None:
-                delay_ns = reply.delay_ns if first else 0
-                data = fast.part(reply)
-                reply = Reply(reply.servo_id, reply.error, reply.parameters, delay_ns)
+            reply = self._reply_in_turn(reading, entry, end_ns)
+            if reply is not None:
+                data = self._status(reply) if fast is None else fast.part(reply)
+                free_ns = self._answer(reply, data, free_ns)
+            elif reading.has_slots and self.skips_absent:
+                free_ns += self._wire_ns(STATUS_BYTES + entry.length)
             else:
-                data = self._codec.status_packet(reply.servo_id, reply.error, reply.parameters)
-            free_ns = self._answer(reply, data, free_ns)
-            first = False
+                self.note(f"servo {entry.servo_id} does not answer: those after it wait for it in vain")
+                return
+
+    def _reply_in_turn(self, reading: ReadInTurn, entry: ReadEntry, end_ns: int) -> Reply | None:
+        servo = next((each for each in self.servos if each.servo_id == entry.servo_id), None)
+        if servo is None or not self._hears(servo):
+            return None
+        reply = servo.answer_in_turn(reading, entry, end_ns)
+        if reply is not None and reading.fast and entry is not reading.entries[0]:
+            return replace(reply, delay_ns=0)  # only the first one of a shared status waits
+        return reply
+
+    def _status(self, reply: Reply) -> bytes:
+        return self._codec.status_packet(reply.servo_id, reply.error, reply.parameters)
 
     def _hears(self, servo: SimulatedServo) -> bool:
         """Return whether the rates differ by less than 3 % (e-Manual, Baud Rate (4))."""

@@ -51,6 +51,11 @@ class ReadInTurn:
     has_slots: bool = False
     """True: a servo may wait for the time of an absent one before it [?]; False: it waits for its reply."""
 
+    @property
+    def lengths(self) -> tuple[int, ...]:
+        """Number of bytes of each entry."""
+        return tuple(each.length for each in self.entries)
+
 
 class Receiver(Protocol):
     """Finds instruction packets in the bytes of a line."""

@@ -19,6 +19,9 @@ STATUS = 0x55
 ALERT = 0x80
 """Bit of a status packet's error: look at Hardware Error Status. It does not say that anything failed."""
 
+LONGEST = 0xFFFF
+"""What a packet's length can say."""
+
 _OVERHEAD = 7
 """Bytes that the length does not count: header, reserved byte, ID, length."""
 _STUFFED = HEADER + b"\xfd"
@@ -103,7 +106,7 @@ class FastStatusPacket:
     """
 
     def __init__(self, lengths: tuple[int, ...]) -> None:
-        self._head = _head(BROADCAST, 1 + sum(length + 4 for length in lengths)) + bytes((STATUS,))
+        self._head = _head(BROADCAST, _fast_length(lengths)) + bytes((STATUS,))
         self._crc = 0
 
     def part(self, reply: Reply) -> bytes:
@@ -132,10 +135,12 @@ def read_in_turn(packet: InstructionPacket) -> ReadInTurn | None:
             entries = _bulk_entries(packet.parameters)
         case _:
             return None
-    if not entries:
-        return None
     fast = packet.instruction in (Instruction.FAST_SYNC_READ, Instruction.FAST_BULK_READ)
-    return ReadInTurn(packet.instruction, entries, fast=fast, has_slots=True)
+    # A fast status is one packet [i]: with an absent servo in it, it stays short.
+    reading = ReadInTurn(packet.instruction, entries, fast=fast, has_slots=not fast)
+    if not entries or (fast and _fast_length(reading.lengths) > LONGEST):
+        return None
+    return reading
 
 
 def _sync_entries(parameters: bytes) -> tuple[ReadEntry, ...]:
@@ -193,6 +198,10 @@ class InstructionReceiver:
 def receiver() -> InstructionReceiver:
     """Return a receiver for one line."""
     return InstructionReceiver()
+
+
+def _fast_length(lengths: tuple[int, ...]) -> int:
+    return 1 + sum(length + 4 for length in lengths)
 
 
 def _head(servo_id: int, length: int) -> bytes:

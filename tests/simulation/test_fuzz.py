@@ -1,0 +1,121 @@
+"""Whatever a host says, a bus does not fall over, and whatever it answers can be trusted."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from dxlrun.simulation.protocol1 import ErrorBit
+from dxlrun.simulation.protocol2 import crc16
+
+LIKE_PACKETS = st.sampled_from([0xFF, 0xFD, 0xFE, 0x00, 0x01, 0x02, 0x03, 0x55, 0x74, 0x82, 0x83, 0x92])
+NOISE = st.lists(LIKE_PACKETS | st.integers(0, 255), max_size=60).map(bytes)
+SMALL = settings(
+    max_examples=80,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],  # each example makes a bus of its own
+)
+
+
+def check1(heard: bytes) -> None:
+    """Fail when the bytes are anything but status packets with good checksums."""
+    while heard:
+        assert heard[:2] == b"\xff\xff"
+        packet, heard = heard[: 4 + heard[3]], heard[4 + heard[3] :]
+        assert sum(packet[2:]) & 0xFF == 0xFF
+
+
+def check2(heard: bytes) -> None:
+    """Fail when the bytes are anything but status packets with good CRCs."""
+    while heard:
+        assert heard[:4] == b"\xff\xff\xfd\x00"
+        size = 7 + int.from_bytes(heard[5:7], "little")
+        packet, heard = heard[:size], heard[size:]
+        assert packet[7] == 0x55
+        assert crc16(packet[:-2]) == int.from_bytes(packet[-2:], "little")
+
+
+def framed1(servo_id: int, instruction: int, parameters: bytes) -> bytes:
+    body = bytes((servo_id, len(parameters) + 2, instruction)) + parameters
+    return b"\xff\xff" + body + bytes((~sum(body) & 0xFF,))
+
+
+def framed2(servo_id: int, instruction: int, parameters: bytes) -> bytes:
+    body = (bytes((instruction,)) + parameters).replace(b"\xff\xff\xfd", b"\xff\xff\xfd\xfd")
+    packet = b"\xff\xff\xfd\x00" + bytes((servo_id,)) + (len(body) + 2).to_bytes(2, "little") + body
+    return packet + crc16(packet).to_bytes(2, "little")
+
+
+INSTRUCTIONS = st.sampled_from([1, 2, 3, 4, 5, 8, 0x10, 0x20, 0x82, 0x83, 0x8A, 0x92, 0x93, 0x9A, 0x77])
+"""Not the factory reset: after it the servo listens elsewhere."""
+
+
+@pytest.mark.parametrize("model", ["AX-12A", "MX-64"])
+@SMALL
+@given(st.lists(NOISE, max_size=5))
+def test_noise_on_protocol_1(make_line: Any, model: str, pieces: list[bytes]) -> None:
+    line = make_line((1,), model)
+    for piece in pieces:
+        line.ports.ports[0].write(piece)
+        check1(line.hear())
+
+
+@pytest.mark.parametrize("model", ["XM430-W350", "XL-320", "YM070-210-M001", "PH42-020-S300"])
+@SMALL
+@given(st.lists(NOISE, max_size=5))
+def test_noise_on_protocol_2(make_line2: Any, model: str, pieces: list[bytes]) -> None:
+    line = make_line2((1,), model)
+    for piece in pieces:
+        line.ports.ports[0].write(piece)
+        check2(line.hear())
+
+
+@pytest.mark.parametrize("model", ["AX-12A", "MX-64"])
+@SMALL
+@given(st.lists(st.tuples(st.sampled_from([1, 0xFE]), INSTRUCTIONS, NOISE), max_size=5))
+def test_any_packet_of_protocol_1(make_line: Any, model: str, packets: list[tuple[int, int, bytes]]) -> None:
+    line = make_line((1,), model)
+    for packet in packets:
+        line.ports.ports[0].write(framed1(*packet))
+        check1(line.hear())
+
+
+@pytest.mark.parametrize("model", ["XM430-W350", "XL-320", "YM070-210-M001"])
+@SMALL
+@given(st.lists(st.tuples(st.sampled_from([1, 0xFE]), INSTRUCTIONS, NOISE), max_size=5))
+def test_any_packet_of_protocol_2(make_line2: Any, model: str, packets: list[tuple[int, int, bytes]]) -> None:
+    line = make_line2((1,), model)
+    line.bus.skips_absent = True
+    for packet in packets:
+        line.ports.ports[0].write(framed2(*packet))
+        if packet[1] not in (0x8A, 0x9A):
+            check2(line.hear())
+        line.wait(0.2)
+
+
+@SMALL
+@given(st.binary(max_size=20), st.integers(0, 7), st.integers(0, 100))
+def test_a_broken_crc_is_never_obeyed(make_line2: Any, parameters: bytes, bit: int, place: int) -> None:
+    line = make_line2((1,))
+    before = bytes(line.read_bytes(1, 0, 120))
+    packet = bytearray(framed2(1, 0x03, bytes((64, 0)) + parameters))
+    packet[7 + place % (len(packet) - 7)] ^= 1 << bit
+    line.ports.ports[0].write(packet)
+    assert line.statuses() in ([(1, 3, b"")], [])
+    line.wait(0.1)
+    assert line.read_bytes(1, 0, 120) == before
+
+
+@SMALL
+@given(st.binary(max_size=20), st.integers(0, 7), st.integers(0, 100))
+def test_a_broken_checksum_is_never_obeyed(make_line: Any, parameters: bytes, bit: int, place: int) -> None:
+    line = make_line((1,))
+    packet = bytearray(framed1(1, 0x03, bytes((24,)) + parameters))
+    packet[4 + place % (len(packet) - 4)] ^= 1 << bit
+    line.ports.ports[0].write(packet)
+    heard = line.hear()
+    assert heard in (framed1(1, ErrorBit.CHECKSUM, b""), b"")
+    assert line.read(1, 24, 1) == 0
