@@ -89,7 +89,10 @@ def added_control_tables(models: Iterable[str]) -> tuple[str, ...]:
 
 
 def _table(name: str, protocol: float) -> ControlTable | None:
-    listing = _index(protocol).get(name)
+    # no dict is built here: a servo that comes back is looked up while the loop runs
+    listing = _shipped(protocol).get(name)
+    if listing is None:
+        listing = next((each for each in _ADDED.get(protocol, ()) if name in each.names), None)
     return None if listing is None else listing.build()
 
 
