@@ -107,3 +107,12 @@ def test_parameters_travel_as_they_were_written(compile_text: Callable[..., Comp
     assert offer.Parameters.model_validate_json(spare.parameters).tolerances.goal == pytest.approx(
         np.radians(5)
     )
+
+
+def test_more_controllers_than_a_cycle_can_hold_are_refused(problems_in: Find, robot_text: str):
+    many = "".join(f"  more{number}: {{type: joint_state_broadcaster}}\n" for number in range(61))
+
+    (problem,) = problems_in(robot_text + many)
+
+    assert problem.what == "the file has 64 controllers, the most are 63"
+    assert (problem.mark.line, problem.mark.column) == (19, 1)

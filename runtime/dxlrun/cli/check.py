@@ -92,6 +92,6 @@ def _print_tables(result: Compiled) -> None:
     from dxlrun.cli.check_tables import tables, verdict
 
     console = out()
-    console.print(verdict(result))
-    for table in tables(result.report):
+    console.print(verdict(result), soft_wrap=True)
+    for table in tables(result.report, console.width):
         console.print(table)

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 
 from rich import box
+from rich.console import Console, RenderableType
+from rich.measure import Measurement
 from rich.table import Table
+from rich.text import Text
 
 from dxlrun.compile import Compiled
 from dxlrun.compile.reach import degrees
@@ -23,27 +28,57 @@ def verdict(result: Compiled) -> str:
     )
 
 
-def tables(report: CheckReport) -> Iterator[Table]:
-    """Yield the tables that have rows."""
-    yield _joints(report.joints)
+def tables(report: CheckReport, width: int) -> Iterator[RenderableType]:
+    """Yield the tables that have rows, for a terminal of `width` columns."""
+    sheets = [_joints(report.joints)]
     if report.controllers:
-        yield _controllers(report.controllers, len(report.joints))
-    yield _buses(report.buses, report.rate)
+        sheets.append(_controllers(report.controllers, len(report.joints)))
+    sheets.append(_buses(report.buses, report.rate))
     if report.motions:
-        yield _motions(report.motions, report.duration)
+        sheets.append(_motions(report.motions, report.duration))
+    for sheet in sheets:
+        yield sheet.shown(width)
 
 
-def _table(title: str, left: Sequence[str], right: Sequence[str] = ()) -> Table:
-    table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)
-    for name in left:
-        table.add_column(name, overflow="fold")
-    for name in right:
-        table.add_column(name, justify="right", no_wrap=True)
-    return table
+@dataclass(slots=True)
+class _Sheet:
+    """Rows under names; a terminal that is too narrow for a table gets a paragraph a row: nothing is cut."""
+
+    title: str
+    left: Sequence[str]
+    right: Sequence[str] = ()
+    rows: list[tuple[str, ...]] = field(default_factory=list)
+
+    def add_row(self, *cells: str) -> None:
+        """Add one cell a column."""
+        self.rows.append(cells)
+
+    def shown(self, width: int) -> RenderableType:
+        """Return what is printed."""
+        table = Table(title=self.title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)
+        for name in self.left:
+            table.add_column(name, no_wrap=True)
+        for name in self.right:
+            table.add_column(name, justify="right", no_wrap=True)
+        for row in self.rows:
+            table.add_row(*(Text(cell) for cell in row))
+        needed = Measurement.get(_UNBOUNDED, _UNBOUNDED.options, table).maximum
+        return table if needed <= width else self._paragraphs(width)
+
+    def _paragraphs(self, width: int) -> Text:
+        lines = [self.title]
+        for first, *rest in self.rows:
+            named = zip((*self.left, *self.right)[1:], rest, strict=True)
+            facts = ", ".join(f"{name} {' '.join(cell.split())}" for name, cell in named if cell)
+            lines.append(textwrap.fill(f"{first}: {facts}", max(width - 1, 20), subsequent_indent="  "))
+        return Text("\n".join(lines) + "\n")
 
 
-def _joints(rows: Sequence[JointRow]) -> Table:
-    table = _table(
+_UNBOUNDED = Console(width=10_000)
+
+
+def _joints(rows: Sequence[JointRow]) -> _Sheet:
+    table = _Sheet(
         "Joints (deg)",
         ["joint", "bus", "model"],
         ["ID", "reference", "direction", "limits", "reach", "velocity limit"],
@@ -67,8 +102,8 @@ def _interval(lower: float, upper: float) -> str:
     return f"{degrees(lower, signed=True)}..{degrees(upper, signed=True)}"
 
 
-def _controllers(rows: Sequence[ControllerRow], joints: int) -> Table:
-    table = _table("Controllers", ["controller", "type", "from", "claims", "of", "active"], ["rate"])
+def _controllers(rows: Sequence[ControllerRow], joints: int) -> _Sheet:
+    table = _Sheet("Controllers", ["controller", "type", "from", "claims", "of", "active"], ["rate"])
     for row in rows:
         whole = f"all {joints} joints" if len(row.joints) == joints else "\n".join(row.joints)
         table.add_row(
@@ -83,8 +118,8 @@ def _controllers(rows: Sequence[ControllerRow], joints: int) -> Table:
     return table
 
 
-def _buses(rows: Sequence[BusRow], rate: float) -> Table:
-    table = _table(
+def _buses(rows: Sequence[BusRow], rate: float) -> _Sheet:
+    table = _Sheet(
         f"Time of one cycle on each bus ({rate:g} Hz leaves {1e3 / rate:.3g} ms)",
         ["bus", "port"],
         [
@@ -113,9 +148,9 @@ def _buses(rows: Sequence[BusRow], rate: float) -> Table:
     return table
 
 
-def _motions(rows: Sequence[MotionRow], duration: float | None) -> Table:
+def _motions(rows: Sequence[MotionRow], duration: float | None) -> _Sheet:
     ending = "" if duration is None else f" (the run ends at {duration:g} s)"
-    table = _table(f"Motions{ending}", ["file", "controller"], ["start", "end", "points", "commands"])
+    table = _Sheet(f"Motions{ending}", ["file", "controller"], ["start", "end", "points", "commands"])
     for row in rows:
         table.add_row(
             row.file,

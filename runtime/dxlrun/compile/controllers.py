@@ -14,6 +14,7 @@ from dxlrun.control.contract import interfaces_breach
 from dxlrun.control.controller import Interfaces, ParametersModel
 from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.control.plugins import Offer, PlugIns
+from dxlrun.cycle import MOST_CONTROLLERS
 from dxlrun.description import Description, problems_of
 
 _RATE_TOLERANCE = 1e-6
@@ -58,6 +59,12 @@ def compile_controllers(
         )
         compiled[name] = CompiledController(plan, offer, parameters)
     _exclusive_claims(description, compiled, problems)
+    if len(description.robot.controllers) > MOST_CONTROLLERS:
+        problems.error(
+            description.marks.key("controllers"),
+            f"the file has {len(description.robot.controllers)} controllers, the most are {MOST_CONTROLLERS}",
+            "take some out",
+        )
     return compiled
 
 
