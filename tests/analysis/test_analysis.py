@@ -131,6 +131,19 @@ def test_a_servo_that_was_silent_is_named(write: Make, cycle: Make, wire: Make) 
     )
 
 
+@pytest.mark.parametrize(
+    ("silent", "words"), [(3, "(100.00%)."), (4, ", and 1 more servo."), (5, ", and 2 more servos.")]
+)
+def test_at_most_three_silent_servos_are_named(write: Make, wire: Make, silent: int, words: str) -> None:
+    packets = [
+        wire(PacketKind.INSTRUCTION, number, number * 1000, bytes([255, 255, number, 4, 2, 36, 6, 0]))
+        for number in range(1, silent + 1)
+    ]
+    sentence = analyze_log(write([], packets)).verdict.sentences[1]
+    assert sentence.endswith(words)
+    assert sentence.count("(main)") == 3
+
+
 def test_a_late_reply_of_another_servo_is_nobodys_answer(write: Make, wire: Make) -> None:
     packets = [wire(PacketKind.INSTRUCTION, 21, 0, ASK_21), wire(PacketKind.STATUS, 5, 500, ANSWER)]
     elbow, head = analyze_log(write([], packets)).servos
@@ -149,7 +162,7 @@ def test_error_bits_are_named(write: Make, cycle: Make, wire: Make) -> None:
     report = analyze_log(write([cycle(0)], packets))
     assert report.servos[0].error_names == ("overheating", "overload")
     assert (
-        "Servos reported errors: servo 5 (left_elbow_joint): overheating, overload in 1 replies."
+        "Servos reported errors: servo 5 (left_elbow_joint): overheating, overload in 1 reply."
         in report.verdict.sentences
     )
     assert not report.verdict.good

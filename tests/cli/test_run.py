@@ -96,6 +96,25 @@ def test_virtual_time_runs_in_this_process(
     assert dxlrun("analyze", log, "--json").out.startswith("{")
 
 
+def test_a_run_says_the_verdict_of_its_log(
+    dxlrun: Callable, torso: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(tmp_path)
+
+    lines = dxlrun(torso, "--virtual", "--duration", "0.2").out.splitlines()
+
+    assert lines[1:3] == [
+        "  The loop kept 50 Hz: 0 of 10 periods skipped, on virtual time.",
+        "  All 8 servos answered every time.",
+    ]
+
+
+def test_one_skipped_period_is_one(dxlrun: Callable, runs: Runs, torso: Path):
+    runs.answer = RunSummary(0, "ended", 100, 1, 2.03, ())
+
+    assert dxlrun(torso).out.splitlines() == ["bioloid_torso: good. 2.0 s, 100 cycles, 1 period skipped"]
+
+
 def test_virtual_time_refuses_a_real_port(dxlrun: Callable, torso: Path):
     said = dxlrun(torso, "port:=/dev/ttyUSB0", "--virtual")
 

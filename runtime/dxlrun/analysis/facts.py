@@ -7,6 +7,7 @@ from datetime import UTC, datetime
 
 import msgspec
 
+from dxlrun.analysis.latency import on_virtual_time
 from dxlrun.analysis.report import Report
 from dxlrun.analysis.tables import Cell, Column, Table, tone_of
 from dxlrun.events import EventCode
@@ -36,11 +37,6 @@ def began(log: Log) -> str:
         return ""
     moment = datetime.fromtimestamp((times[0] + log.header.epoch_offset_ns) / 1e9, UTC)
     return f"{moment:%Y-%m-%d %H:%M:%S} UTC"
-
-
-def on_virtual_time(log: Log) -> bool:
-    """Tell whether the run's clock was virtual: its times are computed, and say nothing of this machine."""
-    return log.metadata.get("run", {}).get("clock") == "virtual"
 
 
 def facts(log: Log, report: Report) -> tuple[Table, ...]:

@@ -57,6 +57,11 @@ class Periods:
     seconds: float
 
 
+def on_virtual_time(log: Log) -> bool:
+    """Tell whether the run's clock was virtual: its times are computed, and say nothing of this machine."""
+    return log.metadata.get("run", {}).get("clock") == "virtual"
+
+
 def latency(log: Log) -> Latency | None:
     """Return the statistics of the wake-ups; None without cycles."""
     late = (log.cycles["woken_ns"] - log.cycles["scheduled_ns"]).astype(np.int64)

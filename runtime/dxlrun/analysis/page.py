@@ -6,13 +6,14 @@ from pathlib import Path
 from xml.etree import ElementTree as ET
 
 from dxlrun.analysis.elements import Element, clean, drawing_of, paragraph, section, table_of
-from dxlrun.analysis.facts import began, facts, on_virtual_time
+from dxlrun.analysis.facts import began, facts
 from dxlrun.analysis.figures.budget import budget_drawings
 from dxlrun.analysis.figures.joints import joint_drawings
 from dxlrun.analysis.figures.latency import latency_drawings
 from dxlrun.analysis.figures.run_time import first_deadline_ns
 from dxlrun.analysis.figures.timeline import events_drawing
 from dxlrun.analysis.figures.wires import reply_drawing
+from dxlrun.analysis.latency import on_virtual_time
 from dxlrun.analysis.report import Report, to_json
 from dxlrun.analysis.tables import (
     Cell,

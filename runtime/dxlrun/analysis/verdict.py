@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from dxlrun.analysis.bus import Servo
-from dxlrun.analysis.latency import Duration, Latency, Periods
+from dxlrun.analysis.latency import Duration, Latency, Periods, on_virtual_time
 from dxlrun.events import Event, Severity
 from dxlrun.recording.reader import Log
 
@@ -42,7 +42,7 @@ def verdict(timing: Timing, servos: Sequence[Servo], log: Log, lost: int) -> Ver
     `lost`: records that the recorder did not get.
     """
     findings = [
-        _loop(timing.periods, timing.latency),
+        _loop(timing.periods, timing.latency, virtual=on_virtual_time(log)),
         _slow(timing.steps, log.period_ns),
         _rough(timing.latency),
         _silent(servos),
@@ -57,15 +57,16 @@ def verdict(timing: Timing, servos: Sequence[Servo], log: Log, lost: int) -> Ver
 Finding = tuple[bool, str]
 
 
-def _loop(account: Periods, wake_ups: Latency | None) -> Finding:
+def _loop(account: Periods, wake_ups: Latency | None, *, virtual: bool) -> Finding:
     if wake_ups is None:
         return False, "The loop never ran a cycle."
     good = account.skipped == 0
     kept = "kept" if good else "did not keep"
+    wake_up = "on virtual time" if virtual else f"worst wake-up {microseconds(wake_ups.max_us)} late"
     return good, (
         f"The loop {kept} {account.rate_hz:g} Hz: {account.skipped} of {account.elapsed} periods skipped"
         f"{'' if good else f' ({account.skipped / account.elapsed:.2%})'}, "
-        f"worst wake-up {microseconds(wake_ups.max_us)} late."
+        f"{wake_up}."
     )
 
 
@@ -101,7 +102,7 @@ def _silent(servos: Sequence[Servo]) -> Finding | None:
         f"{_name(servo)} {servo.lost} of {servo.asked} times ({servo.lost / servo.asked:.2%})"
         for servo in losers[:_MOST_NAMED]
     )
-    more = f", and {len(losers) - _MOST_NAMED} more servos" if len(losers) > _MOST_NAMED else ""
+    more = _more(", and", len(losers))
     rest = len(asked) - len(losers)
     others = f"; {rest} of {len(asked)} servos answered every time" if rest else ""
     return False, f"Replies are missing: {named}{more}{others}."
@@ -116,11 +117,22 @@ def _errors(servos: Sequence[Servo]) -> Finding | None:
     if not troubled:
         return None
     named = "; ".join(
-        f"{_name(servo)}: {', '.join(servo.error_names) or 'unknown bit'} in {servo.errors} replies"
+        f"{_name(servo)}: {', '.join(servo.error_names) or 'unknown bit'} in "
+        f"{_counted(servo.errors, 'reply', 'replies')}"
         for servo in troubled[:_MOST_NAMED]
     )
-    more = f"; and {len(troubled) - _MOST_NAMED} more servos" if len(troubled) > _MOST_NAMED else ""
+    more = _more("; and", len(troubled))
     return False, f"Servos reported errors: {named}{more}."
+
+
+def _more(joining: str, count: int) -> str:
+    """Return how many servos there are beyond those that are named."""
+    beyond = count - _MOST_NAMED
+    return f"{joining} {_counted(beyond, 'more servo', 'more servos')}" if beyond > 0 else ""
+
+
+def _counted(number: int, one: str, many: str) -> str:
+    return f"{number} {one if number == 1 else many}"
 
 
 def _name(servo: Servo) -> str:
@@ -140,9 +152,11 @@ def _events(events: Sequence[Event]) -> Finding | None:
 def _log(account: Periods, log: Log, lost: int) -> Finding | None:
     faults = list(log.damage)
     if lost:
-        faults.append(f"{lost} records were lost on the way to the recorder")
+        faults.append(f"{_counted(lost, 'record was', 'records were')} lost on the way to the recorder")
     if not account.agree:
-        faults.append(f"{account.missing} periods are neither recorded nor declared skipped")
+        faults.append(
+            f"{_counted(account.missing, 'period is', 'periods are')} neither recorded nor declared skipped"
+        )
     if not faults:
         return None
     return False, f"The log is not whole: {'; '.join(faults)}."

@@ -10,6 +10,7 @@ from cyclopts import Parameter
 from dxlrun.cli.flags import Flag, Motions
 from dxlrun.cli.inputs import compiled
 from dxlrun.cli.terminal import out, say_error, say_warning
+from dxlrun.errors import LogError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -18,6 +19,9 @@ if TYPE_CHECKING:
 
     from dxlrun.dynamixel.bus_plan import BusPlan
     from dxlrun.run_summary import RunSummary
+
+_MOST_MESSAGES = 100_000
+"""A log of so many messages is analyzed in about two seconds; nobody wants to wait longer for the prompt."""
 
 
 def run(
@@ -78,6 +82,19 @@ def _ask_servos(buses: Sequence[BusPlan], joints: Sequence[str]) -> Mapping[str,
     return ask_servos(buses, joints)
 
 
+def _verdict(log: str, summary: RunSummary) -> tuple[str, ...]:
+    """Return what the log says of the run, where reading it takes a moment only; else nothing."""
+    if not summary.cycles or summary.messages > _MOST_MESSAGES:
+        return ()
+    from dxlrun.analysis.report import analyze_log
+
+    try:
+        return analyze_log(log).verdict.sentences
+    except LogError as error:
+        say_warning(str(error))
+        return ()
+
+
 def show(summary: RunSummary, robot: str, console: Console) -> None:
     """Print how the run went: what failed and what was not granted to stderr, the rest to stdout."""
     for remark in summary.remarks:
@@ -87,9 +104,11 @@ def show(summary: RunSummary, robot: str, console: Console) -> None:
     verdict = {0: "good", 130: "interrupted"}.get(summary.exit_code, "failed")
     console.print(
         f"{robot}: {verdict}. {summary.elapsed_s:.1f} s, {summary.cycles} cycles, "
-        f"{summary.skipped} periods skipped",
+        f"{summary.skipped} {'period' if summary.skipped == 1 else 'periods'} skipped",
         soft_wrap=True,
     )
     if summary.log is not None:
+        for sentence in _verdict(summary.log, summary):
+            console.print(f"  {sentence}", markup=False, soft_wrap=True)
         console.print(f"log: {summary.log} ({summary.messages} messages)", markup=False, soft_wrap=True)
         console.print(f"next: dxlrun analyze {summary.log}", markup=False, soft_wrap=True)
