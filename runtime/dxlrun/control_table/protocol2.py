@@ -1,7 +1,7 @@
 """Control tables of Protocol 2.0: the maker's own data files in dynamixel-sdk, completed and corrected.
 
 The files give name, address and size of each item, and some units. What they lack (access, ranges, initial
-values, no-load speeds) stands in `protocol2.toml`, what is wrong in them in `sdk_corrections.toml`, with a
+values, no-load speeds) stands in files of ours, what is wrong in them in `sdk_corrections.toml`, with a
 reason each. Only the files are read; the SDK's code is never imported.
 """
 
@@ -19,6 +19,8 @@ from pathlib import Path
 from dxlrun.control_table.sources import Entry, Items, Listing, build_table, in_order, section, whole, words
 from dxlrun.control_table.table import ControlTable
 
+LAYER_FILES = ("every_model.toml", "x_and_mx.toml", "p.toml", "y.toml", "models.toml", "sdk_corrections.toml")
+"""In the order in which they are laid one over the other."""
 FOLDER = Path(__file__).parent.parent / "control_tables" / "protocol2"
 
 _NOT_OF_THE_MODEL = frozenset({"models", "reason", "items", "left_out"})
@@ -65,7 +67,7 @@ def sdk_files() -> tuple[Path, ...]:
 
 def layers() -> tuple[Entry, ...]:
     """Return what is laid over the SDK's data, in this order: what it lacks, then what is wrong in it."""
-    return tuple(layer for name in ("protocol2.toml", "sdk_corrections.toml") for layer in _layers(name))
+    return tuple(layer for name in LAYER_FILES for layer in _layers(name))
 
 
 @functools.cache
