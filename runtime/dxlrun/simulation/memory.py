@@ -32,6 +32,7 @@ class Memory:
             for address in range(item.address, item.address + item.size)
         }
         self._indirect = _indirect_cells(table)
+        self._bounds = {item.name: _bounds(item) for item in table.items.values()}
         self.restore_factory_values()
 
     def restore_factory_values(self, keep: tuple[str, ...] = ()) -> None:
@@ -55,10 +56,10 @@ class Memory:
         return self._values[name]
 
     def __setitem__(self, name: str, wire: int) -> None:
-        if self._values.get(name) == wire:
-            return
         item = self.table.items[name]
         wire &= (1 << 8 * item.size) - 1
+        if self._values.get(name) == wire:
+            return
         self._memory[item.address : item.address + item.size] = wire.to_bytes(item.size, "little")
         self._values[name] = wire
 
@@ -68,17 +69,16 @@ class Memory:
 
     def show(self, name: str, wire: int) -> None:
         """Set an item if the model has it; what does not fit ends at its highest or lowest value."""
-        item = self.table.items.get(name)
-        if item is None:
-            return
-        bits = 8 * item.size - (item.encoding == "twos_complement")
-        lowest = -1 << bits if item.encoding == "twos_complement" else 0
-        self[name] = max(lowest, min((1 << bits) - 1, wire))
+        bounds = self._bounds.get(name)
+        if bounds is not None:
+            self[name] = max(bounds[0], min(bounds[1], wire))
 
     def ticks(self, name: str) -> int:
         """Return the signed number of ticks of an item."""
-        item = self.table.items[name]
-        return item.decode(self._memory[item.address : item.address + item.size])
+        wire, item = self._values[name], self.table.items[name]
+        if item.encoding == "twos_complement":
+            return wire - (wire >> 8 * item.size - 1 << 8 * item.size)
+        return wire if item.encoding == "unsigned" else item.decode(self.data(name))
 
     def data(self, name: str) -> bytes:
         """Return the bytes of an item."""
@@ -125,11 +125,16 @@ class Memory:
 
     def would_be(self, address: int, data: bytes) -> dict[str, int]:
         """Return the integers of the items that a write touches, as they would be after it."""
-        after = self._memory[:]
-        after[address : address + len(data)] = data
         items = [self.table.items[name] for name in self.names(address, len(data))]
+        first, last = (items[0], items[-1]) if items else (None, None)
+        if first and last and (first.address < address or last.address + last.size > address + len(data)):
+            start, end = first.address, last.address + last.size  # parts of items stay as they are
+            before, behind = self._memory[start:address], self._memory[address + len(data) : end]
+            address, data = start, bytes(before) + data + bytes(behind)
         return {
-            item.name: int.from_bytes(after[item.address : item.address + item.size], "little")
+            item.name: int.from_bytes(
+                data[item.address - address : item.address - address + item.size], "little"
+            )
             for item in items
         }
 
@@ -149,6 +154,12 @@ class Memory:
         if item.initial is not None:
             return item.initial
         return max(0, item.minimum) if item.access == "RW" else 0
+
+
+def _bounds(item: ControlItem) -> tuple[int, int]:
+    """Return the lowest and the highest number of ticks that an item's bytes hold."""
+    bits = 8 * item.size - item.signed
+    return (-1 << bits if item.signed else 0), (1 << bits) - 1
 
 
 def in_range(item: ControlItem, wire: int) -> bool:

@@ -54,9 +54,9 @@ class ModeShaft(Shaft):
         """Bring everything that can be read of the motion to the time."""
         memory = self.memory
         angle, velocity, acceleration = self._motion.at(self.now_ns)
-        position = self.position_tick(angle)
-        speed = round(self._sign * velocity / memory.table.rad_s_per_tick)
-        load = max(-1.0, min(1.0, self._sign * self._load()))
+        position, sign = self.position_tick(angle), self._sign
+        speed = round(sign * velocity / memory.table.rad_s_per_tick)
+        load = max(-1.0, min(1.0, sign * self._load()))
         moving = velocity != 0.0 or acceleration != 0.0
         memory.show("present_position", position)
         memory.show("present_velocity", speed)

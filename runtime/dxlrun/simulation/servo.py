@@ -45,7 +45,10 @@ class SimulatedServo:
         self._body, self._instructions = make_body(table, config.position, start_ns, self._note)
         self._silent = False
         self.registers["id"] = config.servo_id
-        self.registers[_baud_item(self.registers)] = _baud_value(self.registers, baud_rate)
+        self._baud_item = (
+            "baud_rate" if "baud_rate" in table.items else "baud_rate_bus"
+        )  # the Y series has two
+        self.registers[self._baud_item] = _baud_value(self.registers, baud_rate)
         self.registers["return_delay_time"] = min(254, round(config.return_delay_ns / 2000))
         self._body.power_up()
 
@@ -64,7 +67,7 @@ class SimulatedServo:
     @property
     def baud_rate(self) -> int:
         """The rate at which it listens, bit/s."""
-        return _rate(self.registers, self.registers[_baud_item(self.registers)])
+        return _rate(self._body.memory, self._body.memory[self._baud_item])
 
     def advance(self, now_ns: int) -> None:
         """Bring the shaft and the present registers to a time; going back is ignored."""
@@ -182,10 +185,6 @@ class SimulatedServo:
         self._note(f"servo {self.servo_id}: turned by hand to {angle} rad")
         self._body.shaft.rest_at(angle)
         self._body.shaft.plan(self._body.shaft.items)
-
-
-def _baud_item(memory: Memory) -> str:
-    return "baud_rate" if "baud_rate" in memory else "baud_rate_bus"  # the Y series has two
 
 
 def _rate(memory: Memory, value: int) -> int:
