@@ -57,16 +57,19 @@ class Bus:
         "_drain_end_ns",
         "_earliest_ns",
         "_free_ns",
+        "_id_at",
         "_index",
         "_job",
         "_last_byte_ns",
         "_now_ns",
         "_open",
         "_opened",
+        "_overhead",
         "_parameters",
         "_port",
         "_quiet_ns",
         "_receiver",
+        "_refusal",
         "_refused",
         "_reply",
         "_reply_size",
@@ -96,6 +99,9 @@ class Bus:
         self._quiet_ns = max(QUIET_BYTES * self._byte_ns, LEAST_QUIET_NS) + plan.latency_ns
         self._dialect = dialect_of(plan.protocol)
         self._opened = self._dialect.opened
+        self._refusal = self._dialect.refused
+        self._overhead = self._dialect.OVERHEAD
+        self._id_at = self._dialect.ID_AT
         self._receiver = Receiver(self._status, self._noise, self._dialect)
         self._parameters = memoryview(bytearray(self._dialect.LONGEST))
         self._views: dict[int, memoryview] = {}
@@ -203,10 +209,10 @@ class Bus:
             self._state = _RESTING
         else:
             reply.outcome = Outcome.TIMEOUT
-            count = len(transaction.packet) + self._dialect.OVERHEAD
+            count = len(transaction.packet) + self._overhead
             self._earliest_ns = self._started_ns + count * self._byte_ns
             self._deadline_ns = self._started_ns + transaction.timeout_ns
-            self._reply_size = self._dialect.widest(max(one.length for one in transaction.awaited))
+            self._reply_size = transaction.widest
             self._open = (1 << len(transaction.awaited)) - 1
             self._refused = False
             self._state = _AWAITING
@@ -238,24 +244,24 @@ class Bus:
         self._sink.packet(self._index, PacketKind.NOISE, BROADCAST_ID, first_ns, last_ns, data)
 
     def _status(self, packet: memoryview, first_ns: int, last_ns: int) -> None:
-        servo_id = self._dialect.servo_id(packet)
-        self._sink.packet(self._index, PacketKind.STATUS, servo_id, first_ns, last_ns, packet)
+        self._sink.packet(self._index, PacketKind.STATUS, packet[self._id_at], first_ns, last_ns, packet)
         status = self._opened(packet) if self._state == _AWAITING else None
         index = -1 if status is None else self._turn(status, last_ns)
-        if status is None or index < 0 or self._job is None or self._awaited is None:
+        if status is None or index < 0 or self._job is None:
             self._stray(packet)
             return
-        length = len(status.parameters)
+        error, parameters = status.error, status.parameters
+        length = len(parameters)
         view = self._views.get(length)
         if view is None:
             view = self._views[length] = self._parameters[:length]
-        view[:] = status.parameters
+        view[:] = parameters
         reply = self._reply
-        reply.error = status.error
+        reply.error = error
         reply.parameters = view
         reply.last_ns = last_ns
         self._open &= ~(1 << index)
-        if self._dialect.refused(status.error, length, self._awaited.awaited[index].length):
+        if error and self._refuses(status, index):
             self._refused = True
         else:
             self._job.status(index, reply)
@@ -265,15 +271,20 @@ class Bus:
 
     def _turn(self, status: Status, last_ns: int) -> int:
         """Return which of the awaited statuses this is; -1 when it is none of them."""
-        length = len(status.parameters)
+        servo_id, error, parameters = status
+        length = len(parameters)
         # an echo, or left over from before, comes sooner than the wire allows
         if self._awaited is None or last_ns < self._earliest_ns + length * self._byte_ns:
             return -1
         for index, one in enumerate(self._awaited.awaited):
-            if one.servo_id == status.servo_id and self._open >> index & 1:
-                fits = length == one.length or self._dialect.refused(status.error, length, one.length)
-                return index if fits else -1
+            if one.servo_id == servo_id and self._open >> index & 1:
+                return index if length == one.length or (error and self._refuses(status, index)) else -1
         return -1
+
+    def _refuses(self, status: Status, index: int) -> bool:
+        assert self._awaited is not None  # noqa: S101  a status has its turn
+        length = self._awaited.awaited[index].length
+        return self._refusal(status.error, len(status.parameters), length)
 
     def _stray(self, packet: memoryview) -> None:
         self.stray_packets += 1

@@ -21,6 +21,7 @@ class Dialect(Protocol):
     PROTOCOL: float
     HEADER: bytes
     OVERHEAD: int
+    ID_AT: int
     LONGEST: int
     HIGHEST_ID: int
     PING_LENGTH: int
@@ -33,10 +34,6 @@ class Dialect(Protocol):
 
     def intact(self, packet: memoryview) -> bool:
         """Say whether the checksum of a whole packet is right."""
-        ...
-
-    def servo_id(self, packet: Bytes) -> int:
-        """Return whom a whole packet names."""
         ...
 
     def opened(self, packet: memoryview) -> Status | None:

@@ -72,7 +72,8 @@ class Line:
         """Return a transaction whose replies come one after the other, each after a return delay."""
         replies = sum(self.dialect.OVERHEAD + one.length for one in awaited)
         due_ns = self.wire_ns(len(packet) + replies) + len(awaited) * self.return_delay_ns
-        return Transaction(packet, servo_id, awaited, due_ns, due_ns + self.latency_ns + PATIENCE_NS)
+        widest = self.dialect.widest(max(one.length for one in awaited))
+        return Transaction(packet, servo_id, awaited, due_ns, due_ns + self.latency_ns + PATIENCE_NS, widest)
 
 
 def listen(duration_ns: int) -> Transaction:

@@ -20,6 +20,8 @@ OVERHEAD = 6
 """Bytes of a packet beside its parameters."""
 LONGEST = 0xFF + 4
 """Bytes of the longest packet: LEN is one byte and counts everything behind itself."""
+ID_AT = 2
+"""Where a packet has the ID of who is addressed, or who answers."""
 HIGHEST_ID = 0xFD
 PING_LENGTH = 0
 """Parameters of the answer to a ping: the model number must be read."""
@@ -107,11 +109,6 @@ def size_at(buffer: Bytes, start: int, end: int) -> int:
 def intact(packet: memoryview) -> bool:
     """Say whether the checksum of a whole packet is right."""
     return ~sum(packet[2:-1]) & 0xFF == packet[-1]
-
-
-def servo_id(packet: Bytes) -> int:
-    """Return whom a whole packet names: who is addressed, or who answers."""
-    return packet[2]
 
 
 def opened(packet: memoryview) -> Status | None:

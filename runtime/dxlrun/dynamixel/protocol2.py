@@ -27,6 +27,8 @@ LONGEST = 2048
 The protocol allows 65,542. Nobody answers with more than a control table (about 1,000 bytes), or 140 servos'
 states in a fast form, and a false header may not hold the line back for longer.
 """
+ID_AT = 4
+"""Where a packet has the ID of who is addressed, or who answers."""
 HIGHEST_ID = 0xFC
 PING_LENGTH = 3
 """Parameters of the answer to a ping: model number (2), firmware version (1)."""
@@ -174,11 +176,6 @@ def size_at(buffer: Bytes, start: int, end: int) -> int:
 def intact(packet: memoryview) -> bool:
     """Say whether the CRC of a whole packet is right."""
     return crc16.umts(packet[:-2]) == packet[-2] | packet[-1] << 8
-
-
-def servo_id(packet: Bytes) -> int:
-    """Return whom a whole packet names: who is addressed, or who answers."""
-    return packet[4]
 
 
 def opened(packet: memoryview) -> Status | None:

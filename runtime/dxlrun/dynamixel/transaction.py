@@ -43,6 +43,8 @@ class Transaction:
     """From the start of the write to the last byte of all replies, by the wire; without: the wire time."""
     timeout_ns: int
     """From the start of the write to giving up; 0 without reply."""
+    widest: int = 0
+    """The most bytes that one of the replies has on the line, stuffing included."""
 
 
 @unique
