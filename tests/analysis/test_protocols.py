@@ -13,7 +13,7 @@ SYNC_READ = bytes.fromhex("fffffd00fe090082840004000102cefa")
 """e-Manual, Protocol 2.0, sync read: present position of servos 1 and 2."""
 FAST_SYNC_READ = bytes.fromhex("fffffd00fe0a008a84000400030704fab5")
 """Servos 3, 7 and 4; the log is not asked whether the CRC is right."""
-BULK_READ_1 = bytes.fromhex("fffffe0992000201240102241b")
+BULK_READ_1 = bytes.fromhex("fffffe09920002032402072411")
 
 
 def asks(wire: Make, at: int, data: bytes, servo_id: int = 254) -> Any:
@@ -55,10 +55,10 @@ def test_one_fast_status_answers_for_all(write: Make, wire: Make) -> None:
 
 
 def test_a_bulk_read_of_protocol_1_asks_each_servo_of_its_list(write: Make, wire: Make) -> None:
-    answer = bytes.fromhex("ffff01040000000000")
-    first, second = analyze_log(write([], [asks(wire, 0, BULK_READ_1), answers(wire, 600, 1, answer)])).servos
-    assert (first.servo_id, first.asked, first.lost, first.replies) == (1, 1, 0, 1)
-    assert (second.servo_id, second.asked, second.lost, second.replies) == (2, 1, 1, 0)
+    answer = bytes.fromhex("ffff030400000000f8")
+    first, second = analyze_log(write([], [asks(wire, 0, BULK_READ_1), answers(wire, 600, 3, answer)])).servos
+    assert (first.servo_id, first.asked, first.lost, first.replies) == (3, 1, 0, 1)
+    assert (second.servo_id, second.asked, second.lost, second.replies) == (7, 1, 1, 0)
 
 
 def test_a_stuffed_list_is_read_as_it_was_meant(write: Make, wire: Make) -> None:

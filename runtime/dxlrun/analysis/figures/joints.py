@@ -29,6 +29,7 @@ from dxlrun.analysis.tracking import Joint
 from dxlrun.interfaces import Floats
 from dxlrun.recording.reader import Log
 
+_LEAST_RAD, _LEAST_RAD_S = 0.1, 0.5
 _FEW = 60
 """So few samples are drawn with a dot each, so few skipped cycles with a line through the figure."""
 _DESIRED: dict[str, object] = {"color": GREEN, "linewidth": 2.8, "alpha": 0.55}
@@ -43,6 +44,14 @@ def joint_drawings(log: Log, joints: tuple[Joint, ...]) -> tuple[Drawing, ...]:
         _JointPlot(log, row, joint, times, columns, Marks.of(log, row)).drawing()
         for row, joint in enumerate(joints)
     )
+
+
+def _spread(axes: Axes, least: float) -> None:
+    """Let the axis span at least so much: a joint at rest is a calm line, not the ticks of its servo."""
+    low, high = axes.get_ylim()
+    missing = (least - (high - low)) / 2
+    if missing > 0:
+        axes.set_ylim(low - missing, high + missing)
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,8 +99,10 @@ class _JointPlot:
             3, 1, sharex=True, gridspec_kw={"height_ratios": [3.0, 1.9, 1.05]}
         )
         self._lines(position, "position")
+        _spread(position, _LEAST_RAD)
         position.set_ylabel("position, rad")
         self._lines(velocity, "velocity")
+        _spread(velocity, _LEAST_RAD_S)
         velocity.set_ylabel("velocity, rad/s")
         skipped = self.times[self.marks.skipped]
         for axes in (position, velocity):
