@@ -242,7 +242,10 @@ def test_an_alert_is_read_once_and_told_in_the_manuals_words(started):
     assert len(reads) == 2  # one at the start, one for the alert
 
 
-@pytest.mark.parametrize("late_ms", [12.5, 19.8, 20.1, 20.6, 21.3, 33.3, 40.5, 60.2])
+@pytest.mark.parametrize(
+    "late_ms",
+    [12.5, 19.8, 20.1, 20.6, 21.3, 21.4, 21.45, 21.5, 21.55, 21.6, 21.65, 21.7, 21.75, 33.3, 40.5, 60.2],
+)
 def test_a_late_reply_is_never_taken_as_current(started, late_ms):
     started.goals.position[:] = [-2.0, 2.0] * 4
     started.goals.velocity[:] = 1.0
