@@ -42,14 +42,14 @@ def events_drawing(log: Log) -> Drawing | None:
         axes.margins(x=0.03)
         axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=3, borderaxespad=0.2)
 
-    counts = ", ".join(
-        f"{int(np.count_nonzero(grades == grade))} of {name}" for grade, (name, *_) in enumerate(_SHAPES)
+    told = ", ".join(
+        f"{name} {np.count_nonzero(grades == grade)}" for grade, (name, *_) in enumerate(_SHAPES)
     )
     words = Words(
         "events-timeline",
         "Events over the run",
-        f"Events over the time of the run in s, one row a kind. {len(log.events)} events: {counts}.",
-        f"{len(log.events)} events: {counts}. Before 0 s the servos are set up.",
+        f"Events over the time of the run in s, one row a kind. {len(log.events)} events: {told}.",
+        f"{len(log.events)} events: {told}. Before 0 s the servos are set up.",
     )
     return draw(words, 0.9 + 0.17 * len(kinds), fill)
 
