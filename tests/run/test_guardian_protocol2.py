@@ -1,0 +1,60 @@
+"""The guardian on Protocol 2.0: the arm is limp after its loop was killed; judged by the ledger."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from dxlrun.simulation.protocol2 import Instruction, receiver
+
+ARM = Path(__file__).parents[2] / "robots/open_manipulator_x.yaml"
+IDS = (11, 12, 13, 14, 15)
+TORQUE_ENABLE = 64  # e-Manual, XM430-W350, control table
+
+
+def writes(data: bytes) -> Iterator[tuple[int, int, bytes]]:
+    """Cut the host's bytes into writes of (ID, address, data); everything must be an intact packet."""
+    line, start = receiver(), 0
+    while (packet := line.feed(data, start)) is not None:
+        assert packet.intact
+        start = packet.end
+        parameters = packet.parameters
+        address = int.from_bytes(parameters[:2], "little")
+        if packet.instruction == Instruction.WRITE:
+            for servo_id in IDS if packet.servo_id == 0xFE else (packet.servo_id,):
+                yield servo_id, address, parameters[2:]
+        elif packet.instruction == Instruction.SYNC_WRITE:
+            step = int.from_bytes(parameters[2:4], "little") + 1
+            for at in range(4, len(parameters), step):
+                yield parameters[at], address, parameters[at + 1 : at + step]
+    assert line.pending == 0
+
+
+def test_an_arm_whose_loop_was_killed_is_limp(
+    start: Callable[..., Any], wait_for: Callable[..., Any], wire_equals_log: Callable[[Any], None]
+) -> None:
+    run = start(robot=ARM)
+
+    def sent() -> bytes:
+        return b"".join(entry.data for entry in run.ledger() if entry.direction == "in")
+
+    def goals() -> bool:
+        return sum(address != TORQUE_ENABLE for _, address, _ in writes(sent())) >= 10 * len(IDS)
+
+    wait_for(goals, "goals in the ledger")
+    os.kill(run.child("dxlrun.loop_process"), signal.SIGKILL)
+    code, _, err = run.finish()
+    assert code == 1
+    assert "torque off was confirmed by all 5 servos" in err
+    torque = dict.fromkeys(IDS, False)
+    changes = []
+    for servo_id, address, data in writes(sent()):
+        if address == TORQUE_ENABLE:
+            torque[servo_id] = bool(data[0])
+            changes.append(bool(data[0]))
+    assert any(changes)
+    assert not any(torque.values())
+    wire_equals_log(run)
