@@ -18,7 +18,8 @@ Shell = Callable[..., "subprocess.CompletedProcess[str]"]
 
 def bash(line: str, directory: Path, path: Path) -> subprocess.CompletedProcess[str]:
     """Run one line with `path` before all other programs, far from this interpreter's own settings."""
-    outside = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "COV_"))}
+    ours = ("PYTHON", "PYTEST", "COV_")
+    outside = {name: value for name, value in os.environ.items() if not name.startswith(ours)}
     environment = outside | {"PATH": f"{path}:{os.environ['PATH']}", "PIP_DISABLE_PIP_VERSION_CHECK": "1"}
     return subprocess.run(
         ["/bin/bash", "-c", line], cwd=directory, env=environment, capture_output=True, text=True, check=False
