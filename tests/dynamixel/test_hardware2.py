@@ -268,6 +268,34 @@ def test_a_late_reply_is_never_taken_as_current(started, late_ms):
     assert started.packets.received() == started.out_of_bus()
 
 
+@pytest.mark.parametrize("late_ms", [20.1, 20.3, 20.6, 20.9, 40.3, 40.6])
+def test_late_replies_of_three_silent_servos_are_never_taken_as_current(make_rig, make_x, late_ms):
+    """Three losses of one group in one cycle: the next request must still differ from the one before."""
+    rig = make_rig(make_x((11, 12, 13)))
+    rig.hardware.start()
+    servos = rig.buses[0].servos
+    for servo in servos:
+        servo.silence()
+    rig.cycle()
+    for servo in servos:
+        servo.silence(False)
+        rig.buses[0].delay_next(servo.servo_id, int(late_ms * 1e6))
+    rig.cycle()
+    for servo in servos:
+        servo.silence()
+    sent = len(rig.out_of_bus())
+    for _ in range(2):  # nobody answers what is asked now: whatever arrives is old
+        rig.cycle()
+        assert not rig.states.valid.any()
+    assert len(rig.out_of_bus()) > sent
+    for servo in servos:
+        servo.silence(False)
+    for _ in range(3):
+        rig.cycle()
+    assert rig.states.valid.all()
+    assert rig.packets.received() == rig.out_of_bus()
+
+
 def test_servos_of_several_layouts_share_a_bus(make_rig, make_plan):
     rig = make_rig(
         make_plan(

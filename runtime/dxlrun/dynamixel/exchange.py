@@ -48,6 +48,7 @@ class CyclicReads:
     __slots__ = (
         "_current",
         "_groups",
+        "_lossy",
         "_made",
         "_patient",
         "_plan",
@@ -79,6 +80,7 @@ class CyclicReads:
         self._replies = tuple(replies)
         self._made: dict[tuple[int, ...], _Request] = {}
         self._shape = [0] * len(self._groups)
+        self._lossy = [False] * len(self._groups)  # whose reply was lost in this cycle
         self._queue: list[_Request] = []
         self._queue_of: tuple[bool, ...] | None = None
         self._current: _Request | None = None
@@ -88,6 +90,11 @@ class CyclicReads:
 
     def begin(self) -> None:
         """Prepare for the next cycle."""
+        for number, lost in enumerate(self._lossy):
+            if lost:
+                # once a cycle: if each loss counted, three silent servos of a group would ask alike for ever
+                self._shape[number] += 1
+                self._lossy[number] = False
         self.fresh[:] = False
         self._patient = True
         silent = tuple(map(bool, self.missed))
@@ -127,7 +134,7 @@ class CyclicReads:
     def _count_out(self, outcome: Outcome) -> None:
         assert self._current is not None  # noqa: S101  something was read
         self._patient = False
-        self._shape[self._current.group] += 1
+        self._lossy[self._current.group] = True
         for servo in self._current.indices:
             if not self.fresh[servo]:
                 self.garbled[servo] = outcome is not Outcome.TIMEOUT
