@@ -120,14 +120,15 @@ def test_a_silent_servo_is_invalid_and_ages_and_the_others_go_on(started):
 def test_a_silent_servo_gets_no_goal_until_its_torque_was_read(started):
     servo = started.buses[0].servo(5)
     servo.silence()
+    before = len(started.into_bus())
     started.cycle()
     started.cycle()
     servo.silence(False)
     for _ in range(4):
         started.cycle()
-    writes = [packet for packet in started.into_bus() if packet[4] == 0x83]
-    named = [5 in packet[7:-1:5] for packet in writes]
-    probes = [packet for packet in started.into_bus() if packet == started.plans[0].torque_reads[2].packet]
+    sent = started.into_bus()[before:]
+    named = [5 in packet[7:-1:5] for packet in sent if packet[4] == 0x83]
+    probes = [packet for packet in sent if packet == started.plans[0].torque_reads[2].packet]
     assert named == [False, False, False, True, True, True]
     assert len(probes) == 1
     (event,) = started.events.of(EventCode.READ_BACK)
@@ -222,6 +223,36 @@ def test_nothing_gives_torque_without_start(make_rig):
         rig.cycle()
     assert torque_on_packets(rig.into_bus()) == []
     assert rig.torque() == [False] * 8
+
+
+def test_a_servo_that_is_reset_while_the_others_get_torque_ends_the_start(make_rig):
+    """It answers again before the first cycle, so no reply is missing; its next goal would be torque on."""
+    rig = make_rig()
+    reset = []
+
+    def brown_out():
+        if not reset and sum(rig.torque()) == 4:
+            reset.append(1)
+            rig.buses[0].servo(1).reset()
+
+    for step in range(4000):
+        rig.buses[0].at(rig.clock.now_ns() + step * 100_000, brown_out)
+    with pytest.raises(StartUpError, match=r"main_1_joint \(ID 1 on bus main\) lost its torque again"):
+        rig.hardware.start()
+    assert reset == [1]
+    assert rig.torque() == [False] * 8
+    assert [packet for packet in rig.into_bus() if packet[4] == 0x83] == []
+
+
+def test_a_line_that_goes_between_read_and_write_is_named_and_the_others_get_their_goals(make_rig, make_plan):
+    rig = make_rig(make_plan((1, 2), name="left"), make_plan((1, 7), name="right", first_row=2))
+    rig.hardware.start()
+    rig.hardware.read()
+    rig.ports.ports[0].unplug()
+    with pytest.raises(PortError, match="bus left on sim: "):
+        rig.hardware.write()
+    assert [source for source, _ in rig.events.of(EventCode.PORT_LOST)] == ["left"]
+    assert rig.into_bus(1)[-1][4] == 0x83
 
 
 def test_two_buses_are_read_side_by_side(make_rig, make_plan):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 
 from dxlrun.clock import Clock
 from dxlrun.dynamixel import startup
@@ -94,7 +95,9 @@ class DynamixelHardware:
         for bus, servos in zip(self._buses, self._servos, strict=True):
             for packet in servos.goals.packets(self._goals, servos.torqued):
                 if bus.failure is None:
-                    bus.send(packet)
+                    # what it raises does not name the bus, and the other lines shall have their goals
+                    with suppress(PortError):
+                        bus.send(packet)
         self._raise_failures()
 
     def idle(self, until_ns: int) -> None:
@@ -154,7 +157,6 @@ class DynamixelHardware:
             raise StartUpError("\n".join(problems))
         for plan, servos, one in zip(self._plans, self._servos, engaged, strict=True):
             assert one is not None  # noqa: S101  no line has failed
-            servos.torqued[:] = True
             for servo, raw in zip(plan.servos, one.goals, strict=True):
                 self._goals.position[servo.row] = joint_position(servo, raw)
             names = ", ".join(servo.joint for servo in plan.servos)
@@ -170,10 +172,19 @@ class DynamixelHardware:
             raise StartUpError(
                 f"{', '.join(silent)} did not answer after torque was switched on: check cable and power"
             )
+        self._torque_lasts()
         for servos in self._servos:
             servos.torqued[:] = True
         # goal = present: none of the goals has a speed yet
         self._goals.velocity[:] = float("nan")
+
+    def _torque_lasts(self) -> None:
+        """Read torque enable of everybody once more: whoever the inrush of the others reset may get no goal."""
+        programs = [startup.confirm(plan) for plan in self._plans]
+        found = run(programs, self._buses, self._ports, self._clock, self._beat)
+        self._raise_failures()
+        if problems := [problem for one in found if one is not None for problem in one]:
+            raise StartUpError("\n".join(problems))
 
     def _raise_failures(self) -> None:
         for plan, bus, servos in zip(self._plans, self._buses, self._servos, strict=True):

@@ -182,6 +182,24 @@ def _engage_one(plan: BusPlan, servo: ServoPlan, result: Engagement) -> Program[
     return problem
 
 
+def confirm(plan: BusPlan) -> Program[list[str]]:
+    """Read torque enable of everybody again, after the last one got torque; return what is wrong.
+
+    Torque on draws current: a servo that browned out meanwhile answers again, limp, before the first cycle.
+    """
+    problems: list[str] = []
+    for servo, read in zip(plan.servos, plan.torque_reads, strict=True):
+        reply = yield from persist(read)
+        if not reply.answered:
+            problems.append(f"{who(plan, servo)} did not answer after torque was switched on")
+        elif reply.parameters[0] != 1:
+            problems.append(
+                f"{who(plan, servo)} lost its torque again while the others got theirs (Torque Enable "
+                f"({servo.torque_address}) is {reply.parameters[0]}): is its supply strong enough?"
+            )
+    return problems
+
+
 def _read_back(plan: BusPlan, servo: ServoPlan, goal: int) -> Program[str]:
     """Make sure that the servo has what was written."""
     line, place = setup_line(plan), servo.goal.position
