@@ -72,11 +72,21 @@ def test_a_cut_reply_in_a_chain_is_lost_alone(started):
     assert started.states.valid.all()
 
 
-def test_an_mx_with_an_offset_is_refused(make_rig, make_plan):
-    rig = make_rig(make_plan((1, 2), models=("AX-12A", "MX-64")))
-    rig.buses[0].servo(2).poke("multi_turn_offset", 100)
-    with pytest.raises(RuntimeError, match="Multi Turn Offset"):
+@pytest.mark.parametrize(
+    ("model", "register", "value", "said"),
+    [
+        ("MX-64", "multi_turn_offset", 100, r"Multi Turn Offset \(20\) = 100, which shifts every position"),
+        ("MX-64", "torque_ctrl_mode_enable", 1, r"\(70\) = 1, so it follows a torque and no goal position"),
+        ("MX-106", "drive_mode", 1, r"Drive Mode \(10\) = 1, so it turns the other way round"),
+        ("EX-106+", "drive_mode", 1, r"Drive Mode \(10\) = 1, so it turns the other way round"),
+    ],
+)
+def test_a_register_that_changes_what_a_goal_means(make_rig, make_plan, model, register, value, said):  # noqa: PLR0917  one row a case
+    rig = make_rig(make_plan((1, 2), models=("AX-12A", model)))
+    rig.buses[0].servo(2).poke(register, value)
+    with pytest.raises(RuntimeError, match=r"\(ID 2 on bus main\).*" + said):
         rig.hardware.start()
+    assert [packet for packet in rig.into_bus() if packet[4] not in (1, 2)] == []
 
 
 def test_the_budget_counts_one_latency_a_request(make_plan):

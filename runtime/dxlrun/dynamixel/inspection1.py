@@ -19,8 +19,10 @@ _BLOCKS = (
 _NEUTRAL = (
     ("multi_turn_offset", 0, "which shifts every position"),
     ("resolution_divider", 1, "which changes what a tick is"),
+    ("drive_mode", 0, "so it turns the other way round or follows another servo"),
+    ("torque_ctrl_mode_enable", 0, "so it follows a torque and no goal position"),
 )
-"""Registers that only some models (MX) have."""
+"""Registers that only some models (MX, EX) have."""
 
 
 class Inspector1(Inspector):
