@@ -135,6 +135,25 @@ def test_a_silent_servo_gets_no_goal_until_its_torque_was_read(started):
     assert "2 replies" in event[1]
 
 
+def test_a_servo_whose_torque_fits_no_gap_gets_its_goals_back_all_the_same(make_rig, make_plan):
+    rig = make_rig(make_plan((1, 2), latency_ns=19_000_000))
+    rig.hardware.start()
+    rig.buses[0].servo(2).silence()
+    before = len(rig.into_bus())
+    rig.cycle(idle=False)
+    rig.buses[0].servo(2).silence(False)
+    for _ in range(60):
+        rig.cycle()
+    sent = rig.into_bus()[before:]
+    named = [2 in packet[7:-1:5] for packet in sent if packet[4] == 0x83]
+    assert not any(named[:40])
+    assert all(named[-5:])
+    assert sent.count(rig.plans[0].torque_reads[1].packet) == 1
+    ((source, text),) = rig.events.of(EventCode.OVERRUN)
+    assert source == "main_2_joint"
+    assert "waits to be read beside the cycle" in text
+
+
 def test_a_servo_that_was_reset_stays_out_and_gets_no_torque(started):
     servo = started.buses[0].servo(5)
     servo.silence()

@@ -101,7 +101,10 @@ class DynamixelHardware:
         self._raise_failures()
 
     def idle(self, until_ns: int) -> None:
-        """Ask one servo a line what its cyclic reads do not tell, if there is time and need for it."""
+        """Ask one servo a line what its cyclic reads do not tell, if there is time and need for it.
+
+        Who waits for its goals longer than `health.STARVED` cycles is asked without the time, too.
+        """
         latest = until_ns - IDLE_MARGIN_NS
         probing = [
             servos.probe(bus, latest - self._clock.now_ns())
@@ -155,7 +158,7 @@ class DynamixelHardware:
         problems = [problem for one in engaged if one is not None for problem in one.problems]
         if problems:
             raise StartUpError("\n".join(problems))
-        for plan, servos, one in zip(self._plans, self._servos, engaged, strict=True):
+        for plan, one in zip(self._plans, engaged, strict=True):
             assert one is not None  # noqa: S101  no line has failed
             for servo, raw in zip(plan.servos, one.goals, strict=True):
                 self._goals.position[servo.row] = joint_position(servo, raw)
@@ -179,7 +182,7 @@ class DynamixelHardware:
         self._goals.velocity[:] = float("nan")
 
     def _torque_lasts(self) -> None:
-        """Read torque enable of everybody once more: whoever the inrush of the others reset may get no goal."""
+        """Read torque enable of everybody again: who was reset by the inrush of others may get no goal."""
         programs = [startup.confirm(plan) for plan in self._plans]
         found = run(programs, self._buses, self._ports, self._clock, self._beat)
         self._raise_failures()

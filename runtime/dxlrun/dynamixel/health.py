@@ -23,6 +23,10 @@ from dxlrun.interfaces import States
 NOISE_EVENT_NS = 1_000_000_000
 """A noisy line has at most one event in this time."""
 
+STARVED = 50
+"""Cycles after which a servo is asked though the gap is too short: a skipped period is better than a joint
+that gets no goals for the rest of the run."""
+
 
 class _Question(NamedTuple):
     """What one servo is asked in a gap, and who takes the answer."""
@@ -50,6 +54,7 @@ class Servos:
         "_probed",
         "_question",
         "_said_errors",
+        "_starved",
         "_states",
         "goals",
         "reads",
@@ -76,6 +81,7 @@ class Servos:
         self._probe: ProgramJob[Reply] | None = None
         self._question: _Question | None = None
         self._probed = 0
+        self._starved = 0  # cycles in a row without time for a question
         self._noise_seen = 0
         self._noise_at_ns = -NOISE_EVENT_NS
         self._lost = False
@@ -109,15 +115,22 @@ class Servos:
         """Load the one read that a servo is owed beside its cyclic ones; False when there is none.
 
         That is torque enable of a servo that waits for its goals, or the hardware error status of one that
-        raised an alert. `left_ns`: how long it may take. Only a servo that answers is asked; of a limp one
-        the torque is known.
+        raised an alert. `left_ns`: how long it may take, but see STARVED. Only a servo that answers is asked;
+        of a limp one the torque is known.
         """
         question = self._owed()
         if question is None:
+            self._starved = 0
             return False
         timeout = question.read.due_ns + self._plan.latency_ns + SHORT_PATIENCE_NS
         if timeout > left_ns:
-            return False
+            self._starved += 1
+            if self._starved <= STARVED:
+                return False
+            need, left = timeout * 1e-6, max(left_ns, 0) * 1e-6
+            text = f"waits to be read beside the cycle: that takes {need:.1f} ms, the gap has {left:.1f} ms"
+            self._say(EventCode.OVERRUN, Severity.WARNING, question.servo, f"{text}; a period may be skipped")
+        self._starved = 0
         self._question, self._probed = question, question.servo
         self._probe = ProgramJob(_once(replace(question.read, timeout_ns=timeout)))
         bus.load(self._probe)
