@@ -196,6 +196,15 @@ def test_a_register_that_does_not_fit(make_rig, make_x, register, value, said):
     assert said in problem
 
 
+def test_a_ramp_of_another_program_is_told(make_rig, make_x):
+    rig = make_rig(make_x((11, 12)))
+    rig.buses[0].servo(12).poke("profile_acceleration", 5)
+    rig.hardware.start()
+    ((joint, text),) = rig.events.of(EventCode.REGISTER_DIFFERS)
+    assert joint == "arm_12_joint"
+    assert "Profile Acceleration (108) is 5" in text
+
+
 def test_take_over_accepts_torque(make_rig, make_x):
     rig = make_rig(make_x((11, 12)), take_over=True)
     rig.buses[0].servo(12).poke("torque_enable", 1)

@@ -26,6 +26,7 @@ ITEMS = (
     "cw_angle_limit",
     "ccw_angle_limit",
     "startup_configuration",
+    "profile_acceleration",
     "torque_enable",
     "status_return_level",
     "hardware_error_status",
@@ -68,6 +69,7 @@ class Inspector2(Inspector):
         self._limits(servo, found)
         self._start_up(servo, found.get("startup_configuration", 0))
         self._state(servo, found)
+        self._ramp(servo, found.get("profile_acceleration", 0))
         self.torque(servo, found["torque_enable"])
         return True
 
@@ -103,6 +105,15 @@ class Inspector2(Inspector):
             self.found.differences.append(
                 (servo.joint, "Startup Configuration bit 1 is set: RAM comes from the backup at power-up")
             )
+
+    def _ramp(self, servo: ServoPlan, raw: int) -> None:
+        """Tell of a ramp that another program left in RAM: nothing here writes it, and goals come late."""
+        item = self.table(servo).items.get("profile_acceleration")
+        if item is not None and raw not in (0, item.initial):
+            text = (
+                f"{called(item)} is {raw}: it reaches its goals late; write 0 there, or switch it off and on"
+            )
+            self.found.differences.append((servo.joint, text))
 
     def _state(self, servo: ServoPlan, found: Mapping[str, int]) -> None:
         items = self.table(servo).items
