@@ -154,6 +154,29 @@ def test_a_servo_whose_torque_fits_no_gap_gets_its_goals_back_all_the_same(make_
     assert "waits to be read beside the cycle" in text
 
 
+def test_a_servo_that_was_lost_goes_slowly_to_a_goal_that_went_on(started):
+    servo = started.buses[0].servo(5)
+    servo.silence()
+    for _ in range(20):
+        started.goals.position[2] += 0.05  # each step is small, and the servo sees none of them
+        started.cycle()
+    servo.silence(False)
+    before = len(started.into_bus())
+    standing = servo.position
+    for _ in range(20):
+        started.cycle()
+    writes = [packet for packet in started.into_bus()[before:] if packet[4] == 0x83]
+    speeds = [dict(zip(p[7:-1:5], p[10:-1:5], strict=True)) for p in writes]  # all fit the low byte
+    assert {one[5] for one in speeds if 5 in one} == {129}  # 1.5 rad/s, and never 0, which is the maximum
+    assert {one[3] for one in speeds} == {0}
+    assert 0.3 < abs(servo.position - standing) < 1.5 * 20 * 0.02
+    for _ in range(40):
+        started.cycle()
+    last = [packet for packet in started.into_bus() if packet[4] == 0x83][-1]
+    assert dict(zip(last[7:-1:5], last[10:-1:5], strict=True))[5] == 0
+    assert started.states.position[2] == pytest.approx(started.goals.position[2], abs=0.01)
+
+
 def test_a_servo_that_was_reset_stays_out_and_gets_no_torque(started):
     servo = started.buses[0].servo(5)
     servo.silence()

@@ -142,9 +142,14 @@ class GoalArrays:
     def __init__(self, plan: BusPlan) -> None:
         self._blocks = tuple(_GoalBlock(plan, layout) for layout in goal_layouts(plan.servos))
 
-    def packets(self, goals: Commands, included: NDArray[np.bool_]) -> list[bytes]:
-        """Return the packets for the servos that are `included`, shape (servos,), and have a goal."""
-        found = (block.packet(goals, included) for block in self._blocks)
+    def packets(
+        self, goals: Commands, included: NDArray[np.bool_], ceiling: Floats | None = None
+    ) -> list[bytes]:
+        """Return the packets for the servos that are `included`, shape (servos,), and have a goal.
+
+        `ceiling`, shape (servos,): the highest speed toward the goal, rad/s; NaN: no other than the goal's.
+        """
+        found = (block.packet(goals, included, ceiling) for block in self._blocks)
         return [packet for packet in found if packet is not None]
 
 
@@ -193,7 +198,7 @@ class _GoalBlock:
         self._highest = np.array([servo.upper_tick for servo in mine], dtype=np.float64)
         self._most = np.array([servo.max_speed_tick for servo in mine], dtype=np.float64)
 
-    def packet(self, goals: Commands, included: NDArray[np.bool_]) -> bytes | None:
+    def packet(self, goals: Commands, included: NDArray[np.bool_], ceiling: Floats | None) -> bytes | None:
         """Return the packet; None: there is nobody."""
         position = goals.position[self._rows]
         chosen = included[self._members] & ~np.isnan(position)
@@ -203,10 +208,13 @@ class _GoalBlock:
         ticks = np.rint((self._direction * position + self._reference) / self._position)
         records["position"] = np.where(chosen, np.clip(ticks, self._lowest, self._highest), 0)
         if self._layout.speed is not None:
-            records["speed"] = self._speeds(goals.velocity[self._rows])
+            velocity = np.abs(goals.velocity[self._rows])
+            if ceiling is not None:
+                velocity = np.fmin(velocity, ceiling[self._members])
+            records["speed"] = self._speeds(velocity)
         sent = records if chosen.all() else records[chosen]
         return self._sync_write(self._layout.address, self._layout.length, sent.tobytes())
 
     def _speeds(self, velocity: Floats) -> Floats:
-        speed = np.rint(np.abs(velocity) / self._speed)
+        speed = np.rint(velocity / self._speed)
         return np.where(np.isnan(speed), 0, np.clip(speed, 1, self._most))

@@ -93,7 +93,7 @@ class DynamixelHardware:
     def write(self) -> None:
         """Send the goals, one sync write a line and layout. Raises PortError when a line is gone."""
         for bus, servos in zip(self._buses, self._servos, strict=True):
-            for packet in servos.goals.packets(self._goals, servos.torqued):
+            for packet in servos.goal_packets(self._goals, self._states):
                 if bus.failure is None:
                     # what it raises does not name the bus, and the other lines shall have their goals
                     with suppress(PortError):

@@ -18,7 +18,7 @@ from dxlrun.dynamixel.plan import plan_line
 from dxlrun.dynamixel.protocol2 import describe_hardware_error
 from dxlrun.dynamixel.transaction import Program, ProgramJob, Reply, Transaction
 from dxlrun.events import EventCode, EventSink, Severity
-from dxlrun.interfaces import States
+from dxlrun.interfaces import Commands, States
 
 NOISE_EVENT_NS = 1_000_000_000
 """A noisy line has at most one event in this time."""
@@ -26,6 +26,13 @@ NOISE_EVENT_NS = 1_000_000_000
 STARVED = 50
 """Cycles after which a servo is asked though the gap is too short: a skipped period is better than a joint
 that gets no goals for the rest of the run."""
+
+LOST_CYCLES = 3
+"""Who missed so many replies in a row held its old goal meanwhile, and comes back to a goal that went on."""
+RETURN_SPEED = 1.5
+"""rad/s, no faster does a servo go to its goal after that; a step that no gate saw is to be a slow one."""
+RETURNED = 0.05
+"""rad from the goal: the servo has caught up."""
 
 
 class _Question(NamedTuple):
@@ -42,6 +49,7 @@ class Servos:
     __slots__ = (
         "_alerts",
         "_bus",
+        "_ceiling",
         "_dialect",
         "_events",
         "_limp",
@@ -53,6 +61,8 @@ class Servos:
         "_probe",
         "_probed",
         "_question",
+        "_returning",
+        "_rows",
         "_said_errors",
         "_starved",
         "_states",
@@ -73,6 +83,9 @@ class Servos:
         """The job that reads every servo once."""
         self.torqued = np.zeros(count, dtype=np.bool_)
         """Shape (servos,): who has torque for certain and missed no reply since; they get goals."""
+        self._rows = [servo.row for servo in plan.servos]
+        self._returning: list[int] = []  # who catches up with its goal, slowly
+        self._ceiling = np.full(count, np.nan)
         self._limp = [False] * count
         self._missed = self.reads.missed
         self._said_errors = [0] * count
@@ -110,6 +123,17 @@ class Servos:
             self._emit(
                 EventCode.BUS_NOISE, Severity.WARNING, self._plan.name, f"{count} bytes belonged to no packet"
             )
+
+    def goal_packets(self, goals: Commands, states: States) -> list[bytes]:
+        """Return the packets with the goals of everybody who may get one; who was lost comes back slowly."""
+        if not self._returning:
+            return self.goals.packets(goals, self.torqued)
+        for index in self._returning[:]:
+            row = self._rows[index]
+            if self.torqued[index] and abs(goals.position[row] - states.position[row]) < RETURNED:
+                self._returning.remove(index)
+                self._ceiling[index] = np.nan
+        return self.goals.packets(goals, self.torqued, self._ceiling)
 
     def probe(self, bus: Bus, left_ns: int) -> bool:
         """Load the one read that a servo is owed beside its cyclic ones; False when there is none.
@@ -193,6 +217,9 @@ class Servos:
             if not fresh:
                 self._missed[index] += 1
                 self.torqued[index] = False
+                if self._missed[index] == LOST_CYCLES and index not in self._returning:
+                    self._returning.append(index)
+                    self._ceiling[index] = RETURN_SPEED
                 if self._missed[index] == 1:
                     how = "sent a garbled reply" if self.reads.garbled[index] else "did not answer"
                     self._say(EventCode.READ_LOST, Severity.WARNING, index, how)
