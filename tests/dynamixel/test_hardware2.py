@@ -196,6 +196,22 @@ def test_a_register_that_does_not_fit(make_rig, make_x, register, value, said):
     assert said in problem
 
 
+def test_an_overload_behind_a_standing_alert_is_told(started):
+    started.cycle()
+    servo = started.buses[0].servo(14)
+    servo.poke("hardware_error_status", 0x01)
+    for _ in range(5):
+        started.cycle()
+    servo.trigger_overload()
+    for _ in range(120):
+        started.cycle()
+    assert started.torque()[3] is False
+    told = [text for _, text in started.events.of(EventCode.SERVO_ERROR)]
+    assert len(told) == 3  # the alert, the first error, and once the second
+    assert "overload error" in told[2]
+    assert [source for source, _ in started.events.of(EventCode.SERVO_LIMP)] == ["arm_14_joint"]
+
+
 def test_a_ramp_of_another_program_is_told(make_rig, make_x):
     rig = make_rig(make_x((11, 12)))
     rig.buses[0].servo(12).poke("profile_acceleration", 5)

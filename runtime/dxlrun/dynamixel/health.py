@@ -27,6 +27,8 @@ STARVED = 50
 """Cycles after which a servo is asked though the gap is too short: a skipped period is better than a joint
 that gets no goals for the rest of the run."""
 
+ALERT_AGAIN = 50
+"""Cycles after which a standing alert is read again: a second error does not change the alert bit."""
 LOST_CYCLES = 3
 """Who missed so many replies in a row held its old goal meanwhile, and comes back to a goal that went on."""
 RETURN_SPEED = 1.5
@@ -47,11 +49,13 @@ class Servos:
     """The servos of one bus: their cyclic reads, their goals, and who may get a goal."""
 
     __slots__ = (
+        "_alert_cycles",
         "_alerts",
         "_bus",
         "_ceiling",
         "_dialect",
         "_events",
+        "_hardware_errors",
         "_limp",
         "_lost",
         "_missed",
@@ -91,6 +95,8 @@ class Servos:
         self._said_errors = [0] * count
         self._dialect = dialect_of(plan.protocol)
         self._alerts: list[int] = []  # who has a hardware error that was not read yet
+        self._alert_cycles = 0
+        self._hardware_errors = [0] * count
         self._probe: ProgramJob[Reply] | None = None
         self._question: _Question | None = None
         self._probed = 0
@@ -167,7 +173,18 @@ class Servos:
         if question is not None and reply is not None and reply.answered:
             question.take(question.servo, reply)
 
+    def _alert_again(self) -> None:
+        """Note now and then to read the hardware error of everybody whose alert stands."""
+        bit = self._dialect.ALERT
+        standing = [index for index, error in enumerate(self._said_errors) if error & bit]
+        self._alert_cycles = self._alert_cycles + 1 if standing else 0
+        if self._alert_cycles >= ALERT_AGAIN:
+            self._alert_cycles = 0
+            self._alerts += [index for index in standing if index not in self._alerts]
+
     def _owed(self) -> _Question | None:
+        if self._dialect.ALERT:
+            self._alert_again()
         for index in self._alerts:
             address = self._plan.servos[index].hardware_error_address
             if address is not None and self.reads.fresh[index]:
@@ -199,6 +216,9 @@ class Servos:
 
     def _take_hardware_error(self, index: int, reply: Reply) -> None:
         self._alerts.remove(index)
+        if reply.parameters[0] == self._hardware_errors[index]:
+            return  # read again, and nothing is new
+        self._hardware_errors[index] = reply.parameters[0]
         address = self._plan.servos[index].hardware_error_address
         words = describe_hardware_error(reply.parameters[0])
         # shutdown may have cut the torque: no goal until it was read
@@ -234,6 +254,8 @@ class Servos:
                 if error & ~self._said_errors[index] & self._dialect.ALERT and index not in self._alerts:
                     self._alerts.append(index)
                 self._said_errors[index] = error
+                if not error & self._dialect.ALERT:
+                    self._hardware_errors[index] = 0
                 severity = Severity.ERROR if error else Severity.INFO
                 self._say(
                     EventCode.SERVO_ERROR, severity, index, f"reports {self._dialect.describe_error(error)}"
