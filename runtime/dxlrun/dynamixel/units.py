@@ -17,9 +17,9 @@ def joint_position(servo: ServoPlan, raw: int) -> float:
 
 
 def goal_ticks(servo: ServoPlan, position: float) -> int:
-    """Return the goal position in ticks of a joint angle, rad; to the nearest, inside 0..max, never wraps."""
+    """Return the goal position in ticks of a joint angle, rad: the nearest that the joint's limits allow."""
     theta = servo.direction * position + servo.reference
-    return min(max(round(theta / servo.rad_per_tick), 0), servo.max_tick)
+    return min(max(round(theta / servo.rad_per_tick), servo.lower_tick), servo.upper_tick)
 
 
 def speed_ticks(servo: ServoPlan, velocity: float) -> int:

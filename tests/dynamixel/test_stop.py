@@ -1,0 +1,67 @@
+"""Torque off on the ways out on which something else is wrong too."""
+
+import pytest
+
+from dxlrun.errors import PortError, StartUpError
+from dxlrun.events import EventCode
+
+
+@pytest.fixture
+def started(make_rig):
+    rig = make_rig()
+    rig.hardware.start()
+    return rig
+
+
+def test_an_unplugged_adapter_is_a_port_error_and_stop_still_speaks(make_rig, make_plan):
+    rig = make_rig(make_plan((1, 2), name="left"), make_plan((1, 7), name="right", first_row=2))
+    rig.hardware.start()
+    rig.ports.ports[0].unplug()
+    with pytest.raises(PortError, match="bus left on sim"):
+        rig.hardware.read()
+    with pytest.raises(PortError, match="bus left"):
+        rig.hardware.write()
+    assert len(rig.events.of(EventCode.PORT_LOST)) == 1
+    failures = rig.hardware.stop()
+    assert len(failures) == 2
+    assert all("bus left" in failure for failure in failures)
+    assert rig.torque(1) == [False, False]
+
+
+def test_stop_with_a_silent_servo_limps_the_others_and_names_it(started):
+    started.buses[0].servo(4).silence()
+    start = started.clock.now_ns()
+    (failure,) = started.hardware.stop()
+    assert "ID 4 on bus main" in failure
+    assert "does not answer" in failure
+    assert started.torque() == [servo.servo_id == 4 for servo in started.buses[0].servos]
+    assert started.clock.now_ns() - start < 200_000_000
+    assert len(started.events.of(EventCode.SHUTDOWN_FAILED)) == 1
+
+
+def test_stop_in_noise_tries_again(started):
+    for servo in started.plans[0].servos:
+        started.buses[0].corrupt_next(servo.servo_id)
+        started.buses[0].truncate_next(servo.servo_id, 3)
+    assert started.hardware.stop() == ()
+    assert started.torque() == [False] * 8
+
+
+def test_a_start_that_fails_says_whose_torque_was_not_confirmed_off(make_rig, monkeypatch):
+    """A servo that falls silent once it has torque: nobody may claim that it is limp."""
+    rig = make_rig()
+    emit = rig.events.emit
+
+    def unplug(code, *rest):
+        if code is EventCode.TORQUE_ON:
+            rig.buses[0].servo(4).silence()
+        emit(code, *rest)
+
+    monkeypatch.setattr(rig.events, "emit", unplug)
+    with pytest.raises(StartUpError) as caught:
+        rig.hardware.start()
+    assert len(caught.value.sentences) == 2
+    assert (
+        "ID 4 on bus main): torque off was sent, but the servo does not answer" in caught.value.sentences[1]
+    )
+    assert rig.torque() == [servo.servo_id == 4 for servo in rig.buses[0].servos]
