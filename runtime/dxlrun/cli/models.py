@@ -91,6 +91,9 @@ def _as_json(table: ControlTable, *, items: bool) -> dict[str, object]:
         "effort_unit": table.effort_unit,
         "max_speed": table.max_speed,
         "stall_torque": table.stall_torque or None,
+        "stall_current": table.stall_current or None,
+        "nominal_voltage": table.nominal_voltage or None,
+        "gear_ratio": table.gear_ratio or None,
         "capabilities": sorted(table.capabilities),
         "baud_rates": dict(table.baud_rates),
     }

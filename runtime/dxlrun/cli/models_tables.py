@@ -54,7 +54,7 @@ def facts(table: ControlTable) -> Text:
     lines = [
         f"{table.model}{names}: model number {table.model_number}, Protocol {table.protocol:.1f}{firmware}",
         f"travel {_travel(table)}, a tick is {math.degrees(table.rad_per_tick):.6g} deg",
-        f"no-load speed {_speed(table)}, stall torque {_torque(table) or 'not given'}",
+        _motor(table),
         f"effort: {_effort(table)}",
         f"can: {can}",
         f"baud rates: {', '.join(str(rate) for rate in sorted(table.baud_rates.values()))}",
@@ -136,6 +136,20 @@ def _speed(table: ControlTable) -> str:
 
 def _torque(table: ControlTable) -> str:
     return f"{table.stall_torque:.3g} Nm" if table.stall_torque else ""
+
+
+def _motor(table: ControlTable) -> str:
+    known = [f"no-load speed {_speed(table)}", f"stall torque {_torque(table) or 'not given'}"]
+    if table.stall_current:
+        known.append(f"stall current {table.stall_current:.3g} A")
+    if table.nominal_voltage:
+        known.append(f"at {table.nominal_voltage:.3g} V")
+    ratio = f"; gear {table.gear_ratio:.5g} : 1" if table.gear_ratio else ""
+    return (
+        f"{', '.join(known[:-1])} {known[-1]}{ratio}"
+        if table.nominal_voltage
+        else f"{', '.join(known)}{ratio}"
+    )
 
 
 def _effort(table: ControlTable) -> str:

@@ -40,6 +40,7 @@ _SI = {
     "us": ("s", 1e-6),
     "ms": ("s", 1e-3),
     "V": ("V", 1.0),
+    "A": ("A", 1.0),
     "mA": ("A", 1e-3),
     "Nm": ("Nm", 1.0),
     "degC": ("degC", 1.0),
@@ -89,11 +90,28 @@ def build_table(data: Entry) -> ControlTable:
         max_speed_tick=(1 << SIGN_BIT) - 1 if speed.encoding == "sign_magnitude" else speed.maximum,
         effort_per_tick=by_name[effort].scale,
         effort_unit=_effort_unit(by_name[effort]),
-        max_speed=quantity(str(data["no_load_speed"]))[1],
-        stall_torque=quantity(str(data["stall_torque"]))[1],
+        max_speed=_figure(data, "no_load_speed", "rad/s"),
+        stall_torque=_figure(data, "stall_torque", "Nm"),
         fast_sync_read_firmware=firmware if isinstance(firmware, int) else None,
         firmware=whole(data, "firmware") if "firmware" in data else 0,
+        gear_ratio=_ratio(data.get("gear_ratio", 0)),
+        stall_current=_figure({"stall_current": "0 A", **data}, "stall_current", "A"),
+        nominal_voltage=_figure({"nominal_voltage": "0 V", **data}, "nominal_voltage", "V"),
     )
+
+
+def _figure(data: Entry, key: str, unit: str) -> float:
+    """Return a quantity of the motor; raises ValueError when it is negative or of another unit."""
+    found, value = quantity(str(data[key]))
+    if found != unit or not value >= 0:
+        raise ValueError(f"{key}: {data[key]!r} is no quantity in {unit} from 0 on")
+    return value
+
+
+def _ratio(value: object) -> float:
+    if not isinstance(value, int | float) or isinstance(value, bool) or not value >= 0:
+        raise ValueError(f"gear_ratio is a number from 0 on, not {value!r}")
+    return float(value)
 
 
 def section(value: object) -> Entry:

@@ -49,13 +49,19 @@ class ControlTable:
     effort_unit: EffortUnit
     """`1`: fraction of the maximum, as the model measures no torque; `A`: motor current."""
     max_speed: float
-    """No-load speed, rad/s, at the voltage that the data file names."""
+    """No-load speed, rad/s, at `nominal_voltage`."""
     stall_torque: float
-    """Nm, at the voltage that the data file names; 0 where the manual gives none."""
+    """Nm, at `nominal_voltage`; 0 where the manual gives none."""
     fast_sync_read_firmware: int | None = None
     """First firmware version with the fast forms; None where the model has none."""
     firmware: int = 0
     """First firmware version that has this table; 0: every one."""
+    gear_ratio: float = 0.0
+    """Turns of the motor for one of the horn; 0 where the manual gives none."""
+    stall_current: float = 0.0
+    """A drawn at `stall_torque`; 0 where the manual gives none."""
+    nominal_voltage: float = 0.0
+    """V at which `max_speed`, `stall_torque` and `stall_current` hold; 0 where the manual gives none."""
 
     @property
     def zero_tick(self) -> int:
