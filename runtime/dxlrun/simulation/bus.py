@@ -118,6 +118,11 @@ class SimulatedBus:
             self._pending.append(_Chunk(start_ns, self._host_free_ns, bytes(data), "echo"))
             self._pending.sort(key=_due)
 
+    def change_rate(self, baud_rate: int) -> None:
+        """Let the host talk and listen at another rate from now on, bit/s."""
+        self.note(f"the host's rate is {baud_rate} bit/s")
+        self.baud_rate = baud_rate
+
     def next_due_ns(self) -> int | None:
         """Return when the next bytes can be taken or the next planned fault happens; None: nothing will."""
         times = [self._pending[0].due_ns] if self._pending else []

@@ -1,0 +1,124 @@
+"""A running simulation as a stranger meets it: device files to open, and nothing else.
+
+Each test takes a bus of its own, so that one process serves a whole module and no test sees another one's
+servos. What the servos refused is read from the ledger in the end, and must be what the tests expected.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+from dynamixel_sdk import PortHandler, port_handler
+
+from dxlrun.simulation import BusConfig, LedgerEntry, read_ledger
+from dxlrun.simulation.process import encode_config
+
+PATIENCE_S = 20.0
+"""How long a test waits for what must come; it decides nothing but when to give up."""
+
+
+class Simulation:
+    """The process of simulated buses."""
+
+    def __init__(self, buses: Sequence[BusConfig], ledger: Path) -> None:
+        self._path = ledger
+        self._refusals: Counter[str] = Counter()
+        ours, theirs = socket.socketpair()
+        ours.settimeout(PATIENCE_S)
+        reader, writer = os.pipe()
+        os.write(writer, encode_config(buses))
+        os.close(writer)
+        with theirs:
+            command = [sys.executable, "-m", "dxlrun.simulation", "--config-fd", str(reader)]
+            command += ["--control-fd", str(theirs.fileno()), "--ledger", str(ledger)]
+            self._child = subprocess.Popen(
+                command, pass_fds=(reader, theirs.fileno()), start_new_session=True
+            )
+        os.close(reader)
+        self._control = ours
+        with ours.makefile("rb") as said:
+            self.ports: dict[str, str] = json.loads(said.readline())["ports"]
+
+    def expect_refusals(self, bus: str, count: int) -> None:
+        """Say how many instructions the servos of a bus were made to refuse."""
+        self._refusals[bus] += count
+
+    def end(self) -> tuple[LedgerEntry, ...]:
+        """Hang up; return what the ledger holds."""
+        try:
+            self._control.close()
+            assert self._child.wait(PATIENCE_S) == 0
+        finally:
+            self._child.kill()
+            self._child.wait()
+        return read_ledger(self._path)
+
+    def judge(self) -> None:
+        """End it, and find in the ledger what was expected and no accident."""
+        notes = [(entry.bus, entry.note) for entry in self.end() if entry.direction == "note"]
+        refused = Counter(bus for bus, note in notes if " refuses " in note)
+        accidents = [note for _, note in notes if "collision" in note or "lost" in note or "broken" in note]
+        assert refused == +self._refusals
+        assert not accidents
+
+
+@pytest.fixture(scope="module")
+def simulation(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """Serve the BUSES of a test's module."""
+    running = Simulation(request.module.BUSES, tmp_path_factory.mktemp("ledger") / "bus.jsonl")
+    try:
+        yield running
+    except BaseException:
+        running.end()
+        raise
+    running.judge()
+
+
+class PatientPort(PortHandler):
+    """The SDK's port, which waits for bytes instead of spinning; it asks for the time as it always did."""
+
+    def setupPort(self, cflag_baud: int) -> bool:
+        ready = bool(super().setupPort(cflag_baud))
+        self.ser.timeout = 0.002
+        return ready
+
+
+@pytest.fixture
+def patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the SDK wait long for what must come: a busy machine must not decide a test."""
+    monkeypatch.setattr(port_handler, "LATENCY_TIMER", PATIENCE_S * 500)
+
+
+class Ports:
+    """The SDK's ports that a test opened."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        self._simulation = simulation
+        self._open: list[PatientPort] = []
+
+    def __call__(self, bus: str, rate: int = 1_000_000) -> PatientPort:
+        port = PatientPort(self._simulation.ports[bus])
+        assert port.setBaudRate(rate)
+        self._open.append(port)
+        return port
+
+    def close(self) -> None:
+        for port in self._open:
+            port.closePort()
+
+
+@pytest.fixture
+def open_port(simulation: Simulation, patience: None) -> Iterator[Ports]:
+    """Open a bus as the SDK's examples do."""
+    ports = Ports(simulation)
+    yield ports
+    ports.close()
