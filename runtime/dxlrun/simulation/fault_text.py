@@ -1,0 +1,345 @@
+"""A fault as one line of text, `lose servo=3 at=2s`: the kinds there are, and what each takes."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from dxlrun.description.units import duration
+from dxlrun.errors import InputError
+
+KindName = Literal[
+    "lose",
+    "corrupt",
+    "truncate",
+    "delay",
+    "duplicate",
+    "noise",
+    "silence",
+    "babble",
+    "reboot",
+    "brownout",
+    "voltage",
+    "overload",
+    "overheat",
+    "duplicate_id",
+    "unplug",
+    "wedge",
+    "storm",
+]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fault:
+    """One thing that goes wrong on simulated buses; `str()` gives the line that `parse_fault` reads back.
+
+    None: not given. Times are ns; `at_ns` counts from the start of the simulation.
+    """
+
+    kind: KindName
+    bus: str | None = None
+    """None: the only bus there is."""
+    servo: int | None = None
+    """ID; for a packet: the servo whose reply it is."""
+    host: bool = False
+    """True: the packet is an instruction of the host, not a reply."""
+    at_ns: int | None = None
+    """When; None and no `packet`: now."""
+    packet: int | None = None
+    """After so many more instruction packets on the bus."""
+    for_ns: int | None = None
+    """How long; None: for good, or as long as such a thing takes."""
+    count: int = 1
+    """How many packets one after the other."""
+    byte: int | None = None
+    """Index of the byte that is spoilt, negative from the end."""
+    flip: int | None = None
+    """Bits of it that are turned."""
+    keep: int | None = None
+    """Bytes of the packet that get through."""
+    by_ns: int | None = None
+    """How much later the reply starts."""
+    copies: int | None = None
+    """How often the reply comes in all."""
+    data: bytes | None = None
+    size: int | None = None
+    """Bytes of noise, drawn from the script's seed."""
+    every_ns: int | None = None
+    """Pause between two bursts of a babbling servo."""
+    volts: float | None = None
+    celsius: float | None = None
+    seed: int | None = None
+    faults: int | None = None
+    within_ns: int | None = None
+    kinds: tuple[str, ...] | None = None
+
+    def __str__(self) -> str:
+        words: list[str] = [self.kind]
+        for name, key in KEYS.items():
+            value = getattr(self, key.field)
+            if value is not None and value != key.default:
+                words.append(f"{name}={key.show(value)}")
+        return " ".join(words)
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """What a kind of fault does, and the keys that its line takes."""
+
+    does: str
+    needs: tuple[str, ...] = ()
+    takes: tuple[str, ...] = ()
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """Every key that it knows."""
+        return (*self.needs, *self.takes)
+
+
+WHEN = ("bus", "at", "packet")
+_OF_PACKET = ("servo", "from", "count", *WHEN)
+
+KINDS: Mapping[str, Kind] = {
+    "lose": Kind("the next reply of a servo, or instruction of the host, is lost", (), _OF_PACKET),
+    "corrupt": Kind(
+        "a byte of it (default: the last) has bits flipped (default 0x01)", (), ("byte", "flip", *_OF_PACKET)
+    ),
+    "truncate": Kind("only its first bytes get through", ("keep",), _OF_PACKET),
+    "delay": Kind("the next reply of a servo starts later", ("servo", "by"), ("count", *WHEN)),
+    "duplicate": Kind(
+        "the next reply of a servo comes twice, or as often as copies=",
+        ("servo",),
+        ("copies", "count", *WHEN),
+    ),
+    "noise": Kind(
+        "bytes that nobody sent are on the line: those of data= (hex), or size= random ones (default 8)",
+        (),
+        ("data", "size", *WHEN),
+    ),
+    "silence": Kind(
+        "the data line of a servo is cut: it goes on with what it does", ("servo",), ("for", *WHEN)
+    ),
+    "babble": Kind(
+        "a servo sends random bytes (size=, default 8) every 2 ms (every=) for 200 ms (for=), unasked",
+        ("servo",),
+        ("for", "every", "size", *WHEN),
+    ),
+    "reboot": Kind(
+        "a servo starts again by itself: RAM is lost, and it hears nothing for 100 ms (for=)",
+        ("servo",),
+        ("for", *WHEN),
+    ),
+    "brownout": Kind(
+        "a servo, or every one on the bus, has no power for 200 ms (for=), then starts again",
+        (),
+        ("servo", "for", *WHEN),
+    ),
+    "voltage": Kind(
+        "the supply of a servo, or of every one on the bus, is another one",
+        ("volts",),
+        ("servo", "for", *WHEN),
+    ),
+    "overload": Kind("the shaft of a servo is loaded beyond its torque", ("servo",), WHEN),
+    "overheat": Kind("a servo is hot (default 90 degrees C)", ("servo",), ("celsius", "for", *WHEN)),
+    "duplicate_id": Kind("a second servo of the same model has this ID", ("servo",), WHEN),
+    "unplug": Kind(
+        "the adapter is pulled, and comes back after for=, under another name", (), ("for", *WHEN)
+    ),
+    "wedge": Kind("the adapter takes bytes and gives none", (), ("for", *WHEN)),
+    "storm": Kind(
+        "so many faults at random times within a time, of those in kinds= (default: those that pass)",
+        ("faults", "within"),
+        ("seed", "kinds", "bus", "at"),
+    ),
+}
+
+
+def parse_fault(text: str) -> Fault:
+    """Return the fault of one line such as `silence servo=3 at=1s for=500ms`.
+
+    Raises InputError with one sentence that says what is wrong and how to write it.
+    """
+    words = text.split()
+    if not words:
+        raise InputError("a fault is missing; write one such as: lose servo=3 at=2s")
+    name = words[0]
+    kind = KINDS.get(name)
+    if kind is None:
+        raise InputError(f"there is no fault {name!r}; {_meant(name, tuple(KINDS), 'the faults are')}")
+    given: dict[str, object] = {}
+    for word in words[1:]:
+        key, equals, value = word.partition("=")
+        if not equals:
+            raise InputError(f"{name}: {word!r} is no key=value; write it as in: {usage(name)}")
+        if key not in kind.keys:
+            raise InputError(f"{name} takes no {key!r}; {_meant(key, kind.keys, 'it takes')}")
+        if KEYS[key].field in given:
+            raise InputError(f"{name}: {key}= is there twice; leave one of them out")
+        try:
+            given[KEYS[key].field] = KEYS[key].parse(value)
+        except ValueError as error:
+            raise InputError(f"{name}: {key}={value}: {error}") from error
+    _check(name, kind, given)
+    return Fault(kind=name, **given)  # type: ignore[arg-type]  # each key's parser gives its field's type
+
+
+def usage(name: str) -> str:
+    """Return how a kind is written: `lose [servo=ID] [from=host] ...`; raises KeyError for no kind."""
+    kind = KINDS[name]
+    needs = [f"{key}={KEYS[key].example}" for key in kind.needs]
+    takes = [f"[{key}={KEYS[key].example}]" for key in kind.takes]
+    return " ".join((name, *needs, *takes))
+
+
+def fault_help() -> tuple[str, ...]:
+    """Return what a person can write: for each kind its line, and what it does."""
+    return tuple(f"{usage(name)}: {kind.does}" for name, kind in KINDS.items())
+
+
+def _check(name: str, kind: Kind, given: Mapping[str, object]) -> None:
+    missing = [key for key in kind.needs if KEYS[key].field not in given]
+    if missing:
+        raise InputError(
+            f"{name} needs {' and '.join(f'{key}=' for key in missing)}; write it as in: {usage(name)}"
+        )
+    if "at_ns" in given and "packet" in given:
+        raise InputError(f"{name} has both at= and packet=; leave one of them out")
+    if "from" in kind.keys and ("servo" in given) == ("host" in given):
+        raise InputError(f"{name} needs either servo=ID, for its reply, or from=host, for an instruction")
+    if "data" in given and "size" in given:
+        raise InputError(f"{name} has both data= and size=; leave one of them out")
+
+
+def _meant(name: str, known: tuple[str, ...], otherwise: str) -> str:
+    near = difflib.get_close_matches(name, known, 1)
+    return f"did you mean {near[0]}?" if near else f"{otherwise} {', '.join(known)}"
+
+
+# How values are read and written
+
+
+@dataclass(frozen=True, slots=True)
+class Key:
+    """How one key of a fault's line is read and written."""
+
+    field: str
+    example: str
+    parse: Callable[[str], object]
+    show: Callable[[object], str] = str
+    default: object = None
+
+
+def _integer(lowest: int, highest: int) -> Callable[[str], int]:
+    def parse(text: str) -> int:
+        try:
+            value = int(text, 0)
+        except ValueError:
+            raise ValueError(f"write a whole number from {lowest} to {highest}") from None
+        if not lowest <= value <= highest:
+            raise ValueError(f"write a whole number from {lowest} to {highest}")
+        return value
+
+    return parse
+
+
+def _number(lowest: float, highest: float) -> Callable[[str], float]:
+    def parse(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not lowest <= value <= highest:
+            raise ValueError(f"write a number from {lowest:g} to {highest:g}, without its unit")
+        return value
+
+    return parse
+
+
+def _time(text: str) -> int:
+    try:
+        return duration(text)
+    except ValueError:
+        raise ValueError("write a time such as 2s, 500ms or 100us") from None
+
+
+def _some_time(text: str) -> int:
+    value = _time(text)
+    if value == 0:
+        raise ValueError("write a time longer than 0, such as 500ms")
+    return value
+
+
+def _show_time(value: object) -> str:
+    total = int(str(value))
+    for unit, ns in (("s", 10**9), ("ms", 10**6), ("us", 10**3)):
+        if total % ns == 0:
+            return f"{total // ns}{unit}"
+    return f"{total}ns"
+
+
+def _show_number(value: object) -> str:
+    short = f"{value:g}"
+    return short if float(short) == value else repr(value)
+
+
+def _hex(text: str) -> bytes:
+    try:
+        data = bytes.fromhex(text)
+    except ValueError:
+        data = b""
+    if not 1 <= len(data) <= _MOST_BYTES:
+        raise ValueError(f"write 1 to {_MOST_BYTES} bytes in hex, such as ff00fd")
+    return data
+
+
+def _host(text: str) -> bool:
+    if text != "host":
+        raise ValueError("write from=host for an instruction, servo=ID for a reply")
+    return True
+
+
+def _name(text: str) -> str:
+    if not text:
+        raise ValueError("write the name of a bus")
+    return text
+
+
+def _kinds(text: str) -> tuple[str, ...]:
+    names = tuple(text.split(","))
+    unknown = [name for name in names if name not in KINDS or name == "storm"]
+    if unknown:
+        near = _meant(unknown[0], tuple(name for name in KINDS if name != "storm"), "write some of")
+        raise ValueError(f"a storm has no {unknown[0]!r}; {near}")
+    return names
+
+
+_MOST_BYTES = 256
+
+KEYS: Mapping[str, Key] = {
+    "bus": Key("bus", "NAME", _name),
+    "servo": Key("servo", "ID", _integer(0, 253)),
+    "from": Key("host", "host", _host, lambda value: "host", default=False),
+    "byte": Key("byte", "INDEX", _integer(-_MOST_BYTES, _MOST_BYTES)),
+    "flip": Key("flip", "BITS", _integer(1, 255), lambda value: f"{value:#04x}"),
+    "keep": Key("keep", "BYTES", _integer(1, _MOST_BYTES)),
+    "by": Key("by_ns", "TIME", _some_time, _show_time),
+    "copies": Key("copies", "NUMBER", _integer(2, 16)),
+    "data": Key("data", "HEX", _hex, lambda value: value.hex() if isinstance(value, bytes) else ""),
+    "size": Key("size", "BYTES", _integer(1, _MOST_BYTES)),
+    "every": Key("every_ns", "TIME", _some_time, _show_time),
+    "volts": Key("volts", "V", _number(0.0, 60.0), _show_number),
+    "celsius": Key("celsius", "DEGREES", _number(-50.0, 200.0), _show_number),
+    "seed": Key("seed", "NUMBER", _integer(0, 2**63 - 1)),
+    "faults": Key("faults", "NUMBER", _integer(1, 100_000)),
+    "within": Key("within_ns", "TIME", _some_time, _show_time),
+    "kinds": Key(
+        "kinds", "KIND,...", _kinds, lambda value: ",".join(value) if isinstance(value, tuple) else ""
+    ),
+    "count": Key("count", "NUMBER", _integer(1, 100_000), default=1),
+    "at": Key("at_ns", "TIME", _time, _show_time),
+    "packet": Key("packet", "NUMBER", _integer(1, 10**9)),
+    "for": Key("for_ns", "TIME", _some_time, _show_time),
+}

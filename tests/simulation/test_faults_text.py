@@ -1,0 +1,95 @@
+"""A fault's line of text: read, refused with a sentence that mends it, and written back."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import pytest
+
+from dxlrun.errors import InputError
+from dxlrun.simulation.fault_text import KEYS, KINDS, Fault, fault_help, parse_fault
+
+LINES = (
+    "lose servo=3 at=2s",
+    "lose from=host packet=7",
+    "corrupt servo=3 byte=5 packet=100",
+    "corrupt bus=main servo=3 byte=-1 flip=0x80 count=3 at=2500us",
+    "truncate servo=3 keep=4",
+    "delay servo=3 by=5ms",
+    "duplicate servo=3 copies=3",
+    "noise data=ff00fd at=1s",
+    "noise size=20",
+    "silence servo=3 at=1s for=500ms",
+    "babble servo=3 size=4 every=1ms for=2s",
+    "reboot servo=0 for=1ns",
+    "brownout for=200ms",
+    "voltage servo=1 volts=7.4",
+    "overload servo=3",
+    "overheat servo=3 celsius=81.123456789",
+    "duplicate_id servo=253",
+    "unplug bus=main at=5s for=2s",
+    "wedge at=0s",
+    "storm seed=7 faults=10 within=30s kinds=lose,corrupt",
+)
+
+
+@pytest.mark.parametrize("line", LINES)
+def test_a_line_is_written_back_as_it_was_read(line: str) -> None:
+    assert str(parse_fault(line)) == line
+
+
+def test_every_kind_has_a_line_here() -> None:
+    assert {line.split()[0] for line in LINES} == set(KINDS)
+
+
+def test_every_field_of_a_fault_can_be_written() -> None:
+    assert {key.field for key in KEYS.values()} == {field.name for field in fields(Fault)} - {"kind"}
+
+
+def test_a_line_can_be_written_in_other_ways_and_has_one_canonical_text() -> None:
+    other = parse_fault("  corrupt   at=0.5s flip=1 byte=0x10 servo=3 ")
+    assert str(other) == "corrupt servo=3 byte=16 flip=0x01 at=500ms"
+    assert other == parse_fault(str(other))
+    assert str(parse_fault("lose servo=3 count=1")) == "lose servo=3"
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("", "a fault is missing; write one such as: lose servo=3 at=2s"),
+        ("loose servo=3", "there is no fault 'loose'; did you mean lose?"),
+        ("explode", "there is no fault 'explode'; the faults are lose, corrupt, truncate"),
+        ("lose 3", "lose: '3' is no key=value; write it as in: lose [servo=ID] [from=host]"),
+        ("lose servos=3", "lose takes no 'servos'; did you mean servo?"),
+        ("lose servo=3 servo=4", "lose: servo= is there twice; leave one of them out"),
+        ("lose", "lose needs either servo=ID, for its reply, or from=host, for an instruction"),
+        ("lose servo=3 from=host", "lose needs either servo=ID, for its reply, or from=host"),
+        ("lose from=me", "lose: from=me: write from=host for an instruction, servo=ID for a reply"),
+        ("lose servo=254", "lose: servo=254: write a whole number from 0 to 253"),
+        ("lose servo=x", "lose: servo=x: write a whole number from 0 to 253"),
+        ("lose servo=3 at=2", "lose: at=2: write a time such as 2s, 500ms or 100us"),
+        ("lose servo=3 at=-2s", "lose: at=-2s: write a time such as 2s, 500ms or 100us"),
+        ("lose servo=3 at=2s packet=3", "lose has both at= and packet=; leave one of them out"),
+        ("delay servo=3", "delay needs by=; write it as in: delay servo=ID by=TIME"),
+        ("delay", "delay needs servo= and by="),
+        ("silence servo=3 for=0s", "silence: for=0s: write a time longer than 0, such as 500ms"),
+        ("voltage volts=nan", "voltage: volts=nan: write a number from 0 to 60, without its unit"),
+        ("voltage volts=12V", "voltage: volts=12V: write a number from 0 to 60, without its unit"),
+        ("noise data=xy", "noise: data=xy: write 1 to 256 bytes in hex, such as ff00fd"),
+        ("noise data=ff size=3", "noise has both data= and size=; leave one of them out"),
+        ("unplug bus=", "unplug: bus=: write the name of a bus"),
+        ("storm faults=3 within=1s kinds=storm", "storm: kinds=storm: a storm has no 'storm'"),
+        ("storm faults=3 within=1s kinds=los", "a storm has no 'los'; did you mean lose?"),
+    ],
+)
+def test_a_wrong_line_is_refused_with_one_sentence_that_mends_it(line: str, said: str) -> None:
+    with pytest.raises(InputError) as refused:
+        parse_fault(line)
+    assert said in str(refused.value)
+    assert len(refused.value.sentences) == 1
+
+
+def test_the_help_has_a_line_for_every_kind() -> None:
+    assert [line.split()[0].rstrip(":") for line in fault_help()] == list(KINDS)
+    delay = "delay servo=ID by=TIME [count=NUMBER] [bus=NAME] [at=TIME] [packet=NUMBER]: the next reply"
+    assert fault_help()[3].startswith(delay)
