@@ -144,6 +144,11 @@ class SimulatedBus:
 
     # What tests see and do
 
+    @property
+    def now_ns(self) -> int:
+        """The time that the bus has reached."""
+        return self._now_ns
+
     def servo(self, servo_id: int) -> SimulatedServo:
         """Return the first servo that has this ID now; raises LookupError when none has."""
         for servo in self.servos:

@@ -144,6 +144,16 @@ class SimulatedServo:
         """True when the motor holds or moves the shaft: torque enabled and its limit not 0."""
         return self._body.shaft.torque_on
 
+    @property
+    def voltage(self) -> float:
+        """Its supply, V."""
+        return self._body.voltage
+
+    @property
+    def temperature(self) -> float:
+        """degrees C."""
+        return self._body.temperature
+
     def silence(self, on: bool = True) -> None:
         """Cut or mend its data line: it hears and answers nothing, and goes on with what it does."""
         self._silent = on
@@ -153,6 +163,11 @@ class SimulatedServo:
         """Cut and give back its power: RAM is lost, the shaft stays where it is."""
         self._note(f"servo {self.servo_id}: power cycle")
         self._body.power_up()
+
+    def cut_power(self, until_ns: int) -> None:
+        """Cut its power until a time: RAM is lost, and it neither moves nor hears anything before."""
+        self.reset()
+        self._body.deaf_until_ns = max(self._body.deaf_until_ns, until_ns)
 
     def poke(self, name: str, wire: int) -> None:
         """Set a control item as if it had been so before; the integer of the wire, no refusal."""
