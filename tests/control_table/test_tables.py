@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+import re
 from fractions import Fraction
 
 import pytest
@@ -203,3 +204,48 @@ def test_every_item_of_every_model_decodes_what_it_encodes(table: ControlTable, 
     low, high = (-1023, 1023) if item.encoding == "sign_magnitude" else (item.minimum, item.maximum)
     ticks = data.draw(st.integers(low, high))
     assert item.decode(item.encode(ticks)) == ticks
+
+
+@every_table
+def test_the_figures_of_a_motor_fit_one_another(table: ControlTable) -> None:
+    # of an ideal motor and gear, Nm/A and V s/rad are equal; real ones lose up to two thirds, and the manual's figures,
+    # each measured by itself, give three models up to a fifth too much (RX-24F, XC430-W150, XL330-M077);
+    # the speed of the AX-12W is what its firmware holds it to in joint mode
+    if table.stall_current and table.model != "AX-12W":
+        efficiency = table.stall_torque / table.stall_current * table.max_speed / table.nominal_voltage
+        assert 0.3 < efficiency < 1.2
+
+
+@every_table
+def test_the_gear_is_the_one_in_the_name(table: ControlTable) -> None:
+    # XM430-W350, PH54-200-S500, YM070-210-R051: the last number is the gear, rounded
+    named = re.fullmatch(r".*-[WTVMSR]0?(\d{2,3})(-R\(A\))?(-FW\d+)?", table.model)
+    if named and table.gear_ratio:
+        assert table.gear_ratio == pytest.approx(int(named[1]), rel=0.065)
+    if table.model.endswith(("M001", "B001")):
+        assert table.gear_ratio == 1
+
+
+@pytest.mark.parametrize(
+    ("model", "protocol", "gear", "amperes", "volts"),
+    [
+        ("AX-12A", 1.0, 254, 1.5, 12),
+        ("RX-64", 1.0, 200, 2.6, 18.5),
+        ("DX-113", 1.0, 192.6, 0, 12),
+        ("MX-106", 1.0, 225, 5.2, 12),
+        ("MX-106", 2.0, 225, 5.2, 12),
+        ("XL-320", 2.0, 238, 1.1, 7.4),
+        ("XL330-M288", 2.0, 288.4, 1.47, 5),
+        ("XL330-M288-FW51", 2.0, 288.4, 1.47, 5),
+        ("XM430-W350", 2.0, 353.5, 2.3, 12),
+        ("XH540-V270", 2.0, 272.5, 2.4, 24),
+        ("PH54-200-S500", 2.0, 501.923, 0, 24),
+        ("YM080-230-A099", 2.0, 99, 22.4, 24),
+        ("XW430-T333", 2.0, 0, 0, 0),
+    ],
+)
+def test_the_motor_is_that_of_the_specifications(
+    model: str, protocol: float, gear: float, amperes: float, volts: float
+) -> None:
+    table = control_table(model, protocol)
+    assert (table.gear_ratio, table.stall_current, table.nominal_voltage) == (gear, amperes, volts)
