@@ -208,9 +208,9 @@ def test_every_item_of_every_model_decodes_what_it_encodes(table: ControlTable, 
 
 @every_table
 def test_the_figures_of_a_motor_fit_one_another(table: ControlTable) -> None:
-    # of an ideal motor and gear, Nm/A and V s/rad are equal; real ones lose up to two thirds, and the manual's figures,
-    # each measured by itself, give three models up to a fifth too much (RX-24F, XC430-W150, XL330-M077);
-    # the speed of the AX-12W is what its firmware holds it to in joint mode
+    # of an ideal motor and gear, Nm/A and V s/rad are equal; real ones lose up to two thirds, and the
+    # manual's figures give three models up to a fifth too much (RX-24F, XC430-W150, XL330-M077); the speed
+    # of the AX-12W is what its firmware holds it to in joint mode
     if table.stall_current and table.model != "AX-12W":
         efficiency = table.stall_torque / table.stall_current * table.max_speed / table.nominal_voltage
         assert 0.3 < efficiency < 1.2
