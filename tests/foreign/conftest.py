@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from dynamixel_sdk import PortHandler, port_handler
+from dynamixel_sdk import PortHandler
 
 from dxlrun.simulation import BusConfig, LedgerEntry, read_ledger
 from dxlrun.simulation.process import encode_config
@@ -84,18 +84,34 @@ def simulation(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPath
 
 
 class PatientPort(PortHandler):
-    """The SDK's port, which waits for bytes instead of spinning; it asks for the time as it always did."""
+    """The SDK's port, which sleeps until bytes come and waits as long as a busy machine needs."""
+
+    def __init__(self, port_name: str) -> None:
+        super().__init__(port_name)
+        self.patience_ms = PATIENCE_S * 1000
+        """How long it waits for an answer; a test of silence makes it short."""
+        self.wanted: int | None = None
+        """So many bytes end a wait for all that may answer, which lasts 0.8 s otherwise."""
 
     def setupPort(self, cflag_baud: int) -> bool:
         ready = bool(super().setupPort(cflag_baud))
         self.ser.timeout = 0.002
         return ready
 
+    def setPacketTimeout(self, packet_length: int) -> None:
+        self.setPacketTimeoutMillis(self.patience_ms)
 
-@pytest.fixture
-def patience(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the SDK wait long for what must come: a busy machine must not decide a test."""
-    monkeypatch.setattr(port_handler, "LATENCY_TIMER", PATIENCE_S * 500)
+    def setPacketTimeoutMillis(self, msec: float) -> None:
+        super().setPacketTimeoutMillis(max(msec, self.patience_ms))
+
+    def readPort(self, length: int) -> bytes:
+        data = bytes(super().readPort(length))
+        if self.wanted is not None:
+            self.wanted -= len(data)
+        return data
+
+    def isPacketTimeout(self) -> bool:
+        return (self.wanted is not None and self.wanted <= 0) or bool(super().isPacketTimeout())
 
 
 class Ports:
@@ -112,12 +128,13 @@ class Ports:
         return port
 
     def close(self) -> None:
+        """Close them all."""
         for port in self._open:
             port.closePort()
 
 
 @pytest.fixture
-def open_port(simulation: Simulation, patience: None) -> Iterator[Ports]:
+def open_port(simulation: Simulation) -> Iterator[Ports]:
     """Open a bus as the SDK's examples do."""
     ports = Ports(simulation)
     yield ports
