@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dxlrun.simulation.bus import BusConfig, SimulatedBus
 from dxlrun.simulation.ledger import Ledger, LedgerEntry, read_ledger
+from dxlrun.simulation.mechanics import Load, Mechanics
 from dxlrun.simulation.servo import ServoConfig, SimulatedServo
 from dxlrun.simulation.virtual import VirtualPort, VirtualPorts
 
@@ -11,6 +12,8 @@ __all__ = [
     "BusConfig",
     "Ledger",
     "LedgerEntry",
+    "Load",
+    "Mechanics",
     "ServoConfig",
     "SimulatedBus",
     "SimulatedServo",

@@ -23,6 +23,7 @@ from dataclasses import dataclass, replace
 
 from dxlrun.simulation import protocol1, protocol2
 from dxlrun.simulation.ledger import Ledger
+from dxlrun.simulation.mechanics import Mechanics
 from dxlrun.simulation.packets import BROADCAST, Codec, InstructionPacket, ReadEntry, ReadInTurn, Reply
 from dxlrun.simulation.servo import ServoConfig, SimulatedServo
 
@@ -71,7 +72,9 @@ class _Fault:
 class SimulatedBus:
     """One line; time comes from the caller and never goes back."""
 
-    def __init__(self, config: BusConfig, ledger: Ledger, start_ns: int) -> None:
+    def __init__(
+        self, config: BusConfig, ledger: Ledger, start_ns: int, mechanics: Mechanics | None = None
+    ) -> None:
         self.name = config.name
         self.baud_rate = config.baud_rate
         """The host's rate, bit/s."""
@@ -81,6 +84,8 @@ class SimulatedBus:
         """Protocol 2.0, a listed servo is absent: True: those after it answer later; False: never [?]."""
         self.ledger = ledger
         self._now_ns = start_ns
+        self.mechanics = mechanics or Mechanics(start_ns)
+        """What the servos move; several buses of one robot share it."""
         self._host_free_ns = start_ns
         self._codec: Codec = protocol2 if config.protocol == 2.0 else protocol1
         self._receiver = self._codec.receiver()
@@ -89,7 +94,9 @@ class SimulatedBus:
         self._agenda: list[tuple[int, int, Callable[[], None]]] = []
         self._order = itertools.count()
         self.servos = tuple(
-            SimulatedServo(servo, config.baud_rate, start_ns, self.note, config.protocol)
+            SimulatedServo(
+                servo, config.baud_rate, start_ns, self.note, config.protocol, mechanics=self.mechanics
+            )
             for servo in config.servos
         )
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from dxlrun.control_table import control_table
 from dxlrun.simulation.bodies import make_body
+from dxlrun.simulation.mechanics import NO_LOAD, Load, Mechanics
 from dxlrun.simulation.memory import Memory
 from dxlrun.simulation.packets import BROADCAST, InstructionPacket, ReadEntry, ReadInTurn, Reply
 
@@ -24,6 +25,8 @@ class ServoConfig:
     """rad, from the servo's raw 0"""
     return_delay_ns: int = 500_000
     """Initial value of Return Delay Time, rounded to its unit of 2 us."""
+    load: Load = NO_LOAD
+    """What its shaft moves."""
 
 
 class SimulatedServo:
@@ -39,6 +42,8 @@ class SimulatedServo:
         start_ns: int,
         note: Callable[[str], None] | None = None,
         protocol: float = 1.0,
+        *,
+        mechanics: Mechanics | None = None,
     ) -> None:
         self._note = note or (lambda text: None)
         table = control_table(config.model, protocol)

@@ -1,0 +1,118 @@
+"""What simulated servos move: joints with inertia, friction and gravity, all of them in one step.
+
+The servos say with which torque they drive at standstill and how much of it each rad/s takes away; a plant
+turns that into motion. `IndependentJoints` is the plant of joints that do not feel one another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Load:
+    """What hangs on the shaft of a servo; nothing by default."""
+
+    inertia: float = 0.0
+    """kg m^2, beside that of the servo's own rotor and gear"""
+    friction: float = 0.0
+    """Nm, Coulomb: the same at every speed, and the most that holds the joint at rest"""
+    gravity: float = 0.0
+    """Nm with which gravity turns the link where it is horizontal"""
+    gravity_angle: float = 0.0
+    """rad from the servo's raw 0, where the link hangs straight down"""
+
+
+NO_LOAD = Load()
+
+
+@dataclass(frozen=True, slots=True)
+class Joint:
+    """One servo's shaft as a plant takes it over."""
+
+    rotor_inertia: float
+    """kg m^2 of rotor and gear, as felt at the shaft"""
+    load: Load
+    angle: float
+    """rad from the servo's raw 0, at the start"""
+
+
+class Plant(Protocol):
+    """All joints of a simulation, in the order in which the servos were added."""
+
+    @property
+    def angle(self) -> Floats:
+        """Angles, rad; the same array for ever."""
+
+    @property
+    def velocity(self) -> Floats:
+        """Speeds, rad/s, counter-clockwise positive; the same array for ever."""
+
+    def step(self, drive: Floats, damping: Floats, dt_s: float) -> None:
+        """Let a time pass in which each servo drives with `drive - damping * velocity`; Nm and Nm s/rad."""
+
+    def place(self, index: int, angle: float) -> None:
+        """Put a joint somewhere, rad, at rest."""
+
+
+PlantMaker = Callable[[Sequence[Joint]], Plant]
+"""Makes the plant of some joints; called again when a servo is added later, with the joints as they are."""
+
+
+class IndependentJoints:
+    """Joints that do not feel one another.
+
+    Velocity first, damping taken at the end of the step: stable at any damping and any step.
+    """
+
+    def __init__(self, joints: Sequence[Joint]) -> None:
+        self.angle: Floats = np.array([joint.angle for joint in joints], dtype=np.float64)
+        self.velocity: Floats = np.zeros(len(joints))
+        self._inverse_inertia = np.array([1.0 / (each.rotor_inertia + each.load.inertia) for each in joints])
+        self._friction = np.array([each.load.friction for each in joints])
+        self._gravity = np.array([each.load.gravity for each in joints])
+        self._down = np.array([each.load.gravity_angle for each in joints])
+        self._has_friction = bool(self._friction.any())
+        self._has_gravity = bool(self._gravity.any())
+        self._torque = np.zeros(len(joints))
+        self._work = np.zeros(len(joints))
+
+    def step(self, drive: Floats, damping: Floats, dt_s: float) -> None:
+        """Let a time pass in which each servo drives with `drive - damping * velocity`; Nm and Nm s/rad."""
+        torque, work, velocity = self._torque, self._work, self.velocity
+        if self._has_gravity:
+            np.subtract(self.angle, self._down, out=work)
+            np.sin(work, out=work)
+            np.multiply(work, self._gravity, out=work)
+            np.subtract(drive, work, out=torque)
+        else:
+            np.copyto(torque, drive)
+        np.multiply(self._inverse_inertia, dt_s, out=work)
+        np.multiply(torque, work, out=torque)
+        np.add(velocity, torque, out=velocity)  # as it would be without friction and damping
+        if self._has_friction:
+            self._rub(work)
+        np.multiply(work, damping, out=work)
+        np.add(work, 1.0, out=work)
+        np.divide(velocity, work, out=velocity)
+        np.multiply(velocity, dt_s, out=work)
+        np.add(self.angle, work, out=self.angle)
+
+    def place(self, index: int, angle: float) -> None:
+        """Put a joint somewhere, rad, at rest."""
+        self.angle[index] = angle
+        self.velocity[index] = 0.0
+
+    def _rub(self, per_torque: Floats) -> None:
+        """Take away what friction takes in a step, and no more: a joint that it stops stays at rest."""
+        most = self._torque
+        np.multiply(self._friction, per_torque, out=most)
+        taken = np.clip(self.velocity, -most, most)
+        np.subtract(self.velocity, taken, out=self.velocity)
