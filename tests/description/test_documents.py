@@ -12,9 +12,11 @@ from dxlrun.description.motion import Formula, FormulaPart, Motion, Point, Point
 from dxlrun.description.robot import (
     Adapter,
     Bus,
+    BusSimulation,
     ControllerEntry,
     Form,
     Joint,
+    JointSimulation,
     Limits,
     Loop,
     Policies,
@@ -22,6 +24,7 @@ from dxlrun.description.robot import (
     Robot,
     RobotModel,
     Scheduler,
+    Simulation,
 )
 
 PAGE = (Path(__file__).parents[2] / "docs" / "robot-file.md").read_text()
@@ -50,7 +53,7 @@ def test_the_examples_of_the_page_are_read(desk: Any) -> None:
 @pytest.mark.parametrize(
     ("prefix", "part"),
     [("", Robot), ("", Bus), ("adapter.", Adapter), ("", Joint), ("limits.", Limits), ("", Loop), ("", Policies),
-     ("scheduler.", Scheduler), ("", ControllerEntry), ("", Recording), ("", RobotModel), ("", Motion), ("", PointsPart),
+     ("scheduler.", Scheduler), ("simulation.", BusSimulation), ("simulation.", JointSimulation), ("simulation.", Simulation), ("", ControllerEntry), ("", Recording), ("", RobotModel), ("", Motion), ("", PointsPart),
      ("", FormulaPart), ("points[].", Point)],
 )  # fmt: skip
 def test_every_key_is_on_the_page(prefix: str, part: type[Form]) -> None:

@@ -46,6 +46,11 @@ DAMAGES = [
     ("baud_rate: 1_000_000", "baud_rate: §0", "buses.main.baud_rate is 0, but must be greater than 0; write"),
     ("adapter: {latency: 1 ms}", "adapter: §1 ms", "buses.main.adapter is the text '1 ms', but must be a mapping"),
     ("latency: 1 ms", "latency: §1", "buses.main.adapter.latency: 1 has no unit; write a duration"),
+    ("direction: 1}", "direction: 1, simulation: {inertia: §0 kg m^2}}", "joints.elbow.simulation.inertia is the text '0 kg m^2', but must be greater than 0; write for example `inertia: 0.01"),
+    ("direction: 1}", "direction: 1, simulation: {friction: §-1 Nm}}", "joints.elbow.simulation.friction is the text '-1 Nm', but must be at least 0; write for example `friction: 0.05 Nm`"),
+    ("direction: 1}", "direction: 1, simulation: {gravity: §0.3}}", "joints.elbow.simulation.gravity: 0.3 has no unit; write a torque"),
+    ("adapter: {latency: 1 ms}", "simulation: {latency_timer: §256 ms}", "buses.main.simulation.latency_timer: no adapter gathers bytes for so long; write 255 ms at most"),
+    ("adapter: {latency: 1 ms}", "simulation: {absent: §dead}", "buses.main.simulation.absent is the text 'dead', but must be silent or slot; write"),
     ("lock_memory: true", "lock_memory: §yes", "loop.scheduler.lock_memory is the text 'yes', but must be true or"),
     ("round_robin", "§rr", "loop.scheduler.policy is the text 'rr', but must be other, fifo or round_robin; write"),
     ("priority: 31", "priority: §100", "loop.scheduler.priority is 100, but must be at most 99; write"),
@@ -104,6 +109,23 @@ def test_a_robot_file_becomes_si_units(desk: Any, robot_text: str) -> None:
     assert (arm.type, arm.active, arm.rate) == ("joint_group_position_controller", False, None)
     assert arm.parameters == {"joints": ["swing", "elbow"]}
     assert robot.controllers["broadcaster"].rate == 25.0
+
+
+def test_what_simulated_servos_are_like_becomes_si_units(desk: Any, robot_text: str) -> None:
+    text = robot_text.replace(
+        "direction: 1}",
+        "direction: 1, simulation: {inertia: 5 kg cm^2, gravity: 300 mNm, gravity_angle: -90 deg}}",
+        1,
+    ).replace(
+        "adapter: {latency: 1 ms}", "simulation: {latency_timer: 4 ms, split: byte, echo: true, absent: slot}"
+    )
+    robot = desk.robot(text + "simulation: {physics: mujoco}\n").robot
+    moved = robot.joints["elbow"].simulation
+    assert (moved.inertia, moved.friction, moved.gravity) == (pytest.approx(5e-4), None, pytest.approx(0.3))
+    assert moved.gravity_angle == pytest.approx(-math.pi / 2)
+    bus = robot.buses["main"].simulation
+    assert (bus.latency_timer, bus.split, bus.echo, bus.absent) == (4_000_000, "byte", True, "slot")
+    assert robot.simulation.physics == "mujoco"
 
 
 def test_what_is_left_out_has_its_default(desk: Any) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 import pytest
 from hypothesis import given, settings
@@ -15,10 +16,14 @@ from dxlrun.description.units import (
     AngularAcceleration,
     AngularVelocity,
     Duration,
+    Inertia,
+    Torque,
     angle,
     angular_acceleration,
     angular_velocity,
     duration,
+    inertia,
+    torque,
 )
 
 
@@ -54,6 +59,47 @@ def test_angle_is_in_rad(text: str, expected: float) -> None:
 )
 def test_velocity_is_in_rad_per_second(text: str, expected: float) -> None:
     assert angular_velocity(text) == pytest.approx(expected, rel=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"), [("0.3 Nm", 0.3), ("20 mNm", 0.02), ("-1Nm", -1.0), ("1_000 Nm", 1000.0)]
+)
+def test_torque_is_in_newton_metres(text: str, expected: float) -> None:
+    assert torque(text) == pytest.approx(expected, rel=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [("0.01 kg m^2", 0.01), ("5 kg cm^2", 5e-4), ("300 g cm^2", 3e-5), ("1e-3kg m^2", 1e-3)],
+)
+def test_inertia_is_in_kilogram_square_metres(text: str, expected: float) -> None:
+    assert inertia(text) == pytest.approx(expected, rel=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("0.01", "'0.01' has no unit; write a moment of inertia with its unit, such as 0.01 kg m^2"),
+        (
+            "0.01 kg",
+            "has the unit kg, which is not one of a moment of inertia; write it as 0.01 kg m^2, 5 kg cm^2 or",
+        ),
+        ("kg m^2", "'kg m^2' is not a moment of inertia; write a moment of inertia such as 0.01 kg m^2"),
+    ],
+)
+def test_what_is_no_inertia_says_how_to_write_one(text: str, complaint: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(complaint)):
+        inertia(text)
+
+
+@pytest.mark.parametrize("text", ["0.25 Nm", "20 mNm"])
+def test_a_torque_in_json_is_read_to_the_same_value(text: str) -> None:
+    class Weight(BaseModel):
+        pull: Torque
+        mass: Inertia
+
+    weight = Weight.model_validate({"pull": text, "mass": "3 g cm^2"})
+    assert Weight.model_validate_json(weight.model_dump_json()) == weight
 
 
 def test_acceleration_is_in_rad_per_square_second() -> None:

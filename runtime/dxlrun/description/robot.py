@@ -17,8 +17,10 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from dxlrun.description.units import Angle, AngularVelocity, Duration
+from dxlrun.description.units import Angle, AngularVelocity, Duration, Inertia, Torque
 
+_LONGEST_TIMER_NS = 255_000_000
+"""The latency timer of an FTDI chip is one byte, ms (FTDI AN232B-04)."""
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*", re.ASCII)
 
 
@@ -53,6 +55,12 @@ def _ordered(value: tuple[float, float]) -> tuple[float, float]:
     return value
 
 
+def _timer(value: int) -> int:
+    if value > _LONGEST_TIMER_NS:
+        raise refuse("no adapter gathers bytes for so long", "write 255 ms at most")
+    return value
+
+
 Name = Annotated[
     str,
     AfterValidator(_name),
@@ -77,6 +85,27 @@ class Adapter(Form):
     )
 
 
+class BusSimulation(Form):
+    """What a simulated bus does beside its servos; a bus on a real port does not use it."""
+
+    latency_timer: Annotated[Duration, AfterValidator(_timer)] = Field(
+        default=0,
+        description="How long the simulated adapter gathers bytes before it hands them over, at most 255 ms.",
+        examples=["4 ms"],
+    )
+    split: Literal["whole", "byte", "random"] = Field(
+        default="whole", description="In which pieces it hands them over.", examples=["byte"]
+    )
+    echo: bool = Field(
+        default=False, description="The host hears its own bytes, as on some adapters.", examples=["true"]
+    )
+    absent: Literal["silent", "slot"] = Field(
+        default="silent",
+        description="In a sync or bulk read, the servos behind an absent one are silent, or wait its slot.",
+        examples=["slot"],
+    )
+
+
 class Bus(Form):
     """One serial line with its servos."""
 
@@ -90,6 +119,11 @@ class Bus(Form):
     adapter: Adapter = Field(default=Adapter(), description="The adapter.", examples=["{latency: 1 ms}"])
     return_delay_time: Duration = Field(
         default=500_000, description="How long a servo waits before it answers.", examples=["500 us"]
+    )
+    simulation: BusSimulation = Field(
+        default=BusSimulation(),
+        description="What the bus does when it is simulated.",
+        examples=["{latency_timer: 4 ms}"],
     )
 
 
@@ -134,6 +168,25 @@ class Limits(Form):
     )
 
 
+class JointSimulation(Form):
+    """What a simulated servo moves; a servo on a real port does not use it."""
+
+    inertia: Annotated[Inertia, Field(gt=0)] | None = Field(
+        default=None, description="Moment of inertia of what it moves.", examples=["0.01 kg m^2"]
+    )
+    friction: Annotated[Torque, Field(ge=0)] | None = Field(
+        default=None, description="Friction of the joint, at every speed.", examples=["0.05 Nm"]
+    )
+    gravity: Annotated[Torque, Field(ge=0)] | None = Field(
+        default=None, description="Torque of the weight when it sticks out horizontally.", examples=["0.3 Nm"]
+    )
+    gravity_angle: Angle | None = Field(
+        default=None,
+        description="Angle of the joint where the weight hangs straight down.",
+        examples=["0 deg"],
+    )
+
+
 class Joint(Form):
     """One joint and its servo: q = direction * (theta - reference)."""
 
@@ -152,6 +205,11 @@ class Joint(Form):
         default=Limits(),
         description="Where it may go, and how fast.",
         examples=["{position: [-90 deg, 90 deg]}"],
+    )
+    simulation: JointSimulation = Field(
+        default=JointSimulation(),
+        description="What its servo moves when it is simulated.",
+        examples=["{inertia: 0.01 kg m^2}"],
     )
 
 
@@ -217,6 +275,16 @@ class RobotModel(Form):
     )
 
 
+class Simulation(Form):
+    """How simulated servos move what they move; servos on a real port do not use it."""
+
+    physics: Literal["independent", "mujoco"] = Field(
+        default="independent",
+        description="Each joint by itself, or all together by MuJoCo after the model's URDF.",
+        examples=["mujoco"],
+    )
+
+
 class Robot(Form):
     """A robot file, without its arguments."""
 
@@ -248,4 +316,9 @@ class Robot(Form):
     recording: Recording = Field(default=Recording(), description="The log.", examples=["{directory: logs}"])
     model: RobotModel | None = Field(
         default=None, description="The robot's body.", examples=["{urdf: torso.urdf}"]
+    )
+    simulation: Simulation = Field(
+        default=Simulation(),
+        description="How simulated servos move what they move.",
+        examples=["{physics: mujoco}"],
     )

@@ -1,8 +1,8 @@
 """Units: angles, speeds and times as a person writes them, `60 deg` or `500 us`, held in SI.
 
-Use `Angle`, `AngularVelocity`, `AngularAcceleration` and `Duration` as types of a model's fields. They take
-text with a unit; a bare number is an error, because nobody can see whether `60` was meant in deg or rad. In
-JSON they are written back as text that they read to the same value.
+Use `Angle`, `AngularVelocity`, `AngularAcceleration`, `Torque`, `Inertia` and `Duration` as types of a
+model's fields. They take text with a unit; a bare number is an error, because nobody can see whether `60`
+was meant in deg or rad. In JSON they are written back as text that they read to the same value.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pydantic_core import PydanticCustomError
 
 # at most three digits of exponent: Fraction("1e-999999999") would fill the memory
 _QUANTITY = re.compile(
-    r"([-+]?(?:\d+(?:_\d+)*)?(?:\.\d*)?(?:[eE][-+]?\d{1,3})?)\s*([A-Za-z/^0-9]*)", re.ASCII
+    r"([-+]?(?:\d+(?:_\d+)*)?(?:\.\d*)?(?:[eE][-+]?\d{1,3})?)\s*([A-Za-z/^0-9 ]*)", re.ASCII
 )
 _LONGEST = 64
 _REV = 2 * math.pi
@@ -26,6 +26,8 @@ _REV = 2 * math.pi
 _ANGLE: Mapping[str, float] = {"deg": math.pi / 180, "rad": 1.0}
 _ANGULAR_VELOCITY: Mapping[str, float] = {"rad/s": 1.0, "deg/s": math.pi / 180, "rpm": _REV / 60}
 _ANGULAR_ACCELERATION: Mapping[str, float] = {"rad/s^2": 1.0, "deg/s^2": math.pi / 180}
+_TORQUE: Mapping[str, float] = {"Nm": 1.0, "mNm": 1e-3}
+_INERTIA: Mapping[str, float] = {"kg m^2": 1.0, "kg cm^2": 1e-4, "g cm^2": 1e-7}
 _DURATION_NS: Mapping[str, int] = {
     "ns": 1,
     "us": 1_000,
@@ -50,6 +52,16 @@ def angular_velocity(text: str) -> float:
 def angular_acceleration(text: str) -> float:
     """Return an acceleration, rad/s^2, from `10 rad/s^2` or `90 deg/s^2`; raises ValueError that says how."""
     return _si(text, "an angular acceleration", _ANGULAR_ACCELERATION, "10 rad/s^2 or 90 deg/s^2")
+
+
+def torque(text: str) -> float:
+    """Return a torque, Nm, from `0.3 Nm` or `20 mNm`; raises ValueError that says how to write one."""
+    return _si(text, "a torque", _TORQUE, "0.3 Nm or 20 mNm")
+
+
+def inertia(text: str) -> float:
+    """Return a moment of inertia, kg m^2, from `0.01 kg m^2` or `300 g cm^2`; raises ValueError."""
+    return _si(text, "a moment of inertia", _INERTIA, "0.01 kg m^2, 5 kg cm^2 or 300 g cm^2")
 
 
 def duration(text: str) -> int:
@@ -95,7 +107,9 @@ def _refusal(what: str, mend: str) -> PydanticCustomError:
 
 
 def _text_schema(example: str, units: Mapping[str, object]) -> WithJsonSchema:
-    pattern = rf"^\s*[-+]?[0-9_.]+([eE][-+]?[0-9]+)?\s*({'|'.join(map(re.escape, units))})\s*$"
+    # an escaped space is none of the escapes that JSON Schema allows
+    names = "|".join(re.escape(unit).replace("\\ ", " ") for unit in units)
+    pattern = rf"^\s*[-+]?[0-9_.]+([eE][-+]?[0-9]+)?\s*({names})\s*$"
     return WithJsonSchema({"type": "string", "pattern": pattern, "examples": [example]})
 
 
@@ -122,6 +136,22 @@ AngularAcceleration = Annotated[
     _text_schema("10 rad/s^2", _ANGULAR_ACCELERATION),
 ]
 """rad/s^2, from `10 rad/s^2` or `90 deg/s^2`."""
+
+Torque = Annotated[
+    float,
+    BeforeValidator(torque),
+    PlainSerializer(lambda value: f"{value!r} Nm", return_type=str, when_used="json"),
+    _text_schema("0.3 Nm", _TORQUE),
+]
+"""Nm, from `0.3 Nm` or `20 mNm`."""
+
+Inertia = Annotated[
+    float,
+    BeforeValidator(inertia),
+    PlainSerializer(lambda value: f"{value!r} kg m^2", return_type=str, when_used="json"),
+    _text_schema("0.01 kg m^2", _INERTIA),
+]
+"""kg m^2, from `0.01 kg m^2`, `5 kg cm^2` or `300 g cm^2`."""
 
 Duration = Annotated[
     int,
