@@ -24,6 +24,7 @@ from dxlrun.guardian import GuardianJob
 from dxlrun.loop_process import LoopJob, Outcome
 from dxlrun.packets import PACKET_SLOT, packet_slots
 from dxlrun.recording.header import LogHeader
+from dxlrun.simulation.process import encode_config
 
 START_TIMEOUT_S = 20.0
 """A child that says nothing for so long will say nothing more; a cold import of numpy takes a second."""
@@ -160,7 +161,7 @@ def _ready(child: Child) -> Mapping[str, object]:
 
 def start_simulation(plan: Plan, ledger: Path | None, memory: Memory) -> tuple[Child, dict[str, str]]:
     """Start the simulated servos; return the process and the pseudo-terminal of each simulated bus."""
-    config = process.memory_file("dxlrun-simulation", msgspec.json.encode(simulated_buses(plan)))
+    config = process.memory_file("dxlrun-simulation", encode_config(simulated_buses(plan)))
     arguments = ["--config-fd", str(config)] + (["--ledger", str(ledger)] if ledger else [])
     child = Child("simulated bus", "dxlrun.simulation", arguments, [config], memory.stderr)
     os.close(config)

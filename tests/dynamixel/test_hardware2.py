@@ -104,7 +104,7 @@ def test_velocity_has_the_joints_sign(started):
 
 @pytest.mark.parametrize("others_answer", [False, True])
 def test_an_absent_servo_costs_the_others_one_cycle_at_most(started, others_answer):
-    started.buses[0].skips_absent = others_answer
+    started.buses[0].absent = "slot" if others_answer else "silent"
     started.cycle()
     started.buses[0].servo(13).silence()
     started.cycle()

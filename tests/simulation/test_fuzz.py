@@ -88,7 +88,7 @@ def test_any_packet_of_protocol_1(make_line: Any, model: str, packets: list[tupl
 @given(st.lists(st.tuples(st.sampled_from([1, 0xFE]), INSTRUCTIONS, NOISE), max_size=5))
 def test_any_packet_of_protocol_2(make_line2: Any, model: str, packets: list[tuple[int, int, bytes]]) -> None:
     line = make_line2((1,), model)
-    line.bus.skips_absent = True
+    line.bus.absent = "slot"
     for packet in packets:
         line.ports.ports[0].write(framed2(*packet))
         if packet[1] not in (0x8A, 0x9A):

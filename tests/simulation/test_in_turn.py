@@ -46,14 +46,14 @@ def test_after_an_absent_servo_nobody_answers(make_line2: Any) -> None:
 
 def test_or_they_wait_for_its_time(make_line2: Any) -> None:
     line = make_line2((1, 3))
-    line.bus.skips_absent = True
+    line.bus.absent = "slot"
     line.tell(BROADCAST, SYNC_READ, POSITION + b"\x01\x02\x03")
     assert [each.servo_id for each in line.statuses()] == [1, 3]
 
 
 def test_a_cut_data_line_and_a_low_return_level_are_as_absent(make_line2: Any) -> None:
     line = make_line2((1, 2, 3))
-    line.bus.skips_absent = True
+    line.bus.absent = "slot"
     line.servo(1).silence()
     line.servo(2).poke("status_return_level", 0)
     line.tell(BROADCAST, SYNC_READ, POSITION + b"\x01\x02\x03")
@@ -132,12 +132,15 @@ def test_a_2xl_knows_no_fast_read(make_line2: Any) -> None:
     assert line.hear() == b""
 
 
-def test_a_fault_hits_one_servo_of_a_chain(make_line2: Any) -> None:
+@pytest.mark.parametrize(("absent", "heard"), [("silent", 15 + 3), ("slot", 15 + 3 + 15)])
+def test_a_cut_answer_is_to_those_after_it_as_none(make_line2: Any, absent: str, heard: int) -> None:
     line = make_line2((1, 2, 3))
+    line.bus.absent = absent
     line.bus.truncate_next(2, 3)
     line.tell(BROADCAST, SYNC_READ, POSITION + b"\x01\x02\x03")
-    heard = line.hear()
-    assert len(heard) == 15 + 3 + 15
+    assert len(line.hear()) == heard
+    line.tell(BROADCAST, SYNC_READ, POSITION + b"\x01\x02\x03")
+    assert len(line.hear()) == 3 * 15
 
 
 def test_a_pause_of_more_than_1500_us_ends_an_instruction(make_line2: Any, make_packet2: Any) -> None:
@@ -177,7 +180,7 @@ def test_the_manual_s_bulk_read(make_line: Any) -> None:
 
 def test_an_absent_servo_breaks_the_bulk_read_of_protocol_1(make_line: Any) -> None:
     line = make_line((1, 3), "MX-64")
-    line.bus.skips_absent = True  # of Protocol 2.0 only
+    line.bus.absent = "slot"  # of Protocol 2.0 only
     line.send(BROADCAST, BULK_READ, *bulk((1, 36, 2), (2, 36, 2), (3, 36, 2)))
     assert len(line.hear()) == 8
 

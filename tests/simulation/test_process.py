@@ -17,7 +17,7 @@ import rustypot
 
 from dxlrun.control_table import control_table
 from dxlrun.simulation import BusConfig, Ledger, ServoConfig, SimulatedBus
-from dxlrun.simulation.process import decode_config, encode_config
+from dxlrun.simulation.process import SimulationConfig, decode_config, encode_config
 from dxlrun.simulation.pseudo_terminal import PseudoTerminal
 
 PING_1 = bytes.fromhex("ff ff 01 02 01 fb")
@@ -131,7 +131,7 @@ def test_what_does_not_fit_into_the_terminal_is_lost_and_noted() -> None:
 
 
 def test_configurations_pass_as_they_are() -> None:
-    assert decode_config(encode_config(BUSES)) == BUSES
+    assert decode_config(encode_config(BUSES)) == SimulationConfig(BUSES)
 
 
 def test_a_foreign_driver_finds_every_item_where_the_servo_holds_it(start: Callable[[], Any]) -> None:

@@ -28,6 +28,8 @@ class LedgerEntry:
     """Seen from the servos: `in` came from the host, `out` went to it."""
     data: bytes
     note: str
+    late_ns: int = 0
+    """`out`, in real time: how long after it should have been the host got the last of them."""
 
 
 class Ledger:
@@ -44,12 +46,29 @@ class Ledger:
         self._file: IO[str] | None = None if path is None else path.open("w", encoding="ascii")
         self._unflushed_ns: int | None = None
 
-    def add(self, t_ns: int, bus: str, direction: Direction, data: bytes = b"", note: str = "") -> None:
+    def add(
+        self,
+        t_ns: int,
+        bus: str,
+        direction: Direction,
+        data: bytes = b"",
+        note: str = "",
+        *,
+        late_ns: int = 0,
+    ) -> None:
         """Enter bytes or a note; a file is flushed by `flush_if_due` and at the end."""
         if self._keep:
-            self.entries.append(LedgerEntry(t_ns, bus, direction, data, note))
+            self.entries.append(LedgerEntry(t_ns, bus, direction, data, note, late_ns))
         if self._file is not None:
-            line = {"t_ns": t_ns, "bus": bus, "direction": direction, "bytes": data.hex(), "note": note}
+            line: dict[str, str | int] = {
+                "t_ns": t_ns,
+                "bus": bus,
+                "direction": direction,
+                "bytes": data.hex(),
+                "note": note,
+            }
+            if late_ns:
+                line["late_ns"] = late_ns
             if self._unflushed_ns is None:
                 self._unflushed_ns = t_ns
             try:
@@ -123,4 +142,5 @@ def _entry(line: dict[str, str | int]) -> LedgerEntry:
         direction="in" if direction == "in" else "out" if direction == "out" else "note",
         data=bytes.fromhex(str(line["bytes"])),
         note=str(line["note"]),
+        late_ns=int(line.get("late_ns", 0)),
     )

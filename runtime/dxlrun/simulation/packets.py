@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 BROADCAST = 0xFE
@@ -19,6 +19,8 @@ class InstructionPacket:
     """False when the checksum is wrong: then nothing else of it can be trusted."""
     end: int
     """Index behind its last byte, in the bytes that completed it."""
+    raw: bytes = field(default=b"", compare=False)
+    """All of its bytes, as they stood on the line."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,13 +12,16 @@ import socket
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import msgspec
 
 from dxlrun.control_table import add_control_table
-from dxlrun.simulation.bus import BusConfig, SimulatedBus
+from dxlrun.simulation.bus import SimulatedBus
+from dxlrun.simulation.bus_config import BusConfig
 from dxlrun.simulation.ledger import Ledger
+from dxlrun.simulation.mechanics import Mechanics
 from dxlrun.simulation.pseudo_terminal import PseudoTerminal
 
 POLL_NS = 80_000
@@ -43,35 +46,53 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # only the front process takes it
     with os.fdopen(options.config_fd, "rb") as file:
-        buses = decode_config(file.read())
-    for text in dict.fromkeys(text for bus in buses for text in bus.control_tables):
+        config = decode_config(file.read())
+    for text in dict.fromkeys(text for bus in config.buses for text in bus.control_tables):
         add_control_table(text)
     with socket.socket(fileno=options.control_fd) as control, Ledger(options.ledger, keep=False) as ledger:
-        Server(buses, ledger, control).run()
+        Server(config, ledger, control).run()
     if ledger.error is None:
         return 0
     print(ledger.error, file=sys.stderr)
     return 1
 
 
-def encode_config(buses: Sequence[BusConfig]) -> bytes:
-    """Return what `--config-fd` takes."""
-    return msgspec.json.encode(list(buses))
+@dataclass(frozen=True, slots=True)
+class SimulationConfig:
+    """What the process of the simulated buses is to serve."""
+
+    buses: tuple[BusConfig, ...]
+    faults: tuple[str, ...] = ()
+    """Lines of faults; their times count from the start."""
+    seed: int = 0
+    """Of what the faults leave to chance."""
+    links: dict[str, str] = field(default_factory=dict)
+    """By bus: path of a symbolic link that always leads to its terminal, as udev's do."""
 
 
-def decode_config(data: bytes) -> tuple[BusConfig, ...]:
-    """Return the buses of `encode_config`; raises msgspec.ValidationError."""
-    return msgspec.json.decode(data, type=tuple[BusConfig, ...])
+def encode_config(config: SimulationConfig | Sequence[BusConfig]) -> bytes:
+    """Return what `--config-fd` takes; buses alone are a configuration without faults."""
+    if not isinstance(config, SimulationConfig):
+        config = SimulationConfig(tuple(config))
+    return msgspec.json.encode(config)
+
+
+def decode_config(data: bytes) -> SimulationConfig:
+    """Return the configuration of `encode_config`; raises msgspec.ValidationError."""
+    return msgspec.json.decode(data, type=SimulationConfig)
 
 
 class Server:
     """Pumps pseudo-terminals and buses; one thread, one select."""
 
-    def __init__(self, buses: Sequence[BusConfig], ledger: Ledger, control: socket.socket) -> None:
+    def __init__(self, config: SimulationConfig, ledger: Ledger, control: socket.socket) -> None:
         start_ns = time.monotonic_ns()
+        mechanics = Mechanics(start_ns)
         self._ledger = ledger
         self._control = control
-        self._terminals = tuple(PseudoTerminal(SimulatedBus(bus, ledger, start_ns)) for bus in buses)
+        self._terminals = tuple(
+            PseudoTerminal(SimulatedBus(bus, ledger, start_ns, mechanics)) for bus in config.buses
+        )
         self._stopped = False
 
     def run(self) -> None:

@@ -125,6 +125,7 @@ def _packet(data: bytes | bytearray, end: int) -> InstructionPacket:
         parameters=bytes(data[5:-1]),
         intact=data[-1] == checksum(data[2:-1]),
         end=end,
+        raw=bytes(data),
     )
 
 

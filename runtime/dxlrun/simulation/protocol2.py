@@ -224,6 +224,7 @@ def _packet(data: bytes, end: int) -> InstructionPacket:
         parameters=body[1:],
         intact=_word(data, len(data) - 2) == crc16(data[:-2]),
         end=end,
+        raw=data,
     )
 
 

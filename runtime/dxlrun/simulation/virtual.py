@@ -16,7 +16,7 @@ class VirtualPort:
         self._clock = clock
         self._bus = bus
         self._arrived = bytearray()
-        self._gone = False
+        self._unplugged = bus.times_unplugged
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
         """Hand bytes to the line now; raises PortError when the adapter was unplugged."""
@@ -39,8 +39,12 @@ class VirtualPort:
 
     def unplug(self) -> None:
         """Pull the adapter: every later use raises PortError."""
-        self._bus.note("adapter unplugged")
-        self._gone = True
+        self._bus.unplug()
+
+    @property
+    def _gone(self) -> bool:
+        """True after the adapter was pulled, also when it is back: a port does not outlive that."""
+        return self._bus.times_unplugged != self._unplugged
 
     def _check(self) -> None:
         if self._gone:
