@@ -32,11 +32,9 @@ class Simulation:
     def __init__(self, buses: Sequence[BusConfig], ledger: Path) -> None:
         self._path = ledger
         self._refusals: Counter[str] = Counter()
-        ours, theirs = socket.socketpair()
-        ours.settimeout(PATIENCE_S)
+        self._control, theirs = socket.socketpair()
+        self._control.settimeout(PATIENCE_S)
         reader, writer = os.pipe()
-        os.write(writer, encode_config(buses))
-        os.close(writer)
         with theirs:
             command = [sys.executable, "-m", "dxlrun.simulation", "--config-fd", str(reader)]
             command += ["--control-fd", str(theirs.fileno()), "--ledger", str(ledger)]
@@ -44,9 +42,12 @@ class Simulation:
                 command, pass_fds=(reader, theirs.fileno()), start_new_session=True
             )
         os.close(reader)
-        self._control = ours
-        with ours.makefile("rb") as said:
-            self.ports: dict[str, str] = json.loads(said.readline())["ports"]
+        with open(writer, "wb") as config:
+            config.write(encode_config(buses))
+        with self._control.makefile("rb") as said:
+            first = said.readline()
+        self.ports: dict[str, str] = json.loads(first)["ports"] if first else {}
+        """The device file of each bus; none when the process ended at once."""
 
     def expect_refusals(self, bus: str, count: int) -> None:
         """Say how many instructions the servos of a bus were made to refuse."""
@@ -91,7 +92,7 @@ class PatientPort(PortHandler):
         self.patience_ms = PATIENCE_S * 1000
         """How long it waits for an answer; a test of silence makes it short."""
         self.wanted: int | None = None
-        """So many bytes end a wait for all that may answer, which lasts 0.8 s otherwise."""
+        """So many bytes end the next wait for all that may answer, which lasts 0.8 s otherwise."""
 
     def setupPort(self, cflag_baud: int) -> bool:
         ready = bool(super().setupPort(cflag_baud))
@@ -111,7 +112,10 @@ class PatientPort(PortHandler):
         return data
 
     def isPacketTimeout(self) -> bool:
-        return (self.wanted is not None and self.wanted <= 0) or bool(super().isPacketTimeout())
+        if self.wanted is not None and self.wanted <= 0:
+            self.wanted = None
+            return True
+        return bool(super().isPacketTimeout())
 
 
 class Ports:
@@ -139,3 +143,9 @@ def open_port(simulation: Simulation) -> Iterator[Ports]:
     ports = Ports(simulation)
     yield ports
     ports.close()
+
+
+@pytest.fixture
+def patient_port() -> type[PatientPort]:
+    """Put in the place of the SDK's port where a program opens it itself."""
+    return PatientPort

@@ -1,0 +1,179 @@
+"""The maker's newer Python interface (dynamixel_easy_sdk), which brings control tables of its own."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from dynamixel_easy_sdk import (
+    Connector,
+    ControlTable,
+    Direction,
+    DxlError,
+    DxlRuntimeError,
+    OperatingMode,
+    ProfileConfiguration,
+    connector,
+)
+
+from dxlrun.control_table import all_tables, control_table
+from dxlrun.simulation import BusConfig, ServoConfig
+
+NUMBERS = ControlTable.parsingModelList()
+MODELS = tuple(
+    table.model
+    for table in all_tables()
+    if table.protocol == 2.0 and table.model_number in NUMBERS and not table.model.endswith("-FW51")
+)
+"""Every model of which both know a table."""
+POSITION = 1.0
+"""rad, of every servo at the start: also a gripper reaches it."""
+PATIENCE_S = 20.0
+
+
+def line(name: str, *models: str) -> BusConfig:
+    servos = tuple(ServoConfig(each, model, POSITION) for each, model in enumerate(models, start=1))
+    return BusConfig(name, 1_000_000, servos, 2.0)
+
+
+BUSES = (
+    line("models", *MODELS),
+    line("modes", "XM430-W350"),
+    line("settings", "XM430-W350"),
+    line("group", "XM430-W350", "XM430-W350"),
+    line("guarded", "XM430-W350"),
+    line("reset", "XL430-W250"),
+)
+
+
+@pytest.fixture
+def connect(
+    simulation: Any, patient_port: Any, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Callable[[str], Connector]]:
+    """Connect to a bus, through a port that waits."""
+    monkeypatch.setattr(connector, "PortHandler", patient_port)
+    opened: list[Connector] = []
+
+    def open_bus(name: str) -> Connector:
+        opened.append(Connector(simulation.ports[name], 1_000_000))
+        return opened[-1]
+
+    yield open_bus
+    for each in opened:
+        each.closePort()
+
+
+def until(condition: Callable[[], bool]) -> bool:
+    """Return whether something came true within the patience."""
+    deadline = time.monotonic() + PATIENCE_S
+    while time.monotonic() < deadline:
+        if condition():
+            return True
+    return False
+
+
+def test_it_finds_every_model_and_reads_it_by_its_own_table(connect: Any) -> None:
+    bus = connect("models")
+    bus._port_handler.wanted = len(MODELS) * 14
+    found = bus.broadcastPing()
+    assert list(found) == list(range(1, len(MODELS) + 1))
+    for servo_id, model in enumerate(MODELS, start=1):
+        if model == "XL-320":
+            continue  # its file there has no operating mode, and a Motor reads it at once
+        motor = bus.createMotor(servo_id)
+        table = control_table(model, 2.0)
+        assert motor.model_number == table.model_number
+        assert motor.torque_status == 0
+        assert motor.operating_mode_status in (OperatingMode.POSITION, OperatingMode.CURRENT_BASED_POSITION)
+        assert abs(motor.getPresentPosition() * table.rad_per_tick - POSITION) < 0.01, model
+
+
+def test_a_motor_moves_in_position_and_velocity_mode(connect: Any) -> None:
+    motor = connect("modes").createMotor(1)
+    motor.enableTorque()
+    goal = motor.getPresentPosition() + 150
+    motor.setGoalPosition(goal)
+    assert until(lambda: abs(motor.getPresentPosition() - goal) < 20)
+    motor.disableTorque()
+    motor.setOperatingMode(OperatingMode.VELOCITY)
+    motor.enableTorque()
+    motor.setGoalVelocity(60)
+    assert until(lambda: motor.getPresentVelocity() > 40)
+    motor.setGoalVelocity(-60)
+    assert until(lambda: motor.getPresentVelocity() < -40)
+    motor.disableTorque()
+    assert until(lambda: motor.getPresentVelocity() == 0)
+
+
+def test_settings_are_kept_and_limits_hold(connect: Any, simulation: Any) -> None:
+    motor = connect("settings").createMotor(1)
+    before = motor.getPresentPosition()
+    motor.setDirection(Direction.REVERSE)
+    motor.setProfileConfiguration(ProfileConfiguration.TIME_BASED)
+    assert abs(motor.getPresentPosition() + before) <= 1  # e-Manual, Drive Mode (10): the sign turns
+    motor.setDirection(Direction.NORMAL)
+    motor.setHomingOffset(-300)
+    assert abs(motor.getPresentPosition() - (before - 300)) <= 1
+    motor.setHomingOffset(0)
+    motor.setMinPositionLimit(500)
+    motor.setMaxPositionLimit(900)
+    assert (motor.getMinPositionLimit(), motor.getMaxPositionLimit()) == (500, 900)
+    motor.enableTorque()
+    simulation.expect_refusals("settings", 1)
+    with pytest.raises(DxlRuntimeError, match="limit") as refused:
+        motor.setGoalPosition(1000)
+    assert refused.value.dxl_error == DxlError.SDK_ERRNUM_DATA_LIMIT
+
+
+def test_a_group_reads_and_writes_by_sync_and_by_bulk(connect: Any) -> None:
+    bus = connect("group")
+    one, other = (bus.createMotor(each) for each in (1, 2))
+    group = bus.createGroupExecutor()
+    for motor in (one, other):
+        group.addCmd(motor.stageEnableTorque())
+    group.executeWrite()
+    assert [one.isTorqueOn(), other.isTorqueOn()] == [1, 1]
+    group.clearStagedWriteCommands()
+    group.addCmd(one.stageSetGoalPosition(800))
+    group.addCmd(other.stageLEDOn())
+    group.executeWrite()
+    group.addCmd(one.stageGetPresentPosition())
+    group.addCmd(other.stageIsLEDOn())
+
+    def arrived() -> bool:
+        position, led = group.executeRead()
+        assert led == 1
+        return abs(position - 800) < 20
+
+    assert until(arrived)
+
+
+def test_a_locked_eeprom_is_an_access_error(connect: Any, simulation: Any) -> None:
+    motor = connect("guarded").createMotor(1)
+    motor.enableTorque()
+    motor.torque_status = 0  # it would not even ask otherwise
+    simulation.expect_refusals("guarded", 1)
+    with pytest.raises(DxlRuntimeError) as refused:
+        motor.setHomingOffset(1)
+    assert refused.value.dxl_error == DxlError.SDK_ERRNUM_ACCESS
+
+
+def test_a_factory_reset_but_for_id_and_rate_leaves_the_servo_there(connect: Any) -> None:
+    bus = connect("reset")
+    motor = bus.createMotor(1)
+    motor.changeID(9)
+    motor.setMinPositionLimit(500)
+    motor.factoryResetExceptIDAndBaudRate()
+    bus._port_handler.patience_ms = 30.0
+
+    def answers() -> bool:
+        try:
+            return bool(motor.ping() == 1060)
+        except DxlRuntimeError:
+            return False
+
+    assert until(answers)
+    bus._port_handler.patience_ms = PATIENCE_S * 1000
+    assert motor.getMinPositionLimit() == 0
