@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 
 @dataclass(frozen=True, slots=True)
@@ -13,6 +14,8 @@ class RunOptions:
     take_over: bool = False
     """Accept servos that are already torqued."""
     debug: bool = False
+    ledger: Path | None = None
+    """Where simulated buses write what they saw; None: beside the log, on virtual time nowhere."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -84,10 +84,10 @@ class _Run:
 
     def start(self) -> Child:
         """Start everything in order, return the guardian; raises PortError or ProcessFault."""
-        ledger = None
+        ledger = self.options.ledger
         if self.options.record:
             self.log = new_log(Path(self.plan.recording_directory), self.plan.robot)
-            ledger = ledger_of(self.log)
+            ledger = ledger or ledger_of(self.log)
         ports: dict[str, str] = {}
         if self.plan.simulated:
             self.simulation, ports = start_simulation(self.plan, ledger, self.memory)

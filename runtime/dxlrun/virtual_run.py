@@ -63,11 +63,14 @@ class _NoSinks:
 class VirtualRobot:
     """A robot and its simulated servos on virtual time; two of them from one plan do exactly the same.
 
-    `log`: where the log goes, None for no log. Every bus of the plan is simulated, whatever its port says.
+    `log`: where the log goes, None for no log. `ledger`: where the simulated buses enter what they see, None
+    for one in memory; it is closed with the log. Every bus of the plan is simulated, whatever its port says.
     Raises InputError when the plan has a bus that is not `sim`.
     """
 
-    def __init__(self, plan: Plan, *, log: Path | None = None, take_over: bool = False) -> None:
+    def __init__(
+        self, plan: Plan, *, log: Path | None = None, take_over: bool = False, ledger: Ledger | None = None
+    ) -> None:
         real = [bus.name for bus in plan.buses if bus.port != "sim"]
         if real:
             raise InputError(
@@ -76,7 +79,7 @@ class VirtualRobot:
             )
         self.plan = plan
         self.clock = VirtualClock()
-        self.ledger = Ledger()
+        self.ledger = Ledger() if ledger is None else ledger
         """Every byte that the simulated servos received and sent."""
         self.buses = tuple(SimulatedBus(config, self.ledger, 0) for config in simulated_buses(plan))
         """The simulated lines, in the order of the plan's buses; faults are injected here."""
@@ -131,6 +134,7 @@ class VirtualRobot:
             self._sinks.packets.commit()
             if self._writer:
                 self.messages = self._writer.close().messages
+            self.ledger.close()
         return self.result
 
 
@@ -138,7 +142,9 @@ def run_virtual(plan: Plan, options: RunOptions) -> RunSummary:
     """Run a plan on virtual time for the command line; the log has the times of the virtual clock."""
     log = new_log(Path(plan.recording_directory), plan.robot) if options.record else None
     try:
-        robot = VirtualRobot(plan, log=log, take_over=options.take_over)
+        # nobody asks a command line for the entries afterwards: memory stays bounded
+        ledger = Ledger(options.ledger, keep=False)
+        robot = VirtualRobot(plan, log=log, take_over=options.take_over, ledger=ledger)
     except BaseException:
         if log:
             discard_log(log)
@@ -151,7 +157,8 @@ def run_virtual(plan: Plan, options: RunOptions) -> RunSummary:
         if options.debug:
             sys.stderr.write(traceback.format_exc())
         result, refused = LoopResult(0, 0, "fault"), error.sentences
-    sentences = (*refused, *((result.detail,) if result.detail else ()), *robot.failures)
+    incomplete = () if ledger.error is None else (ledger.error,)
+    sentences = (*refused, *((result.detail,) if result.detail else ()), *robot.failures, *incomplete)
     return RunSummary(
         exit_code=1 if sentences or result.reason == "fault" else 0,
         reason=result.reason,

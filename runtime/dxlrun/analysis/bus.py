@@ -107,7 +107,7 @@ class _Pairing:
 
 def traffic(log: Log) -> tuple[tuple[Servo, ...], tuple[BusTraffic, ...]]:
     """Return the traffic per servo and per bus. Raises LogError when a packet cannot be read."""
-    joints = _joints(log)
+    joints = joints_of(log)
     servos: list[Servo] = []
     buses: list[BusTraffic] = []
     for index, name in enumerate(log.buses):
@@ -182,7 +182,7 @@ class _Planned(msgspec.Struct):
     buses: list[_PlannedBus] = []
 
 
-def _joints(log: Log) -> dict[tuple[str, int], str]:
+def joints_of(log: Log) -> dict[tuple[str, int], str]:
     """Return the joint of each servo, by bus and ID, from the plan in the log."""
     try:
         plan = msgspec.json.decode(log.attachments.get("plan.json", b"{}"), type=_Planned)

@@ -19,7 +19,7 @@ _WIDEST = 120
 
 
 @dataclass(frozen=True, slots=True)
-class _Shown:
+class Shown:
     """A table that leaves out its details where the terminal is narrow."""
 
     table: Table
@@ -52,4 +52,4 @@ def render(report: Report) -> Group:
     """Return what a terminal shows of a report: sentences, then one table a subject that has something."""
     style = "green" if report.verdict.good else "yellow"
     sentences = (Text(sentence, style=style) for sentence in report.verdict.sentences)
-    return Group(*sentences, *(_Shown(table) for table in tables(report)))
+    return Group(*sentences, *(Shown(table) for table in tables(report)))

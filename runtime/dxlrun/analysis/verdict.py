@@ -118,7 +118,7 @@ def _errors(servos: Sequence[Servo]) -> Finding | None:
         return None
     named = "; ".join(
         f"{_name(servo)}: {', '.join(servo.error_names) or 'unknown bit'} in "
-        f"{_counted(servo.errors, 'reply', 'replies')}"
+        f"{counted(servo.errors, 'reply', 'replies')}"
         for servo in troubled[:_MOST_NAMED]
     )
     more = _more("; and", len(troubled))
@@ -128,10 +128,11 @@ def _errors(servos: Sequence[Servo]) -> Finding | None:
 def _more(joining: str, count: int) -> str:
     """Return how many servos there are beyond those that are named."""
     beyond = count - _MOST_NAMED
-    return f"{joining} {_counted(beyond, 'more servo', 'more servos')}" if beyond > 0 else ""
+    return f"{joining} {counted(beyond, 'more servo', 'more servos')}" if beyond > 0 else ""
 
 
-def _counted(number: int, one: str, many: str) -> str:
+def counted(number: int, one: str, many: str) -> str:
+    """Return a number with its noun, as a person writes them."""
     return f"{number} {one if number == 1 else many}"
 
 
@@ -152,10 +153,10 @@ def _events(events: Sequence[Event]) -> Finding | None:
 def _log(account: Periods, log: Log, lost: int) -> Finding | None:
     faults = list(log.damage)
     if lost:
-        faults.append(f"{_counted(lost, 'record was', 'records were')} lost on the way to the recorder")
+        faults.append(f"{counted(lost, 'record was', 'records were')} lost on the way to the recorder")
     if not account.agree:
         faults.append(
-            f"{_counted(account.missing, 'period is', 'periods are')} neither recorded nor declared skipped"
+            f"{counted(account.missing, 'period is', 'periods are')} neither recorded nor declared skipped"
         )
     if not faults:
         return None

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from dxlrun.cli.flags import Flag, JsonFlag
 from dxlrun.cli.terminal import out
-from dxlrun.errors import InputError
+from dxlrun.errors import InputError, LogError
 
 if TYPE_CHECKING:
     from dxlrun.analysis.report import Report
@@ -16,7 +16,13 @@ if TYPE_CHECKING:
 
 
 def analyze(
-    log: Path, /, *, report: Path | None = None, as_json: JsonFlag = False, debug: Flag = False
+    log: Path,
+    /,
+    *,
+    report: Path | None = None,
+    ledger: Path | None = None,
+    as_json: JsonFlag = False,
+    debug: Flag = False,
 ) -> int:
     """Analyze a log: wake-up latency, duration of each step, skipped periods, packets and errors per servo.
 
@@ -27,6 +33,9 @@ def analyze(
     report
         Also write a page with all numbers and plots to this file, such as report.html; it loads nothing
         from anywhere, and prints well. Needs matplotlib: `pip install 'dxlrun[report]'`.
+    ledger
+        Compare the log with the ledger of the simulated buses instead, byte by byte; the exit code is 1
+        when they differ, 2 when one of them cannot be read.
     as_json
         Print the result as JSON.
     debug
@@ -36,6 +45,10 @@ def analyze(
         raise InputError(f"there is no log {log}; a run says at its end where its log is")
     if report is not None:
         _check_target(report)
+    if ledger is not None:
+        if report is not None:
+            raise InputError("a report does not hold a comparison; give --report and --ledger one at a time")
+        return _compare(log, ledger, as_json=as_json)
     from dxlrun.analysis import report as analysis
     from dxlrun.analysis.terminal import render
     from dxlrun.recording.reader import read_log
@@ -52,6 +65,30 @@ def analyze(
     if report is not None:
         console.print(f"\nreport: {report}", markup=False, soft_wrap=True)
     return 0
+
+
+def _compare(log: Path, ledger: Path, *, as_json: bool) -> int:
+    """Say where a log and a ledger differ; return 1 when they do."""
+    if not ledger.is_file():
+        raise InputError(
+            f"there is no ledger {ledger}; a run on simulated buses leaves one beside its log, named "
+            "LOG.ledger.jsonl, and `dxlrun sim` writes the one it is given with --ledger"
+        )
+    from dxlrun.analysis.ledger_report import compare, to_json
+    from dxlrun.analysis.ledger_tables import render_comparison
+    from dxlrun.recording.reader import read_log
+    from dxlrun.simulation import read_ledger
+
+    try:
+        result = compare(read_log(log), read_ledger(ledger), ledger)
+    except LogError as error:
+        raise InputError(str(error)) from error  # 1 says that they differ
+    console = out()
+    if as_json:
+        console.file.write(to_json(result).decode() + "\n")
+    else:
+        console.print(render_comparison(result))
+    return 0 if result.same else 1
 
 
 def _check_target(target: Path) -> None:

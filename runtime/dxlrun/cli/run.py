@@ -10,13 +10,14 @@ from cyclopts import Parameter
 from dxlrun.cli.flags import Flag, Motions
 from dxlrun.cli.inputs import compiled
 from dxlrun.cli.terminal import out, say_error, say_warning
-from dxlrun.errors import LogError
+from dxlrun.errors import InputError, LogError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from rich.console import Console
 
+    from dxlrun.compile.plan import Plan
     from dxlrun.dynamixel.bus_plan import BusPlan
     from dxlrun.run_summary import RunSummary
 
@@ -33,6 +34,7 @@ def run(
     no_record: Flag = False,
     take_over: Flag = False,
     virtual: Flag = False,
+    ledger: Path | None = None,
     debug: Flag = False,
 ) -> int:
     """Run a robot until its motions have ended, or until Ctrl-C.
@@ -53,15 +55,20 @@ def run(
         Start although a servo has its torque on already.
     virtual
         Run on virtual time, as fast as the processor can; only with simulated buses.
+    ledger
+        Write what the simulated buses saw to this file, for `dxlrun analyze LOG --ledger FILE`; without it
+        a run writes it beside its log, one on virtual time not at all.
     debug
         Print the traceback of an error, and what the processes said.
     """
     result = compiled(robot, assignments, play, duration, None if virtual else _ask_servos)
     for warning in result.warnings:
         say_warning(str(warning))
+    if ledger is not None:
+        _check_ledger(ledger, result.plan)
     from dxlrun.run_summary import RunOptions
 
-    options = RunOptions(record=not no_record, take_over=take_over, debug=debug)
+    options = RunOptions(record=not no_record, take_over=take_over, debug=debug, ledger=ledger)
     console = out()
     if virtual:
         from dxlrun.virtual_run import run_virtual
@@ -73,6 +80,21 @@ def run(
         summary = run_robot(result.plan, options, console)
     show(summary, result.plan.robot, console)
     return summary.exit_code
+
+
+def _check_ledger(ledger: Path, plan: Plan) -> None:
+    """Raise InputError where no ledger can be written, before anything starts."""
+    if not plan.simulated:
+        raise InputError(
+            f"a ledger tells what simulated buses saw, and {plan.robot} has none: give the argument "
+            "port:=sim, or leave out --ledger"
+        )
+    if not ledger.parent.is_dir():
+        raise InputError(f"there is no directory {ledger.parent} for the ledger; make it first")
+    try:
+        ledger.open("w").close()
+    except OSError as error:
+        raise InputError(f"the ledger {ledger} cannot be written: {error.strerror or error}") from error
 
 
 def _ask_servos(buses: Sequence[BusPlan], joints: Sequence[str]) -> Mapping[str, str]:

@@ -1,0 +1,113 @@
+"""The comparison of a log with a ledger as tables, for the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rich.console import Group
+from rich.text import Text
+
+from dxlrun.analysis.ledger_faults import FaultAnswers
+from dxlrun.analysis.ledger_report import ComparedBus, Difference, LedgerReport
+from dxlrun.analysis.tables import Cell, Column, Table
+from dxlrun.analysis.terminal import Shown
+from dxlrun.analysis.verdict import microseconds
+
+MOST_SHOWN = 20
+"""Differences and faults in a table; `--json` has all."""
+_MOST_BYTES = 16
+
+
+def render_comparison(report: LedgerReport) -> Group:
+    """Return what a terminal shows: sentences, then one table a subject that has something."""
+    style = "green" if report.same else "red"
+    first, *others = report.sentences
+    found = (
+        buses_table(report.buses),
+        differences_table(report.differences),
+        faults_table(report.faults),
+    )
+    return Group(
+        Text(first, style=style),
+        *(Text(sentence) for sentence in others),
+        *(Shown(table) for table in found if table.rows),
+    )
+
+
+def buses_table(buses: Sequence[ComparedBus]) -> Table:
+    """Return what was compared on each bus."""
+    names = ("sent", "bytes", "replies", "bytes", "noise", "differences", "declared", "outside the run")
+    rows = tuple(
+        (
+            Cell(bus.name),
+            Cell(str(bus.sent_packets)),
+            Cell(str(bus.sent_bytes)),
+            Cell(str(bus.replies)),
+            Cell(str(bus.received_bytes)),
+            Cell(f"{bus.noise_bytes} B", "warning" if bus.noise_bytes else "plain"),
+            Cell(str(bus.differences), "error" if bus.differences else "plain"),
+            Cell(str(bus.declared), "warning" if bus.declared else "plain"),
+            Cell(f"{bus.outside_bytes} B"),
+        )
+        for bus in buses
+    )
+    return Table("Buses", (Column("bus", "name"), *(Column(name) for name in names)), rows)
+
+
+def differences_table(differences: Sequence[Difference]) -> Table:
+    """Return where log and ledger differ, the first ones first."""
+    columns = (
+        Column("at, s"),
+        Column("bus", "name"),
+        Column("host", "name"),
+        Column("only in the log", "text"),
+        Column("only in the ledger", "text"),
+        Column("declared", "text"),
+    )
+    rows = tuple(
+        (
+            Cell(f"{one.seconds:.6f}"),
+            Cell(one.bus),
+            Cell(one.way),
+            Cell(_bytes(one.only_log), "plain" if one.declared else "error"),
+            Cell(_bytes(one.only_ledger), "plain" if one.declared else "error"),
+            Cell(one.declared or "-"),
+        )
+        for one in differences[:MOST_SHOWN]
+    )
+    return Table(_title("Differences", len(differences)), columns, rows)
+
+
+def faults_table(faults: Sequence[FaultAnswers]) -> Table:
+    """Return the injected faults, each beside the first event that may answer it."""
+    columns = (
+        Column("at, s"),
+        Column("bus", "name"),
+        Column("fault", "text"),
+        Column("after"),
+        Column("event of the log", "text"),
+    )
+    rows = []
+    for fault in faults[:MOST_SHOWN]:
+        first = fault.answers[0] if fault.answers else None
+        rows.append(
+            (
+                Cell(f"{fault.seconds:.6f}"),
+                Cell(fault.bus),
+                Cell(fault.text),
+                Cell(microseconds(first.after_ms * 1000) if first else "-"),
+                Cell(f"{first.name} {first.source}: {first.text}" if first else "none within 2 s"),
+            )
+        )
+    return Table(_title("Injected faults", len(faults)), columns, tuple(rows))
+
+
+def _title(what: str, number: int) -> str:
+    return what if number <= MOST_SHOWN else f"{what}: the first {MOST_SHOWN} of {number}; --json has all"
+
+
+def _bytes(data: bytes) -> str:
+    if not data:
+        return "-"
+    more = f" ... {len(data)} bytes" if len(data) > _MOST_BYTES else ""
+    return data[:_MOST_BYTES].hex(" ") + more
