@@ -6,30 +6,9 @@ import difflib
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Literal
 
 from dxlrun.description.units import duration
 from dxlrun.errors import InputError
-
-KindName = Literal[
-    "lose",
-    "corrupt",
-    "truncate",
-    "delay",
-    "duplicate",
-    "noise",
-    "silence",
-    "babble",
-    "reboot",
-    "brownout",
-    "voltage",
-    "overload",
-    "overheat",
-    "duplicate_id",
-    "unplug",
-    "wedge",
-    "storm",
-]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,7 +18,8 @@ class Fault:
     None: not given. Times are ns; `at_ns` counts from the start of the simulation.
     """
 
-    kind: KindName
+    kind: str
+    """One of KINDS."""
     bus: str | None = None
     """None: the only bus there is."""
     servo: int | None = None
@@ -99,6 +79,8 @@ class Kind:
         return (*self.needs, *self.takes)
 
 
+SHORTEST_PAUSE_NS = 100_000
+"""A babbling servo without pauses would leave the simulation no time."""
 WHEN = ("bus", "at", "packet")
 _OF_PACKET = ("servo", "from", "count", *WHEN)
 
@@ -143,7 +125,7 @@ KINDS: Mapping[str, Kind] = {
         ("servo", "for", *WHEN),
     ),
     "overload": Kind("the shaft of a servo is loaded beyond its torque", ("servo",), WHEN),
-    "overheat": Kind("a servo is hot (default 90 degrees C)", ("servo",), ("celsius", "for", *WHEN)),
+    "overheat": Kind("a servo is hot (default 90)", ("servo",), ("celsius", "for", *WHEN)),
     "duplicate_id": Kind("a second servo of the same model has this ID", ("servo",), WHEN),
     "unplug": Kind(
         "the adapter is pulled, and comes back after for=, under another name", (), ("for", *WHEN)
@@ -272,6 +254,13 @@ def _some_time(text: str) -> int:
     return value
 
 
+def _pause(text: str) -> int:
+    value = _time(text)
+    if value < SHORTEST_PAUSE_NS:
+        raise ValueError("write a time of 100us or more")
+    return value
+
+
 def _show_time(value: object) -> str:
     total = int(str(value))
     for unit, ns in (("s", 10**9), ("ms", 10**6), ("us", 10**3)):
@@ -329,7 +318,7 @@ KEYS: Mapping[str, Key] = {
     "copies": Key("copies", "NUMBER", _integer(2, 16)),
     "data": Key("data", "HEX", _hex, lambda value: value.hex() if isinstance(value, bytes) else ""),
     "size": Key("size", "BYTES", _integer(1, _MOST_BYTES)),
-    "every": Key("every_ns", "TIME", _some_time, _show_time),
+    "every": Key("every_ns", "TIME", _pause, _show_time),
     "volts": Key("volts", "V", _number(0.0, 60.0), _show_number),
     "celsius": Key("celsius", "DEGREES", _number(-50.0, 200.0), _show_number),
     "seed": Key("seed", "NUMBER", _integer(0, 2**63 - 1)),

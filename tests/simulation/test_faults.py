@@ -1,0 +1,433 @@
+"""Each kind of fault, as the host and the ledger see it; storms; and faults that could never happen."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from dxlrun.clock import VirtualClock
+from dxlrun.errors import InputError, PortError
+from dxlrun.simulation import BusConfig, Ledger, ServoConfig, SimulatedBus, VirtualPorts
+from dxlrun.simulation.faults import FaultScript, parse_fault
+from dxlrun.simulation.storm import PASSING
+
+PING, READ, WRITE = 0x01, 0x02, 0x03
+TORQUE_ENABLE, LED = 24, 25
+MS = 1_000_000
+PONG = {servo_id: bytes((0xFF, 0xFF, servo_id, 2, 0, ~(servo_id + 2) & 0xFF)) for servo_id in (1, 2)}
+"""A ping's answer: e-Manual, Protocol 1.0, Status Packet."""
+
+
+def inject(line: Any, *texts: str, seed: int = 0) -> FaultScript:
+    """Hang faults on a line, now."""
+    script = FaultScript([parse_fault(text) for text in texts], seed)
+    script.attach((line.bus,), start_ns=0, now_ns=line.clock.now_ns())
+    return script
+
+
+def happened(line: Any) -> list[str]:
+    return [note.removeprefix("fault: ") for note in line.notes() if note.startswith("fault: ")]
+
+
+def ping(line: Any, servo_id: int = 1) -> bytes:
+    """Return what the host hears after a ping."""
+    line.send(servo_id, PING)
+    heard: bytes = line.hear()
+    return heard
+
+
+# Packets
+
+
+def test_a_lost_reply_is_missing_once_and_the_servo_obeyed(line: Any) -> None:
+    inject(line, "lose servo=1")
+    line.send(1, WRITE, LED, 1)
+    assert line.hear() == b""
+    assert line.servo(1).registers["led"] == 1
+    assert ping(line) == PONG[1]
+    assert happened(line) == ["lose servo=1"]
+
+
+def test_the_reply_of_another_servo_is_not_touched(line: Any) -> None:
+    script = inject(line, "lose servo=1")
+    assert ping(line, 2) == PONG[2]
+    assert happened(line) == []
+    assert [str(fault) for fault in script.waiting] == ["lose servo=1"]
+
+
+def test_several_replies_are_lost_one_after_the_other_and_the_fault_is_told_once(line: Any) -> None:
+    inject(line, "lose servo=1 count=3")
+    assert [ping(line) for _ in range(4)] == [b"", b"", b"", PONG[1]]
+    assert happened(line) == ["lose servo=1 count=3"]
+
+
+def test_a_lost_instruction_is_heard_by_no_servo(line: Any) -> None:
+    inject(line, "lose from=host")
+    line.send(1, WRITE, LED, 1)
+    assert line.hear() == b""
+    assert line.servo(1).registers["led"] == 0
+    assert ping(line) == PONG[1]
+    assert happened(line) == ["lose from=host"]
+
+
+@pytest.mark.parametrize(
+    ("text", "wrong"),
+    [
+        ("corrupt servo=1", {5: 0x01}),
+        ("corrupt servo=1 byte=2 flip=0x80", {2: 0x80}),
+        ("corrupt servo=1 byte=-6 flip=0xff", {0: 0xFF}),
+        ("corrupt servo=1 byte=99", {5: 0x01}),
+        ("corrupt servo=1 byte=-99", {0: 0x01}),
+    ],
+)
+def test_a_corrupted_reply_differs_in_the_bits_that_were_asked_for(
+    line: Any, text: str, wrong: dict[int, int]
+) -> None:
+    inject(line, text)
+    heard = ping(line)
+    assert {index: a ^ b for index, (a, b) in enumerate(zip(heard, PONG[1], strict=True)) if a != b} == wrong
+    assert ping(line) == PONG[1]
+    assert happened(line) == [text]
+
+
+def test_a_corrupted_instruction_is_not_obeyed(line: Any) -> None:
+    inject(line, "corrupt from=host byte=6")
+    line.send(1, WRITE, LED, 1)
+    line.hear()
+    assert line.servo(1).registers["led"] == 0
+    assert happened(line) == ["corrupt from=host byte=6"]
+
+
+def test_of_a_truncated_reply_the_first_bytes_come(line: Any) -> None:
+    inject(line, "truncate servo=1 keep=4")
+    assert ping(line) == PONG[1][:4]
+    assert ping(line) == PONG[1]
+    assert happened(line) == ["truncate servo=1 keep=4"]
+
+
+def test_a_delayed_reply_comes_whole_and_later(line: Any) -> None:
+    def answered_after_ns() -> int:
+        sent_ns = line.clock.now_ns()
+        assert ping(line) == PONG[1]
+        return int(next(e.t_ns for e in reversed(line.ledger.entries) if e.direction == "out")) - sent_ns
+
+    usual_ns = answered_after_ns()
+    inject(line, "delay servo=1 by=5ms")
+    assert answered_after_ns() == usual_ns + 5 * MS
+    assert answered_after_ns() == usual_ns
+    assert happened(line) == ["delay servo=1 by=5ms"]
+
+
+@pytest.mark.parametrize(("text", "times"), [("duplicate servo=1", 2), ("duplicate servo=1 copies=4", 4)])
+def test_a_duplicated_reply_comes_several_times(line: Any, text: str, times: int) -> None:
+    inject(line, text)
+    assert ping(line) == PONG[1] * times
+    assert ping(line) == PONG[1]
+    assert happened(line) == [text]
+
+
+# The line
+
+
+def test_noise_comes_between_the_packets(line: Any) -> None:
+    inject(line, "noise data=ff00fd")
+    assert line.hear() == b"\xff\x00\xfd"
+    assert ping(line) == PONG[1]
+    assert happened(line) == ["noise data=ff00fd"]
+
+
+def test_random_noise_is_that_of_the_seed(make_line: Callable[..., Any]) -> None:
+    heard = []
+    for seed in (1, 1, 2):
+        line = make_line()
+        inject(line, "noise size=20", seed=seed)
+        heard.append(line.hear())
+    assert {len(each) for each in heard} == {20}
+    assert heard[0] == heard[1] != heard[2]
+
+
+def test_a_babbling_servo_talks_until_its_time_is_over(line: Any) -> None:
+    inject(line, "babble servo=1 size=4 every=1ms for=10ms")
+    assert len(line.hear(20 * MS)) == 40
+    assert line.hear(20 * MS) == b""
+    assert happened(line) == ["babble servo=1 size=4 every=1ms for=10ms"]
+
+
+def test_a_babbling_servo_spoils_what_the_host_says(line: Any) -> None:
+    inject(line, "babble servo=1 size=100 every=1ms for=50ms")
+    line.hear(MS // 2)
+    line.send(2, WRITE, LED, 1)
+    line.hear(100 * MS)
+    assert line.servo(2).registers["led"] == 0
+    assert any("collision" in note for note in line.notes())
+
+
+def test_an_unplugged_adapter_is_gone_and_comes_back(line: Any) -> None:
+    inject(line, "unplug at=1s for=2s")
+    assert ping(line) == PONG[1]
+    line.clock.wait_until(1_000 * MS)
+    line.bus.advance(1_000 * MS)
+    with pytest.raises(PortError):
+        line.send(1, PING)
+    line.bus.advance(2_999 * MS)
+    assert not line.bus.plugged
+    line.bus.advance(3_000 * MS)
+    assert line.bus.plugged
+    assert happened(line) == ["unplug at=1s for=2s"]
+
+
+def test_a_wedged_adapter_takes_bytes_and_gives_none(line: Any) -> None:
+    inject(line, "wedge for=50ms")
+    line.send(1, WRITE, LED, 1)
+    assert line.hear(40 * MS) == b""
+    assert ping(line, 2) == b""
+    line.hear(20 * MS)
+    assert ping(line) == PONG[1]
+    assert happened(line) == ["wedge for=50ms"]
+
+
+# Servos
+
+
+def test_a_silent_servo_keeps_what_it_has_and_speaks_again(line: Any) -> None:
+    line.write(1, TORQUE_ENABLE, 1)
+    inject(line, "silence servo=1 for=50ms")
+    assert ping(line) == b""
+    assert ping(line, 2) == PONG[2]
+    line.hear(50 * MS)
+    assert ping(line) == PONG[1]
+    assert line.read(1, TORQUE_ENABLE, 1) == 1
+    assert happened(line) == ["silence servo=1 for=50ms"]
+
+
+def test_a_servo_is_silent_until_the_last_of_two_faults_ends(line: Any) -> None:
+    inject(line, "silence servo=1 at=0s for=20ms", "silence servo=1 at=10ms for=50ms")
+    line.hear(40 * MS)
+    assert ping(line) == b""
+    line.hear(20 * MS)
+    assert ping(line) == PONG[1]
+    assert len(happened(line)) == 2
+
+
+def test_a_rebooted_servo_is_deaf_and_has_lost_its_ram_alone(line: Any) -> None:
+    for servo_id in (1, 2):
+        line.write(servo_id, TORQUE_ENABLE, 1)
+    inject(line, "reboot servo=1 for=50ms")
+    assert ping(line) == b""
+    line.hear(50 * MS)
+    assert [line.read(servo_id, TORQUE_ENABLE, 1) for servo_id in (1, 2)] == [0, 1]
+    assert happened(line) == ["reboot servo=1 for=50ms"]
+
+
+def test_a_brown_out_takes_the_power_of_every_servo(line: Any) -> None:
+    for servo_id in (1, 2):
+        line.write(servo_id, TORQUE_ENABLE, 1)
+    inject(line, "brownout for=50ms")
+    assert [ping(line, servo_id) for servo_id in (1, 2)] == [b"", b""]
+    line.hear(50 * MS)
+    assert [line.read(servo_id, TORQUE_ENABLE, 1) for servo_id in (1, 2)] == [0, 0]
+    assert happened(line) == ["brownout for=50ms"]
+
+
+def test_after_a_brown_out_a_servo_counts_its_time_from_when_the_power_is_back(line2: Any) -> None:
+    inject(line2, "brownout servo=1 at=1s for=500ms")
+    line2.wait(2.0)
+    assert line2.get("realtime_tick", 1) == pytest.approx(500, abs=5)
+    assert line2.get("realtime_tick", 2) == pytest.approx(2000, abs=15)
+
+
+def test_a_wrong_voltage_is_an_error_as_long_as_it_lasts(line: Any) -> None:
+    inject(line, "voltage servo=1 volts=5.1 for=50ms")
+    for wrong in (0x01, 0):  # e-Manual, Protocol 1.0, Error: bit 0, Input Voltage
+        answer = line.ask(1, PING)
+        assert answer.error == wrong
+        line.hear(60 * MS)
+    assert line.read(1, 42, 1) == 120
+    assert happened(line) == ["voltage servo=1 volts=5.1 for=50ms"]
+
+
+def test_two_wrong_voltages_leave_the_one_that_was_before(line: Any) -> None:
+    inject(line, "voltage volts=5 at=0s for=20ms", "voltage servo=1 volts=20 at=10ms for=50ms")
+    line.hear(100 * MS)
+    assert [line.read(servo_id, 42, 1) for servo_id in (1, 2)] == [120, 120]
+
+
+def test_an_overloaded_servo_tells_it(line: Any) -> None:
+    inject(line, "overload servo=1")
+    answer = line.ask(1, PING)
+    assert answer.error == 0x20  # e-Manual, Protocol 1.0, Error: bit 5, Overload
+    assert line.ask(2, PING).error == 0
+    assert happened(line) == ["overload servo=1"]
+
+
+def test_a_hot_servo_of_protocol_2_switches_off_and_tells_it(line2: Any) -> None:
+    line2.set("torque_enable", 1)
+    inject(line2, "overheat servo=1")
+    answer = line2.request(1, PING)
+    assert answer.error == 0x80  # e-Manual, Protocol 2.0, Error: Alert
+    assert line2.get("hardware_error_status") == 0x04  # e-Manual, XM430-W350: bit 2, OverHeating
+    assert line2.get("torque_enable") == 0
+    assert happened(line2) == ["overheat servo=1"]
+
+
+def test_two_servos_with_one_id_talk_at_once(line: Any) -> None:
+    inject(line, "duplicate_id servo=1")
+    line.write(2, LED, 1)
+    twins = [servo for servo in line.bus.servos if servo.servo_id == 1]
+    assert len(twins) == 2
+    twins[1].poke("led", 1)
+    line.send(1, READ, LED, 1)
+    line.hear()
+    assert any("collision" in note for note in line.notes())
+    assert happened(line) == ["duplicate_id servo=1"]
+
+
+# When
+
+
+def test_a_fault_waits_for_its_time(line: Any) -> None:
+    inject(line, "lose servo=1 at=500ms")
+    assert ping(line) == PONG[1]
+    line.clock.wait_until(500 * MS)
+    assert ping(line) == b""
+    assert ping(line) == PONG[1]
+
+
+def test_times_count_from_the_start_of_the_simulation(make_line: Callable[..., Any]) -> None:
+    line = make_line(start_ns=7_000 * MS)
+    FaultScript([parse_fault("silence servo=1 at=500ms")]).attach((line.bus,), start_ns=7_000 * MS)
+    line.clock.wait_until(7_499 * MS)
+    assert ping(line) == PONG[1]
+    line.clock.wait_until(7_501 * MS)
+    assert ping(line) == b""
+
+
+def test_a_fault_waits_for_its_packet(line: Any) -> None:
+    inject(line, "silence servo=1 packet=3")
+    heard = [ping(line) for _ in range(5)]
+    assert heard[:2] == [PONG[1]] * 2
+    assert heard[3:] == [b""] * 2
+
+
+def test_a_fault_by_hand_happens_now(line: Any) -> None:
+    line.clock.wait_until(5_000 * MS)
+    inject(line, "silence servo=1")
+    assert ping(line) == b""
+    (told,) = (entry for entry in line.ledger.entries if entry.note == "fault: silence servo=1")
+    assert told.t_ns == 5_000 * MS
+
+
+# What could never happen
+
+
+def two_buses() -> tuple[SimulatedBus, ...]:
+    ledger = Ledger()
+    servos = {"left": (1, 2), "right": (3,), "bare": ()}
+    return tuple(
+        SimulatedBus(
+            BusConfig(name, 1_000_000, tuple(ServoConfig(each, "AX-12A", 2.0) for each in ids)), ledger, 0
+        )
+        for name, ids in servos.items()
+    )
+
+
+def test_all_that_could_never_happen_is_told_at_once_and_nothing_is_planned() -> None:
+    buses = two_buses()
+    script = FaultScript(
+        [
+            parse_fault(text)
+            for text in (
+                "silence bus=left servo=1",
+                "lose servo=1",
+                "lose bus=middle servo=1",
+                "lose bus=left servo=3",
+                "storm bus=bare faults=3 within=1s",
+                "unplug bus=right at=1s",
+            )
+        ]
+    )
+    with pytest.raises(InputError) as refused:
+        script.attach(buses, now_ns=2_000 * MS)
+    assert refused.value.sentences == (
+        "lose servo=1: there are 3 buses; say which one: bus=left or bus=right or bus=bare",
+        "lose bus=middle servo=1: there is no bus 'middle'; write bus=left or bus=right or bus=bare",
+        "lose bus=left servo=3: bus left has no servo 3; its servos are 1, 2",
+        "storm bus=bare faults=3 within=1s: bus bare has no servos; name another one with bus=",
+        "unplug bus=right at=1s: it is 2.000 s after the start already; leave at= out for now",
+    )
+    assert all(bus.next_due_ns() is None for bus in buses)
+    assert script.waiting == ()
+
+
+# Storms
+
+
+def stormy(text: str, *, seed: int = 0, model: str = "AX-12A", ids: tuple[int, ...] = (1, 2, 3)) -> Any:
+    """Return the ledger of 3 s in which a host reads all servos in turn while a storm blows."""
+    clock, ledger = VirtualClock(0), Ledger()
+    bus = SimulatedBus(
+        BusConfig("main", 1_000_000, tuple(ServoConfig(each, model, 2.0) for each in ids)), ledger, 0
+    )
+    port = VirtualPorts(clock, (bus,)).ports[0]
+    FaultScript([parse_fault(each) for each in text.splitlines()], seed).attach((bus,))
+    buffer = memoryview(bytearray(4096))
+    while clock.now_ns() < 3_000 * MS:
+        for servo_id in ids:
+            body = bytes((servo_id, 4, READ, 36, 2))
+            port.write(b"\xff\xff" + body + bytes((~sum(body) & 0xFF,)))
+            clock.wait_until(clock.now_ns() + 5 * MS)
+            port.read_into(buffer)
+    return ledger.entries
+
+
+def faults_of(entries: Any) -> list[str]:
+    return [entry.note.removeprefix("fault: ") for entry in entries if entry.note.startswith("fault: ")]
+
+
+def test_a_storm_is_the_same_again_from_its_seed() -> None:
+    storm = "storm seed=7 faults=40 within=2s"
+    entries = stormy(storm)
+    assert entries == stormy(storm)
+    assert faults_of(entries) != faults_of(stormy("storm seed=8 faults=40 within=2s"))
+
+
+def test_a_storm_without_a_seed_takes_that_of_the_script() -> None:
+    storm = "storm faults=10 within=2s"
+    assert stormy(storm, seed=1) == stormy(storm, seed=1)
+    assert faults_of(stormy(storm, seed=1)) != faults_of(stormy(storm, seed=2))
+
+
+def test_a_storm_has_every_kind_that_passes_and_each_fault_stands_in_the_ledger_once() -> None:
+    told = faults_of(stormy("storm seed=7 faults=100 within=2s"))
+    assert {text.split()[0] for text in told} == set(PASSING)
+    assert max(Counter(told).values()) == 1
+    assert len(told) == 100
+    assert all(str(parse_fault(text)) == text for text in told)
+    assert all(0 <= (parse_fault(text).at_ns or 0) <= 2_000 * MS for text in told)
+
+
+def test_the_lines_of_a_storm_in_the_ledger_make_the_same_storm_again() -> None:
+    entries = stormy("storm seed=3 faults=30 within=2s kinds=lose,corrupt,truncate,delay,silence,reboot")
+    lines = sorted(faults_of(entries), key=lambda text: parse_fault(text).at_ns or 0)
+    assert stormy("\n".join(lines)) == entries
+
+
+def test_a_storm_has_only_the_kinds_that_it_names() -> None:
+    told = faults_of(stormy("storm seed=1 faults=12 within=1s kinds=lose,overheat at=1s"))
+    assert {text.split()[0] for text in told} == {"lose", "overheat"}
+    assert all(1_000 * MS <= (parse_fault(text).at_ns or 0) <= 2_000 * MS for text in told)
+
+
+def test_a_storm_over_several_buses_names_the_bus_of_each_fault() -> None:
+    left, right, _ = two_buses()
+    script = FaultScript([parse_fault("storm seed=2 faults=20 within=1s")])
+    script.attach((left, right))
+    assert {match[1] for fault in script.waiting if (match := re.search(r"bus=(\w+)", str(fault)))} == {
+        "left",
+        "right",
+    }
+    assert all(fault.servo in (None, 3) for fault in script.waiting if fault.bus == "right")
