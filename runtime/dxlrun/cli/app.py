@@ -16,6 +16,7 @@ from dxlrun.cli.models import models
 from dxlrun.cli.replay import replay
 from dxlrun.cli.run import run
 from dxlrun.cli.schema import schema
+from dxlrun.cli.sim import sim
 from dxlrun.cli.terminal import say_error, say_warning
 from dxlrun.errors import DxlrunError, InputError
 
@@ -25,6 +26,7 @@ INTERRUPTED = 130
 HELP = """Run a robot of Dynamixel servos from one YAML file.
 
 `dxlrun ROBOT.yaml` runs it, `dxlrun check ROBOT.yaml` looks at it without touching hardware,
+`dxlrun sim ROBOT.yaml` simulates its servos for other programs,
 `dxlrun analyze LOG` says what happened in a run."""
 
 EPILOGUE = """Exit codes: 0 good, 1 the robot or the run failed, 2 the input is wrong, 130 interrupted."""
@@ -43,6 +45,7 @@ def build() -> App:
     app.command(check)
     app.command(analyze)
     app.command(replay)
+    app.command(sim)
     app.command(schema)
     app.command(models)
     return app

@@ -12,7 +12,7 @@ from dxlrun.errors import InputError
 if TYPE_CHECKING:
     from dxlrun.compile import Ask, Compiled
 
-COMMANDS = ("analyze", "check", "replay", "schema")
+COMMANDS = ("analyze", "check", "models", "replay", "schema", "sim")
 
 
 SHORTEST_S, LONGEST_S = 1e-6, 1e9

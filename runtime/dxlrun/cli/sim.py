@@ -1,0 +1,196 @@
+"""`dxlrun sim`: simulated servos that other programs open as they would open an adapter."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from dxlrun.cli.flags import Flag, JsonFlag
+from dxlrun.cli.inputs import compiled
+from dxlrun.cli.sim_inputs import Absent, AdapterWishes, Split, read_faults, servo_bus, with_adapter
+from dxlrun.cli.terminal import out, say_error, say_warning
+from dxlrun.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from dxlrun.cli.sim_views import Shown
+    from dxlrun.simulation import BusConfig
+    from dxlrun.simulation.process import SimulationConfig
+    from dxlrun.simulation_front import FrontOptions, Served
+
+Words = Annotated[tuple[str, ...], Parameter(negative=(), show_default=False, allow_leading_hyphen=False)]
+Seed = Annotated[int, Parameter(show_default=False)]
+
+
+def sim(
+    robot: Path | None = None,
+    /,
+    *assignments: Annotated[str, Parameter(name="arg:=value")],
+    servo: Words = (),
+    baud: int | None = None,
+    protocol: float | None = None,
+    link: Path | None = None,
+    fault: Words = (),
+    faults: Path | None = None,
+    seed: Seed = 0,
+    ledger: Path | None = None,
+    latency_timer: str | None = None,
+    split: Split | None = None,
+    echo: Flag = False,
+    absent: Absent | None = None,
+    as_json: JsonFlag = False,
+    debug: Flag = False,
+) -> int:
+    """Serve simulated servos on pseudo-terminals until Ctrl-C, for any program that speaks Dynamixel.
+
+    Give a robot file, or servos by `--servo`. Faults can be typed while it runs; `help` lists them.
+
+    Parameters
+    ----------
+    robot
+        A robot file: each of its buses is simulated, whatever its port says.
+    assignments
+        Arguments of the robot file, for example rate:=25.
+    servo
+        Servos on one bus without a robot file, MODEL:IDS, for example XL430-W250:1-3 or AX-12A:1,4; may be
+        given several times.
+    baud
+        Baud rate of that bus, bit/s; without it the one that the servos are shipped with.
+    protocol
+        Protocol of that bus, 1.0 or 2.0; needed only by models that exist with both.
+    link
+        A symbolic link to the pseudo-terminal, which gets another name at each start; with several buses
+        LINK.NAME for each bus.
+    fault
+        A fault, for example "lose servo=3 at=2s"; may be given several times.
+    faults
+        A text file of faults, one a line.
+    seed
+        What is random in faults and adapter is drawn from this number (0 without it).
+    ledger
+        Write every byte on the buses with its time, and every fault, into this file.
+    latency_timer
+        The adapter keeps replies back for so long, for example "4 ms", as FTDI adapters do.
+    split
+        How the adapter hands replies over: whole, byte by byte, or in pieces of random length.
+    echo
+        The adapter gives back what is sent, as some half-duplex adapters do.
+    absent
+        What those after an absent servo do in a sync or bulk read: answer never (silent), or later (slot).
+    as_json
+        Print the ports as JSON, then a line of JSON for each fault.
+    debug
+        Print the traceback of an error, and what the process of the servos said.
+    """
+    planned = read_faults(fault, faults)
+    title, buses, hint = _from_file(robot, assignments, servo, baud, protocol)
+    wishes = AdapterWishes(latency_timer, split, echo, absent)
+    buses = tuple(with_adapter(bus, wishes, seed) for bus in buses)
+    links = link_of_each(buses, link)
+    from dxlrun.cli.sim_views import Shown, ending
+    from dxlrun.simulation.process import SimulationConfig
+    from dxlrun.simulation_front import FrontOptions
+
+    _writable(ledger)
+    config = SimulationConfig(
+        buses=buses,
+        faults=tuple(str(each) for each in planned),
+        seed=seed,
+        links={bus: str(path) for bus, path in links.items()},
+    )
+    shown = Shown(title, buses, links, hint)
+    served = _serve(config, FrontOptions(ledger), shown, as_json=as_json)
+    if not as_json:
+        out().print(ending(title, served.elapsed_s, served.look), markup=False, soft_wrap=True)
+        if ledger is not None:
+            out().print(f"ledger: {ledger}", markup=False, soft_wrap=True)
+    for sentence in served.sentences:
+        say_error(f"{title}: {sentence}")
+    return 1 if served.sentences else 0
+
+
+def _from_file(
+    robot: Path | None,
+    assignments: Sequence[str],
+    servo: Sequence[str],
+    baud: int | None,
+    protocol: float | None,
+) -> tuple[str, tuple[BusConfig, ...], str | None]:
+    """Return title, buses, and a command line that would use them."""
+    if robot is None:
+        if not servo:
+            raise InputError(
+                "there is nothing to simulate; give a robot file, or servos such as --servo XL430-W250:1-3"
+            )
+        return "simulation", (servo_bus(servo, baud, protocol),), None
+    options = {"--servo": servo or None, "--baud": baud, "--protocol": protocol}
+    given = [name for name, value in options.items() if value is not None]
+    if given:
+        raise InputError(f"{' and '.join(given)} and a robot file exclude each other; leave one of them out")
+    result = compiled(robot, assignments, (), None)
+    for warning in result.warnings:
+        say_warning(str(warning))
+    from dxlrun.compile.simulated import simulated_buses
+
+    plan = result.plan
+    everywhere = replace(plan, buses=tuple(replace(bus, port="sim") for bus in plan.buses))
+    others = [word for word in assignments if not word.startswith("port:=")]
+    hint = " ".join(["dxlrun", str(robot), *others, "port:={port}"])
+    takes_port = len(plan.buses) == 1 and "port" in plan.arguments
+    return plan.robot, simulated_buses(everywhere), hint if takes_port else None
+
+
+def link_of_each(buses: Sequence[BusConfig], link: Path | None) -> dict[str, Path]:
+    """Return the link of each bus: LINK itself for one bus, LINK.NAME for several.
+
+    Raises InputError when something that is no link stands there, or no link can be made there.
+    """
+    if link is None:
+        return {}
+    names = [bus.name for bus in buses]
+    links = {name: link if len(names) == 1 else link.with_name(f"{link.name}.{name}") for name in names}
+    wrong = []
+    if not link.parent.is_dir():
+        wrong.append(f"--link {link}: there is no directory {link.parent}; make it first")
+    wrong += [
+        f"--link {path} stands there already and is no link; it is not replaced, choose another --link"
+        for path in links.values()
+        if path.exists() and not path.is_symlink()
+    ]
+    if wrong:
+        raise InputError("\n".join(wrong))
+    return {name: path.absolute() for name, path in links.items()}
+
+
+def _writable(ledger: Path | None) -> None:
+    """Refuse a ledger that cannot be written with one sentence, before anything starts."""
+    if ledger is None:
+        return
+    try:
+        ledger.open("a").close()
+    except OSError as error:
+        raise InputError(
+            f"--ledger {ledger} cannot be written ({error.strerror}); choose another file"
+        ) from None
+
+
+def _serve(config: SimulationConfig, options: FrontOptions, shown: Shown, *, as_json: bool) -> Served:
+    """Serve it to whom stdout leads: a program, a pipe, or a person at a terminal."""
+    from dxlrun.cli.sim_views import JsonView, PlainView
+    from dxlrun.simulation_front import TypedLines, serve
+
+    typed = TypedLines(sys.stdin.fileno())
+    if as_json:
+        return serve(config, options, JsonView(shown), typed)
+    if not sys.stdout.isatty():
+        return serve(config, options, PlainView(shown), typed)
+    from dxlrun.cli.sim_table import TableView
+
+    view = TableView(shown, out())
+    with view.showing():
+        return serve(config, options, view, typed)

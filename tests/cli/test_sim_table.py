@@ -1,0 +1,120 @@
+"""The live table of `dxlrun sim`, and the letters that are typed below it."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from io import StringIO
+
+import pytest
+from rich.console import Console
+
+from dxlrun.cli.sim_table import page
+from dxlrun.simulation_front import Look, ServoLook, TypedLines
+
+
+def look(count: int, **changes: float) -> Look:
+    servos = [
+        ServoLook(
+            bus="main",
+            id=each,
+            model="XL430-W250",
+            torque=each == 1,
+            goal=None if each == 2 else math.pi,
+            present=math.pi / 2,
+            temperature=31.4,
+            voltage=11.94,
+            error=0x20 if each == 2 else 0,
+            heard=100 + each,
+            answered=each,
+        )
+        for each in range(1, count + 1)
+    ]
+    return Look(tuple(servos), changes)
+
+
+def drawn(shown: Look, typed: str = "", height: int = 24, *, several: bool = False) -> list[str]:
+    file = StringIO()
+    Console(file=file, width=100, height=height).print(page(shown, typed, height, several=several))
+    return [line.rstrip() for line in file.getvalue().splitlines()]
+
+
+def test_a_line_a_servo_says_what_it_does():
+    head, _, first, second, *_ = drawn(look(2))
+
+    assert head.split() == [
+        *(
+            "ID",
+            "model",
+            "torque",
+            "goal",
+            "deg",
+            "present",
+            "deg",
+            "degC",
+            "V",
+            "errors",
+            "heard",
+            "answered",
+        )
+    ]
+    assert first.split() == ["1", "XL430-W250", "on", "180.0", "90.0", "31", "11.9", "-", "101", "1"]
+    assert second.split() == ["2", "XL430-W250", "-", "-", "90.0", "31", "11.9", "0x20", "102", "2"]
+
+
+def test_buses_are_named_where_there_are_several():
+    assert drawn(look(1), several=True)[2].split()[:3] == ["main", "1", "XL430-W250"]
+
+
+def test_what_is_typed_stands_below():
+    *_, late, prompt = drawn(look(1, median=12.0), "lose servo=3")
+
+    assert late == "replies later than planned: median 12 us"
+    assert prompt.startswith("fault> lose servo=3")
+
+
+def test_a_low_window_keeps_the_prompt():
+    lines = drawn(look(40), "lose", height=12)
+
+    assert len(lines) < 12
+    assert "... and 34 more; a higher window shows them" in lines
+    assert lines[-1].startswith("fault> lose")
+
+
+@pytest.fixture
+def keyboard() -> Iterator[tuple[int, TypedLines]]:
+    reader, writer = os.pipe()
+    yield writer, TypedLines(reader)
+    os.close(reader)
+
+
+@pytest.mark.parametrize(
+    ("letters", "lines", "pending"),
+    [
+        (b"lose servo=1\nreboot servo=2\nno", ["lose servo=1", "reboot servo=2"], "no"),
+        (b"overlaod\x7f\x7f\x7foad servo=1\r", ["overload servo=1"], ""),
+        (b"rubbish\x15help\n\n  \n", ["help"], ""),
+        (b"lo\x1b[A\x1b[1;5Dse\x1bOP \xff\x00\n", ["lose \ufffd"], ""),
+        (b"x" * 3000, [], "x" * 1024),
+    ],
+)
+def test_letters_become_lines(
+    keyboard: tuple[int, TypedLines], letters: bytes, lines: list[str], pending: str
+):
+    writer, typed = keyboard
+    os.write(writer, letters)
+
+    assert typed.receive() == lines
+    assert (typed.pending, typed.ended) == (pending, False)
+    os.close(writer)
+
+
+def test_an_end_gives_what_was_not_finished(keyboard: tuple[int, TypedLines]):
+    writer, typed = keyboard
+    os.write(writer, b"help")
+    os.close(writer)
+
+    assert typed.receive() == []
+    assert typed.receive() == ["help"]
+    assert typed.ended

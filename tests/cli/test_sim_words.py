@@ -1,0 +1,168 @@
+"""What `dxlrun sim` makes of its words, before anything starts."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+
+from dxlrun.cli.sim import link_of_each
+from dxlrun.cli.sim_inputs import AdapterWishes, read_faults, servo_bus, with_adapter
+from dxlrun.cli.sim_views import PlainView, Shown, ending
+from dxlrun.errors import InputError
+from dxlrun.simulation import BusConfig, ServoConfig
+from dxlrun.simulation_front import Look, ServoLook
+
+BUS = BusConfig("main", 57_600, (ServoConfig(1, "XL430-W250", 0.0),), 2.0)
+
+
+def test_servos_need_no_robot_file():
+    bus = servo_bus(["XL430-W250:1-3", "XM430-W350:11,9"], None, None)
+
+    assert [(servo.servo_id, servo.model) for servo in bus.servos] == [
+        *((each, "XL430-W250") for each in (1, 2, 3)),
+        *((each, "XM430-W350") for each in (11, 9)),
+    ]
+    assert (bus.baud_rate, bus.protocol) == (57_600, 2.0)
+    assert bus.servos[0].position == pytest.approx(math.pi, abs=0.001)  # the middle, where it is mounted
+
+
+@pytest.mark.parametrize(
+    ("word", "rate"), [("AX-12A:1", 1_000_000), ("RX-28:1", 57_600), ("YM070-210-M001:1", 57_600)]
+)
+def test_without_a_baud_rate_it_is_that_of_a_new_servo(word: str, rate: int):
+    assert servo_bus([word], None, None).baud_rate == rate
+
+
+def test_protocol_1_has_rates_by_its_formula():
+    assert servo_bus(["AX-12A:1"], 333_333, None).baud_rate == 333_333
+
+
+def test_a_name_with_two_firmwares_follows_the_protocol():
+    assert servo_bus(["MX-28:1"], None, 1.0).protocol == 1.0
+    assert servo_bus(["MX-28:1"], None, 2.0).protocol == 2.0
+    assert servo_bus(["MX-28:1", "XM430-W350:2"], 1_000_000, None).protocol == 2.0
+
+
+@pytest.mark.parametrize(
+    ("words", "sentences"),
+    [
+        (["--servo", "AX-12A"], ["--servo AX-12A: this is not MODEL:IDS; write it such as XL430-W250:1-3"]),
+        (["--servo", "AX-12A:3-1"], ["--servo AX-12A:3-1: 3-1 is empty; write the lower ID first"]),
+        (["--servo", "AX-12A:1-99999999999999"], ["1-99999999999999 is no ID of a servo"]),
+        (["--servo", "XL430-W250:253"], ["XL430-W250 cannot have ID 253; Protocol 2.0 goes to 252"]),
+        (
+            ["--servo", "AX-12B:1", "--servo", "toaster:2", "--servo", "AX-12A:x"],
+            [
+                "--servo AX-12A:x: this is not MODEL:IDS",
+                "--servo: there is no model AX-12B; did you mean AX-12?",
+                "--servo: there is no model toaster; `dxlrun models` lists all",
+            ],
+        ),
+        (["--servo", "AX-12A:1,2,1"], ["ID 1 is given to AX-12A and to AX-12A; give every servo its own"]),
+        (["--servo", "MX-28:1"], ["MX-28 exist with Protocol 1.0 and with 2.0; say which one by --protocol"]),
+        (["--servo", "MX-28:1", "--protocol", "3"], ["there is no Protocol 3; --protocol is 1.0 or 2.0"]),
+        (["--servo", "AX-12A:1", "--protocol", "2"], ["AX-12A speaks Protocol 1.0, not 2.0"]),
+        (["--servo", "AX-12A:1", "--servo", "XM430-W350:2"], ["a bus has one protocol"]),
+        (["--servo", "XM430-W350:1", "--baud", "12345"], ["has no baud rate of 12345 bit/s; it has 9600"]),
+        (["--servo", "AX-12A:1", "--servo", "RX-28:2"], ["AX-12A 1000000, RX-28 57600); give one by --baud"]),
+        ([], ["there is nothing to simulate; give a robot file, or servos"]),
+        (["{torso}", "--servo", "AX-12A:1", "--baud", "9600"], ["--servo and --baud and a robot file excl"]),
+        (["{torso}", "--fault", "lsoe servo=3"], ["--fault 'lsoe servo=3': there is no fault"]),
+        (["{torso}", "--faults", "missing.txt"], ["the faults in missing.txt cannot be read (No such file"]),
+        (["{torso}", "--latency-timer", "4"], ["--latency-timer '4': "]),
+        (["{torso}", "--ledger", "missing/ledger"], ["--ledger missing/ledger cannot be written"]),
+        (["{torso}", "--link", "missing/robot"], ["--link missing/robot: there is no directory missing"]),
+        (["torso.yaml"], ["there is no robot file torso.yaml; check the path"]),
+    ],
+)  # fmt: skip
+def test_wrong_words_are_sentences_and_exit_code_two(
+    dxlrun, torso: Path, words: list[str], sentences: list[str]
+):
+    said = dxlrun("sim", *(word.format(torso=torso) for word in words))
+
+    assert (said.code, said.out) == (2, "")
+    told = [line for line in said.errors if ": warning: " not in line]
+    assert len(told) == len(sentences), told
+    for line, sentence in zip(told, sentences, strict=True):
+        assert sentence in line
+
+
+def test_faults_come_from_the_line_and_from_a_file(tmp_path: Path):
+    file = tmp_path / "faults.txt"
+    file.write_text(
+        "# a bad day\n\nsilence servo=2 at=2s for=1s   # a loose plug\n  overload servo=1 at=3s\n"
+    )
+
+    read = read_faults(["lose servo=1 at=1s"], file)
+
+    assert [str(fault).split()[0] for fault in read] == ["lose", "silence", "overload"]
+
+
+def test_every_wrong_fault_is_told_with_its_place(dxlrun, torso: Path, tmp_path: Path):
+    file = tmp_path / "faults.txt"
+    file.write_text("lose servo=1\n  lose servo=one\nexplode\n")
+
+    alone = dxlrun("sim", torso, "--faults", file)
+    both = dxlrun("sim", torso, "--faults", file, "--fault", "lose")
+
+    assert [line.split(" ")[0] for line in alone.errors] == [f"{file}:2:3:", f"{file}:3:1:"]
+    assert (alone.code, both.code) == (2, 2)
+    assert len(both.errors) == 3
+
+
+def test_options_replace_what_the_robot_file_says_of_the_adapter():
+    wishes = AdapterWishes("4 ms", "random", echo=True, absent="slot")
+    bus = with_adapter(BUS, wishes, 7)
+
+    assert (bus.adapter.latency_timer_ns, bus.adapter.split, bus.adapter.echo) == (4_000_000, "random", True)
+    assert (bus.adapter.seed, bus.absent) == (7, "slot")
+    assert with_adapter(bus, AdapterWishes(), 7) == bus
+
+
+def test_one_bus_has_the_link_itself_and_several_have_its_name_and_theirs(tmp_path: Path):
+    other = BusConfig("arm", 57_600, (), 2.0)
+
+    assert link_of_each([BUS], tmp_path / "robot") == {"main": tmp_path / "robot"}
+    assert link_of_each([BUS, other], tmp_path / "robot") == {
+        "main": tmp_path / "robot.main",
+        "arm": tmp_path / "robot.arm",
+    }
+    assert link_of_each([BUS], None) == {}
+
+
+def test_what_is_no_link_is_never_replaced(tmp_path: Path):
+    (tmp_path / "file").write_text("precious")
+    (tmp_path / "dangling").symlink_to("/dev/pts/nowhere")
+
+    with pytest.raises(InputError, match="stands there already and is no link"):
+        link_of_each([BUS], tmp_path / "file")
+    assert link_of_each([BUS], tmp_path / "dangling") == {"main": tmp_path / "dangling"}
+
+
+def test_the_ports_are_said_once(capsys: pytest.CaptureFixture[str]):
+    servos = tuple(ServoConfig(each, "AX-12A", 0.0) for each in (1, 2, 3, 7))
+    bus = BusConfig("main", 1_000_000, servos)
+    view = PlainView(Shown("torso", (bus,), {"main": Path("/tmp/robot")}, "dxlrun torso.yaml port:={port}"))  # noqa: S108
+
+    view.opened({"main": "/dev/pts/7"})
+    view.fault("lose servo=1")
+
+    assert capsys.readouterr().out.splitlines() == [
+        "torso: 4 servos simulated on 1 bus; Ctrl-C ends it, `help` lists faults to type",
+        "  main: /tmp/robot (/dev/pts/7), 1000000 bit/s, Protocol 1.0, AX-12A 1-3, 7",
+        "next: dxlrun torso.yaml port:=/tmp/robot",
+        "fault: lose servo=1",
+    ]
+
+
+def test_the_last_line_says_what_passed():
+    servo = ServoLook("main", 1, "AX-12A", True, None, 0.0, 25.0, 12.0, 0, heard=1, answered=0)
+    look = Look((servo,), {"median": 12.3, "p99": 80.0})
+
+    assert ending("torso", 2.04, look) == (
+        "torso: ended after 2.0 s. 1 packet heard, 0 packets answered; "
+        "replies later than planned: median 12 us, p99 80 us"
+    )
+    assert ending("torso", 2.04, Look()) == "torso: ended after 2.0 s. 0 packets heard, 0 packets answered"
