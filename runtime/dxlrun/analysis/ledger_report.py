@@ -16,6 +16,7 @@ import msgspec
 from dxlrun.analysis.bus import joints_of
 from dxlrun.analysis.ledger_alignment import Span, differing
 from dxlrun.analysis.ledger_faults import FaultAnswers, answered, faults_in
+from dxlrun.analysis.ledger_lateness import Lateness, lateness
 from dxlrun.analysis.ledger_streams import WAYS, Stream, Way, logged, seen
 from dxlrun.analysis.verdict import counted
 from dxlrun.errors import InputError
@@ -77,6 +78,8 @@ class LedgerReport:
     """In order of time."""
     faults: tuple[FaultAnswers, ...]
     """What was injected during the run."""
+    lateness: Lateness | None
+    """None where no servo said anything."""
 
 
 def compare(log: Log, entries: Sequence[LedgerEntry], ledger: Path) -> LedgerReport:
@@ -104,14 +107,16 @@ def compare(log: Log, entries: Sequence[LedgerEntry], ledger: Path) -> LedgerRep
         buses.append(_bus(name, packets, found, outside))
         differences += found
     faults = answered(faults_in(of_run), log.events, joints_of(log), begin_ns)
+    late = lateness(log, of_run)
     return LedgerReport(
         log=str(log.path),
         ledger=str(ledger),
         same=not any(bus.differences for bus in buses),
-        sentences=tuple(_sentences(buses, faults)),
+        sentences=(*_sentences(buses, faults), *_said_of(late)),
         buses=tuple(buses),
         differences=tuple(sorted(differences, key=lambda difference: difference.seconds)),
         faults=faults,
+        lateness=late,
     )
 
 
@@ -242,3 +247,12 @@ def _sentences(buses: Sequence[ComparedBus], faults: Sequence[FaultAnswers]) -> 
         were = "fault was" if len(faults) == 1 else "faults were"
         said.append(f"{len(faults)} {were} injected{borne}.")
     return said
+
+
+def _said_of(late: Lateness | None) -> list[str]:
+    """Return what a person must know of the simulation before they blame the loop."""
+    if late is None or not late.overruns:
+        return []
+    overran = f"The loop overran {counted(late.overruns, 'time', 'times')}"
+    beside = "never" if not late.overruns_beside else counted(late.overruns_beside, "time", "times")
+    return [f"{overran}, {beside} with a simulated reply that was more than 1 ms late."]

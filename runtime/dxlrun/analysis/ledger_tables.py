@@ -8,6 +8,7 @@ from rich.console import Group
 from rich.text import Text
 
 from dxlrun.analysis.ledger_faults import FaultAnswers
+from dxlrun.analysis.ledger_lateness import Lateness
 from dxlrun.analysis.ledger_report import ComparedBus, Difference, LedgerReport
 from dxlrun.analysis.tables import Cell, Column, Table
 from dxlrun.analysis.terminal import Shown
@@ -26,6 +27,7 @@ def render_comparison(report: LedgerReport) -> Group:
         buses_table(report.buses),
         differences_table(report.differences),
         faults_table(report.faults),
+        lateness_table(report.lateness),
     )
     return Group(
         Text(first, style=style),
@@ -100,6 +102,24 @@ def faults_table(faults: Sequence[FaultAnswers]) -> Table:
             )
         )
     return Table(_title("Injected faults", len(faults)), columns, tuple(rows))
+
+
+def lateness_table(late: Lateness | None) -> Table:
+    """Return how late the simulation itself was; empty on virtual time, where nothing is late."""
+    columns = (Column("simulation", "name"), Column(""))
+    if late is None or not late.max_us:
+        return Table("", columns, ())
+    rows = (
+        ("deliveries", str(late.deliveries)),
+        ("late, median", microseconds(late.median_us)),
+        ("  99 %", microseconds(late.p99_us)),
+        ("  maximum", microseconds(late.max_us)),
+        ("later than 1 ms", str(late.rough)),
+        ("overruns of the loop", str(late.overruns)),
+        ("  beside one later than 1 ms", str(late.overruns_beside)),
+    )
+    cells = tuple((Cell(name), Cell(value)) for name, value in rows)
+    return Table("How late the simulated buses were", columns, cells)
 
 
 def _title(what: str, number: int) -> str:
