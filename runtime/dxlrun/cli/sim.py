@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from dxlrun.cli.sim_views import Shown
     from dxlrun.simulation import BusConfig
+    from dxlrun.simulation.faults import Fault
     from dxlrun.simulation.process import SimulationConfig
     from dxlrun.simulation_front import FrontOptions, Served
 
@@ -92,6 +93,7 @@ def sim(
     wishes = AdapterWishes(latency_timer, split, echo, absent)
     buses = tuple(with_adapter(bus, wishes, seed) for bus in buses)
     links = link_of_each(buses, link)
+    refuse_what_cannot_be(buses, planned, seed)
     from dxlrun.cli.sim_views import Shown, ending
     from dxlrun.simulation.process import SimulationConfig
     from dxlrun.simulation_front import FrontOptions
@@ -143,6 +145,22 @@ def _from_file(
     hint = " ".join(["dxlrun", str(robot), *others, "port:={port}"])
     takes_port = len(plan.buses) == 1 and "port" in plan.arguments
     return plan.robot, simulated_buses(everywhere), hint if takes_port else None
+
+
+def refuse_what_cannot_be(buses: Sequence[BusConfig], faults: Sequence[Fault], seed: int) -> None:
+    """Put the buses together as their process will, so that what is wrong is said before anything starts.
+
+    Raises InputError for a servo that cannot be as it is told, and for each fault that could never happen.
+    """
+    from dxlrun.simulation import Ledger, SimulatedBus
+    from dxlrun.simulation.faults import FaultScript
+
+    ledger = Ledger(keep=False)
+    try:
+        tried = [SimulatedBus(bus, ledger, 0) for bus in buses]
+    except ValueError as error:
+        raise InputError(f"a servo cannot be simulated: {error}") from error
+    FaultScript(faults, seed).attach(tried)
 
 
 def link_of_each(buses: Sequence[BusConfig], link: Path | None) -> dict[str, Path]:
