@@ -37,7 +37,7 @@ def compile_buses(
                 name=name,
                 port=bus.port,
                 baud_rate=bus.baud_rate,
-                latency_ns=0 if bus.port == SIMULATED else bus.adapter.latency,
+                latency_ns=bus.simulation.latency_timer if bus.port == SIMULATED else bus.adapter.latency,
                 return_delay_ns=bus.return_delay_time,
                 joints=wirings,
                 protocol=bus.protocol,

@@ -3,11 +3,50 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 import msgspec
 
 from dxlrun.control.loop_plan import LoopPlan
 from dxlrun.dynamixel.bus_plan import BusPlan
+
+
+@dataclass(frozen=True, slots=True)
+class LoadPlan:
+    """What a simulated servo moves, as the servo feels it.
+
+    `dxlrun.simulation` has such words, too, but the loop reads the plan and must not load the simulation.
+    """
+
+    inertia: float = 0.0
+    """kg m^2"""
+    friction: float = 0.0
+    """Nm"""
+    gravity: float = 0.0
+    """Nm where the weight sticks out horizontally"""
+    gravity_angle: float = 0.0
+    """rad from the servo's raw 0, where the weight hangs straight down"""
+
+
+@dataclass(frozen=True, slots=True)
+class AdapterPlan:
+    """How a simulated bus and its adapter behave beside the servos."""
+
+    latency_timer_ns: int = 0
+    split: Literal["whole", "byte", "random"] = "whole"
+    echo: bool = False
+    absent: Literal["silent", "slot"] = "silent"
+
+
+@dataclass(frozen=True, slots=True)
+class SimulationPlan:
+    """What simulated servos and buses are told beside the rest of the plan."""
+
+    loads: dict[str, LoadPlan] = field(default_factory=dict)
+    """By joint; one that is missing moves nothing but itself."""
+    adapters: dict[str, AdapterPlan] = field(default_factory=dict)
+    """By bus."""
+    physics: Literal["independent", "mujoco"] = "independent"
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +67,7 @@ class Plan:
     """Text of each file that the robot file includes, by its name seen from there."""
     urdf: str | None = None
     """The robot's URDF as it was read."""
+    simulation: SimulationPlan = field(default_factory=SimulationPlan)
 
     @property
     def simulated(self) -> bool:

@@ -13,9 +13,10 @@ from dxlrun.compile.controllers import compile_controllers
 from dxlrun.compile.joints import AUTO, compile_joints
 from dxlrun.compile.left_out import left_out_names, still_true
 from dxlrun.compile.motions import compile_motion
-from dxlrun.compile.plan import Plan
+from dxlrun.compile.plan import Plan, SimulationPlan
 from dxlrun.compile.problems import Problems
 from dxlrun.compile.report import Checked, CheckReport, check_report
+from dxlrun.compile.simulation import compile_simulation
 from dxlrun.compile.twins import check_twins
 from dxlrun.compile.urdf import compile_urdf
 from dxlrun.control.loop_plan import LoopPlan, SchedulerPlan
@@ -112,6 +113,7 @@ def compile_robot(
     check_twins(description, {name: joint.table for name, joint in joints.items()}, problems)
     buses = compile_buses(description, joints, problems)
     urdf = compile_urdf(description, joints, problems)
+    simulation = compile_simulation(description, joints, problems)
     controllers = compile_controllers(description, plugins, problems)
     names = (*description.robot.controllers, *left_out_names(description, "controllers"))
     parts = [
@@ -122,10 +124,10 @@ def compile_robot(
     if end_ns is None and parts:
         end_ns = max(part.end_ns for part in parts)
     checked = Checked(description, joints, buses, controllers, parts, end_ns)
-    return Compiled(_plan(checked, urdf), problems.warnings, check_report(checked))
+    return Compiled(_plan(checked, urdf, simulation), problems.warnings, check_report(checked))
 
 
-def _plan(checked: Checked, urdf: str | None) -> Plan:
+def _plan(checked: Checked, urdf: str | None, simulation: SimulationPlan) -> Plan:
     description, robot = checked.description, checked.description.robot
     scheduler = robot.loop.scheduler
     commands = [command for part in checked.parts for command in part.commands]
@@ -151,4 +153,5 @@ def _plan(checked: Checked, urdf: str | None) -> Plan:
             for file, text in description.included.items()
         },
         urdf=urdf,
+        simulation=simulation,
     )

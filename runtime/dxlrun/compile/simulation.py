@@ -1,0 +1,104 @@
+"""The `simulation` keys of the robot file: what simulated servos move, and how their adapters behave.
+
+On a real port nothing of it is used, so what could not be simulated is then a warning at most.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Mapping
+
+from dxlrun.compile.buses import SIMULATED
+from dxlrun.compile.joints import CompiledJoint
+from dxlrun.compile.plan import AdapterPlan, LoadPlan, SimulationPlan
+from dxlrun.compile.problems import Problems
+from dxlrun.description import Description
+from dxlrun.description.robot import BusSimulation
+
+NEEDS_MUJOCO = "physics: mujoco needs MuJoCo, which is not installed"
+INSTALL_MUJOCO = "`pip install 'dxlrun[physics]'` installs it; or take physics: independent"
+NEEDS_URDF = "physics: mujoco moves the bodies of a URDF, and the file names none"
+NAME_URDF = "write `model: {urdf: ...}`, or take physics: independent"
+
+
+def compile_simulation(
+    description: Description, joints: Mapping[str, CompiledJoint], problems: Problems
+) -> SimulationPlan:
+    """Return what simulated servos and buses are told, and warn of what makes no sense."""
+    for name, joint in joints.items():
+        _check_load(description, name, joint, problems)
+    _check_buses(description, problems)
+    _check_physics(description, problems)
+    return SimulationPlan(
+        loads={name: load for name, joint in joints.items() if (load := _load(joint)) != LoadPlan()},
+        adapters={
+            name: AdapterPlan(told.latency_timer, told.split, told.echo, told.absent)
+            for name, bus in description.robot.buses.items()
+            if (told := bus.simulation) != BusSimulation()
+        },
+        physics=description.robot.simulation.physics,
+    )
+
+
+def _load(joint: CompiledJoint) -> LoadPlan:
+    told = joint.described.simulation
+    if not told.gravity:
+        return LoadPlan(told.inertia or 0.0, told.friction or 0.0)
+    return LoadPlan(
+        inertia=told.inertia or 0.0,
+        friction=told.friction or 0.0,
+        gravity=told.gravity,
+        gravity_angle=joint.described.reference + joint.described.direction * (told.gravity_angle or 0.0),
+    )
+
+
+def _check_load(description: Description, name: str, joint: CompiledJoint, problems: Problems) -> None:
+    told, table = joint.described.simulation, joint.table
+    if told.gravity_angle is not None and not told.gravity:
+        problems.warning(
+            description.marks.value("joints", name, "simulation", "gravity_angle"),
+            f"gravity_angle says where the weight of {name} hangs down, but it has none",
+            "say how heavy it is by `gravity: ... Nm`, or take gravity_angle out",
+        )
+    for key, torque, what in (
+        ("friction", told.friction, "cannot turn against a friction"),
+        ("gravity", told.gravity, "cannot hold a weight"),
+    ):
+        if torque is not None and 0 < table.stall_torque <= torque:
+            problems.warning(
+                description.marks.value("joints", name, "simulation", key),
+                f"the {table.model} of {name} {what} of {torque:g} Nm: "
+                f"it stalls at {table.stall_torque:g} Nm",
+                "check the value and its unit",
+            )
+    if description.robot.simulation.physics == "mujoco":
+        for key, value in (("inertia", told.inertia), ("gravity", told.gravity)):
+            if value is not None:
+                problems.warning(
+                    description.marks.value("joints", name, "simulation", key),
+                    f"with physics: mujoco the URDF says the {key} of {name}",
+                    f"take {key} out; it counts only for joints that the URDF does not turn",
+                )
+
+
+def _check_buses(description: Description, problems: Problems) -> None:
+    for name, bus in description.robot.buses.items():
+        if bus.simulation.absent == "slot" and bus.protocol == 1.0:
+            problems.warning(
+                description.marks.value("buses", name, "simulation", "absent"),
+                f"absent: slot is for servos of Protocol 2.0, bus {name} speaks Protocol 1.0",
+                "take it out",
+            )
+
+
+def _check_physics(description: Description, problems: Problems) -> None:
+    robot = description.robot
+    if robot.simulation.physics != "mujoco":
+        return
+    mark = description.marks.value("simulation", "physics")
+    simulated = any(bus.port == SIMULATED for bus in robot.buses.values())
+    tell = problems.error if simulated else problems.warning
+    if robot.model is None:
+        tell(mark, NEEDS_URDF, NAME_URDF)
+    if importlib.util.find_spec("mujoco") is None:
+        tell(mark, NEEDS_MUJOCO, INSTALL_MUJOCO)

@@ -1,0 +1,148 @@
+"""What the robot file says of simulated servos and adapters, on its way to the simulated bus."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from dxlrun.compile import Compiled
+from dxlrun.compile.plan import AdapterPlan, LoadPlan, SimulationPlan, from_json, to_json
+from dxlrun.compile.simulated import simulated_buses
+from dxlrun.errors import Problem
+from dxlrun.simulation import AdapterConfig, Load
+
+Compile = Callable[..., Compiled]
+ProblemsIn = Callable[..., tuple[Problem, ...]]
+
+
+@pytest.fixture
+def simulated(robot_text: str) -> str:
+    return robot_text.replace("/dev/ttyUSB0", "sim")
+
+
+def _joint(text: str, simulation: str) -> str:
+    """Say something of the left arm, whose reference is 60 deg and whose direction is -1."""
+    return text.replace("    direction: -1\n", f"    direction: -1\n    simulation: {simulation}\n", 1)
+
+
+def _bus(text: str, simulation: str) -> str:
+    return text.replace("adapter: {latency: 1 ms}}", f"simulation: {simulation}}}", 1)
+
+
+def test_what_a_servo_moves_reaches_the_simulated_servo(compile_text: Compile, simulated: str) -> None:
+    text = _joint(
+        simulated, "{inertia: 0.01 kg m^2, friction: 50 mNm, gravity: 0.3 Nm, gravity_angle: 90 deg}"
+    )
+    (bus,) = simulated_buses(compile_text(text).plan)
+    # the joint's +90 deg are the servo's 60 deg - 90 deg
+    assert bus.servos[0].load == Load(0.01, 0.05, 0.3, pytest.approx(math.radians(-30)))
+    assert bus.servos[1].load == Load()
+
+
+def test_a_weight_hangs_down_where_the_joint_is_zero_if_nothing_else_is_said(
+    compile_text: Compile, simulated: str
+) -> None:
+    (bus,) = simulated_buses(compile_text(_joint(simulated, "{gravity: 0.3 Nm}")).plan)
+    assert bus.servos[0].load == Load(gravity=0.3, gravity_angle=pytest.approx(math.radians(60)))
+
+
+def test_how_the_adapter_behaves_reaches_the_simulated_bus(compile_text: Compile, simulated: str) -> None:
+    plan = compile_text(_bus(simulated, "{latency_timer: 4 ms, split: byte, echo: true}")).plan
+    (bus,) = simulated_buses(plan)
+    assert bus.adapter == AdapterConfig(latency_timer_ns=4_000_000, split="byte", echo=True)
+    assert bus.absent == "silent"
+
+
+def test_the_time_budget_counts_the_simulated_timer(compile_text: Compile, simulated: str) -> None:
+    without = compile_text(simulated).plan.buses[0]
+    with_timer = compile_text(_bus(simulated, "{latency_timer: 2 ms}")).plan.buses[0]
+    assert (without.latency_ns, with_timer.latency_ns) == (0, 2_000_000)
+    assert with_timer.budget.total_ns > without.budget.total_ns
+
+
+def test_a_real_port_does_not_use_it_and_refuses_nothing(
+    compile_text: Compile, robot_text: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    told = robot_text.replace("latency: 1 ms}", "latency: 1 ms}, simulation: {latency_timer: 255 ms}")
+    compiled = compile_text(_joint(told, "{gravity: 90 Nm}") + "simulation: {physics: mujoco}\n")
+    (bus,) = compiled.plan.buses
+    assert bus.latency_ns == 1_000_000
+    assert simulated_buses(compiled.plan) == ()
+    assert [each.what for each in compiled.warnings if "physics: mujoco" in each.what] == [
+        "with physics: mujoco the URDF says the gravity of left_arm_joint",
+        "physics: mujoco moves the bodies of a URDF, and the file names none",
+        "physics: mujoco needs MuJoCo, which is not installed",
+    ]
+
+
+def test_the_plan_keeps_it_and_old_plans_have_none(compile_text: Compile, simulated: str) -> None:
+    plan = compile_text(_bus(_joint(simulated, "{friction: 0.1 Nm}"), "{split: random}")).plan
+    assert plan.simulation == SimulationPlan(
+        {"left_arm_joint": LoadPlan(friction=0.1)}, {"main": AdapterPlan(split="random")}
+    )
+    assert from_json(to_json(plan)) == plan
+    text = to_json(compile_text(simulated).plan)
+    _, _, rest = text.partition(b',"simulation":')
+    old = text[: -len(rest) - len(b',"simulation":')] + b"}"
+    assert from_json(old).simulation == SimulationPlan()
+
+
+@pytest.mark.parametrize(
+    ("simulation", "what", "mend"),
+    [
+        (
+            "{gravity_angle: 0 deg}",
+            "gravity_angle says where the weight of left_arm_joint hangs down, but it has none",
+            "say how heavy it is by `gravity: ... Nm`, or take gravity_angle out",
+        ),
+        (
+            "{friction: 1.5 Nm}",
+            "the AX-12A of left_arm_joint cannot turn against a friction of 1.5 Nm: it stalls at 1.5 Nm",
+            "check the value and its unit",
+        ),
+        (
+            "{gravity: 2 Nm}",
+            "the AX-12A of left_arm_joint cannot hold a weight of 2 Nm: it stalls at 1.5 Nm",
+            "check the value and its unit",
+        ),
+    ],
+)
+def test_what_makes_no_sense_is_a_warning_at_its_place(
+    problems_in: ProblemsIn, simulated: str, simulation: str, what: str, mend: str
+) -> None:
+    (problem,) = [each for each in problems_in(_joint(simulated, simulation)) if "left_arm" in each.what]
+    assert (problem.severity, problem.what, problem.mend) == ("warning", what, mend)
+    assert (
+        problem.mark.line
+        == _joint(simulated, simulation).splitlines().index(f"    simulation: {simulation}") + 1
+    )
+
+
+def test_slots_of_absent_servos_are_for_protocol_2(problems_in: ProblemsIn, simulated: str) -> None:
+    (problem,) = [each for each in problems_in(_bus(simulated, "{absent: slot}")) if "absent" in each.what]
+    assert problem.what == "absent: slot is for servos of Protocol 2.0, bus main speaks Protocol 1.0"
+    assert problem.severity == "warning"
+
+
+def test_mujoco_needs_a_urdf(problems_in: ProblemsIn, simulated: str) -> None:
+    (problem,) = [
+        each for each in problems_in(simulated + "simulation: {physics: mujoco}\n") if "URDF" in each.what
+    ]
+    assert problem.severity == "error"
+    assert problem.mend == "write `model: {urdf: ...}`, or take physics: independent"
+
+
+def test_mujoco_that_is_not_installed_is_named_with_its_extra(
+    problems_in: ProblemsIn, simulated: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "pair.urdf").write_text("<robot name='pair'><link name='body'/></robot>", encoding="utf-8")
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    text = simulated + "model: {urdf: pair.urdf}\nsimulation: {physics: mujoco}\n"
+    (problem,) = [each for each in problems_in(text) if each.severity == "error"]
+    assert problem.what == "physics: mujoco needs MuJoCo, which is not installed"
+    assert "pip install 'dxlrun[physics]'" in problem.mend
