@@ -160,7 +160,8 @@ def test_a_locked_eeprom_is_an_access_error(connect: Any, simulation: Any) -> No
     assert refused.value.dxl_error == DxlError.SDK_ERRNUM_ACCESS
 
 
-def test_a_factory_reset_but_for_id_and_rate_leaves_the_servo_there(connect: Any) -> None:
+def test_a_factory_reset_but_for_id_and_rate_leaves_the_servo_there(connect: Any, simulation: Any) -> None:
+    simulation.expect_haste("reset")
     bus = connect("reset")
     motor = bus.createMotor(1)
     motor.changeID(9)

@@ -195,7 +195,10 @@ def test_indirect_addresses_gather_items_in_one_block(open_port: Any, sdk: Any) 
     assert until(arrived)
 
 
-def test_indirect_addresses_are_those_of_the_manual_again_after_a_reboot(open_port: Any, sdk: Any) -> None:
+def test_indirect_addresses_are_those_of_the_manual_again_after_a_reboot(
+    open_port: Any, sdk: Any, simulation: Any
+) -> None:
+    simulation.expect_haste("indirect")
     port = open_port("indirect")
     first = sdk.read2ByteTxRx(port, 2, INDIRECT_ADDRESS)
     assert first == (INDIRECT_DATA, COMM_SUCCESS, 0)  # e-Manual: each points at its own data
@@ -205,7 +208,10 @@ def test_indirect_addresses_are_those_of_the_manual_again_after_a_reboot(open_po
     assert sdk.read2ByteTxRx(port, 2, INDIRECT_ADDRESS) == first
 
 
-def test_reboot_brings_the_ram_to_its_start_and_keeps_the_eeprom(open_port: Any, sdk: Any) -> None:
+def test_reboot_brings_the_ram_to_its_start_and_keeps_the_eeprom(
+    open_port: Any, sdk: Any, simulation: Any
+) -> None:
+    simulation.expect_haste("reboot")
     port = open_port("reboot")
     assert good(sdk.write1ByteTxRx(port, 1, RETURN_DELAY, 100))
     assert good(sdk.write1ByteTxRx(port, 1, LED, 1), sdk.write1ByteTxRx(port, 1, TORQUE, 1))
@@ -214,7 +220,8 @@ def test_reboot_brings_the_ram_to_its_start_and_keeps_the_eeprom(open_port: Any,
     assert [sdk.read1ByteTxRx(port, 1, each)[0] for each in (TORQUE, LED, RETURN_DELAY)] == [0, 0, 100]
 
 
-def test_factory_reset_keeps_what_its_option_names(open_port: Any, sdk: Any) -> None:
+def test_factory_reset_keeps_what_its_option_names(open_port: Any, sdk: Any, simulation: Any) -> None:
+    simulation.expect_haste("reset")
     port = open_port("reset")
     assert good(sdk.write1ByteTxRx(port, 2, RETURN_DELAY, 0))
     assert good(sdk.factoryReset(port, 2, 0x02))  # all but ID and baud rate
