@@ -89,10 +89,13 @@ def test_what_it_does_not_know_is_an_instruction_error(
     assert line.ask(1, instruction, *parameters) == (1, ErrorBit.INSTRUCTION, b"")
 
 
-def test_a_wrong_checksum_is_answered_as_such_and_not_obeyed(line: Any) -> None:
+@pytest.mark.parametrize(("answers", "said"), [(False, ""), (True, "ff ff 01 02 10 ec")])
+def test_a_wrong_checksum_is_not_obeyed(line: Any, answers: bool, said: str) -> None:
+    line.servo().answers_damaged = answers
     line.ports.ports[0].write(bytes.fromhex("ff ff 01 04 03 19 01 00"))
-    assert line.hear() == bytes.fromhex("ff ff 01 02 10 ec")
+    assert line.hear() == bytes.fromhex(said)
     assert line.servo().registers["led"] == 0
+    assert any("CHECKSUM" in note for note in line.notes())
 
 
 def test_broadcasts_are_obeyed_and_never_answered(line: Any) -> None:

@@ -9,6 +9,7 @@ import math
 from enum import IntEnum, unique
 
 from dxlrun.control_table import ControlItem
+from dxlrun.simulation.choices import choices
 from dxlrun.simulation.memory import Memory, in_range
 from dxlrun.simulation.protocol1 import ErrorBit
 from dxlrun.simulation.protocol2 import ErrorNumber
@@ -24,14 +25,21 @@ _TURNS = 256
 """Reach of extended position control to either side (e-Manual, X series, Goal Position (116): 1,048,575)."""
 
 
+_MULTI_TURN_GOAL = 28_672
+"""Reach of multi-turn mode to either side (e-Manual, MX series, Goal Position (30))."""
+_MULTI_TURN_LIMIT = 4095
+
+
 @unique
 class OperatingMode(IntEnum):
-    """Operating Mode (11) where the shaft moves; the position limits hold in POSITION."""
+    """Operating Mode (11); the position limits hold in POSITION."""
 
+    CURRENT = 0
     VELOCITY = 1
     POSITION = 3
     EXTENDED_POSITION = 4
     CURRENT_BASED_POSITION = 5
+    PWM = 16
 
 
 class LockRules:
@@ -56,15 +64,26 @@ class LockRules:
 
     def _refusal_of(self, item: ControlItem, wire: int) -> int:
         memory = self._memory
-        if item.access == "R" or not in_range(item, wire):
+        if item.access == "R" or not self._in_range(item, wire):
             return ErrorBit.RANGE
         if memory.get("lock") == 1 and (item.area == "EEPROM" or (item.name == "lock" and wire == 0)):
             return ErrorBit.RANGE
+        if (
+            item.name == "goal_torque"
+            and abs(item.decode(wire.to_bytes(2, "little"))) > memory["torque_limit"]
+        ):
+            return ErrorBit.RANGE  # e-Manual, Goal Torque (71): it cannot be bigger than Torque Limit
         if wheel_mode(memory):
             return 0
         if item.name == "moving_speed" and wire > memory.table.max_speed_tick:
             return ErrorBit.RANGE  # the direction bit belongs to wheel mode: "0 ~ 1,023 can be used"
         return ErrorBit.ANGLE_LIMIT if _beyond_angle_limits(memory, item.name, wire) else 0
+
+    def _in_range(self, item: ControlItem, wire: int) -> bool:
+        """Return whether a value may be: in multi-turn mode goals count turns, in two's complement."""
+        if item.name == "goal_position" and multi_turn_mode(self._memory):
+            return abs(wire - (wire >> 15 << 16)) <= _MULTI_TURN_GOAL
+        return in_range(item, wire)
 
 
 class TorqueRules:
@@ -72,6 +91,7 @@ class TorqueRules:
 
     def __init__(self, memory: Memory) -> None:
         self._memory = memory
+        self._choices = choices(memory.table)
 
     def refusal(self, address: int, data: bytes) -> int:
         """Return the error number with which a write would be refused; 0 when it would not.
@@ -104,10 +124,19 @@ class TorqueRules:
     def _in_range(self, item: ControlItem, wire: int) -> bool:
         """Return whether a value may be: a goal of many turns where the mode is not that of one turn."""
         memory = self._memory
+        if (listed := self._choices.get(item.name)) is not None:
+            return wire in listed
+        if item.name == "moving_speed" and not wheel_mode(memory):
+            return wire <= memory.table.max_speed_tick  # e-Manual, XL-320: the direction is for wheel mode
         if item.name != "goal_position" or self._one_turn(item):
-            return in_range(item, wire)
+            return in_range(item, wire) or self._within_wide_limits(item, wire)
         highest = round(_TURNS * math.tau / memory.table.rad_per_tick) - 1
         return abs(item.decode(wire.to_bytes(item.size, "little"))) <= max(highest, item.maximum)
+
+    def _within_wide_limits(self, item: ControlItem, wire: int) -> bool:
+        """Return whether a goal is one that only the position limits bound: those of Y reach over turns."""
+        limit = self._memory.table.items.get("max_position_limit")
+        return item.name == "goal_position" and limit is not None and in_range(limit, wire)
 
     def _one_turn(self, goal: ControlItem) -> bool:
         """Return whether the goal stays within a turn: by the operating mode, or as a gripper has no more."""
@@ -148,7 +177,14 @@ def wheel_mode(memory: Memory) -> bool:
     return memory.get("cw_angle_limit") == 0 and memory.get("ccw_angle_limit") == 0
 
 
+def multi_turn_mode(memory: Memory) -> bool:
+    """Return whether a servo of Protocol 1.0 counts turns: both angle limits are 4095 (e-Manual, MX)."""
+    if "multi_turn_offset" not in memory:
+        return False
+    return memory["cw_angle_limit"] == memory["ccw_angle_limit"] == _MULTI_TURN_LIMIT
+
+
 def _beyond_angle_limits(memory: Memory, name: str, wire: int) -> bool:
-    if name != "goal_position" or "cw_angle_limit" not in memory:
+    if name != "goal_position" or "cw_angle_limit" not in memory or multi_turn_mode(memory):
         return False
     return not memory["cw_angle_limit"] <= wire <= memory["ccw_angle_limit"]

@@ -40,10 +40,15 @@ class Instructions(Protocol):
 
 
 def make_body(
-    table: ControlTable, angle: float, start_ns: int, note: Callable[[str], None]
+    table: ControlTable,
+    angle: float,
+    start_ns: int,
+    note: Callable[[str], None],
+    firmware: int | None = None,
 ) -> tuple[Body, Instructions]:
     """Return a servo that is not switched on yet, its shaft at `angle` (rad from raw 0)."""
-    firmware = max(FIRMWARE[table.protocol], table.firmware, table.fast_sync_read_firmware or 0)
+    if firmware is None:
+        firmware = max(FIRMWARE[table.protocol], table.firmware, table.fast_sync_read_firmware or 0)
     memory = Memory(table, firmware)
     shaft: Shaft
     if "operating_mode" in table.items:

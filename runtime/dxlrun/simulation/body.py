@@ -14,6 +14,8 @@ from dxlrun.simulation.shaft import Shaft
 BOOT_NS = 100_000_000
 """How long a servo hears nothing after a reboot; no manual names it [i]."""
 
+_SECONDARY_IDS = ("secondary_shadow_id", "secondary_id")
+
 
 class Body(ABC):
     """One servo as its own instructions and its surroundings act on it."""
@@ -34,12 +36,23 @@ class Body(ABC):
         """How long a reboot or a factory reset by an instruction takes: Protocol 2.0."""
         self.deaf_until_ns = shaft.now_ns
         """Until then it boots and hears nothing."""
+        self.answers_damaged = False
+        """True: a packet with a wrong checksum is answered by the manual's error; False: never [?]."""
         self._registered: tuple[int, bytes] | None = None
+        self._secondary_item = next((each for each in _SECONDARY_IDS if each in memory), None)
 
     @property
     def servo_id(self) -> int:
         """ID (3 or 7)."""
         return self.memory["id"]
+
+    @property
+    def secondary_id(self) -> int | None:
+        """Secondary ID (12): 253 to 255 switch it off, and the ID goes first (e-Manual, X series)."""
+        if self._secondary_item is None:
+            return None
+        secondary = self.memory[self._secondary_item]
+        return None if secondary > 252 or secondary == self.memory["id"] else secondary
 
     def advance(self, now_ns: int) -> None:
         """Let time pass."""
@@ -66,6 +79,11 @@ class Body(ABC):
         memory.show("present_temperature", round(self.temperature))
         memory.show("present_voltage", round(self.voltage * 10))
         memory.show("present_input_voltage", round(self.voltage * 10))
+
+    @property
+    def hears_protocol(self) -> bool:
+        """False when it was told to speak another protocol."""
+        return True
 
     # Instructions that both protocols have
 

@@ -27,7 +27,7 @@ from dxlrun.simulation.adapter import Adapter
 from dxlrun.simulation.bus_config import BusConfig, ServoCounts
 from dxlrun.simulation.ledger import Ledger
 from dxlrun.simulation.mechanics import Mechanics
-from dxlrun.simulation.packets import BROADCAST, Codec, InstructionPacket, ReadEntry, ReadInTurn, Reply
+from dxlrun.simulation.packets import Codec, InstructionPacket, ReadEntry, ReadInTurn, Reply
 from dxlrun.simulation.servo import ServoConfig, SimulatedServo
 from dxlrun.simulation.wire import Chain, Change, Chunk, Wire
 
@@ -314,7 +314,7 @@ class SimulatedBus:
             self._read_in_turn(reading, end_ns)
         else:
             for servo in self.servos:
-                if packet.servo_id not in (servo.servo_id, BROADCAST) or not self._hears(servo):
+                if not servo.listens_to(packet.servo_id) or not self._hears(servo):
                     continue
                 counts = self._counts[servo]
                 counts.heard += packet.intact

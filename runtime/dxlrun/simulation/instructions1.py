@@ -17,7 +17,12 @@ class Instructions1:
         self._body = body
 
     def answers(self, packet: InstructionPacket, own: bool) -> bool:
-        """Return whether a status packet follows (Status Return Level (16)); of broadcasts only to a ping."""
+        """Return whether a status packet follows (Status Return Level (16)); of broadcasts only to a ping.
+
+        A packet with a wrong checksum gets none, unless `Body.answers_damaged` asks for the manual's error.
+        """
+        if not packet.intact and not self._body.answers_damaged:
+            return False
         if packet.intact and packet.instruction == Instruction.PING:
             return True
         level = 1 if packet.intact and packet.instruction == Instruction.READ else 2

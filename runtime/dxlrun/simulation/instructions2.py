@@ -15,8 +15,11 @@ SLOT_NS = 1_000_000
 
 _PING_REPLY = 14
 _CLEAR_TURNS = bytes.fromhex("01 44 58 4c 22")
+_CLEAR_ERROR = bytes.fromhex("02 45 52 43 4c")
 _BACK_UP = bytes.fromhex("01 43 54 52 4c")
 _RESTORE = bytes.fromhex("02 43 54 52 4c")
+_CLEARS_SINCE = 42
+"""Firmware of MX (2.0) and X from which on Clear is known, and a reset of everything is not for all."""
 _KEPT_BY_RESET = {0xFF: (), 0x01: ("id",), 0x02: ("id", "baud_rate", "baud_rate_bus")}
 
 
@@ -27,9 +30,15 @@ class Instructions2:
         self._body = body
 
     def answers(self, packet: InstructionPacket, own: bool) -> bool:
-        """Return whether a status packet follows (Status Return Level (68)); of broadcasts only to a ping."""
+        """Return whether a status packet follows (Status Return Level (68)); of broadcasts only to a ping.
+
+        Instructions to the Secondary ID get none, and a packet with a wrong CRC none, unless
+        `Body.answers_damaged` asks for the manual's error.
+        """
+        if not packet.intact and not self._body.answers_damaged:
+            return False
         if packet.intact and packet.instruction == Instruction.PING:
-            return True
+            return own or packet.servo_id == BROADCAST
         level = 1 if packet.intact and packet.instruction == Instruction.READ else 2
         return own and level <= self._body.memory["status_return_level"]
 
@@ -56,15 +65,15 @@ class Instructions2:
             case Instruction.READ if len(parameters) == 4:
                 answer = _read(self._body, _word(parameters, 0), _word(parameters, 2))
             case Instruction.WRITE if len(parameters) >= 3:
-                answer = self._body.write(_word(parameters, 0), parameters[2:]), b""
+                answer = self._write(packet.servo_id, _word(parameters, 0), parameters[2:]), b""
             case Instruction.REG_WRITE if len(parameters) >= 3:
-                answer = self._body.register(_word(parameters, 0), parameters[2:]), b""
+                answer = self._register(packet.servo_id, _word(parameters, 0), parameters[2:]), b""
             case Instruction.ACTION if self._body.has_registered:
                 answer = self._body.act(), b""
             case Instruction.SYNC_WRITE if packet.servo_id == BROADCAST:
-                answer = _sync_write(self._body, parameters), b""
+                answer = self._sync_write(parameters), b""
             case Instruction.BULK_WRITE if packet.servo_id == BROADCAST:
-                answer = _bulk_write(self._body, parameters), b""
+                answer = self._bulk_write(parameters), b""
             case _:
                 answer = _manage(self._body, packet), b""
         return answer
@@ -86,6 +95,42 @@ class Instructions2:
                 return None
         return answer
 
+    def _write(self, servo_id: int, address: int, data: bytes) -> int:
+        """Write what an instruction to an ID brought; through the Secondary ID it cannot reach the EEPROM."""
+        if servo_id == self._body.secondary_id and self._body.memory.reaches_eeprom(address, data):
+            return ErrorNumber.ACCESS
+        return self._body.write(address, data)
+
+    def _register(self, servo_id: int, address: int, data: bytes) -> int:
+        if servo_id == self._body.secondary_id and self._body.memory.reaches_eeprom(address, data):
+            return ErrorNumber.ACCESS
+        return self._body.register(address, data)
+
+    def _sync_write(self, parameters: bytes) -> int:
+        address, length = _word(parameters, 0), _word(parameters, 2)
+        if length == 0 or len(parameters) < 5 + length or (len(parameters) - 4) % (length + 1):
+            return ErrorNumber.INSTRUCTION
+        error, ids = 0, (self._body.servo_id, self._body.secondary_id)
+        for start in range(4, len(parameters), length + 1):
+            if parameters[start] in ids:  # a listed Secondary ID counts as well [i]
+                error = self._write(parameters[start], address, parameters[start + 1 : start + 1 + length])
+        return error
+
+    def _bulk_write(self, parameters: bytes) -> int:
+        writes, start = [], 0
+        while start < len(parameters):
+            length = _word(parameters, start + 3)
+            data = parameters[start + 5 : start + 5 + length]
+            if length == 0 or len(data) < length:
+                return ErrorNumber.INSTRUCTION  # and nothing of it is done [i]
+            writes.append((parameters[start], _word(parameters, start + 1), data))
+            start += 5 + length
+        error, ids = 0, (self._body.servo_id, self._body.secondary_id)
+        for servo_id, address, data in writes:
+            if servo_id in ids:
+                error = self._write(servo_id, address, data)
+        return error
+
 
 def _read(body: Body, address: int, length: int) -> Answer:
     """Return data, or an access error where no item is; cells between items are 0 [i]."""
@@ -95,53 +140,43 @@ def _read(body: Body, address: int, length: int) -> Answer:
     return 0, data
 
 
-def _sync_write(body: Body, parameters: bytes) -> int:
-    address, length = _word(parameters, 0), _word(parameters, 2)
-    if length == 0 or len(parameters) < 5 + length or (len(parameters) - 4) % (length + 1):
-        return ErrorNumber.INSTRUCTION
-    error, servo_id = 0, body.servo_id
-    for start in range(4, len(parameters), length + 1):
-        if parameters[start] == servo_id:
-            error = body.write(address, parameters[start + 1 : start + 1 + length])
-    return error
-
-
-def _bulk_write(body: Body, parameters: bytes) -> int:
-    writes, start = [], 0
-    while start < len(parameters):
-        length = _word(parameters, start + 3)
-        data = parameters[start + 5 : start + 5 + length]
-        if length == 0 or len(data) < length:
-            return ErrorNumber.INSTRUCTION  # and nothing of it is done [i]
-        writes.append((parameters[start], _word(parameters, start + 1), data))
-        start += 5 + length
-    error, own = 0, body.servo_id
-    for servo_id, address, data in writes:
-        if servo_id == own:
-            error = body.write(address, data)
-    return error
-
-
 def _manage(body: TorqueBody, packet: InstructionPacket) -> int:
-    """Obey what is not reading or writing; an instruction error for what it does not know."""
+    """Obey what is not reading or writing; an instruction error for what it does not know.
+
+    To its Secondary ID a servo does nothing of it that would change the EEPROM [i].
+    """
+    error: int = ErrorNumber.INSTRUCTION
     match packet.instruction, packet.parameters:
         case Instruction.REBOOT, b"":
             body.reboot()
-            return 0
+            error = 0
         case Instruction.FACTORY_RESET, parameters if len(parameters) == 1:
-            return _reset(body, parameters[0], packet.servo_id == BROADCAST)
-        case Instruction.CLEAR, parameters if parameters == _CLEAR_TURNS:
-            return body.clear_turns()
-        case Instruction.CONTROL_TABLE_BACKUP, parameters if parameters == _BACK_UP:
-            return body.back_up()
-        case Instruction.CONTROL_TABLE_BACKUP, parameters if parameters == _RESTORE:
-            return body.restore_backup()
-    return ErrorNumber.INSTRUCTION
+            error = _reset(body, parameters[0], packet.servo_id)
+        case Instruction.CLEAR, parameters if parameters == _CLEAR_TURNS and _clears(body):
+            error = body.clear_turns()
+        case Instruction.CLEAR, parameters if parameters == _CLEAR_ERROR and body.has_error_code:
+            error = body.clear_error()
+        case Instruction.CONTROL_TABLE_BACKUP, parameters if parameters == _BACK_UP and body.keeps_backup:
+            error = body.back_up()
+        case Instruction.CONTROL_TABLE_BACKUP, parameters if parameters == _RESTORE and body.keeps_backup:
+            shadow = packet.servo_id == body.secondary_id
+            error = ErrorNumber.ACCESS if shadow else body.restore_backup()
+    return error
 
 
-def _reset(body: TorqueBody, option: int, to_all: bool) -> int:
+def _clears(body: TorqueBody) -> bool:
+    """Return whether a servo knows Clear: MX (2.0) and X since firmware 42; P and Y [i], not the XL-320."""
+    memory = body.memory
+    old = memory["firmware_version"] < _CLEARS_SINCE and memory.table.items["torque_enable"].address == 64
+    return "operating_mode" in memory and not old
+
+
+def _reset(body: TorqueBody, option: int, servo_id: int) -> int:
+    if servo_id == body.secondary_id:
+        return ErrorNumber.ACCESS
     kept = _KEPT_BY_RESET.get(option)
-    if kept is None or (option == 0xFF and to_all):  # e-Manual, Factory Reset: "will NOT be activated"
+    # e-Manual, Factory Reset: a reset of everything "will NOT be activated" for all
+    if kept is None or (option == 0xFF and servo_id == BROADCAST and _clears(body)):
         return ErrorNumber.INSTRUCTION
     body.memory.restore_factory_values(keep=kept)
     body.reboot()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 
 from dxlrun.control_table import ControlItem, ControlTable
 
@@ -48,6 +49,12 @@ class Memory:
         for item in self.table.items.values():
             if item.area == "RAM":
                 self[item.name] = self._initial(item)
+
+    def reset(self, names: Iterable[str]) -> None:
+        """Set some items to their initial values, those of them that the model has."""
+        for name in names:
+            if (item := self.table.items.get(name)) is not None:
+                self[name] = self._initial(item)
 
     def __contains__(self, name: str) -> bool:
         return name in self._values
@@ -119,6 +126,13 @@ class Memory:
             self._names_at[address, length] = names
         return names
 
+    def reaches_eeprom(self, address: int, data: bytes) -> bool:
+        """Return whether a write would change the EEPROM area, also through Indirect Data."""
+        items = self.table.items
+        return any(
+            items[name].area == "EEPROM" for run in self.runs(address, data) for name in self.would_be(*run)
+        )
+
     def touches(self, address: int, length: int) -> bool:
         """Return whether any of some cells belongs to an item."""
         return any(cell in self._item_at for cell in range(address, address + length))
@@ -144,10 +158,6 @@ class Memory:
         self._memory[address : address + len(data)] = data
         self._values.update(after)
         return tuple(after)
-
-    def backup(self) -> dict[str, int]:
-        """Return the integers of all items that can be written."""
-        return {name: self[name] for name, item in self.table.items.items() if item.access == "RW"}
 
     @staticmethod
     def _initial(item: ControlItem) -> int:

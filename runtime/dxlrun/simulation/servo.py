@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from dxlrun.control_table import control_table
+from dxlrun.control_table import ControlTable, control_table, models_by_number
 from dxlrun.simulation.bodies import make_body
 from dxlrun.simulation.mechanics import NO_LOAD, Load, Mechanics
 from dxlrun.simulation.memory import Memory
@@ -27,6 +27,11 @@ class ServoConfig:
     """Initial value of Return Delay Time, rounded to its unit of 2 us."""
     load: Load = NO_LOAD
     """What its shaft moves."""
+    firmware: int | None = None
+    """Firmware Version: it decides the control table where a model has two, and the fast reads.
+
+    None: one that has all that the model's table names.
+    """
 
 
 class SimulatedServo:
@@ -46,8 +51,10 @@ class SimulatedServo:
         mechanics: Mechanics | None = None,
     ) -> None:
         self._note = note or (lambda text: None)
-        table = control_table(config.model, protocol)
-        self._body, self._instructions = make_body(table, config.position, start_ns, self._note)
+        table = _table(config, protocol)
+        self._body, self._instructions = make_body(
+            table, config.position, start_ns, self._note, config.firmware
+        )
         self._silent = False
         self.registers["id"] = config.servo_id
         self._baud_item = (
@@ -70,6 +77,15 @@ class SimulatedServo:
         return self._body.servo_id
 
     @property
+    def secondary_id(self) -> int | None:
+        """Secondary ID (12), to which it hears and never answers; None: it has none, or it is off."""
+        return self._body.secondary_id
+
+    def listens_to(self, servo_id: int) -> bool:
+        """Return whether an instruction to an ID, or to all, is for this servo."""
+        return servo_id in (self.servo_id, BROADCAST) or servo_id == self.secondary_id
+
+    @property
     def baud_rate(self) -> int:
         """The rate at which it listens, bit/s."""
         return _rate(self._body.memory, self._body.memory[self._baud_item])
@@ -83,7 +99,7 @@ class SimulatedServo:
         """Obey an instruction whose last byte arrived at `now_ns`; return the reply, None for silence."""
         servo_id = self.servo_id  # a write of ID is still answered under the old one [i]
         own = packet.servo_id == servo_id
-        if not (own or packet.servo_id == BROADCAST) or not self._hears(now_ns):
+        if not self.listens_to(packet.servo_id) or not self._hears(now_ns):
             return None
         body, instructions = self._body, self._instructions
         answering = instructions.answers(packet, own)
@@ -109,7 +125,7 @@ class SimulatedServo:
         return Reply(self.servo_id, answer[0] | self._body.state(), answer[1], delay_ns)
 
     def _hears(self, now_ns: int) -> bool:
-        if self._silent or now_ns < self._body.deaf_until_ns:
+        if self._silent or now_ns < self._body.deaf_until_ns or not self._body.hears_protocol:
             return False
         self._body.hear(now_ns)
         return True
@@ -124,6 +140,15 @@ class SimulatedServo:
     @wakes_on_goal.setter
     def wakes_on_goal(self, on: bool) -> None:
         self._body.wakes_on_goal = on
+
+    @property
+    def answers_damaged(self) -> bool:
+        """Whether a packet with a wrong checksum gets the manual's error; a robot may do either [?]."""
+        return self._body.answers_damaged
+
+    @answers_damaged.setter
+    def answers_damaged(self, on: bool) -> None:
+        self._body.answers_damaged = on
 
     @property
     def boot_ns(self) -> int:
@@ -205,6 +230,17 @@ class SimulatedServo:
         self._note(f"servo {self.servo_id}: turned by hand to {angle} rad")
         self._body.shaft.rest_at(angle)
         self._body.shaft.plan(self._body.shaft.items)
+
+
+def _table(config: ServoConfig, protocol: float) -> ControlTable:
+    """Return the table of a model, or the one that its number has with the firmware that was asked for."""
+    table = control_table(config.model, protocol)
+    if config.firmware is None:
+        return table
+    fitting = (
+        each for each in models_by_number(table.model_number, protocol) if each.firmware <= config.firmware
+    )
+    return next(fitting, table)
 
 
 def _rate(memory: Memory, value: int) -> int:

@@ -1,10 +1,15 @@
-"""How a servo of Protocol 2.0 protects itself: Hardware Error Status, its latch, and the Bus Watchdog."""
+"""How a servo of Protocol 2.0 protects itself: Hardware Error Status, its latch, and the Bus Watchdog.
+
+The Y series tells of errors by Error Code instead, each of which takes the torque away. Not modelled of it:
+the time that switching its torque takes, its brake, and Controller State but for off, running and fault.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from enum import IntFlag, unique
 
+from dxlrun.control_table import ControlItem
 from dxlrun.simulation.access import OperatingMode, TorqueRules, watchdog_expired
 from dxlrun.simulation.body import Body
 from dxlrun.simulation.memory import Memory
@@ -31,8 +36,31 @@ class HardwareError(IntFlag):
     OVERLOAD = 0x20
 
 
+_GAINS = (
+    "velocity_i_gain",
+    "velocity_p_gain",
+    "position_d_gain",
+    "position_i_gain",
+    "position_p_gain",
+    "feedforward_2nd_gain",
+    "feedforward_1st_gain",
+)
+_LIMITS = frozenset(("pwm_limit", "current_limit"))
+_PROFILE = ("profile_acceleration", "profile_velocity")
+_SPEAKS = (2, 20, 21, 22)
+"""Values of Protocol Type (13) with which a servo hears Protocol 2.0: without a remote control on the line it
+falls back from S.BUS, iBUS and RC-PWM (e-Manual, X330, Protocol Type (13))."""
+
 _XL320_BIT = {HardwareError.OVERLOAD: 0x01, HardwareError.OVERHEATING: 0x02, HardwareError.VOLTAGE: 0x04}
 """The XL-320 orders them otherwise (e-Manual, XL-320, Shutdown (18))."""
+
+_ERROR_CODE = {HardwareError.OVERLOAD: 0x05, HardwareError.OVERHEATING: 0x04}
+_OVER_VOLTAGE, _LOW_VOLTAGE = 0x01, 0x02
+"""Error Code (153) of the Y series; the other codes are not modelled. Source: the maker's ROS package
+dynamixel_hardware_interface, ErrorCodeTable."""
+_HISTORY = 16
+_INVERTER_OFF, _RUNNING, _FAULT = 2, 5, 8
+"""Controller State (152) of the Y series."""
 
 
 class TorqueBody(Body):
@@ -41,6 +69,8 @@ class TorqueBody(Body):
     def __init__(self, memory: Memory, shaft: Shaft, note: Callable[[str], None]) -> None:
         super().__init__(memory, shaft, note)
         self._rules = TorqueRules(memory)
+        self.has_error_code = "error_code" in memory
+        """True for the Y series, which keeps its turns without power, too."""
         self._backup: dict[str, int] = {}
         self._shut_down = False
         self._started_ns = shaft.now_ns
@@ -79,20 +109,27 @@ class TorqueBody(Body):
         return error
 
     def state(self) -> int:
-        """Return the alert bit while Hardware Error Status tells of something."""
-        return ALERT if self.memory.get("hardware_error_status") else 0
+        """Return the alert bit while Hardware Error Status or Error Code tells of something."""
+        memory = self.memory
+        return ALERT if memory.get("error_code" if self.has_error_code else "hardware_error_status") else 0
 
     def protect(self, refused: int = 0) -> None:
         """Show what is wrong, and switch the torque off until a reboot when Shutdown lists it."""
         memory = self.memory
         wrong = self._wrong()
+        if self.has_error_code:
+            self._tell_error_code(wrong)
         latched = memory.get("hardware_error_status") if self._shut_down else 0
-        memory.show("hardware_error_status", wrong | latched)
-        if wrong & memory.get("shutdown") and not self._shut_down:
+        shown = sum(_XL320_BIT[each] if "control_mode" in memory else each for each in wrong)
+        memory.show("hardware_error_status", shown | latched)
+        listed = bool(wrong) if self.has_error_code else shown & memory.get("shutdown")
+        if listed and not self._shut_down:
             self._shut_down = True
-            self.note(f"servo {self.servo_id}: shutdown, torque off: hardware error status {wrong:#04x}")
+            named = f"error code {memory['error_code']:#04x}" if self.has_error_code else f"{shown:#04x}"
+            self.note(f"servo {self.servo_id}: shutdown, torque off: hardware error status {named}")
             memory["torque_enable"] = 0
             self.shaft.plan(("torque_enable",))
+        self._show_controller_state()
 
     def reboot(self) -> None:
         """Start again; the servo is deaf until it has."""
@@ -100,40 +137,106 @@ class TorqueBody(Body):
         self.power_up()
         self.deaf_until_ns = self.shaft.now_ns + self.boot_ns
 
+    def power_up(self) -> None:
+        """Start: RAM is as it is at power-up, and so is the angle, but for the turns of the Y series."""
+        angle = self.shaft.angle
+        super().power_up()
+        if self.has_error_code:
+            self._rest_at(angle)
+
     def clear_turns(self) -> int:
-        """Bring Present Position back into one turn; return the error: it must not move."""
-        if self.shaft.moving:
+        """Bring Present Position back into one turn; return the error: it must not move.
+
+        The Y series wants the torque off as well, and reboots. The goal is then the position [i].
+        """
+        if self.shaft.moving or (self.has_error_code and self.memory.get("torque_enable")):
             return ErrorNumber.RESULT_FAIL
-        self.shaft.rest_at(self.shaft.within_a_turn(self.shaft.angle))
-        self.shaft.plan(("goal_position",))
+        self._rest_at(self.shaft.within_a_turn(self.shaft.angle))
+        if self.has_error_code:
+            self.reboot()
         return 0
 
-    def back_up(self) -> int:
-        """Keep the control table; return the error: the torque must be off."""
-        if self.memory.get("torque_enable"):
+    def clear_error(self) -> int:
+        """Forget Error Code; return the error: what it tells of must be over (e-Manual, Y series)."""
+        if self._wrong():
             return ErrorNumber.RESULT_FAIL
-        self._backup = self.memory.backup()
+        self.memory["error_code"] = 0
+        self.memory.reset(f"error_code_history_{number}" for number in range(1, _HISTORY + 1))
+        self._shut_down = False
+        self._show_controller_state()
+        return 0
+
+    @property
+    def keeps_backup(self) -> bool:
+        """True when it knows Control Table Backup: models with fast reads, since the same firmware, and Y.
+
+        e-Manual, Protocol 2.0, Control Table Backup (0x20).
+        """
+        first = self.memory.table.fast_sync_read_firmware
+        if first is not None:
+            return self.memory["firmware_version"] >= first
+        return "backup_ready" in self.memory
+
+    def back_up(self) -> int:
+        """Keep EEPROM, gains, profile and indirect addresses; return the error: the torque must be off.
+
+        P keeps no indirect addresses; so does Y [i].
+        """
+        memory = self.memory
+        if memory.get("torque_enable"):
+            return ErrorNumber.RESULT_FAIL
+        self._backup = {
+            name: memory[name] for name, item in memory.table.items.items() if _is_kept(name, item)
+        }
+        memory.show("backup_ready", 1)
         return 0
 
     def restore_backup(self) -> int:
-        """Take the control table that was kept; return the error: torque must be off, one be kept."""
-        if self.memory.get("torque_enable") or not self._backup:
+        """Take back the EEPROM that was kept, and reboot; return the error: torque off, and a backup."""
+        memory = self.memory
+        if memory.get("torque_enable") or not self._backup:
             return ErrorNumber.RESULT_FAIL
         for name, wire in self._backup.items():
-            self.memory[name] = wire
+            if memory.table.items[name].area == "EEPROM":
+                memory[name] = wire
+        self.reboot()
         return 0
 
-    def _wrong(self) -> int:
+    def _rest_at(self, angle: float) -> None:
+        self.shaft.rest_at(angle)
+        self.memory["goal_position"] = self.shaft.position_tick(angle)
+        self.shaft.plan(("goal_position",))
+
+    def _wrong(self) -> tuple[HardwareError, ...]:
         memory = self.memory
         wrong = [HardwareError.OVERLOAD] if self.overload else []
         if "max_voltage_limit" in memory:
             volts = round(self.voltage * 10)
             if not memory["min_voltage_limit"] <= volts <= memory["max_voltage_limit"]:
                 wrong.append(HardwareError.VOLTAGE)
-        if self.temperature > memory.get("temperature_limit", 255):
+        limit = "motor_temperature_limit" if self.has_error_code else "temperature_limit"
+        if self.temperature > memory.get(limit, 255):
             wrong.append(HardwareError.OVERHEATING)
-        by_control_mode = "control_mode" in memory
-        return sum(_XL320_BIT[each] if by_control_mode else each for each in wrong)
+        return tuple(wrong)
+
+    def _tell_error_code(self, wrong: tuple[HardwareError, ...]) -> None:
+        """Show the newest error; the same one does not count twice, and the history holds the last 16."""
+        memory = self.memory
+        low = round(self.voltage * 10) < memory["min_voltage_limit"]
+        codes = [_ERROR_CODE.get(each, _LOW_VOLTAGE if low else _OVER_VOLTAGE) for each in wrong]
+        names = [f"error_code_history_{number}" for number in range(1, _HISTORY + 1)]
+        history = [memory[name] for name in names if memory[name]]
+        for code in codes:
+            if code not in history:
+                history.append(code)
+                memory["error_code"] = code
+        for name, code in zip(names, history[-_HISTORY:], strict=False):
+            memory[name] = code
+
+    def _show_controller_state(self) -> None:
+        memory = self.memory
+        state = _RUNNING if memory.get("torque_enable") else _INVERTER_OFF
+        memory.show("controller_state", _FAULT if self._shut_down else state)
 
     def _start_up(self) -> None:
         memory = self.memory
@@ -141,10 +244,12 @@ class TorqueBody(Body):
         self._started_ns = self._heard_ns = self.shaft.now_ns
         if "torque_limit" in memory and "max_torque" in memory:
             memory["torque_limit"] = memory["max_torque"]
+        memory.show("backup_ready", bool(self._backup))
+        self._reset_goals()
         configuration = memory.get("startup_configuration")
         if configuration & RAM_FROM_BACKUP:
             for name, wire in self._backup.items():
-                if memory.table.items[name].area == "RAM" and name != "torque_enable":
+                if memory.table.items[name].area == "RAM":
                     memory[name] = wire
         if configuration & TORQUE_ON_AT_START:
             memory["torque_enable"] = 1
@@ -153,11 +258,51 @@ class TorqueBody(Body):
     def _obey(self, names: Iterable[str]) -> None:
         memory = self.memory
         if "operating_mode" in names:
-            # e-Manual, Operating Mode (11): the goals are reset; position control knows one turn only.
-            if memory["operating_mode"] == OperatingMode.POSITION:
-                self.shaft.rest_at(self.shaft.within_a_turn(self.shaft.angle))
-            memory["goal_position"] = self.shaft.position_tick(self.shaft.angle)
-            memory.show("goal_velocity", 0)
+            self._change_mode()
+        elif not _LIMITS.isdisjoint(names):
+            self._reset_goals()
+        if "protocol_type" in names and memory["protocol_type"] not in _SPEAKS:
+            self.note(
+                f"servo {self.servo_id} hears Protocol 2.0 no more: protocol type {memory['protocol_type']}"
+            )
         by_goal = memory.get("drive_mode") & TORQUE_ON_BY_GOAL
         if by_goal and not _GOALS.isdisjoint(names) and "torque_enable" not in names and not self._shut_down:
             memory["torque_enable"] = 1
+        if self.has_error_code:
+            self._show_controller_state()
+
+    @property
+    def hears_protocol(self) -> bool:
+        """False when Protocol Type is that of another protocol."""
+        return self.memory.get("protocol_type", 2) in _SPEAKS
+
+    def _change_mode(self) -> None:
+        """Begin with another operating mode as the manual says (e-Manual, X series, Operating Mode (11)).
+
+        Gains, profile and the goals that limit are reset; position control knows one turn only.
+        """
+        memory = self.memory
+        memory.reset((*_GAINS, *_PROFILE))
+        if memory["operating_mode"] == OperatingMode.POSITION and not self.has_error_code:
+            self.shaft.rest_at(self.shaft.within_a_turn(self.shaft.angle))
+        memory["goal_position"] = self.shaft.position_tick(self.shaft.angle)
+        memory.show("goal_velocity", 0)
+        self._reset_goals()
+
+    def _reset_goals(self) -> None:
+        """Set Goal PWM and Goal Current to their limits; to 0 in the mode that obeys them [i]."""
+        memory = self.memory
+        mode = memory.get("operating_mode")
+        for goal, limit, obeyed in (
+            ("goal_pwm", "pwm_limit", OperatingMode.PWM),
+            ("goal_current", "current_limit", OperatingMode.CURRENT),
+        ):
+            if limit in memory:
+                memory.show(goal, 0 if mode == obeyed else memory[limit])
+
+
+def _is_kept(name: str, item: ControlItem) -> bool:
+    """Return whether a backup holds an item (e-Manual, Protocol 2.0, Control Table Backup (0x20))."""
+    if name.startswith("indirect_address_"):
+        return item.area == "RAM"
+    return item.access == "RW" and (item.area == "EEPROM" or name in _GAINS or name in _PROFILE)

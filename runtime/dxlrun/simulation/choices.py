@@ -1,0 +1,42 @@
+"""Items whose values the e-Manual lists one by one; a control table knows only the lowest and the highest."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+from dxlrun.control_table import ControlTable
+
+_TORQUE_ENABLE_OF_P = 512
+"""Address of Torque Enable on P, PRO(A) and RH-P12-RN(A)."""
+
+
+def choices(table: ControlTable) -> Mapping[str, frozenset[int]]:
+    """Return the items of a model with the values that they may have; anything else is out of range.
+
+    Sections "Operating Mode" and "Protocol Type" of the models' pages.
+    """
+    listed = {"operating_mode": _operating_modes(table), "protocol_type": _protocol_types(table)}
+    return MappingProxyType({name: frozenset(each) for name, each in listed.items() if name in table.items})
+
+
+def _operating_modes(table: ControlTable) -> tuple[int, ...]:
+    item = table.items.get("operating_mode")
+    if item is None or item.maximum == 3:
+        return 0, 1, 3  # Y
+    if item.maximum == 5:
+        return 0, 5  # RH-P12-RN(A)
+    if table.items["torque_enable"].address == _TORQUE_ENABLE_OF_P:
+        return 0, 1, 3, 4, 16
+    return (0, 1, 3, 4, 5, 16) if "goal_current" in table.items else (1, 3, 4, 16)
+
+
+def _protocol_types(table: ControlTable) -> tuple[int, ...]:
+    item = table.items.get("protocol_type")
+    if item is None or item.maximum == 2:
+        return (2,)  # Y
+    if item.maximum == 10:
+        return 2, 10  # P: Modbus-RTU
+    if "330-" in table.model:
+        return 2, 20, 21, 22  # S.BUS, iBUS, RC-PWM
+    return 1, 2

@@ -1,0 +1,358 @@
+"""What a servo of Protocol 2.0 does beside reading and writing, and which firmware and model knows it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from dxlrun.simulation import ServoConfig, SimulatedServo
+from dxlrun.simulation.protocol2 import ErrorNumber
+
+PING, READ, WRITE, REG_WRITE, ACTION, RESET, REBOOT, CLEAR, BACKUP = 1, 2, 3, 4, 5, 6, 8, 0x10, 0x20
+SYNC_READ, SYNC_WRITE, FAST_SYNC_READ = 0x82, 0x83, 0x8A
+BROADCAST = 0xFE
+ALERT = 0x80
+CLEAR_TURNS = bytes.fromhex("01 44584c22")
+CLEAR_ERROR = bytes.fromhex("02 4552434c")
+BACK_UP = bytes.fromhex("01 4354524c")
+RESTORE = bytes.fromhex("02 4354524c")
+LED_ON = bytes.fromhex("4100 01")
+UNKNOWN = (1, ErrorNumber.INSTRUCTION, b"")
+DONE = (1, 0, b"")
+
+
+def boot(line: Any) -> None:
+    line.wait(0.2)
+
+
+# Secondary ID: the example of the manual's page of an X servo
+
+
+def test_all_obey_a_secondary_id_and_only_its_owner_answers(make_line2: Any) -> None:
+    line = make_line2((1, 2, 3, 4, 5), "XL430-W250")
+    for servo_id in range(1, 6):
+        assert line.set("secondary_shadow_id", 5, servo_id) == 0
+    assert line.request(1, WRITE, LED_ON) == (1, 0, b"")
+    assert line.request(5, WRITE, LED_ON) == (5, 0, b"")
+    assert [line.get("led", each) for each in range(1, 6)] == [1] * 5
+    for servo_id in range(1, 6):
+        assert line.set("secondary_shadow_id", 100, servo_id) == 0
+    assert line.request(100, WRITE, b"\x41\x00\x00") is None
+    assert [line.get("led", each) for each in range(1, 6)] == [0] * 5
+
+
+def test_nothing_is_answered_under_a_secondary_id(line2: Any) -> None:
+    line2.set("secondary_shadow_id", 100)
+    assert line2.request(100, PING) is None
+    assert line2.request(100, READ, b"\x84\x00\x04\x00") is None
+    line2.tell(BROADCAST, SYNC_READ, bytes.fromhex("84000400 64"))
+    assert line2.statuses() == []
+
+
+def test_the_eeprom_is_closed_to_a_secondary_id(line2: Any) -> None:
+    line2.set("secondary_shadow_id", 100)
+    assert line2.request(100, WRITE, b"\x0a\x00\x01") is None
+    assert line2.request(100, REG_WRITE, b"\x0a\x00\x01") is None
+    assert line2.request(100, RESET, b"\x02") is None
+    boot(line2)
+    assert line2.get("drive_mode") == 0
+    assert line2.get("registered_instruction") == 0
+    assert line2.get("secondary_shadow_id") == 100
+    assert line2.request(100, REG_WRITE, LED_ON) is None
+    assert line2.request(100, ACTION) is None
+    assert line2.get("led") == 1
+
+
+def test_a_listed_secondary_id_is_written_to(line2: Any) -> None:
+    for servo_id in (1, 2):
+        line2.set("secondary_shadow_id", 100, servo_id)
+    line2.tell(BROADCAST, SYNC_WRITE, bytes.fromhex("41000100 64 01"))
+    assert [line2.get("led", each) for each in (1, 2)] == [1, 1]
+
+
+@pytest.mark.parametrize("value", [253, 254, 255])
+def test_a_secondary_id_above_252_is_off(line2: Any, value: int) -> None:
+    line2.set("secondary_shadow_id", value)
+    assert line2.servo().secondary_id is None
+    line2.set("secondary_shadow_id", 1)  # and so is one that is the ID
+    assert line2.request(1, PING) is not None
+
+
+# Changing how it is reached: the status still goes under the old one
+
+
+def test_a_new_id_counts_from_the_next_instruction(line2: Any) -> None:
+    assert line2.request(1, WRITE, b"\x07\x00\x09") == (1, 0, b"")
+    assert line2.request(1, PING) is None
+    assert line2.request(9, PING) is not None
+
+
+def test_a_new_baud_rate_counts_from_the_next_instruction(line2: Any) -> None:
+    assert line2.request(1, WRITE, b"\x08\x00\x04") == (1, 0, b"")
+    assert line2.request(1, PING) is None
+    line2.bus.baud_rate = 2_000_000
+    assert line2.request(1, PING) is not None
+
+
+def test_another_protocol_type_is_the_end_of_hearing(line2: Any) -> None:
+    assert line2.set("protocol_type", 1) == 0
+    assert line2.request(1, PING) is None
+    line2.servo().poke("protocol_type", 2)
+    assert line2.request(1, PING) is not None
+
+
+# Clear
+
+
+def far(line: Any, turns: int = 3) -> None:
+    line.servo().poke("operating_mode", 4)
+    line.servo().turn_by_hand(turns * 4096 * line.servo().registers.table.rad_per_tick + 0.1)
+
+
+def test_clear_brings_the_position_into_one_turn(line2: Any) -> None:
+    far(line2)
+    assert line2.get("present_position") > 4096
+    assert line2.request(1, CLEAR, CLEAR_TURNS) == DONE
+    assert 0 <= line2.get("present_position") < 4096
+    assert line2.get("goal_position") == line2.get("present_position")
+
+
+def test_clear_is_refused_while_it_moves(line2: Any) -> None:
+    line2.set("torque_enable", 1)
+    line2.set("goal_position", 3500)
+    assert line2.request(1, CLEAR, CLEAR_TURNS).error == ErrorNumber.RESULT_FAIL
+
+
+def test_clear_came_with_firmware_42(line2: Any) -> None:
+    line2.servo().poke("firmware_version", 41)
+    assert line2.request(1, CLEAR, CLEAR_TURNS) == UNKNOWN
+    assert line2.request(1, CLEAR, CLEAR_ERROR) == UNKNOWN  # which only the Y series knows
+
+
+def test_a_reset_of_everything_was_for_all_before_firmware_42(make_line2: Any) -> None:
+    line = make_line2((7,))
+    line.servo(7).poke("firmware_version", 41)
+    line.tell(BROADCAST, RESET, b"\xff")
+    assert line.bus.servos[0].servo_id == 1
+
+
+@pytest.mark.parametrize("option", [0x01, 0x02])
+def test_a_reset_that_keeps_the_id_is_for_all_and_not_answered(line2: Any, option: int) -> None:
+    for servo_id in (1, 2):
+        line2.set("drive_mode", 1, servo_id)
+    line2.tell(BROADCAST, RESET, bytes((option,)))
+    assert line2.statuses() == []
+    assert [each.registers["drive_mode"] for each in line2.bus.servos] == [0, 0]
+    assert [each.servo_id for each in line2.bus.servos] == [1, 2]
+
+
+def test_a_reboot_of_all_is_not_answered(line2: Any) -> None:
+    line2.set("led", 1)
+    line2.tell(BROADCAST, REBOOT)
+    assert line2.statuses() == []
+    boot(line2)
+    assert line2.get("led") == 0
+
+
+# Control Table Backup
+
+
+def test_a_backup_holds_eeprom_gains_profile_and_indirect_addresses(make_line2: Any) -> None:
+    line = make_line2((1,), "XL330-M288")
+    kept = {"drive_mode": 1, "position_p_gain": 77, "profile_velocity": 123, "indirect_address_1": 132}
+    for name, value in {**kept, "led": 1, "startup_configuration": 2}.items():
+        assert line.set(name, value) == 0, name
+    assert line.get("backup_ready") == 0
+    assert line.request(1, BACKUP, BACK_UP) == DONE
+    assert line.get("backup_ready") == 1
+    for name, value in {"drive_mode": 0, "position_p_gain": 5, "profile_velocity": 5}.items():
+        line.set(name, value)
+    assert line.request(1, BACKUP, RESTORE) == DONE
+    assert line.request(1, PING) is None  # it reboots
+    boot(line)
+    assert {name: line.get(name) for name in kept} == kept
+    assert line.get("led") == 0
+    assert line.get("backup_ready") == 1
+
+
+def test_restoring_brings_the_eeprom_alone_where_the_ram_is_not_asked_for(make_line2: Any) -> None:
+    line = make_line2((1,), "XL330-M288")
+    line.set("profile_velocity", 123)
+    line.set("drive_mode", 1)
+    line.request(1, BACKUP, BACK_UP)
+    line.set("drive_mode", 0)
+    line.request(1, BACKUP, RESTORE)
+    boot(line)
+    assert (line.get("drive_mode"), line.get("profile_velocity")) == (1, 0)
+
+
+def test_no_backup_with_torque_and_no_restoring_of_none(line2: Any) -> None:
+    assert line2.request(1, BACKUP, RESTORE).error == ErrorNumber.RESULT_FAIL
+    line2.set("torque_enable", 1)
+    assert line2.request(1, BACKUP, BACK_UP).error == ErrorNumber.RESULT_FAIL
+
+
+@pytest.mark.parametrize(
+    ("model", "firmware", "knows"),
+    [
+        ("XM430-W350", 44, False),
+        ("XM430-W350", 45, True),
+        ("XL330-M288", 45, False),
+        ("XL330-M288", 46, True),
+        ("PH54-200-S500", 11, False),
+        ("PH54-200-S500", 12, True),
+        ("2XL430-W250", 45, False),
+        ("MX-64", 45, False),
+        ("XL-320", 45, False),
+    ],
+)
+def test_backup_and_fast_reads_came_with_a_firmware(
+    make_line2: Any, model: str, firmware: int, knows: bool
+) -> None:
+    line = make_line2((1,), model)
+    line.servo().poke("firmware_version", firmware)
+    assert line.request(1, BACKUP, BACK_UP) == (DONE if knows else UNKNOWN)
+    line.tell(BROADCAST, FAST_SYNC_READ, bytes.fromhex("0000 0200 01"))
+    assert bool(line.hear()) == knows
+
+
+@pytest.mark.parametrize(
+    ("firmware", "model"), [(51, "XL330-M288-FW51"), (52, "XL330-M288"), (None, "XL330-M288")]
+)
+def test_the_firmware_decides_the_control_table(firmware: int | None, model: str) -> None:
+    servo = SimulatedServo(ServoConfig(1, "XL330-M288", 0.0, firmware=firmware), 57_600, 0, protocol=2.0)
+    assert servo.registers.table.model == model
+    assert servo.registers["firmware_version"] == (firmware or 52)
+
+
+# Operating modes
+
+
+def test_another_operating_mode_resets_what_the_manual_lists(line2: Any) -> None:
+    changes = {"position_p_gain": 5, "velocity_i_gain": 6, "profile_velocity": 7, "profile_acceleration": 8}
+    for name, value in {**changes, "goal_pwm": 100, "goal_current": 100}.items():
+        assert line2.set(name, value) == 0
+    assert line2.set("operating_mode", 5) == 0
+    table = line2.servo().registers.table
+    assert {name: line2.get(name) for name in changes} == {
+        name: table.items[name].initial for name in changes
+    }
+    assert line2.get("goal_pwm") == line2.get("pwm_limit")
+    assert line2.get("goal_current") == line2.get("current_limit")
+
+
+@pytest.mark.parametrize(("mode", "goal"), [(0, "goal_current"), (16, "goal_pwm")])
+def test_the_goal_that_a_mode_obeys_begins_at_0(line2: Any, mode: int, goal: str) -> None:
+    line2.set("operating_mode", mode)
+    assert line2.get(goal) == 0
+
+
+def test_a_lower_limit_takes_the_goal_with_it(line2: Any) -> None:
+    assert line2.get("goal_pwm") == 885
+    line2.set("pwm_limit", 400)
+    assert line2.get("goal_pwm") == 400
+
+
+# The Y series
+
+
+def test_a_y_servo_keeps_its_turns_until_it_clears_them_without_torque(make_line2: Any) -> None:
+    line = make_line2((1,), "YM070-210-M001")
+    turn = round(6.283185307 / line.servo().registers.table.rad_per_tick)
+    line.servo().turn_by_hand(3 * 6.283185307 + 0.5)
+    line.servo().reset()
+    assert line.get("present_position") > 3 * turn
+    line.servo().poke("torque_enable", 1)
+    assert line.request(1, CLEAR, CLEAR_TURNS).error == ErrorNumber.RESULT_FAIL
+    line.servo().poke("torque_enable", 0)
+    assert line.request(1, CLEAR, CLEAR_TURNS) == DONE
+    assert line.request(1, PING) is None  # it reboots
+    boot(line)
+    assert 0 <= line.get("present_position") < turn
+
+
+def test_a_y_servo_tells_of_errors_by_code_and_forgets_them_when_they_are_over(make_line2: Any) -> None:
+    line = make_line2((1,), "YM070-210-M001")
+    line.set("torque_enable", 1)
+    assert line.get("controller_state") == 5
+    line.servo().set_temperature(90)
+    assert line.request(1, PING).error == ALERT
+    assert (line.get("error_code"), line.get("error_code_history_1")) == (4, 4)
+    assert (line.get("torque_enable"), line.get("controller_state")) == (0, 8)
+    assert line.set("torque_enable", 1) == ALERT | ErrorNumber.RESULT_FAIL
+    assert line.request(1, CLEAR, CLEAR_ERROR).error & 0x7F == ErrorNumber.RESULT_FAIL
+    line.servo().set_temperature(30)
+    assert line.request(1, PING).error == ALERT  # it stays until it is cleared
+    assert line.request(1, CLEAR, CLEAR_ERROR) == DONE
+    assert (line.get("error_code"), line.get("error_code_history_1"), line.get("controller_state")) == (
+        0,
+        0,
+        2,
+    )
+    assert line.set("torque_enable", 1) == 0
+    line.servo().set_voltage(10.0)
+    line.servo().set_voltage(50.0)
+    assert [line.get(f"error_code_history_{each}") for each in (1, 2)] == [2, 1]
+
+
+# Registered instructions
+
+
+def test_a_newer_registered_write_takes_the_place_of_the_older(line2: Any) -> None:
+    assert line2.request(1, REG_WRITE, b"\x70\x00\x05\x00\x00\x00") == DONE
+    assert line2.request(1, REG_WRITE, LED_ON) == DONE
+    assert line2.request(1, REG_WRITE, b"\x40\x00\x02").error == ErrorNumber.DATA_RANGE  # and not this one
+    assert line2.request(1, ACTION) == DONE
+    assert (line2.get("led"), line2.get("profile_velocity")) == (1, 0)
+    assert line2.request(1, ACTION) == UNKNOWN
+
+
+def test_a_registered_write_is_checked_again_when_it_acts(line2: Any) -> None:
+    assert line2.request(1, REG_WRITE, b"\x0a\x00\x01") == DONE
+    line2.set("torque_enable", 1)
+    assert line2.request(1, ACTION).error == ErrorNumber.ACCESS
+    assert line2.get("drive_mode") == 0
+
+
+def test_a_reboot_forgets_a_registered_write(line2: Any) -> None:
+    line2.request(1, REG_WRITE, LED_ON)
+    line2.request(1, REBOOT)
+    boot(line2)
+    assert line2.get("registered_instruction") == 0
+    assert line2.request(1, ACTION) == UNKNOWN
+
+
+# Indirect addresses
+
+
+def test_a_sync_read_goes_through_indirect_data(line2: Any) -> None:
+    for servo_id in (1, 2):
+        for index in range(4):
+            assert line2.set(f"indirect_address_{index + 1}", 132 + index, servo_id) == 0
+    line2.tell(BROADCAST, SYNC_READ, bytes.fromhex("e000 0400 0102"))
+    said = line2.statuses()
+    assert [int.from_bytes(each.parameters, "little") for each in said] == [
+        line2.get("present_position", each) for each in (1, 2)
+    ]
+
+
+def test_indirect_addresses_are_of_the_ram_only_and_lost_with_it(line2: Any) -> None:
+    assert line2.set("indirect_address_1", 63) == ErrorNumber.DATA_RANGE
+    assert line2.set("indirect_address_1", 662) == ErrorNumber.DATA_RANGE
+    assert line2.set("indirect_address_56", 65) == 0
+    line2.request(1, REBOOT)
+    boot(line2)
+    assert line2.get("indirect_address_56") == 661
+    assert line2.set("torque_enable", 1) == 0
+    assert line2.set("indirect_address_1", 65) == 0  # they are no EEPROM
+
+
+def test_indirect_addresses_of_p_are_eeprom(make_line2: Any) -> None:
+    line = make_line2((1,), "PH54-200-S500")
+    assert line.set("indirect_address_1", 513) == 0
+    line.request(1, REBOOT)
+    boot(line)
+    assert line.get("indirect_address_1") == 513
+    line.set("torque_enable", 1)
+    assert line.set("indirect_address_1", 514) == ErrorNumber.ACCESS
