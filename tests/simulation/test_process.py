@@ -9,14 +9,15 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import pytest
 import rustypot
 
 from dxlrun.control_table import control_table
-from dxlrun.simulation import BusConfig, Ledger, ServoConfig, SimulatedBus
+from dxlrun.simulation import BusConfig, Ledger, ServoConfig, SimulatedBus, read_ledger
 from dxlrun.simulation.process import SimulationConfig, decode_config, encode_config
 from dxlrun.simulation.pseudo_terminal import PseudoTerminal
 
@@ -159,16 +160,18 @@ def test_a_foreign_driver_finds_every_item_where_the_servo_holds_it(start: Calla
 
 
 @contextlib.contextmanager
-def bare(path: Path, *options: str) -> Iterator[tuple[subprocess.Popen[bytes], socket.socket]]:
+def bare(
+    path: Path, *options: str, config: SimulationConfig | None = None
+) -> Iterator[tuple[subprocess.Popen[bytes], socket.socket]]:
     """Start it from a file; give the process and our end of the control socket."""
-    path.write_bytes(encode_config(BUSES))
+    path.write_bytes(encode_config(config or BUSES))
     ours, theirs = socket.socketpair()
-    with ours, theirs, path.open("rb") as config:
-        command = [sys.executable, "-m", "dxlrun.simulation", "--config-fd", str(config.fileno())]
+    with ours, theirs, path.open("rb") as file:
+        command = [sys.executable, "-m", "dxlrun.simulation", "--config-fd", str(file.fileno())]
         command += ["--control-fd", str(theirs.fileno()), *options]
         child = subprocess.Popen(
             command,
-            pass_fds=(config.fileno(), theirs.fileno()),
+            pass_fds=(file.fileno(), theirs.fileno()),
             stderr=subprocess.PIPE,
             start_new_session=True,
         )
@@ -193,3 +196,101 @@ def test_a_full_disk_does_not_stop_it_and_is_told_at_the_end(tmp_path: Path) -> 
         control.close()
         assert b"No space left" in child.communicate(timeout=PATIENCE_S)[1]
         assert child.returncode == 1
+
+
+@dataclass
+class Talk:
+    """Lines of JSON with the process."""
+
+    control: socket.socket
+    said: IO[bytes]
+
+    def ask(self, **question: object) -> dict[str, Any]:
+        self.control.sendall(json.dumps(question).encode() + b"\n")
+        return self.next()
+
+    def next(self) -> dict[str, Any]:
+        answer: dict[str, Any] = json.loads(self.said.readline())
+        return answer
+
+
+@contextlib.contextmanager
+def talking(path: Path, config: SimulationConfig, *options: str) -> Iterator[tuple[Talk, dict[str, Any]]]:
+    """Start it and give what it says first; it must end in order."""
+    with bare(path, *options, config=config) as (child, control):
+        control.settimeout(PATIENCE_S)
+        with control.makefile("rb") as said:
+            talk = Talk(control, said)
+            yield talk, talk.next()
+        control.close()
+        assert child.communicate(timeout=PATIENCE_S)[1] == b""
+        assert child.returncode == 0
+
+
+def test_a_look_tells_of_every_servo(tmp_path: Path) -> None:
+    with talking(tmp_path / "config", SimulationConfig(BUSES)) as (talk, first):
+        assert talk.ask(look=True)["lateness_us"] == {}
+        with opened(first["ports"]["main"]) as port:
+            os.write(port, PING_1)
+            hear(port, 6)
+        look = talk.ask(look=True)
+    one, two, other = look["servos"]
+    assert (one["bus"], one["id"], one["model"]) == ("main", 1, "AX-12A")
+    assert (one["heard"], one["answered"], two["heard"], other["bus"]) == (1, 1, 0, "arm")
+    assert one["present"] == pytest.approx(2.0, abs=0.01)
+    assert (one["torque"], one["error"]) == (False, 0)
+    assert 0 <= look["lateness_us"]["median"] <= look["lateness_us"]["maximum"]
+
+
+def test_faults_by_hand_happen_and_are_told(tmp_path: Path) -> None:
+    with talking(tmp_path / "config", SimulationConfig(BUSES)) as (talk, first):
+        assert "bus" in talk.ask(fault="lose servo=1")["error"]  # there are two
+        assert "error" in talk.ask(fault="explode")
+        assert "error" in talk.ask(other=[], look="yes")
+        assert talk.ask(fault="lose  bus=main servo=1")["fault"] == "lose bus=main servo=1"
+        with opened(first["ports"]["main"]) as port:
+            os.write(port, PING_1)
+            assert talk.next() == {"happened": "lose bus=main servo=1"}
+            os.write(port, PING_1)
+            assert hear(port, 6) == PONG_1
+
+
+def test_a_fault_that_could_never_happen_is_refused_before_anything_starts(tmp_path: Path) -> None:
+    config = SimulationConfig(BUSES, faults=("lose bus=main servo=9",))
+    with bare(tmp_path / "config", config=config) as (child, control):
+        with control.makefile("rb") as said:
+            assert "no servo 9" in json.loads(said.readline())["error"]
+        assert child.communicate(timeout=PATIENCE_S)[1] == b""
+        assert child.returncode == 2
+
+
+def test_an_unplugged_adapter_hangs_up_and_comes_back_under_another_name(tmp_path: Path) -> None:
+    link = tmp_path / "robot"
+    config = SimulationConfig(BUSES, links={"main": str(link)})
+    with talking(tmp_path / "config", config) as (talk, first):
+        before = first["ports"]["main"]
+        assert os.readlink(link) == before
+        with opened(str(link)) as port:
+            assert "fault" in talk.ask(fault="unplug bus=main for=300ms")
+            while talk.next() != {"ports": {**first["ports"], "main": ""}}:
+                pass
+            assert not link.is_symlink()
+            assert select.select([port], [], [], PATIENCE_S)[0]
+            with contextlib.suppress(OSError):  # EIO on Linux
+                assert os.read(port, 10) == b""
+            after = talk.next()["ports"]["main"]
+            assert after not in ("", before)
+            assert os.readlink(link) == after
+            with opened(str(link)) as again:
+                os.write(again, PING_1)
+                assert hear(again, 6) == PONG_1
+    assert not link.is_symlink()
+
+
+def test_real_time_is_asked_for_and_what_was_granted_is_said(tmp_path: Path) -> None:
+    path = tmp_path / "bus.jsonl"
+    options = ("--priority", "1", "--core", "1023", "--ledger", str(path))
+    with talking(tmp_path / "config", SimulationConfig(BUSES), *options) as (_, first):
+        assert "priority 1" in first["real_time"]
+        assert "no core of its own" in first["real_time"]
+    assert read_ledger(path)[0].note == f"real time: {first['real_time']}"

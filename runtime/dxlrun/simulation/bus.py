@@ -52,6 +52,8 @@ class SimulatedBus:
         self.plugged = True
         """False: nothing is between the host and the line."""
         self.times_unplugged = 0
+        self.lateness_ns: deque[int] = deque(maxlen=1000)
+        """How long after its time the host got what it got last, where the caller of `take` is punctual."""
         self.servos: tuple[SimulatedServo, ...] = ()
         self.mechanics = mechanics or Mechanics(start_ns)
         """What the servos move; several buses of one robot share it."""
@@ -120,12 +122,19 @@ class SimulatedBus:
         taken = bytearray()
         while (part := self._adapter.hand_over(now_ns, passing)) is not None:
             late_ns = now_ns - part.planned_ns if punctual else 0
+            if punctual:
+                self.lateness_ns.append(late_ns)
             for chunk in part.ended:
                 self.ledger.add(chunk.due_ns, self.name, "out", chunk.data, chunk.note, late_ns=late_ns)
             taken += part.data
         return bytes(taken)
 
     # What tests see and do
+
+    @property
+    def host_free_ns(self) -> int:
+        """When the last byte that the host handed over has passed the wire."""
+        return self._host_free_ns
 
     @property
     def now_ns(self) -> int:
@@ -320,8 +329,7 @@ class SimulatedBus:
                 counts.heard += packet.intact
                 reply = servo.execute(packet, end_ns)
                 if reply is not None:
-                    counts.answered += 1
-                    counts.errors += reply.error != 0
+                    counts.answer(reply.error)
                     self._answer(reply, self._status(reply), end_ns)
         self._passed_by()
 
@@ -365,8 +373,7 @@ class SimulatedBus:
         reply = servo.answer_in_turn(reading, entry, end_ns)
         if reply is None:
             return None
-        counts.answered += 1
-        counts.errors += reply.error != 0
+        counts.answer(reply.error)
         if reading.fast and entry is not reading.entries[0]:
             return replace(reply, delay_ns=0)  # only the first one of a shared status waits
         return reply

@@ -38,3 +38,11 @@ class ServoCounts:
     answered: int = 0
     errors: int = 0
     """Answers that tell of an error."""
+    last_error: int = 0
+    """Of its last answer, as it stood in the packet."""
+
+    def answer(self, error: int) -> None:
+        """Count an answer."""
+        self.answered += 1
+        self.errors += error != 0
+        self.last_error = error

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -12,6 +13,9 @@ from typing import IO, Literal
 from dxlrun.errors import LogError
 
 Direction = Literal["in", "out", "note"]
+
+_BUFFER = 1 << 16
+"""Bytes that are written out together."""
 
 FLUSH_NS = 500_000_000
 """A ledger file is never further behind than this."""
@@ -42,8 +46,11 @@ class Ledger:
         self.entries: list[LedgerEntry] = []
         self.error: str | None = None
         """Why the file is not complete; None: it is."""
+        self.on_note: Callable[[str], None] | None = None
+        """Who is told of each note."""
         self._keep = keep
-        self._file: IO[str] | None = None if path is None else path.open("w", encoding="ascii")
+        self._file: IO[bytes] | None = None if path is None else path.open("wb", _BUFFER)
+        self._names: dict[str, str] = {}
         self._unflushed_ns: int | None = None
 
     def add(
@@ -60,21 +67,24 @@ class Ledger:
         if self._keep:
             self.entries.append(LedgerEntry(t_ns, bus, direction, data, note, late_ns))
         if self._file is not None:
-            line: dict[str, str | int] = {
-                "t_ns": t_ns,
-                "bus": bus,
-                "direction": direction,
-                "bytes": data.hex(),
-                "note": note,
-            }
-            if late_ns:
-                line["late_ns"] = late_ns
-            if self._unflushed_ns is None:
-                self._unflushed_ns = t_ns
-            try:
-                self._file.write(json.dumps(line) + "\n")
-            except OSError as error:
-                self._give_up(error)
+            self._write(t_ns, bus, direction, data.hex(), _tail(note, late_ns))
+        if direction == "note" and self.on_note is not None:
+            self.on_note(note)
+
+    def _write(self, t_ns: int, bus: str, direction: Direction, data: str, tail: str) -> None:
+        """Write a line of JSON; put together by hand, because a busy bus has thousands of them a second."""
+        if self._file is None:
+            return
+        name = self._names.get(bus)
+        if name is None:
+            name = self._names[bus] = json.dumps(bus)
+        line = f'{{"t_ns": {t_ns}, "bus": {name}, "direction": "{direction}", "bytes": "{data}"{tail}}}\n'
+        if self._unflushed_ns is None:
+            self._unflushed_ns = t_ns
+        try:
+            self._file.write(line.encode("ascii"))
+        except OSError as error:
+            self._give_up(error)
 
     def flush_due_ns(self) -> int | None:
         """Return when the file must be flushed, ns on the clock of the entries; None: all is written."""
@@ -117,6 +127,12 @@ class Ledger:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _tail(note: str, late_ns: int) -> str:
+    """Return the end of a line of JSON."""
+    text = f', "note": {json.dumps(note)}' if note else ', "note": ""'
+    return f'{text}, "late_ns": {late_ns}' if late_ns else text
 
 
 def read_ledger(path: Path) -> tuple[LedgerEntry, ...]:

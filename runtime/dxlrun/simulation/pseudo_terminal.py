@@ -8,6 +8,7 @@ import struct
 import tty
 
 from dxlrun.simulation.bus import SimulatedBus
+from dxlrun.simulation.link import Link
 
 _TCGETS2, _TCSETS2 = 0x802C542A, 0x402C542B
 """Terminal settings with the rate as a number (Linux, asm-generic/ioctls.h): they know every rate."""
@@ -23,18 +24,45 @@ class PseudoTerminal:
     rate, and servos at the old one hear nothing.
     """
 
-    def __init__(self, bus: SimulatedBus) -> None:
+    def __init__(self, bus: SimulatedBus, link: Link | None = None) -> None:
         self.bus = bus
-        self._master, self._slave = os.openpty()
-        tty.setraw(self._slave)
-        _set_rate(self._slave, bus.baud_rate)
-        os.set_blocking(self._master, False)
-        self.path = os.ttyname(self._slave)
-        """Path of the device that a host opens."""
+        self._link = link
+        self._master, self._slave = self._new_pair()
+        self._times_unplugged = bus.times_unplugged
+        self.plugged = True
+        """False: the host saw it go, and no device is there."""
+        self._publish()
+
+    @property
+    def path(self) -> str:
+        """Path of the device that a host opens, empty while the adapter is unplugged."""
+        return os.ttyname(self._slave) if self.plugged else ""
 
     def fileno(self) -> int:
         """Return the descriptor that becomes readable when the host has written."""
         return self._master
+
+    def follow_adapter(self) -> bool:
+        """Go and come back with the adapter of the bus; return whether the device is another one now.
+
+        It comes back under another name, because a host may still hold the old one, as udev would have it;
+        the link follows. What the host wrote meanwhile is lost.
+        """
+        if self._times_unplugged == self.bus.times_unplugged and self.plugged == self.bus.plugged:
+            return False
+        if self._times_unplugged != self.bus.times_unplugged:
+            self._times_unplugged = self.bus.times_unplugged
+            old = self._master, self._slave
+            self._master, self._slave = self._new_pair()  # while the old name is still taken
+            _close(old)
+            self._unpublish()
+        self.plugged = self.bus.plugged
+        if self.plugged:
+            try:
+                self._publish()
+            except OSError as error:
+                self.bus.note(f"the link does not follow the adapter: {error}")
+        return True
 
     def receive(self, now_ns: int) -> None:
         """Hand what the host has written to the bus, as if it had been written at `now_ns`."""
@@ -49,7 +77,7 @@ class PseudoTerminal:
 
     def deliver(self, now_ns: int) -> None:
         """Give the host what has reached it by `now_ns`; what does not fit into the terminal is lost."""
-        data = self.bus.take(now_ns)
+        data = self.bus.take(now_ns, punctual=True)
         if not data:
             return
         try:
@@ -60,9 +88,29 @@ class PseudoTerminal:
             self.bus.note(f"{len(data) - written} bytes to the host are lost: it does not read")
 
     def close(self) -> None:
-        """Take the terminal away."""
-        os.close(self._master)
-        os.close(self._slave)
+        """Take the terminal and its link away."""
+        _close((self._master, self._slave))
+        self._unpublish()
+
+    def _new_pair(self) -> tuple[int, int]:
+        master, slave = os.openpty()
+        tty.setraw(slave)
+        _set_rate(slave, self.bus.baud_rate)
+        os.set_blocking(master, False)
+        return master, slave
+
+    def _publish(self) -> None:
+        if self._link is not None:
+            self._link.point(self.path)
+
+    def _unpublish(self) -> None:
+        if self._link is not None:
+            self._link.remove()
+
+
+def _close(pair: tuple[int, int]) -> None:
+    for descriptor in pair:
+        os.close(descriptor)
 
 
 def _rate(terminal: int) -> int:
