@@ -142,8 +142,8 @@ class Ports:
 
     def close(self) -> None:
         """Close them all."""
-        for port in self._open:
-            port.closePort()
+        while self._open:
+            self._open.pop().closePort()
 
 
 @pytest.fixture
