@@ -14,9 +14,8 @@ from dxlrun.compile.plan import AdapterPlan, LoadPlan, SimulationPlan
 from dxlrun.compile.problems import Problems
 from dxlrun.description import Description
 from dxlrun.description.robot import BusSimulation
+from dxlrun.simulation.mujoco_plant import INSTALL_MUJOCO, NEEDS_MUJOCO
 
-NEEDS_MUJOCO = "physics: mujoco needs MuJoCo, which is not installed"
-INSTALL_MUJOCO = "`pip install 'dxlrun[physics]'` installs it; or take physics: independent"
 NEEDS_URDF = "physics: mujoco moves the bodies of a URDF, and the file names none"
 NAME_URDF = "write `model: {urdf: ...}`, or take physics: independent"
 

@@ -1,0 +1,167 @@
+"""Bodies of a URDF that servos move together: each of its joints is turned by a servo's torque, in MuJoCo.
+
+What is taken of the URDF: its tree, masses and inertias (of a link without `inertial`: those of its collision
+shapes at the density of water), `dynamics` of its joints, gravity along -z of its first link, which does not
+move. What is not: meshes, contacts, limits of joints; and joints that no servo turns stand still. Only hinges
+are turned: how far the turn of a servo would move a slide is said nowhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dxlrun.errors import InputError
+from dxlrun.simulation.plant import NO_LOAD, Floats, IndependentJoints, Joint, PlantMaker
+
+if TYPE_CHECKING:
+    from mujoco import MjModel, MjSpec
+
+NEEDS_MUJOCO = "physics: mujoco needs MuJoCo, which is not installed"
+INSTALL_MUJOCO = "`pip install 'dxlrun[physics]'` installs it; or take physics: independent"
+
+_LEAST_MASS = 1e-6
+"""kg. A link with neither `inertial` nor a shape: MuJoCo refuses a moving body without mass."""
+_LEAST_INERTIA = 1e-9
+"""kg m^2, as above"""
+_FRICTION_SOLREF = (0.004, 1.0)
+_FRICTION_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
+"""Friction that holds: with MuJoCo's own values a joint creeps although its friction could hold it."""
+
+
+@dataclass(frozen=True, slots=True)
+class UrdfJoint:
+    """Which joint of a URDF a servo turns: q = direction * (theta - reference)."""
+
+    name: str
+    reference: float
+    """rad, of the servo from its raw 0"""
+    direction: int
+
+
+@dataclass(frozen=True, slots=True)
+class UrdfBodies:
+    """A URDF, and how servos turn its joints."""
+
+    urdf: str
+    joints: tuple[UrdfJoint, ...]
+    """In the order in which the servos are added; servos after them move by themselves."""
+
+
+def mujoco_plant(bodies: UrdfBodies) -> PlantMaker:
+    """Return what makes the plant of these bodies.
+
+    Joints that the URDF lacks, or does not draw as hinges, move by themselves. Raises InputError when MuJoCo
+    is not installed, cannot take the URDF, or would turn nothing.
+    """
+    try:
+        import mujoco
+    except ImportError as error:
+        raise InputError(f"{NEEDS_MUJOCO}; {INSTALL_MUJOCO}") from error
+    try:
+        text = _without_files(bodies.urdf)
+        spec = mujoco.MjSpec.from_string(text)
+        hinges = {each.name for each in spec.joints if each.type == mujoco.mjtJoint.mjJNT_HINGE}
+        turned = {row: joint for row, joint in enumerate(bodies.joints) if joint.name in hinges}
+        _compiled(text, {joint.name: Joint(0.0, NO_LOAD, 0.0) for joint in turned.values()})
+    except (ValueError, SyntaxError) as error:  # a ParseError of XML is a SyntaxError
+        told = " ".join(str(error).split())
+        raise InputError(f"MuJoCo cannot take the URDF: {told}; correct it") from error
+    if not turned:
+        raise InputError(
+            "physics: mujoco turns no joint: no hinge of the URDF has the name of a joint of the robot file; "
+            "give them the same names, or take physics: independent"
+        )
+    return lambda joints: MujocoPlant(text, turned, joints)
+
+
+class MujocoPlant:
+    """Joints that feel one another through their bodies; those without a body move by themselves."""
+
+    def __init__(self, urdf: str, turned: Mapping[int, UrdfJoint], joints: Sequence[Joint]) -> None:
+        import mujoco
+
+        self.angle: Floats = np.array([joint.angle for joint in joints], dtype=np.float64)
+        self.velocity: Floats = np.zeros(len(joints))
+        rows = [row for row in range(len(joints)) if row in turned]
+        self._alone = np.array([row for row in range(len(joints)) if row not in turned], dtype=np.intp)
+        self._independent = IndependentJoints([joints[row] for row in self._alone])
+        self._rows = np.array(rows, dtype=np.intp)
+        self._reference = np.array([turned[row].reference for row in rows])
+        self._direction = np.array([float(turned[row].direction) for row in rows])
+        self._model = _compiled(urdf, {turned[row].name: joints[row] for row in rows})
+        self._data = mujoco.MjData(self._model)
+        self._step = mujoco.mj_step
+        # only hinges are left, so that a joint's coordinate and speed stand at its own number
+        self._numbers = np.array([self._model.joint(turned[row].name).id for row in rows], dtype=np.intp)
+        self._own_damping = self._model.dof_damping[self._numbers].copy()
+
+    def step(self, drive: Floats, damping: Floats, dt_s: float) -> None:
+        """Let a time pass in which each servo drives with `drive - damping * velocity`; Nm and Nm s/rad."""
+        if len(self._rows):
+            self._step_bodies(drive, damping, dt_s)
+        if len(self._alone):
+            alone, independent = self._alone, self._independent
+            independent.angle[:] = self.angle[alone]
+            independent.velocity[:] = self.velocity[alone]
+            independent.step(drive[alone], damping[alone], dt_s)
+            self.angle[alone] = independent.angle
+            self.velocity[alone] = independent.velocity
+
+    def place(self, index: int, angle: float) -> None:
+        """Put a joint somewhere, rad, at rest."""
+        self.angle[index] = angle
+        self.velocity[index] = 0.0
+
+    def _step_bodies(self, drive: Floats, damping: Floats, dt_s: float) -> None:
+        rows, numbers, direction = self._rows, self._numbers, self._direction
+        model, data = self._model, self._data
+        model.opt.timestep = dt_s
+        # MuJoCo's own integrator takes damping at the end of the step, as independent joints do
+        model.dof_damping[numbers] = self._own_damping + damping[rows]
+        data.qpos[numbers] = direction * (self.angle[rows] - self._reference)
+        data.qvel[numbers] = direction * self.velocity[rows]
+        data.qfrc_applied[numbers] = direction * drive[rows]
+        self._step(model, data)
+        self.angle[rows] = self._reference + direction * data.qpos[numbers]
+        self.velocity[rows] = direction * data.qvel[numbers]
+
+
+def _compiled(urdf: str, turned: Mapping[str, Joint]) -> MjModel:
+    """Return the model in which the joints of these names turn, and no other; raises ValueError."""
+    import mujoco
+
+    spec: MjSpec = mujoco.MjSpec.from_string(urdf)
+    spec.compiler.boundmass = _LEAST_MASS
+    spec.compiler.boundinertia = _LEAST_INERTIA
+    disabled = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_LIMIT
+    spec.option.disableflags |= int(disabled)
+    for equality in list(spec.equalities):  # of `mimic`
+        spec.delete(equality)
+    for joint in list(spec.joints):
+        if joint.name not in turned:
+            spec.delete(joint)
+            continue
+        servo = turned[joint.name]
+        joint.armature = servo.rotor_inertia
+        joint.frictionloss += servo.load.friction
+        joint.solref_friction = _FRICTION_SOLREF
+        joint.solimp_friction = _FRICTION_SOLIMP
+    return spec.compile()
+
+
+def _without_files(urdf: str) -> str:
+    """Return a URDF without what is read from other files or only looked at; raises ParseError."""
+    from xml.etree import ElementTree  # only who has a URDF pays for it
+
+    root = ElementTree.fromstring(urdf)  # noqa: S314 (no DTD: the robot file's compiler refuses one)
+    for material in root.findall("material"):
+        root.remove(material)
+    for link in root.iter("link"):
+        for shape in (*link.findall("visual"), *link.findall("collision")):
+            if shape.tag == "visual" or shape.find("geometry/mesh") is not None:
+                link.remove(shape)
+    return ElementTree.tostring(root, encoding="unicode")
