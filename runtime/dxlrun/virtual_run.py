@@ -23,7 +23,7 @@ from dxlrun.recording.log_writer import LogWriter
 from dxlrun.ring import Handover
 from dxlrun.run_log import discard_log, log_header, new_log
 from dxlrun.run_summary import RunOptions, RunSummary
-from dxlrun.simulation import Ledger, SimulatedBus, VirtualPorts
+from dxlrun.simulation import Ledger, Mechanics, SimulatedBus, VirtualPorts
 
 
 @dataclass(slots=True)
@@ -81,7 +81,10 @@ class VirtualRobot:
         self.clock = VirtualClock()
         self.ledger = Ledger() if ledger is None else ledger
         """Every byte that the simulated servos received and sent."""
-        self.buses = tuple(SimulatedBus(config, self.ledger, 0) for config in simulated_buses(plan))
+        mechanics = Mechanics(0)
+        self.buses = tuple(
+            SimulatedBus(config, self.ledger, 0, mechanics) for config in simulated_buses(plan)
+        )
         """The simulated lines, in the order of the plan's buses; faults are injected here."""
         self.stop = StopFlag()
         self.result: LoopResult | None = None
