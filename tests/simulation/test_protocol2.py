@@ -164,6 +164,17 @@ def test_fast_status_of_the_manual_s_form() -> None:
     assert int.from_bytes(whole[22:24], "little") == crc16(whole[:22])
 
 
+def test_fast_bulk_status_of_the_manual() -> None:
+    status = FastStatusPacket((4, 2, 1))
+    parts = [status.part(Reply(each, 0, bytes.fromhex(data), 0)) for each, data in FAST_BULK]
+    assert b"".join(parts) == bytes.fromhex(
+        "fffffd00 fe 1400 55 00 03 a6000000 67a4  00 07 a501 2474  00 04 1f d9c1"
+    )
+
+
+FAST_BULK = ((3, "a6000000"), (7, "a501"), (4, "1f"))
+
+
 def test_fast_status_is_not_stuffed() -> None:
     data = bytes.fromhex("fffffd00")
     assert data + bytes(0) in FastStatusPacket((4,)).part(Reply(1, 0, data, 0))[8:]

@@ -63,11 +63,10 @@ def read_in_turn(packet: InstructionPacket) -> ReadInTurn | None:
     listed = packet.parameters[1:]
     if packet.parameters[:1] != b"\x00" or not listed or len(listed) % 3:
         return None
-    entries = tuple(
-        ReadEntry(servo_id=listed[start + 1], address=listed[start + 2], length=listed[start])
-        for start in range(0, len(listed), 3)
-    )
-    return ReadInTurn(packet.instruction, entries)
+    entries: dict[int, ReadEntry] = {}
+    for length, servo_id, address in zip(listed[::3], listed[1::3], listed[2::3], strict=True):
+        entries.setdefault(servo_id, ReadEntry(servo_id, address, length))  # of an ID listed twice the first
+    return ReadInTurn(packet.instruction, tuple(entries.values()))
 
 
 def fast_status(lengths: tuple[int, ...]) -> NoReturn:
