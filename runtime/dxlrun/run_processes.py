@@ -16,7 +16,7 @@ from dxlrun import heartbeat, process, ring
 from dxlrun.assembly import cycle_layout
 from dxlrun.commands import COMMAND_SLOT, command_slots
 from dxlrun.compile.plan import Plan, to_json
-from dxlrun.compile.simulated import simulated_buses
+from dxlrun.compile.simulated import simulated_bodies, simulated_buses
 from dxlrun.cycle import cycle_slots
 from dxlrun.errors import PortError, ProcessFault
 from dxlrun.events import EVENT_SLOT, event_slots
@@ -24,7 +24,7 @@ from dxlrun.guardian import GuardianJob
 from dxlrun.loop_process import LoopJob, Outcome
 from dxlrun.packets import PACKET_SLOT, packet_slots
 from dxlrun.recording.header import LogHeader
-from dxlrun.simulation.process import encode_config
+from dxlrun.simulation.process import SimulationConfig, encode_config
 
 START_TIMEOUT_S = 20.0
 """A child that says nothing for so long will say nothing more; a cold import of numpy takes a second."""
@@ -165,7 +165,8 @@ def start_simulation(plan: Plan, ledger: Path | None, memory: Memory) -> tuple[C
     With a loop in real time they get a priority above loop and guardian, and the last core: a servo's
     electronics do not wait for the host's processor.
     """
-    config = process.memory_file("dxlrun-simulation", encode_config(simulated_buses(plan)))
+    told = SimulationConfig(simulated_buses(plan), bodies=simulated_bodies(plan))
+    config = process.memory_file("dxlrun-simulation", encode_config(told))
     arguments = ["--config-fd", str(config)] + (["--ledger", str(ledger)] if ledger else [])
     scheduler = plan.loop.scheduler
     if scheduler.policy != "other":

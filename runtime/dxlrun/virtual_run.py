@@ -12,7 +12,7 @@ from dxlrun.assembly import assemble
 from dxlrun.clock import VirtualClock
 from dxlrun.commands import CommandRing, NoCommands
 from dxlrun.compile.plan import Plan
-from dxlrun.compile.simulated import simulated_buses
+from dxlrun.compile.simulated import simulated_bodies, simulated_buses
 from dxlrun.control.loop import LoopResult, StopFlag
 from dxlrun.control.plugins import load_plugins
 from dxlrun.cycle import CycleRecord
@@ -24,6 +24,7 @@ from dxlrun.ring import Handover
 from dxlrun.run_log import discard_log, log_header, new_log
 from dxlrun.run_summary import RunOptions, RunSummary
 from dxlrun.simulation import Ledger, Mechanics, SimulatedBus, VirtualPorts
+from dxlrun.simulation.mujoco_plant import mujoco_plant
 
 
 @dataclass(slots=True)
@@ -81,7 +82,8 @@ class VirtualRobot:
         self.clock = VirtualClock()
         self.ledger = Ledger() if ledger is None else ledger
         """Every byte that the simulated servos received and sent."""
-        mechanics = Mechanics(0)
+        bodies = simulated_bodies(plan)
+        mechanics = Mechanics(0, mujoco_plant(bodies) if bodies else None)
         self.buses = tuple(
             SimulatedBus(config, self.ledger, 0, mechanics) for config in simulated_buses(plan)
         )

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from dxlrun.cli.sim_views import Shown
     from dxlrun.simulation import BusConfig
     from dxlrun.simulation.faults import Fault
+    from dxlrun.simulation.mujoco_plant import UrdfBodies
     from dxlrun.simulation.process import SimulationConfig
     from dxlrun.simulation_front import FrontOptions, Served
 
@@ -89,7 +90,7 @@ def sim(
         Print the traceback of an error, and what the process of the servos said.
     """
     planned = read_faults(fault, faults)
-    title, buses, hint = _from_file(robot, assignments, servo, baud, protocol)
+    title, buses, bodies, hint = _from_file(robot, assignments, servo, baud, protocol)
     wishes = AdapterWishes(latency_timer, split, echo, absent)
     buses = tuple(with_adapter(bus, wishes, seed) for bus in buses)
     links = link_of_each(buses, link)
@@ -104,6 +105,7 @@ def sim(
         faults=tuple(str(each) for each in planned),
         seed=seed,
         links={bus: str(path) for bus, path in links.items()},
+        bodies=bodies,
     )
     shown = Shown(title, buses, links, hint)
     served = _serve(config, FrontOptions(ledger), shown, as_json=as_json)
@@ -122,14 +124,14 @@ def _from_file(
     servo: Sequence[str],
     baud: int | None,
     protocol: float | None,
-) -> tuple[str, tuple[BusConfig, ...], str | None]:
-    """Return title, buses, and a command line that would use them."""
+) -> tuple[str, tuple[BusConfig, ...], UrdfBodies | None, str | None]:
+    """Return title, buses, what their servos move together, and a command line that would use them."""
     if robot is None:
         if not servo:
             raise InputError(
                 "there is nothing to simulate; give a robot file, or servos such as --servo XL430-W250:1-3"
             )
-        return "simulation", (servo_bus(servo, baud, protocol),), None
+        return "simulation", (servo_bus(servo, baud, protocol),), None, None
     options = {"--servo": servo or None, "--baud": baud, "--protocol": protocol}
     given = [name for name, value in options.items() if value is not None]
     if given:
@@ -137,14 +139,19 @@ def _from_file(
     result = compiled(robot, assignments, (), None)
     for warning in result.warnings:
         say_warning(str(warning))
-    from dxlrun.compile.simulated import simulated_buses
+    from dxlrun.compile.simulated import simulated_bodies, simulated_buses
 
     plan = result.plan
     everywhere = replace(plan, buses=tuple(replace(bus, port="sim") for bus in plan.buses))
     others = [word for word in assignments if not word.startswith("port:=")]
     hint = " ".join(["dxlrun", str(robot), *others, "port:={port}"])
     takes_port = len(plan.buses) == 1 and "port" in plan.arguments
-    return plan.robot, simulated_buses(everywhere), hint if takes_port else None
+    return (
+        plan.robot,
+        simulated_buses(everywhere),
+        simulated_bodies(everywhere),
+        hint if takes_port else None,
+    )
 
 
 def refuse_what_cannot_be(buses: Sequence[BusConfig], faults: Sequence[Fault], seed: int) -> None:

@@ -3,14 +3,38 @@
 from __future__ import annotations
 
 from dxlrun.compile.plan import AdapterPlan, LoadPlan, Plan
+from dxlrun.compile.simulation import NAME_URDF, NEEDS_URDF
 from dxlrun.control_table import added_control_tables
 from dxlrun.dynamixel.bus_plan import BusPlan
+from dxlrun.errors import InputError
 from dxlrun.simulation import AdapterConfig, BusConfig, Load, ServoConfig
+from dxlrun.simulation.mujoco_plant import UrdfBodies, UrdfJoint, mujoco_plant
 
 
 def simulated_buses(plan: Plan) -> tuple[BusConfig, ...]:
     """Return the simulated lines of a plan: the servos that it expects, each at its reference (q = 0)."""
     return tuple(_bus(plan, bus) for bus in plan.buses if bus.port == "sim")
+
+
+def simulated_bodies(plan: Plan) -> UrdfBodies | None:
+    """Return the bodies that the servos of `simulated_buses` move together; None: each joint by itself.
+
+    Raises InputError when the robot file asks for bodies that cannot be moved: here, where a person sees it,
+    and not in the process of the simulated buses.
+    """
+    if plan.simulation.physics == "independent":
+        return None
+    if plan.urdf is None:
+        raise InputError(f"{NEEDS_URDF}; {NAME_URDF}")
+    joints = (
+        UrdfJoint(servo.joint, servo.reference, servo.direction)
+        for bus in plan.buses
+        if bus.port == "sim"
+        for servo in bus.servos
+    )
+    bodies = UrdfBodies(plan.urdf, tuple(joints))
+    mujoco_plant(bodies)
+    return bodies
 
 
 def _bus(plan: Plan, bus: BusPlan) -> BusConfig:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import msgspec
 
 from dxlrun.simulation.bus_config import BusConfig
+from dxlrun.simulation.mujoco_plant import UrdfBodies
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,6 +22,8 @@ class SimulationConfig:
     """Of what the faults leave to chance."""
     links: dict[str, str] = field(default_factory=dict)
     """By bus: path of a symbolic link that always leads to its terminal, as udev's do."""
+    bodies: UrdfBodies | None = None
+    """What the servos move together; None: each joint moves by itself."""
 
 
 def encode_config(config: SimulationConfig | Sequence[BusConfig]) -> bytes:

@@ -19,6 +19,7 @@ from dxlrun.simulation.ledger import Ledger
 from dxlrun.simulation.link import Link
 from dxlrun.simulation.look import lateness_us, servo_looks
 from dxlrun.simulation.mechanics import Mechanics
+from dxlrun.simulation.mujoco_plant import mujoco_plant
 from dxlrun.simulation.pseudo_terminal import PseudoTerminal
 from dxlrun.simulation.realtime import Patience
 
@@ -39,8 +40,8 @@ class _Question(msgspec.Struct):
 class Server:
     """Pumps pseudo-terminals and buses until the control socket ends or SIGTERM comes.
 
-    Raises InputError when a fault of the configuration could never happen, OSError when a terminal or a link
-    cannot be made.
+    Raises InputError when a fault of the configuration could never happen, or its bodies cannot be moved,
+    OSError when a terminal or a link cannot be made.
     """
 
     def __init__(self, config: SimulationConfig, ledger: Ledger, line: ControlLine) -> None:
@@ -49,7 +50,7 @@ class Server:
         self._line = line
         self._seed = config.seed
         self._typed = 0
-        mechanics = Mechanics(self.start_ns)
+        mechanics = Mechanics(self.start_ns, mujoco_plant(config.bodies) if config.bodies else None)
         self._buses = tuple(SimulatedBus(bus, ledger, self.start_ns, mechanics) for bus in config.buses)
         FaultScript([parse_fault(text) for text in config.faults], config.seed).attach(
             self._buses, start_ns=self.start_ns
