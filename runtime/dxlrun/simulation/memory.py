@@ -9,6 +9,9 @@ from dxlrun.control_table import ControlItem, ControlTable
 
 _INDIRECT = re.compile(r"indirect_address_(\d+)")
 
+_CELLS_KEPT = 1024
+"""So many places of a table are looked up only once: a host writes few of them, rubbish goes everywhere."""
+
 Run = tuple[int, bytes]
 """Address and bytes that belong there."""
 
@@ -123,6 +126,8 @@ class Memory:
             items = [self._item_at.get(cell) for cell in range(address, address + length)]
             owned = [item.name for item in items if item is not None]
             names = tuple(dict.fromkeys(owned)) if len(owned) == length else ()
+            if len(self._names_at) >= _CELLS_KEPT:
+                self._names_at.clear()
             self._names_at[address, length] = names
         return names
 
