@@ -127,6 +127,42 @@ def test_two_servos_collide_on_a_broadcast_ping(line: Any) -> None:
     assert any("collision" in note for note in line.notes())
 
 
+def test_goals_of_multi_turn_mode_count_turns(make_line: Any) -> None:
+    line = make_line((1,), "MX-28")
+    assert line.write(1, 6, *low_high(4095), *low_high(4095)) == 0
+    goals = (28_672, 28_673, -28_672 & 0xFFFF, -28_673 & 0xFFFF)
+    errors = [line.write(1, 30, *low_high(goal)) for goal in goals]
+    assert errors == [0, ErrorBit.RANGE, 0, ErrorBit.RANGE]
+    assert line.read(1, 30, 2) == goals[2]
+
+
+def test_goal_torque_cannot_be_bigger_than_torque_limit(make_line: Any) -> None:
+    line = make_line((1,), "MX-64")
+    assert line.write(1, 34, *low_high(500)) == 0
+    errors = [line.write(1, 71, *low_high(torque)) for torque in (500, 501, 1024 + 500, 1024 + 501)]
+    assert errors == [0, ErrorBit.RANGE, 0, ErrorBit.RANGE]
+
+
+def test_an_mx_counts_milliseconds_from_its_power_up(make_line: Any) -> None:
+    line = make_line((1,), "MX-28")
+    first = line.read(1, 50, 2)
+    line.clock.wait_until(line.clock.now_ns() + 2_000_000_000)
+    assert line.read(1, 50, 2) - first == pytest.approx(2010, abs=1)
+    line.servo().reset()
+    assert line.read(1, 50, 2) < 10
+    line.clock.wait_until(line.clock.now_ns() + 32_768_000_000)
+    assert line.read(1, 50, 2) < 50
+
+
+@pytest.mark.parametrize("level", [0, 1, 2])
+def test_a_broadcast_is_answered_at_no_status_return_level(line: Any, level: int) -> None:
+    line.send(BROADCAST, WRITE, 16, level)
+    for instruction, parameters in ((READ, (36, 2)), (WRITE, (25, 1)), (REG_WRITE, (25, 0)), (ACTION, ())):
+        line.send(BROADCAST, instruction, *parameters)
+    assert line.hear() == b""
+    assert line.servo().registers["led"] == 0
+
+
 @pytest.mark.parametrize(
     ("level", "ping", "read", "write"),
     [(0, True, False, False), (1, True, True, False), (2, True, True, True)],
@@ -222,8 +258,8 @@ def test_a_goal_wakes_a_limp_servo_and_it_goes_there(line: Any) -> None:
     assert line.read(1, 24, 1) == 1
     assert line.read(1, 46, 1) == 1
     line.clock.wait_until(2_000_000_000)
-    assert line.read(1, 36, 2) == 700
-    assert line.servo().position == 700 * TICK
+    assert line.read(1, 36, 2) == pytest.approx(700, abs=2)
+    assert line.servo().position == pytest.approx(700 * TICK, abs=2 * TICK)
     assert line.read(1, 46, 1) == 0
     assert line.read(1, 38, 4) == 0  # speed and load
 
@@ -236,7 +272,7 @@ def test_waking_by_a_goal_can_be_switched_off(line: Any) -> None:
     assert line.servo().position == 2.0
     line.write(1, 24, 1)  # and then it goes to the goal that stands there
     line.clock.wait_until(4_000_000_000)
-    assert line.read(1, 36, 2) == 700
+    assert line.read(1, 36, 2) == pytest.approx(700, abs=2)
 
 
 @pytest.mark.parametrize(
@@ -263,7 +299,8 @@ def test_torque_off_in_the_middle_stops_it_there(line: Any) -> None:
     stopped = line.servo().position
     assert 2.0 < stopped < 1023 * TICK
     line.clock.wait_until(3_000_000_000)
-    assert line.servo().position == stopped
+    assert line.servo().position == pytest.approx(stopped, abs=0.1)  # it comes to rest by itself
+    assert line.servo().velocity == 0.0
 
 
 def test_wheel_mode_turns_by_output_and_zero_stops(line: Any) -> None:
@@ -309,10 +346,10 @@ def test_overload_takes_the_torque_until_the_limit_is_written(line: Any) -> None
     assert not line.servo().torque_on
     stopped = line.servo().position
     line.clock.wait_until(3_000_000_000)
-    assert line.servo().position == stopped
+    assert line.servo().position == pytest.approx(stopped, abs=0.1)
     assert line.write(1, 34, *low_high(1023)) == 0
     line.clock.wait_until(6_000_000_000)
-    assert line.read(1, 36, 2) == 700
+    assert line.read(1, 36, 2) == pytest.approx(700, abs=2)
 
 
 def test_heat_is_an_error_and_shuts_down(line: Any) -> None:
@@ -342,7 +379,7 @@ def test_a_cut_data_line_silences_but_does_not_stop(line: Any) -> None:
     assert line.ask(1, PING) is None
     line.send(BROADCAST, WRITE, 24, 0)
     line.clock.wait_until(3_000_000_000)
-    assert line.servo().position == 1023 * TICK
+    assert line.servo().position == pytest.approx(1023 * TICK, abs=2 * TICK)
     line.servo().silence(False)
     assert line.read(1, 24, 1) == 1
 
