@@ -22,6 +22,10 @@ class PseudoTerminal:
 
     A terminal that was never told a rate has that of the bus; a host that sets another one talks at that
     rate, and servos at the old one hear nothing.
+
+    What a USB adapter would not do [i]: a host that throws its output away (`tcflush(TCOFLUSH)`, pyserial's
+    `reset_output_buffer`) right after writing loses what the kernel has not handed over yet; pypot 5.0 does
+    so before each packet.
     """
 
     def __init__(self, bus: SimulatedBus, link: Link | None = None) -> None:
