@@ -8,21 +8,24 @@ are turned: how far the turn of a servo would move a slide is said nowhere.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dxlrun.errors import InputError
-from dxlrun.simulation.plant import NO_LOAD, Floats, IndependentJoints, Joint, PlantMaker
+from dxlrun.simulation.plant import Floats, IndependentJoints, Joint, PlantMaker
 
 if TYPE_CHECKING:
+    from xml.etree.ElementTree import Element
+
     from mujoco import MjModel, MjSpec
 
 NEEDS_MUJOCO = "physics: mujoco needs MuJoCo, which is not installed"
 INSTALL_MUJOCO = "`pip install 'dxlrun[physics]'` installs it; or take physics: independent"
 
+_HINGES = ("revolute", "continuous")
 _LEAST_MASS = 1e-6
 """kg. A link with neither `inertial` nor a shape: MuJoCo refuses a moving body without mass."""
 _LEAST_INERTIA = 1e-9
@@ -58,15 +61,19 @@ def mujoco_plant(bodies: UrdfBodies) -> PlantMaker:
     is not installed, cannot take the URDF, or would turn nothing.
     """
     try:
-        import mujoco
+        import mujoco  # noqa: F401 (it may be there and yet not load)
     except ImportError as error:
         raise InputError(f"{NEEDS_MUJOCO}; {INSTALL_MUJOCO}") from error
+    from xml.etree import ElementTree  # only who has a URDF pays for it
+
     try:
-        text = _without_files(bodies.urdf)
-        spec = mujoco.MjSpec.from_string(text)
-        hinges = {each.name for each in spec.joints if each.type == mujoco.mjtJoint.mjJNT_HINGE}
+        # no DTD can be in it: the robot file's compiler refuses one
+        root = ElementTree.fromstring(bodies.urdf)  # noqa: S314
+        hinges = {each.get("name") for each in root.findall("joint") if each.get("type") in _HINGES}
         turned = {row: joint for row, joint in enumerate(bodies.joints) if joint.name in hinges}
-        _compiled(text, {joint.name: Joint(0.0, NO_LOAD, 0.0) for joint in turned.values()})
+        _make_movable(root, {joint.name for joint in turned.values()})
+        text = ElementTree.tostring(root, encoding="unicode")
+        _compiled(text, {})
     except (ValueError, SyntaxError) as error:  # a ParseError of XML is a SyntaxError
         told = " ".join(str(error).split())
         raise InputError(f"MuJoCo cannot take the URDF: {told}; correct it") from error
@@ -95,7 +102,7 @@ class MujocoPlant:
         self._model = _compiled(urdf, {turned[row].name: joints[row] for row in rows})
         self._data = mujoco.MjData(self._model)
         self._step = mujoco.mj_step
-        # only hinges are left, so that a joint's coordinate and speed stand at its own number
+        # all joints are hinges, so that a joint's coordinate and speed stand at its own number
         self._numbers = np.array([self._model.joint(turned[row].name).id for row in rows], dtype=np.intp)
         self._own_damping = self._model.dof_damping[self._numbers].copy()
 
@@ -130,8 +137,26 @@ class MujocoPlant:
         self.velocity[rows] = direction * data.qvel[numbers]
 
 
+def _make_movable(root: Element, turned: Set[str]) -> None:
+    """Leave of a URDF what servos move: joints that none of them turns are fixed, files are not asked for."""
+    for joint in root.findall("joint"):
+        if joint.get("name") not in turned:
+            joint.set("type", "fixed")
+        for mimic in joint.findall("mimic"):
+            joint.remove(mimic)
+    for material in root.findall("material"):
+        root.remove(material)
+    for link in root.findall("link"):
+        for shape in (*link.findall("visual"), *link.findall("collision")):
+            if shape.tag == "visual" or shape.find("geometry/mesh") is not None:
+                link.remove(shape)
+
+
 def _compiled(urdf: str, turned: Mapping[str, Joint]) -> MjModel:
-    """Return the model in which the joints of these names turn, and no other; raises ValueError."""
+    """Return the model with the rotors and frictions of servos at the joints of these names.
+
+    Raises ValueError when MuJoCo cannot take the URDF.
+    """
     import mujoco
 
     spec: MjSpec = mujoco.MjSpec.from_string(urdf)
@@ -139,29 +164,10 @@ def _compiled(urdf: str, turned: Mapping[str, Joint]) -> MjModel:
     spec.compiler.boundinertia = _LEAST_INERTIA
     disabled = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_LIMIT
     spec.option.disableflags |= int(disabled)
-    for equality in list(spec.equalities):  # of `mimic`
-        spec.delete(equality)
-    for joint in list(spec.joints):
-        if joint.name not in turned:
-            spec.delete(joint)
-            continue
-        servo = turned[joint.name]
-        joint.armature = servo.rotor_inertia
-        joint.frictionloss += servo.load.friction
-        joint.solref_friction = _FRICTION_SOLREF
-        joint.solimp_friction = _FRICTION_SOLIMP
+    for joint in spec.joints:
+        if (servo := turned.get(joint.name)) is not None:
+            joint.armature = servo.rotor_inertia
+            joint.frictionloss += servo.load.friction
+            joint.solref_friction = _FRICTION_SOLREF
+            joint.solimp_friction = _FRICTION_SOLIMP
     return spec.compile()
-
-
-def _without_files(urdf: str) -> str:
-    """Return a URDF without what is read from other files or only looked at; raises ParseError."""
-    from xml.etree import ElementTree  # only who has a URDF pays for it
-
-    root = ElementTree.fromstring(urdf)  # noqa: S314 (no DTD: the robot file's compiler refuses one)
-    for material in root.findall("material"):
-        root.remove(material)
-    for link in root.iter("link"):
-        for shape in (*link.findall("visual"), *link.findall("collision")):
-            if shape.tag == "visual" or shape.find("geometry/mesh") is not None:
-                link.remove(shape)
-    return ElementTree.tostring(root, encoding="unicode")
