@@ -48,6 +48,22 @@ def test_a_name_prints_its_control_table(dxlrun):
     assert set(control_table("AX-12A").items) <= rows.keys()
 
 
+@pytest.mark.parametrize(
+    ("model", "line"),
+    [
+        (
+            "XM430-W350",
+            "no-load speed 46 rpm at 12 V, stall torque 4.1 Nm, stall current 2.3 A, gear 353.5 : 1",
+        ),
+        ("DX-113", "no-load speed 54 rpm at 12 V, stall torque 1 Nm, gear 192.6 : 1"),
+        ("PH54-200-S500", "no-load speed 33.1 rpm at 24 V, stall torque not given, gear 501.92 : 1"),
+        ("XW430-T333", "no-load speed 31.8 rpm, stall torque not given"),
+    ],
+)
+def test_a_name_prints_its_motor_as_far_as_the_manual_gives_it(dxlrun, model, line):
+    assert dxlrun("models", model).out.splitlines()[2] == line
+
+
 def test_a_name_of_both_protocols_prints_both_tables(dxlrun):
     both = dxlrun("models", "MX-28")
     second = dxlrun("models", "MX-28", "--protocol", "2")
@@ -73,6 +89,8 @@ def test_json_of_one_model_holds_all_that_the_table_knows(dxlrun):
 
     table = control_table("XM430-W350")
     assert told["rad_per_tick"] == table.rad_per_tick
+    motor = {name: told[name] for name in ("stall_torque", "stall_current", "nominal_voltage", "gear_ratio")}
+    assert motor == {"stall_torque": 4.1, "stall_current": 2.3, "nominal_voltage": 12.0, "gear_ratio": 353.5}
     assert told["capabilities"] == sorted(table.capabilities)
     assert told["baud_rates"]["3"] == 1_000_000
     items = {item["name"]: item for item in told["items"]}

@@ -11,9 +11,10 @@ import pytest
 
 from dxlrun.compile import Compiled
 from dxlrun.compile.plan import AdapterPlan, LoadPlan, SimulationPlan, from_json, to_json
-from dxlrun.compile.simulated import simulated_buses
-from dxlrun.errors import Problem
+from dxlrun.compile.simulated import simulated_bodies, simulated_buses
+from dxlrun.errors import InputError, Problem
 from dxlrun.simulation import AdapterConfig, Load
+from dxlrun.simulation.mujoco_plant import UrdfBodies, UrdfJoint
 
 Compile = Callable[..., Compiled]
 ProblemsIn = Callable[..., tuple[Problem, ...]]
@@ -146,3 +147,60 @@ def test_mujoco_that_is_not_installed_is_named_with_its_extra(
     (problem,) = [each for each in problems_in(text) if each.severity == "error"]
     assert problem.what == "physics: mujoco needs MuJoCo, which is not installed"
     assert "pip install 'dxlrun[physics]'" in problem.mend
+
+
+URDF = """<robot name="pair"><link name="body"/><link name="left"/><link name="right"/>
+<joint name="left_arm_joint" type="revolute"><parent link="body"/><child link="left"/>
+<limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
+<joint name="right_arm_joint" type="continuous"><parent link="body"/><child link="right"/></joint></robot>
+"""
+
+
+def _with_bodies(text: str, folder: Path, urdf: str = URDF) -> str:
+    (folder / "pair.urdf").write_text(urdf, encoding="utf-8")
+    return text + "model: {urdf: pair.urdf}\nsimulation: {physics: mujoco}\n"
+
+
+def test_without_a_word_each_joint_moves_by_itself(compile_text: Compile, simulated: str) -> None:
+    assert simulated_bodies(compile_text(simulated).plan) is None
+
+
+def test_bodies_are_turned_by_the_servos_in_the_order_of_the_buses(
+    compile_text: Compile, simulated: str, tmp_path: Path
+) -> None:
+    # the first joint of the file stands on the second bus
+    two = simulated.replace("loop:", "  second: {port: sim, protocol: 1.0, baud_rate: 1_000_000}\nloop:", 1)
+    two = two.replace("bus: main\n    id: 1", "bus: second\n    id: 1", 1)
+    plan = compile_text(_with_bodies(two, tmp_path)).plan
+    assert [each.servo_id for bus in simulated_buses(plan) for each in bus.servos] == [2, 1]
+    assert simulated_bodies(plan) == UrdfBodies(
+        URDF,
+        (
+            UrdfJoint("right_arm_joint", pytest.approx(math.radians(240)), 1),
+            UrdfJoint("left_arm_joint", pytest.approx(math.radians(60)), -1),
+        ),
+    )
+
+
+def test_bodies_that_cannot_be_moved_are_told_before_a_process_starts(
+    compile_text: Compile, simulated: str, tmp_path: Path
+) -> None:
+    loose = URDF.replace('<child link="left"/>', '<child link="nothing"/>')
+    with pytest.raises(InputError, match="MuJoCo cannot take the URDF"):
+        simulated_bodies(compile_text(_with_bodies(simulated, tmp_path, loose)).plan)
+
+
+def test_bodies_without_a_urdf_are_told_when_a_real_port_is_simulated_after_all(
+    compile_text: Compile, robot_text: str
+) -> None:
+    plan = compile_text(robot_text + "simulation: {physics: mujoco}\n").plan
+    with pytest.raises(InputError, match=r"the file names none; write `model: \{urdf: \.\.\.\}`"):
+        simulated_bodies(plan)
+
+
+def test_with_mujoco_the_urdf_says_what_a_joint_moves(
+    problems_in: ProblemsIn, simulated: str, tmp_path: Path
+) -> None:
+    text = _with_bodies(_joint(simulated, "{inertia: 1 kg cm^2, friction: 0.1 Nm}"), tmp_path)
+    told = [each.what for each in problems_in(text) if "physics" in each.what]
+    assert told == ["with physics: mujoco the URDF says the inertia of left_arm_joint"]

@@ -139,17 +139,16 @@ def _torque(table: ControlTable) -> str:
 
 
 def _motor(table: ControlTable) -> str:
-    known = [f"no-load speed {_speed(table)}", f"stall torque {_torque(table) or 'not given'}"]
+    """Say what the motor does at its nominal voltage, as far as the manual gives it."""
+    known = [f"no-load speed {_speed(table)}"]
+    if table.nominal_voltage:
+        known[0] += f" at {table.nominal_voltage:.3g} V"
+    known.append(f"stall torque {_torque(table) or 'not given'}")
     if table.stall_current:
         known.append(f"stall current {table.stall_current:.3g} A")
-    if table.nominal_voltage:
-        known.append(f"at {table.nominal_voltage:.3g} V")
-    ratio = f"; gear {table.gear_ratio:.5g} : 1" if table.gear_ratio else ""
-    return (
-        f"{', '.join(known[:-1])} {known[-1]}{ratio}"
-        if table.nominal_voltage
-        else f"{', '.join(known)}{ratio}"
-    )
+    if table.gear_ratio:
+        known.append(f"gear {table.gear_ratio:.5g} : 1")
+    return ", ".join(known)
 
 
 def _effort(table: ControlTable) -> str:
