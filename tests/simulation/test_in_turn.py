@@ -212,5 +212,5 @@ def test_other_models_of_protocol_1_move_too(make_line: Any, model: str) -> None
     goal = table.max_tick // 2
     assert line.write(1, 30, goal & 0xFF, goal >> 8) == 0
     line.clock.wait_until(3_000_000_000)
-    assert line.read(1, 36, 2) == goal
-    assert line.servo().position == pytest.approx(goal * table.rad_per_tick)
+    assert abs(line.read(1, 36, 2) - goal) <= 2  # within the compliance margin
+    assert line.servo().position == pytest.approx(goal * table.rad_per_tick, abs=2 * table.rad_per_tick)

@@ -61,6 +61,11 @@ class Adapter:
         self._burst: deque[HandOver] = deque()
         """Pieces of what the timer let go."""
 
+    @property
+    def holds(self) -> bool:
+        """True when something has arrived that the host has not got."""
+        return bool(self.arrived or self._burst)
+
     def accept(self, chunk: Chunk) -> bool:
         """Take what has passed the wire; False: there is no room for it."""
         if sum(len(each.data) for each in self.arrived) + len(chunk.data) > UNREAD_LIMIT:

@@ -16,14 +16,13 @@ The rules of the line:
 
 from __future__ import annotations
 
-import heapq
-import itertools
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 
 from dxlrun.simulation import protocol1, protocol2
 from dxlrun.simulation.adapter import Adapter
+from dxlrun.simulation.agenda import Agenda
 from dxlrun.simulation.bus_config import BusConfig, ServoCounts
 from dxlrun.simulation.ledger import Ledger
 from dxlrun.simulation.mechanics import Mechanics
@@ -67,10 +66,7 @@ class SimulatedBus:
         self._chain: Chain | None = None
         self._changes: dict[int, deque[Change]] = {}
         self._instruction_changes: deque[Change] = deque()
-        self._agenda: list[tuple[int, int, Callable[[], None]]] = []
-        self._countdowns: list[tuple[int, int, Callable[[], None]]] = []
-        self._packets = 0
-        self._order = itertools.count()
+        self._agenda = Agenda()
         self._counts: dict[SimulatedServo, ServoCounts] = {}
         for servo in config.servos:
             self.add_servo(servo)
@@ -106,9 +102,8 @@ class SimulatedBus:
         due_ns = None if self._wedged else self._adapter.next_ns(passing)
         if passing and (due_ns is None or passing[0].due_ns < due_ns):
             due_ns = passing[0].due_ns  # perhaps somebody waits for it, to answer next
-        if self._agenda and (due_ns is None or self._agenda[0][0] < due_ns):
-            return self._agenda[0][0]
-        return due_ns
+        planned_ns = self._agenda.next_ns
+        return planned_ns if planned_ns is not None and (due_ns is None or planned_ns < due_ns) else due_ns
 
     def take(self, now_ns: int, *, punctual: bool = False) -> bytes:
         """Return the bytes that have reached the host by `now_ns`, each once.
@@ -117,7 +112,7 @@ class SimulatedBus:
         """
         self._pass_time(now_ns)
         passing = self._wire.passing
-        if self._wedged or not (self._adapter.arrived or passing):
+        if self._wedged or not (passing or self._adapter.holds):
             return b""
         taken = bytearray()
         while (part := self._adapter.hand_over(now_ns, passing)) is not None:
@@ -169,12 +164,11 @@ class SimulatedBus:
 
     def at(self, t_ns: int, action: Callable[[], None]) -> None:
         """Plan a fault: `action` is called when the bus' time reaches `t_ns`."""
-        heapq.heappush(self._agenda, (t_ns, next(self._order), action))
+        self._agenda.at(t_ns, action)
 
     def after(self, packets: int, action: Callable[[], None]) -> None:
         """Plan a fault: `action` is called when the servos have obeyed so many more instruction packets."""
-        heapq.heappush(self._countdowns, (self._packets + packets, next(self._order), action))
-        self._count_down()
+        self._agenda.after(packets, action)
 
     def note(self, text: str) -> None:
         """Enter a note into the ledger, at the bus' time."""
@@ -250,12 +244,12 @@ class SimulatedBus:
         """Let everything happen that happens by itself until `now_ns`, in order."""
         passing, agenda = self._wire.passing, self._agenda
         while True:
-            if passing and passing[0].due_ns <= now_ns and not (agenda and agenda[0][0] < passing[0].due_ns):
+            t_ns = agenda.next_ns
+            if passing and passing[0].due_ns <= now_ns and (t_ns is None or t_ns >= passing[0].due_ns):
                 self._arrive(passing.pop(0))
-            elif agenda and agenda[0][0] <= now_ns:
-                t_ns, _, action = heapq.heappop(agenda)
+            elif t_ns is not None and t_ns <= now_ns:
                 self._now_ns = max(self._now_ns, t_ns)
-                action()
+                agenda.pop()()
             else:
                 break
         self._now_ns = max(self._now_ns, now_ns)
@@ -305,16 +299,7 @@ class SimulatedBus:
             position = other.end
             self._execute(other, end_ns)
         if not heard:
-            self._passed_by()
-
-    def _passed_by(self) -> None:
-        self._packets += 1
-        if self._countdowns:
-            self._count_down()
-
-    def _count_down(self) -> None:
-        while self._countdowns and self._countdowns[0][0] <= self._packets:
-            heapq.heappop(self._countdowns)[2]()
+            self._agenda.packet_passed()
 
     def _execute(self, packet: InstructionPacket, end_ns: int) -> None:
         self._chain = None  # who waited for its turn hears another instruction
@@ -331,7 +316,7 @@ class SimulatedBus:
                 if reply is not None:
                     counts.answer(reply.error)
                     self._answer(reply, self._status(reply), end_ns)
-        self._passed_by()
+        self._agenda.packet_passed()
 
     def _read_in_turn(self, reading: ReadInTurn, end_ns: int) -> None:
         """Let the listed servos answer, each when it has heard the one before it."""

@@ -8,6 +8,9 @@ from dataclasses import dataclass
 
 from dxlrun.simulation.packets import FastStatus, ReadEntry, ReadInTurn, Reply
 
+MOST_PASSING = 256
+"""Packets on their way to the host at once: a host that floods a line on virtual time fills no memory."""
+
 
 @dataclass(slots=True)
 class Chain:
@@ -74,7 +77,9 @@ class Wire:
     def send(self, chunk: Chunk) -> None:
         """Put bytes on their way to the host, mixed with what is on the wire at the same time."""
         passing = self.passing
-        if passing:
+        if len(passing) >= MOST_PASSING:
+            self._note(f"{len(chunk.data)} bytes to the host are lost: too much waits for the line")
+        elif passing:
             for other in [each for each in passing if each.overlaps(chunk.first_ns, chunk.due_ns)]:
                 passing.remove(other)
                 self._note(f"collision: {other.data.hex(' ')} and {chunk.data.hex(' ')} at once")

@@ -1,0 +1,295 @@
+"""The adapter between line and host: when bytes are handed over, in what pieces, what faults do to it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Literal
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dxlrun.clock import VirtualClock
+from dxlrun.errors import PortError
+from dxlrun.simulation import AdapterConfig, BusConfig, Ledger, ServoConfig, SimulatedBus, VirtualPorts
+
+PING_1 = bytes.fromhex("ff ff 01 02 01 fb")
+PONG_1 = bytes.fromhex("ff ff 01 02 00 fc")
+READ_1 = bytes.fromhex("ff ff 01 04 02 24 06 ce")
+MS = 1_000_000
+BYTE = 10_000
+"""ns, at 1 Mbit/s"""
+PONG_ENDS = 6 * BYTE + 500_000 + 6 * BYTE
+
+
+def new_bus(adapter: AdapterConfig, ids: tuple[int, ...] = (1, 2)) -> SimulatedBus:
+    servos = tuple(ServoConfig(servo_id, "AX-12A", 2.0) for servo_id in ids)
+    return SimulatedBus(BusConfig("main", 1_000_000, servos, adapter=adapter), Ledger(), 0)
+
+
+def handed_over(bus: SimulatedBus, until_ns: int = 10**12) -> list[tuple[int, bytes]]:
+    """Take whatever comes as soon as it comes."""
+    parts = []
+    while (due_ns := bus.next_due_ns()) is not None and due_ns <= until_ns:
+        if data := bus.take(due_ns):
+            parts.append((due_ns, data))
+    return parts
+
+
+def notes(bus: SimulatedBus) -> list[str]:
+    return [entry.note for entry in bus.ledger.entries if entry.direction == "note"]
+
+
+@pytest.mark.parametrize("timer_ms", [1, 4, 16])
+def test_the_latency_timer_keeps_a_short_reply_back(timer_ms: int) -> None:
+    bus = new_bus(AdapterConfig(latency_timer_ns=timer_ms * MS))
+    bus.receive(PING_1, 0)
+    assert handed_over(bus) == [(timer_ms * MS, PONG_1)]
+    assert [entry.t_ns for entry in bus.ledger.entries] == [0, PONG_ENDS]  # the ledger tells of the wire
+
+
+def test_a_host_that_asks_at_once_waits_a_whole_timer_for_each_reply() -> None:
+    bus = new_bus(AdapterConfig(latency_timer_ns=16 * MS))
+    now = 0
+    for turn in range(1, 9):
+        bus.receive(PING_1, now)
+        ((now, data),) = handed_over(bus)
+        assert (now, data) == (turn * 16 * MS, PONG_1)
+
+
+def test_a_full_packet_does_not_wait_for_the_timer() -> None:
+    bus = new_bus(AdapterConfig(latency_timer_ns=16 * MS))
+    noise = bytes(range(100))
+    bus.inject_noise(noise, 0)
+    assert handed_over(bus) == [(62 * BYTE, noise[:62]), (62 * BYTE + 16 * MS, noise[62:])]
+
+
+def test_the_timer_may_run_out_in_the_middle_of_a_reply() -> None:
+    bus = new_bus(AdapterConfig(latency_timer_ns=MS))
+    bus.inject_noise(bytes(range(20)), MS - 5 * BYTE)
+    assert handed_over(bus) == [(MS, bytes(range(5))), (2 * MS, bytes(range(5, 20)))]
+
+
+def test_bytes_one_by_one_come_as_they_pass_the_wire() -> None:
+    bus = new_bus(AdapterConfig(split="byte"))
+    bus.receive(PING_1, 0)
+    first = PONG_ENDS - 5 * BYTE
+    assert handed_over(bus) == [(first + index * BYTE, PONG_1[index : index + 1]) for index in range(6)]
+
+
+def test_a_burst_of_the_timer_can_be_split_too() -> None:
+    bus = new_bus(AdapterConfig(latency_timer_ns=4 * MS, split="byte"))
+    bus.receive(PING_1, 0)
+    parts = handed_over(bus)
+    assert [data for _, data in parts] == [PONG_1[index : index + 1] for index in range(6)]
+    assert parts[0][0] == 4 * MS
+
+
+def test_random_pieces_are_drawn_from_the_seed() -> None:
+    def pieces(seed: int) -> list[int]:
+        bus = new_bus(AdapterConfig(split="random", seed=seed))
+        for turn in range(20):
+            bus.receive(READ_1, turn * MS * 2)
+            bus.advance(turn * MS * 2 + MS)
+        return [len(data) for _, data in handed_over(bus)]
+
+    assert pieces(1) == pieces(1)
+    assert pieces(1) != pieces(2)
+    assert len(set(pieces(1))) > 4
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.sampled_from((0, MS, 3 * MS, 16 * MS)),
+    st.sampled_from(("whole", "byte", "random")),
+    st.lists(st.tuples(st.binary(min_size=1, max_size=90), st.integers(0, 3 * MS)), min_size=1, max_size=8),
+    st.integers(50_000, 2 * MS),
+)
+def test_every_byte_comes_once_in_order_and_not_before_it_passed(
+    timer_ns: int, split: Literal["whole", "byte", "random"], noises: list[tuple[bytes, int]], look_ns: int
+) -> None:
+    bus = new_bus(AdapterConfig(timer_ns, split))
+    now, arrivals = 0, []
+    for data, pause_ns in noises:
+        now += pause_ns
+        bus.inject_noise(data, now)
+        arrivals += [(now + (index + 1) * BYTE, byte) for index, byte in enumerate(data)]
+        now += len(data) * BYTE
+    heard = bytearray()
+    for t_ns in range(0, now + 17 * MS, look_ns):
+        part = bus.take(t_ns)
+        for index in range(len(heard), len(heard) + len(part)):
+            assert arrivals[index][0] <= t_ns
+        heard += part
+    heard += bus.take(now + 1000 * MS)
+    assert bytes(heard) == bytes(byte for _, byte in arrivals)
+    assert bus.next_due_ns() is None
+    assert b"".join(each.data for each in bus.ledger.entries if each.direction == "out") == bytes(heard)
+
+
+def test_an_adapter_that_echoes_gives_the_host_its_own_bytes_first() -> None:
+    bus = new_bus(AdapterConfig(echo=True))
+    bus.receive(PING_1, 0)
+    assert handed_over(bus) == [(6 * BYTE, PING_1), (PONG_ENDS, PONG_1)]
+
+
+def test_a_collision_in_a_reply_that_is_half_handed_over_takes_only_the_rest() -> None:
+    bus = new_bus(AdapterConfig(split="byte"))
+    bus.receive(READ_1, 0)  # the reply passes from 580 to 700 us
+    whole = b"".join(data for _, data in handed_over(bus, 610_000))
+    assert len(whole) == 3
+    bus.receive(bytes(1), 612_000)  # into its fourth byte
+    assert b"".join(data for _, data in handed_over(bus)) == b""
+    assert any("talks into" in note for note in notes(bus))
+
+
+def test_a_wedged_adapter_takes_bytes_and_gives_none_until_it_is_mended() -> None:
+    bus = new_bus(AdapterConfig())
+    bus.wedge(True)
+    bus.receive(PING_1, 0)
+    assert handed_over(bus) == []
+    bus.wedge(False)
+    bus.receive(PING_1, 10 * MS)
+    assert [data for _, data in handed_over(bus)] == [PONG_1]
+    assert bus.counts(bus.servo(1)).heard == 1
+    assert notes(bus)[0] == "adapter wedged"
+
+
+def test_an_unplugged_adapter_loses_what_was_on_its_way() -> None:
+    bus = new_bus(AdapterConfig())
+    bus.receive(PING_1, 0)
+    bus.at(300_000, bus.unplug)
+    assert handed_over(bus) == []
+    assert not bus.plugged
+    bus.plug_in()
+    bus.receive(PING_1, 10 * MS)
+    assert [data for _, data in handed_over(bus)] == [PONG_1]
+    assert [note for note in notes(bus) if note.startswith("adapter")] == [
+        "adapter unplugged",
+        "adapter plugged in",
+    ]
+
+
+def test_a_port_does_not_outlive_its_adapter_though_it_comes_back() -> None:
+    clock = VirtualClock()
+    bus = new_bus(AdapterConfig())
+    port = VirtualPorts(clock, [bus]).ports[0]
+    bus.unplug()
+    bus.plug_in()
+    with pytest.raises(PortError, match="adapter of bus main is gone"):
+        port.write(PING_1)
+    again = VirtualPorts(clock, [bus])
+    again.ports[0].write(PING_1)
+    assert again.wait(10**9) == [0]
+
+
+# Hooks for faults
+
+
+def test_what_the_servos_hear_of_an_instruction_can_be_changed_or_lost() -> None:
+    bus = new_bus(AdapterConfig())
+    bus.alter_next_instruction("lost", lambda packet: b"")
+    bus.alter_next_instruction("byte 5 flipped", lambda packet: packet[:5] + bytes((packet[5] ^ 1,)))
+    heard = []
+    for turn in range(3):
+        bus.receive(PING_1, turn * 10 * MS)
+        heard.append(b"".join(data for _, data in handed_over(bus, (turn + 1) * 10 * MS - 1)))
+    assert heard == [b"", b"", PONG_1]
+    assert notes(bus)[:2] == [
+        "the servos hear another instruction: lost",
+        "the servos hear another instruction: byte 5 flipped",
+    ]
+
+
+def test_a_cut_instruction_swallows_the_begin_of_the_next_one_unless_a_pause_ends_it() -> None:
+    bus = new_bus(AdapterConfig())
+    bus.alter_next_instruction("cut", lambda packet: packet[:4])
+    bus.receive(PING_1, 0)
+    bus.receive(PING_1, 1 * MS)
+    assert handed_over(bus, 10 * MS) == []
+    bus.receive(PING_1, 300 * MS)
+    assert [data for _, data in handed_over(bus)] == [PONG_1]
+
+
+def test_something_can_be_planned_after_so_many_instructions(make_packet: Callable[..., bytes]) -> None:
+    bus = new_bus(AdapterConfig())
+    happened: list[str] = []
+    bus.after(2, lambda: happened.append("two"))
+    bus.after(1, lambda: happened.append("one"))
+    bus.after(0, lambda: happened.append("now"))
+    assert happened == ["now"]
+    bus.receive(make_packet(0xFE, 3, 25, 1), 0)
+    assert happened == ["now", "one"]
+    bus.receive(PING_1, MS)
+    assert happened == ["now", "one", "two"]
+
+
+def test_a_reply_can_come_twice() -> None:
+    bus = new_bus(AdapterConfig())
+    bus.alter_next(1, "duplicated", lambda reply: reply, copies=2)
+    bus.receive(PING_1, 0)
+    assert handed_over(bus) == [(PONG_ENDS, PONG_1), (PONG_ENDS + 6 * BYTE, PONG_1)]
+    assert notes(bus) == ["servo 1: duplicated"]
+
+
+def test_a_servo_that_joins_the_line_answers_and_a_second_one_of_its_kind_collides() -> None:
+    bus = new_bus(AdapterConfig())
+    bus.add_servo(ServoConfig(7, "AX-12A", 1.0))
+    bus.receive(bytes.fromhex("ff ff 07 02 01 f5"), 0)
+    assert handed_over(bus)[0][1] == bytes.fromhex("ff ff 07 02 00 f6")
+    bus.add_servo(ServoConfig(1, "AX-12A", 1.0))
+    bus.receive(READ_1, 10 * MS)
+    reply = handed_over(bus)[0][1]
+    assert sum(reply[2:]) & 0xFF != 0xFF
+
+
+def test_the_counts_tell_what_each_servo_heard_and_said(make_packet: Callable[..., bytes]) -> None:
+    bus = new_bus(AdapterConfig())
+    asked = (PING_1, make_packet(0xFE, 3, 25, 1), make_packet(1, 3, 25, 1), make_packet(2, 3, 25, 9))
+    spoiled = make_packet(2, 2, 36, 2)[:-1] + b"\x00"
+    for turn, data in enumerate((*asked, spoiled)):
+        bus.receive(data, turn * 10 * MS)
+        bus.take((turn + 1) * 10 * MS)
+    one, two = (bus.counts(bus.servo(servo_id)) for servo_id in (1, 2))
+    assert (one.heard, one.answered, one.errors) == (3, 2, 0)
+    assert (two.heard, two.answered, two.errors) == (2, 1, 1)
+    assert two.last_error == 0x08  # range (e-Manual, Protocol 1.0, Error)
+
+
+# Who is read in turn
+
+
+def sync_read(line: Any) -> None:
+    line.tell(0xFE, 0x82, bytes.fromhex("84000400 010203"))
+
+
+def test_who_waits_for_its_turn_gives_up_when_it_hears_another_instruction(
+    make_line2: Any, make_packet2: Any
+) -> None:
+    line = make_line2((1, 2, 3), return_delay_ns=500_000)
+    sync_read(line)
+    line.bus.receive(make_packet2(9, 1), line.clock.now_ns() + 200_000)  # before the first one talks
+    assert [each.servo_id for each in line.statuses()] == [1]
+
+
+@pytest.mark.parametrize(("absent", "ids"), [("silent", []), ("slot", [3])])
+def test_who_cannot_make_out_the_one_before_it_takes_it_for_absent(
+    make_line2: Any, absent: str, ids: list[int]
+) -> None:
+    line = make_line2((1, 2, 3), return_delay_ns=100_000)
+    line.bus.absent = absent
+    line.bus.corrupt_next(1, index=10)
+    line.bus.truncate_next(2, 0)
+    sync_read(line)
+    heard = line.hear()
+    assert heard[15:][4:5] == bytes(ids)
+
+
+def test_the_host_that_talks_into_a_chain_ends_it(make_line2: Any) -> None:
+    line = make_line2((1, 2, 3), return_delay_ns=100_000)
+    sync_read(line)  # 17 bytes; the first status from 270 to 420 us
+    start = line.clock.now_ns()
+    line.bus.receive(b"\x55", start + 400_000)
+    heard = line.hear()
+    assert len(heard) == 13
+    assert any("wait for it in vain" in note for note in line.notes())
