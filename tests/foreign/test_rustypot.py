@@ -42,6 +42,7 @@ BUSES = (
     BusConfig("moved", RATE, MIXED, 2.0),
     line("many", "Xl330", 8),
     line("restarted", "Xl430", 1),
+    line("stuffed", "Xl330", 1),
 )
 
 
@@ -141,6 +142,14 @@ def test_a_fast_sync_read_of_eight_servos_tells_what_a_sync_read_does(connect: A
     fast = bus.sync_read_raw_data(ids, 132, 4)
     assert [list(each) for each in fast] == [list(each) for each in slow]
     assert all(abs(int.from_bytes(bytes(each), "little") - 1304) <= 1 for each in fast)
+
+
+def test_data_that_look_like_a_header_arrive_as_they_were_meant(connect: Any) -> None:
+    servo = connect("stuffed", "Xl330")
+    tricky = [0xFF, 0xFF, 0xFF, 0xFF, 0xFD, 0, 0, 0]  # Goal Velocity -1, Profile Acceleration 253
+    assert servo.write_raw_data_with_error(1, 104, tricky) == 0
+    data, error = servo.read_raw_data_with_error(1, 104, 8)
+    assert (list(data), error) == (tricky, 0)
 
 
 def test_a_reboot_and_a_factory_reset_are_answered(connect: Any, simulation: Any) -> None:
