@@ -321,6 +321,18 @@ def test_a_fault_by_hand_happens_now(line: Any) -> None:
     assert told.t_ns == 5_000 * MS
 
 
+def test_faults_by_hand_overlap_with_those_of_the_script(line: Any) -> None:
+    script = inject(line, "silence servo=1 for=50ms")
+    line.hear()
+    script.add(parse_fault("silence servo=1 for=10ms"), line.clock.now_ns())
+    line.hear(20 * MS)
+    assert ping(line) == b""
+    line.hear(20 * MS)
+    assert ping(line) == PONG[1]
+    with pytest.raises(InputError, match="bus main has no servo 9; its servos are 1, 2"):
+        script.add(parse_fault("silence servo=9"), line.clock.now_ns())
+
+
 # What could never happen
 
 

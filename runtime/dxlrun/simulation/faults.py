@@ -24,6 +24,9 @@ class FaultScript:
     def __init__(self, faults: Sequence[Fault], seed: int = 0) -> None:
         self._faults = tuple(faults)
         self._seed = seed
+        self._buses: Sequence[SimulatedBus] = ()
+        self._start_ns = 0
+        self._lines = 0
         self._injections: list[Injection] = []
         self._holds: Holds = {}
 
@@ -33,18 +36,29 @@ class FaultScript:
         `start_ns` is when the simulation started, on the clock of the buses. Raises InputError with one
         sentence for each fault that could never happen; then none is planned.
         """
-        now_ns = start_ns if now_ns is None else now_ns
+        self._buses, self._start_ns = tuple(buses), start_ns
+        self._plan(self._faults, start_ns if now_ns is None else now_ns)
+
+    def add(self, fault: Fault, now_ns: int) -> None:
+        """Plan one more fault on the attached buses, by hand; without a time it happens at `now_ns`.
+
+        Raises InputError with one sentence when it could never happen.
+        """
+        self._plan((fault,), now_ns)
+
+    def _plan(self, faults: Sequence[Fault], now_ns: int) -> None:
         injections: list[Injection] = []
         wrong: list[str] = []
-        for index, fault in enumerate(self._faults):
+        for index, fault in enumerate(faults, start=self._lines):
             try:
-                injections += self._placed(fault, index, buses, now_ns - start_ns)
+                injections += self._placed(fault, index, now_ns - self._start_ns)
             except InputError as error:
                 wrong.append(f"{fault}: {error}")
         if wrong:
             raise InputError("\n".join(wrong))
+        self._lines += len(faults)
         for injection in injections:
-            _plan(injection, start_ns, now_ns)
+            _place(injection, self._start_ns, now_ns)
         self._injections += injections
 
     @property
@@ -52,11 +66,9 @@ class FaultScript:
         """Faults that have not happened, so far or for ever: a servo that is not asked loses no reply."""
         return tuple(each.fault for each in self._injections if not each.happened)
 
-    def _placed(
-        self, fault: Fault, index: int, buses: Sequence[SimulatedBus], since_ns: int
-    ) -> list[Injection]:
+    def _placed(self, fault: Fault, index: int, since_ns: int) -> list[Injection]:
         """Return what a line stands for; raises InputError when it could not happen."""
-        chosen = _chosen(fault, buses)
+        chosen = _chosen(fault, self._buses)
         if fault.at_ns is not None and fault.at_ns < since_ns:
             raise InputError(f"it is {since_ns / 1e9:.3f} s after the start already; leave at= out for now")
         random = self._random(fault, index)
@@ -64,7 +76,7 @@ class FaultScript:
             return [Injection(fault, chosen[0], random, self._holds)]
         drawn = members(fault, chosen, since_ns, random)
         return [
-            Injection(each, _chosen(each, buses)[0], self._random(each, number), self._holds)
+            Injection(each, _chosen(each, self._buses)[0], self._random(each, number), self._holds)
             for number, each in enumerate(drawn)
         ]
 
@@ -91,7 +103,7 @@ def _chosen(fault: Fault, buses: Sequence[SimulatedBus]) -> Sequence[SimulatedBu
     return chosen
 
 
-def _plan(injection: Injection, start_ns: int, now_ns: int) -> None:
+def _place(injection: Injection, start_ns: int, now_ns: int) -> None:
     fault, bus = injection.fault, injection.bus
     if fault.packet is not None:
         bus.after(fault.packet, injection.begin)

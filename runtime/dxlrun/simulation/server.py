@@ -48,13 +48,10 @@ class Server:
         self.start_ns = time.monotonic_ns()
         self._ledger = ledger
         self._line = line
-        self._seed = config.seed
-        self._typed = 0
         mechanics = Mechanics(self.start_ns, mujoco_plant(config.bodies) if config.bodies else None)
         self._buses = tuple(SimulatedBus(bus, ledger, self.start_ns, mechanics) for bus in config.buses)
-        FaultScript([parse_fault(text) for text in config.faults], config.seed).attach(
-            self._buses, start_ns=self.start_ns
-        )
+        self._faults = FaultScript([parse_fault(text) for text in config.faults], config.seed)
+        self._faults.attach(self._buses, start_ns=self.start_ns)
         self._terminals = tuple(
             PseudoTerminal(bus, Link(Path(config.links[bus.name])) if bus.name in config.links else None)
             for bus in self._buses
@@ -135,9 +132,7 @@ class Server:
         """Plan a fault that was given by hand, and return what is answered."""
         try:
             fault = parse_fault(text)
-            self._typed += 1
-            script = FaultScript([fault], self._seed + self._typed)
-            script.attach(self._buses, start_ns=self.start_ns, now_ns=now_ns)
+            self._faults.add(fault, now_ns)
         except InputError as error:
             return {"error": str(error)}
         return {"fault": str(fault)}

@@ -21,6 +21,8 @@ PASSING: tuple[str, ...] = (
 )
 """Kinds after which everything is as it was: a storm has these when it names none."""
 
+SHORTEST_BOOT_NS = 50_000_000
+"""No servo is back sooner after it lost its power [i]."""
 _HOST_SHARE = 0.25
 """So many of the packets that are lost or broken are the host's."""
 _STEP_NS = 1000
@@ -37,8 +39,8 @@ _GIVEN: Mapping[str, Callable[[Random], Fault]] = {
     "babble": lambda random: Fault(
         kind="babble", for_ns=_some_ns(random, 1_000_000, 200_000_000), size=random.randint(1, 16)
     ),
-    "reboot": lambda random: Fault(kind="reboot", for_ns=_some_ns(random, 10_000_000, 500_000_000)),
-    "brownout": lambda random: Fault(kind="brownout", for_ns=_some_ns(random, 10_000_000, 500_000_000)),
+    "reboot": lambda random: Fault(kind="reboot", for_ns=_some_ns(random, SHORTEST_BOOT_NS, 500_000_000)),
+    "brownout": lambda random: Fault(kind="brownout", for_ns=_some_ns(random, SHORTEST_BOOT_NS, 500_000_000)),
     "voltage": lambda random: Fault(
         kind="voltage", volts=round(random.uniform(5.0, 20.0), 1), for_ns=_some_ns(random, 10_000_000, 10**9)
     ),
