@@ -223,6 +223,12 @@ def test_a_rebooted_servo_is_deaf_and_has_lost_its_ram_alone(line: Any) -> None:
     assert happened(line) == ["reboot servo=1 for=50ms"]
 
 
+def test_a_servo_that_nobody_asked_for_long_reboots_at_the_time_of_the_fault(line2: Any) -> None:
+    inject(line2, "reboot servo=1 at=1s")
+    line2.wait(2.0)
+    assert line2.get("realtime_tick", 1) == pytest.approx(1000, abs=15)
+
+
 def test_a_brown_out_takes_the_power_of_every_servo(line: Any) -> None:
     for servo_id in (1, 2):
         line.write(servo_id, TORQUE_ENABLE, 1)
@@ -336,7 +342,7 @@ def test_faults_by_hand_overlap_with_those_of_the_script(line: Any) -> None:
 # What could never happen
 
 
-def two_buses() -> tuple[SimulatedBus, ...]:
+def three_buses() -> tuple[SimulatedBus, ...]:
     ledger = Ledger()
     servos = {"left": (1, 2), "right": (3,), "bare": ()}
     return tuple(
@@ -348,7 +354,7 @@ def two_buses() -> tuple[SimulatedBus, ...]:
 
 
 def test_all_that_could_never_happen_is_told_at_once_and_nothing_is_planned() -> None:
-    buses = two_buses()
+    buses = three_buses()
     script = FaultScript(
         [
             parse_fault(text)
@@ -435,7 +441,7 @@ def test_a_storm_has_only_the_kinds_that_it_names() -> None:
 
 
 def test_a_storm_over_several_buses_names_the_bus_of_each_fault() -> None:
-    left, right, _ = two_buses()
+    left, right, _ = three_buses()
     script = FaultScript([parse_fault("storm seed=2 faults=20 within=1s")])
     script.attach((left, right))
     assert {match[1] for fault in script.waiting if (match := re.search(r"bus=(\w+)", str(fault)))} == {
@@ -443,3 +449,9 @@ def test_a_storm_over_several_buses_names_the_bus_of_each_fault() -> None:
         "right",
     }
     assert all(fault.servo in (None, 3) for fault in script.waiting if fault.bus == "right")
+
+
+def test_a_storm_stays_on_the_bus_that_it_names() -> None:
+    script = FaultScript([parse_fault("storm bus=right seed=2 faults=20 within=1s")])
+    script.attach(three_buses())
+    assert {(fault.bus, fault.servo or 3) for fault in script.waiting} == {("right", 3)}

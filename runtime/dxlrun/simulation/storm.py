@@ -72,7 +72,7 @@ def members(storm: Fault, buses: Sequence[SimulatedBus], since_ns: int, random: 
         elif kind not in _OF_LINE:
             fault = replace(fault, servo=random.choice(bus.servos).servo_id)
         at_ns = begin_ns + random.randint(0, steps) * _STEP_NS
-        drawn.append(replace(fault, bus=bus.name if len(buses) > 1 else None, at_ns=at_ns))
+        drawn.append(replace(fault, bus=bus.name if len(buses) > 1 else storm.bus, at_ns=at_ns))
     return tuple(sorted(drawn, key=_time))
 
 
