@@ -1,0 +1,101 @@
+"""Every line that the grammar of faults allows can happen; every other one is refused; a seeded sample."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+
+from dxlrun.errors import InputError
+from dxlrun.simulation.fault_text import KEYS, KINDS, parse_fault
+from dxlrun.simulation.faults import FaultScript
+
+MS = 1_000_000
+VALUES: dict[str, tuple[str, ...]] = {
+    "bus": ("main",),
+    "servo": ("1", "2"),
+    "from": ("host",),
+    "byte": ("0", "-1", "7", "200", "-200"),
+    "flip": ("1", "0xff"),
+    "keep": ("1", "5", "200"),
+    "by": ("1ns", "3ms", "40ms"),
+    "copies": ("2", "16"),
+    "data": ("ff", "ffff0102", "fffffd00"),
+    "size": ("1", "256"),
+    "every": ("100us", "2ms"),
+    "volts": ("0", "7.4", "60"),
+    "celsius": ("-50", "200"),
+    "seed": ("0", "5"),
+    "faults": ("1", "20"),
+    "within": ("1us", "200ms"),
+    "kinds": ("lose", ",".join(kind for kind in KINDS if kind != "storm")),
+    "count": ("1", "7"),
+    "at": ("0s", "50ms", "5s"),
+    "packet": ("1", "10", "100000"),
+    "for": ("1ns", "30ms", "5s"),
+}
+
+
+def drawn(chance: random.Random, kind: str) -> str:
+    """Return a line of a kind; some of them say what excludes each other."""
+    keys = [*KINDS[kind].needs, *(key for key in KINDS[kind].takes if chance.random() < 0.4)]
+    return " ".join((kind, *(f"{key}={chance.choice(VALUES[key])}" for key in keys)))
+
+
+def lines(chance: random.Random, count: int) -> list[str]:
+    """Return lines of all kinds in turn that are right."""
+    right: list[str] = []
+    while len(right) < count:
+        line = drawn(chance, tuple(KINDS)[len(right) % len(KINDS)])
+        try:
+            right.append(str(parse_fault(line)))
+        except InputError:
+            continue
+    return right
+
+
+def test_the_sample_has_a_value_for_every_key() -> None:
+    assert set(VALUES) == set(KEYS)
+
+
+@pytest.mark.parametrize("protocol", [1, 2])
+def test_faults_of_every_kind_together_end_nothing_and_are_told_once(
+    protocol: int, request: pytest.FixtureRequest
+) -> None:
+    make = request.getfixturevalue("make_line" if protocol == 1 else "make_line2")
+    ping = request.getfixturevalue("make_packet" if protocol == 1 else "make_packet2")
+    chance = random.Random(protocol)
+    for _ in range(6):
+        line = make()
+        texts = lines(chance, 2 * len(KINDS))
+        script = FaultScript([parse_fault(text) for text in texts], chance.randrange(100))
+        script.attach((line.bus,))
+        planned = [str(fault) for fault in script.waiting]
+        while line.clock.now_ns() < 300 * MS:
+            for servo_id in (1, 2):
+                line.bus.receive(ping(servo_id, 0x01), line.clock.now_ns())
+                line.clock.wait_until(line.clock.now_ns() + 5 * MS)
+                assert len(line.bus.take(line.clock.now_ns())) < 10_000
+        happened = [n.removeprefix("fault: ") for n in line.notes() if n.startswith("fault: ")]
+        assert sorted([*happened, *map(str, script.waiting)]) == sorted(planned)
+        assert len(happened) > len(planned) / 4
+
+
+def test_a_line_is_refused_with_a_sentence_or_read_and_written_back_whatever_it_is() -> None:
+    chance = random.Random(3)
+    refused = []
+    for index in range(3000):
+        line = drawn(chance, tuple(KINDS)[index % len(KINDS)])
+        for _ in range(chance.randint(0, 3)):
+            at = chance.randrange(len(line) + 1)
+            line = (
+                line[:at] + chance.choice(("", " ", "=", "x", "-", "9", "\x00", "é", line)) + line[at + 1 :]
+            )
+        try:
+            fault = parse_fault(line)
+        except InputError as error:
+            refused.append(error)
+        else:
+            assert parse_fault(str(fault)) == fault
+    assert 500 < len(refused) < 2900
+    assert {len(error.sentences) for error in refused} == {1}
