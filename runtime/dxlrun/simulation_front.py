@@ -72,8 +72,11 @@ class Audience(Protocol):
     look_every_s: float | None
     """How often it wants a look; None: never."""
 
-    def opened(self, ports: Mapping[str, str]) -> None:
-        """Take the device of each bus; told once."""
+    def opened(self, ports: Mapping[str, str], real_time: str) -> None:
+        """Take the device of each bus, and what the system granted of real time; told once."""
+
+    def moved(self, ports: Mapping[str, str]) -> None:
+        """Take the new device of each bus whose adapter was pulled: it comes back under another name."""
 
     def fault(self, text: str) -> None:
         """Take a fault that was injected now, by hand or by the script."""
@@ -213,12 +216,15 @@ class _Front:
         self._audience = audience
         self._typed = typed
         self._stop = stop
+        self._ports: dict[str, str] = {}
         self.newest = Look()
         self.sentences: list[str] = []
 
     def run(self) -> None:
         """Tell the ports, then pass on what comes from either side until it is stopped."""
-        self._audience.opened(msgspec.convert(self._child.ready()["ports"], type=dict[str, str]))
+        first = self._child.ready()
+        self._ports = _ports(first)
+        self._audience.opened(self._ports, str(first.get("real_time", "")))
         look_s = time.monotonic()
         while not self._child.line.closed:
             if self._audience.look_every_s is not None and time.monotonic() >= look_s:
@@ -261,12 +267,21 @@ class _Front:
                 self.newest = msgspec.convert(message, type=Look)
                 if self._audience.look_every_s is not None:
                     self._audience.look(self.newest, self._typed.pending if self._typed else "")
+            elif "ports" in message:
+                self._move(_ports(message))
             elif "happened" in message:
                 self._audience.fault(str(message["happened"]))
             elif "fault" in message:
                 self._audience.accepted(str(message["fault"]))
             elif "error" in message:
                 self._audience.refused(str(message["error"]))
+
+    def _move(self, ports: dict[str, str]) -> None:
+        """Tell what is another port now; an adapter that comes back says the same ports once more."""
+        moved = {bus: port for bus, port in ports.items() if port != self._ports.get(bus)}
+        self._ports = ports
+        if moved:
+            self._audience.moved(moved)
 
     def _last_look(self) -> None:
         """Take what is still to be told, and the servos' last counts."""
@@ -278,6 +293,10 @@ class _Front:
             if left <= 0 or not select.select([self._child.line], [], [], left)[0]:
                 return
             self._listen()
+
+
+def _ports(message: Mapping[str, object]) -> dict[str, str]:
+    return msgspec.convert(message["ports"], type=dict[str, str])
 
 
 @contextmanager

@@ -70,6 +70,7 @@ def test_a_name_with_two_firmwares_follows_the_protocol():
         ([], ["there is nothing to simulate; give a robot file, or servos"]),
         (["{torso}", "--servo", "AX-12A:1", "--baud", "9600"], ["--servo and --baud and a robot file excl"]),
         (["{torso}", "--fault", "lsoe servo=3"], ["--fault 'lsoe servo=3': there is no fault"]),
+        (["--servo", "AX-12A:1", "--fault", "lose servo=2"], ["bus main has no servo 2; its servos are 1"]),
         (["{torso}", "--faults", "missing.txt"], ["the faults in missing.txt cannot be read (No such file"]),
         (["{torso}", "--latency-timer", "4"], ["--latency-timer '4': "]),
         (["{torso}", "--ledger", "missing/ledger"], ["--ledger missing/ledger cannot be written"]),
@@ -146,13 +147,16 @@ def test_the_ports_are_said_once(capsys: pytest.CaptureFixture[str]):
     bus = BusConfig("main", 1_000_000, servos)
     view = PlainView(Shown("torso", (bus,), {"main": Path("/tmp/robot")}, "dxlrun torso.yaml port:={port}"))  # noqa: S108
 
-    view.opened({"main": "/dev/pts/7"})
+    view.opened({"main": "/dev/pts/7"}, "core 1")
+    view.moved({"main": "/dev/pts/9"})
     view.fault("lose servo=1")
 
     assert capsys.readouterr().out.splitlines() == [
         "torso: 4 servos simulated on 1 bus; Ctrl-C ends it, `help` lists faults to type",
         "  main: /tmp/robot (/dev/pts/7), 1000000 bit/s, Protocol 1.0, AX-12A 1-3, 7",
+        "  in real time: core 1",
         "next: dxlrun torso.yaml port:=/tmp/robot",
+        "main: the adapter comes back as /dev/pts/9; /tmp/robot follows it",
         "fault: lose servo=1",
     ]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -26,6 +27,10 @@ if TYPE_CHECKING:
     from dxlrun.simulation_front import FrontOptions, Served
 
 Words = Annotated[tuple[str, ...], Parameter(negative=(), show_default=False, allow_leading_hyphen=False)]
+_ABOVE_LOOP = 2
+"""The guardian is one above the loop."""
+_PRIORITY = 31 + _ABOVE_LOOP
+"""Where no robot file says the loop's: above that of a loop that says nothing else."""
 Seed = Annotated[int, Parameter(show_default=False)]
 
 
@@ -90,7 +95,7 @@ def sim(
         Print the traceback of an error, and what the process of the servos said.
     """
     planned = read_faults(fault, faults)
-    title, buses, bodies, hint = _from_file(robot, assignments, servo, baud, protocol)
+    title, buses, bodies, priority, hint = _from_file(robot, assignments, servo, baud, protocol)
     wishes = AdapterWishes(latency_timer, split, echo, absent)
     buses = tuple(with_adapter(bus, wishes, seed) for bus in buses)
     links = link_of_each(buses, link)
@@ -108,7 +113,8 @@ def sim(
         bodies=bodies,
     )
     shown = Shown(title, buses, links, hint)
-    served = _serve(config, FrontOptions(ledger), shown, as_json=as_json)
+    options = FrontOptions(ledger, priority, core=max(os.sched_getaffinity(0)))
+    served = _serve(config, options, shown, as_json=as_json)
     if not as_json:
         out().print(ending(title, served.elapsed_s, served.look), markup=False, soft_wrap=True)
         if ledger is not None:
@@ -124,14 +130,14 @@ def _from_file(
     servo: Sequence[str],
     baud: int | None,
     protocol: float | None,
-) -> tuple[str, tuple[BusConfig, ...], UrdfBodies | None, str | None]:
-    """Return title, buses, what their servos move together, and a command line that would use them."""
+) -> tuple[str, tuple[BusConfig, ...], UrdfBodies | None, int, str | None]:
+    """Return title, buses, what their servos move together, a priority above the loop's, and what to run."""
     if robot is None:
         if not servo:
             raise InputError(
                 "there is nothing to simulate; give a robot file, or servos such as --servo XL430-W250:1-3"
             )
-        return "simulation", (servo_bus(servo, baud, protocol),), None, None
+        return "simulation", (servo_bus(servo, baud, protocol),), None, _PRIORITY, None
     options = {"--servo": servo or None, "--baud": baud, "--protocol": protocol}
     given = [name for name, value in options.items() if value is not None]
     if given:
@@ -150,6 +156,7 @@ def _from_file(
         plan.robot,
         simulated_buses(everywhere),
         simulated_bodies(everywhere),
+        min(plan.loop.scheduler.priority + _ABOVE_LOOP, 99),
         hint if takes_port else None,
     )
 

@@ -41,9 +41,14 @@ class TableView:
         with _letters(), self._live:
             yield
 
-    def opened(self, ports: Mapping[str, str]) -> None:
+    def opened(self, ports: Mapping[str, str], real_time: str) -> None:
         """Say where the buses are."""
-        for line in self._shown.lines(ports):
+        for line in self._shown.lines(ports, real_time):
+            self._say(line)
+
+    def moved(self, ports: Mapping[str, str]) -> None:
+        """Say where the buses are now."""
+        for line in self._shown.moves(ports):
             self._say(line)
 
     def fault(self, text: str) -> None:

@@ -33,8 +33,8 @@ class Shown:
         """Return the name under which another program opens a bus: it stays when an adapter is pulled."""
         return str(self.links.get(bus, ports[bus]))
 
-    def lines(self, ports: Mapping[str, str]) -> list[str]:
-        """Return what is said first: what is simulated, and where."""
+    def lines(self, ports: Mapping[str, str], real_time: str) -> list[str]:
+        """Return what is said first: what is simulated, where, and how punctual it can be."""
         count = sum(len(bus.servos) for bus in self.buses)
         servos, buses = _number(count, "servo"), _number(len(self.buses), "bus")
         said = [f"{self.title}: {servos} simulated on {buses}; Ctrl-C ends it, `help` lists faults to type"]
@@ -45,9 +45,18 @@ class Shown:
                 f"  {bus.name}: {where}{really}, {bus.baud_rate} bit/s, Protocol {bus.protocol:.1f}, "
                 f"{_models(bus)}"
             )
+        if real_time:
+            said.append(f"  in real time: {real_time}")
         if self.hint is not None and self.buses:
             said.append(f"next: {self.hint.format(port=self.port(self.buses[0].name, ports))}")
         return said
+
+    def moves(self, ports: Mapping[str, str]) -> list[str]:
+        """Return what is said when adapters were pulled, which come back under other names."""
+        return [f"{bus}: the adapter comes back as {port}{self._link(bus)}" for bus, port in ports.items()]
+
+    def _link(self, bus: str) -> str:
+        return f"; {self.links[bus]} follows it" if bus in self.links else ""
 
 
 class PlainView:
@@ -59,9 +68,14 @@ class PlainView:
         self._shown = shown
         self._console: Console = out()
 
-    def opened(self, ports: Mapping[str, str]) -> None:
+    def opened(self, ports: Mapping[str, str], real_time: str) -> None:
         """Say where the buses are."""
-        for line in self._shown.lines(ports):
+        for line in self._shown.lines(ports, real_time):
+            self._say(line)
+
+    def moved(self, ports: Mapping[str, str]) -> None:
+        """Say where the buses are now."""
+        for line in self._shown.moves(ports):
             self._say(line)
 
     def fault(self, text: str) -> None:
@@ -96,9 +110,14 @@ class JsonView:
     def __init__(self, shown: Shown) -> None:
         self._shown = shown
 
-    def opened(self, ports: Mapping[str, str]) -> None:
+    def opened(self, ports: Mapping[str, str], real_time: str) -> None:
         """Write where the buses are."""
-        self._write({"ports": {bus: self._shown.port(bus, ports) for bus in ports}, "devices": dict(ports)})
+        named = {bus: self._shown.port(bus, ports) for bus in ports}
+        self._write({"ports": named, "devices": dict(ports), "real_time": real_time})
+
+    def moved(self, ports: Mapping[str, str]) -> None:
+        """Write where the buses are now."""
+        self._write({"devices": dict(ports)})
 
     def fault(self, text: str) -> None:
         """Write that a fault happened."""

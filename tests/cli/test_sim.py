@@ -1,0 +1,286 @@
+"""`dxlrun sim` as a person uses it: started, talked to by other programs, stopped."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import pty
+import re
+import select
+import signal
+import struct
+import subprocess
+import sys
+import termios
+from collections.abc import Callable, Iterator
+from fcntl import ioctl
+from pathlib import Path
+
+import pytest
+
+from dxlrun.simulation import read_ledger
+
+CODE = "import sys; from dxlrun.cli import main; sys.exit(main(sys.argv[1:]))"
+OWN_TERMINAL = "import fcntl, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0)"
+"""As a shell does it, so that Ctrl-C is a signal."""
+PATIENCE_S = 20.0
+"""How long a test waits for what must come; it decides nothing but when to give up."""
+PING_1 = bytes.fromhex("ff ff fd 00 01 03 00 01 19 4e")
+PONG_1 = bytes.fromhex("ff ff fd 00 01 07 00 55 00 24 04 2d")
+"""A ping of servo 1 (e-Manual, Protocol 2.0, Ping), and the first bytes of the answer of an XL430-W250."""
+PING_2 = bytes.fromhex("ff ff fd 00 02 03 00 01 19 72")
+TWO = """
+name: two_buses
+buses:
+  left: {port: /dev/ttyUSB0, protocol: 2.0, baud_rate: 1_000_000, adapter: {latency: 1 ms}}
+  right: {port: /dev/ttyUSB1, protocol: 1.0, baud_rate: 1_000_000, adapter: {latency: 1 ms}}
+loop: {rate: 20}
+joints:
+  left_joint: {bus: left, id: 1, model: XL430-W250, reference: 180 deg, direction: 1}
+  right_joint: {bus: right, id: 1, model: AX-12A, reference: 150 deg, direction: 1}
+controllers:
+  joint_state_broadcaster: {type: joint_state_broadcaster}
+"""
+
+
+class Sim:
+    """A simulation that was started from a command line."""
+
+    def __init__(self, process: subprocess.Popen[bytes]) -> None:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        self.process = process
+        self.input, self._out = process.stdin, process.stdout
+        self._said = b""
+
+    def line(self) -> str:
+        """Return the next line that it says."""
+        while b"\n" not in self._said:
+            assert select.select([self._out], [], [], PATIENCE_S)[0], f"it says no more after {self._said!r}"
+            piece = os.read(self._out.fileno(), 65536)
+            assert piece, self.process.communicate()[1]
+            self._said += piece
+        line, _, self._said = self._said.partition(b"\n")
+        return line.decode()
+
+    def type(self, line: str) -> None:
+        self.input.write(line.encode() + b"\n")
+        self.input.flush()
+
+    def end(self) -> tuple[int, str, str]:
+        """Return exit code, what was not read yet, and the errors, when it has ended."""
+        out, err = self.process.communicate(timeout=PATIENCE_S)
+        return self.process.returncode, (self._said + out).decode(), err.decode()
+
+    def stop(self, number: signal.Signals = signal.SIGINT) -> tuple[int, str, str]:
+        self.process.send_signal(number)
+        return self.end()
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Callable[..., Sim]]:
+    with contextlib.ExitStack() as stack:
+
+        def start(*words: object) -> Sim:
+            process = subprocess.Popen(
+                [sys.executable, "-P", "-c", CODE, "sim", *map(str, words)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                cwd=tmp_path,
+            )
+            stack.enter_context(process)
+            stack.callback(process.kill)
+            return Sim(process)
+
+        yield start
+
+
+def hear(path: Path | str, ask: bytes, size: int) -> bytes:
+    """Open a port as any program would, ask, and return what comes."""
+    port = os.open(path, os.O_RDWR | os.O_NOCTTY)
+    try:
+        os.write(port, ask)
+        heard = b""
+        while len(heard) < size:
+            assert select.select([port], [], [], PATIENCE_S)[0], f"only {heard.hex(' ')} came"
+            heard += os.read(port, 256)
+        return heard
+    finally:
+        os.close(port)
+
+
+def test_a_robot_runs_against_it_as_against_a_real_one(
+    start: Callable[..., Sim], torso: Path, tmp_path: Path
+):
+    sim = start(torso, "--link", "torso", "--ledger", "ledger.jsonl")
+    assert sim.line() == (
+        "bioloid_torso: 8 servos simulated on 1 bus; Ctrl-C ends it, `help` lists faults to type"
+    )
+    assert re.match(
+        r"  main: .*/torso \(/dev/pts/\d+\), 1000000 bit/s, Protocol 1.0, AX-12A 1-6, 20-21$", sim.line()
+    )
+    assert sim.line().startswith("  in real time: ")
+    hint = sim.line()
+    assert hint == f"next: dxlrun {torso} port:={tmp_path / 'torso'}"
+
+    words = [*hint.split()[2:], "rate:=20", "--duration", "0.5", "--no-record"]
+    ran = subprocess.run(
+        [sys.executable, "-P", "-c", CODE, *words], capture_output=True, text=True, check=False, cwd=tmp_path
+    )
+    assert ran.returncode == 0, ran.stderr
+    assert "bioloid_torso: good." in ran.stdout
+    code, out, err = sim.stop()
+
+    assert code == 0, err
+    assert re.search(
+        r"bioloid_torso: ended after [\d.]+ s\. (\d{3,}) packets heard, \1 packets answered|heard", out
+    )
+    assert out.splitlines()[-1] == "ledger: ledger.jsonl"
+    assert not os.path.lexists(tmp_path / "torso")
+    asked = [entry for entry in read_ledger(tmp_path / "ledger.jsonl") if entry.direction == "in"]
+    assert len(asked) > 100
+
+
+def test_servos_without_a_robot_file_answer_and_take_faults_that_are_typed(start: Callable[..., Sim]):
+    sim = start("--servo", "XL430-W250:1-2", "--json")
+    ports = json.loads(sim.line())["ports"]
+
+    assert hear(ports["main"], PING_1, 14)[:12] == PONG_1
+    sim.type("silence servo=1")
+    assert json.loads(sim.line()) == {"fault": "silence servo=1"}
+    sim.type("slience servo=1")
+    assert "did you mean silence?" in json.loads(sim.line())["error"]
+    sim.type("help")
+    assert any(line.startswith("lose ") for line in json.loads(sim.line())["faults"])
+
+    sim.input.close()  # nobody types any more: that ends nothing
+    sim.process.stdin = None
+    assert hear(ports["main"], PING_2, 14)[:5] == PING_2[:5]
+    assert sim.stop(signal.SIGTERM) == (0, "", "")
+
+
+PAGE = (Path(__file__).parents[2] / "docs" / "simulation.md").read_text()
+
+
+def test_the_programs_of_the_page_run_against_the_servos_of_the_page(
+    start: Callable[..., Sim], tmp_path: Path
+):
+    link = str(tmp_path / "robot")
+    page = PAGE.replace("/tmp/robot", link)  # noqa: S108
+    (words,) = re.findall(r"^    dxlrun sim (--servo XL430.+)$", page, re.MULTILINE)
+    sim = start(*words.split(), "--json")
+    assert json.loads(sim.line())["ports"] == {"main": link}
+    said = [
+        subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path
+        ).stdout
+        for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    ]
+
+    assert said[0] == "(1060, 0, 0)\n"
+    assert len(json.loads(said[1])) == 3
+    assert sim.stop()[0] == 0
+
+
+def test_every_bus_is_simulated_and_has_a_link_of_its_own(start: Callable[..., Sim], tmp_path: Path):
+    (tmp_path / "robot.yaml").write_text(TWO)
+    sim = start("robot.yaml", "--link", "robot", "--json")
+    told = json.loads(sim.line())
+
+    assert told["ports"] == {name: str(tmp_path / f"robot.{name}") for name in ("left", "right")}
+    assert {name: os.readlink(port) for name, port in told["ports"].items()} == told["devices"]
+    assert hear(told["ports"]["left"], PING_1, 14)[:12] == PONG_1
+    assert hear(told["ports"]["right"], bytes.fromhex("ff ff 01 02 01 fb"), 6) == bytes.fromhex(
+        "ff ff 01 02 00 fc"
+    )
+    assert sim.stop()[0] == 0
+    assert not list(tmp_path.glob("robot.*t"))
+
+
+def test_a_planned_fault_is_told_when_it_happens_and_stands_in_the_ledger(
+    start: Callable[..., Sim], tmp_path: Path
+):
+    sim = start("--servo", "XL430-W250:1", "--fault", "lose servo=1", "--fault", "overload servo=1 packet=2",
+                "--ledger", "ledger.jsonl")  # fmt: skip
+    sim.line()
+    port = sim.line().split()[1].rstrip(",")
+    sim.line()
+    hear(port, PING_1 + PING_1, 14)
+
+    assert [sim.line(), sim.line()] == ["fault: lose servo=1", "fault: overload servo=1 packet=2"]
+    assert sim.stop()[0] == 0
+    notes = [entry.note for entry in read_ledger(tmp_path / "ledger.jsonl")]
+    assert [note for note in notes if note.startswith("fault: ")] == [
+        "fault: lose servo=1",
+        "fault: overload servo=1 packet=2",
+    ]
+
+
+def test_a_simulation_whose_process_dies_fails_and_says_so(start: Callable[..., Sim], tmp_path: Path):
+    sim = start("--servo", "AX-12A:1", "--json", "--link", "robot")
+    sim.line()
+    children = Path(f"/proc/{sim.process.pid}/task/{sim.process.pid}/children").read_text().split()
+    os.kill(int(children[0]), signal.SIGKILL)
+    code, _, err = sim.end()
+
+    assert code == 1
+    assert "simulation: the simulated bus ended in the middle" in err
+
+
+def test_a_front_that_is_killed_leaves_no_link(start: Callable[..., Sim], tmp_path: Path):
+    sim = start("--servo", "AX-12A:1", "--json", "--link", "robot")
+    sim.line()
+    (child,) = Path(f"/proc/{sim.process.pid}/task/{sim.process.pid}/children").read_text().split()
+    ended = os.pidfd_open(int(child))
+    sim.process.kill()
+
+    assert select.select([ended], [], [], PATIENCE_S)[0]
+    os.close(ended)
+    assert not os.path.lexists(tmp_path / "robot")
+
+
+@contextlib.contextmanager
+def on_terminal(tmp_path: Path, *words: str) -> Iterator[tuple[subprocess.Popen[bytes], int]]:
+    ours, theirs = pty.openpty()
+    ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 120, 0, 0))
+    environment = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES")}
+    process = subprocess.Popen(
+        [sys.executable, "-P", "-c", f"{OWN_TERMINAL}; {CODE}", "sim", *words],
+        stdin=theirs,
+        stdout=theirs,
+        stderr=theirs,
+        env=environment | {"TERM": "xterm"},
+        cwd=tmp_path,
+        start_new_session=True,
+    )
+    try:
+        with process:
+            yield process, ours
+    finally:
+        process.kill()
+        os.close(theirs)
+        os.close(ours)
+
+
+def test_on_a_terminal_a_table_lives_and_letters_are_shown(tmp_path: Path):
+    with on_terminal(tmp_path, "--servo", "XL430-W250:1-2") as (process, terminal):
+        shown = ""
+
+        def until(pattern: str) -> None:
+            nonlocal shown
+            while not re.search(pattern, shown):
+                assert select.select([terminal], [], [], PATIENCE_S)[0], shown
+                shown += re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", os.read(terminal, 65536).decode())
+
+        until(r"2 +XL430-W250 +- +\S+ +180\.0")
+        os.write(terminal, b"overlaod\x7f\x7f\x7foad servo=2")
+        until("fault> overload servo=2")
+        os.write(terminal, b"\n")
+        until("\nfault: overload servo=2|\rfault: overload servo=2")
+        until(r"2 +XL430-W250 .* 0x20")
+        os.write(terminal, b"\x03")  # Ctrl-C is a signal here as everywhere
+        until("simulation: ended after")
+        assert process.wait(PATIENCE_S) == 0
+        assert termios.tcgetattr(terminal)[3] & termios.ECHO  # as it was before
