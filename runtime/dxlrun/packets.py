@@ -28,6 +28,9 @@ class PacketKind(IntEnum):
     """Bytes from the line that belong to no intact packet."""
 
 
+_KINDS = frozenset(int(kind) for kind in PacketKind)
+
+
 @dataclass(frozen=True, slots=True)
 class LoggedPacket:
     """One packet, or one run of noise, on one bus.
@@ -143,18 +146,31 @@ class NoPackets:
 
 def decode_packets(payload: Payload) -> list[LoggedPacket]:
     """Return the packets of one committed batch, oldest first. Raises ValueError when it is not one."""
-    packets: list[LoggedPacket] = []
-    start = 0
-    while start < len(payload):
+    return [
+        LoggedPacket(bus, PacketKind(kind), servo_id, first_ns, last_ns, data)
+        for bus, kind, servo_id, first_ns, last_ns, data in split_packets(payload)
+    ]
+
+
+def split_packets(payload: Payload) -> list[tuple[int, int, int, int, int, bytes]]:
+    """Return the fields of LoggedPacket as plain values: the recorder takes thousands a second.
+
+    Raises ValueError when the payload is not a batch.
+    """
+    packets: list[tuple[int, int, int, int, int, bytes]] = []
+    start, end = 0, len(payload)
+    while start < end:
         try:
             bus, kind, servo_id, length, first_ns, last_ns = _HEADER.unpack_from(payload, start)
         except struct.error as error:
             raise ValueError(f"a batch of packets ends inside a header: {error}") from error
+        if kind not in _KINDS:
+            raise ValueError(f"a packet is of kind {kind}, which is none")
         start += _HEADER.size
         data = bytes(payload[start : start + length])
         if len(data) != length:
             raise ValueError("a batch of packets ends inside a packet")
-        packets.append(LoggedPacket(bus, PacketKind(kind), servo_id, first_ns, last_ns, data))
+        packets.append((bus, kind, servo_id, first_ns, last_ns, data))
         start += length
     return packets
 

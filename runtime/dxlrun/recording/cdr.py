@@ -13,6 +13,7 @@ import re
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TypeAlias
 
 import numpy as np
@@ -241,6 +242,25 @@ def _many(one: tuple[Write, Read]) -> tuple[Write, Read]:
     return write, read
 
 
+def _texts() -> tuple[Write, Read]:
+    """Names of joints: the same in every message, so their bytes are made once."""
+    write_each, read = _many(_text())
+
+    @lru_cache(maxsize=64)
+    def packed(texts: tuple[str, ...], at: int) -> bytes:
+        buffer = bytearray(_HEAD + at)
+        write_each(buffer, texts)
+        return bytes(buffer[_HEAD + at :])
+
+    def write(buffer: bytearray, value: Value) -> None:
+        if isinstance(value, tuple):
+            buffer += packed(value, (len(buffer) - _HEAD) % 4)  # nothing in it is aligned to more
+        else:
+            write_each(buffer, value)
+
+    return write, read
+
+
 def _nested(name: str, definitions: Mapping[str, tuple[Field, ...]]) -> tuple[Write, Read]:
     fields = definitions[name]
     steps = [_field(field, definitions) for field in fields]
@@ -264,5 +284,7 @@ def _nested(name: str, definitions: Mapping[str, tuple[Field, ...]]) -> tuple[Wr
 def _field(field: Field, definitions: Mapping[str, tuple[Field, ...]]) -> tuple[Write, Read]:
     if field.kind in _PRIMITIVES:
         return _numbers(field.kind) if field.sequence else _number(field.kind)
-    one = _text() if field.kind == "string" else _nested(field.kind, definitions)
+    if field.kind == "string":
+        return _texts() if field.sequence else _text()
+    one = _nested(field.kind, definitions)
     return _many(one) if field.sequence else one

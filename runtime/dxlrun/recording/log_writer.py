@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import IO, cast
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from dxlrun.commands import CommandPieces
 from dxlrun.cycle import CycleLayout
 from dxlrun.events import Event, EventCode, Severity, decode_event
-from dxlrun.packets import decode_packets
+from dxlrun.packets import split_packets
 from dxlrun.recording import schemas
 from dxlrun.recording.cdr import ENCAPSULATION, Codec
 from dxlrun.recording.header import LogHeader, LogSummary, to_metadata
@@ -24,6 +25,8 @@ from dxlrun.ring import Payload
 
 CHUNK_BYTES = 256 * 1024
 _NO_NUMBERS = np.zeros(0)
+_PACKET = struct.Struct("<4sqqBBxxI")
+"""What precedes the bytes of a BUS_PACKET, as Codec packs it: nine of ten messages are packets."""
 _LIBRARY = "dxlrun"
 _MEDIA_TYPES = {".json": "application/json", ".yaml": "application/yaml", ".txt": "text/plain"}
 
@@ -50,10 +53,9 @@ class LogWriter:
         )
         self._sequences: dict[int, int] = {}
         self._pieces = CommandPieces()
-        self._packet, self._event, self._ros_log, self._joint_state, self._command = (
+        self._event, self._ros_log, self._joint_state, self._command = (
             Codec(message)
             for message in (
-                schemas.BUS_PACKET,
                 schemas.EVENT,
                 schemas.ROS_LOG,
                 schemas.JOINT_STATE,
@@ -201,11 +203,9 @@ class LogWriter:
         self._guarded(lambda: self._packets(payload))
 
     def _packets(self, payload: Payload) -> None:
-        for packet in decode_packets(payload):
-            data = self._packet.pack(
-                packet.first_ns, packet.last_ns, packet.kind, packet.servo_id, packet.data
-            )
-            self._add(self._bus_channels[packet.bus], packet.last_ns, data)
+        for bus, kind, servo_id, first_ns, last_ns, data in split_packets(payload):
+            head = _PACKET.pack(ENCAPSULATION, first_ns, last_ns, kind, servo_id, len(data))
+            self._add(self._bus_channels[bus], last_ns, head + data)
 
     def command(self, payload: Payload) -> None:
         """Write one command that a controller was handed, when its last piece is there.

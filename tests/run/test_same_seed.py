@@ -1,0 +1,61 @@
+"""Two runs on virtual time with one seed are one, faults and split replies too, and told as they were."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from dxlrun.analysis.ledger_report import compare
+from dxlrun.compile.plan import AdapterPlan, Plan
+from dxlrun.recording.reader import read_log
+from dxlrun.simulation import Ledger, read_ledger
+from dxlrun.simulation.faults import FaultScript, parse_fault
+from dxlrun.testing import plan_of
+from dxlrun.virtual_run import VirtualRobot
+
+TORSO = Path(__file__).parents[2] / "robots/bioloid_torso.yaml"
+STARTED_NS = 1_000_000_000
+"""The start-up is over: a fault in it ends the run before it has begun."""
+
+
+@pytest.fixture(scope="module")
+def plan() -> Plan:
+    """The torso behind an adapter that waits 1 ms and hands bytes over in random pieces."""
+    plan = plan_of(TORSO, duration_s=3)
+    adapters = {"main": AdapterPlan(latency_timer_ns=1_000_000, split="random")}
+    return replace(plan, simulation=replace(plan.simulation, adapters=adapters))
+
+
+def run(plan: Plan, directory: Path, seed: int) -> tuple[Path, Path]:
+    """Run in a storm of faults; return log and ledger."""
+    directory.mkdir()
+    log, ledger = directory / "run.mcap", directory / "run.ledger.jsonl"
+    robot = VirtualRobot(plan, log=log, ledger=Ledger(ledger, keep=False))
+    storm = parse_fault("storm faults=8 within=2s")
+    FaultScript([storm], seed).attach(robot.buses, start_ns=STARTED_NS)
+    robot.run()
+    return log, ledger
+
+
+def test_two_runs_with_one_seed_are_the_same_to_the_bit_and_another_seed_is_another_run(
+    plan: Plan, tmp_path: Path
+) -> None:
+    once, again, other = (
+        run(plan, tmp_path / name, seed) for name, seed in (("once", 7), ("again", 7), ("other", 8))
+    )
+    for first, second in zip(once, again, strict=True):
+        assert first.read_bytes() == second.read_bytes()
+    assert other[0].read_bytes() != once[0].read_bytes()
+    assert any("fault: " in entry.note for entry in read_ledger(once[1]))
+
+
+@pytest.mark.parametrize("seed", [1, 3])
+def test_the_log_tells_a_storm_as_the_bus_saw_it(plan: Plan, tmp_path: Path, seed: int) -> None:
+    log, ledger = run(plan, tmp_path / "run", seed)
+
+    report = compare(read_log(log), read_ledger(ledger), ledger)
+
+    assert report.differences == ()
+    assert report.faults
