@@ -99,12 +99,14 @@ class MujocoPlant:
         self._rows = np.array(rows, dtype=np.intp)
         self._reference = np.array([turned[row].reference for row in rows])
         self._direction = np.array([float(turned[row].direction) for row in rows])
-        self._model = _compiled(urdf, {turned[row].name: joints[row] for row in rows})
-        self._data = mujoco.MjData(self._model)
-        self._step = mujoco.mj_step
-        # all joints are hinges, so that a joint's coordinate and speed stand at its own number
-        self._numbers = np.array([self._model.joint(turned[row].name).id for row in rows], dtype=np.intp)
-        self._own_damping = self._model.dof_damping[self._numbers].copy()
+        model = _compiled(urdf, {turned[row].name: joints[row] for row in rows})
+        data = mujoco.MjData(model)
+        self._model, self._data, self._step = model, data, mujoco.mj_step
+        # views that stay; all joints are hinges, so that coordinate and speed stand at a joint's own number
+        self._damping, self._force = model.dof_damping, data.qfrc_applied
+        self._turn, self._speed = data.qpos, data.qvel
+        self._numbers = np.array([model.joint(turned[row].name).id for row in rows], dtype=np.intp)
+        self._own_damping = model.dof_damping[self._numbers]
 
     def step(self, drive: Floats, damping: Floats, dt_s: float) -> None:
         """Let a time pass in which each servo drives with `drive - damping * velocity`; Nm and Nm s/rad."""
@@ -125,16 +127,15 @@ class MujocoPlant:
 
     def _step_bodies(self, drive: Floats, damping: Floats, dt_s: float) -> None:
         rows, numbers, direction = self._rows, self._numbers, self._direction
-        model, data = self._model, self._data
-        model.opt.timestep = dt_s
+        self._model.opt.timestep = dt_s
         # MuJoCo's own integrator takes damping at the end of the step, as independent joints do
-        model.dof_damping[numbers] = self._own_damping + damping[rows]
-        data.qpos[numbers] = direction * (self.angle[rows] - self._reference)
-        data.qvel[numbers] = direction * self.velocity[rows]
-        data.qfrc_applied[numbers] = direction * drive[rows]
-        self._step(model, data)
-        self.angle[rows] = self._reference + direction * data.qpos[numbers]
-        self.velocity[rows] = direction * data.qvel[numbers]
+        self._damping[numbers] = self._own_damping + damping[rows]
+        self._turn[numbers] = direction * (self.angle[rows] - self._reference)
+        self._speed[numbers] = direction * self.velocity[rows]
+        self._force[numbers] = direction * drive[rows]
+        self._step(self._model, self._data)
+        self.angle[rows] = self._reference + direction * self._turn[numbers]
+        self.velocity[rows] = direction * self._speed[numbers]
 
 
 def _make_movable(root: Element, turned: Set[str]) -> None:
