@@ -272,6 +272,13 @@ def test_a_y_servo_keeps_its_turns_until_it_clears_them_without_torque(make_line
     assert 0 <= line.get("present_position") < turn
 
 
+def test_goals_of_a_y_servo_go_as_far_as_its_position_limits(make_line2: Any) -> None:
+    line = make_line2((1,), "YM070-210-M001")
+    line.set("max_position_limit", 2_000_000)  # nearly four turns
+    assert line.set("goal_position", 2_000_000) == 0
+    assert line.set("goal_position", 2_000_001) == ErrorNumber.DATA_LIMIT
+
+
 def test_a_y_servo_tells_of_errors_by_code_and_forgets_them_when_they_are_over(make_line2: Any) -> None:
     line = make_line2((1,), "YM070-210-M001")
     line.set("torque_enable", 1)

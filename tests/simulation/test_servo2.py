@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from typing import Any
+from unittest.mock import ANY
 
 import pytest
 
@@ -240,6 +241,25 @@ def test_an_alert_is_no_failed_transaction(line2: Any) -> None:
     line2.servo().trigger_overload()
     assert line2.request(1, WRITE, b"\x41\x00\x01") == (1, ALERT, b"")
     assert line2.get("led") == 1
+
+
+def test_every_status_tells_of_an_error_as_long_as_it_lasts(make_line2: Any) -> None:
+    line = make_line2((1, 2))
+    line.servo().trigger_overload()
+    for instruction, parameters in (
+        (PING, b""),
+        (READ, b"\x84\x00\x04\x00"),
+        (WRITE, b"\x41\x00\x01"),
+        (REG_WRITE, b"\x41\x00\x01"),
+        (ACTION, b""),
+    ):
+        assert line.request(1, instruction, parameters) == (1, ALERT, ANY)
+    assert line.request(1, 0x07).error == ALERT | ErrorNumber.INSTRUCTION
+    line.tell(BROADCAST, 0x82, bytes.fromhex("84000400 0102"))
+    assert [each.error for each in line.statuses()] == [ALERT, 0]
+    line.tell(BROADCAST, 0x8A, bytes.fromhex("84000400 0102"))
+    fast = line.hear()
+    assert (fast[8], fast[8 + 8]) == (ALERT, 0)
 
 
 def test_what_shutdown_does_not_list_is_only_told(line2: Any) -> None:
