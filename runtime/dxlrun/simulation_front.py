@@ -76,7 +76,7 @@ class Audience(Protocol):
         """Take the device of each bus, and what the system granted of real time; told once."""
 
     def moved(self, ports: Mapping[str, str]) -> None:
-        """Take the new device of each bus whose adapter was pulled: it comes back under another name."""
+        """Take the new devices: empty for an adapter that was pulled, another name when it is back."""
 
     def fault(self, text: str) -> None:
         """Take a fault that was injected now, by hand or by the script."""
@@ -277,7 +277,7 @@ class _Front:
                 self._audience.refused(str(message["error"]))
 
     def _move(self, ports: dict[str, str]) -> None:
-        """Tell what is another port now; an adapter that comes back says the same ports once more."""
+        """Tell what is another port now."""
         moved = {bus: port for bus, port in ports.items() if port != self._ports.get(bus)}
         self._ports = ports
         if moved:

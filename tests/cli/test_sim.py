@@ -184,13 +184,22 @@ def test_the_programs_of_the_page_run_against_the_servos_of_the_page(
     assert sim.stop()[0] == 0
 
 
-def test_every_bus_is_simulated_and_has_a_link_of_its_own(start: Callable[..., Sim], tmp_path: Path):
+def test_every_bus_is_simulated_and_has_a_link_that_follows_its_adapter(
+    start: Callable[..., Sim], tmp_path: Path
+):
     (tmp_path / "robot.yaml").write_text(TWO)
     sim = start("robot.yaml", "--link", "robot", "--json")
     told = json.loads(sim.line())
 
     assert told["ports"] == {name: str(tmp_path / f"robot.{name}") for name in ("left", "right")}
     assert {name: os.readlink(port) for name, port in told["ports"].items()} == told["devices"]
+    assert hear(told["ports"]["left"], PING_1, 14)[:12] == PONG_1
+    sim.type("unplug bus=left for=1ms")
+    for expected in ({"fault": "unplug bus=left for=1ms"}, {"devices": {"left": ""}}):
+        assert json.loads(sim.line()) == expected
+    (back,) = json.loads(sim.line())["devices"].values()
+    assert back != told["devices"]["left"]
+    assert os.readlink(told["ports"]["left"]) == back
     assert hear(told["ports"]["left"], PING_1, 14)[:12] == PONG_1
     assert hear(told["ports"]["right"], bytes.fromhex("ff ff 01 02 01 fb"), 6) == bytes.fromhex(
         "ff ff 01 02 00 fc"

@@ -148,6 +148,7 @@ def test_the_ports_are_said_once(capsys: pytest.CaptureFixture[str]):
     view = PlainView(Shown("torso", (bus,), {"main": Path("/tmp/robot")}, "dxlrun torso.yaml port:={port}"))  # noqa: S108
 
     view.opened({"main": "/dev/pts/7"}, "core 1")
+    view.moved({"main": ""})
     view.moved({"main": "/dev/pts/9"})
     view.fault("lose servo=1")
 
@@ -156,7 +157,8 @@ def test_the_ports_are_said_once(capsys: pytest.CaptureFixture[str]):
         "  main: /tmp/robot (/dev/pts/7), 1000000 bit/s, Protocol 1.0, AX-12A 1-3, 7",
         "  in real time: core 1",
         "next: dxlrun torso.yaml port:=/tmp/robot",
-        "main: the adapter comes back as /dev/pts/9; /tmp/robot follows it",
+        "main: no adapter, no port",
+        "main: the adapter is back as /dev/pts/9, and /tmp/robot leads to it",
         "fault: lose servo=1",
     ]
 

@@ -52,11 +52,16 @@ class Shown:
         return said
 
     def moves(self, ports: Mapping[str, str]) -> list[str]:
-        """Return what is said when adapters were pulled, which come back under other names."""
-        return [f"{bus}: the adapter comes back as {port}{self._link(bus)}" for bus, port in ports.items()]
+        """Return what is said when adapters were pulled, or came back under other names."""
+        return [
+            f"{bus}: the adapter is back as {port}{self._link(bus)}"
+            if port
+            else f"{bus}: no adapter, no port"
+            for bus, port in ports.items()
+        ]
 
     def _link(self, bus: str) -> str:
-        return f"; {self.links[bus]} follows it" if bus in self.links else ""
+        return f", and {self.links[bus]} leads to it" if bus in self.links else ""
 
 
 class PlainView:

@@ -1,0 +1,44 @@
+"""docs/simulation.md says what is so."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from dxlrun.cli import sim
+from dxlrun.simulation.fault_text import KINDS
+from dxlrun.simulation.process import SimulationConfig
+from dxlrun.simulation_front import Look, Served
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "simulation.md").read_text()
+COMMANDS = re.findall(r"^    (dxlrun sim .+)$", PAGE, re.MULTILINE)
+
+
+@pytest.mark.parametrize("line", COMMANDS)
+def test_each_command_of_the_page_is_understood(
+    dxlrun, line: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    asked: list[SimulationConfig] = []
+
+    def serve(config: SimulationConfig, *_: object, **__: object) -> Served:
+        asked.append(config)
+        return Served(1.0, Look(), ())
+
+    monkeypatch.setattr(sim, "_serve", serve)
+    (tmp_path / "robots").symlink_to(ROOT / "robots")
+    monkeypatch.chdir(tmp_path)
+
+    said = dxlrun(*shlex.split(line)[1:])
+
+    assert said.code == 0, said.err
+    ((bus,),) = (config.buses for config in asked)
+    assert bus.servos
+
+
+def test_the_page_lists_every_kind_of_fault():
+    rows = re.findall(r"^\| ((?:`\w+`(?:, )?)+) \| .* \|$", PAGE.split("## Faults")[1], re.MULTILINE)
+    assert {kind for row in rows for kind in re.findall(r"`(\w+)`", row)} == set(KINDS)
