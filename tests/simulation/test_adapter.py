@@ -293,3 +293,15 @@ def test_the_host_that_talks_into_a_chain_ends_it(make_line2: Any) -> None:
     heard = line.hear()
     assert len(heard) == 13
     assert any("wait for it in vain" in note for note in line.notes())
+
+
+def test_two_servos_with_one_id_garble_their_turn_and_break_the_chain(make_line2: Any) -> None:
+    line = make_line2((1, 2, 3), return_delay_ns=100_000)
+    twin = line.bus.add_servo(ServoConfig(2, "XM430-W350", 1.0, 100_000))
+    sync_read(line)
+    heard = line.hear()
+    assert heard[:5] == bytes.fromhex("fffffd00 01")
+    assert len(heard) == 2 * 15
+    twin.poke("id", 9)  # on the line of its own from now on
+    sync_read(line)
+    assert [each.servo_id for each in line.statuses()] == [1, 2, 3]

@@ -68,6 +68,8 @@ class SimulatedBus:
         self._instruction_changes: deque[Change] = deque()
         self._agenda = Agenda()
         self._counts: dict[SimulatedServo, ServoCounts] = {}
+        self._listeners: dict[int, tuple[SimulatedServo, ...]] = {}
+        """Who hears which ID: forgotten when a servo changes its ID or rate."""
         for servo in config.servos:
             self.add_servo(servo)
 
@@ -95,6 +97,7 @@ class SimulatedBus:
         self.note(f"the host's rate is {baud_rate} bit/s")
         self.baud_rate = baud_rate
         self._wire.baud_rate = baud_rate
+        self._listeners.clear()
 
     def next_due_ns(self) -> int | None:
         """Return when something happens by itself: bytes can be taken, a fault comes; None: nothing will."""
@@ -150,6 +153,8 @@ class SimulatedBus:
         )
         self.servos += (servo,)
         self._counts[servo] = ServoCounts()
+        self._listeners.clear()
+        servo.registers.on_identity = self._listeners.clear
         return servo
 
     def counts(self, servo: SimulatedServo) -> ServoCounts:
@@ -183,10 +188,7 @@ class SimulatedBus:
         delay_ns: int = 0,
         copies: int = 1,
     ) -> None:
-        """Change a servo's next reply that has no fault yet, let it start later, or send it several times.
-
-        `text` says in the ledger what happened to it.
-        """
+        """Change a servo's next reply, let it start later or come several times; the ledger gets `text`."""
         self._changes.setdefault(servo_id, deque()).append(Change(text, change, delay_ns, copies))
 
     def alter_next_instruction(self, text: str, change: Callable[[bytes], bytes]) -> None:
@@ -209,8 +211,7 @@ class SimulatedBus:
 
     def delay_next(self, servo_id: int, delay_ns: int) -> None:
         """Let a servo's next reply start later."""
-        text = f"its reply delayed by {delay_ns} ns"
-        self.alter_next(servo_id, text, lambda reply: reply, delay_ns=delay_ns)
+        self.alter_next(servo_id, f"its reply delayed by {delay_ns} ns", bytes, delay_ns=delay_ns)
 
     def inject_noise(self, data: bytes, at_ns: int) -> None:
         """Put bytes on the line that no servo sent, toward the host, beginning at `at_ns`."""
@@ -307,9 +308,7 @@ class SimulatedBus:
         if reading is not None:
             self._read_in_turn(reading, end_ns)
         else:
-            for servo in self.servos:
-                if not servo.listens_to(packet.servo_id) or not self._hears(servo):
-                    continue
+            for servo in self._listeners.get(packet.servo_id) or self._find_listeners(packet.servo_id):
                 counts = self._counts[servo]
                 counts.heard += packet.intact
                 reply = servo.execute(packet, end_ns)
@@ -321,11 +320,11 @@ class SimulatedBus:
     def _read_in_turn(self, reading: ReadInTurn, end_ns: int) -> None:
         """Let the listed servos answer, each when it has heard the one before it."""
         slots = reading.has_slots and self.absent == "slot"
-        waiting: deque[tuple[ReadEntry, Reply | None]] = deque()
+        waiting: deque[tuple[ReadEntry, list[Reply]]] = deque()
         for entry in reading.entries:
-            reply = self._reply_in_turn(reading, entry, end_ns)
-            waiting.append((entry, reply))
-            if reply is None and not slots:
+            replies = self._replies_in_turn(reading, entry, end_ns)
+            waiting.append((entry, replies))
+            if not replies and not slots:
                 break
         fast = self._codec.fast_status(reading.lengths) if reading.fast else None
         self._chain = Chain(reading, waiting, fast, slots)
@@ -334,41 +333,51 @@ class SimulatedBus:
     def _continue(self, chain: Chain, free_ns: int) -> None:
         """Let the next one answer; nobody does any more when there is none."""
         while chain.waiting:
-            entry, reply = chain.waiting.popleft()
+            entry, replies = chain.waiting.popleft()
             slot_ns = self._wire.duration_ns(STATUS_BYTES + entry.length)
-            if reply is not None:
+            chain.slot_end_ns = free_ns + slot_ns
+            sent = False
+            for reply in replies:  # two servos with one ID talk at once
                 data = self._status(reply) if chain.fast is None else chain.fast.part(reply)
                 chain.slot_end_ns = free_ns + reply.delay_ns + slot_ns
-                if self._answer(reply, data, free_ns, chain):
-                    return  # its end is heard
-                free_ns = chain.slot_end_ns
-            else:
-                free_ns += slot_ns
+                sent = self._answer(reply, data, free_ns, chain) or sent
+            if sent:
+                return  # its end is heard
+            free_ns = chain.slot_end_ns
             if not chain.has_slots:
                 self.note(f"servo {entry.servo_id} does not answer: those after it wait for it in vain")
                 break
         self._chain = None
 
-    def _reply_in_turn(self, reading: ReadInTurn, entry: ReadEntry, end_ns: int) -> Reply | None:
-        servo = next((each for each in self.servos if each.servo_id == entry.servo_id), None)
-        if servo is None or not self._hears(servo):
-            return None
-        counts = self._counts[servo]
-        counts.heard += 1
-        reply = servo.answer_in_turn(reading, entry, end_ns)
-        if reply is None:
-            return None
-        counts.answer(reply.error)
-        if reading.fast and entry is not reading.entries[0]:
-            return replace(reply, delay_ns=0)  # only the first one of a shared status waits
-        return reply
+    def _replies_in_turn(self, reading: ReadInTurn, entry: ReadEntry, end_ns: int) -> list[Reply]:
+        replies = []
+        for servo in self._listeners.get(entry.servo_id) or self._find_listeners(entry.servo_id):
+            if servo.servo_id != entry.servo_id:
+                continue  # only by its secondary ID, to which it never answers
+            counts = self._counts[servo]
+            counts.heard += 1
+            reply = servo.answer_in_turn(reading, entry, end_ns)
+            if reply is None:
+                continue
+            counts.answer(reply.error)
+            if reading.fast and entry is not reading.entries[0]:
+                reply = replace(reply, delay_ns=0)  # only the first one of a shared status waits
+            replies.append(reply)
+        return replies
 
     def _status(self, reply: Reply) -> bytes:
         return self._codec.status_packet(reply.servo_id, reply.error, reply.parameters)
 
-    def _hears(self, servo: SimulatedServo) -> bool:
-        """Return whether the rates differ by less than 3 % (e-Manual, Baud Rate (4))."""
-        return abs(servo.baud_rate - self.baud_rate) < 0.03 * self.baud_rate
+    def _find_listeners(self, servo_id: int) -> tuple[SimulatedServo, ...]:
+        """Return who hears an ID; rates may differ by less than 3 % (e-Manual, Baud Rate (4))."""
+        tolerance = 0.03 * self.baud_rate
+        found = tuple(
+            servo
+            for servo in self.servos
+            if servo.listens_to(servo_id) and abs(servo.baud_rate - self.baud_rate) < tolerance
+        )
+        self._listeners[servo_id] = found
+        return found
 
     def _answer(self, reply: Reply, data: bytes, free_ns: int, chain: Chain | None = None) -> bool:
         """Send a servo's bytes, faults and all, some time after the line is free; False: nothing was sent."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 from dxlrun.control_table import ControlItem, ControlTable
 
@@ -11,6 +11,8 @@ _INDIRECT = re.compile(r"indirect_address_(\d+)")
 
 _CELLS_KEPT = 1024
 """So many places of a table are looked up only once: a host writes few of them, rubbish goes everywhere."""
+
+_IDENTITY = frozenset(("id", "secondary_id", "baud_rate", "baud_rate_bus"))
 
 Run = tuple[int, bytes]
 """Address and bytes that belong there."""
@@ -25,6 +27,8 @@ class Memory:
     def __init__(self, table: ControlTable, firmware: int) -> None:
         self.table = table
         self.firmware = firmware
+        self.on_identity: Callable[[], None] | None = None
+        """Who is told when an item changes that says what the servo hears."""
         self._memory = bytearray(table.size)
         self._values: dict[str, int] = {}  # the same as in the bytes: looked up far more often than written
         self._names_at: dict[
@@ -72,6 +76,8 @@ class Memory:
             return
         self._memory[item.address : item.address + item.size] = wire.to_bytes(item.size, "little")
         self._values[name] = wire
+        if name in _IDENTITY and self.on_identity is not None:
+            self.on_identity()
 
     def get(self, name: str, otherwise: int = 0) -> int:
         """Return the integer of an item, or another one when the model has no such item."""
@@ -162,6 +168,8 @@ class Memory:
         after = self.would_be(address, data)
         self._memory[address : address + len(data)] = data
         self._values.update(after)
+        if self.on_identity is not None and not _IDENTITY.isdisjoint(after):
+            self.on_identity()
         return tuple(after)
 
     @staticmethod

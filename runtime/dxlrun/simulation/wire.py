@@ -17,7 +17,7 @@ class Chain:
     """A read in turn that is under way: who is still to answer, each after it heard the one before it."""
 
     reading: ReadInTurn
-    waiting: deque[tuple[ReadEntry, Reply | None]]
+    waiting: deque[tuple[ReadEntry, list[Reply]]]
     fast: FastStatus | None
     has_slots: bool
     """True: who does not hear the one before it answers when that one's time is over; False: never [?]."""
