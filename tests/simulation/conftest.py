@@ -20,6 +20,7 @@ from dxlrun.simulation import (
     BusConfig,
     Ledger,
     LedgerEntry,
+    Load,
     ServoConfig,
     SimulatedBus,
     SimulatedServo,
@@ -184,10 +185,13 @@ def build_line(
     position: float = 2.0,
     return_delay_ns: int = 500_000,
     start_ns: int = 0,
+    load: Load | None = None,
 ) -> Line:
     clock = VirtualClock(start_ns)
     ledger = Ledger()
-    servos = tuple(ServoConfig(servo_id, model, position, return_delay_ns) for servo_id in ids)
+    servos = tuple(
+        ServoConfig(servo_id, model, position, return_delay_ns, load or Load()) for servo_id in ids
+    )
     bus = SimulatedBus(BusConfig("main", baud_rate, servos, protocol), ledger, start_ns)
     return kind(clock, bus, ledger, VirtualPorts(clock, (bus,)))
 

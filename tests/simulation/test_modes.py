@@ -3,13 +3,24 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 
+from dxlrun.simulation import Load
+
 TICK = math.tau / 4096
 RPM = math.tau / 60
 CLEAR_TURNS = bytes.fromhex("01 44584c22")
+
+
+@pytest.fixture
+def make_loaded2(make_line2: Any) -> Callable[[Load], Any]:
+    def make(load: Load) -> Any:
+        return make_line2((1,), "XM430-W350", load=load)
+
+    return make
 
 
 def move(line: Any, goal: int, seconds: float = 3.0) -> int:
@@ -36,24 +47,26 @@ def test_position_control_goes_there_and_rests(line2: Any) -> None:
 def test_profile_velocity_is_the_speed(line2: Any) -> None:
     line2.set("profile_velocity", 50)
     assert move(line2, 0, 0.3) < round(2.0 / TICK)
-    assert line2.servo().velocity == pytest.approx(-50 * 0.229 * RPM, rel=1e-3)
-    assert line2.get("present_velocity") == -50
+    assert line2.servo().velocity == pytest.approx(-50 * 0.229 * RPM, rel=0.02)
+    assert line2.get("present_velocity") == pytest.approx(-50, abs=1)
     assert line2.get("moving") == 1
 
 
 def test_profile_velocity_0_is_as_fast_as_it_can(line2: Any) -> None:
     move(line2, 4095, 0.1)
-    assert line2.servo().velocity == pytest.approx(line2.servo().registers.table.max_speed)
+    assert line2.servo().velocity == pytest.approx(line2.servo().registers.table.max_speed, rel=1e-3)
 
 
 def test_profile_acceleration_is_the_slope(line2: Any) -> None:
+    line2.set("profile_velocity", 200)
     line2.set("profile_acceleration", 10)
     line2.set("torque_enable", 1)
     line2.set("goal_position", 4095)
+    line2.wait(0.3)
     first, start_ns = line2.servo().velocity, line2.clock.now_ns()
     line2.wait(0.1)
     slope = (line2.servo().velocity - first) / ((line2.clock.now_ns() - start_ns) * 1e-9)
-    assert slope == pytest.approx(10 * 214.577 * math.tau / 3600)
+    assert slope == pytest.approx(10 * 214.577 * math.tau / 3600, rel=0.03)
 
 
 def test_a_time_based_profile_takes_its_time(line2: Any) -> None:
@@ -124,14 +137,47 @@ def test_reverse_mode_turns_the_direction(line2: Any) -> None:
     assert line2.servo().position - (2.0 - math.tau) == pytest.approx(-100 * TICK, abs=TICK)
 
 
-@pytest.mark.parametrize("mode", [0, 16])
-def test_modes_that_are_not_modelled_take_their_goals_and_stay(line2: Any, mode: int) -> None:
-    assert line2.set("operating_mode", mode) == 0
+def test_pwm_control_turns_at_its_part_of_the_no_load_speed(line2: Any) -> None:
+    assert line2.set("operating_mode", 16) == 0
     assert line2.set("torque_enable", 1) == 0
-    assert line2.set("goal_current", 100) == 0
-    assert line2.set("goal_pwm", 100) == 0
+    line2.wait(0.5)
+    assert line2.servo().velocity == 0.0  # a goal that the mode obeys begins with 0
+    assert line2.set("goal_pwm", -400) == 0
     line2.wait(1)
-    assert line2.get("present_position") == round(2.0 / TICK)
+    full = line2.servo().registers.table.max_speed
+    assert line2.servo().velocity == pytest.approx(-full * 400 / 885, rel=0.01)
+    assert line2.get("present_pwm") == pytest.approx(-400, abs=1)
+
+
+def test_current_control_gives_the_torque_of_its_current(make_loaded2: Any) -> None:
+    line = make_loaded2(Load(gravity=1.0, gravity_angle=2.0, friction=0.02))
+    assert line.set("operating_mode", 0) == 0
+    assert line.set("torque_enable", 1) == 0
+    assert line.set("goal_current", 100) == 0
+    line.wait(3)
+    ampere = 100 * 0.00269
+    assert math.sin(line.servo().position - 2.0) == pytest.approx(ampere * 4.1 / 2.3, abs=0.02)
+    assert line.get("present_current") == pytest.approx(100, abs=1)
+
+
+def test_current_based_position_control_pushes_no_harder_than_its_current(make_loaded2: Any) -> None:
+    line = make_loaded2(Load(gravity=1.0, gravity_angle=2.0, friction=0.02))
+    assert line.set("operating_mode", 5) == 0
+    assert line.set("torque_enable", 1) == 0
+    assert line.set("goal_current", 100) == 0
+    assert line.set("goal_position", 4000) == 0
+    line.wait(3)
+    assert math.sin(line.servo().position - 2.0) == pytest.approx(100 * 0.00269 * 4.1 / 2.3, abs=0.02)
+    assert line.set("goal_current", 800) == 0
+    line.wait(3)
+    assert line.get("present_position") > 3900
+
+
+def test_goal_pwm_limits_position_control(line2: Any) -> None:
+    assert line2.set("goal_pwm", 177) == 0
+    move(line2, 4095, 0.3)
+    full = line2.servo().registers.table.max_speed
+    assert line2.servo().velocity == pytest.approx(full * 177 / 885, rel=0.01)
 
 
 def test_a_goal_wakes_it_only_where_drive_mode_says_so(line2: Any) -> None:

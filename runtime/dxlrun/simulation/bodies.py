@@ -10,6 +10,7 @@ from dxlrun.simulation import instructions1, instructions2
 from dxlrun.simulation.body import Body
 from dxlrun.simulation.joint_shaft import JointShaft
 from dxlrun.simulation.lock_body import LockBody
+from dxlrun.simulation.mechanics import Load, Mechanics
 from dxlrun.simulation.memory import Memory
 from dxlrun.simulation.mode_shaft import ModeShaft
 from dxlrun.simulation.packets import InstructionPacket, ReadEntry, ReadInTurn
@@ -41,9 +42,11 @@ class Instructions(Protocol):
 
 def make_body(
     table: ControlTable,
+    mechanics: Mechanics,
+    load: Load,
     angle: float,
-    start_ns: int,
     note: Callable[[str], None],
+    *,
     firmware: int | None = None,
 ) -> tuple[Body, Instructions]:
     """Return a servo that is not switched on yet, its shaft at `angle` (rad from raw 0)."""
@@ -52,9 +55,9 @@ def make_body(
     memory = Memory(table, firmware)
     shaft: Shaft
     if "operating_mode" in table.items:
-        shaft = ModeShaft(memory, start_ns, angle)
+        shaft = ModeShaft(memory, mechanics, load, angle)
     else:
-        shaft = JointShaft(memory, start_ns, angle)
+        shaft = JointShaft(memory, mechanics, load, angle)
     if table.protocol == 1.0:
         lock_body = LockBody(memory, shaft, note)
         return lock_body, instructions1.Instructions1(lock_body)

@@ -6,10 +6,11 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 
 from dxlrun.simulation.memory import Memory
 from dxlrun.simulation.shaft import Shaft
+from dxlrun.simulation.strain import SUPPLY_OHM
 
 BOOT_NS = 100_000_000
 """How long a servo hears nothing after a reboot; no manual names it [i]."""
@@ -24,10 +25,8 @@ class Body(ABC):
         self.memory = memory
         self.shaft = shaft
         self.note = note
+        self._voltage = 0.0
         self.voltage = _supply(memory)
-        """V"""
-        self.temperature = 30.0
-        """degrees C"""
         self.overload = False
         """True while the shaft is loaded beyond the torque."""
         self.wakes_on_goal = True
@@ -36,6 +35,10 @@ class Body(ABC):
         """How long a reboot or a factory reset by an instruction takes: Protocol 2.0."""
         self.deaf_until_ns = shaft.now_ns
         """Until then it boots and hears nothing."""
+        self._started_ns = shaft.now_ns
+        shaft.mechanics.watch(shaft.index, self._strained)
+        self._live = {name: show for name, show in self._live_items().items() if name in memory}
+        self._live_in: dict[tuple[int, int], tuple[str, ...]] = {}
         self.answers_damaged = False
         """True: a packet with a wrong checksum is answered by the manual's error; False: never [?]."""
         self._registered: tuple[int, bytes] | None = None
@@ -45,6 +48,25 @@ class Body(ABC):
     def servo_id(self) -> int:
         """ID (3 or 7)."""
         return self.memory["id"]
+
+    @property
+    def voltage(self) -> float:
+        """Voltage of the supply, V; the servo sees less while it draws current."""
+        return self._voltage
+
+    @voltage.setter
+    def voltage(self, volts: float) -> None:
+        self._voltage = volts
+        self.shaft.mechanics.supply(self.shaft.index, volts)
+
+    @property
+    def temperature(self) -> float:
+        """degrees C."""
+        return float(self.shaft.mechanics.strain.temperature[self.shaft.index])
+
+    @temperature.setter
+    def temperature(self, celsius: float) -> None:
+        self.shaft.mechanics.strain.temperature[self.shaft.index] = celsius
 
     @property
     def secondary_id(self) -> int | None:
@@ -74,11 +96,8 @@ class Body(ABC):
 
     def refresh(self) -> None:
         """Bring all that can be read to the time."""
-        self.shaft.refresh()
-        memory = self.memory
-        memory.show("present_temperature", round(self.temperature))
-        memory.show("present_voltage", round(self.voltage * 10))
-        memory.show("present_input_voltage", round(self.voltage * 10))
+        for name, show in self._live.items():
+            self.memory.show(name, show())
 
     @property
     def hears_protocol(self) -> bool:
@@ -89,8 +108,15 @@ class Body(ABC):
 
     def read(self, address: int, length: int) -> bytes | None:
         """Return bytes of the table, None where it has none."""
-        self.refresh()
-        return self.memory.read(address, length)
+        memory, live = self.memory, self._live
+        for run_address, run in memory.runs(address, bytes(length)):
+            cells = run_address, len(run)
+            names = self._live_in.get(cells)
+            if names is None:
+                names = self._live_in[cells] = tuple(name for name in live if _overlaps(memory, name, *cells))
+            for name in names:
+                memory.show(name, live[name]())
+        return memory.read(address, length)
 
     def write(self, address: int, data: bytes) -> int:
         """Write, or return the error with which it is refused; 0 when it is not."""
@@ -132,6 +158,31 @@ class Body(ABC):
         self.memory[name] = wire
         self.shaft.plan((name,))
 
+    # What time and load do
+
+    def _live_items(self) -> Mapping[str, Callable[[], int]]:
+        """Return the items that change by themselves: worked out when they are read, not before."""
+        return {
+            **self.shaft.live(),
+            "present_temperature": lambda: round(self.temperature),
+            "present_inverter_temperature": lambda: round(self.temperature),
+            "present_motor_temperature": lambda: round(self.temperature),
+            "present_voltage": lambda: self._shown_voltage("present_voltage"),
+            "present_input_voltage": lambda: self._shown_voltage("present_input_voltage"),
+            "realtime_tick": lambda: (self.shaft.now_ns - self._started_ns) // 1_000_000 % 32768,
+        }
+
+    def _shown_voltage(self, name: str) -> int:
+        drawn = abs(self.shaft.duty * self.shaft.current)
+        return round((self._voltage - SUPPLY_OHM * drawn) / self.memory.table.items[name].scale)
+
+    def _strained(self) -> None:
+        """Take note that it became warmer or colder, or was overloaded for too long."""
+        if not self.overload and self.shaft.mechanics.overloaded(self.shaft.index):
+            self.overload = True
+            self.note(f"servo {self.servo_id}: overload, it does not hold its load")
+        self.protect()
+
     # What the protocols do differently
 
     @abstractmethod
@@ -158,7 +209,17 @@ class Body(ABC):
         self.memory.show("registered_instruction", value)
 
 
+def _overlaps(memory: Memory, name: str, address: int, length: int) -> bool:
+    item = memory.table.items[name]
+    return item.address < address + length and address < item.address + item.size
+
+
 def _supply(memory: Memory) -> float:
-    """Return the voltage at which a servo is tried: 12 V, or the middle of its limits, V."""
+    """Return the voltage at which a servo is tried, V.
+
+    The one that the manual's figures are for; else 12 V, or the middle of its limits.
+    """
+    if memory.table.nominal_voltage:
+        return memory.table.nominal_voltage
     lowest, highest = memory.get("min_voltage_limit", 0), memory.get("max_voltage_limit", 999)
     return 12.0 if lowest <= 120 <= highest else (lowest + highest) / 20

@@ -17,17 +17,10 @@ class LockBody(Body):
     def __init__(self, memory: Memory, shaft: Shaft, note: Callable[[str], None]) -> None:
         super().__init__(memory, shaft, note)
         self._rules = LockRules(memory)
-        self._started_ns = shaft.now_ns
 
     def refusal(self, address: int, data: bytes) -> int:
         """Return the error bits of a write, 0 when it is allowed."""
         return self._rules.refusal(address, data)
-
-    def refresh(self) -> None:
-        """Bring all that can be read to the time; Realtime Tick (50) where the model has it (MX)."""
-        super().refresh()
-        elapsed_ms = (self.shaft.now_ns - self._started_ns) // 1_000_000
-        self.memory.show("realtime_tick", elapsed_ms % 32768)
 
     def state(self) -> int:
         """Return the error bits that last as long as their cause."""

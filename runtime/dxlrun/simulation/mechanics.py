@@ -1,29 +1,38 @@
-"""All servos of one simulation as mechanics: stepped together on one grid of time."""
+"""All servos of one simulation as mechanics: stepped together on one grid of time.
+
+In each step the profiles say where the servos' controllers want to be, the control law which torque their
+motors give, and the plant what it moves. Commands act at the next point of the grid; between its points
+angles go on with their velocity. While nothing moves, nothing is computed.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import heapq
+import itertools
+from collections.abc import Callable
 
 import numpy as np
 
+from dxlrun.simulation.command import LIMP, ROWS, Command
+from dxlrun.simulation.control_law import ControlLaw
+from dxlrun.simulation.motor import Motor
 from dxlrun.simulation.plant import NO_LOAD, Floats, IndependentJoints, Joint, Load, Plant, PlantMaker
+from dxlrun.simulation.profile import Profiles
+from dxlrun.simulation.strain import OVERLOAD_TICKS, Strain
 
 __all__ = ["NO_LOAD", "STEP_NS", "Load", "Mechanics", "Motor", "Plant", "PlantMaker"]
 
 STEP_NS = 2_000_000
 """Step of the grid. The fastest thing in a servo here is its motor's time constant of 10 ms."""
 
+STRAIN_NS = 100_000_000
+"""So often servos feel heat and load; a whole number of steps."""
 
-@dataclass(frozen=True, slots=True)
-class Motor:
-    """A servo's motor with its gear, as felt at the shaft, at its nominal voltage."""
+_STEPS_A_LOOK = 16
+"""So often it is looked whether all rest."""
 
-    max_speed: float
-    """No-load speed, rad/s"""
-    stall_torque: float
-    """Nm"""
-    inertia: float
-    """kg m^2 of rotor and gear"""
+_STILL, _UNDRIVEN = 1e-6, 1e-8
+"""rad/s, and its change in a step: below both a servo rests."""
 
 
 class Mechanics:
@@ -31,27 +40,159 @@ class Mechanics:
 
     def __init__(self, start_ns: int, plant: PlantMaker | None = None) -> None:
         self._make_plant: PlantMaker = plant or IndependentJoints
-        self._grid_ns = start_ns
-        self._joints: list[Joint] = []
-        self._drive: Floats = np.zeros(0)
-        self._damping: Floats = np.zeros(0)
-        self.plant: Plant = self._make_plant(())
+        self.grid_ns = start_ns
+        """Time of the last step"""
+        self._start_ns = start_ns
+        self._motors: list[Motor] = []
+        self._loads: list[Load] = []
+        self._watchers: dict[int, Callable[[], None]] = {}
+        self._agenda: list[tuple[int, int, Callable[[], None]]] = []
+        self._order = itertools.count()
+        self._busy = False
+        self._commanded = False
+        self._rests = False
+        self._build(np.zeros(0), np.zeros(0))
+
+    # Servos
 
     def add(self, motor: Motor, load: Load, angle: float) -> int:
-        """Add a servo with its shaft at an angle, rad from its raw 0, at rest; return its index."""
-        self._joints = [
-            Joint(joint.rotor_inertia, joint.load, float(self.plant.angle[index]))
-            for index, joint in enumerate(self._joints)
-        ]
-        self._joints.append(Joint(motor.inertia, load, angle))
-        velocity = self.plant.velocity
-        self.plant = self._make_plant(self._joints)
-        self.plant.velocity[:-1] = velocity
-        self._drive, self._damping = np.zeros(len(self._joints)), np.zeros(len(self._joints))
-        return len(self._joints) - 1
+        """Add a servo with its shaft at an angle, rad from its raw 0, at rest and limp; return its index."""
+        plant, profiles, law, strain = self.plant, self.profiles, self.law, self.strain
+        commands, count = self._commands, len(self._motors)
+        self._motors.append(motor)
+        self._loads.append(load)
+        self._build(np.append(plant.angle, angle), np.append(plant.velocity, 0.0))
+        self._commands[:, :count] = commands
+        self._commands[ROWS["goal"], count] = angle
+        self.profiles.position[:count], self.profiles.velocity[:count] = profiles.position, profiles.velocity
+        self.law.stall[:count], self.law.integral[:count] = law.stall, law.integral
+        self.strain.temperature[:count] = strain.temperature
+        self.strain.overloaded[:count] = strain.overloaded
+        self._wake()
+        return count
+
+    def motor(self, index: int) -> Motor:
+        """Return a servo's motor."""
+        return self._motors[index]
+
+    def watch(self, index: int, act: Callable[[], None]) -> None:
+        """Let a servo be told when its temperature changes by a degree, or when it is overloaded."""
+        self._watchers[index] = act
+
+    def supply(self, index: int, volts: float) -> None:
+        """Give a servo another voltage: its stall torque and no-load speed go with it."""
+        motor = self._motors[index]
+        self.law.stall[index] = motor.stall_torque * (volts / motor.voltage if motor.voltage else 1.0)
+        self._wake()
+
+    def command(self, index: int, command: Command) -> None:
+        """Command a servo; its trajectory goes on from where it is, that of a limp one from the shaft."""
+        was_limp = self._commands[ROWS["limit"], index] == 0.0
+        was_turning = self._commands[ROWS["turning"], index] != 0.0
+        self._commands[:, index] = command
+        if command.limit == 0.0:
+            self._commands[ROWS["goal"], index] = self.plant.angle[index]
+        if was_limp or command.limit == 0.0 or was_turning != (command.turning != 0.0):
+            self.profiles.position[index] = self.plant.angle[index]
+            self.profiles.velocity[index] = self.plant.velocity[index] if command.turning else 0.0
+            self.law.integral[index] = 0.0
+        self._wake()
+
+    def aim(self, index: int, goal: float, speed: float, acceleration: float) -> None:
+        """Change the goal of a servo and its profile, and nothing else; as in `Command`."""
+        self.profiles.aim(index, goal, speed, acceleration)
+        self._rests = False
+
+    def place(self, index: int, angle: float) -> None:
+        """Put a shaft somewhere, rad, at rest; its trajectory begins there."""
+        self.plant.place(index, angle)
+        self.profiles.position[index], self.profiles.velocity[index] = angle, 0.0
+        if self._commands[ROWS["limit"], index] == 0.0:
+            self._commands[ROWS["goal"], index] = angle
+        self.profiles.arrived = False
+        self._rests = False
+
+    def overloaded(self, index: int) -> bool:
+        """Return whether a servo has been overloaded for too long."""
+        return bool(self.strain.overloaded[index] >= OVERLOAD_TICKS)
+
+    # Time
+
+    def call_at(self, t_ns: int, action: Callable[[], None]) -> None:
+        """Let something happen at the first point of the grid that is not before a time."""
+        heapq.heappush(self._agenda, (t_ns, next(self._order), action))
 
     def advance(self, now_ns: int) -> None:
         """Step up to the last point of the grid before a time."""
-        while self._grid_ns + STEP_NS <= now_ns:
-            self.plant.step(self._drive, self._damping, STEP_NS * 1e-9)
-            self._grid_ns += STEP_NS
+        if self._busy or self.grid_ns + STEP_NS > now_ns:
+            return
+        self._busy = True  # what is called on the way may look at the time, not change it
+        try:
+            while self.grid_ns + STEP_NS <= now_ns:
+                self._go_on(now_ns)
+        finally:
+            self._busy = False
+
+    def _go_on(self, now_ns: int) -> None:
+        """Take one step, or as many as nothing happens in."""
+        while self._agenda and self._agenda[0][0] <= self.grid_ns:
+            heapq.heappop(self._agenda)[2]()
+        if self._rests or not self._motors:
+            until_ns = min(now_ns, self._next_strain_ns)
+            if self._agenda:
+                until_ns = min(until_ns, self._agenda[0][0])
+            self.grid_ns += max(1, (until_ns - self.grid_ns) // STEP_NS) * STEP_NS
+        else:
+            self._step()
+            self.grid_ns += STEP_NS
+        if self.grid_ns >= self._next_strain_ns:
+            self._next_strain_ns += STRAIN_NS
+            self._feel()
+
+    def _step(self) -> None:
+        plant, profiles, law = self.plant, self.profiles, self.law
+        if self._commanded:
+            self._commanded = False
+            profiles.commanded()
+            law.commanded()
+        profiles.step()
+        law.step(profiles, plant.angle, plant.velocity)
+        if (self.grid_ns - self._start_ns) // STEP_NS % _STEPS_A_LOOK:
+            plant.step(law.drive, law.damping, STEP_NS * 1e-9)
+            return
+        before = plant.velocity.copy()
+        plant.step(law.drive, law.damping, STEP_NS * 1e-9)
+        profiles.look()
+        still = profiles.arrived and np.abs(plant.velocity).max() < _STILL
+        if still and np.abs(before - plant.velocity).max() < _UNDRIVEN:
+            plant.velocity.fill(0.0)
+            self._rests = True
+
+    def _feel(self) -> None:
+        if not self._motors:
+            return
+        most = self.law.stall * self._commands[ROWS["limit"]]
+        for index in self.strain.tick(self.law.torque, most):
+            if (act := self._watchers.get(index)) is not None:
+                act()
+
+    def _wake(self) -> None:
+        self._commanded = True
+        self._rests = False
+
+    def _build(self, angle: Floats, velocity: Floats) -> None:
+        count, dt_s = len(self._motors), STEP_NS * 1e-9
+        self.plant: Plant = self._make_plant(
+            [
+                Joint(motor.inertia, load, float(each))
+                for motor, load, each in zip(self._motors, self._loads, angle, strict=True)
+            ]
+        )
+        self.plant.velocity[:] = velocity
+        self._commands = np.tile(np.array([LIMP]).T, (1, count))
+        nominal = np.array([motor.stall_torque for motor in self._motors])
+        self.profiles = Profiles(self._commands, self.plant.angle, dt_s)
+        self.law = ControlLaw(self._commands, np.array([motor.damping for motor in self._motors]), dt_s)
+        self.law.stall[:] = nominal
+        self.strain = Strain(nominal, STRAIN_NS * 1e-9)
+        self._next_strain_ns = self.grid_ns - (self.grid_ns - self._start_ns) % STRAIN_NS + STRAIN_NS

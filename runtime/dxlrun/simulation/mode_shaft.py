@@ -1,27 +1,38 @@
-"""The shaft of servos with an operating mode: Protocol 2.0 but the XL-320.
-
-Modelled: velocity (1), position (3), extended position (4) and, without its limit of the current,
-current-based position (5). In the other modes, current or torque (0) and PWM (16), the registers take what is
-written and the shaft stays where it is.
-"""
+"""The shaft of servos with an operating mode: Protocol 2.0 but the XL-320."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from typing import ClassVar
 
-from dxlrun.simulation.access import OperatingMode, watchdog_expired
-from dxlrun.simulation.shaft import ACCELERATION, Drive, Shaft, in_turn
+from dxlrun.simulation.access import watchdog_expired
+from dxlrun.simulation.command import FREE, LIMP, Command
+from dxlrun.simulation.gains import position_gains, velocity_gains
+from dxlrun.simulation.mechanics import Load, Mechanics
+from dxlrun.simulation.memory import Memory
+from dxlrun.simulation.shaft import Shaft, Trajectory
 
 REVERSE, TIME_BASED = 0x01, 0x04
 """Bits of Drive Mode (10): clockwise is positive; Profile Velocity and Acceleration are durations in ms."""
 
-_PER_MINUTE_SQUARED = 214.577 * math.tau / 3600
-"""Unit of Profile Acceleration (108), rad/s^2 (e-Manual, X series: 214.577 rev/min^2)."""
+CURRENT, VELOCITY, POSITION, EXTENDED, CURRENT_BASED, PWM = 0, 1, 3, 4, 5, 16
+"""Operating Mode (11)"""
+
+_RECTANGULAR, _TRIANGULAR, _TRAPEZOIDAL = 0x10, 0x20, 0x30
+_ARRIVED, _ON_THE_WAY = 0x01, 0x02
+"""Bits of Moving Status (123): the profile's kind, in position, a profile is under way."""
+
+_IN_POSITION_TICKS = 10
+"""So near is "in position"; the manual of the X series names no number [i]."""
 
 
 class ModeShaft(Shaft):
-    """Moves by Goal Position or Goal Velocity, with the profile that stands beside it."""
+    """Moves by the goal of its mode, with the profile that stands beside it.
+
+    Where Profile Velocity is 0 there is no profile (a step), where Profile Acceleration is 0 it is
+    rectangular (e-Manual, X series, Profile Velocity (112)); velocity control uses the acceleration only.
+    """
 
     items: ClassVar[frozenset[str]] = frozenset(
         (
@@ -31,42 +42,83 @@ class ModeShaft(Shaft):
             "homing_offset",
             "goal_position",
             "goal_velocity",
+            "goal_current",
+            "goal_pwm",
             "profile_velocity",
             "profile_acceleration",
             "velocity_limit",
+            "current_limit",
+            "pwm_limit",
             "bus_watchdog",
+            "position_p_gain",
+            "position_i_gain",
+            "position_d_gain",
+            "velocity_p_gain",
+            "velocity_i_gain",
+            "feedforward_1st_gain",
+            "feedforward_2nd_gain",
         )
     )
+    aims: ClassVar[frozenset[str]] = frozenset(("goal_position", "profile_velocity", "profile_acceleration"))
+
+    def __init__(self, memory: Memory, mechanics: Mechanics, load: Load, angle: float) -> None:
+        super().__init__(memory, mechanics, load, angle)
+        self._aimed: tuple[int, int, int] = (0, 0, 0)
+        self._profile_kind = 0
+        items = memory.table.items
+        item = items.get("profile_acceleration")
+        self._acceleration_unit = item.scale if item is not None else 1.0
+        self._pwm_unit = items["goal_pwm"].scale if "goal_pwm" in items else 1 / 885
+        self._current_unit = items["goal_current"].scale if "goal_current" in items else 0.001
 
     def within_a_turn(self, angle: float) -> float:
         """Return the angle within the turn that the encoder knows: 0 to 4095 ticks, or around 0."""
         shown = self._sign * angle
         if self.memory.table.items["min_position_limit"].minimum < 0:
             return self._sign * (shown - math.tau * round(shown / math.tau))
-        return self._sign * in_turn(shown)
+        # less than half a tick below 0 is still 0
+        half = self.memory.table.rad_per_tick / 2
+        return self._sign * (shown - math.tau * math.floor((shown + half) / math.tau))
 
     def position_tick(self, angle: float) -> int:
         """Return what Present Position shows."""
         tick = round(self._sign * angle / self.memory.table.rad_per_tick)
         return tick + self._offset
 
-    def refresh(self) -> None:
-        """Bring everything that can be read of the motion to the time."""
-        memory = self.memory
-        angle, velocity, acceleration = self._motion.at(self.now_ns)
-        position, sign = self.position_tick(angle), self._sign
-        speed = round(sign * velocity / memory.table.rad_s_per_tick)
-        load = max(-1.0, min(1.0, sign * self._load()))
-        moving = velocity != 0.0 or acceleration != 0.0
-        memory.show("present_position", position)
-        memory.show("present_velocity", speed)
-        memory.show("position_trajectory", position)
-        memory.show("velocity_trajectory", speed)
-        memory.show("present_load", round(load * 1000))  # unit 0.1 %
-        memory.show("present_current", round(load * memory.get("current_limit", 1000)))
-        memory.show("present_pwm", round(load * memory.get("pwm_limit", 885)))
-        memory.show("moving", int(moving))
-        memory.show("moving_status", int(not moving))  # bit 0: in position
+    def live(self) -> Mapping[str, Callable[[], int]]:
+        """Return the items that show the motion, each with what it shows now, in ticks."""
+        return {
+            "present_position": lambda: self.position_tick(self.angle),
+            "present_velocity": lambda: self._velocity_tick("present_velocity", self.velocity),
+            "position_trajectory": lambda: self.position_tick(self._trajectory_angle),
+            "velocity_trajectory": lambda: self._velocity_tick("velocity_trajectory", self._trajectory_speed),
+            "present_load": lambda: round(self._sign * self.duty * 1000),  # unit 0.1 %, as the output is
+            "present_current": lambda: round(self._sign * self.current / self._current_unit),
+            "present_pwm": lambda: round(self._sign * self.duty / self._pwm_unit),
+            "moving": lambda: int(self.moving),
+            "moving_status": self._moving_status,
+        }
+
+    def _velocity_tick(self, name: str, velocity: float) -> int:
+        return round(self._sign * velocity / self.memory.table.items[name].scale)
+
+    @property
+    def _trajectory_angle(self) -> float:
+        return float(self.mechanics.profiles.position[self.index]) if self._goes_to_goal else self.angle
+
+    @property
+    def _trajectory_speed(self) -> float:
+        speed = float(self.mechanics.profiles.velocity[self.index])
+        return speed if self._goes_to_goal or (self._last and self._last.turning) else 0.0
+
+    def _moving_status(self) -> int:
+        if not self._goes_to_goal:
+            return _ARRIVED if not self.moving else 0
+        if self._under_way:
+            return self._profile_kind | _ON_THE_WAY
+        goal = float(self.mechanics.profiles.position[self.index])
+        near = abs(goal - self.angle) <= _IN_POSITION_TICKS * self.memory.table.rad_per_tick
+        return self._profile_kind | (_ARRIVED if near else 0)
 
     @property
     def _sign(self) -> int:
@@ -76,46 +128,86 @@ class ModeShaft(Shaft):
     def _offset(self) -> int:
         return self.memory.ticks("homing_offset") if "homing_offset" in self.memory else 0
 
-    def _wanted(self) -> Drive:
+    @property
+    def _controls_position(self) -> bool:
+        return self.memory["operating_mode"] in {POSITION, EXTENDED, CURRENT_BASED}
+
+    @property
+    def _noticed_speed(self) -> float:
+        threshold = self.memory.get("moving_threshold", 1)
+        return max(threshold, 0.5) * self.memory.table.rad_s_per_tick
+
+    def _command(self) -> Command:
+        memory, mode = self.memory, self.memory["operating_mode"]
+        if watchdog_expired(memory):
+            return LIMP
+        duty = self._part("goal_pwm", "pwm_limit")
+        limit = memory.get("pwm_limit", round(1 / self._pwm_unit)) * self._pwm_unit
+        if mode == PWM:
+            return Command(bias=duty, limit=limit)
+        limit = min(limit, abs(duty)) if "goal_pwm" in memory else limit
+        torque = self._goal_torque()
+        if mode == CURRENT:
+            return Command(bias=math.copysign(limit, torque), limit=limit, torque_limit=abs(torque))
+        if mode == VELOCITY:
+            return self._turn(limit)
+        if not self._controls_position:
+            return LIMP  # a value that the model's manual does not name
+        command = position_gains(memory)._replace(limit=limit)
+        return command._replace(torque_limit=abs(torque)) if mode == CURRENT_BASED else command
+
+    def _turn(self, limit: float) -> Command:
         memory = self.memory
-        if not self.torque_on or watchdog_expired(memory):
-            return ()
-        match memory["operating_mode"]:
-            case OperatingMode.VELOCITY:
-                return self._turn()
-            case (
-                OperatingMode.POSITION
-                | OperatingMode.EXTENDED_POSITION
-                | OperatingMode.CURRENT_BASED_POSITION
-            ):
-                return self._move()
-        return ()
+        speed = self._sign * memory.ticks("goal_velocity") * memory.table.rad_s_per_tick
+        ramp = self._profile("profile_acceleration") * self._acceleration_unit or FREE
+        return velocity_gains(memory)._replace(turning=1.0, speed=speed, acceleration=ramp, limit=limit)
 
-    def _turn(self) -> Drive:
-        table = self.memory.table
-        speed = self._sign * self.memory.ticks("goal_velocity") * table.rad_s_per_tick
-        highest = table.max_speed
-        ramp = self._profile("profile_acceleration")
-        return max(-highest, min(highest, speed)), ramp * _PER_MINUTE_SQUARED if ramp else ACCELERATION
+    def _part(self, name: str, otherwise: str) -> float:
+        memory = self.memory
+        ticks = memory.ticks(name) if name in memory else memory.get(otherwise)
+        return self._sign * ticks * self._pwm_unit
 
-    def _move(self) -> Drive:
+    def _goal_torque(self) -> float:
+        memory = self.memory
+        if "goal_current" not in memory:
+            return FREE
+        ampere = self._sign * memory.ticks("goal_current") * self._current_unit
+        return ampere * self.motor.torque_per_ampere
+
+    def _new_trajectory(self, *, afresh: bool = False) -> Trajectory | None:
         memory, table = self.memory, self.memory.table
+        velocity, ramp = self._profile("profile_velocity"), self._profile("profile_acceleration")
+        aimed = (memory["goal_position"], velocity, ramp)
+        if aimed == self._aimed and not afresh:
+            return None
+        self._aimed = aimed
         goal = self._sign * (memory.ticks("goal_position") - self._offset) * table.rad_per_tick
-        profile, ramp = self._profile("profile_velocity"), self._profile("profile_acceleration")
+        if not velocity:
+            self._profile_kind = 0
+            return goal, FREE, FREE
+        distance = abs(goal - float(self.mechanics.profiles.position[self.index]))
         if memory.get("drive_mode") & TIME_BASED:
-            return self._timed(goal, profile * 1e-3, ramp * 1e-3)
-        speed = profile * table.rad_s_per_tick or table.max_speed
-        acceleration = ramp * _PER_MINUTE_SQUARED or ACCELERATION
-        return goal, min(speed, table.max_speed), acceleration
+            return self._timed(goal, distance, velocity * 1e-3, ramp * 1e-3)
+        speed = velocity * table.rad_s_per_tick
+        acceleration = ramp * self._acceleration_unit or FREE
+        self._profile_kind = _kind(ramp, distance, speed, acceleration)
+        return goal, speed, acceleration
 
-    def _timed(self, goal: float, duration: float, ramp: float) -> Drive:
-        """Return the move that takes a duration, s, and a time to come to speed, s; 0: the least."""
-        distance, highest = abs(goal - self.angle), self.memory.table.max_speed
-        if duration <= 0.0 or distance == 0.0:
-            return goal, highest, ACCELERATION
+    def _timed(self, goal: float, distance: float, duration: float, ramp: float) -> Trajectory:
+        """Return the move that takes a duration, s, and a time to come to speed, s, at most half of it."""
+        if distance == 0.0:
+            return goal, FREE, FREE
         ramp = min(ramp, duration / 2)
         speed = distance / (duration - ramp)
-        return goal, min(speed, highest), min(speed / ramp, ACCELERATION) if ramp else ACCELERATION
+        acceleration = speed / ramp if ramp else FREE
+        self._profile_kind = _kind(ramp, distance, speed, acceleration)
+        return goal, speed, acceleration
 
     def _profile(self, name: str) -> int:
         return abs(self.memory.ticks(name)) if name in self.memory else 0
+
+
+def _kind(ramp: float, distance: float, speed: float, acceleration: float) -> int:
+    if not ramp:
+        return _RECTANGULAR
+    return _TRAPEZOIDAL if distance * acceleration > speed * speed else _TRIANGULAR

@@ -81,28 +81,34 @@ class IndependentJoints:
         self._down = np.array([each.load.gravity_angle for each in joints])
         self._has_friction = bool(self._friction.any())
         self._has_gravity = bool(self._gravity.any())
-        self._torque = np.zeros(len(joints))
-        self._work = np.zeros(len(joints))
+        self._torque, self._work, self._less = (np.zeros(len(joints)) for _ in range(3))
+        self._one, self._dt = np.ones(len(joints)), np.zeros(len(joints))
+        self._per_torque, self._most = np.zeros(len(joints)), np.zeros(len(joints))
+        self._dt_s = 0.0
 
     def step(self, drive: Floats, damping: Floats, dt_s: float) -> None:
         """Let a time pass in which each servo drives with `drive - damping * velocity`; Nm and Nm s/rad."""
         torque, work, velocity = self._torque, self._work, self.velocity
+        if dt_s != self._dt_s:
+            self._set_step(dt_s)
         if self._has_gravity:
             np.subtract(self.angle, self._down, out=work)
             np.sin(work, out=work)
             np.multiply(work, self._gravity, out=work)
             np.subtract(drive, work, out=torque)
+            np.multiply(torque, self._per_torque, out=torque)
         else:
-            np.copyto(torque, drive)
-        np.multiply(self._inverse_inertia, dt_s, out=work)
-        np.multiply(torque, work, out=torque)
+            np.multiply(drive, self._per_torque, out=torque)
         np.add(velocity, torque, out=velocity)  # as it would be without friction and damping
         if self._has_friction:
-            self._rub(work)
-        np.multiply(work, damping, out=work)
-        np.add(work, 1.0, out=work)
+            # what friction takes in a step, and no more: a joint that it stops stays at rest
+            np.minimum(velocity, self._most, out=work)
+            np.maximum(work, self._less, out=work)
+            np.subtract(velocity, work, out=velocity)
+        np.multiply(self._per_torque, damping, out=work)
+        np.add(work, self._one, out=work)
         np.divide(velocity, work, out=velocity)
-        np.multiply(velocity, dt_s, out=work)
+        np.multiply(velocity, self._dt, out=work)
         np.add(self.angle, work, out=self.angle)
 
     def place(self, index: int, angle: float) -> None:
@@ -110,9 +116,9 @@ class IndependentJoints:
         self.angle[index] = angle
         self.velocity[index] = 0.0
 
-    def _rub(self, per_torque: Floats) -> None:
-        """Take away what friction takes in a step, and no more: a joint that it stops stays at rest."""
-        most = self._torque
-        np.multiply(self._friction, per_torque, out=most)
-        taken = np.clip(self.velocity, -most, most)
-        np.subtract(self.velocity, taken, out=self.velocity)
+    def _set_step(self, dt_s: float) -> None:
+        self._dt_s = dt_s
+        self._dt.fill(dt_s)
+        np.multiply(self._inverse_inertia, dt_s, out=self._per_torque)
+        np.multiply(self._friction, self._per_torque, out=self._most)
+        np.negative(self._most, out=self._less)

@@ -53,7 +53,12 @@ class SimulatedServo:
         self._note = note or (lambda text: None)
         table = _table(config, protocol)
         self._body, self._instructions = make_body(
-            table, config.position, start_ns, self._note, config.firmware
+            table,
+            mechanics or Mechanics(start_ns),
+            config.load,
+            config.position,
+            self._note,
+            firmware=config.firmware,
         )
         self._silent = False
         self.registers["id"] = config.servo_id

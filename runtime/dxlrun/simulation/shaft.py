@@ -1,20 +1,19 @@
-"""The shaft of a simulated servo: what the registers command, how it moves, what the registers show of it."""
+"""The shaft of a simulated servo: what the registers command, and what they show of how it moves."""
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import ClassVar
 
-from dxlrun.simulation import motion
+from dxlrun.simulation.command import LIMP, Command
+from dxlrun.simulation.mechanics import Load, Mechanics
 from dxlrun.simulation.memory import Memory
+from dxlrun.simulation.motor import TIME_CONSTANT_S, motor_of
 
-ACCELERATION = 100.0
-"""rad/s^2. The manual names none: 1.5 Nm of stall torque on 0.015 kg m^2 of gear and a light link [i]."""
-
-Drive = tuple[float, ...]
-"""What is commanded: nothing (limp), or a speed, or a goal with a speed and an acceleration; SI units."""
+Trajectory = tuple[float, float, float]
+"""Goal, rad of the shaft, and the profile's speed, rad/s, and acceleration, rad/s^2."""
 
 
 class Shaft(ABC):
@@ -22,28 +21,44 @@ class Shaft(ABC):
 
     items: ClassVar[frozenset[str]]
     """Items whose writing may change the motion."""
+    aims: ClassVar[frozenset[str]]
+    """Those of them that change only the trajectory while a position is controlled."""
 
-    def __init__(self, memory: Memory, start_ns: int, angle: float) -> None:
+    def __init__(self, memory: Memory, mechanics: Mechanics, load: Load, angle: float) -> None:
         self.memory = memory
-        self.now_ns = start_ns
-        self._motion = motion.rest(start_ns, angle)
-        self._drive: Drive = ()
+        self.mechanics = mechanics
+        self.motor = motor_of(memory.table)
+        self.index = mechanics.add(self.motor, load, angle)
+        self.now_ns = mechanics.grid_ns
+        self._last: Command | None = None
+        self._goes_to_goal = False
 
     @property
     def angle(self) -> float:
         """Angle, rad from raw 0, of the shaft itself: turns count, Homing Offset and reversal do not."""
-        return self._motion.at(self.now_ns)[0]
+        plant, ahead_ns = self.mechanics.plant, self.now_ns - self.mechanics.grid_ns
+        angle = float(plant.angle[self.index])
+        return angle + float(plant.velocity[self.index]) * ahead_ns * 1e-9 if ahead_ns > 0 else angle
 
     @property
     def velocity(self) -> float:
         """Speed, rad/s, counter-clockwise positive."""
-        return self._motion.at(self.now_ns)[1]
+        return float(self.mechanics.plant.velocity[self.index])
+
+    @property
+    def current(self) -> float:
+        """Current of the motor, A, positive when it drives counter-clockwise."""
+        return float(self.mechanics.law.torque[self.index]) / self.motor.torque_per_ampere
+
+    @property
+    def duty(self) -> float:
+        """Part of the supply's voltage that the motor gets, -1 to 1."""
+        return float(self.mechanics.law.duty[self.index])
 
     @property
     def moving(self) -> bool:
-        """True until it rests."""
-        _, velocity, acceleration = self._motion.at(self.now_ns)
-        return velocity != 0.0 or acceleration != 0.0
+        """True while its trajectory moves, or it is faster than it can tell from rest."""
+        return self._under_way or abs(self.velocity) > self._noticed_speed
 
     @property
     def torque_on(self) -> bool:
@@ -52,32 +67,32 @@ class Shaft(ABC):
 
     def rest_at(self, angle: float) -> None:
         """Put the shaft somewhere, at rest; what is commanded counts from the next `plan`."""
-        self._motion = motion.rest(self.now_ns, angle)
-        self._drive = ()
+        self.mechanics.place(self.index, angle)
+        self._last = None
+        self._goes_to_goal = False
 
     def advance(self, now_ns: int) -> None:
         """Let time pass; going back is ignored."""
-        self.now_ns = max(self.now_ns, now_ns)
+        if now_ns > self.now_ns:
+            self.now_ns = now_ns
+            self.mechanics.advance(now_ns)
 
     def plan(self, written: Iterable[str]) -> None:
-        """Start another motion when what was written asks for one."""
+        """Command what was written, if it asks for something else."""
         if self.items.isdisjoint(written):
             return
-        drive = self._wanted()
-        if drive == self._drive:
+        if self._goes_to_goal and self.aims.issuperset(written):
+            if (trajectory := self._new_trajectory()) is not None:
+                self.mechanics.aim(self.index, *trajectory)
             return
-        self._drive = drive
-        angle, velocity, _ = self._motion.at(self.now_ns)
-        if not drive:
-            self._motion = motion.rest(self.now_ns, angle)
-        elif len(drive) == 2:
-            self._motion = motion.turn(self.now_ns, angle, velocity, *drive)
-        else:
-            goal, speed, acceleration = drive
-            start = self._start_of_move(angle)
-            self._motion = motion.move_to(
-                self.now_ns, start, velocity, goal, speed=speed, acceleration=acceleration
-            )
+        command = self._command() if self.torque_on else LIMP
+        self._goes_to_goal = command.limit > 0.0 and self._controls_position
+        if self._goes_to_goal and (trajectory := self._new_trajectory(afresh=True)) is not None:
+            goal, speed, acceleration = trajectory
+            command = command._replace(goal=goal, speed=speed, acceleration=acceleration)
+        if command != self._last:
+            self._last = command
+            self.mechanics.command(self.index, command)
 
     def power_up(self) -> None:
         """Come to rest within one turn, and take the angle as the goal [i]."""
@@ -93,24 +108,38 @@ class Shaft(ABC):
         """Return what Present Position shows."""
 
     @abstractmethod
-    def refresh(self) -> None:
-        """Bring the registers of the shaft to the time."""
+    def live(self) -> Mapping[str, Callable[[], int]]:
+        """Return the items that show the motion, each with what it shows now, in ticks."""
 
     @abstractmethod
-    def _wanted(self) -> Drive: ...
+    def _command(self) -> Command:
+        """Return what the registers command while torque is on, the trajectory to a goal left out."""
 
-    def _start_of_move(self, angle: float) -> float:
-        return angle
+    @property
+    @abstractmethod
+    def _controls_position(self) -> bool: ...
 
-    def _load(self) -> float:
-        """Return the load as a part of the maximum, with the speed's sign.
+    @property
+    @abstractmethod
+    def _noticed_speed(self) -> float: ...
 
-        No mechanics stand behind it: some for the speed, some for the change of it [i].
-        """
-        _, velocity, acceleration = self._motion.at(self.now_ns)
-        return 0.1 * velocity / self.memory.table.max_speed + 0.4 * acceleration / ACCELERATION
+    @abstractmethod
+    def _new_trajectory(self, *, afresh: bool = False) -> Trajectory | None:
+        """Return the trajectory that the registers command; None: it is the one that goes on already."""
+
+    @property
+    def _under_way(self) -> bool:
+        return self._goes_to_goal and not self.mechanics.profiles.at_goal(self.index)
 
 
 def in_turn(angle: float) -> float:
     """Return the same direction between 0 and a whole turn."""
     return angle if 0 <= angle < math.tau else angle % math.tau
+
+
+def critical_d(p: float, max_speed: float) -> float:
+    """Return the D gain, duty per rad/s, with which a P gain, duty per rad, does not overshoot.
+
+    With the motor's time constant T and its no-load speed w the loop is T x'' + (1 + D w) x' + P w x = 0.
+    """
+    return max(0.0, 2 * math.sqrt(p * max_speed * TIME_CONSTANT_S) - 1.0) / max_speed

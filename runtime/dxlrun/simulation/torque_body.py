@@ -73,30 +73,36 @@ class TorqueBody(Body):
         """True for the Y series, which keeps its turns without power, too."""
         self._backup: dict[str, int] = {}
         self._shut_down = False
-        self._started_ns = shaft.now_ns
         self._heard_ns = shaft.now_ns
-
-    def advance(self, now_ns: int) -> None:
-        """Let time pass, and stop where the Bus Watchdog's time runs out."""
-        units = self.memory.get("bus_watchdog")
-        if units and self.memory.get("torque_enable") and not watchdog_expired(self.memory):
-            end_ns = self._heard_ns + units * WATCHDOG_UNIT_NS
-            if now_ns > end_ns:
-                self.shaft.advance(end_ns)
-                self.note(f"servo {self.servo_id}: bus watchdog after {units * 20} ms")
-                self.poke("bus_watchdog", -1)
-        super().advance(now_ns)
+        self._watched = False
 
     def hear(self, now_ns: int) -> None:
         """Take note of an instruction: the Bus Watchdog's time begins again."""
         self.advance(now_ns)
         self._heard_ns = self.shaft.now_ns
+        self._watch()
 
-    def refresh(self) -> None:
-        """Bring all that can be read to the time."""
-        super().refresh()
-        elapsed_ms = (self.shaft.now_ns - self._started_ns) // 1_000_000
-        self.memory.show("realtime_tick", elapsed_ms % 32768)
+    def _watch(self) -> None:
+        """See to it that the Bus Watchdog is looked after when its time runs out."""
+        if not self._watched and (units := self._watchdog_units()):
+            self._watched = True
+            self.shaft.mechanics.call_at(self._heard_ns + units * WATCHDOG_UNIT_NS, self._stop_unheard)
+
+    def _watchdog_units(self) -> int:
+        """Return for how long the Bus Watchdog waits, in its unit; 0 while it does not."""
+        memory = self.memory
+        units = memory.get("bus_watchdog")
+        return units if units and memory.get("torque_enable") and not watchdog_expired(memory) else 0
+
+    def _stop_unheard(self) -> None:
+        """Stop where the Bus Watchdog's time has run out; else look again when it does."""
+        self._watched = False
+        units = self._watchdog_units()
+        if not units or self.shaft.mechanics.grid_ns < self._heard_ns + units * WATCHDOG_UNIT_NS:
+            self._watch()
+            return
+        self.note(f"servo {self.servo_id}: bus watchdog after {units * 20} ms")
+        self.poke("bus_watchdog", -1)
 
     def refusal(self, address: int, data: bytes) -> int:
         """Return the error number of a write, 0 when it is allowed.
@@ -270,6 +276,7 @@ class TorqueBody(Body):
             memory["torque_enable"] = 1
         if self.has_error_code:
             self._show_controller_state()
+        self._watch()
 
     @property
     def hears_protocol(self) -> bool:
