@@ -45,8 +45,8 @@ class Simulation:
         os.close(reader)
         with open(writer, "wb") as config:
             config.write(encode_config(buses))
-        with self._control.makefile("rb") as said:
-            first = said.readline()
+        self._said = self._control.makefile("rb")
+        first = self._said.readline()
         self.ports: dict[str, str] = json.loads(first)["ports"] if first else {}
         """The device file of each bus; none when the process ended at once."""
 
@@ -58,9 +58,16 @@ class Simulation:
         """Say that a test asks again before an answer came, and may talk into it on a busy machine."""
         self._hasty.add(bus)
 
+    def fault(self, line: str) -> None:
+        """Break something on the running simulation; return when it took the order."""
+        self._control.sendall(json.dumps({"fault": line}).encode() + b"\n")
+        while "fault" not in (said := json.loads(self._said.readline())):
+            assert "error" not in said, said
+
     def end(self) -> tuple[LedgerEntry, ...]:
         """Hang up; return what the ledger holds."""
         try:
+            self._said.close()
             self._control.close()
             assert self._child.wait(PATIENCE_S) == 0
         finally:
