@@ -1,4 +1,9 @@
-"""What each kind of fault does to a bus when its moment has come."""
+"""What each kind of fault does to a bus when its moment has come.
+
+Simpler than the world: noise and a babbling servo reach the host and spoil what it says meanwhile, but no
+servo takes their bytes for an instruction; a supply changes from one moment to the next; a servo without
+power is limp at once; a second servo with an ID stands where the first one stands, and carries no load [i].
+"""
 
 from __future__ import annotations
 
