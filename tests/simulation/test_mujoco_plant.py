@@ -117,6 +117,13 @@ def test_friction_holds_what_it_can_hold() -> None:
     assert slipping.angle[0] < -0.05
 
 
+def test_damping_and_friction_of_the_urdf_are_added() -> None:
+    rubbed = FLAT.replace("</joint>", '<dynamics damping="0.3" friction="0.2"/></joint>')
+    bodies = _plant(rubbed, UrdfJoint("shoulder", 0.0, 1), load=Load(friction=0.1))
+    _run(bodies, 3.0, drive=0.5, damping=0.1)
+    assert bodies.velocity[0] == pytest.approx((0.5 - 0.2 - 0.1) / (0.3 + 0.1), rel=0.01)
+
+
 def test_the_shoulder_feels_what_the_elbow_does() -> None:
     joints = (UrdfJoint("shoulder", 0.0, 1), UrdfJoint("elbow", 0.0, 1))
     # both links stretched out: the lower weight hangs on two levers
@@ -149,6 +156,17 @@ def test_what_the_urdf_does_not_turn_moves_by_itself_and_what_nobody_turns_stand
     alone = IndependentJoints([Joint(ROTOR, NO_LOAD, 1.5)])
     _run(alone, 1.0, drive=0.02, damping=0.5)
     assert plant.angle[2] == alone.angle[0] > 1.5
+
+
+def test_a_joint_with_a_servo_of_its_own_mimics_nobody() -> None:
+    mimic = TWO.replace('name="elbow"', 'name="wrist"').replace(
+        "</joint></robot>", '<mimic joint="shoulder" multiplier="1"/></joint></robot>'
+    )
+    plant = _plant(
+        mimic, UrdfJoint("shoulder", 0.0, 1), UrdfJoint("wrist", 0.0, 1), angles=[0.0, math.pi / 2]
+    )
+    _run(plant, 1.0, drive=[2 * PULL, 0.0], damping=0.5)
+    assert plant.angle == pytest.approx([0.0, math.pi / 2], abs=1e-6)
 
 
 def test_a_servo_that_is_added_later_moves_by_itself() -> None:

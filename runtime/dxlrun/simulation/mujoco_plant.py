@@ -139,17 +139,15 @@ class MujocoPlant:
 
 
 def _make_movable(root: Element, turned: Set[str]) -> None:
-    """Leave of a URDF what servos move: joints that none of them turns are fixed, files are not asked for."""
+    """Leave of a URDF what servos move: joints that none of them turns are fixed, meshes are not there."""
     for joint in root.findall("joint"):
         if joint.get("name") not in turned:
             joint.set("type", "fixed")
         for mimic in joint.findall("mimic"):
             joint.remove(mimic)
-    for material in root.findall("material"):
-        root.remove(material)
     for link in root.findall("link"):
         for shape in (*link.findall("visual"), *link.findall("collision")):
-            if shape.tag == "visual" or shape.find("geometry/mesh") is not None:
+            if shape.find("geometry/mesh") is not None:
                 link.remove(shape)
 
 

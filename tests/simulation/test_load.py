@@ -1,0 +1,113 @@
+"""What a servo moves, felt through its registers: each joint by itself, and as a body of a URDF in MuJoCo."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, Literal
+
+import pytest
+import serial
+
+from dxlrun.simulation import BusConfig, Load, Mechanics, ServoConfig, SimulatedBus, VirtualPorts
+from dxlrun.simulation.configuration import SimulationConfig
+from dxlrun.simulation.mujoco_plant import UrdfBodies, UrdfJoint, mujoco_plant
+
+TICK = math.tau / 4096
+MASS, ARM = 0.5, 0.2
+PULL = MASS * 9.81 * ARM
+"""Nm of the arm where it sticks out"""
+STALL = 4.1
+"""Nm of an XM430-W350 at 12 V (e-Manual, Specifications)"""
+START = 2048
+"""Ticks; there the arm is horizontal."""
+
+Physics = Literal["independent", "mujoco"]
+Hang = Callable[[Physics], Any]
+
+URDF = f"""<robot name="arm"><link name="base"/>
+<link name="arm"><inertial><origin xyz="{ARM} 0 0"/><mass value="{MASS}"/>
+<inertia ixx="1e-9" iyy="1e-9" izz="1e-9" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="shoulder" type="continuous"><parent link="base"/><child link="arm"/><axis xyz="0 1 0"/></joint>
+</robot>"""
+"""About +y: the arm sinks as its angle grows; the servo, which stands the other way round, turns back."""
+
+
+@pytest.fixture
+def hang(make_line2: Callable[..., Any]) -> Hang:
+    """Return a bus with one XM430-W350 that holds an arm, limp and horizontal at the start."""
+
+    def hang(physics: Physics) -> Any:
+        if physics == "mujoco":
+            bodies = UrdfBodies(URDF, (UrdfJoint("shoulder", START * TICK, -1),))
+            mechanics, load = Mechanics(0, mujoco_plant(bodies)), Load()
+        else:
+            mechanics = Mechanics(0)
+            load = Load(inertia=MASS * ARM**2, gravity=PULL, gravity_angle=START * TICK - math.pi / 2)
+        line = make_line2((1,))
+        servo = ServoConfig(1, "XM430-W350", START * TICK, load=load)
+        line.bus = SimulatedBus(BusConfig("main", 1_000_000, (servo,), 2.0), line.ledger, 0, mechanics)
+        line.ports = VirtualPorts(line.clock, (line.bus,))
+        return line
+
+    return hang
+
+
+both = pytest.mark.parametrize("physics", ["independent", "mujoco"])
+
+
+@both
+@pytest.mark.parametrize("gain", [400, 800, 1600])
+def test_an_arm_sags_by_the_torque_that_the_p_gain_gives(hang: Hang, physics: Physics, gain: int) -> None:
+    line = hang(physics)
+    line.set("position_p_gain", gain)
+    line.set("torque_enable", 1)
+    line.set("goal_position", START)
+    line.wait(3)
+    # gain / 128 is the PWM of a tick, 885 the whole of it (e-Manual, Position PID Gain and Goal PWM)
+    sag = START - line.get("present_position")
+    assert sag * gain / 128 / 885 * STALL == pytest.approx(PULL * math.cos(sag * TICK), rel=0.03, abs=0.02)
+
+
+@both
+def test_a_limp_arm_falls_and_swings(hang: Hang, physics: Physics) -> None:
+    line = hang(physics)
+    line.set("torque_enable", 0)
+    lowest = 0
+    for _ in range(100):
+        line.wait(0.03)
+        lowest = min(lowest, line.get("present_position") - START)
+    assert lowest < -900, "a quarter of a turn is 1024"
+    line.wait(20)
+    assert line.get("present_position") - START == pytest.approx(-1024, abs=3)
+
+
+def test_both_ways_of_moving_show_the_host_the_same(hang: Hang) -> None:
+    lines = [hang("independent"), hang("mujoco")]
+    for line in lines:
+        line.set("torque_enable", 1)
+        line.set("profile_velocity", 60)
+        line.set("goal_position", START + 600)
+    for _ in range(40):
+        alone, together = (line.get("present_position") for line in lines)
+        assert together == pytest.approx(alone, abs=3)
+        for line in lines:
+            line.wait(0.05)
+    assert alone > START + 500
+
+
+def test_the_process_of_simulated_buses_moves_bodies(
+    start_buses: Callable[..., Any], make_packet2: Callable[..., bytes]
+) -> None:
+    bodies = UrdfBodies(URDF, (UrdfJoint("shoulder", START * TICK, -1),))
+    bus = BusConfig("main", 1_000_000, (ServoConfig(1, "XM430-W350", START * TICK),), 2.0)
+    running = start_buses(SimulationConfig((bus,), bodies=bodies))
+    read = make_packet2(1, 0x02, bytes.fromhex("8400 0400"))  # present position
+    with serial.Serial(running.ports["main"], 1_000_000, timeout=20) as port:
+        for _ in range(20_000):  # limp, it falls within a second, however busy the machine
+            port.write(read)
+            position = int.from_bytes(port.read(15)[9:13], "little", signed=True)
+            if position < START - 500:
+                break
+    assert position < START - 500
+    assert running.hang_up() == 0
