@@ -12,7 +12,7 @@ _INDIRECT = re.compile(r"indirect_address_(\d+)")
 _CELLS_KEPT = 1024
 """So many places of a table are looked up only once: a host writes few of them, rubbish goes everywhere."""
 
-_IDENTITY = frozenset(("id", "secondary_id", "baud_rate", "baud_rate_bus"))
+_IDENTITY = frozenset(("id", "secondary_id", "secondary_shadow_id", "baud_rate", "baud_rate_bus"))
 
 Run = tuple[int, bytes]
 """Address and bytes that belong there."""
