@@ -254,6 +254,18 @@ def test_a_lower_limit_takes_the_goal_with_it(line2: Any) -> None:
     assert line2.get("goal_pwm") == 400
 
 
+def test_switching_the_torque_on_brings_a_position_into_one_turn(line2: Any) -> None:
+    line2.servo().turn_by_hand(2 * 6.283185307 + 1.0)
+    assert line2.get("present_position") > 2 * 4096
+    line2.set("torque_enable", 1)
+    assert line2.get("present_position") < 4096
+    line2.set("torque_enable", 0)
+    line2.set("operating_mode", 4)
+    line2.servo().turn_by_hand(2 * 6.283185307 + 1.0)
+    line2.set("torque_enable", 1)
+    assert line2.get("present_position") > 2 * 4096 - 100  # many turns are what this mode is for
+
+
 # The Y series
 
 

@@ -134,6 +134,8 @@ def test_goals_of_multi_turn_mode_count_turns(make_line: Any) -> None:
     errors = [line.write(1, 30, *low_high(goal)) for goal in goals]
     assert errors == [0, ErrorBit.RANGE, 0, ErrorBit.RANGE]
     assert line.read(1, 30, 2) == goals[2]
+    line.servo().turn_by_hand(-3.0)
+    assert line.read(1, 36, 2) == pytest.approx((1 << 16) - 3.0 / math.tau * 4096, abs=2)
 
 
 def test_goal_torque_cannot_be_bigger_than_torque_limit(make_line: Any) -> None:

@@ -15,6 +15,9 @@ from dxlrun.simulation.strain import SUPPLY_OHM
 BOOT_NS = 100_000_000
 """How long a servo hears nothing after a reboot; no manual names it [i]."""
 
+_READS_KEPT = 1024
+"""So many reads are looked up only once: a host reads few places, rubbish goes everywhere."""
+
 _SECONDARY_IDS = ("secondary_shadow_id", "secondary_id")
 
 
@@ -109,10 +112,14 @@ class Body(ABC):
     def read(self, address: int, length: int) -> bytes | None:
         """Return bytes of the table, None where it has none."""
         memory, live = self.memory, self._live
+        if address + length > memory.table.size:
+            return None
         for run_address, run in memory.runs(address, bytes(length)):
             cells = run_address, len(run)
             names = self._live_in.get(cells)
             if names is None:
+                if len(self._live_in) >= _READS_KEPT:
+                    self._live_in.clear()
                 names = self._live_in[cells] = tuple(name for name in live if _overlaps(memory, name, *cells))
             for name in names:
                 memory.show(name, live[name]())

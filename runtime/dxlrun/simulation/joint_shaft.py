@@ -91,7 +91,7 @@ class JointShaft(Shaft):
     def live(self) -> Mapping[str, Callable[[], int]]:
         """Return the items that show the motion, each with what it shows now, in ticks."""
         return {
-            "present_position": lambda: self.position_tick(self.angle),
+            "present_position": lambda: self.position_tick(self.angle) & 0xFFFF,  # turns below 0: as goals
             "present_speed": self._present_speed,
             "present_load": self._present_load,
             "moving": lambda: int(self.moving),

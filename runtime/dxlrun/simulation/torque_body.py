@@ -6,6 +6,7 @@ the time that switching its torque takes, its brake, and Controller State but fo
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from enum import IntFlag, unique
 
@@ -267,6 +268,8 @@ class TorqueBody(Body):
             self._change_mode()
         elif not _LIMITS.isdisjoint(names):
             self._reset_goals()
+        if "torque_enable" in names and memory["torque_enable"]:
+            self._find_turn()
         if "protocol_type" in names and memory["protocol_type"] not in _SPEAKS:
             self.note(
                 f"servo {self.servo_id} hears Protocol 2.0 no more: protocol type {memory['protocol_type']}"
@@ -290,11 +293,22 @@ class TorqueBody(Body):
         """
         memory = self.memory
         memory.reset((*_GAINS, *_PROFILE))
-        if memory["operating_mode"] == OperatingMode.POSITION and not self.has_error_code:
-            self.shaft.rest_at(self.shaft.within_a_turn(self.shaft.angle))
+        self._find_turn()
         memory["goal_position"] = self.shaft.position_tick(self.shaft.angle)
         memory.show("goal_velocity", 0)
         self._reset_goals()
+
+    def _find_turn(self) -> None:
+        """Bring Present Position into the turn that position control knows.
+
+        e-Manual, X series, Torque Enable (64): it is reset when mode or torque change.
+        """
+        shaft = self.shaft
+        if self.memory.get("operating_mode") != OperatingMode.POSITION or self.has_error_code:
+            return
+        inside = shaft.within_a_turn(shaft.angle)
+        if abs(inside - shaft.angle) > math.pi:
+            shaft.rest_at(inside)
 
     def _reset_goals(self) -> None:
         """Set Goal PWM and Goal Current to their limits; to 0 in the mode that obeys them [i]."""
