@@ -42,6 +42,9 @@ class OperatingMode(IntEnum):
     PWM = 16
 
 
+_POSITION = int(OperatingMode.POSITION)
+
+
 class LockRules:
     """Protocol 1.0: Lock (47) closes the EEPROM until the power is cut."""
 
@@ -92,6 +95,11 @@ class TorqueRules:
     def __init__(self, memory: Memory) -> None:
         self._memory = memory
         self._choices = choices(memory.table)
+        goal = memory.table.items.get("goal_position")
+        self._has_one_turn = (
+            goal is not None
+            and (goal.maximum - goal.minimum + 1) * memory.table.rad_per_tick < 0.99 * math.tau
+        )
 
     def refusal(self, address: int, data: bytes) -> int:
         """Return the error number with which a write would be refused; 0 when it would not.
@@ -128,7 +136,7 @@ class TorqueRules:
             return wire in listed
         if item.name == "moving_speed" and not wheel_mode(memory):
             return wire <= memory.table.max_speed_tick  # e-Manual, XL-320: the direction is for wheel mode
-        if item.name != "goal_position" or self._one_turn(item):
+        if item.name != "goal_position" or self._one_turn():
             return in_range(item, wire) or self._within_wide_limits(item, wire)
         highest = round(_TURNS * math.tau / memory.table.rad_per_tick) - 1
         return abs(item.decode(wire.to_bytes(item.size, "little"))) <= max(highest, item.maximum)
@@ -138,24 +146,20 @@ class TorqueRules:
         limit = self._memory.table.items.get("max_position_limit")
         return item.name == "goal_position" and limit is not None and in_range(limit, wire)
 
-    def _one_turn(self, goal: ControlItem) -> bool:
+    def _one_turn(self) -> bool:
         """Return whether the goal stays within a turn: by the operating mode, or as a gripper has no more."""
-        memory = self._memory
-        reach = (goal.maximum - goal.minimum + 1) * memory.table.rad_per_tick
-        return (
-            memory.get("operating_mode", OperatingMode.POSITION) == OperatingMode.POSITION
-            or reach < 0.99 * math.tau
-        )
+        return self._has_one_turn or self._memory.get("operating_mode", _POSITION) == _POSITION
 
     def _beyond_limit(self, item: ControlItem, wire: int) -> bool:
         memory = self._memory
-        value = item.decode(wire.to_bytes(item.size, "little"))
         limit = _LIMITS_OF_GOALS.get(item.name)
-        if limit is not None and limit in memory:
-            return abs(value) > memory[limit]
-        if item.name != "goal_position":
+        limited = limit is not None and limit in memory
+        if not limited and item.name != "goal_position":
             return False
-        if "max_position_limit" in memory and self._one_turn(item):
+        value = item.decode(wire.to_bytes(item.size, "little"))
+        if limit is not None and limited:
+            return abs(value) > memory[limit]
+        if "max_position_limit" in memory and self._one_turn():
             lowest, highest = memory.ticks("min_position_limit"), memory.ticks("max_position_limit")
             return not lowest <= value <= highest
         return not wheel_mode(memory) and _beyond_angle_limits(memory, item.name, wire)

@@ -68,10 +68,16 @@ class Adapter:
 
     def accept(self, chunk: Chunk) -> bool:
         """Take what has passed the wire; False: there is no room for it."""
-        if sum(len(each.data) for each in self.arrived) + len(chunk.data) > UNREAD_LIMIT:
+        if self.arrived and sum(len(each.data) for each in self.arrived) + len(chunk.data) > UNREAD_LIMIT:
             return False
         self.arrived.append(chunk)
         return True
+
+    def give_all(self) -> Sequence[Chunk]:
+        """Return all that has passed the wire, as an adapter without timer and pieces gives it."""
+        given = tuple(self.arrived)
+        self.arrived.clear()
+        return given
 
     def forget(self) -> None:
         """Lose everything that the host has not got."""
@@ -80,27 +86,25 @@ class Adapter:
 
     def next_ns(self, passing: Sequence[Chunk]) -> int | None:
         """Return when the next bytes are handed over, were nothing to disturb them; None: never."""
+        if self.immediate:
+            first = self.arrived or passing
+            return first[0].due_ns if first else None
         if self._burst:
             return self._burst[0].planned_ns
         queue = (*self.arrived, *passing)
         if not queue:
             return None
-        if self.immediate:
-            return queue[0].due_ns
         if self.config.latency_timer_ns:
             return self._timer_ns(queue)
         return queue[0].passed_ns(min(len(queue[0].data), queue[0].given + self._piece) - 1)
 
     def hand_over(self, now_ns: int, passing: Sequence[Chunk]) -> HandOver | None:
-        """Return what the host gets next, None when that is after `now_ns`."""
+        """Return what the host gets next by timer and pieces, None when that is after `now_ns`."""
         due_ns = self.next_ns(passing)
         if due_ns is None or due_ns > now_ns:
             return None
         if self._burst:
             return self._burst.popleft()
-        if self.immediate:
-            chunk = self.arrived.popleft()
-            return HandOver(due_ns, chunk.data, (chunk,))
         if self.config.latency_timer_ns:
             self._timed_ns = due_ns
             self._burst.extend(self._pieces(due_ns, self._gather(due_ns, BURST, passing)))

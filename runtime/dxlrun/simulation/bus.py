@@ -25,10 +25,11 @@ from dxlrun.simulation.adapter import Adapter
 from dxlrun.simulation.agenda import Agenda
 from dxlrun.simulation.bus_config import BusConfig, ServoCounts
 from dxlrun.simulation.ledger import Ledger
+from dxlrun.simulation.listeners import Listeners
 from dxlrun.simulation.mechanics import Mechanics
 from dxlrun.simulation.packets import Codec, InstructionPacket, ReadEntry, ReadInTurn, Reply
 from dxlrun.simulation.servo import ServoConfig, SimulatedServo
-from dxlrun.simulation.wire import Chain, Change, Chunk, Wire
+from dxlrun.simulation.wire import Alteration, Chain, Change, Chunk, Wire
 
 STATUS_BYTES = 11
 """Bytes of a status packet of Protocol 2.0 without data: the slot of an absent servo is as long [i]."""
@@ -41,8 +42,6 @@ class SimulatedBus:
         self, config: BusConfig, ledger: Ledger, start_ns: int, mechanics: Mechanics | None = None
     ) -> None:
         self.name = config.name
-        self.baud_rate = config.baud_rate
-        """The host's rate, bit/s."""
         self.protocol = config.protocol
         self.absent = config.absent
         self.echo = config.adapter.echo
@@ -68,8 +67,7 @@ class SimulatedBus:
         self._instruction_changes: deque[Change] = deque()
         self._agenda = Agenda()
         self._counts: dict[SimulatedServo, ServoCounts] = {}
-        self._listeners: dict[int, tuple[SimulatedServo, ...]] = {}
-        """Who hears which ID: forgotten when a servo changes its ID or rate."""
+        self._listeners = Listeners(config.baud_rate)
         for servo in config.servos:
             self.add_servo(servo)
 
@@ -92,12 +90,20 @@ class SimulatedBus:
         if self.echo:
             self._wire.echo(Chunk(start_ns, self._host_free_ns, bytes(data), "echo"))
 
+    @property
+    def baud_rate(self) -> int:
+        """The host's rate, bit/s."""
+        return self._wire.baud_rate
+
+    @baud_rate.setter
+    def baud_rate(self, baud_rate: int) -> None:
+        self._wire.baud_rate = baud_rate
+        self._listeners.change_rate(baud_rate)
+
     def change_rate(self, baud_rate: int) -> None:
         """Let the host talk and listen at another rate from now on, bit/s."""
         self.note(f"the host's rate is {baud_rate} bit/s")
         self.baud_rate = baud_rate
-        self._wire.baud_rate = baud_rate
-        self._listeners.clear()
 
     def next_due_ns(self) -> int | None:
         """Return when something happens by itself: bytes can be taken, a fault comes; None: nothing will."""
@@ -117,6 +123,8 @@ class SimulatedBus:
         passing = self._wire.passing
         if self._wedged or not (passing or self._adapter.holds):
             return b""
+        if self._adapter.immediate:
+            return self._take_at_once(now_ns, punctual)
         taken = bytearray()
         while (part := self._adapter.hand_over(now_ns, passing)) is not None:
             late_ns = now_ns - part.planned_ns if punctual else 0
@@ -126,6 +134,16 @@ class SimulatedBus:
                 self.ledger.add(chunk.due_ns, self.name, "out", chunk.data, chunk.note, late_ns=late_ns)
             taken += part.data
         return bytes(taken)
+
+    def _take_at_once(self, now_ns: int, punctual: bool) -> bytes:
+        """Return all that has passed the wire: nothing is kept back or cut."""
+        arrived = self._adapter.give_all()
+        for chunk in arrived:
+            late_ns = now_ns - chunk.due_ns if punctual else 0
+            if punctual:
+                self.lateness_ns.append(late_ns)
+            self.ledger.add(chunk.due_ns, self.name, "out", chunk.data, chunk.note, late_ns=late_ns)
+        return arrived[0].data if len(arrived) == 1 else b"".join([chunk.data for chunk in arrived])
 
     # What tests see and do
 
@@ -153,8 +171,7 @@ class SimulatedBus:
         )
         self.servos += (servo,)
         self._counts[servo] = ServoCounts()
-        self._listeners.clear()
-        servo.registers.on_identity = self._listeners.clear
+        self._listeners.add(servo)
         return servo
 
     def counts(self, servo: SimulatedServo) -> ServoCounts:
@@ -180,18 +197,12 @@ class SimulatedBus:
         self.ledger.add(self._now_ns, self.name, "note", note=text)
 
     def alter_next(
-        self,
-        servo_id: int,
-        text: str,
-        change: Callable[[bytes], bytes],
-        *,
-        delay_ns: int = 0,
-        copies: int = 1,
+        self, servo_id: int, text: str, change: Alteration, *, delay_ns: int = 0, copies: int = 1
     ) -> None:
         """Change a servo's next reply, let it start later or come several times; the ledger gets `text`."""
         self._changes.setdefault(servo_id, deque()).append(Change(text, change, delay_ns, copies))
 
-    def alter_next_instruction(self, text: str, change: Callable[[bytes], bytes]) -> None:
+    def alter_next_instruction(self, text: str, change: Alteration) -> None:
         """Change what the servos hear of the next whole instruction packet; b"" loses it."""
         self._instruction_changes.append(Change(text, change))
 
@@ -308,7 +319,7 @@ class SimulatedBus:
         if reading is not None:
             self._read_in_turn(reading, end_ns)
         else:
-            for servo in self._listeners.get(packet.servo_id) or self._find_listeners(packet.servo_id):
+            for servo in self._listeners.of(packet.servo_id):
                 counts = self._counts[servo]
                 counts.heard += packet.intact
                 reply = servo.execute(packet, end_ns)
@@ -351,7 +362,7 @@ class SimulatedBus:
 
     def _replies_in_turn(self, reading: ReadInTurn, entry: ReadEntry, end_ns: int) -> list[Reply]:
         replies = []
-        for servo in self._listeners.get(entry.servo_id) or self._find_listeners(entry.servo_id):
+        for servo in self._listeners.of(entry.servo_id):
             if servo.servo_id != entry.servo_id:
                 continue  # only by its secondary ID, to which it never answers
             counts = self._counts[servo]
@@ -367,17 +378,6 @@ class SimulatedBus:
 
     def _status(self, reply: Reply) -> bytes:
         return self._codec.status_packet(reply.servo_id, reply.error, reply.parameters)
-
-    def _find_listeners(self, servo_id: int) -> tuple[SimulatedServo, ...]:
-        """Return who hears an ID; rates may differ by less than 3 % (e-Manual, Baud Rate (4))."""
-        tolerance = 0.03 * self.baud_rate
-        found = tuple(
-            servo
-            for servo in self.servos
-            if servo.listens_to(servo_id) and abs(servo.baud_rate - self.baud_rate) < tolerance
-        )
-        self._listeners[servo_id] = found
-        return found
 
     def _answer(self, reply: Reply, data: bytes, free_ns: int, chain: Chain | None = None) -> bool:
         """Send a servo's bytes, faults and all, some time after the line is free; False: nothing was sent."""

@@ -110,10 +110,11 @@ class Instructions2:
         address, length = _word(parameters, 0), _word(parameters, 2)
         if length == 0 or len(parameters) < 5 + length or (len(parameters) - 4) % (length + 1):
             return ErrorNumber.INSTRUCTION
-        error, ids = 0, (self._body.servo_id, self._body.secondary_id)
+        error, own, secondary = 0, self._body.servo_id, self._body.secondary_id
         for start in range(4, len(parameters), length + 1):
-            if parameters[start] in ids:  # a listed Secondary ID counts as well [i]
-                error = self._write(parameters[start], address, parameters[start + 1 : start + 1 + length])
+            listed = parameters[start]
+            if listed in (own, secondary):  # a listed Secondary ID counts as well [i]
+                error = self._write(listed, address, parameters[start + 1 : start + 1 + length])
         return error
 
     def _bulk_write(self, parameters: bytes) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable
+from typing import NamedTuple
 
 from dxlrun.control_table import ControlItem, ControlTable
 
@@ -16,6 +17,19 @@ _IDENTITY = frozenset(("id", "secondary_id", "secondary_shadow_id", "baud_rate",
 
 Run = tuple[int, bytes]
 """Address and bytes that belong there."""
+
+
+class _Cells(NamedTuple):
+    """What stands in a row of cells."""
+
+    names: tuple[str, ...]
+    """Their items; none when a cell belongs to no item."""
+    only: str | None
+    """The item that they are, when they are one from its first byte to its last."""
+    touched: bool
+    """True when one of them belongs to an item."""
+    direct: bool
+    """True when none of them stands for another one."""
 
 
 class Memory:
@@ -31,9 +45,7 @@ class Memory:
         """Who is told when an item changes that says what the servo hears."""
         self._memory = bytearray(table.size)
         self._values: dict[str, int] = {}  # the same as in the bytes: looked up far more often than written
-        self._names_at: dict[
-            tuple[int, int], tuple[str, ...]
-        ] = {}  # hosts write the same cells again and again
+        self._cells_at: dict[tuple[int, int], _Cells] = {}  # hosts ask for the same again and again
         self._item_at: dict[int, ControlItem] = {
             address: item
             for item in table.items.values()
@@ -105,15 +117,17 @@ class Memory:
         """Return bytes of the table, None where it has none; cells between items are 0 [i]."""
         if length < 1 or address + length > len(self._memory):
             return None
+        if self._cells(address, length).direct:
+            return bytes(self._memory[address : address + length])
         data = self._memory[address : address + length]
-        for cell in self._indirect.keys() & range(address, address + length) if self._indirect else ():
+        for cell in self._indirect.keys() & range(address, address + length):
             target = self[self._indirect[cell]]
             data[cell - address] = self._memory[target] if target < len(self._memory) else 0
         return bytes(data)
 
     def runs(self, address: int, data: bytes) -> tuple[Run, ...]:
         """Return where bytes really go: as they are, or to the cells behind Indirect Data."""
-        if not self._indirect or self._indirect.keys().isdisjoint(range(address, address + len(data))):
+        if self._cells(address, len(data)).direct:
             return ((address, data),)
         runs: list[Run] = []
         for cell, byte in enumerate(data, start=address):
@@ -127,15 +141,23 @@ class Memory:
 
     def names(self, address: int, length: int) -> tuple[str, ...]:
         """Return the items of some cells, none when a cell belongs to no item."""
-        names = self._names_at.get((address, length))
-        if names is None:
-            items = [self._item_at.get(cell) for cell in range(address, address + length)]
-            owned = [item.name for item in items if item is not None]
+        return self._cells(address, length).names
+
+    def _cells(self, address: int, length: int) -> _Cells:
+        """Return what some cells are; looked up once."""
+        cells = self._cells_at.get((address, length))
+        if cells is None:
+            spanned = range(address, address + length)
+            owned = [item.name for cell in spanned if (item := self._item_at.get(cell)) is not None]
             names = tuple(dict.fromkeys(owned)) if len(owned) == length else ()
-            if len(self._names_at) >= _CELLS_KEPT:
-                self._names_at.clear()
-            self._names_at[address, length] = names
-        return names
+            only = self.table.items[names[0]] if len(names) == 1 else None
+            whole = only is not None and (only.address, only.size) == (address, length)
+            direct = self._indirect.keys().isdisjoint(spanned)
+            cells = _Cells(names, names[0] if whole else None, bool(owned), direct)
+            if len(self._cells_at) >= _CELLS_KEPT:
+                self._cells_at.clear()
+            self._cells_at[address, length] = cells
+        return cells
 
     def reaches_eeprom(self, address: int, data: bytes) -> bool:
         """Return whether a write would change the EEPROM area, also through Indirect Data."""
@@ -146,10 +168,13 @@ class Memory:
 
     def touches(self, address: int, length: int) -> bool:
         """Return whether any of some cells belongs to an item."""
-        return any(cell in self._item_at for cell in range(address, address + length))
+        return self._cells(address, length).touched
 
     def would_be(self, address: int, data: bytes) -> dict[str, int]:
         """Return the integers of the items that a write touches, as they would be after it."""
+        cells = self._cells(address, len(data))
+        if cells.only is not None:
+            return {cells.only: int.from_bytes(data, "little")}
         items = [self.table.items[name] for name in self.names(address, len(data))]
         first, last = (items[0], items[-1]) if items else (None, None)
         if first and last and (first.address < address or last.address + last.size > address + len(data)):

@@ -108,8 +108,7 @@ class SimulatedServo:
             return None
         body, instructions = self._body, self._instructions
         answering = instructions.answers(packet, own)
-        byte_ns = 10_000_000_000 // self.baud_rate
-        delay_ns = instructions.delay_ns(packet, byte_ns)
+        delay_ns = instructions.delay_ns(packet, 10_000_000_000 // self.baud_rate) if answering else 0
         error, parameters = instructions.obey(packet)
         if error:
             said = f"{packet.instruction:#04x} {packet.parameters.hex(' ')}"

@@ -12,6 +12,10 @@ MOST_PASSING = 256
 """Packets on their way to the host at once: a host that floods a line on virtual time fills no memory."""
 
 
+Alteration = Callable[[bytes], bytes]
+"""What becomes of a packet's bytes."""
+
+
 @dataclass(slots=True)
 class Chain:
     """A read in turn that is under way: who is still to answer, each after it heard the one before it."""
@@ -56,7 +60,7 @@ class Change:
     """What happens to the next packet of somebody."""
 
     text: str
-    change: Callable[[bytes], bytes]
+    change: Alteration
     delay_ns: int = 0
     copies: int = 1
 
