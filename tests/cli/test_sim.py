@@ -148,7 +148,8 @@ def test_servos_without_a_robot_file_answer_and_take_faults_that_are_typed(start
     ports = json.loads(sim.line())["ports"]
 
     assert hear(ports["main"], PING_1, 14)[:12] == PONG_1
-    sim.type("silence servo=1")
+    sim.type("silence  servo=0x1")
+    assert json.loads(sim.line()) == {"understood": "silence servo=1"}
     assert json.loads(sim.line()) == {"fault": "silence servo=1"}
     sim.type("slience servo=1")
     assert "did you mean silence?" in json.loads(sim.line())["error"]
@@ -195,7 +196,8 @@ def test_every_bus_is_simulated_and_has_a_link_that_follows_its_adapter(
     assert {name: os.readlink(port) for name, port in told["ports"].items()} == told["devices"]
     assert hear(told["ports"]["left"], PING_1, 14)[:12] == PONG_1
     sim.type("unplug bus=left for=1ms")
-    for expected in ({"fault": "unplug bus=left for=1ms"}, {"devices": {"left": ""}}):
+    line = "unplug bus=left for=1ms"
+    for expected in ({"understood": line}, {"fault": line}, {"devices": {"left": ""}}):
         assert json.loads(sim.line()) == expected
     (back,) = json.loads(sim.line())["devices"].values()
     assert back != told["devices"]["left"]

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator
+from dataclasses import replace
 from io import StringIO
 
 import pytest
 from rich.console import Console
 
-from dxlrun.cli.sim_table import page
+from dxlrun.cli.sim_table import TableView, page
+from dxlrun.cli.sim_views import Shown
 from dxlrun.simulation_front import Look, ServoLook, TypedLines
 
 
@@ -41,30 +43,26 @@ def drawn(shown: Look, typed: str = "", height: int = 24, *, several: bool = Fal
 
 
 def test_a_line_a_servo_says_what_it_does():
-    head, _, first, second, *_ = drawn(look(2))
+    head, units, _, first, second, *_ = drawn(look(2))
 
-    assert head.split() == [
-        *(
-            "ID",
-            "model",
-            "torque",
-            "goal",
-            "deg",
-            "present",
-            "deg",
-            "degC",
-            "V",
-            "errors",
-            "heard",
-            "answered",
-        )
+    assert f"{head} {units}".split() == [
+        *("goal", "present", "ID", "model", "torque", "deg", "deg", "degC", "V", "errors", "heard", "said")
     ]
     assert first.split() == ["1", "XL430-W250", "on", "180.0", "90.0", "31", "11.9", "-", "101", "1"]
     assert second.split() == ["2", "XL430-W250", "-", "-", "90.0", "31", "11.9", "0x20", "102", "2"]
 
 
+def test_eighty_columns_hold_it_whole():
+    named = replace(look(1).servos[0], bus="left_arm", model="YM070-210-M001", heard=123456, answered=123456)
+    file = StringIO()
+    Console(file=file, width=80).print(page(Look((named,)), "", 24, several=True))
+
+    assert "\N{HORIZONTAL ELLIPSIS}" not in file.getvalue()
+    assert "left_arm" in file.getvalue()
+
+
 def test_buses_are_named_where_there_are_several():
-    assert drawn(look(1), several=True)[2].split()[:3] == ["main", "1", "XL430-W250"]
+    assert drawn(look(1), several=True)[3].split()[:3] == ["main", "1", "XL430-W250"]
 
 
 def test_what_is_typed_stands_below():
@@ -78,8 +76,27 @@ def test_a_low_window_keeps_the_prompt():
     lines = drawn(look(40), "lose", height=12)
 
     assert len(lines) < 12
-    assert "... and 34 more; a higher window shows them" in lines
+    assert "... and 35 more; a higher window shows them" in lines
     assert lines[-1].startswith("fault> lose")
+
+
+def test_the_table_is_drawn_again_below_whatever_is_said():
+    file = StringIO()
+    console = Console(file=file, force_terminal=True, width=80, height=20)
+    view = TableView(Shown("torso", (), {}), console)
+    with view.showing():
+        for say in (view.fault, view.accepted, view.refused, lambda line: view.moved({line: ""})):
+            view.look(look(2), "lose")
+            file.seek(0)
+            file.truncate()
+            say("a line that is much wider than the window of eighty columns, so that it must be folded")
+            said = file.getvalue()
+            assert said.index("folded") < said.index("XL430-W250") < said.index("lose")
+        view.help()
+        file.seek(0)
+        file.truncate()
+    assert "XL430-W250" in file.getvalue()
+    assert "fault> " not in file.getvalue()  # nobody can type any more
 
 
 @pytest.fixture

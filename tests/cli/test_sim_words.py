@@ -145,7 +145,7 @@ def test_what_is_no_link_is_never_replaced(tmp_path: Path):
 def test_the_ports_are_said_once(capsys: pytest.CaptureFixture[str]):
     servos = tuple(ServoConfig(each, "AX-12A", 0.0) for each in (1, 2, 3, 7))
     bus = BusConfig("main", 1_000_000, servos)
-    view = PlainView(Shown("torso", (bus,), {"main": Path("/tmp/robot")}, "dxlrun torso.yaml port:={port}"))  # noqa: S108
+    view = PlainView(Shown("torso", (bus,), {"main": Path("/tmp/robot")}, "dxlrun torso.yaml"))  # noqa: S108
 
     view.opened({"main": "/dev/pts/7"}, "core 1")
     view.moved({"main": ""})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -150,7 +151,7 @@ def _from_file(
     plan = result.plan
     everywhere = replace(plan, buses=tuple(replace(bus, port="sim") for bus in plan.buses))
     others = [word for word in assignments if not word.startswith("port:=")]
-    hint = " ".join(["dxlrun", str(robot), *others, "port:={port}"])
+    hint = shlex.join(["dxlrun", str(robot), *others])
     takes_port = len(plan.buses) == 1 and "port" in plan.arguments
     return (
         plan.robot,

@@ -16,12 +16,13 @@ from rich.table import Table
 from rich.text import Text
 
 from dxlrun.cli.sim_views import Shown, fault_lines
+from dxlrun.simulation_front import Look
 
 if TYPE_CHECKING:
-    from dxlrun.simulation_front import Look, ServoLook
+    from dxlrun.simulation_front import ServoLook
 
 _LOOK_S = 0.25
-_AROUND = 6
+_AROUND = 7
 """Lines of the screen that are not servos: head and rule of the table, lateness, prompt, what happened."""
 
 
@@ -34,12 +35,14 @@ class TableView:
         self._shown = shown
         self._console = console
         self._live = Live(console=console, auto_refresh=False, transient=False)
+        self._newest = Look()
 
     @contextmanager
     def showing(self) -> Iterator[None]:
         """Show it; the terminal hands letters over one by one meanwhile, and does not show them itself."""
         with _letters(), self._live:
             yield
+            self._draw(None)  # what was being typed is of no use any more
 
     def opened(self, ports: Mapping[str, str], real_time: str) -> None:
         """Say where the buses are."""
@@ -70,15 +73,23 @@ class TableView:
 
     def look(self, look: Look, typed: str) -> None:
         """Draw the servos, and what was typed so far."""
-        self._live.update(page(look, typed, self._console.height, several=len(self._shown.buses) > 1))
-        self._live.refresh()
+        self._newest = look
+        self._draw(typed)
+
+    def _draw(self, typed: str | None) -> None:
+        several = len(self._shown.buses) > 1
+        self._live.update(page(self._newest, typed, self._console.height, several=several), refresh=True)
 
     def _say(self, line: str, style: str = "") -> None:
-        self._console.print(Text(line, style=style), soft_wrap=True)
+        # folded, not soft_wrap: rich does not draw the table again below a line that is wider than the window
+        self._console.print(Text(line, style=style))
 
 
-def page(look: Look, typed: str, height: int, *, several: bool) -> Group:
-    """Return what stands at the bottom of a screen of `height` lines; `several`: buses are told apart."""
+def page(look: Look, typed: str | None, height: int, *, several: bool) -> Group:
+    """Return what stands at the bottom of a screen of `height` lines; `several`: buses are told apart.
+
+    `typed` is None when nothing more can be typed.
+    """
     room = max(1, height - _AROUND)
     parts: list[Table | Text] = [servo_table(look.servos[:room], several=several)]
     if len(look.servos) > room:
@@ -86,21 +97,22 @@ def page(look: Look, typed: str, height: int, *, several: bool) -> Group:
     if look.lateness_us:
         late = ", ".join(f"{name} {value:.0f} us" for name, value in look.lateness_us.items())
         parts.append(Text(f"replies later than planned: {late}", style="dim"))
-    parts.append(Text.assemble(("fault> ", "bold"), typed, ("\N{LOWER ONE EIGHTH BLOCK}", "blink")))
+    if typed is not None:
+        parts.append(Text.assemble(("fault> ", "bold"), typed, ("\N{LOWER ONE EIGHTH BLOCK}", "blink")))
     return Group(*parts)
 
 
 def servo_table(servos: Sequence[ServoLook], *, several: bool) -> Table:
     """Return one line a servo."""
-    shown = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
+    shown = Table(box=box.SIMPLE_HEAD, padding=0, show_edge=False)
     for name in (["bus"] if several else []) + ["ID"]:
         shown.add_column(name, justify="right", no_wrap=True)
     shown.add_column("model", no_wrap=True)
     shown.add_column("torque", no_wrap=True)
-    for name in ("goal deg", "present deg", "degC", "V"):
+    for name in ("goal\ndeg", "present\ndeg", "degC", "V"):
         shown.add_column(name, justify="right", no_wrap=True)
     shown.add_column("errors", no_wrap=True)
-    for name in ("heard", "answered"):
+    for name in ("heard", "said"):
         shown.add_column(name, justify="right", no_wrap=True)
     for servo in servos:
         shown.add_row(*([servo.bus] if several else []), *_cells(servo), style="red" if servo.error else "")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -27,7 +28,7 @@ class Shown:
     links: Mapping[str, Path]
     """Link of each bus that has one."""
     hint: str | None = None
-    """A command line that uses the simulation, with {port} where the port goes."""
+    """A command line that uses the simulation when the port is added."""
 
     def port(self, bus: str, ports: Mapping[str, str]) -> str:
         """Return the name under which another program opens a bus: it stays when an adapter is pulled."""
@@ -48,7 +49,8 @@ class Shown:
         if real_time:
             said.append(f"  in real time: {real_time}")
         if self.hint is not None and self.buses:
-            said.append(f"next: {self.hint.format(port=self.port(self.buses[0].name, ports))}")
+            port = shlex.quote(self.port(self.buses[0].name, ports))
+            said.append(f"next: {self.hint} port:={port}")
         return said
 
     def moves(self, ports: Mapping[str, str]) -> list[str]:
@@ -88,7 +90,8 @@ class PlainView:
         self._say(f"fault: {text}")
 
     def accepted(self, text: str) -> None:
-        """Say nothing: it is told when it happens."""
+        """Say how a line was understood: it may be planned for later."""
+        self._say(f"understood: {text}")
 
     def refused(self, sentence: str) -> None:
         """Say what is wrong with a line that was typed."""
@@ -129,7 +132,8 @@ class JsonView:
         self._write({"fault": text})
 
     def accepted(self, text: str) -> None:
-        """Write nothing: it is written when it happens."""
+        """Write how a line was understood: it may be planned for later."""
+        self._write({"understood": text})
 
     def refused(self, sentence: str) -> None:
         """Write what is wrong with a line that was typed."""
