@@ -130,6 +130,13 @@ def test_slots_of_absent_servos_are_for_protocol_2(problems_in: ProblemsIn, simu
     assert problem.severity == "warning"
 
 
+def test_an_echo_is_for_other_programs(problems_in: ProblemsIn, simulated: str, robot_text: str) -> None:
+    (problem,) = [each for each in problems_in(_bus(simulated, "{echo: true}")) if "echo" in each.what]
+    assert problem.severity == "warning"
+    assert problem.what == "dxlrun does not run on an adapter that echoes, as bus main then does"
+    assert not [each for each in problems_in(_bus(robot_text, "{echo: true}")) if "echo" in each.what]
+
+
 def test_mujoco_needs_a_urdf(problems_in: ProblemsIn, simulated: str) -> None:
     (problem,) = [
         each for each in problems_in(simulated + "simulation: {physics: mujoco}\n") if "URDF" in each.what

@@ -88,6 +88,12 @@ def _check_buses(description: Description, problems: Problems) -> None:
                 f"absent: slot is for servos of Protocol 2.0, bus {name} speaks Protocol 1.0",
                 "take it out",
             )
+        if bus.simulation.echo and bus.port == SIMULATED:
+            problems.warning(
+                description.marks.value("buses", name, "simulation", "echo"),
+                f"dxlrun does not run on an adapter that echoes, as bus {name} then does",
+                "echo is for other programs, through `dxlrun sim`; take it out",
+            )
 
 
 def _check_physics(description: Description, problems: Problems) -> None:
