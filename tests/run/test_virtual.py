@@ -21,7 +21,7 @@ TORSO = ROBOTS / "bioloid_torso.yaml"
 THREE_PARTS = ROBOTS / "motions/three_parts.yaml"
 LAG_S = 0.1
 """A command goes out in one cycle, moves the servo in the next, and is read in the one after: 60 ms at 50 Hz;
-the servo's bounded acceleration adds the rest."""
+what the servo's position control lags behind adds the rest."""
 
 
 @pytest.fixture(scope="module")
@@ -73,9 +73,9 @@ def test_each_arm_follows_its_formula(
     settled = (seconds >= LAG_S) & (seconds <= duration_s)
     read = log.cycles["position"][settled, row]
     band = np.array([[wanted(t - lag) for lag in np.linspace(0.0, LAG_S, 21)] for t in seconds[settled]])
-    tick = 300 / 1023 * pi / 180
-    assert (read >= band.min(axis=1) - tick).all()
-    assert (read <= band.max(axis=1) + tick).all()
+    off = 1.5 * 300 / 1023 * pi / 180  # the goal is rounded to a tick, and the compliance margin is one
+    assert (read >= band.min(axis=1) - off).all()
+    assert (read <= band.max(axis=1) + off).all()
 
 
 def test_the_head_obeys_its_commands(log_of_three_parts: Path) -> None:

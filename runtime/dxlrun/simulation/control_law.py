@@ -114,6 +114,8 @@ class ControlLaw:
             np.minimum(work, self._limit, out=duty)
             np.maximum(duty, self._least, out=duty)
             np.multiply(duty, self.stall, out=self.drive)
+            if self._current:
+                np.copyto(self.damping, self._motor_damping)  # the step before may have taken it away
             if self._integrates:
                 np.equal(work, duty, out=within)
         else:
@@ -137,8 +139,6 @@ class ControlLaw:
 
     def _limit_current(self) -> None:
         """Hold the motor's torque where its current is controlled."""
-        if not self._damps:
-            np.copyto(self.damping, self._motor_damping)
         limit = self._rows["torque_limit"]
         over = np.abs(self.torque) > limit
         np.clip(self.torque, -limit, limit, out=self.torque)

@@ -37,7 +37,7 @@ class Profiles:
         # arrays, as numpy is slower with numbers
         self._dt, self._per_dt = np.full(size, dt_s), np.full(size, 1.0 / dt_s)
         self._ramp, self._back, self._half = np.zeros(size), np.zeros(size), np.zeros(size)
-        self._half_squared, self._twice = np.zeros(size), np.zeros(size)
+        self._per_braking, self._one, self._one_half = np.zeros(size), np.ones(size), np.full(size, 0.5)
         self._error, self._wanted, self._reach = np.zeros(size), np.zeros(size), np.zeros(size)
         self._turning = np.zeros(size, dtype=bool)
         self._turns = False
@@ -71,15 +71,21 @@ class Profiles:
             return
         error, wanted, reach = self._error, self._wanted, self._reach
         np.subtract(self._goal, self.position, out=error)
-        np.abs(error, out=wanted)
-        np.multiply(wanted, self._per_dt, out=reach)
-        # What can be braked away on the rest of the way in whole steps, v (v + a dt) / 2a = |error|, and no
-        # more than leads to the goal in this step.
-        np.multiply(wanted, self._twice, out=wanted)
-        np.add(wanted, self._half_squared, out=wanted)
+        np.abs(error, out=reach)
+        # Braking by a dt in each of n steps from v on takes n v - n (n - 1) / 2 a dt in steps of dt: for the
+        # rest of the way the least n with which it can end at rest, and the v that ends exactly there.
+        np.multiply(reach, self._per_braking, out=wanted)
+        np.add(wanted, self._one, out=wanted)
         np.sqrt(wanted, out=wanted)
-        np.subtract(wanted, self._half, out=wanted)
-        np.minimum(wanted, reach, out=wanted)
+        np.subtract(wanted, self._one, out=wanted)
+        np.multiply(wanted, self._one_half, out=wanted)
+        np.ceil(wanted, out=wanted)
+        np.maximum(wanted, self._one, out=wanted)
+        np.multiply(reach, self._per_dt, out=reach)
+        np.divide(reach, wanted, out=reach)
+        np.subtract(wanted, self._one, out=wanted)
+        np.multiply(wanted, self._half, out=wanted)
+        np.add(wanted, reach, out=wanted)
         np.minimum(wanted, self._speed, out=wanted)
         np.copysign(wanted, error, out=wanted)
         if self._turns:
@@ -105,4 +111,4 @@ class Profiles:
     def _accelerate(self, index: int, acceleration: float) -> None:
         ramp = acceleration * self._dt_s
         self._ramp[index], self._back[index], self._half[index] = ramp, -ramp, ramp / 2
-        self._half_squared[index], self._twice[index] = ramp * ramp / 4, 2 * acceleration
+        self._per_braking[index] = 8 / (ramp * self._dt_s)

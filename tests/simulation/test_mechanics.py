@@ -1,0 +1,231 @@
+"""Motor, load and control law of simulated servos, against what paper and pencil say."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from dxlrun.control_table import all_tables, control_table
+from dxlrun.simulation.command import LIMP, Command
+from dxlrun.simulation.mechanics import STEP_NS, Load, Mechanics
+from dxlrun.simulation.motor import Motor, motor_of
+from dxlrun.simulation.strain import AMBIENT_C, COOLING_S, STALLED_RISE_C
+
+MOTOR = Motor(max_speed=6.0, stall_torque=2.0, stall_current=1.0, voltage=12.0, inertia=0.003)
+S = 1_000_000_000
+
+
+def one(command: Command = LIMP, load: Load | None = None, angle: float = 0.0) -> Mechanics:
+    mechanics = Mechanics(0)
+    mechanics.add(MOTOR, load or Load(), angle)
+    mechanics.command(0, command)
+    return mechanics
+
+
+def state(mechanics: Mechanics) -> tuple[float, float]:
+    return float(mechanics.plant.angle[0]), float(mechanics.plant.velocity[0])
+
+
+def pid(p: float, goal: float, **rest: float) -> Command:
+    return Command(goal=goal, p_ccw=p, p_cw=p, limit=1.0)._replace(**rest)
+
+
+# Motor
+
+
+@pytest.mark.parametrize("duty", [1.0, 0.5, -0.25])
+def test_an_unloaded_motor_turns_at_its_duty_of_the_no_load_speed(duty: float) -> None:
+    mechanics = one(Command(bias=duty, limit=1.0))
+    mechanics.advance(S)
+    assert state(mechanics)[1] == pytest.approx(6.0 * duty)
+
+
+def test_speed_falls_with_torque_in_a_line_down_to_stall() -> None:
+    half = one(Command(bias=1.0, limit=1.0), Load(friction=1.0))
+    half.advance(S)
+    assert state(half)[1] == pytest.approx(3.0)
+    stalled = one(Command(bias=1.0, limit=1.0), Load(friction=2.01))
+    stalled.advance(S)
+    assert state(stalled) == (0.0, 0.0)
+
+
+def test_it_comes_to_speed_with_the_time_constant_of_motor_and_load() -> None:
+    mechanics = one(Command(bias=1.0, limit=1.0), Load(inertia=0.03))
+    mechanics.advance(100_000_000)  # 0.033 kg m^2 * 6 rad/s / 2 Nm = 0.099 s
+    assert state(mechanics)[1] == pytest.approx(6.0 * (1 - math.exp(-0.1 / 0.099)), rel=0.02)
+
+
+def test_less_voltage_is_less_speed_and_less_torque() -> None:
+    mechanics = one(Command(bias=1.0, limit=1.0), Load(friction=0.5))
+    mechanics.supply(0, 9.0)
+    mechanics.advance(S)
+    assert state(mechanics)[1] == pytest.approx(6.0 * 0.75 - 0.5 / MOTOR.damping)
+
+
+def test_every_model_has_a_motor_that_turns() -> None:
+    mechanics, tables = Mechanics(0), all_tables()
+    for table in tables:
+        index = mechanics.add(motor_of(table), Load(), 0.0)
+        mechanics.command(index, Command(bias=1.0, limit=1.0))
+    mechanics.advance(S // 2)
+    assert mechanics.plant.velocity == pytest.approx([table.max_speed for table in tables], rel=1e-3)
+
+
+def test_current_control_holds_the_torque_up_to_what_the_voltage_gives() -> None:
+    mechanics = one(Command(bias=1.0, limit=1.0, torque_limit=0.5), Load(inertia=1.0))
+    mechanics.advance(S)
+    assert state(mechanics)[1] == pytest.approx(0.5 / 1.003, rel=0.01)
+    free = one(Command(bias=1.0, limit=1.0, torque_limit=0.5))
+    free.advance(S)
+    assert state(free)[1] == pytest.approx(6.0)
+
+
+# Load
+
+
+def test_a_held_pendulum_sags_by_gravity_over_stiffness() -> None:
+    mechanics = one(pid(5.0, 1.0), Load(gravity=0.8, gravity_angle=1.0 - math.pi / 2))
+    mechanics.advance(2 * S)
+    sag = 1.0 - state(mechanics)[0]
+    assert 5.0 * 2.0 * sag == pytest.approx(0.8 * math.cos(sag), rel=1e-3)
+
+
+def test_a_limp_link_falls_to_where_it_hangs_and_its_friction_holds_a_light_one() -> None:
+    falling = one(LIMP, Load(gravity=0.5, gravity_angle=0.0), angle=1.5)
+    falling.advance(10 * S)
+    assert state(falling) == pytest.approx((0.0, 0.0), abs=1e-4)
+    stuck = one(LIMP, Load(gravity=0.5, friction=0.6), angle=1.5)
+    stuck.advance(10 * S)
+    assert state(stuck) == (1.5, 0.0)
+
+
+def test_friction_leaves_the_error_that_its_torque_needs() -> None:
+    mechanics = one(pid(5.0, 1.0, speed=1.0), Load(friction=0.2))
+    mechanics.advance(3 * S)
+    left = 1.0 - state(mechanics)[0]
+    assert 0 < 5.0 * 2.0 * left <= 0.2 + 1e-6
+    assert state(mechanics)[1] == 0.0
+
+
+def test_an_integral_takes_that_error_away() -> None:
+    mechanics = one(pid(5.0, 1.0, i=20.0), Load(gravity=0.8, gravity_angle=1.0 - math.pi / 2))
+    mechanics.advance(3 * S)
+    assert state(mechanics)[0] == pytest.approx(1.0, abs=1e-3)
+
+
+# Position control
+
+
+def test_a_step_settles_with_little_overshoot() -> None:
+    mechanics = one(pid(5.0, 1.0))
+    highest = 0.0
+    for now in range(0, S, STEP_NS):
+        mechanics.advance(now)
+        highest = max(highest, state(mechanics)[0])
+    assert highest < 1.02
+    assert state(mechanics) == pytest.approx((1.0, 0.0), abs=1e-5)
+
+
+def test_within_the_margin_nothing_drives_and_beyond_it_the_punch_does() -> None:
+    soft = pid(2.0, 1.0, margin_ccw=0.1, margin_cw=0.1, punch=0.05)
+    inside = one(soft, angle=0.91)
+    inside.advance(S)
+    assert state(inside) == (0.91, 0.0)
+    outside = one(soft, Load(friction=0.09), angle=0.89)  # the punch gives 0.1 Nm
+    outside.advance(S)
+    assert 0.9 <= state(outside)[0] < 0.95
+
+
+def test_each_side_has_a_margin_and_a_slope_of_its_own() -> None:
+    load = Load(gravity=0.4, gravity_angle=1.0)
+    sides = pid(2.0, 1.0, p_cw=20.0, margin_ccw=0.2)
+    below, above = one(sides, load, angle=0.6), one(sides, load, angle=1.4)
+    below.advance(3 * S)
+    above.advance(3 * S)
+    assert state(below)[0] == pytest.approx(1.0, abs=0.2)
+    assert state(above)[0] == pytest.approx(1.0, abs=0.02)
+
+
+def test_a_limit_of_the_duty_limits_speed_and_torque() -> None:
+    mechanics = one(pid(5.0, 9.0, limit=0.2))
+    mechanics.advance(S // 2)
+    assert state(mechanics)[1] == pytest.approx(1.2)
+
+
+# Time
+
+
+def test_steps_do_not_depend_on_when_somebody_looks() -> None:
+    def run(period_ns: int) -> tuple[float, float]:
+        mechanics = one(pid(5.0, 1.0, speed=2.0, acceleration=9.0), Load(gravity=0.3, friction=0.05))
+        for now in range(period_ns, 730_000_001, period_ns):
+            mechanics.advance(now)
+        return state(mechanics)
+
+    assert run(1_000_000) == run(10_000_000) == run(730_000_000)
+
+
+def test_a_servo_that_is_added_later_leaves_the_others_as_they_are() -> None:
+    alone, joined = one(pid(5.0, 1.0, speed=2.0)), one(pid(5.0, 1.0, speed=2.0))
+    for mechanics in (alone, joined):
+        mechanics.advance(200_000_000)
+    joined.add(MOTOR, Load(), -1.0)
+    for mechanics in (alone, joined):
+        mechanics.advance(S)
+    assert state(joined) == state(alone)
+    assert joined.plant.angle[1] == -1.0
+
+
+def times_of(mechanics: Mechanics, planned: tuple[int, ...]) -> list[int]:
+    times: list[int] = []
+    for t_ns in planned:
+        mechanics.call_at(t_ns, lambda: times.append(mechanics.grid_ns))
+    mechanics.advance(2 * S)
+    return times
+
+
+def test_what_is_planned_happens_at_its_time_moving_or_at_rest() -> None:
+    for command in (LIMP, Command(bias=1.0, limit=1.0)):
+        assert times_of(one(command), (1_500_000_001, 300_000_000)) == [300_000_000, 1_502_000_000]
+
+
+def test_a_servo_at_rest_wakes_for_a_new_goal() -> None:
+    mechanics = one(pid(5.0, 1.0))
+    mechanics.advance(5 * S)
+    mechanics.aim(0, 0.5, 1.0, 100.0)
+    mechanics.advance(8 * S)
+    assert state(mechanics)[0] == pytest.approx(0.5, abs=1e-5)
+
+
+# Heat and overload
+
+
+def test_copper_warms_by_the_square_of_the_torque_and_cools_again() -> None:
+    mechanics = one(Command(bias=0.5, limit=1.0), Load(friction=2.0))
+    mechanics.advance(60 * S)
+    warm = AMBIENT_C + STALLED_RISE_C * 0.25 * (1 - math.exp(-60 / COOLING_S))
+    assert mechanics.strain.temperature[0] == pytest.approx(warm, rel=0.01)
+    mechanics.command(0, LIMP)
+    mechanics.advance(3060 * S)
+    assert mechanics.strain.temperature[0] == pytest.approx(AMBIENT_C, abs=0.1)
+
+
+def test_a_load_that_cannot_be_held_is_told_after_a_second_and_a_hard_start_is_not() -> None:
+    told = []
+    blocked = one(pid(5.0, 1.0), Load(friction=3.0))
+    blocked.watch(0, lambda: told.append(blocked.grid_ns) if blocked.overloaded(0) else None)
+    blocked.advance(3 * S)
+    assert told[0] == pytest.approx(S, abs=200_000_000)
+    starting = one(pid(5.0, 50.0), Load(inertia=0.1))
+    starting.advance(3 * S)
+    assert not starting.overloaded(0)
+
+
+def test_torque_figures_are_those_of_the_tables() -> None:
+    motor = motor_of(control_table("XM430-W350"))
+    assert (motor.max_speed, motor.stall_torque, motor.stall_current) == pytest.approx(
+        (4.817, 4.1, 2.3), rel=1e-3
+    )
+    assert np.isclose(motor.torque_per_ampere, 4.1 / 2.3)

@@ -1,0 +1,83 @@
+"""The trajectories inside simulated servos, against the manual's trapezoids worked out by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dxlrun.simulation.command import LIMP, Command
+from dxlrun.simulation.profile import Profiles
+
+DT = 0.002
+
+
+def profile(command: Command, start: float = 0.0) -> Profiles:
+    return Profiles(np.array([command]).T.copy(), np.array([start]), DT)
+
+
+def run(profiles: Profiles, seconds: float) -> list[tuple[float, float]]:
+    """Return position and velocity after each step."""
+    seen = []
+    for _ in range(round(seconds / DT)):
+        profiles.step()
+        seen.append((float(profiles.position[0]), float(profiles.velocity[0])))
+    return seen
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.floats(-2, 2), st.floats(-2, 2), st.floats(1, 10), st.floats(5, 200))
+def test_from_rest_it_reaches_the_goal_within_its_bounds_and_never_passes_it(
+    start: float, goal: float, speed: float, acceleration: float
+) -> None:
+    profiles = profile(Command(goal=goal, speed=speed, acceleration=acceleration), start)
+    distance = abs(goal - start)
+    seen = run(profiles, distance / speed + speed / acceleration + 2 * (distance / acceleration) ** 0.5 + 0.1)
+    low, high = min(start, goal) - 1e-9, max(start, goal) + 1e-9
+    assert all(low <= position <= high for position, _ in seen)
+    assert max(abs(velocity) for _, velocity in seen) <= speed + 1e-9
+    steps = np.abs(np.diff([0.0, *(velocity for _, velocity in seen)]))
+    assert steps.max() <= acceleration * DT + 1e-9
+    assert seen[-1] == pytest.approx((goal, 0.0), abs=1e-9)
+
+
+def test_a_long_way_takes_the_time_of_a_trapezoid() -> None:
+    # 0.2 s up to 2 rad/s, 0.2 s down, 0.4 rad in both: 2.6 rad at 2 rad/s between
+    seen = run(profile(Command(goal=3.0, speed=2.0, acceleration=10.0)), 2.0)
+    arrived = next(index for index, (position, _) in enumerate(seen) if position > 3.0 - 1e-6)
+    assert arrived * DT == pytest.approx(0.2 + 1.3 + 0.2, abs=3 * DT)
+    assert seen[round(0.85 / DT)] == pytest.approx((1.5, 2.0), abs=2 * 2.0 * DT)
+
+
+def test_without_acceleration_it_is_a_rectangle_and_without_speed_a_step() -> None:
+    assert run(profile(Command(goal=1.0, speed=2.0)), 0.3)[-1] == pytest.approx((0.6, 2.0))
+    assert run(profile(Command(goal=1.0)), DT)[0][0] == pytest.approx(1.0)
+
+
+def test_another_goal_on_the_way_is_taken_up_with_the_velocity_that_it_has() -> None:
+    profiles = profile(Command(goal=3.0, speed=2.0, acceleration=10.0))
+    before = run(profiles, 0.5)[-1]
+    profiles.aim(0, -1.0, 2.0, 10.0)
+    after = run(profiles, 3.0)
+    assert after[0][1] == pytest.approx(before[1] - 10.0 * DT)
+    assert max(position for position, _ in after) == pytest.approx(before[0] + 2.0**2 / 20, abs=0.01)
+    assert after[-1][0] == pytest.approx(-1.0)
+
+
+def test_turning_goes_on_for_ever_and_never_arrives() -> None:
+    profiles = profile(Command(speed=-2.0, acceleration=10.0, turning=1.0))
+    seen = run(profiles, 1.2)
+    assert seen[round(0.1 / DT) - 1][1] == pytest.approx(-1.0)
+    assert seen[-1] == pytest.approx((-0.2 - 2.0, -2.0), abs=0.01)
+    profiles.look()
+    assert not profiles.arrived
+
+
+def test_it_arrives_exactly_and_then_costs_nothing() -> None:
+    profiles = profile(LIMP._replace(goal=0.1 + 0.2, speed=1.0, acceleration=7.0))
+    run(profiles, 1.0)
+    profiles.look()
+    assert profiles.arrived
+    assert profiles.position[0] == 0.1 + 0.2
+    assert profiles.velocity[0] == 0.0
