@@ -112,7 +112,7 @@ class Body(ABC):
     def read(self, address: int, length: int) -> bytes | None:
         """Return bytes of the table, None where it has none."""
         memory, live = self.memory, self._live
-        if address + length > memory.table.size:
+        if address + length > memory.size:
             return None
         for run_address, run in memory.runs(address, bytes(length)):
             cells = run_address, len(run)

@@ -43,7 +43,9 @@ class Memory:
         self.firmware = firmware
         self.on_identity: Callable[[], None] | None = None
         """Who is told when an item changes that says what the servo hears."""
-        self._memory = bytearray(table.size)
+        self.size = table.size
+        """Bytes from address 0 to the end of the last item."""
+        self._memory = bytearray(self.size)
         self._values: dict[str, int] = {}  # the same as in the bytes: looked up far more often than written
         self._cells_at: dict[tuple[int, int], _Cells] = {}  # hosts ask for the same again and again
         self._item_at: dict[int, ControlItem] = {
@@ -115,7 +117,7 @@ class Memory:
 
     def read(self, address: int, length: int) -> bytes | None:
         """Return bytes of the table, None where it has none; cells between items are 0 [i]."""
-        if length < 1 or address + length > len(self._memory):
+        if length < 1 or address + length > self.size:
             return None
         if self._cells(address, length).direct:
             return bytes(self._memory[address : address + length])
