@@ -1,6 +1,10 @@
 """A simulated servo as bus and tests see it: it hears instructions, answers, and can be broken.
 
 Where the e-Manual says nothing, `[i]` marks what was inferred; nothing here was compared with a servo yet.
+
+Not modelled: other protocols than 1.0 and 2.0 on one line (a servo that is told to speak one falls silent),
+what the two shafts of a 2XL or 2XC share, servos that Drive Mode couples, and what firmware decides beyond
+the control table, the fast reads, Clear and Control Table Backup.
 """
 
 from __future__ import annotations
