@@ -40,6 +40,8 @@ LASTING = ",".join(name for name in KINDS if name not in {"storm", "unplug"})
 ALL = f"{LASTING},unplug"
 DURATION_S = 2.5
 MS = 1_000_000
+SOME_CYCLES = 100
+"""In so many cycles somebody answers and gets a goal, or there was nothing to judge."""
 LATEST = 2
 """Cycles; see `samples_are_what_was_sent`."""
 REPLY_NS = 2 * MS
@@ -237,7 +239,7 @@ def goals_are_within_limits(said: Sequence[Said], bus: BusPlan, robot: VirtualRo
             assert abs(goal - last) <= most, (t_ns, joint.name)
         before[servo.servo_id] = t_ns, goal
         count += 1
-    assert count or robot.result is None or robot.result.reason == "fault"
+    assert count or robot.result is None or robot.result.cycles < SOME_CYCLES
 
 
 def nothing_wakes_after_the_set_up(said: Sequence[Said], witness: Witness, bus: BusPlan, log: Log) -> None:
@@ -282,7 +284,7 @@ def samples_are_what_was_sent(
                 and not any(_same(each, late, since_ns, int(cycle["woken_ns"])) for late in witness.delayed)
             ]
             assert float(cycle["position"][servo.row]) in sent, (int(cycle["woken_ns"]), servo.joint)
-    assert valid or not len(log.cycles) or "wedge" in str(entries)
+    assert valid or len(log.cycles) < SOME_CYCLES
 
 
 def _same(told: Told, late: Told, since_ns: int, woken_ns: int) -> bool:
