@@ -12,7 +12,7 @@ import select
 import signal
 import socket
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -27,6 +27,7 @@ from dxlrun.simulation.process import SimulationConfig, encode_config
 
 _LAST_LOOK_S = 1.0
 """How long the last look may take: a process that does not answer in it ends without."""
+_STOPS = frozenset((signal.SIGINT, signal.SIGTERM))
 _LONGEST_LINE = 1024
 _BACKGROUND_S = 0.5
 _ESCAPE = re.compile(r"\x1b(?:\[[0-9;?]*[ -/]*[@-~]|O.|.)?")
@@ -102,6 +103,8 @@ class Served:
     look: Look
     sentences: tuple[str, ...]
     """What went wrong; nothing in a simulation that ran until it was stopped."""
+    printed: str = ""
+    """What the process of the simulated buses printed."""
 
 
 class TypedLines:
@@ -185,13 +188,13 @@ def serve(
         finally:
             child.end()
     sentences = list(front.sentences)
-    printed = process.whole(errors).decode(errors="replace").strip().splitlines()
+    printed = process.whole(errors).decode(errors="replace")
     os.close(errors)
     if child.process.returncode and not sentences:
         sentences.append(f"the simulated bus ended with exit code {child.process.returncode}")
-    if sentences and printed:
-        sentences.append(f"it printed last: {printed[-1]}")
-    return Served(time.monotonic() - began, front.newest, tuple(sentences))
+    if sentences and printed.strip():
+        sentences.append(f"it printed last: {printed.strip().splitlines()[-1]}")
+    return Served(time.monotonic() - began, front.newest, tuple(sentences), printed)
 
 
 def _start(config: SimulationConfig, options: FrontOptions, errors: int) -> Child:
@@ -231,7 +234,7 @@ class _Front:
                 self._child.line.send({"look": True})
                 look_s = time.monotonic() + self._audience.look_every_s
             ready = select.select(self._sources(), [], [], self._patience(look_s))[0]
-            if self._stop in ready:
+            if self._stop in ready and _STOPS.intersection(self._stop.recv(64)):
                 self._last_look()
                 return
             if self._typed in ready and self._typed is not None:
@@ -301,11 +304,10 @@ def _ports(message: Mapping[str, object]) -> dict[str, str]:
 
 @contextmanager
 def _stop_signals() -> Iterator[socket.socket]:
-    """Give a socket that becomes readable when SIGINT or SIGTERM comes; afterwards they do what they did."""
+    """Give a socket that says the numbers of signals; SIGINT and SIGTERM do nothing else meanwhile."""
     wake, signalled = socket.socketpair()
     signalled.setblocking(False)
-    numbers: Sequence[signal.Signals] = (signal.SIGINT, signal.SIGTERM)
-    before = {number: signal.signal(number, lambda *_: None) for number in numbers}
+    before = {number: signal.signal(number, lambda *_: None) for number in _STOPS}
     descriptor = signal.set_wakeup_fd(signalled.fileno(), warn_on_full_buffer=False)
     try:
         yield wake

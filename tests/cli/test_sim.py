@@ -286,6 +286,13 @@ def test_on_a_terminal_a_table_lives_and_letters_are_shown(tmp_path: Path):
                 shown += re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", os.read(terminal, 65536).decode())
 
         until(r"2 +XL430-W250 +- +\S+ +180\.0")
+        mode = termios.tcgetattr(terminal)
+        mode[3] |= termios.ECHO  # as a shell may leave it after Ctrl-Z and fg
+        termios.tcsetattr(terminal, termios.TCSANOW, mode)
+        process.send_signal(signal.SIGCONT)
+        while termios.tcgetattr(terminal)[3] & termios.ECHO:
+            drawn = len(shown)
+            until(rf"(?s).{{{drawn}}}.*heard")
         os.write(terminal, b"overlaod\x7f\x7f\x7foad servo=2")
         until("fault> overload servo=2")
         os.write(terminal, b"\n")

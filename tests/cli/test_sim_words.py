@@ -69,6 +69,7 @@ def test_a_name_with_two_firmwares_follows_the_protocol():
         (["--servo", "AX-12A:1", "--servo", "RX-28:2"], ["AX-12A 1000000, RX-28 57600); give one by --baud"]),
         ([], ["there is nothing to simulate; give a robot file, or servos"]),
         (["{torso}", "--servo", "AX-12A:1", "--baud", "9600"], ["--servo and --baud and a robot file excl"]),
+        (["--servo", "AX-12A:1", "AX-12A:2"], ["AX-12A:2 is no robot file; if it is a servo"]),
         (["{torso}", "--fault", "lsoe servo=3"], ["--fault 'lsoe servo=3': there is no fault"]),
         (["--servo", "AX-12A:1", "--fault", "lose servo=2"], ["bus main has no servo 2; its servos are 1"]),
         (["{torso}", "--faults", "missing.txt"], ["the faults in missing.txt cannot be read (No such file"]),

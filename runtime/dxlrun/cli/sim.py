@@ -120,6 +120,8 @@ def sim(
         out().print(ending(title, served.elapsed_s, served.look), markup=False, soft_wrap=True)
         if ledger is not None:
             out().print(f"ledger: {ledger}", markup=False, soft_wrap=True)
+    if debug:
+        sys.stderr.write(served.printed)
     for sentence in served.sentences:
         say_error(f"{title}: {sentence}")
     return 1 if served.sentences else 0
@@ -141,6 +143,8 @@ def _from_file(
         return "simulation", (servo_bus(servo, baud, protocol),), None, _PRIORITY, None
     options = {"--servo": servo or None, "--baud": baud, "--protocol": protocol}
     given = [name for name, value in options.items() if value is not None]
+    if servo and not robot.is_file():
+        raise InputError(f"{robot} is no robot file; if it is a servo, give it a --servo of its own")
     if given:
         raise InputError(f"{' and '.join(given)} and a robot file exclude each other; leave one of them out")
     result = compiled(robot, assignments, (), None)
@@ -220,7 +224,7 @@ def _serve(config: SimulationConfig, options: FrontOptions, shown: Shown, *, as_
     typed = TypedLines(sys.stdin.fileno())
     if as_json:
         return serve(config, options, JsonView(shown), typed)
-    if not sys.stdout.isatty():
+    if not sys.stdout.isatty() or not typed.in_foreground:
         return serve(config, options, PlainView(shown), typed)
     from dxlrun.cli.sim_table import TableView
 

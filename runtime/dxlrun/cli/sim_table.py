@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import os
+import signal
 import sys
 import termios
 from collections.abc import Iterator, Mapping, Sequence
@@ -144,9 +146,18 @@ def _letters() -> Iterator[None]:
     before = termios.tcgetattr(descriptor)
     changed = termios.tcgetattr(descriptor)
     changed[3] &= ~(termios.ICANON | termios.ECHO)
-    termios.tcsetattr(descriptor, termios.TCSADRAIN, changed)
+
+    def set_up(mode: list[int | list[bytes | int]]) -> None:
+        # a job in the background that touches its terminal would be stopped; and the terminal may be gone
+        with suppress(termios.error, OSError):
+            if os.tcgetpgrp(descriptor) == os.getpgrp():
+                termios.tcsetattr(descriptor, termios.TCSADRAIN, mode)
+
+    set_up(changed)
+    # after Ctrl-Z and fg the shell may have set it otherwise
+    continued = signal.signal(signal.SIGCONT, lambda *_: set_up(changed))
     try:
         yield
     finally:
-        with suppress(termios.error):  # the terminal is gone
-            termios.tcsetattr(descriptor, termios.TCSADRAIN, before)
+        signal.signal(signal.SIGCONT, continued)
+        set_up(before)
