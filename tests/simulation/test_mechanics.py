@@ -9,7 +9,7 @@ import pytest
 
 from dxlrun.control_table import all_tables, control_table
 from dxlrun.simulation.command import LIMP, Command
-from dxlrun.simulation.mechanics import STEP_NS, Load, Mechanics
+from dxlrun.simulation.mechanics import EAGER_NS, EASY_NS, STEP_NS, Load, Mechanics
 from dxlrun.simulation.motor import Motor, motor_of
 from dxlrun.simulation.strain import AMBIENT_C, COOLING_S, STALLED_RISE_C
 
@@ -229,3 +229,17 @@ def test_torque_figures_are_those_of_the_tables() -> None:
         (4.817, 4.1, 2.3), rel=1e-3
     )
     assert np.isclose(motor.torque_per_ampere, 4.1 / 2.3)
+
+
+def test_in_real_time_it_goes_on_often_while_it_moves_and_seldom_while_it_cools() -> None:
+    mechanics = one(pid(5.0, 1.0))
+    mechanics.advance(100_000_000)
+    assert mechanics.due_ns() == mechanics.grid_ns + EAGER_NS
+    mechanics.advance(3 * S)
+    mechanics.heat(0, 30.01)
+    mechanics.advance(4 * S)
+    assert mechanics.due_ns() == mechanics.grid_ns + EASY_NS
+    mechanics.advance(2_000 * S)
+    assert mechanics.due_ns() is None
+    mechanics.call_at(2_001 * S, lambda: None)
+    assert mechanics.due_ns() == 2_001 * S + STEP_NS

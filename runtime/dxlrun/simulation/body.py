@@ -69,7 +69,7 @@ class Body(ABC):
 
     @temperature.setter
     def temperature(self, celsius: float) -> None:
-        self.shaft.mechanics.strain.temperature[self.shaft.index] = celsius
+        self.shaft.mechanics.heat(self.shaft.index, celsius)
 
     @property
     def secondary_id(self) -> int | None:

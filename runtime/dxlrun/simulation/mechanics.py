@@ -25,6 +25,10 @@ __all__ = ["NO_LOAD", "STEP_NS", "Load", "Mechanics", "Motor", "Plant", "PlantMa
 STEP_NS = 2_000_000
 """Step of the grid. The fastest thing in a servo here is its motor's time constant of 10 ms."""
 
+EAGER_NS, EASY_NS = 4_000_000, 1_000_000_000
+"""In real time it is let go on so often while servos move and while they only cool: to catch up with a long
+pause of the host would delay the next reply."""
+
 STRAIN_NS = 100_000_000
 """So often servos feel heat and load; a whole number of steps."""
 
@@ -43,6 +47,7 @@ class Mechanics:
         self.grid_ns = start_ns
         """Time of the last step"""
         self._start_ns = start_ns
+        self._next_strain_ns = start_ns + STRAIN_NS
         self._motors: list[Motor] = []
         self._loads: list[Load] = []
         self._watchers: dict[int, Callable[[], None]] = {}
@@ -100,6 +105,7 @@ class Mechanics:
 
     def aim(self, index: int, goal: float, speed: float, acceleration: float) -> None:
         """Change the goal of a servo and its profile, and nothing else; as in `Command`."""
+        self.strain.calm = False
         self.profiles.aim(index, goal, speed, acceleration)
         self._rests = False
 
@@ -112,6 +118,11 @@ class Mechanics:
         self.profiles.arrived = False
         self._rests = False
 
+    def heat(self, index: int, celsius: float) -> None:
+        """Bring a servo to a temperature, degrees C; it goes back to that of its load."""
+        self.strain.temperature[index] = celsius
+        self.strain.calm = False
+
     def overloaded(self, index: int) -> bool:
         """Return whether a servo has been overloaded for too long."""
         return bool(self.strain.overloaded[index] >= OVERLOAD_TICKS)
@@ -121,6 +132,18 @@ class Mechanics:
     def call_at(self, t_ns: int, action: Callable[[], None]) -> None:
         """Let something happen at the first point of the grid that is not before a time."""
         heapq.heappush(self._agenda, (t_ns, next(self._order), action))
+
+    def due_ns(self) -> int | None:
+        """Return when it should be let go on in real time, though nobody asks; None: it has nothing to do."""
+        if not self._motors:
+            return None
+        if not self._rests:
+            return self.grid_ns + EAGER_NS
+        agenda_ns = self._agenda[0][0] + STEP_NS if self._agenda else None
+        if self.strain.calm:
+            return agenda_ns
+        easy_ns = self.grid_ns + EASY_NS
+        return easy_ns if agenda_ns is None else min(easy_ns, agenda_ns)
 
     def advance(self, now_ns: int) -> None:
         """Step up to the last point of the grid before a time."""
@@ -138,16 +161,23 @@ class Mechanics:
         while self._agenda and self._agenda[0][0] <= self.grid_ns:
             heapq.heappop(self._agenda)[2]()
         if self._rests or not self._motors:
-            until_ns = min(now_ns, self._next_strain_ns)
-            if self._agenda:
-                until_ns = min(until_ns, self._agenda[0][0])
-            self.grid_ns += max(1, (until_ns - self.grid_ns) // STEP_NS) * STEP_NS
+            self._skip(now_ns)
         else:
             self._step()
             self.grid_ns += STEP_NS
         if self.grid_ns >= self._next_strain_ns:
-            self._next_strain_ns += STRAIN_NS
+            self._next_strain_ns = self._strain_after(self.grid_ns)
             self._feel()
+
+    def _skip(self, now_ns: int) -> None:
+        """Let the time pass in which nothing moves, and nothing gets warmer or colder."""
+        until_ns = now_ns if self.strain.calm else min(now_ns, self._next_strain_ns)
+        if self._agenda:
+            until_ns = min(until_ns, self._agenda[0][0])
+        self.grid_ns += max(1, (until_ns - self.grid_ns) // STEP_NS) * STEP_NS
+
+    def _strain_after(self, t_ns: int) -> int:
+        return t_ns - (t_ns - self._start_ns) % STRAIN_NS + STRAIN_NS
 
     def _step(self) -> None:
         plant, profiles, law = self.plant, self.profiles, self.law
@@ -179,6 +209,7 @@ class Mechanics:
     def _wake(self) -> None:
         self._commanded = True
         self._rests = False
+        self.strain.calm = False
 
     def _build(self, angle: Floats, velocity: Floats) -> None:
         count, dt_s = len(self._motors), STEP_NS * 1e-9
@@ -195,4 +226,4 @@ class Mechanics:
         self.law = ControlLaw(self._commands, np.array([motor.damping for motor in self._motors]), dt_s)
         self.law.stall[:] = nominal
         self.strain = Strain(nominal, STRAIN_NS * 1e-9)
-        self._next_strain_ns = self.grid_ns - (self.grid_ns - self._start_ns) % STRAIN_NS + STRAIN_NS
+        self._next_strain_ns = self._strain_after(self.grid_ns)

@@ -29,6 +29,9 @@ MOST_BACKLOG_NS = 20_000_000
 
 So it feels the rate of its line, as with an adapter."""
 
+MOVE_NS = 300_000
+"""So long the mechanics of a few steps may take."""
+
 
 class _Question(msgspec.Struct):
     """A line of the starter."""
@@ -48,8 +51,9 @@ class Server:
         self.start_ns = time.monotonic_ns()
         self._ledger = ledger
         self._line = line
-        mechanics = Mechanics(self.start_ns, mujoco_plant(config.bodies) if config.bodies else None)
-        self._buses = tuple(SimulatedBus(bus, ledger, self.start_ns, mechanics) for bus in config.buses)
+        plant = mujoco_plant(config.bodies) if config.bodies else None
+        self._mechanics = Mechanics(self.start_ns, plant)
+        self._buses = tuple(SimulatedBus(bus, ledger, self.start_ns, self._mechanics) for bus in config.buses)
         self._faults = FaultScript([parse_fault(text) for text in config.faults], config.seed)
         self._faults.attach(self._buses, start_ns=self.start_ns)
         self._terminals = tuple(
@@ -88,6 +92,7 @@ class Server:
                 terminal.receive(now_ns)
             if terminal.follow_adapter():
                 self._line.send({"ports": self._ports()})
+        self._move(now_ns)
         if unsent:
             self._line.flush()
         if self._line in readable:
@@ -96,14 +101,20 @@ class Server:
             self._stopped = True
         self._ledger.flush_if_due(now_ns)
 
+    def _move(self, now_ns: int) -> None:
+        """Let the servos move on, unless a reply is about to leave."""
+        due = (bus.next_due_ns() for bus in self._buses)
+        if all(due_ns is None or due_ns - now_ns > MOVE_NS for due_ns in due):
+            self._mechanics.advance(now_ns)
+
     def _next_ns(self, now_ns: int) -> int | None:
         """Return when something is to be done without being asked."""
         times = [due_ns for bus in self._buses if (due_ns := bus.next_due_ns()) is not None]
         backlogs = (bus.host_free_ns - MOST_BACKLOG_NS for bus in self._buses)
         times += [free_ns for free_ns in backlogs if free_ns > now_ns]
-        flush_ns = self._ledger.flush_due_ns()
-        if flush_ns is not None:
-            times.append(flush_ns)
+        times += (
+            t_ns for t_ns in (self._ledger.flush_due_ns(), self._mechanics.due_ns()) if t_ns is not None
+        )
         return min(times, default=None)
 
     def _ports(self) -> dict[str, str]:

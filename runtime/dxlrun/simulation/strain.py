@@ -21,6 +21,9 @@ OVERLOAD_PART = 0.8
 OVERLOAD_TICKS = 10
 """Ticks of `Strain` that it may last: a second [i]"""
 
+_STEADY_C = 1e-7
+"""degrees C in a tick; a smaller change shows nowhere in years."""
+
 SUPPLY_OHM = 0.1
 """Resistance of cable and plugs between supply and servo [i]"""
 
@@ -36,6 +39,8 @@ class Strain:
         """degrees C"""
         self.overloaded = np.zeros(size, dtype=np.int64)
         """Ticks since the load became too much"""
+        self.calm = False
+        """True when the same load would change nothing any more"""
 
     def tick(self, torque: Floats, most: Floats) -> list[int]:
         """Let a time pass under torques, Nm; return the servos that have something new to notice.
@@ -44,8 +49,10 @@ class Strain:
         """
         shown = np.rint(self.temperature)
         load = torque / self._nominal_stall
-        self.temperature += (AMBIENT_C + STALLED_RISE_C * load * load - self.temperature) * self._part
+        change = (AMBIENT_C + STALLED_RISE_C * load * load - self.temperature) * self._part
+        self.temperature += change
         too_much = (np.abs(torque) >= OVERLOAD_PART * most) & (most > 0.0)
         self.overloaded = np.where(too_much, self.overloaded + 1, 0)
+        self.calm = bool(np.abs(change).max() < _STEADY_C and not too_much.any())
         news = (np.rint(self.temperature) != shown) | (self.overloaded == OVERLOAD_TICKS)
         return np.flatnonzero(news).tolist() if news.any() else []
