@@ -71,8 +71,8 @@ def _compare(log: Path, ledger: Path, *, as_json: bool) -> int:
     """Say where a log and a ledger differ; return 1 when they do."""
     if not ledger.is_file():
         raise InputError(
-            f"there is no ledger {ledger}; a run on simulated buses leaves one beside its log, named "
-            "LOG.ledger.jsonl, and `dxlrun sim` writes the one it is given with --ledger"
+            f"there is no ledger {ledger}; a run on simulated buses in real time leaves one beside its log, "
+            f"here {log.with_suffix('.ledger.jsonl')}, and `dxlrun sim` writes where its --ledger says"
         )
     from dxlrun.analysis.ledger_report import compare, to_json
     from dxlrun.analysis.ledger_tables import render_comparison
