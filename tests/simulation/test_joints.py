@@ -1,0 +1,193 @@
+"""How servos with angle limits and gains move: compliance, wheel, torque mode, heat and overload."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+
+from dxlrun.simulation import Load
+
+S = 1_000_000_000
+
+
+def put(line: Any, name: str, wire: int) -> int:
+    """Write an item by name, as the integer of the wire; return the error."""
+    item = line.bus.servo(1).registers.table.items[name]
+    data = (wire & (1 << 8 * item.size) - 1).to_bytes(item.size, "little")
+    return int(line.write(1, item.address, *data))
+
+
+def look(line: Any, name: str) -> int:
+    item = line.bus.servo(1).registers.table.items[name]
+    return int(line.read(1, item.address, item.size))
+
+
+def wait(line: Any, seconds: float) -> None:
+    line.clock.wait_until(line.clock.now_ns() + round(seconds * S))
+
+
+def fastest(line: Any, seconds: float) -> float:
+    """Return the highest speed in a time, rad/s."""
+    highest = 0.0
+    for _ in range(round(seconds / 0.01)):
+        wait(line, 0.01)
+        highest = max(highest, abs(line.servo().velocity))
+    return highest
+
+
+@pytest.mark.parametrize(
+    ("model", "no_load", "low", "high"), [("MX-64", 6.597, 1396, 2700), ("AX-12A", 6.178, 318, 709)]
+)
+def test_without_a_speed_it_goes_as_fast_as_it_can(
+    make_line: Any, model: str, no_load: float, low: int, high: int
+) -> None:
+    line = make_line(
+        (1,), model, position=low * (math.tau / 4096 if model == "MX-64" else 300 / 1023 / 57.29578)
+    )
+    put(line, "goal_position", high)
+    assert fastest(line, 1.0) == pytest.approx(no_load, rel=0.02)
+    assert look(line, "present_position") == pytest.approx(high, abs=1)
+    assert look(line, "moving") == 0
+
+
+@pytest.mark.parametrize(("model", "unit"), [("MX-64", 0.114), ("AX-12A", 0.111)])
+def test_moving_speed_is_the_speed_on_the_way(make_line: Any, model: str, unit: float) -> None:
+    line = make_line((1,), model, position=1.0)
+    put(line, "moving_speed", 84)
+    put(line, "goal_position", 1000 if model == "AX-12A" else 3500)
+    wait(line, 1.0)
+    assert line.servo().velocity == pytest.approx(84 * unit * math.tau / 60, rel=0.02)
+    assert look(line, "moving") == 1
+
+
+def test_a_wider_slope_sags_more_under_the_same_load(make_line: Any) -> None:
+    sags = []
+    for slope in (32, 128):
+        line = make_line(
+            (1,), "AX-12A", position=2.0, load=Load(gravity=0.5, gravity_angle=2.0 - math.pi / 2)
+        )
+        put(line, "cw_compliance_slope", slope)
+        put(line, "ccw_compliance_slope", slope)
+        put(line, "goal_position", round(2.0 / math.radians(300) * 1023))
+        wait(line, 3)
+        sags.append(2.0 - line.servo().position)
+        assert look(line, "present_load") == pytest.approx(1023 * 0.5 * math.cos(sags[-1]) / 1.5, abs=15)
+    # (0.333 of the output - 0.031 of punch) / 0.969 of the slope, beyond a margin of 0.29 degrees
+    expected = [0.312 * slope * math.radians(300) / 1023 + 0.005 for slope in (32, 128)]
+    assert sags == pytest.approx(expected, rel=0.1)
+
+
+def test_an_mx_servo_holds_as_hard_as_its_p_gain_and_exactly_with_an_i_gain(make_line: Any) -> None:
+    line = make_line((1,), "MX-64", position=2.0, load=Load(gravity=2.0, gravity_angle=2.0 - math.pi / 2))
+    put(line, "goal_position", round(2.0 / math.tau * 4096))
+    wait(line, 2)
+    soft = 2.0 - line.servo().position
+    put(line, "p_gain", 128)
+    wait(line, 2)
+    assert 2.0 - line.servo().position == pytest.approx(soft / 4, rel=0.1)
+    put(line, "i_gain", 50)
+    wait(line, 3)
+    assert line.servo().position == pytest.approx(2.0, abs=0.002)
+
+
+def test_goal_acceleration_is_the_slope_of_the_speed(make_line: Any) -> None:
+    line = make_line((1,), "MX-64", position=1.0)
+    put(line, "goal_acceleration", 20)
+    put(line, "goal_position", 3500)
+    wait(line, 0.3)
+    first, start_ns = line.servo().velocity, line.clock.now_ns()
+    wait(line, 0.2)
+    slope = (line.servo().velocity - first) / ((line.clock.now_ns() - start_ns) * 1e-9)
+    assert slope == pytest.approx(20 * math.radians(8.583), rel=0.03)
+
+
+def test_the_wheel_of_an_mx_keeps_its_speed_under_load_and_that_of_an_ax_does_not(make_line: Any) -> None:
+    part = {}
+    for model in ("MX-64", "AX-12A"):
+        line = make_line((1,), model, load=Load(friction=0.5))
+        put(line, "cw_angle_limit", 0)
+        put(line, "ccw_angle_limit", 0)
+        put(line, "torque_enable", 1)
+        put(line, "moving_speed", 300)
+        wait(line, 3)
+        table = line.servo().registers.table
+        wanted = 300 * table.rad_s_per_tick if model == "MX-64" else 300 / 1023 * table.max_speed
+        part[model] = line.servo().velocity / wanted
+    assert part["MX-64"] == pytest.approx(1.0, abs=0.01)
+    assert part["AX-12A"] < 0.5
+
+
+def test_in_torque_control_mode_goal_torque_is_the_current(make_line: Any) -> None:
+    line = make_line((1,), "MX-64", position=2.0, load=Load(gravity=2.0, gravity_angle=2.0, friction=0.1))
+    put(line, "torque_enable", 1)
+    put(line, "torque_ctrl_mode_enable", 1)
+    put(line, "goal_torque", 1024 + 200)  # clockwise, 0.9 A of the 4.1 A at 6 Nm
+    wait(line, 3)
+    assert 2.0 * math.sin(line.servo().position - 2.0) == pytest.approx(-0.9 * 6.0 / 4.1, abs=0.1)
+    assert look(line, "current") == pytest.approx(2048 - 200, abs=2)
+
+
+def test_torque_limit_limits_what_it_holds(make_line: Any) -> None:
+    line = make_line((1,), "AX-12A", position=2.0, load=Load(gravity=1.0, gravity_angle=2.0 - math.pi / 2))
+    put(line, "shutdown", 0)
+    put(line, "torque_limit", 341)
+    put(line, "goal_position", round(2.0 / math.radians(300) * 1023))
+    wait(line, 3)
+    assert math.cos(2.0 - line.servo().position) == pytest.approx(0.5, abs=0.02)
+
+
+def test_a_blocked_servo_is_overloaded_after_a_second_and_lets_go(make_line: Any) -> None:
+    line = make_line((1,), "AX-12A", position=2.0, load=Load(friction=2.0))
+    put(line, "goal_position", 1000)
+    wait(line, 0.8)
+    assert look(line, "torque_limit") == 1023
+    wait(line, 0.5)
+    assert look(line, "torque_limit") == 0
+    assert line.ask(1, 0x01).error == 0x20
+    assert any("overload" in note for note in line.notes())
+
+
+def test_a_servo_that_holds_a_heavy_load_gets_hot_and_lets_go(make_line2: Any) -> None:
+    line = make_line2(
+        (1,), "XM430-W350", position=2.0, load=Load(gravity=2.4, gravity_angle=2.0 - math.pi / 2)
+    )
+    line.set("torque_enable", 1)
+    line.set("goal_position", round(2.0 / math.tau * 4096))
+    line.wait(60)
+    assert 35 < line.get("present_temperature") < 80
+    assert line.get("present_input_voltage") < 120
+    line.wait(400)
+    assert line.get("hardware_error_status") == 0x04
+    assert line.get("torque_enable") == 0
+    assert line.servo().position == pytest.approx(2.0 - math.pi / 2, abs=0.01)  # it hangs
+
+
+def test_an_x_servo_sags_as_its_p_gain_says(make_line2: Any) -> None:
+    line = make_line2(
+        (1,), "XM430-W350", position=2.0, load=Load(gravity=1.0, gravity_angle=2.0 - math.pi / 2)
+    )
+    line.set("torque_enable", 1)
+    line.set("goal_position", round(2.0 / math.tau * 4096))
+    line.wait(2)
+    sag = 2.0 - line.servo().position
+    # 800 / 128 of 885 PWM units for a tick of 4096 a turn, 4.1 Nm at 885
+    assert sag == pytest.approx(1.0 * math.cos(sag) / (800 / 128 / 885 * 4096 / math.tau * 4.1), rel=0.05)
+    assert line.get("present_current") == pytest.approx(math.cos(sag) / 4.1 * 2.3 / 0.00269, abs=3)
+
+
+def test_moving_status_tells_profile_and_arrival(make_line2: Any) -> None:
+    line = make_line2((1,), "XM430-W350", position=1.0)
+    line.set("profile_velocity", 50)
+    line.set("profile_acceleration", 5)
+    line.set("torque_enable", 1)
+    line.set("goal_position", 3000)
+    line.wait(0.5)
+    assert line.get("moving_status") == 0x32  # trapezoid, under way
+    assert 0 < line.get("velocity_trajectory") <= 50
+    behind = line.get("position_trajectory") - line.get("present_position")
+    assert 0 <= behind < 100
+    line.wait(5)
+    assert line.get("moving_status") == 0x31
+    assert line.get("moving") == 0
