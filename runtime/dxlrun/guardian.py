@@ -94,8 +94,9 @@ class LastHand:
         outcome = limp(job.buses, ports, self._clock, packets, beat=self._heartbeat.look)
         packets.commit()
         silent = [str(one) for one in outcome if not one.confirmed]
+        everybody = "the servo" if len(outcome) == 1 else f"all {len(outcome)} servos"
         result = (
-            f"torque off was confirmed by all {len(outcome)} servos"
+            f"torque off was confirmed by {everybody}"
             if not silent
             else f"torque off was sent, but not confirmed by {', '.join(silent)}"
         )

@@ -31,6 +31,7 @@ from dxlrun.errors import DxlrunError, PlugInError
 from dxlrun.events import EventCode, EventRing, Severity
 from dxlrun.heartbeat import Heartbeat, Phase
 from dxlrun.packets import PacketBatch
+from dxlrun.plurals import counted
 from dxlrun.ring import RingWriter
 
 _PR_SET_PDEATHSIG = 1
@@ -103,7 +104,8 @@ def _refuse_threads() -> Callable[[str], None]:
         count = realtime.thread_count()
         if count != 1:
             raise PlugInError(
-                f"plug-in {name} started {count - 1} more thread(s) in the loop's process; "
+                f"plug-in {name} started {counted(count - 1, 'more thread', 'more threads')} in the loop's "
+                "process; "
                 "CPython would hand the interpreter over to them in the middle of a cycle: "
                 "let it work in on_configure without threads, or in a process of its own"
             )

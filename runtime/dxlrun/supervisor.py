@@ -23,6 +23,7 @@ from dxlrun.events import Severity
 from dxlrun.guardian import GuardianJob, LastHand
 from dxlrun.heartbeat import Heartbeat, Phase, Standstill
 from dxlrun.loop_process import Outcome
+from dxlrun.plurals import counted
 from dxlrun.run_log import discard_log, epoch_offset_ns, ledger_of, log_header, new_log
 from dxlrun.run_processes import (
     END_TIMEOUT_S,
@@ -169,7 +170,8 @@ class _Run:
                     self.messages = summary["messages"]
                     if summary["gaps"]:
                         self.sentences.append(
-                            f"the log has {summary['gaps']} declared gap(s): the recorder was too slow"
+                            f"the log lacks {counted(summary['gaps'], 'record', 'records')}, and says so: "
+                            "the recorder was too slow"
                         )
             recorder.end()
         except ProcessFault as fault:
@@ -214,7 +216,7 @@ def _progress(plan: Plan, status: Status, began: float) -> Callable[[Heartbeat],
             end = f" of {plan.loop.end_ns / 1e9:.1f}" if plan.loop.end_ns else ""
             status.update(
                 f"{plan.robot}: {heartbeat.cycles * plan.loop.period_ns / 1e9:.1f}{end} s, "
-                f"cycle {heartbeat.cycles}, {heartbeat.skipped} periods skipped "
+                f"cycle {heartbeat.cycles}, {counted(heartbeat.skipped, 'period', 'periods')} skipped "
                 f"({time.monotonic() - began:.0f} s; Ctrl-C stops)"
             )
 

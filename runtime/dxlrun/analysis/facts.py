@@ -11,6 +11,7 @@ from dxlrun.analysis.latency import on_virtual_time
 from dxlrun.analysis.report import Report
 from dxlrun.analysis.tables import Cell, Column, Table, tone_of
 from dxlrun.events import EventCode
+from dxlrun.plurals import counted
 from dxlrun.recording.reader import Log
 
 
@@ -81,7 +82,7 @@ def _buses(log: Log) -> Table:
             (
                 f"bus {name}",
                 f"port {bus.port}, Protocol {bus.protocol:.1f}, {bus.baud_rate / 1e6:g} Mbit/s, "
-                f"{len(bus.servos)} servos ({', '.join(models)})",
+                f"{counted(len(bus.servos), 'servo', 'servos')} ({', '.join(models)})",
             )
         )
     return _pairs("Buses of the plan", rows)

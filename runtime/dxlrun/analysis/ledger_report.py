@@ -18,10 +18,10 @@ from dxlrun.analysis.ledger_alignment import Span, differing
 from dxlrun.analysis.ledger_faults import FaultAnswers, answered, faults_in
 from dxlrun.analysis.ledger_lateness import Lateness, lateness
 from dxlrun.analysis.ledger_streams import WAYS, Stream, Way, logged, seen
-from dxlrun.analysis.verdict import counted
 from dxlrun.errors import InputError
 from dxlrun.events import EventCode
 from dxlrun.packets import LoggedPacket, PacketKind
+from dxlrun.plurals import counted
 from dxlrun.recording.reader import Log
 from dxlrun.simulation import LedgerEntry
 

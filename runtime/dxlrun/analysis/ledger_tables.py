@@ -10,7 +10,7 @@ from rich.text import Text
 from dxlrun.analysis.ledger_faults import FaultAnswers
 from dxlrun.analysis.ledger_lateness import Lateness
 from dxlrun.analysis.ledger_report import ComparedBus, Difference, LedgerReport
-from dxlrun.analysis.tables import Cell, Column, Table
+from dxlrun.analysis.tables import Cell, Column, Table, once
 from dxlrun.analysis.terminal import Shown
 from dxlrun.analysis.verdict import microseconds
 
@@ -98,7 +98,9 @@ def faults_table(faults: Sequence[FaultAnswers]) -> Table:
                 Cell(fault.bus),
                 Cell(fault.text),
                 Cell(microseconds(first.after_ms * 1000) if first else "-"),
-                Cell(f"{first.name} {first.source}: {first.text}" if first else "none within 2 s"),
+                Cell(
+                    f"{first.name}: {once(f'{first.source}: {first.text}')}" if first else "none within 2 s"
+                ),
             )
         )
     return Table(_title("Injected faults", len(faults)), columns, tuple(rows))

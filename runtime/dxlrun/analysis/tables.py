@@ -170,7 +170,7 @@ def events_table(events: Iterable[EventCount]) -> Table:
     """Return the kinds of events, the grave ones first."""
     columns = [Column("event", "name"), Column("count"), Column("the first", "text")]
     rows = [
-        (Cell(event.name, tone_of(event.severity)), str(event.count), _once(event.first)) for event in events
+        (Cell(event.name, tone_of(event.severity)), str(event.count), once(event.first)) for event in events
     ]
     return _table("Events", columns, rows)
 
@@ -182,8 +182,8 @@ def tone_of(severity: int) -> Tone:
     return "warning" if severity >= Severity.WARNING else "plain"
 
 
-def _once(text: str) -> str:
-    """Drop a source that its own text names again, and the lines of a traceback but the last."""
+def once(text: str) -> str:
+    """Return `source: text` for a cell, without a source that its text repeats; of a traceback the end."""
     source, _, said = text.partition(": ")
     line = said.strip().splitlines()[-1].strip() if said.strip() else ""
     return line if line.startswith(source) else f"{source}: {line}"

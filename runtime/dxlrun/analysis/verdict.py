@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from dxlrun.analysis.bus import Servo
 from dxlrun.analysis.latency import Duration, Latency, Periods, on_virtual_time
 from dxlrun.events import Event, Severity
+from dxlrun.plurals import counted
 from dxlrun.recording.reader import Log
 
 ROUGH_SHARE = 0.01
@@ -129,11 +130,6 @@ def _more(joining: str, count: int) -> str:
     """Return how many servos there are beyond those that are named."""
     beyond = count - _MOST_NAMED
     return f"{joining} {counted(beyond, 'more servo', 'more servos')}" if beyond > 0 else ""
-
-
-def counted(number: int, one: str, many: str) -> str:
-    """Return a number with its noun, as a person writes them."""
-    return f"{number} {one if number == 1 else many}"
 
 
 def _name(servo: Servo) -> str:

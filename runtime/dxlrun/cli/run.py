@@ -11,6 +11,7 @@ from dxlrun.cli.flags import Flag, Motions
 from dxlrun.cli.inputs import compiled
 from dxlrun.cli.terminal import out, say_error, say_warning
 from dxlrun.errors import InputError, LogError
+from dxlrun.plurals import counted
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -125,12 +126,13 @@ def show(summary: RunSummary, robot: str, console: Console) -> None:
         say_error(f"{robot}: {sentence}")
     verdict = {0: "good", 130: "interrupted"}.get(summary.exit_code, "failed")
     console.print(
-        f"{robot}: {verdict}. {summary.elapsed_s:.1f} s, {summary.cycles} cycles, "
-        f"{summary.skipped} {'period' if summary.skipped == 1 else 'periods'} skipped",
+        f"{robot}: {verdict}. {summary.elapsed_s:.1f} s, {counted(summary.cycles, 'cycle', 'cycles')}, "
+        f"{counted(summary.skipped, 'period', 'periods')} skipped",
         soft_wrap=True,
     )
     if summary.log is not None:
         for sentence in _verdict(summary.log, summary):
             console.print(f"  {sentence}", markup=False, soft_wrap=True)
-        console.print(f"log: {summary.log} ({summary.messages} messages)", markup=False, soft_wrap=True)
+        held = counted(summary.messages, "message", "messages")
+        console.print(f"log: {summary.log} ({held})", markup=False, soft_wrap=True)
         console.print(f"next: dxlrun analyze {summary.log}", markup=False, soft_wrap=True)

@@ -15,6 +15,7 @@ from dxlrun.cycle import CycleRecord
 from dxlrun.errors import PortError
 from dxlrun.events import EventCode, EventSink, Severity
 from dxlrun.hardware import Hardware
+from dxlrun.plurals import counted
 
 
 @dataclass(slots=True)
@@ -155,7 +156,7 @@ class Loop:
                 Severity.WARNING,
                 "loop",
                 f"cycle {cycle} ended {(passed_ns - cycle * self.plan.period_ns) / 1e6:.3f} ms after its "
-                f"deadline; {skipped} period(s) skipped",
+                f"deadline; {counted(skipped, 'period', 'periods')} skipped",
             )
         self._late = bool(skipped)
         return following
@@ -170,5 +171,7 @@ class Loop:
 
     def _tell_end(self, reason: str, detail: str) -> None:
         severity = Severity.FATAL if reason == "fault" else Severity.INFO
-        text = f"loop {reason} after {self._cycles} cycles, {self._skipped} periods skipped"
+        cycles = counted(self._cycles, "cycle", "cycles")
+        skipped = counted(self._skipped, "period", "periods")
+        text = f"loop {reason} after {cycles}, {skipped} skipped"
         self.events.emit(EventCode.LOOP_STOPPED, severity, "loop", f"{text}: {detail}" if detail else text)

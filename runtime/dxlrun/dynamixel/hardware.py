@@ -123,7 +123,10 @@ class DynamixelHardware:
         if not failures:
             count = sum(len(plan.servos) for plan in self._plans)
             self._events.emit(
-                EventCode.TORQUE_OFF, Severity.INFO, "hardware", f"torque is off on all {count} servos"
+                EventCode.TORQUE_OFF,
+                Severity.INFO,
+                "hardware",
+                f"torque is off on {'the servo' if count == 1 else f'all {count} servos'}",
             )
         return failures
 

@@ -19,6 +19,7 @@ from dxlrun.dynamixel.protocol2 import describe_hardware_error
 from dxlrun.dynamixel.transaction import Program, ProgramJob, Reply, Transaction
 from dxlrun.events import EventCode, EventSink, Severity
 from dxlrun.interfaces import Commands, States
+from dxlrun.plurals import counted
 
 NOISE_EVENT_NS = 1_000_000_000
 """A noisy line has at most one event in this time."""
@@ -127,7 +128,10 @@ class Servos:
             count = self._bus.noise_bytes - self._noise_seen
             self._noise_seen, self._noise_at_ns = self._bus.noise_bytes, now_ns
             self._emit(
-                EventCode.BUS_NOISE, Severity.WARNING, self._plan.name, f"{count} bytes belonged to no packet"
+                EventCode.BUS_NOISE,
+                Severity.WARNING,
+                self._plan.name,
+                f"{counted(count, 'byte', 'bytes')} belonged to no packet",
             )
 
     def goal_packets(self, goals: Commands, states: States) -> list[bytes]:
@@ -244,7 +248,9 @@ class Servos:
                     how = "sent a garbled reply" if self.reads.garbled[index] else "did not answer"
                     self._say(EventCode.READ_LOST, Severity.WARNING, index, how)
             elif self._missed[index]:
-                text = f"answers again; {self._missed[index]} replies in a row were lost"
+                missed = self._missed[index]
+                lost = "1 reply was" if missed == 1 else f"{missed} replies in a row were"
+                text = f"answers again; {lost} lost"
                 self._missed[index] = 0
                 self._say(EventCode.READ_BACK, Severity.INFO, index, text)
 

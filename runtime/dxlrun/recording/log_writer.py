@@ -16,6 +16,7 @@ from dxlrun.commands import CommandPieces
 from dxlrun.cycle import CycleLayout
 from dxlrun.events import Event, EventCode, Severity, decode_event
 from dxlrun.packets import split_packets
+from dxlrun.plurals import counted
 from dxlrun.recording import schemas
 from dxlrun.recording.cdr import ENCAPSULATION, Codec
 from dxlrun.recording.header import LogHeader, LogSummary, to_metadata
@@ -243,7 +244,9 @@ class LogWriter:
     def gap(self, source: str, lost: int) -> None:
         """Declare that `lost` records of `source` did not reach the log; it becomes an event."""
         self._lost += lost
-        text = f"{lost} records of {source} were overwritten or damaged before the recorder read them"
+        what = counted(lost, f"record of {source} was", f"records of {source} were")
+        them = "it" if lost == 1 else "them"
+        text = f"{what} overwritten or damaged before the recorder read {them}"
         event = Event(self._last_ns, EventCode.RECORDER_GAP, Severity.ERROR, "recorder", text)
         self._guarded(lambda: self._write_event(event))
 

@@ -15,6 +15,7 @@ from dxlrun.control.manager import Manager
 from dxlrun.control.plugins import PlugIns, load_plugins
 from dxlrun.cycle import CycleLayout, CycleRecord
 from dxlrun.events import EventCode, Severity
+from dxlrun.plurals import counted
 from dxlrun.recording.reader import read_log
 from dxlrun.replay.changes import Setting, with_arguments, with_settings
 from dxlrun.replay.comparison import Comparison, Difference, JointDifferences
@@ -52,9 +53,10 @@ class ReplayReport:
     def sentence(self) -> str:
         """The result in one sentence."""
         if self.same:
-            return f"{self.robot}: {self.compared} cycles replayed, 0 differences"
+            return f"{self.robot}: {counted(self.compared, 'cycle', 'cycles')} replayed, 0 differences"
         if not self.different:
-            return f"{self.robot}: {self.compared} cycles replayed without a difference, then {self.fault}"
+            replayed = f"{counted(self.compared, 'cycle', 'cycles')} replayed without a difference"
+            return f"{self.robot}: {replayed}, then {self.fault}"
         ended = f"; then {self.fault}" if self.fault else ""
         return f"{self.robot}: {self.different} of {self.compared} replayed cycles differ{ended}"
 

@@ -10,6 +10,7 @@ from dxlrun.analysis.figures.drawing import BLUE, ERROR, WARNING, Drawing, Words
 from dxlrun.analysis.figures.run_time import first_deadline_ns
 from dxlrun.events import Severity
 from dxlrun.interfaces import Floats
+from dxlrun.plurals import counted
 from dxlrun.recording.reader import Log
 
 _SHAPES = (
@@ -45,11 +46,12 @@ def events_drawing(log: Log) -> Drawing | None:
     told = ", ".join(
         f"{name} {np.count_nonzero(grades == grade)}" for grade, (name, *_) in enumerate(_SHAPES)
     )
+    number = counted(len(log.events), "event", "events")
     words = Words(
         "events-timeline",
         "Events over the run",
-        f"Events over the time of the run in s, one row a kind. {len(log.events)} events: {told}.",
-        f"{len(log.events)} events: {told}. Before 0 s the servos are set up.",
+        f"Events over the time of the run in s, one row a kind. {number}: {told}.",
+        f"{number}: {told}. Before 0 s the servos are set up.",
     )
     return draw(words, 0.9 + 0.17 * len(kinds), fill)
 
