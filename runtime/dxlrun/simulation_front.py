@@ -12,7 +12,7 @@ import select
 import signal
 import socket
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -187,14 +187,20 @@ def serve(
             front.run()
         finally:
             child.end()
-    sentences = list(front.sentences)
     printed = process.whole(errors).decode(errors="replace")
     os.close(errors)
-    if child.process.returncode and not sentences:
-        sentences.append(f"the simulated bus ended with exit code {child.process.returncode}")
-    if sentences and printed.strip():
-        sentences.append(f"it printed last: {printed.strip().splitlines()[-1]}")
-    return Served(time.monotonic() - began, front.newest, tuple(sentences), printed)
+    sentences = _sentences(front.sentences, child.process.returncode, printed)
+    return Served(time.monotonic() - began, front.newest, sentences, printed)
+
+
+def _sentences(before: Sequence[str], code: int, printed: str) -> tuple[str, ...]:
+    """Return what went wrong: a process that ends with a code other than 0 prints why."""
+    last = printed.strip().splitlines()[-1:]
+    if before:
+        return (*before, *(f"it printed last: {line} (--debug shows all)" for line in last))
+    if not code:
+        return ()
+    return tuple(last) or (f"the simulated bus ended with exit code {code}",)
 
 
 def _start(config: SimulationConfig, options: FrontOptions, errors: int) -> Child:

@@ -127,6 +127,18 @@ def test_letters_become_lines(
     os.close(writer)
 
 
+def test_a_job_in_the_background_leaves_its_terminal_alone(
+    keyboard: tuple[int, TypedLines], monkeypatch: pytest.MonkeyPatch
+):
+    _, typed = keyboard
+    assert typed.in_foreground  # a pipe may always be read
+
+    monkeypatch.setattr(os, "tcgetpgrp", lambda _: os.getpgrp() + 1)
+    assert not typed.in_foreground
+    monkeypatch.setattr(os, "tcgetpgrp", lambda _: os.getpgrp())
+    assert typed.in_foreground
+
+
 def test_an_end_gives_what_was_not_finished(keyboard: tuple[int, TypedLines]):
     writer, typed = keyboard
     os.write(writer, b"help")

@@ -169,7 +169,7 @@ def test_the_last_line_says_what_passed():
     look = Look((servo,), {"median": 12.3, "p99": 80.0})
 
     assert ending("torso", 2.04, look) == (
-        "torso: ended after 2.0 s. 1 packet heard, 0 packets answered; "
+        "torso: ended after 2.0 s. 1 packet heard, 0 answered; "
         "replies later than planned: median 12 us, p99 80 us"
     )
-    assert ending("torso", 2.04, Look()) == "torso: ended after 2.0 s. 0 packets heard, 0 packets answered"
+    assert ending("torso", 2.04, Look()) == "torso: ended after 2.0 s. 0 packets heard, 0 answered"

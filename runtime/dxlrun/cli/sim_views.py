@@ -164,7 +164,7 @@ def ending(title: str, elapsed_s: float, look: Look) -> str:
     heard, answered = (sum(getattr(servo, name) for servo in look.servos) for name in ("heard", "answered"))
     late = ", ".join(f"{name} {value:.0f} us" for name, value in look.lateness_us.items())
     said = f"{title}: ended after {elapsed_s:.1f} s. "
-    said += f"{_number(heard, 'packet')} heard, {_number(answered, 'packet')} answered"
+    said += f"{_number(heard, 'packet')} heard, {answered} answered"
     return said + (f"; replies later than planned: {late}" if late else "")
 
 
