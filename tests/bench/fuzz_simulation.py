@@ -252,7 +252,7 @@ def main() -> None:
     count = int(sys.argv[1]) if len(sys.argv) > 1 else 1_000_000
     seed = int(sys.argv[2]) if len(sys.argv) > 2 else 1
     for protocol in (1.0, 2.0):
-        campaign(protocol, 10_000, seed)  # all that is loaded once is loaded
+        campaign(protocol, 25_000, seed)  # all models are loaded
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         began = time.monotonic()
         tally = campaign(protocol, count // 2, seed)

@@ -40,11 +40,13 @@ PROTOCOLS = (  # section "Protocol Type"
     ("X[LC]330*", {2, 20, 21, 22}),
     ("*", {1, 2}),
 )
+PROFILES_BOUND_BY_LIMITS = ("P[HM]*", "[HM]*-R(A)", "RH-P12-RN(A)", "YM*")
 GOALS_BOUND_BY_LIMITS = "YM*"
 """Models whose position limits reach over turns, so that a goal has no other bounds."""
 
 CHANGES_THE_LINE = ("id", "baud_rate", "baud_rate_bus", "status_return_level", "protocol_type", "lock")
 """After a write of these the servo answers otherwise, or not at all: each is set back at once."""
+LIMITS = ("pwm_limit", "current_limit", "velocity_limit", "acceleration_limit", "max_position_limit")
 MEASURED = ("current",)
 """The manual lets it be written, and the servo goes on to show what it measures (MX-64, MX-106)."""
 
@@ -67,7 +69,7 @@ class Desk:
     def open_limits(self) -> None:
         """Set what limits the goals to the widest."""
         for item in self.table.items.values():
-            if item.name in ("pwm_limit", "current_limit", "velocity_limit", "max_position_limit"):
+            if item.name in LIMITS:
                 self.servo.registers[item.name] = item.maximum
             if item.name == "min_position_limit":
                 self.servo.registers[item.name] = item.minimum
@@ -231,6 +233,17 @@ def test_a_goal_beyond_a_limit_is_a_limit_error(table: ControlTable) -> None:
             desk.servo.registers[limit] = 7
             errors = [desk.write(item, wire(item, value)) for value in (-8, -7, 7, 8)]
             assert errors == [DATA_LIMIT, 0, 0, DATA_LIMIT], goal
+    for profile, limit in (
+        ("profile_velocity", "velocity_limit"),
+        ("profile_acceleration", "acceleration_limit"),
+    ):
+        if profile in table.items and limit in table.items:
+            item = table.items[profile]
+            desk.servo.registers[limit] = 7
+            bounded = any(fnmatch.fnmatchcase(table.model, each) for each in PROFILES_BOUND_BY_LIMITS)
+            assert [desk.write(item, wire(item, value)) for value in (7, 8)] == [0, DATA_LIMIT * bounded], (
+                profile
+            )
     if "max_position_limit" in table.items:
         item = table.items["goal_position"]
         desk.servo.registers["max_position_limit"] = 200

@@ -9,7 +9,7 @@ import math
 from enum import IntEnum, unique
 
 from dxlrun.control_table import ControlItem
-from dxlrun.simulation.choices import choices
+from dxlrun.simulation.choices import TORQUE_ENABLE_OF_P, choices
 from dxlrun.simulation.memory import Memory, in_range
 from dxlrun.simulation.protocol1 import ErrorBit
 from dxlrun.simulation.protocol2 import ErrorNumber
@@ -20,6 +20,10 @@ _LIMITS_OF_GOALS = {
     "goal_torque": "torque_limit",
     "goal_velocity": "velocity_limit",
 }
+_LIMITS_OF_PROFILES = {"profile_velocity": "velocity_limit", "profile_acceleration": "acceleration_limit"}
+"""On P and PRO(A) these "cannot exceed" their limits (e-Manual, Profile Velocity (560)); of Y it is inferred
+[i], on X they may."""
+
 _GOALS = frozenset(("goal_pwm", "goal_current", "goal_velocity", "goal_position"))
 _TURNS = 256
 """Reach of extended position control to either side (e-Manual, X series, Goal Position (116): 1,048,575)."""
@@ -95,6 +99,9 @@ class TorqueRules:
     def __init__(self, memory: Memory) -> None:
         self._memory = memory
         self._choices = choices(memory.table)
+        bounded = memory.table.items["torque_enable"].address == TORQUE_ENABLE_OF_P
+        limits = _LIMITS_OF_GOALS | (_LIMITS_OF_PROFILES if bounded else {})
+        self._limits = {name: limit for name, limit in limits.items() if limit in memory}
         goal = memory.table.items.get("goal_position")
         self._has_one_turn = (
             goal is not None
@@ -152,12 +159,11 @@ class TorqueRules:
 
     def _beyond_limit(self, item: ControlItem, wire: int) -> bool:
         memory = self._memory
-        limit = _LIMITS_OF_GOALS.get(item.name)
-        limited = limit is not None and limit in memory
-        if not limited and item.name != "goal_position":
+        limit = self._limits.get(item.name)
+        if limit is None and item.name != "goal_position":
             return False
         value = item.decode(wire.to_bytes(item.size, "little"))
-        if limit is not None and limited:
+        if limit is not None:
             return abs(value) > memory[limit]
         if "max_position_limit" in memory and self._one_turn():
             lowest, highest = memory.ticks("min_position_limit"), memory.ticks("max_position_limit")

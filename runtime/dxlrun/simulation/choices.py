@@ -7,8 +7,8 @@ from types import MappingProxyType
 
 from dxlrun.control_table import ControlTable
 
-_TORQUE_ENABLE_OF_P = 512
-"""Address of Torque Enable on P, PRO(A) and RH-P12-RN(A)."""
+TORQUE_ENABLE_OF_P = 512
+"""Address of Torque Enable on P, PRO(A), RH-P12-RN(A) and Y."""
 
 
 def choices(table: ControlTable) -> Mapping[str, frozenset[int]]:
@@ -26,7 +26,7 @@ def _operating_modes(table: ControlTable) -> tuple[int, ...]:
         return 0, 1, 3  # Y
     if item.maximum == 5:
         return 0, 5  # RH-P12-RN(A)
-    if table.items["torque_enable"].address == _TORQUE_ENABLE_OF_P:
+    if table.items["torque_enable"].address == TORQUE_ENABLE_OF_P:
         return 0, 1, 3, 4, 16
     return (0, 1, 3, 4, 5, 16) if "goal_current" in table.items else (1, 3, 4, 16)
 
