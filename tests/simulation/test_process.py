@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,8 +19,11 @@ import rustypot
 
 from dxlrun.control_table import control_table
 from dxlrun.simulation import BusConfig, Ledger, ServoConfig, SimulatedBus, read_ledger
+from dxlrun.simulation.control_line import ControlLine
+from dxlrun.simulation.link import Link
 from dxlrun.simulation.process import SimulationConfig, decode_config, encode_config
 from dxlrun.simulation.pseudo_terminal import PseudoTerminal
+from dxlrun.simulation.realtime import Patience
 
 PING_1 = bytes.fromhex("ff ff 01 02 01 fb")
 PONG_1 = bytes.fromhex("ff ff 01 02 00 fc")
@@ -255,11 +259,20 @@ def test_faults_by_hand_happen_and_are_told(tmp_path: Path) -> None:
             assert hear(port, 6) == PONG_1
 
 
-def test_a_fault_that_could_never_happen_is_refused_before_anything_starts(tmp_path: Path) -> None:
-    config = SimulationConfig(BUSES, faults=("lose bus=main servo=9",))
+@pytest.mark.parametrize(
+    ("config", "said_so"),
+    [
+        (SimulationConfig(BUSES, faults=("lose bus=main servo=9",)), "no servo 9"),
+        (SimulationConfig(BUSES, links={"main": "/nowhere/link"}), "/nowhere/link"),
+        (SimulationConfig((BusConfig("main", 3, BUSES[0].servos),)), "3 bit/s"),
+    ],
+)
+def test_what_cannot_be_served_is_refused_with_a_sentence(
+    tmp_path: Path, config: SimulationConfig, said_so: str
+) -> None:
     with bare(tmp_path / "config", config=config) as (child, control):
         with control.makefile("rb") as said:
-            assert "no servo 9" in json.loads(said.readline())["error"]
+            assert said_so in json.loads(said.readline())["error"]
         assert child.communicate(timeout=PATIENCE_S)[1] == b""
         assert child.returncode == 2
 
@@ -294,3 +307,84 @@ def test_real_time_is_asked_for_and_what_was_granted_is_said(tmp_path: Path) -> 
         assert "priority 1" in first["real_time"]
         assert "no core of its own" in first["real_time"]
     assert read_ledger(path)[0].note == f"real time: {first['real_time']}"
+
+
+RATES = (57_600, 1_000_000, 2_000_000, 4_000_000)
+
+
+def test_no_reply_is_there_before_wire_time_and_return_delay_have_passed(start_buses: Any) -> None:
+    """Judged by the host's own clock; by how much later it comes, tests/bench/simulated_bus.py measures."""
+    ping = bytes.fromhex("ff ff fd 00 01 03 00 01 19 4e")
+    servo = ServoConfig(1, "XM430-W350", 2.0, 200_000)
+    buses = [BusConfig(str(rate), rate, (servo,), 2.0) for rate in RATES]
+    running = start_buses(buses)
+    for rate in RATES:
+        bound_ns = (len(ping) + 14) * 10_000_000_000 // rate + 200_000
+        with opened(running.ports[str(rate)]) as port:
+            for _ in range(40):
+                asked_ns = time.monotonic_ns()
+                os.write(port, ping)
+                hear(port, 14)
+                assert time.monotonic_ns() - asked_ns >= bound_ns
+    assert running.hang_up() == 0
+    replies = [entry for entry in running.ledger() if entry.direction == "out"]
+    assert len(replies) == 40 * len(RATES)
+    assert all(entry.late_ns > 0 for entry in replies)  # none was handed over before it was due
+
+
+def test_polling_is_bounded_and_sleeping_is_not_endless() -> None:
+    patience, now, polled = Patience(0), 0, 0
+    for _ in range(100_000):  # something is always due in 60 us
+        wait_s = patience.until(now + 60_000, now)
+        assert wait_s is not None
+        spent = 1_000 if wait_s == 0 else round(wait_s * 1e9)
+        polled += spent if wait_s == 0 else 0
+        now += spent
+    assert polled < now / 6 + 25_000_000
+    assert patience.until(None, now) is None
+    assert patience.until(now - 5, now + 10**9) == 0
+    assert patience.until(now + 3 * 10**9, now + 2 * 10**9) == pytest.approx(1.0, abs=1e-3)
+
+
+def test_a_host_that_floods_the_line_feels_its_rate(start_buses: Any) -> None:
+    running = start_buses([BusConfig("slow", 57_600, (ServoConfig(1, "AX-12A", 1.0),))])
+    with opened(running.ports["slow"]) as port:
+        os.set_blocking(port, False)
+        sent = 0
+        with contextlib.suppress(BlockingIOError):
+            while sent < 1_000_000:  # 3 minutes of the line
+                sent += os.write(port, bytes(4096))
+        assert sent < 1_000_000
+    assert running.hang_up() == 0
+
+
+def test_what_nobody_reads_from_the_control_socket_is_dropped() -> None:
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        line = ControlLine(theirs)
+        for number in range(20_000):
+            line.send({"number": number, "text": "x" * 100})
+        assert line.has_unsent
+        ours.sendall(b"one\ntw")
+        assert line.receive() == [b"one"]
+        ours.sendall(b"o\n" + bytes(70_000))
+        said = [each for _ in range(3) for each in line.receive()]
+        assert said == [b"two"]
+        ours.close()
+        line.receive()
+        line.flush()
+        assert line.closed
+
+
+def test_a_link_never_replaces_a_file_and_goes_only_where_it_was_put(tmp_path: Path) -> None:
+    file, link = tmp_path / "file", tmp_path / "link"
+    file.write_text("mine")
+    with pytest.raises(FileExistsError, match="is no link"):
+        Link(file).point("/dev/null")
+    one, other = Link(link), Link(link)
+    one.point("/dev/null")
+    other.point("/dev/zero")
+    one.remove()
+    assert os.readlink(link) == "/dev/zero"
+    other.remove()
+    assert os.listdir(tmp_path) == ["file"]

@@ -42,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         line = ControlLine(control)
         try:
             server = Server(config, ledger, line)
-        except (DxlrunError, OSError) as error:
+        except (DxlrunError, OSError, LookupError, ValueError) as error:
             line.send({"error": str(error)})
             return 2
         granted = realtime.prepare(options.priority, options.core)

@@ -14,6 +14,8 @@ LONGEST_POLL_NS = 80_000
 _POLL_SHARE = 8
 """One part in so many of all time may be polled; a busy bus is served by sleeping alone."""
 _BUDGET_NS = 20_000_000
+_PAUSE_NS = 100_000
+"""So long the process at least sleeps when it may not poll: what becomes due meanwhile goes out together."""
 
 
 def prepare(priority: int, core: int) -> str:
@@ -55,7 +57,8 @@ def _take_priority(priority: int) -> str:
 class Patience:
     """Decides how long to sleep before something is due, and when to poll the clock instead.
 
-    Polling is punctual and costs the processor; it is bounded to an eighth of all time.
+    Polling is punctual and costs the processor; it is bounded to an eighth of all time. Beyond that, replies
+    are handed over a little late, several at once.
     """
 
     def __init__(self, now_ns: int) -> None:
@@ -76,4 +79,4 @@ class Patience:
         if left_ns > LONGEST_POLL_NS:
             return (left_ns - (LONGEST_POLL_NS if self._budget_ns > 0 else 0)) * 1e-9
         self._polls = self._budget_ns > 0
-        return 0.0 if self._polls or left_ns <= 0 else left_ns * 1e-9
+        return 0.0 if self._polls or left_ns <= 0 else _PAUSE_NS * 1e-9

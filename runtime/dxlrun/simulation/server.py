@@ -6,6 +6,7 @@ import select
 import signal
 import socket
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
@@ -75,7 +76,8 @@ class Server:
 
     def _turn(self, wake: socket.socket) -> None:
         now_ns = time.monotonic_ns()
-        patience = self._patience.until(self._next_ns(now_ns), now_ns)
+        dues = [bus.next_due_ns() for bus in self._buses]
+        patience = self._patience.until(self._next_ns(dues, now_ns), now_ns)
         sources: list[PseudoTerminal | socket.socket | ControlLine] = [
             each
             for each in self._terminals
@@ -85,10 +87,14 @@ class Server:
         writable = (self._line,) if self._line.has_unsent else ()
         readable, unsent, _ = select.select(sources, writable, (), patience)
         # What was due before the host wrote goes out first: the host could have read it.
-        for terminal in self._terminals:
+        now_ns = time.monotonic_ns()
+        for terminal, due_ns in zip(self._terminals, dues, strict=True):
+            wrote = terminal in readable
+            if not wrote and (due_ns is None or due_ns > now_ns):
+                continue
             now_ns = time.monotonic_ns()
             terminal.deliver(now_ns)
-            if terminal in readable:
+            if wrote:
                 terminal.receive(now_ns)
             if terminal.follow_adapter():
                 self._line.send({"ports": self._ports()})
@@ -107,9 +113,9 @@ class Server:
         if all(due_ns is None or due_ns - now_ns > MOVE_NS for due_ns in due):
             self._mechanics.advance(now_ns)
 
-    def _next_ns(self, now_ns: int) -> int | None:
+    def _next_ns(self, dues: Sequence[int | None], now_ns: int) -> int | None:
         """Return when something is to be done without being asked."""
-        times = [due_ns for bus in self._buses if (due_ns := bus.next_due_ns()) is not None]
+        times = [due_ns for due_ns in dues if due_ns is not None]
         backlogs = (bus.host_free_ns - MOST_BACKLOG_NS for bus in self._buses)
         times += [free_ns for free_ns in backlogs if free_ns > now_ns]
         times += (
