@@ -319,6 +319,20 @@ def test_the_watchdog_s_stop_is_at_its_time(line2: Any) -> None:
     assert line2.servo().position == pytest.approx(stopped, abs=1e-3)
 
 
+def test_a_shorter_watchdog_counts_at_once_and_a_longer_one_too(line2: Any) -> None:
+    line2.set("torque_enable", 1)
+    for units, seconds, expired in ((127, 0.5, False), (5, 0.2, True)):
+        assert line2.set("bus_watchdog", units) == 0
+        line2.wait(seconds)
+        assert (line2.get("bus_watchdog") == 0xFF) == expired
+    assert line2.set("bus_watchdog", 0) == 0
+    for units, seconds, expired in ((5, 0.05, False), (127, 2.4, False), (127, 2.6, True)):
+        assert line2.set("bus_watchdog", units) == 0
+        line2.wait(seconds)
+        assert (line2.get("bus_watchdog") == 0xFF) == expired
+    assert line2.get("torque_enable") == 1
+
+
 # Indirect addresses
 
 

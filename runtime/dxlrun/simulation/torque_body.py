@@ -75,19 +75,26 @@ class TorqueBody(Body):
         self._backup: dict[str, int] = {}
         self._shut_down = False
         self._heard_ns = shaft.now_ns
-        self._watched = False
+        self._looked_after_ns: int | None = None
+        """When the Bus Watchdog is looked after next; None: never."""
 
     def hear(self, now_ns: int) -> None:
-        """Take note of an instruction: the Bus Watchdog's time begins again."""
+        """Take note of an instruction to it: the Bus Watchdog's time begins again.
+
+        Whether those to other servos count is not said [?].
+        """
         self.advance(now_ns)
         self._heard_ns = self.shaft.now_ns
         self._watch()
 
     def _watch(self) -> None:
-        """See to it that the Bus Watchdog is looked after when its time runs out."""
-        if not self._watched and (units := self._watchdog_units()):
-            self._watched = True
-            self.shaft.mechanics.call_at(self._heard_ns + units * WATCHDOG_UNIT_NS, self._stop_unheard)
+        """See to it that the Bus Watchdog is looked after when its time runs out, or before."""
+        if not (units := self._watchdog_units()):
+            return
+        end_ns = self._heard_ns + units * WATCHDOG_UNIT_NS
+        if self._looked_after_ns is None or end_ns < self._looked_after_ns:
+            self._looked_after_ns = end_ns
+            self.shaft.mechanics.call_at(end_ns, lambda: self._stop_unheard(end_ns))
 
     def _watchdog_units(self) -> int:
         """Return for how long the Bus Watchdog waits, in its unit; 0 while it does not."""
@@ -95,9 +102,11 @@ class TorqueBody(Body):
         units = memory.get("bus_watchdog")
         return units if units and memory.get("torque_enable") and not watchdog_expired(memory) else 0
 
-    def _stop_unheard(self) -> None:
+    def _stop_unheard(self, at_ns: int) -> None:
         """Stop where the Bus Watchdog's time has run out; else look again when it does."""
-        self._watched = False
+        if at_ns != self._looked_after_ns:
+            return  # its time was made shorter since
+        self._looked_after_ns = None
         units = self._watchdog_units()
         if not units or self.shaft.mechanics.grid_ns < self._heard_ns + units * WATCHDOG_UNIT_NS:
             self._watch()
