@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 
-from dxlrun.simulation import Load
+from dxlrun.control_table import all_tables
+from dxlrun.simulation import Load, Mechanics, ServoConfig, SimulatedServo
 
 S = 1_000_000_000
 
@@ -191,3 +192,30 @@ def test_moving_status_tells_profile_and_arrival(make_line2: Any) -> None:
     line.wait(5)
     assert line.get("moving_status") == 0x31
     assert line.get("moving") == 0
+
+
+def test_every_model_settles_where_it_should_without_much_overshoot() -> None:
+    mechanics, tables = Mechanics(0), all_tables()
+    servos = [
+        SimulatedServo(ServoConfig(1, each.model, 1.0), 57_600, 0, None, each.protocol, mechanics=mechanics)
+        for each in tables
+        if each.model != "XL-320"
+    ]
+    goals = []
+    for servo in servos:
+        table = servo.registers.table
+        goals.append(round(min(1.5, 0.9 * table.max_tick * table.rad_per_tick) / table.rad_per_tick))
+        servo.poke("torque_enable", 1)
+        servo.poke("goal_position", goals[-1])
+    highest = [0.0] * len(servos)
+    for now in range(0, 3 * S, 10_000_000):
+        mechanics.advance(now)
+        highest = [max(pair) for pair in zip(highest, mechanics.plant.angle.tolist(), strict=True)]
+    for servo, goal, top in zip(servos, goals, highest, strict=True):
+        servo.advance(3 * S)
+        table, margin = servo.registers.table, servo.registers.get("cw_compliance_margin")
+        assert servo.position == pytest.approx(
+            goal * table.rad_per_tick, abs=(1 + margin) * table.rad_per_tick
+        )
+        assert top < goal * table.rad_per_tick + 0.2 * 0.5, table.model
+        assert servo.registers.get("moving") == 0

@@ -184,17 +184,21 @@ class JointShaft(Shaft):
         memory = self.memory
         punch = memory["punch"] / 1023
         unit = memory.table.rad_per_tick
+        seen = unit / 2 if punch else 0.0  # less than half a tick of error is none
         return Command(
             p_ccw=(1.0 - punch) / (_slope(memory["ccw_compliance_slope"]) * SLOPE_TICK),
             p_cw=(1.0 - punch) / (_slope(memory["cw_compliance_slope"]) * SLOPE_TICK),
-            margin_ccw=memory["ccw_compliance_margin"] * unit,
-            margin_cw=memory["cw_compliance_margin"] * unit,
+            margin_ccw=max(seen, memory["ccw_compliance_margin"] * unit),
+            margin_cw=max(seen, memory["cw_compliance_margin"] * unit),
             punch=punch,
             limit=limit,
         )
 
     def _pid(self, limit: float) -> Command:
-        """Kp = P / 8, Ki = I * 1000 / 2048, Kd = D * 4 / 1000, in one unit (e-Manual, MX-28, PID Gains)."""
+        """Kp = P / 8, Ki = I * 1000 / 2048, Kd = D * 4 / 1000, in one unit (e-Manual, MX-28, PID Gains).
+
+        What Punch does beside PID gains no manual says: nothing here [?].
+        """
         memory = self.memory
         unit = 8 / (SLOPE_TIMES_P * SLOPE_TICK)
         p = memory["p_gain"] / 8 * unit
@@ -203,7 +207,6 @@ class JointShaft(Shaft):
             p_cw=p,
             i=memory["i_gain"] * 1000 / 2048 * unit,
             d=memory["d_gain"] * 4 / 1000 * unit,
-            punch=memory.get("punch") / 1023,
             limit=limit,
         )
 
