@@ -51,7 +51,7 @@ class SimulatedBus:
         """False: nothing is between the host and the line."""
         self.times_unplugged = 0
         self.lateness_ns: deque[int] = deque(maxlen=1000)
-        """How long after its time the host got what it got last, where the caller of `take` is punctual."""
+        """How long after its time the host got what it got last, in real time."""
         self.servos: tuple[SimulatedServo, ...] = ()
         self.mechanics = mechanics or Mechanics(start_ns)
         """What the servos move; several buses of one robot share it."""
@@ -114,36 +114,38 @@ class SimulatedBus:
         planned_ns = self._agenda.next_ns
         return planned_ns if planned_ns is not None and (due_ns is None or planned_ns < due_ns) else due_ns
 
-    def take(self, now_ns: int, *, punctual: bool = False) -> bytes:
+    def take(self, now_ns: int, *, handed_ns: int | None = None) -> bytes:
         """Return the bytes that have reached the host by `now_ns`, each once.
 
-        `punctual`: the caller comes when they are due, and how late it is belongs into the ledger.
+        `handed_ns`: when the host really gets them; how late that is belongs into the ledger.
         """
         self._pass_time(now_ns)
         passing = self._wire.passing
         if self._wedged or not (passing or self._adapter.holds):
             return b""
         if self._adapter.immediate:
-            return self._take_at_once(now_ns, punctual)
+            return self._take_at_once(handed_ns)
         taken = bytearray()
         while (part := self._adapter.hand_over(now_ns, passing)) is not None:
-            late_ns = now_ns - part.planned_ns if punctual else 0
-            if punctual:
-                self.lateness_ns.append(late_ns)
+            late_ns = self._late_ns(part.planned_ns, handed_ns)
             for chunk in part.ended:
                 self.ledger.add(chunk.due_ns, self.name, "out", chunk.data, chunk.note, late_ns=late_ns)
             taken += part.data
         return bytes(taken)
 
-    def _take_at_once(self, now_ns: int, punctual: bool) -> bytes:
+    def _take_at_once(self, handed_ns: int | None) -> bytes:
         """Return all that has passed the wire: nothing is kept back or cut."""
         arrived = self._adapter.give_all()
         for chunk in arrived:
-            late_ns = now_ns - chunk.due_ns if punctual else 0
-            if punctual:
-                self.lateness_ns.append(late_ns)
+            late_ns = self._late_ns(chunk.due_ns, handed_ns)
             self.ledger.add(chunk.due_ns, self.name, "out", chunk.data, chunk.note, late_ns=late_ns)
         return arrived[0].data if len(arrived) == 1 else b"".join([chunk.data for chunk in arrived])
+
+    def _late_ns(self, planned_ns: int, handed_ns: int | None) -> int:
+        if handed_ns is None:
+            return 0
+        self.lateness_ns.append(handed_ns - planned_ns)
+        return handed_ns - planned_ns
 
     # What tests see and do
 

@@ -113,7 +113,9 @@ class Instructions2:
         error, own, secondary = 0, self._body.servo_id, self._body.secondary_id
         for start in range(4, len(parameters), length + 1):
             listed = parameters[start]
-            if listed in (own, secondary):  # a listed Secondary ID counts as well [i]
+            if listed == own:
+                error = self._body.write(address, parameters[start + 1 : start + 1 + length])
+            elif listed == secondary:  # a listed Secondary ID counts as well [i]
                 error = self._write(listed, address, parameters[start + 1 : start + 1 + length])
         return error
 

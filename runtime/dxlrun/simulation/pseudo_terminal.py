@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import struct
+import time
 import tty
 
 from dxlrun.simulation.bus import SimulatedBus
@@ -81,7 +82,7 @@ class PseudoTerminal:
 
     def deliver(self, now_ns: int) -> None:
         """Give the host what has reached it by `now_ns`; what does not fit into the terminal is lost."""
-        data = self.bus.take(now_ns, punctual=True)
+        data = self.bus.take(now_ns, handed_ns=time.monotonic_ns())
         if not data:
             return
         try:

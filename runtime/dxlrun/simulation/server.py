@@ -89,15 +89,13 @@ class Server:
         # What was due before the host wrote goes out first: the host could have read it.
         now_ns = time.monotonic_ns()
         for terminal, due_ns in zip(self._terminals, dues, strict=True):
-            wrote = terminal in readable
-            if not wrote and (due_ns is None or due_ns > now_ns):
-                continue
-            now_ns = time.monotonic_ns()
-            terminal.deliver(now_ns)
-            if wrote:
-                terminal.receive(now_ns)
-            if terminal.follow_adapter():
-                self._line.send({"ports": self._ports()})
+            if (due_ns is not None and due_ns <= now_ns) or terminal in readable:
+                terminal.deliver(now_ns)
+                if terminal.follow_adapter():
+                    self._line.send({"ports": self._ports()})
+        for terminal in self._terminals:
+            if terminal in readable and terminal.plugged:
+                terminal.receive(now_ns)  # of that moment, however long the others took
         self._move(now_ns)
         if unsent:
             self._line.flush()

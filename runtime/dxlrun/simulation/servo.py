@@ -92,7 +92,7 @@ class SimulatedServo:
 
     def listens_to(self, servo_id: int) -> bool:
         """Return whether an instruction to an ID, or to all, is for this servo."""
-        return servo_id in (self.servo_id, BROADCAST) or servo_id == self.secondary_id
+        return servo_id == BROADCAST or servo_id in (self.servo_id, self.secondary_id)
 
     @property
     def baud_rate(self) -> int:
@@ -108,7 +108,7 @@ class SimulatedServo:
         """Obey an instruction whose last byte arrived at `now_ns`; return the reply, None for silence."""
         servo_id = self.servo_id  # a write of ID is still answered under the old one [i]
         own = packet.servo_id == servo_id
-        if not self.listens_to(packet.servo_id) or not self._hears(now_ns):
+        if not (own or self.listens_to(packet.servo_id)) or not self._hears(now_ns):
             return None
         body, instructions = self._body, self._instructions
         answering = instructions.answers(packet, own)
