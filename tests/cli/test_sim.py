@@ -176,13 +176,19 @@ def test_the_programs_of_the_page_run_against_the_servos_of_the_page(
     assert json.loads(sim.line())["ports"] == {"main": link}
     said = [
         subprocess.run(
-            [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path
+            [sys.executable, "-c", code],
+            capture_output=True,
+            text=True,
+            check=True,
+            cwd=tmp_path,
+            env=os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"},
         ).stdout
         for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     ]
 
     assert said[0] == "(1060, 0, 0)\n"
     assert len(json.loads(said[1])) == 3
+    assert json.loads(said[2]) == {"fault": "silence servo=2"}
     assert sim.stop()[0] == 0
 
 
