@@ -29,7 +29,7 @@ from dxlrun.errors import DxlrunError
 from dxlrun.events import EventCode
 from dxlrun.packets import PacketKind
 from dxlrun.recording.reader import Log, read_log
-from dxlrun.simulation import LedgerEntry
+from dxlrun.simulation import LedgerEntry, SimulatedBus, SimulatedServo
 from dxlrun.simulation.fault_text import KINDS
 from dxlrun.simulation.faults import FaultScript, parse_fault
 from dxlrun.testing import VirtualRobot, simulated_robot
@@ -113,15 +113,18 @@ class Witness:
 
     def look(self) -> None:
         (bus,) = self.robot.buses
-        ids = [servo.servo_id for servo in bus.servos]
-        for servo in bus.servos:
-            if ids.count(servo.servo_id) > 1:
-                continue  # one answers, the other one obeys: no host can tell
+        for servo in alone(bus):
             torque = servo.registers["torque_enable"]
             if torque and not self.torque.get(servo, 0):
                 self.found.append((bus.now_ns, servo.servo_id))
             self.torque[servo] = torque
         bus.at(bus.now_ns + 2 * MS, self.look)
+
+
+def alone(bus: SimulatedBus) -> list[SimulatedServo]:
+    """Return the servos whose ID nobody else has: of two, one answers and the other obeys, unseen."""
+    ids = [servo.servo_id for servo in bus.servos]
+    return [servo for servo in bus.servos if ids.count(servo.servo_id) == 1]
 
 
 @pytest.mark.campaign
@@ -264,6 +267,7 @@ def samples_are_what_was_sent(
     pass for current.
     """
     told = list(states(entries, bus))
+    judged = {servo.servo_id for servo in alone(witness.robot.buses[0])}
     at = 0
     valid = 0
     for number, cycle in enumerate(log.cycles):
@@ -274,7 +278,7 @@ def samples_are_what_was_sent(
         while end < len(told) and told[end].t_ns <= cycle["read_ns"]:
             end += 1
         for servo in bus.servos:
-            if not cycle["valid"][servo.row]:
+            if not cycle["valid"][servo.row] or servo.servo_id not in judged:
                 continue
             valid += 1
             sent = [
@@ -353,7 +357,7 @@ def the_log_is_the_wire(entries: Sequence[LedgerEntry], log: Log) -> None:
 def everybody_who_hears_is_limp(robot: VirtualRobot, started: bool) -> None:
     (bus,) = robot.buses
     bus.advance(robot.clock.now_ns())
-    on = {servo.servo_id for servo in bus.servos if servo.registers["torque_enable"]}
+    on = {servo.servo_id for servo in alone(bus) if servo.registers["torque_enable"]}
     told = {
         servo.servo_id
         for servo in robot.plan.buses[0].servos
