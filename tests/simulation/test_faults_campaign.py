@@ -267,6 +267,7 @@ def samples_are_what_was_sent(
     pass for current.
     """
     told = list(states(entries, bus))
+    asked_ns = held_back(told, witness.delayed)
     judged = {servo.servo_id for servo in alone(witness.robot.buses[0])}
     at = 0
     valid = 0
@@ -285,20 +286,22 @@ def samples_are_what_was_sent(
                 joint_position(servo, ticks_in(servo.state.position, each.data))
                 for each in told[at:end]
                 if each.servo_id == servo.servo_id
-                and not any(_same(each, late, since_ns, int(cycle["woken_ns"])) for late in witness.delayed)
+                and not since_ns <= asked_ns.get(each, -1) < cycle["woken_ns"]
             ]
             assert float(cycle["position"][servo.row]) in sent, (int(cycle["woken_ns"]), servo.joint)
     assert valid or len(log.cycles) < SOME_CYCLES
 
 
-def _same(told: Told, late: Told, since_ns: int, woken_ns: int) -> bool:
-    """Return whether a state is a reply that was held back, and asked for in one of the cycles before."""
-    return (
-        since_ns <= late.asked_ns < woken_ns
-        and told.servo_id == late.servo_id
-        and told.data == late.data
-        and late.t_ns <= told.t_ns <= late.t_ns + REPLY_NS
-    )
+def held_back(told: Sequence[Told], delayed: Sequence[Told]) -> dict[Told, int]:
+    """Return the states that a fault held back, and when the host had asked for each."""
+    asked_ns: dict[Told, int] = {}
+    for late in delayed:
+        for each in told:
+            on_time = late.t_ns <= each.t_ns <= late.t_ns + REPLY_NS
+            if on_time and (each.servo_id, each.data) == (late.servo_id, late.data):
+                asked_ns[each] = late.asked_ns
+                break  # a later one of the same bytes is a new one
+    return asked_ns
 
 
 def states(entries: Sequence[LedgerEntry], bus: BusPlan) -> Iterator[Told]:
