@@ -21,8 +21,8 @@ from typing import Protocol
 import msgspec
 
 from dxlrun import process
+from dxlrun.child import Child
 from dxlrun.process import Line
-from dxlrun.run_processes import Child
 from dxlrun.simulation.process import SimulationConfig, encode_config
 
 _LAST_LOOK_S = 1.0

@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.status import Status
 
 from dxlrun import process
+from dxlrun.child import END_TIMEOUT_S, Child
 from dxlrun.compile.plan import Plan
 from dxlrun.errors import ProcessFault
 from dxlrun.events import Severity
@@ -26,8 +27,6 @@ from dxlrun.loop_process import Outcome
 from dxlrun.plurals import counted
 from dxlrun.run_log import discard_log, epoch_offset_ns, ledger_of, log_header, new_log
 from dxlrun.run_processes import (
-    END_TIMEOUT_S,
-    Child,
     Memory,
     guardian_job,
     start_guardian,
