@@ -219,3 +219,17 @@ def test_every_model_settles_where_it_should_without_much_overshoot() -> None:
         )
         assert top < goal * table.rad_per_tick + 0.2 * 0.5, table.model
         assert servo.registers.get("moving") == 0
+
+
+def test_multi_turn_mode_counts_turns_to_either_side(make_line: Any) -> None:
+    line = make_line((1,), "MX-64", position=1.0)
+    for name, wire in (("cw_angle_limit", 4095), ("ccw_angle_limit", 4095), ("multi_turn_offset", 100)):
+        assert put(line, name, wire) == 0
+    assert put(line, "goal_position", -5000) == 0
+    wait(line, 4)
+    assert look(line, "present_position") == -5000 & 0xFFFF
+    assert line.servo().position == pytest.approx(-5100 * math.tau / 4096, abs=1e-3)
+    put(line, "resolution_divider", 4)
+    put(line, "goal_position", 5000)
+    wait(line, 20)
+    assert line.servo().position == pytest.approx(4 * 4900 * math.tau / 4096, abs=1e-2)

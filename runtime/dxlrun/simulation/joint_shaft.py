@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import ClassVar
 
-from dxlrun.simulation.access import wheel_mode
+from dxlrun.simulation.access import multi_turn_mode, wheel_mode
 from dxlrun.simulation.command import FREE, Command
 from dxlrun.simulation.mechanics import Load, Mechanics
 from dxlrun.simulation.memory import Memory
@@ -74,10 +74,9 @@ class JointShaft(Shaft):
     def position_tick(self, angle: float) -> int:
         """Return what Present Position shows; beyond the reach the nearest end [i]."""
         table = self.memory.table
-        if self._multi_turn:
-            divider = self.memory["resolution_divider"]
-            tick = math.floor(angle / table.rad_per_tick / divider + 0.5)
-            return tick + self.memory.ticks("multi_turn_offset")
+        if multi_turn_mode(self.memory):
+            tick = round(angle / table.rad_per_tick / self.memory["resolution_divider"])
+            return tick + self.memory.ticks("multi_turn_offset") & 0xFFFF  # in two's complement
         if wheel_mode(self.memory):
             angle = in_turn(angle)
         else:
@@ -116,17 +115,6 @@ class JointShaft(Shaft):
         return max(item.minimum, min(item.maximum, _MID_OF_CURRENT[name] + round(self.current / item.scale)))
 
     @property
-    def _multi_turn(self) -> bool:
-        """True where both angle limits are the highest tick (e-Manual, MX-28, CW/CCW Angle Limit (6, 8))."""
-        memory = self.memory
-        highest = memory.table.max_tick
-        return (
-            "resolution_divider" in memory
-            and memory["cw_angle_limit"] == highest
-            and memory["ccw_angle_limit"] == highest
-        )
-
-    @property
     def _controls_speed(self) -> bool:
         return "resolution_divider" in self.memory
 
@@ -151,7 +139,7 @@ class JointShaft(Shaft):
         if afresh:
             self._turns_apart = self._whole_turns(self.angle)
         self._aimed = aimed
-        if self._multi_turn:
+        if multi_turn_mode(memory):
             signed = aimed[0] - (aimed[0] >> 15 << 16)
             ticks = (signed - memory.ticks("multi_turn_offset")) * memory["resolution_divider"]
             goal = ticks * table.rad_per_tick
