@@ -64,8 +64,9 @@ def _loop(account: Periods, wake_ups: Latency | None, *, virtual: bool) -> Findi
     good = account.skipped == 0
     kept = "kept" if good else "did not keep"
     wake_up = "on virtual time" if virtual else f"worst wake-up {microseconds(wake_ups.max_us)} late"
+    elapsed = counted(account.elapsed, "period", "periods")
     return good, (
-        f"The loop {kept} {account.rate_hz:g} Hz: {account.skipped} of {account.elapsed} periods skipped"
+        f"The loop {kept} {account.rate_hz:g} Hz: {account.skipped} of {elapsed} skipped"
         f"{'' if good else f' ({account.skipped / account.elapsed:.2%})'}, "
         f"{wake_up}."
     )

@@ -15,16 +15,19 @@ from rich.text import Text
 from dxlrun.compile import Compiled
 from dxlrun.compile.reach import degrees
 from dxlrun.compile.report import BusRow, CheckReport, ControllerRow, JointRow, MotionRow
+from dxlrun.plurals import counted
 
 
 def verdict(result: Compiled) -> str:
     """Say in one line how it stands."""
     report = result.report
     active = sum(controller.active for controller in report.controllers)
+    joints = counted(len(report.joints), "joint", "joints")
+    controllers = counted(len(report.controllers), "controller", "controllers")
     warnings = len(result.warnings)
     return (
-        f"{report.robot}: good. {len(report.joints)} joints, {active} of {len(report.controllers)} "
-        f"controllers active, {report.rate:g} Hz, {warnings or 'no'} warning{'s' * (warnings != 1)}"
+        f"{report.robot}: good. {joints}, {active} of {controllers} active, {report.rate:g} Hz, "
+        f"{warnings or 'no'} warning{'s' * (warnings != 1)}"
     )
 
 
@@ -105,7 +108,8 @@ def _interval(lower: float, upper: float) -> str:
 def _controllers(rows: Sequence[ControllerRow], joints: int) -> _Sheet:
     table = _Sheet("Controllers", ["controller", "type", "from", "claims", "of", "active"], ["rate"])
     for row in rows:
-        whole = f"all {joints} joints" if len(row.joints) == joints else "\n".join(row.joints)
+        everyone = "the joint" if joints == 1 else f"all {joints} joints"
+        whole = everyone if len(row.joints) == joints else "\n".join(row.joints)
         table.add_row(
             row.name,
             row.type,
