@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from dxlrun.cli.terminal import out, say_error
+from dxlrun.plurals import counted
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -37,7 +38,7 @@ class Shown:
     def lines(self, ports: Mapping[str, str], real_time: str) -> list[str]:
         """Return what is said first: what is simulated, where, and how punctual it can be."""
         count = sum(len(bus.servos) for bus in self.buses)
-        servos, buses = _number(count, "servo"), _number(len(self.buses), "bus")
+        servos, buses = counted(count, "servo", "servos"), counted(len(self.buses), "bus", "buses")
         said = [f"{self.title}: {servos} simulated on {buses}; Ctrl-C ends it, `help` lists faults to type"]
         for bus in self.buses:
             where = self.port(bus.name, ports)
@@ -164,13 +165,8 @@ def ending(title: str, elapsed_s: float, look: Look) -> str:
     heard, answered = (sum(getattr(servo, name) for servo in look.servos) for name in ("heard", "answered"))
     late = ", ".join(f"{name} {value:.0f} us" for name, value in look.lateness_us.items())
     said = f"{title}: ended after {elapsed_s:.1f} s. "
-    said += f"{_number(heard, 'packet')} heard, {answered} answered"
+    said += f"{counted(heard, 'packet', 'packets')} heard, {answered} answered"
     return said + (f"; replies later than planned: {late}" if late else "")
-
-
-def _number(count: int, noun: str) -> str:
-    plural = noun + ("es" if noun.endswith("s") else "s")
-    return f"{count} {noun if count == 1 else plural}"
 
 
 def _models(bus: BusConfig) -> str:
