@@ -1,4 +1,8 @@
-"""The USB adapter between line and host: when it hands over what it has heard, and in what pieces."""
+"""The USB adapter between line and host: when it hands over what it has heard, and in what pieces.
+
+Not modelled: the frames of USB itself (125 us or 1 ms), what a hub or another device on it costs, the way of
+the host's bytes to the line, and modem lines.
+"""
 
 from __future__ import annotations
 

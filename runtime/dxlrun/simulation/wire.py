@@ -1,4 +1,9 @@
-"""The half-duplex line: what passes it toward the host, and what becomes of two that talk at once."""
+"""The half-duplex line: what passes it toward the host, and what becomes of two that talk at once.
+
+Not modelled: what servos make of noise and of each other's replies (of those they hear only the end of the
+one before them in a read in turn), framing errors and breaks, garbage between rates that differ by less than
+3 %, levels and reflections on the cable.
+"""
 
 from __future__ import annotations
 
