@@ -210,3 +210,32 @@ def test_an_xl320_moves_by_its_own_items(make_line2: Any) -> None:
 def test_an_rh_p12_closes(make_line2: Any) -> None:
     line = make_line2((1,), "RH-P12-RN(A)", position=0.0)
     assert move(line, 740) == 740
+
+
+def test_feed_forward_of_what_motor_and_rotor_take_leaves_no_lag(make_line2: Any) -> None:
+    lags = {}
+    # 1 / no-load speed, and 10 ms of it per rad/s^2, in the gains' units of PWM, ticks and ms
+    unit = 4096 / math.tau / 885
+    for first, second in ((0, 0), (round(4e3 / 4.817 / unit), round(4e6 * 0.01 / 4.817 / unit))):
+        line = make_line2((1,), "XM430-W350", position=1.0)
+        line.set("profile_velocity", 100)
+        line.set("profile_acceleration", 10)
+        line.set("feedforward_1st_gain", first)
+        line.set("feedforward_2nd_gain", second)
+        line.set("torque_enable", 1)
+        line.set("goal_position", 3000)
+        line.wait(0.5)
+        shown = line.servo().registers
+        lags[first] = shown.ticks("position_trajectory") - shown.ticks("present_position")
+    without, with_it = lags.values()
+    assert without > 30
+    assert abs(with_it) < 5
+
+
+def test_a_model_without_gains_in_the_manual_keeps_its_speed_too(make_line2: Any) -> None:
+    line = make_line2((1,), "PM54-060-S250", position=0.0)
+    line.set("operating_mode", 1)
+    line.set("torque_enable", 1)
+    line.set("goal_velocity", 1000)
+    line.wait(2)
+    assert line.get("present_velocity") == pytest.approx(1000, abs=2)

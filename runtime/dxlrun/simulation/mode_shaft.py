@@ -104,7 +104,10 @@ class ModeShaft(Shaft):
 
     @property
     def _trajectory_angle(self) -> float:
-        return float(self.mechanics.profiles.position[self.index]) if self._goes_to_goal else self.angle
+        if not self._goes_to_goal:
+            return self.angle
+        ahead_s = max(0, self.now_ns - self.mechanics.grid_ns) * 1e-9
+        return float(self.mechanics.profiles.position[self.index]) + self._trajectory_speed * ahead_s
 
     @property
     def _trajectory_speed(self) -> float:
