@@ -76,6 +76,10 @@ def test_a_name_with_two_firmwares_follows_the_protocol():
         (["{torso}", "--latency-timer", "4"], ["--latency-timer '4': "]),
         (["{torso}", "--ledger", "missing/ledger"], ["--ledger missing/ledger cannot be written"]),
         (["{torso}", "--link", "missing/robot"], ["--link missing/robot: there is no directory missing"]),
+        (
+            ["--servo", "toaster:1", "--fault", "explode", "--ledger", "missing/ledger"],
+            ["there is no fault 'explode'", "--ledger missing/ledger cannot be written", "no model toaster"],
+        ),
         (["torso.yaml"], ["there is no robot file torso.yaml; check the path"]),
     ],
 )  # fmt: skip
@@ -102,12 +106,12 @@ def test_faults_come_from_the_line_and_from_a_file(tmp_path: Path):
     assert [str(fault).split()[0] for fault in read] == ["lose", "silence", "overload"]
 
 
-def test_every_wrong_fault_is_told_with_its_place(dxlrun, torso: Path, tmp_path: Path):
+def test_every_wrong_fault_is_told_with_its_place(dxlrun, tmp_path: Path):
     file = tmp_path / "faults.txt"
     file.write_text("lose servo=1\n  lose servo=one\nexplode\n")
 
-    alone = dxlrun("sim", torso, "--faults", file)
-    both = dxlrun("sim", torso, "--faults", file, "--fault", "lose")
+    alone = dxlrun("sim", "--servo", "AX-12A:1", "--faults", file)
+    both = dxlrun("sim", "--servo", "AX-12A:1", "--faults", file, "--fault", "lose")
 
     assert [line.split(" ")[0] for line in alone.errors] == [f"{file}:2:3:", f"{file}:3:1:"]
     assert (alone.code, both.code) == (2, 2)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,7 +13,7 @@ from cyclopts import Parameter
 
 from dxlrun.cli.flags import Flag, JsonFlag
 from dxlrun.cli.inputs import compiled
-from dxlrun.cli.sim_inputs import Absent, AdapterWishes, Split, read_faults, servo_bus, with_adapter
+from dxlrun.cli.sim_inputs import Absent, AdapterWishes, Mistakes, Split, read_faults, servo_bus, with_adapter
 from dxlrun.cli.terminal import out, say_error, say_warning
 from dxlrun.errors import InputError
 
@@ -95,26 +95,32 @@ def sim(
     debug
         Print the traceback of an error, and what the process of the servos said.
     """
-    planned = read_faults(fault, faults)
-    title, buses, bodies, priority, hint = _from_file(robot, assignments, servo, baud, protocol)
-    wishes = AdapterWishes(latency_timer, split, echo, absent)
-    buses = tuple(with_adapter(bus, wishes, seed) for bus in buses)
-    links = link_of_each(buses, link)
+    mistakes = Mistakes()
+    with mistakes.collected():
+        planned = read_faults(fault, faults)
+    with mistakes.collected():
+        _writable(ledger)
+    with mistakes.collected():
+        told = _told(robot, assignments, servo, baud, protocol)
+        wishes = AdapterWishes(latency_timer, split, echo, absent)
+        buses = tuple(with_adapter(bus, wishes, seed) for bus in told.buses)
+        links = link_of_each(buses, link)
+    mistakes.refuse()
     refuse_what_cannot_be(buses, planned, seed)
     from dxlrun.cli.sim_views import Shown, ending
     from dxlrun.simulation.process import SimulationConfig
     from dxlrun.simulation_front import FrontOptions
 
-    _writable(ledger)
+    title = told.title
     config = SimulationConfig(
         buses=buses,
         faults=tuple(str(each) for each in planned),
         seed=seed,
         links={bus: str(path) for bus, path in links.items()},
-        bodies=bodies,
+        bodies=told.bodies,
     )
-    shown = Shown(title, buses, links, hint)
-    options = FrontOptions(ledger, priority, core=max(os.sched_getaffinity(0)))
+    shown = Shown(title, buses, links, told.hint)
+    options = FrontOptions(ledger, told.priority, core=max(os.sched_getaffinity(0)))
     served = _serve(config, options, shown, as_json=as_json)
     if not as_json:
         out().print(ending(title, served.elapsed_s, served.look), markup=False, soft_wrap=True)
@@ -127,20 +133,34 @@ def sim(
     return 1 if served.sentences else 0
 
 
-def _from_file(
+@dataclass(frozen=True, slots=True)
+class _Told:
+    """What is to be simulated."""
+
+    title: str
+    buses: tuple[BusConfig, ...]
+    bodies: UrdfBodies | None = None
+    """What their servos move together; None: each joint by itself."""
+    priority: int = _PRIORITY
+    """Real-time priority above the loop's."""
+    hint: str | None = None
+    """A command line that uses it when the port is added."""
+
+
+def _told(
     robot: Path | None,
     assignments: Sequence[str],
     servo: Sequence[str],
     baud: int | None,
     protocol: float | None,
-) -> tuple[str, tuple[BusConfig, ...], UrdfBodies | None, int, str | None]:
-    """Return title, buses, what their servos move together, a priority above the loop's, and what to run."""
+) -> _Told:
+    """Return what the robot file says, or `--servo`."""
     if robot is None:
         if not servo:
             raise InputError(
                 "there is nothing to simulate; give a robot file, or servos such as --servo XL430-W250:1-3"
             )
-        return "simulation", (servo_bus(servo, baud, protocol),), None, _PRIORITY, None
+        return _Told("simulation", (servo_bus(servo, baud, protocol),))
     options = {"--servo": servo or None, "--baud": baud, "--protocol": protocol}
     given = [name for name, value in options.items() if value is not None]
     if servo and not robot.is_file():
@@ -157,12 +177,12 @@ def _from_file(
     others = [word for word in assignments if not word.startswith("port:=")]
     hint = shlex.join(["dxlrun", str(robot), *others])
     takes_port = len(plan.buses) == 1 and "port" in plan.arguments
-    return (
-        plan.robot,
-        simulated_buses(everywhere),
-        simulated_bodies(everywhere),
-        min(plan.loop.scheduler.priority + _ABOVE_LOOP, 99),
-        hint if takes_port else None,
+    return _Told(
+        title=plan.robot,
+        buses=simulated_buses(everywhere),
+        bodies=simulated_bodies(everywhere),
+        priority=min(plan.loop.scheduler.priority + _ABOVE_LOOP, 99),
+        hint=hint if takes_port else None,
     )
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -35,6 +36,28 @@ class AdapterWishes:
     split: Split | None = None
     echo: bool = False
     absent: Absent | None = None
+
+
+class Mistakes:
+    """What is wrong in parts of a command line that have nothing to do with one another, told together."""
+
+    def __init__(self) -> None:
+        self._errors: list[InputError] = []
+
+    @contextmanager
+    def collected(self) -> Iterator[None]:
+        """Keep the InputError of a part."""
+        try:
+            yield
+        except InputError as error:
+            self._errors.append(error)
+
+    def refuse(self) -> None:
+        """Raise what was kept as one InputError, if anything was."""
+        if len(self._errors) == 1:
+            raise self._errors[0]
+        if self._errors:
+            raise InputError("\n".join(str(error) for error in self._errors))
 
 
 def servo_bus(words: Sequence[str], baud_rate: int | None, protocol: float | None) -> BusConfig:
