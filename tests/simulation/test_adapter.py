@@ -305,3 +305,15 @@ def test_two_servos_with_one_id_garble_their_turn_and_break_the_chain(make_line2
     twin.poke("id", 9)  # on the line of its own from now on
     sync_read(line)
     assert [each.servo_id for each in line.statuses()] == [1, 2, 3]
+
+
+def test_a_servo_that_changes_its_id_or_rate_is_found_under_the_new_one_only(make_line2: Any) -> None:
+    line = make_line2((1,))
+    assert line.request(9, 0x01) is None
+    assert line.set("id", 9) == 0
+    assert line.request(1, 0x01) is None
+    assert line.request(9, 0x01) is not None
+    line.bus.change_rate(57_600)
+    assert line.request(9, 0x01) is None
+    line.servo(9).poke("baud_rate", 1)
+    assert line.request(9, 0x01) is not None
