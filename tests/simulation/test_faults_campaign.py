@@ -289,7 +289,7 @@ def samples_are_what_was_sent(
                 and not since_ns <= asked_ns.get(each, -1) < cycle["woken_ns"]
             ]
             assert float(cycle["position"][servo.row]) in sent, (int(cycle["woken_ns"]), servo.joint)
-    assert valid or len(log.cycles) < SOME_CYCLES
+    assert valid or not judged or len(log.cycles) < SOME_CYCLES
 
 
 def held_back(told: Sequence[Told], delayed: Sequence[Told]) -> dict[Told, int]:
