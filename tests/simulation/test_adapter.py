@@ -204,7 +204,10 @@ def test_what_the_servos_hear_of_an_instruction_can_be_changed_or_lost() -> None
 def test_a_cut_instruction_swallows_the_begin_of_the_next_one_unless_a_pause_ends_it() -> None:
     bus = new_bus(AdapterConfig())
     bus.alter_next_instruction("cut", lambda packet: packet[:4])
+    counted: list[int] = []
+    bus.after(1, lambda: counted.append(1))
     bus.receive(PING_1, 0)
+    assert counted == [1]
     bus.receive(PING_1, 1 * MS)
     assert handed_over(bus, 10 * MS) == []
     bus.receive(PING_1, 300 * MS)

@@ -312,7 +312,7 @@ class SimulatedBus:
         while (other := self._receiver.feed(heard, position)) is not None:
             position = other.end
             self._execute(other, end_ns)
-        if not heard:
+        if not position:  # it was one all the same
             self._agenda.packet_passed()
 
     def _execute(self, packet: InstructionPacket, end_ns: int) -> None:
