@@ -10,7 +10,7 @@ from enum import IntEnum, unique
 
 from dxlrun.control_table import ControlItem
 from dxlrun.simulation.choices import TORQUE_ENABLE_OF_P, choices
-from dxlrun.simulation.memory import Memory, in_range
+from dxlrun.simulation.memory import Memory, Run, in_range
 from dxlrun.simulation.protocol1 import ErrorBit
 from dxlrun.simulation.protocol2 import ErrorNumber
 
@@ -55,18 +55,17 @@ class LockRules:
     def __init__(self, memory: Memory) -> None:
         self._memory = memory
 
-    def refusal(self, address: int, data: bytes) -> int:
+    def refusal(self, run: Run) -> int:
         """Return the error bits with which a write would be refused; 0 when it would not.
 
         A cell that no item owns, a read-only item, a locked one and a value out of its range are each a range
         error [i]; a goal outside the angle limits is an angle limit error (e-Manual, Goal Position (30)).
         """
-        after = self._memory.would_be(address, data)
-        if not after:
+        if not run.cells.items:
             return ErrorBit.RANGE
         error = 0
-        for name, wire in after.items():
-            error |= self._refusal_of(self._memory.table.items[name], wire)
+        for item in run.cells.items:
+            error |= self._refusal_of(item, run.after[item.name])
         return error
 
     def _refusal_of(self, item: ControlItem, wire: int) -> int:
@@ -108,23 +107,21 @@ class TorqueRules:
             and (goal.maximum - goal.minimum + 1) * memory.table.rad_per_tick < 0.99 * math.tau
         )
 
-    def refusal(self, address: int, data: bytes) -> int:
+    def refusal(self, run: Run) -> int:
         """Return the error number with which a write would be refused; 0 when it would not.
 
         Part of an item is a length error (e-Manual, Protocol 2.0, "Error": Data Length Error). Where several
         items are refused, the error is that of the first [i].
         """
-        memory = self._memory
-        after = memory.would_be(address, data)
-        if not after:
+        cells = run.cells
+        if not cells.items or cells.read_only or (cells.eeprom and self._memory.get("torque_enable")):
             return ErrorNumber.ACCESS
-        items = [memory.table.items[name] for name in after]
-        for item in items:
-            if item.access == "R" or (item.area == "EEPROM" and memory.get("torque_enable")):
-                return ErrorNumber.ACCESS
-        if items[0].address < address or items[-1].address + items[-1].size > address + len(data):
+        if not cells.whole:
             return ErrorNumber.DATA_LENGTH
-        return next((error for item in items if (error := self._refusal_of(item, after[item.name]))), 0)
+        for item in cells.items:
+            if error := self._refusal_of(item, run.after[item.name]):
+                return error
+        return 0
 
     def _refusal_of(self, item: ControlItem, wire: int) -> int:
         memory = self._memory

@@ -6,9 +6,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
+from collections.abc import Set as AbstractSet
 
-from dxlrun.simulation.memory import Memory
+from dxlrun.simulation.memory import Memory, Run
 from dxlrun.simulation.shaft import Shaft
 from dxlrun.simulation.strain import SUPPLY_OHM
 
@@ -114,8 +115,9 @@ class Body(ABC):
         memory, live = self.memory, self._live
         if address + length > memory.size:
             return None
-        for run_address, run in memory.runs(address, bytes(length)):
-            cells = run_address, len(run)
+        direct = memory.cells(address, length).direct
+        for target, first, last in ((address, 0, length),) if direct else memory.places(address, length):
+            cells = target, last - first
             names = self._live_in.get(cells)
             if names is None:
                 if len(self._live_in) >= _READS_KEPT:
@@ -129,18 +131,18 @@ class Body(ABC):
         """Write, or return the error with which it is refused; 0 when it is not."""
         runs = self.memory.runs(address, data)
         for run in runs:
-            if error := self.refusal(*run):
+            if error := self.refusal(run):
                 return error
         for run in runs:
-            names = self.memory.write(*run)
-            self._obey(names)
-            self.shaft.plan(names)
+            self.memory.write(run)
+            self._obey(run.cells.names)
+            self.shaft.plan(run.cells.names)
         return 0
 
     def register(self, address: int, data: bytes) -> int:
         """Keep a write for `act`, or return the error with which it is refused."""
         for run in self.memory.runs(address, data):
-            if error := self.refusal(*run):
+            if error := self.refusal(run):
                 return error
         self._registered = (address, data)
         self._show_registered(1)
@@ -193,7 +195,7 @@ class Body(ABC):
     # What the protocols do differently
 
     @abstractmethod
-    def refusal(self, address: int, data: bytes) -> int:
+    def refusal(self, run: Run) -> int:
         """Return the error of a write, 0 when it is allowed."""
 
     @abstractmethod
@@ -208,7 +210,7 @@ class Body(ABC):
     def _start_up(self) -> None: ...
 
     @abstractmethod
-    def _obey(self, names: Iterable[str]) -> None:
+    def _obey(self, names: AbstractSet[str]) -> None:
         """Do what the writing of some items does beside changing them."""
 
     def _show_registered(self, value: int) -> None:

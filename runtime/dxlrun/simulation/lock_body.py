@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
+from collections.abc import Set as AbstractSet
 
 from dxlrun.simulation.access import LockRules
 from dxlrun.simulation.body import Body
-from dxlrun.simulation.memory import Memory
+from dxlrun.simulation.memory import Memory, Run
 from dxlrun.simulation.protocol1 import ErrorBit
 from dxlrun.simulation.shaft import Shaft
 
@@ -18,9 +19,9 @@ class LockBody(Body):
         super().__init__(memory, shaft, note)
         self._rules = LockRules(memory)
 
-    def refusal(self, address: int, data: bytes) -> int:
+    def refusal(self, run: Run) -> int:
         """Return the error bits of a write, 0 when it is allowed."""
-        return self._rules.refusal(address, data)
+        return self._rules.refusal(run)
 
     def state(self) -> int:
         """Return the error bits that last as long as their cause."""
@@ -45,7 +46,7 @@ class LockBody(Body):
         self._started_ns = self.shaft.now_ns
         self.memory["torque_limit"] = self.memory["max_torque"]  # e-Manual, Torque Limit (34)
 
-    def _obey(self, names: Iterable[str]) -> None:
+    def _obey(self, names: AbstractSet[str]) -> None:
         memory = self.memory
         if "goal_position" in names and self.wakes_on_goal and "torque_enable" not in names:
             memory["torque_enable"] = 1

@@ -15,21 +15,35 @@ _CELLS_KEPT = 1024
 
 _IDENTITY = frozenset(("id", "secondary_id", "secondary_shadow_id", "baud_rate", "baud_rate_bus"))
 
-Run = tuple[int, bytes]
-"""Address and bytes that belong there."""
 
-
-class _Cells(NamedTuple):
+class Cells(NamedTuple):
     """What stands in a row of cells."""
 
-    names: tuple[str, ...]
+    items: tuple[ControlItem, ...]
     """Their items; none when a cell belongs to no item."""
-    only: str | None
-    """The item that they are, when they are one from its first byte to its last."""
+    names: frozenset[str]
+    whole: bool
+    """True when they are those items from the first byte to the last."""
     touched: bool
     """True when one of them belongs to an item."""
     direct: bool
     """True when none of them stands for another one."""
+    read_only: bool
+    """True when one of the items is."""
+    eeprom: bool
+    """True when one of the items is in the EEPROM area."""
+    identity: bool
+    """True when one of the items says what the servo hears."""
+
+
+class Run(NamedTuple):
+    """Bytes for a row of cells."""
+
+    address: int
+    data: bytes
+    cells: Cells
+    after: dict[str, int]
+    """The integers of the items that a write touches, as they would be after it."""
 
 
 class Memory:
@@ -47,7 +61,7 @@ class Memory:
         """Bytes from address 0 to the end of the last item."""
         self._memory = bytearray(self.size)
         self._values: dict[str, int] = {}  # the same as in the bytes: looked up far more often than written
-        self._cells_at: dict[tuple[int, int], _Cells] = {}  # hosts ask for the same again and again
+        self._cells_at: dict[tuple[int, int], Cells] = {}  # hosts ask for the same again and again
         self._item_at: dict[int, ControlItem] = {
             address: item
             for item in table.items.values()
@@ -119,7 +133,7 @@ class Memory:
         """Return bytes of the table, None where it has none; cells between items are 0 [i]."""
         if length < 1 or address + length > self.size:
             return None
-        if self._cells(address, length).direct:
+        if self.cells(address, length).direct:
             return bytes(self._memory[address : address + length])
         data = self._memory[address : address + length]
         for cell in self._indirect.keys() & range(address, address + length):
@@ -129,33 +143,44 @@ class Memory:
 
     def runs(self, address: int, data: bytes) -> tuple[Run, ...]:
         """Return where bytes really go: as they are, or to the cells behind Indirect Data."""
-        if self._cells(address, len(data)).direct:
-            return ((address, data),)
-        runs: list[Run] = []
-        for cell, byte in enumerate(data, start=address):
-            name = self._indirect.get(cell)
-            target = cell if name is None else self[name]
-            if runs and runs[-1][0] + len(runs[-1][1]) == target:
-                runs[-1] = runs[-1][0], runs[-1][1] + bytes((byte,))
+        cells = self.cells(address, len(data))
+        if cells.direct:
+            return (self._run(address, data, cells),)
+        return tuple(
+            self._run(target, data[first:last], self.cells(target, last - first))
+            for target, first, last in self.places(address, len(data))
+        )
+
+    def places(self, address: int, length: int) -> list[tuple[int, int, int]]:
+        """Return where some cells really are: address, and the first and last of them that begin there."""
+        places: list[tuple[int, int, int]] = []
+        for index in range(length):
+            name = self._indirect.get(address + index)
+            target = address + index if name is None else self[name]
+            if places and places[-1][0] + index - places[-1][1] == target:
+                places[-1] = places[-1][0], places[-1][1], index + 1
             else:
-                runs.append((target, bytes((byte,))))
-        return tuple(runs)
+                places.append((target, index, index + 1))
+        return places
 
-    def names(self, address: int, length: int) -> tuple[str, ...]:
-        """Return the items of some cells, none when a cell belongs to no item."""
-        return self._cells(address, length).names
-
-    def _cells(self, address: int, length: int) -> _Cells:
+    def cells(self, address: int, length: int) -> Cells:
         """Return what some cells are; looked up once."""
         cells = self._cells_at.get((address, length))
         if cells is None:
             spanned = range(address, address + length)
             owned = [item.name for cell in spanned if (item := self._item_at.get(cell)) is not None]
             names = tuple(dict.fromkeys(owned)) if len(owned) == length else ()
-            only = self.table.items[names[0]] if len(names) == 1 else None
-            whole = only is not None and (only.address, only.size) == (address, length)
-            direct = self._indirect.keys().isdisjoint(spanned)
-            cells = _Cells(names, names[0] if whole else None, bool(owned), direct)
+            items = tuple(self.table.items[name] for name in names)
+            cells = Cells(
+                items,
+                frozenset(names),
+                whole=bool(items) and sum(item.size for item in items) == length,
+                touched=bool(owned),
+                direct=self._indirect.keys().isdisjoint(spanned),
+                read_only=any(item.access == "R" for item in items),
+                eeprom=any(item.area == "EEPROM" for item in items),
+                identity=not _IDENTITY.isdisjoint(names),
+            )
             if len(self._cells_at) >= _CELLS_KEPT:
                 self._cells_at.clear()
             self._cells_at[address, length] = cells
@@ -163,41 +188,36 @@ class Memory:
 
     def reaches_eeprom(self, address: int, data: bytes) -> bool:
         """Return whether a write would change the EEPROM area, also through Indirect Data."""
-        items = self.table.items
-        return any(
-            items[name].area == "EEPROM" for run in self.runs(address, data) for name in self.would_be(*run)
-        )
+        return any(run.cells.eeprom for run in self.runs(address, data))
 
     def touches(self, address: int, length: int) -> bool:
         """Return whether any of some cells belongs to an item."""
-        return self._cells(address, length).touched
+        return self.cells(address, length).touched
 
-    def would_be(self, address: int, data: bytes) -> dict[str, int]:
-        """Return the integers of the items that a write touches, as they would be after it."""
-        cells = self._cells(address, len(data))
-        if cells.only is not None:
-            return {cells.only: int.from_bytes(data, "little")}
-        items = [self.table.items[name] for name in self.names(address, len(data))]
-        first, last = (items[0], items[-1]) if items else (None, None)
-        if first and last and (first.address < address or last.address + last.size > address + len(data)):
-            start, end = first.address, last.address + last.size  # parts of items stay as they are
+    def _run(self, address: int, data: bytes, cells: Cells) -> Run:
+        """Return bytes for some cells, with what would be after it."""
+        items = cells.items
+        if len(items) == 1 and cells.whole:
+            return Run(address, data, cells, {items[0].name: int.from_bytes(data, "little")})
+        start, all_of_them = address, data
+        if items and not cells.whole:  # parts of items stay as they are
+            start, end = items[0].address, items[-1].address + items[-1].size
             before, behind = self._memory[start:address], self._memory[address + len(data) : end]
-            address, data = start, bytes(before) + data + bytes(behind)
-        return {
+            all_of_them = bytes(before) + data + bytes(behind)
+        after = {
             item.name: int.from_bytes(
-                data[item.address - address : item.address - address + item.size], "little"
+                all_of_them[item.address - start : item.address - start + item.size], "little"
             )
             for item in items
         }
+        return Run(address, data, cells, after)
 
-    def write(self, address: int, data: bytes) -> tuple[str, ...]:
-        """Write bytes that were not refused; return the names of the items that they touch."""
-        after = self.would_be(address, data)
-        self._memory[address : address + len(data)] = data
-        self._values.update(after)
-        if self.on_identity is not None and not _IDENTITY.isdisjoint(after):
+    def write(self, run: Run) -> None:
+        """Write bytes that were not refused."""
+        self._memory[run.address : run.address + len(run.data)] = run.data
+        self._values.update(run.after)
+        if run.cells.identity and self.on_identity is not None:
             self.on_identity()
-        return tuple(after)
 
     @staticmethod
     def _initial(item: ControlItem) -> int:

@@ -1,7 +1,8 @@
 """Protocol 2.0 as a servo sees it: bytes of the line -> instructions, replies -> bytes.
 
 Written from the protocol alone (ROBOTIS e-Manual, "DYNAMIXEL Protocol 2.0"), without the host's packet code:
-one codec for both sides would agree with its own mistakes. Only the CRC is a library's; the tests have another.
+one codec for both sides would agree with its own mistakes.
+Only the CRC is a library's; the tests have another.
 """
 
 from __future__ import annotations

@@ -7,13 +7,14 @@ the time that switching its torque takes, its brake, and Controller State but fo
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
+from collections.abc import Set as AbstractSet
 from enum import IntFlag, unique
 
 from dxlrun.control_table import ControlItem
 from dxlrun.simulation.access import OperatingMode, TorqueRules, watchdog_expired
 from dxlrun.simulation.body import Body
-from dxlrun.simulation.memory import Memory
+from dxlrun.simulation.memory import Memory, Run
 from dxlrun.simulation.protocol2 import ALERT, ErrorNumber
 from dxlrun.simulation.shaft import Shaft
 
@@ -114,13 +115,13 @@ class TorqueBody(Body):
         self.note(f"servo {self.servo_id}: bus watchdog after {units * 20} ms")
         self.poke("bus_watchdog", -1)
 
-    def refusal(self, address: int, data: bytes) -> int:
+    def refusal(self, run: Run) -> int:
         """Return the error number of a write, 0 when it is allowed.
 
         After a shutdown the torque stays off until a reboot: a result fail [i].
         """
-        error = self._rules.refusal(address, data)
-        if not error and self._shut_down and self.memory.would_be(address, data).get("torque_enable"):
+        error = self._rules.refusal(run)
+        if not error and self._shut_down and run.after.get("torque_enable"):
             return ErrorNumber.RESULT_FAIL
         return error
 
@@ -271,7 +272,7 @@ class TorqueBody(Body):
             memory["torque_enable"] = 1
         self.shaft.plan(("torque_enable",))
 
-    def _obey(self, names: Iterable[str]) -> None:
+    def _obey(self, names: AbstractSet[str]) -> None:
         memory = self.memory
         if "operating_mode" in names:
             self._change_mode()
