@@ -53,15 +53,16 @@ def test_a_name_with_two_firmwares_follows_the_protocol():
         (["--servo", "AX-12A:1-99999999999999"], ["1-99999999999999 is no ID of a servo"]),
         (["--servo", "XL430-W250:253"], ["XL430-W250 cannot have ID 253; Protocol 2.0 goes to 252"]),
         (
-            ["--servo", "AX-12B:1", "--servo", "toaster:2", "--servo", "AX-12A:x"],
+            ["--servo", "AX-12B:1", "--servo", "xl430:3", "--servo", "toaster:2", "--servo", "AX-12A:x"],
             [
                 "--servo AX-12A:x: this is not MODEL:IDS",
                 "--servo: there is no model AX-12B; did you mean AX-12?",
+                "--servo: there is no model xl430; did you mean XL430-W250?",
                 "--servo: there is no model toaster; `dxlrun models` lists all",
             ],
         ),
         (["--servo", "AX-12A:1,2,1"], ["ID 1 is given to AX-12A and to AX-12A; give every servo its own"]),
-        (["--servo", "MX-28:1"], ["MX-28 exist with Protocol 1.0 and with 2.0; say which one by --protocol"]),
+        (["--servo", "MX-28:1"], ["MX-28 exists with Protocol 1.0 and with 2.0; say which one by --p"]),
         (["--servo", "MX-28:1", "--protocol", "3"], ["there is no Protocol 3; --protocol is 1.0 or 2.0"]),
         (["--servo", "AX-12A:1", "--protocol", "2"], ["AX-12A speaks Protocol 1.0, not 2.0"]),
         (["--servo", "AX-12A:1", "--servo", "XM430-W350:2"], ["a bus has one protocol"]),
@@ -73,12 +74,15 @@ def test_a_name_with_two_firmwares_follows_the_protocol():
         (["{torso}", "--fault", "lsoe servo=3"], ["--fault 'lsoe servo=3': there is no fault"]),
         (["--servo", "AX-12A:1", "--fault", "lose servo=2"], ["bus main has no servo 2; its servos are 1"]),
         (["{torso}", "--faults", "missing.txt"], ["the faults in missing.txt cannot be read (No such file"]),
-        (["{torso}", "--latency-timer", "4"], ["--latency-timer '4': "]),
+        (
+            ["{torso}", "--latency-timer", "4", "--link", "missing/robot"],
+            ["--latency-timer '4': ", "--link missing/robot: "],
+        ),
         (["{torso}", "--ledger", "missing/ledger"], ["--ledger missing/ledger cannot be written"]),
         (["{torso}", "--link", "missing/robot"], ["--link missing/robot: there is no directory missing"]),
         (
-            ["--servo", "toaster:1", "--fault", "explode", "--ledger", "missing/ledger"],
-            ["there is no fault 'explode'", "--ledger missing/ledger cannot be written", "no model toaster"],
+            ["--servo", "toaster:1", "--fault", "explode", "--ledger", "no/ledger", "--latency-timer", "x"],
+            ["no fault 'explode'", "--ledger no/ledger cannot", "--latency-timer 'x': ", "no model toaster"],
         ),
         (["torso.yaml"], ["there is no robot file torso.yaml; check the path"]),
     ],
@@ -119,7 +123,7 @@ def test_every_wrong_fault_is_told_with_its_place(dxlrun, tmp_path: Path):
 
 
 def test_options_replace_what_the_robot_file_says_of_the_adapter():
-    wishes = AdapterWishes("4 ms", "random", echo=True, absent="slot")
+    wishes = AdapterWishes(4_000_000, "random", echo=True, absent="slot")
     bus = with_adapter(BUS, wishes, 7)
 
     assert (bus.adapter.latency_timer_ns, bus.adapter.split, bus.adapter.echo) == (4_000_000, "random", True)

@@ -85,9 +85,8 @@ def _explain(error: Exception) -> int:
             say_error(f"dxlrun: {line}")
         return error.exit_code
     if isinstance(error, CycloptsError):
-        say_error(
-            f"dxlrun: {' '.join(str(error).split()).removesuffix('.')}; `dxlrun --help` shows the usage"
-        )
+        usage = " ".join(("dxlrun", *(error.command_chain or ()), "--help"))
+        say_error(f"dxlrun: {' '.join(str(error).split()).removesuffix('.')}; `{usage}` shows the usage")
         return InputError.exit_code
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename else ""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import json
 from dataclasses import asdict
 from typing import TYPE_CHECKING
@@ -58,7 +57,7 @@ def models(
 
 def _tables(name: str | None, protocol: float | None) -> list[ControlTable]:
     """Return the tables that are asked for; raises InputError when there is none."""
-    from dxlrun.control_table import all_tables, control_table, model_names
+    from dxlrun.control_table import all_tables, control_table, model_names, perhaps_meant
 
     if protocol not in (None, 1.0, 2.0):
         raise InputError(f"there is no Protocol {protocol:g}; --protocol is 1.0 or 2.0")
@@ -67,11 +66,8 @@ def _tables(name: str | None, protocol: float | None) -> list[ControlTable]:
     wanted = [each for each in (1.0, 2.0) if protocol in (None, each)]
     found = [control_table(name, each) for each in wanted if name in model_names(each)]
     if not found:
-        known = {each.lower(): each for each in model_names(protocol)}
-        close = difflib.get_close_matches(name.lower(), known, n=1)
-        mend = f"did you mean {known[close[0]]}?" if close else "`dxlrun models` lists all"
         speaks = "" if protocol is None else f" of Protocol {protocol:.1f}"
-        raise InputError(f"there is no model {name}{speaks}; {mend}")
+        raise InputError(f"there is no model {name}{speaks}; {perhaps_meant(name, protocol)}")
     return found
 
 

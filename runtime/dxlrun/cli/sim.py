@@ -13,7 +13,16 @@ from cyclopts import Parameter
 
 from dxlrun.cli.flags import Flag, JsonFlag
 from dxlrun.cli.inputs import compiled
-from dxlrun.cli.sim_inputs import Absent, AdapterWishes, Mistakes, Split, read_faults, servo_bus, with_adapter
+from dxlrun.cli.sim_inputs import (
+    Absent,
+    AdapterWishes,
+    Mistakes,
+    Split,
+    read_faults,
+    read_latency,
+    servo_bus,
+    with_adapter,
+)
 from dxlrun.cli.terminal import out, say_error, say_warning
 from dxlrun.errors import InputError
 
@@ -101,11 +110,13 @@ def sim(
     with mistakes.collected():
         _writable(ledger)
     with mistakes.collected():
+        latency_ns = read_latency(latency_timer)
+    with mistakes.collected():
         told = _told(robot, assignments, servo, baud, protocol)
-        wishes = AdapterWishes(latency_timer, split, echo, absent)
-        buses = tuple(with_adapter(bus, wishes, seed) for bus in told.buses)
-        links = link_of_each(buses, link)
+        links = link_of_each(told.buses, link)
     mistakes.refuse()
+    wishes = AdapterWishes(latency_ns, split, echo, absent)
+    buses = tuple(with_adapter(bus, wishes, seed) for bus in told.buses)
     refuse_what_cannot_be(buses, planned, seed)
     from dxlrun.cli.sim_views import Shown, ending
     from dxlrun.simulation.process import SimulationConfig

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -32,7 +31,7 @@ BUS = "main"
 class AdapterWishes:
     """The options about the adapter; None: as the robot file says."""
 
-    latency_timer: str | None = None
+    latency_timer_ns: int | None = None
     split: Split | None = None
     echo: bool = False
     absent: Absent | None = None
@@ -90,18 +89,22 @@ def servo_bus(words: Sequence[str], baud_rate: int | None, protocol: float | Non
     )
 
 
-def with_adapter(bus: BusConfig, wishes: AdapterWishes, seed: int) -> BusConfig:
-    """Return a bus behind the adapter that the options want; raises InputError for a latency that is none."""
+def read_latency(text: str | None) -> int | None:
+    """Return the time of `--latency-timer` in ns; raises InputError for one that is none."""
     from dxlrun.description.units import duration
 
     try:
-        latency_ns = None if wishes.latency_timer is None else duration(wishes.latency_timer)
+        return None if text is None else duration(text)
     except ValueError as error:
-        raise InputError(f"--latency-timer {wishes.latency_timer!r}: {error}") from None
-    told = bus.adapter
+        raise InputError(f"--latency-timer {text!r}: {error}") from None
+
+
+def with_adapter(bus: BusConfig, wishes: AdapterWishes, seed: int) -> BusConfig:
+    """Return a bus behind the adapter that the options want."""
+    told, wished_ns = bus.adapter, wishes.latency_timer_ns
     adapter = replace(
         told,
-        latency_timer_ns=told.latency_timer_ns if latency_ns is None else latency_ns,
+        latency_timer_ns=told.latency_timer_ns if wished_ns is None else wished_ns,
         split=wishes.split or told.split,
         echo=wishes.echo or told.echo,
         seed=seed,
@@ -188,17 +191,14 @@ def _ids(text: str) -> list[int]:
 
 
 def _unknown(models: Sequence[str]) -> list[str]:
-    from dxlrun.control_table import model_names
+    from dxlrun.control_table import model_names, perhaps_meant
 
-    known = {name.lower(): name for name in model_names()}
-    wrong = []
-    for model in dict.fromkeys(models):
-        if model in known.values():
-            continue
-        close = difflib.get_close_matches(model.lower(), known, n=1)
-        mend = f"did you mean {known[close[0]]}?" if close else "`dxlrun models` lists all"
-        wrong.append(f"--servo: there is no model {model}; {mend}")
-    return wrong
+    known = model_names()
+    return [
+        f"--servo: there is no model {model}; {perhaps_meant(model)}"
+        for model in dict.fromkeys(models)
+        if model not in known
+    ]
 
 
 def _protocol(models: Sequence[str], wanted: float | None) -> float:
@@ -228,8 +228,9 @@ def _protocol(models: Sequence[str], wanted: float | None) -> float:
         )
     if len(common) > 1:
         names = " and ".join(spoken)
+        exist = "exists" if len(spoken) == 1 else "exist"
         raise InputError(
-            f"{names} exist with Protocol 1.0 and with 2.0; say which one by --protocol 1.0 or 2.0"
+            f"{names} {exist} with Protocol 1.0 and with 2.0; say which one by --protocol 1.0 or 2.0"
         )
     return common[0]
 

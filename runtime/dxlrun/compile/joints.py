@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from dxlrun.compile.problems import Problems, suggestion
 from dxlrun.compile.reach import Interval, degrees, joint_reach
 from dxlrun.control.loop_plan import JointPlan
-from dxlrun.control_table import ControlTable, control_table, model_names
+from dxlrun.control_table import ControlTable, control_table, model_names, perhaps_meant
 from dxlrun.description import Description
 from dxlrun.description.robot import Joint
 
@@ -113,9 +113,7 @@ def _table(
     except LookupError:
         spoken = [protocol for protocol in _USUAL if model in model_names(protocol)]
     if not spoken:
-        problems.error(
-            mark, f"no control table for model {model} of {name}", suggestion(model, model_names(wanted))
-        )
+        problems.error(mark, f"no control table for model {model} of {name}", perhaps_meant(model, wanted))
         return None
     if bus is not None:
         problems.error(

@@ -12,6 +12,7 @@ from dxlrun.control_table.models import (
     control_table,
     model_names,
     models_by_number,
+    perhaps_meant,
 )
 from dxlrun.control_table.sources import read_control_table
 from dxlrun.control_table.table import CAPABILITIES, ControlTable, EffortUnit
@@ -31,5 +32,6 @@ __all__ = [
     "control_table",
     "model_names",
     "models_by_number",
+    "perhaps_meant",
     "read_control_table",
 ]

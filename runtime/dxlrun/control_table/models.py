@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import functools
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
@@ -13,6 +14,8 @@ from dxlrun.control_table.table import ControlTable
 
 _ADDED: dict[float, list[Listing]] = {1.0: [], 2.0: []}
 """Tables of plug-ins; they are added while a process starts, before its first robot is compiled."""
+_MOST_MEANT = 4
+"""More names of models are no help to a person."""
 _TEXTS: dict[str, str] = {}
 """Name -> TOML text of the tables that were added."""
 
@@ -40,6 +43,16 @@ def control_table(model: str, protocol: float | None = None) -> ControlTable:
 def model_names(protocol: float | None = None) -> tuple[str, ...]:
     """Return every name that `control_table` knows (of one protocol if given), aliases too, sorted."""
     return tuple(sorted({name for each in (1.0, 2.0) if protocol in (None, each) for name in _index(each)}))
+
+
+def perhaps_meant(name: str, protocol: float | None = None) -> str:
+    """Return how to mend a name that no model has: those that begin with it, else the closest one."""
+    known = {each.lower(): each for each in model_names(protocol)}
+    meant = sorted(each for each in known if each.startswith(name.lower()))
+    if not 0 < len(meant) <= _MOST_MEANT:
+        meant = difflib.get_close_matches(name.lower(), known, n=1)
+    names = " or ".join(known[each] for each in meant)
+    return f"did you mean {names}?" if names else "`dxlrun models` lists all"
 
 
 def all_tables() -> tuple[ControlTable, ...]:
