@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dxlrun.simulation.body import Body
 from dxlrun.simulation.packets import BROADCAST, InstructionPacket, ReadEntry, ReadInTurn
-from dxlrun.simulation.protocol2 import ErrorNumber, Instruction
+from dxlrun.simulation.protocol2 import ErrorNumber, Instruction, ListedWrites, bulk_writes, sync_writes
 from dxlrun.simulation.torque_body import TorqueBody
 
 Answer = tuple[int, bytes]
@@ -71,9 +71,9 @@ class Instructions2:
             case Instruction.ACTION if self._body.has_registered:
                 answer = self._body.act(), b""
             case Instruction.SYNC_WRITE if packet.servo_id == BROADCAST:
-                answer = self._sync_write(parameters), b""
+                answer = self._write_listed(sync_writes(parameters)), b""
             case Instruction.BULK_WRITE if packet.servo_id == BROADCAST:
-                answer = self._bulk_write(parameters), b""
+                answer = self._write_listed(bulk_writes(parameters)), b""
             case _:
                 answer = _manage(self._body, packet), b""
         return answer
@@ -106,32 +106,16 @@ class Instructions2:
             return ErrorNumber.ACCESS
         return self._body.register(address, data)
 
-    def _sync_write(self, parameters: bytes) -> int:
-        address, length = _word(parameters, 0), _word(parameters, 2)
-        if length == 0 or len(parameters) < 5 + length or (len(parameters) - 4) % (length + 1):
-            return ErrorNumber.INSTRUCTION
-        error, own, secondary = 0, self._body.servo_id, self._body.secondary_id
-        for start in range(4, len(parameters), length + 1):
-            listed = parameters[start]
-            if listed == own:
-                error = self._body.write(address, parameters[start + 1 : start + 1 + length])
-            elif listed == secondary:  # a listed Secondary ID counts as well [i]
-                error = self._write(listed, address, parameters[start + 1 : start + 1 + length])
-        return error
-
-    def _bulk_write(self, parameters: bytes) -> int:
-        writes, start = [], 0
-        while start < len(parameters):
-            length = _word(parameters, start + 3)
-            data = parameters[start + 5 : start + 5 + length]
-            if length == 0 or len(data) < length:
-                return ErrorNumber.INSTRUCTION  # and nothing of it is done [i]
-            writes.append((parameters[start], _word(parameters, start + 1), data))
-            start += 5 + length
-        error, ids = 0, (self._body.servo_id, self._body.secondary_id)
-        for servo_id, address, data in writes:
-            if servo_id in ids:
-                error = self._write(servo_id, address, data)
+    def _write_listed(self, writes: ListedWrites | None) -> int:
+        """Do what a list says for this servo, in its order; a listed Secondary ID counts as well [i]."""
+        if writes is None:
+            return ErrorNumber.INSTRUCTION  # and nothing of it is done [i]
+        error, secondary = 0, self._body.secondary_id
+        listed = writes.get(self._body.servo_id, ())
+        if secondary is not None and secondary in writes:
+            listed = sorted((*listed, *writes[secondary]))
+        for _, servo_id, address, data in listed:
+            error = self._write(servo_id, address, data)
         return error
 
 

@@ -7,7 +7,9 @@ Only the CRC is a library's; the tests have another.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from enum import IntEnum, unique
+from functools import lru_cache
 
 from fastcrc.crc16 import umts
 
@@ -145,6 +147,38 @@ def _bulk_entries(parameters: bytes) -> tuple[ReadEntry, ...]:
         ReadEntry(parameters[start], _word(parameters, start + 1), _word(parameters, start + 3))
         for start in range(0, len(parameters), 5)
     )
+
+
+ListedWrites = Mapping[int, Sequence[tuple[int, int, int, bytes]]]
+"""What a list says for each ID: place in the list, ID, address, data."""
+
+
+@lru_cache(maxsize=1)  # the servos of a line ask one after the other for the same
+def sync_writes(parameters: bytes) -> ListedWrites | None:
+    """Return what a sync write says for each ID; None: its parameters are wrong."""
+    address, length = _word(parameters, 0), _word(parameters, 2)
+    if length == 0 or len(parameters) < 5 + length or (len(parameters) - 4) % (length + 1):
+        return None
+    writes: dict[int, list[tuple[int, int, int, bytes]]] = {}
+    for start in range(4, len(parameters), length + 1):
+        servo_id, data = parameters[start], parameters[start + 1 : start + 1 + length]
+        writes.setdefault(servo_id, []).append((start, servo_id, address, data))
+    return writes
+
+
+@lru_cache(maxsize=1)
+def bulk_writes(parameters: bytes) -> ListedWrites | None:
+    """Return what a bulk write says for each ID; None: its parameters are wrong."""
+    writes: dict[int, list[tuple[int, int, int, bytes]]] = {}
+    start = 0
+    while start < len(parameters):
+        servo_id, length = parameters[start], _word(parameters, start + 3)
+        data = parameters[start + 5 : start + 5 + length]
+        if length == 0 or len(data) < length:
+            return None
+        writes.setdefault(servo_id, []).append((start, servo_id, _word(parameters, start + 1), data))
+        start += 5 + length
+    return writes
 
 
 class InstructionReceiver:
