@@ -377,7 +377,8 @@ def test_a_baud_rate_that_no_servo_has_is_refused() -> None:
 def test_values_and_bytes_of_the_registers_never_differ() -> None:
     table = control_table("AX-12A")
     registers = Memory(table, 24)
-    registers.write(26, bytes((5, 6, 7, 8, 0x23, 0x01)))
+    for run in registers.runs(26, bytes((5, 6, 7, 8, 0x23, 0x01))):
+        registers.write(run)
     registers["moving_speed"] = 77
     for item in table.items.values():
         data = registers.read(item.address, item.size)

@@ -25,6 +25,7 @@ _LIMITS_OF_PROFILES = {"profile_velocity": "velocity_limit", "profile_accelerati
 [i], on X they may."""
 
 _GOALS = frozenset(("goal_pwm", "goal_current", "goal_velocity", "goal_position"))
+_NOTHING = (1 << 64, -1 << 64)
 _TURNS = 256
 """Reach of extended position control to either side (e-Manual, X series, Goal Position (116): 1,048,575)."""
 
@@ -98,6 +99,15 @@ class TorqueRules:
     def __init__(self, memory: Memory) -> None:
         self._memory = memory
         self._choices = choices(memory.table)
+        self._allowed: dict[str, tuple[int, int]] = {}
+        """Least and greatest value that was allowed: what lies between them is allowed as well, until another
+        item than a goal changes."""
+        decisive = [
+            item.name
+            for item in memory.table.items.values()
+            if item.access == "RW" and not item.name.startswith(("goal_", "profile_"))
+        ]
+        memory.watch(decisive, self._allowed.clear)
         bounded = memory.table.items["torque_enable"].address == TORQUE_ENABLE_OF_P
         limits = _LIMITS_OF_GOALS | (_LIMITS_OF_PROFILES if bounded else {})
         self._limits = {name: limit for name, limit in limits.items() if limit in memory}
@@ -119,8 +129,15 @@ class TorqueRules:
         if not cells.whole:
             return ErrorNumber.DATA_LENGTH
         for item in cells.items:
-            if error := self._refusal_of(item, run.after[item.name]):
+            wire = run.after[item.name]
+            value = wire - (wire >> 8 * item.size - 1 << 8 * item.size) if item.signed else wire
+            least, greatest = self._allowed.get(item.name, _NOTHING)
+            if least <= value <= greatest:
+                continue
+            if error := self._refusal_of(item, wire):
                 return error
+            if item.name not in self._choices and item.encoding != "sign_magnitude":
+                self._allowed[item.name] = min(least, value), max(greatest, value)
         return 0
 
     def _refusal_of(self, item: ControlItem, wire: int) -> int:

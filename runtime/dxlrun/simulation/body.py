@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from collections.abc import Set as AbstractSet
 
-from dxlrun.simulation.memory import Memory, Run
+from dxlrun.simulation.memory import IDENTITY, Memory, Run
 from dxlrun.simulation.shaft import Shaft
 from dxlrun.simulation.strain import SUPPLY_OHM
 
@@ -42,16 +42,18 @@ class Body(ABC):
         self._started_ns = shaft.now_ns
         shaft.mechanics.watch(shaft.index, self._strained)
         self._live = {name: show for name, show in self._live_items().items() if name in memory}
-        self._live_in: dict[tuple[int, int], tuple[str, ...]] = {}
+        self._live_in: dict[tuple[int, int], tuple[tuple[str, Callable[[], int]], ...]] = {}
         self.answers_damaged = False
         """True: a packet with a wrong checksum is answered by the manual's error; False: never [?]."""
         self._registered: tuple[int, bytes] | None = None
         self._secondary_item = next((each for each in _SECONDARY_IDS if each in memory), None)
-
-    @property
-    def servo_id(self) -> int:
+        self.servo_id = 0
         """ID (3 or 7)."""
-        return self.memory["id"]
+        self.secondary_id: int | None = None
+        """Secondary ID (12): 253 to 255 switch it off, and the ID goes first (e-Manual, X series)."""
+        self.hears_protocol = True
+        """False when it was told to speak another protocol."""
+        memory.watch(IDENTITY, self._identify)
 
     @property
     def voltage(self) -> float:
@@ -72,13 +74,12 @@ class Body(ABC):
     def temperature(self, celsius: float) -> None:
         self.shaft.mechanics.heat(self.shaft.index, celsius)
 
-    @property
-    def secondary_id(self) -> int | None:
-        """Secondary ID (12): 253 to 255 switch it off, and the ID goes first (e-Manual, X series)."""
-        if self._secondary_item is None:
-            return None
-        secondary = self.memory[self._secondary_item]
-        return None if secondary > 252 or secondary == self.memory["id"] else secondary
+    def _identify(self) -> None:
+        """Take note of what it hears."""
+        self.servo_id = self.memory["id"]
+        secondary = None if self._secondary_item is None else self.memory[self._secondary_item]
+        off = secondary is None or secondary > 252 or secondary == self.servo_id
+        self.secondary_id = None if off else secondary
 
     def advance(self, now_ns: int) -> None:
         """Let time pass."""
@@ -103,28 +104,25 @@ class Body(ABC):
         for name, show in self._live.items():
             self.memory.show(name, show())
 
-    @property
-    def hears_protocol(self) -> bool:
-        """False when it was told to speak another protocol."""
-        return True
-
     # Instructions that both protocols have
 
     def read(self, address: int, length: int) -> bytes | None:
         """Return bytes of the table, None where it has none."""
-        memory, live = self.memory, self._live
+        memory = self.memory
         if address + length > memory.size:
             return None
         direct = memory.cells(address, length).direct
         for target, first, last in ((address, 0, length),) if direct else memory.places(address, length):
             cells = target, last - first
-            names = self._live_in.get(cells)
-            if names is None:
+            live = self._live_in.get(cells)
+            if live is None:
                 if len(self._live_in) >= _READS_KEPT:
                     self._live_in.clear()
-                names = self._live_in[cells] = tuple(name for name in live if _overlaps(memory, name, *cells))
-            for name in names:
-                memory.show(name, live[name]())
+                live = self._live_in[cells] = tuple(
+                    each for each in self._live.items() if _overlaps(memory, each[0], *cells)
+                )
+            for name, show in live:
+                memory.show(name, show())
         return memory.read(address, length)
 
     def write(self, address: int, data: bytes) -> int:

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import replace
 
 from dxlrun.simulation import protocol1, protocol2
 from dxlrun.simulation.adapter import Adapter
@@ -374,7 +373,7 @@ class SimulatedBus:
                 continue
             counts.answer(reply.error)
             if reading.fast and entry is not reading.entries[0]:
-                reply = replace(reply, delay_ns=0)  # only the first one of a shared status waits
+                reply = reply._replace(delay_ns=0)  # only the first one of a shared status waits
             replies.append(reply)
         return replies
 

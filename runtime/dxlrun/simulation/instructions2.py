@@ -13,6 +13,7 @@ Answer = tuple[int, bytes]
 SLOT_NS = 1_000_000
 """What a servo's slot after a broadcast ping is longer than its reply [i]."""
 
+_PING = int(Instruction.PING)
 _PING_REPLY = 14
 _CLEAR_TURNS = bytes.fromhex("01 44 58 4c 22")
 _CLEAR_ERROR = bytes.fromhex("02 45 52 43 4c")
@@ -35,12 +36,14 @@ class Instructions2:
         Instructions to the Secondary ID get none, and a packet with a wrong CRC none, unless
         `Body.answers_damaged` asks for the manual's error.
         """
+        if not own:
+            return packet.servo_id == BROADCAST and packet.intact and packet.instruction == _PING
         if not packet.intact and not self._body.answers_damaged:
             return False
-        if packet.intact and packet.instruction == Instruction.PING:
-            return own or packet.servo_id == BROADCAST
+        if packet.intact and packet.instruction == _PING:
+            return True
         level = 1 if packet.intact and packet.instruction == Instruction.READ else 2
-        return own and level <= self._body.memory["status_return_level"]
+        return level <= self._body.memory["status_return_level"]
 
     def delay_ns(self, packet: InstructionPacket, byte_ns: int) -> int:
         """Return how long the servo waits: Return Delay Time, after a broadcast ping also for its slot."""

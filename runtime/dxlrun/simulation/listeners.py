@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dxlrun.simulation.memory import IDENTITY
 from dxlrun.simulation.servo import SimulatedServo
 
 
@@ -17,7 +18,7 @@ class Listeners:
         """Take note of a servo that hangs on the line now."""
         self._servos.append(servo)
         self._of.clear()
-        servo.registers.on_identity = self._of.clear
+        servo.registers.watch(IDENTITY, self._of.clear)
 
     def change_rate(self, baud_rate: int) -> None:
         """Take note that the host talks at another rate, bit/s."""

@@ -13,7 +13,8 @@ _INDIRECT = re.compile(r"indirect_address_(\d+)")
 _CELLS_KEPT = 1024
 """So many places of a table are looked up only once: a host writes few of them, rubbish goes everywhere."""
 
-_IDENTITY = frozenset(("id", "secondary_id", "secondary_shadow_id", "baud_rate", "baud_rate_bus"))
+IDENTITY = ("id", "secondary_id", "secondary_shadow_id", "baud_rate", "baud_rate_bus", "protocol_type")
+"""Items that say what the servo hears."""
 
 
 class Cells(NamedTuple):
@@ -32,8 +33,6 @@ class Cells(NamedTuple):
     """True when one of the items is."""
     eeprom: bool
     """True when one of the items is in the EEPROM area."""
-    identity: bool
-    """True when one of the items says what the servo hears."""
 
 
 class Run(NamedTuple):
@@ -55,8 +54,6 @@ class Memory:
     def __init__(self, table: ControlTable, firmware: int) -> None:
         self.table = table
         self.firmware = firmware
-        self.on_identity: Callable[[], None] | None = None
-        """Who is told when an item changes that says what the servo hears."""
         self.size = table.size
         """Bytes from address 0 to the end of the last item."""
         self._memory = bytearray(self.size)
@@ -69,6 +66,11 @@ class Memory:
         }
         self._indirect = _indirect_cells(table)
         self._bounds = {item.name: _bounds(item) for item in table.items.values()}
+        self._places = {
+            item.name: (item.address, item.address + item.size, item.size, (1 << 8 * item.size) - 1)
+            for item in table.items.values()
+        }
+        self._watchers: dict[str, list[Callable[[], None]]] = {}
         self.restore_factory_values()
 
     def restore_factory_values(self, keep: tuple[str, ...] = ()) -> None:
@@ -98,14 +100,24 @@ class Memory:
         return self._values[name]
 
     def __setitem__(self, name: str, wire: int) -> None:
-        item = self.table.items[name]
-        wire &= (1 << 8 * item.size) - 1
+        start, end, size, mask = self._places[name]
+        wire &= mask
         if self._values.get(name) == wire:
             return
-        self._memory[item.address : item.address + item.size] = wire.to_bytes(item.size, "little")
+        self._memory[start:end] = wire.to_bytes(size, "little")
         self._values[name] = wire
-        if name in _IDENTITY and self.on_identity is not None:
-            self.on_identity()
+        if name in self._watchers:
+            self._tell((name,))
+
+    def watch(self, names: Iterable[str], act: Callable[[], None]) -> None:
+        """Let something be done now, and whenever one of some items changes; others may stay the same."""
+        for name in names:
+            self._watchers.setdefault(name, []).append(act)
+        act()
+
+    def _tell(self, names: Iterable[str]) -> None:
+        for act in dict.fromkeys(act for name in names for act in self._watchers.get(name, ())):
+            act()
 
     def get(self, name: str, otherwise: int = 0) -> int:
         """Return the integer of an item, or another one when the model has no such item."""
@@ -115,7 +127,8 @@ class Memory:
         """Set an item if the model has it; what does not fit ends at its highest or lowest value."""
         bounds = self._bounds.get(name)
         if bounds is not None:
-            self[name] = max(bounds[0], min(bounds[1], wire))
+            lowest, highest = bounds
+            self[name] = lowest if wire < lowest else min(wire, highest)
 
     def ticks(self, name: str) -> int:
         """Return the signed number of ticks of an item."""
@@ -179,7 +192,6 @@ class Memory:
                 direct=self._indirect.keys().isdisjoint(spanned),
                 read_only=any(item.access == "R" for item in items),
                 eeprom=any(item.area == "EEPROM" for item in items),
-                identity=not _IDENTITY.isdisjoint(names),
             )
             if len(self._cells_at) >= _CELLS_KEPT:
                 self._cells_at.clear()
@@ -216,8 +228,8 @@ class Memory:
         """Write bytes that were not refused."""
         self._memory[run.address : run.address + len(run.data)] = run.data
         self._values.update(run.after)
-        if run.cells.identity and self.on_identity is not None:
-            self.on_identity()
+        if not self._watchers.keys().isdisjoint(run.after):
+            self._tell(run.after)
 
     @staticmethod
     def _initial(item: ControlItem) -> int:

@@ -70,6 +70,8 @@ class ModeShaft(Shaft):
         self._acceleration_unit = item.scale if item is not None else 1.0
         self._pwm_unit = items["goal_pwm"].scale if "goal_pwm" in items else 1 / 885
         self._current_unit = items["goal_current"].scale if "goal_current" in items else 0.001
+        self._sign, self._offset = 1, 0
+        memory.watch(("drive_mode", "homing_offset"), self._orient)
 
     def within_a_turn(self, angle: float) -> float:
         """Return the angle within the turn that the encoder knows: 0 to 4095 ticks, or around 0."""
@@ -123,13 +125,10 @@ class ModeShaft(Shaft):
         near = abs(goal - self.angle) <= _IN_POSITION_TICKS * self.memory.table.rad_per_tick
         return self._profile_kind | (_ARRIVED if near else 0)
 
-    @property
-    def _sign(self) -> int:
-        return -1 if self.memory.get("drive_mode") & REVERSE else 1
-
-    @property
-    def _offset(self) -> int:
-        return self.memory.ticks("homing_offset") if "homing_offset" in self.memory else 0
+    def _orient(self) -> None:
+        """Take note of how the servo counts angles."""
+        self._sign = -1 if self.memory.get("drive_mode") & REVERSE else 1
+        self._offset = self.memory.ticks("homing_offset") if "homing_offset" in self.memory else 0
 
     @property
     def _controls_position(self) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 BROADCAST = 0xFE
 
@@ -23,8 +23,7 @@ class InstructionPacket:
     """All of its bytes, as they stood on the line."""
 
 
-@dataclass(frozen=True, slots=True)
-class Reply:
+class Reply(NamedTuple):
     """What a servo sends back, and how long after the instruction's last byte it starts to."""
 
     servo_id: int

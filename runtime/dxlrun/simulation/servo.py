@@ -92,7 +92,7 @@ class SimulatedServo:
 
     def listens_to(self, servo_id: int) -> bool:
         """Return whether an instruction to an ID, or to all, is for this servo."""
-        return servo_id == BROADCAST or servo_id in (self.servo_id, self.secondary_id)
+        return servo_id == BROADCAST or servo_id in (self._body.servo_id, self._body.secondary_id)
 
     @property
     def baud_rate(self) -> int:
@@ -106,11 +106,11 @@ class SimulatedServo:
 
     def execute(self, packet: InstructionPacket, now_ns: int) -> Reply | None:
         """Obey an instruction whose last byte arrived at `now_ns`; return the reply, None for silence."""
-        servo_id = self.servo_id  # a write of ID is still answered under the old one [i]
+        body, instructions = self._body, self._instructions
+        servo_id = body.servo_id  # a write of ID is still answered under the old one [i]
         own = packet.servo_id == servo_id
         if not (own or self.listens_to(packet.servo_id)) or not self._hears(now_ns):
             return None
-        body, instructions = self._body, self._instructions
         answering = instructions.answers(packet, own)
         delay_ns = instructions.delay_ns(packet, 10_000_000_000 // self.baud_rate) if answering else 0
         error, parameters = instructions.obey(packet)
@@ -129,8 +129,8 @@ class SimulatedServo:
         answer = self._instructions.answer_in_turn(reading, entry)
         if answer is None:
             return None
-        delay_ns = self.registers["return_delay_time"] * 2000
-        return Reply(self.servo_id, answer[0] | self._body.state(), answer[1], delay_ns)
+        delay_ns = self._body.memory["return_delay_time"] * 2000
+        return Reply(self._body.servo_id, answer[0] | self._body.state(), answer[1], delay_ns)
 
     def _hears(self, now_ns: int) -> bool:
         if self._silent or now_ns < self._body.deaf_until_ns or not self._body.hears_protocol:

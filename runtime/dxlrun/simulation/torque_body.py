@@ -291,10 +291,9 @@ class TorqueBody(Body):
             self._show_controller_state()
         self._watch()
 
-    @property
-    def hears_protocol(self) -> bool:
-        """False when Protocol Type is that of another protocol."""
-        return self.memory.get("protocol_type", 2) in _SPEAKS
+    def _identify(self) -> None:
+        super()._identify()
+        self.hears_protocol = self.memory.get("protocol_type", 2) in _SPEAKS
 
     def _change_mode(self) -> None:
         """Begin with another operating mode as the manual says (e-Manual, X series, Operating Mode (11)).
