@@ -23,15 +23,13 @@ from dxlrun.simulation import protocol1, protocol2
 from dxlrun.simulation.adapter import Adapter
 from dxlrun.simulation.agenda import Agenda
 from dxlrun.simulation.bus_config import BusConfig, ServoCounts
+from dxlrun.simulation.delivery import Delivery
 from dxlrun.simulation.ledger import Ledger
 from dxlrun.simulation.listeners import Listeners
 from dxlrun.simulation.mechanics import Mechanics
 from dxlrun.simulation.packets import Codec, InstructionPacket, ReadEntry, ReadInTurn, Reply
 from dxlrun.simulation.servo import ServoConfig, SimulatedServo
-from dxlrun.simulation.wire import Alteration, Chain, Change, Chunk, Wire
-
-STATUS_BYTES = 11
-"""Bytes of a status packet of Protocol 2.0 without data: the slot of an absent servo is as long [i]."""
+from dxlrun.simulation.wire import STATUS_BYTES, Alteration, Chain, Change, Chunk, Wire
 
 
 class SimulatedBus:
@@ -49,8 +47,6 @@ class SimulatedBus:
         self.plugged = True
         """False: nothing is between the host and the line."""
         self.times_unplugged = 0
-        self.lateness_ns: deque[int] = deque(maxlen=1000)
-        """How long after its time the host got what it got last, in real time."""
         self.servos: tuple[SimulatedServo, ...] = ()
         self.mechanics = mechanics or Mechanics(start_ns)
         """What the servos move; several buses of one robot share it."""
@@ -60,6 +56,9 @@ class SimulatedBus:
         self._receiver = self._codec.receiver()
         self._wire = Wire(config.baud_rate, self.note)
         self._adapter = Adapter(config.adapter, start_ns)
+        self._delivery = Delivery(self._adapter, ledger, config.name)
+        self.lateness_ns = self._delivery.lateness_ns
+        """How long after its time the host got what it got last, in real time."""
         self._wedged = False
         self._chain: Chain | None = None
         self._changes: dict[int, deque[Change]] = {}
@@ -113,6 +112,17 @@ class SimulatedBus:
         planned_ns = self._agenda.next_ns
         return planned_ns if planned_ns is not None and (due_ns is None or planned_ns < due_ns) else due_ns
 
+    def next_delivery_ns(self, gather_ns: int) -> int | None:
+        """Return `next_due_ns`, or when the last answer has passed that follows it within a time."""
+        due_ns, chain, passing = self.next_due_ns(), self._chain, self._wire.passing
+        if due_ns is None or chain is None or not (chain.waiting and self._adapter.immediate):
+            return due_ns
+        if not passing or passing[0].chain is not chain or passing[0].due_ns != due_ns:
+            return due_ns
+        planned_ns = self._agenda.next_ns
+        gathered_ns = chain.heard_ns(due_ns, gather_ns, self._wire.duration_ns)
+        return gathered_ns if planned_ns is None else min(gathered_ns, max(due_ns, planned_ns))
+
     def take(self, now_ns: int, *, handed_ns: int | None = None) -> bytes:
         """Return the bytes that have reached the host by `now_ns`, each once.
 
@@ -122,29 +132,7 @@ class SimulatedBus:
         passing = self._wire.passing
         if self._wedged or not (passing or self._adapter.holds):
             return b""
-        if self._adapter.immediate:
-            return self._take_at_once(handed_ns)
-        taken = bytearray()
-        while (part := self._adapter.hand_over(now_ns, passing)) is not None:
-            late_ns = self._late_ns(part.planned_ns, handed_ns)
-            for chunk in part.ended:
-                self.ledger.add(chunk.due_ns, self.name, "out", chunk.data, chunk.note, late_ns=late_ns)
-            taken += part.data
-        return bytes(taken)
-
-    def _take_at_once(self, handed_ns: int | None) -> bytes:
-        """Return all that has passed the wire: nothing is kept back or cut."""
-        arrived = self._adapter.give_all()
-        for chunk in arrived:
-            late_ns = self._late_ns(chunk.due_ns, handed_ns)
-            self.ledger.add(chunk.due_ns, self.name, "out", chunk.data, chunk.note, late_ns=late_ns)
-        return arrived[0].data if len(arrived) == 1 else b"".join([chunk.data for chunk in arrived])
-
-    def _late_ns(self, planned_ns: int, handed_ns: int | None) -> int:
-        if handed_ns is None:
-            return 0
-        self.lateness_ns.append(handed_ns - planned_ns)
-        return handed_ns - planned_ns
+        return self._delivery.take(now_ns, passing, handed_ns)
 
     # What tests see and do
 

@@ -11,8 +11,8 @@ _PR_SET_TIMERSLACK = 29
 
 LONGEST_POLL_NS = 80_000
 """A sleep wakes some 50 us late on a stock kernel: so long before a reply is due the clock is polled."""
-_POLL_SHARE = 8
-"""One part in so many of all time may be polled; a busy bus is served by sleeping alone."""
+_POLL_SHARE = 6
+"""One part in so many of the waiting may be polled: who has little time to wait sleeps."""
 _BUDGET_NS = 20_000_000
 _PAUSE_NS = 100_000
 """So long the process at least sleeps when it may not poll: what becomes due meanwhile goes out together."""
@@ -57,21 +57,18 @@ def _take_priority(priority: int) -> str:
 class Patience:
     """Decides how long to sleep before something is due, and when to poll the clock instead.
 
-    Polling is punctual and costs the processor; it is bounded to an eighth of all time. Beyond that, replies
+    Polling is punctual and costs the processor; it is bounded to a sixth of the waiting. Beyond that, replies
     are handed over a little late, several at once.
     """
 
     def __init__(self, now_ns: int) -> None:
         self._budget_ns = _BUDGET_NS
-        self._settled_ns = now_ns
+        self._asked_ns = now_ns
         self._polls = False
 
     def until(self, due_ns: int | None, now_ns: int) -> float | None:
         """Return for how long to sleep, s; 0: poll; None: for ever."""
-        elapsed_ns = now_ns - self._settled_ns
-        self._settled_ns = now_ns
-        spent_ns = elapsed_ns if self._polls else 0
-        self._budget_ns = min(_BUDGET_NS, self._budget_ns + elapsed_ns // _POLL_SHARE - spent_ns)
+        self._asked_ns = now_ns
         self._polls = False
         if due_ns is None:
             return None
@@ -80,3 +77,9 @@ class Patience:
             return (left_ns - (LONGEST_POLL_NS if self._budget_ns > 0 else 0)) * 1e-9
         self._polls = self._budget_ns > 0
         return 0.0 if self._polls or left_ns <= 0 else _PAUSE_NS * 1e-9
+
+    def woke(self, now_ns: int) -> None:
+        """Take note of how long it has really waited."""
+        waited_ns = now_ns - self._asked_ns
+        spent_ns = waited_ns if self._polls else 0
+        self._budget_ns = min(_BUDGET_NS, self._budget_ns + waited_ns // _POLL_SHARE - spent_ns)

@@ -6,7 +6,6 @@ import select
 import signal
 import socket
 import time
-from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
@@ -29,6 +28,10 @@ MOST_BACKLOG_NS = 20_000_000
 """A host that hands over bytes faster than they pass the wire is not read while so much of them waits.
 
 So it feels the rate of its line, as with an adapter."""
+
+GATHER_NS = 125_000
+"""Answers of a read in turn that follow one so closely are handed over together with it, as in one microframe
+of USB: each hand-over costs the processor more than an answer."""
 
 MOVE_NS = 300_000
 """So long the mechanics of a few steps may take."""
@@ -76,50 +79,47 @@ class Server:
 
     def _turn(self, wake: socket.socket) -> None:
         now_ns = time.monotonic_ns()
-        dues = [bus.next_due_ns() for bus in self._buses]
-        patience = self._patience.until(self._next_ns(dues, now_ns), now_ns)
-        sources: list[PseudoTerminal | socket.socket | ControlLine] = [
-            each
-            for each in self._terminals
-            if each.plugged and each.bus.host_free_ns - now_ns <= MOST_BACKLOG_NS
-        ]
-        sources += (self._line, wake)
-        writable = (self._line,) if self._line.has_unsent else ()
-        readable, unsent, _ = select.select(sources, writable, (), patience)
+        dues = [bus.next_delivery_ns(GATHER_NS) for bus in self._buses]
+        soonest_ns = min([due_ns for due_ns in dues if due_ns is not None], default=None)
+        if soonest_ns is None or soonest_ns - now_ns > MOVE_NS:  # no reply is about to leave
+            self._mechanics.advance(now_ns)
+        sources, next_ns = self._sources(now_ns, soonest_ns)
+        patience = self._patience.until(next_ns, now_ns)
+        writable = (self._line.fileno(),) if self._line.has_unsent else ()
+        readable, unsent, _ = select.select(
+            [*sources, self._line.fileno(), wake.fileno()], writable, (), patience
+        )
         # What was due before the host wrote goes out first: the host could have read it.
         now_ns = time.monotonic_ns()
+        self._patience.woke(now_ns)
+        heard = [sources[number] for number in readable if number in sources]
         for terminal, due_ns in zip(self._terminals, dues, strict=True):
-            if (due_ns is not None and due_ns <= now_ns) or terminal in readable:
+            if (due_ns is not None and due_ns <= now_ns) or terminal in heard:
                 terminal.deliver(now_ns)
                 if terminal.follow_adapter():
                     self._line.send({"ports": self._ports()})
-        for terminal in self._terminals:
-            if terminal in readable and terminal.plugged:
+        for terminal in heard:
+            if terminal.plugged:
                 terminal.receive(now_ns)  # of that moment, however long the others took
-        self._move(now_ns)
         if unsent:
             self._line.flush()
-        if self._line in readable:
+        if self._line.fileno() in readable:
             self._listen(now_ns)
-        if wake in readable:
+        if wake.fileno() in readable:
             self._stopped = True
         self._ledger.flush_if_due(now_ns)
 
-    def _move(self, now_ns: int) -> None:
-        """Let the servos move on, unless a reply is about to leave."""
-        due = (bus.next_due_ns() for bus in self._buses)
-        if all(due_ns is None or due_ns - now_ns > MOVE_NS for due_ns in due):
-            self._mechanics.advance(now_ns)
-
-    def _next_ns(self, dues: Sequence[int | None], now_ns: int) -> int | None:
-        """Return when something is to be done without being asked."""
-        times = [due_ns for due_ns in dues if due_ns is not None]
-        backlogs = (bus.host_free_ns - MOST_BACKLOG_NS for bus in self._buses)
-        times += [free_ns for free_ns in backlogs if free_ns > now_ns]
-        times += (
-            t_ns for t_ns in (self._ledger.flush_due_ns(), self._mechanics.due_ns()) if t_ns is not None
-        )
-        return min(times, default=None)
+    def _sources(self, now_ns: int, soonest_ns: int | None) -> tuple[dict[int, PseudoTerminal], int | None]:
+        """Return whose bytes are taken, by descriptor, and when something is to be done unasked."""
+        sources: dict[int, PseudoTerminal] = {}
+        times = [soonest_ns, self._ledger.flush_due_ns(), self._mechanics.due_ns()]
+        for terminal in self._terminals:
+            taken_ns = terminal.bus.host_free_ns - MOST_BACKLOG_NS
+            if taken_ns > now_ns:
+                times.append(taken_ns)
+            elif terminal.plugged:
+                sources[terminal.fileno()] = terminal
+        return sources, min([t_ns for t_ns in times if t_ns is not None], default=None)
 
     def _ports(self) -> dict[str, str]:
         return {terminal.bus.name: terminal.path for terminal in self._terminals}

@@ -17,6 +17,11 @@ MOST_PASSING = 256
 """Packets on their way to the host at once: a host that floods a line on virtual time fills no memory."""
 
 
+STATUS_BYTES = 11
+"""Bytes of a status packet of Protocol 2.0 without data: the slot of an absent servo is as long [i]."""
+_STATUS_OF_FAST = 4
+"""Bytes that a servo adds to a shared status, without its data."""
+
 Alteration = Callable[[bytes], bytes]
 """What becomes of a packet's bytes."""
 
@@ -32,6 +37,19 @@ class Chain:
     """True: who does not hear the one before it answers when that one's time is over; False: never [?]."""
     slot_end_ns: int = 0
     """When the time of the one that answers now is over."""
+
+    def heard_ns(self, due_ns: int, within_ns: int, duration_ns: Callable[[int], int]) -> int:
+        """Return when the last of those has answered who do so within a time after another one's answer."""
+        heard_ns = due_ns
+        for entry, replies in self.waiting:
+            if len(replies) != 1:
+                break
+            size = entry.length + (_STATUS_OF_FAST if self.fast else STATUS_BYTES)
+            next_ns = heard_ns + replies[0].delay_ns + duration_ns(size)
+            if next_ns > due_ns + within_ns:
+                break
+            heard_ns = next_ns
+        return heard_ns
 
 
 @dataclass(slots=True)
