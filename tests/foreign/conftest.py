@@ -55,7 +55,10 @@ class Simulation:
         self._refusals[bus] += count
 
     def expect_haste(self, bus: str) -> None:
-        """Say that a test asks again before an answer came, and may talk into it on a busy machine."""
+        """Say that a test asks again before an answer came, and may talk into it on a busy machine.
+
+        What collides there is refused, too: such a bus is not judged.
+        """
         self._hasty.add(bus)
 
     def fault(self, line: str) -> None:
@@ -77,12 +80,13 @@ class Simulation:
 
     def judge(self) -> None:
         """End it, and find in the ledger what was expected and no accident."""
-        notes = [(entry.bus, entry.note) for entry in self.end() if entry.direction == "note"]
+        entries = [
+            entry for entry in self.end() if entry.direction == "note" and entry.bus not in self._hasty
+        ]
+        notes = [(entry.bus, entry.note) for entry in entries]
         refused = Counter(bus for bus, note in notes if " refuses " in note)
         accidents = [
-            note
-            for bus, note in notes
-            if bus not in self._hasty and any(word in note for word in ("collision", "lost", "broken"))
+            note for _, note in notes if any(word in note for word in ("collision", "lost", "broken"))
         ]
         assert refused == +self._refusals
         assert not accidents
