@@ -13,7 +13,7 @@ Answer = tuple[int, bytes]
 SLOT_NS = 1_000_000
 """What a servo's slot after a broadcast ping is longer than its reply [i]."""
 
-_PING = int(Instruction.PING)
+_PING, _SYNC_WRITE = int(Instruction.PING), int(Instruction.SYNC_WRITE)
 _PING_REPLY = 14
 _CLEAR_TURNS = bytes.fromhex("01 44 58 4c 22")
 _CLEAR_ERROR = bytes.fromhex("02 45 52 43 4c")
@@ -61,6 +61,8 @@ class Instructions2:
         if not packet.intact:
             return ErrorNumber.CRC, b""
         parameters = packet.parameters
+        if packet.instruction == _SYNC_WRITE and packet.servo_id == BROADCAST:  # the most frequent by far
+            return self._write_listed(sync_writes(parameters)), b""
         match packet.instruction:
             case Instruction.PING:
                 memory = self._body.memory
@@ -73,8 +75,6 @@ class Instructions2:
                 answer = self._register(packet.servo_id, _word(parameters, 0), parameters[2:]), b""
             case Instruction.ACTION if self._body.has_registered:
                 answer = self._body.act(), b""
-            case Instruction.SYNC_WRITE if packet.servo_id == BROADCAST:
-                answer = self._write_listed(sync_writes(parameters)), b""
             case Instruction.BULK_WRITE if packet.servo_id == BROADCAST:
                 answer = self._write_listed(bulk_writes(parameters)), b""
             case _:

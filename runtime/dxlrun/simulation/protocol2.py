@@ -55,6 +55,13 @@ class Instruction(IntEnum):
     FAST_BULK_READ = 0x9A
 
 
+_LONGEST_KNOWN = 1265
+"""Bytes that list all servos of a line once: longer lists are rubbish, and not kept."""
+
+_FAST_READS = frozenset((Instruction.FAST_SYNC_READ, Instruction.FAST_BULK_READ))
+_READS_IN_TURN = _FAST_READS | {Instruction.SYNC_READ, Instruction.BULK_READ}
+
+
 @unique
 class ErrorNumber(IntEnum):
     """Number in bits 0..6 of a status packet's error (e-Manual, Protocol 2.0, "Error")."""
@@ -86,9 +93,11 @@ def unstuffed(body: bytes) -> bytes:
 
 def status_packet(servo_id: int, error: int, parameters: bytes = b"") -> bytes:
     """Return the bytes of a status packet."""
-    body = stuffed(bytes((STATUS, error)) + parameters)
+    body = bytes((STATUS, error)) + parameters
+    if HEADER in body:
+        body = stuffed(body)
     packet = _head(servo_id, len(body) + 2) + body
-    return packet + crc16(packet).to_bytes(2, "little")
+    return packet + umts(packet).to_bytes(2, "little")
 
 
 class FastStatusPacket:
@@ -118,18 +127,21 @@ def fast_status(lengths: tuple[int, ...]) -> FastStatusPacket:
 
 def read_in_turn(packet: InstructionPacket) -> ReadInTurn | None:
     """Return what a sync or bulk read asks for; None: it is none, or its parameters are wrong."""
-    if not packet.intact or packet.servo_id != BROADCAST:
+    if packet.instruction not in _READS_IN_TURN or not packet.intact or packet.servo_id != BROADCAST:
         return None
-    match packet.instruction:
-        case Instruction.SYNC_READ | Instruction.FAST_SYNC_READ:
-            entries = _sync_entries(packet.parameters)
-        case Instruction.BULK_READ | Instruction.FAST_BULK_READ:
-            entries = _bulk_entries(packet.parameters)
-        case _:
-            return None
-    fast = packet.instruction in (Instruction.FAST_SYNC_READ, Instruction.FAST_BULK_READ)
+    known = _reading if len(packet.parameters) <= _LONGEST_KNOWN else _reading.__wrapped__
+    return known(packet.instruction, packet.parameters)
+
+
+@lru_cache(maxsize=16)  # hosts ask again and again for the same
+def _reading(instruction: int, parameters: bytes) -> ReadInTurn | None:
+    fast = instruction in _FAST_READS
+    if instruction in (Instruction.SYNC_READ, Instruction.FAST_SYNC_READ):
+        entries = _sync_entries(parameters)
+    else:
+        entries = _bulk_entries(parameters)
     # A fast status is one packet [i]: with an absent servo in it, it stays short.
-    reading = ReadInTurn(packet.instruction, entries, fast=fast, has_slots=not fast)
+    reading = ReadInTurn(instruction, entries, fast=fast, has_slots=not fast)
     if not entries or (fast and _fast_length(reading.lengths) > LONGEST):
         return None
     return reading
@@ -250,7 +262,7 @@ def _packet(data: bytes, end: int) -> InstructionPacket:
         servo_id=data[4],
         instruction=body[0],
         parameters=body[1:],
-        intact=_word(data, len(data) - 2) == crc16(data[:-2]),
+        intact=_word(data, len(data) - 2) == umts(data[:-2]),
         end=end,
         raw=data,
     )

@@ -76,6 +76,9 @@ class TorqueBody(Body):
         self._backup: dict[str, int] = {}
         self._shut_down = False
         self._heard_ns = shaft.now_ns
+        self._guarded = False
+        """False while Bus Watchdog is 0."""
+        memory.watch(("bus_watchdog",), self._guard)
         self._looked_after_ns: int | None = None
         """When the Bus Watchdog is looked after next; None: never."""
 
@@ -84,9 +87,13 @@ class TorqueBody(Body):
 
         Whether those to other servos count is not said [?].
         """
-        self.advance(now_ns)
+        self.shaft.advance(now_ns)
         self._heard_ns = self.shaft.now_ns
-        self._watch()
+        if self._guarded:
+            self._watch()
+
+    def _guard(self) -> None:
+        self._guarded = self.memory.get("bus_watchdog") != 0
 
     def _watch(self) -> None:
         """See to it that the Bus Watchdog is looked after when its time runs out, or before."""
@@ -289,7 +296,8 @@ class TorqueBody(Body):
             memory["torque_enable"] = 1
         if self.has_error_code:
             self._show_controller_state()
-        self._watch()
+        if self._guarded:
+            self._watch()
 
     def _identify(self) -> None:
         super()._identify()
