@@ -15,15 +15,16 @@ from dxlrun.simulation.faults import FaultScript, parse_fault
 from dxlrun.testing import plan_of
 from dxlrun.virtual_run import VirtualRobot
 
-TORSO = Path(__file__).parents[2] / "robots/bioloid_torso.yaml"
+ROBOTS = Path(__file__).parents[2] / "robots"
+TORSO = ROBOTS / "bioloid_torso.yaml"
 STARTED_NS = 1_000_000_000
 """The start-up is over: a fault in it ends the run before it has begun."""
 
 
 @pytest.fixture(scope="module")
 def plan() -> Plan:
-    """The torso behind an adapter that waits 1 ms and hands bytes over in random pieces."""
-    plan = plan_of(TORSO, duration_s=3)
+    """The thesis' arms behind an adapter that waits 1 ms and hands bytes over in random pieces."""
+    plan = plan_of(TORSO, play=[ROBOTS / "motions/three_parts.yaml"], duration_s=5)
     adapters = {"main": AdapterPlan(latency_timer_ns=1_000_000, split="random")}
     return replace(plan, simulation=replace(plan.simulation, adapters=adapters))
 

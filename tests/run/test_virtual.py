@@ -1,4 +1,4 @@
-"""The torso on virtual time: the thesis' three parts follow their formulas, and two runs are one."""
+"""The torso on virtual time: the thesis' three parts follow their formulas, and the log is the wire."""
 
 from __future__ import annotations
 
@@ -96,12 +96,6 @@ def test_the_head_obeys_its_commands(log_of_three_parts: Path) -> None:
     assert speed == pytest.approx(-30 * pi / 180, rel=0.03)
 
 
-def test_two_runs_write_identical_logs(log_of_three_parts: Path, tmp_path: Path) -> None:
-    again = tmp_path / "again.mcap"
-    simulated_robot(TORSO, play=[THREE_PARTS], log=again).run()
-    assert again.read_bytes() == log_of_three_parts.read_bytes()
-
-
 def test_the_log_is_the_wire(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     robot = simulated_robot(TORSO, duration_s=1.0, log=path)
@@ -140,7 +134,7 @@ def test_virtual_time_refuses_a_real_port() -> None:
 def test_the_command_line_runs_on_virtual_time(tmp_path: Path) -> None:
     dxlrun = Path(sys.executable).with_name("dxlrun")
     done = subprocess.run(
-        [dxlrun, TORSO, "--virtual", "--duration", "60"],
+        [dxlrun, TORSO, "--virtual", "--duration", "6"],
         cwd=tmp_path,
         capture_output=True,
         text=True,
@@ -148,4 +142,4 @@ def test_the_command_line_runs_on_virtual_time(tmp_path: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     log = read_log(next((tmp_path / "logs").glob("*.mcap")))
-    assert len(log.cycles) == 3000
+    assert len(log.cycles) == 300
