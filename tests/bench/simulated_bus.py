@@ -185,7 +185,8 @@ def show_load(seconds: float, options: Sequence[str]) -> None:
             f"{BUSES * SERVOS_A_BUS} servos on {BUSES} buses at 4 Mbit/s, {elapsed_s:.1f} s, asked 1000 "
             f"times a second: each bus answered {answered / BUSES / elapsed_s:.0f} times a second whole "
             f"({sum(host.given_up for host in hosts)} answers had not come in 5 ms, the host was late "
-            f"{late} times); the simulator used {spent_s / elapsed_s:.2f} of a core, the host {host_s / elapsed_s:.2f}"
+            f"{late} times); the simulator used {spent_s / elapsed_s:.2f} of a core, "
+            f"the host {host_s / elapsed_s:.2f}"
         )
 
 
