@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from collections.abc import Set as AbstractSet
 
-from dxlrun.simulation.memory import IDENTITY, Memory, Run
+from dxlrun.simulation.memory import IDENTITY, LiveItems, Memory, Run
 from dxlrun.simulation.shaft import Shaft
 from dxlrun.simulation.strain import SUPPLY_OHM
 
@@ -42,7 +42,7 @@ class Body(ABC):
         self._started_ns = shaft.now_ns
         shaft.mechanics.watch(shaft.index, self._strained)
         self._live = {name: show for name, show in self._live_items().items() if name in memory}
-        self._live_in: dict[tuple[int, int], tuple[tuple[str, Callable[[], int]], ...]] = {}
+        self._live_in: dict[tuple[int, int], LiveItems] = {}
         self.answers_damaged = False
         """True: a packet with a wrong checksum is answered by the manual's error; False: never [?]."""
         self._registered: tuple[int, bytes] | None = None
@@ -111,19 +111,23 @@ class Body(ABC):
         memory = self.memory
         if address + length > memory.size:
             return None
-        direct = memory.cells(address, length).direct
-        for target, first, last in ((address, 0, length),) if direct else memory.places(address, length):
-            cells = target, last - first
-            live = self._live_in.get(cells)
-            if live is None:
-                if len(self._live_in) >= _READS_KEPT:
-                    self._live_in.clear()
-                live = self._live_in[cells] = tuple(
-                    each for each in self._live.items() if _overlaps(memory, each[0], *cells)
-                )
-            for name, show in live:
-                memory.show(name, show())
+        if memory.cells(address, length).direct:
+            memory.show_all(self._live_in.get((address, length)) or self._look_up(address, length))
+        else:
+            for target, first, last in memory.places(address, length):
+                memory.show_all(self._look_up(target, last - first))
         return memory.read(address, length)
+
+    def _look_up(self, address: int, length: int) -> LiveItems:
+        """Return the items that change by themselves in some cells; looked up once."""
+        live = self._live_in.get((address, length))
+        if live is None:
+            if len(self._live_in) >= _READS_KEPT:
+                self._live_in.clear()
+            live = self._live_in[address, length] = tuple(
+                each for each in self._live.items() if _overlaps(self.memory, each[0], address, length)
+            )
+        return live
 
     def write(self, address: int, data: bytes) -> int:
         """Write, or return the error with which it is refused; 0 when it is not."""

@@ -35,6 +35,10 @@ class Cells(NamedTuple):
     """True when one of the items is in the EEPROM area."""
 
 
+LiveItems = tuple[tuple[str, Callable[[], int]], ...]
+"""Items by name, each with what it shows now, in ticks."""
+
+
 class Run(NamedTuple):
     """Bytes for a row of cells."""
 
@@ -129,6 +133,21 @@ class Memory:
         if bounds is not None:
             lowest, highest = bounds
             self[name] = lowest if wire < lowest else min(wire, highest)
+
+    def show_all(self, live: LiveItems) -> None:
+        """Set items of the model to what they show now, as `show` does, for what is read all the time."""
+        values, memory = self._values, self._memory
+        for name, show in live:
+            wire = show()
+            lowest, highest = self._bounds[name]
+            wire = lowest if wire < lowest else min(wire, highest)
+            start, end, size, mask = self._places[name]
+            wire &= mask
+            if values[name] != wire:
+                memory[start:end] = wire.to_bytes(size, "little")
+                values[name] = wire
+                if name in self._watchers:
+                    self._tell((name,))
 
     def ticks(self, name: str) -> int:
         """Return the signed number of ticks of an item."""

@@ -72,6 +72,8 @@ class ModeShaft(Shaft):
         self._current_unit = items["goal_current"].scale if "goal_current" in items else 0.001
         self._sign, self._offset = 1, 0
         memory.watch(("drive_mode", "homing_offset"), self._orient)
+        self._velocity_wanted, self._ramp_wanted = 0, 0
+        memory.watch(("profile_velocity", "profile_acceleration"), self._note_profile)
 
     def within_a_turn(self, angle: float) -> float:
         """Return the angle within the turn that the encoder knows: 0 to 4095 ticks, or around 0."""
@@ -161,7 +163,7 @@ class ModeShaft(Shaft):
     def _turn(self, limit: float) -> Command:
         memory = self.memory
         speed = self._sign * memory.ticks("goal_velocity") * memory.table.rad_s_per_tick
-        ramp = self._profile("profile_acceleration") * self._acceleration_unit or FREE
+        ramp = self._ramp_wanted * self._acceleration_unit or FREE
         return velocity_gains(memory)._replace(turning=1.0, speed=speed, acceleration=ramp, limit=limit)
 
     def _part(self, name: str, otherwise: str) -> float:
@@ -178,7 +180,7 @@ class ModeShaft(Shaft):
 
     def _new_trajectory(self, *, afresh: bool = False) -> Trajectory | None:
         memory, table = self.memory, self.memory.table
-        velocity, ramp = self._profile("profile_velocity"), self._profile("profile_acceleration")
+        velocity, ramp = self._velocity_wanted, self._ramp_wanted
         aimed = (memory["goal_position"], velocity, ramp)
         if aimed == self._aimed and not afresh:
             return None
@@ -204,6 +206,10 @@ class ModeShaft(Shaft):
         acceleration = speed / ramp if ramp else FREE
         self._profile_kind = _kind(ramp, distance, speed, acceleration)
         return goal, speed, acceleration
+
+    def _note_profile(self) -> None:
+        self._velocity_wanted = self._profile("profile_velocity")
+        self._ramp_wanted = self._profile("profile_acceleration")
 
     def _profile(self, name: str) -> int:
         return abs(self.memory.ticks(name)) if name in self.memory else 0

@@ -12,7 +12,7 @@ _PR_SET_TIMERSLACK = 29
 LONGEST_POLL_NS = 80_000
 """A sleep wakes some 50 us late on a stock kernel: so long before a reply is due the clock is polled."""
 _POLL_SHARE = 6
-"""One part in so many of the waiting may be polled: who has little time to wait sleeps."""
+"""One part in so many of the time may be polled by which the process waits longer than it works."""
 _BUDGET_NS = 20_000_000
 _PAUSE_NS = 100_000
 """So long the process at least sleeps when it may not poll: what becomes due meanwhile goes out together."""
@@ -57,18 +57,20 @@ def _take_priority(priority: int) -> str:
 class Patience:
     """Decides how long to sleep before something is due, and when to poll the clock instead.
 
-    Polling is punctual and costs the processor; it is bounded to a sixth of the waiting. Beyond that, replies
-    are handed over a little late, several at once.
+    Polling is punctual and costs the processor; it is bounded to a sixth of the time, and who works half of
+    the time does not poll at all. Beyond that, replies are handed over a little late, several at once.
     """
 
     def __init__(self, now_ns: int) -> None:
         self._budget_ns = _BUDGET_NS
-        self._asked_ns = now_ns
+        self._asked_ns = self._woken_ns = now_ns
         self._polls = False
 
     def until(self, due_ns: int | None, now_ns: int) -> float | None:
         """Return for how long to sleep, s; 0: poll; None: for ever."""
         self._asked_ns = now_ns
+        worked_ns = now_ns - self._woken_ns
+        self._budget_ns = max(-_BUDGET_NS, self._budget_ns - worked_ns // _POLL_SHARE)
         self._polls = False
         if due_ns is None:
             return None
@@ -80,6 +82,7 @@ class Patience:
 
     def woke(self, now_ns: int) -> None:
         """Take note of how long it has really waited."""
+        self._woken_ns = now_ns
         waited_ns = now_ns - self._asked_ns
         spent_ns = waited_ns if self._polls else 0
         self._budget_ns = min(_BUDGET_NS, self._budget_ns + waited_ns // _POLL_SHARE - spent_ns)

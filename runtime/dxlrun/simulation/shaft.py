@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import ClassVar
 
 from dxlrun.simulation.command import LIMP, Command
-from dxlrun.simulation.mechanics import Load, Mechanics
+from dxlrun.simulation.mechanics import STEP_NS, Load, Mechanics
 from dxlrun.simulation.memory import Memory
 from dxlrun.simulation.motor import TIME_CONSTANT_S, motor_of
 
@@ -37,18 +37,18 @@ class Shaft(ABC):
     def angle(self) -> float:
         """Angle, rad from raw 0, of the shaft itself: turns count, Homing Offset and reversal do not."""
         plant, ahead_ns = self.mechanics.plant, self.now_ns - self.mechanics.grid_ns
-        angle = float(plant.angle[self.index])
-        return angle + float(plant.velocity[self.index]) * ahead_ns * 1e-9 if ahead_ns > 0 else angle
+        angle: float = plant.angle.item(self.index)
+        return angle + plant.velocity.item(self.index) * ahead_ns * 1e-9 if ahead_ns > 0 else angle
 
     @property
     def velocity(self) -> float:
         """Speed, rad/s, counter-clockwise positive."""
-        return float(self.mechanics.plant.velocity[self.index])
+        return self.mechanics.plant.velocity.item(self.index)
 
     @property
     def current(self) -> float:
         """Current of the motor, A, positive when it drives counter-clockwise."""
-        return float(self.mechanics.law.torque[self.index]) / self.motor.torque_per_ampere
+        return self.mechanics.law.torque.item(self.index) / self.motor.torque_per_ampere
 
     @property
     def duty(self) -> float:
@@ -75,7 +75,8 @@ class Shaft(ABC):
         """Let time pass; going back is ignored."""
         if now_ns > self.now_ns:
             self.now_ns = now_ns
-            self.mechanics.advance(now_ns)
+            if now_ns - self.mechanics.grid_ns >= STEP_NS:
+                self.mechanics.advance(now_ns)
 
     def plan(self, written: Iterable[str]) -> None:
         """Command what was written, if it asks for something else."""

@@ -87,8 +87,9 @@ class TorqueBody(Body):
 
         Whether those to other servos count is not said [?].
         """
-        self.shaft.advance(now_ns)
-        self._heard_ns = self.shaft.now_ns
+        shaft = self.shaft
+        shaft.advance(now_ns)
+        self._heard_ns = shaft.now_ns
         if self._guarded:
             self._watch()
 
