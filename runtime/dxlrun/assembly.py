@@ -17,6 +17,7 @@ from dxlrun.cycle import CycleLayout, CycleRecord
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.port import Ports
 from dxlrun.events import EventSink
+from dxlrun.inbox import Inbox, NoInbox
 from dxlrun.packets import PacketSink
 
 
@@ -67,6 +68,8 @@ def assemble(
     beat: Callable[[], None],
     stop: StopFlag,
     take_over: bool = False,
+    inbox: Inbox | None = None,
+    patience: Callable[[int], None] = lambda _: None,
 ) -> Robot:
     """Build everything between the ports and the log; configures the controllers, sends nothing."""
     record = CycleRecord(cycle_layout(plan))
@@ -94,6 +97,9 @@ def assemble(
         plan=plan.loop,
         beat=beat,
         stop=stop,
+        inbox=inbox or NoInbox(),
+        commands=sinks.commands,
+        patience=patience,
     )
     manager.configure()
     return Robot(hardware, manager, loop, record)

@@ -11,13 +11,13 @@ from dxlrun.ring import RING_SECONDS, Appender, Payload
 COMMAND_SLOT = 512
 """Bytes of one slot of a commands' ring; a longer array takes several slots."""
 
-_HEADER = struct.Struct("<qqqIIHHH2x")
+_HEADER = struct.Struct("<qqqqIIHHH2x")
 _LONGEST_NAME = 64
 
 
 @dataclass(frozen=True, slots=True)
 class TakenCommand:
-    """One command that a cycle took, for a controller that was active or not."""
+    """One command that a cycle took: for a controller, active or not, or for the loop itself."""
 
     t_ns: int
     """Time of the cycle's wake-up, ns of the run's clock."""
@@ -25,11 +25,14 @@ class TakenCommand:
     planned: int
     """Number of the command in the plan's commands, whose array it is; -1: the array is `data`."""
     controller: str
+    """Empty: the loop itself."""
     kind: str
     origin: str
     """Who asked."""
     data: bytes
-    """Little-endian float64; empty for a planned command."""
+    """Little-endian float64, for the loop JSON; empty for a planned command."""
+    lease_ns: int = 0
+    """For how long a set-point of a stream counts; 0: for ever."""
 
 
 class CommandSink(Protocol):
@@ -66,7 +69,13 @@ class CommandRing:
         lengths = len(controller), len(kind), len(origin)
         for part in range(pieces):
             head = _HEADER.pack(
-                command.t_ns, command.cycle, command.planned, part, pieces - part - 1, *lengths
+                command.t_ns,
+                command.cycle,
+                command.planned,
+                command.lease_ns,
+                part,
+                pieces - part - 1,
+                *lengths,
             )
             self._writer.append(head + names + command.data[part * room : (part + 1) * room])
 
@@ -103,7 +112,7 @@ class CommandPieces:
 
 def _decode(payload: Payload) -> tuple[TakenCommand, int, int]:
     try:
-        t_ns, cycle, planned, part, remaining, *lengths = _HEADER.unpack_from(payload)
+        t_ns, cycle, planned, lease_ns, part, remaining, *lengths = _HEADER.unpack_from(payload)
     except struct.error as error:
         raise ValueError(f"a command ends inside its header: {error}") from error
     data = bytes(payload[_HEADER.size :])
@@ -114,7 +123,7 @@ def _decode(payload: Payload) -> tuple[TakenCommand, int, int]:
         names.append(data[:length].decode(errors="replace"))
         data = data[length:]
     controller, kind, origin = names
-    return TakenCommand(t_ns, cycle, planned, controller, kind, origin, data), part, remaining
+    return TakenCommand(t_ns, cycle, planned, controller, kind, origin, data, lease_ns), part, remaining
 
 
 def command_slots(period_ns: int, controllers: int) -> int:

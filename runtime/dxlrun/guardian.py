@@ -188,9 +188,12 @@ class Guardian:
         """Return why the loop is not waited for any longer, if it is not."""
         now_ns, phase = self._clock.now_ns(), self._heartbeat.phase
         still_ns = self._still.ns((phase, self._heartbeat.beats), now_ns)
-        if still_ns > patience_ns(phase, self._job.period_ns):
+        if still_ns > self._patience_ns(phase):
             return "hung"
         return "late" if now_ns > self._stop_by_ns else None
+
+    def _patience_ns(self, phase: Phase) -> float:
+        return patience_ns(phase, self._heartbeat.cycle_ns or self._job.period_ns)
 
     def _wish(self) -> Literal["stop", "cut"] | None:
         """Return what the terminal asks; one that is gone cannot ask any more: stop in order."""
@@ -200,7 +203,7 @@ class Guardian:
         return "stop" if messages or self._control.closed else None
 
     def _how(self, ending: Ending, loop: subprocess.Popen[bytes]) -> str:
-        still_ms = patience_ns(self._heartbeat.phase, self._job.period_ns) / 1e6
+        still_ms = self._patience_ns(self._heartbeat.phase) / 1e6
         return {
             "hung": f"the loop stood still for more than {still_ms:.0f} ms and was killed",
             "late": f"the loop did not stop within {self._job.exit_timeout_ns / 1e9:g} s and was killed",

@@ -30,6 +30,7 @@ from dxlrun.dynamixel.port import SerialPort, SerialPorts
 from dxlrun.errors import DxlrunError, PlugInError
 from dxlrun.events import EventCode, EventRing, Severity
 from dxlrun.heartbeat import Heartbeat, Phase
+from dxlrun.mailbox import Mailbox
 from dxlrun.packets import PacketBatch
 from dxlrun.ring import RingWriter
 
@@ -49,6 +50,8 @@ class LoopJob:
     events: int
     commands: int
     result: int
+    mailbox: int
+    answers: int
     take_over: bool
     ports: tuple[int, ...] = ()
     guardian: int = 0
@@ -146,6 +149,8 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: RingSinks) -> Ou
         beat=Pulse(heartbeat, stop),
         stop=stop,
         take_over=job.take_over,
+        inbox=Mailbox(job.mailbox, RingWriter(job.answers)),
+        patience=heartbeat.may_take,
     )
     heartbeat.enter(Phase.SETUP)
     try:

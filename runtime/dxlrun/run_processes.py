@@ -12,12 +12,12 @@ from pathlib import Path
 
 import msgspec
 
-from dxlrun import heartbeat, process, ring
+from dxlrun import heartbeat, mailbox, process, ring
 from dxlrun.assembly import cycle_layout
 from dxlrun.commands import COMMAND_SLOT, command_slots
 from dxlrun.compile.plan import Plan, to_json
 from dxlrun.compile.simulated import simulated_buses
-from dxlrun.cycle import cycle_slots
+from dxlrun.cycle import MOST_CONTROLLERS, cycle_slots
 from dxlrun.errors import PortError, ProcessFault
 from dxlrun.events import EVENT_SLOT, event_slots
 from dxlrun.guardian import GuardianJob
@@ -46,6 +46,8 @@ class Memory:
     guardian_packets: int
     guardian_events: int
     result: int
+    mailbox: int
+    answers: int
     stderr: int
 
     @classmethod
@@ -64,6 +66,8 @@ class Memory:
             guardian_packets=ring.create("guardian-packets", PACKET_SLOT, _GUARDIAN_SLOTS),
             guardian_events=ring.create("guardian-events", EVENT_SLOT, _GUARDIAN_SLOTS),
             result=process.memory_file("dxlrun-result"),
+            mailbox=mailbox.create(MOST_CONTROLLERS),
+            answers=ring.create("answers", mailbox.ANSWER_SLOT, mailbox.ANSWER_SLOTS),
             stderr=process.memory_file("dxlrun-stderr"),
         )
 
@@ -189,6 +193,8 @@ def guardian_job(plan: Plan, ports: Mapping[str, str], memory: Memory, *, take_o
         memory.events,
         memory.commands,
         memory.result,
+        memory.mailbox,
+        memory.answers,
         take_over,
     )
     scheduler = plan.loop.scheduler
@@ -214,6 +220,8 @@ def guardian_job(plan: Plan, ports: Mapping[str, str], memory: Memory, *, take_o
             memory.events,
             memory.commands,
             memory.result,
+            memory.mailbox,
+            memory.answers,
             memory.stderr,
         ),
     )

@@ -18,6 +18,7 @@ from dxlrun.control.plugins import load_plugins
 from dxlrun.cycle import CycleRecord
 from dxlrun.errors import DxlrunError, InputError
 from dxlrun.events import EventCode, EventRing, Severity
+from dxlrun.inbox import QueueInbox
 from dxlrun.packets import NoPackets, PacketBatch
 from dxlrun.recording.log_writer import LogWriter
 from dxlrun.ring import Handover
@@ -81,6 +82,8 @@ class VirtualRobot:
         self.buses = tuple(SimulatedBus(config, self.ledger, 0) for config in simulated_buses(plan))
         """The simulated lines, in the order of the plan's buses; faults are injected here."""
         self.stop = StopFlag()
+        self.inbox = QueueInbox()
+        """Commands put here are taken at the start of a cycle."""
         self.result: LoopResult | None = None
         self.failures: tuple[str, ...] = ()
         """What could not be switched off at the end, one sentence each."""
@@ -96,6 +99,7 @@ class VirtualRobot:
             beat=lambda: None,
             stop=self.stop,
             take_over=take_over,
+            inbox=self.inbox,
         )
 
     def _sinks_for(self, writer: LogWriter | None) -> _LogSinks | _NoSinks:

@@ -72,7 +72,7 @@ def test_an_overrun_of_a_hair_skips_one_period(robot):
     assert [cycle["skipped"] for cycle in robot.sink.cycles] == [0, 0, 1, 0]
     assert (result.cycles, result.skipped) == (4, 1)
     ((_, text),) = robot.events.of(EventCode.OVERRUN)
-    assert text == "cycle 1 ended 20.000 ms after its deadline; 1 period(s) skipped"
+    assert text == "cycle 1 ended 20.000 ms after its deadline; 1 period skipped"
 
 
 def test_a_row_of_overruns_is_told_once(robot):

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 Policy = Literal["other", "fifo", "round_robin"]
+OverrunPolicy = Literal["skip", "catch_up", "stop"]
+"""What becomes of deadlines that passed while a cycle was late."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +48,10 @@ class ControllerPlan:
     active: bool
     every: int
     """Updated every n-th cycle."""
+    rate: float | None = None
+    """Updates per second that the file asks for, Hz; None: the loop's."""
+    fallback: str = ""
+    """Name of the controller that takes over when this one breaks its contract; empty: none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,3 +80,6 @@ class LoopPlan:
     """Sorted by time."""
     end_ns: int | None
     """Stop by itself at this time since the first deadline; None: run until told."""
+    overrun: OverrunPolicy = "skip"
+    least_period_ns: int = 0
+    """The shortest period that the buses allow, by the time budget; 0: not computed."""
