@@ -7,7 +7,7 @@ import select
 import subprocess
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 
 import msgspec
@@ -24,6 +24,7 @@ from dxlrun.guardian import GuardianJob
 from dxlrun.loop_process import LoopJob, Outcome
 from dxlrun.packets import PACKET_SLOT, packet_slots
 from dxlrun.recording.header import LogHeader
+from dxlrun.remote.job import Descriptors, GatewayJob
 
 START_TIMEOUT_S = 20.0
 """A child that says nothing for so long will say nothing more; a cold import of numpy takes a second."""
@@ -179,6 +180,24 @@ def start_recorder(log: Path, header: LogHeader, memory: Memory) -> Child:
     child = Child("recorder", "dxlrun.recording", ["--job-fd", str(descriptor)], descriptors, memory.stderr)
     os.close(descriptor)
     _ready(child)
+    return child
+
+
+def start_gateway(log: Path | None, memory: Memory) -> Child:
+    """Start the gateway; it says where its socket is when it is ready, nobody waits for it."""
+    shared = Descriptors(
+        memory.heartbeat,
+        memory.cycles,
+        memory.events,
+        memory.guardian_events,
+        memory.mailbox,
+        memory.answers,
+    )
+    job = GatewayJob(memory.plan, shared, str(log) if log else None)
+    descriptor = process.memory_file("dxlrun-gateway", msgspec.json.encode(job))
+    inherited = [descriptor, memory.plan, *astuple(shared)]
+    child = Child("gateway", "dxlrun.remote", ["--job-fd", str(descriptor)], inherited, memory.stderr)
+    os.close(descriptor)
     return child
 
 

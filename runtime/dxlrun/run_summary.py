@@ -13,6 +13,8 @@ class RunOptions:
     take_over: bool = False
     """Accept servos that are already torqued."""
     debug: bool = False
+    gateway: bool = True
+    """Let others steer the run, over a Unix socket."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +29,7 @@ class RunSummary:
     sentences: tuple[str, ...]
     """What went wrong, one sentence each; empty after a good run."""
     remarks: tuple[str, ...] = ()
-    """What the operating system did not grant."""
+    """What the operating system did not grant, and what went wrong beside the robot."""
     log: str | None = None
     messages: int = 0
     """Messages in the log."""

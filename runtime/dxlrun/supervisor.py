@@ -29,6 +29,7 @@ from dxlrun.run_processes import (
     Child,
     Memory,
     guardian_job,
+    start_gateway,
     start_guardian,
     start_recorder,
     start_simulation,
@@ -73,6 +74,8 @@ class _Run:
     simulation: Child | None = None
     recorder: Child | None = None
     guardian: Child | None = None
+    gateway: Child | None = None
+    remarks: list[str] = field(default_factory=list)
     job: GuardianJob | None = None
     loop: int | None = None
     """A pidfd of the loop's process; None before there is one, and after it was seen to be gone."""
@@ -118,6 +121,7 @@ class _Run:
                 asked = self.signals.count
                 guardian.line.send({"stop": True} if asked == 1 else {"cut": True})
             show(heartbeat)
+            self._look_after_gateway(heartbeat)
             message = guardian.poll(_POLL_S)
             if message and "ended" in message:
                 self.ended = message
@@ -125,6 +129,23 @@ class _Run:
                 self.sentences.append("the guardian did not look after the loop any more and was killed")
                 guardian.kill()
                 break
+
+    def _look_after_gateway(self, heartbeat: Heartbeat) -> None:
+        """Start it when the loop runs, so that nothing waits for it; without it the robot goes on."""
+        if self.gateway is None:
+            if self.options.gateway and heartbeat.phase is Phase.RUNNING:
+                self.gateway = start_gateway(self.log, self.memory)
+        elif self.gateway.process.poll() is not None and not self.remarks:
+            said = self.gateway.poll(0)
+            why = f" ({said['error']})" if said and "error" in said else ""
+            self.remarks.append(f"the gateway ended{why}: the run goes on, and nobody can steer it")
+
+    def _end_gateway(self, gateway: Child) -> None:
+        """End the gateway, which keeps nothing; remove its socket."""
+        said = gateway.poll(0) or {}
+        gateway.kill()
+        if "socket" in said:
+            Path(str(said["socket"])).unlink(missing_ok=True)
 
     def _without_guardian(self, loop: int, guardian: Child, job: GuardianJob) -> None:
         """The guardian is gone: the kernel told the loop to stop; see that it does, or cut torque here."""
@@ -150,6 +171,8 @@ class _Run:
             if self.loop is not None and self.ended is None and self.job is not None:
                 self._without_guardian(self.loop, self.guardian, self.job)
             self.loop = None
+        if self.gateway:
+            self._end_gateway(self.gateway)
         if self.recorder:
             self._end_recorder(self.recorder)
         if self.simulation:
@@ -243,7 +266,7 @@ def _summary(run: _Run, elapsed_s: float) -> RunSummary:
         skipped=outcome.skipped,
         elapsed_s=elapsed_s,
         sentences=tuple(sentences),
-        remarks=outcome.grants,
+        remarks=(*outcome.grants, *run.remarks),
         log=str(run.log) if run.log else None,
         messages=run.messages,
     )

@@ -164,7 +164,7 @@ def test_a_command_reaches_its_controller_and_the_log(watched):
     ("name", "data", "why"),
     [
         ("whole", b"", "not active"),
-        ("nobody", b"", "no such controller"),
+        ("nobody", b"", "no such controller as nobody"),
         ("left", b"abc", "no array of numbers"),
     ],
 )

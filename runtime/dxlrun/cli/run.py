@@ -33,6 +33,7 @@ def run(
     no_record: Flag = False,
     take_over: Flag = False,
     virtual: Flag = False,
+    no_gateway: Flag = False,
     debug: Flag = False,
 ) -> int:
     """Run a robot until its motions have ended, or until Ctrl-C.
@@ -53,6 +54,8 @@ def run(
         Start although a servo has its torque on already.
     virtual
         Run on virtual time, as fast as the processor can; only with simulated buses.
+    no_gateway
+        Let nobody steer the run.
     debug
         Print the traceback of an error, and what the processes said.
     """
@@ -61,7 +64,7 @@ def run(
         say_warning(str(warning))
     from dxlrun.run_summary import RunOptions
 
-    options = RunOptions(record=not no_record, take_over=take_over, debug=debug)
+    options = RunOptions(record=not no_record, take_over=take_over, debug=debug, gateway=not no_gateway)
     console = out()
     if virtual:
         from dxlrun.virtual_run import run_virtual

@@ -105,10 +105,13 @@ class Manager:
         return self.fault
 
     def hand(self, controller: str, kind: str, data: NDArray[np.float64], origin: str, time_ns: int) -> str:
-        """Hand a prepared command to a controller; return why it was refused, empty when it was taken."""
+        """Hand a prepared command to a controller; return why it was refused, empty when it was taken.
+
+        Without an `origin` no event tells of it: the next one of a stream.
+        """
         managed = self._named.get(controller)
         if managed is None:
-            return "there is no such controller"
+            return f"there is no such controller as {controller}"
         if not managed.active:
             return "the controller is not active"
         try:
@@ -116,7 +119,8 @@ class Manager:
         except ControllerFault as fault:
             self._end(managed, fault, time_ns)
             return str(fault)
-        self._tell(EventCode.COMMAND, managed, f"{kind} from {origin}")
+        if origin:
+            self._tell(EventCode.COMMAND, managed, f"{kind} from {origin}")
         return ""
 
     def hold(self, controller: str) -> None:

@@ -120,7 +120,9 @@ class Steering:
         if len(command.data) % 8:
             return f"{len(command.data)} bytes are no array of numbers"
         data = np.frombuffer(command.data, dtype="<f8")
-        refusal = self.manager.hand(command.controller, command.kind, data, command.origin, time_ns)
+        streaming = command.lease_ns and command.controller in self._leases
+        origin = "" if streaming else command.origin
+        refusal = self.manager.hand(command.controller, command.kind, data, origin, time_ns)
         if not refusal:
             if command.lease_ns:
                 self._leases[command.controller] = self.record.woken_ns + command.lease_ns
