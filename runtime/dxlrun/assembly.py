@@ -83,6 +83,7 @@ def assemble(
         sinks.events,
         beat,
         take_over=take_over,
+        restore_torque=plan.loop.policies.reduces_torque,
     )
     manager = Manager(plan.loop, plugins, record, sinks.events, clock, commands=sinks.commands)
     gate = Gate(plan.loop, record, sinks.events)

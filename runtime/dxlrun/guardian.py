@@ -22,6 +22,7 @@ import msgspec
 
 from dxlrun import process
 from dxlrun.clock import MonotonicClock
+from dxlrun.control.policy_plan import TORQUE_STAYS, Last
 from dxlrun.control.realtime import set_policy
 from dxlrun.dynamixel.bus_plan import BusPlan
 from dxlrun.dynamixel.limp import limp
@@ -68,6 +69,8 @@ class GuardianJob:
     desk: int
     """The loop's unfinished batch of packets."""
     stderr: int
+    last: Last
+    """How the robot is left when the loop is gone in the middle of a run."""
     loop: dict[str, object]
     """The loop's job, but for its port descriptors and its guardian."""
     loop_descriptors: tuple[int, ...]
@@ -82,6 +85,16 @@ class LastHand:
         self._heartbeat = Heartbeat(job.heartbeat)
         self._ring = RingWriter(job.packets)
         self._events = EventRing(RingWriter(job.events), self._clock)
+
+    def end(self, descriptors: Sequence[int], how: str, severity: Severity) -> list[str]:
+        """Leave the robot as the policy for a fault does, without its steps; return that as sentences.
+
+        A robot holds only when it ran: in a set-up some servos have torque and others have not.
+        """
+        if self._job.last == "limp" or self._heartbeat.phase is not Phase.RUNNING:
+            return self.limp(descriptors, how, severity)
+        self.tell(f"{how}; {TORQUE_STAYS}", severity)
+        return [how, TORQUE_STAYS]
 
     def limp(self, descriptors: Sequence[int], how: str, severity: Severity) -> list[str]:
         """Send torque off to every servo; return `how` it came to that, and the result, as sentences."""
@@ -137,8 +150,11 @@ class Guardian:
             outcome = [f"{self._how(ending, loop)}; nothing had been sent to the robot"]
             self._hand.tell(outcome[0], Severity.ERROR)
         elif ending != "done":
-            severity = Severity.WARNING if ending == "cut" else Severity.ERROR
-            outcome = self._hand.limp(descriptors, self._how(ending, loop), severity)
+            how = self._how(ending, loop)
+            if ending == "cut":
+                outcome = self._hand.limp(descriptors, how, Severity.WARNING)
+            else:
+                outcome = self._hand.end(descriptors, how, Severity.ERROR)
         self._control.send({"ended": ending, "outcome": outcome})
 
     def _execute(self, descriptors: list[int]) -> subprocess.Popen[bytes]:

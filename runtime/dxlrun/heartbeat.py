@@ -26,7 +26,7 @@ class Phase(IntEnum):
     RUNNING = 2
     STOPPING = 3
     DONE = 4
-    """Torque was switched off by the loop itself, as far as the servos answered."""
+    """The loop itself has left the robot as its policy says: limp, as far as servos answered, or holding."""
 
 
 def create() -> int:

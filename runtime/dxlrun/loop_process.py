@@ -24,6 +24,7 @@ from dxlrun.compile.plan import Plan, from_json
 from dxlrun.control import realtime
 from dxlrun.control.loop import StopFlag
 from dxlrun.control.plugins import load_plugins
+from dxlrun.control.policy_plan import TORQUE_STAYS, Last
 from dxlrun.cycle import CycleRecord
 from dxlrun.dynamixel.hardware import TAKEN_BACK
 from dxlrun.dynamixel.port import SerialPort, SerialPorts
@@ -70,6 +71,8 @@ class Outcome:
     """What a person must know, one sentence each."""
     grants: tuple[str, ...] = ()
     """What the operating system did not grant."""
+    remarks: tuple[str, ...] = ()
+    """What a person should know beside that."""
     traceback: str = ""
 
 
@@ -160,6 +163,8 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: RingSinks) -> Ou
         notes: list[str] = getattr(asked, "__notes__", [])
         return Outcome("stopped", sentences=tuple(note for note in notes if note != TAKEN_BACK))
     refused: tuple[str, ...] = ()
+    failures: tuple[str, ...] = ()
+    last: Last = "limp"
     try:
         grants = realtime.apply(plan.loop.scheduler)
         for grant in grants:
@@ -169,11 +174,14 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: RingSinks) -> Ou
         heartbeat.beat()
         heartbeat.enter(Phase.RUNNING)
         result = robot.loop.run()
+        last = result.last
     finally:
-        heartbeat.enter(Phase.STOPPING)
-        failures = robot.hardware.stop()
+        if last == "limp":
+            heartbeat.enter(Phase.STOPPING)
+            failures = robot.hardware.stop()
     detail = (result.detail,) if result.detail else ()
-    return Outcome(result.reason, result.cycles, result.skipped, (*detail, *failures), refused)
+    remarks = (TORQUE_STAYS,) if last == "hold" else ()
+    return Outcome(result.reason, result.cycles, result.skipped, (*detail, *failures), refused, remarks)
 
 
 def main() -> None:

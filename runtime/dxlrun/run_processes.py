@@ -229,6 +229,7 @@ def guardian_job(plan: Plan, ports: Mapping[str, str], memory: Memory, *, take_o
         loop_packets=memory.packets,
         desk=memory.desk,
         stderr=memory.stderr,
+        last=plan.loop.policies.on_fault.last,
         loop=msgspec.to_builtins(loop),
         loop_descriptors=(
             memory.plan,

@@ -159,10 +159,12 @@ class _Run:
         phase = Heartbeat(self.memory.heartbeat).phase
         self.sentences.append("the guardian ended in the middle of the run")
         if phase is Phase.DONE:
-            self.sentences.append("the loop stopped and switched torque off")
+            self.sentences.append("the loop stopped and left the robot as its policy says")
         elif phase is not Phase.LOADING:
             how = "the loop ended too" if gone else "the loop did not stop and was killed"
-            self.sentences += LastHand(job).limp(guardian.line.descriptors, how, Severity.ERROR)
+            hand = LastHand(job)
+            leave = hand.limp if self.signals.count > max(asked, 1) else hand.end
+            self.sentences += leave(guardian.line.descriptors, how, Severity.ERROR)
 
     def end(self) -> None:
         """End what is left, in order: guardian, recorder, simulated bus."""
@@ -266,7 +268,7 @@ def _summary(run: _Run, elapsed_s: float) -> RunSummary:
         skipped=outcome.skipped,
         elapsed_s=elapsed_s,
         sentences=tuple(sentences),
-        remarks=(*outcome.grants, *run.remarks),
+        remarks=(*outcome.grants, *outcome.remarks, *run.remarks),
         log=str(run.log) if run.log else None,
         messages=run.messages,
     )

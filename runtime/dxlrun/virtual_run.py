@@ -15,6 +15,7 @@ from dxlrun.compile.plan import Plan
 from dxlrun.compile.simulated import simulated_buses
 from dxlrun.control.loop import LoopResult, StopFlag
 from dxlrun.control.plugins import load_plugins
+from dxlrun.control.policy_plan import TORQUE_STAYS, Last
 from dxlrun.cycle import CycleRecord
 from dxlrun.errors import DxlrunError, InputError
 from dxlrun.events import EventCode, EventRing, Severity
@@ -118,16 +119,19 @@ class VirtualRobot:
         return self.robot.record
 
     def run(self) -> LoopResult:
-        """Set up, run to the plan's end or a fault, switch torque off, close the log.
+        """Set up, run to the plan's end or a fault, switch torque off unless a policy holds, close the log.
 
         Raises StartUpError; a controller's fault is in the result.
         """
         try:
             self.robot.hardware.start()
+            last: Last = "limp"
             try:
                 self.result = self.robot.loop.run()
+                last = self.result.last
             finally:
-                self.failures = self.robot.hardware.stop()
+                if last == "limp":
+                    self.failures = self.robot.hardware.stop()
         except DxlrunError as error:
             self._sinks.events.emit(EventCode.SETUP, Severity.ERROR, "loop", "\n".join(error.sentences))
             raise
@@ -163,6 +167,7 @@ def run_virtual(plan: Plan, options: RunOptions) -> RunSummary:
         skipped=result.skipped,
         elapsed_s=time.monotonic() - began,
         sentences=sentences,
+        remarks=(TORQUE_STAYS,) if result.last == "hold" else (),
         log=str(log) if log else None,
         messages=robot.messages,
     )

@@ -9,18 +9,21 @@ from typing import Literal, Protocol
 import numpy as np
 
 from dxlrun.clock import Clock
-from dxlrun.commands import CommandSink, NoCommands
+from dxlrun.commands import CommandSink, NoCommands, TakenCommand
 from dxlrun.control.gate import Gate
 from dxlrun.control.loop_plan import LoopPlan
+from dxlrun.control.lost_servos import LostServos
 from dxlrun.control.managed import PERIOD_CAP
 from dxlrun.control.manager import Manager
+from dxlrun.control.policy_plan import Last, PolicyName
+from dxlrun.control.safe_motion import SafeMotion
 from dxlrun.control.schedule import Schedule
 from dxlrun.control.steering import Steering
 from dxlrun.cycle import CycleRecord
 from dxlrun.errors import PortError
 from dxlrun.events import EventCode, EventSink, Severity
-from dxlrun.hardware import Hardware
-from dxlrun.inbox import Inbox, NoInbox
+from dxlrun.hardware import LOST_CYCLES, Hardware
+from dxlrun.inbox import LOOP, Inbox, NoInbox
 
 MOST_RATE = 100_000.0
 """Hz; as in the robot file."""
@@ -61,6 +64,8 @@ class LoopResult:
     reason: Literal["ended", "stopped", "fault"]
     detail: str = ""
     """One sentence where the reason is a fault."""
+    last: Last = "limp"
+    """How the policy leaves the robot; who started the hardware sees to it."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -97,15 +102,20 @@ class Loop:
     _cycles: int = field(default=0, init=False)
     _skipped: int = field(default=0, init=False)
     _late: bool = field(default=False, init=False)
+    _lost: LostServos = field(init=False)
+    _given_up: tuple[PolicyName, str] | None = field(default=None, init=False)
+    _motion: SafeMotion | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         self.schedule = Schedule(self.plan.period_ns)
+        self._lost = LostServos(len(self.plan.joints))
         self.steering = Steering(
             self.inbox, self, self.manager, self.record, self.events, self.commands, self.clock
         )
 
     def run(self) -> LoopResult:
-        """Activate the controllers, run until the plan's end, a stop or a fault, deactivate them.
+        """Activate the controllers, run until the plan's end, a stop or a fault, deactivate them; then go
+        through the steps of the policy for that, which leaves the robot limp or holding.
 
         What controllers raise, and PortError of the hardware, become the result; nothing else is caught.
         """
@@ -126,8 +136,13 @@ class Loop:
             self.manager.deactivate(self.schedule.time_ns(self.clock.now_ns()))
         if reason != "fault" and self.manager.fault is not None:
             reason, detail = "fault", self.manager.fault
+        policy: PolicyName = "on_fault" if reason == "fault" else "on_exit"
+        if self._given_up:
+            policy, sentence = self._given_up
+            reason, detail = "fault", detail or sentence
+        last = self._wind_up(policy)
         self._tell_end(reason, detail)
-        return LoopResult(self._cycles, self._skipped, reason, detail)
+        return LoopResult(self._cycles, self._skipped, reason, detail, last)
 
     # What clients may ask for, through Steering
 
@@ -166,6 +181,15 @@ class Loop:
         self.stop.request()
         return ""
 
+    def expire(self, controller: str) -> str:
+        """Hold a controller whose stream of commands ended, or end the run, as the policy says."""
+        policy = self.plan.policies.on_stale_command
+        if policy.goes_on:
+            self.manager.hold(controller)
+            return "its joints are held"
+        self._give_up("on_stale_command", f"the stream of commands for {controller} ended")
+        return f"the run ends: {policy.text}"
+
     # Inside
 
     def _cycle_until_end(self) -> tuple[Literal["ended", "stopped", "fault"], str]:
@@ -176,6 +200,8 @@ class Loop:
                 return "ended", ""
             if self.stop.requested:
                 return "stopped", ""
+            if self._given_up:
+                return "fault", self._given_up[1]
             self._one(self._cycle)
             if self._next() and self.plan.overrun == "stop":
                 return "fault", f"cycle {self.record.cycle} ended after the next deadline; overrun: stop"
@@ -196,12 +222,10 @@ class Loop:
         self.hardware.read()
         record.read_ns = now_ns()
         self.manager.begin()
-        record.command_count = self.steering.take(schedule.time_ns(woken_ns))
-        if self.paused:
-            record.commands.position.fill(np.nan)
-            record.commands.velocity.fill(np.nan)
+        if self._motion:
+            self._motion.command()
         else:
-            self.manager.update(cycle - self._paused_cycles, schedule.time_ns(woken_ns))
+            self._command(cycle, schedule.time_ns(woken_ns))
         self.gate.apply(record.commands, record.goals, dt_ns)
         record.updated_ns = now_ns()
         self.hardware.write()
@@ -210,12 +234,75 @@ class Loop:
         self._cycles += 1
         self.beat()
 
+    def _command(self, cycle: int, time_ns: int) -> None:
+        """Take what clients want, and let the controllers command, as far as their servos answer."""
+        record = self.record
+        if self._lost.look(record.states.valid):
+            self._miss()
+        record.command_count = self.steering.take(time_ns)
+        if self.paused:
+            record.commands.position.fill(np.nan)
+            record.commands.velocity.fill(np.nan)
+        else:
+            self.manager.update(cycle - self._paused_cycles, time_ns)
+
+    def _miss(self) -> None:
+        """Other servos are lost than in the cycle before: do what the policy says."""
+        policy, rows = self.plan.policies.on_lost_servo, self._lost.rows
+        if policy.goes_on:
+            self.gate.ease_in(self.manager.wait_for(rows))
+        elif rows:
+            names = ", ".join(self.plan.joints[row].name for row in sorted(rows))
+            self._give_up("on_lost_servo", f"{names} missed {LOST_CYCLES} replies in a row")
+
+    def _give_up(self, policy: PolicyName, why: str) -> None:
+        """End the run after this cycle, by another policy than on_exit."""
+        if self._given_up is None:
+            self._given_up = policy, f"{why}; {policy}: {self.plan.policies.named(policy).text}"
+
+    def _wind_up(self, name: PolicyName) -> Last:
+        """Go through the steps of a policy in more cycles; return how it leaves the robot."""
+        policy = self.plan.policies.named(name)
+        if policy.steps:
+            self._tell_policy(name, policy.text)
+            if self.paused:
+                self.resume()
+            motion = SafeMotion(policy, self.plan.policies.limit_ns, self.record, self.hardware.limit_torque)
+            self._motion = motion
+            try:
+                while not motion.over:
+                    self._one(self._cycle)
+                    self._next()
+            except PortError as error:
+                motion.give_up(str(error))
+            if motion.unfinished:
+                text = f"{name}: {motion.unfinished}; now {policy.last}"
+                self.events.emit(EventCode.POLICY, Severity.WARNING, "loop", text)
+        if policy.last == "hold":
+            self.events.emit(EventCode.POLICY, Severity.WARNING, "loop", f"{name}: torque stays on")
+        return policy.last
+
+    def _tell_policy(self, name: PolicyName, text: str) -> None:
+        """Leave in the log in which cycle a policy begins."""
+        self.events.emit(EventCode.POLICY, Severity.INFO, "loop", f"{name}: {text}")
+        self.commands.take(
+            TakenCommand(
+                t_ns=self.record.woken_ns,
+                cycle=self._cycle,
+                planned=-1,
+                controller=LOOP,
+                kind="policy",
+                origin="loop",
+                data=f'{{"policy":"{name}"}}'.encode(),
+            )
+        )
+
     def _next(self) -> int:
         """Go to the next cycle; return how many are declared skipped before it."""
         cycle, schedule = self._cycle, self.schedule
         now_ns = self.clock.now_ns()
         following = schedule.following(cycle, now_ns, self.plan.overrun)
-        if self.plan.end_ns is not None:
+        if self.plan.end_ns is not None and not self._motion:
             # nothing is skipped behind the end
             left_ns = self.plan.end_ns - schedule.time_ns(schedule.deadline_ns(cycle))
             following = min(following, cycle + max(1, -(-left_ns // schedule.period_ns)))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
+
+from dxlrun.control.policy_plan import PolicyPlan
 
 Policy = Literal["other", "fifo", "round_robin"]
 OverrunPolicy = Literal["skip", "catch_up", "stop"]
@@ -83,3 +85,4 @@ class LoopPlan:
     overrun: OverrunPolicy = "skip"
     least_period_ns: int = 0
     """The shortest period that the buses allow, by the time budget; 0: not computed."""
+    policies: PolicyPlan = field(default_factory=PolicyPlan)

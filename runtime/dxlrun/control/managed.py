@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import traceback
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -45,6 +46,7 @@ class Managed:
         self._nominal_ns = context.period_ns
         self._every = plan.every
         self._held = False
+        self._waiting = False
         self._last_ns = -1
         self._last_number = -1
         self._finite = np.zeros(len(rows), dtype=np.bool_)
@@ -98,6 +100,21 @@ class Managed:
         self._held = True
         self._withdraw()
 
+    def wait_for(self, lost: Collection[int]) -> bool:
+        """Hold its joints as long as one that it claims is lost, of these rows; return whether that changed
+        anything for the robot."""
+        waiting = bool(self._claimed) and any(row in lost for row in self._rows.tolist())
+        changed = waiting != self._waiting
+        self._waiting = waiting
+        if waiting and self.active:
+            self._withdraw()
+        return changed and self.active
+
+    @property
+    def waiting(self) -> bool:
+        """True while one of the joints that it claims is lost."""
+        return self._waiting
+
     def pace(self, period_ns: int, every: int) -> None:
         """Let it be updated in every n-th of the loop's periods."""
         self._every = every
@@ -106,7 +123,9 @@ class Managed:
 
     def due(self, number: int) -> bool:
         """Say whether the controller is updated in this period; a skipped turn is made up in the next one."""
-        return not self._held and number // self._every > self._last_number // self._every
+        return not (self._held or self._waiting) and (
+            number // self._every > self._last_number // self._every
+        )
 
     def update(self, number: int, time_ns: int) -> None:
         """Update and merge its commands into the robot's. Raises ControllerFault."""
@@ -125,6 +144,11 @@ class Managed:
                 self._judge(claim)
         for claim in self._claimed:
             claim.merged[self._rows] = claim.own
+
+    @property
+    def rows(self) -> NDArray[np.intp]:
+        """Rows of its joints in the robot's arrays."""
+        return self._rows
 
     def gather(self) -> None:
         """Copy the robot's states and goals into the controller's own arrays."""

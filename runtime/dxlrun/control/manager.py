@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -52,6 +52,8 @@ class Manager:
         self._named: dict[str, Managed] = {}
         self._commands: tuple[tuple[ScheduledCommand, NDArray[np.float64]], ...] = ()
         self._next = 0
+        self._lost: Collection[int] = ()
+        self._failed: set[str] = set()
 
     def configure(self) -> None:
         """Build and configure every controller, decode every command; allocates, before real time.
@@ -129,6 +131,24 @@ class Manager:
         if managed is not None and managed.active:
             managed.hold()
 
+    def wait_for(self, lost: Collection[int]) -> tuple[int, ...]:
+        """Hold every controller that claims a lost joint, of these rows, as long as it is lost.
+
+        Returns the rows of those that go on again. A controller that is activated meanwhile waits too.
+        """
+        self._lost = lost
+        going: list[int] = []
+        for managed in self._managed:
+            if not managed.wait_for(lost):
+                continue
+            text, severity = "goes on: all its joints answer again", Severity.INFO
+            if managed.waiting:
+                text, severity = "is held until all its joints answer again", Severity.WARNING
+            else:
+                going += managed.rows.tolist()
+            self._events.emit(EventCode.POLICY, severity, managed.plan.name, text)
+        return tuple(going)
+
     def switch(self, activate: Sequence[str], deactivate: Sequence[str], time_ns: int) -> str:
         """Deactivate and activate controllers in one step; return why nothing was done, empty when it was.
 
@@ -173,6 +193,7 @@ class Manager:
         except (ControllerFault, PlugInError) as error:
             return str(error)
         managed.pace(self._period_ns, _every(plan, self._period_ns))
+        managed.wait_for(self._lost)
         self._managed = (*self._managed[:index], managed, *self._managed[index + 1 :])
         self._named[plan.name] = managed
         self._tell_loaded(managed, "loaded", begin_ns)
@@ -238,7 +259,7 @@ class Manager:
         try:
             managed.deactivate(time_ns)
         except ControllerFault as fault:
-            self._end(managed, fault, time_ns)
+            self._end(managed, fault, time_ns, leaving=True)
         else:
             self._tell(EventCode.CONTROLLER_DEACTIVATED, managed, "inactive")
 
@@ -264,15 +285,19 @@ class Manager:
             )
         )
 
-    def _end(self, managed: Managed, fault: ControllerFault, time_ns: int) -> None:
-        """Take a controller that broke its contract out of the robot, say so, let its fallback take over."""
+    def _end(self, managed: Managed, fault: ControllerFault, time_ns: int, *, leaving: bool = False) -> None:
+        """Take a controller that broke its contract out of the robot, say so, let its fallback take over.
+
+        Nobody takes over from one that was `leaving` anyway, nor does one that broke its own contract before.
+        """
         managed.release()
         self._record.active &= ~managed.bit
         text = "\n".join([str(fault), *getattr(fault, "__notes__", ())])
         self._events.emit(EventCode.CONTROLLER_FAULT, Severity.ERROR, managed.plan.name, text)
+        self._failed.add(managed.plan.name)
         name = managed.plan.fallback
-        refusal = self.switch((name,), (), time_ns) if name else "it has no fallback"
-        if refusal:
+        # two that fall back on each other would do so for ever
+        if not name or leaving or name in self._failed or self.switch((name,), (), time_ns):
             self.fault = self.fault or str(fault)
 
     def _tell_loaded(self, managed: Managed, what: str, begin_ns: int) -> None:

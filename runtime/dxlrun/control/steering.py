@@ -36,6 +36,10 @@ class Steered(Protocol):
         """End the run in order after this cycle."""
         ...
 
+    def expire(self, controller: str) -> str:
+        """Do what the policy for a stale command says; return that in words."""
+        ...
+
     @property
     def paused(self) -> bool:
         """True between `pause` and `resume`."""
@@ -133,13 +137,8 @@ class Steering:
     def _expire(self) -> None:
         for name in [name for name, until in self._leases.items() if until < self.record.woken_ns]:
             del self._leases[name]
-            self.manager.hold(name)
-            self.events.emit(
-                EventCode.STALE_COMMAND,
-                Severity.WARNING,
-                name,
-                "the stream of commands ended; its joints are held",
-            )
+            text = f"the stream of commands ended; {self.loop.expire(name)}"
+            self.events.emit(EventCode.STALE_COMMAND, Severity.WARNING, name, text)
 
     def _obey(self, command: Command, time_ns: int) -> str:
         try:

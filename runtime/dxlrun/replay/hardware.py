@@ -88,6 +88,9 @@ class RecordedHardware:
             self._stop.request()
         self._index = following
 
+    def limit_torque(self, fraction: float) -> None:
+        """Limit nothing: what the servos did then is in their states."""
+
     def stop(self) -> tuple[str, ...]:
         """Do nothing: no servo has torque."""
         return ()
