@@ -70,6 +70,7 @@ def assemble(
     take_over: bool = False,
     inbox: Inbox | None = None,
     patience: Callable[[int], None] = lambda _: None,
+    pace: Callable[[int], None] = lambda _: None,
 ) -> Robot:
     """Build everything between the ports and the log; configures the controllers, sends nothing."""
     record = CycleRecord(cycle_layout(plan))
@@ -101,6 +102,8 @@ def assemble(
         inbox=inbox or NoInbox(),
         commands=sinks.commands,
         patience=patience,
+        pace=pace,
+        overrun_hooks=plugins.overrun_hooks,
     )
     manager.configure()
     return Robot(hardware, manager, loop, record)

@@ -15,6 +15,7 @@ from dxlrun.control.loop_plan import LoopPlan
 from dxlrun.control.lost_servos import LostServos
 from dxlrun.control.managed import PERIOD_CAP
 from dxlrun.control.manager import Manager
+from dxlrun.control.overrun import OverrunHook, Overruns
 from dxlrun.control.policy_plan import Last, PolicyName
 from dxlrun.control.safe_motion import SafeMotion
 from dxlrun.control.schedule import Schedule
@@ -93,8 +94,13 @@ class Loop:
     """Takes what came through the inbox, for the log."""
     patience: Callable[[int], None] = lambda _: None
     """Tells the guardian how long a cycle may take from now on, ns."""
+    pace: Callable[[int], None] = lambda _: None
+    """Tells the clock another period, ns, so that its polling stays a small share of it."""
+    overrun_hooks: tuple[OverrunHook, ...] = ()
+    """Plug-ins that decide what becomes of a late cycle."""
     schedule: Schedule = field(init=False)
     steering: Steering = field(init=False)
+    _overruns: Overruns = field(init=False)
     paused: bool = field(default=False, init=False)
     _cycle: int = field(default=0, init=False)
     _paused_cycles: int = field(default=0, init=False)
@@ -108,6 +114,7 @@ class Loop:
 
     def __post_init__(self) -> None:
         self.schedule = Schedule(self.plan.period_ns)
+        self._overruns = Overruns(self.plan.overrun, self.overrun_hooks, self.events)
         self._lost = LostServos(len(self.plan.joints))
         self.steering = Steering(
             self.inbox, self, self.manager, self.record, self.events, self.commands, self.clock
@@ -157,6 +164,7 @@ class Loop:
             return refusal
         self.schedule.change(self._cycle, period_ns)
         self.patience(period_ns)
+        self.pace(period_ns)
         return ""
 
     def pause(self) -> str:
@@ -203,7 +211,7 @@ class Loop:
             if self._given_up:
                 return "fault", self._given_up[1]
             self._one(self._cycle)
-            if self._next() and self.plan.overrun == "stop":
+            if self._next():
                 return "fault", f"cycle {self.record.cycle} ended after the next deadline; overrun: stop"
         return "fault", self.manager.fault
 
@@ -297,11 +305,13 @@ class Loop:
             )
         )
 
-    def _next(self) -> int:
-        """Go to the next cycle; return how many are declared skipped before it."""
+    def _next(self) -> bool:
+        """Go to the next cycle, past those that are declared skipped; say whether that is to end the run."""
         cycle, schedule = self._cycle, self.schedule
-        now_ns = self.clock.now_ns()
-        following = schedule.following(cycle, now_ns, self.plan.overrun)
+        now_ns, policy = self.clock.now_ns(), self.plan.overrun
+        if now_ns > (due_ns := schedule.deadline_ns(cycle + 1)):
+            policy = self._overruns.decide(cycle + 1, due_ns, now_ns)
+        following = schedule.following(cycle, now_ns, policy)
         if self.plan.end_ns is not None and not self._motion:
             # nothing is skipped behind the end
             left_ns = self.plan.end_ns - schedule.time_ns(schedule.deadline_ns(cycle))
@@ -313,16 +323,18 @@ class Loop:
         self._cycle = following
         self.record.skipped = skipped
         self._skipped += skipped
-        if skipped and not self._late:
+        late = bool(skipped) or (policy == "catch_up" and now_ns > due_ns)
+        if late and not self._late:
             late_ms = (now_ns - schedule.deadline_ns(cycle)) / 1e6
             self.events.emit(
                 EventCode.OVERRUN,
                 Severity.WARNING,
                 "loop",
-                f"cycle {cycle} ended {late_ms:.3f} ms after its deadline; {periods(skipped)} skipped",
+                f"cycle {cycle} ended {late_ms:.3f} ms after its deadline; {periods(skipped)} skipped"
+                f"{', the next one follows at once' if policy == 'catch_up' else ''}",
             )
-        self._late = bool(skipped)
-        return skipped
+        self._late = late
+        return bool(skipped) and policy == "stop"
 
     def _tell_start(self) -> None:
         """Leave in the log what the controllers are activated with: nothing else tells it."""
