@@ -1,10 +1,13 @@
-"""Commands on their way to the log: what was handed to controllers, in which cycle; an input of the run."""
+"""Commands on their way to the log: what cycles took for controllers and for the loop; an input of the run."""
 
 from __future__ import annotations
 
 import struct
 from dataclasses import dataclass, replace
 from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
 
 from dxlrun.ring import RING_SECONDS, Appender, Payload
 
@@ -13,6 +16,8 @@ COMMAND_SLOT = 512
 
 _HEADER = struct.Struct("<qqqqIIHHH2x")
 _LONGEST_NAME = 64
+_NUMBER = 8
+"""Bytes of a float64."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,9 +39,35 @@ class TakenCommand:
     lease_ns: int = 0
     """For how long a set-point of a stream counts; 0: for ever."""
 
+    @property
+    def for_loop(self) -> bool:
+        """True where no controller but the loop itself is meant."""
+        return not self.controller
+
+    @property
+    def text(self) -> str:
+        """The data as the log's text: JSON for the loop, hexadecimal for what is no array of numbers, else
+        empty. Bytes that are no UTF-8 become escapes that no JSON has: what was refused stays refused."""
+        if self.for_loop:
+            return self.data.decode(errors="backslashreplace")
+        return self.data.hex() if len(self.data) % _NUMBER else ""
+
+    @property
+    def numbers(self) -> NDArray[np.float64]:
+        """The data as the log's array; empty where it is the text."""
+        whole = not self.for_loop and len(self.data) % _NUMBER == 0
+        return np.frombuffer(self.data if whole else b"", dtype="<f8")
+
+
+def data_of(controller: str, text: str, numbers: NDArray[np.float64]) -> bytes:
+    """Return a command's data from its text and its array in the log. Raises ValueError when neither fits."""
+    if controller and text:
+        return bytes.fromhex(text)
+    return numbers.tobytes() if controller else text.encode()
+
 
 class CommandSink(Protocol):
-    """Takes what was handed to controllers; never blocks, never raises."""
+    """Takes what cycles took; never blocks, never raises."""
 
     def take(self, command: TakenCommand) -> None:
         """Record one command."""

@@ -208,7 +208,7 @@ class LogWriter:
             self._add(self._bus_channels[packet.bus], packet.last_ns, data)
 
     def command(self, payload: Payload) -> None:
-        """Write one command that a controller was handed, when its last piece is there.
+        """Write one command that a cycle took, when its last piece is there.
 
         Raises ValueError for a piece whose predecessors were lost.
         """
@@ -219,10 +219,12 @@ class LogWriter:
             command.t_ns,
             command.cycle,
             command.planned,
+            command.lease_ns,
             command.controller,
             command.kind,
             command.origin,
-            np.frombuffer(command.data, dtype="<f8"),
+            command.text,
+            command.numbers,
         )
         self._guarded(lambda: self._add(self._taken_channel, command.t_ns, data))
 
@@ -243,7 +245,8 @@ class LogWriter:
     def gap(self, source: str, lost: int) -> None:
         """Declare that `lost` records of `source` did not reach the log; it becomes an event."""
         self._lost += lost
-        text = f"{lost} records of {source} were overwritten or damaged before the recorder read them"
+        what, were, it = ("record", "was", "it") if lost == 1 else ("records", "were", "them")
+        text = f"{lost} {what} of {source} {were} overwritten or damaged before the recorder read {it}"
         event = Event(self._last_ns, EventCode.RECORDER_GAP, Severity.ERROR, "recorder", text)
         self._guarded(lambda: self._write_event(event))
 
