@@ -1,4 +1,4 @@
-"""Commands on their way to the log: what cycles took for controllers and for the loop; an input of the run."""
+"""Commands on their way to the log: what cycles took for controllers and the loop; an input of the run."""
 
 from __future__ import annotations
 

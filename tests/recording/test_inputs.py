@@ -74,7 +74,7 @@ def test_what_was_no_json_is_none_in_the_log(log: LogWriter, tmp_path: Path) -> 
     read = read_log(tmp_path / "run.mcap")
     first, second, third = (command.data for command in read.commands)
     for data in (first, second, third):
-        with pytest.raises(ValueError, match="Expecting|Invalid"):
+        with pytest.raises(ValueError, match=r"Expecting|Invalid"):
             json.loads(data)
     assert read.complete
 

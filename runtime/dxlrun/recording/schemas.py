@@ -159,8 +159,8 @@ string text
 
 COMMAND = MessageType(
     "dxlrun_msgs/msg/Command",
-    """# A command that a cycle took, for a controller or (no name) for the loop itself; it may have been refused,
-# which an event says. t_ns: of the cycle's wake-up. planned: its number in the commands of plan.json, whose
+    """# A command that a cycle took, for a controller or (no name) for the loop itself; an event says when it
+# was refused. t_ns: of the cycle's wake-up. planned: its number in the commands of plan.json, whose
 # array it is; -1: the array is data. lease_ns: for how long a set-point of a stream counts; 0: for ever.
 # text: JSON for the loop; for a controller empty, or in hexadecimal what is no array of numbers.
 int64 t_ns
