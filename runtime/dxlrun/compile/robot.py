@@ -16,9 +16,10 @@ from dxlrun.compile.motions import compile_motion
 from dxlrun.compile.plan import Plan
 from dxlrun.compile.problems import Problems
 from dxlrun.compile.report import Checked, CheckReport, check_report
+from dxlrun.compile.scheduler import check_scheduler, least_period_ns, scheduler_plan
 from dxlrun.compile.twins import check_twins
 from dxlrun.compile.urdf import compile_urdf
-from dxlrun.control.loop_plan import LoopPlan, SchedulerPlan
+from dxlrun.control.loop_plan import LoopPlan
 from dxlrun.control.plugins import load_plugins
 from dxlrun.description import Description, MotionDescription, read_motion, survey_robot
 from dxlrun.dynamixel.bus_plan import BusPlan
@@ -109,6 +110,7 @@ def compile_robot(
     problems = Problems()
     plugins = load_plugins()  # first, as they may bring the servo models of joints along
     joints = compile_joints(description, problems, models or {})
+    check_scheduler(description, problems)
     check_twins(description, {name: joint.table for name, joint in joints.items()}, problems)
     buses = compile_buses(description, joints, problems)
     urdf = compile_urdf(description, joints, problems)
@@ -127,15 +129,16 @@ def compile_robot(
 
 def _plan(checked: Checked, urdf: str | None) -> Plan:
     description, robot = checked.description, checked.description.robot
-    scheduler = robot.loop.scheduler
     commands = [command for part in checked.parts for command in part.commands]
     loop = LoopPlan(
         period_ns=round(1e9 / robot.loop.rate),
-        scheduler=SchedulerPlan(scheduler.policy, scheduler.priority, scheduler.lock_memory),
+        scheduler=scheduler_plan(robot.loop),
         joints=tuple(joint.plan for joint in checked.joints.values()),
         controllers=tuple(controller.plan for controller in checked.controllers.values()),
         commands=tuple(sorted(commands, key=lambda command: command.at_ns)),
         end_ns=checked.end_ns,
+        overrun=robot.loop.overrun,
+        least_period_ns=least_period_ns(robot.loop, checked.buses),
     )
     return Plan(
         robot=robot.name,

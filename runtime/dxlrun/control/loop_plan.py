@@ -19,6 +19,12 @@ class SchedulerPlan:
     policy: Policy
     priority: int
     lock_memory: bool
+    cores: tuple[int, ...] = ()
+    """Where the loop may run; empty: anywhere."""
+    polling_ns: int | None = None
+    """Longest time that the clock is polled before a deadline; None: a tenth of the period."""
+    idle_latency: bool = False
+    """Keep the cores from deep idle states."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from dxlrun.description.units import Angle, AngularVelocity, Duration
+from dxlrun.description.units import Angle, AngularVelocity, AutoDuration, Duration
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*", re.ASCII)
 
@@ -50,6 +50,12 @@ def _whole(value: object) -> object:
 def _ordered(value: tuple[float, float]) -> tuple[float, float]:
     if not value[0] < value[1]:
         raise refuse("the lower limit is not below the upper one", "write [lower, upper]")
+    return value
+
+
+def _cores(value: tuple[int, ...]) -> tuple[int, ...]:
+    if not value or len(set(value)) < len(value):
+        raise refuse("cores are given once each, and at least one", "write for example [3]")
     return value
 
 
@@ -107,6 +113,20 @@ class Scheduler(Form):
         examples=["31"],
     )
     lock_memory: bool = Field(default=False, description="Keep all memory in RAM.", examples=["true"])
+    cores: (
+        Annotated[
+            tuple[Annotated[int, Field(ge=0, le=1023)], ...], Field(strict=False), AfterValidator(_cores)
+        ]
+        | None
+    ) = Field(default=None, description="Processor cores that the loop may run on.", examples=["[3]"])
+    polling: AutoDuration = Field(
+        default="auto",
+        description="Longest time that the clock is polled before a deadline; auto: a tenth of the period.",
+        examples=["100 us"],
+    )
+    idle_latency: bool = Field(
+        default=False, description="Keep processor cores from deep idle states.", examples=["true"]
+    )
 
 
 class Loop(Form):
@@ -116,8 +136,10 @@ class Loop(Form):
     scheduler: Scheduler = Field(
         default=Scheduler(), description="Real-time wishes.", examples=["{policy: round_robin}"]
     )
-    overrun: Literal["skip"] = Field(
-        default="skip", description="After a late cycle, whole periods are skipped.", examples=["skip"]
+    overrun: Literal["skip", "catch_up", "stop"] = Field(
+        default="skip",
+        description="After a late cycle, whole periods are skipped, or caught up with, or the run ends.",
+        examples=["catch_up"],
     )
 
 
