@@ -18,10 +18,12 @@ from dxlrun.description.robot import (
     Limits,
     Loop,
     Policies,
+    PoseStep,
     Recording,
     Robot,
     RobotModel,
     Scheduler,
+    TorqueStep,
 )
 
 PAGE = (Path(__file__).parents[2] / "docs" / "robot-file.md").read_text()
@@ -49,7 +51,7 @@ def test_the_examples_of_the_page_are_read(desk: Any) -> None:
 
 @pytest.mark.parametrize(
     ("prefix", "part"),
-    [("", Robot), ("", Bus), ("adapter.", Adapter), ("", Joint), ("limits.", Limits), ("", Loop), ("", Policies),
+    [("", Robot), ("", Bus), ("adapter.", Adapter), ("", Joint), ("limits.", Limits), ("", Loop), ("", Policies), ("", PoseStep), ("", TorqueStep),
      ("scheduler.", Scheduler), ("", ControllerEntry), ("", Recording), ("", RobotModel), ("", Motion), ("", PointsPart),
      ("", FormulaPart), ("points[].", Point)],
 )  # fmt: skip

@@ -14,6 +14,7 @@ from dxlrun.compile.joints import AUTO, compile_joints
 from dxlrun.compile.left_out import left_out_names, still_true
 from dxlrun.compile.motions import compile_motion
 from dxlrun.compile.plan import Plan
+from dxlrun.compile.policies import compile_policies
 from dxlrun.compile.problems import Problems
 from dxlrun.compile.report import Checked, CheckReport, check_report
 from dxlrun.compile.scheduler import check_scheduler, least_period_ns, scheduler_plan
@@ -115,6 +116,7 @@ def compile_robot(
     buses = compile_buses(description, joints, problems)
     urdf = compile_urdf(description, joints, problems)
     controllers = compile_controllers(description, plugins, problems)
+    policies = compile_policies(description, joints, buses, problems)
     names = (*description.robot.controllers, *left_out_names(description, "controllers"))
     parts = [
         part for motion in motions for part in compile_motion(motion, controllers, names, joints, problems)
@@ -123,7 +125,7 @@ def compile_robot(
     end_ns = duration_ns
     if end_ns is None and parts:
         end_ns = max(part.end_ns for part in parts)
-    checked = Checked(description, joints, buses, controllers, parts, end_ns)
+    checked = Checked(description, joints, buses, controllers, parts, end_ns, policies)
     return Compiled(_plan(checked, urdf), problems.warnings, check_report(checked))
 
 
@@ -137,6 +139,7 @@ def _plan(checked: Checked, urdf: str | None) -> Plan:
         controllers=tuple(controller.plan for controller in checked.controllers.values()),
         commands=tuple(sorted(commands, key=lambda command: command.at_ns)),
         end_ns=checked.end_ns,
+        policies=checked.policies,
         overrun=robot.loop.overrun,
         least_period_ns=least_period_ns(robot.loop, checked.buses),
     )
@@ -154,4 +157,5 @@ def _plan(checked: Checked, urdf: str | None) -> Plan:
             for file, text in description.included.items()
         },
         urdf=urdf,
+        gateway=robot.processes.gateway.enabled,
     )
