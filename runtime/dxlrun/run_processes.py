@@ -184,7 +184,10 @@ def start_recorder(log: Path, header: LogHeader, memory: Memory) -> Child:
 
 
 def start_gateway(log: Path | None, memory: Memory) -> Child:
-    """Start the gateway; it says where its socket is when it is ready, nobody waits for it."""
+    """Start the gateway; it says where its socket is when it is ready, nobody waits for it.
+
+    Raises OSError when the system has no process left.
+    """
     shared = Descriptors(
         memory.heartbeat,
         memory.cycles,
@@ -193,12 +196,13 @@ def start_gateway(log: Path | None, memory: Memory) -> Child:
         memory.mailbox,
         memory.answers,
     )
-    job = GatewayJob(memory.plan, shared, str(log) if log else None)
+    job = GatewayJob(memory.plan, shared, str(log.absolute()) if log else None)
     descriptor = process.memory_file("dxlrun-gateway", msgspec.json.encode(job))
     inherited = [descriptor, memory.plan, *astuple(shared)]
-    child = Child("gateway", "dxlrun.remote", ["--job-fd", str(descriptor)], inherited, memory.stderr)
-    os.close(descriptor)
-    return child
+    try:
+        return Child("gateway", "dxlrun.remote", ["--job-fd", str(descriptor)], inherited, memory.stderr)
+    finally:
+        os.close(descriptor)
 
 
 def guardian_job(plan: Plan, ports: Mapping[str, str], memory: Memory, *, take_over: bool) -> GuardianJob:

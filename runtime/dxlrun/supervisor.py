@@ -75,6 +75,8 @@ class _Run:
     recorder: Child | None = None
     guardian: Child | None = None
     gateway: Child | None = None
+    socket: Path | None = None
+    """Where the gateway listens; None before it does."""
     remarks: list[str] = field(default_factory=list)
     job: GuardianJob | None = None
     loop: int | None = None
@@ -84,6 +86,11 @@ class _Run:
     ended: Mapping[str, object] | None = None
     """What the guardian said at the end."""
     messages: int = 0
+    steerable: bool = field(init=False)
+    """False when nobody wants a gateway, and after it ended."""
+
+    def __post_init__(self) -> None:
+        self.steerable = self.options.gateway and self.plan.gateway
 
     def start(self) -> Child:
         """Start everything in order, return the guardian; raises PortError or ProcessFault."""
@@ -133,19 +140,34 @@ class _Run:
     def _look_after_gateway(self, heartbeat: Heartbeat) -> None:
         """Start it when the loop runs, so that nothing waits for it; without it the robot goes on."""
         if self.gateway is None:
-            if self.options.gateway and heartbeat.phase is Phase.RUNNING:
-                self.gateway = start_gateway(self.log, self.memory)
-        elif self.gateway.process.poll() is not None and not self.remarks:
-            said = self.gateway.poll(0)
-            why = f" ({said['error']})" if said and "error" in said else ""
-            self.remarks.append(f"the gateway ended{why}: the run goes on, and nobody can steer it")
+            if self.steerable and heartbeat.phase is Phase.RUNNING:
+                try:
+                    self.gateway = start_gateway(self.log, self.memory)
+                except OSError as error:
+                    self._without_gateway(f"did not start ({error.strerror or error})")
+        elif message := self.gateway.poll(0):
+            if "socket" in message:
+                self.socket = Path(str(message["socket"]))
+            else:
+                self._without_gateway(f"did not start ({message.get('error')})")
+        elif self.gateway.line.closed:
+            self._without_gateway("ended")
 
-    def _end_gateway(self, gateway: Child) -> None:
-        """End the gateway, which keeps nothing; remove its socket."""
-        said = gateway.poll(0) or {}
-        gateway.kill()
-        if "socket" in said:
-            Path(str(said["socket"])).unlink(missing_ok=True)
+    def _without_gateway(self, what: str) -> None:
+        """Say that nobody can steer the run any more, and start no other gateway."""
+        self.steerable = False
+        self.remarks.append(f"the gateway {what}: the run goes on, and nobody can steer it")
+        self._end_gateway()
+
+    def _end_gateway(self) -> None:
+        """End the gateway, which keeps nothing, and remove its socket."""
+        if self.gateway:
+            message = self.gateway.poll(0) or {}
+            self.gateway.kill()
+            self.gateway = None
+            place = self.socket or message.get("socket")
+            if place is not None:
+                Path(str(place)).unlink(missing_ok=True)
 
     def _without_guardian(self, loop: int, guardian: Child, job: GuardianJob) -> None:
         """The guardian is gone: the kernel told the loop to stop; see that it does, or cut torque here."""
@@ -167,18 +189,17 @@ class _Run:
             self.sentences += leave(guardian.line.descriptors, how, Severity.ERROR)
 
     def end(self) -> None:
-        """End what is left, in order: guardian, recorder, simulated bus."""
+        """End what is left, in order: guardian, recorder, simulated bus, gateway."""
         if self.guardian:
             self.guardian.end()
             if self.loop is not None and self.ended is None and self.job is not None:
                 self._without_guardian(self.loop, self.guardian, self.job)
             self.loop = None
-        if self.gateway:
-            self._end_gateway(self.gateway)
         if self.recorder:
             self._end_recorder(self.recorder)
         if self.simulation:
             self.simulation.end()
+        self._end_gateway()  # the last one: when its socket is gone, the log is closed
 
     def _end_recorder(self, recorder: Child) -> None:
         """Let the recorder drain the rings and close the log; say so when it could not."""

@@ -14,11 +14,13 @@ from dxlrun.description.robot import (
     Bus,
     ControllerEntry,
     Form,
+    Gateway,
     Joint,
     Limits,
     Loop,
     Policies,
     PoseStep,
+    Processes,
     Recording,
     Robot,
     RobotModel,
@@ -52,7 +54,7 @@ def test_the_examples_of_the_page_are_read(desk: Any) -> None:
 @pytest.mark.parametrize(
     ("prefix", "part"),
     [("", Robot), ("", Bus), ("adapter.", Adapter), ("", Joint), ("limits.", Limits), ("", Loop), ("", Policies), ("", PoseStep), ("", TorqueStep),
-     ("scheduler.", Scheduler), ("", ControllerEntry), ("", Recording), ("", RobotModel), ("", Motion), ("", PointsPart),
+     ("scheduler.", Scheduler), ("", ControllerEntry), ("", Recording), ("", Processes), ("gateway.", Gateway), ("", RobotModel), ("", Motion), ("", PointsPart),
      ("", FormulaPart), ("points[].", Point)],
 )  # fmt: skip
 def test_every_key_is_on_the_page(prefix: str, part: type[Form]) -> None:

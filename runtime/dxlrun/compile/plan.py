@@ -28,6 +28,8 @@ class Plan:
     """Text of each file that the robot file includes, by its name seen from there."""
     urdf: str | None = None
     """The robot's URDF as it was read."""
+    gateway: bool = True
+    """Others may steer the run, over a Unix socket."""
 
     @property
     def simulated(self) -> bool:

@@ -5,7 +5,7 @@
     with dxlrun.connect() as robot:
         robot.send("head", "posvel", {"positions": [0.3, 0.0], "velocities": [1.0, 1.0]})
 
-Only the standard library is needed on this side; one connection, one request at a time.
+Only the standard library is needed on this side; one connection, one request at a time, of one thread.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from __future__ import annotations
 import http.client
 import json
 import os
+import select
 import socket
 import time
 from collections.abc import Mapping, Sequence
@@ -21,14 +22,18 @@ from types import TracebackType
 from urllib.parse import quote
 
 from dxlrun.errors import DxlrunError, Refused
-from dxlrun.remote.sockets import SUFFIX, directory, running
+from dxlrun.remote.sockets import MOST_BYTES, alive, running, sockets
 
 __all__ = ["RemoteRobot", "Stream", "connect", "running"]
 
 TIMEOUT_S = 10.0
 """How long an answer may take; the gateway answers within two seconds or so, whatever the loop does."""
 LEASE_S = 0.2
+_IDLE_S = 20.0
+"""The gateway closes silent connections after 30 s; one that was silent for so long is not used again."""
 _STOP_S = 30.0
+_WRONG_INPUT = (404, 413, 422)
+"""Statuses of wishes that would be refused at any time: no such thing, too long, not as they must be."""
 
 
 class _Connection(http.client.HTTPConnection):
@@ -44,21 +49,34 @@ class _Connection(http.client.HTTPConnection):
         self.sock.settimeout(self.timeout)
         self.sock.connect(str(self._path))
 
+    @property
+    def hung_up(self) -> bool:
+        """True when the other end has closed it; it says nothing unless asked, so any byte means that too."""
+        if self.sock is None:
+            return False
+        look = select.poll()
+        look.register(self.sock, select.POLLIN)
+        return bool(look.poll(0))
+
 
 def connect(robot: str | None = None, client: str | None = None) -> RemoteRobot:
     """Return a running robot, by its name; without one, the only one that runs.
 
     `client` names you in the robot's log. Raises DxlrunError when no such robot runs, or several do.
     """
-    names = running()
-    if robot is None and len(names) != 1:
-        which = f"several robots run: {', '.join(names)}; name one" if names else "no robot runs; start one"
-        raise DxlrunError(f"{which} (dxlrun ROBOT.yaml)" if not names else which)
-    name = robot or names[0]
-    if name not in names:
-        found = f"; these run: {', '.join(names)}" if names else ""
-        raise DxlrunError(f"no robot {name} runs{found}")
-    return RemoteRobot(name, directory() / f"{name}{SUFFIX}", client or f"python {os.getpid()}")
+    found = sockets()
+    names = ", ".join(sorted(found))
+    if robot is None:
+        if not found:
+            raise DxlrunError("no robot runs that can be steered; start one (dxlrun ROBOT.yaml)")
+        if len(found) > 1:
+            raise DxlrunError(f"several robots run: {names}; name one")
+        robot = next(iter(found))
+    if robot not in found:
+        raise DxlrunError(
+            f"no robot {robot} runs that can be steered; " + (f"these do: {names}" if names else "start it")
+        )
+    return RemoteRobot(robot, found[robot], client or f"python {os.getpid()}")
 
 
 class RemoteRobot:
@@ -68,7 +86,12 @@ class RemoteRobot:
         self.name = name
         self._path = path
         self._connection = _Connection(path)
-        self._headers = {"X-Dxlrun-Client": client, "Content-Type": "application/json"}
+        self._used = time.monotonic()
+        shown = "".join(letter for letter in client if letter.isprintable())
+        self._headers = {
+            "X-Dxlrun-Client": shown.encode().decode("latin-1"),  # UTF-8 in what HTTP takes for Latin-1
+            "Content-Type": "application/json",
+        }
 
     def __enter__(self) -> RemoteRobot:
         return self
@@ -86,21 +109,21 @@ class RemoteRobot:
 
     def info(self) -> dict[str, object]:
         """Return who it is: rate, controllers and what they take, cycles, log."""
-        return self._get("/robot")
+        return self._ask("GET", "/robot")
 
     def states(self) -> dict[str, object]:
         """Return the newest cycle: each joint's position (rad), velocity (rad/s), effort, age (s), goals."""
-        return self._get("/states")
+        return self._ask("GET", "/states")
 
     def events(self, after: int = 0) -> dict[str, object]:
-        """Return what happened since event number `after`, and the number of the last one."""
-        return self._get(f"/events?after={after}")
+        """Return what happened since event number `after`, at most 200, and the number of the last one."""
+        return self._ask("GET", f"/events?after={after}")
 
     # Steering
 
     def send(self, controller: str, kind: str, command: Mapping[str, object]) -> None:
         """Give a controller a typed command; returns when the loop has taken it."""
-        self._post(f"/controllers/{quote(controller)}/commands/{quote(kind)}", command)
+        self._post(f"/controllers/{_quoted(controller)}/commands/{_quoted(kind)}", command)
 
     def stream(self, controller: str, kind: str, lease: float = LEASE_S) -> Stream:
         """Return a stream of set-points for a controller, of which the newest counts, for `lease` seconds."""
@@ -128,51 +151,78 @@ class RemoteRobot:
 
     def unload(self, name: str) -> None:
         """Take a controller that is not active out of the paused loop."""
-        self._ask("DELETE", f"/controllers/{quote(name)}", None)
+        self._ask("DELETE", f"/controllers/{_quoted(name)}")
 
     def stop(self, wait: bool = True) -> None:
-        """End the run in order; with `wait`, return when it has ended. Raises DxlrunError after 30 s."""
-        self._post("/stop")
+        """End the run in order; with `wait`, return when it has ended and its log is closed.
+
+        Raises DxlrunError when it has not ended after 30 s.
+        """
+        try:
+            self._post("/stop")
+        except Refused:
+            raise
+        except DxlrunError:
+            if alive(self._path):
+                raise
         self.close()
         until = time.monotonic() + _STOP_S
-        while wait and self._path.exists():
+        while wait and alive(self._path):
             if time.monotonic() > until:
                 raise DxlrunError(f"{self.name} did not end within {_STOP_S:g} s")
             time.sleep(0.05)
 
     # Inside
 
-    def _get(self, path: str) -> dict[str, object]:
-        return self._ask("GET", path, None)
-
     def _post(self, path: str, content: Mapping[str, object] | None = None) -> None:
         self._ask("POST", path, content)
 
-    def _ask(self, method: str, path: str, content: Mapping[str, object] | None) -> dict[str, object]:
-        body = None if content is None else json.dumps(content).encode()
-        try:
-            answer, status = self._exchange(method, path, body)
-        except (http.client.HTTPException, OSError) as error:
+    def _ask(self, method: str, path: str, content: Mapping[str, object] | None = None) -> dict[str, object]:
+        """Ask once and return the answer: nothing is ever asked twice, the first may have been heard."""
+        body = None if content is None else _json(content)
+        idle = time.monotonic() - self._used > _IDLE_S
+        if idle or self._connection.hung_up:
             self.close()
-            raise DxlrunError(
-                f"{self.name} does not answer any more: {error or type(error).__name__}"
-            ) from error
-        if "refused" in answer or status >= 400:
-            raise Refused(str(answer.get("refused", f"HTTP status {status}")))
+        try:
+            self._connection.request(method, path, body, self._headers)
+            response = self._connection.getresponse()
+            answer = json.loads(response.read())
+        except (http.client.HTTPException, OSError, ValueError) as error:
+            self.close()
+            why = str(error) or type(error).__name__
+            raise DxlrunError(f"{self.name} does not answer any more: {why}") from error
+        except BaseException:  # Ctrl-C between question and answer: the answer must not meet the next one
+            self.close()
+            raise
+        self._used = time.monotonic()
+        if not isinstance(answer, dict):
+            raise DxlrunError(f"{self.name} answers in a way that this version does not know")
+        if "refused" in answer or response.status >= 400:
+            sentence = str(answer.get("refused", f"HTTP status {response.status}"))
+            raise Refused(sentence, wrong_input=response.status in _WRONG_INPUT)
         return answer
 
-    def _exchange(self, method: str, path: str, body: bytes | None) -> tuple[dict[str, object], int]:
-        try:
-            return self._once(method, path, body)
-        except (http.client.RemoteDisconnected, BrokenPipeError, ConnectionResetError):
-            self.close()  # an idle connection is closed after a while: the next request begins another
-            return self._once(method, path, body)
 
-    def _once(self, method: str, path: str, body: bytes | None) -> tuple[dict[str, object], int]:
-        self._connection.request(method, path, body, self._headers)
-        response = self._connection.getresponse()
-        answer = json.loads(response.read())
-        return (answer if isinstance(answer, dict) else {}), response.status
+def _quoted(name: str) -> str:
+    return quote(name, safe="")
+
+
+def _json(content: Mapping[str, object]) -> bytes:
+    """Return the body of a request; arrays of numpy are lists there. Raises Refused for what is none."""
+    try:
+        body = json.dumps(content, default=_plain, allow_nan=False).encode()
+    except (TypeError, ValueError, RecursionError) as error:
+        raise Refused(f"this cannot be sent: {error}; use numbers, texts, lists and mappings") from error
+    if len(body) > MOST_BYTES:
+        raise Refused(f"{len(body)} bytes are too many, at most {MOST_BYTES} are taken at once")
+    return body
+
+
+def _plain(value: object) -> object:
+    lists = getattr(value, "tolist", None)
+    if lists is None:
+        raise TypeError(f"{type(value).__name__} is not JSON")
+    return lists()
 
 
 class Stream:
@@ -180,7 +230,7 @@ class Stream:
 
     def __init__(self, robot: RemoteRobot, controller: str, kind: str, lease: float) -> None:
         self._robot = robot
-        self._path = f"/controllers/{quote(controller)}/set-points/{quote(kind)}?lease={lease:g}"
+        self._path = f"/controllers/{_quoted(controller)}/set-points/{_quoted(kind)}?lease={lease:g}"
 
     def send(self, command: Mapping[str, object]) -> None:
         """Leave the newest set-point; returns before the loop has taken it."""

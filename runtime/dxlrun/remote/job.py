@@ -25,3 +25,4 @@ class GatewayJob:
     """Descriptor of the plan's JSON."""
     memory: Descriptors
     log: str | None
+    """Where the log is written, from the root; None: there is none."""

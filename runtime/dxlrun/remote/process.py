@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import os
+import ctypes
 import signal
 import socket
 import sys
@@ -17,15 +17,14 @@ from dxlrun import process
 from dxlrun.compile.plan import Plan, from_json
 from dxlrun.control.plugins import load_plugins
 from dxlrun.errors import DxlrunError
+from dxlrun.remote.connection import MOST_CONNECTIONS, Connection
 from dxlrun.remote.gateway import Gateway
 from dxlrun.remote.job import GatewayJob
 from dxlrun.remote.link import Link
 from dxlrun.remote.preparation import Preparation
 from dxlrun.remote.sockets import listen
 
-NICENESS = 10
-"""The robot comes first: a busy gateway gets what loop, guardian and recorder leave over."""
-MOST_CONNECTIONS = 64
+_PR_SET_PDEATHSIG = 1
 
 
 class _Server(uvicorn.Server):
@@ -38,39 +37,47 @@ class _Server(uvicorn.Server):
 
 
 async def serve(link: Link, gateway: Gateway, listener: socket.socket, control: socket.socket) -> None:
-    """Serve until the other end of `control` is closed."""
+    """Serve until the other end of `control` is closed, or the link fails, whose error is raised."""
     config = uvicorn.Config(
         gateway.app(),
+        http=Connection,
+        ws="none",
+        lifespan="off",
+        log_config=None,
         log_level="critical",
         access_log=False,
-        lifespan="off",
-        limit_concurrency=MOST_CONNECTIONS,
-        timeout_keep_alive=30,
+        proxy_headers=False,
+        server_header=False,
+        backlog=MOST_CONNECTIONS,
         timeout_graceful_shutdown=1,
-        ws="none",
         h11_max_incomplete_event_size=16384,
     )
     server = _Server(config)
+
+    def end(*_: object) -> None:
+        server.should_exit = True
 
     def hung_up() -> None:
         with suppress(OSError):
             if control.recv(4096):
                 return
-        server.should_exit = True
+        end()
 
     asyncio.get_running_loop().add_reader(control.fileno(), hung_up)
     watching = asyncio.create_task(link.watch())
-    try:
-        await server.serve(sockets=[listener])
-    finally:
-        watching.cancel()
+    watching.add_done_callback(end)
+    await server.serve(sockets=[listener])
+    watching.cancel()
+    with suppress(asyncio.CancelledError):
+        await watching
 
 
 def main() -> None:
     """Run the gateway's process: `--job-fd N --control-fd M`."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    with suppress(OSError):
-        os.nice(NICENESS)
+    sys.stdout = sys.stderr = process.Printed(sys.stderr.fileno())
+    # a plug-in's endless `prepare` must not outlive the run
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     job = msgspec.json.decode(process.whole(int(sys.argv[2])), type=GatewayJob)
     control = socket.socket(fileno=int(sys.argv[4]))
     line = process.Line(control)
