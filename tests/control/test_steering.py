@@ -93,6 +93,14 @@ def test_a_switch_that_cannot_be_is_refused_whole(watched, switch, why):
     assert why in robot.events.of(EventCode.COMMAND_REFUSED)[0][1]
 
 
+def test_bytes_that_are_no_text_are_refused(watched):
+    robot = watched.robot
+    watched.at[2] = [lambda: robot.post("", "switch", b'{"activate": ["\xff"]}')]
+    watched.run(5)
+    assert "does not fit" in robot.inbox.answers[1]
+    assert watched.active() == [0b011] * 5
+
+
 def test_a_controller_in_both_lists_begins_anew(watched):
     watched.at[2] = [lambda: watched.robot.ask("switch", activate=["left"], deactivate=["left"])]
     watched.run(4)

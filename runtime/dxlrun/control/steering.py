@@ -143,7 +143,7 @@ class Steering:
     def _obey(self, command: Command, time_ns: int) -> str:
         try:
             return self._do(command, time_ns)
-        except msgspec.MsgspecError as error:
+        except (msgspec.MsgspecError, UnicodeDecodeError) as error:
             return f"its data does not fit: {error}"
 
     def _do(self, command: Command, time_ns: int) -> str:
