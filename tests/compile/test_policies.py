@@ -32,7 +32,7 @@ MISTAKES = [
     ("exit_timeout: 6 s\n", "exit_timeout: 3 s\n", "on_exit may take"),
     ("active: false\n", "active: false\n    fallback: §spar\n", "the fallback spar of spare is no controller of the file"),
     ("active: false\n", "active: false\n    fallback: §spare\n", "spare is its own fallback"),
-    ("active: false\n", "active: false\n    fallback: §arms\n", "the fallback arms of spare is active from the start"),
+    ("rate: 25}", "rate: 25, fallback: §arms}", "the fallback arms of states is active from the start"),
     ("rate: 25}", "rate: 25, fallback: §spare}", "the fallback spare of states claims joints of arms, which goes on"),
 ]  # fmt: skip
 

@@ -192,6 +192,8 @@ def _fallbacks(description: Description, compiled: dict[str, CompiledController]
             problems.error(mark, what, suggestion(entry.fallback, tuple(robot.controllers)))
         elif entry.fallback == name:
             problems.error(mark, f"{name} is its own fallback", "name another controller, or take it out")
+        elif not entry.active:
+            continue  # who is active when it fails depends on what is switched
         elif other.active:
             what = f"the fallback {entry.fallback} of {name} is active from the start"
             problems.error(mark, what, f"write active: false in {entry.fallback}: it takes over later")
