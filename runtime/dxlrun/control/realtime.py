@@ -13,6 +13,7 @@ from pathlib import Path
 from dxlrun.control import memory
 from dxlrun.control.loop_plan import Policy, SchedulerPlan
 from dxlrun.control.rights import allow, user
+from dxlrun.events import EventCode, EventSink, Severity
 
 _PR_SET_TIMERSLACK = 29  # linux/prctl.h
 _TASKS = Path("/proc/self/task")
@@ -52,7 +53,7 @@ def apply(plan: SchedulerPlan) -> tuple[Grant, ...]:
         _attempt("memory in place", _keep_memory),
         *((lock_memory(),) if plan.lock_memory else ()),
         *((_attempt("idle latency", _wake_at_once),) if plan.idle_latency else ()),
-        *((set_policy(plan.policy, plan.priority),) if plan.policy != "other" else ()),
+        *((_policy_of(plan),) if plan.policy != "other" else ()),
     )
 
 
@@ -62,6 +63,13 @@ def apply_to_guardian(priority: int, lock: bool) -> tuple[Grant, ...]:
         *((lock_memory(),) if lock else ()),
         *((set_policy("round_robin", priority),) if priority else ()),
     )
+
+
+def tell(grants: Sequence[Grant], source: str, events: EventSink) -> None:
+    """Leave in the log what became of the wishes of a process."""
+    for grant in grants:
+        severity = Severity.INFO if grant.granted else Severity.WARNING
+        events.emit(EventCode.SCHEDULER, severity, source, grant.told)
 
 
 def freeze_collector() -> Grant:
@@ -75,14 +83,26 @@ def freeze_collector() -> Grant:
     return Grant("collector", True, "the garbage collector is frozen and off")
 
 
-def set_policy(policy: Policy, priority: int) -> Grant:
-    """Give the calling thread a real-time policy; a child process does not inherit it; never raises."""
-    return _attempt("scheduler", lambda: _set_policy(policy, priority))
+def set_policy(policy: Policy, priority: int, limit: int | None = None) -> Grant:
+    """Give the calling thread a real-time policy; a child process does not inherit it; never raises.
+
+    `limit` is the rtprio that a refusal asks for, where other processes need more than `priority`.
+    """
+    return _attempt("scheduler", lambda: _set_policy(policy, priority, limit or priority))
 
 
 def lock_memory() -> Grant:
     """Lock all memory, now and later, but only where later allocations cannot fail by it; never raises."""
     return _attempt("locked memory", _lock_memory)
+
+
+def _policy_of(plan: SchedulerPlan) -> Grant:
+    return set_policy(plan.policy, plan.priority, guardian_priority(plan))
+
+
+def guardian_priority(plan: SchedulerPlan) -> int:
+    """Return the priority of the guardian, one above the loop's; 0: none."""
+    return 0 if plan.policy == "other" else min(plan.priority + 1, 99)
 
 
 def thread_count() -> int:
@@ -101,7 +121,7 @@ def _attempt(wish: str, act: Callable[[], Grant]) -> Grant:
         return Grant(wish, False, f"{wish}: this system does not offer it ({error})")
 
 
-def _set_policy(policy: Policy, priority: int) -> Grant:
+def _set_policy(policy: Policy, priority: int, limit: int) -> Grant:
     if policy == "other":
         return Grant("scheduler", True, "the ordinary scheduler was asked for")
     wished = os.SCHED_FIFO if policy == "fifo" else os.SCHED_RR
@@ -113,7 +133,7 @@ def _set_policy(policy: Policy, priority: int) -> Grant:
             False,
             f"scheduler {policy} {priority} was refused, it runs with ordinary priority and any busy "
             "program may delay it by milliseconds",
-            f"allow it with `{allow('rtprio', min(priority + 1, 99))}` {_AGAIN}",
+            f"allow it with `{allow('rtprio', limit)}` {_AGAIN}",
         )
     return Grant("scheduler", True, f"scheduler {policy}, priority {priority}")
 

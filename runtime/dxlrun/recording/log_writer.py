@@ -39,6 +39,8 @@ class LogWriter:
     def __init__(self, path: Path, header: LogHeader) -> None:
         self.header = header
         self.error: str | None = None
+        self.late_metadata: dict[str, dict[str, str]] = {}
+        """Written at the end, beside the header's: what became known in the run."""
         self._layout = CycleLayout(header.joints, [c.name for c in header.controllers])
         self._file = LogFile(path)
         self._messages = self._lost = self._unwritten = self._last_ns = 0
@@ -279,6 +281,8 @@ class LogWriter:
     def _finish(self) -> None:
         self._writer.flush()  # type: ignore[no-untyped-call]  # mcap does not annotate it
         self._mark_whole()
+        for name, record in sorted(self.late_metadata.items()):
+            self._writer.add_metadata(name, dict(sorted(record.items())))
         self._writer.add_metadata(
             schemas.SUMMARY_NAME, {"messages": str(self._messages), "gaps": str(self._lost)}
         )
