@@ -212,9 +212,13 @@ def _json(content: Mapping[str, object]) -> bytes:
     try:
         body = json.dumps(content, default=_plain, allow_nan=False).encode()
     except (TypeError, ValueError, RecursionError) as error:
-        raise Refused(f"this cannot be sent: {error}; use numbers, texts, lists and mappings") from error
+        raise Refused(
+            f"this cannot be sent: {error}; use numbers, texts, lists and mappings", wrong_input=True
+        ) from error
     if len(body) > MOST_BYTES:
-        raise Refused(f"{len(body)} bytes are too many, at most {MOST_BYTES} are taken at once")
+        raise Refused(
+            f"{len(body)} bytes are too many, at most {MOST_BYTES} are taken at once", wrong_input=True
+        )
     return body
 
 
