@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun import RemoteRobot, connect, running
+from dxlrun import DxlrunError, RemoteRobot, connect, running
 from dxlrun.cli.inputs import COMMANDS_WHILE_IT_RUNS
 
 ROOT = Path(__file__).parents[2]
@@ -126,20 +126,22 @@ def test_the_list_has_every_controller_and_what_it_takes(dxlrun, torso: RemoteRo
     said = dxlrun("list")
     assert (said.code, said.err) == (0, "")
     assert said.out.startswith("bioloid_torso: 50 Hz, ")
-    rows = {line.split()[0]: " ".join(line.split()) for line in said.out.splitlines() if line.strip()}
-    joints = "head_pitch_joint, head_yaw_joint"
-    assert rows["head"] == f"head active 50 Hz posvel: positions, velocities {joints}"
-    assert rows["left_arm"].startswith(
-        "left_arm active 50 Hz trajectory: points, [start_in] left_shoulder_swi"
-    )
-    assert rows["whole_body_posvel"].startswith("whole_body_posvel inactive 50 Hz")
-    assert rows["joint_state_broadcaster"] == "joint_state_broadcaster active 50 Hz nothing"
+    (shown,) = re.findall(r"    dxlrun list\n\n```\n(.*?)```", PAGE, re.DOTALL)
+    assert said.out.split("\n", 1)[1].split() == shown.split("\n", 1)[1].split()
 
 
 def test_the_list_as_json_is_what_the_robot_tells(dxlrun, torso: RemoteRobot) -> None:
     (told,) = json.loads(dxlrun("list", "--json", "--robot", "bioloid_torso").out)
     assert (told["name"], told["robot"], told["rate"]) == ("bioloid_torso", "bioloid_torso", 50.0)
     assert [one["name"] for one in told["controllers"]] == list(controllers(torso))
+
+
+def test_a_robot_that_went_away_is_said(dxlrun, torso: RemoteRobot, monkeypatch: pytest.MonkeyPatch) -> None:
+    def gone(robot: RemoteRobot) -> None:
+        raise DxlrunError(f"{robot.name} does not answer any more")
+
+    monkeypatch.setattr(RemoteRobot, "info", gone)
+    assert dxlrun("list") == (1, "", "dxlrun: bioloid_torso does not answer any more\n")
 
 
 # Steering
@@ -168,6 +170,8 @@ def test_send_takes_a_file(dxlrun, torso: RemoteRobot, tmp_path: Path) -> None:
         ("send joint_state_broadcaster go", "joint_state_broadcaster takes no command go; there is none"),
         ("send head posvel positions=[30,0]", "positions[0]: 30 has no unit; write an angle with its unit"),
         ("send head posvel positions=[30deg,0deg]", "posvel of head: velocities: Field required"),
+        ("send joint_state_broadcaster go now=.nan", "takes no command go"),
+        ("send head posvel positions=[1deg] force=.nan", "this cannot be sent"),
         ("send head posvel positions=[1deg] velocities=[1rpm]", "1 positions for 2 joints"),
         (
             "switch --activate hed --deactivate left_arn",
@@ -264,6 +268,16 @@ def test_the_log_can_say_which_verb_it_was(dxlrun, torso: RemoteRobot) -> None:
         tick.wait(0.01)
     assert len(texts) == 1
     assert texts[0].endswith("from dxlrun rate")
+
+
+def test_stop_waits_for_the_end_unless_told(
+    dxlrun, torso: RemoteRobot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waits: list[bool] = []
+    monkeypatch.setattr(RemoteRobot, "stop", lambda robot, wait: waits.append(wait))
+    assert dxlrun("stop").out == "bioloid_torso has ended\n"
+    assert dxlrun("stop", "--no-wait").out == "bioloid_torso is ending\n"
+    assert waits == [True, False]
 
 
 # The pages

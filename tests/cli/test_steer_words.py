@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.cli.robots import command, headline, state
+from dxlrun.cli.robots import command, controllers, headline, state
 from dxlrun.cli.written import Written, is_played
 
 NOBODY = "dxlrun: no robot runs that could be steered; `dxlrun ROBOT.yaml` starts one"
@@ -145,3 +145,14 @@ def test_a_list_says_how_a_robot_is() -> None:
     ]  # fmt: skip
     assert command("go", {"properties": {"a": {}, "b": {}}, "required": ["a"]}) == "go: a, [b]"
     assert command("reset", {}) == "reset"
+
+
+@pytest.mark.parametrize("width", [20, 60, 200])
+def test_no_name_is_broken_on_a_narrow_terminal(width: int) -> None:
+    joints = [f"a_rather_long_name_of_joint_{number}" for number in range(8)]
+    arm = {"name": "arm", "active": True, "held": False, "rate": 50.0, "takes": {}, "joints": joints}
+    head = {**arm, "name": "head", "command": (), "takes": {"go": {}, "stop": {}}}
+    first, below, second = controllers({"controllers": [arm | {"command": ("position",)}, head]}, width)
+    assert (first, second) == ("  arm   active        50 Hz", "  head  active        50 Hz  go; stop")
+    assert below.split() == ["moves", *", ".join(joints).split()]
+    assert max(map(len, below.splitlines())) < max(width, 45)

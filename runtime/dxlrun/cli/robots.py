@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
+import textwrap
+from collections.abc import Iterator, Mapping
 
 from dxlrun.cli.flags import Flag, JsonFlag
 from dxlrun.cli.terminal import out, say_error
 from dxlrun.compile.problems import suggestion
 from dxlrun.errors import DxlrunError, InputError
-
-if TYPE_CHECKING:
-    from rich.table import Table
 
 
 def list_robots(*, robot: str | None = None, as_json: JsonFlag = False, debug: Flag = False) -> int:
@@ -46,7 +43,8 @@ def list_robots(*, robot: str | None = None, as_json: JsonFlag = False, debug: F
         return code
     for info in told:
         console.print(headline(info), markup=False, soft_wrap=True)
-        console.print(controllers(info))
+        for line in controllers(info, console.width):
+            console.print(line, markup=False, soft_wrap=True)
     if not names:
         console.print("no robot runs that could be steered; `dxlrun ROBOT.yaml` starts one", soft_wrap=True)
     return code
@@ -60,25 +58,24 @@ def headline(info: Mapping[str, object]) -> str:
     return f"{info['name']}: {info['rate']:g} Hz{paused}, {info['cycles']} cycles, {periods}, {log}"
 
 
-def controllers(info: Mapping[str, object]) -> Table:
-    """Return one row a controller; on a narrow terminal the cells are folded, never cut."""
-    from rich import box
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(box=box.SIMPLE_HEAD)
-    for name in ("controller", "state"):
-        table.add_column(name, overflow="fold")
-    table.add_column("rate", justify="right", overflow="fold")
-    for name in ("takes", "moves, in this order"):
-        table.add_column(name, overflow="fold")
+def controllers(info: Mapping[str, object], width: int) -> Iterator[str]:
+    """Yield a line for each controller, and below it its joints in their order, wrapped to the terminal."""
     rows = info["controllers"]
-    for one in rows if isinstance(rows, list) else []:
-        joints = ", ".join(one["joints"]) if one["command"] else "nothing"
-        takes = "\n".join(command(kind, schema) for kind, schema in one["takes"].items())
-        cells = (one["name"], state(one), f"{one['rate']:g} Hz", takes, joints)
-        table.add_row(*(Text(cell) for cell in cells))
-    return table
+    told = rows if isinstance(rows, list) else []
+    longest = max((len(one["name"]) for one in told), default=0)
+    for one in told:
+        takes = "; ".join(command(kind, schema) for kind, schema in one["takes"].items())
+        line = f"  {one['name']:{longest}}  {state(one):8}  {one['rate']:6g} Hz  {takes}"
+        yield line.rstrip()
+        if one["command"]:  # who only looks has no joints of its own
+            yield textwrap.fill(
+                "moves " + ", ".join(one["joints"]),
+                max(width - 1, 20),
+                initial_indent="      ",
+                subsequent_indent="      ",
+                break_long_words=False,
+                break_on_hyphens=False,
+            )
 
 
 def state(controller: Mapping[str, object]) -> str:
