@@ -216,7 +216,8 @@ def check_pose(robot: VirtualRobot) -> None:
         sent = goals(robot, servo)
         assert sent[-1][1] == ticks
         moving = [(t, now) for (t, now), (_, after) in itertools.pairwise(sent) if now != after]
-        way, time_s = abs(ticks - moving[0][1]) * TICK, (sent[-1][0] - moving[0][0]) * 1e-9
+        there_ns = next(t for t, now in sent if now == ticks)
+        way, time_s = abs(ticks - moving[0][1]) * TICK, (there_ns - moving[0][0]) * 1e-9
         assert time_s > way / math.radians(60) - LATE_S
         steps = [abs(after - now) * TICK for (_, now), (_, after) in itertools.pairwise(sent)]
         assert max(steps) < math.radians(60) * (0.02 + LATE_S) + TICK
