@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TypeVar
@@ -28,7 +27,7 @@ class Allowance:
     """So many a second for each process that asks, and no more (token bucket of a tenth of a second)."""
 
     rate: float
-    now: Callable[[], float] = time.monotonic
+    now: Callable[[], float]
     """Returns the time, s."""
     _left: dict[str, tuple[float, float]] = field(default_factory=dict, init=False)
     """Peer -> what it has left, and since when."""

@@ -15,6 +15,7 @@
 from __future__ import annotations
 
 import math
+import time
 import traceback
 from collections.abc import Awaitable, Callable
 from functools import partial
@@ -51,13 +52,19 @@ Handler: TypeAlias = Callable[[Request], Awaitable[Response]]
 class Gateway:
     """The routes; every wish is checked and prepared here, so that the loop only has to take it."""
 
-    def __init__(self, link: Link, preparation: Preparation, log: str | None) -> None:
+    def __init__(
+        self,
+        link: Link,
+        preparation: Preparation,
+        log: str | None,
+        now: Callable[[], float] = time.monotonic,
+    ) -> None:
         self._link = link
         self._preparation = preparation
         self._log = log
-        self._operations = Allowance(MOST_OPERATIONS)
-        self._set_points = Allowance(MOST_SET_POINTS)
-        self._looks = Allowance(MOST_LOOKS)
+        self._operations = Allowance(MOST_OPERATIONS, now)
+        self._set_points = Allowance(MOST_SET_POINTS, now)
+        self._looks = Allowance(MOST_LOOKS, now)
 
     def app(self) -> Starlette:
         """Return the ASGI application."""
