@@ -160,6 +160,8 @@ class Loop:
         period_ns = round(1e9 / rate)
         if period_ns < self.plan.least_period_ns:
             return f"the buses allow at most {1e9 / self.plan.least_period_ns:.4g} Hz"
+        if refusal := self.plan.policies.refuse_period(period_ns, self.plan.period_ns):
+            return refusal
         if refusal := self.manager.change_period(period_ns):
             return refusal
         self.schedule.change(self._cycle, period_ns)

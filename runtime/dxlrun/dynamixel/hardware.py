@@ -75,10 +75,10 @@ class DynamixelHardware:
         given is taken back, and a note of the exception says whether every servo confirmed that.
         """
         self._survey()
-        if self._restore_torque:
-            self._restore_limits()
         try:
             self._engage()
+            if self._restore_torque:
+                self._restore_limits()
             self._first_states()
         except BaseException as error:  # also an interrupt: nothing may leave here with torque on
             for sentence in self.stop() or (TAKEN_BACK,):

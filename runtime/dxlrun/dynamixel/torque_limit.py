@@ -28,7 +28,10 @@ class TorqueLimits:
 
 
 def restore(plan: BusPlan) -> Program[TorqueLimits]:
-    """Give every servo all of its torque again; nobody has torque yet."""
+    """Give every servo all of its torque again, after its goal is where it stands.
+
+    One that was weak and held may have sagged: with an old goal it would spring back.
+    """
     found = TorqueLimits()
     line = setup_line(plan)
     for servo in plan.servos:
