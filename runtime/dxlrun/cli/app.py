@@ -12,6 +12,7 @@ from cyclopts import App, CycloptsError
 
 from dxlrun.cli.analyze import analyze
 from dxlrun.cli.check import check
+from dxlrun.cli.doctor import doctor
 from dxlrun.cli.models import models
 from dxlrun.cli.replay import replay
 from dxlrun.cli.robots import list_robots
@@ -49,6 +50,7 @@ def build() -> App:
     app.command(replay)
     app.command(schema)
     app.command(models)
+    app.command(doctor)
     app.command(list_robots, name="list", group=RUNNING)
     for verb in (switch, send, rate, pause, resume, load, unload, stop):
         app.command(verb, group=RUNNING)

@@ -205,9 +205,9 @@ def _wake_at_once() -> Grant:
     return Grant("idle latency", True, "cores are kept from deep idle states")
 
 
-def allow_idle_latency() -> str:
-    """Return the command that lets this user keep cores from deep idle states, for good."""
-    rule = f'KERNEL=="cpu_dma_latency", OWNER="{user()}"'
+def allow_idle_latency(who: str = "") -> str:
+    """Return the command that lets a user (this one) keep cores from deep idle states, for good."""
+    rule = f'KERNEL=="cpu_dma_latency", OWNER="{who or user()}"'
     return (
         f"echo '{rule}' | sudo tee /etc/udev/rules.d/70-dxlrun.rules && sudo udevadm control --reload && "
         "sudo udevadm trigger --name-match=cpu_dma_latency"

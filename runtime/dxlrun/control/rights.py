@@ -45,9 +45,9 @@ def lockable_bytes() -> int:
     return _finite(resource.getrlimit(resource.RLIMIT_MEMLOCK)[0], UNLIMITED)
 
 
-def allow(limit: str, value: int | str) -> str:
-    """Return the command that raises a limit of this user from the next log-in on (limits.conf(5))."""
-    return f"echo '{user()} - {limit} {value}' | sudo tee -a {LIMITS}"
+def allow(limit: str, value: int | str, who: str = "") -> str:
+    """Return the command that raises a limit of a user (this one) from the next log-in on, limits.conf(5)."""
+    return f"echo '{who or user()} - {limit} {value}' | sudo tee -a {LIMITS}"
 
 
 def user() -> str:
