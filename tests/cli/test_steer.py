@@ -162,6 +162,18 @@ def test_send_takes_a_file(dxlrun, torso: RemoteRobot, tmp_path: Path) -> None:
     until(torso, "left_elbow_joint", 0.1745)
 
 
+def test_what_no_motion_is_made_of_is_sent_as_it_was_written(
+    dxlrun, torso: RemoteRobot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    grip = {"properties": {"positions": {}, "force": {}}}
+    hand = {"controllers": [{"name": "hand", "takes": {"grip": grip}}]}
+    sent: list[object] = []
+    monkeypatch.setattr(RemoteRobot, "info", lambda robot: hand)
+    monkeypatch.setattr(RemoteRobot, "send", lambda robot, *what: sent.append(what))
+    assert dxlrun("send", "hand", "grip", "positions=[30]", "force=5 N").code == 0
+    assert sent == [("hand", "grip", {"positions": [30], "force": "5 N"})]
+
+
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
