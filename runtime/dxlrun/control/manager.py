@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from dxlrun.clock import Clock
 from dxlrun.commands import CommandSink, NoCommands, TakenCommand
-from dxlrun.control.claims import conflicts
+from dxlrun.control.claims import conflicts, told
 from dxlrun.control.controller import Context, Controller, JointLimits
 from dxlrun.control.loop_plan import ControllerPlan, LoopPlan, ScheduledCommand
 from dxlrun.control.managed import Managed
@@ -175,13 +175,14 @@ class Manager:
         if busy := [name for name in activate if self._named[name].active and name not in leaving]:
             return f"{', '.join(busy)} is active already"
         staying = [one.plan for one in self._managed if one.active and one.plan.name not in leaving]
-        clash = conflicts([*staying, *(self._named[name].plan for name in activate)])
-        return "; ".join(str(conflict) for conflict in clash)
+        return told(conflicts([*staying, *(self._named[name].plan for name in activate)]))
 
     def load(self, plan: ControllerPlan) -> str:
         """Configure one more controller, inactive; return why not. Only while the loop is paused."""
         if plan.name in self._named:
             return f"there is a controller {plan.name} already"
+        if not _fits(plan, self._period_ns):
+            return f"its rate {plan.rate:g} Hz does not divide the loop's {1e9 / self._period_ns:g} Hz"
         index = self._free_index()
         if index >= MOST_CONTROLLERS:
             return f"there are {MOST_CONTROLLERS} controllers, which is the most"
@@ -189,10 +190,11 @@ class Manager:
             return f"the robot has no joint {', '.join(unknown)}"
         begin_ns = self._clock.now_ns()
         try:
-            managed = self._configured(index, replace(plan, active=False))
+            every = _every(plan, self._period_ns)
+            managed = self._configured(index, replace(plan, active=False, every=every))
         except (ControllerFault, PlugInError) as error:
             return str(error)
-        managed.pace(self._period_ns, _every(plan, self._period_ns))
+        managed.pace(self._period_ns, every)
         managed.wait_for(self._lost)
         self._managed = (*self._managed[:index], managed, *self._managed[index + 1 :])
         self._named[plan.name] = managed
@@ -205,7 +207,8 @@ class Manager:
         The log shows each controller by its place.
         """
         for index in range(len(self._plan.controllers), len(self._managed)):
-            if self._managed[index].plan.name not in self._named:
+            there = self._managed[index]
+            if self._named.get(there.plan.name) is not there:  # the name may live on in another place
                 return index
         return len(self._managed)
 
@@ -238,6 +241,11 @@ class Manager:
     def active(self) -> tuple[str, ...]:
         """Names of the active controllers, in the order of their updates."""
         return tuple(managed.plan.name for managed in self._managed if managed.active)
+
+    @property
+    def plans(self) -> tuple[ControllerPlan, ...]:
+        """The plans of all controllers by their places, which are their bits in the record's masks."""
+        return tuple(managed.plan for managed in self._managed)
 
     def deactivate(self, time_ns: int) -> None:
         """Deactivate whoever is active, the last one first; raises nothing, a fault is in `fault`."""
@@ -339,7 +347,7 @@ class Manager:
         return Context(
             name=plan.name,
             joints=plan.joints,
-            period_ns=plan.every * self._plan.period_ns,
+            period_ns=plan.every * self._period_ns,
             limits=JointLimits(
                 lower=np.array([joint.lower for joint in joints], dtype=np.float64),
                 upper=np.array([joint.upper for joint in joints], dtype=np.float64),
