@@ -231,6 +231,33 @@ def test_places_of_unloaded_controllers_are_used_again(watched):
     assert set(robot.inbox.answers.values()) == {""}
 
 
+def test_a_controller_is_loaded_into_the_first_free_place_under_whatever_name(watched):
+    robot = watched.robot
+
+    def ask(kind, name):
+        wish = {"controller": name} if kind == "unload" else loaded() | {"name": name}
+        return lambda: robot.ask(kind, **wish)
+
+    steps = ("load", "a"), ("load", "b"), ("unload", "a"), ("unload", "b"), ("load", "b"), ("load", "c")
+    watched.at[1] = [lambda: robot.ask("pause"), *(ask(*step) for step in steps)]
+    watched.at[2] = [lambda: robot.ask("switch", activate=["c"], deactivate=["left"])]
+    watched.run(4)
+    assert set(robot.inbox.answers.values()) == {""}
+    assert watched.active()[2:] == [0b010010] * 2
+
+
+def test_a_controller_is_loaded_with_the_period_that_the_loop_has_now(watched):
+    robot = watched.robot
+    watched.at[1] = [lambda: robot.ask("rate", rate=100.0), lambda: robot.ask("pause")]
+    watched.at[2] = [
+        lambda: robot.ask("load", **loaded() | {"rate": 30.0}),
+        lambda: robot.ask("load", **loaded() | {"rate": 25.0}),
+    ]
+    watched.run(4)
+    assert robot.inbox.answers == {1: "", 2: "", 3: "its rate 30 Hz does not divide the loop's 100 Hz", 4: ""}
+    assert robot.manager._named["extra"]._context.period_ns == 40_000_000
+
+
 def test_a_fallback_takes_over_in_the_cycle_of_the_fault(make_robot):
     watched = Watched(make_robot, left={"fallback": "careful"})
     robot = watched.robot
