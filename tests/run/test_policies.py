@@ -257,6 +257,18 @@ def test_controllers_are_deactivated_before_a_policy_moves(
     assert all(mask == 0b11 for mask, _ in seen[: len(active)])
 
 
+def test_who_asks_for_something_during_a_policy_is_told_that_the_run_ends(
+    built: Callable[..., VirtualRobot], acts: dict[str, Act]
+) -> None:
+    robot = built(on_exit=STEPS["pose"])
+    stop_signal(robot, acts)
+    switch = Command(1, LOOP, "switch", b'{"deactivate":["pair"]}', "anna")
+    robot.buses[0].at(START_NS + 100_000_000, lambda: robot.inbox.waiting.append(switch))
+    robot.run()
+    assert robot.inbox.answers == {1: "the run is ending"}
+    check_pose(robot)
+
+
 def test_a_joint_that_cannot_reach_its_pose_does_not_keep_the_robot_from_its_end(
     built: Callable[..., VirtualRobot], acts: dict[str, Act]
 ) -> None:

@@ -10,6 +10,12 @@ from typing import Any
 
 import pytest
 
+from dxlrun.events import Severity
+from dxlrun.guardian import LastHand
+from dxlrun.heartbeat import Heartbeat, Phase
+from dxlrun.run_processes import Memory, guardian_job
+from dxlrun.testing import plan_of
+
 Start = Callable[..., Any]
 Limp = Callable[[Any], bool]
 POLICIES = """\
@@ -77,3 +83,22 @@ def test_the_guardian_holds_a_robot_whose_loop_is_gone_when_the_policy_says_so(
     assert "the loop's process ended by itself (signal SIGKILL)" in err
     assert "torque stays on, as the policy says" in err
     assert not all_limp(run)
+
+
+@pytest.mark.parametrize(
+    ("phase", "holds"), [(Phase.SETUP, False), (Phase.RUNNING, True), (Phase.STOPPING, False)]
+)
+def test_the_guardian_holds_only_a_robot_that_was_running(
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, phase: Phase, holds: bool
+) -> None:
+    """In a set-up, and while torque is switched off, some servos have torque and others have not."""
+    robot = tmp_path / "holding.yaml"
+    robot.write_text((tmp_path / "pair.yaml").read_text() + "policies: {on_fault: hold}\n")
+    plan = plan_of(robot)
+    memory = Memory.create(plan)
+    Heartbeat(memory.heartbeat).enter(phase)
+    limp: list[str] = []
+    monkeypatch.setattr(LastHand, "limp", lambda hand, ports, how, severity: limp.append(how) or [how])
+    said = LastHand(guardian_job(plan, {}, memory, take_over=False)).end((), "it died", Severity.ERROR)
+    assert bool(limp) is not holds
+    assert ("torque stays on" in " ".join(said)) is holds

@@ -233,6 +233,7 @@ class Loop:
         record.read_ns = now_ns()
         self.manager.begin()
         if self._motion:
+            self.steering.refuse("the run is ending")
             self._motion.command()
         else:
             self._command(cycle, schedule.time_ns(woken_ns))

@@ -105,6 +105,11 @@ class Steering:
             self._expire()
         return count
 
+    def refuse(self, why: str) -> None:
+        """Answer what waits without doing it; it is not in the log, as it changes nothing."""
+        for command in self.inbox.take():
+            self.inbox.answer(command.number, why)
+
     def _log(self, command: Command) -> None:
         record = self.record
         self.taken.take(
