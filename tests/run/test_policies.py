@@ -194,6 +194,8 @@ def test_each_policy_is_done_on_each_trigger(  # noqa: PLR0917  fixtures
     trigger(robot, acts)
     result = robot.run()
     assert result.reason == reason
+    if name in ("on_lost_servo", "on_stale_command"):
+        assert f"; {name}: " in result.detail
     assert robot.clock.now_ns() < START_NS * 2 + 4_500_000_000
     if steps in ("limp", "pose"):
         assert not any(torque(robot).values())
