@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from dxlrun.cli.inputs import COMMANDS_WHILE_IT_RUNS
 from dxlrun.compile import compile_files
 from dxlrun.testing import simulated_robot
 
@@ -19,6 +20,7 @@ README = (ROOT / "README.md").read_text()
 BIN = Path(sys.executable).parent
 COMMANDS = [line.strip() for line in README.splitlines() if line.startswith("    ")]
 RUNS = [line for line in COMMANDS if line.startswith("dxlrun") and "/dev/tty" not in line and "*" not in line]
+RUNS = [line for line in RUNS if line.split()[1] not in COMMANDS_WHILE_IT_RUNS]  # tests/cli/test_steer.py
 
 
 def blocks(language: str) -> list[str]:
@@ -84,9 +86,10 @@ def test_the_robot_file_runs(tmp_path: Path) -> None:
 
 
 def test_the_controller_moves_the_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (controller,) = (block for block in blocks("python") if "class Wave" in block)
     (tmp_path / "my_package").mkdir()
     (tmp_path / "my_package/__init__.py").touch()
-    (tmp_path / "my_package/wave.py").write_text(blocks("python")[0])
+    (tmp_path / "my_package/wave.py").write_text(controller)
     info = tmp_path / "my_package-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my-package\nVersion: 1.0\n")

@@ -1,4 +1,4 @@
-"""dxlrun: what a plug-in's author needs, and nothing else.
+"""dxlrun: what the author of a plug-in needs, and who steers a running robot; nothing else.
 
 `import dxlrun` is light: each name is imported when it is first used, so that neither numpy nor pydantic is
 loaded for a command line that only prints its help.
@@ -29,9 +29,11 @@ if TYPE_CHECKING:
         PlugInError,
         PortError,
         ProcessFault,
+        Refused,
         StartUpError,
     )
     from dxlrun.interfaces import Commands, Floats, States
+    from dxlrun.remote.client import RemoteRobot, Stream, connect, running
 
 __all__ = [
     "CONTRACT_VERSION",
@@ -54,9 +56,14 @@ __all__ = [
     "PlugInError",
     "PortError",
     "ProcessFault",
+    "Refused",
+    "RemoteRobot",
     "StartUpError",
     "States",
+    "Stream",
+    "connect",
     "hookimpl",
+    "running",
 ]
 
 _ROOMS = {
@@ -79,9 +86,11 @@ _ROOMS = {
         "PlugInError",
         "PortError",
         "ProcessFault",
+        "Refused",
         "StartUpError",
     ),
     "dxlrun.interfaces": ("Commands", "Floats", "States"),
+    "dxlrun.remote.client": ("RemoteRobot", "Stream", "connect", "running"),
 }
 _HOME = {name: room for room, names in _ROOMS.items() for name in names}
 

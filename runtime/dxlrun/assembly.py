@@ -17,6 +17,7 @@ from dxlrun.cycle import CycleLayout, CycleRecord
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.port import Ports
 from dxlrun.events import EventSink
+from dxlrun.inbox import Inbox, NoInbox
 from dxlrun.packets import PacketSink
 
 
@@ -67,6 +68,9 @@ def assemble(
     beat: Callable[[], None],
     stop: StopFlag,
     take_over: bool = False,
+    inbox: Inbox | None = None,
+    patience: Callable[[int], None] = lambda _: None,
+    pace: Callable[[int], None] = lambda _: None,
 ) -> Robot:
     """Build everything between the ports and the log; configures the controllers, sends nothing."""
     record = CycleRecord(cycle_layout(plan))
@@ -80,6 +84,7 @@ def assemble(
         sinks.events,
         beat,
         take_over=take_over,
+        restore_torque=plan.loop.policies.reduces_torque,
     )
     manager = Manager(plan.loop, plugins, record, sinks.events, clock, commands=sinks.commands)
     gate = Gate(plan.loop, record, sinks.events)
@@ -94,6 +99,11 @@ def assemble(
         plan=plan.loop,
         beat=beat,
         stop=stop,
+        inbox=inbox or NoInbox(),
+        commands=sinks.commands,
+        patience=patience,
+        pace=pace,
+        overrun_hooks=plugins.overrun_hooks,
     )
     manager.configure()
     return Robot(hardware, manager, loop, record)

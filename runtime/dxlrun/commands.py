@@ -1,4 +1,4 @@
-"""Commands on their way to the log: what was handed to controllers, in which cycle; an input of the run."""
+"""Commands on their way to the log: what cycles took for controllers and the loop; an input of the run."""
 
 from __future__ import annotations
 
@@ -6,18 +6,23 @@ import struct
 from dataclasses import dataclass, replace
 from typing import Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from dxlrun.ring import RING_SECONDS, Appender, Payload
 
 COMMAND_SLOT = 512
 """Bytes of one slot of a commands' ring; a longer array takes several slots."""
 
-_HEADER = struct.Struct("<qqqIIHHH2x")
+_HEADER = struct.Struct("<qqqqIIHHH2x")
 _LONGEST_NAME = 64
+_NUMBER = 8
+"""Bytes of a float64."""
 
 
 @dataclass(frozen=True, slots=True)
 class TakenCommand:
-    """One command that a cycle took, for a controller that was active or not."""
+    """One command that a cycle took: for a controller, active or not, or for the loop itself."""
 
     t_ns: int
     """Time of the cycle's wake-up, ns of the run's clock."""
@@ -25,15 +30,44 @@ class TakenCommand:
     planned: int
     """Number of the command in the plan's commands, whose array it is; -1: the array is `data`."""
     controller: str
+    """Empty: the loop itself."""
     kind: str
     origin: str
     """Who asked."""
     data: bytes
-    """Little-endian float64; empty for a planned command."""
+    """Little-endian float64, for the loop JSON; empty for a planned command."""
+    lease_ns: int = 0
+    """For how long a set-point of a stream counts; 0: for ever."""
+
+    @property
+    def for_loop(self) -> bool:
+        """True where no controller but the loop itself is meant."""
+        return not self.controller
+
+    @property
+    def text(self) -> str:
+        """The data as the log's text: JSON for the loop, hexadecimal for what is no array of numbers, else
+        empty. Bytes that are no UTF-8 become escapes that no JSON has: what was refused stays refused."""
+        if self.for_loop:
+            return self.data.decode(errors="backslashreplace")
+        return self.data.hex() if len(self.data) % _NUMBER else ""
+
+    @property
+    def numbers(self) -> NDArray[np.float64]:
+        """The data as the log's array; empty where it is the text."""
+        whole = not self.for_loop and len(self.data) % _NUMBER == 0
+        return np.frombuffer(self.data if whole else b"", dtype="<f8")
+
+
+def data_of(controller: str, text: str, numbers: NDArray[np.float64]) -> bytes:
+    """Return a command's data from its text and its array in the log. Raises ValueError when neither fits."""
+    if controller and text:
+        return bytes.fromhex(text)
+    return numbers.tobytes() if controller else text.encode()
 
 
 class CommandSink(Protocol):
-    """Takes what was handed to controllers; never blocks, never raises."""
+    """Takes what cycles took; never blocks, never raises."""
 
     def take(self, command: TakenCommand) -> None:
         """Record one command."""
@@ -66,7 +100,13 @@ class CommandRing:
         lengths = len(controller), len(kind), len(origin)
         for part in range(pieces):
             head = _HEADER.pack(
-                command.t_ns, command.cycle, command.planned, part, pieces - part - 1, *lengths
+                command.t_ns,
+                command.cycle,
+                command.planned,
+                command.lease_ns,
+                part,
+                pieces - part - 1,
+                *lengths,
             )
             self._writer.append(head + names + command.data[part * room : (part + 1) * room])
 
@@ -103,7 +143,7 @@ class CommandPieces:
 
 def _decode(payload: Payload) -> tuple[TakenCommand, int, int]:
     try:
-        t_ns, cycle, planned, part, remaining, *lengths = _HEADER.unpack_from(payload)
+        t_ns, cycle, planned, lease_ns, part, remaining, *lengths = _HEADER.unpack_from(payload)
     except struct.error as error:
         raise ValueError(f"a command ends inside its header: {error}") from error
     data = bytes(payload[_HEADER.size :])
@@ -114,7 +154,7 @@ def _decode(payload: Payload) -> tuple[TakenCommand, int, int]:
         names.append(data[:length].decode(errors="replace"))
         data = data[length:]
     controller, kind, origin = names
-    return TakenCommand(t_ns, cycle, planned, controller, kind, origin, data), part, remaining
+    return TakenCommand(t_ns, cycle, planned, controller, kind, origin, data, lease_ns), part, remaining
 
 
 def command_slots(period_ns: int, controllers: int) -> int:

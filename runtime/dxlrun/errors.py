@@ -9,6 +9,7 @@ Exception
     ├── StartUpError               a servo is not what the robot file says; no torque was given
     ├── ControllerFault            a controller raised, or broke its contract
     ├── ProcessFault               a process of the run ended or hung
+    ├── Refused                    a running robot does not do what it was asked; 2: a wrong wish
     └── LogError (ValueError)      a log cannot be read
 ```
 """
@@ -74,6 +75,14 @@ class PlugInError(InputError, ImportError):
 
 class PortError(DxlrunError, OSError):
     """A serial line cannot be opened, is held by somebody else, or is gone."""
+
+
+class Refused(DxlrunError):
+    """A running robot does not do what it was asked; the message says why, and how to ask better."""
+
+    def __init__(self, sentence: str, *, wrong_input: bool = False) -> None:
+        super().__init__(sentence)
+        self.exit_code = InputError.exit_code if wrong_input else DxlrunError.exit_code
 
 
 class StartUpError(DxlrunError, RuntimeError):

@@ -53,6 +53,14 @@ class EventCode(IntEnum):
     CONTROLLER_FAULT = 34
     CONTROLLER_SAYS = 35
     """Free text of a controller: goal reached, goal preempted, tolerance violated."""
+    STEERED = 36
+    """The loop did what a client asked of it: switch, rate, pause, resume, load, unload, stop."""
+    STALE_COMMAND = 37
+    """A stream of commands ended without a word; the policy for it begins."""
+    CONTROLLER_LOADED = 38
+    """A controller came or went while the loop was paused; the text has the time that it took."""
+    POLICY = 39
+    """A policy of the robot file begins or ends: what for, and what it does."""
     GATE = 40
     """A command was clamped at the last gate; the text names joint, controller and limit."""
     GUARDIAN = 50

@@ -22,7 +22,8 @@ import msgspec
 
 from dxlrun import process
 from dxlrun.clock import MonotonicClock
-from dxlrun.control.realtime import set_policy
+from dxlrun.control import realtime
+from dxlrun.control.policy_plan import TORQUE_STAYS, Last
 from dxlrun.dynamixel.bus_plan import BusPlan
 from dxlrun.dynamixel.limp import limp
 from dxlrun.dynamixel.port import SerialPort, SerialPorts
@@ -60,6 +61,7 @@ class GuardianJob:
     """How long the loop may take to stop when it is asked to."""
     priority: int
     """Real-time priority of the guardian; 0: none."""
+    lock_memory: bool
     heartbeat: int
     packets: int
     events: int
@@ -68,6 +70,8 @@ class GuardianJob:
     desk: int
     """The loop's unfinished batch of packets."""
     stderr: int
+    last: Last
+    """How the robot is left when the loop is gone in the middle of a run."""
     loop: dict[str, object]
     """The loop's job, but for its port descriptors and its guardian."""
     loop_descriptors: tuple[int, ...]
@@ -82,6 +86,16 @@ class LastHand:
         self._heartbeat = Heartbeat(job.heartbeat)
         self._ring = RingWriter(job.packets)
         self._events = EventRing(RingWriter(job.events), self._clock)
+
+    def end(self, descriptors: Sequence[int], how: str, severity: Severity) -> list[str]:
+        """Leave the robot as the policy for a fault does, without its steps; return that as sentences.
+
+        A robot holds only when it ran: in a set-up some servos have torque and others have not.
+        """
+        if self._job.last == "limp" or self._heartbeat.phase is not Phase.RUNNING:
+            return self.limp(descriptors, how, severity)
+        self.tell(f"{how}; {TORQUE_STAYS}", severity)
+        return [how, TORQUE_STAYS]
 
     def limp(self, descriptors: Sequence[int], how: str, severity: Severity) -> list[str]:
         """Send torque off to every servo; return `how` it came to that, and the result, as sentences."""
@@ -102,6 +116,10 @@ class LastHand:
         )
         self.tell(f"{how}; {result}", Severity.ERROR if silent else severity)
         return [how, result]
+
+    def tell_grants(self, grants: Sequence[realtime.Grant]) -> None:
+        """Put into the log what the operating system granted to this process."""
+        realtime.tell(grants, "guardian", self._events)
 
     def tell(self, text: str, severity: Severity) -> None:
         """Put a sentence into the log."""
@@ -127,19 +145,23 @@ class Guardian:
             for path, bus in zip(self._job.ports, self._job.buses, strict=True)
         ]
         descriptors = [port.fileno() for port in opened]
+        # before the loop is executed, which inherits none of it: whoever starts us is told at once
+        grants = realtime.apply_to_guardian(self._job.priority, self._job.lock_memory)
+        self._hand.tell_grants(grants)
         loop = self._execute(descriptors)
         # whoever asked gets the ports too: should this process die, they are still held, and still open
-        self._control.send({"loop": loop.pid}, descriptors)
-        if self._job.priority:
-            set_policy("round_robin", self._job.priority)
+        self._control.send({"loop": loop.pid, "grants": msgspec.to_builtins(grants)}, descriptors)
         ending = self._watch(loop)
         outcome: list[str] = []
         if ending == "unused":
             outcome = [f"{self._how(ending, loop)}; nothing had been sent to the robot"]
             self._hand.tell(outcome[0], Severity.ERROR)
         elif ending != "done":
-            severity = Severity.WARNING if ending == "cut" else Severity.ERROR
-            outcome = self._hand.limp(descriptors, self._how(ending, loop), severity)
+            how = self._how(ending, loop)
+            if ending == "cut":
+                outcome = self._hand.limp(descriptors, how, Severity.WARNING)
+            else:
+                outcome = self._hand.end(descriptors, how, Severity.ERROR)
         self._control.send({"ended": ending, "outcome": outcome})
 
     def _execute(self, descriptors: list[int]) -> subprocess.Popen[bytes]:
@@ -189,9 +211,12 @@ class Guardian:
         """Return why the loop is not waited for any longer, if it is not."""
         now_ns, phase = self._clock.now_ns(), self._heartbeat.phase
         still_ns = self._still.ns((phase, self._heartbeat.beats), now_ns)
-        if still_ns > patience_ns(phase, self._job.period_ns):
+        if still_ns > self._patience_ns(phase):
             return "hung"
         return "late" if now_ns > self._stop_by_ns else None
+
+    def _patience_ns(self, phase: Phase) -> float:
+        return patience_ns(phase, self._heartbeat.cycle_ns or self._job.period_ns)
 
     def _wish(self) -> Literal["stop", "cut"] | None:
         """Return what the terminal asks; one that is gone cannot ask any more: stop in order."""
@@ -201,7 +226,7 @@ class Guardian:
         return "stop" if messages or self._control.closed else None
 
     def _how(self, ending: Ending, loop: subprocess.Popen[bytes]) -> str:
-        still_ms = patience_ns(self._heartbeat.phase, self._job.period_ns) / 1e6
+        still_ms = self._patience_ns(self._heartbeat.phase) / 1e6
         return {
             "hung": f"the loop stood still for more than {still_ms:.0f} ms and was killed",
             "late": f"the loop did not stop within {self._job.exit_timeout_ns / 1e9:g} s and was killed",

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import Protocol
 
+LOST_CYCLES = 3
+"""A servo that missed so many replies in a row is lost, until it answers again."""
+
 
 class Hardware(Protocol):
     """Joints that can be read and commanded; the arrays (States, goals) are given when it is built."""
@@ -22,6 +25,10 @@ class Hardware(Protocol):
 
     def write(self) -> None:
         """Send the goal arrays."""
+        ...
+
+    def limit_torque(self, fraction: float) -> None:
+        """Let no servo exert more than a fraction of its own limit; the next start-up takes it back."""
         ...
 
     def idle(self, until_ns: int) -> None:

@@ -13,7 +13,7 @@ import os
 from enum import IntEnum, unique
 
 _SIZE = 4096
-_PHASE, _BEATS, _CYCLE, _SKIPPED, _LOOKS = range(5)
+_PHASE, _BEATS, _CYCLE, _SKIPPED, _LOOKS, _CYCLE_NS = range(6)
 
 
 @unique
@@ -26,7 +26,7 @@ class Phase(IntEnum):
     RUNNING = 2
     STOPPING = 3
     DONE = 4
-    """Torque was switched off by the loop itself, as far as the servos answered."""
+    """The loop itself has left the robot as its policy says: limp, as far as servos answered, or holding."""
 
 
 def create() -> int:
@@ -55,6 +55,10 @@ class Heartbeat:
         self._words[_CYCLE] = cycle
         self._words[_SKIPPED] = skipped
 
+    def may_take(self, cycle_ns: int) -> None:
+        """Show how long a cycle may take from now on, ns: the period, or more while the loop is paused."""
+        self._words[_CYCLE_NS] = cycle_ns
+
     def enter(self, phase: Phase) -> None:
         """Show that a phase begins."""
         self._words[_PHASE] = phase
@@ -82,6 +86,11 @@ class Heartbeat:
     def cycles(self) -> int:
         """Number of cycles that ran."""
         return self._words[_CYCLE]
+
+    @property
+    def cycle_ns(self) -> int:
+        """How long a cycle may take, ns; 0 while nobody has said it."""
+        return self._words[_CYCLE_NS]
 
     @property
     def skipped(self) -> int:

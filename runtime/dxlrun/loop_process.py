@@ -23,13 +23,16 @@ from dxlrun.commands import CommandRing
 from dxlrun.compile.plan import Plan, from_json
 from dxlrun.control import realtime
 from dxlrun.control.loop import StopFlag
+from dxlrun.control.margin import Pacing
 from dxlrun.control.plugins import load_plugins
+from dxlrun.control.policy_plan import TORQUE_STAYS, Last
 from dxlrun.cycle import CycleRecord
 from dxlrun.dynamixel.hardware import TAKEN_BACK
 from dxlrun.dynamixel.port import SerialPort, SerialPorts
 from dxlrun.errors import DxlrunError, PlugInError
 from dxlrun.events import EventCode, EventRing, Severity
 from dxlrun.heartbeat import Heartbeat, Phase
+from dxlrun.mailbox import Mailbox
 from dxlrun.packets import PacketBatch
 from dxlrun.plurals import counted
 from dxlrun.ring import RingWriter
@@ -50,6 +53,10 @@ class LoopJob:
     events: int
     commands: int
     result: int
+    mailbox: int
+    answers: int
+    grants: int
+    """Where it leaves what the operating system granted."""
     take_over: bool
     ports: tuple[int, ...] = ()
     guardian: int = 0
@@ -66,8 +73,8 @@ class Outcome:
     skipped: int = 0
     sentences: tuple[str, ...] = ()
     """What a person must know, one sentence each."""
-    grants: tuple[str, ...] = ()
-    """What the operating system did not grant."""
+    remarks: tuple[str, ...] = ()
+    """What a person should know beside that."""
     traceback: str = ""
 
 
@@ -139,15 +146,20 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: RingSinks) -> Ou
     ports = SerialPorts(
         [SerialPort(descriptor, bus.port) for descriptor, bus in zip(job.ports, plan.buses, strict=True)]
     )
+    clock = MonotonicClock()
+    pacing = Pacing(clock, plan.loop.scheduler.polling_ns)
     robot = assemble(
         plan,
         load_plugins(_refuse_threads()),
         ports=ports,
-        clock=MonotonicClock(),
+        clock=clock,
         sinks=sinks,
         beat=Pulse(heartbeat, stop),
         stop=stop,
         take_over=job.take_over,
+        inbox=Mailbox(job.mailbox, RingWriter(job.answers)),
+        patience=heartbeat.may_take,
+        pace=pacing,
     )
     heartbeat.enter(Phase.SETUP)
     try:
@@ -156,21 +168,25 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: RingSinks) -> Ou
         sinks.events.emit(EventCode.SETUP, Severity.INFO, "loop", "the set-up was given up on request")
         notes: list[str] = getattr(asked, "__notes__", [])
         return Outcome("stopped", sentences=tuple(note for note in notes if note != TAKEN_BACK))
-    refused: tuple[str, ...] = ()
+    failures: tuple[str, ...] = ()
+    last: Last = "limp"
     try:
         grants = realtime.apply(plan.loop.scheduler)
-        for grant in grants:
-            severity = Severity.INFO if grant.granted else Severity.WARNING
-            sinks.events.emit(EventCode.SCHEDULER, severity, "loop", grant.sentence)
-        refused = tuple(grant.sentence for grant in grants if not grant.granted)
+        heartbeat.beat()
+        grants = (*grants, pacing.measure(plan.loop.period_ns, heartbeat.beat))
+        realtime.tell(grants, "loop", sinks.events)
+        os.pwrite(job.grants, msgspec.json.encode(grants), 0)
         heartbeat.beat()
         heartbeat.enter(Phase.RUNNING)
         result = robot.loop.run()
+        last = result.last
     finally:
-        heartbeat.enter(Phase.STOPPING)
-        failures = robot.hardware.stop()
+        if last == "limp":
+            heartbeat.enter(Phase.STOPPING)
+            failures = robot.hardware.stop()
     detail = (result.detail,) if result.detail else ()
-    return Outcome(result.reason, result.cycles, result.skipped, (*detail, *failures), refused)
+    remarks = (TORQUE_STAYS,) if last == "hold" else ()
+    return Outcome(result.reason, result.cycles, result.skipped, (*detail, *failures), remarks)
 
 
 def main() -> None:

@@ -185,6 +185,14 @@ class RingReader:
         record = self._copy(number)
         return Gap(1) if record is None else record
 
+    def newest(self) -> bytes | None:
+        """Return the newest record and go on behind it; None when there is nothing new, or it was damaged."""
+        head = self._words[_HEAD]
+        if head <= self._next:
+            return None
+        self._next = head
+        return self._copy(head - 1)
+
     def _copy(self, number: int) -> bytes | None:
         start = _HEADER + number % self._slots * self._stride
         word = start // _WORD

@@ -4,23 +4,25 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 
 import msgspec
 
-from dxlrun import heartbeat, process, ring
+from dxlrun import heartbeat, mailbox, process, ring
 from dxlrun.assembly import cycle_layout
 from dxlrun.child import Child
 from dxlrun.commands import COMMAND_SLOT, command_slots
 from dxlrun.compile.plan import Plan, to_json
 from dxlrun.compile.simulated import simulated_bodies, simulated_buses
-from dxlrun.cycle import cycle_slots
+from dxlrun.control.realtime import Grant, guardian_priority
+from dxlrun.cycle import MOST_CONTROLLERS, cycle_slots
 from dxlrun.events import EVENT_SLOT, event_slots
 from dxlrun.guardian import GuardianJob
 from dxlrun.loop_process import LoopJob, Outcome
 from dxlrun.packets import PACKET_SLOT, packet_slots
 from dxlrun.recording.header import LogHeader
+from dxlrun.remote.job import Descriptors, GatewayJob
 from dxlrun.simulation.process import SimulationConfig, encode_config
 
 _GUARDIAN_SLOTS = 1024
@@ -40,6 +42,9 @@ class Memory:
     guardian_packets: int
     guardian_events: int
     result: int
+    mailbox: int
+    answers: int
+    grants: int
     stderr: int
 
     @classmethod
@@ -58,6 +63,9 @@ class Memory:
             guardian_packets=ring.create("guardian-packets", PACKET_SLOT, _GUARDIAN_SLOTS),
             guardian_events=ring.create("guardian-events", EVENT_SLOT, _GUARDIAN_SLOTS),
             result=process.memory_file("dxlrun-result"),
+            mailbox=mailbox.create(MOST_CONTROLLERS),
+            answers=ring.create("answers", mailbox.ANSWER_SLOT, mailbox.ANSWER_SLOTS),
+            grants=process.memory_file("dxlrun-grants"),
             stderr=process.memory_file("dxlrun-stderr"),
         )
 
@@ -67,6 +75,13 @@ class Memory:
             return msgspec.json.decode(process.whole(self.result), type=Outcome)
         except msgspec.MsgspecError:  # nothing, or what was cut short
             return None
+
+    def loop_grants(self) -> tuple[Grant, ...]:
+        """Return what the operating system granted to the loop; nothing before it runs."""
+        try:
+            return msgspec.json.decode(process.whole(self.grants), type=tuple[Grant, ...])
+        except msgspec.MsgspecError:
+            return ()
 
     def rings(self) -> list[dict[str, object]]:
         """Return what the recorder reads, and from whom."""
@@ -118,6 +133,28 @@ def start_recorder(log: Path, header: LogHeader, memory: Memory) -> Child:
     return child
 
 
+def start_gateway(log: Path | None, memory: Memory) -> Child:
+    """Start the gateway; it says where its socket is when it is ready, nobody waits for it.
+
+    Raises OSError when the system has no process left.
+    """
+    shared = Descriptors(
+        memory.heartbeat,
+        memory.cycles,
+        memory.events,
+        memory.guardian_events,
+        memory.mailbox,
+        memory.answers,
+    )
+    job = GatewayJob(memory.plan, shared, str(log.absolute()) if log else None)
+    descriptor = process.memory_file("dxlrun-gateway", msgspec.json.encode(job))
+    inherited = [descriptor, memory.plan, *astuple(shared)]
+    try:
+        return Child("gateway", "dxlrun.remote", ["--job-fd", str(descriptor)], inherited, memory.stderr)
+    finally:
+        os.close(descriptor)
+
+
 def guardian_job(plan: Plan, ports: Mapping[str, str], memory: Memory, *, take_over: bool) -> GuardianJob:
     """Return what the guardian is to do, and through it the loop."""
     loop = LoopJob(
@@ -129,6 +166,9 @@ def guardian_job(plan: Plan, ports: Mapping[str, str], memory: Memory, *, take_o
         memory.events,
         memory.commands,
         memory.result,
+        memory.mailbox,
+        memory.answers,
+        memory.grants,
         take_over,
     )
     scheduler = plan.loop.scheduler
@@ -137,13 +177,15 @@ def guardian_job(plan: Plan, ports: Mapping[str, str], memory: Memory, *, take_o
         ports=tuple(ports.get(bus.name, bus.port) for bus in plan.buses),
         period_ns=plan.loop.period_ns,
         exit_timeout_ns=plan.exit_timeout_ns,
-        priority=0 if scheduler.policy == "other" else min(scheduler.priority + 1, 99),
+        priority=guardian_priority(scheduler),
+        lock_memory=scheduler.lock_memory,
         heartbeat=memory.heartbeat,
         packets=memory.guardian_packets,
         events=memory.guardian_events,
         loop_packets=memory.packets,
         desk=memory.desk,
         stderr=memory.stderr,
+        last=plan.loop.policies.on_fault.last,
         loop=msgspec.to_builtins(loop),
         loop_descriptors=(
             memory.plan,
@@ -154,6 +196,9 @@ def guardian_job(plan: Plan, ports: Mapping[str, str], memory: Memory, *, take_o
             memory.events,
             memory.commands,
             memory.result,
+            memory.mailbox,
+            memory.answers,
+            memory.grants,
             memory.stderr,
         ),
     )

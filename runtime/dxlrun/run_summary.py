@@ -16,6 +16,8 @@ class RunOptions:
     debug: bool = False
     ledger: Path | None = None
     """Where simulated buses write what they saw; None: beside the log, on virtual time nowhere."""
+    gateway: bool = True
+    """Let others steer the run, over a Unix socket."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +32,7 @@ class RunSummary:
     sentences: tuple[str, ...]
     """What went wrong, one sentence each; empty after a good run."""
     remarks: tuple[str, ...] = ()
-    """What the operating system did not grant."""
+    """What the operating system did not grant, and what went wrong beside the robot."""
     log: str | None = None
     messages: int = 0
     """Messages in the log."""

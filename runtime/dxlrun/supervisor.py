@@ -13,14 +13,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+import msgspec
 from rich.console import Console
 from rich.status import Status
 
 from dxlrun import process
 from dxlrun.child import END_TIMEOUT_S, Child
 from dxlrun.compile.plan import Plan
+from dxlrun.control.realtime import Grant
 from dxlrun.errors import ProcessFault
 from dxlrun.events import Severity
+from dxlrun.grant_table import ProcessGrant, granted_text, refusals, show_grants
 from dxlrun.guardian import GuardianJob, LastHand
 from dxlrun.heartbeat import Heartbeat, Phase, Standstill
 from dxlrun.loop_process import Outcome
@@ -29,6 +32,7 @@ from dxlrun.run_log import discard_log, epoch_offset_ns, ledger_of, log_header, 
 from dxlrun.run_processes import (
     Memory,
     guardian_job,
+    start_gateway,
     start_guardian,
     start_recorder,
     start_simulation,
@@ -70,9 +74,14 @@ class _Run:
     options: RunOptions
     memory: Memory
     signals: _Signals
+    out: Console
     simulation: Child | None = None
     recorder: Child | None = None
     guardian: Child | None = None
+    gateway: Child | None = None
+    socket: Path | None = None
+    """Where the gateway listens; None before it does."""
+    remarks: list[str] = field(default_factory=list)
     job: GuardianJob | None = None
     loop: int | None = None
     """A pidfd of the loop's process; None before there is one, and after it was seen to be gone."""
@@ -81,6 +90,14 @@ class _Run:
     ended: Mapping[str, object] | None = None
     """What the guardian said at the end."""
     messages: int = 0
+    guardian_grants: tuple[Grant, ...] = ()
+    grants: tuple[ProcessGrant, ...] = ()
+    """What the operating system granted, once the loop runs."""
+    steerable: bool = field(init=False)
+    """False when nobody wants a gateway, and after it ended."""
+
+    def __post_init__(self) -> None:
+        self.steerable = self.options.gateway and self.plan.gateway
 
     def start(self) -> Child:
         """Start everything in order, return the guardian; raises PortError or ProcessFault."""
@@ -97,7 +114,9 @@ class _Run:
         others = [child for child in (self.simulation, self.recorder) if child]
         self.job = guardian_job(self.plan, ports, self.memory, take_over=self.options.take_over)
         self.guardian = start_guardian(self.job, others)
-        loop = self.guardian.ready()["loop"]
+        ready = self.guardian.ready()
+        loop = ready["loop"]
+        self.guardian_grants = msgspec.convert(ready["grants"], type=tuple[Grant, ...])
         with suppress(ProcessLookupError):  # the guardian has reaped it already, and knows what to do
             self.loop = os.pidfd_open(int(str(loop)))
         return self.guardian
@@ -118,6 +137,8 @@ class _Run:
                 asked = self.signals.count
                 guardian.line.send({"stop": True} if asked == 1 else {"cut": True})
             show(heartbeat)
+            self._look_at_grants()
+            self._look_after_gateway(heartbeat)
             message = guardian.poll(_POLL_S)
             if message and "ended" in message:
                 self.ended = message
@@ -125,6 +146,50 @@ class _Run:
                 self.sentences.append("the guardian did not look after the loop any more and was killed")
                 guardian.kill()
                 break
+
+    def _look_at_grants(self) -> None:
+        """Show what the operating system granted, and let the log keep it, once the loop has said it."""
+        loop = () if self.grants else self.memory.loop_grants()
+        if loop:
+            self.grants = (
+                *(ProcessGrant("loop", grant) for grant in loop),
+                *(ProcessGrant("guardian", grant) for grant in self.guardian_grants),
+            )
+            show_grants(self.grants, self.out)
+            if self.recorder:
+                self.recorder.line.send({"metadata": {"granted": granted_text(self.grants)}})
+
+    def _look_after_gateway(self, heartbeat: Heartbeat) -> None:
+        """Start it when the loop runs, so that nothing waits for it; without it the robot goes on."""
+        if self.gateway is None:
+            if self.steerable and heartbeat.phase is Phase.RUNNING:
+                try:
+                    self.gateway = start_gateway(self.log, self.memory)
+                except OSError as error:
+                    self._without_gateway(f"did not start ({error.strerror or error})")
+        elif message := self.gateway.poll(0):
+            if "socket" in message:
+                self.socket = Path(str(message["socket"]))
+            else:
+                self._without_gateway(f"did not start ({message.get('error')})")
+        elif self.gateway.line.closed:
+            self._without_gateway("ended")
+
+    def _without_gateway(self, what: str) -> None:
+        """Say that nobody can steer the run any more, and start no other gateway."""
+        self.steerable = False
+        self.remarks.append(f"the gateway {what}: the run goes on, and nobody can steer it")
+        self._end_gateway()
+
+    def _end_gateway(self) -> None:
+        """End the gateway, which keeps nothing, and remove its socket."""
+        if self.gateway:
+            message = self.gateway.poll(0) or {}
+            self.gateway.kill()
+            self.gateway = None
+            place = self.socket or message.get("socket")
+            if place is not None:
+                Path(str(place)).unlink(missing_ok=True)
 
     def _without_guardian(self, loop: int, guardian: Child, job: GuardianJob) -> None:
         """The guardian is gone: the kernel told the loop to stop; see that it does, or cut torque here."""
@@ -138,13 +203,16 @@ class _Run:
         phase = Heartbeat(self.memory.heartbeat).phase
         self.sentences.append("the guardian ended in the middle of the run")
         if phase is Phase.DONE:
-            self.sentences.append("the loop stopped and switched torque off")
+            self.sentences.append("the loop stopped and left the robot as its policy says")
         elif phase is not Phase.LOADING:
             how = "the loop ended too" if gone else "the loop did not stop and was killed"
-            self.sentences += LastHand(job).limp(guardian.line.descriptors, how, Severity.ERROR)
+            hand = LastHand(job)
+            leave = hand.limp if self.signals.count > max(asked, 1) else hand.end
+            self.sentences += leave(guardian.line.descriptors, how, Severity.ERROR)
 
     def end(self) -> None:
-        """End what is left, in order: guardian, recorder, simulated bus."""
+        """End what is left, in order: guardian, recorder, simulated bus, gateway."""
+        self._look_at_grants()
         if self.guardian:
             self.guardian.end()
             if self.loop is not None and self.ended is None and self.job is not None:
@@ -154,6 +222,7 @@ class _Run:
             self._end_recorder(self.recorder)
         if self.simulation:
             self.simulation.end()
+        self._end_gateway()  # the last one: when its socket is gone, the log is closed
 
     def _end_recorder(self, recorder: Child) -> None:
         """Let the recorder drain the rings and close the log; say so when it could not."""
@@ -188,7 +257,7 @@ def run_robot(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
     Raises PortError (a port is missing, busy, forbidden) and ProcessFault (a child did not start).
     """
     signals = _Signals()
-    run = _Run(plan, options, Memory.create(plan), signals)
+    run = _Run(plan, options, Memory.create(plan), signals, out)
     began = time.monotonic()
     with signals.caught():
         try:
@@ -244,7 +313,7 @@ def _summary(run: _Run, elapsed_s: float) -> RunSummary:
         skipped=outcome.skipped,
         elapsed_s=elapsed_s,
         sentences=tuple(sentences),
-        remarks=outcome.grants,
+        remarks=(*refusals(run.grants, run.out), *outcome.remarks, *run.remarks),
         log=str(run.log) if run.log else None,
         messages=run.messages,
     )

@@ -15,9 +15,11 @@ from dxlrun.compile.plan import Plan
 from dxlrun.compile.simulated import simulated_bodies, simulated_buses
 from dxlrun.control.loop import LoopResult, StopFlag
 from dxlrun.control.plugins import load_plugins
+from dxlrun.control.policy_plan import TORQUE_STAYS, Last
 from dxlrun.cycle import CycleRecord
 from dxlrun.errors import DxlrunError, InputError
 from dxlrun.events import EventCode, EventRing, Severity
+from dxlrun.inbox import QueueInbox
 from dxlrun.packets import NoPackets, PacketBatch
 from dxlrun.recording.log_writer import LogWriter
 from dxlrun.ring import Handover
@@ -89,6 +91,8 @@ class VirtualRobot:
         )
         """The simulated lines, in the order of the plan's buses; faults are injected here."""
         self.stop = StopFlag()
+        self.inbox = QueueInbox()
+        """Commands put here are taken at the start of a cycle."""
         self.result: LoopResult | None = None
         self.failures: tuple[str, ...] = ()
         """What could not be switched off at the end, one sentence each."""
@@ -104,6 +108,7 @@ class VirtualRobot:
             beat=lambda: None,
             stop=self.stop,
             take_over=take_over,
+            inbox=self.inbox,
         )
 
     def _sinks_for(self, writer: LogWriter | None) -> _LogSinks | _NoSinks:
@@ -122,16 +127,19 @@ class VirtualRobot:
         return self.robot.record
 
     def run(self) -> LoopResult:
-        """Set up, run to the plan's end or a fault, switch torque off, close the log.
+        """Set up, run to the plan's end or a fault, switch torque off unless a policy holds, close the log.
 
         Raises StartUpError; a controller's fault is in the result.
         """
         try:
             self.robot.hardware.start()
+            last: Last = "limp"
             try:
                 self.result = self.robot.loop.run()
+                last = self.result.last
             finally:
-                self.failures = self.robot.hardware.stop()
+                if last == "limp":
+                    self.failures = self.robot.hardware.stop()
         except DxlrunError as error:
             self._sinks.events.emit(EventCode.SETUP, Severity.ERROR, "loop", "\n".join(error.sentences))
             raise
@@ -171,6 +179,7 @@ def run_virtual(plan: Plan, options: RunOptions) -> RunSummary:
         skipped=result.skipped,
         elapsed_s=time.monotonic() - began,
         sentences=sentences,
+        remarks=(TORQUE_STAYS,) if result.last == "hold" else (),
         log=str(log) if log else None,
         messages=robot.messages,
     )

@@ -247,6 +247,7 @@ def test_json_carries_the_whole_report(write: Make, cycle: Make) -> None:
         "agree": True,
         "rate_hz": 50.0,
         "seconds": 0.02,
+        "rates_hz": [50.0],
     }
     assert read["joints"][0]["name"] == "left_elbow_joint"
 

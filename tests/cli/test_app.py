@@ -22,7 +22,9 @@ def loaded_by(*words: str) -> tuple[int, set[str]]:
     return int(words_out[1]), set(words_out[2:])
 
 
-@pytest.mark.parametrize("words", [("--help",), ("check", "--help"), ("--version",), ("no_such_verb",)])
+@pytest.mark.parametrize(
+    "words", [("--help",), ("check", "--help"), ("pause", "--help"), ("--version",), ("no_such_verb",)]
+)
 def test_what_needs_no_robot_imports_neither_numpy_nor_pydantic(words: tuple[str, ...]):
     _, modules = loaded_by(*words)
 
@@ -63,6 +65,7 @@ def test_nothing_to_do_shows_the_help_and_is_wrong_input(dxlrun):
 @pytest.mark.parametrize(
     ("words", "says"),
     [
+        (["swich"], "'swich' is neither a command nor a robot file; did you mean switch?"),
         (["chekc"], "'chekc' is neither a command nor a robot file; did you mean check?"),
         (["dance"], "'dance' is neither a command nor a robot file; a robot is run by `dxlrun ROBOT.yaml`"),
         (["missing/robot.yaml"], "there is no robot file missing/robot.yaml; check the path"),

@@ -32,7 +32,11 @@ controllers:
   states: {type: joint_state_broadcaster, rate: 25}
   head: {type: joint_trajectory_controller, active: "${on}", joints: [pan, tilt], tolerances: {goal: 2 deg}}
   other: {type: "${kind}", whatever: 5}
-policies: {exit_timeout: 2 s}
+poses: {home: {pan: 0 rad, tilt: "${zero}"}}
+policies:
+  on_exit: [{pose: home, speed: 60 deg/s}, {reduce_torque: 0.5}, hold]
+  on_fault: limp
+  exit_timeout: 2 s
 recording: {directory: logs}
 model: {urdf: pair.urdf}
 """
@@ -110,6 +114,12 @@ MISTAKES = [
     ("joints: [pan, tilt], ", "", "controllers/head"),
     ("goal: 2 deg", "goal: 2", "controllers/head/tolerances/goal"),
     ("tolerances: {goal", "tolerances: {goals", "controllers/head/tolerances"),
+    ("pan: 0 rad", "pan: 0", "poses/home/pan"),
+    ("pose: home", "pos: home", "policies/on_exit"),
+    ("60 deg/s", "60 deg", "policies/on_exit"),
+    ("reduce_torque: 0.5", "reduce_torque: 2", "policies/on_exit"),
+    ("}, hold]", "}, wait]", "policies/on_exit"),
+    ("on_fault: limp", "on_fault: stop", "policies/on_fault"),
     ("urdf: pair.urdf", "{}", "model"),
     ("model: {urdf: pair.urdf}", "include: x.yaml", "include"),
     ("model: {urdf: pair.urdf}", "sensors: {}", ""),

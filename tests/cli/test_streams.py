@@ -27,7 +27,7 @@ def shell(line: str, directory: Path) -> "subprocess.CompletedProcess[str]":
         ("check {torso}", 0),
         ("check missing.yaml", 2),
         ("{torso} --virtual --duration 0.2 --no-record", 0),
-        ("{torso} --duration 0.2 --no-record", 0),
+        ("{torso} --duration 0.2 --no-record --no-gateway", 0),
     ],
 )
 def test_closed_streams_change_nothing_but_what_is_seen(

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -24,6 +25,7 @@ from dxlrun.control.manager import Manager
 from dxlrun.control.plugins import Offer, PlugIns
 from dxlrun.cycle import CycleLayout, CycleRecord
 from dxlrun.events import EventCode, Severity
+from dxlrun.inbox import LOOP, Command, QueueInbox
 
 PERIOD_NS = 20_000_000
 
@@ -126,6 +128,10 @@ class Robot:
         self.sink = Sink()
         self.stop = StopFlag()
         self.beats = 0
+        self.inbox = QueueInbox()
+        self.taken: list[Any] = []
+        self.patience: list[int] = []
+        self._asked = 0
         self._controllers: list[ControllerPlan] = []
         self._offers: dict[str, Offer] = {}
         self.commands: list[ScheduledCommand] = []
@@ -139,6 +145,8 @@ class Robot:
         command: tuple[str, ...] = ("position", "velocity"),
         active: bool = True,
         every: int = 1,
+        rate: float | None = None,
+        fallback: str = "",
         parameters: str = "{}",
     ) -> None:
         plan = ControllerPlan(
@@ -151,6 +159,8 @@ class Robot:
             publishes=(),
             active=active,
             every=every,
+            rate=rate,
+            fallback=fallback,
         )
         self._controllers.append(plan)
         self._offers[name] = Offer(name, controller, "tests 1")
@@ -163,7 +173,21 @@ class Robot:
         data = np.array(values, dtype="<f8").tobytes()
         self.commands.append(ScheduledCommand(at_ns, controller, kind, data, "motion.yaml:7:5"))
 
-    def build(self, end_ns: int | None = None) -> None:
+    def post(self, controller: str, kind: str, data: bytes = b"", lease_ns: int = 0) -> int:
+        """Put a command into the inbox; return its number."""
+        self._asked += 1
+        self.inbox.waiting.append(Command(self._asked, controller, kind, data, "anna", lease_ns))
+        return self._asked
+
+    def ask(self, kind: str, **data: Any) -> int:
+        """Ask the loop itself for something; return the number."""
+        return self.post(LOOP, kind, msgspec.json.encode(data) if data else b"")
+
+    def take(self, command: Any) -> None:
+        """Keep what the log gets."""
+        self.taken.append(command)
+
+    def build(self, end_ns: int | None = None, **plan: Any) -> None:
         self.plan = LoopPlan(
             period_ns=PERIOD_NS,
             scheduler=SchedulerPlan("other", 31, False),
@@ -171,6 +195,7 @@ class Robot:
             controllers=tuple(self._controllers),
             commands=tuple(self.commands),
             end_ns=end_ns,
+            **plan,
         )
         layout = CycleLayout(self.names, tuple(plan.name for plan in self._controllers))
         self.record = CycleRecord(layout)
@@ -189,6 +214,9 @@ class Robot:
             plan=self.plan,
             beat=self._beat,
             stop=self.stop,
+            inbox=self.inbox,
+            commands=self,
+            patience=self.patience.append,
         )
         self.manager.configure()
         self.hardware.start()

@@ -188,7 +188,7 @@ def test_commands_to_nobody_are_refused_in_words(robot):
     assert run(robot, 2).reason == "ended"
     assert robot.events.of(EventCode.COMMAND_REFUSED) == [
         ("asleep", "go from motion.yaml:7:5 refused: the controller is not active"),
-        ("unknown", "go from motion.yaml:7:5 refused: there is no such controller"),
+        ("unknown", "go from motion.yaml:7:5 refused: there is no such controller as unknown"),
     ]
 
 

@@ -2,16 +2,20 @@
 
 import ctypes
 import gc
+import json
 import os
 import resource
+import struct
 import subprocess
 import sys
 import threading
 
 import pytest
 
-from dxlrun.control import realtime
+from dxlrun.clock import MonotonicClock
+from dxlrun.control import memory, realtime, rights
 from dxlrun.control.loop_plan import SchedulerPlan
+from dxlrun.control.margin import Pacing, overshoot_ns
 
 
 @pytest.fixture
@@ -21,63 +25,321 @@ def asked(monkeypatch):
 
     class Libc:
         def __getattr__(self, name):
-            return lambda *arguments: calls.append(name) or 0
+            return lambda *arguments: calls.append(name) or name == "mallopt"
 
     monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: Libc())
     monkeypatch.setattr(os, "sched_setscheduler", lambda *arguments: calls.append(arguments))
+    monkeypatch.setattr(os, "sched_setaffinity", lambda _, cores: calls.append(("cores", cores)))
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1, 2, 3})
     monkeypatch.setattr(realtime, "freeze_collector", lambda: calls.append("gc"))
     return calls
 
 
-def test_everything_is_asked_for_and_the_policy_last(asked, monkeypatch):
-    monkeypatch.setattr(realtime, "_may_lock", lambda: True)
-    grants = realtime.apply(SchedulerPlan("fifo", 40, True))
+@pytest.fixture
+def may(monkeypatch):
+    """Set what this process may: capabilities, and the limits of memory and priority."""
+
+    def set_rights(*capabilities, memlock=8 << 20, rtprio=0):
+        limits = {resource.RLIMIT_MEMLOCK: memlock, resource.RLIMIT_RTPRIO: rtprio}
+        monkeypatch.setattr(rights, "has_capability", lambda bit: bit in capabilities)
+        monkeypatch.setattr(resource, "getrlimit", lambda which: (limits[which],) * 2)
+
+    return set_rights
+
+
+def test_everything_is_asked_for_and_the_policy_last(asked, may, monkeypatch, tmp_path):
+    may(rights.IPC_LOCK)
+    monkeypatch.setattr(realtime, "IDLE_LATENCY", tmp_path / "cpu_dma_latency")
+    realtime.IDLE_LATENCY.touch()
+    plan = SchedulerPlan("fifo", 40, True, cores=(0, 1, 2, 3), idle_latency=True)
+    grants = realtime.apply(plan)
     assert all(grant.granted for grant in grants[1:])
     (pid, policy, parameters) = asked.pop()
     assert (pid, policy, parameters.sched_priority) == (0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, 40)
-    assert asked == ["gc", "prctl", "mlockall"]
+    assert asked == ["gc", "prctl", ("cores", (0, 1, 2, 3)), "mallopt", "mallopt", "mlockall"]
+    assert [grant.wish for grant in grants[1:]] == [
+        "timer slack",
+        "cores",
+        "memory in place",
+        "locked memory",
+        "idle latency",
+        "scheduler",
+    ]
+    assert struct.unpack("i", realtime.IDLE_LATENCY.read_bytes()) == (0,)
 
 
-def test_the_ordinary_policy_asks_for_nothing(asked):
+def test_the_ordinary_policy_asks_for_nothing_that_needs_a_right(asked):
     realtime.apply(SchedulerPlan("other", 31, False))
-    assert asked == ["gc", "prctl"]
+    assert asked == ["gc", "prctl", "mallopt", "mallopt"]
 
 
-def test_a_refused_policy_says_how_to_allow_it(asked, monkeypatch):
-    def refuse(*_):
-        raise PermissionError(1, "Operation not permitted")
+def refuse(*_):
+    raise PermissionError(1, "Operation not permitted")
 
+
+def test_a_refused_policy_says_what_is_lost_and_how_to_allow_it(asked, monkeypatch):
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
-    grant = realtime.set_policy("round_robin", 31)
+    grant = realtime.apply(SchedulerPlan("round_robin", 31, False))[-1]
     assert not grant.granted
     assert "round_robin 31 was refused" in grant.sentence
-    assert "rtprio 32" in grant.sentence
+    assert "may delay it" in grant.sentence
+    assert "rtprio 32" in grant.mend  # the guardian needs one more
+    assert "rtprio 32" in realtime.apply_to_guardian(32, lock=False)[0].mend
+    assert grant.told == f"{grant.sentence}: {grant.mend}"
 
 
-def test_memory_is_not_locked_where_later_allocations_would_fail(asked, monkeypatch):
-    monkeypatch.setattr(realtime, "_may_lock", lambda: False)
-    monkeypatch.setattr(resource, "getrlimit", lambda _: (8 << 20, 8 << 20))
-    grant = realtime.apply(SchedulerPlan("other", 31, True))[-1]
+def test_memory_is_not_locked_where_later_allocations_would_fail(asked, may):
+    may()
+    grant = realtime.lock_memory()
     assert (grant.wish, grant.granted) == ("locked memory", False)
-    assert "memlock unlimited" in grant.sentence
-    assert "mlockall" not in asked
+    assert "memlock unlimited" in grant.mend
+    assert asked == []
 
 
-def test_an_unlimited_allowance_is_enough_to_lock(asked, monkeypatch):
-    monkeypatch.setattr(realtime, "_may_lock", lambda: False)
-    monkeypatch.setattr(resource, "getrlimit", lambda _: (resource.RLIM_INFINITY,) * 2)
+def test_an_unlimited_allowance_is_enough_to_lock(asked, may):
+    may(memlock=resource.RLIM_INFINITY)
     assert realtime.apply(SchedulerPlan("other", 31, True))[-1].granted
     assert asked[-1] == "mlockall"
 
 
-def test_another_system_is_told_and_not_a_crash(asked, monkeypatch):
+def test_a_core_that_there_is_not_is_named(asked, monkeypatch):
+    grant = realtime.apply(SchedulerPlan("other", 31, False, cores=(3, 9)))[2]
+    assert (grant.granted, grant.sentence) == (
+        False,
+        "there is no core 9 for this process, it runs on 0, 1, 2, 3",
+    )
+
+
+def test_cores_none_of_which_there_is_leave_the_loop_where_it_was(asked, monkeypatch):
+    def invalid(*_):
+        raise OSError(22, "Invalid argument")
+
+    monkeypatch.setattr(os, "sched_setaffinity", invalid)
+    grant = realtime.apply(SchedulerPlan("other", 31, False, cores=(9,)))[2]
+    assert (grant.granted, grant.sentence) == (
+        False,
+        "there is no core 9 for this process, it runs on 0, 1, 2, 3",
+    )
+
+
+def test_one_core_is_said_in_the_singular(asked, monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {2})
+    grant = realtime.apply(SchedulerPlan("other", 31, False, cores=(2,)))[2]
+    assert (grant.granted, grant.sentence) == (True, "stays on core 2")
+
+
+def test_a_refused_idle_latency_says_the_rule_that_allows_it(asked, monkeypatch):
+    monkeypatch.setattr(os, "open", refuse)
+    grant = realtime.apply(SchedulerPlan("other", 31, False, idle_latency=True))[-1]
+    assert (grant.wish, grant.granted) == ("idle latency", False)
+    assert 'KERNEL=="cpu_dma_latency", OWNER="' in grant.mend
+
+
+def test_another_system_is_told_and_not_a_crash(asked, may, monkeypatch):
+    may(rights.IPC_LOCK)
     monkeypatch.setattr(sys, "platform", "plan9")
     monkeypatch.delattr(os, "sched_setscheduler")
-    monkeypatch.setattr(realtime, "_may_lock", lambda: True)
-    slack, memory, scheduler = realtime.apply(SchedulerPlan("fifo", 40, True))[1:]
-    for grant in (slack, memory, scheduler):
+    monkeypatch.delattr(os, "sched_setaffinity")
+    plan = SchedulerPlan("fifo", 40, True, cores=(1,))
+    for grant in realtime.apply(plan)[1:]:
         assert not grant.granted
         assert "this system does not offer it" in grant.sentence
+
+
+def test_a_c_library_without_mallopt_is_told(asked, monkeypatch):
+    monkeypatch.setattr(memory, "libc", object)
+    grant = realtime.apply(SchedulerPlan("other", 31, False))[2]
+    assert (grant.wish, grant.granted) == ("memory in place", False)
+    assert "mallopt is missing" in grant.sentence
+
+
+def test_the_guardian_asks_for_one_priority_above_the_loop(asked, may):
+    may(rights.IPC_LOCK)
+    locked, scheduler = realtime.apply_to_guardian(32, lock=True)
+    assert locked.granted
+    assert scheduler.sentence == "scheduler round_robin, priority 32"
+    assert realtime.apply_to_guardian(0, lock=False) == ()
+
+
+@pytest.mark.parametrize(
+    ("capabilities", "rtprio", "highest"),
+    [((rights.SYS_NICE,), 0, 99), ((), 0, 0), ((), 40, 40), ((), resource.RLIM_INFINITY, 99)],
+)
+def test_the_highest_priority_is_what_limit_and_capability_allow(may, capabilities, rtprio, highest):
+    may(*capabilities, rtprio=rtprio)
+    assert rights.highest_priority() == highest
+
+
+def test_capabilities_are_read_from_the_kernels_mask(tmp_path):
+    status = tmp_path / "status"
+    status.write_text("Name:\tx\nCapEff:\t0000000000804000\n")
+    assert rights.has_capability(rights.SYS_NICE, status)
+    assert rights.has_capability(rights.IPC_LOCK, status)
+    assert not rights.has_capability(12, status)
+    assert not rights.has_capability(rights.SYS_NICE, tmp_path / "nothing")
+
+
+# The margin that is polled
+
+
+def pacing(most_ns, late, period_ns=20_000_000):
+    """Measure with sleeps that wake late by turns; return the clock, the pacing and what was told."""
+    clock = MonotonicClock()
+    turns = iter(late * 40)
+    naps = []
+    pace = Pacing(clock, most_ns)
+    beats = []
+    grant = pace.measure(period_ns, lambda: beats.append(1), lambda nap: naps.append(nap) or next(turns))
+    assert len(beats) == len(naps) == 32
+    assert max(naps) <= period_ns
+    return clock, pace, grant
+
+
+def test_the_margin_covers_what_sleeps_overshoot_and_half_as_much_again():
+    clock, _, grant = pacing(None, [60_000, 80_000])
+    assert clock.spin_ns == 120_000
+    assert grant.granted
+    assert grant.sentence == (
+        "polls the clock for 120 us before each deadline, 0.6% of a core; "
+        "19 of 20 sleeps woke at most 80 us late"
+    )
+
+
+def test_one_sleep_in_32_that_wakes_far_too_late_does_not_count():
+    clock, _, _ = pacing(None, [50_000] * 31 + [9_000_000])
+    assert clock.spin_ns == 75_000
+
+
+def test_without_a_word_at_most_a_tenth_of_the_period_is_polled():
+    clock, _, grant = pacing(None, [400_000], period_ns=2_000_000)
+    assert clock.spin_ns == 200_000
+    assert "10.0% of a core" in grant.sentence
+    assert grant.sentence.endswith("so that some cycles begin late")
+
+
+@pytest.mark.parametrize(("most_ns", "margin_ns"), [(0, 0), (30_000, 30_000), (900_000, 600_000)])
+def test_the_file_bounds_the_margin_and_what_was_measured_bounds_the_file(most_ns, margin_ns):
+    clock, _, grant = pacing(most_ns, [400_000])
+    assert clock.spin_ns == margin_ns
+    assert grant.granted
+
+
+def test_a_change_of_rate_keeps_the_share():
+    clock, pace, _ = pacing(None, [400_000])
+    assert clock.spin_ns == 600_000
+    pace(1_000_000)
+    assert clock.spin_ns == 100_000
+    pace(20_000_000)
+    assert clock.spin_ns == 600_000
+
+
+def test_at_least_half_of_a_period_is_left_to_others():
+    clock, pace, _ = pacing(1_000_000, [4_000_000])
+    pace(1_000_000)
+    assert clock.spin_ns == 500_000
+
+
+def test_a_sleep_never_wakes_early():
+    assert overshoot_ns(1_000) >= 0
+
+
+# In processes of their own, with the real system calls
+
+
+def outcome(script):
+    """Run a script in a process of its own; return what it printed as JSON."""
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=60
+    )
+    assert done.stderr == ""
+    return json.loads(done.stdout)
+
+
+WISHES = """
+import gc, json, os, resource
+from dxlrun.control import realtime, rights
+from dxlrun.control.loop_plan import SchedulerPlan
+{before}
+plan = SchedulerPlan('round_robin', 31, True, cores=(min(os.sched_getaffinity(0)),), idle_latency=True)
+may = (rights.lockable_bytes() == rights.UNLIMITED, rights.highest_priority() >= 31)
+grants = realtime.apply(plan) + realtime.apply_to_guardian(32, True)
+print(json.dumps({{
+    "granted": [[one.wish, one.granted] for one in grants], "told": [one.told for one in grants],
+    "collector": gc.isenabled(), "threads": realtime.thread_count(), "may": may,
+    "policy": os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK, "cores": len(os.sched_getaffinity(0)),
+}}))
+"""
+NOBODY = """
+resource.setrlimit(resource.RLIMIT_MEMLOCK, (1 << 16, 1 << 16))
+resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
+if os.getuid() == 0: os.setuid(65534)
+"""
+
+
+def test_a_real_process_without_rights_gets_plain_sentences():
+    """As nobody, with the usual limits: what needs no right is granted, and nothing is raised."""
+    found = outcome(WISHES.format(before=NOBODY))
+    granted = dict(found["granted"][:5])
+    assert granted == {
+        "collector": True,
+        "timer slack": True,
+        "cores": True,
+        "memory in place": True,
+        "locked memory": False,
+    }
+    assert found["granted"][5] == ["idle latency", False]
+    assert found["granted"][6:] == [["scheduler", False], ["locked memory", False], ["scheduler", False]]
+    assert (found["collector"], found["threads"], found["cores"]) == (False, 1, 1)
+    assert found["policy"] == os.SCHED_OTHER
+    refused = [
+        told for (_, granted), told in zip(found["granted"], found["told"], strict=True) if not granted
+    ]
+    assert all("Traceback" not in told and "Errno 1" not in told for told in refused)
+    assert sum("/etc/security/limits.d/dxlrun.conf" in told for told in refused) == 4
+
+
+def test_a_real_process_gets_what_its_rights_say():
+    """Whoever runs the tests, root or not, in a container or not: what is told is what the kernel did."""
+    found = outcome(WISHES.format(before=""))
+    granted = dict(found["granted"])
+    lockable, prioritised = found["may"]
+    if not lockable:
+        assert not granted["locked memory"]
+    if not prioritised:
+        assert not granted["scheduler"]
+    assert (found["policy"] == os.SCHED_RR) == granted["scheduler"]
+    assert granted["cores"]
+    assert found["cores"] == 1
+
+
+def test_touched_memory_is_there_when_it_is_needed():
+    """Pages that come and go with big arrays, in cycle 0 and later: none is missing after it was prepared."""
+    script = """
+import json
+from dxlrun.control import memory
+def faults(cycles):
+    before = memory.page_faults()
+    for _ in range(cycles):
+        bytearray(400_000)
+    return memory.page_faults() - before
+faults(1)
+unprepared = faults(50)
+memory.keep_freed()
+memory.touch()
+faults(1)
+print(json.dumps([unprepared, faults(50)]))
+"""
+    unprepared, prepared = outcome(script)
+    assert prepared < 10 < unprepared
+
+
+def test_the_collector_is_off_and_what_lives_is_frozen():
+    script = (
+        "import gc, json\nfrom dxlrun.control import realtime\n"
+        "realtime.freeze_collector()\nprint(json.dumps([gc.isenabled(), gc.get_freeze_count() > 1000]))\n"
+    )
+    assert outcome(script) == [False, True]
+    assert gc.isenabled()
 
 
 def test_a_thread_is_counted():
@@ -90,38 +352,3 @@ def test_a_thread_is_counted():
     finally:
         go.set()
         thread.join()
-
-
-def test_a_real_process_without_rights_gets_plain_sentences():
-    """As nobody, with the usual limits: nothing is granted that matters, nothing is raised."""
-    script = (
-        "import gc, os, resource, json\n"
-        "from dxlrun.control import realtime\n"
-        "from dxlrun.control.loop_plan import SchedulerPlan\n"
-        "resource.setrlimit(resource.RLIMIT_MEMLOCK, (1 << 16, 1 << 16))\n"
-        "resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))\n"
-        "if os.getuid() == 0: os.setuid(65534)\n"
-        "grants = realtime.apply(SchedulerPlan('round_robin', 31, True))\n"
-        "print(json.dumps([[g.wish, g.granted] for g in grants]))\n"
-        "print(gc.isenabled(), realtime.thread_count())\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=60
-    )
-    assert done.stderr == ""
-    assert done.stdout.splitlines() == [
-        '[["collector", true], ["timer slack", true], ["locked memory", false], ["scheduler", false]]',
-        "False 1",
-    ]
-
-
-def test_the_collector_is_off_and_what_lives_is_frozen():
-    script = (
-        "import gc\nfrom dxlrun.control import realtime\n"
-        "realtime.freeze_collector()\nprint(gc.isenabled(), gc.get_freeze_count() > 1000)\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=60
-    )
-    assert done.stdout.split() == ["False", "True"]
-    assert gc.isenabled()

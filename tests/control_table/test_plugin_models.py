@@ -115,7 +115,7 @@ def test_a_robot_of_foreign_servos_runs_in_simulation(
     robot = tmp_path / "robot.yaml"
     robot.write_text(ROBOT)
     run = subprocess.run(
-        [sys.executable, "-c", MAIN, str(robot), "--duration", "0.2", "--no-record", *words],
+        [sys.executable, "-c", MAIN, str(robot), "--duration", "0.2", "--no-record", "--no-gateway", *words],
         env=os.environ | {"PYTHONPATH": str(tmp_path)},
         cwd=tmp_path,
         capture_output=True,

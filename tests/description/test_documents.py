@@ -15,16 +15,20 @@ from dxlrun.description.robot import (
     BusSimulation,
     ControllerEntry,
     Form,
+    Gateway,
     Joint,
     JointSimulation,
     Limits,
     Loop,
     Policies,
+    PoseStep,
+    Processes,
     Recording,
     Robot,
     RobotModel,
     Scheduler,
     Simulation,
+    TorqueStep,
 )
 
 PAGE = (Path(__file__).parents[2] / "docs" / "robot-file.md").read_text()
@@ -52,8 +56,8 @@ def test_the_examples_of_the_page_are_read(desk: Any) -> None:
 
 @pytest.mark.parametrize(
     ("prefix", "part"),
-    [("", Robot), ("", Bus), ("adapter.", Adapter), ("", Joint), ("limits.", Limits), ("", Loop), ("", Policies),
-     ("scheduler.", Scheduler), ("simulation.", BusSimulation), ("simulation.", JointSimulation), ("simulation.", Simulation), ("", ControllerEntry), ("", Recording), ("", RobotModel), ("", Motion), ("", PointsPart),
+    [("", Robot), ("", Bus), ("adapter.", Adapter), ("", Joint), ("limits.", Limits), ("", Loop), ("", Policies), ("", PoseStep), ("", TorqueStep),
+     ("scheduler.", Scheduler), ("simulation.", BusSimulation), ("simulation.", JointSimulation), ("simulation.", Simulation), ("", ControllerEntry), ("", Recording), ("", Processes), ("gateway.", Gateway), ("", RobotModel), ("", Motion), ("", PointsPart),
      ("", FormulaPart), ("points[].", Point)],
 )  # fmt: skip
 def test_every_key_is_on_the_page(prefix: str, part: type[Form]) -> None:

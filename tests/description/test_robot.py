@@ -17,8 +17,10 @@ from dxlrun.description.robot import (
     Limits,
     Loop,
     Policies,
+    PoseStep,
     Robot,
     Scheduler,
+    TorqueStep,
 )
 from dxlrun.errors import Mark
 
@@ -60,7 +62,17 @@ DAMAGES = [
     ("rate: 25", "rate: §-1", "controllers.broadcaster.rate is -1, but must be greater than 0; write"),
     ("broadcaster: {type: joint_state_broadcaster, ", "§broadcaster: {", "controllers.broadcaster has no type; add"),
     ("  broadcaster: {", "  §broad caster: {", "controllers.broad caster: 'broad caster' is no name; start"),
-    ("on_exit: limp", "on_exit: §stop", "policies.on_exit is the text 'stop', but must be limp; write"),
+    ("on_exit: limp", "on_exit: §stop", "policies.on_exit is the text 'stop', but must be limp or hold; write"),
+    ("on_exit: limp", "on_exit: §[]", "policies.on_exit has too few entries; write at least 1"),
+    ("on_exit: limp", "on_exit: §{pose: a}", "policies.on_exit is a mapping, but must be a list; write [a, b, ...]"),
+    ("on_exit: limp", "on_exit: [§stop]", "policies.on_exit[0] is the text 'stop', but must be limp or hold; write"),
+    ("on_exit: limp", "on_exit: [§{pose: home}]", "policies.on_exit[0] has no speed; add `speed: 60 deg/s`"),
+    ("on_exit: limp", "on_exit: [{pose: home, speed: §60}]", "policies.on_exit[0].speed: 60 has no unit; write"),
+    ("on_exit: limp", "on_exit: [{reduce_torque: §1}]", "policies.on_exit[0].reduce_torque is 1, but must be less"),
+    ("on_exit: limp", "on_exit: [{reduce_torque: 0.5, §step: 3}]", "policies.on_exit[0] has an unknown key 'step'; did"),
+    ("recording:", "poses: {home: {elbow: §1}}\nrecording:", "poses.home.elbow: 1 has no unit; write an angle"),
+    ("recording:", "poses: {home: §{}}\nrecording:", "poses.home has too few entries; write at least 1"),
+    ("rate: 25", "fallback: §5", "controllers.broadcaster.fallback is 5, but must be text; put"),
     ("exit_timeout: 3 s", "exit_timeout: §0 s", "policies.exit_timeout is 0, but must be greater than 0; write"),
     ("directory: elsewhere", "directory: §5", 'recording.directory is 5, but must be text; put it in quotes: "5"'),
     ("directory: elsewhere", 'directory: §""', "recording.directory is too short; write something"),
@@ -70,7 +82,7 @@ DAMAGES = [
     ("recording:", "include: §fragment.yaml\nrecording:", "include is the text 'fragment.yaml', but must be a list"),
     ("recording:", "include: [§5]\nrecording:", "include[0] is 5, but must be a file's name; name it"),
     ("recording:", 'include: [§"${port}.yaml"]\nrecording:', "arguments are not put into include; write"),
-    ("recording:", "§processes: {}\nrecording:", "processes is not possible; this version starts no gateway"),
+    ("recording:", "processes: {§view: {}}\nrecording:", "processes.view is not possible; this version has"),
     ("recording:", "§model: {}\nrecording:", "model has no urdf; add `urdf: torso.urdf`"),
     ("recording:", 'model: {urdf: §""}\nrecording:', "model.urdf is too short; write something"),
     ("recording:", "§includes: []\nrecording:", "the file has an unknown key 'includes'; did you mean include?"),
@@ -171,7 +183,8 @@ def test_the_text_and_the_places_are_kept(desk: Any, robot_text: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "part", [Robot, Bus, Adapter, Loop, Scheduler, Joint, Limits, ControllerEntry, Policies]
+    "part",
+    [Robot, Bus, Adapter, Loop, Scheduler, Joint, Limits, ControllerEntry, Policies, PoseStep, TorqueStep],
 )
 def test_every_key_is_described_with_an_example(part: type[Form]) -> None:
     for key, field in part.model_fields.items():

@@ -22,6 +22,7 @@ MESSAGES = [
     schemas.CYCLE,
     schemas.BUS_PACKET,
     schemas.EVENT,
+    schemas.COMMAND,
     schemas.STRING,
 ]
 TEXT = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=20)

@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from dxlrun.commands import CommandRing, TakenCommand
+from dxlrun.events import Event, EventCode, EventRing, Severity
 from dxlrun.recording.log_writer import LogWriter
 from dxlrun.recording.reader import Log, read_log
 from dxlrun.ring import Handover
@@ -138,6 +139,16 @@ def run(robot_file: Path, tmp_path: Path) -> Callable[..., Path]:
 
 
 @dataclass
+class Then:
+    """A clock that says when an event happened."""
+
+    t_ns: int = 0
+
+    def now_ns(self) -> int:
+        return self.t_ns
+
+
+@dataclass
 class Changed:
     """What a log has, to be changed before it is written anew."""
 
@@ -146,6 +157,7 @@ class Changed:
     attachments: dict[str, bytes]
     metadata: dict[str, dict[str, str]]
     activation: NDArray[np.void] | None
+    events: list[Event]
     gaps: list[tuple[str, int]] = field(default_factory=list)
 
 
@@ -158,7 +170,9 @@ def changed(tmp_path: Path) -> Callable[[Path, Callable[[Changed], None]], Path]
         metadata = {k: v for k, v in log.metadata.items() if k not in ("dxlrun", "dxlrun_summary")}
         attachments = {k: v for k, v in log.attachments.items() if k != "header.json"}
         activation = None if log.activation is None else log.activation.copy()
-        content = Changed(log.cycles.copy(), list(log.commands), attachments, metadata, activation)
+        content = Changed(
+            log.cycles.copy(), list(log.commands), attachments, metadata, activation, list(log.events)
+        )
         change(content)
         new = tmp_path / "changed.mcap"
         new.unlink(missing_ok=True)
@@ -171,6 +185,11 @@ def changed(tmp_path: Path) -> Callable[[Path, Callable[[Changed], None]], Path]
             ring.take(command)
         for row in range(len(content.cycles)):
             writer.cycle(content.cycles[row : row + 1].tobytes())
+        then = Then()
+        events = EventRing(Handover(writer.event), then)
+        for event in content.events:
+            then.t_ns = event.t_ns
+            events.emit(EventCode(event.code), Severity(event.severity), event.source, event.text)
         for source, lost in content.gaps:
             writer.gap(source, lost)
         writer.close()

@@ -66,7 +66,7 @@ def test_remarks_go_to_stderr(
     assert main(["replay", str(changed(pair_log, change))]) == 1
     said = capsys.readouterr()
     assert said.out.splitlines() == [
-        "pair: 1 of 10 replayed cycles differ",
+        "pair: 1 of 10 replayed cycles differs",
         "first: cycle 2, 0.040 s, controller states: recorded not active, replayed active",
     ]
     version, gap = said.err.splitlines()

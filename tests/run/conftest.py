@@ -167,13 +167,19 @@ def start(tmp_path: Path) -> Iterator[Start]:
     started: list[Running] = []
 
     def begin(
-        *arguments: str, path: Path | None = None, robot: Path | None = None, closed: bool = False
+        *arguments: str,
+        path: Path | None = None,
+        robot: Path | None = None,
+        closed: bool = False,
+        gateway: bool = False,
+        before: tuple[str, ...] = (),
     ) -> Running:
         paths = [str(path)] if path else []
         mark = f"DXLRUN_TEST={tmp_path}/{len(started)}"
         environment = os.environ | {"PYTHONPATH": os.pathsep.join([*paths, *_python_path()])}
         environment |= dict([mark.split("=")])
-        command = [str(DXLRUN), str(robot or tmp_path / "pair.yaml"), *arguments]
+        command = [*before, str(DXLRUN), str(robot or tmp_path / "pair.yaml"), *arguments]
+        command += [] if gateway else ["--no-gateway"]
         close = f"exec >&- 2>&- <&-; exec {shlex.join(command)}"
         process = subprocess.Popen(
             ["/bin/sh", "-c", close] if closed else command,

@@ -56,6 +56,7 @@ def _run(log: Log, report: Report) -> Table:
         ("began", began(log)),
         ("lasted", f"{account.seconds:.1f} s"),
         ("rate", f"{account.rate_hz:g} Hz, period {log.period_ns / 1e6:g} ms"),
+        *(("rates", account.rates) for _ in account.rates_hz[1:2]),
         ("clock", clock),
         ("joints", str(len(log.joints))),
         ("controllers", ", ".join(controller.name for controller in log.controllers)),
@@ -96,11 +97,14 @@ def _real_time(log: Log) -> Table:
         locked = ", memory locked" if wish.get("lock_memory") == "true" else ""
         policy = wish.get("policy", "?")
         priority = f", priority {wish.get('priority', '?')}" if policy != "other" else ""
-        rows.append(("asked for", f"scheduler {policy}{priority}{locked}"))
+        cores = f", cores {wish['cores']}" if wish.get("cores") else ""
+        awake = ", cores kept awake" if wish.get("idle_latency") == "true" else ""
+        rows.append(("asked for", f"scheduler {policy}{priority}{locked}{cores}{awake}"))
     for event in log.events:
         if event.code == EventCode.SCHEDULER:
             tone = tone_of(event.severity)
-            rows.append(("granted" if tone == "plain" else "not granted", Cell(event.text, tone)))
+            whom = " to the guardian" if event.source == "guardian" else ""
+            rows.append((f"{'granted' if tone == 'plain' else 'not granted'}{whom}", Cell(event.text, tone)))
     return _pairs("Real time", rows)
 
 

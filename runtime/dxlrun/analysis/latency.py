@@ -13,6 +13,8 @@ ROUGH_NS = 150_000
 """A wake-up later than this does not happen on a real-time kernel (M. A. Araujo, UFU 2017)."""
 
 _MS = 1_000_000
+_MOST_RATES = 4
+"""More are not said one by one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,12 +56,46 @@ class Periods:
     agree: bool
     """records + skipped = elapsed, and each record declares what is missing right before it."""
     rate_hz: float
+    """At the start."""
     seconds: float
+    rates_hz: tuple[float, ...] = ()
+    """Every rate at which cycles ran, in the order in which they came first."""
+
+    @property
+    def rates(self) -> str:
+        """The rates in words."""
+        rates = self.rates_hz or (self.rate_hz,)
+        if len(rates) > _MOST_RATES:
+            return f"{len(rates)} rates from {min(rates):g} to {max(rates):g} Hz"
+        *others, last = (f"{rate:g} Hz" for rate in rates)
+        return f"{', '.join(others)} and {last}" if others else last
 
 
 def on_virtual_time(log: Log) -> bool:
     """Tell whether the run's clock was virtual: its times are computed, and say nothing of this machine."""
     return log.metadata.get("run", {}).get("clock") == "virtual"
+
+
+def first_deadline_ns(log: Log) -> int:
+    """Return the loop's first deadline; the time of the first event in a log without cycles."""
+    if log.activation is not None:
+        return int(log.activation["scheduled_ns"][0])
+    if len(log.cycles):
+        first = log.cycles[0]
+        return int(first["scheduled_ns"]) - int(first["cycle"]) * log.period_ns
+    return log.events[0].t_ns if log.events else 0
+
+
+def cycle_periods_ns(log: Log) -> NDArray[np.int64]:
+    """Return the period in which each cycle ran, ns: the time to the next deadline, shape (cycles,).
+
+    A change of the rate holds from the cycle that took it. Where cycles are lost it is a mean over them.
+    """
+    numbers, due = log.cycles["cycle"], log.cycles["scheduled_ns"]
+    if len(numbers) < 2:
+        return np.full(len(numbers), log.period_ns, dtype=np.int64)
+    between = np.diff(due) // np.maximum(np.diff(numbers), 1)
+    return np.append(between, between[-1])
 
 
 def latency(log: Log) -> Latency | None:
@@ -75,7 +111,7 @@ def latency(log: Log) -> Latency | None:
         mode_us=int(bins[np.argmax(counts)]),
         share_over_150_us=float(np.mean(late > ROUGH_NS)),
         share_over_1_ms=float(np.mean(late > _MS)),
-        share_over_period=float(np.mean(late > log.period_ns)),
+        share_over_period=float(np.mean(late > cycle_periods_ns(log))),
     )
 
 
@@ -115,6 +151,8 @@ def periods(log: Log) -> Periods:
     records, declared = len(numbers), int(skipped.sum())
     elapsed = int(numbers[-1]) + 1 if records else 0
     steps = np.diff(numbers, prepend=-1) - 1
+    each = cycle_periods_ns(log)
+    end_ns = int(log.cycles["scheduled_ns"][-1] + each[-1]) if records else 0
     return Periods(
         elapsed=elapsed,
         records=records,
@@ -122,5 +160,6 @@ def periods(log: Log) -> Periods:
         missing=elapsed - records - declared,
         agree=bool(np.array_equal(steps, skipped)),
         rate_hz=1e9 / log.period_ns,
-        seconds=elapsed * log.period_ns / 1e9,
+        seconds=(end_ns - first_deadline_ns(log)) / 1e9 if records else 0.0,
+        rates_hz=tuple(1e9 / period for period in dict.fromkeys(each.tolist()) if period > 0),
     )

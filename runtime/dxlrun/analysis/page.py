@@ -10,10 +10,9 @@ from dxlrun.analysis.facts import began, facts
 from dxlrun.analysis.figures.budget import budget_drawings
 from dxlrun.analysis.figures.joints import joint_drawings
 from dxlrun.analysis.figures.latency import latency_drawings
-from dxlrun.analysis.figures.run_time import first_deadline_ns
 from dxlrun.analysis.figures.timeline import events_drawing
 from dxlrun.analysis.figures.wires import reply_drawing
-from dxlrun.analysis.latency import on_virtual_time
+from dxlrun.analysis.latency import first_deadline_ns, on_virtual_time
 from dxlrun.analysis.report import Report, to_json
 from dxlrun.analysis.tables import (
     Cell,
@@ -25,6 +24,7 @@ from dxlrun.analysis.tables import (
     joints_table,
     loop_table,
     servos_table,
+    steering_table,
     steps_table,
     tone_of,
 )
@@ -82,7 +82,7 @@ def _key_numbers(report: Report) -> Element:
     """Return the numbers that a reader compares between runs."""
     account, late = report.periods, report.latency
     numbers = [
-        ("rate", f"{account.rate_hz:g} Hz"),
+        ("rate", account.rates),
         ("lasted", f"{account.seconds:.1f} s"),
         ("periods skipped", f"{account.skipped} of {account.elapsed}"),
     ]
@@ -116,6 +116,7 @@ def _sections(log: Log, report: Report) -> list[Element]:
         _budget(log, report),
         _joints(log, report),
         _wires(report),
+        _steering(report),
         _events(log, report),
     ]
     return [part for part in found if len(part) > 1]
@@ -161,6 +162,11 @@ def _wires(report: Report) -> Element:
     if drawing is not None:
         parts.append(drawing_of(drawing))
     return section("buses", "Buses and servos", parts)
+
+
+def _steering(report: Report) -> Element:
+    table = steering_table(report.steering)
+    return section("steering", "Steered from outside", [table_of(table)] if table.rows else [])
 
 
 def _events(log: Log, report: Report) -> Element:

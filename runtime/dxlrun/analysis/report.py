@@ -19,6 +19,7 @@ from dxlrun.analysis.latency import (
     latency,
     periods,
 )
+from dxlrun.analysis.steering import Act, Pause, acts, pauses
 from dxlrun.analysis.tracking import Joint, tracking
 from dxlrun.analysis.verdict import Timing, Verdict, verdict
 from dxlrun.events import EventCode
@@ -53,6 +54,9 @@ class Report:
     buses: tuple[BusTraffic, ...]
     joints: tuple[Joint, ...]
     events: tuple[EventCount, ...]
+    steering: tuple[Act, ...]
+    """What was asked from outside, a stream as one."""
+    pauses: tuple[Pause, ...]
     gaps: int
     """Records that the recorder did not get."""
     complete: bool
@@ -67,7 +71,8 @@ def analyze_log(path: str | Path) -> Report:
 def analyze(log: Log) -> Report:
     """Analyze a log that was read. Raises LogError when a packet in it cannot be read."""
     servos, buses = traffic(log)
-    timing, lost = Timing(periods(log), latency(log), durations(log)), _gaps(log)
+    timing = Timing(periods(log), latency(log), durations(log), acts(log), pauses(log))
+    lost = _gaps(log)
     return Report(
         log=str(log.path),
         robot=log.header.robot,
@@ -80,6 +85,8 @@ def analyze(log: Log) -> Report:
         buses=buses,
         joints=tracking(log),
         events=_events(log),
+        steering=tuple(timing.acts),
+        pauses=tuple(timing.pauses),
         gaps=lost,
         complete=log.complete,
         damage=log.damage,

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 from dxlrun.analysis.latency import Duration
 from dxlrun.analysis.report import EventCount, Report
+from dxlrun.analysis.steering import Act
 from dxlrun.analysis.verdict import microseconds
 from dxlrun.events import Severity
+
+_MOST_ACTS = 100
 
 Tone = Literal["plain", "warning", "error"]
 
@@ -49,6 +52,7 @@ def tables(report: Report) -> tuple[Table, ...]:
         servos_table(report),
         buses_table(report),
         joints_table(report),
+        steering_table(report.steering),
         events_table(report.events),
     )
     return tuple(table for table in found if table.rows)
@@ -61,6 +65,7 @@ def loop_table(report: Report) -> Table:
         ("periods elapsed", str(account.elapsed)),
         ("cycles recorded", str(account.records)),
         ("periods skipped", Cell(str(account.skipped), "warning" if account.skipped else "plain")),
+        *(("periods paused", str(count)) for count in [sum(p.periods for p in report.pauses)] if count),
         ("recorded + skipped = elapsed", "yes" if account.agree else f"no, {account.missing} missing"),
     ]
     if late is not None:
@@ -74,7 +79,7 @@ def loop_table(report: Report) -> Table:
             ("  later than one period", f"{late.share_over_period:.3%}"),
         ]
     rows += [("records lost", str(report.gaps)), ("log complete", "yes" if report.complete else "no")]
-    title = f"{report.robot}, {account.rate_hz:g} Hz, {account.seconds:.1f} s"
+    title = f"{report.robot}, {account.rates}, {account.seconds:.1f} s"
     return _table(title, [Column("loop", "name"), Column("")], rows)
 
 
@@ -164,6 +169,29 @@ def joints_table(report: Report) -> Table:
 
 def _radians(value: float | None) -> str:
     return "-" if value is None else f"{value:.4f}"
+
+
+def steering_table(acts: Sequence[Act]) -> Table:
+    """Return what was asked of the loop while it ran, and by whom; of very much the first."""
+    columns = [
+        Column("s"),
+        Column("cycle"),
+        Column("asked", "text"),
+        Column("by", "name"),
+        Column("", "text"),
+    ]
+    rows = [
+        (
+            f"{act.time_s:.3f}",
+            str(act.cycle),
+            act.what,
+            act.origin,
+            Cell(f"refused: {act.refusal}", "warning") if act.refusal else "done",
+        )
+        for act in acts[:_MOST_ACTS]
+    ]
+    more = f" (the first {_MOST_ACTS} of {len(acts)})" if len(acts) > _MOST_ACTS else ""
+    return _table(f"Steered{more}", columns, rows)
 
 
 def events_table(events: Iterable[EventCount]) -> Table:

@@ -7,17 +7,35 @@ real-time kernel); a servo is *named* when a single reply of it is missing or ca
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from dxlrun.analysis.bus import Servo
-from dxlrun.analysis.latency import Duration, Latency, Periods, on_virtual_time
+from dxlrun.analysis.latency import Duration, Latency, Periods, cycle_periods_ns, on_virtual_time
+from dxlrun.analysis.steering import Act, Pause
 from dxlrun.events import Event, Severity
 from dxlrun.plurals import counted
 from dxlrun.recording.reader import Log
 
 ROUGH_SHARE = 0.01
 _MOST_NAMED = 3
+_KINDS = {
+    "switch": "switch",
+    "rate": "change of the rate",
+    "pause": "pause",
+    "load": "controller loaded",
+    "unload": "controller unloaded",
+    "stop": "stop",
+}
+_MANY = {
+    "switch": "switches",
+    "change of the rate": "changes of the rate",
+    "controller loaded": "controllers loaded",
+    "controller unloaded": "controllers unloaded",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +53,8 @@ class Timing:
     periods: Periods
     latency: Latency | None
     steps: Sequence[Duration]
+    acts: Sequence[Act] = ()
+    pauses: Sequence[Pause] = ()
 
 
 def verdict(timing: Timing, servos: Sequence[Servo], log: Log, lost: int) -> Verdict:
@@ -44,8 +64,9 @@ def verdict(timing: Timing, servos: Sequence[Servo], log: Log, lost: int) -> Ver
     """
     findings = [
         _loop(timing.periods, timing.latency, virtual=on_virtual_time(log)),
-        _slow(timing.steps, log.period_ns),
+        _slow(timing.steps, log),
         _rough(timing.latency),
+        _steered(timing.acts, timing.pauses),
         _silent(servos),
         _errors(servos),
         _events(log.events),
@@ -66,22 +87,49 @@ def _loop(account: Periods, wake_ups: Latency | None, *, virtual: bool) -> Findi
     wake_up = "on virtual time" if virtual else f"worst wake-up {microseconds(wake_ups.max_us)} late"
     elapsed = counted(account.elapsed, "period", "periods")
     return good, (
-        f"The loop {kept} {account.rate_hz:g} Hz: {account.skipped} of {elapsed} skipped"
+        f"The loop {kept} {account.rates}: {account.skipped} of {elapsed} skipped"
         f"{'' if good else f' ({account.skipped / account.elapsed:.2%})'}, "
         f"{wake_up}."
     )
 
 
-def _slow(steps: Sequence[Duration], period_ns: int) -> Finding | None:
-    """Say which step made a cycle longer than the period; `steps` ends with the whole cycle."""
-    if not steps or steps[-1].max_us * 1000 <= period_ns:
+def _slow(steps: Sequence[Duration], log: Log) -> Finding | None:
+    """Say which step made a cycle longer than its period; `steps` ends with the whole cycle."""
+    if not steps:
         return None
-    *parts, whole = steps
-    longest = max(parts, key=lambda step: step.max_us)
+    periods_ns = cycle_periods_ns(log)
+    lasted_ns = log.cycles["written_ns"] - log.cycles["woken_ns"]
+    worst = int(np.argmax(lasted_ns - periods_ns))
+    if lasted_ns[worst] <= periods_ns[worst]:
+        return None
+    longest = max(steps[:-1], key=lambda step: step.max_us)
     return False, (
-        f"A cycle took up to {microseconds(whole.max_us)}, longer than its period of "
-        f"{microseconds(period_ns / 1e3)}; the longest {longest.name} took {microseconds(longest.max_us)}."
+        f"A cycle took up to {microseconds(lasted_ns[worst] / 1e3)}, longer than its period of "
+        f"{microseconds(periods_ns[worst] / 1e3)}; the longest {longest.name} took "
+        f"{microseconds(longest.max_us)}."
     )
+
+
+def _steered(acts: Sequence[Act], pauses: Sequence[Pause]) -> Finding | None:
+    """Say what others asked of the loop in the run; nobody did: nothing."""
+    asked = [act for act in acts if act.origin != "loop"]
+    if not asked:
+        return None
+    done = Counter(
+        _KINDS.get(act.kind, "command")
+        for act in asked
+        if not (act.refusal or act.set_points or act.kind == "resume")  # a pause has an end
+    )
+    parts = [counted(count, what, _MANY.get(what, f"{what}s")) for what, count in done.items()]
+    streams = [act for act in asked if act.set_points and not act.refusal]
+    if streams:
+        points = counted(sum(act.set_points for act in streams), "set-point", "set-points")
+        parts.append(f"{counted(len(streams), 'stream', 'streams')} of {points}")
+    refused = sum(bool(act.refusal) for act in asked)
+    parts += [f"{refused} refused"] if refused else []
+    still = sum(pause.end_s - pause.begin_s for pause in pauses)
+    paused = f"; it was paused for {microseconds(still * 1e6)}" if pauses else ""
+    return True, f"It was steered from outside: {', '.join(parts)}{paused}."
 
 
 def _rough(wake_ups: Latency | None) -> Finding | None:

@@ -12,22 +12,27 @@ from cyclopts import App, CycloptsError
 
 from dxlrun.cli.analyze import analyze
 from dxlrun.cli.check import check
+from dxlrun.cli.doctor import doctor
 from dxlrun.cli.models import models
 from dxlrun.cli.replay import replay
+from dxlrun.cli.robots import list_robots
 from dxlrun.cli.run import run
 from dxlrun.cli.schema import schema
 from dxlrun.cli.sim import sim
+from dxlrun.cli.steer import load, pause, rate, resume, send, stop, switch, unload
 from dxlrun.cli.terminal import say_error, say_warning
 from dxlrun.errors import DxlrunError, InputError
 
 INTERRUPTED = 130
 """128 + SIGINT, as shells say it."""
 
+RUNNING = "Commands for a robot that runs"
+
 HELP = """Run a robot of Dynamixel servos from one YAML file.
 
 `dxlrun ROBOT.yaml` runs it, `dxlrun check ROBOT.yaml` looks at it without touching hardware,
 `dxlrun sim ROBOT.yaml` simulates its servos for other programs,
-`dxlrun analyze LOG` says what happened in a run."""
+`dxlrun analyze LOG` says what happened in a run, `dxlrun list` shows the robots that run."""
 
 EPILOGUE = """Exit codes: 0 good, 1 the robot or the run failed, 2 the input is wrong, 130 interrupted."""
 
@@ -48,6 +53,10 @@ def build() -> App:
     app.command(sim)
     app.command(schema)
     app.command(models)
+    app.command(doctor)
+    app.command(list_robots, name="list", group=RUNNING)
+    for verb in (switch, send, rate, pause, resume, load, unload, stop):
+        app.command(verb, group=RUNNING)
     return app
 
 

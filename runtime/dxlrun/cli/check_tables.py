@@ -14,7 +14,7 @@ from rich.text import Text
 
 from dxlrun.compile import Compiled
 from dxlrun.compile.reach import degrees
-from dxlrun.compile.report import BusRow, CheckReport, ControllerRow, JointRow, MotionRow
+from dxlrun.compile.report import BusRow, CheckReport, ControllerRow, JointRow, MotionRow, PolicyRow
 from dxlrun.plurals import counted
 
 
@@ -37,6 +37,7 @@ def tables(report: CheckReport, width: int) -> Iterator[RenderableType]:
     if report.controllers:
         sheets.append(_controllers(report.controllers, len(report.joints)))
     sheets.append(_buses(report.buses, report.rate))
+    sheets.append(_policies(report.policies))
     if report.motions:
         sheets.append(_motions(report.motions, report.duration))
     for sheet in sheets:
@@ -149,6 +150,13 @@ def _buses(rows: Sequence[BusRow], rate: float) -> _Sheet:
             f"{row.highest_rate:.0f} Hz",
             f"{row.share:.0%}",
         )
+    return table
+
+
+def _policies(rows: Sequence[PolicyRow]) -> _Sheet:
+    table = _Sheet("Policies", ["policy", "does", "when the loop is gone"], ["at most"])
+    for row in rows:
+        table.add_row(row.name, row.does, row.without_loop, f"{row.longest:.1f} s" if row.longest else "")
     return table
 
 

@@ -12,7 +12,8 @@ from dxlrun.errors import InputError
 if TYPE_CHECKING:
     from dxlrun.compile import Ask, Compiled
 
-COMMANDS = ("analyze", "check", "models", "replay", "schema", "sim")
+COMMANDS = ("analyze", "check", "doctor", "models", "replay", "schema", "sim")
+COMMANDS_WHILE_IT_RUNS = ("list", "switch", "send", "rate", "pause", "resume", "load", "unload", "stop")
 
 
 SHORTEST_S, LONGEST_S = 1e-6, 1e9
@@ -67,10 +68,11 @@ def _known_file(robot: Path) -> None:
         raise InputError(f"{word} is a directory; give the robot file in it")
     if robot.suffix in (".yaml", ".yml") or len(robot.parts) > 1:
         raise InputError(f"there is no robot file {word}; check the path")
-    close = difflib.get_close_matches(word, COMMANDS, n=1)
+    known = COMMANDS + COMMANDS_WHILE_IT_RUNS
+    close = difflib.get_close_matches(word, known, n=1)
     hint = (
         f"did you mean {close[0]}?"
         if close
-        else f"a robot is run by `dxlrun ROBOT.yaml`, the commands are {', '.join(COMMANDS)}"
+        else f"a robot is run by `dxlrun ROBOT.yaml`, the commands are {', '.join(known)}"
     )
     raise InputError(f"{word!r} is neither a command nor a robot file; {hint}")

@@ -36,6 +36,7 @@ def run(
     take_over: Flag = False,
     virtual: Flag = False,
     ledger: Path | None = None,
+    no_gateway: Flag = False,
     debug: Flag = False,
 ) -> int:
     """Run a robot until its motions have ended, or until Ctrl-C.
@@ -59,6 +60,8 @@ def run(
     ledger
         Write what the simulated buses saw to this file, for `dxlrun analyze LOG --ledger FILE`; without it
         a run writes it beside its log, one on virtual time not at all.
+    no_gateway
+        Let nobody steer the run.
     debug
         Print the traceback of an error, and what the processes said.
     """
@@ -69,7 +72,9 @@ def run(
         _check_ledger(ledger, result.plan)
     from dxlrun.run_summary import RunOptions
 
-    options = RunOptions(record=not no_record, take_over=take_over, debug=debug, ledger=ledger)
+    options = RunOptions(
+        record=not no_record, take_over=take_over, debug=debug, ledger=ledger, gateway=not no_gateway
+    )
     console = out()
     if virtual:
         from dxlrun.virtual_run import run_virtual

@@ -56,9 +56,12 @@ def compile_controllers(
             publishes=offer.controller.publishes,
             active=entry.active,
             every=every,
+            rate=entry.rate,
+            fallback=entry.fallback or "",
         )
         compiled[name] = CompiledController(plan, offer, parameters)
     _exclusive_claims(description, compiled, problems)
+    _fallbacks(description, compiled, problems)
     if len(description.robot.controllers) > MOST_CONTROLLERS:
         problems.error(
             description.marks.key("controllers"),
@@ -174,6 +177,32 @@ def _interfaces(
             good = False
         seen.add(joint)
     return interfaces if good else None
+
+
+def _fallbacks(description: Description, compiled: dict[str, CompiledController], problems: Problems) -> None:
+    """Make sure that each fallback can take over when the moment comes."""
+    robot = description.robot
+    for name, entry in robot.controllers.items():
+        if entry.fallback is None:
+            continue
+        mark = description.marks.value("controllers", name, "fallback")
+        other = robot.controllers.get(entry.fallback)
+        if other is None:
+            what = f"the fallback {entry.fallback} of {name} is no controller of the file"
+            problems.error(mark, what, suggestion(entry.fallback, tuple(robot.controllers)))
+        elif entry.fallback == name:
+            problems.error(mark, f"{name} is its own fallback", "name another controller, or take it out")
+        elif not entry.active:
+            continue  # who is active when it fails depends on what is switched
+        elif other.active:
+            what = f"the fallback {entry.fallback} of {name} is active from the start"
+            problems.error(mark, what, f"write active: false in {entry.fallback}: it takes over later")
+        elif name in compiled and entry.fallback in compiled:
+            staying = [one.plan for one in compiled.values() if one.plan.active and one.plan.name != name]
+            after = [*staying, compiled[entry.fallback].plan]
+            for holder in sorted({c.holder for c in conflicts(after) if entry.fallback == c.other}):
+                what = f"the fallback {entry.fallback} of {name} claims joints of {holder}, which goes on"
+                problems.error(mark, what, "take these joints out of it, or name another controller")
 
 
 def _exclusive_claims(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-from dxlrun.compile.places import texts
+from dxlrun.compile.places import policy_marks, texts
 from dxlrun.description import Description
 from dxlrun.errors import Mark, Problem
 
@@ -30,6 +30,15 @@ def _silent(description: Description) -> Iterator[Mark]:
     for name, joint in robot.joints.items():
         if joint.bus in buses or ("buses",) in description.left_out:
             yield marks.value("joints", name, "bus")
+    for name, pose in robot.poses.items():
+        yield from (marks.key("poses", name, joint) for joint in pose if joint in joints)
+    if ("poses",) in description.left_out or left_out_names(description, "poses") or joints:
+        yield from policy_marks(description)  # they may point at what was left out, or be short without it
+    yield from (
+        marks.value("controllers", name, "fallback")
+        for name, controller in robot.controllers.items()
+        if controller.fallback in left_out_names(description, "controllers")
+    )
     for name, controller in robot.controllers.items():
         for path, text in texts(controller.parameters, ("controllers", name)):
             if text in joints:

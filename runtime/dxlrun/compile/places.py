@@ -16,6 +16,16 @@ def joint_mark(description: Description, controller: str, joint: str) -> Mark:
     return description.marks.value(*named[-1]) if named else description.marks.key(*start)
 
 
+def policy_marks(description: Description) -> Iterator[Mark]:
+    """Yield where the policies of the file and their steps stand."""
+    for name, policy in description.robot.policies:
+        yield description.marks.value("policies", name)
+        if isinstance(policy, tuple):
+            for index in range(len(policy)):
+                yield description.marks.value("policies", name, index)
+                yield description.marks.value("policies", name, index, "pose")
+
+
 def texts(value: object, path: KeyPath) -> Iterator[tuple[KeyPath, str]]:
     """Yield every text of a tree with its path."""
     if isinstance(value, str):

@@ -68,6 +68,8 @@ class Plan:
     urdf: str | None = None
     """The robot's URDF as it was read."""
     simulation: SimulationPlan = field(default_factory=SimulationPlan)
+    gateway: bool = True
+    """Others may steer the run, over a Unix socket."""
 
     @property
     def simulated(self) -> bool:

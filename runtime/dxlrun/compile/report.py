@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from dxlrun.compile.controllers import CompiledController
 from dxlrun.compile.joints import CompiledJoint
 from dxlrun.compile.motions import CompiledPart
+from dxlrun.control.policy_plan import POLICIES, PolicyPlan
 from dxlrun.description import Description
 from dxlrun.dynamixel.bus_plan import BusPlan
 
@@ -22,6 +23,7 @@ class Checked:
     controllers: Mapping[str, CompiledController]
     parts: Sequence[CompiledPart]
     end_ns: int | None
+    policies: PolicyPlan
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +79,19 @@ class BusRow:
 
 
 @dataclass(frozen=True, slots=True)
+class PolicyRow:
+    """What happens when something does not go on as planned."""
+
+    name: str
+    does: str
+    """Its steps, and how the robot is left; or who is held while the run goes on."""
+    longest: float
+    """s, that the steps take at the most"""
+    without_loop: str
+    """What of it is left when the loop is gone: what the guardian does."""
+
+
+@dataclass(frozen=True, slots=True)
 class MotionRow:
     """One part of a motion file; times in s since the loop's first deadline."""
 
@@ -98,6 +113,7 @@ class CheckReport:
     joints: tuple[JointRow, ...]
     controllers: tuple[ControllerRow, ...]
     buses: tuple[BusRow, ...]
+    policies: tuple[PolicyRow, ...]
     motions: tuple[MotionRow, ...]
     duration: float | None
     """s; None: the run goes on until it is told to stop."""
@@ -112,6 +128,7 @@ def check_report(checked: Checked) -> CheckReport:
         joints=tuple(_joint_row(joint) for joint in checked.joints.values()),
         controllers=tuple(_controller_row(controller, rate) for controller in checked.controllers.values()),
         buses=tuple(_bus_row(bus, rate) for bus in checked.buses),
+        policies=_policy_rows(checked.policies),
         motions=tuple(_motion_row(part) for part in checked.parts),
         duration=None if checked.end_ns is None else checked.end_ns * 1e-9,
     )
@@ -163,6 +180,22 @@ def _bus_row(bus: BusPlan, rate: float) -> BusRow:
         highest_rate=budget.highest_rate_hz,
         share=budget.total_ns * 1e-9 * rate,
     )
+
+
+_WHO_IS_HELD = {
+    "on_lost_servo": "hold its controllers until it answers, the others go on",
+    "on_stale_command": "hold its joints until the next command",
+}
+
+
+def _policy_rows(policies: PolicyPlan) -> tuple[PolicyRow, ...]:
+    rows = []
+    for name in POLICIES:
+        policy = policies.named(name)
+        going_on = _WHO_IS_HELD.get(name, policy.text) if policy.goes_on else policy.text
+        alone = policies.on_fault.last
+        rows.append(PolicyRow(name, going_on, policy.longest_ns * 1e-9, alone))
+    return tuple(rows)
 
 
 def _motion_row(part: CompiledPart) -> MotionRow:

@@ -14,12 +14,14 @@ from dxlrun.compile.joints import AUTO, compile_joints
 from dxlrun.compile.left_out import left_out_names, still_true
 from dxlrun.compile.motions import compile_motion
 from dxlrun.compile.plan import Plan, SimulationPlan
+from dxlrun.compile.policies import compile_policies
 from dxlrun.compile.problems import Problems
 from dxlrun.compile.report import Checked, CheckReport, check_report
+from dxlrun.compile.scheduler import check_scheduler, least_period_ns, scheduler_plan
 from dxlrun.compile.simulation import compile_simulation
 from dxlrun.compile.twins import check_twins
 from dxlrun.compile.urdf import compile_urdf
-from dxlrun.control.loop_plan import LoopPlan, SchedulerPlan
+from dxlrun.control.loop_plan import LoopPlan
 from dxlrun.control.plugins import load_plugins
 from dxlrun.description import Description, MotionDescription, read_motion, survey_robot
 from dxlrun.dynamixel.bus_plan import BusPlan
@@ -110,11 +112,13 @@ def compile_robot(
     problems = Problems()
     plugins = load_plugins()  # first, as they may bring the servo models of joints along
     joints = compile_joints(description, problems, models or {})
+    check_scheduler(description, problems)
     check_twins(description, {name: joint.table for name, joint in joints.items()}, problems)
     buses = compile_buses(description, joints, problems)
     urdf = compile_urdf(description, joints, problems)
     simulation = compile_simulation(description, joints, problems)
     controllers = compile_controllers(description, plugins, problems)
+    policies = compile_policies(description, joints, buses, problems)
     names = (*description.robot.controllers, *left_out_names(description, "controllers"))
     parts = [
         part for motion in motions for part in compile_motion(motion, controllers, names, joints, problems)
@@ -123,21 +127,23 @@ def compile_robot(
     end_ns = duration_ns
     if end_ns is None and parts:
         end_ns = max(part.end_ns for part in parts)
-    checked = Checked(description, joints, buses, controllers, parts, end_ns)
+    checked = Checked(description, joints, buses, controllers, parts, end_ns, policies)
     return Compiled(_plan(checked, urdf, simulation), problems.warnings, check_report(checked))
 
 
 def _plan(checked: Checked, urdf: str | None, simulation: SimulationPlan) -> Plan:
     description, robot = checked.description, checked.description.robot
-    scheduler = robot.loop.scheduler
     commands = [command for part in checked.parts for command in part.commands]
     loop = LoopPlan(
         period_ns=round(1e9 / robot.loop.rate),
-        scheduler=SchedulerPlan(scheduler.policy, scheduler.priority, scheduler.lock_memory),
+        scheduler=scheduler_plan(robot.loop),
         joints=tuple(joint.plan for joint in checked.joints.values()),
         controllers=tuple(controller.plan for controller in checked.controllers.values()),
         commands=tuple(sorted(commands, key=lambda command: command.at_ns)),
         end_ns=checked.end_ns,
+        policies=checked.policies,
+        overrun=robot.loop.overrun,
+        least_period_ns=least_period_ns(robot.loop, checked.buses),
     )
     return Plan(
         robot=robot.name,
@@ -154,4 +160,5 @@ def _plan(checked: Checked, urdf: str | None, simulation: SimulationPlan) -> Pla
         },
         urdf=urdf,
         simulation=simulation,
+        gateway=robot.processes.gateway.enabled,
     )

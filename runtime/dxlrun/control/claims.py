@@ -54,3 +54,13 @@ def conflicts(claimants: Iterable[Claimant]) -> tuple[Conflict, ...]:
             if holder != claimant.name:
                 found.append(Conflict(joint, holder, claimant.name))
     return tuple(found)
+
+
+def told(found: Iterable[Conflict]) -> str:
+    """Say who stands in whose way: each pair once, however many joints it is about; empty for nobody."""
+    pairs: dict[tuple[str, str], list[Conflict]] = {}
+    for conflict in found:
+        pairs.setdefault((conflict.holder, conflict.other), []).append(conflict)
+    return "; ".join(
+        str(many[0]) + (f" and {len(many) - 1} more" if many[1:] else "") for many in pairs.values()
+    )

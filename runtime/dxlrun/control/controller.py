@@ -87,7 +87,7 @@ class Controller(ABC, Generic[P]):
     """
 
     Parameters: ClassVar[type[ParametersModel]] = ParametersModel
-    """The model of the controller's keys in the robot file (all but type, active and rate)."""
+    """The model of the controller's keys in the robot file (all but type, active, rate and fallback)."""
     Commands: ClassVar[Mapping[str, type[CommandModel]]] = {}
     """The typed commands it takes, by name."""
     publishes: ClassVar[tuple[str, ...]] = ()

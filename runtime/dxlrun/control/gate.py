@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -54,15 +56,21 @@ class Gate:
             [np.inf if joint.velocity is None else joint.velocity for joint in plan.joints], dtype=np.float64
         )
         self._slow = np.minimum(self._speed, SLOW_SPEED)
-        self._slow_ns = SLOW_START_NS
+        self._slow_ns = np.full(count, SLOW_START_NS, dtype=np.int64)
+        self._longest_slow_ns = SLOW_START_NS
         self._before = np.zeros(count, dtype=np.uint8)
         self._flags = np.zeros(count, dtype=np.uint8)
         self._wanted, self._inside, self._step, self._low, self._high = (np.empty(count) for _ in range(5))
         self._finite, self._mask = (np.empty(count, dtype=np.bool_) for _ in range(2))
 
-    def ease_in(self) -> None:
-        """Limit the steps of the coming second to SLOW_SPEED: torque was just switched on."""
-        self._slow_ns = SLOW_START_NS
+    def ease_in(self, rows: Sequence[int] | None = None) -> None:
+        """Limit the steps of the coming second to SLOW_SPEED, of all joints or of these rows.
+
+        Torque was just switched on, or nobody commanded the joints for a while.
+        """
+        if rows is None or rows:
+            self._slow_ns[slice(None) if rows is None else list(rows)] = SLOW_START_NS
+            self._longest_slow_ns = SLOW_START_NS
 
     def apply(self, commands: Commands, goals: Commands, dt_ns: int) -> None:
         """Move `goals` toward `commands` in place; `dt_ns` is the time since the cycle before."""
@@ -90,8 +98,7 @@ class Gate:
         self._flag(Clamp.UPPER)
         np.maximum(self._wanted, low, out=inside)
         np.minimum(inside, high, out=inside)
-        np.multiply(self._speed if self._slow_ns <= 0 else self._slow, max(dt_ns, 1) * 1e-9, out=step)
-        self._slow_ns = max(0, self._slow_ns - dt_ns)
+        np.multiply(self._highest(dt_ns), max(dt_ns, 1) * 1e-9, out=step)
         np.subtract(goal, step, out=low)
         np.add(goal, step, out=high)
         np.less(inside, low, out=self._mask)
@@ -101,6 +108,15 @@ class Gate:
         np.fmax(inside, low, out=inside)
         np.fmin(inside, high, out=inside)
         np.copyto(goal, inside, where=finite)
+
+    def _highest(self, dt_ns: int) -> Floats:
+        """Return the speed that each goal may have in this cycle, rad/s."""
+        if self._longest_slow_ns <= 0:
+            return self._speed
+        speed = np.where(self._slow_ns > 0, self._slow, self._speed)
+        self._slow_ns -= dt_ns
+        self._longest_slow_ns -= dt_ns
+        return speed
 
     def _velocity(self, wanted: Floats, goal: Floats) -> None:
         """A speed belongs to the position that it was commanded with: both are kept, or both are new."""

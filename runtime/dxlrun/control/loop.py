@@ -6,16 +6,32 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
+import numpy as np
+
 from dxlrun.clock import Clock
+from dxlrun.commands import CommandSink, NoCommands, TakenCommand
 from dxlrun.control.gate import Gate
 from dxlrun.control.loop_plan import LoopPlan
+from dxlrun.control.lost_servos import LostServos
 from dxlrun.control.managed import PERIOD_CAP
 from dxlrun.control.manager import Manager
+from dxlrun.control.overrun import OverrunHook, Overruns
+from dxlrun.control.policy_plan import Last, PolicyName
+from dxlrun.control.safe_motion import SafeMotion
+from dxlrun.control.schedule import Schedule
+from dxlrun.control.steering import Steering
 from dxlrun.cycle import CycleRecord
 from dxlrun.errors import PortError
 from dxlrun.events import EventCode, EventSink, Severity
-from dxlrun.hardware import Hardware
+from dxlrun.hardware import LOST_CYCLES, Hardware
+from dxlrun.inbox import LOOP, Inbox, NoInbox
 from dxlrun.plurals import counted
+
+MOST_RATE = 100_000.0
+"""Hz; as in the robot file."""
+PAUSED_CYCLE_NS = 200_000_000
+"""How long a cycle may take while the loop is paused: a controller may be loaded in it. The guardian has
+patience for some of them."""
 
 
 @dataclass(slots=True)
@@ -50,16 +66,17 @@ class LoopResult:
     reason: Literal["ended", "stopped", "fault"]
     detail: str = ""
     """One sentence where the reason is a fault."""
+    last: Last = "limp"
+    """How the policy leaves the robot; who started the hardware sees to it."""
 
 
 @dataclass(slots=True, kw_only=True)
 class Loop:
     """One robot's control loop; hardware is started before and stopped after it by whoever built it.
 
-    Cycle i is due at t_0 + i * T. After a cycle, the next one is the first whose deadline has not passed: the
-    deadlines between are declared skipped, the phase of the schedule stays, two cycles never follow each
-    other in a burst. Controllers get the time of the wake-up since t_0, and the true time since the cycle
-    before, at most PERIOD_CAP periods.
+    Cycle n is due by the Schedule, which keeps its phase. Controllers get the time of the wake-up since the
+    first deadline, pauses left out, and the true time since the cycle before, at most PERIOD_CAP periods.
+    Commands from the inbox are taken after the wake-up, a bounded number of them.
     """
 
     clock: Clock
@@ -73,20 +90,46 @@ class Loop:
     beat: Callable[[], None]
     """Shows the guardian that the loop lives; called once a cycle."""
     stop: StopFlag
-    _start_ns: int = field(default=0, init=False)
+    inbox: Inbox = field(default_factory=NoInbox)
+    commands: CommandSink = field(default_factory=NoCommands)
+    """Takes what came through the inbox, for the log."""
+    patience: Callable[[int], None] = lambda _: None
+    """Tells the guardian how long a cycle may take from now on, ns."""
+    pace: Callable[[int], None] = lambda _: None
+    """Tells the clock another period, ns, so that its polling stays a small share of it."""
+    overrun_hooks: tuple[OverrunHook, ...] = ()
+    """Plug-ins that decide what becomes of a late cycle."""
+    schedule: Schedule = field(init=False)
+    steering: Steering = field(init=False)
+    _overruns: Overruns = field(init=False)
+    paused: bool = field(default=False, init=False)
+    _cycle: int = field(default=0, init=False)
+    _paused_cycles: int = field(default=0, init=False)
     _woken_ns: int = field(default=0, init=False)
     _cycles: int = field(default=0, init=False)
     _skipped: int = field(default=0, init=False)
     _late: bool = field(default=False, init=False)
+    _lost: LostServos = field(init=False)
+    _given_up: tuple[PolicyName, str] | None = field(default=None, init=False)
+    _motion: SafeMotion | None = field(default=None, init=False)
+
+    def __post_init__(self) -> None:
+        self.schedule = Schedule(self.plan.period_ns)
+        self._overruns = Overruns(self.plan.overrun, self.overrun_hooks, self.events)
+        self._lost = LostServos(len(self.plan.joints))
+        self.steering = Steering(
+            self.inbox, self, self.manager, self.record, self.events, self.commands, self.clock
+        )
 
     def run(self) -> LoopResult:
-        """Activate the controllers, run until the plan's end, a stop or a fault, deactivate them.
+        """Activate the controllers, run until the plan's end, a stop or a fault, deactivate them; then go
+        through the steps of the policy for that, which leaves the robot limp or holding.
 
         What controllers raise, and PortError of the hardware, become the result; nothing else is caught.
         """
         period_ns = self.plan.period_ns
-        self._start_ns = self.clock.now_ns() + period_ns
-        self._woken_ns = self._start_ns - period_ns
+        self._woken_ns = self.clock.now_ns()
+        self.schedule.start(self._woken_ns)
         self.events.emit(
             EventCode.LOOP_STARTED, Severity.INFO, "loop", f"loop started, period {period_ns / 1e6:g} ms"
         )
@@ -98,32 +141,90 @@ class Loop:
         except PortError as error:
             reason, detail = "fault", str(error)
         finally:
-            self.manager.deactivate(self.clock.now_ns() - self._start_ns)
+            self.manager.deactivate(self.schedule.time_ns(self.clock.now_ns()))
         if reason != "fault" and self.manager.fault is not None:
             reason, detail = "fault", self.manager.fault
+        policy: PolicyName = "on_fault" if reason == "fault" else "on_exit"
+        if self._given_up:
+            policy, sentence = self._given_up
+            reason, detail = "fault", detail or sentence
+        last = self._wind_up(policy)
         self._tell_end(reason, detail)
-        return LoopResult(self._cycles, self._skipped, reason, detail)
+        return LoopResult(self._cycles, self._skipped, reason, detail, last)
+
+    # What clients may ask for, through Steering
+
+    def change_rate(self, rate: float) -> str:
+        """Run in another period from the next cycle on, Hz; return why not."""
+        if not 0 < rate <= MOST_RATE:
+            return f"{rate:g} Hz is no rate; write one up to {MOST_RATE:g}"
+        period_ns = round(1e9 / rate)
+        if period_ns < self.plan.least_period_ns:
+            return f"the buses allow at most {1e9 / self.plan.least_period_ns:.4g} Hz"
+        if refusal := self.plan.policies.refuse_period(period_ns, self.plan.period_ns):
+            return refusal
+        if refusal := self.manager.change_period(period_ns):
+            return refusal
+        self.schedule.change(self._cycle, period_ns)
+        self.patience(period_ns)
+        self.pace(period_ns)
+        return ""
+
+    def pause(self) -> str:
+        """Stop the controllers' time after this cycle's read; return why not."""
+        if self.paused:
+            return "the loop is paused already"
+        self.paused = True
+        self.patience(PAUSED_CYCLE_NS)
+        return ""
+
+    def resume(self) -> str:
+        """Let the controllers' time go on; goals that moved away meanwhile are approached slowly."""
+        if not self.paused:
+            return "the loop is not paused"
+        self.paused = False
+        self.gate.ease_in()
+        self.patience(self.schedule.period_ns)
+        return ""
+
+    def finish(self) -> str:
+        """End the run in order after this cycle."""
+        self.stop.request()
+        return ""
+
+    def expire(self, controller: str) -> str:
+        """Hold a controller whose stream of commands ended, or end the run, as the policy says."""
+        policy = self.plan.policies.on_stale_command
+        if policy.goes_on:
+            self.manager.hold(controller)
+            return "its joints are held"
+        self._give_up("on_stale_command", f"the stream of commands for {controller} ended")
+        return f"the run ends: {policy.text}"
+
+    # Inside
 
     def _cycle_until_end(self) -> tuple[Literal["ended", "stopped", "fault"], str]:
         """Run cycles; return why they ended, and a sentence for a fault."""
-        end_ns, period_ns = self.plan.end_ns, self.plan.period_ns
-        cycle = 0
+        end_ns, schedule = self.plan.end_ns, self.schedule
         while self.manager.fault is None:
-            if end_ns is not None and cycle * period_ns >= end_ns:
+            if end_ns is not None and schedule.time_ns(schedule.deadline_ns(self._cycle)) >= end_ns:
                 return "ended", ""
             if self.stop.requested:
                 return "stopped", ""
-            self._one(cycle)
-            cycle = self._next(cycle)
+            if self._given_up:
+                return "fault", self._given_up[1]
+            self._one(self._cycle)
+            if self._next():
+                return "fault", f"cycle {self.record.cycle} ended after the next deadline; overrun: stop"
         return "fault", self.manager.fault
 
     def _one(self, cycle: int) -> None:
-        """Wait for a deadline, then read, update, gate and write."""
-        record, now_ns = self.record, self.clock.now_ns
-        deadline_ns = self._start_ns + cycle * self.plan.period_ns
+        """Wait for a deadline, then take commands, read, update, gate and write."""
+        record, now_ns, schedule = self.record, self.clock.now_ns, self.schedule
+        deadline_ns = schedule.deadline_ns(cycle)
         self.hardware.idle(deadline_ns)
         woken_ns = self.clock.wait_until(deadline_ns)
-        dt_ns = min(woken_ns - self._woken_ns, PERIOD_CAP * self.plan.period_ns)
+        dt_ns = min(woken_ns - self._woken_ns, PERIOD_CAP * schedule.period_ns)
         self._woken_ns = woken_ns
         record.cycle = cycle
         record.scheduled_ns = deadline_ns
@@ -131,7 +232,12 @@ class Loop:
         record.period_ns = dt_ns
         self.hardware.read()
         record.read_ns = now_ns()
-        self.manager.update(woken_ns - self._start_ns)
+        self.manager.begin()
+        if self._motion:
+            self.steering.refuse("the run is ending")
+            self._motion.command()
+        else:
+            self._command(cycle, schedule.time_ns(woken_ns))
         self.gate.apply(record.commands, record.goals, dt_ns)
         record.updated_ns = now_ns()
         self.hardware.write()
@@ -140,32 +246,106 @@ class Loop:
         self._cycles += 1
         self.beat()
 
-    def _next(self, cycle: int) -> int:
-        """Return the first cycle whose deadline has not passed; declare those between as skipped."""
-        passed_ns = self.clock.now_ns() - self._start_ns
-        following = max(cycle + 1, -(-passed_ns // self.plan.period_ns))
-        if self.plan.end_ns is not None:
-            last = max(cycle + 1, -(-self.plan.end_ns // self.plan.period_ns))
-            following = min(following, last)
+    def _command(self, cycle: int, time_ns: int) -> None:
+        """Take what clients want, and let the controllers command, as far as their servos answer."""
+        record = self.record
+        if self._lost.look(record.states.valid):
+            self._miss()
+        record.command_count = self.steering.take(time_ns)
+        if self.paused:
+            record.commands.position.fill(np.nan)
+            record.commands.velocity.fill(np.nan)
+        else:
+            self.manager.update(cycle - self._paused_cycles, time_ns)
+
+    def _miss(self) -> None:
+        """Other servos are lost than in the cycle before: do what the policy says."""
+        policy, rows = self.plan.policies.on_lost_servo, self._lost.rows
+        if policy.goes_on:
+            self.gate.ease_in(self.manager.wait_for(rows))
+        elif rows:
+            names = ", ".join(self.plan.joints[row].name for row in sorted(rows))
+            self._give_up("on_lost_servo", f"{names} missed {LOST_CYCLES} replies in a row")
+
+    def _give_up(self, policy: PolicyName, why: str) -> None:
+        """End the run after this cycle, by another policy than on_exit."""
+        if self._given_up is None:
+            self._given_up = policy, f"{why}; {policy}: {self.plan.policies.named(policy).text}"
+
+    def _wind_up(self, name: PolicyName) -> Last:
+        """Go through the steps of a policy in more cycles; return how it leaves the robot."""
+        policy = self.plan.policies.named(name)
+        if policy.steps:
+            self._tell_policy(name, policy.text)
+            if self.paused:
+                self.resume()
+            motion = SafeMotion(policy, self.plan.policies.limit_ns, self.record, self.hardware.limit_torque)
+            self._motion = motion
+            try:
+                while not motion.over:
+                    self._one(self._cycle)
+                    self._next()
+            except PortError as error:
+                motion.give_up(str(error))
+            if motion.unfinished:
+                text = f"{name}: {motion.unfinished}; now {policy.last}"
+                self.events.emit(EventCode.POLICY, Severity.WARNING, "loop", text)
+        if policy.last == "hold":
+            self.events.emit(EventCode.POLICY, Severity.WARNING, "loop", f"{name}: torque stays on")
+        return policy.last
+
+    def _tell_policy(self, name: PolicyName, text: str) -> None:
+        """Leave in the log in which cycle a policy begins."""
+        self.events.emit(EventCode.POLICY, Severity.INFO, "loop", f"{name}: {text}")
+        self.commands.take(
+            TakenCommand(
+                t_ns=self.record.woken_ns,
+                cycle=self._cycle,
+                planned=-1,
+                controller=LOOP,
+                kind="policy",
+                origin="loop",
+                data=f'{{"policy":"{name}"}}'.encode(),
+            )
+        )
+
+    def _next(self) -> bool:
+        """Go to the next cycle, past those that are declared skipped; say whether that is to end the run."""
+        cycle, schedule = self._cycle, self.schedule
+        now_ns, policy = self.clock.now_ns(), self.plan.overrun
+        if now_ns > (due_ns := schedule.deadline_ns(cycle + 1)):
+            policy = self._overruns.decide(cycle + 1, due_ns, now_ns)
+        following = schedule.following(cycle, now_ns, policy)
+        if self.plan.end_ns is not None and not self._motion:
+            # nothing is skipped behind the end
+            left_ns = self.plan.end_ns - schedule.time_ns(schedule.deadline_ns(cycle))
+            following = min(following, cycle + max(1, -(-left_ns // schedule.period_ns)))
         skipped = following - cycle - 1
+        if self.paused:
+            self._paused_cycles += following - cycle
+            schedule.paused_ns += (following - cycle) * schedule.period_ns
+        self._cycle = following
         self.record.skipped = skipped
         self._skipped += skipped
-        if skipped and not self._late:
+        late = bool(skipped) or (policy == "catch_up" and now_ns > due_ns)
+        if late and not self._late:
+            late_ms = (now_ns - schedule.deadline_ns(cycle)) / 1e6
             self.events.emit(
                 EventCode.OVERRUN,
                 Severity.WARNING,
                 "loop",
-                f"cycle {cycle} ended {(passed_ns - cycle * self.plan.period_ns) / 1e6:.3f} ms after its "
-                f"deadline; {counted(skipped, 'period', 'periods')} skipped",
+                f"cycle {cycle} ended {late_ms:.3f} ms after its deadline; "
+                f"{counted(skipped, 'period', 'periods')} skipped"
+                f"{', the next one follows at once' if policy == 'catch_up' else ''}",
             )
-        self._late = bool(skipped)
-        return following
+        self._late = late
+        return bool(skipped) and policy == "stop"
 
     def _tell_start(self) -> None:
         """Leave in the log what the controllers are activated with: nothing else tells it."""
         record = self.record
         record.cycle = -1
-        record.scheduled_ns = self._start_ns
+        record.scheduled_ns = self.schedule.start_ns
         record.woken_ns = record.read_ns = record.updated_ns = record.written_ns = self.clock.now_ns()
         self.sink.begin(record)
 

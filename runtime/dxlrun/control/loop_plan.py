@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
+from dxlrun.control.policy_plan import PolicyPlan
+
 Policy = Literal["other", "fifo", "round_robin"]
+OverrunPolicy = Literal["skip", "catch_up", "stop"]
+"""What becomes of deadlines that passed while a cycle was late."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -15,6 +19,12 @@ class SchedulerPlan:
     policy: Policy
     priority: int
     lock_memory: bool
+    cores: tuple[int, ...] = ()
+    """Where the loop may run; empty: anywhere."""
+    polling_ns: int | None = None
+    """Longest time that the clock is polled before a deadline; None: a tenth of the period."""
+    idle_latency: bool = False
+    """Keep the cores from deep idle states."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +56,10 @@ class ControllerPlan:
     active: bool
     every: int
     """Updated every n-th cycle."""
+    rate: float | None = None
+    """Updates per second that the file asks for, Hz; None: the loop's."""
+    fallback: str = ""
+    """Name of the controller that takes over when this one breaks its contract; empty: none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,3 +88,7 @@ class LoopPlan:
     """Sorted by time."""
     end_ns: int | None
     """Stop by itself at this time since the first deadline; None: run until told."""
+    overrun: OverrunPolicy = "skip"
+    least_period_ns: int = 0
+    """The shortest period that the buses allow, by the time budget; 0: not computed."""
+    policies: PolicyPlan = field(default_factory=PolicyPlan)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import traceback
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -31,14 +32,21 @@ class Managed:
         context: Context,
         rows: NDArray[np.intp],
         record: CycleRecord,
+        *,
+        bit: int,
     ) -> None:
         self.plan = plan
+        self.bit = bit
+        """Of the record's mask of active controllers."""
         self.active = False
         self._controller = controller
         self._context = context
         self._rows = rows
         self._record = record
         self._nominal_ns = context.period_ns
+        self._every = plan.every
+        self._held = False
+        self._waiting = False
         self._last_ns = -1
         self._last_number = -1
         self._finite = np.zeros(len(rows), dtype=np.bool_)
@@ -58,6 +66,7 @@ class Managed:
             raise self._fault("on_activate", error) from error
         self._last_ns = -1
         self._last_number = -1
+        self._held = False
         self.active = True
 
     def deactivate(self, time_ns: int) -> None:
@@ -71,20 +80,52 @@ class Managed:
     def release(self) -> None:
         """Take its commands out of the robot's: the gate holds what it last let through."""
         self.active = False
+        self._withdraw()
+
+    def _withdraw(self) -> None:
         for claim in self._claimed:
             claim.merged[self._rows] = np.nan
 
     def command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
         """Hand over a prepared command. Raises ControllerFault."""
+        self._held = False
         self.gather()
         try:
             self._controller.on_command(kind, data, time_ns)
         except (Exception, SystemExit) as error:  # see activate
             raise self._fault(f"on_command ({kind})", error) from error
 
+    def hold(self) -> None:
+        """Take its commands out of the robot's, and update it no more, until the next command."""
+        self._held = True
+        self._withdraw()
+
+    def wait_for(self, lost: Collection[int]) -> bool:
+        """Hold its joints as long as one that it claims is lost, of these rows; return whether that changed
+        anything for the robot."""
+        waiting = bool(self._claimed) and any(row in lost for row in self._rows.tolist())
+        changed = waiting != self._waiting
+        self._waiting = waiting
+        if waiting and self.active:
+            self._withdraw()
+        return changed and self.active
+
+    @property
+    def waiting(self) -> bool:
+        """True while one of the joints that it claims is lost."""
+        return self._waiting
+
+    def pace(self, period_ns: int, every: int) -> None:
+        """Let it be updated in every n-th of the loop's periods."""
+        self._every = every
+        self._nominal_ns = every * period_ns
+        self._last_number = -1  # turns are counted anew
+
     def due(self, number: int) -> bool:
         """Say whether the controller is updated in this period; a skipped turn is made up in the next one."""
-        return number // self.plan.every > self._last_number // self.plan.every
+        return not (self._held or self._waiting) and (
+            number // self._every > self._last_number // self._every
+        )
 
     def update(self, number: int, time_ns: int) -> None:
         """Update and merge its commands into the robot's. Raises ControllerFault."""
@@ -103,6 +144,11 @@ class Managed:
                 self._judge(claim)
         for claim in self._claimed:
             claim.merged[self._rows] = claim.own
+
+    @property
+    def rows(self) -> NDArray[np.intp]:
+        """Rows of its joints in the robot's arrays."""
+        return self._rows
 
     def gather(self) -> None:
         """Copy the robot's states and goals into the controller's own arrays."""

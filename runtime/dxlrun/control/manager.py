@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,12 +12,12 @@ from pydantic import ValidationError
 
 from dxlrun.clock import Clock
 from dxlrun.commands import CommandSink, NoCommands, TakenCommand
-from dxlrun.control.claims import conflicts
+from dxlrun.control.claims import conflicts, told
 from dxlrun.control.controller import Context, Controller, JointLimits
 from dxlrun.control.loop_plan import ControllerPlan, LoopPlan, ScheduledCommand
 from dxlrun.control.managed import Managed
 from dxlrun.control.plugins import PlugIns
-from dxlrun.cycle import CycleRecord
+from dxlrun.cycle import MOST_CONTROLLERS, CycleRecord
 from dxlrun.errors import ControllerFault, PlugInError
 from dxlrun.events import EventCode, EventSink, Severity
 from dxlrun.interfaces import Commands, States
@@ -46,9 +47,13 @@ class Manager:
         self._clock = clock
         self._taken = commands or NoCommands()
         self._rows = {joint.name: row for row, joint in enumerate(plan.joints)}
+        self._period_ns = plan.period_ns
         self._managed: tuple[Managed, ...] = ()
+        self._named: dict[str, Managed] = {}
         self._commands: tuple[tuple[ScheduledCommand, NDArray[np.float64]], ...] = ()
         self._next = 0
+        self._lost: Collection[int] = ()
+        self._failed: set[str] = set()
 
     def configure(self) -> None:
         """Build and configure every controller, decode every command; allocates, before real time.
@@ -62,55 +67,209 @@ class Manager:
         self._managed = tuple(
             self._configured(index, controller) for index, controller in enumerate(self._plan.controllers)
         )
+        self._named = {managed.plan.name: managed for managed in self._managed}
         self._commands = tuple(
             (command, np.frombuffer(command.data, dtype="<f8")) for command in self._plan.commands
         )
 
     def activate(self, time_ns: int) -> None:
         """Activate what the plan wants active; states and goals must be fresh. A fault is in `fault`."""
-        for index, managed in enumerate(self._managed):
+        for managed in self._managed:
             if managed.plan.active and not managed.active:
-                try:
-                    managed.activate(time_ns)
-                except ControllerFault as fault:
-                    self._end(managed, fault)
-                else:
-                    self._record.active |= 1 << index
-                    self._tell(EventCode.CONTROLLER_ACTIVATED, managed, "active")
+                self._activate(managed, time_ns)
 
-    def update(self, time_ns: int) -> str | None:
-        """Hand over the commands that are due and update every active controller whose turn it is.
-
-        `time_ns` is the time of this cycle since the loop's first deadline. A controller that breaks its
-        contract is ended, its joints are held by the gate, the others go on; returns `fault`.
-        """
-        record, now_ns = self._record, self._clock.now_ns
+    def begin(self) -> None:
+        """Begin a cycle: nobody was updated in it yet."""
+        record = self._record
         record.published = 0
+        record.command_count = 0
         record.clamped.fill(0)
         record.controller_ns.fill(0)
-        record.command_count = self._hand_over(time_ns)
-        number = time_ns // self._plan.period_ns
+
+    def update(self, turn: int, time_ns: int) -> str | None:
+        """Hand over the commands that are due and update every active controller whose turn it is.
+
+        `turn` counts the periods since the first deadline, `time_ns` is the controllers' time; pauses are in
+        neither. A controller that breaks its contract is ended, its fallback takes over, or its joints are
+        held by the gate; the others go on. Returns `fault`.
+        """
+        record, now_ns = self._record, self._clock.now_ns
+        record.command_count += self._hand_over(time_ns)
         for index, managed in enumerate(self._managed):
-            if managed.active and managed.due(number):
+            if managed.active and managed.due(turn):
                 begin_ns = now_ns()
                 try:
-                    managed.update(number, time_ns)
+                    managed.update(turn, time_ns)
                 except ControllerFault as fault:
-                    self._end(managed, fault)
-                record.controller_ns[index] = now_ns() - begin_ns
+                    self._end(managed, fault, time_ns)
+                if index < len(record.controller_ns):
+                    record.controller_ns[index] = now_ns() - begin_ns
         return self.fault
+
+    def hand(self, controller: str, kind: str, data: NDArray[np.float64], origin: str, time_ns: int) -> str:
+        """Hand a prepared command to a controller; return why it was refused, empty when it was taken.
+
+        Without an `origin` no event tells of it: the next one of a stream.
+        """
+        managed = self._named.get(controller)
+        if managed is None:
+            return f"there is no such controller as {controller}"
+        if not managed.active:
+            return "the controller is not active"
+        try:
+            managed.command(kind, data, time_ns)
+        except ControllerFault as fault:
+            self._end(managed, fault, time_ns)
+            return str(fault)
+        if origin:
+            self._tell(EventCode.COMMAND, managed, f"{kind} from {origin}")
+        return ""
+
+    def hold(self, controller: str) -> None:
+        """Withdraw what a controller commands until it gets another command; it stays active."""
+        managed = self._named.get(controller)
+        if managed is not None and managed.active:
+            managed.hold()
+
+    def wait_for(self, lost: Collection[int]) -> tuple[int, ...]:
+        """Hold every controller that claims a lost joint, of these rows, as long as it is lost.
+
+        Returns the rows of those that go on again. A controller that is activated meanwhile waits too.
+        """
+        self._lost = lost
+        going: list[int] = []
+        for managed in self._managed:
+            if not managed.wait_for(lost):
+                continue
+            text, severity = "goes on: all its joints answer again", Severity.INFO
+            if managed.waiting:
+                text, severity = "is held until all its joints answer again", Severity.WARNING
+            else:
+                going += managed.rows.tolist()
+            self._events.emit(EventCode.POLICY, severity, managed.plan.name, text)
+        return tuple(going)
+
+    def switch(self, activate: Sequence[str], deactivate: Sequence[str], time_ns: int) -> str:
+        """Deactivate and activate controllers in one step; return why nothing was done, empty when it was.
+
+        A controller in both lists begins anew. Claims are those of everybody who is active afterwards.
+        """
+        if refusal := self._refuse_switch(activate, deactivate):
+            return refusal
+        for name in deactivate:
+            self._deactivate(self._named[name], time_ns)
+        for name in activate:
+            self._activate(self._named[name], time_ns)
+        return ""
+
+    def _refuse_switch(self, activate: Sequence[str], deactivate: Sequence[str]) -> str:
+        for names in (activate, deactivate):
+            for name in names:
+                if name not in self._named:
+                    return f"there is no controller {name}"
+            if len(set(names)) != len(names):
+                return "a controller is named twice"
+        if idle := [name for name in deactivate if not self._named[name].active]:
+            return f"{', '.join(idle)} is not active"
+        leaving = set(deactivate)
+        if busy := [name for name in activate if self._named[name].active and name not in leaving]:
+            return f"{', '.join(busy)} is active already"
+        staying = [one.plan for one in self._managed if one.active and one.plan.name not in leaving]
+        return told(conflicts([*staying, *(self._named[name].plan for name in activate)]))
+
+    def load(self, plan: ControllerPlan) -> str:
+        """Configure one more controller, inactive; return why not. Only while the loop is paused."""
+        if plan.name in self._named:
+            return f"there is a controller {plan.name} already"
+        if not _fits(plan, self._period_ns):
+            return f"its rate {plan.rate:g} Hz does not divide the loop's {1e9 / self._period_ns:g} Hz"
+        index = self._free_index()
+        if index >= MOST_CONTROLLERS:
+            return f"there are {MOST_CONTROLLERS} controllers, which is the most"
+        if unknown := [joint for joint in plan.joints if joint not in self._rows]:
+            return f"the robot has no joint {', '.join(unknown)}"
+        begin_ns = self._clock.now_ns()
+        try:
+            every = _every(plan, self._period_ns)
+            managed = self._configured(index, replace(plan, active=False, every=every))
+        except (ControllerFault, PlugInError) as error:
+            return str(error)
+        managed.pace(self._period_ns, every)
+        managed.wait_for(self._lost)
+        self._managed = (*self._managed[:index], managed, *self._managed[index + 1 :])
+        self._named[plan.name] = managed
+        self._tell_loaded(managed, "loaded", begin_ns)
+        return ""
+
+    def _free_index(self) -> int:
+        """Return a place for a controller; those of the plan keep theirs, also when they were unloaded.
+
+        The log shows each controller by its place.
+        """
+        for index in range(len(self._plan.controllers), len(self._managed)):
+            there = self._managed[index]
+            if self._named.get(there.plan.name) is not there:  # the name may live on in another place
+                return index
+        return len(self._managed)
+
+    def unload(self, name: str) -> str:
+        """Forget a controller that is not active; return why not. Only while the loop is paused."""
+        managed = self._named.get(name)
+        if managed is None:
+            return f"there is no controller {name}"
+        if managed.active:
+            return f"{name} is active; deactivate it first"
+        begin_ns = self._clock.now_ns()
+        del self._named[name]
+        self._tell_loaded(managed, "unloaded", begin_ns)
+        return ""
+
+    def change_period(self, period_ns: int) -> str:
+        """Let every controller keep its own rate in another period of the loop; return why that cannot be."""
+        for managed in self._named.values():
+            if not _fits(managed.plan, period_ns):
+                return (
+                    f"controller {managed.plan.name} runs at {managed.plan.rate:g} Hz, of which "
+                    f"{1e9 / period_ns:g} Hz is no multiple"
+                )
+        self._period_ns = period_ns
+        for managed in self._named.values():
+            managed.pace(period_ns, _every(managed.plan, period_ns))
+        return ""
+
+    @property
+    def active(self) -> tuple[str, ...]:
+        """Names of the active controllers, in the order of their updates."""
+        return tuple(managed.plan.name for managed in self._managed if managed.active)
+
+    @property
+    def plans(self) -> tuple[ControllerPlan, ...]:
+        """The plans of all controllers by their places, which are their bits in the record's masks."""
+        return tuple(managed.plan for managed in self._managed)
 
     def deactivate(self, time_ns: int) -> None:
         """Deactivate whoever is active, the last one first; raises nothing, a fault is in `fault`."""
-        for index, managed in reversed(tuple(enumerate(self._managed))):
+        for managed in reversed(self._managed):
             if managed.active:
-                try:
-                    managed.deactivate(time_ns)
-                except ControllerFault as fault:
-                    self._end(managed, fault)
-                else:
-                    self._record.active &= ~(1 << index)
-                    self._tell(EventCode.CONTROLLER_DEACTIVATED, managed, "inactive")
+                self._deactivate(managed, time_ns)
+
+    def _activate(self, managed: Managed, time_ns: int) -> None:
+        try:
+            managed.activate(time_ns)
+        except ControllerFault as fault:
+            self._end(managed, fault, time_ns)
+        else:
+            self._record.active |= managed.bit
+            self._tell(EventCode.CONTROLLER_ACTIVATED, managed, "active")
+
+    def _deactivate(self, managed: Managed, time_ns: int) -> None:
+        self._record.active &= ~managed.bit
+        try:
+            managed.deactivate(time_ns)
+        except ControllerFault as fault:
+            self._end(managed, fault, time_ns, leaving=True)
+        else:
+            self._tell(EventCode.CONTROLLER_DEACTIVATED, managed, "inactive")
 
     def _hand_over(self, time_ns: int) -> int:
         """Give each command whose time has come to its controller; return how many were taken."""
@@ -119,7 +278,11 @@ class Manager:
             command, data = self._commands[self._next]
             self._tell_taken(self._next, command)
             self._next += 1
-            taken += self._hand(command, data, time_ns)
+            refusal = self.hand(command.controller, command.kind, data, command.origin, time_ns)
+            taken += not refusal
+            if refusal:
+                text = f"{command.kind} from {command.origin} refused: {refusal}"
+                self._events.emit(EventCode.COMMAND_REFUSED, Severity.WARNING, command.controller, text)
         return taken
 
     def _tell_taken(self, planned: int, command: ScheduledCommand) -> None:
@@ -130,30 +293,24 @@ class Manager:
             )
         )
 
-    def _hand(self, command: ScheduledCommand, data: NDArray[np.float64], time_ns: int) -> bool:
-        what = f"{command.kind} from {command.origin}"
-        managed = next((one for one in self._managed if one.plan.name == command.controller), None)
-        if managed is None or not managed.active:
-            why = "there is no such controller" if managed is None else "the controller is not active"
-            self._events.emit(
-                EventCode.COMMAND_REFUSED, Severity.WARNING, command.controller, f"{what} refused: {why}"
-            )
-            return False
-        try:
-            managed.command(command.kind, data, time_ns)
-        except ControllerFault as fault:
-            self._end(managed, fault)
-            return False
-        self._tell(EventCode.COMMAND, managed, what)
-        return True
+    def _end(self, managed: Managed, fault: ControllerFault, time_ns: int, *, leaving: bool = False) -> None:
+        """Take a controller that broke its contract out of the robot, say so, let its fallback take over.
 
-    def _end(self, managed: Managed, fault: ControllerFault) -> None:
-        """Take a controller that broke its contract out of the robot, and say so."""
+        Nobody takes over from one that was `leaving` anyway, nor does one that broke its own contract before.
+        """
         managed.release()
-        self._record.active &= ~(1 << self._managed.index(managed))
-        self.fault = self.fault or str(fault)
+        self._record.active &= ~managed.bit
         text = "\n".join([str(fault), *getattr(fault, "__notes__", ())])
         self._events.emit(EventCode.CONTROLLER_FAULT, Severity.ERROR, managed.plan.name, text)
+        self._failed.add(managed.plan.name)
+        name = managed.plan.fallback
+        # two that fall back on each other would do so for ever
+        if not name or leaving or name in self._failed or self.switch((name,), (), time_ns):
+            self.fault = self.fault or str(fault)
+
+    def _tell_loaded(self, managed: Managed, what: str, begin_ns: int) -> None:
+        text = f"{what} in {(self._clock.now_ns() - begin_ns) / 1e6:.1f} ms, while the loop stood still"
+        self._tell(EventCode.CONTROLLER_LOADED, managed, text)
 
     def _tell(self, code: EventCode, managed: Managed, text: str) -> None:
         self._events.emit(code, Severity.INFO, managed.plan.name, text)
@@ -168,7 +325,7 @@ class Manager:
                 f"controller {plan.name} raised in on_configure: {type(error).__name__}: {error}"
             ) from error
         rows = np.array([self._rows[joint] for joint in plan.joints], dtype=np.intp)
-        return Managed(plan, controller, context, rows, self._record)
+        return Managed(plan, controller, context, rows, self._record, bit=1 << index)
 
     def _built(self, plan: ControllerPlan) -> Controller[Any]:
         offer = self._plugins.controllers.get(plan.type)
@@ -190,7 +347,7 @@ class Manager:
         return Context(
             name=plan.name,
             joints=plan.joints,
-            period_ns=plan.every * self._plan.period_ns,
+            period_ns=plan.every * self._period_ns,
             limits=JointLimits(
                 lower=np.array([joint.lower for joint in joints], dtype=np.float64),
                 upper=np.array([joint.upper for joint in joints], dtype=np.float64),
@@ -217,3 +374,16 @@ class Manager:
             self._record.published |= bit
 
         return publish
+
+
+def _fits(plan: ControllerPlan, period_ns: int) -> bool:
+    """Say whether a controller's own rate can be kept: the loop's is a multiple of it."""
+    if plan.rate is None:
+        return True
+    turns = 1e9 / period_ns / plan.rate
+    return round(turns) >= 1 and abs(turns - round(turns)) < 1e-6 * turns
+
+
+def _every(plan: ControllerPlan, period_ns: int) -> int:
+    """Return every how many cycles a controller is updated."""
+    return 1 if plan.rate is None else max(1, round(1e9 / period_ns / plan.rate))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import cast
@@ -13,6 +14,7 @@ import pluggy
 from dxlrun.control.contract import ControllerClass, controller_breach, hook_breach
 from dxlrun.control.controller import CONTRACT_VERSION
 from dxlrun.control.hookspecs import GROUP, HookSpecs
+from dxlrun.control.overrun import Decide, OverrunHook
 from dxlrun.control_table import add_control_table
 from dxlrun.errors import PlugInError
 
@@ -37,6 +39,16 @@ class PlugIns:
     broken: Mapping[str, str]
     """One sentence a plug-in that could not be used, by its entry point's name, and one a type that two
     plug-ins offer, by the type's name."""
+    overrun_hooks: tuple[OverrunHook, ...] = ()
+    """Who is asked what becomes of a late cycle, in this order."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """What one plug-in brings."""
+
+    offers: tuple[Offer, ...] = ()
+    overrun: Decide | None = None
 
 
 def load_plugins(after_each: Callable[[str], None] | None = None) -> PlugIns:
@@ -47,6 +59,7 @@ def load_plugins(after_each: Callable[[str], None] | None = None) -> PlugIns:
     """
     offers: dict[str, Offer] = {}
     broken: dict[str, str] = {}
+    hooks: list[OverrunHook] = []
     ambiguous: dict[str, str] = {}
     for entry_point in sorted(entry_points(group=GROUP), key=_order):
         publisher = _publisher(entry_point)
@@ -54,10 +67,12 @@ def load_plugins(after_each: Callable[[str], None] | None = None) -> PlugIns:
             found = _load(entry_point, publisher)
         except PlugInError as error:
             broken[_free_key(entry_point.name, publisher, broken)] = str(error)
-            found = ()
+            found = _Found()
+        if found.overrun is not None:
+            hooks.append(OverrunHook(f"{entry_point.name} ({publisher})", found.overrun))
         if after_each is not None:
             after_each(f"{entry_point.name} ({publisher})")
-        for offer in found:
+        for offer in found.offers:
             first = offers.setdefault(offer.type, offer)
             if first is not offer:
                 ambiguous[offer.type] = (
@@ -65,7 +80,7 @@ def load_plugins(after_each: Callable[[str], None] | None = None) -> PlugIns:
                     f"{offer.type}; neither is used: uninstall one of them, or ask an author for another name"
                 )
     usable = {name: offer for name, offer in offers.items() if name not in ambiguous}
-    return PlugIns(controllers=usable, broken=broken | ambiguous)
+    return PlugIns(controllers=usable, broken=broken | ambiguous, overrun_hooks=tuple(hooks))
 
 
 def _order(entry_point: EntryPoint) -> tuple[str, str]:
@@ -87,7 +102,7 @@ def _free_key(name: str, publisher: str, taken: Mapping[str, str]) -> str:
     return name if name not in taken else f"{name} ({publisher})"
 
 
-def _load(entry_point: EntryPoint, publisher: str) -> tuple[Offer, ...]:
+def _load(entry_point: EntryPoint, publisher: str) -> _Found:
     """Return what one plug-in offers. Raises PlugInError with one sentence that names its distribution."""
 
     def refuse(what: str, mend: str) -> PlugInError:
@@ -130,7 +145,20 @@ def _load(entry_point: EntryPoint, publisher: str) -> tuple[Offer, ...]:
     )
     for models in servo_models:
         _add_servo_models(models, refuse)
-    return offers
+    return _Found(offers, _overrun(manager))
+
+
+def _overrun(manager: pluggy.PluginManager) -> Decide | None:
+    """Return what the loop calls for the hook `dxlrun_overrun`, with the arguments that the plug-in wants."""
+    found = manager.hook.dxlrun_overrun.get_hookimpls()
+    return partial(_call, found[0].function, found[0].argnames) if found else None
+
+
+def _call(
+    function: Callable[..., object], wanted: Sequence[str], cycle: int, scheduled_ns: int, actual_ns: int
+) -> object:
+    given = {"cycle": cycle, "scheduled_ns": scheduled_ns, "actual_ns": actual_ns}
+    return function(**{name: given[name] for name in wanted})
 
 
 def _add_servo_models(models: object, refuse: Callable[[str, str], PlugInError]) -> None:

@@ -11,13 +11,22 @@ from pydantic import (
     BaseModel,
     BeforeValidator,
     ConfigDict,
+    Discriminator,
     Field,
+    Tag,
     WithJsonSchema,
     model_validator,
 )
 from pydantic_core import PydanticCustomError
 
-from dxlrun.description.units import Angle, AngularVelocity, Duration, Inertia, Torque
+from dxlrun.description.units import (
+    Angle,
+    AngularVelocity,
+    AutoDuration,
+    Duration,
+    Inertia,
+    Torque,
+)
 
 _LONGEST_TIMER_NS = 255_000_000
 """The latency timer of an FTDI chip is one byte, ms (FTDI AN232B-04)."""
@@ -58,6 +67,12 @@ def _ordered(value: tuple[float, float]) -> tuple[float, float]:
 def _timer(value: int) -> int:
     if value > _LONGEST_TIMER_NS:
         raise refuse("no adapter gathers bytes for so long", "write 255 ms at most")
+    return value
+
+
+def _cores(value: tuple[int, ...]) -> tuple[int, ...]:
+    if not value or len(set(value)) < len(value):
+        raise refuse("cores are given once each, and at least one", "write for example [3]")
     return value
 
 
@@ -141,6 +156,20 @@ class Scheduler(Form):
         examples=["31"],
     )
     lock_memory: bool = Field(default=False, description="Keep all memory in RAM.", examples=["true"])
+    cores: (
+        Annotated[
+            tuple[Annotated[int, Field(ge=0, le=1023)], ...], Field(strict=False), AfterValidator(_cores)
+        ]
+        | None
+    ) = Field(default=None, description="Processor cores that the loop may run on.", examples=["[3]"])
+    polling: AutoDuration = Field(
+        default="auto",
+        description="Longest time that the clock is polled before a deadline; auto: a tenth of the period.",
+        examples=["100 us"],
+    )
+    idle_latency: bool = Field(
+        default=False, description="Keep processor cores from deep idle states.", examples=["true"]
+    )
 
 
 class Loop(Form):
@@ -150,8 +179,10 @@ class Loop(Form):
     scheduler: Scheduler = Field(
         default=Scheduler(), description="Real-time wishes.", examples=["{policy: round_robin}"]
     )
-    overrun: Literal["skip"] = Field(
-        default="skip", description="After a late cycle, whole periods are skipped.", examples=["skip"]
+    overrun: Literal["skip", "catch_up", "stop"] = Field(
+        default="skip",
+        description="After a late cycle, whole periods are skipped, or caught up with, or the run ends.",
+        examples=["catch_up"],
     )
 
 
@@ -213,8 +244,11 @@ class Joint(Form):
     )
 
 
+_COMMON_KEYS = ("type", "active", "rate", "fallback")
+
+
 class ControllerEntry(Form):
-    """One controller; the keys beside type, active and rate are its own parameters."""
+    """One controller; the keys beside type, active, rate and fallback are its own parameters."""
 
     type: str = Field(
         min_length=1, description="Type that a plug-in offers.", examples=["joint_group_position_controller"]
@@ -222,6 +256,12 @@ class ControllerEntry(Form):
     active: bool = Field(default=True, description="Active from the start.", examples=["false"])
     rate: float | None = Field(
         default=None, gt=0, description="Updates per second, Hz; the loop's when absent.", examples=["50"]
+    )
+    fallback: str | None = Field(
+        default=None,
+        min_length=1,
+        description="Controller that takes over when this one breaks its contract.",
+        examples=["stand_still"],
     )
     parameters: dict[str, object] = Field(
         default={}, description="All other keys of the entry; the controller's type says which there are."
@@ -232,22 +272,81 @@ class ControllerEntry(Form):
     def _gather_parameters(cls, entry: object) -> object:
         if not isinstance(entry, dict):
             return entry
-        own = {key: value for key, value in entry.items() if key in ("type", "active", "rate")}
+        own = {key: value for key, value in entry.items() if key in _COMMON_KEYS}
         return {**own, "parameters": {key: value for key, value in entry.items() if key not in own}}
+
+
+class PoseStep(Form):
+    """A step of a policy: to a pose."""
+
+    pose: str = Field(min_length=1, description="Name of a pose.", examples=["home"])
+    speed: Annotated[AngularVelocity, Field(gt=0)] = Field(
+        description="How fast each joint goes there.", examples=["60 deg/s"]
+    )
+
+
+class TorqueStep(Form):
+    """A step of a policy: less torque, little by little."""
+
+    reduce_torque: float = Field(
+        gt=0, lt=1, description="What is left of each servo's own torque limit.", examples=["0.3"]
+    )
+    steps: int = Field(default=5, ge=1, le=100, description="In how many steps.", examples=["5"])
+    over: Annotated[Duration, Field(gt=0)] = Field(
+        default=1_000_000_000, description="How long it takes.", examples=["1 s"]
+    )
+
+
+Word = Literal["limp", "hold"]
+"""Torque off; or torque on, every joint where it is."""
+
+
+def _kind_of_step(step: object) -> str:
+    if isinstance(step, dict):
+        return "<torque>" if "reduce_torque" in step else "<pose>"
+    if isinstance(step, TorqueStep):
+        return "<torque>"
+    return "<pose>" if isinstance(step, PoseStep) else "<word>"
+
+
+def _kind_of_policy(policy: object) -> str:
+    return "<steps>" if isinstance(policy, list | tuple | dict) else "<word>"
+
+
+PolicyStep = Annotated[
+    Annotated[Word, Tag("<word>")]
+    | Annotated[PoseStep, Tag("<pose>")]
+    | Annotated[TorqueStep, Tag("<torque>")],
+    Discriminator(_kind_of_step),
+]
+Policy = Annotated[
+    Annotated[Word, Tag("<word>")]
+    | Annotated[tuple[PolicyStep, ...], Field(strict=False, min_length=1), Tag("<steps>")],
+    Discriminator(_kind_of_policy),
+]
+"""What is done, in order; after the last step the robot is limp, unless that is `hold`."""
 
 
 class Policies(Form):
     """What happens when something does not go on as planned."""
 
-    on_exit: Literal["limp"] = Field(default="limp", description="At the end of a run.", examples=["limp"])
-    on_fault: Literal["limp"] = Field(
-        default="limp", description="When the loop or the bus failed.", examples=["limp"]
+    on_exit: Policy = Field(
+        default="limp",
+        description="At the end of a run.",
+        examples=["[{pose: home, speed: 60 deg/s}, limp]"],
     )
-    on_lost_servo: Literal["hold"] = Field(
-        default="hold", description="The other joints, when a servo stopped answering.", examples=["hold"]
+    on_fault: Policy = Field(
+        default="limp", description="When the loop, a bus or a controller failed.", examples=["limp"]
     )
-    on_stale_command: Literal["hold"] = Field(
-        default="hold", description="A joint that nobody commands any more.", examples=["hold"]
+    on_lost_servo: Policy = Field(
+        default="hold",
+        description="When a servo stopped answering; hold: its controllers wait, the others go on.",
+        examples=["hold"],
+    )
+    on_stale_command: Policy = Field(
+        default="hold",
+        description="When a stream of commands stopped; hold: its joints stay, the run goes on.",
+        examples=["hold"],
     )
     exit_timeout: Duration = Field(
         default=2_000_000_000, gt=0, description="Longest orderly end of a run.", examples=["2 s"]
@@ -262,6 +361,26 @@ class Recording(Form):
         min_length=1,
         description="Where logs are written, from the working directory.",
         examples=["logs"],
+    )
+
+
+class Gateway(Form):
+    """The process by which others steer the run."""
+
+    enabled: bool = Field(
+        default=True, description="Let this user's programs steer the run.", examples=["false"]
+    )
+
+
+class Processes(Form):
+    """Processes beside the loop."""
+
+    refused: ClassVar[Mapping[str, str]] = {"view": "this version has no view yet; take it out"}
+
+    gateway: Gateway = Field(
+        default=Gateway(),
+        description="Steering from outside, over a Unix socket.",
+        examples=["{enabled: false}"],
     )
 
 
@@ -290,7 +409,6 @@ class Robot(Form):
 
     refused: ClassVar[Mapping[str, str]] = {
         "sensors": "this version has no sensors yet; take the block out",
-        "processes": "this version starts no gateway and no view yet; take the block out",
     }
     read_before: ClassVar[tuple[str, ...]] = ("arguments", "include")
     """Keys of the file that are taken out of it before the model sees it."""
@@ -308,12 +426,22 @@ class Robot(Form):
         description="Controllers by name, updated in this order.",
         examples=["{head: {type: ...}}"],
     )
+    poses: dict[Name, Annotated[dict[Name, Angle], Field(min_length=1)]] = Field(
+        default={},
+        description="Angles of some or all joints, by name, for policies.",
+        examples=["{home: {head_joint: 0 deg}}"],
+    )
     policies: Policies = Field(
         default=Policies(),
         description="What happens on faults and at the end.",
         examples=["{exit_timeout: 2 s}"],
     )
     recording: Recording = Field(default=Recording(), description="The log.", examples=["{directory: logs}"])
+    processes: Processes = Field(
+        default=Processes(),
+        description="Processes beside the loop.",
+        examples=["{gateway: {enabled: false}}"],
+    )
     model: RobotModel | None = Field(
         default=None, description="The robot's body.", examples=["{urdf: torso.urdf}"]
     )

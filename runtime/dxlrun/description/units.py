@@ -11,7 +11,7 @@ import math
 import re
 from collections.abc import Mapping
 from fractions import Fraction
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field, PlainSerializer, WithJsonSchema
 from pydantic_core import PydanticCustomError
@@ -106,11 +106,22 @@ def _refusal(what: str, mend: str) -> PydanticCustomError:
     return PydanticCustomError("dxlrun", "{what}; {mend}", {"what": what, "mend": mend})
 
 
-def _text_schema(example: str, units: Mapping[str, object]) -> WithJsonSchema:
+def _auto_duration(value: str) -> int | str:
+    if value == "auto":
+        return value
+    try:
+        return duration(value)
+    except PydanticCustomError as error:
+        context = error.context or {}
+        raise _refusal(str(context["what"]), f"{context['mend']}, or auto") from error
+
+
+def _text_schema(example: str, units: Mapping[str, object], *others: dict[str, object]) -> WithJsonSchema:
     # an escaped space is none of the escapes that JSON Schema allows
     names = "|".join(re.escape(unit).replace("\\ ", " ") for unit in units)
     pattern = rf"^\s*[-+]?[0-9_.]+([eE][-+]?[0-9]+)?\s*({names})\s*$"
-    return WithJsonSchema({"type": "string", "pattern": pattern, "examples": [example]})
+    schema: dict[str, object] = {"type": "string", "pattern": pattern, "examples": [example]}
+    return WithJsonSchema({"anyOf": [schema, *others]} if others else schema)
 
 
 Angle = Annotated[
@@ -160,6 +171,16 @@ Duration = Annotated[
     _text_schema("500 us", _DURATION_NS),
 ]
 """ns, never negative, from `500 us`, `1 ms`, `2 s` or `1 min`."""
+
+AutoDuration = Annotated[
+    int | Literal["auto"],
+    BeforeValidator(_auto_duration),
+    PlainSerializer(
+        lambda value: value if value == "auto" else f"{value} ns", return_type=str, when_used="json"
+    ),
+    _text_schema("500 us", _DURATION_NS, {"type": "string", "const": "auto"}),
+]
+"""ns as Duration, or the word `auto`."""
 
 Angles = Annotated[tuple[Angle, ...], Field(strict=False)]
 """Several angles, rad, from `[60 deg, 1 rad]`; shape (written ones,)."""

@@ -43,6 +43,18 @@ class GoalLayout:
 
 
 @dataclass(frozen=True, slots=True)
+class TorqueLimit:
+    """Where a servo's torque is limited in RAM, and where its own limit stands, which it begins with."""
+
+    name: str
+    """As the e-Manual writes it: `Torque Limit (34)`."""
+    address: int
+    full_address: int
+    size: int
+    """Of both, bytes."""
+
+
+@dataclass(frozen=True, slots=True)
 class ServoPlan:
     """One servo and the joint that it moves: q = direction * (theta - reference)."""
 
@@ -71,6 +83,8 @@ class ServoPlan:
     """Where torque enable stands, one byte."""
     hardware_error_address: int | None
     """Where hardware error status stands, one byte; None where the model has none."""
+    torque_limit: TorqueLimit | None = None
+    """None where the model has none that limits position control."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,12 +6,13 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 
 from dxlrun.clock import Clock
-from dxlrun.dynamixel import startup
+from dxlrun.dynamixel import startup, torque_limit
 from dxlrun.dynamixel.bus import Bus, pump, run
 from dxlrun.dynamixel.bus_plan import BusPlan
 from dxlrun.dynamixel.health import Servos
 from dxlrun.dynamixel.limp import LimpOutcome, limp_buses
 from dxlrun.dynamixel.port import Ports
+from dxlrun.dynamixel.torque_limit import reduced
 from dxlrun.dynamixel.units import joint_position
 from dxlrun.errors import PortError, StartUpError
 from dxlrun.events import EventCode, EventSink, Severity
@@ -47,6 +48,7 @@ class DynamixelHardware:
         events: EventSink,
         beat: Callable[[], None],
         take_over: bool = False,
+        restore_torque: bool = False,
     ) -> None:
         self._plans = tuple(plans)
         self._ports = ports
@@ -56,6 +58,8 @@ class DynamixelHardware:
         self._events = events
         self._beat = beat
         self._take_over = take_over
+        self._restore_torque = restore_torque
+        self._full_torque: list[list[int]] = []
         self._buses = tuple(
             Bus(index, plan, port, clock, packets)
             for index, (plan, port) in enumerate(zip(self._plans, ports.ports, strict=True))
@@ -73,6 +77,8 @@ class DynamixelHardware:
         self._survey()
         try:
             self._engage()
+            if self._restore_torque:
+                self._restore_limits()
             self._first_states()
         except BaseException as error:  # also an interrupt: nothing may leave here with torque on
             for sentence in self.stop() or (TAKEN_BACK,):
@@ -99,6 +105,13 @@ class DynamixelHardware:
                     with suppress(PortError):
                         bus.send(packet)
         self._raise_failures()
+
+    def limit_torque(self, fraction: float) -> None:
+        """Let no servo exert more than a fraction of its own limit; `restore_torque` takes that back."""
+        for plan, bus, full in zip(self._plans, self._buses, self._full_torque, strict=False):
+            for packet in reduced(plan, full, fraction):
+                with suppress(PortError):  # as with goals: the next read names the bus
+                    bus.send(packet)
 
     def idle(self, until_ns: int) -> None:
         """Ask one servo a line what its cyclic reads do not tell, if there is time and need for it.
@@ -153,6 +166,18 @@ class DynamixelHardware:
                     self._events.emit(EventCode.REGISTER_DIFFERS, Severity.WARNING, joint, text)
         if problems:
             raise StartUpError("\n".join(problems))
+
+    def _restore_limits(self) -> None:
+        """Give the servos the torque again that a policy of an earlier run may have left them without."""
+        programs = [torque_limit.restore(plan) for plan in self._plans]
+        found = run(programs, self._buses, self._ports, self._clock, self._beat)
+        self._raise_failures()
+        limits = [one for one in found if one is not None]
+        if problems := [problem for one in limits for problem in one.problems]:
+            raise StartUpError("\n".join(problems))
+        self._full_torque = [one.full for one in limits]
+        for joint, text in (restored for one in limits for restored in one.restored):
+            self._events.emit(EventCode.SETUP, Severity.INFO, joint, text)
 
     def _engage(self) -> None:
         programs = [startup.engage(plan) for plan in self._plans]

@@ -18,6 +18,7 @@ from dxlrun.dynamixel.plan import plan_line
 from dxlrun.dynamixel.protocol2 import describe_hardware_error
 from dxlrun.dynamixel.transaction import Program, ProgramJob, Reply, Transaction
 from dxlrun.events import EventCode, EventSink, Severity
+from dxlrun.hardware import LOST_CYCLES
 from dxlrun.interfaces import Commands, States
 from dxlrun.plurals import counted
 
@@ -30,10 +31,9 @@ that gets no goals for the rest of the run."""
 
 ALERT_AGAIN = 50
 """Cycles after which a standing alert is read again: a second error does not change the alert bit."""
-LOST_CYCLES = 3
-"""Who missed so many replies in a row held its old goal meanwhile, and comes back to a goal that went on."""
 RETURN_SPEED = 1.5
-"""rad/s, no faster does a servo go to its goal after that; a step that no gate saw is to be a slow one."""
+"""rad/s, no faster does a servo that was lost go to its goal, which may have gone on: a step that no gate saw
+is to be a slow one."""
 RETURNED = 0.05
 """rad from the goal: the servo has caught up."""
 

@@ -8,7 +8,15 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 from dxlrun.control_table import ControlItem, ControlTable
-from dxlrun.dynamixel.bus_plan import Budget, BusPlan, Field, GoalLayout, ServoPlan, StateLayout
+from dxlrun.dynamixel.bus_plan import (
+    Budget,
+    BusPlan,
+    Field,
+    GoalLayout,
+    ServoPlan,
+    StateLayout,
+    TorqueLimit,
+)
 from dxlrun.dynamixel.dialect import dialect_of
 from dxlrun.dynamixel.line import Line
 from dxlrun.dynamixel.transaction import BROADCAST_ID, Transaction
@@ -166,7 +174,18 @@ def _servo(joint: Wiring) -> ServoPlan:
         goal=_goal_layout(table),
         torque_address=table.items["torque_enable"].address,
         hardware_error_address=None if hardware_error is None else hardware_error.address,
+        torque_limit=_torque_limit(table),
     )
+
+
+def _torque_limit(table: ControlTable) -> TorqueLimit | None:
+    """Return where a model's torque is limited; see `dynamixel.torque_limit` for the manual's pages."""
+    for name, full in (("torque_limit", "max_torque"), ("goal_pwm", "pwm_limit")):
+        item, own = table.items.get(name), table.items.get(full)
+        if item is not None and own is not None and item.size == own.size:
+            words = name.replace("_", " ").title().replace("Pwm", "PWM")
+            return TorqueLimit(f"{words} ({item.address})", item.address, own.address, item.size)
+    return None
 
 
 def _state_layout(table: ControlTable) -> StateLayout:

@@ -43,6 +43,8 @@ class LogWriter:
     def __init__(self, path: Path, header: LogHeader) -> None:
         self.header = header
         self.error: str | None = None
+        self.late_metadata: dict[str, dict[str, str]] = {}
+        """Written at the end, beside the header's: what became known in the run."""
         self._layout = CycleLayout(header.joints, [c.name for c in header.controllers])
         self._file = LogFile(path)
         self._messages = self._lost = self._unwritten = self._last_ns = 0
@@ -209,7 +211,7 @@ class LogWriter:
             self._add(self._bus_channels[bus], last_ns, head + data)
 
     def command(self, payload: Payload) -> None:
-        """Write one command that a controller was handed, when its last piece is there.
+        """Write one command that a cycle took, when its last piece is there.
 
         Raises ValueError for a piece whose predecessors were lost.
         """
@@ -220,10 +222,12 @@ class LogWriter:
             command.t_ns,
             command.cycle,
             command.planned,
+            command.lease_ns,
             command.controller,
             command.kind,
             command.origin,
-            np.frombuffer(command.data, dtype="<f8"),
+            command.text,
+            command.numbers,
         )
         self._guarded(lambda: self._add(self._taken_channel, command.t_ns, data))
 
@@ -279,6 +283,8 @@ class LogWriter:
     def _finish(self) -> None:
         self._writer.flush()  # type: ignore[no-untyped-call]  # mcap does not annotate it
         self._mark_whole()
+        for name, record in sorted(self.late_metadata.items()):
+            self._writer.add_metadata(name, dict(sorted(record.items())))
         self._writer.add_metadata(
             schemas.SUMMARY_NAME, {"messages": str(self._messages), "gaps": str(self._lost)}
         )

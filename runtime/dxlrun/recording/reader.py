@@ -18,7 +18,7 @@ from mcap.stream_reader import CRCValidationError, StreamReader, get_chunk_data_
 from numpy.typing import NDArray
 from zstandard import ZstdError
 
-from dxlrun.commands import TakenCommand
+from dxlrun.commands import TakenCommand, data_of
 from dxlrun.cycle import CycleLayout
 from dxlrun.errors import LogError
 from dxlrun.events import Event
@@ -66,7 +66,7 @@ class Log:
     activation: NDArray[np.void] | None = None
     """Shape (1,), as `cycles`: states and goals when the controllers were activated; None: not in the log."""
     commands: tuple[TakenCommand, ...] = ()
-    """What was handed to controllers, in order."""
+    """What cycles took for controllers and for the loop, in order."""
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -171,7 +171,12 @@ def _commands(messages: list[bytes]) -> tuple[TakenCommand, ...]:
             controller=str(values["controller"]),
             kind=str(values["kind"]),
             origin=str(values["origin"]),
-            data=cast("NDArray[np.float64]", values["data"]).tobytes(),
+            data=data_of(
+                str(values["controller"]),
+                str(values["text"]),
+                cast("NDArray[np.float64]", values["data"]),
+            ),
+            lease_ns=cast("int", values["lease_ns"]),
         )
         for values in map(codec.unpack, messages)
     )

@@ -7,7 +7,7 @@ import select
 import signal
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, TypeAlias
 
@@ -62,15 +62,25 @@ class _Tap:
         self.take = takers[ring.kind]
 
 
+@dataclass(frozen=True, slots=True)
+class _Wish:
+    """What the supervisor asks for in one line."""
+
+    finish: bool = False
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+
+
 class Control:
     """The line to the supervisor: JSON lines both ways; a supervisor that is gone counts as `finish`."""
 
-    __slots__ = ("_descriptor", "_pending", "finish")
+    __slots__ = ("_descriptor", "_pending", "finish", "metadata")
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor
         self._pending = b""
         self.finish = False
+        self.metadata: dict[str, dict[str, str]] = {}
+        """What the log is to say of the run beside what was known at its start."""
 
     def say(self, message: dict[str, object]) -> None:
         """Send one line; nobody listening is not the recorder's trouble."""
@@ -91,9 +101,11 @@ class Control:
         *lines, self._pending = self._pending.split(b"\n")
         for line in lines:
             try:
-                self.finish |= bool(msgspec.json.decode(line, type=dict[str, object]).get("finish"))
+                wish = msgspec.json.decode(line, type=_Wish)
             except msgspec.MsgspecError:
                 continue  # a line that is no JSON asks for nothing
+            self.finish |= wish.finish
+            self.metadata |= wish.metadata
         self.finish |= not data
 
 
@@ -117,6 +129,7 @@ class Recorder:
                 self._control.wait(0)
         while self._turn():
             self._control.say({"draining": True})
+        self._log.late_metadata |= self._control.metadata
         summary = self._log.close()
         self._report()
         return summary

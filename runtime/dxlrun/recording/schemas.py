@@ -31,7 +31,7 @@ METADATA_NAME = "dxlrun"
 SUMMARY_NAME = "dxlrun_summary"
 """The metadata record that a finished log ends with."""
 HEADER_ATTACHMENT = "header.json"
-FORMAT = "1"
+FORMAT = "2"
 """Grows when a reader of the version before would misread a log."""
 
 _RULE = "=" * 80
@@ -159,15 +159,19 @@ string text
 
 COMMAND = MessageType(
     "dxlrun_msgs/msg/Command",
-    """# A command that a cycle took for a controller. t_ns: of the cycle's wake-up. planned: its number in
-# the commands of plan.json, whose array it is; -1: the array is data.
+    """# A command that a cycle took, for a controller or (no name) for the loop itself; an event says when it
+# was refused. t_ns: of the cycle's wake-up. planned: its number in the commands of plan.json, whose
+# array it is; -1: the array is data. lease_ns: for how long a set-point of a stream counts; 0: for ever.
+# text: JSON for the loop; for a controller empty, or in hexadecimal what is no array of numbers.
 int64 t_ns
 int64 cycle
 int64 planned
+int64 lease_ns
 string controller
 string kind
 string origin
+string text
 float64[] data
 """,
-    "RIHS01_c36bb4c117379590a595107b90a16e31448d4a4f2b4485d41f5744d08de0a47b",
+    "RIHS01_7dd2e55f1fcd868f64d4cb24f352e0436dd8e8a6037b4115b0e01c0a29f89f1a",
 )

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.control.loop_plan import LoopPlan
+from dxlrun.control.loop_plan import ControllerPlan, LoopPlan
 from dxlrun.cycle import CycleRecord
 from dxlrun.errors import LogError
 from dxlrun.interfaces import Floats
@@ -53,9 +54,17 @@ class JointDifferences:
 class Comparison:
     """The sink of a replayed loop: compares each cycle as it comes; NaN and zero by their bits too."""
 
-    def __init__(self, plan: LoopPlan, cycles: NDArray[np.void], start_ns: int) -> None:
+    def __init__(
+        self,
+        plan: LoopPlan,
+        cycles: NDArray[np.void],
+        start_ns: int,
+        controllers: Callable[[], Sequence[ControllerPlan]],
+    ) -> None:
         self.first: Difference | None = None
         self._plan = plan
+        self._controllers = controllers
+        """Those there are now, by their bits: some are loaded while the loop is paused."""
         self._cycles = cycles
         self._start_ns = start_ns
         self._recorded: dict[str, _Words] = {
@@ -96,6 +105,12 @@ class Comparison:
         """Compare one finished cycle. Raises LogError when its inputs are not the recorded ones."""
         index = self._index
         row = self._cycles[index]
+        if record.cycle == row["cycle"] and record.scheduled_ns != row["scheduled_ns"]:
+            raise LogError(
+                f"cycle {record.cycle} was due {self._since_start(int(row['scheduled_ns']))} in the run and "
+                f"{self._since_start(record.scheduled_ns)} in the replay: a change of the rate in the log is "
+                "not the one that was made, or the dxlrun that made the log counts in another way"
+            )
         if record.cycle != row["cycle"] or record.period_ns != row["period_ns"]:
             raise LogError(
                 f"cycle {int(row['cycle'])} was given a period of {int(row['period_ns'])} ns in the run and "
@@ -113,13 +128,19 @@ class Comparison:
                 self.first = self._of_joint(index, name, bits, active)
         self._index += 1
 
+    def _since_start(self, time_ns: int) -> str:
+        return f"at {(time_ns - self._start_ns) * 1e-9:.6f} s"
+
     def _of_activity(self, index: int, active: int) -> Difference:
         recorded = int(self._cycles["active"][index])
         changed = recorded ^ active
         bit = (changed & -changed).bit_length() - 1
         states = [("active" if mask >> bit & 1 else "not active") for mask in (recorded, active)]
         cycle, time_s = self._when(index)
-        return Difference(cycle, time_s, "active", None, self._plan.controllers[bit].name, *states)
+        plans = self._controllers()
+        # one that the replay could not load has no name here
+        name = plans[bit].name if bit < len(plans) else f"number {bit}, loaded in the run"
+        return Difference(cycle, time_s, "active", None, name, *states)
 
     def _of_joint(self, index: int, name: str, bits: _Words, active: int) -> Difference:
         row = int(np.argmax(self._differs[name][index]))
@@ -135,7 +156,7 @@ class Comparison:
         return int(row["cycle"]), (int(row["woken_ns"]) - self._start_ns) * 1e-9
 
     def _owner(self, joint: str, active: int) -> str | None:
-        for bit, controller in enumerate(self._plan.controllers):
+        for bit, controller in enumerate(self._controllers()):
             if active >> bit & 1 and controller.command and joint in controller.joints:
                 return controller.name
         return None

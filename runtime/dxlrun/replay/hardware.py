@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from dxlrun.control.loop import StopFlag
 from dxlrun.cycle import CycleRecord
+from dxlrun.errors import PortError
 
 _STATES = ("position", "velocity", "effort", "valid", "age_ns")
 
@@ -39,7 +40,8 @@ class RecordedHardware:
     """Servos that say what they said then, bit for bit, and take no goals; see `dxlrun.hardware.Hardware`.
 
     After each cycle it moves the clock to the deadline of the next recorded one, so that the loop skips the
-    periods that were skipped; after the last one it asks the loop to stop.
+    periods that were skipped. After the cycle before number `ends` of them it asks the loop to stop: those
+    from there on are a policy's. After the last one there is no bus any more.
     """
 
     def __init__(
@@ -49,7 +51,10 @@ class RecordedHardware:
         record: CycleRecord,
         clock: RecordedClock,
         stop: StopFlag,
+        *,
+        ends: int,
     ) -> None:
+        self._ends = ends
         self._states = {name: np.ascontiguousarray(cycles[name]) for name in _STATES}
         self._due, self._woken, self._read, self._written = (
             cycles[name].tolist() for name in ("scheduled_ns", "woken_ns", "read_ns", "written_ns")
@@ -69,7 +74,9 @@ class RecordedHardware:
         np.copyto(record.goals.velocity, self._activation["goal_velocity"])
 
     def idle(self, until_ns: int) -> None:
-        """Let the coming wait end when it ended then."""
+        """Let the coming wait end when it ended then. Raises PortError behind the last cycle."""
+        if self._index == len(self._woken):
+            raise PortError("the log ends")
         self._clock.wake_ns = self._woken[self._index]
 
     def read(self) -> None:
@@ -85,8 +92,12 @@ class RecordedHardware:
             self._clock.move(self._due[following])
         else:
             self._clock.move(self._written[self._index])
+        if following == self._ends:
             self._stop.request()
         self._index = following
+
+    def limit_torque(self, fraction: float) -> None:
+        """Limit nothing: what the servos did then is in their states."""
 
     def stop(self) -> tuple[str, ...]:
         """Do nothing: no servo has torque."""

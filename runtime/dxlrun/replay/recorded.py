@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
@@ -12,15 +13,23 @@ from numpy.typing import NDArray
 
 from dxlrun.commands import TakenCommand
 from dxlrun.control.controller import CONTRACT_VERSION
-from dxlrun.control.loop_plan import LoopPlan, ScheduledCommand
+from dxlrun.control.loop_plan import LoopPlan
 from dxlrun.control.plugins import PlugIns
+from dxlrun.control.policy_plan import PolicyName, PolicyPlan
 from dxlrun.errors import LogError
 from dxlrun.events import EventCode
 from dxlrun.recording.reader import Log
+from dxlrun.recording.steered import Steered, policy_begun, steered, untold
 
 PLAN = "plan.json"
 _LIBRARIES = ("dxlrun", "numpy")
 """Whose version may change a command."""
+
+
+class _Begun(msgspec.Struct):
+    """Data of the command that tells of a policy."""
+
+    policy: PolicyName
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,11 +52,18 @@ class Recorded:
     log: Path
     plan: RecordedPlan
     loop: LoopPlan
-    """The plan's loop with the commands that the cycles really took; it has no end of its own."""
+    """The plan's loop with those of its commands that cycles really took. It ends, skips periods and begins a
+    policy where the run did, not by itself."""
     activation: np.void
     """States and goals when the controllers were activated."""
     start_ns: int
     """Deadline of cycle 0."""
+    steered: tuple[Steered, ...]
+    """What clients asked of the loop."""
+    commands: tuple[TakenCommand, ...]
+    """All that cycles took."""
+    ends: int
+    """How many of `cycles` are before the steps of a policy; the controllers are not active in those."""
     cycles: NDArray[np.void]
     """Those that can be compared: from cycle 0 to the first that is missing."""
     in_log: int
@@ -79,9 +95,22 @@ def recorded(log: Log) -> Recorded:
         )
     _check_times(log, start_ns, plan.loop.period_ns)
     usable, stopped = _until_gap(log)
-    loop = replace(plan.loop, commands=_commands(log, plan.loop, start_ns), end_ns=None)
+    usable, ends, stopped = _until_policy(log, usable, stopped)
     remarks = () if log.complete else log.damage
-    return Recorded(path, plan, loop, activation, start_ns, cycles[:usable], len(cycles), stopped, remarks)
+    return Recorded(
+        log=path,
+        plan=plan,
+        loop=_loop(log, plan.loop),
+        activation=activation,
+        start_ns=start_ns,
+        steered=steered(log),
+        commands=log.commands,
+        ends=ends,
+        cycles=cycles[:usable],
+        in_log=len(cycles),
+        stopped=stopped,
+        remarks=remarks,
+    )
 
 
 def version_remarks(log: Log, loop: LoopPlan, plugins: PlugIns) -> tuple[str, ...]:
@@ -133,16 +162,40 @@ def _version(log: Log) -> str:
 
 
 def _check_times(log: Log, start_ns: int, period_ns: int) -> None:
-    """Refuse times that no loop can have had; a replay would follow them without an end."""
+    """Refuse times that no loop can have had; a replay would follow them without an end.
+
+    The time between two deadlines is as many periods as their numbers say; another period begins only in a
+    cycle that took a change of the rate, and none is known where cycles are lost.
+    """
     cycles = log.cycles
     number, due, woken = cycles["cycle"], cycles["scheduled_ns"], cycles["woken_ns"]
-    wrong = (due - start_ns != number * period_ns) | (woken < due) | (cycles["read_ns"] < woken)
-    wrong[1:] |= np.diff(number) <= 0
+    passed = np.diff(number, prepend=0)
+    elapsed_ns = np.diff(due, prepend=start_ns)
+    changes = [command.cycle for command in log.commands if command.for_loop and command.kind == "rate"]
+    begins = np.unique(np.searchsorted(number, changes, side="right")).tolist()
+    period = np.full(len(number), period_ns)
+    for first, end in itertools.pairwise([*begins, len(number)]):
+        period[first:end] = elapsed_ns[first] // max(int(passed[first]), 1)
+    wrong = (woken < due) | (cycles["read_ns"] < woken) | (elapsed_ns != passed * period)
+    wrong[1:] |= passed[1:] <= 0
+    _check_commands(log)
     if wrong.any():
         raise LogError(
             f"{log.path}: the times of cycle {int(number[int(np.argmax(wrong))])} contradict its number: "
             "the log is damaged"
         )
+
+
+def _check_commands(log: Log) -> None:
+    """Refuse a command whose time is not that of the cycle that took it."""
+    woken = dict(zip(log.cycles["cycle"].tolist(), log.cycles["woken_ns"].tolist(), strict=True))
+    policy = policy_begun(log)
+    for command in log.commands:
+        if command is not policy and woken.get(command.cycle, command.t_ns) != command.t_ns:
+            raise LogError(
+                f"{log.path}: a command ({command.kind}) that cycle {command.cycle} took has not its time: "
+                "the log is damaged"
+            )
 
 
 def _until_gap(log: Log) -> tuple[int, str]:
@@ -158,9 +211,11 @@ def _until_gap(log: Log) -> tuple[int, str]:
     held = np.zeros(len(cycles), dtype=np.int64)
     at = {int(cycle): index for index, cycle in enumerate(number)}
     for command in log.commands:
-        if command.cycle in at:
+        if command.cycle in at and not command.for_loop:
             held[at[command.cycle]] += 1
-    short = np.flatnonzero(held < cycles["command_count"])
+    missing = held < cycles["command_count"]
+    missing[[at[cycle] for cycle in untold(log)]] = True
+    short = np.flatnonzero(missing)
     if len(short) and int(short[0]) < usable:
         usable = int(short[0])
         stopped = f"the log misses a command that cycle {int(number[usable])} took"
@@ -176,15 +231,44 @@ def _until_gap(log: Log) -> tuple[int, str]:
     return usable, stopped
 
 
-def _commands(log: Log, loop: LoopPlan, start_ns: int) -> tuple[ScheduledCommand, ...]:
-    """Return what the cycles took, due at the very time at which its cycle woke."""
-    return tuple(_command(log, loop, command, start_ns) for command in log.commands)
+def _until_policy(log: Log, usable: int, stopped: str) -> tuple[int, int, str]:
+    """Return how many cycles can be compared, how many of them are the controllers', and why not more.
+
+    A cycle in which a bus failed is not in the log, but the time of the one after it counts from it.
+    """
+    cycles, policy = log.cycles, policy_begun(log)
+    if policy is None:
+        return usable, usable, stopped
+    ends = min(usable, int(np.searchsorted(cycles["cycle"], policy.cycle)))
+    if 0 < ends < usable:
+        passed_ns = int(cycles["woken_ns"][ends]) - int(cycles["woken_ns"][ends - 1])
+        if policy.t_ns != int(cycles["woken_ns"][ends - 1]) and int(cycles["period_ns"][ends]) < passed_ns:
+            return ends, ends, f"a bus failed in cycle {policy.cycle}; what came after it is not compared"
+    return usable, ends, stopped
 
 
-def _command(log: Log, loop: LoopPlan, command: TakenCommand, start_ns: int) -> ScheduledCommand:
-    at_ns = command.t_ns - start_ns
-    if command.planned < 0:
-        return ScheduledCommand(at_ns, command.controller, command.kind, command.data, command.origin)
-    if command.planned >= len(loop.commands):
-        raise LogError(f"{log.path}: cycle {command.cycle} took a command that the plan in the log has not")
-    return replace(loop.commands[command.planned], at_ns=at_ns)
+def _loop(log: Log, plan: LoopPlan) -> LoopPlan:
+    """Return the loop as the replay runs it: what time and signals decided in the run is in the log."""
+    taken = {command.planned for command in log.commands if command.planned >= 0}
+    if beyond := sorted(number for number in taken if number >= len(plan.commands)):
+        cycle = next(command.cycle for command in log.commands if command.planned == beyond[0])
+        raise LogError(f"{log.path}: cycle {cycle} took a command that the plan in the log has not")
+    return replace(
+        plan,
+        commands=tuple(command for number, command in enumerate(plan.commands) if number in taken),
+        end_ns=None,
+        overrun="skip",
+        policies=_policies(log, plan.policies),
+    )
+
+
+def _policies(log: Log, policies: PolicyPlan) -> PolicyPlan:
+    """Let the run's own policy begin where it is stopped."""
+    begun = policy_begun(log)
+    if begun is None:
+        return policies
+    try:
+        name = msgspec.json.decode(begun.data, type=_Begun).policy
+    except msgspec.MsgspecError as error:
+        raise LogError(f"{log.path}: the log does not say which policy began: {error}") from error
+    return replace(policies, on_exit=policies.named(name))

@@ -20,6 +20,7 @@ from dxlrun.recording.reader import read_log
 from dxlrun.replay.changes import Setting, with_arguments, with_settings
 from dxlrun.replay.comparison import Comparison, Difference, JointDifferences
 from dxlrun.replay.hardware import RecordedClock, RecordedHardware
+from dxlrun.replay.inputs import PlannedCommands, RecordedInbox
 from dxlrun.replay.recorded import Recorded, recorded, version_remarks
 
 
@@ -52,13 +53,14 @@ class ReplayReport:
     @property
     def sentence(self) -> str:
         """The result in one sentence."""
+        cycles = counted(self.compared, "cycle", "cycles")
         if self.same:
-            return f"{self.robot}: {counted(self.compared, 'cycle', 'cycles')} replayed, 0 differences"
+            return f"{self.robot}: {cycles} replayed, 0 differences"
         if not self.different:
-            replayed = f"{counted(self.compared, 'cycle', 'cycles')} replayed without a difference"
-            return f"{self.robot}: {replayed}, then {self.fault}"
+            return f"{self.robot}: {cycles} replayed without a difference, then {self.fault}"
         ended = f"; then {self.fault}" if self.fault else ""
-        return f"{self.robot}: {self.different} of {self.compared} replayed cycles differ{ended}"
+        differ = "differs" if self.different == 1 else "differ"
+        return f"{self.robot}: {self.different} of {self.compared} replayed cycles {differ}{ended}"
 
 
 def to_json(report: ReplayReport) -> bytes:
@@ -85,10 +87,9 @@ def replay_log(
     read = read_log(log)
     inputs = recorded(read)
     plugins = load_plugins()
-    remarks = (*inputs.remarks, *version_remarks(read, inputs.plan.loop, plugins))
     loop = with_arguments(inputs.plan, inputs.loop, arguments or {})
     loop = with_settings(loop, settings, plugins)
-    comparison, result = _run(inputs, loop, plugins)
+    comparison, result, refused = _run(inputs, loop, plugins)
     early = comparison.compared < len(inputs.cycles)
     return ReplayReport(
         log=str(log),
@@ -98,21 +99,25 @@ def replay_log(
         different=comparison.different,
         first=comparison.first,
         joints=comparison.joints(),
-        fault=f"the replay ended: {result.detail}" if early else "",
+        fault=f"the replay ended: {result.detail or 'its policy was done'}" if early else "",
         stopped="" if early else inputs.stopped,
-        remarks=remarks,
+        remarks=(*inputs.remarks, *version_remarks(read, inputs.plan.loop, plugins), *refused),
     )
 
 
-def _run(inputs: Recorded, plan: LoopPlan, plugins: PlugIns) -> tuple[Comparison, LoopResult]:
-    """Put recorded hardware and clock into the loop that runs robots, and run it."""
+def _run(
+    inputs: Recorded, plan: LoopPlan, plugins: PlugIns
+) -> tuple[Comparison, LoopResult, tuple[str, ...]]:
+    """Put recorded hardware, clock and clients into the loop that runs robots, and run it."""
     names = tuple(joint.name for joint in plan.joints)
     record = CycleRecord(CycleLayout(names, tuple(controller.name for controller in plan.controllers)))
     stop, events = StopFlag(), _Silence()
     clock = RecordedClock(inputs.start_ns - plan.period_ns)
-    hardware = RecordedHardware(inputs.cycles, inputs.activation, record, clock, stop)
-    manager = Manager(plan, plugins, record, events, clock)
-    comparison = Comparison(plan, inputs.cycles, inputs.start_ns)
+    hardware = RecordedHardware(inputs.cycles, inputs.activation, record, clock, stop, ends=inputs.ends)
+    taken = PlannedCommands(inputs.commands, str(inputs.log))
+    manager = Manager(plan, plugins, record, events, clock, commands=taken)
+    inbox = RecordedInbox(inputs.steered, record)
+    comparison = Comparison(plan, inputs.cycles, inputs.start_ns, lambda: manager.plans)
     loop = Loop(
         clock=clock,
         hardware=hardware,
@@ -124,7 +129,9 @@ def _run(inputs: Recorded, plan: LoopPlan, plugins: PlugIns) -> tuple[Comparison
         plan=plan,
         beat=lambda: None,
         stop=stop,
+        inbox=inbox,
     )
     manager.configure()
     hardware.start()
-    return comparison, loop.run()
+    result = loop.run()
+    return comparison, result, tuple(inbox.remarks)

@@ -7,17 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.analysis.latency import ROUGH_NS
+from dxlrun.analysis.latency import ROUGH_NS, first_deadline_ns
 from dxlrun.interfaces import Floats
 from dxlrun.recording.reader import Log
-
-
-def first_deadline_ns(log: Log) -> int:
-    """Return the loop's first deadline; the time of the first event in a log without cycles."""
-    if len(log.cycles):
-        first = log.cycles[0]
-        return int(first["scheduled_ns"]) - int(first["cycle"]) * log.period_ns
-    return log.events[0].t_ns if log.events else 0
 
 
 def run_time_s(log: Log) -> Floats:

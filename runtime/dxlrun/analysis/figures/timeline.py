@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from dxlrun.analysis.envelope import COLUMNS
 from dxlrun.analysis.figures.drawing import BLUE, ERROR, WARNING, Drawing, Words, draw, time_axis
-from dxlrun.analysis.figures.run_time import first_deadline_ns
+from dxlrun.analysis.latency import first_deadline_ns
 from dxlrun.events import Severity
 from dxlrun.interfaces import Floats
 from dxlrun.plurals import counted

@@ -1,0 +1,146 @@
+"""Policies and poses of the robot file against joints, limits, servos, and the time that the end may take."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from dxlrun.compile.joints import CompiledJoint
+from dxlrun.compile.problems import Problems, suggestion
+from dxlrun.compile.reach import Interval, degrees
+from dxlrun.control.policy_plan import HOLD, LIMP, POLICIES, Last, Policy, PolicyName, PolicyPlan, Step
+from dxlrun.control.safe_motion import longest_ns
+from dxlrun.description import Description
+from dxlrun.description.robot import PoseStep, TorqueStep
+from dxlrun.dynamixel.bus_plan import BusPlan
+
+MARGIN_NS = 100_000_000
+"""For the processor, and for servos that answer only the second time, while torque is switched off."""
+
+
+def compile_policies(
+    description: Description,
+    joints: Mapping[str, CompiledJoint],
+    buses: Sequence[BusPlan],
+    problems: Problems,
+) -> PolicyPlan:
+    """Return the policies of a file; says what of them does not fit the robot or its `exit_timeout`."""
+    _check_poses(description, joints, problems)
+    robot = description.robot
+    limit_ns = robot.policies.exit_timeout - _reserve_ns(buses, robot.loop.rate)
+    found: dict[PolicyName, Policy] = {}
+    for name in POLICIES:
+        found[name] = _policy(description, name, joints, problems)
+        if any(step.levels for step in found[name].steps):
+            _check_torque(description, name, buses, problems)
+        if found[name].steps and found[name].longest_ns > limit_ns:
+            _too_long(description, found[name], name, limit_ns, problems)
+    return PolicyPlan(
+        on_exit=found["on_exit"],
+        on_fault=found["on_fault"],
+        on_lost_servo=found["on_lost_servo"],
+        on_stale_command=found["on_stale_command"],
+        limit_ns=max(0, limit_ns),
+    )
+
+
+def _check_poses(description: Description, joints: Mapping[str, CompiledJoint], problems: Problems) -> None:
+    known = tuple(description.robot.joints)
+    for pose, angles in description.robot.poses.items():
+        for joint, angle in angles.items():
+            if joint not in known:
+                mark = description.marks.key("poses", pose, joint)
+                what = f"pose {pose} has joint {joint}, which the file does not have"
+                problems.error(mark, what, suggestion(joint, known))
+            elif joint in joints:
+                plan = joints[joint].plan
+                allowed = Interval(plan.lower, plan.upper)
+                if not allowed.contains(Interval(angle, angle)):
+                    mark = description.marks.value("poses", pose, joint)
+                    what = f"pose {pose} puts {joint} at {degrees(angle, signed=True)} deg"
+                    problems.error(mark, what, f"it can go to {allowed}")
+
+
+def _policy(
+    description: Description, name: PolicyName, joints: Mapping[str, CompiledJoint], problems: Problems
+) -> Policy:
+    written = getattr(description.robot.policies, name)
+    if isinstance(written, str):
+        return HOLD if written == "hold" else LIMP
+    last: Last = "limp"
+    steps: list[Step] = []
+    for index, step in enumerate(written):
+        if isinstance(step, str):
+            last = "hold" if step == "hold" else "limp"
+            if index + 1 < len(written):
+                mark = description.marks.value("policies", name, index)
+                problems.error(mark, f"{name} goes on after {step}", f"write {step} as the last step")
+        elif isinstance(step, PoseStep):
+            mark_path = ("policies", name, index, "pose")
+            angles = description.robot.poses.get(step.pose)
+            if angles is None:
+                mark = description.marks.value(*mark_path)
+                known = tuple(description.robot.poses)
+                what = f"{name} has pose {step.pose}, which the file does not have"
+                problems.error(mark, what, suggestion(step.pose, known) if known else "write it in poses")
+            else:
+                steps.append(_pose(step, angles, joints))
+        else:
+            steps.append(_less_torque(step))
+    return Policy(tuple(steps), last)
+
+
+def _pose(step: PoseStep, angles: Mapping[str, float], joints: Mapping[str, CompiledJoint]) -> Step:
+    longest = 0
+    for name, angle in angles.items():
+        if name in joints:
+            plan = joints[name].plan
+            speed = step.speed if plan.velocity is None else min(step.speed, plan.velocity)
+            longest = max(longest, longest_ns(max(plan.upper - angle, angle - plan.lower), speed))
+    return Step(
+        text=f"pose {step.pose} at {degrees(step.speed)} deg/s",
+        longest_ns=longest,
+        targets=tuple(angles.get(name) for name in joints),
+        speed=step.speed,
+    )
+
+
+def _less_torque(step: TorqueStep) -> Step:
+    text = f"torque down to {step.reduce_torque:.0%} in {step.steps} steps over {step.over * 1e-9:g} s"
+    return Step(text=text, longest_ns=step.over, fraction=step.reduce_torque, levels=step.steps)
+
+
+def _check_torque(
+    description: Description, name: PolicyName, buses: Sequence[BusPlan], problems: Problems
+) -> None:
+    for servo in (servo for bus in buses for servo in bus.servos):
+        if servo.torque_limit is None:
+            problems.error(
+                description.marks.value("policies", name),
+                f"{name} reduces torque, but the {servo.model} of {servo.joint} has no torque limit in RAM",
+                "take reduce_torque out",
+            )
+
+
+def _reserve_ns(buses: Sequence[BusPlan], rate: float) -> int:
+    """Return what of the exit timeout the steps may not have: two periods, and torque off on every line."""
+    limp = [
+        sum(each.due_ns + bus.latency_ns * bool(each.awaited) for each in (*bus.limp, *bus.torque_reads))
+        for bus in buses
+    ]
+    return max(limp, default=0) + round(2e9 / rate) + MARGIN_NS
+
+
+def _too_long(
+    description: Description, policy: Policy, name: PolicyName, limit_ns: int, problems: Problems
+) -> None:
+    timeout_ns = description.robot.policies.exit_timeout
+    needed_s = (policy.longest_ns + timeout_ns - limit_ns) * 1e-9
+    slowest = max(policy.steps, key=lambda step: step.longest_ns)
+    origin = " from the farthest limit" if slowest.targets else ""
+    problems.error(
+        description.marks.value("policies", name),
+        f"{name} may take {policy.longest_ns * 1e-9:.1f} s ({slowest.text}: up to "
+        f"{slowest.longest_ns * 1e-9:.1f} s{origin}), but of exit_timeout {timeout_ns * 1e-9:g} s it has "
+        f"{max(limit_ns, 0) * 1e-9:.1f} s",
+        f"raise exit_timeout to {-(-needed_s * 10 // 1) / 10:g} s, or make its steps faster",
+    )

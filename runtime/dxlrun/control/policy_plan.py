@@ -1,0 +1,96 @@
+"""Policies as data: what a robot does when a run ends, or when something does not go on as planned."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+PolicyName = Literal["on_exit", "on_fault", "on_lost_servo", "on_stale_command"]
+POLICIES: tuple[PolicyName, ...] = ("on_exit", "on_fault", "on_lost_servo", "on_stale_command")
+Last = Literal["limp", "hold"]
+"""How a robot is left: torque off, or torque on where it stands."""
+TORQUE_STAYS = (
+    "torque stays on, as the policy says: the robot holds until its power is off; "
+    "the next run needs --take-over"
+)
+"""What a person is told of a run that ends with `hold`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One thing that is done, cycle by cycle, before the robot is left: a pose, or less torque."""
+
+    text: str
+    """As a person reads it: `pose home at 60 deg/s`."""
+    longest_ns: int
+    """How long it takes at the most."""
+    targets: tuple[float | None, ...] = ()
+    """rad, one a joint, None where the pose says nothing; empty: this step is no pose."""
+    speed: float = 0.0
+    """rad/s, toward the pose"""
+    fraction: float = 1.0
+    """Of each servo's own torque limit, at the end of the step."""
+    levels: int = 0
+    """In how many steps the torque becomes less; 0: it stays."""
+
+
+@dataclass(frozen=True, slots=True)
+class Policy:
+    """Steps in order, and how the robot is left."""
+
+    steps: tuple[Step, ...] = ()
+    last: Last = "limp"
+
+    @property
+    def text(self) -> str:
+        """The policy in words."""
+        return ", then ".join([*(step.text for step in self.steps), self.last])
+
+    @property
+    def goes_on(self) -> bool:
+        """True when it does nothing but hold: where the run need not end for that, it does not."""
+        return not self.steps and self.last == "hold"
+
+    @property
+    def longest_ns(self) -> int:
+        """How long the steps take at the most, ns."""
+        return sum(step.longest_ns for step in self.steps)
+
+
+LIMP = Policy()
+HOLD = Policy(last="hold")
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyPlan:
+    """The four policies of a robot."""
+
+    on_exit: Policy = LIMP
+    """When a run was asked to stop, or came to its end."""
+    on_fault: Policy = LIMP
+    """When the loop or a bus failed, or a controller whose fallback did not take over."""
+    on_lost_servo: Policy = HOLD
+    on_stale_command: Policy = HOLD
+    limit_ns: int = 1_500_000_000
+    """The steps are cut short after this time: what is left of the exit timeout is for torque off."""
+
+    @property
+    def reduces_torque(self) -> bool:
+        """True when any of them leaves the servos with less torque, which a start-up must give back."""
+        return any(step.levels for name in POLICIES for step in self.named(name).steps)
+
+    def refuse_period(self, period_ns: int, planned_ns: int) -> str:
+        """Say why the steps would not be over in time in another period than the planned one, ns.
+
+        A wish to stop is seen a period later, and the first step begins one after that.
+        """
+        longest_ns = max(self.named(name).longest_ns for name in POLICIES)
+        slowest_ns = planned_ns + max(0, self.limit_ns - longest_ns) // 2
+        if not longest_ns or period_ns <= slowest_ns:
+            return ""
+        return f"its policies need at least {1e9 / slowest_ns:.2g} Hz to end the run within exit_timeout"
+
+    def named(self, name: PolicyName) -> Policy:
+        """Return one of the four."""
+        found: Policy = getattr(self, name)
+        return found

@@ -1,0 +1,106 @@
+"""Safe motion: the steps of a policy, carried out by the loop cycle by cycle, through gate and hardware.
+
+Nothing here reads a clock: times are those of the cycles, so that a replay does the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from dxlrun.control.gate import SLOW_SPEED, SLOW_START_NS
+from dxlrun.control.policy_plan import Policy, Step
+from dxlrun.cycle import CycleRecord
+from dxlrun.interfaces import Floats
+
+ARRIVED = 0.05
+"""rad; so near to its pose a joint counts as there. Ten ticks of an AX-12: friction holds it off by some."""
+SETTLE_NS = 300_000_000
+"""A joint that has its pose as goal for so long and is not there will not come: it is blocked or too weak."""
+
+
+def longest_ns(distance: float, speed: float) -> int:
+    """Return how long a pose takes at the most from `distance` rad away at `speed` rad/s, ns.
+
+    The gate lets nothing go faster than SLOW_SPEED in the first second, and a run may be stopped in it.
+    """
+    slow_s = SLOW_START_NS * 1e-9
+    slow = min(speed, SLOW_SPEED)
+    left = max(0.0, distance - slow * slow_s)
+    return round((min(distance, slow * slow_s) / slow + left / speed) * 1e9) + SETTLE_NS
+
+
+@dataclass(slots=True)
+class SafeMotion:
+    """A policy under way; `over` when its last step has ended, or its time has.
+
+    A pose: goals move toward it at the step's speed, from where they are, and it is reached when the joints
+    are there, or SETTLE_NS later. Less torque: so many times within the step's time a smaller limit, from the
+    servos' own one down to `fraction` of it.
+    """
+
+    policy: Policy
+    limit_ns: int
+    record: CycleRecord
+    limit_torque: Callable[[float], None]
+    over: bool = field(default=False, init=False)
+    unfinished: str = field(default="", init=False)
+    """Which step ended before it was done, and why; empty: none."""
+    _index: int = field(default=0, init=False)
+    _began_ns: int = field(default=-1, init=False)
+    _step_ns: int = field(default=0, init=False)
+    _there_ns: int = field(default=-1, init=False)
+    _level: int = field(default=0, init=False)
+
+    def __post_init__(self) -> None:
+        self.over = not self.policy.steps
+
+    def command(self) -> None:
+        """Command this cycle's part of the step; the robot's commands are empty when there is none left."""
+        record = self.record
+        now_ns = record.woken_ns
+        record.commands.position.fill(np.nan)
+        record.commands.velocity.fill(np.nan)
+        if self._began_ns < 0:
+            self._began_ns = self._step_ns = now_ns
+        if now_ns - self._began_ns >= self.limit_ns:
+            self.give_up("its time is over")
+        while not self.over and self._ended(self.policy.steps[self._index], now_ns):
+            self._index += 1
+            self._step_ns, self._there_ns, self._level = now_ns, -1, 0
+            self.over = self._index == len(self.policy.steps)
+
+    def give_up(self, why: str) -> None:
+        """End before the steps are done."""
+        if not self.over:
+            self.over = True
+            self.unfinished = f"{self.policy.steps[self._index].text} ends early: {why}"
+
+    def _ended(self, step: Step, now_ns: int) -> bool:
+        """Do a step's part of this cycle; return whether the step has ended."""
+        return self._reached(step, now_ns) if step.targets else self._weakened(step, now_ns)
+
+    def _reached(self, step: Step, now_ns: int) -> bool:
+        record = self.record
+        goal, commands = record.goals.position, record.commands
+        target: Floats = np.array([np.nan if one is None else one for one in step.targets])
+        named = np.isfinite(target)
+        if not np.any(named & (np.abs(target - goal) > 1e-9)):
+            self._there_ns = now_ns if self._there_ns < 0 else self._there_ns
+            states = record.states
+            away = named & states.valid & (np.abs(target - states.position) > ARRIVED)
+            return not away.any() or now_ns - self._there_ns >= SETTLE_NS
+        reach = step.speed * max(record.period_ns, 1) * 1e-9
+        np.copyto(commands.position, goal + np.clip(target - goal, -reach, reach), where=named)
+        commands.velocity[named] = step.speed
+        return False
+
+    def _weakened(self, step: Step, now_ns: int) -> bool:
+        passed_ns = now_ns - self._step_ns
+        level = min(step.levels, 1 + passed_ns * step.levels // max(step.longest_ns, 1))
+        if level != self._level:
+            self._level = level
+            self.limit_torque(1.0 - (1.0 - step.fraction) * level / step.levels)
+        return passed_ns >= step.longest_ns

@@ -1,0 +1,176 @@
+"""Steering: what the loop does with commands from outside, at the start of a cycle, so many and no more."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import msgspec
+import numpy as np
+
+from dxlrun.clock import Clock
+from dxlrun.commands import CommandSink, TakenCommand
+from dxlrun.control.loop_plan import ControllerPlan
+from dxlrun.control.manager import Manager
+from dxlrun.cycle import CycleRecord
+from dxlrun.events import EventCode, EventSink, Severity
+from dxlrun.inbox import LOOP, Command, Inbox
+
+
+class Steered(Protocol):
+    """What can be done to a loop from outside; each returns why it was refused, empty when it was done."""
+
+    def change_rate(self, rate: float) -> str:
+        """Run in another period from the next cycle on; Hz."""
+        ...
+
+    def pause(self) -> str:
+        """Stop the controllers' time: servos are read and held, nobody is updated."""
+        ...
+
+    def resume(self) -> str:
+        """Let the controllers' time go on."""
+        ...
+
+    def finish(self) -> str:
+        """End the run in order after this cycle."""
+        ...
+
+    def expire(self, controller: str) -> str:
+        """Do what the policy for a stale command says; return that in words."""
+        ...
+
+    @property
+    def paused(self) -> bool:
+        """True between `pause` and `resume`."""
+        ...
+
+
+class Switch(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Data of `switch`: names of controllers; all of it happens in one cycle, or nothing does."""
+
+    activate: tuple[str, ...] = ()
+    deactivate: tuple[str, ...] = ()
+
+
+class Rate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Data of `rate`."""
+
+    rate: float
+    """Hz"""
+
+
+class Unload(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Data of `unload`."""
+
+    controller: str
+
+
+KINDS = ("switch", "rate", "pause", "resume", "load", "unload", "stop")
+"""Commands for the loop itself; `load` carries a ControllerPlan, `pause`, `resume` and `stop` nothing."""
+
+
+@dataclass(slots=True)
+class Steering:
+    """Takes commands out of an inbox and answers each of them once."""
+
+    inbox: Inbox
+    loop: Steered
+    manager: Manager
+    record: CycleRecord
+    events: EventSink
+    taken: CommandSink
+    clock: Clock
+    _leases: dict[str, int] = field(default_factory=dict)
+    """Controller -> when its stream runs out, ns of the clock."""
+
+    def take(self, time_ns: int) -> int:
+        """Do what waits, and end streams whose lease ran out; return how many commands controllers took."""
+        count = 0
+        for command in self.inbox.take():
+            self._log(command)
+            obey = self._obey if command.controller == LOOP else self._hand
+            refusal = obey(command, time_ns)
+            if refusal:
+                source = command.controller or "loop"
+                text = f"{command.kind} from {command.origin} refused: {refusal}"
+                self.events.emit(EventCode.COMMAND_REFUSED, Severity.WARNING, source, text)
+            elif command.controller == LOOP:
+                text = f"{command.kind} {command.data.decode(errors='replace')}".strip()
+                self.events.emit(EventCode.STEERED, Severity.INFO, "loop", f"{text} from {command.origin}")
+            else:
+                count += 1
+            self.inbox.answer(command.number, refusal)
+        if self._leases:
+            self._expire()
+        return count
+
+    def refuse(self, why: str) -> None:
+        """Answer what waits without doing it; it is not in the log, as it changes nothing."""
+        for command in self.inbox.take():
+            self.inbox.answer(command.number, why)
+
+    def _log(self, command: Command) -> None:
+        record = self.record
+        self.taken.take(
+            TakenCommand(
+                t_ns=record.woken_ns,
+                cycle=record.cycle,
+                planned=-1,
+                controller=command.controller,
+                kind=command.kind,
+                origin=command.origin,
+                data=command.data,
+                lease_ns=command.lease_ns,
+            )
+        )
+
+    def _hand(self, command: Command, time_ns: int) -> str:
+        if len(command.data) % 8:
+            return f"{len(command.data)} bytes are no array of numbers"
+        data = np.frombuffer(command.data, dtype="<f8")
+        streaming = command.lease_ns and command.controller in self._leases
+        origin = "" if streaming else command.origin
+        refusal = self.manager.hand(command.controller, command.kind, data, origin, time_ns)
+        if not refusal:
+            if command.lease_ns:
+                self._leases[command.controller] = self.record.woken_ns + command.lease_ns
+            else:
+                self._leases.pop(command.controller, None)
+        return refusal
+
+    def _expire(self) -> None:
+        for name in [name for name, until in self._leases.items() if until < self.record.woken_ns]:
+            del self._leases[name]
+            text = f"the stream of commands ended; {self.loop.expire(name)}"
+            self.events.emit(EventCode.STALE_COMMAND, Severity.WARNING, name, text)
+
+    def _obey(self, command: Command, time_ns: int) -> str:
+        try:
+            return self._do(command, time_ns)
+        except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+            return f"its data does not fit: {error}"
+
+    def _do(self, command: Command, time_ns: int) -> str:
+        loop, manager, data = self.loop, self.manager, command.data
+        match command.kind:
+            case "switch":
+                switch = msgspec.json.decode(data, type=Switch)
+                refusal = manager.switch(switch.activate, switch.deactivate, time_ns)
+            case "rate":
+                refusal = loop.change_rate(msgspec.json.decode(data, type=Rate).rate)
+            case "pause":
+                refusal = loop.pause()
+            case "resume":
+                refusal = loop.resume()
+            case "stop":
+                refusal = loop.finish()
+            case "load" | "unload" if not loop.paused:
+                refusal = "pause the loop first: it stands still meanwhile"
+            case "load":
+                refusal = manager.load(msgspec.json.decode(data, type=ControllerPlan))
+            case "unload":
+                refusal = manager.unload(msgspec.json.decode(data, type=Unload).controller)
+            case _:
+                refusal = f"the loop knows {', '.join(KINDS)}"
+        return refusal

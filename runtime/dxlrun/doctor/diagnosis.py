@@ -1,0 +1,30 @@
+"""Diagnosis: every check of the doctor, in the order in which a person should mend."""
+
+from __future__ import annotations
+
+from dxlrun.doctor.finding import Finding
+from dxlrun.doctor.kernel import clock_source, kernel, real_time_share, system
+from dxlrun.doctor.machine import Machine
+from dxlrun.doctor.ports import latency_timers, ports
+from dxlrun.doctor.processor import cores, governor, idle_latency
+from dxlrun.doctor.rights import locked_memory, priority
+
+
+def diagnose(machine: Machine) -> tuple[Finding, ...]:
+    """Return what was found; on a system that cannot run robots, that alone."""
+    first = system(machine)
+    if first.state == "missing":
+        return (first,)
+    return (
+        first,
+        *ports(machine),
+        *latency_timers(machine),
+        priority(machine),
+        locked_memory(machine),
+        kernel(machine),
+        real_time_share(machine),
+        clock_source(machine),
+        cores(machine),
+        governor(machine),
+        idle_latency(machine),
+    )

@@ -1,0 +1,1 @@
+"""Steering from outside: the gateway's process beside a run, and the client that talks to it."""

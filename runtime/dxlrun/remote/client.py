@@ -1,0 +1,249 @@
+"""Client: a running robot from Python.
+
+    import dxlrun
+
+    with dxlrun.connect() as robot:
+        robot.send("head", "posvel", {"positions": [0.3, 0.0], "velocities": [1.0, 1.0]})
+
+Only the standard library is needed on this side; one connection, one request at a time, of one thread.
+"""
+
+from __future__ import annotations
+
+import http.client
+import json
+import os
+import select
+import socket
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from urllib.parse import quote
+
+from dxlrun.errors import DxlrunError, Refused
+from dxlrun.remote.sockets import MOST_BYTES, alive, running, sockets
+
+__all__ = ["RemoteRobot", "Stream", "connect", "running"]
+
+TIMEOUT_S = 10.0
+"""How long an answer may take; the gateway answers within two seconds or so, whatever the loop does."""
+LEASE_S = 0.2
+_IDLE_S = 20.0
+"""The gateway closes silent connections after 30 s; one that was silent for so long is not used again."""
+_STOP_S = 30.0
+_WRONG_INPUT = (404, 413, 422)
+"""Statuses of wishes that would be refused at any time: no such thing, too long, not as they must be."""
+
+
+class _Connection(http.client.HTTPConnection):
+    """HTTP over a Unix socket."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__("localhost", timeout=TIMEOUT_S)
+        self._path = path
+
+    def connect(self) -> None:
+        """Connect to the socket's path."""
+        self.sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self.sock.settimeout(self.timeout)
+        self.sock.connect(str(self._path))
+
+    @property
+    def hung_up(self) -> bool:
+        """True when the other end has closed it; it says nothing unless asked, so any byte means that too."""
+        if self.sock is None:
+            return False
+        look = select.poll()
+        look.register(self.sock, select.POLLIN)
+        return bool(look.poll(0))
+
+
+def connect(robot: str | None = None, client: str | None = None) -> RemoteRobot:
+    """Return a running robot, by its name; without one, the only one that runs.
+
+    `client` names you in the robot's log. Raises DxlrunError when no such robot runs, or several do.
+    """
+    found = sockets()
+    names = ", ".join(sorted(found))
+    if robot is None:
+        if not found:
+            raise DxlrunError("no robot runs that can be steered; start one (dxlrun ROBOT.yaml)")
+        if len(found) > 1:
+            raise DxlrunError(f"several robots run: {names}; name one")
+        robot = next(iter(found))
+    if robot not in found:
+        raise DxlrunError(
+            f"no robot {robot} runs that can be steered; " + (f"these do: {names}" if names else "start it")
+        )
+    return RemoteRobot(robot, found[robot], client or f"python {os.getpid()}")
+
+
+class RemoteRobot:
+    """A running robot. Everything raises Refused with the reason, and DxlrunError when the robot is gone."""
+
+    def __init__(self, name: str, path: Path, client: str) -> None:
+        self.name = name
+        self._path = path
+        self._connection = _Connection(path)
+        self._used = time.monotonic()
+        shown = "".join(letter for letter in client if letter.isprintable())
+        self._headers = {
+            "X-Dxlrun-Client": shown.encode().decode("latin-1"),  # UTF-8 in what HTTP takes for Latin-1
+            "Content-Type": "application/json",
+        }
+
+    def __enter__(self) -> RemoteRobot:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the connection; the robot goes on."""
+        self._connection.close()
+
+    # Looking
+
+    def info(self) -> dict[str, object]:
+        """Return who it is: rate, controllers and what they take, cycles, log."""
+        return self._ask("GET", "/robot")
+
+    def states(self) -> dict[str, object]:
+        """Return the newest cycle: each joint's position (rad), velocity (rad/s), effort, age (s), goals."""
+        return self._ask("GET", "/states")
+
+    def events(self, after: int = 0) -> dict[str, object]:
+        """Return what happened since event number `after`, at most 200, and the number of the last one."""
+        return self._ask("GET", f"/events?after={after}")
+
+    # Steering
+
+    def send(self, controller: str, kind: str, command: Mapping[str, object]) -> None:
+        """Give a controller a typed command; returns when the loop has taken it."""
+        self._post(f"/controllers/{_quoted(controller)}/commands/{_quoted(kind)}", command)
+
+    def stream(self, controller: str, kind: str, lease: float = LEASE_S) -> Stream:
+        """Return a stream of set-points for a controller, of which the newest counts, for `lease` seconds."""
+        return Stream(self, controller, kind, lease)
+
+    def switch(self, activate: Sequence[str] = (), deactivate: Sequence[str] = ()) -> None:
+        """Activate and deactivate controllers in one cycle, or not at all."""
+        self._post("/switch", {"activate": list(activate), "deactivate": list(deactivate)})
+
+    def rate(self, rate: float) -> None:
+        """Let the loop run at another rate, Hz."""
+        self._post("/rate", {"rate": rate})
+
+    def pause(self) -> None:
+        """Hold the joints; the controllers' time stands still."""
+        self._post("/pause")
+
+    def resume(self) -> None:
+        """Let the controllers go on where they were."""
+        self._post("/resume")
+
+    def load(self, name: str, entry: Mapping[str, object]) -> None:
+        """Load a controller into the paused loop; `entry` is written as in the robot file."""
+        self._post("/controllers", {**entry, "name": name})
+
+    def unload(self, name: str) -> None:
+        """Take a controller that is not active out of the paused loop."""
+        self._ask("DELETE", f"/controllers/{_quoted(name)}")
+
+    def stop(self, wait: bool = True) -> None:
+        """End the run in order; with `wait`, return when it has ended and its log is closed.
+
+        Raises DxlrunError when it has not ended after 30 s.
+        """
+        try:
+            self._post("/stop")
+        except Refused:
+            raise
+        except DxlrunError:
+            if alive(self._path):
+                raise
+        self.close()
+        until = time.monotonic() + _STOP_S
+        while wait and alive(self._path):
+            if time.monotonic() > until:
+                raise DxlrunError(f"{self.name} did not end within {_STOP_S:g} s")
+            time.sleep(0.05)
+
+    # Inside
+
+    def _post(self, path: str, content: Mapping[str, object] | None = None) -> None:
+        self._ask("POST", path, content)
+
+    def _ask(self, method: str, path: str, content: Mapping[str, object] | None = None) -> dict[str, object]:
+        """Ask once and return the answer: nothing is ever asked twice, the first may have been heard."""
+        body = None if content is None else _json(content)
+        idle = time.monotonic() - self._used > _IDLE_S
+        if idle or self._connection.hung_up:
+            self.close()
+        try:
+            self._connection.request(method, path, body, self._headers)
+            response = self._connection.getresponse()
+            answer = json.loads(response.read())
+        except (http.client.HTTPException, OSError, ValueError) as error:
+            self.close()
+            why = str(error) or type(error).__name__
+            raise DxlrunError(f"{self.name} does not answer any more: {why}") from error
+        except BaseException:  # Ctrl-C between question and answer: the answer must not meet the next one
+            self.close()
+            raise
+        self._used = time.monotonic()
+        if not isinstance(answer, dict):
+            raise DxlrunError(f"{self.name} answers in a way that this version does not know")
+        if "refused" in answer or response.status >= 400:
+            sentence = str(answer.get("refused", f"HTTP status {response.status}"))
+            raise Refused(sentence, wrong_input=response.status in _WRONG_INPUT)
+        return answer
+
+
+def _quoted(name: str) -> str:
+    return quote(name, safe="")
+
+
+def _json(content: Mapping[str, object]) -> bytes:
+    """Return the body of a request; arrays of numpy are lists there. Raises Refused for what is none."""
+    try:
+        body = json.dumps(content, default=_plain, allow_nan=False).encode()
+    except (TypeError, ValueError, RecursionError) as error:
+        raise Refused(
+            f"this cannot be sent: {error}; use numbers, texts, lists and mappings", wrong_input=True
+        ) from error
+    if len(body) > MOST_BYTES:
+        raise Refused(
+            f"{len(body)} bytes are too many, at most {MOST_BYTES} are taken at once", wrong_input=True
+        )
+    return body
+
+
+def _plain(value: object) -> object:
+    lists = getattr(value, "tolist", None)
+    if lists is None:
+        raise TypeError(f"{type(value).__name__} is not JSON")
+    return lists()
+
+
+class Stream:
+    """Set-points for one controller; when they cease for longer than the lease, its joints are held."""
+
+    def __init__(self, robot: RemoteRobot, controller: str, kind: str, lease: float) -> None:
+        self._robot = robot
+        self._path = f"/controllers/{_quoted(controller)}/set-points/{_quoted(kind)}?lease={lease:g}"
+
+    def send(self, command: Mapping[str, object]) -> None:
+        """Leave the newest set-point; returns before the loop has taken it."""
+        self._robot._post(self._path, command)
+
+    def __enter__(self) -> Stream:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Nothing is said: the lease runs out, and the joints are held."""

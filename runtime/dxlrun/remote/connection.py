@@ -1,0 +1,72 @@
+"""Connections: how much patience the gateway has with each of them, and how many it keeps.
+
+A client may hang in the middle of a request, never read its answer, or open connections without end: the
+connection that was silent longest goes, so that there is always one for who comes next, with `stop` for
+example. Who is at the other end is asked of the kernel (SO_PEERCRED, unix(7)).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import socket
+import struct
+
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+MOST_CONNECTIONS = 64
+SILENCE_S = 30.0
+"""After so long without a byte from the other side, whatever it waits for, a connection is closed."""
+
+_CREDENTIALS = struct.Struct("3i")
+
+
+class Connection(H11Protocol):
+    """HTTP/1.1 on one connection, closed when it is silent for too long, or the oldest of too many."""
+
+    def connection_made(  # type: ignore[override]
+        self, transport: asyncio.Transport
+    ) -> None:
+        """Begin, unless it is somebody else's; let another one go when there are too many."""
+        super().connection_made(transport)
+        self.heard = self.loop.time()
+        process, user = _peer(transport)
+        if user not in (0, os.getuid()):  # the socket's mode says the same; twice is not too often
+            transport.abort()
+            return
+        self.client = (f"process {process}", 0)
+        others = [
+            one
+            for one in self.connections
+            if isinstance(one, Connection) and one is not self and not one.transport.is_closing()
+        ]
+        if len(others) >= MOST_CONNECTIONS:
+            min(others, key=lambda one: (one.busy, one.heard)).transport.abort()
+        self._look()
+
+    def data_received(self, data: bytes) -> None:
+        """Take what came."""
+        self.heard = self.loop.time()
+        super().data_received(data)
+
+    @property
+    def busy(self) -> bool:
+        """True while a request of it is answered."""
+        return self.cycle is not None and not self.cycle.response_complete
+
+    def _look(self) -> None:
+        """Close it when it was silent for too long, else look again when that may be."""
+        silent = self.loop.time() - self.heard
+        if silent >= SILENCE_S:
+            self.transport.abort()  # not close: that would wait for a reader that may never read
+        elif not self.transport.is_closing():
+            self.loop.call_later(SILENCE_S - silent + 0.01, self._look)
+
+
+def _peer(transport: asyncio.Transport) -> tuple[int, int]:
+    """Return process ID and user ID of who connected."""
+    end = transport.get_extra_info("socket")
+    process, user, _ = _CREDENTIALS.unpack(
+        end.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+    )
+    return process, user

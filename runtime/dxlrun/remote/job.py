@@ -1,0 +1,28 @@
+"""What the gateway's process is given; light, because the process in the terminal imports it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Descriptors:
+    """The memory that the gateway shares with the loop's process."""
+
+    heartbeat: int
+    cycles: int
+    events: int
+    guardian_events: int
+    mailbox: int
+    answers: int
+
+
+@dataclass(frozen=True, slots=True)
+class GatewayJob:
+    """A run, for its gateway."""
+
+    plan: int
+    """Descriptor of the plan's JSON."""
+    memory: Descriptors
+    log: str | None
+    """Where the log is written, from the root; None: there is none."""

@@ -1,0 +1,216 @@
+"""Link: the gateway's end of the loop: its mailbox, its answers, its newest cycle, its events."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import msgspec
+
+from dxlrun.compile.plan import Plan
+from dxlrun.control.loop_plan import ControllerPlan
+from dxlrun.cycle import CycleLayout, CycleRecord
+from dxlrun.events import Event, EventCode, decode_event
+from dxlrun.heartbeat import Heartbeat, Phase
+from dxlrun.inbox import LOOP, Command
+from dxlrun.mailbox import LARGEST, Answers, MailboxWriter
+from dxlrun.remote.job import Descriptors
+from dxlrun.remote.preparation import Refusal
+from dxlrun.ring import RingReader
+
+ANSWER_S = 2.0
+"""A loop that does not answer in this time, and two of its periods, is not waited for any longer."""
+MOST_WAITING = 64
+MOST_WAITING_BYTES = 2 * LARGEST
+"""What may wait for the loop's answer; the rest of the mailbox is kept for `stop`."""
+KEPT_EVENTS = 1000
+LONGEST_DATA = LARGEST - 1024
+"""Bytes; what an operation of the mailbox has beside names."""
+_LOOK_S = 0.002
+_HELD = {
+    EventCode.STALE_COMMAND: True,
+    EventCode.COMMAND: False,
+    EventCode.CONTROLLER_ACTIVATED: False,
+    EventCode.CONTROLLER_DEACTIVATED: False,
+}
+"""Events of a controller -> whether its joints are held afterwards because its stream ended."""
+
+
+@dataclass(slots=True)
+class Loaded:
+    """A controller and its place: the bit by which the cycles show that it is active."""
+
+    plan: ControllerPlan
+    place: int
+    held: bool = False
+    switched: tuple[bool, int] | None = None
+    """What a switch made of it, and how many cycles had ended then: their records do not show it yet."""
+
+
+@dataclass(slots=True)
+class _Asked:
+    """A command whose answer is awaited."""
+
+    size: int
+    answer: asyncio.Future[str]
+    done: Callable[[], object] | None
+    """What the gateway knows anew when the loop has done it; also when nobody waits for the answer."""
+
+
+@dataclass(slots=True)
+class _Teller:
+    """A process that tells events."""
+
+    ring: RingReader
+    last: int = 0
+    """Number of its newest event: pieces that follow belong to it."""
+
+
+class Link:
+    """What the gateway knows of the loop, and how it asks it; one asyncio loop, no threads."""
+
+    def __init__(self, plan: Plan, memory: Descriptors) -> None:
+        self.plan = plan
+        self.rate = 1e9 / plan.loop.period_ns
+        self.paused = False
+        self.heartbeat = Heartbeat(memory.heartbeat)
+        self.controllers = {one.name: Loaded(one, place) for place, one in enumerate(plan.loop.controllers)}
+        self.events: deque[tuple[int, Event]] = deque(maxlen=KEPT_EVENTS)
+        self._cycles = RingReader(memory.cycles)
+        joints = tuple(joint.name for joint in plan.loop.joints)
+        layout = CycleLayout(joints, tuple(one.name for one in plan.loop.controllers))
+        self._record = CycleRecord(layout)
+        self._tellers = [_Teller(RingReader(memory.events)), _Teller(RingReader(memory.guardian_events))]
+        self._mailbox = MailboxWriter(memory.mailbox)
+        self._answers = Answers(memory.answers)
+        self._numbers = itertools.count(1)
+        self._event_numbers = itertools.count(1)
+        self._asked: dict[int, _Asked] = {}
+        self._asked_bytes = 0
+
+    # Looking
+
+    def newest(self) -> CycleRecord | None:
+        """Return the newest cycle, None before the first; the memory is used again."""
+        found = self._cycles.newest()
+        if found is not None and len(found) == len(self._record.raw):
+            self._record.raw[:] = found
+        return self._record if self._record.woken_ns else None
+
+    def active(self, loaded: Loaded) -> bool:
+        """Say whether a controller is active: by the newest cycle, or by a switch of the one that runs."""
+        if loaded.switched is not None:
+            active, ended = loaded.switched
+            if self.heartbeat.cycles <= ended:
+                return active
+            loaded.switched = None
+        record = self.newest()
+        return record is not None and bool(record.active >> loaded.place & 1)
+
+    # Asking
+
+    async def ask(
+        self,
+        controller: str,
+        kind: str,
+        data: bytes,
+        origin: str,
+        done: Callable[[], object] | None = None,
+    ) -> None:
+        """Hand a command to the loop and wait for its answer; raises Refusal.
+
+        `done` is called when the loop has done it, also when that is after the wait was given up. `stop` is
+        taken however much waits already.
+        """
+        if self.heartbeat.phase is not Phase.RUNNING:
+            raise Refusal(503, "the run is at its end")
+        size = len(data) + 1024
+        if len(data) > LONGEST_DATA:
+            raise Refusal(413, f"{len(data)} bytes are too many for one command; send less at once")
+        stop = controller == LOOP and kind == "stop"
+        full = len(self._asked) >= MOST_WAITING or self._asked_bytes + size > MOST_WAITING_BYTES
+        number = next(self._numbers)
+        if (full and not stop) or not self._mailbox.post(Command(number, controller, kind, data, origin)):
+            raise Refusal(429, "so much waits for the loop already that there is no room; ask less often")
+        answer: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+        self._asked[number] = _Asked(size, answer, done)
+        self._asked_bytes += size
+        patience = ANSWER_S + min(2 / self.rate, ANSWER_S)
+        try:
+            refusal = await asyncio.wait_for(answer, patience)
+        except TimeoutError:
+            what = f"the loop did not answer within {patience:.1f} s; it may still do it"
+            raise Refusal(503, what) from None
+        if refusal:
+            raise Refusal(409, refusal)
+
+    async def ask_loop(
+        self, kind: str, data: object, origin: str, done: Callable[[], object] | None = None
+    ) -> None:
+        """Ask the loop itself for something; raises Refusal."""
+        await self.ask(LOOP, kind, b"" if data is None else msgspec.json.encode(data), origin, done)
+
+    def set_point(self, loaded: Loaded, kind: str, data: bytes, origin: str, lease_ns: int) -> None:
+        """Leave the newest set-point of a stream for the loop; raises Refusal."""
+        if self.heartbeat.phase is not Phase.RUNNING:
+            raise Refusal(503, "the run is at its end")
+        command = Command(next(self._numbers), loaded.plan.name, kind, data, origin, lease_ns)
+        if not self._mailbox.set_point(loaded.place, command):
+            raise Refusal(413, "this command is too long for a stream; send it as a command")
+
+    # What the loop did
+
+    def switched(self, activate: Sequence[str], deactivate: Sequence[str]) -> None:
+        """Note a switch that the loop has done; the record of its cycle is still to come."""
+        for names, active in ((deactivate, False), (activate, True)):
+            for name in names:
+                if (loaded := self.controllers.get(name)) is not None:
+                    loaded.switched = (active, self.heartbeat.cycles)
+
+    def loaded(self, plan: ControllerPlan) -> None:
+        """Note a controller that the loop has loaded, in the place that the loop gave it."""
+        taken = {one.place for one in self.controllers.values()}
+        own = len(self.plan.loop.controllers)
+        self.controllers[plan.name] = Loaded(plan, next(i for i in itertools.count(own) if i not in taken))
+
+    async def watch(self) -> None:
+        """Collect answers and events for ever."""
+        while True:
+            self.collect()
+            await asyncio.sleep(_LOOK_S if self._asked else 10 * _LOOK_S)
+
+    def collect(self) -> None:
+        """Collect the answers and events that have come."""
+        for number, refusal in self._answers.new():
+            asked = self._asked.pop(number, None)
+            if asked is None:
+                continue  # a set-point of a stream
+            self._asked_bytes -= asked.size
+            if not refusal and asked.done is not None:
+                asked.done()
+            if not asked.answer.done():
+                asked.answer.set_result(refusal)
+        for teller in self._tellers:
+            while (record := teller.ring.read()) is not None:
+                if isinstance(record, bytes):  # the log tells of gaps
+                    with suppress(ValueError):
+                        self._hear(teller, decode_event(record))
+
+    def _hear(self, teller: _Teller, event: Event) -> None:
+        """Keep an event; a long text comes in pieces, one after the other."""
+        if event.part:
+            for index in reversed(range(len(self.events))):
+                number, before = self.events[index]
+                if number == teller.last:
+                    self.events[index] = (number, replace(before, text=before.text + event.text))
+                    break
+            return
+        teller.last = next(self._event_numbers)
+        self.events.append((teller.last, event))
+        loaded = self.controllers.get(event.source)
+        if loaded is not None and event.code in _HELD:
+            loaded.held = _HELD[EventCode(event.code)]

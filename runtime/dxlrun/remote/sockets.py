@@ -1,0 +1,124 @@
+"""Where the sockets of running robots are, and which robots run; both ends of a socket know this.
+
+A socket is in `$XDG_RUNTIME_DIR/dxlrun` (XDG Base Directory Specification) where that is ours, else in
+`/tmp/dxlrun-<user ID>`. Runs are looked for in both: a service and a login shell may differ in the variable.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import socket
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from dxlrun.errors import DxlrunError
+
+SUFFIX = ".sock"
+MOST_BYTES = 1 << 20
+"""The longest body of a request; longer ones are refused before they are read."""
+LONGEST_PATH = 107
+"""Bytes; what Linux takes as the name of a Unix socket (unix(7)), without the final zero."""
+
+
+def places() -> list[Path]:
+    """Return the directories in which this user's sockets may be, the one for new sockets first."""
+    found = [Path(f"/tmp/dxlrun-{os.getuid()}")]  # noqa: S108  entered only when it is ours alone
+    runtime = Path(os.environ.get("XDG_RUNTIME_DIR", ""))
+    with suppress(OSError):
+        # that of another user, left in the environment by su or sudo, is not ours to write into
+        if runtime.is_absolute() and runtime.stat().st_uid == os.getuid():
+            found.insert(0, runtime / "dxlrun")
+    return found
+
+
+def ours(place: Path) -> bool:
+    """Say whether a directory belongs to this user and nobody else may look into it; no link is followed."""
+    try:
+        found = place.lstat()
+    except OSError:
+        return False
+    return stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o077
+
+
+def listen(robot: str) -> tuple[socket.socket, Path]:
+    """Return a listening socket of a robot (mode 0600) and its path.
+
+    A second run of the same robot gets its process' number into the name. Raises DxlrunError when there is
+    no safe place for a socket.
+    """
+    place = places()[0]
+    with suppress(OSError):
+        place.mkdir(mode=0o700)
+    if not ours(place):
+        raise DxlrunError(
+            f"{place} must be a directory that only you may enter: remove it, or set XDG_RUNTIME_DIR"
+        )
+    with _alone(place):
+        path = place / f"{robot}{SUFFIX}"
+        if alive(path):
+            path = place / f"{robot}-{os.getpid()}{SUFFIX}"
+        if len(os.fsencode(path)) > LONGEST_PATH:
+            raise DxlrunError(f"{path} is too long for a socket: give the robot a shorter name")
+        path.unlink(missing_ok=True)
+        return _bound(path), path
+
+
+def _bound(path: Path) -> socket.socket:
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    before = os.umask(0o177)
+    try:
+        listener.bind(str(path))
+        listener.listen(64)
+    except OSError as error:
+        listener.close()
+        raise DxlrunError(f"{path} cannot be opened: {error.strerror or error}") from error
+    finally:
+        os.umask(before)
+    return listener
+
+
+@contextmanager
+def _alone(place: Path) -> Iterator[None]:
+    """Keep others from looking between the birth of a socket and its first ear, and from removing it."""
+    descriptor = os.open(place, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def alive(path: Path) -> bool:
+    """Say whether a process listens at a socket, also one that is busy or stopped; never waits."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.setblocking(False)
+        try:
+            probe.connect(str(path))
+        except BlockingIOError:  # so many wait there that there is no room for one more
+            return True
+        except OSError:
+            return False
+        return True
+
+
+def running() -> tuple[str, ...]:
+    """Return the names of the robots that run and can be steered; sockets that nobody serves are removed."""
+    return tuple(sorted(sockets()))
+
+
+def sockets() -> dict[str, Path]:
+    """Return the living sockets by the names of their robots, and remove the dead ones."""
+    found: dict[str, Path] = {}
+    for place in places():
+        if not ours(place):
+            continue
+        with _alone(place):
+            for path in place.glob(f"*{SUFFIX}"):
+                if alive(path):
+                    found.setdefault(path.stem, path)
+                else:
+                    path.unlink(missing_ok=True)
+    return found

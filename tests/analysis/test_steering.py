@@ -1,0 +1,158 @@
+"""Analysis of steered runs: periods are counted through other rates and pauses, and told to people."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from rich.console import Console
+
+from dxlrun.analysis.latency import cycle_periods_ns
+from dxlrun.analysis.page import page
+from dxlrun.analysis.report import Report, analyze
+from dxlrun.analysis.tables import steering_table
+from dxlrun.analysis.terminal import render
+from dxlrun.inbox import Command, QueueInbox
+from dxlrun.recording.reader import Log, read_log
+from dxlrun.testing import VirtualRobot, simulated_robot
+
+MS = 1_000_000
+ROBOT = """\
+name: pair
+buses:
+  main: {port: sim, protocol: 1.0, baud_rate: 1_000_000, return_delay_time: 100 us, adapter: {latency: 1 ms}}
+loop: {rate: 50}
+joints:
+  pan: {bus: main, id: 3, model: AX-12A, reference: 150 deg, direction: 1}
+  tilt: {bus: main, id: 7, model: AX-12A, reference: 150 deg, direction: -1}
+controllers:
+  states: {type: joint_state_broadcaster}
+  head: {type: joint_group_position_controller, joints: [pan, tilt]}
+  tail: {type: joint_group_position_controller, joints: [tilt], active: false}
+"""
+
+
+def ask(kind: str, **data: object) -> Command:
+    return Command(0, "", kind, msgspec.json.encode(data) if data else b"", "anna")
+
+
+def send(*numbers: float, lease_ns: int = 0, controller: str = "head") -> Command:
+    return Command(0, controller, "positions", np.array(numbers).tobytes(), "bob", lease_ns)
+
+
+Asked = Mapping[int, Sequence[Command]]
+ASKED: Asked = {
+    5: [ask("rate", rate=100)],
+    15: [ask("pause"), ask("pause")],
+    25: [ask("rate", rate=50)],
+    30: [ask("resume")],
+    **{cycle: [send(0.1, 0.1, lease_ns=50 * MS)] for cycle in range(31, 39)},
+    50: [ask("switch", activate=["tail"], deactivate=["head"]), send(0.2, 0.2, lease_ns=50 * MS)],
+    51: [send(0.2, 0.2, lease_ns=50 * MS), send(0.1, controller="tail")],
+    55: [Command(0, "", "load", b'{"name":', "mallory"), ask("stop")],
+}
+
+
+class Clients(QueueInbox):
+    def __init__(self, robot: VirtualRobot, asked: Asked) -> None:
+        super().__init__()
+        self.record, self.asked = robot.record, asked
+
+    def take(self) -> Sequence[Command]:
+        self.waiting.extend(self.asked.get(self.record.cycle, ()))
+        return super().take()
+
+
+def run(directory: Path, asked: Asked) -> Log:
+    (directory / "pair.yaml").write_text(ROBOT)
+    robot = simulated_robot(directory / "pair.yaml", duration_s=2.0, log=directory / "run.mcap")
+    robot.robot.loop.steering.inbox = Clients(robot, asked)
+    robot.run()
+    return read_log(directory / "run.mcap")
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Log:
+    return run(tmp_path_factory.mktemp("steered"), ASKED)
+
+
+@pytest.fixture(scope="module")
+def report(log: Log) -> Report:
+    return analyze(log)
+
+
+def test_the_periods_are_those_of_each_cycle(log: Log, report: Report) -> None:
+    expected = [20 * MS] * 5 + [10 * MS] * 20 + [20 * MS] * 31
+    assert cycle_periods_ns(log).tolist() == expected
+    account = report.periods
+    assert (account.elapsed, account.records, account.skipped, account.missing) == (56, 56, 0, 0)
+    assert account.agree
+    assert account.seconds == pytest.approx(sum(expected) / 1e9)
+    assert account.rates_hz == (50.0, 100.0)
+
+
+def test_the_verdict_says_it(report: Report) -> None:
+    loop, steered, *_ = report.verdict.sentences
+    assert loop == "The loop kept 50 Hz and 100 Hz: 0 of 56 periods skipped, on virtual time."
+    assert steered == (
+        "It was steered from outside: 2 changes of the rate, 1 pause, 1 switch, 1 command, 1 stop, "
+        "1 stream of 8 set-points, 3 refused; it was paused for 200.00 ms."
+    )
+
+
+def test_the_table_tells_who_asked_for_what(report: Report) -> None:
+    rows = [[cell.text for cell in row[1:]] for row in steering_table(report.steering).rows]
+    assert rows == [
+        ["5", "rate 100 Hz", "anna", "done"],
+        ["15", "pause", "anna", "done"],
+        ["15", "pause", "anna", "refused: the loop is paused already"],
+        ["25", "rate 50 Hz", "anna", "done"],
+        ["30", "resume", "anna", "done"],
+        ["31", "stream of positions for head, 8 set-points, lease 50 ms", "bob", "done"],
+        ["50", "switch activate tail; deactivate head", "anna", "done"],
+        [
+            "50",
+            "stream of positions for head, 2 set-points, lease 50 ms",
+            "bob",
+            "refused: the controller is not active",
+        ],
+        ["51", "positions for tail", "bob", "done"],
+        ["55", 'load {"name":', "mallory", rows[-2][-1]],
+        ["55", "stop", "anna", "done"],
+    ]
+    assert report.steering[1].time_s == pytest.approx(0.2)
+
+
+def test_a_pause_is_counted_in_periods_and_in_seconds(report: Report) -> None:
+    (pause,) = report.pauses
+    assert (pause.begin_s, pause.end_s) == pytest.approx((0.2, 0.4))
+    assert pause.periods == 15
+    console = Console(file=io.StringIO(), width=160)
+    console.print(render(report))
+    shown = console.file.getvalue()  # type: ignore[attr-defined]  # a StringIO, given above
+    assert "periods paused" in shown
+    assert "pair, 50 Hz and 100 Hz, 0.9 s" in shown
+    assert "switch activate tail; deactivate head" in shown
+
+
+def test_a_pause_that_the_run_ends_in_lasts_to_the_end(tmp_path: Path) -> None:
+    (pause,) = analyze(run(tmp_path, {10: [ask("pause")], 20: [ask("stop")]})).pauses
+    assert pause.periods == 11
+
+
+def test_the_page_shows_it(log: Log, report: Report) -> None:
+    text = page(log, report)
+    assert 'id="steering"' in text
+    assert "switch activate tail; deactivate head" in text
+    assert "paused" in text
+
+
+def test_a_run_that_nobody_steered_says_nothing_of_it(tmp_path: Path) -> None:
+    log = run(tmp_path, {20: []})
+    report = analyze(log)
+    assert (report.steering, report.pauses) == ((), ())
+    assert not any("steered" in sentence for sentence in report.verdict.sentences)

@@ -1,0 +1,272 @@
+"""`dxlrun doctor` on this machine, and on made-up ones that lack one thing each."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dxlrun.control.rights import UNLIMITED
+from dxlrun.doctor import Finding, Machine, diagnose
+from dxlrun.doctor.machine import may_schedule
+
+GOOD = {
+    "proc/sys/kernel/osrelease": "6.12.1-rt5",
+    "proc/sys/kernel/version": "#1 SMP PREEMPT_RT Sat Nov 1 2025",
+    "proc/sys/kernel/sched_rt_runtime_us": "950000",
+    "sys/devices/system/clocksource/clocksource0/current_clocksource": "tsc",
+    "sys/devices/system/cpu/isolated": "",
+    "sys/devices/system/cpu/cpu0/cpufreq/scaling_governor": "performance",
+    "sys/devices/system/cpu/cpu1/cpufreq/scaling_governor": "performance",
+    "sys/bus/usb-serial/devices/ttyUSB0/latency_timer": "1",
+    "dev/cpu_dma_latency": "",
+    "dev/ttyUSB0": "",
+    "etc/os-release": 'NAME="Some Linux"\nID=some\n',
+}
+Look = Callable[..., dict[str, Finding]]
+
+
+@pytest.fixture
+def look(tmp_path: Path) -> Look:
+    """Return what the doctor finds on a machine that is good but for what is given, by what was looked at."""
+
+    def look(files: dict[str, str | None] | None = None, **other: Any) -> dict[str, Finding]:
+        for name, text in (GOOD | (files or {})).items():
+            if text is not None:
+                path = tmp_path / name
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_text(text)
+        rights = {"user": "anna", "cores": 4, "highest_priority": 99, "lockable": UNLIMITED}
+        given = rights | {"platform": "linux", "may_schedule": lambda: True, "may_write": lambda _: True}
+        return {one.what: one for one in diagnose(Machine(**(given | {"root": tmp_path} | other)))}
+
+    return look
+
+
+def test_a_good_machine_has_nothing_to_mend(look: Look) -> None:
+    found = look()
+    assert {one.state for one in found.values()} == {"good"}
+    assert not any(one.mend for one in found.values())
+    assert list(found) == [
+        "system",
+        "/dev/ttyUSB0",
+        "latency timer of ttyUSB0",
+        "real-time priority",
+        "locked memory",
+        "kernel",
+        "real-time share",
+        "clock",
+        "cores",
+        "CPU governor",
+        "idle latency",
+    ]
+
+
+LIMITS = "sudo tee -a /etc/security/limits.d/dxlrun.conf"
+CONTAINER = "--cap-add SYS_NICE --ulimit rtprio=98 --ulimit memlock=-1"
+
+
+@pytest.mark.parametrize(
+    ("files", "rights", "what", "found", "mend"),
+    [
+        (
+            {"sys/bus/usb-serial/devices/ttyUSB0/latency_timer": "16"},
+            {},
+            "latency timer of ttyUSB0",
+            "16 ms where 1 ms is possible",
+            "echo 1 | sudo tee /sys/bus/usb-serial/devices/ttyUSB0/latency_timer",
+        ),
+        (
+            {"sys/bus/usb-serial/devices/ttyUSB0/latency_timer": "?"},
+            {},
+            "latency timer of ttyUSB0",
+            "it cannot be read",
+            "cat /sys/bus/usb-serial/devices/ttyUSB0/latency_timer",
+        ),
+        ({}, {"highest_priority": 0}, "real-time priority", "none is allowed", LIMITS),
+        ({}, {"highest_priority": 20}, "real-time priority", "up to 20, 32 are wanted", "rtprio 98"),
+        ({".dockerenv": ""}, {"highest_priority": 0}, "real-time priority", "none is allowed", CONTAINER),
+        ({}, {"may_schedule": lambda: False}, "real-time priority", "the kernel refuses it", "sysctl"),
+        (
+            {"run/.containerenv": ""},
+            {"may_schedule": lambda: False},
+            "real-time priority",
+            "the kernel refuses it",
+            CONTAINER,
+        ),
+        ({}, {"lockable": 8 << 20}, "locked memory", "only 8192 KiB may be locked", "memlock unlimited"),
+        (
+            {"proc/sys/kernel/version": "#1 SMP PREEMPT_DYNAMIC Sat"},
+            {},
+            "kernel",
+            "a stock kernel (PREEMPT_DYNAMIC)",
+            "install your distribution's PREEMPT_RT kernel",
+        ),
+        (
+            {"proc/sys/kernel/version": "#1 SMP", "etc/os-release": "ID=raspbian\nID_LIKE=debian\n"},
+            {},
+            "kernel",
+            "a stock kernel (no preemption)",
+            "sudo apt install linux-image-rt-$(dpkg --print-architecture)",
+        ),
+        (
+            {"proc/sys/kernel/version": "#1 SMP", ".dockerenv": ""},
+            {},
+            "kernel",
+            "a stock kernel (no preemption)",
+            "on the machine that runs this container",
+        ),
+        (
+            {"proc/sys/kernel/sched_rt_runtime_us": "-1"},
+            {},
+            "real-time share",
+            "may take all of a core",
+            "sudo sysctl kernel.sched_rt_runtime_us=950000",
+        ),
+        (
+            {"sys/devices/system/clocksource/clocksource0/current_clocksource": "hpet"},
+            {},
+            "clock",
+            "the clock source is hpet, which is slow to read",
+            "clocksource=tsc",
+        ),
+        ({}, {"cores": 1}, "cores", "there is one core for all processes", "two cores"),
+        (
+            {"sys/devices/system/cpu/cpu1/cpufreq/scaling_governor": "powersave"},
+            {},
+            "CPU governor",
+            "performance, powersave where performance is meant",
+            "echo performance | sudo tee /sys/devices/system/cpu/cpu*/cpufreq/scaling_governor",
+        ),
+        (
+            {},
+            {"may_write": lambda path: path.name != "cpu_dma_latency"},
+            "idle latency",
+            "runs may not keep cores awake",
+            "/etc/udev/rules.d/70-dxlrun.rules",
+        ),
+    ],
+)
+def test_one_thing_that_could_be_better_is_told_with_the_command_that_mends_it(
+    *, look: Look, files: dict[str, str], rights: dict[str, Any], what: str, found: str, mend: str
+) -> None:
+    by_name = look(files, **rights)
+    assert [one.what for one in by_name.values() if one.state != "good"] == [what]
+    one = by_name[what]
+    assert one.state == "worse"
+    assert found in one.found
+    assert mend in one.mend
+    assert one.why
+
+
+@pytest.mark.parametrize(
+    ("group", "mode", "found", "mend"),
+    [
+        (
+            "dialout",
+            0o660,
+            "it belongs to the group dialout, and anna is not in it",
+            "sudo usermod -aG dialout anna",
+        ),
+        ("root", 0o660, "anna may not open it", "sudo chmod a+rw /dev/ttyUSB0"),
+        ("dialout", 0o600, "anna may not open it", "sudo chmod a+rw /dev/ttyUSB0"),
+    ],
+)
+def test_a_port_that_may_not_be_opened_is_missing(
+    *, look: Look, monkeypatch: pytest.MonkeyPatch, group: str, mode: int, found: str, mend: str
+) -> None:
+    monkeypatch.setattr(Path, "group", lambda _: group)
+    look()  # makes the files
+
+    def closed(path: Path) -> bool:
+        os.chmod(path, mode)
+        return False
+
+    one = look(may_write=closed)["/dev/ttyUSB0"]
+    assert (one.state, one.found) == ("missing", found)
+    assert mend in one.mend
+
+
+def test_without_an_adapter_nothing_is_wrong(look: Look) -> None:
+    found = look({"dev/ttyUSB0": None, "sys/bus/usb-serial/devices/ttyUSB0/latency_timer": None})
+    assert found["ports"].state == "good"
+    assert not any("latency timer" in what for what in found)
+
+
+def test_what_a_machine_hides_is_not_called_bad(tmp_path: Path) -> None:
+    """An empty root, as in a container without /sys: nothing is raised, nothing is called missing."""
+    machine = Machine(
+        platform="linux",
+        root=tmp_path,
+        cores=2,
+        highest_priority=99,
+        lockable=UNLIMITED,
+        may_schedule=lambda: True,
+    )
+    assert [one.what for one in diagnose(machine) if one.state != "good"] == ["kernel"]
+
+
+def test_isolated_cores_are_offered_to_the_loop(look: Look) -> None:
+    assert "isolated: 3" in look({"sys/devices/system/cpu/isolated": "3"})["cores"].found
+
+
+@pytest.mark.parametrize(
+    ("other", "found"),
+    [
+        ({"platform": "darwin"}, "this is darwin; robots run on Linux only"),
+        ({"platform": "win32"}, "this is win32; robots run on Linux only"),
+        ({"missing_calls": ("pidfd_open",)}, "this Python has no pidfd_open"),
+    ],
+)
+def test_another_system_is_told_in_one_sentence(look: Look, other: dict[str, Any], found: str) -> None:
+    (one,) = look(**other).values()
+    assert (one.what, one.state) == ("system", "missing")
+    assert found in one.found
+    assert one.mend
+
+
+def test_trying_a_policy_leaves_none_behind() -> None:
+    before = os.sched_getscheduler(0)
+    may_schedule()
+    assert os.sched_getscheduler(0) == before
+
+
+# The command
+
+
+def test_the_doctor_looks_at_this_machine(dxlrun: Callable[..., Any]) -> None:
+    said = dxlrun("doctor", "--json")
+    told = json.loads(said.out)
+    states = {check["state"] for check in told["checks"]}
+    assert said.code == (1 if "missing" in states else 0)
+    assert told["ok"] == ("missing" not in states)
+    assert states <= {"good", "worse", "missing"}
+    assert all(set(check) == {"what", "state", "found", "why", "mend"} for check in told["checks"])
+    assert all(check["mend"] for check in told["checks"] if check["state"] != "good")
+
+
+def test_a_person_gets_a_table_the_commands_and_a_verdict(
+    dxlrun: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    other = Machine(platform="linux", root=tmp_path, user="anna", may_schedule=lambda: False)
+    monkeypatch.setattr(Machine, "this", lambda: other)
+    said = dxlrun("doctor")
+    assert said.code == 0
+    lines = said.out.splitlines()
+    assert lines[0].split() == ["system", "good", "Linux", "of", "an", "unknown", "version"]
+    why = lines.index("locked memory: a page that was swapped out delays the loop by milliseconds")
+    assert lines[why + 1].startswith("    echo 'anna - memlock unlimited' | sudo tee -a ")
+    assert lines[-1] == "robots run here: 0 missing, 4 could be better"
+
+
+def test_on_another_system_the_exit_code_says_so(
+    dxlrun: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Machine, "this", lambda: Machine(platform="darwin"))
+    said = dxlrun("doctor")
+    assert said.code == 1
+    assert said.out.splitlines()[-1] == "no robot runs here like this: 1 missing, 0 could be better"

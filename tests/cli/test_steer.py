@@ -1,0 +1,344 @@
+"""The verbs for a robot that runs, as a person types them, on one running torso; and docs/steering.md."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from dxlrun import DxlrunError, RemoteRobot, connect, running
+from dxlrun.cli.inputs import COMMANDS_WHILE_IT_RUNS
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "steering.md").read_text()
+TORSO = ROOT / "robots" / "bioloid_torso.yaml"
+CODE = "import sys; from dxlrun.cli import main; sys.exit(main())"
+DEADLINE_S = 30.0
+
+
+class Stage:
+    """Keeps a torso running; what it wrote stands in `said`."""
+
+    def __init__(self, directory: Path) -> None:
+        self.directory = directory
+        self.process: subprocess.Popen[bytes] | None = None
+
+    @property
+    def said(self) -> str:
+        return (self.directory / "said").read_text()
+
+    def start(self) -> None:
+        """Start a torso, unless it runs."""
+        if self.process is not None and self.process.poll() is None:
+            if running():
+                return
+            self.ended()
+        with (self.directory / "said").open("wb") as said:
+            self.process = subprocess.Popen(
+                [sys.executable, "-P", "-c", CODE, str(TORSO), "--duration", "300", "--no-record"],
+                cwd=self.directory,
+                stdout=said,
+                stderr=said,
+            )
+        tick, give_up = threading.Event(), time.monotonic() + DEADLINE_S
+        while not running():
+            assert self.process.poll() is None, self.said
+            assert time.monotonic() < give_up, self.said
+            tick.wait(0.05)
+
+    def ended(self) -> int:
+        """Return the exit code of the torso that ran."""
+        assert self.process is not None
+        return self.process.wait(DEADLINE_S)
+
+
+@pytest.fixture(scope="module")
+def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stage]:
+    directory = tmp_path_factory.mktemp("run")
+    stage = Stage(directory)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_RUNTIME_DIR", str(directory))
+        patch.setattr(
+            "dxlrun.remote.sockets.places", lambda: [directory / "dxlrun"]
+        )  # other runs are not ours
+        yield stage
+        if stage.process is not None and stage.process.poll() is None:
+            stage.process.terminate()
+            stage.ended()
+
+
+@pytest.fixture
+def torso(stage: Stage) -> Iterator[RemoteRobot]:
+    """The torso as it is after its start."""
+    stage.start()
+    with connect(client="the test") as robot:
+        yield robot
+    if running() and stage.process is not None and stage.process.poll() is None:
+        with connect(client="the test") as robot:
+            settle(robot)
+
+
+def settle(robot: RemoteRobot) -> None:
+    """Bring a torso back to where a test expects it."""
+    info = robot.info()
+    wanted = {"joint_state_broadcaster", "head", "left_arm", "right_arm"}
+    active = {name for name, one in controllers(robot).items() if one["active"]}
+    if active != wanted:
+        robot.switch(sorted(wanted - active), sorted(active - wanted))
+    for name in set(controllers(robot)) - wanted:
+        if name == "spare":
+            robot.unload(name)
+    if info["paused"]:
+        robot.resume()
+    if info["rate"] != 50:
+        robot.rate(50)
+
+
+def controllers(robot: RemoteRobot) -> dict[str, dict[str, object]]:
+    told = robot.info()["controllers"]
+    assert isinstance(told, list)
+    return {one["name"]: one for one in told}
+
+
+def until(robot: RemoteRobot, joint: str, goal: float) -> None:
+    """Wait until a joint is sent to `goal`, rad, within half a tick."""
+    tick, give_up, joints = threading.Event(), time.monotonic() + DEADLINE_S, {}
+    while time.monotonic() < give_up:
+        joints = robot.states()["joints"]
+        if joints[joint]["goal_position"] == pytest.approx(goal, abs=0.003):
+            return
+        tick.wait(0.01)
+    raise AssertionError(f"{joint} was never sent to {goal}: {joints}")
+
+
+# Looking
+
+
+def test_the_list_has_every_controller_and_what_it_takes(dxlrun, torso: RemoteRobot) -> None:
+    said = dxlrun("list")
+    assert (said.code, said.err) == (0, "")
+    assert said.out.startswith("bioloid_torso: 50 Hz, ")
+    (shown,) = re.findall(r"    dxlrun list\n\n```\n(.*?)```", PAGE, re.DOTALL)
+    assert said.out.split("\n", 1)[1].split() == shown.split("\n", 1)[1].split()
+
+
+def test_the_list_as_json_is_what_the_robot_tells(dxlrun, torso: RemoteRobot) -> None:
+    (told,) = json.loads(dxlrun("list", "--json", "--robot", "bioloid_torso").out)
+    assert (told["name"], told["robot"], told["rate"]) == ("bioloid_torso", "bioloid_torso", 50.0)
+    assert [one["name"] for one in told["controllers"]] == list(controllers(torso))
+
+
+def test_a_robot_that_went_away_is_said(dxlrun, torso: RemoteRobot, monkeypatch: pytest.MonkeyPatch) -> None:
+    def gone(robot: RemoteRobot) -> None:
+        raise DxlrunError(f"{robot.name} does not answer any more")
+
+    monkeypatch.setattr(RemoteRobot, "info", gone)
+    assert dxlrun("list") == (1, "", "dxlrun: bioloid_torso does not answer any more\n")
+
+
+# Steering
+
+
+def test_send_moves_the_joints_that_are_named_with_units(dxlrun, torso: RemoteRobot) -> None:
+    said = dxlrun("send", "head", "posvel", "positions=[20 deg, -30 deg]", "velocities=[1 rad/s, 30 rpm]")
+    assert said == (0, "bioloid_torso: head has taken posvel\n", "")
+    until(torso, "head_yaw_joint", -0.5236)
+    until(torso, "head_pitch_joint", 0.3491)
+
+
+def test_send_takes_a_file(dxlrun, torso: RemoteRobot, tmp_path: Path) -> None:
+    file = tmp_path / "wave.yaml"
+    file.write_text("points:\n  - {time: 200 ms, positions: [0.1 rad, 0 deg, 10 deg]}\n")
+    said = dxlrun("send", "left_arm", "trajectory", "--file", file, "--json")
+    assert said == (0, '{"robot": "bioloid_torso", "done": true}\n', "")
+    until(torso, "left_elbow_joint", 0.1745)
+
+
+def test_what_no_motion_is_made_of_is_sent_as_it_was_written(
+    dxlrun, torso: RemoteRobot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    grip = {"properties": {"positions": {}, "force": {}}}
+    hand = {"controllers": [{"name": "hand", "takes": {"grip": grip}}]}
+    sent: list[object] = []
+    monkeypatch.setattr(RemoteRobot, "info", lambda robot: hand)
+    monkeypatch.setattr(RemoteRobot, "send", lambda robot, *what: sent.append(what))
+    assert dxlrun("send", "hand", "grip", "positions=[30]", "force=5 N").code == 0
+    assert sent == [("hand", "grip", {"positions": [30], "force": "5 N"})]
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ("send heat posvel", "bioloid_torso has no controller heat; did you mean head?"),
+        ("send head possvel", "head takes no command possvel; did you mean posvel?"),
+        ("send joint_state_broadcaster go", "joint_state_broadcaster takes no command go; there is none"),
+        ("send head posvel positions=[30,0]", "positions[0]: 30 has no unit; write an angle with its unit"),
+        ("send head posvel positions=[30deg,0deg]", "posvel of head: velocities: Field required"),
+        ("send joint_state_broadcaster go now=.nan", "takes no command go"),
+        ("send head posvel positions=[1deg] force=.nan", "this cannot be sent"),
+        ("send head posvel positions=[1deg] velocities=[1rpm]", "1 positions for 2 joints"),
+        (
+            "switch --activate hed --deactivate left_arn",
+            "bioloid_torso has no controller left_arn; did you mean",
+        ),
+        ("unload spar", "bioloid_torso has no controller spar; known: "),
+        ("load spare type=joint_state_brodcaster", "did you mean joint_state_broadcaster?"),
+        ("pause --robot torso", "no robot torso runs; known: bioloid_torso"),
+    ],
+)
+def test_a_wrong_wish_is_wrong_input(dxlrun, torso: RemoteRobot, words: str, sentence: str) -> None:
+    said = dxlrun(*words.split())
+    assert (said.code, said.out) == (2, "")
+    assert sentence in said.err
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (
+            "switch --activate whole_body_position",
+            "controllers left_arm and whole_body_position both command joint",
+        ),
+        ("switch --activate head", "head is active already"),
+        ("resume", "the loop is not paused"),
+        ("load spare type=joint_state_broadcaster", "pause the loop first"),
+        ("rate 100000", "Hz"),
+    ],
+)
+def test_what_the_loop_refuses_is_a_failure_with_its_reason(
+    dxlrun, torso: RemoteRobot, words: str, sentence: str
+) -> None:
+    said = dxlrun(*words.split())
+    assert (said.code, said.out) == (1, "")
+    assert said.err.startswith("dxlrun: ")
+    assert sentence in said.err
+
+
+def test_a_switch_hands_joints_over(dxlrun, torso: RemoteRobot) -> None:
+    words = "--activate whole_body_position --deactivate head left_arm right_arm"
+    said = dxlrun("switch", *words.split())
+    assert (
+        said.out
+        == "bioloid_torso: whole_body_position active; head, left_arm, right_arm not active any more\n"
+    )
+    active = [name for name, one in controllers(torso).items() if one["active"]]
+    assert active == ["joint_state_broadcaster", "whole_body_position"]
+
+
+def test_a_rate_holds_at_once(dxlrun, torso: RemoteRobot) -> None:
+    assert dxlrun("rate", "80").out == "bioloid_torso runs at 80 Hz\n"
+    assert torso.info()["rate"] == 80
+    assert dxlrun("list").out.startswith("bioloid_torso: 80 Hz, ")
+
+
+def test_a_pause_is_when_controllers_are_loaded_and_unloaded(dxlrun, torso: RemoteRobot) -> None:
+    assert dxlrun("pause").out == ("bioloid_torso is paused, its joints are held; `dxlrun resume` goes on\n")
+    assert dxlrun("list").out.startswith("bioloid_torso: 50 Hz, paused, ")
+    said = dxlrun("load", "spare", "type=joint_group_position_controller", "joints=[head_yaw_joint]")
+    assert said == (
+        0, "bioloid_torso: spare is loaded; `dxlrun switch --activate spare` starts it\n", "",
+    )  # fmt: skip
+    assert dxlrun("load", "spare", "type=joint_state_broadcaster").code == 1
+    assert dxlrun("switch", "--activate", "spare", "--deactivate", "head").code == 0
+    assert dxlrun("unload", "spare").err == "dxlrun: spare is active; deactivate it first\n"
+    assert dxlrun("switch", "--deactivate", "spare", "--activate", "head").code == 0
+    assert dxlrun("unload", "spare").out == "bioloid_torso: spare is unloaded\n"
+    assert dxlrun("resume").out == "bioloid_torso goes on\n"
+    assert torso.info()["paused"] is False
+    assert "spare" not in controllers(torso)
+
+
+def test_of_several_robots_one_must_be_chosen(dxlrun, torso: RemoteRobot, stage: Stage) -> None:
+    sockets = stage.directory / "dxlrun"
+    (sockets / "twin.sock").symlink_to(sockets / "bioloid_torso.sock")
+    try:
+        said = dxlrun("pause")
+        assert (said.code, said.err) == (
+            2, "dxlrun: several robots run; choose one: --robot bioloid_torso, --robot twin\n",
+        )  # fmt: skip
+        assert dxlrun("rate", "40", "--robot", "twin").out == "twin runs at 40 Hz\n"
+        assert dxlrun("list").out.count(": 40 Hz, ") == 2
+    finally:
+        (sockets / "twin.sock").unlink()
+
+
+def test_the_log_can_say_which_verb_it_was(dxlrun, torso: RemoteRobot) -> None:
+    last = torso.events()["last"]
+    assert dxlrun("rate", "60").code == 0
+
+    tick, give_up, texts = threading.Event(), time.monotonic() + DEADLINE_S, []
+    while not texts and time.monotonic() < give_up:
+        texts = [one["text"] for one in torso.events(last)["events"] if one["name"] == "steered"]
+        tick.wait(0.01)
+    assert len(texts) == 1
+    assert texts[0].endswith("from dxlrun rate")
+
+
+def test_stop_waits_for_the_end_unless_told(
+    dxlrun, torso: RemoteRobot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waits: list[bool] = []
+    monkeypatch.setattr(RemoteRobot, "stop", lambda robot, wait: waits.append(wait))
+    assert dxlrun("stop").out == "bioloid_torso has ended\n"
+    assert dxlrun("stop", "--no-wait").out == "bioloid_torso is ending\n"
+    assert waits == [True, False]
+
+
+# The pages
+
+
+def test_what_the_readme_steers_works_on_its_torso(dxlrun, torso: RemoteRobot) -> None:
+    readme = (ROOT / "README.md").read_text()
+    (script,) = (code for code in re.findall(r"```python\n(.*?)```", readme, re.DOTALL) if "connect(" in code)
+    exec(script, {})  # noqa: S102  ours
+    until(torso, "head_pitch_joint", 0.3)
+    lines = [line.split("dxlrun ")[1] for line in readme.splitlines() if line.startswith("    dxlrun ")]
+    lines = [line for line in lines if line.split()[0] in COMMANDS_WHILE_IT_RUNS]
+    assert len(lines) == 2
+    for line in lines:
+        assert dxlrun(*shlex.split(line)).code == 0, line
+
+
+def test_the_script_of_the_page_steers_a_torso(torso: RemoteRobot, tmp_path: Path) -> None:
+    (script,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+    assert len(script.splitlines()) <= 30
+    told = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=False, cwd=tmp_path
+    )
+    assert (told.returncode, told.stderr) == (0, "")
+    (shown,) = re.findall(r"It prints:\n\n```\n(.*?)```", PAGE, re.DOTALL)
+    assert told.stdout == shown
+    assert torso.info()["rate"] == 40
+
+
+def test_the_commands_of_the_page_work_in_their_order(
+    dxlrun, torso: RemoteRobot, stage: Stage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (name,) = re.findall(r"where `(.+?)` is", PAGE)
+    (file,) = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
+    (tmp_path / name).write_text(file)
+    monkeypatch.chdir(tmp_path)
+    started, *lines = re.findall(r"^    dxlrun (.+)$", PAGE, re.MULTILINE)
+    assert started == "robots/bioloid_torso.yaml"
+    assert {line.split()[0] for line in lines} == set(COMMANDS_WHILE_IT_RUNS)
+    for line in lines:
+        said = dxlrun(*shlex.split(line))
+        assert (said.code, said.err) == (0, ""), line
+    assert said.out == "bioloid_torso has ended\n"
+    assert running() == ()
+    assert stage.ended() == 0
+    assert "bioloid_torso: good." in stage.said
+
+
+def test_the_page_says_what_the_client_can() -> None:
+    rows = "".join(line.split("|")[1] for line in PAGE.splitlines() if line.startswith("| `"))
+    methods = {name for name in dir(RemoteRobot) if not name.startswith("_")} - {"close", "name"}
+    assert methods <= set(re.findall(r"`(\w+)\(", rows))

@@ -1,0 +1,120 @@
+# ruff: noqa: E501 (what is written and what is said stand side by side)
+
+"""Poses, policies and fallbacks against the robot: each mistake at its place, and what is made of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+
+from dxlrun.compile import Compiled
+from dxlrun.control.policy_plan import HOLD, LIMP, Policy
+from dxlrun.errors import Problem
+
+Find = Callable[..., tuple[Problem, ...]]
+POLICIES = """\
+poses:
+  home: {left_arm_joint: 0 deg, right_arm_joint: -20 deg}
+  nod: {right_arm_joint: 10 deg}
+policies:
+  on_exit: [{pose: home, speed: 90 deg/s}, {reduce_torque: 0.25, steps: 3, over: 600 ms}]
+  on_fault: [hold]
+  on_lost_servo: [{pose: nod, speed: 4 rad/s}, hold]
+  exit_timeout: 6 s
+"""
+MISTAKES = [
+    ("pose: home", "pose: §hom", "on_exit has pose hom, which the file does not have; did you mean home?"),
+    ("home: {left_arm_joint", "home: {§left_arm", "pose home has joint left_arm, which the file does not have; did"),
+    ("joint: -20 deg", "joint: §-91 deg", "pose home puts right_arm_joint at -91 deg; it can go to -90..+60 deg"),
+    ("[hold]", "[§hold, limp]", "on_fault goes on after hold; write hold as the last step"),
+    ("exit_timeout: 6 s\n", "exit_timeout: 3 s\n", "on_exit may take"),
+    ("active: false\n", "active: false\n    fallback: §spar\n", "the fallback spar of spare is no controller of the file"),
+    ("active: false\n", "active: false\n    fallback: §spare\n", "spare is its own fallback"),
+    ("rate: 25}", "rate: 25, fallback: §arms}", "the fallback arms of states is active from the start"),
+    ("rate: 25}", "rate: 25, fallback: §spare}", "the fallback spare of states claims joints of arms, which goes on"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("right", "wrong", "says"), MISTAKES, ids=[says[:40] for _, _, says in MISTAKES])
+def test_each_mistake_is_named_where_it_stands(
+    problems_in: Find, robot_text: str, right: str, wrong: str, says: str
+) -> None:
+    text = robot_text + POLICIES
+    assert text.count(right) == 1
+    pointed = text.replace(right, wrong)
+    (problem,) = problems_in(pointed.replace("§", ""))
+    assert str(problem).split(": ", 1)[1].startswith(says)
+    if "§" in wrong:
+        before = pointed[: pointed.index("§")]
+        assert (problem.mark.line, problem.mark.column) == (
+            before.count("\n") + 1,
+            len(before) - before.rfind("\n"),
+        )
+
+
+def test_steps_that_take_too_long_say_what_would_do(problems_in: Find, robot_text: str) -> None:
+    (problem,) = problems_in((robot_text + POLICIES).replace("exit_timeout: 6 s", "exit_timeout: 3 s"))
+    assert "pose home at 90 deg/s: up to" in problem.what
+    seconds = problem.mend.removeprefix("raise exit_timeout to ").split(" s,")[0]
+    mended = (robot_text + POLICIES).replace("exit_timeout: 6 s", f"exit_timeout: {seconds} s")
+    assert problems_in(mended) == ()
+
+
+def test_a_fallback_is_in_the_plan(compile_text: Callable[..., Compiled], robot_text: str) -> None:
+    text = robot_text.replace(
+        "type: joint_group_posvel_controller", "type: joint_group_posvel_controller\n    fallback: spare"
+    )
+    arms = compile_text(text).plan.loop.controllers[1]
+    assert (arms.name, arms.fallback) == ("arms", "spare")
+
+
+def test_without_policies_a_run_ends_limp_and_a_lost_servo_does_not_end_it(
+    compile_text: Callable[..., Compiled], robot_text: str
+) -> None:
+    policies = compile_text(robot_text).plan.loop.policies
+    assert (policies.on_exit, policies.on_fault) == (LIMP, LIMP)
+    assert (policies.on_lost_servo, policies.on_stale_command) == (HOLD, HOLD)
+    assert not policies.reduces_torque
+
+
+def test_policies_become_steps_in_radians(compile_text: Callable[..., Compiled], robot_text: str) -> None:
+    policies = compile_text(robot_text + POLICIES).plan.loop.policies
+    home, torque = policies.on_exit.steps
+    assert home.targets == pytest.approx((0.0, math.radians(-20)))
+    assert home.speed == pytest.approx(math.radians(90))
+    assert (torque.fraction, torque.levels, torque.longest_ns) == (0.25, 3, 600_000_000)
+    assert policies.on_exit.last == "limp"
+    assert policies.on_fault == Policy((), "hold")
+    assert policies.on_lost_servo.steps[0].targets == (None, pytest.approx(math.radians(10)))
+    assert policies.on_lost_servo.last == "hold"
+    assert not policies.on_lost_servo.goes_on
+    assert policies.reduces_torque
+
+
+def test_a_pose_takes_its_time_from_the_farthest_limit_with_a_slow_first_second(
+    compile_text: Callable[..., Compiled], robot_text: str
+) -> None:
+    """right_arm_joint, 10 deg of -90..60: 100 deg away; a second at 1.5 rad/s, the rest at 4 rad/s, 0.3 s to
+    settle."""
+    step = compile_text(robot_text + POLICIES).plan.loop.policies.on_lost_servo.steps[0]
+    assert step.longest_ns * 1e-9 == pytest.approx(1 + (math.radians(100) - 1.5) / 4 + 0.3, abs=1e-6)
+
+
+def test_a_pose_of_a_joint_that_was_left_out_is_not_said_again(problems_in: Find, robot_text: str) -> None:
+    text = (robot_text + POLICIES).replace("id: 2\n", "id: 999\n")
+    said = [problem.what for problem in problems_in(text)]
+    assert said == ["joints.right_arm_joint.id is 999, but must be at most 253"]
+
+
+def test_the_check_tells_each_policy_and_what_is_left_without_the_loop(
+    compile_text: Callable[..., Compiled], robot_text: str
+) -> None:
+    rows = {row.name: row for row in compile_text(robot_text + POLICIES).report.policies}
+    assert rows["on_exit"].does == (
+        "pose home at 90 deg/s, then torque down to 25% in 3 steps over 0.6 s, then limp"
+    )
+    assert (rows["on_fault"].does, rows["on_fault"].without_loop) == ("hold", "hold")
+    assert rows["on_lost_servo"].without_loop == "hold"
+    assert "until the next command" in rows["on_stale_command"].does

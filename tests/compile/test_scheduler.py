@@ -1,0 +1,85 @@
+"""What the robot file wishes from the operating system, and how fast the buses let the loop become."""
+
+import pytest
+
+WISHES = "{policy: fifo, priority: 40, cores: [1, 3], polling: 250 us, idle_latency: true}"
+
+
+def with_loop(text, loop):
+    return text.replace("loop: {rate: 50}", f"loop: {loop}")
+
+
+def test_every_wish_reaches_the_plan(compile_text, robot_text):
+    text = with_loop(robot_text, f"{{rate: 50, overrun: catch_up, scheduler: {WISHES}}}")
+    loop = compile_text(text).plan.loop
+    wish = loop.scheduler
+    assert (wish.policy, wish.priority, wish.cores) == ("fifo", 40, (1, 3))
+    assert (wish.polling_ns, wish.idle_latency) == (250_000, True)
+    assert loop.overrun == "catch_up"
+
+
+def test_without_a_wish_nothing_is_asked_for(compile_text, robot_text):
+    loop = compile_text(robot_text).plan.loop
+    wish = loop.scheduler
+    assert (wish.policy, wish.cores, wish.polling_ns, wish.idle_latency) == ("other", (), None, False)
+    assert loop.overrun == "skip"
+
+
+def test_polling_may_be_left_to_the_measurement(compile_text, robot_text):
+    text = with_loop(robot_text, "{rate: 50, scheduler: {polling: auto}}")
+    assert compile_text(text).plan.loop.scheduler.polling_ns is None
+
+
+def test_the_slowest_bus_says_how_short_a_period_may_become(compile_text, robot_text):
+    two = robot_text.replace(
+        "loop:",
+        "  slow: {port: /dev/ttyUSB1, protocol: 1.0, baud_rate: 57_600, adapter: {latency: 1 ms}}\nloop:",
+    ).replace("    bus: main\n    id: 2", "    bus: slow\n    id: 2")
+    plan = compile_text(two).plan
+    fast, slow = (bus.budget.total_ns for bus in plan.buses)
+    assert plan.loop.least_period_ns == slow > fast
+
+
+def test_the_rate_of_the_file_is_always_possible(compile_text, robot_text):
+    total_ns = compile_text(robot_text).plan.buses[0].budget.total_ns
+    rate = 1e9 / total_ns
+    loop = compile_text(with_loop(robot_text, f"{{rate: {rate!r}}}").replace(", rate: 25", "")).plan.loop
+    assert loop.least_period_ns <= loop.period_ns
+
+
+@pytest.mark.parametrize(
+    ("loop", "told"),
+    [
+        (
+            "{rate: 50, scheduler: {polling: 12 ms}}",
+            "4:39: polling 12 ms is more than half of the period, 20 ms; write less, or auto",
+        ),
+        (
+            "{rate: 50, scheduler: {policy: fifo, priority: 99}}",
+            "4:54: warning: priority 99 leaves none above it for the guardian; write 98 at most",
+        ),
+        (
+            "{rate: 50, scheduler: {cores: [2, 2]}}",
+            "4:37: loop.scheduler.cores: cores are given once each, and at least one; write for example [3]",
+        ),
+        (
+            "{rate: 50, scheduler: {cores: []}}",
+            "4:37: loop.scheduler.cores: cores are given once each, and at least one; write for example [3]",
+        ),
+        (
+            "{rate: 50, scheduler: {cores: [-1]}}",
+            "4:38: loop.scheduler.cores[0] is -1, but must be at least 0; correct it",
+        ),
+        (
+            "{rate: 50, scheduler: {polling: often}}",
+            "4:39: loop.scheduler.polling: 'often' is not a duration; "
+            "write a duration such as 500 us, 1 ms, 2 s or 1 min, or auto",
+        ),
+        (
+            "{rate: 50, overrun: later}",
+            "4:27: loop.overrun is the text 'later', but must be skip, catch_up or stop; write it so",
+        ),
+    ],
+)
+def test_a_wish_that_cannot_be_is_told_with_its_place(problems_in, robot_text, loop, told):
+    assert [str(one).split("robot.yaml:")[1] for one in problems_in(with_loop(robot_text, loop))] == [told]

@@ -1,0 +1,27 @@
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from dxlrun.control.claims import conflicts, told
+
+
+@dataclass(frozen=True)
+class Wants:
+    name: str
+    joints: tuple[str, ...]
+    command: tuple[str, ...] = ("position",)
+
+
+def test_each_pair_that_wants_the_same_joints_is_told_once() -> None:
+    found = conflicts(
+        [Wants("left", ("a", "b", "c")), Wants("right", ("d",)), Wants("whole", tuple("abcde"))]
+    )
+    assert told(found) == (
+        "controllers left and whole both command joint a and 2 more; "
+        "controllers right and whole both command joint d"
+    )
+
+
+def test_who_only_looks_is_in_nobodys_way() -> None:
+    found = conflicts([Wants("all", ("a",)), Wants("eyes", ("a",), command=())])
+    assert (found, told(found)) == ((), "")

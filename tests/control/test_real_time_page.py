@@ -1,0 +1,46 @@
+"""The page on real time says what the program does."""
+
+import re
+from pathlib import Path
+from types import ModuleType
+from typing import get_args
+
+import pluggy
+
+from dxlrun.control import margin
+from dxlrun.control.contract import hook_breach
+from dxlrun.control.hookspecs import GROUP, HookSpecs
+from dxlrun.control.loop_plan import OverrunPolicy
+from dxlrun.control.schedule import MOST_CAUGHT_UP
+from dxlrun.description.robot import Scheduler
+
+PAGE = (Path(__file__).parents[2] / "docs" / "real-time.md").read_text()
+FLAT = " ".join(PAGE.split())
+
+
+def test_the_hook_of_the_page_is_one():
+    (source,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+    module = ModuleType("page")
+    exec(source, module.__dict__)  # noqa: S102 (it is our own page)
+    manager = pluggy.PluginManager(GROUP)
+    manager.add_hookspecs(HookSpecs)
+    assert hook_breach(module, manager) is None
+    assert module.dxlrun_overrun(0, 50_000_001) == "stop"
+    assert module.dxlrun_overrun(0, 50_000_000) is None
+
+
+def test_every_policy_for_late_cycles_is_on_the_page():
+    assert set(re.findall(r"^\| `(\w+)` \| [a-z]", PAGE, re.MULTILINE)) >= set(get_args(OverrunPolicy))
+    assert f"up to {MOST_CAUGHT_UP} late cycles follow at once" in PAGE
+
+
+def test_every_wish_is_on_the_page():
+    for key in Scheduler.model_fields:
+        assert f"`{key}`" in PAGE, key
+
+
+def test_the_numbers_of_polling_are_those_of_the_program():
+    assert (margin.AUTO_SHARE, margin.MOST_SHARE, margin._TRIES) == (10, 2, 32)
+    assert "sleeps 32 times" in FLAT
+    assert "at most a tenth of the period" in FLAT
+    assert "never more than half of the period" in FLAT

@@ -1,0 +1,157 @@
+"""Random sequences of steering: what is never allowed to happen, whatever a client asks for.
+
+CI runs a sample; `DXLRUN_SEQUENCES=10000 python -m pytest tests/control/test_sequences.py` runs them all.
+"""
+
+import os
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+PERIOD_NS = 20_000_000
+SEQUENCES = int(os.environ.get("DXLRUN_SEQUENCES", "60"))
+NAMES = ("a", "b", "c", "d", "nobody")
+JOINTS = {"a": ("j0",), "b": ("j1", "j2"), "c": ("j0", "j1", "j2"), "d": ("j2",), "x": ("j0",), "y": ("j1",)}
+
+names = st.one_of(
+    st.sampled_from([(), ("a",), ("b",), ("c",), ("d",), ("a", "b"), ("b", "d")]),
+    st.lists(st.sampled_from(NAMES), max_size=3),
+)
+switches = st.builds(lambda on, off: ("switch", {"activate": on, "deactivate": off}), names, names)
+rates = st.sampled_from([25.0, 50.0, 100.0, 75.0, 0.0, -1.0, 1e9]).map(lambda rate: ("rate", {"rate": rate}))
+plain = st.sampled_from(["pause", "resume", "stop?", ""]).map(lambda kind: (kind, {}))
+loads = st.sampled_from(["x", "y"]).map(lambda name: ("load", {"name": name}))
+unloads = st.sampled_from(["a", "x", "y"]).map(lambda name: ("unload", {"controller": name}))
+commands = st.builds(
+    lambda name, lease: ("command", {"name": name, "lease": lease}), st.sampled_from(NAMES), st.integers(0, 3)
+)
+waits = st.integers(1, 4).map(lambda cycles: ("wait", {"cycles": cycles}))
+sequences = st.lists(
+    st.one_of(switches, switches, rates, plain, loads, unloads, commands, waits, st.just(("fail", {}))),
+    min_size=5,
+    max_size=25,
+)
+
+
+class Run:
+    """One robot whose controllers write their own mark, so that a goal tells who commanded it."""
+
+    def __init__(self, make_robot):
+        self.robot = robot = make_robot(joints=3)
+        self.failing = False
+        for mark, name in enumerate("abcd", start=1):
+            rate = 25.0 if name == "b" else None
+            fallback = "d" if name == "c" else ""
+            robot.script(
+                name,
+                self.writer(mark, name),
+                joints=JOINTS[name],
+                active=name in "ab",
+                every=2 if rate else 1,
+                rate=rate,
+                fallback=fallback,
+            )
+        robot.build()
+        robot.hardware.keep = False
+        self.updated = set()
+        self.written = []
+
+    def writer(self, mark, name):
+        def act(controller, step, time_ns, value):
+            if step == "update":
+                self.updated.add(controller.context.name)
+                if self.failing and name == "c":
+                    raise RuntimeError("lost its way")
+                controller.context.commands.position[:] = mark / 100
+                controller.context.commands.velocity[:] = 1.0
+
+        return act
+
+    def plan_of(self, name):
+        kind = {"x": "a", "y": "d"}[name]
+        return {
+            "name": name,
+            "type": kind,
+            "distribution": "tests 1",
+            "parameters": "{}",
+            "joints": JOINTS[name],
+            "command": ["position", "velocity"],
+            "publishes": [],
+            "active": True,
+            "every": 1,
+        }
+
+    def steps(self, sequence):
+        """Give one operation a cycle to the loop; after each cycle, look at what may never be."""
+        todo = list(sequence)
+        waiting = 0
+        for kind, data in todo:
+            waiting += data.get("cycles", 1)
+            yield kind, data
+            for _ in range(data.get("cycles", 1) - 1):
+                yield "", {}
+        for _ in range(3):
+            yield "", {}
+
+    def run(self, sequence):
+        robot, steps = self.robot, self.steps(sequence)
+
+        def idle(deadline_ns):
+            self.updated.clear()
+            kind, data = next(steps, ("end", {}))
+            if kind == "end":
+                robot.stop.request()
+            elif kind == "fail":
+                self.failing = True
+            elif kind == "command":
+                robot.post(data["name"], "position", b"", data["lease"] * PERIOD_NS)
+            elif kind == "load":
+                robot.ask("load", **self.plan_of(data["name"]))
+            elif kind:
+                robot.ask(kind, **data)
+
+        robot.hardware.idle = idle
+        append = robot.sink.append
+        robot.sink.append = lambda record: (append(record), self.judge(record))
+        return robot.loop.run()
+
+    def judge(self, record):
+        manager = self.robot.manager
+        active = manager.active
+        assert record.active == sum(manager._named[name].bit for name in active)
+        claimed = [joint for name in active for joint in JOINTS[name]]
+        assert len(claimed) == len(set(claimed)), "two controllers have one joint"
+        assert self.updated <= set(active) | self.ended(), "an inactive controller was updated"
+        marks = {round(value * 100) for value in record.commands.position if np.isfinite(value)}
+        allowed = {{"a": 1, "b": 2, "c": 3, "d": 4, "x": 1, "y": 4}[name] for name in active}
+        assert marks <= allowed, "the robot was commanded by somebody who is not active"
+        if self.robot.loop.paused:
+            assert not marks
+            assert not self.updated
+
+    def ended(self):
+        """Return who was ended by its fault in this very cycle."""
+        return {"c"} if self.failing else set()
+
+
+@pytest.mark.campaign
+@settings(
+    max_examples=SEQUENCES,
+    deadline=None,
+    derandomize=SEQUENCES < 1000,
+    database=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(sequence=sequences)
+def test_whatever_is_asked_claims_stay_single_and_only_active_controllers_command(make_robot, sequence):
+    run = Run(make_robot)
+    result = run.run(sequence)
+    asked, answered = run.robot._asked, run.robot.inbox.answers
+    assert len(answered) + len(run.robot.inbox.waiting) == asked
+    cycles = run.robot.sink.cycles
+    assert result.cycles == len(cycles)
+    assert result.cycles + result.skipped == cycles[-1]["cycle"] + 1 if cycles else True
+    due = [cycle["scheduled_ns"] for cycle in cycles]
+    assert due == sorted(set(due))

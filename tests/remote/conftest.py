@@ -1,0 +1,210 @@
+"""A gateway without processes: its link lies on real rings, the test is the loop at their other end."""
+
+import asyncio
+import json
+from types import SimpleNamespace
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+import dxlrun
+from dxlrun import heartbeat, mailbox, ring
+from dxlrun.compile.plan import Plan
+from dxlrun.control.loop_plan import ControllerPlan, JointPlan, LoopPlan, SchedulerPlan
+from dxlrun.control.plugins import Offer, PlugIns
+from dxlrun.cycle import CycleLayout, CycleRecord
+from dxlrun.events import EVENT_SLOT, EventRing
+from dxlrun.heartbeat import Heartbeat, Phase
+from dxlrun.mailbox import Mailbox
+from dxlrun.remote.gateway import Gateway
+from dxlrun.remote.job import Descriptors
+from dxlrun.remote.link import Link
+from dxlrun.remote.preparation import Preparation
+
+PERIOD_NS = 20_000_000
+
+
+class Go(dxlrun.CommandModel):
+    """Where to."""
+
+    positions: list[float]
+
+
+class Number(dxlrun.CommandModel):
+    """How many."""
+
+    count: int
+
+
+class ArmParameters(dxlrun.ParametersModel):
+    joints: list[str]
+
+
+class Arm(dxlrun.Controller[ArmParameters]):
+    Parameters = ArmParameters
+    Commands: ClassVar = {"go": Go, "many": Number, "break": Number, "leave": Number}
+
+    @classmethod
+    def interfaces(cls, parameters, joints):
+        return dxlrun.Interfaces(joints=tuple(parameters.joints), command=("position",))
+
+    @classmethod
+    def prepare(cls, kind, command, parameters):
+        if kind == "many":
+            return np.zeros(command.count)
+        if kind == "break":
+            raise KeyError("a mistake of its author")
+        if kind == "leave":
+            raise SystemExit(3)
+        if len(command.positions) != len(parameters.joints):
+            raise ValueError(f"{len(parameters.joints)} positions,\nplease")
+        return np.array(command.positions)
+
+    def update(self, time_ns, period_ns):
+        pass
+
+
+def controller(name, joint, active=True):
+    return ControllerPlan(
+        name=name,
+        type="arm",
+        distribution="tests 1",
+        parameters=json.dumps({"joints": [joint]}),
+        joints=(joint,),
+        command=("position",),
+        publishes=(),
+        active=active,
+        every=1,
+    )
+
+
+PLAN = Plan(
+    robot="pair",
+    loop=LoopPlan(
+        period_ns=PERIOD_NS,
+        scheduler=SchedulerPlan("other", 1, False),
+        joints=(JointPlan("pan", -1.0, 1.0, None), JointPlan("tilt", -1.0, 1.0, None)),
+        controllers=(
+            controller("left", "pan"),
+            controller("right", "tilt"),
+            controller("spare", "pan", False),
+        ),
+        commands=(),
+        end_ns=None,
+    ),
+    buses=(),
+    exit_timeout_ns=1,
+    recording_directory="logs",
+    source_file="pair.yaml",
+    source_text="",
+    arguments={},
+)
+
+
+class Desk:
+    """The loop's end of a link, and a client's end of the gateway; the loop does nothing by itself."""
+
+    def __init__(self):
+        memory = Descriptors(
+            heartbeat=heartbeat.create(),
+            cycles=ring.create("cycles", 1024, 8),
+            events=ring.create("events", EVENT_SLOT, 4096),
+            guardian_events=ring.create("events", EVENT_SLOT, 64),
+            mailbox=mailbox.create(8),
+            answers=ring.create("answers", mailbox.ANSWER_SLOT, mailbox.ANSWER_SLOTS),
+        )
+        self.heartbeat = Heartbeat(memory.heartbeat)
+        self.heartbeat.enter(Phase.RUNNING)
+        self.mailbox = Mailbox(memory.mailbox, ring.RingWriter(memory.answers))
+        layout = CycleLayout(("pan", "tilt"), ("left", "right", "spare"))
+        self.record = CycleRecord(layout)
+        self.record.active = 0b011
+        self.cycles = ring.RingWriter(memory.cycles)
+        self.clock = SimpleNamespace(now_ns=lambda: 7_000_000_000)
+        self.events = EventRing(ring.RingWriter(memory.events), self.clock)
+        self.guardian_events = EventRing(ring.RingWriter(memory.guardian_events), self.clock)
+        self.link = Link(PLAN, memory)
+        plugins = PlugIns({"arm": Offer("arm", Arm, "tests 1")}, {})
+        self.gateway = Gateway(
+            self.link, Preparation(("pan", "tilt"), plugins), "/logs/pair.mcap", now=lambda: self.now
+        )
+        self.app = self.gateway.app()
+        self.now = 100.0  # of allowances, s
+        self.taken = []
+        self.ended = 0
+        self.finish_cycle()
+
+    # The loop
+
+    def take(self, refusal=""):
+        """Take what a cycle takes and answer it; return it."""
+        commands = list(self.mailbox.take())
+        for command in commands:
+            self.mailbox.answer(command.number, refusal)
+        self.taken += commands
+        return commands
+
+    def finish_cycle(self):
+        self.record.cycle, self.record.woken_ns = self.ended, 1_000_000_000 + self.ended * PERIOD_NS
+        self.cycles.append(self.record.raw)
+        self.ended += 1
+        self.heartbeat.cycle(self.ended, 0)
+
+    # The client
+
+    def ask(self, *words, refusal="", **options):
+        """Ask the gateway, with a loop that answers; return status and content."""
+        return asyncio.run(self._ask_and_answer(refusal, words, options))
+
+    async def _ask_and_answer(self, refusal, words, options):
+        asked = asyncio.ensure_future(self.request(*words, **options))
+        while not asked.done():
+            self.take(refusal)
+            self.link.collect()
+            await asyncio.sleep(0)
+        return asked.result()
+
+    async def request(
+        self, method, path, body=b"", *, headers=(), chunks=None, client=("process 1", 0), heard=None
+    ):
+        """One request by ASGI; `chunks` are the messages that come from the client instead of a body."""
+        if not isinstance(body, bytes):
+            body = json.dumps(body).encode()
+        path, _, query = path.partition("?")
+        scope = {
+            "type": "http",
+            "http_version": "1.1",
+            "method": method,
+            "scheme": "http",
+            "path": path,
+            "raw_path": path.encode(),
+            "query_string": query.encode(),
+            "root_path": "",
+            "headers": [(name.encode(), value) for name, value in headers],
+            "client": client,
+            "server": None,
+        }
+        chunks = iter([{"type": "http.request", "body": body}] if chunks is None else chunks)
+        said = []
+
+        async def receive():
+            if heard is not None:
+                heard.append(1)
+            chunk = next(chunks, None)
+            if chunk is None:
+                await asyncio.Event().wait()
+            return chunk
+
+        async def send(message):
+            said.append(message)
+
+        await self.app(scope, receive, send)
+        self.headers = dict(said[0]["headers"])
+        content = b"".join(message.get("body", b"") for message in said[1:])
+        return said[0]["status"], json.loads(content) if content else None
+
+
+@pytest.fixture
+def desk():
+    return Desk()

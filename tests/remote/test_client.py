@@ -1,0 +1,191 @@
+"""The client: what it asks, what it never asks twice, and what it says when a robot is gone."""
+
+import socket
+import threading
+
+import numpy as np
+import pytest
+
+import dxlrun
+from dxlrun.remote import client as module
+from dxlrun.remote import sockets
+from dxlrun.remote.sockets import MOST_BYTES, listen
+
+
+def answer(body, status=b"200 OK"):
+    return b"HTTP/1.1 %s\r\nContent-Length: %d\r\n\r\n%s" % (status, len(body), body)
+
+
+OK = answer(b'{"done": true}')
+
+
+class Peer:
+    """A gateway that gives one answer after the other: bytes, or None to hang up."""
+
+    def __init__(self, answers):
+        self.listener, self.path = listen("pair")
+        self.answers = list(answers)
+        self.heard = []
+        self.connections = 0
+        self.thread = threading.Thread(target=self._serve)
+        self.thread.start()
+
+    def _serve(self):
+        while self.answers:
+            with self.listener.accept()[0] as end:
+                self.connections += 1
+                while self.answers and (request := self._request(end)):
+                    self.heard.append(request)
+                    said = self.answers.pop(0)
+                    if said is None:
+                        if not self.answers:
+                            self.listener.close()  # as a process that dies: nobody can come any more
+                        break
+                    end.sendall(said)
+        self.listener.close()
+
+    def _request(self, end):
+        data = b""
+        while b"\r\n\r\n" not in data:
+            data += (more := end.recv(65536))
+            if not more:
+                return b""
+        head, _, body = data.partition(b"\r\n\r\n")
+        length = int(
+            next((line[16:] for line in head.split(b"\r\n") if line.startswith(b"Content-Length: ")), 0)
+        )
+        while len(body) < length:
+            body += end.recv(65536)
+        return head + b"\r\n\r\n" + body
+
+
+@pytest.fixture(autouse=True)
+def place(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    both = sockets.places
+    monkeypatch.setattr(sockets, "places", lambda: both()[:1])
+    return tmp_path / "dxlrun"
+
+
+@pytest.fixture
+def peer(place):
+    """Return how to start a gateway with some answers, and a client of it."""
+    peers = []
+
+    def make(*answers):
+        peers.append(Peer(answers))
+        robot = module.RemoteRobot("pair", peers[-1].path, "anna")
+        peers[-1].robot = robot
+        return peers[-1]
+
+    yield make
+    for one in peers:
+        one.robot.close()
+        while one.thread.is_alive() and one.answers:
+            one.answers.clear()
+            with socket.socket(socket.AF_UNIX) as last:
+                last.connect_ex(str(one.path))
+        one.thread.join()
+
+
+def test_arrays_of_numpy_are_sent_as_lists_and_names_cannot_leave_their_place(peer):
+    one = peer(OK)
+    one.robot.send("a/../b?", "go", {"positions": np.array([1.0, 2.0]), "count": np.int64(3)})
+    head, _, body = one.heard[0].partition(b"\r\n\r\n")
+    assert head.startswith(b"POST /controllers/a%2F..%2Fb%3F/commands/go HTTP/1.1\r\n")
+    assert body == b'{"positions": [1.0, 2.0], "count": 3}'
+    assert b"X-Dxlrun-Client: anna" in head
+
+
+def test_a_clients_name_may_be_any_text(place):
+    with listen("pair")[0]:
+        robot = dxlrun.connect(client="Jürgen 机器\r\nX-Evil: 1")
+    sent = robot._headers["X-Dxlrun-Client"].encode("latin-1").decode()
+    assert sent == "Jürgen 机器X-Evil: 1"
+
+
+@pytest.mark.parametrize(
+    ("command", "sentence"),
+    [
+        ({"positions": [float("nan")]}, "this cannot be sent: .*not JSON compliant"),
+        ({"positions": {1, 2}}, "this cannot be sent: set is not JSON"),
+        ({"positions": "a" * MOST_BYTES}, "bytes are too many, at most 1048576"),
+    ],
+)
+def test_what_cannot_be_sent_is_refused_here(peer, command, sentence):
+    one = peer(OK)
+    with pytest.raises(dxlrun.Refused, match=sentence):
+        one.robot.send("head", "go", command)
+    one.robot.pause()
+    assert len(one.heard) == 1  # the pause
+
+
+def test_a_refusal_is_raised_with_its_sentence(peer):
+    one = peer(
+        answer(b'{"refused": "it is paused already"}', b"409 Conflict"), answer(b"{}", b"418 Teapot"), OK
+    )
+    with pytest.raises(dxlrun.Refused, match="it is paused already"):
+        one.robot.pause()
+    with pytest.raises(dxlrun.Refused, match="HTTP status 418"):
+        one.robot.pause()
+    one.robot.resume()
+    assert one.connections == 1
+
+
+@pytest.mark.parametrize(
+    "said",
+    [None, b"rubbish\r\n\r\n", answer(b"Service Unavailable", b"503 no"), answer(b"[]"), OK[:-3]],
+    ids=["hang up", "rubbish", "no JSON", "a list", "cut off"],
+)
+def test_what_may_have_been_heard_is_never_asked_again(peer, said, monkeypatch):
+    monkeypatch.setattr(module, "TIMEOUT_S", 0.2)
+    one = peer(said, OK)
+    with pytest.raises(
+        dxlrun.DxlrunError, match=r"pair (does not answer any more|answers in a way)"
+    ) as caught:
+        one.robot.send("head", "go", {})
+    assert not isinstance(caught.value, dxlrun.Refused)
+    assert len(one.heard) == 1
+
+
+def test_a_connection_that_was_closed_while_nobody_asked_is_opened_anew(peer):
+    one = peer(OK, OK)
+    one.robot.pause()
+    one.robot._connection.sock.shutdown(socket.SHUT_RDWR)  # as when the gateway closes it
+    one.robot.resume()
+    assert (len(one.heard), one.connections) == (2, 2)
+
+
+def test_a_connection_that_was_idle_for_long_is_not_used_again(peer, monkeypatch):
+    one = peer(OK, OK)
+    one.robot.pause()
+    monkeypatch.setattr(module, "_IDLE_S", -1.0)
+    one.robot.resume()
+    assert (len(one.heard), one.connections) == (2, 2)
+
+
+def test_who_is_meant_must_be_clear():
+    with pytest.raises(dxlrun.DxlrunError, match="no robot runs that can be steered; start one"):
+        dxlrun.connect()
+    with listen("torso")[0]:
+        assert dxlrun.connect().name == "torso"
+        with pytest.raises(
+            dxlrun.DxlrunError, match="no robot pair runs that can be steered; these do: torso"
+        ):
+            dxlrun.connect("pair")
+        with listen("pair")[0]:
+            assert dxlrun.connect("pair").name == "pair"
+            with pytest.raises(dxlrun.DxlrunError, match="several robots run: pair, torso; name one"):
+                dxlrun.connect()
+
+
+def test_a_stop_whose_answer_was_lost_with_the_robot_is_a_stop(peer):
+    one = peer(None)
+    one.robot.stop()
+    assert one.heard[0].startswith(b"POST /stop ")
+
+
+def test_a_stop_that_a_living_robot_does_not_answer_is_an_error(peer):
+    one = peer(None, OK)
+    with pytest.raises(dxlrun.DxlrunError, match="does not answer any more"):
+        one.robot.stop()

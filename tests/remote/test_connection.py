@@ -1,0 +1,221 @@
+"""Clients that hang, flood, die or send rubbish, at the real socket; the loop's mailbox is the judge."""
+
+import asyncio
+import json
+import os
+import random
+import socket
+import struct
+from contextlib import suppress
+
+import pytest
+
+from dxlrun.remote import connection
+from dxlrun.remote.connection import MOST_CONNECTIONS
+from dxlrun.remote.process import serve
+from dxlrun.remote.sockets import MOST_BYTES
+
+STOP = b"POST /stop HTTP/1.1\r\nHost: x\r\nContent-Length: 0\r\n\r\n"
+GO = b"POST /controllers/left/commands/go HTTP/1.1\r\nHost: x\r\n"
+
+
+class Door:
+    """The gateway's server on a socket, and the ways in which clients come."""
+
+    def __init__(self, desk, path):
+        self.desk, self.path = desk, str(path)
+
+    def open(self, act):
+        """Serve until `act` has ended; return what it returned."""
+        return asyncio.run(self._open(act))
+
+    async def _open(self, act):
+        listener = socket.socket(socket.AF_UNIX)
+        listener.bind(self.path)
+        listener.listen(64)
+        ours, control = socket.socketpair()
+        serving = asyncio.ensure_future(serve(self.desk.link, self.desk.gateway, listener, control))
+        looping = asyncio.ensure_future(self._loop())
+        try:
+            return await act()
+        finally:
+            looping.cancel()
+            ours.close()
+            await serving
+            listener.close()
+            control.close()
+
+    async def _loop(self):
+        while True:
+            self.desk.take()
+            await asyncio.sleep(0.001)
+
+    async def connect(self, data=b""):
+        reader, writer = await asyncio.open_unix_connection(self.path)
+        writer.write(data)
+        return reader, writer
+
+    async def say(self, data):
+        """Send what a client may send, and return what it is answered before the connection is closed."""
+        reader, writer = await self.connect(data)
+        writer.write_eof()
+        answer = await reader.read()
+        writer.close()
+        return answer
+
+    async def stopped(self):
+        """Say whether `stop` is taken from a client that comes now."""
+        reader, writer = await self.connect(STOP)
+        status = await reader.readline()
+        writer.close()
+        return status == b"HTTP/1.1 200 OK\r\n" and self.desk.taken[-1].kind == "stop"
+
+
+@pytest.fixture
+def door(desk, tmp_path):
+    return Door(desk, tmp_path / "s.sock")
+
+
+def test_clients_that_hang_do_not_keep_others_out(door):
+    async def act():
+        hanging = [await door.connect(GO[:length]) for length in range(MOST_CONNECTIONS + 20)]
+        assert await door.stopped()
+        closed = [reader for reader, _ in hanging if reader.at_eof()]
+        for _, writer in hanging:
+            writer.close()
+        return len(closed)
+
+    assert door.open(act) >= 20
+    assert [command.kind for command in door.desk.taken] == ["stop"]
+
+
+def test_a_connection_that_says_nothing_is_closed(door, monkeypatch):
+    monkeypatch.setattr(connection, "SILENCE_S", 0.02)
+
+    async def act():
+        ends = [await door.connect(data) for data in (b"", GO[:30], GO + b"Content-Length: 20\r\n\r\n{")]
+        answers = []
+        for reader, writer in ends:
+            try:
+                answers.append(await reader.read())
+            except ConnectionResetError:
+                answers.append(b"")
+            writer.close()
+        return answers
+
+    assert door.open(act) == [b"", b"", b""]
+    assert door.desk.taken == []
+
+
+RUBBISH = [
+    random.Random(3).randbytes(4096),
+    b"\r\n" * 100_000,
+    b"GET / HTTP/9.9\r\n\r\n",
+    b"GET /" + b"a" * 100_000 + b" HTTP/1.1\r\n\r\n",
+    b"GET / HTTP/1.1\r\n" + b"a: b\r\n" * 10_000,
+    GO + b"Content-Length: 5\r\nContent-Length: 6\r\n\r\n",
+    GO + b"Transfer-Encoding: chunked\r\n\r\nXYZ\r\n",
+    b"GET /robot HTTP/1.1\r\nHost: x\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\r\n" + bytes(100),
+    STOP[:-2],
+]
+
+
+def test_rubbish_is_no_command_and_the_next_client_is_served(door):
+    async def act():
+        for rubbish in RUBBISH:
+            _, writer = await door.connect(rubbish)
+            await asyncio.sleep(0)
+            assert await door.stopped()
+            writer.close()
+
+    door.open(act)
+    assert [command.kind for command in door.desk.taken] == ["stop"] * len(RUBBISH)
+
+
+@pytest.mark.parametrize("way", ["announced", "in pieces"])
+def test_ten_megabytes_are_refused_and_not_read(door, way):
+    def flood():
+        head = (
+            b"Content-Length: 10000000\r\n\r\n"
+            if way == "announced"
+            else b"Transfer-Encoding: chunked\r\n\r\n"
+        )
+        piece = bytes(65_536) if way == "announced" else b"10000\r\n" + bytes(65_536) + b"\r\n"
+        sent = 0
+        with socket.socket(socket.AF_UNIX) as client:
+            client.connect(door.path)
+            client.sendall(GO + head)
+            with suppress(ConnectionError):
+                while sent < 10_000_000:
+                    sent += client.send(piece)
+            return sent, client.recv(100)
+
+    async def act():
+        told = await asyncio.to_thread(flood)
+        assert await door.stopped()
+        return told
+
+    sent, answer = door.open(act)
+    assert sent < 2 * MOST_BYTES
+    assert answer.startswith(b"HTTP/1.1 413 ")
+    assert [command.kind for command in door.desk.taken] == ["stop"]
+
+
+def test_a_client_that_dies_after_asking_changes_nothing_for_others(door):
+    body = json.dumps({"positions": [0.5]}).encode()
+    request = GO + b"Content-Length: %d\r\n\r\n" % len(body) + body
+
+    async def act():
+        for _ in range(10):
+            _, writer = await door.connect(request)
+            await asyncio.sleep(0.002)
+            writer.transport.abort()
+        assert await door.stopped()
+
+    door.open(act)
+    kinds = [command.kind for command in door.desk.taken]
+    assert kinds[-1] == "stop"
+    assert set(kinds[:-1]) <= {"go"}
+    assert len(kinds) <= 11
+    assert {command.data for command in door.desk.taken[:-1]} <= {struct.pack("<d", 0.5)}
+
+
+def test_a_client_that_asks_without_reading_is_not_served_for_ever(door):
+    request = b"GET /robot HTTP/1.1\r\nHost: x\r\n\r\n"
+
+    async def act():
+        _, writer = await door.connect()
+        sent = 0
+        while sent < 10_000_000:  # more than socket and gateway may keep
+            writer.write(request * 1000)
+            sent += 1000 * len(request)
+            try:
+                await asyncio.wait_for(writer.drain(), 0.2)
+            except TimeoutError:
+                break
+        assert await door.stopped()
+        writer.transport.abort()
+        return sent
+
+    assert door.open(act) < 10_000_000
+
+
+def test_a_client_without_a_name_is_known_by_its_process(door):
+    door.open(door.stopped)
+    assert door.desk.taken[0].origin == f"process {os.getpid()}"
+
+
+def test_the_gateway_ends_when_its_line_does_also_with_clients_that_hang(door):
+    clients = [socket.socket(socket.AF_UNIX) for _ in range(2)]
+
+    async def act():
+        for client, data in zip(clients, (GO[:20], GO + b"Content-Length: 20\r\n\r\n{"), strict=True):
+            client.connect(door.path)
+            client.send(data)
+        assert await door.stopped()
+
+    door.open(act)
+    for client in clients:
+        with client, suppress(ConnectionResetError):
+            while client.recv(1000):  # until the end
+                pass

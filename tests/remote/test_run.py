@@ -1,0 +1,211 @@
+"""Whole runs: one that is steered from Python until it is told to stop, and one whose gateway dies."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import dxlrun
+from dxlrun.events import EventCode
+from dxlrun.recording.reader import read_log
+
+DXLRUN = Path(sys.executable).with_name("dxlrun")
+ROBOT = """\
+name: pair
+buses:
+  main:
+    port: sim
+    protocol: 1.0
+    baud_rate: 1_000_000
+    return_delay_time: 100 us
+    adapter: {latency: 1 ms}
+loop: {rate: 50}
+joints:
+  pan: {bus: main, id: 3, model: AX-12A, reference: 150 deg, direction: 1}
+  tilt: {bus: main, id: 7, model: AX-12A, reference: 150 deg, direction: -1}
+controllers:
+  hold: {type: joint_group_position_controller, joints: [pan, tilt]}
+  solo: {type: joint_group_position_controller, joints: [pan], active: false}
+"""
+DEADLINE_S = 30.0
+
+
+def await_truth(look, what):
+    """Return what `look` finds; fails when it finds nothing for half a minute."""
+    tick, give_up = threading.Event(), time.monotonic() + DEADLINE_S
+    while time.monotonic() < give_up:
+        if found := look():
+            return found
+        tick.wait(0.02)
+    raise AssertionError(f"waited {DEADLINE_S} s for {what}")
+
+
+class Run:
+    """A `dxlrun` in a directory of its own, and what it left behind."""
+
+    def __init__(self, directory: Path, *words: str) -> None:
+        self.directory = directory
+        (directory / "pair.yaml").write_text(ROBOT)
+        self.process = subprocess.Popen(
+            [DXLRUN, "pair.yaml", *words],
+            cwd=directory,
+            text=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        )
+        await_truth(lambda: "pair" in dxlrun.running(), "the gateway")
+        self.robot = dxlrun.connect(client="anna")
+        self.log_path = Path(str(self.robot.info()["log"]))
+
+    def finish(self):
+        self.out, self.err = self.process.communicate(timeout=DEADLINE_S)
+        self.log = read_log(self.log_path)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory) -> Iterator[Path]:
+    with pytest.MonkeyPatch.context() as patch:
+        directory = tmp_path_factory.mktemp("run")
+        patch.setenv("XDG_RUNTIME_DIR", str(directory))
+        yield directory / "dxlrun"
+
+
+def misbehave(path: Path) -> None:
+    """Be a client that nobody wants: hang in half a request, 70 times, and send what is never read."""
+    clients = [socket.socket(socket.AF_UNIX) for _ in range(70)]
+    for client in clients:
+        client.connect(str(path))
+        with suppress(OSError):
+            client.sendall(b"POST /controllers/hold/commands/positions HTTP/1.1\r\n")
+    with socket.socket(socket.AF_UNIX) as flood:
+        flood.connect(str(path))
+        with suppress(OSError):
+            flood.sendall(
+                b"POST /switch HTTP/1.1\r\nHost: x\r\nContent-Length: 9000000\r\n\r\n" + bytes(9_000_000)
+            )
+    for client in clients:
+        client.close()
+
+
+@pytest.fixture(scope="module")
+def steered(tmp_path_factory, place):
+    """A run that was steered with everything there is, and stopped by its client."""
+    run = Run(tmp_path_factory.mktemp("steered"))
+    robot, run.refused = run.robot, []
+
+    def refused(ask, *words):
+        with pytest.raises(dxlrun.Refused) as caught:
+            ask(*words)
+        run.refused.append((str(caught.value), caught.value.exit_code))
+
+    robot.send("hold", "positions", {"positions": np.array([0.1, 0.1])})
+    refused(robot.send, "hold", "positions", {"positions": [0.1]})
+    refused(robot.switch, ["solo"])
+    robot.switch(activate=["solo"], deactivate=["hold"])
+    with robot.stream("solo", "positions", lease=0.1) as stream:
+        for step in range(5):
+            stream.send({"positions": [0.01 * step]})
+    await_truth(lambda: robot.info()["controllers"][1]["held"], "the end of the stream's lease")
+    misbehave(place / "pair.sock")
+    robot.rate(100.0)
+    refused(robot.load, "more", {"type": "joint_group_position_controller", "joints": ["tilt"]})
+    robot.pause()
+    robot.load("more", {"type": "joint_group_position_controller", "joints": ["tilt"], "rate": 50})
+    robot.resume()
+    robot.switch(activate=["more"])
+    robot.send("more", "positions", {"positions": [0.2]})
+    run.info, run.states, run.events = robot.info(), robot.states(), robot.events()
+    robot.stop()
+    run.stopped = read_log(run.log_path)  # at once: `stop` returns when the log is closed
+    run.finish()
+    return run
+
+
+def test_a_steered_run_ends_well_when_its_client_says_so(steered, place):
+    assert (steered.process.returncode, steered.err) == (0, ""), steered.out + steered.err
+    assert steered.stopped.complete
+    assert list(place.iterdir()) == []
+    with pytest.raises(dxlrun.DxlrunError, match=r"pair does not answer any more: .*No such file"):
+        steered.robot.info()
+
+
+def test_the_log_has_what_was_asked_and_who_asked_it(steered):
+    commands = steered.log.commands
+    asked = [(one.controller, one.kind) for one in commands if not one.lease_ns]
+    assert asked == [
+        ("hold", "positions"),
+        ("", "switch"),
+        ("", "switch"),
+        ("", "rate"),
+        ("", "load"),
+        ("", "pause"),
+        ("", "load"),
+        ("", "resume"),
+        ("", "switch"),
+        ("more", "positions"),
+        ("", "stop"),
+    ]
+    assert {one.origin for one in commands} == {"anna"}
+    streamed = [one for one in commands if one.lease_ns]
+    assert 1 <= len(streamed) <= 5
+    assert {(one.controller, one.lease_ns) for one in streamed} == {("solo", 100_000_000)}
+    assert np.frombuffer(streamed[-1].data) == pytest.approx([0.04])  # the newest of them always arrives
+
+
+def test_refusals_say_why_and_whether_the_wish_itself_was_wrong(steered):
+    assert [code for _, code in steered.refused] == [2, 1, 1]
+    sentences = " / ".join(sentence for sentence, _ in steered.refused)
+    assert "hold" in sentences
+    assert "pan" in sentences
+    assert "pause the loop first" in sentences
+
+
+def test_the_robot_tells_its_clients_what_became_of_it(steered):
+    info = steered.info
+    told = {one["name"]: (one["active"], one["rate"]) for one in info["controllers"]}
+    assert told == {"hold": (False, 100.0), "solo": (True, 100.0), "more": (True, 50.0)}
+    assert (info["rate"], info["paused"], info["joints"]) == (100.0, False, ["pan", "tilt"])
+    assert set(steered.states["joints"]) == {"pan", "tilt"}
+    names = [event["name"] for event in steered.events["events"]]
+    assert "stale_command" in names
+    assert names.count("steered") == 6
+    json.dumps(steered.events)
+
+
+def test_clients_that_misbehave_leave_nothing_in_the_log(steered):
+    assert not any(one.origin.startswith("process") for one in steered.log.commands)
+    assert not [event for event in steered.log.events if event.code == EventCode.CONTROLLER_FAULT]
+
+
+def test_without_its_gateway_the_robot_goes_on_and_says_so(tmp_path_factory, place):
+    run = Run(tmp_path_factory.mktemp("killed"))
+    pid = gateway_of(run.process.pid)
+    before = run.robot.info()["cycles"]
+    os.kill(pid, signal.SIGKILL)
+    await_truth(lambda: not list(place.iterdir()), "the removal of the dead socket")
+    with pytest.raises(dxlrun.DxlrunError, match="pair does not answer any more"):
+        run.robot.pause()
+    await_truth(lambda: len(read_log(run.log_path).cycles) > before + 25, "more cycles")
+    run.process.send_signal(signal.SIGINT)
+    run.finish()
+    assert run.process.returncode == 130
+    assert "the gateway ended: the run goes on, and nobody can steer it" in " ".join(run.err.split())
+    assert run.log.complete
+
+
+def gateway_of(terminal: int) -> int:
+    """Return the process ID of a run's gateway."""
+    for child in Path(f"/proc/{terminal}/task/{terminal}/children").read_text().split():
+        if b"dxlrun.remote" in Path(f"/proc/{child}/cmdline").read_bytes().split(b"\0"):
+            return int(child)
+    raise AssertionError("there is no gateway")

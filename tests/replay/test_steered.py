@@ -1,0 +1,335 @@
+"""A replay of a steered run has no difference: what clients asked, they ask of the same cycles again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from dxlrun.control.loop_plan import ControllerPlan
+from dxlrun.errors import LogError
+from dxlrun.events import EventCode
+from dxlrun.inbox import Command, QueueInbox
+from dxlrun.recording.reader import Log, read_log
+from dxlrun.recording.steered import policy_begun, steered
+from dxlrun.replay import replay_log
+from dxlrun.testing import VirtualRobot, simulated_robot
+
+Change = Callable[..., Path]
+MS = 1_000_000
+MORE = """\
+  standby: {type: all_inputs, joints: [tilt, nod], gain: 1e-3, active: false}
+  direct: {type: joint_group_position_controller, joints: [tilt, nod], active: false}
+"""
+KEEPS = ("", "")
+FALLS = ("[tilt, nod]}", "[tilt, nod], give_up_after: 0.35, fallback: standby}")
+FAILS = ("[tilt, nod]}", "[tilt, nod], give_up_after: 0.35}")
+LOADED = ControllerPlan(
+    name="guest",
+    type="joint_group_posvel_controller",
+    distribution="dxlrun 0",
+    parameters='{"joints":["nod"]}',
+    joints=("nod",),
+    command=("position", "velocity"),
+    publishes=(),
+    active=False,
+    every=1,
+    rate=25.0,
+)
+
+
+def ask(kind: str, data: object = None) -> Command:
+    """Return a command for the loop."""
+    return Command(0, "", kind, b"" if data is None else msgspec.json.encode(data), "anna")
+
+
+def switch(activate: Sequence[str] = (), deactivate: Sequence[str] = ()) -> Command:
+    return ask("switch", {"activate": activate, "deactivate": deactivate})
+
+
+def rate(hz: float) -> Command:
+    return ask("rate", {"rate": hz})
+
+
+def send(controller: str, kind: str, *numbers: float, lease_ns: int = 0) -> Command:
+    """Return a command for a controller."""
+    return Command(0, controller, kind, np.array(numbers).tobytes(), "anna", lease_ns)
+
+
+Asked = Mapping[int, Sequence[Command]]
+GUESTS = [ask("pause"), ask("load", LOADED), switch(["guest"], ["all_inputs"]), ask("resume")]
+STORIES: dict[str, Asked] = {
+    "rates": {5: [rate(100)], 20: [rate(25), rate(200)], 50: [rate(50), rate(1e9), rate(60)]},
+    "a pause in a motion": {15: [ask("pause")], 30: [ask("resume"), ask("resume")]},
+    "a pause before the motion": {2: [ask("pause")], 25: [rate(100)], 33: [ask("resume")]},
+    "switches": {
+        4: [switch(["standby"])],
+        6: [switch(["standby"], ["all_inputs"])],
+        20: [switch(["all_inputs"], ["standby"]), switch([], ["head"]), switch(["nobody"])],
+        30: [switch(["head"])],
+    },
+    "a stream that ends": {
+        3: [switch(["direct"], ["all_inputs"])],
+        **{
+            cycle: [send("direct", "positions", 0.01 * cycle, 0.1, lease_ns=50 * MS)]
+            for cycle in range(4, 15)
+        },
+        30: [send("direct", "positions", 0.2, 0.3)],
+        35: [Command(0, "direct", "positions", b"thirteen byte", "mallory"), ask("what", {"is": "this"})],
+    },
+    "a controller that is loaded": {
+        5: GUESTS,
+        9: [send("guest", "posvel", 0.3, 1.0)],
+        25: [ask("unload", {"controller": "guest"}), switch(["all_inputs"], ["guest"]), ask("pause")],
+        26: [ask("unload", {"controller": "guest"}), ask("load", LOADED), ask("resume")],
+    },
+    "a fallback": {5: [rate(100)], 15: [rate(50)]},
+    "a stop in a pause": {10: [ask("pause")], 20: [ask("stop")]},
+    "rubbish": {4: [Command(0, "", "switch", b'{"activate": ["\xff"]}', "mallory"), ask("policy")]},
+}
+
+
+class Clients(QueueInbox):
+    """Ask what they ask in the cycle that the story says."""
+
+    def __init__(self, robot: VirtualRobot, asked: Asked) -> None:
+        super().__init__()
+        self.record, self.asked = robot.record, asked
+
+    def take(self) -> Sequence[Command]:
+        self.waiting.extend(self.asked.get(self.record.cycle, ()))
+        return super().take()
+
+
+@pytest.fixture
+def steer(robot_file: Path, tmp_path: Path) -> Callable[..., Path]:
+    """Run the robot for a second while clients ask of it; return the log."""
+
+    def run(
+        asked: Asked,
+        more: str = "",
+        before: Callable[[VirtualRobot], None] | None = None,
+        edit: tuple[str, str] = ("", ""),
+    ) -> Path:
+        text = robot_file.read_text() + MORE + more
+        assert edit[0] in text
+        text = text.replace(*edit, 1)
+        file, log = tmp_path / "steered.yaml", tmp_path / "run.mcap"
+        file.write_text(text)
+        log.unlink(missing_ok=True)
+        motion = robot_file.with_name("look.yaml")
+        robot = simulated_robot(file, play=[motion], duration_s=1.0, log=log)
+        robot.robot.loop.steering.inbox = Clients(robot, asked)
+        if before:
+            before(robot)
+        robot.run()
+        return log
+
+    return run
+
+
+def whole(path: Path) -> Log:
+    """Assert that a replay compares everything and finds no difference; return the log."""
+    log = read_log(path)
+    report = replay_log(path)
+    assert (report.compared, report.different, report.first) == (len(log.cycles), 0, None)
+    assert (report.fault, report.stopped, report.remarks) == ("", "", ())
+    assert log.complete
+    return log
+
+
+@pytest.mark.parametrize("story", STORIES)
+def test_a_steered_run(steer: Callable[..., Path], story: str) -> None:
+    log = whole(steer(STORIES[story], edit=FALLS if story == "a fallback" else KEEPS))
+    asked = [command for _, commands in sorted(STORIES[story].items()) for command in commands]
+    told = [(one.command.controller, one.command.kind, one.command.lease_ns) for one in steered(log)]
+    assert told == [(one.controller, one.kind, one.lease_ns) for one in asked]
+    refused = [event.text for event in log.events if event.code == EventCode.COMMAND_REFUSED]
+    assert [one.refusal for one in steered(log) if one.refusal] == [
+        text.split(" refused: ", 1)[1] for text in refused
+    ]
+
+
+def test_the_stories_do_what_they_are_there_for(steer: Callable[..., Path]) -> None:
+    log = whole(steer(STORIES["rates"]))
+    assert set(np.diff(log.cycles["scheduled_ns"]).tolist()) == {20 * MS, 10 * MS, 5 * MS}
+    log = whole(steer(STORIES["a fallback"], edit=FALLS))
+    assert {int(mask) for mask in log.cycles["active"]} == {0b0111, 0b1011}
+    log = whole(steer(STORIES["a controller that is loaded"]))
+    assert (log.cycles["active"] >> 5 & 1).any()
+    log = whole(steer(STORIES["a stream that ends"]))
+    assert [event.name for event in log.events].count("stale_command") == 1
+
+
+ENDS = {
+    "the end": (
+        "{on_exit: [{pose: home, speed: 60 deg/s}, {reduce_torque: 0.5, steps: 2, over: 100 ms}, hold]}",
+        {},
+    ),
+    "a stop in a pause": ("{on_exit: [{pose: home, speed: 60 deg/s}, limp]}", STORIES["a stop in a pause"]),
+    "a fault": ("{on_fault: [{pose: home, speed: 60 deg/s}, limp]}", STORIES["rates"]),
+    "a stale command": (
+        "{on_stale_command: [{pose: home, speed: 60 deg/s}, hold]}",
+        {3: [switch(["direct"], ["all_inputs"]), send("direct", "positions", 0.1, 0.1, lease_ns=50 * MS)]},
+    ),
+}
+
+
+@pytest.mark.parametrize("end", ENDS)
+def test_a_run_that_ended_by_a_policy(steer: Callable[..., Path], end: str) -> None:
+    policies, asked = ENDS[end]
+    poses = "poses: {home: {pan: 0 deg, tilt: 10 deg, nod: 5 deg}}"
+    edit = FAILS if end == "a fault" else KEEPS
+    log = whole(steer(asked, f"{poses}\npolicies: {{exit_timeout: 4 s, {policies[1:]}\n", edit=edit))
+    begun = policy_begun(log)
+    assert begun is not None
+    assert (log.cycles["active"][log.cycles["cycle"] >= begun.cycle] == 0).all()
+    assert (log.cycles["cycle"] >= begun.cycle).sum() >= 5
+
+
+@pytest.mark.parametrize("overrun", ["skip", "catch_up", "stop"])
+@pytest.mark.parametrize("lost", ["hold", "[{pose: home, speed: 60 deg/s}, limp]"])
+def test_late_cycles_and_lost_servos_while_it_is_steered(
+    steer: Callable[..., Path], overrun: str, lost: str
+) -> None:
+    def silence(robot: VirtualRobot) -> None:
+        def all_of_them(silent: bool) -> None:
+            for one in (3, 7, 8):
+                robot.buses[0].servo(one).silence(silent)
+
+        for begin, end in ((400, 430), (600, 900)):
+            robot.buses[0].at(begin * MS, lambda: all_of_them(True))
+            robot.buses[0].at(end * MS, lambda: all_of_them(False))
+
+    poses = "poses: {home: {pan: 0 deg, tilt: 10 deg, nod: 5 deg}}"
+    policies = (
+        f"{{exit_timeout: 4 s, on_lost_servo: {lost}, on_fault: [{{pose: home, speed: 60 deg/s}}, limp]}}"
+    )
+    log = whole(
+        steer(
+            {2: [rate(200)], 40: [rate(100)], 60: [ask("pause"), rate(200)], 70: [ask("resume")]},
+            f"{poses}\npolicies: {policies}\n",
+            silence,
+            ('loop: {rate: "${rate}"}', f'loop: {{rate: "${{rate}}", overrun: {overrun}}}'),
+        )
+    )
+    assert not log.cycles["valid"].all()
+    late = log.cycles["written_ns"][:-1] > log.cycles["scheduled_ns"][1:]
+    assert late.any() or log.cycles["skipped"].any()
+    assert (policy_begun(log) is None) == (overrun != "stop" and lost == "hold")
+
+
+COMMANDS = st.one_of(
+    st.sampled_from([25, 50, 100, 200, 60]).map(rate),
+    st.sampled_from(["pause", "resume", "resume"]).map(ask),
+    st.builds(
+        switch,
+        *[st.lists(st.sampled_from(["head", "all_inputs", "standby", "direct", "guest"]), max_size=2)] * 2,
+    ),
+    st.builds(
+        lambda name, kind, value, lease_ns: send(name, kind, *[value] * 2, lease_ns=lease_ns),
+        st.sampled_from(["direct", "guest", "standby", "nobody"]),
+        st.sampled_from(["positions", "posvel"]),
+        st.floats(-1, 1),
+        st.sampled_from([0, 30 * MS, 100 * MS]),
+    ),
+    st.just(ask("load", LOADED)),
+    st.just(ask("unload", {"controller": "guest"})),
+)
+
+
+@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.dictionaries(st.integers(0, 45), st.lists(COMMANDS, min_size=1, max_size=4), max_size=15))
+def test_any_sequence_of_commands(steer: Callable[..., Path], asked: dict[int, list[Command]]) -> None:
+    whole(steer({**asked, 60: [ask("stop")]}))  # a pause has no end
+
+
+def with_command(which: str, number: int = 0, **other: Any) -> Callable[[Any], None]:
+    """Change the first command of this kind, or the one of that number."""
+
+    def change(content: Any) -> None:
+        index = [i for i, one in enumerate(content.commands) if one.kind == which][number]
+        content.commands[index] = replace(content.commands[index], **other)
+
+    return change
+
+
+FLIPPED: dict[str, tuple[str, Callable[[Any], None], int]] = {
+    "who is switched": (
+        "switches",
+        with_command("switch", data=switch([], ["all_inputs"]).data),
+        4,
+    ),
+    "a set-point": (
+        "a stream that ends",
+        with_command("positions", data=np.array([0.04, 0.5]).tobytes()),
+        4,
+    ),
+    "a lease": ("a stream that ends", with_command("positions", 10, lease_ns=0), 17),
+    "a pause": ("a pause in a motion", with_command("pause", kind="resume"), 16),
+    "what is loaded": (
+        "a controller that is loaded",
+        with_command(
+            "load", data=msgspec.json.encode(replace(LOADED, rate=50.0, parameters='{"joints":["pan"]}'))
+        ),
+        9,
+    ),
+}
+
+
+@pytest.mark.parametrize("flipped", FLIPPED)
+def test_a_flipped_command_is_found(steer: Callable[..., Path], changed: Change, flipped: str) -> None:
+    story, change, latest = FLIPPED[flipped]
+    report = replay_log(changed(steer(STORIES[story]), change))
+    assert not report.same
+    assert report.first is not None
+    assert report.first.cycle <= latest, report.first
+
+
+def test_another_rate_contradicts_the_deadlines(steer: Callable[..., Path], changed: Change) -> None:
+    log = steer(STORIES["rates"])
+    with pytest.raises(LogError, match="a change of the rate in the log is not the one that was made"):
+        replay_log(changed(log, with_command("rate", data=rate(50).data)))
+    with pytest.raises(LogError, match="contradict"):
+        replay_log(changed(log, with_command("rate", kind="resume")))
+
+
+def test_a_command_at_another_time_is_damage(steer: Callable[..., Path], changed: Change) -> None:
+    log = steer(STORIES["a pause in a motion"])
+    for kind in ("pause", "trajectory"):
+        with pytest.raises(LogError, match=f"a command \\({kind}\\) that cycle .* has not its time"):
+            replay_log(changed(log, with_command(kind, t_ns=77)))
+
+
+def test_nothing_is_compared_behind_a_lost_command_for_the_loop(
+    steer: Callable[..., Path], changed: Change
+) -> None:
+    def lose(content: Any) -> None:
+        content.commands = [one for one in content.commands if one.kind != "resume"]
+        content.gaps = [("loop/commands", 1)]
+
+    report = replay_log(changed(steer(STORIES["a pause in a motion"]), lose))
+    assert (report.compared, report.different) == (30, 0)
+    assert report.stopped.startswith(
+        "the log misses a command that cycle 30 took (1 record of loop/commands was overwritten or damaged "
+        "before the recorder read it)"
+    )
+
+
+def test_what_is_refused_only_in_the_replay_is_said(steer: Callable[..., Path], changed: Change) -> None:
+    gone = replace(LOADED, type="gone")
+    change = with_command("load", data=msgspec.json.encode(gone))
+    report = replay_log(changed(steer(STORIES["a controller that is loaded"]), change))
+    assert report.remarks[0] == (
+        "load for the loop in cycle 5 was done in the run and is refused (no plug-in offers the type gone of "
+        "controller guest) in the replay"
+    )
+    assert report.first is not None
+    assert report.first.cycle == 5

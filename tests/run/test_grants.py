@@ -1,0 +1,114 @@
+"""What the operating system granted: a table on a terminal, remarks elsewhere, all of it in the log."""
+
+from __future__ import annotations
+
+import io
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from dxlrun.control.realtime import Grant
+from dxlrun.events import EventCode
+from dxlrun.grant_table import ProcessGrant, granted_text, refusals, show_grants
+
+GRANTS = (
+    ProcessGrant("loop", Grant("timer slack", True, "timer slack 1 ns")),
+    ProcessGrant(
+        "loop", Grant("scheduler", False, "it was refused, so that", "allow it with `a long command`")
+    ),
+    ProcessGrant("guardian", Grant("scheduler", False, "it was refused", "allow it with `a long command`")),
+)
+
+
+def console(*, terminal: bool) -> tuple[Console, io.StringIO]:
+    text = io.StringIO()
+    return Console(file=text, force_terminal=terminal, width=60, no_color=True, highlight=False), text
+
+
+def test_a_terminal_gets_a_table_and_each_command_once_and_unbroken() -> None:
+    out, text = console(terminal=True)
+    show_grants(GRANTS, out)
+    lines = text.getvalue().splitlines()
+    assert len(lines) == 1 + len(GRANTS) + 1
+    assert lines[1].split()[:3] == ["timer", "slack", "yes"]
+    assert "guardian: scheduler" in lines[3]
+    assert lines[4].count("allow it with `a long command`") == 1
+    assert refusals(GRANTS, out) == ()
+
+
+def test_elsewhere_what_was_refused_is_a_remark_of_its_own() -> None:
+    out, text = console(terminal=False)
+    show_grants(GRANTS, out)
+    assert text.getvalue() == ""
+    assert refusals(GRANTS, out) == (
+        "it was refused, so that: allow it with `a long command`",
+        "guardian: it was refused: allow it with `a long command`",
+    )
+
+
+def test_the_log_has_it_all() -> None:
+    assert granted_text(GRANTS) == {
+        "timer slack": "yes: timer slack 1 ns",
+        "scheduler": "no: it was refused, so that",
+        "guardian: scheduler": "no: it was refused",
+    }
+
+
+ROBOT = """\
+name: wisher
+buses: {m: {port: sim, protocol: 1.0, baud_rate: 1_000_000}}
+loop:
+  rate: 100
+  scheduler: {policy: fifo, priority: 30, lock_memory: true, cores: [0], idle_latency: true}
+joints: {j: {bus: m, id: 3, model: AX-12A, reference: 150 deg, direction: 1}}
+"""
+WISHES = [
+    "collector",
+    "cores",
+    "idle latency",
+    "locked memory",
+    "memory in place",
+    "polling",
+    "scheduler",
+    "timer slack",
+]
+
+
+WITHOUT_RIGHTS = """
+import ctypes, os, resource, sys
+for capability in range(64):
+    ctypes.CDLL(None).prctl(24, capability, 0, 0, 0)  # PR_CAPBSET_DROP: also root gets none at the next exec
+resource.setrlimit(resource.RLIMIT_MEMLOCK, (1 << 16, 1 << 16))
+resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
+os.execv(sys.argv[1], sys.argv[1:])
+"""
+
+
+@pytest.mark.parametrize("before", [(), (sys.executable, "-c", WITHOUT_RIGHTS)], ids=["as is", "no rights"])
+def test_a_run_says_what_it_was_granted(
+    start: Callable[..., Any], tmp_path: Path, before: tuple[str, ...]
+) -> None:
+    """Once with the rights of whoever runs the tests, once without capabilities and limits."""
+    robot = tmp_path / "wisher.yaml"
+    robot.write_text(ROBOT)
+    run = start("--duration", "0.2", robot=robot, before=before)
+    code, _, err = run.finish()
+    assert code == 0, err
+    log = run.log()
+    granted = log.metadata["granted"]
+    loops = [name for name in granted if not name.startswith("guardian")]
+    assert sorted(loops) == WISHES
+    assert sorted(set(granted) - set(loops)) == ["guardian: locked memory", "guardian: scheduler"]
+    told = [event for event in log.events if event.code == EventCode.SCHEDULER]
+    assert [event.source for event in told].count("guardian") == 2
+    assert len(told) == len(granted)
+    refused = [name for name, text in granted.items() if text.startswith("no")]
+    assert len(err.splitlines()) == len(refused)
+    if before:
+        assert {"locked memory", "scheduler", "guardian: locked memory", "guardian: scheduler"} <= set(
+            refused
+        )

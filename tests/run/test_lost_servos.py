@@ -1,0 +1,207 @@
+"""A servo that stops answering holds its own controllers, nobody else; who takes over from a controller."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dxlrun.events import EventCode
+from dxlrun.inbox import LOOP, Command
+from dxlrun.testing import read_log, simulated_robot
+from dxlrun.virtual_run import VirtualRobot
+from dxlrun_controllers.group import JointGroupPositionController
+
+ROBOT = """\
+name: three
+buses:
+  main: {port: sim, protocol: 1.0, baud_rate: 1_000_000, return_delay_time: 100 us, adapter: {latency: 1 ms}}
+loop: {rate: 50}
+joints:
+  pan: {bus: main, id: 3, model: AX-12A, reference: 150 deg, direction: 1}
+  tilt: {bus: main, id: 7, model: AX-12A, reference: 150 deg, direction: 1}
+  yaw: {bus: main, id: 9, model: AX-12A, reference: 150 deg, direction: 1}
+controllers:
+  states: {type: joint_state_broadcaster}
+  pair: {type: joint_group_position_controller, joints: [pan, tilt], fallback: calm}
+  single: {type: joint_group_position_controller, joints: [yaw]}
+  calm: {type: joint_group_position_controller, joints: [pan, tilt], active: false, fallback: pair}
+"""
+PERIOD_NS = 20_000_000
+TICK = math.radians(300 / 1023)
+GONE_NS, BACK_NS = 500_000_000, 1_500_000_000
+Act = Callable[[Any, int], None]
+
+
+@pytest.fixture
+def acts(monkeypatch: pytest.MonkeyPatch) -> dict[str, Act]:
+    """What each controller does in its updates, by name."""
+    found: dict[str, Act] = {}
+
+    def update(controller: Any, time_ns: int, period_ns: int) -> None:
+        if act := found.get(controller.context.name):
+            act(controller, time_ns)
+
+    monkeypatch.setattr(JointGroupPositionController, "update", update)
+    return found
+
+
+def sway(controller: Any, time_ns: int) -> None:
+    """Move all joints of a controller, 3 rad/s at the most."""
+    controller.context.commands.position[:] = math.sin(3 * time_ns * 1e-9)
+
+
+def give_up(controller: Any, time_ns: int) -> None:
+    """Break the contract after a while."""
+    if time_ns >= GONE_NS:
+        raise ValueError(f"{controller.context.name} gave up")
+    sway(controller, time_ns)
+
+
+@pytest.fixture
+def built(tmp_path: Path) -> Callable[..., VirtualRobot]:
+    """Build the robot on virtual time, with a log."""
+
+    def build(duration_s: float = 2.5) -> VirtualRobot:
+        path = tmp_path / "three.yaml"
+        path.write_text(ROBOT)
+        return simulated_robot(path, duration_s=duration_s, log=tmp_path / "run.mcap")
+
+    return build
+
+
+def goals(robot: VirtualRobot, servo: int) -> list[tuple[int, float]]:
+    """Return the goals that a servo got in cycles: time and rad."""
+    found = []
+    for entry in robot.ledger.entries:
+        data = entry.data
+        if entry.direction == "in" and data[4:7] == bytes((0x83, 30, 4)):
+            found += [
+                (entry.t_ns, int.from_bytes(data[at + 1 : at + 3], "little") * TICK)
+                for at in range(7, len(data) - 1, 5)
+                if data[at] == servo
+            ]
+    return found
+
+
+def swing(sent: list[tuple[int, float]], begin_ns: int, end_ns: int) -> float:
+    """Return how far goals went from one another between two times, rad."""
+    angles = [angle for t, angle in sent if begin_ns < t < end_ns]
+    return max(angles) - min(angles)
+
+
+def lose_tilt(robot: VirtualRobot) -> None:
+    servo = robot.buses[0].servo(7)
+    robot.buses[0].at(GONE_NS, servo.silence)
+    robot.buses[0].at(BACK_NS, lambda: servo.silence(False))
+
+
+def test_controllers_of_a_lost_servo_are_held_and_the_others_go_on(
+    built: Callable[..., VirtualRobot], acts: dict[str, Act], tmp_path: Path
+) -> None:
+    acts |= {"pair": sway, "single": sway}
+    robot = built()
+    lose_tilt(robot)
+    assert robot.run().reason == "ended"
+    lost_ns = GONE_NS + 4 * PERIOD_NS
+    assert swing(goals(robot, 3), lost_ns, BACK_NS) == 0
+    assert [t for t, _ in goals(robot, 7) if lost_ns < t < BACK_NS] == []
+    assert swing(goals(robot, 9), lost_ns, BACK_NS) > 0.5
+    told = [event.text for event in read_log(tmp_path / "run.mcap").events if event.code == EventCode.POLICY]
+    assert told == ["is held until all its joints answer again", "goes on: all its joints answer again"]
+
+
+def test_a_controller_goes_on_slowly_when_its_servo_answers_again(
+    built: Callable[..., VirtualRobot], acts: dict[str, Act]
+) -> None:
+    acts |= {"pair": sway, "single": sway}
+    robot = built()
+    lose_tilt(robot)
+    robot.run()
+    after = [(t, angle) for t, angle in goals(robot, 3) if t > BACK_NS]
+    assert swing(goals(robot, 3), BACK_NS + 500_000_000, 10 * BACK_NS) > 0.5
+    slow = [(t, angle) for t, angle in after if t < BACK_NS + 900_000_000]
+    steps = [abs(angle - before) for (_, before), (_, angle) in itertools.pairwise(slow)]
+    assert max(steps) <= 1.5 * 0.02 + TICK
+    eased = [angle for t, angle in goals(robot, 9) if BACK_NS < t < BACK_NS + 900_000_000]
+    assert max(abs(b - a) for a, b in itertools.pairwise(eased)) > 1.5 * 0.02 + TICK, "nobody slowed yaw down"
+
+
+def test_two_missed_replies_hold_nobody(
+    built: Callable[..., VirtualRobot], acts: dict[str, Act], tmp_path: Path
+) -> None:
+    acts |= {"pair": sway}
+    robot = built(1.0)
+    robot.buses[0].at(GONE_NS, lambda: [robot.buses[0].truncate_next(7, 0) for _ in range(2)])
+    robot.run()
+    assert not [one for one in read_log(tmp_path / "run.mcap").events if one.code == EventCode.POLICY]
+
+
+def test_a_command_does_not_wake_a_controller_whose_servo_is_lost(
+    built: Callable[..., VirtualRobot],
+) -> None:
+    robot = built(1.2)
+    lose_tilt(robot)
+    command = Command(1, "pair", "positions", bytes(8) + bytes(8), "anna")
+    shifted = Command(1, "pair", "positions", b"\0\0\0\0\0\0\xe0?" * 2, "anna")  # 0.5 rad
+    robot.buses[0].at(GONE_NS - 100_000_000, lambda: robot.inbox.waiting.append(command))
+    robot.buses[0].at(GONE_NS + 200_000_000, lambda: robot.inbox.waiting.append(shifted))
+    robot.run()
+    assert robot.inbox.answers == {1: ""}
+    assert swing(goals(robot, 3), GONE_NS, BACK_NS) == 0
+
+
+def test_a_controller_that_is_activated_while_its_servo_is_lost_waits_for_it_too(
+    built: Callable[..., VirtualRobot], acts: dict[str, Act]
+) -> None:
+    acts |= {"calm": sway}
+    robot = built(2.5)
+    lose_tilt(robot)
+    switch = Command(1, LOOP, "switch", b'{"activate":["calm"],"deactivate":["pair"]}', "anna")
+    robot.buses[0].at(GONE_NS + 200_000_000, lambda: robot.inbox.waiting.append(switch))
+    robot.run()
+    assert robot.inbox.answers == {1: ""}
+    assert swing(goals(robot, 3), GONE_NS, BACK_NS) == 0
+    assert swing(goals(robot, 3), BACK_NS, 10 * BACK_NS) > 0.5
+
+
+def test_a_fallback_takes_over_in_the_same_cycle_and_the_run_goes_on(
+    built: Callable[..., VirtualRobot], acts: dict[str, Act], tmp_path: Path
+) -> None:
+    taken: list[int] = []
+    acts |= {"pair": give_up, "calm": lambda controller, time_ns: taken.append(time_ns)}
+    robot = built(1.0)
+    assert robot.run().reason == "ended"
+    log = read_log(tmp_path / "run.mcap")
+    masks = log.cycles["active"].tolist()
+    assert {mask & 0b1010 for mask in masks} == {0b0010, 0b1000}
+    fault = next(event for event in log.events if event.code == EventCode.CONTROLLER_FAULT)
+    assert (fault.source, "pair gave up" in fault.text) == ("pair", True)
+    assert swing(goals(robot, 3), GONE_NS + 3 * PERIOD_NS, 10 * GONE_NS) < 2 * TICK
+    assert taken
+
+
+def test_two_that_fall_back_on_each_other_end_the_run_when_both_have_failed(
+    built: Callable[..., VirtualRobot], acts: dict[str, Act]
+) -> None:
+    acts |= {"pair": give_up, "calm": give_up}
+    result = built(1.0).run()
+    assert result.reason == "fault"
+    assert "calm gave up" in result.detail
+
+
+def test_nobody_takes_over_from_a_controller_that_fails_while_it_leaves(
+    built: Callable[..., VirtualRobot], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def leave(controller: Any, time_ns: int) -> None:
+        raise ValueError("not like this")
+
+    monkeypatch.setattr(JointGroupPositionController, "on_deactivate", leave)
+    robot = built(0.2)
+    result = robot.run()
+    assert result.reason == "fault"
+    assert robot.robot.manager.active == ()

@@ -1,0 +1,368 @@
+"""Each policy on each trigger, judged by what the simulated servos were sent."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dxlrun.inbox import LOOP, Command
+from dxlrun.testing import simulated_robot
+from dxlrun.virtual_run import VirtualRobot
+from dxlrun_controllers.group import JointGroupPositionController
+
+ROBOT = """\
+name: three
+buses:
+  main: {port: sim, protocol: 1.0, baud_rate: 1_000_000, return_delay_time: 100 us, adapter: {latency: 1 ms}}
+loop: {rate: 50, overrun: stop}
+joints:
+  pan:
+    {bus: main, id: 3, model: AX-12A, reference: 150 deg, direction: 1, limits: {position: [-1 rad, 1 rad]}}
+  tilt:
+    {bus: main, id: 7, model: AX-12A, reference: 150 deg, direction: -1, limits: {position: [-1 rad, 1 rad]}}
+  yaw: {bus: main, id: 9, model: AX-12A, reference: 150 deg, direction: 1}
+controllers:
+  pair: {type: joint_group_position_controller, joints: [pan, tilt]}
+  single: {type: joint_group_position_controller, joints: [yaw]}
+poses:
+  home: {pan: 20 deg, tilt: -10 deg}
+"""
+TICK = math.radians(300 / 1023)
+HOME = {3: round(math.radians(170) / TICK), 7: round(math.radians(160) / TICK)}
+STEPS = {
+    "limp": "limp",
+    "hold": "hold",
+    "pose": "[{pose: home, speed: 60 deg/s}, limp]",
+    "less torque": "[{reduce_torque: 0.3, steps: 3, over: 300 ms}, hold]",
+}
+TORQUE_ENABLE, GOAL, TORQUE_LIMIT = 24, 30, 34
+LATE_S = 0.03
+"""How late a cycle is in the worst of the triggers."""
+START_NS = 500_000_000
+"""Since the loop's first deadline, or more, when something goes wrong."""
+Act = Callable[[Any, int], None]
+
+
+def writes(robot: VirtualRobot) -> Iterator[tuple[int, int, int, bytes]]:
+    """Yield time, servo, address and data of everything that was written to servos, from the wire."""
+    for entry in robot.ledger.entries:
+        data = entry.data if entry.direction == "in" else b""
+        while data:
+            servo, instruction, parameters = data[2], data[4], data[5 : 3 + data[3]]
+            if instruction == 0x03:
+                for each in (3, 7, 9) if servo == 0xFE else (servo,):
+                    yield entry.t_ns, each, parameters[0], parameters[1:]
+            elif instruction == 0x83:
+                size = parameters[1] + 1
+                for at in range(2, len(parameters), size):
+                    yield entry.t_ns, parameters[at], parameters[0], parameters[at + 1 : at + size]
+            data = data[4 + data[3] :]
+
+
+def torque(robot: VirtualRobot) -> dict[int, bool]:
+    """Return who has torque at the end of the wire's story."""
+    state = {3: False, 7: False, 9: False}
+    for _, servo, address, data in writes(robot):
+        if address == TORQUE_ENABLE:
+            state[servo] = bool(data[0])
+    return state
+
+
+def goals(robot: VirtualRobot, servo: int) -> list[tuple[int, int]]:
+    """Return the goals that a servo got after its torque: time and ticks."""
+    sent = [
+        (t, int.from_bytes(data[:2], "little"))
+        for t, one, at, data in writes(robot)
+        if (one, at) == (servo, GOAL)
+    ]
+    return sent[1:]
+
+
+def limits(robot: VirtualRobot, servo: int) -> list[int]:
+    """Return the torque limits that a servo got."""
+    return [
+        int.from_bytes(data, "little")
+        for _, one, at, data in writes(robot)
+        if (one, at) == (servo, TORQUE_LIMIT)
+    ]
+
+
+@pytest.fixture
+def acts(monkeypatch: pytest.MonkeyPatch) -> dict[str, Act]:
+    """What the controllers do in their updates, by name; nothing else than before for the others."""
+    found: dict[str, Act] = {}
+
+    def update(controller: Any, time_ns: int, period_ns: int) -> None:
+        if act := found.get(controller.context.name):
+            act(controller, time_ns)
+
+    monkeypatch.setattr(JointGroupPositionController, "update", update)
+    return found
+
+
+@pytest.fixture
+def built(tmp_path: Path) -> Callable[..., VirtualRobot]:
+    """Build the robot with policies on virtual time."""
+
+    def build(
+        duration_s: float = 60.0, more: str = "", change: tuple[str, str] = ("", ""), **policies: str
+    ) -> VirtualRobot:
+        said = ", ".join(f"{name}: {policy}" for name, policy in (policies | {"exit_timeout": "4 s"}).items())
+        path = tmp_path / "three.yaml"
+        path.write_text(ROBOT.replace(*change) + more + f"policies: {{{said}}}\n")
+        return simulated_robot(path, duration_s=duration_s)
+
+    return build
+
+
+# Each trigger takes the robot before its run, and what its controllers do, and lets something happen.
+
+
+def stop_signal(robot: VirtualRobot, acts: dict[str, Act]) -> None:
+    robot.buses[0].at(START_NS, robot.stop.request)
+
+
+def stop_verb(robot: VirtualRobot, acts: dict[str, Act]) -> None:
+    robot.buses[0].at(START_NS, lambda: robot.inbox.waiting.append(Command(1, LOOP, "stop", b"", "anna")))
+
+
+def stop_in_a_pause(robot: VirtualRobot, acts: dict[str, Act]) -> None:
+    robot.buses[0].at(START_NS, lambda: robot.inbox.waiting.append(Command(1, LOOP, "pause", b"", "anna")))
+    robot.buses[0].at(2 * START_NS, robot.stop.request)
+
+
+def failure(robot: VirtualRobot, acts: dict[str, Act]) -> None:
+    def fail(controller: Any, time_ns: int) -> None:
+        if time_ns > START_NS:
+            raise ValueError("no way")
+
+    acts["single"] = fail
+
+
+def overrun(robot: VirtualRobot, acts: dict[str, Act]) -> None:
+    def dawdle(controller: Any, time_ns: int) -> None:
+        if START_NS < time_ns < START_NS + 40_000_000:
+            robot.clock.wait_until(robot.clock.now_ns() + 30_000_000)
+
+    acts["single"] = dawdle
+
+
+def silence(robot: VirtualRobot, acts: dict[str, Act]) -> None:
+    robot.buses[0].at(START_NS, lambda: robot.buses[0].servo(9).silence())
+
+
+def stale(robot: VirtualRobot, acts: dict[str, Act]) -> None:
+    data = np.zeros(1).tobytes()
+    command = Command(1, "single", "positions", data, "anna", lease_ns=100_000_000)
+    robot.buses[0].at(START_NS, lambda: robot.inbox.waiting.append(command))
+
+
+TRIGGERS = {
+    ("on_exit", stop_signal): "stopped",
+    ("on_exit", stop_verb): "stopped",
+    ("on_exit", stop_in_a_pause): "stopped",
+    ("on_fault", failure): "fault",
+    ("on_fault", overrun): "fault",
+    ("on_lost_servo", silence): "fault",
+    ("on_stale_command", stale): "fault",
+}
+CASES = [
+    pytest.param(name, trigger, reason, steps, id=f"{trigger.__name__}-{steps}")
+    for (name, trigger), reason in TRIGGERS.items()
+    for steps in STEPS
+    if not (steps == "hold" and name in ("on_lost_servo", "on_stale_command"))
+]
+
+
+@pytest.mark.parametrize(("name", "trigger", "reason", "steps"), CASES)
+def test_each_policy_is_done_on_each_trigger(  # noqa: PLR0917  fixtures
+    built: Callable[..., VirtualRobot],
+    acts: dict[str, Act],
+    name: str,
+    trigger: Callable[[VirtualRobot, dict[str, Act]], None],
+    reason: str,
+    steps: str,
+) -> None:
+    robot = built(**{name: STEPS[steps]})
+    trigger(robot, acts)
+    result = robot.run()
+    assert result.reason == reason
+    if name in ("on_lost_servo", "on_stale_command"):
+        assert f"; {name}: " in result.detail
+    assert robot.clock.now_ns() < START_NS * 2 + 4_500_000_000
+    if steps in ("limp", "pose"):
+        assert not any(torque(robot).values())
+        assert result.last == "limp"
+    else:
+        assert all(torque(robot).values())
+        assert result.last == "hold"
+    if steps == "pose":
+        check_pose(robot)
+    if steps == "less torque":
+        assert limits(robot, 3) == limits(robot, 7) == [784, 546, 307]
+        assert goals(robot, 3)[-1][1] == goals(robot, 3)[0][1]
+    else:
+        assert limits(robot, 3) == []
+
+
+def check_pose(robot: VirtualRobot) -> None:
+    """The last goals are the pose, they came there at its speed, and the servos are near."""
+    for servo, ticks in HOME.items():
+        sent = goals(robot, servo)
+        assert sent[-1][1] == ticks
+        moving = [(t, now) for (t, now), (_, after) in itertools.pairwise(sent) if now != after]
+        there_ns = next(t for t, now in sent if now == ticks)
+        way, time_s = abs(ticks - moving[0][1]) * TICK, (there_ns - moving[0][0]) * 1e-9
+        assert time_s > way / math.radians(60) - LATE_S
+        steps = [abs(after - now) * TICK for (_, now), (_, after) in itertools.pairwise(sent)]
+        assert max(steps) < math.radians(60) * (0.02 + LATE_S) + TICK
+        assert robot.buses[0].servo(servo).position == pytest.approx(ticks * TICK, abs=0.1)
+    assert goals(robot, 9)[-1][1] == goals(robot, 9)[0][1]
+
+
+def test_the_end_of_a_run_is_an_exit(built: Callable[..., VirtualRobot]) -> None:
+    robot = built(duration_s=0.5, on_exit=STEPS["pose"])
+    assert robot.run().reason == "ended"
+    check_pose(robot)
+    assert not any(torque(robot).values())
+
+
+def test_controllers_are_deactivated_before_a_policy_moves(
+    built: Callable[..., VirtualRobot], acts: dict[str, Act]
+) -> None:
+    active: list[int] = []
+    robot = built(on_exit=STEPS["pose"])
+    stop_signal(robot, acts)
+    last = robot.robot.loop.sink.append
+    seen: list[tuple[int, bool]] = []
+
+    class Sink:
+        begin = staticmethod(robot.robot.loop.sink.begin)
+
+        def append(self, record: Any) -> None:
+            seen.append((record.active, bool(np.isfinite(record.commands.position).any())))
+            last(record)
+
+    acts["pair"] = lambda controller, time_ns: active.append(time_ns)
+    robot.robot.loop.sink = Sink()
+    robot.run()
+    during = [mask for mask, _ in seen[len(active) :]]
+    assert len(during) > 10
+    assert set(during) == {0}
+    assert all(mask == 0b11 for mask, _ in seen[: len(active)])
+
+
+def test_who_asks_for_something_during_a_policy_is_told_that_the_run_ends(
+    built: Callable[..., VirtualRobot], acts: dict[str, Act]
+) -> None:
+    robot = built(on_exit=STEPS["pose"])
+    stop_signal(robot, acts)
+    switch = Command(1, LOOP, "switch", b'{"deactivate":["pair"]}', "anna")
+    robot.buses[0].at(START_NS + 100_000_000, lambda: robot.inbox.waiting.append(switch))
+    robot.run()
+    assert robot.inbox.answers == {1: "the run is ending"}
+    check_pose(robot)
+
+
+def test_a_joint_that_cannot_reach_its_pose_does_not_keep_the_robot_from_its_end(
+    built: Callable[..., VirtualRobot], acts: dict[str, Act]
+) -> None:
+    robot = built(on_exit=STEPS["pose"])
+    stop_signal(robot, acts)
+    servo = robot.buses[0].servo(3)
+    robot.buses[0].at(START_NS - 100_000_000, lambda: servo.poke("torque_enable", 0))
+    robot.run()
+    assert robot.clock.now_ns() < START_NS + 2_600_000_000
+    assert not any(torque(robot).values())
+
+
+def test_steps_are_cut_short_when_the_time_for_them_is_over(
+    built: Callable[..., VirtualRobot], acts: dict[str, Act]
+) -> None:
+    robot = built(on_exit="[{pose: home, speed: 30 deg/s}, hold]")
+    stop_signal(robot, acts)
+    plan = robot.robot.loop.plan
+    robot.robot.loop.plan = replace(plan, policies=replace(plan.policies, limit_ns=200_000_000))
+    assert robot.run().last == "hold"
+    assert goals(robot, 3)[-1][0] < START_NS + 400_000_000
+    assert goals(robot, 3)[0][1] < goals(robot, 3)[-1][1] < HOME[3]
+    assert all(torque(robot).values())
+
+
+@pytest.mark.parametrize(("rate", "refused"), [(1.0, True), (25.0, False)])
+def test_a_rate_at_which_the_policies_would_not_end_in_time_is_refused(
+    built: Callable[..., VirtualRobot], rate: float, refused: bool
+) -> None:
+    robot = built(duration_s=0.1, on_exit="[{pose: home, speed: 30 deg/s}, limp]")
+    robot.inbox.waiting.append(Command(1, LOOP, "rate", f'{{"rate": {rate}}}'.encode(), "anna"))
+    robot.run()
+    assert ("to end the run within exit_timeout" in robot.inbox.answers[1]) is refused
+
+
+@pytest.mark.parametrize("steps", ["pose", "less torque"])
+def test_without_a_line_the_steps_are_left_out_and_the_last_one_counts(
+    built: Callable[..., VirtualRobot], steps: str
+) -> None:
+    robot = built(on_fault=STEPS[steps])
+    (port,) = robot.robot.hardware._ports.ports
+    robot.buses[0].at(START_NS, port.unplug)  # type: ignore[attr-defined]
+    result = robot.run()
+    assert (result.reason, result.last) == ("fault", "limp" if steps == "pose" else "hold")
+    assert "adapter of bus main is gone" in result.detail
+    assert limits(robot, 3) == []
+    assert len(robot.failures) == (3 if steps == "pose" else 0)
+
+
+def test_a_start_up_gives_back_the_torque_that_a_policy_took(built: Callable[..., VirtualRobot]) -> None:
+    robot = built(duration_s=0.1, on_fault=STEPS["less torque"])
+    robot.buses[0].servo(7).poke("torque_limit", 307)
+    robot.run()
+    assert limits(robot, 7) == [1023]
+    assert limits(robot, 3) == []
+    order = [at for _, servo, at, _ in writes(robot) if servo == 7]
+    assert order[:3] == [GOAL, TORQUE_ENABLE, TORQUE_LIMIT], (
+        "a weak servo may have sagged: its goal comes first"
+    )
+
+
+def test_a_torque_limit_that_no_policy_touches_is_left_alone(built: Callable[..., VirtualRobot]) -> None:
+    robot = built(duration_s=0.1)
+    robot.buses[0].servo(7).poke("torque_limit", 307)
+    robot.run()
+    assert limits(robot, 7) == []
+
+
+def test_less_torque_is_a_fraction_of_what_the_servo_may_by_itself(
+    built: Callable[..., VirtualRobot], acts: dict[str, Act]
+) -> None:
+    robot = built(on_exit=STEPS["less torque"])
+    robot.buses[0].servo(3).poke("max_torque", 500)
+    stop_signal(robot, acts)
+    robot.run()
+    assert limits(robot, 3) == [500, 383, 267, 150]  # the first one at the start-up
+
+
+def test_on_protocol_2_the_pwm_is_reduced(tmp_path: Path) -> None:
+    path = tmp_path / "one.yaml"
+    path.write_text(
+        "name: one\n"
+        "buses: {main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, return_delay_time: 100 us}}\n"
+        "loop: {rate: 50}\n"
+        "joints: {pan: {bus: main, id: 3, model: XM430-W350, reference: 180 deg, direction: 1}}\n"
+        "policies: {on_exit: [{reduce_torque: 0.4, steps: 2, over: 200 ms}, hold]}\n"
+    )
+    robot = simulated_robot(path, duration_s=0.2)
+    full = 885
+    robot.run()
+    head = bytes((0x83, 100, 0, 2, 0, 3))  # sync write, Goal PWM (100), two bytes, servo 3
+    sent = b"".join(entry.data for entry in robot.ledger.entries if entry.direction == "in")
+    found = [int.from_bytes(part[:2], "little") for part in sent.split(head)[1:]]
+    assert found == [round(full * 0.7), round(full * 0.4)]
+    assert robot.buses[0].servo(3).torque_on

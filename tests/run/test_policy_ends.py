@@ -1,0 +1,104 @@
+"""Policies of whole runs in real time: signals, a second Ctrl-C, a loop that is gone; judged by the wire."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dxlrun.events import Severity
+from dxlrun.guardian import LastHand
+from dxlrun.heartbeat import Heartbeat, Phase
+from dxlrun.run_processes import Memory, guardian_job
+from dxlrun.testing import plan_of
+
+Start = Callable[..., Any]
+Limp = Callable[[Any], bool]
+POLICIES = """\
+poses:
+  home: {{pan: 60 deg, tilt: 60 deg}}
+policies: {{on_exit: [{{pose: home, speed: {speed}}}, {last}], on_fault: hold, exit_timeout: {timeout}}}
+"""
+
+
+@pytest.fixture
+def holding(start: Start, tmp_path: Path) -> Callable[..., Any]:
+    """Start the robot with policies, and wait until it sends goals."""
+
+    def begin(speed: str, last: str, timeout: str) -> Any:
+        robot = tmp_path / "holding.yaml"
+        text = (tmp_path / "pair.yaml").read_text()
+        robot.write_text(text + POLICIES.format(speed=speed, last=last, timeout=timeout))
+        run = start(robot=robot)
+        run.wait_until_moving()
+        return run
+
+    return begin
+
+
+def goals(run: Any) -> list[int]:
+    """Return the goals of pan that cycles sent, ticks."""
+    sent = (entry.data for entry in run.ledger() if entry.direction == "in")
+    return [int.from_bytes(data[8:10], "little") for data in sent if data[4:8] == bytes((0x83, 30, 4, 3))]
+
+
+def test_a_second_interrupt_cuts_torque_in_the_middle_of_a_policy(
+    holding: Callable[..., Any], all_limp: Limp, wait_for: Callable[..., Any]
+) -> None:
+    run = holding("20 deg/s", "hold", "12 s")
+    run.signal(signal.SIGINT)
+    wait_for(lambda: goals(run)[-1] != goals(run)[0], "the pose's first goals")
+    run.signal(signal.SIGTERM)  # another one, because two of a kind at once may arrive as one
+    code, _, err = run.finish()
+    assert code == 130, err
+    assert "torque was cut on request" in err
+    assert all_limp(run)
+    assert goals(run)[-1] < 700, "the pose is at 716: it was cut on its way"
+
+
+def test_an_interrupt_takes_the_robot_to_its_pose_and_holds_it_there(
+    holding: Callable[..., Any], all_limp: Limp
+) -> None:
+    run = holding("180 deg/s", "hold", "4 s")
+    run.signal(signal.SIGINT)
+    code, _, err = run.finish()
+    assert code == 130
+    assert "torque stays on, as the policy says" in err
+    assert "--take-over" in err
+    assert goals(run)[-1] == 716
+    assert not all_limp(run)
+
+
+def test_the_guardian_holds_a_robot_whose_loop_is_gone_when_the_policy_says_so(
+    holding: Callable[..., Any], all_limp: Limp
+) -> None:
+    run = holding("180 deg/s", "limp", "4 s")
+    os.kill(run.child("dxlrun.loop_process"), signal.SIGKILL)
+    code, _, err = run.finish()
+    assert code == 1
+    assert "the loop's process ended by itself (signal SIGKILL)" in err
+    assert "torque stays on, as the policy says" in err
+    assert not all_limp(run)
+
+
+@pytest.mark.parametrize(
+    ("phase", "holds"), [(Phase.SETUP, False), (Phase.RUNNING, True), (Phase.STOPPING, False)]
+)
+def test_the_guardian_holds_only_a_robot_that_was_running(
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, phase: Phase, holds: bool
+) -> None:
+    """In a set-up, and while torque is switched off, some servos have torque and others have not."""
+    robot = tmp_path / "holding.yaml"
+    robot.write_text((tmp_path / "pair.yaml").read_text() + "policies: {on_fault: hold}\n")
+    plan = plan_of(robot)
+    memory = Memory.create(plan)
+    Heartbeat(memory.heartbeat).enter(phase)
+    limp: list[str] = []
+    monkeypatch.setattr(LastHand, "limp", lambda hand, ports, how, severity: limp.append(how) or [how])
+    said = LastHand(guardian_job(plan, {}, memory, take_over=False)).end((), "it died", Severity.ERROR)
+    assert bool(limp) is not holds
+    assert ("torque stays on" in " ".join(said)) is holds
