@@ -57,7 +57,7 @@ class Simulation:
     def expect_haste(self, bus: str) -> None:
         """Say that a test asks again before an answer came, and may talk into it on a busy machine.
 
-        What collides there is refused, too: such a bus is not judged.
+        What collides there is refused, too: such a bus is judged only for refusals that are missing.
         """
         self._hasty.add(bus)
 
@@ -80,15 +80,16 @@ class Simulation:
 
     def judge(self) -> None:
         """End it, and find in the ledger what was expected and no accident."""
-        entries = [
-            entry for entry in self.end() if entry.direction == "note" and entry.bus not in self._hasty
-        ]
-        notes = [(entry.bus, entry.note) for entry in entries]
+        notes = [(entry.bus, entry.note) for entry in self.end() if entry.direction == "note"]
         refused = Counter(bus for bus, note in notes if " refuses " in note)
+        for bus in self._hasty:
+            refused[bus] = min(refused[bus], self._refusals[bus])
         accidents = [
-            note for _, note in notes if any(word in note for word in ("collision", "lost", "broken"))
+            note
+            for bus, note in notes
+            if bus not in self._hasty and any(word in note for word in ("collision", "lost", "broken"))
         ]
-        assert refused == +self._refusals
+        assert +refused == +self._refusals
         assert not accidents
 
 

@@ -105,6 +105,18 @@ def test_goals_beyond_a_limit_are_limit_errors(line2: Any) -> None:
     assert line2.set("goal_pwm", 501) == ErrorNumber.DATA_LIMIT
 
 
+def test_what_was_allowed_before_is_refused_when_a_limit_or_the_mode_changes(line2: Any) -> None:
+    line2.set("operating_mode", 4)
+    assert line2.set("goal_position", 100_000) == 0
+    assert line2.set("goal_position", 0) == 0
+    line2.set("operating_mode", 3)
+    assert line2.set("goal_position", 50_000) == ErrorNumber.DATA_RANGE
+    assert line2.set("goal_position", 4000) == 0
+    assert line2.set("max_position_limit", 2000) == 0
+    assert line2.set("goal_position", 3000) == ErrorNumber.DATA_LIMIT
+    assert line2.set("goal_position", 1000) == 0
+
+
 def test_torque_locks_the_eeprom_and_nothing_else(line2: Any) -> None:
     assert line2.set("torque_enable", 1) == 0
     assert line2.set("return_delay_time", 0) == ErrorNumber.ACCESS

@@ -99,6 +99,7 @@ class TorqueRules:
     def __init__(self, memory: Memory) -> None:
         self._memory = memory
         self._choices = choices(memory.table)
+        self._signed = frozenset(item.name for item in memory.table.items.values() if item.signed)
         self._allowed: dict[str, tuple[int, int]] = {}
         """Least and greatest value that was allowed: what lies between them is allowed as well, until another
         item than a goal changes."""
@@ -129,15 +130,16 @@ class TorqueRules:
         if not cells.whole:
             return ErrorNumber.DATA_LENGTH
         for item in cells.items:
-            wire = run.after[item.name]
-            value = wire - (wire >> 8 * item.size - 1 << 8 * item.size) if item.signed else wire
-            least, greatest = self._allowed.get(item.name, _NOTHING)
+            name = item.name
+            wire = run.after[name]
+            value = wire - (wire >> 8 * item.size - 1 << 8 * item.size) if name in self._signed else wire
+            least, greatest = self._allowed.get(name, _NOTHING)
             if least <= value <= greatest:
                 continue
             if error := self._refusal_of(item, wire):
                 return error
-            if item.name not in self._choices and item.encoding != "sign_magnitude":
-                self._allowed[item.name] = min(least, value), max(greatest, value)
+            if name not in self._choices and item.encoding != "sign_magnitude":
+                self._allowed[name] = min(least, value), max(greatest, value)
         return 0
 
     def _refusal_of(self, item: ControlItem, wire: int) -> int:

@@ -131,14 +131,16 @@ class Body(ABC):
 
     def write(self, address: int, data: bytes) -> int:
         """Write, or return the error with which it is refused; 0 when it is not."""
-        runs = self.memory.runs(address, data)
+        memory = self.memory
+        runs = memory.runs(address, data)
         for run in runs:
             if error := self.refusal(run):
                 return error
         for run in runs:
-            self.memory.write(run)
-            self._obey(run.cells.names)
-            self.shaft.plan(run.cells.names)
+            names = run.cells.names
+            memory.write(run)
+            self._obey(names)
+            self.shaft.plan(names)
         return 0
 
     def register(self, address: int, data: bytes) -> int:

@@ -70,6 +70,8 @@ class ModeShaft(Shaft):
         self._acceleration_unit = item.scale if item is not None else 1.0
         self._pwm_unit = items["goal_pwm"].scale if "goal_pwm" in items else 1 / 885
         self._current_unit = items["goal_current"].scale if "goal_current" in items else 0.001
+        self._scale = {name: item.scale for name, item in items.items()}
+        self._rad_per_tick = memory.table.rad_per_tick
         self._sign, self._offset = 1, 0
         memory.watch(("drive_mode", "homing_offset"), self._orient)
         self._velocity_wanted, self._ramp_wanted = 0, 0
@@ -86,7 +88,7 @@ class ModeShaft(Shaft):
 
     def position_tick(self, angle: float) -> int:
         """Return what Present Position shows."""
-        tick = round(self._sign * angle / self.memory.table.rad_per_tick)
+        tick = round(self._sign * angle / self._rad_per_tick)
         return tick + self._offset
 
     def live(self) -> Mapping[str, Callable[[], int]]:
@@ -104,7 +106,7 @@ class ModeShaft(Shaft):
         }
 
     def _velocity_tick(self, name: str, velocity: float) -> int:
-        return round(self._sign * velocity / self.memory.table.items[name].scale)
+        return round(self._sign * velocity / self._scale[name])
 
     @property
     def _trajectory_angle(self) -> float:

@@ -32,8 +32,7 @@ class Reply(NamedTuple):
     delay_ns: int
 
 
-@dataclass(frozen=True, slots=True)
-class ReadEntry:
+class ReadEntry(NamedTuple):
     """What one servo of a list is asked for."""
 
     servo_id: int

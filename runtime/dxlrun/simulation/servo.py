@@ -129,13 +129,15 @@ class SimulatedServo:
         answer = self._instructions.answer_in_turn(reading, entry)
         if answer is None:
             return None
-        delay_ns = self._body.memory["return_delay_time"] * 2000
-        return Reply(self._body.servo_id, answer[0] | self._body.state(), answer[1], delay_ns)
+        body = self._body
+        delay_ns = body.memory["return_delay_time"] * 2000
+        return Reply(body.servo_id, answer[0] | body.state(), answer[1], delay_ns)
 
     def _hears(self, now_ns: int) -> bool:
-        if self._silent or now_ns < self._body.deaf_until_ns or not self._body.hears_protocol:
+        body = self._body
+        if self._silent or now_ns < body.deaf_until_ns or not body.hears_protocol:
             return False
-        self._body.hear(now_ns)
+        body.hear(now_ns)
         return True
 
     # What tests see and do

@@ -1,0 +1,112 @@
+"""Answers of a read in turn that are handed over together: the same bytes as those one by one."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+
+import pytest
+from fastcrc import crc16
+
+from dxlrun.simulation import BusConfig, Ledger, LedgerEntry, ServoConfig, SimulatedBus
+
+MICROFRAME_NS = 125_000
+SYNC_READ, FAST_SYNC_READ, BULK_READ = 0x82, 0x8A, 0x92
+PRESENT_POSITION = bytes((132, 0, 4, 0))
+IDS = (1, 2, 3, 4, 5)
+
+
+def packet2(servo_id: int, instruction: int, parameters: bytes) -> bytes:
+    head = b"\xff\xff\xfd\x00" + bytes((servo_id,)) + (len(parameters) + 3).to_bytes(2, "little")
+    packet = head + bytes((instruction,)) + parameters
+    return packet + crc16.umts(packet).to_bytes(2, "little")
+
+
+def bus_of(ledger: Ledger, *, absent: str = "silent", baud_rate: int = 4_000_000) -> SimulatedBus:
+    servos = tuple(ServoConfig(each, "XM430-W350", 0.5 * each, return_delay_ns=0) for each in IDS)
+    config = BusConfig("b", baud_rate, servos, 2.0, absent="slot" if absent == "slot" else "silent")
+    return SimulatedBus(config, ledger, 0)
+
+
+def question(chance: random.Random) -> bytes:
+    ids = bytes(chance.sample((*IDS, 9), chance.randint(1, 6)))
+    match chance.randint(0, 3):
+        case 0:
+            return packet2(0xFE, BULK_READ, b"".join(bytes((each,)) + PRESENT_POSITION for each in ids))
+        case 1:
+            return packet2(0xFE, FAST_SYNC_READ, PRESENT_POSITION + ids)
+        case 2:
+            goals = b"".join(bytes((each, chance.randrange(256), chance.randrange(16), 0, 0)) for each in ids)
+            return packet2(0xFE, 0x83, bytes((116, 0, 4, 0)) + goals)
+        case _:
+            return packet2(0xFE, SYNC_READ, PRESENT_POSITION + ids)
+
+
+def disturb(bus: SimulatedBus, chance: random.Random, now_ns: int) -> None:
+    servo_id = chance.choice(IDS)
+    match chance.randint(0, 12):
+        case 0:
+            bus.corrupt_next(servo_id)
+        case 1:
+            bus.truncate_next(servo_id, chance.randint(0, 9))
+        case 2:
+            bus.delay_next(servo_id, chance.randrange(200_000))
+        case 3:
+            bus.inject_noise(b"\x55\xaa", now_ns + chance.randrange(300_000))
+        case 4:
+            bus.at(now_ns + chance.randrange(300_000), bus.servo(servo_id).silence)
+            bus.at(now_ns + 400_000, lambda: bus.servo(servo_id).silence(False))
+        case _:
+            pass
+
+
+def entries_of(
+    seed: int, absent: str, next_ns: Callable[[SimulatedBus], int | None]
+) -> tuple[list[LedgerEntry], int]:
+    """Return what the ledger of random traffic says, and how often the host was given something."""
+    chance, ledger, now_ns, hands = random.Random(seed), Ledger(), 0, 0
+    bus = bus_of(ledger, absent=absent)
+    bus.receive(packet2(0xFE, 0x83, bytes((64, 0, 1, 0)) + b"".join(bytes((each, 1)) for each in IDS)), 0)
+    for _ in range(60):
+        disturb(bus, chance, now_ns)
+        bus.receive(question(chance), now_ns)
+        end_ns = now_ns + chance.choice((200_000, 2_000_000))  # the first is within most replies
+        while (due_ns := next_ns(bus)) is not None and due_ns <= end_ns:
+            hands += bool(bus.take(due_ns))
+        bus.take(end_ns)
+        now_ns = end_ns
+    return ledger.entries, hands
+
+
+@pytest.mark.parametrize("absent", ["silent", "slot"])
+@pytest.mark.parametrize("seed", range(4))
+def test_gathered_answers_stand_in_the_ledger_as_single_ones_do(seed: int, absent: str) -> None:
+    def of_bus(entries: list[LedgerEntry]) -> list[LedgerEntry]:
+        """Return entries in the order of time: what is handed over later is entered later."""
+        return sorted(entries, key=lambda each: (each.t_ns, each.direction, each.data, each.note))
+
+    single, often = entries_of(seed, absent, SimulatedBus.next_due_ns)
+    gathered, seldom = entries_of(seed, absent, lambda bus: bus.next_delivery_ns(MICROFRAME_NS))
+    assert of_bus(gathered) == of_bus(single)
+    assert seldom < often
+
+
+def test_no_answer_waits_longer_than_a_microframe_and_the_last_one_not_at_all() -> None:
+    ledger = Ledger()
+    bus = bus_of(ledger)
+    bus.receive(packet2(0xFE, SYNC_READ, PRESENT_POSITION + bytes(IDS)), 0)
+    handed = []
+    while (due_ns := bus.next_delivery_ns(MICROFRAME_NS)) is not None:
+        size = len(bus.take(due_ns))
+        handed.append((due_ns, size // 15))
+    replies = [entry.t_ns for entry in ledger.entries if entry.direction == "out"]
+    assert handed == [(replies[3], 4), (replies[4], 1)]  # 37.5 us each: the fourth one ends 112.5 us later
+    assert all(each - replies[0] <= MICROFRAME_NS for each in replies[:4])
+
+
+def test_slow_lines_gather_nothing() -> None:
+    bus = bus_of(Ledger(), baud_rate=57_600)
+    bus.receive(packet2(0xFE, SYNC_READ, PRESENT_POSITION + bytes(IDS)), 0)
+    while (due_ns := bus.next_due_ns()) is not None:
+        assert bus.next_delivery_ns(MICROFRAME_NS) == due_ns
+        bus.take(due_ns)
