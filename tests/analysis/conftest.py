@@ -64,6 +64,7 @@ class Said:
     code: EventCode
     severity: Severity
     text: str
+    source: str = "head"
 
 
 Write = Callable[..., Path]
@@ -105,7 +106,7 @@ def make_log(
     batch.commit()
     ring = EventRing(Handover(log.event), VirtualClock(9))
     for said in events:
-        ring.emit(said.code, said.severity, "head", said.text)
+        ring.emit(said.code, said.severity, said.source, said.text)
     if gaps:
         log.gap("loop/packets", gaps)
     if close:

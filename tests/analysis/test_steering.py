@@ -148,7 +148,8 @@ def test_the_page_shows_it(log: Log, report: Report) -> None:
     text = page(log, report)
     assert 'id="steering"' in text
     assert "switch activate tail; deactivate head" in text
-    assert "paused" in text
+    assert text.count("Shaded: the loop was paused. Dotted lines: it was steered otherwise.") == 4
+    assert "The dashed lines are the periods, 10 ms to 20 ms" in text
 
 
 def test_a_run_that_nobody_steered_says_nothing_of_it(tmp_path: Path) -> None:

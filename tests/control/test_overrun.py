@@ -107,6 +107,16 @@ def test_nobody_is_asked_while_cycles_are_in_time(robot):
     assert asked == []
 
 
+def test_another_rate_is_told_to_the_clock_which_polls_before_each_deadline(robot):
+    robot.build(end_ns=PERIOD_NS)
+    told = []
+    robot.loop.pace = told.append
+    assert robot.loop.change_rate(100) == ""
+    assert told == [10_000_000]
+    assert robot.loop.change_rate(0) != ""
+    assert told == [10_000_000]
+
+
 PLUGIN = """
 from dxlrun import hookimpl
 

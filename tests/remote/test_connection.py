@@ -97,7 +97,7 @@ def test_a_connection_that_says_nothing_is_closed(door, monkeypatch):
         answers = []
         for reader, writer in ends:
             try:
-                answers.append(await reader.read())
+                answers.append(await asyncio.wait_for(reader.read(), 10))
             except ConnectionResetError:
                 answers.append(b"")
             writer.close()

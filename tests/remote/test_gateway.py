@@ -133,7 +133,7 @@ def test_a_body_that_is_announced_too_long_is_refused_before_it_is_read(desk):
 
 def test_of_a_body_without_end_a_mebibyte_is_read_and_no_more(desk):
     heard = []
-    endless = (chunk(bytes(65_536)) for _ in iter(int, 1))
+    endless = (chunk(bytes(65_536)) for _ in range(1000))
     status, _ = desk.ask("POST", GO, chunks=endless, heard=heard)
     assert status == 413
     assert len(heard) == MOST_BYTES // 65_536 + 1
@@ -212,6 +212,18 @@ def test_one_process_may_ask_for_so_many_operations_a_second_but_stop_is_not_cou
     told = [desk.ask("POST", "/pause")[0] for _ in range(30)]
     assert told == [200] * int(MOST_OPERATIONS / 10) + [429] * (30 - int(MOST_OPERATIONS / 10))
     assert desk.ask("POST", "/stop") == (200, DONE)
+
+
+def test_long_bodies_count_as_many_short_ones_of_the_process_that_sends_them(desk):
+    long = {"positions": [0] * 100_000}
+    told = [desk.ask("POST", GO, long)[0] for _ in range(5)]
+    assert told == [422, 422, 429, 429, 429]
+    desk.now += 0.05
+    assert desk.ask("POST", "/pause")[0] == 429
+    assert desk.ask("POST", "/pause", client=("process 2", 0))[0] == 200
+    assert desk.ask("POST", "/stop")[0] == 200
+    desk.now += 0.2
+    assert desk.ask("POST", "/pause")[0] == 200
 
 
 def test_an_answer_that_comes_too_late_is_still_what_the_gateway_knows(desk, monkeypatch):

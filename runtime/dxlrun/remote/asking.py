@@ -16,6 +16,8 @@ from dxlrun.remote.sockets import MOST_BYTES
 
 MOST_PEERS = 256
 """Processes whose allowance is remembered."""
+CHARGED_BYTES = 16_384
+"""So many bytes of a body count as one request more."""
 BODY_S = 10.0
 """How long a body may take to arrive."""
 LONGEST_ORIGIN = 64
@@ -24,7 +26,10 @@ T = TypeVar("T")
 
 @dataclass(slots=True)
 class Allowance:
-    """So many a second for each process that asks, and no more (token bucket of a tenth of a second)."""
+    """So many a second for each process that asks, and no more (token bucket of a tenth of a second).
+
+    Long bodies count as many short ones: what they cost to read and to judge keeps others waiting.
+    """
 
     rate: float
     now: Callable[[], float]
@@ -34,14 +39,23 @@ class Allowance:
 
     def spend(self, peer: str) -> None:
         """Take one; raises Refusal when there is none left."""
+        left = self._refilled(peer)
+        if left < 1:
+            raise Refusal(429, f"more than {self.rate:g} a second, or too much in them; ask less often")
+        self._left[peer] = (left - 1, self.now())
+
+    def charge(self, peer: str, size: int) -> None:
+        """Take what a body of so many bytes costs, also when that is more than is left."""
+        self._left[peer] = (self._refilled(peer) - size // CHARGED_BYTES, self.now())
+
+    def _refilled(self, peer: str) -> float:
         now, most = self.now(), self.rate / 10
         left, since = self._left.pop(peer, (most, now))
         left = min(most, left + (now - since) * self.rate)
-        self._left[peer] = (left - 1 if left >= 1 else left, now)
+        self._left[peer] = (left, now)
         if len(self._left) > MOST_PEERS:
             del self._left[next(iter(self._left))]
-        if left < 1:
-            raise Refusal(429, f"more than {self.rate:g} a second; ask less often")
+        return left
 
 
 async def body(request: Request) -> bytes:
@@ -58,6 +72,8 @@ async def body(request: Request) -> bytes:
                     raise Refusal(413, f"at most {MOST_BYTES} bytes are taken at once")
     except TimeoutError:
         raise Refusal(408, f"the request did not arrive within {BODY_S:g} s") from None
+    finally:
+        request.state.received = len(content)
     return bytes(content)
 
 

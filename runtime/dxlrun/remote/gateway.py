@@ -245,6 +245,9 @@ def _answered(handler: Handler, allowance: Allowance | None) -> Handler:
         except Exception as error:  # the last resort: one request fails, the gateway goes on
             traceback.print_exc()
             return _refused(500, f"the gateway failed: {type(error).__name__}: {error}; --debug shows where")
+        finally:
+            if allowance is not None:
+                allowance.charge(peer(request), getattr(request.state, "received", 0))
 
     return answer
 

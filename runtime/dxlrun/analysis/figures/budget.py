@@ -24,6 +24,8 @@ from dxlrun.analysis.figures.drawing import (
     time_axis,
 )
 from dxlrun.analysis.figures.run_time import run_time_s
+from dxlrun.analysis.figures.steered import SteeringMarks
+from dxlrun.analysis.latency import cycle_periods_ns
 from dxlrun.analysis.verdict import microseconds
 from dxlrun.recording.reader import Log
 
@@ -33,6 +35,8 @@ _STEPS = (
     ("update", "read_ns", "updated_ns", GREEN),
     ("write", "updated_ns", "written_ns", ORANGE),
 )
+_FEW = 5
+"""So many periods are drawn with a line each."""
 _MOST_PERIODS = 2.5
 """The axis ends here: one cycle of a second would flatten all others. What is beyond is marked and said."""
 
@@ -50,7 +54,8 @@ def budget_drawings(log: Log) -> tuple[Drawing, ...]:
 
 
 def _typical(log: Log, steps: _Rows) -> Drawing:
-    period = log.period_ns / 1e6
+    periods = sorted(set((cycle_periods_ns(log) / 1e6).tolist()))
+    period = periods[-1]
     worst = steps[:, int(steps.sum(axis=0).argmax())]
     bars = (
         ("longest cycle", worst),
@@ -80,22 +85,28 @@ def _typical(log: Log, steps: _Rows) -> Drawing:
         axes.grid(visible=False, axis="y")
         axes.set_xlim(0, end)
         axes.set_xlabel("time since the cycle's deadline, ms")
-        _period(axes, period, vertical=True)
+        for one in periods if len(periods) <= _FEW else (periods[0], period):
+            axes.axvline(one, color=ERROR, linewidth=0.9, linestyle=DASHED)
         _legend(axes)
 
+    lines = f"The dashed line is the period, {period:g} ms"
+    if len(periods) > 1:
+        lines = f"The dashed lines are the periods, {periods[0]:g} ms to {period:g} ms"
     said = "; ".join(f"{name}: {microseconds(float(values.sum()) * 1e3)}" for name, values in reversed(bars))
     words = Words(
         "budget-typical",
         "Budget of a cycle",
         f"Stacked bars of wake-up, read, update and write in ms against the period of {period:g} ms. {said}.",
-        f"{said[0].upper()}{said[1:]}. The dashed line is the period, {period:g} ms; what is left of it is "
+        f"{said[0].upper()}{said[1:]}. {lines}; what is left of it is "
         "idle. The steps' 99 % need not come in the same cycle.",
     )
     return draw(words, 1.9, fill)
 
 
 def _over_time(log: Log, steps: _Rows) -> Drawing:
-    period = log.period_ns / 1e6
+    periods = cycle_periods_ns(log) / 1e6
+    period = float(periods.max())
+    steering = SteeringMarks.of(log)
     total = steps.sum(axis=0)
     columns = Columns(steps.shape[1])
     picked = columns.largest(total)
@@ -123,11 +134,15 @@ def _over_time(log: Log, steps: _Rows) -> Drawing:
         )
         axes.set_ylim(0, end)
         axes.set_ylabel("time since the\ncycle's deadline, ms")
-        _period(axes, period, vertical=False)
+        if periods.min() < period:
+            axes.step(times, periods, where="post", color=ERROR, linewidth=0.9, linestyle=DASHED)
+        else:
+            axes.axhline(period, color=ERROR, linewidth=0.9, linestyle=DASHED)
+        steering.draw(axes)
         time_axis(axes)
         _legend(axes)
 
-    over = int(np.count_nonzero(total > period))
+    over = int(np.count_nonzero(total > periods))
     told = (
         f"{over} of {len(total)} cycles ended later than one period after their deadline."
         if over
@@ -139,11 +154,12 @@ def _over_time(log: Log, steps: _Rows) -> Drawing:
         if len(beyond)
         else ""
     )
+    drawn = columns.said("its longest cycle, and the median as a line")
     words = Words(
         "budget-time",
         "Duration of the steps over the run",
         f"Stacked areas of wake-up, read, update and write in ms over the time of the run in s. {told}{cut}",
-        f"{told}{cut} {columns.said('its longest cycle, and the median as a line')}".strip(),
+        " ".join(f"{told}{cut} {drawn} {steering.said}".split()),
     )
     return draw(words, 2.6, fill)
 
@@ -151,11 +167,6 @@ def _over_time(log: Log, steps: _Rows) -> Drawing:
 def _end(period: float, values: list[float]) -> float:
     """Return where the axis ends, ms: the period in sight, and never more than a few of it."""
     return min(max(*values, period) * 1.12, _MOST_PERIODS * period)
-
-
-def _period(axes: Axes, period: float, *, vertical: bool) -> None:
-    line = axes.axvline if vertical else axes.axhline
-    line(period, color=ERROR, linewidth=0.9, linestyle=DASHED)
 
 
 def _legend(axes: Axes) -> None:

@@ -25,6 +25,7 @@ from dxlrun.analysis.figures.drawing import (
     time_axis,
 )
 from dxlrun.analysis.figures.run_time import Marks, run_time_s
+from dxlrun.analysis.figures.steered import SteeringMarks
 from dxlrun.analysis.tracking import Joint
 from dxlrun.interfaces import Floats
 from dxlrun.recording.reader import Log
@@ -39,9 +40,9 @@ _READ: dict[str, object] = {"color": BLUE, "linewidth": 1.1}
 
 def joint_drawings(log: Log, joints: tuple[Joint, ...]) -> tuple[Drawing, ...]:
     """Return a figure for each joint, in the order of the log; `log` has at least one cycle."""
-    times, columns = run_time_s(log), Columns(len(log.cycles))
+    times, columns, steering = run_time_s(log), Columns(len(log.cycles)), SteeringMarks.of(log)
     return tuple(
-        _JointPlot(log, row, joint, times, columns, Marks.of(log, row)).drawing()
+        _JointPlot(log, row, joint, times, columns, Marks.of(log, row), steering).drawing()
         for row, joint in enumerate(joints)
     )
 
@@ -64,6 +65,7 @@ class _JointPlot:
     times: Floats
     columns: Columns
     marks: Marks
+    steering: SteeringMarks
 
     def drawing(self) -> Drawing:
         """Return the figure and what is said about it."""
@@ -80,7 +82,10 @@ class _JointPlot:
             joint.name,
             "Position in rad (wanted by the controller, sent to the servo, read) and velocity in rad/s of "
             f"{joint.name} over the time of the run in s. {error} Cycles: {told}.",
-            f"{error} Cycles: {told}. {self.columns.said('the smallest and the largest value')}".strip(),
+            " ".join(
+                f"{error} Cycles: {told}. {self.columns.said('the smallest and the largest value')} "
+                f"{self.steering.said}".split()
+            ),
         )
         return draw(words, 3.9, self._fill)
 
@@ -108,6 +113,7 @@ class _JointPlot:
         for axes in (position, velocity):
             for time in skipped if len(skipped) <= _FEW else ():  # more would bury the curves
                 axes.axvline(time, color=ERROR, linewidth=0.7, alpha=0.45)
+            self.steering.draw(axes)
         self._strip(strip)
         time_axis(strip)
 

@@ -13,7 +13,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLoca
 from dxlrun.analysis.envelope import Columns
 from dxlrun.analysis.figures import drawing
 from dxlrun.analysis.figures.drawing import BLUE, MUTED, WARNING, Drawing, Words, draw, reference
-from dxlrun.analysis.latency import ROUGH_NS, Latency
+from dxlrun.analysis.latency import ROUGH_NS, Latency, cycle_periods_ns
 from dxlrun.analysis.verdict import microseconds
 from dxlrun.interfaces import Floats
 from dxlrun.recording.reader import Log
@@ -159,8 +159,13 @@ def _kept(count: int) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
 
 def _lines(axes: Axes, log: Log, late: Floats, *, vertical: bool) -> None:
     reference(axes, _ROUGH_US, "150 us", vertical=vertical, colour=MUTED)
-    period_us = log.period_ns / 1e3
+    period_us = float(cycle_periods_ns(log).min()) / 1e3
+    name = "one period" if period_us * 1e3 == log.period_ns else "the shortest period"
     if late.max() > period_us / 4:
         reference(
-            axes, period_us, f"one period, {microseconds(period_us)}", vertical=vertical, colour=WARNING
+            axes,
+            period_us,
+            f"{name}, {microseconds(period_us)}",
+            vertical=vertical,
+            colour=WARNING,
         )

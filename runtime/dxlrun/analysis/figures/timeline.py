@@ -7,6 +7,7 @@ from matplotlib.figure import Figure
 
 from dxlrun.analysis.envelope import COLUMNS
 from dxlrun.analysis.figures.drawing import BLUE, ERROR, WARNING, Drawing, Words, draw, time_axis
+from dxlrun.analysis.figures.steered import SteeringMarks
 from dxlrun.analysis.latency import first_deadline_ns
 from dxlrun.events import Severity
 from dxlrun.interfaces import Floats
@@ -28,10 +29,12 @@ def events_drawing(log: Log) -> Drawing | None:
     kinds = list(dict.fromkeys(event.name for event in sorted(log.events, key=lambda event: event.t_ns)))
     times = np.array([(event.t_ns - start) / 1e9 for event in log.events])
     rows = np.array([kinds.index(event.name) for event in log.events], dtype=np.float64)
+    steering = SteeringMarks.of(log)
     grades = np.array([_grade(event.severity) for event in log.events])
 
     def fill(figure: Figure) -> None:
         axes = figure.subplots()
+        steering.draw(axes)
         for grade, (name, _, shape, colour, size) in enumerate(_SHAPES):
             chosen = grades == grade
             if chosen.any():
@@ -51,7 +54,7 @@ def events_drawing(log: Log) -> Drawing | None:
         "events-timeline",
         "Events over the run",
         f"Events over the time of the run in s, one row a kind. {number}: {told}.",
-        f"{number}: {told}. Before 0 s the servos are set up.",
+        f"{number}: {told}. Before 0 s the servos are set up. {steering.said}".strip(),
     )
     return draw(words, 0.9 + 0.17 * len(kinds), fill)
 

@@ -1,0 +1,136 @@
+"""Whether a run has a gateway is what robot file and command line say; nobody waits until it has started."""
+
+import io
+from functools import cache
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from dxlrun import supervisor
+from dxlrun.compile import compile_files
+from dxlrun.compile.plan import from_json, to_json
+from dxlrun.heartbeat import Heartbeat, Phase, create
+from dxlrun.run_summary import RunOptions
+
+ROBOT = Path(__file__).parents[2] / "robots" / "single_joint.yaml"
+
+
+class Gateway:
+    """What the supervisor sees of a gateway: what it says, and that its line is closed afterwards."""
+
+    def __init__(self, *messages):
+        self.messages = list(messages)
+        self.line = self
+        self.closed = not messages
+        self.killed = False
+
+    def poll(self, timeout_s):
+        self.closed = True
+        return self.messages.pop(0) if self.messages else None
+
+    def kill(self):
+        self.killed = True
+
+
+@pytest.fixture(scope="module")
+def plan(tmp_path_factory):
+    """Return the plan of a robot file with one more block."""
+    directory = tmp_path_factory.mktemp("robots")
+
+    @cache
+    def make(block):
+        path = directory / "robot.yaml"
+        path.write_text(f"{ROBOT.read_text()}\n{block}\n")
+        return from_json(to_json(compile_files(path, {}, (), None, None).plan))
+
+    return make
+
+
+@pytest.fixture
+def make_run(plan):
+    def make(block="", **options):
+        signals, out = supervisor._Signals(), Console(file=io.StringIO())
+        return supervisor._Run(plan(block), RunOptions(**options), None, signals, out)
+
+    return make
+
+
+@pytest.fixture
+def heartbeat():
+    found = Heartbeat(create())
+    found.enter(Phase.RUNNING)
+    return found
+
+
+@pytest.fixture
+def started(monkeypatch):
+    """The gateways that were started; the next one to start may be put into it."""
+    found = []
+    ready = [Gateway({"socket": "/nowhere/robot.sock"})]
+
+    def start(log, memory):
+        if isinstance(ready[0], OSError):
+            raise ready[0]
+        found.append(ready[0])
+        return ready[0]
+
+    monkeypatch.setattr(supervisor, "start_gateway", start)
+    start.found, start.ready = found, ready
+    return start
+
+
+@pytest.mark.parametrize(
+    ("block", "wanted", "count"),
+    [
+        ("", True, 1),
+        ("processes: {gateway: {enabled: true}}", True, 1),
+        ("processes: {gateway: {enabled: false}}", True, 0),
+        ("", False, 0),
+        ("processes: {gateway: {enabled: true}}", False, 0),
+    ],
+)
+def test_both_the_robot_file_and_the_command_line_can_forbid_it(make_run, started, block, wanted, count):
+    run = make_run(block, gateway=wanted)
+    heartbeat = Heartbeat(create())
+    heartbeat.enter(Phase.RUNNING)
+    for _ in range(3):
+        run._look_after_gateway(heartbeat)
+    assert len(started.found) == count
+
+
+@pytest.mark.parametrize("phase", [Phase.LOADING, Phase.SETUP, Phase.STOPPING, Phase.DONE])
+def test_it_is_started_when_the_loop_runs_and_not_before_or_after(make_run, started, heartbeat, phase):
+    heartbeat.enter(phase)
+    make_run()._look_after_gateway(heartbeat)
+    assert started.found == []
+
+
+@pytest.mark.parametrize(
+    ("ready", "remark"),
+    [
+        (OSError(11, "Resource temporarily unavailable"), "did not start (Resource temporarily unavailable)"),
+        (Gateway({"error": "/tmp/x must be a directory"}), "did not start (/tmp/x must be a directory)"),  # noqa: S108
+        (Gateway(), "ended"),
+    ],
+    ids=["no process", "no place", "ends"],
+)
+def test_without_it_the_run_goes_on_with_one_remark(make_run, started, heartbeat, ready, remark):
+    run = make_run()
+    started.ready[0] = ready
+    for _ in range(5):
+        run._look_after_gateway(heartbeat)
+    assert run.remarks == [f"the gateway {remark}: the run goes on, and nobody can steer it"]
+    assert run.sentences == []
+    assert all(one.killed for one in started.found)
+
+
+def test_the_socket_of_a_gateway_that_was_killed_is_removed(make_run, started, heartbeat, tmp_path):
+    place = tmp_path / "robot.sock"
+    place.touch()
+    started.ready[0] = Gateway({"socket": str(place)})
+    run = make_run()
+    for _ in range(3):
+        run._look_after_gateway(heartbeat)
+    assert not place.exists()
+    assert len(run.remarks) == 1

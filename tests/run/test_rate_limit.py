@@ -1,0 +1,36 @@
+"""A running loop becomes as fast as the robot file's buses allow, and no faster."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from dxlrun.inbox import LOOP, Command
+from dxlrun.testing import simulated_robot
+
+ROBOT = """\
+name: pair
+buses:
+  fast: {port: sim, protocol: 1.0, baud_rate: 1_000_000, return_delay_time: 100 us}
+  slow: {port: sim, protocol: 1.0, baud_rate: 57_600, return_delay_time: 100 us}
+loop: {rate: 50}
+joints:
+  pan: {bus: fast, id: 3, model: AX-12A, reference: 150 deg, direction: 1}
+  tilt: {bus: slow, id: 7, model: AX-12A, reference: 150 deg, direction: 1}
+"""
+
+
+@pytest.mark.parametrize(("share", "refused"), [(0.9, False), (1.1, True)])
+def test_the_slowest_bus_bounds_the_rate(tmp_path: Path, share: float, refused: bool) -> None:
+    path = tmp_path / "pair.yaml"
+    path.write_text(ROBOT)
+    robot = simulated_robot(path, duration_s=0.2)
+    highest = min(bus.budget.highest_rate_hz for bus in robot.plan.buses)
+    wish = msgspec.json.encode({"rate": share * highest})
+    robot.inbox.waiting.append(Command(1, LOOP, "rate", wish, "anna", 0))
+    result = robot.run()
+    assert robot.inbox.answers == {1: f"the buses allow at most {highest:.4g} Hz" if refused else ""}
+    assert result.skipped == 0
+    assert (result.cycles > 11) == (not refused)
