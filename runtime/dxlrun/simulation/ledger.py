@@ -17,6 +17,9 @@ Direction = Literal["in", "out", "note"]
 _BUFFER = 1 << 16
 """Bytes that are written out together."""
 
+_LINES = 128
+"""Entries that are encoded together."""
+
 FLUSH_NS = 500_000_000
 """A ledger file is never further behind than this."""
 
@@ -51,6 +54,7 @@ class Ledger:
         self._keep = keep
         self._file: IO[bytes] | None = None if path is None else path.open("wb", _BUFFER)
         self._names: dict[str, str] = {}
+        self._lines: list[str] = []
         self._unflushed_ns: int | None = None
 
     def add(
@@ -81,10 +85,18 @@ class Ledger:
         line = f'{{"t_ns": {t_ns}, "bus": {name}, "direction": "{direction}", "bytes": "{data}"{tail}}}\n'
         if self._unflushed_ns is None:
             self._unflushed_ns = t_ns
-        try:
-            self._file.write(line.encode("ascii"))
-        except OSError as error:
-            self._give_up(error)
+        self._lines.append(line)
+        if len(self._lines) >= _LINES:
+            self._write_lines()
+
+    def _write_lines(self) -> None:
+        lines = "".join(self._lines)
+        self._lines.clear()
+        if self._file is not None:
+            try:
+                self._file.write(lines.encode("ascii"))
+            except OSError as error:
+                self._give_up(error)
 
     def flush_due_ns(self) -> int | None:
         """Return when the file must be flushed, ns on the clock of the entries; None: all is written."""
@@ -99,6 +111,7 @@ class Ledger:
     def flush(self) -> None:
         """Write the file out."""
         self._unflushed_ns = None
+        self._write_lines()
         if self._file is not None:
             try:
                 self._file.flush()
