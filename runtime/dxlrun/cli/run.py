@@ -98,6 +98,10 @@ def _verdict(log: str, summary: RunSummary) -> tuple[str, ...]:
         return ()
 
 
+def _counted(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"
+
+
 def show(summary: RunSummary, robot: str, console: Console) -> None:
     """Print how the run went: what failed and what was not granted to stderr, the rest to stdout."""
     for remark in summary.remarks:
@@ -106,12 +110,13 @@ def show(summary: RunSummary, robot: str, console: Console) -> None:
         say_error(f"{robot}: {sentence}")
     verdict = {0: "good", 130: "interrupted"}.get(summary.exit_code, "failed")
     console.print(
-        f"{robot}: {verdict}. {summary.elapsed_s:.1f} s, {summary.cycles} cycles, "
-        f"{summary.skipped} {'period' if summary.skipped == 1 else 'periods'} skipped",
+        f"{robot}: {verdict}. {summary.elapsed_s:.1f} s, {_counted(summary.cycles, 'cycle')}, "
+        f"{_counted(summary.skipped, 'period')} skipped",
         soft_wrap=True,
     )
     if summary.log is not None:
         for sentence in _verdict(summary.log, summary):
             console.print(f"  {sentence}", markup=False, soft_wrap=True)
-        console.print(f"log: {summary.log} ({summary.messages} messages)", markup=False, soft_wrap=True)
+        messages = _counted(summary.messages, "message")
+        console.print(f"log: {summary.log} ({messages})", markup=False, soft_wrap=True)
         console.print(f"next: dxlrun analyze {summary.log}", markup=False, soft_wrap=True)
