@@ -45,7 +45,7 @@ STEPS = {
 TORQUE_ENABLE, GOAL, TORQUE_LIMIT = 24, 30, 34
 LATE_S = 0.03
 """How late a cycle is in the worst of the triggers."""
-START_NS = 500_000_000
+START_NS = 200_000_000
 """Since the loop's first deadline, or more, when something goes wrong."""
 Act = Callable[[Any, int], None]
 
