@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import signal
 import struct
 
 import msgspec
@@ -12,7 +13,7 @@ from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.events import EventCode, Severity
 from dxlrun.heartbeat import Phase
 from dxlrun.inbox import MOST_PER_CYCLE
-from dxlrun.remote import asking, link
+from dxlrun.remote import asking, link, preparation
 from dxlrun.remote.gateway import MOST_OPERATIONS, MOST_SET_POINTS
 from dxlrun.remote.sockets import MOST_BYTES
 
@@ -365,6 +366,18 @@ def test_a_controller_whose_stream_ended_is_held_until_its_next_command(desk):
     ):
         desk.events.emit(code, Severity.INFO, "left", "")
         assert held() is expected
+
+
+def test_a_plug_in_that_thinks_for_ever_is_interrupted_and_the_next_client_is_served(desk, monkeypatch):
+    monkeypatch.setattr(preparation, "BUDGET_S", 0.05)
+    status, content = desk.ask("POST", "/controllers/left/commands/brood", {"count": 1})
+    assert (status, content["refused"]) == (
+        422,
+        "left thought about this for more than 0.05 s; send less at once",
+    )
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+    assert desk.ask("POST", "/stop") == (200, DONE)
+    assert [command.kind for command in desk.taken] == ["stop"]
 
 
 def test_a_failure_of_the_gateway_itself_fails_one_request_only(desk, monkeypatch, capsys):
