@@ -16,6 +16,8 @@ COMMAND_SLOT = 512
 
 _HEADER = struct.Struct("<qqqqIIHHH2x")
 _LONGEST_NAME = 64
+_FULL_MAILBOX = 5 * 1024
+"""Slots: 1 MiB of commands with the longest names (272 bytes a slot), and a long set-point of 63 streams."""
 _NUMBER = 8
 """Bytes of a float64."""
 
@@ -158,5 +160,9 @@ def _decode(payload: Payload) -> tuple[TakenCommand, int, int]:
 
 
 def command_slots(period_ns: int, controllers: int) -> int:
-    """Return how many slots hold 10 s in which every controller takes a short command in each cycle."""
-    return max(1024, RING_SECONDS * 1_000_000_000 // period_ns * controllers)
+    """Return how many slots hold 10 s in which every controller takes a short command in each cycle.
+
+    Beside them there is room for everything that a full mailbox gives one cycle: a command that overwrote its
+    own beginning would never come whole into the log.
+    """
+    return _FULL_MAILBOX + RING_SECONDS * 1_000_000_000 // period_ns * controllers

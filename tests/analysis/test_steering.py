@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -137,6 +138,21 @@ def test_a_pause_is_counted_in_periods_and_in_seconds(report: Report) -> None:
     assert "periods paused" in shown
     assert "pair, 50 Hz and 100 Hz, 0.9 s" in shown
     assert "switch activate tail; deactivate head" in shown
+
+
+def test_a_cycle_is_measured_by_its_own_period(tmp_path: Path) -> None:
+    asked = {5: [ask("rate", rate=200)], 60: [ask("rate", rate=25)]}
+    log = run(tmp_path, asked)
+    whole = log.cycles["written_ns"] - log.cycles["woken_ns"]
+    stretched = log.cycles.copy()
+    late = 30
+    stretched["written_ns"][late] += 8 * MS - whole[late]
+    stretched["written_ns"][70] += 16 * MS
+    report = analyze(replace(log, cycles=stretched))
+    sentence = next(one for one in report.verdict.sentences if one.startswith("A cycle"))
+    assert (
+        sentence == "A cycle took up to 8000 us, longer than its period of 5000 us; its write took 7400 us."
+    )
 
 
 def test_a_pause_that_the_run_ends_in_lasts_to_the_end(tmp_path: Path) -> None:

@@ -210,6 +210,20 @@ def test_what_a_machine_hides_is_not_called_bad(tmp_path: Path) -> None:
     assert [one.what for one in diagnose(machine) if one.state != "good"] == ["kernel"]
 
 
+@pytest.mark.parametrize(
+    ("capabilities", "priority", "memory"),
+    [
+        ((), "up to 99, by the limit rtprio", "all of it, by the limit memlock"),
+        (("CAP_SYS_NICE", "CAP_IPC_LOCK"), "up to 99, by CAP_SYS_NICE", "all of it, by CAP_IPC_LOCK"),
+    ],
+)
+def test_a_right_says_where_it_comes_from(
+    look: Look, capabilities: tuple[str, ...], priority: str, memory: str
+) -> None:
+    found = look(capabilities=capabilities)
+    assert (found["real-time priority"].found, found["locked memory"].found) == (priority, memory)
+
+
 def test_isolated_cores_are_offered_to_the_loop(look: Look) -> None:
     assert "isolated: 3" in look({"sys/devices/system/cpu/isolated": "3"})["cores"].found
 

@@ -7,7 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dxlrun import mailbox
 from dxlrun.commands import COMMAND_SLOT, CommandPieces, CommandRing, TakenCommand, command_slots
+from dxlrun.cycle import MOST_CONTROLLERS
+from dxlrun.inbox import Command
 from dxlrun.ring import Handover, Payload, RingReader, RingWriter, create
 
 NAMES = st.text(st.characters(exclude_categories=["Cs"]), max_size=12)
@@ -108,3 +111,26 @@ def test_it_fits_a_ring_of_its_size() -> None:
         assert isinstance(record, bytes)
         found = pieces.add(record)
     assert found == long_command(9)
+
+
+def test_what_a_full_mailbox_gives_one_cycle_comes_whole_into_the_log() -> None:
+    descriptor = create("commands", COMMAND_SLOT, command_slots(20_000_000, 1))
+    writer, reader = RingWriter(descriptor), RingReader(descriptor)
+    box = mailbox.create(MOST_CONTROLLERS)
+    client = mailbox.MailboxWriter(box)
+    origin = "o" * 64
+    number = 0
+    while client.post(Command(number, "c" * 64, "k" * 64, bytes(mailbox.LARGEST // 2), origin)):
+        number += 1
+    for place in range(MOST_CONTROLLERS):
+        assert client.set_point(place, Command(place, "c" * 64, "k" * 64, bytes(1600), origin, 1))
+    ring = CommandRing(writer)
+    taken = mailbox.Mailbox(box, Slots()).take()
+    assert len(taken) == number + MOST_CONTROLLERS
+    for one in taken:
+        ring.take(TakenCommand(0, 0, -1, one.controller, one.kind, one.origin, one.data, one.lease_ns))
+    pieces, found = CommandPieces(), 0
+    while (record := reader.read()) is not None:
+        assert isinstance(record, bytes)
+        found += pieces.add(record) is not None
+    assert found == len(taken)

@@ -8,27 +8,25 @@ from typing import Any
 
 import pytest
 
+from dxlrun.description.form import Form
 from dxlrun.description.motion import Formula, FormulaPart, Motion, Point, PointsPart, Target
+from dxlrun.description.policies import Policies, PoseStep, TorqueStep
 from dxlrun.description.robot import (
     Adapter,
     Bus,
     BusSimulation,
     ControllerEntry,
-    Form,
     Gateway,
     Joint,
     JointSimulation,
     Limits,
     Loop,
-    Policies,
-    PoseStep,
     Processes,
     Recording,
     Robot,
     RobotModel,
     Scheduler,
     Simulation,
-    TorqueStep,
 )
 
 PAGE = (Path(__file__).parents[2] / "docs" / "robot-file.md").read_text()

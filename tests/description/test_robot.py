@@ -8,20 +8,9 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from dxlrun.description.robot import (
-    Adapter,
-    Bus,
-    ControllerEntry,
-    Form,
-    Joint,
-    Limits,
-    Loop,
-    Policies,
-    PoseStep,
-    Robot,
-    Scheduler,
-    TorqueStep,
-)
+from dxlrun.description.form import Form
+from dxlrun.description.policies import Policies, PoseStep, TorqueStep
+from dxlrun.description.robot import Adapter, Bus, ControllerEntry, Joint, Limits, Loop, Robot, Scheduler
 from dxlrun.errors import Mark
 
 DAMAGES = [

@@ -2,6 +2,8 @@
 
 import asyncio
 import json
+import time
+from contextlib import suppress
 from types import SimpleNamespace
 from typing import ClassVar
 
@@ -43,7 +45,7 @@ class ArmParameters(dxlrun.ParametersModel):
 
 class Arm(dxlrun.Controller[ArmParameters]):
     Parameters = ArmParameters
-    Commands: ClassVar = {"go": Go, "many": Number, "break": Number, "leave": Number}
+    Commands: ClassVar = {"go": Go, "many": Number, "break": Number, "leave": Number, "brood": Number}
 
     @classmethod
     def interfaces(cls, parameters, joints):
@@ -57,6 +59,9 @@ class Arm(dxlrun.Controller[ArmParameters]):
             raise KeyError("a mistake of its author")
         if kind == "leave":
             raise SystemExit(3)
+        while kind == "brood":
+            with suppress(Exception):
+                time.sleep(0.001)
         if len(command.positions) != len(parameters.joints):
             raise ValueError(f"{len(parameters.joints)} positions,\nplease")
         return np.array(command.positions)

@@ -1,6 +1,7 @@
 """Clients that hang, flood, die or send rubbish, at the real socket; the loop's mailbox is the judge."""
 
 import asyncio
+import gc
 import json
 import os
 import random
@@ -198,6 +199,20 @@ def test_a_client_that_asks_without_reading_is_not_served_for_ever(door):
         return sent
 
     assert door.open(act) < 10_000_000
+
+
+def test_connections_that_came_and_went_leave_nothing_in_memory(door):
+    async def act():
+        for _ in range(200):
+            _, writer = await door.connect(GO[:20])
+            writer.close()
+            await writer.wait_closed()
+        assert await door.stopped()
+        await asyncio.sleep(0.01)
+        gc.collect()
+        return sum(isinstance(one, connection.Connection) for one in gc.get_objects())
+
+    assert door.open(act) <= 5
 
 
 def test_a_client_without_a_name_is_known_by_its_process(door):

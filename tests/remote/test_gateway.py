@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import signal
 import struct
 
 import msgspec
@@ -12,8 +13,8 @@ from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.events import EventCode, Severity
 from dxlrun.heartbeat import Phase
 from dxlrun.inbox import MOST_PER_CYCLE
-from dxlrun.remote import asking, link
-from dxlrun.remote.gateway import MOST_EVENTS, MOST_OPERATIONS, MOST_SET_POINTS
+from dxlrun.remote import asking, link, preparation
+from dxlrun.remote.gateway import MOST_OPERATIONS, MOST_SET_POINTS
 from dxlrun.remote.sockets import MOST_BYTES
 
 DONE = {"done": True}
@@ -324,29 +325,31 @@ def test_states_are_those_of_the_newest_cycle_and_what_is_not_there_is_null(desk
     assert (tilt["position"], tilt["valid"], tilt["age"]) == (None, False, 0.04)
 
 
-def test_events_of_both_processes_are_whole_and_come_in_portions(desk):
+def test_events_of_both_processes_are_whole_and_are_told_once_to_who_asks_after_the_last(desk):
     long = "ä" * 400
     desk.events.emit(EventCode.SETUP, Severity.INFO, "loop", long)
     desk.guardian_events.emit(EventCode.GUARDIAN, Severity.INFO, "guardian", long)
     desk.link.collect()
     told = desk.ask("GET", "/events")[1]
-    assert [one["text"] for one in told["events"]] == [long, long]
-    for number in range(MOST_EVENTS + 1):
-        desk.events.emit(EventCode.SETUP, Severity.INFO, "loop", str(number))
+    assert [(one["source"], one["text"]) for one in told["events"]] == [("loop", long), ("guardian", long)]
+    desk.events.emit(EventCode.SETUP, Severity.INFO, "loop", "more")
     desk.link.collect()
     told = desk.ask("GET", f"/events?after={told['last']}")[1]
-    assert [one["text"] for one in told["events"]] == [str(number) for number in range(MOST_EVENTS)]
-    told = desk.ask("GET", f"/events?after={told['last']}")[1]
-    assert [one["text"] for one in told["events"]] == [str(MOST_EVENTS)]
+    assert [one["text"] for one in told["events"]] == ["more"]
     assert desk.ask("GET", f"/events?after={told['last']}")[1] == {"events": [], "last": told["last"]}
 
 
-def test_a_storm_of_events_is_kept_in_bounded_memory(desk):
-    for number in range(3000):
-        desk.events.emit(EventCode.GATE, Severity.WARNING, "pan", str(number))
-    desk.link.collect()
-    assert len(desk.link.events) == link.KEPT_EVENTS
-    assert desk.link.events[-1][1].text == "2999"
+@pytest.mark.parametrize(("text", "count"), [("x", 3000), ("x" * 7000, 300)])
+def test_a_storm_of_events_is_kept_in_bounded_memory(desk, text, count):
+    for number in range(count):
+        desk.events.emit(EventCode.GATE, Severity.WARNING, "pan", f"{number} {text}")
+        desk.link.collect()
+    kept = [event.text for _, event in desk.link.events]
+    assert len(kept) <= link.KEPT_EVENTS
+    assert sum(map(len, kept)) <= link.KEPT_TEXT
+    assert len(kept) == link.KEPT_EVENTS or sum(map(len, kept)) > link.KEPT_TEXT - 8000
+    assert kept[-1].startswith(f"{count - 1} ")
+    assert all(one.endswith(text) for one in kept)
 
 
 def test_a_controller_whose_stream_ended_is_held_until_its_next_command(desk):
@@ -363,6 +366,18 @@ def test_a_controller_whose_stream_ended_is_held_until_its_next_command(desk):
     ):
         desk.events.emit(code, Severity.INFO, "left", "")
         assert held() is expected
+
+
+def test_a_plug_in_that_thinks_for_ever_is_interrupted_and_the_next_client_is_served(desk, monkeypatch):
+    monkeypatch.setattr(preparation, "BUDGET_S", 0.05)
+    status, content = desk.ask("POST", "/controllers/left/commands/brood", {"count": 1})
+    assert (status, content["refused"]) == (
+        422,
+        "left thought about this for more than 0.05 s; send less at once",
+    )
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+    assert desk.ask("POST", "/stop") == (200, DONE)
+    assert [command.kind for command in desk.taken] == ["stop"]
 
 
 def test_a_failure_of_the_gateway_itself_fails_one_request_only(desk, monkeypatch, capsys):

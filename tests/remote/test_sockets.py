@@ -68,6 +68,13 @@ def test_the_socket_of_a_dead_run_is_removed_or_taken_over(place):
         assert running() == ("pair",)
 
 
+def test_what_is_no_socket_is_left_alone(place):
+    listen("pair")[0].close()
+    (place / "folder.sock").mkdir()
+    assert running() == ()
+    assert [path.name for path in place.iterdir()] == ["folder.sock"]
+
+
 def test_a_gateway_that_is_too_busy_to_listen_is_not_taken_for_dead():
     listener, path = listen("pair")
     listener.listen(0)

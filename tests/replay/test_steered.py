@@ -333,3 +333,40 @@ def test_what_is_refused_only_in_the_replay_is_said(steer: Callable[..., Path], 
     )
     assert report.first is not None
     assert report.first.cycle == 5
+
+
+def test_cycles_that_are_lost_around_another_rate_are_no_contradiction(
+    steer: Callable[..., Path], changed: Change
+) -> None:
+    def lose(content: Any) -> None:
+        content.cycles = np.delete(content.cycles, range(18, 24))  # the rate changes in cycle 20
+
+    report = replay_log(changed(steer(STORIES["rates"]), lose))
+    assert (report.compared, report.different) == (18, 0)
+    assert report.stopped.startswith("the log misses cycles between 18 and 23")
+
+
+def test_a_policy_of_which_the_log_has_lost_the_beginning(
+    steer: Callable[..., Path], changed: Change
+) -> None:
+    policies = "policies: {exit_timeout: 4 s, on_exit: [{pose: home, speed: 60 deg/s}, limp]}\n"
+    log = steer({}, "poses: {home: {pan: 0 deg, tilt: 10 deg, nod: 5 deg}}\n" + policies)
+    begun = policy_begun(read_log(log))
+    assert begun is not None
+
+    def lose(content: Any) -> None:
+        content.commands.pop()
+
+    report = replay_log(changed(log, lose))
+    assert (report.compared, report.different) == (begun.cycle, 0)
+    assert report.stopped == f"the log misses in which cycle a policy began after cycle {begun.cycle - 1}"
+
+
+def test_a_bus_that_is_gone_before_the_policy(steer: Callable[..., Path]) -> None:
+    def pull(robot: VirtualRobot) -> None:
+        (port,) = robot.robot.hardware._ports.ports  # no face of a run pulls adapters
+        robot.buses[0].at(500 * MS, port.unplug)
+
+    policies = "policies: {exit_timeout: 4 s, on_fault: [{pose: home, speed: 60 deg/s}, limp]}\n"
+    log = whole(steer({5: [rate(100)]}, "poses: {home: {pan: 0 deg}}\n" + policies, pull))
+    assert policy_begun(log) is not None

@@ -45,7 +45,7 @@ STEPS = {
 TORQUE_ENABLE, GOAL, TORQUE_LIMIT = 24, 30, 34
 LATE_S = 0.03
 """How late a cycle is in the worst of the triggers."""
-START_NS = 500_000_000
+START_NS = 200_000_000
 """Since the loop's first deadline, or more, when something goes wrong."""
 Act = Callable[[Any, int], None]
 
@@ -277,8 +277,10 @@ def test_a_joint_that_cannot_reach_its_pose_does_not_keep_the_robot_from_its_end
     robot = built(on_exit=STEPS["pose"])
     stop_signal(robot, acts)
     servo = robot.buses[0].servo(3)
+    servo.wakes_on_goal = False
     robot.buses[0].at(START_NS - 100_000_000, lambda: servo.poke("torque_enable", 0))
     robot.run()
+    assert servo.position < (HOME[3] - 20) * TICK
     assert robot.clock.now_ns() < START_NS + 2_600_000_000
     assert not any(torque(robot).values())
 
@@ -294,6 +296,23 @@ def test_steps_are_cut_short_when_the_time_for_them_is_over(
     assert goals(robot, 3)[-1][0] < START_NS + 400_000_000
     assert goals(robot, 3)[0][1] < goals(robot, 3)[-1][1] < HOME[3]
     assert all(torque(robot).values())
+
+
+def test_periods_are_skipped_behind_the_end_of_the_motions_too(built: Callable[..., VirtualRobot]) -> None:
+    robot = built(duration_s=0.2, on_exit=STEPS["pose"])
+    hardware, clock = robot.robot.hardware, robot.clock
+    read, woken = hardware.read, []
+
+    def slow() -> None:
+        woken.append(robot.record.woken_ns)
+        if len(woken) == 22:
+            clock.wait_until(clock.now_ns() + 90_000_000)
+        read()
+
+    hardware.read = slow  # type: ignore[method-assign]
+    result = robot.run()
+    assert result.skipped == 4
+    assert np.diff(woken[10:]).min() >= 20_000_000, "two cycles never follow each other in a burst"
 
 
 @pytest.mark.parametrize(("rate", "refused"), [(1.0, True), (25.0, False)])

@@ -7,6 +7,7 @@ real-time kernel); a servo is *named* when a single reply of it is missing or ca
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -64,7 +65,7 @@ def verdict(timing: Timing, servos: Sequence[Servo], log: Log, lost: int) -> Ver
     """
     findings = [
         _loop(timing.periods, timing.latency, virtual=on_virtual_time(log)),
-        _slow(timing.steps, log),
+        _slow(log),
         _rough(timing.latency),
         _steered(timing.acts, timing.pauses),
         _silent(servos),
@@ -93,20 +94,21 @@ def _loop(account: Periods, wake_ups: Latency | None, *, virtual: bool) -> Findi
     )
 
 
-def _slow(steps: Sequence[Duration], log: Log) -> Finding | None:
-    """Say which step made a cycle longer than its period; `steps` ends with the whole cycle."""
-    if not steps:
+def _slow(log: Log) -> Finding | None:
+    """Say which step made a cycle longer than its period, of the cycle that exceeds it most."""
+    cycles, periods_ns = log.cycles, cycle_periods_ns(log)
+    if not len(cycles):
         return None
-    periods_ns = cycle_periods_ns(log)
-    lasted_ns = log.cycles["written_ns"] - log.cycles["woken_ns"]
-    worst = int(np.argmax(lasted_ns - periods_ns))
-    if lasted_ns[worst] <= periods_ns[worst]:
+    worst = int(np.argmax(cycles["written_ns"] - cycles["woken_ns"] - periods_ns))
+    times = [int(cycles[name][worst]) for name in ("woken_ns", "read_ns", "updated_ns", "written_ns")]
+    lasted_ns, period_ns = times[-1] - times[0], int(periods_ns[worst])
+    if lasted_ns <= period_ns:
         return None
-    longest = max(steps[:-1], key=lambda step: step.max_us)
+    steps_ns = (end - begin for begin, end in itertools.pairwise(times))
+    longest_ns, name = max(zip(steps_ns, ("read", "update", "write"), strict=True))
     return False, (
-        f"A cycle took up to {microseconds(lasted_ns[worst] / 1e3)}, longer than its period of "
-        f"{microseconds(periods_ns[worst] / 1e3)}; the longest {longest.name} took "
-        f"{microseconds(longest.max_us)}."
+        f"A cycle took up to {microseconds(lasted_ns / 1e3)}, longer than its period of "
+        f"{microseconds(period_ns / 1e3)}; its {name} took {microseconds(longest_ns / 1e3)}."
     )
 
 

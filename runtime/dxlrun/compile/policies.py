@@ -10,7 +10,7 @@ from dxlrun.compile.reach import Interval, degrees
 from dxlrun.control.policy_plan import HOLD, LIMP, POLICIES, Last, Policy, PolicyName, PolicyPlan, Step
 from dxlrun.control.safe_motion import longest_ns
 from dxlrun.description import Description
-from dxlrun.description.robot import PoseStep, TorqueStep
+from dxlrun.description.policies import PoseStep, TorqueStep
 from dxlrun.dynamixel.bus_plan import BusPlan
 
 MARGIN_NS = 100_000_000

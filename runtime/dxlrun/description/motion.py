@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Self
 
 from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
-from dxlrun.description.robot import Form, Name, refuse
+from dxlrun.description.form import Form, Name, refuse
 from dxlrun.description.units import Angle, AngularAcceleration, AngularVelocity, Duration
 
 

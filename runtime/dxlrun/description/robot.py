@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import (
     AfterValidator,
-    BaseModel,
     BeforeValidator,
-    ConfigDict,
-    Discriminator,
     Field,
-    Tag,
-    WithJsonSchema,
     model_validator,
 )
-from pydantic_core import PydanticCustomError
 
+from dxlrun.description.form import Form, Name, refuse
+from dxlrun.description.policies import Policies
 from dxlrun.description.units import (
     Angle,
     AngularVelocity,
@@ -30,19 +25,6 @@ from dxlrun.description.units import (
 
 _LONGEST_TIMER_NS = 255_000_000
 """The latency timer of an FTDI chip is one byte, ms (FTDI AN232B-04)."""
-_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*", re.ASCII)
-
-
-def refuse(what: str, mend: str) -> PydanticCustomError:
-    """Return the error of a validator that says what is wrong, and apart from it how to mend it."""
-    return PydanticCustomError("dxlrun", "{what}; {mend}", {"what": what, "mend": mend})
-
-
-def _name(value: str) -> str:
-    # names become topics of the log and interfaces `<joint>/<interface>`
-    if not _NAME.fullmatch(value):
-        raise refuse(f"{value!r} is no name", "start with a letter, and use letters, digits and _ only")
-    return value
 
 
 def _protocol(value: float) -> float:
@@ -74,20 +56,6 @@ def _cores(value: tuple[int, ...]) -> tuple[int, ...]:
     if not value or len(set(value)) < len(value):
         raise refuse("cores are given once each, and at least one", "write for example [3]")
     return value
-
-
-Name = Annotated[
-    str,
-    AfterValidator(_name),
-    WithJsonSchema({"type": "string", "pattern": f"^{_NAME.pattern}$"}),
-]
-"""Letters, digits and _, first a letter."""
-
-
-class Form(BaseModel):
-    """Base of all parts: frozen, unknown keys refused, finite numbers only, no number made from text."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
 
 class Adapter(Form):
@@ -274,83 +242,6 @@ class ControllerEntry(Form):
             return entry
         own = {key: value for key, value in entry.items() if key in _COMMON_KEYS}
         return {**own, "parameters": {key: value for key, value in entry.items() if key not in own}}
-
-
-class PoseStep(Form):
-    """A step of a policy: to a pose."""
-
-    pose: str = Field(min_length=1, description="Name of a pose.", examples=["home"])
-    speed: Annotated[AngularVelocity, Field(gt=0)] = Field(
-        description="How fast each joint goes there.", examples=["60 deg/s"]
-    )
-
-
-class TorqueStep(Form):
-    """A step of a policy: less torque, little by little."""
-
-    reduce_torque: float = Field(
-        gt=0, lt=1, description="What is left of each servo's own torque limit.", examples=["0.3"]
-    )
-    steps: int = Field(default=5, ge=1, le=100, description="In how many steps.", examples=["5"])
-    over: Annotated[Duration, Field(gt=0)] = Field(
-        default=1_000_000_000, description="How long it takes.", examples=["1 s"]
-    )
-
-
-Word = Literal["limp", "hold"]
-"""Torque off; or torque on, every joint where it is."""
-
-
-def _kind_of_step(step: object) -> str:
-    if isinstance(step, dict):
-        return "<torque>" if "reduce_torque" in step else "<pose>"
-    if isinstance(step, TorqueStep):
-        return "<torque>"
-    return "<pose>" if isinstance(step, PoseStep) else "<word>"
-
-
-def _kind_of_policy(policy: object) -> str:
-    return "<steps>" if isinstance(policy, list | tuple | dict) else "<word>"
-
-
-PolicyStep = Annotated[
-    Annotated[Word, Tag("<word>")]
-    | Annotated[PoseStep, Tag("<pose>")]
-    | Annotated[TorqueStep, Tag("<torque>")],
-    Discriminator(_kind_of_step),
-]
-Policy = Annotated[
-    Annotated[Word, Tag("<word>")]
-    | Annotated[tuple[PolicyStep, ...], Field(strict=False, min_length=1), Tag("<steps>")],
-    Discriminator(_kind_of_policy),
-]
-"""What is done, in order; after the last step the robot is limp, unless that is `hold`."""
-
-
-class Policies(Form):
-    """What happens when something does not go on as planned."""
-
-    on_exit: Policy = Field(
-        default="limp",
-        description="At the end of a run.",
-        examples=["[{pose: home, speed: 60 deg/s}, limp]"],
-    )
-    on_fault: Policy = Field(
-        default="limp", description="When the loop, a bus or a controller failed.", examples=["limp"]
-    )
-    on_lost_servo: Policy = Field(
-        default="hold",
-        description="When a servo stopped answering; hold: its controllers wait, the others go on.",
-        examples=["hold"],
-    )
-    on_stale_command: Policy = Field(
-        default="hold",
-        description="When a stream of commands stopped; hold: its joints stay, the run goes on.",
-        examples=["hold"],
-    )
-    exit_timeout: Duration = Field(
-        default=2_000_000_000, gt=0, description="Longest orderly end of a run.", examples=["2 s"]
-    )
 
 
 class Recording(Form):

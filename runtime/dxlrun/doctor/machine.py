@@ -8,10 +8,20 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from dxlrun.control.rights import UNLIMITED, highest_priority, lockable_bytes, user
+from dxlrun.control.rights import (
+    IPC_LOCK,
+    SYS_NICE,
+    UNLIMITED,
+    has_capability,
+    highest_priority,
+    lockable_bytes,
+    user,
+)
 
 NEEDED = ("memfd_create", "pidfd_open", "sched_setscheduler")
 """Calls of `os` without which no run starts; Linux has them all since 5.3."""
+
+_CAPABILITIES = {SYS_NICE: "CAP_SYS_NICE", IPC_LOCK: "CAP_IPC_LOCK"}
 
 
 def _open_to_us(path: Path) -> bool:
@@ -41,6 +51,8 @@ class Machine:
     user: str = "nobody"
     cores: int = 1
     """On which this process may run."""
+    capabilities: tuple[str, ...] = ()
+    """Those that matter here: CAP_SYS_NICE, CAP_IPC_LOCK."""
     highest_priority: int = 0
     """99 with the capability; 0: none."""
     lockable: int = 0
@@ -57,6 +69,7 @@ class Machine:
         return cls(
             user=user(),
             cores=len(os.sched_getaffinity(0)),
+            capabilities=tuple(name for bit, name in _CAPABILITIES.items() if has_capability(bit)),
             highest_priority=highest_priority(),
             lockable=lockable_bytes(),
         )

@@ -28,16 +28,20 @@ def priority(machine: Machine) -> Finding:
             why,
             _CONTAINER if machine.container else "sudo sysctl kernel.sched_rt_runtime_us=950000",
         )
-    return Finding(what, "good", f"up to {highest}", why)
+    return Finding(what, "good", f"up to {highest}, {_by(machine, 'CAP_SYS_NICE', 'rtprio')}", why)
 
 
 def locked_memory(machine: Machine) -> Finding:
     """Look whether a run may lock all of its memory (RLIMIT_MEMLOCK, CAP_IPC_LOCK)."""
     what, why = "locked memory", "a page that was swapped out delays the loop by milliseconds"
     if machine.locks_all:
-        return Finding(what, "good", "all of it may be locked", why)
+        return Finding(what, "good", f"all of it, {_by(machine, 'CAP_IPC_LOCK', 'memlock')}", why)
     found = f"only {machine.lockable >> 10} KiB may be locked"
     return Finding(what, "worse", found, why, _mend(machine, "memlock", "unlimited"))
+
+
+def _by(machine: Machine, capability: str, limit: str) -> str:
+    return f"by {capability}" if capability in machine.capabilities else f"by the limit {limit}"
 
 
 def _mend(machine: Machine, limit: str, value: int | str) -> str:

@@ -116,7 +116,7 @@ class RemoteRobot:
         return self._ask("GET", "/states")
 
     def events(self, after: int = 0) -> dict[str, object]:
-        """Return what happened since event number `after`, at most 200, and the number of the last one."""
+        """Return what happened since event number `after`, as far as it is kept, and the last number."""
         return self._ask("GET", f"/events?after={after}")
 
     # Steering

@@ -30,6 +30,7 @@ class Connection(H11Protocol):
         """Begin, unless it is somebody else's; let another one go when there are too many."""
         super().connection_made(transport)
         self.heard = self.loop.time()
+        self._timer = self.loop.call_later(SILENCE_S, self._look)
         process, user = _peer(transport)
         if user not in (0, os.getuid()):  # the socket's mode says the same; twice is not too often
             transport.abort()
@@ -42,7 +43,12 @@ class Connection(H11Protocol):
         ]
         if len(others) >= MOST_CONNECTIONS:
             min(others, key=lambda one: (one.busy, one.heard)).transport.abort()
-        self._look()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Leave nothing behind: a timer would keep all of it for as long as the patience lasts."""
+        self._timer.cancel()
+        self._unset_keepalive_if_required()
+        super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
         """Take what came."""
@@ -59,8 +65,8 @@ class Connection(H11Protocol):
         silent = self.loop.time() - self.heard
         if silent >= SILENCE_S:
             self.transport.abort()  # not close: that would wait for a reader that may never read
-        elif not self.transport.is_closing():
-            self.loop.call_later(SILENCE_S - silent + 0.01, self._look)
+        else:
+            self._timer = self.loop.call_later(SILENCE_S - silent + 0.01, self._look)
 
 
 def _peer(transport: asyncio.Transport) -> tuple[int, int]:

@@ -19,7 +19,6 @@ import time
 import traceback
 from collections.abc import Awaitable, Callable
 from functools import partial
-from itertools import islice
 from typing import TypeAlias
 
 import msgspec
@@ -40,8 +39,6 @@ MOST_OPERATIONS = 200.0
 MOST_SET_POINTS = 4000.0
 MOST_LOOKS = 2000.0
 """A second, of one process; a short burst may be as many at once as come in a tenth of it."""
-MOST_EVENTS = 200
-"""In one answer; `last` is the number after which to ask for the rest."""
 LEASE_S = (0.01, 0.2, 60.0)
 """Shortest, default and longest time that a set-point of a stream counts."""
 LONGEST_SENTENCE = 2000
@@ -132,9 +129,8 @@ class Gateway:
         return _json({"cycle": record.cycle, "time": record.woken_ns * 1e-9, "joints": rows})
 
     async def events(self, request: Request) -> Response:
-        """What happened since event `after`, as far as it is kept; the oldest first, so many at once."""
+        """What happened since event `after`, as far as it is kept; `last` is the newest's number."""
         after = number(request, "after", 0.0)
-        found = list(islice(((n, event) for n, event in self._link.events if n > after), MOST_EVENTS))
         newest = self._link.events[-1][0] if self._link.events else 0
         rows = [
             {
@@ -145,9 +141,10 @@ class Gateway:
                 "source": event.source,
                 "text": event.text,
             }
-            for n, event in found
+            for n, event in self._link.events
+            if n > after
         ]
-        return _json({"events": rows, "last": found[-1][0] if found else newest})
+        return _json({"events": rows, "last": newest})
 
     # Steering
 

@@ -28,6 +28,8 @@ MOST_WAITING = 64
 MOST_WAITING_BYTES = 2 * LARGEST
 """What may wait for the loop's answer; the rest of the mailbox is kept for `stop`."""
 KEPT_EVENTS = 1000
+KEPT_TEXT = 1 << 20
+"""So many of the newest events are kept for clients, and so many characters of their texts."""
 LONGEST_DATA = LARGEST - 1024
 """Bytes; what an operation of the mailbox has beside names."""
 _LOOK_S = 0.002
@@ -79,7 +81,7 @@ class Link:
         self.paused = False
         self.heartbeat = Heartbeat(memory.heartbeat)
         self.controllers = {one.name: Loaded(one, place) for place, one in enumerate(plan.loop.controllers)}
-        self.events: deque[tuple[int, Event]] = deque(maxlen=KEPT_EVENTS)
+        self.events: deque[tuple[int, Event]] = deque()
         self._cycles = RingReader(memory.cycles)
         joints = tuple(joint.name for joint in plan.loop.joints)
         layout = CycleLayout(joints, tuple(one.name for one in plan.loop.controllers))
@@ -89,6 +91,7 @@ class Link:
         self._answers = Answers(memory.answers)
         self._numbers = itertools.count(1)
         self._event_numbers = itertools.count(1)
+        self._text = 0
         self._asked: dict[int, _Asked] = {}
         self._asked_bytes = 0
 
@@ -202,6 +205,9 @@ class Link:
 
     def _hear(self, teller: _Teller, event: Event) -> None:
         """Keep an event; a long text comes in pieces, one after the other."""
+        self._text += len(event.text)
+        while self.events and (self._text > KEPT_TEXT or len(self.events) >= KEPT_EVENTS):
+            self._text -= len(self.events.popleft()[1].text)
         if event.part:
             for index in reversed(range(len(self.events))):
                 number, before = self.events[index]

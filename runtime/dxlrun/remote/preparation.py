@@ -6,7 +6,9 @@ All of a plug-in's code that a client can reach runs here, in the gateway's proc
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Mapping
+import signal
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,10 +19,13 @@ from dxlrun.control.contract import interfaces_breach
 from dxlrun.control.controller import Interfaces
 from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.control.plugins import Offer, PlugIns
-from dxlrun.description.robot import ControllerEntry, Name
+from dxlrun.description.form import Name
+from dxlrun.description.robot import ControllerEntry
 
 LONGEST_NAME = 64
 """Of a controller that is loaded; the log cuts names there."""
+BUDGET_S = 5.0
+"""How long a plug-in may think about one wish, while every other client waits, who wants to stop too."""
 _MOST_MISTAKES = 5
 _LONGEST_PLACE = 80
 _NAME: TypeAdapter[str] = TypeAdapter(Name)
@@ -32,6 +37,33 @@ class Refusal(Exception):
     def __init__(self, status: int, sentence: str) -> None:
         super().__init__(sentence)
         self.status = status
+
+
+class _TooLong(BaseException):
+    """A plug-in thought for too long; no Exception, which it may catch."""
+
+
+@contextmanager
+def _bounded(whose: str) -> Iterator[None]:
+    """Interrupt a plug-in's Python code after BUDGET_S, in the main thread; raises Refusal then.
+
+    A call into C that never returns is not interrupted: then Ctrl-C in the robot's terminal is what is left.
+    """
+
+    def interrupt(*_: object) -> None:
+        raise _TooLong
+
+    before = signal.signal(signal.SIGALRM, interrupt)
+    signal.setitimer(signal.ITIMER_REAL, BUDGET_S)
+    try:
+        yield
+    except _TooLong:
+        raise Refusal(
+            422, f"{whose} thought about this for more than {BUDGET_S:g} s; send less at once"
+        ) from None
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,10 +104,13 @@ class Preparation:
                 raise Refusal(404, f"{plan.name} takes no commands")
             raise Refusal(404, f"{plan.name} takes no command {kind}; {suggestion(kind, known)}")
         try:
-            command = model.model_validate_json(body)
-            parameters = controller.Parameters.model_validate_json(plan.parameters)
-            prepared = controller.prepare(kind, command, parameters)
-            return np.ascontiguousarray(prepared, dtype="<f8").tobytes()
+            with _bounded(plan.name):
+                command = model.model_validate_json(body)
+                parameters = controller.Parameters.model_validate_json(plan.parameters)
+                prepared = controller.prepare(kind, command, parameters)
+                return np.ascontiguousarray(prepared, dtype="<f8").tobytes()
+        except Refusal:
+            raise
         except ValidationError as error:
             raise Refusal(422, f"{kind} of {plan.name}: {told(error)}") from error
         except ValueError as error:  # the way in which a plug-in refuses
@@ -124,8 +159,11 @@ class Preparation:
     def _interfaces(self, name: str, offer: Offer, own: Mapping[str, object]) -> Interfaces:
         """Ask a controller's class what it wants with these parameters."""
         try:
-            parameters = offer.controller.Parameters.model_validate(own)
-            interfaces = offer.controller.interfaces(parameters, self.joints)
+            with _bounded(name):
+                parameters = offer.controller.Parameters.model_validate(own)
+                interfaces = offer.controller.interfaces(parameters, self.joints)
+        except Refusal:
+            raise
         except ValidationError as error:
             raise Refusal(422, f"{name}: {told(error)}") from error
         except (Exception, SystemExit) as error:  # a plug-in's code

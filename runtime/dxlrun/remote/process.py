@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import ctypes
+import math
 import signal
 import socket
 import sys
@@ -17,7 +18,7 @@ from dxlrun import process
 from dxlrun.compile.plan import Plan, from_json
 from dxlrun.control.plugins import load_plugins
 from dxlrun.errors import DxlrunError
-from dxlrun.remote.connection import MOST_CONNECTIONS, Connection
+from dxlrun.remote.connection import MOST_CONNECTIONS, SILENCE_S, Connection
 from dxlrun.remote.gateway import Gateway
 from dxlrun.remote.job import GatewayJob
 from dxlrun.remote.link import Link
@@ -49,6 +50,7 @@ async def serve(link: Link, gateway: Gateway, listener: socket.socket, control: 
         proxy_headers=False,
         server_header=False,
         backlog=MOST_CONNECTIONS,
+        timeout_keep_alive=math.ceil(SILENCE_S) + 1,  # the connection's own patience ends before
         timeout_graceful_shutdown=1,
         h11_max_incomplete_event_size=16384,
     )

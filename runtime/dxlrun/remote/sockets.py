@@ -119,6 +119,6 @@ def sockets() -> dict[str, Path]:
             for path in place.glob(f"*{SUFFIX}"):
                 if alive(path):
                     found.setdefault(path.stem, path)
-                else:
+                elif path.is_socket():
                     path.unlink(missing_ok=True)
     return found

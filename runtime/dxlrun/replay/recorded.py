@@ -172,11 +172,15 @@ def _check_times(log: Log, start_ns: int, period_ns: int) -> None:
     passed = np.diff(number, prepend=0)
     elapsed_ns = np.diff(due, prepend=start_ns)
     changes = [command.cycle for command in log.commands if command.for_loop and command.kind == "rate"]
-    begins = np.unique(np.searchsorted(number, changes, side="right")).tolist()
+    begins = np.unique(np.searchsorted(number, changes, side="right"))
+    begins = begins[begins < len(number)]
+    unknown = begins[passed[begins] != 1 + cycles["skipped"][begins]]
     period = np.full(len(number), period_ns)
-    for first, end in itertools.pairwise([*begins, len(number)]):
-        period[first:end] = elapsed_ns[first] // max(int(passed[first]), 1)
-    wrong = (woken < due) | (cycles["read_ns"] < woken) | (elapsed_ns != passed * period)
+    for first, end in itertools.pairwise([*np.union1d(begins, unknown + 1).tolist(), len(number)]):
+        period[first:end] = elapsed_ns[first] // max(int(passed[first]), 1) if first < end else 0
+    uneven = elapsed_ns != passed * period
+    uneven[unknown] = False
+    wrong = (woken < due) | (cycles["read_ns"] < woken) | uneven
     wrong[1:] |= passed[1:] <= 0
     _check_commands(log)
     if wrong.any():
@@ -238,7 +242,13 @@ def _until_policy(log: Log, usable: int, stopped: str) -> tuple[int, int, str]:
     """
     cycles, policy = log.cycles, policy_begun(log)
     if policy is None:
-        return usable, usable, stopped
+        told = [
+            event.t_ns for event in log.events if (event.code, event.source) == (EventCode.POLICY, "loop")
+        ]
+        ends = int(np.searchsorted(cycles["woken_ns"], told[0], side="right")) if told else usable
+        if ends >= usable:
+            return usable, usable, stopped
+        return ends, ends, f"the log misses in which cycle a policy began after cycle {ends - 1}"
     ends = min(usable, int(np.searchsorted(cycles["cycle"], policy.cycle)))
     if 0 < ends < usable:
         passed_ns = int(cycles["woken_ns"][ends]) - int(cycles["woken_ns"][ends - 1])

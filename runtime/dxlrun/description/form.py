@@ -1,0 +1,37 @@
+"""Form: what all parts of the files have in common, and what a name may be."""
+
+from __future__ import annotations
+
+import re
+from typing import Annotated
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, WithJsonSchema
+from pydantic_core import PydanticCustomError
+
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*", re.ASCII)
+
+
+def refuse(what: str, mend: str) -> PydanticCustomError:
+    """Return the error of a validator that says what is wrong, and apart from it how to mend it."""
+    return PydanticCustomError("dxlrun", "{what}; {mend}", {"what": what, "mend": mend})
+
+
+def _name(value: str) -> str:
+    # names become topics of the log and interfaces `<joint>/<interface>`
+    if not _NAME.fullmatch(value):
+        raise refuse(f"{value!r} is no name", "start with a letter, and use letters, digits and _ only")
+    return value
+
+
+Name = Annotated[
+    str,
+    AfterValidator(_name),
+    WithJsonSchema({"type": "string", "pattern": f"^{_NAME.pattern}$"}),
+]
+"""Letters, digits and _, first a letter."""
+
+
+class Form(BaseModel):
+    """Base of all parts: frozen, unknown keys refused, finite numbers only, no number made from text."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
