@@ -1,7 +1,13 @@
-"""A replay of a steered run has no difference: what clients asked, they ask of the same cycles again."""
+"""A replay of a steered run has no difference: what clients asked, they ask of the same cycles again.
+
+CI tries 8 random runs. More of them before a release:
+
+    DXLRUN_STEERED_RUNS=1000 pytest tests/replay/test_steered.py -m campaign
+"""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -135,6 +141,27 @@ def steer(robot_file: Path, tmp_path: Path) -> Callable[..., Path]:
     return run
 
 
+@pytest.fixture(scope="module")
+def logs() -> dict[str, Path]:
+    """The logs of the stories that were told already."""
+    return {}
+
+
+@pytest.fixture
+def tell(
+    steer: Callable[..., Path], logs: dict[str, Path], tmp_path_factory: pytest.TempPathFactory
+) -> Callable[[str], Path]:
+    """Return the log of a story, which is run once."""
+
+    def told(story: str) -> Path:
+        if story not in logs:
+            log = steer(STORIES[story], edit=FALLS if story == "a fallback" else KEEPS)
+            logs[story] = log.rename(tmp_path_factory.mktemp("story") / "run.mcap")
+        return logs[story]
+
+    return told
+
+
 def whole(path: Path) -> Log:
     """Assert that a replay compares everything and finds no difference; return the log."""
     log = read_log(path)
@@ -146,8 +173,8 @@ def whole(path: Path) -> Log:
 
 
 @pytest.mark.parametrize("story", STORIES)
-def test_a_steered_run(steer: Callable[..., Path], story: str) -> None:
-    log = whole(steer(STORIES[story], edit=FALLS if story == "a fallback" else KEEPS))
+def test_a_steered_run(tell: Callable[[str], Path], story: str) -> None:
+    log = whole(tell(story))
     asked = [command for _, commands in sorted(STORIES[story].items()) for command in commands]
     told = [(one.command.controller, one.command.kind, one.command.lease_ns) for one in steered(log)]
     assert told == [(one.controller, one.kind, one.lease_ns) for one in asked]
@@ -157,14 +184,14 @@ def test_a_steered_run(steer: Callable[..., Path], story: str) -> None:
     ]
 
 
-def test_the_stories_do_what_they_are_there_for(steer: Callable[..., Path]) -> None:
-    log = whole(steer(STORIES["rates"]))
+def test_the_stories_do_what_they_are_there_for(tell: Callable[[str], Path]) -> None:
+    log = read_log(tell("rates"))
     assert set(np.diff(log.cycles["scheduled_ns"]).tolist()) == {20 * MS, 10 * MS, 5 * MS}
-    log = whole(steer(STORIES["a fallback"], edit=FALLS))
+    log = read_log(tell("a fallback"))
     assert {int(mask) for mask in log.cycles["active"]} == {0b0111, 0b1011}
-    log = whole(steer(STORIES["a controller that is loaded"]))
+    log = read_log(tell("a controller that is loaded"))
     assert (log.cycles["active"] >> 5 & 1).any()
-    log = whole(steer(STORIES["a stream that ends"]))
+    log = read_log(tell("a stream that ends"))
     assert [event.name for event in log.events].count("stale_command") == 1
 
 
@@ -245,7 +272,12 @@ COMMANDS = st.one_of(
 )
 
 
-@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@pytest.mark.campaign
+@settings(
+    max_examples=int(os.environ.get("DXLRUN_STEERED_RUNS", "8")),
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
 @given(st.dictionaries(st.integers(0, 45), st.lists(COMMANDS, min_size=1, max_size=4), max_size=15))
 def test_any_sequence_of_commands(steer: Callable[..., Path], asked: dict[int, list[Command]]) -> None:
     whole(steer({**asked, 60: [ask("stop")]}))  # a pause has no end
@@ -285,37 +317,37 @@ FLIPPED: dict[str, tuple[str, Callable[[Any], None], int]] = {
 
 
 @pytest.mark.parametrize("flipped", FLIPPED)
-def test_a_flipped_command_is_found(steer: Callable[..., Path], changed: Change, flipped: str) -> None:
+def test_a_flipped_command_is_found(tell: Callable[[str], Path], changed: Change, flipped: str) -> None:
     story, change, latest = FLIPPED[flipped]
-    report = replay_log(changed(steer(STORIES[story]), change))
+    report = replay_log(changed(tell(story), change))
     assert not report.same
     assert report.first is not None
     assert report.first.cycle <= latest, report.first
 
 
-def test_another_rate_contradicts_the_deadlines(steer: Callable[..., Path], changed: Change) -> None:
-    log = steer(STORIES["rates"])
+def test_another_rate_contradicts_the_deadlines(tell: Callable[[str], Path], changed: Change) -> None:
+    log = tell("rates")
     with pytest.raises(LogError, match="a change of the rate in the log is not the one that was made"):
         replay_log(changed(log, with_command("rate", data=rate(50).data)))
     with pytest.raises(LogError, match="contradict"):
         replay_log(changed(log, with_command("rate", kind="resume")))
 
 
-def test_a_command_at_another_time_is_damage(steer: Callable[..., Path], changed: Change) -> None:
-    log = steer(STORIES["a pause in a motion"])
+def test_a_command_at_another_time_is_damage(tell: Callable[[str], Path], changed: Change) -> None:
+    log = tell("a pause in a motion")
     for kind in ("pause", "trajectory"):
         with pytest.raises(LogError, match=f"a command \\({kind}\\) that cycle .* has not its time"):
             replay_log(changed(log, with_command(kind, t_ns=77)))
 
 
 def test_nothing_is_compared_behind_a_lost_command_for_the_loop(
-    steer: Callable[..., Path], changed: Change
+    tell: Callable[[str], Path], changed: Change
 ) -> None:
     def lose(content: Any) -> None:
         content.commands = [one for one in content.commands if one.kind != "resume"]
         content.gaps = [("loop/commands", 1)]
 
-    report = replay_log(changed(steer(STORIES["a pause in a motion"]), lose))
+    report = replay_log(changed(tell("a pause in a motion"), lose))
     assert (report.compared, report.different) == (30, 0)
     assert report.stopped.startswith(
         "the log misses a command that cycle 30 took (1 record of loop/commands was overwritten or damaged "
@@ -323,10 +355,10 @@ def test_nothing_is_compared_behind_a_lost_command_for_the_loop(
     )
 
 
-def test_what_is_refused_only_in_the_replay_is_said(steer: Callable[..., Path], changed: Change) -> None:
+def test_what_is_refused_only_in_the_replay_is_said(tell: Callable[[str], Path], changed: Change) -> None:
     gone = replace(LOADED, type="gone")
     change = with_command("load", data=msgspec.json.encode(gone))
-    report = replay_log(changed(steer(STORIES["a controller that is loaded"]), change))
+    report = replay_log(changed(tell("a controller that is loaded"), change))
     assert report.remarks[0] == (
         "load for the loop in cycle 5 was done in the run and is refused (no plug-in offers the type gone of "
         "controller guest) in the replay"
@@ -336,12 +368,12 @@ def test_what_is_refused_only_in_the_replay_is_said(steer: Callable[..., Path], 
 
 
 def test_cycles_that_are_lost_around_another_rate_are_no_contradiction(
-    steer: Callable[..., Path], changed: Change
+    tell: Callable[[str], Path], changed: Change
 ) -> None:
     def lose(content: Any) -> None:
         content.cycles = np.delete(content.cycles, range(18, 24))  # the rate changes in cycle 20
 
-    report = replay_log(changed(steer(STORIES["rates"]), lose))
+    report = replay_log(changed(tell("rates"), lose))
     assert (report.compared, report.different) == (18, 0)
     assert report.stopped.startswith("the log misses cycles between 18 and 23")
 
