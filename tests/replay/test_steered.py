@@ -1,8 +1,6 @@
 """A replay of a steered run has no difference: what clients asked, they ask of the same cycles again.
 
-CI tries 8 random runs. More of them before a release:
-
-    DXLRUN_STEERED_RUNS=1000 pytest tests/replay/test_steered.py -m campaign
+CI tries 8 random runs; `DXLRUN_STEERED_RUNS=1000 pytest tests/replay/test_steered.py` tries more.
 """
 
 from __future__ import annotations
@@ -52,7 +50,6 @@ LOADED = ControllerPlan(
 
 
 def ask(kind: str, data: object = None) -> Command:
-    """Return a command for the loop."""
     return Command(0, "", kind, b"" if data is None else msgspec.json.encode(data), "anna")
 
 
