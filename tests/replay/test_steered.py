@@ -36,17 +36,9 @@ KEEPS = ("", "")
 FALLS = ("[tilt, nod]}", "[tilt, nod], give_up_after: 0.35, fallback: standby}")
 FAILS = ("[tilt, nod]}", "[tilt, nod], give_up_after: 0.35}")
 LOADED = ControllerPlan(
-    name="guest",
-    type="joint_group_posvel_controller",
-    distribution="dxlrun 0",
-    parameters='{"joints":["nod"]}',
-    joints=("nod",),
-    command=("position", "velocity"),
-    publishes=(),
-    active=False,
-    every=1,
-    rate=25.0,
-)
+    "guest", "joint_group_posvel_controller", "dxlrun 0", '{"joints":["nod"]}', ("nod",),
+    ("position", "velocity"), (), active=False, every=1, rate=25.0,
+)  # fmt: skip
 
 
 def ask(kind: str, data: object = None) -> Command:
