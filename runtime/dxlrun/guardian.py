@@ -210,8 +210,8 @@ class Guardian:
     def _impatience(self) -> Literal["hung", "late"] | None:
         """Return why the loop is not waited for any longer, if it is not."""
         now_ns, phase = self._clock.now_ns(), self._heartbeat.phase
-        still_ns = self._still.ns((phase, self._heartbeat.beats), now_ns)
-        if still_ns > self._patience_ns(phase):
+        patience_ns = self._patience_ns(phase)  # first: the loop beats before it asks for less of it
+        if self._still.ns((phase, self._heartbeat.beats), now_ns) > patience_ns:
             return "hung"
         return "late" if now_ns > self._stop_by_ns else None
 

@@ -105,13 +105,15 @@ class RingSinks:
 
 
 def _refuse_threads() -> Callable[[str], None]:
-    """Return the check that no plug-in brought a thread into the loop's process."""
+    """Return the check that no plug-in brought a thread into the loop's process, the fault of the newest."""
+    before = 1
 
     def check(name: str) -> None:
-        count = realtime.thread_count()
-        if count != 1:
+        nonlocal before
+        more, before = realtime.thread_count() - before, max(before, realtime.thread_count())
+        if more > 0:
             raise PlugInError(
-                f"plug-in {name} started {counted(count - 1, 'more thread', 'more threads')} in the loop's "
+                f"plug-in {name} started {counted(more, 'more thread', 'more threads')} in the loop's "
                 "process; "
                 "CPython would hand the interpreter over to them in the middle of a cycle: "
                 "let it work in on_configure without threads, or in a process of its own"

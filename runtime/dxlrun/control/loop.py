@@ -11,7 +11,7 @@ import numpy as np
 from dxlrun.clock import Clock
 from dxlrun.commands import CommandSink, NoCommands, TakenCommand
 from dxlrun.control.gate import Gate
-from dxlrun.control.loop_plan import LoopPlan
+from dxlrun.control.loop_plan import ControllerPlan, LoopPlan
 from dxlrun.control.lost_servos import LostServos
 from dxlrun.control.managed import PERIOD_CAP
 from dxlrun.control.manager import Manager
@@ -27,8 +27,8 @@ from dxlrun.hardware import LOST_CYCLES, Hardware
 from dxlrun.inbox import LOOP, Inbox, NoInbox
 from dxlrun.plurals import counted
 
-MOST_RATE = 100_000.0
-"""Hz; as in the robot file."""
+LEAST_RATE, MOST_RATE = 0.01, 100_000.0
+"""Hz; the latter as in the robot file."""
 PAUSED_CYCLE_NS = 200_000_000
 """How long a cycle may take while the loop is paused: a controller may be loaded in it. The guardian has
 patience for some of them."""
@@ -105,6 +105,10 @@ class Loop:
     paused: bool = field(default=False, init=False)
     _cycle: int = field(default=0, init=False)
     _paused_cycles: int = field(default=0, init=False)
+    _stood: bool = field(default=False, init=False)
+    """True in a cycle that is, or was until a moment ago, in a pause: a controller may have been loaded."""
+    _time_ns: int = field(default=0, init=False)
+    """The controllers' time at their last updates."""
     _woken_ns: int = field(default=0, init=False)
     _cycles: int = field(default=0, init=False)
     _skipped: int = field(default=0, init=False)
@@ -156,8 +160,8 @@ class Loop:
 
     def change_rate(self, rate: float) -> str:
         """Run in another period from the next cycle on, Hz; return why not."""
-        if not 0 < rate <= MOST_RATE:
-            return f"{rate:g} Hz is no rate; write one up to {MOST_RATE:g}"
+        if not LEAST_RATE <= rate <= MOST_RATE:
+            return f"{rate:g} Hz is no rate; write one from {LEAST_RATE:g} Hz to {MOST_RATE:g} Hz"
         period_ns = round(1e9 / rate)
         if period_ns < self.plan.least_period_ns:
             return f"the buses allow at most {1e9 / self.plan.least_period_ns:.4g} Hz"
@@ -166,7 +170,7 @@ class Loop:
         if refusal := self.manager.change_period(period_ns):
             return refusal
         self.schedule.change(self._cycle, period_ns)
-        self.patience(period_ns)
+        self._tell_patience()
         self.pace(period_ns)
         return ""
 
@@ -174,8 +178,8 @@ class Loop:
         """Stop the controllers' time after this cycle's read; return why not."""
         if self.paused:
             return "the loop is paused already"
-        self.paused = True
-        self.patience(PAUSED_CYCLE_NS)
+        self.paused = self._stood = True
+        self._tell_patience()
         return ""
 
     def resume(self) -> str:
@@ -184,8 +188,14 @@ class Loop:
             return "the loop is not paused"
         self.paused = False
         self.gate.ease_in()
-        self.patience(self.schedule.period_ns)
+        self._tell_patience()
         return ""
+
+    def load(self, plan: ControllerPlan) -> str:
+        """Configure one more controller, inactive; return why not. The guardian has patience for each."""
+        refusal = self.manager.load(plan)
+        self.beat()
+        return refusal
 
     def finish(self) -> str:
         """End the run in order after this cycle."""
@@ -202,6 +212,12 @@ class Loop:
         return f"the run ends: {policy.text}"
 
     # Inside
+
+    def _tell_patience(self) -> None:
+        """Tell the guardian how long a cycle may take; what this one took until now counts no more."""
+        self.beat()
+        period_ns = self.schedule.period_ns
+        self.patience(max(period_ns, PAUSED_CYCLE_NS) if self.paused else period_ns)
 
     def _cycle_until_end(self) -> tuple[Literal["ended", "stopped", "fault"], str]:
         """Run cycles; return why they ended, and a sentence for a fault."""
@@ -230,6 +246,7 @@ class Loop:
         record.scheduled_ns = deadline_ns
         record.woken_ns = woken_ns
         record.period_ns = dt_ns
+        self._stood = self.paused
         self.hardware.read()
         record.read_ns = now_ns()
         self.manager.begin()
@@ -237,7 +254,7 @@ class Loop:
             self.steering.refuse("the run is ending")
             self._motion.command()
         else:
-            self._command(cycle, schedule.time_ns(woken_ns))
+            self._command(cycle, self._controllers_time())
         self.gate.apply(record.commands, record.goals, dt_ns)
         record.updated_ns = now_ns()
         self.hardware.write()
@@ -256,7 +273,17 @@ class Loop:
             record.commands.position.fill(np.nan)
             record.commands.velocity.fill(np.nan)
         else:
+            self._time_ns = time_ns
             self.manager.update(cycle - self._paused_cycles, time_ns)
+
+    def _controllers_time(self) -> int:
+        """Return the time of this cycle for controllers, which never goes back: who was late when the pause
+        began may catch up in it."""
+        time_ns = self.schedule.time_ns(self._woken_ns)
+        if self.paused and time_ns <= self._time_ns:
+            self.schedule.paused_ns -= self._time_ns + self.schedule.period_ns - time_ns
+            time_ns = self.schedule.time_ns(self._woken_ns)
+        return time_ns
 
     def _miss(self) -> None:
         """Other servos are lost than in the cycle before: do what the policy says."""
@@ -313,21 +340,24 @@ class Loop:
         """Go to the next cycle, past those that are declared skipped; say whether that is to end the run."""
         cycle, schedule = self._cycle, self.schedule
         now_ns, policy = self.clock.now_ns(), self.plan.overrun
-        if now_ns > (due_ns := schedule.deadline_ns(cycle + 1)):
-            policy = self._overruns.decide(cycle + 1, due_ns, now_ns)
+        if self._stood:
+            policy = "skip" if policy == "stop" else policy  # a pause may take its time
+        elif now_ns > schedule.deadline_ns(cycle + 1):
+            policy = self._overruns.decide(cycle + 1, schedule.deadline_ns(cycle + 1), now_ns)
         following = schedule.following(cycle, now_ns, policy)
-        if self.plan.end_ns is not None and not self._motion:
+        if self.plan.end_ns is not None and not self._motion and not self._stood:
             # nothing is skipped behind the end
             left_ns = self.plan.end_ns - schedule.time_ns(schedule.deadline_ns(cycle))
             following = min(following, cycle + max(1, -(-left_ns // schedule.period_ns)))
         skipped = following - cycle - 1
-        if self.paused:
-            self._paused_cycles += following - cycle
-            schedule.paused_ns += (following - cycle) * schedule.period_ns
+        if self._stood:
+            still = following - cycle if self.paused else skipped
+            self._paused_cycles += still
+            schedule.paused_ns += still * schedule.period_ns
         self._cycle = following
         self.record.skipped = skipped
         self._skipped += skipped
-        late = bool(skipped) or (policy == "catch_up" and now_ns > due_ns)
+        late = bool(skipped) or (policy == "catch_up" and now_ns > schedule.deadline_ns(cycle + 1))
         if late and not self._late:
             late_ms = (now_ns - schedule.deadline_ns(cycle)) / 1e6
             self.events.emit(

@@ -39,6 +39,8 @@ class Managed:
         self.bit = bit
         """Of the record's mask of active controllers."""
         self.active = False
+        self.until_ns = 0
+        """When its stream of commands runs out, ns of the clock; 0: there is none."""
         self._controller = controller
         self._context = context
         self._rows = rows
@@ -67,6 +69,7 @@ class Managed:
         self._last_ns = -1
         self._last_number = -1
         self._held = False
+        self.until_ns = 0
         self.active = True
 
     def deactivate(self, time_ns: int) -> None:
@@ -80,15 +83,18 @@ class Managed:
     def release(self) -> None:
         """Take its commands out of the robot's: the gate holds what it last let through."""
         self.active = False
+        self.until_ns = 0
         self._withdraw()
 
     def _withdraw(self) -> None:
         for claim in self._claimed:
             claim.merged[self._rows] = np.nan
 
-    def command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
-        """Hand over a prepared command. Raises ControllerFault."""
+    def command(self, kind: str, data: NDArray[np.float64], time_ns: int, until_ns: int = 0) -> None:
+        """Hand over a prepared command, which runs out at `until_ns` unless that is 0. Raises
+        ControllerFault."""
         self._held = False
+        self.until_ns = until_ns
         self.gather()
         try:
             self._controller.on_command(kind, data, time_ns)

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
 from dxlrun.clock import Clock
 from dxlrun.commands import CommandSink, NoCommands, TakenCommand
 from dxlrun.control.claims import conflicts, told
-from dxlrun.control.controller import Context, Controller, JointLimits
+from dxlrun.control.controller import Context, JointLimits
 from dxlrun.control.loop_plan import ControllerPlan, LoopPlan, ScheduledCommand
 from dxlrun.control.managed import Managed
 from dxlrun.control.plugins import PlugIns
+from dxlrun.control.turns import every, fits
 from dxlrun.cycle import MOST_CONTROLLERS, CycleRecord
 from dxlrun.errors import ControllerFault, PlugInError
 from dxlrun.events import EventCode, EventSink, Severity
@@ -74,9 +73,8 @@ class Manager:
 
     def activate(self, time_ns: int) -> None:
         """Activate what the plan wants active; states and goals must be fresh. A fault is in `fault`."""
-        for managed in self._managed:
-            if managed.plan.active and not managed.active:
-                self._activate(managed, time_ns)
+        wanted = [one for one in self._managed if one.plan.active and not one.active]
+        self._activate_all(wanted, time_ns)
 
     def begin(self) -> None:
         """Begin a cycle: nobody was updated in it yet."""
@@ -106,24 +104,43 @@ class Manager:
                     record.controller_ns[index] = now_ns() - begin_ns
         return self.fault
 
-    def hand(self, controller: str, kind: str, data: NDArray[np.float64], origin: str, time_ns: int) -> str:
+    def hand(  # noqa: PLR0917  a command's parts, as they come
+        self,
+        controller: str,
+        kind: str,
+        data: NDArray[np.float64],
+        origin: str,
+        time_ns: int,
+        until_ns: int = 0,
+    ) -> str:
         """Hand a prepared command to a controller; return why it was refused, empty when it was taken.
 
-        Without an `origin` no event tells of it: the next one of a stream.
+        `until_ns` is when it runs out, ns of the clock, unless another one follows (see `stale`); 0: never.
+        The next one of a stream is told by no event.
         """
         managed = self._named.get(controller)
         if managed is None:
             return f"there is no such controller as {controller}"
         if not managed.active:
-            return "the controller is not active"
+            return f"{controller} is not active; switch to it first"
+        streaming = until_ns and managed.until_ns
         try:
-            managed.command(kind, data, time_ns)
+            managed.command(kind, data, time_ns, until_ns)
         except ControllerFault as fault:
             self._end(managed, fault, time_ns)
             return str(fault)
-        if origin:
+        if not streaming:
             self._tell(EventCode.COMMAND, managed, f"{kind} from {origin}")
         return ""
+
+    def stale(self, now_ns: int) -> list[str]:
+        """Return the controllers whose stream of commands has run out, each of them once."""
+        names: list[str] = []
+        for managed in self._managed:
+            if 0 < managed.until_ns < now_ns:
+                managed.until_ns = 0
+                names.append(managed.plan.name)
+        return names
 
     def hold(self, controller: str) -> None:
         """Withdraw what a controller commands until it gets another command; it stays active."""
@@ -158,8 +175,7 @@ class Manager:
             return refusal
         for name in deactivate:
             self._deactivate(self._named[name], time_ns)
-        for name in activate:
-            self._activate(self._named[name], time_ns)
+        self._activate_all([self._named[name] for name in activate], time_ns)
         return ""
 
     def _refuse_switch(self, activate: Sequence[str], deactivate: Sequence[str]) -> str:
@@ -175,13 +191,14 @@ class Manager:
         if busy := [name for name in activate if self._named[name].active and name not in leaving]:
             return f"{', '.join(busy)} is active already"
         staying = [one.plan for one in self._managed if one.active and one.plan.name not in leaving]
-        return told(conflicts([*staying, *(self._named[name].plan for name in activate)]))
+        clash = told(conflicts([*staying, *(self._named[name].plan for name in activate)]))
+        return f"{clash}; deactivate whoever is in the way in the same switch" if clash else ""
 
     def load(self, plan: ControllerPlan) -> str:
         """Configure one more controller, inactive; return why not. Only while the loop is paused."""
         if plan.name in self._named:
             return f"there is a controller {plan.name} already"
-        if not _fits(plan, self._period_ns):
+        if not fits(plan, self._period_ns):
             return f"its rate {plan.rate:g} Hz does not divide the loop's {1e9 / self._period_ns:g} Hz"
         index = self._free_index()
         if index >= MOST_CONTROLLERS:
@@ -190,11 +207,12 @@ class Manager:
             return f"the robot has no joint {', '.join(unknown)}"
         begin_ns = self._clock.now_ns()
         try:
-            every = _every(plan, self._period_ns)
-            managed = self._configured(index, replace(plan, active=False, every=every))
+            turns = every(plan, self._period_ns)
+            managed = self._configured(index, replace(plan, active=False, every=turns))
         except (ControllerFault, PlugInError) as error:
             return str(error)
-        managed.pace(self._period_ns, every)
+        self._failed.discard(plan.name)  # that was another one
+        managed.pace(self._period_ns, turns)
         managed.wait_for(self._lost)
         self._managed = (*self._managed[:index], managed, *self._managed[index + 1 :])
         self._named[plan.name] = managed
@@ -227,14 +245,14 @@ class Manager:
     def change_period(self, period_ns: int) -> str:
         """Let every controller keep its own rate in another period of the loop; return why that cannot be."""
         for managed in self._named.values():
-            if not _fits(managed.plan, period_ns):
+            if not fits(managed.plan, period_ns):
                 return (
                     f"controller {managed.plan.name} runs at {managed.plan.rate:g} Hz, of which "
                     f"{1e9 / period_ns:g} Hz is no multiple"
                 )
         self._period_ns = period_ns
         for managed in self._named.values():
-            managed.pace(period_ns, _every(managed.plan, period_ns))
+            managed.pace(period_ns, every(managed.plan, period_ns))
         return ""
 
     @property
@@ -253,21 +271,29 @@ class Manager:
             if managed.active:
                 self._deactivate(managed, time_ns)
 
-    def _activate(self, managed: Managed, time_ns: int) -> None:
-        try:
-            managed.activate(time_ns)
-        except ControllerFault as fault:
-            self._end(managed, fault, time_ns)
-        else:
-            self._record.active |= managed.bit
-            self._tell(EventCode.CONTROLLER_ACTIVATED, managed, "active")
+    def _activate_all(self, wanted: Sequence[Managed], time_ns: int) -> None:
+        """Activate controllers whose claims were checked together, then the fallbacks of those that failed:
+        a fallback that came first could have a joint that belongs to one of the others."""
+        failed: list[tuple[Managed, ControllerFault]] = []
+        for managed in wanted:
+            try:
+                managed.activate(time_ns)
+            except ControllerFault as fault:
+                self._take_out(managed, fault)
+                failed.append((managed, fault))
+            else:
+                self._record.active |= managed.bit
+                self._tell(EventCode.CONTROLLER_ACTIVATED, managed, "active")
+        for managed, breach in failed:
+            self._fall_back(managed, breach, time_ns)
 
     def _deactivate(self, managed: Managed, time_ns: int) -> None:
         self._record.active &= ~managed.bit
         try:
             managed.deactivate(time_ns)
         except ControllerFault as fault:
-            self._end(managed, fault, time_ns, leaving=True)
+            self._take_out(managed, fault)  # nobody takes over from one that was leaving anyway
+            self.fault = self.fault or str(fault)
         else:
             self._tell(EventCode.CONTROLLER_DEACTIVATED, managed, "inactive")
 
@@ -293,19 +319,23 @@ class Manager:
             )
         )
 
-    def _end(self, managed: Managed, fault: ControllerFault, time_ns: int, *, leaving: bool = False) -> None:
-        """Take a controller that broke its contract out of the robot, say so, let its fallback take over.
+    def _end(self, managed: Managed, fault: ControllerFault, time_ns: int) -> None:
+        """Take a controller that broke its contract out of the robot, say so, let its fallback take over."""
+        self._take_out(managed, fault)
+        self._fall_back(managed, fault, time_ns)
 
-        Nobody takes over from one that was `leaving` anyway, nor does one that broke its own contract before.
-        """
+    def _take_out(self, managed: Managed, fault: ControllerFault) -> None:
         managed.release()
         self._record.active &= ~managed.bit
         text = "\n".join([str(fault), *getattr(fault, "__notes__", ())])
         self._events.emit(EventCode.CONTROLLER_FAULT, Severity.ERROR, managed.plan.name, text)
         self._failed.add(managed.plan.name)
+
+    def _fall_back(self, managed: Managed, fault: ControllerFault, time_ns: int) -> None:
+        """Let a fallback take over, but for one that broke its own contract before: two that fall back on
+        each other would do so for ever."""
         name = managed.plan.fallback
-        # two that fall back on each other would do so for ever
-        if not name or leaving or name in self._failed or self.switch((name,), (), time_ns):
+        if not name or name in self._failed or self.switch((name,), (), time_ns):
             self.fault = self.fault or str(fault)
 
     def _tell_loaded(self, managed: Managed, what: str, begin_ns: int) -> None:
@@ -316,7 +346,7 @@ class Manager:
         self._events.emit(code, Severity.INFO, managed.plan.name, text)
 
     def _configured(self, index: int, plan: ControllerPlan) -> Managed:
-        controller = self._built(plan)
+        controller = self._plugins.built(plan)
         context = self._context(index, plan)
         try:
             controller.on_configure(context)
@@ -324,22 +354,9 @@ class Manager:
             raise ControllerFault(
                 f"controller {plan.name} raised in on_configure: {type(error).__name__}: {error}"
             ) from error
+        self._plugins.after_each(f"of controller {plan.name}")
         rows = np.array([self._rows[joint] for joint in plan.joints], dtype=np.intp)
         return Managed(plan, controller, context, rows, self._record, bit=1 << index)
-
-    def _built(self, plan: ControllerPlan) -> Controller[Any]:
-        offer = self._plugins.controllers.get(plan.type)
-        if offer is None:
-            why = "; ".join(self._plugins.broken.values())
-            raise PlugInError(
-                f"no plug-in offers the type {plan.type} of controller {plan.name}"
-                + (f" ({why})" if why else "")
-            )
-        try:
-            parameters = offer.controller.Parameters.model_validate_json(plan.parameters)
-        except ValidationError as error:
-            raise PlugInError(f"parameters of controller {plan.name}: {error}") from error
-        return offer.controller(parameters)
 
     def _context(self, index: int, plan: ControllerPlan) -> Context:
         joints = [self._plan.joints[self._rows[joint]] for joint in plan.joints]
@@ -374,16 +391,3 @@ class Manager:
             self._record.published |= bit
 
         return publish
-
-
-def _fits(plan: ControllerPlan, period_ns: int) -> bool:
-    """Say whether a controller's own rate can be kept: the loop's is a multiple of it."""
-    if plan.rate is None:
-        return True
-    turns = 1e9 / period_ns / plan.rate
-    return round(turns) >= 1 and abs(turns - round(turns)) < 1e-6 * turns
-
-
-def _every(plan: ControllerPlan, period_ns: int) -> int:
-    """Return every how many cycles a controller is updated."""
-    return 1 if plan.rate is None else max(1, round(1e9 / period_ns / plan.rate))

@@ -7,16 +7,18 @@ from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import pluggy
+from pydantic import ValidationError
 
 from dxlrun.control.contract import ControllerClass, controller_breach, hook_breach
-from dxlrun.control.controller import CONTRACT_VERSION
+from dxlrun.control.controller import CONTRACT_VERSION, Controller
 from dxlrun.control.hookspecs import GROUP, HookSpecs
+from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.control.overrun import Decide, OverrunHook
 from dxlrun.control_table import add_control_table
-from dxlrun.errors import PlugInError
+from dxlrun.errors import ControllerFault, PlugInError
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +32,10 @@ class Offer:
     """Who published it: `name version`."""
 
 
+def _look_away(name: str) -> None:
+    """Do nothing: processes without a loop may have threads."""
+
+
 @dataclass(frozen=True, slots=True)
 class PlugIns:
     """All controllers that are installed, and why others are not to be had."""
@@ -41,6 +47,31 @@ class PlugIns:
     plug-ins offer, by the type's name."""
     overrun_hooks: tuple[OverrunHook, ...] = ()
     """Who is asked what becomes of a late cycle, in this order."""
+    after_each: Callable[[str], None] = _look_away
+    """Called with a name after foreign code prepared something; it may raise PlugInError."""
+
+    def built(self, plan: ControllerPlan) -> Controller[Any]:
+        """Return a new controller of the plan's type.
+
+        Raises PlugInError (the type is not to be had, parameters do not fit it), and ControllerFault for
+        whatever else its class raises.
+        """
+        offer = self.controllers.get(plan.type)
+        if offer is None:
+            why = "; ".join(self.broken.values())
+            raise PlugInError(
+                f"no plug-in offers the type {plan.type} of controller {plan.name}"
+                + (f" ({why})" if why else "")
+            )
+        try:
+            parameters = offer.controller.Parameters.model_validate_json(plan.parameters)
+            return offer.controller(parameters)
+        except ValidationError as error:
+            raise PlugInError(f"parameters of controller {plan.name}: {error}") from error
+        except (Exception, SystemExit) as error:  # foreign code: one sentence instead of its traceback
+            raise ControllerFault(
+                f"controller {plan.name} cannot be built: {type(error).__name__}: {error}"
+            ) from error
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,11 +82,12 @@ class _Found:
     overrun: Decide | None = None
 
 
-def load_plugins(after_each: Callable[[str], None] | None = None) -> PlugIns:
+def load_plugins(after_each: Callable[[str], None] = _look_away) -> PlugIns:
     """Import every entry point of the group `dxlrun` and ask it for its controllers and servo models.
 
     `after_each` is called with the plug-in's name and distribution after its import, broken or not; what it
-    raises passes through: the loop's process counts its threads there. Itself raises nothing.
+    raises passes through: the loop's process counts its threads there, and again when a controller was
+    configured. Itself raises nothing.
     """
     offers: dict[str, Offer] = {}
     broken: dict[str, str] = {}
@@ -70,8 +102,7 @@ def load_plugins(after_each: Callable[[str], None] | None = None) -> PlugIns:
             found = _Found()
         if found.overrun is not None:
             hooks.append(OverrunHook(f"{entry_point.name} ({publisher})", found.overrun))
-        if after_each is not None:
-            after_each(f"{entry_point.name} ({publisher})")
+        after_each(f"{entry_point.name} ({publisher})")
         for offer in found.offers:
             first = offers.setdefault(offer.type, offer)
             if first is not offer:
@@ -80,7 +111,7 @@ def load_plugins(after_each: Callable[[str], None] | None = None) -> PlugIns:
                     f"{offer.type}; neither is used: uninstall one of them, or ask an author for another name"
                 )
     usable = {name: offer for name, offer in offers.items() if name not in ambiguous}
-    return PlugIns(controllers=usable, broken=broken | ambiguous, overrun_hooks=tuple(hooks))
+    return PlugIns(usable, broken | ambiguous, tuple(hooks), after_each)
 
 
 def _order(entry_point: EntryPoint) -> tuple[str, str]:

@@ -80,15 +80,18 @@ class PolicyPlan:
         return any(step.levels for name in POLICIES for step in self.named(name).steps)
 
     def refuse_period(self, period_ns: int, planned_ns: int) -> str:
-        """Say why the steps would not be over in time in another period than the planned one, ns.
+        """Say why a run would not end in time in another period than the planned one, ns.
 
-        A wish to stop is seen a period later, and the first step begins one after that.
+        A wish to stop is seen a period later, and the first step begins one after that; two planned periods
+        are kept free for it beside the limit.
         """
         longest_ns = max(self.named(name).longest_ns for name in POLICIES)
-        slowest_ns = planned_ns + max(0, self.limit_ns - longest_ns) // 2
-        if not longest_ns or period_ns <= slowest_ns:
+        left_ns = max(0, self.limit_ns - longest_ns)
+        slowest_ns = planned_ns + (left_ns // 2 if longest_ns else planned_ns + left_ns)
+        if period_ns <= slowest_ns:
             return ""
-        return f"its policies need at least {1e9 / slowest_ns:.2g} Hz to end the run within exit_timeout"
+        what = "its policies need" if longest_ns else "it takes"
+        return f"{what} at least {1e9 / slowest_ns:.2g} Hz to end the run within exit_timeout"
 
     def named(self, name: PolicyName) -> Policy:
         """Return one of the four."""

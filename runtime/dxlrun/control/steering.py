@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Protocol
 
 import msgspec
@@ -30,6 +30,10 @@ class Steered(Protocol):
 
     def resume(self) -> str:
         """Let the controllers' time go on."""
+        ...
+
+    def load(self, plan: ControllerPlan) -> str:
+        """Configure one more controller; the guardian has patience for each of them."""
         ...
 
     def finish(self) -> str:
@@ -81,8 +85,6 @@ class Steering:
     events: EventSink
     taken: CommandSink
     clock: Clock
-    _leases: dict[str, int] = field(default_factory=dict)
-    """Controller -> when its stream runs out, ns of the clock."""
 
     def take(self, time_ns: int) -> int:
         """Do what waits, and end streams whose lease ran out; return how many commands controllers took."""
@@ -101,8 +103,7 @@ class Steering:
             else:
                 count += 1
             self.inbox.answer(command.number, refusal)
-        if self._leases:
-            self._expire()
+        self._expire()
         return count
 
     def refuse(self, why: str) -> None:
@@ -129,26 +130,19 @@ class Steering:
         if len(command.data) % 8:
             return f"{len(command.data)} bytes are no array of numbers"
         data = np.frombuffer(command.data, dtype="<f8")
-        streaming = command.lease_ns and command.controller in self._leases
-        origin = "" if streaming else command.origin
-        refusal = self.manager.hand(command.controller, command.kind, data, origin, time_ns)
-        if not refusal:
-            if command.lease_ns:
-                self._leases[command.controller] = self.record.woken_ns + command.lease_ns
-            else:
-                self._leases.pop(command.controller, None)
-        return refusal
+        until_ns = self.record.woken_ns + command.lease_ns if command.lease_ns else 0
+        name, kind, origin = command.controller, command.kind, command.origin
+        return self.manager.hand(name, kind, data, origin, time_ns, until_ns)
 
     def _expire(self) -> None:
-        for name in [name for name, until in self._leases.items() if until < self.record.woken_ns]:
-            del self._leases[name]
+        for name in self.manager.stale(self.record.woken_ns):
             text = f"the stream of commands ended; {self.loop.expire(name)}"
             self.events.emit(EventCode.STALE_COMMAND, Severity.WARNING, name, text)
 
     def _obey(self, command: Command, time_ns: int) -> str:
         try:
             return self._do(command, time_ns)
-        except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
             return f"its data does not fit: {error}"
 
     def _do(self, command: Command, time_ns: int) -> str:
@@ -168,7 +162,7 @@ class Steering:
             case "load" | "unload" if not loop.paused:
                 refusal = "pause the loop first: it stands still meanwhile"
             case "load":
-                refusal = manager.load(msgspec.json.decode(data, type=ControllerPlan))
+                refusal = loop.load(msgspec.json.decode(data, type=ControllerPlan))
             case "unload":
                 refusal = manager.unload(msgspec.json.decode(data, type=Unload).controller)
             case _:
