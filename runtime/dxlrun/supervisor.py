@@ -193,21 +193,22 @@ class _Run:
 
     def _without_guardian(self, loop: int, guardian: Child, job: GuardianJob) -> None:
         """The guardian is gone: the kernel told the loop to stop; see that it does, or cut torque here."""
-        asked = self.signals.count
         give_up = time.monotonic() + self.plan.exit_timeout_ns * 1e-9
         while not (gone := bool(select.select([loop], [], [], _POLL_S)[0])):
-            if time.monotonic() > give_up or self.signals.count > max(asked, 1):
+            # the second wish may have been told to a guardian that did not hear it any more
+            if time.monotonic() > give_up or self.signals.count > 1:
                 signal.pidfd_send_signal(loop, signal.SIGKILL)
                 select.select([loop], [], [])
                 break
         phase = Heartbeat(self.memory.heartbeat).phase
         self.sentences.append("the guardian ended in the middle of the run")
-        if phase is Phase.DONE:
+        cut = self.signals.count > 1
+        if phase is Phase.DONE and not cut:
             self.sentences.append("the loop stopped and left the robot as its policy says")
         elif phase is not Phase.LOADING:
             how = "the loop ended too" if gone else "the loop did not stop and was killed"
             hand = LastHand(job)
-            leave = hand.limp if self.signals.count > max(asked, 1) else hand.end
+            leave = hand.limp if cut else hand.end
             self.sentences += leave(guardian.line.descriptors, how, Severity.ERROR)
 
     def end(self) -> None:

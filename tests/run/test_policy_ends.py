@@ -60,6 +60,20 @@ def test_a_second_interrupt_cuts_torque_in_the_middle_of_a_policy(
     assert goals(run)[-1] < 700, "the pose is at 716: it was cut on its way"
 
 
+def test_a_second_interrupt_counts_though_the_guardian_never_heard_of_it(
+    holding: Callable[..., Any], all_limp: Limp
+) -> None:
+    run = holding("20 deg/s", "hold", "12 s")
+    guardian = run.child("dxlrun.guardian")
+    os.kill(guardian, signal.SIGSTOP)
+    run.signal(signal.SIGINT)
+    run.signal(signal.SIGTERM)
+    os.kill(guardian, signal.SIGKILL)
+    run.finish()
+    assert all_limp(run)
+    assert goals(run)[-1] < 700, "the pose is at 716: it was cut on its way"
+
+
 def test_an_interrupt_takes_the_robot_to_its_pose_and_holds_it_there(
     holding: Callable[..., Any], all_limp: Limp
 ) -> None:
