@@ -119,7 +119,7 @@ def test_the_table_tells_who_asked_for_what(report: Report) -> None:
             "50",
             "stream of positions for head, 2 set-points, lease 50 ms",
             "bob",
-            "refused: the controller is not active",
+            "refused: head is not active; switch to it first",
         ],
         ["51", "positions for tail", "bob", "done"],
         ["55", 'load {"name":', "mallory", rows[-2][-1]],

@@ -233,6 +233,11 @@ def test_a_switch_hands_joints_over(dxlrun, torso: RemoteRobot) -> None:
     assert active == ["joint_state_broadcaster", "whole_body_position"]
 
 
+def test_a_controller_that_is_switched_off_and_on_has_begun_anew(dxlrun, torso: RemoteRobot) -> None:
+    said = dxlrun("switch", "--activate", "head", "--deactivate", "head", "left_arm")
+    assert said.out == "bioloid_torso: left_arm not active any more; head begun anew\n"
+
+
 def test_a_rate_holds_at_once(dxlrun, torso: RemoteRobot) -> None:
     assert dxlrun("rate", "80").out == "bioloid_torso runs at 80 Hz\n"
     assert torso.info()["rate"] == 80

@@ -187,7 +187,7 @@ def test_commands_to_nobody_are_refused_in_words(robot):
     robot.send(0, "unknown", "go")
     assert run(robot, 2).reason == "ended"
     assert robot.events.of(EventCode.COMMAND_REFUSED) == [
-        ("asleep", "go from motion.yaml:7:5 refused: the controller is not active"),
+        ("asleep", "go from motion.yaml:7:5 refused: asleep is not active; switch to it first"),
         ("unknown", "go from motion.yaml:7:5 refused: there is no such controller as unknown"),
     ]
 

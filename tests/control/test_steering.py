@@ -76,7 +76,10 @@ def test_a_switch_happens_in_one_cycle_or_not_at_all(watched):
 @pytest.mark.parametrize(
     ("switch", "why"),
     [
-        ({"activate": ["whole"], "deactivate": ["left"]}, "right and whole both command joint j1"),
+        (
+            {"activate": ["whole"], "deactivate": ["left"]},
+            "right and whole both command joint j1; deactivate",
+        ),
         ({"activate": ["whole", "left"]}, "left is active already"),
         ({"activate": ["nobody"]}, "no controller nobody"),
         ({"deactivate": ["whole"]}, "whole is not active"),
@@ -146,7 +149,13 @@ def test_another_rate_begins_at_the_next_deadline_and_controllers_keep_theirs(ma
 
 @pytest.mark.parametrize(
     ("rate", "why"),
-    [(60.0, "of which 60 Hz is no multiple"), (500.0, "at most 200 Hz"), (0.0, "no rate"), (-3.0, "no rate")],
+    [
+        (60.0, "of which 60 Hz is no multiple"),
+        (500.0, "at most 200 Hz"),
+        (0.001, "hears nobody between two cycles; write 1 to 100000"),
+        (0.0, "no rate"),
+        (-3.0, "no rate"),
+    ],
 )
 def test_a_rate_that_cannot_be_is_refused(make_robot, rate, why):
     watched = Watched(make_robot, right={"every": 2, "rate": 25.0})

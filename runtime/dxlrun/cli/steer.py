@@ -65,9 +65,13 @@ def switch(*, activate: Names = (), deactivate: Names = (), whom: Whom = ONLY_ON
     with _robot(whom, "switch") as robot:
         _known(robot, *activate, *deactivate)
         robot.switch(activate, deactivate)
-        parts = [", ".join(activate) + " active" if activate else ""]
-        parts.append(", ".join(deactivate) + " not active any more" if deactivate else "")
-        return _done(robot, whom, f"{robot.name}: {'; '.join(part for part in parts if part)}")
+        groups = {
+            "active": [name for name in activate if name not in deactivate],
+            "not active any more": [name for name in deactivate if name not in activate],
+            "begun anew": [name for name in activate if name in deactivate],
+        }
+        parts = [f"{', '.join(names)} {state}" for state, names in groups.items() if names]
+        return _done(robot, whom, f"{robot.name}: {'; '.join(parts)}")
 
 
 def send(

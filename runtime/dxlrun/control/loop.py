@@ -27,8 +27,11 @@ from dxlrun.hardware import LOST_CYCLES, Hardware
 from dxlrun.inbox import LOOP, Inbox, NoInbox
 from dxlrun.plurals import counted
 
-LEAST_RATE, MOST_RATE = 0.01, 100_000.0
-"""Hz; the latter as in the robot file."""
+MOST_RATE = 100_000.0
+"""Hz; as in the robot file."""
+LEAST_RATE = 1.0
+"""Hz, of what is asked while the loop runs: a wish is heard once a cycle, `stop` too, and the guardian's
+patience follows the rate."""
 PAUSED_CYCLE_NS = 200_000_000
 """How long a cycle may take while the loop is paused: a controller may be loaded in it. The guardian has
 patience for some of them."""
@@ -161,7 +164,8 @@ class Loop:
     def change_rate(self, rate: float) -> str:
         """Run in another period from the next cycle on, Hz; return why not."""
         if not LEAST_RATE <= rate <= MOST_RATE:
-            return f"{rate:g} Hz is no rate; write one from {LEAST_RATE:g} Hz to {MOST_RATE:g} Hz"
+            why = ", since the loop hears nobody between two cycles" if 0 < rate < LEAST_RATE else ""
+            return f"{rate:g} Hz is no rate to change to{why}; write {LEAST_RATE:g} to {MOST_RATE:.0f}"
         period_ns = round(1e9 / rate)
         if period_ns < self.plan.least_period_ns:
             return f"the buses allow at most {1e9 / self.plan.least_period_ns:.4g} Hz"
