@@ -54,6 +54,13 @@ def test_operations_keep_their_order_and_a_cycle_takes_only_so_many(both):
     assert [one.number for one in both.take_all()] == list(range(MOST_PER_CYCLE, 20))
 
 
+def test_of_long_operations_a_cycle_takes_one(both):
+    for number in range(3):
+        assert both.writer.post(command(number, bytes(LARGEST - 100)))
+    both.writer.post(command(3))
+    assert [[one.number for one in both.reader.take()] for _ in range(4)] == [[0], [1], [2], [3]]
+
+
 def test_of_a_stream_the_newest_set_point_wins(both):
     for number in range(50):
         both.writer.set_point(1, command(number, lease_ns=5))
@@ -124,6 +131,14 @@ def test_a_writer_that_fills_it_with_rubbish_gets_no_exception_out_of_the_loop(b
         for _ in range(3):
             assert len(both.reader.take()) <= MOST_PER_CYCLE + PLACES
     assert both.reader.dropped > 100
+
+
+def test_counts_at_the_end_of_their_words_get_no_exception_out_of_the_loop(both):
+    last = 2**64 - 8
+    os.pwrite(both.descriptor, struct.pack("<QQ", last + 7, last), 24)
+    os.pwrite(both.descriptor, struct.pack("<I", 0xFFFFFFFF), 64 + last % (4 * LARGEST))
+    assert list(both.reader.take()) == []
+    assert both.reader.dropped == 1
 
 
 def test_answers_come_back_by_their_numbers_and_long_ones_are_cut(both):
