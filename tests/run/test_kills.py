@@ -43,9 +43,14 @@ def kills() -> list[Any]:
     return [pytest.param(*one, id=f"{one[0]}-{one[2]}s-after-{one[1]}-{n}") for n, one in enumerate(drawn)]
 
 
+def heard(run: Any) -> bytes:
+    """Return by the ledger what the servos heard."""
+    return b"".join(entry.data for entry in run.ledger() if entry.direction == "in")
+
+
 def stage(run: Any) -> str:
     """Say by the ledger how far the robot had come."""
-    wire = b"".join(entry.data for entry in run.ledger() if entry.direction == "in")
+    wire = heard(run)
     if not wire:
         return "before the first byte"
     if b"\x83\x1e" in wire:
@@ -71,7 +76,7 @@ def test_a_kill_leaves_the_robot_limp(  # noqa: PLR0917  fixtures
     run = start("--duration", "0.6", robot=robot)
     wait_for(lambda: run.processes().get(victim) or run.process.poll() is not None, f"the {victim}")
     if since == "wire":
-        wait_for(lambda: run.ledger() or run.process.poll() is not None, "the first byte")
+        wait_for(lambda: heard(run) or run.process.poll() is not None, "the first byte")
     threading.Event().wait(after_s)
     process = run.processes().get(victim)  # a run may be over before a late kill: that is judged the same
     if process is not None:
@@ -85,6 +90,6 @@ def test_a_kill_leaves_the_robot_limp(  # noqa: PLR0917  fixtures
         assert code in (0, 1)
     if code == 0:
         assert err == ""
-    if run.one("*.mcap") is not None and run.ledger():
+    if run.one("*.mcap") is not None and heard(run):
         run.log()
     print(f"{victim} killed {'after the end' if process is None else stage(run)}")
