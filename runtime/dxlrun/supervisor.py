@@ -21,6 +21,7 @@ from dxlrun import process
 from dxlrun.child import END_TIMEOUT_S, Child
 from dxlrun.compile.plan import Plan
 from dxlrun.control.realtime import Grant
+from dxlrun.dynamixel.serial_open import let_go
 from dxlrun.errors import ProcessFault
 from dxlrun.events import Severity
 from dxlrun.grant_table import ProcessGrant, granted_text, refusals, show_grants
@@ -219,6 +220,8 @@ class _Run:
             if self.loop is not None and self.ended is None and self.job is not None:
                 self._without_guardian(self.loop, self.guardian, self.job)
             self.loop = None
+            let_go(self.guardian.line.descriptors)
+            self.guardian.line.descriptors.clear()
         if self.recorder:
             self._end_recorder(self.recorder)
         if self.simulation:

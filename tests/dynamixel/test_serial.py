@@ -12,7 +12,7 @@ import pytest
 from dxlrun.clock import MonotonicClock
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.port import SerialPort, SerialPorts
-from dxlrun.dynamixel.serial_open import open_serial
+from dxlrun.dynamixel.serial_open import let_go, open_serial
 from dxlrun.errors import PortError
 from dxlrun.interfaces import Commands, States
 from dxlrun.simulation import BusConfig, ServoConfig
@@ -98,8 +98,24 @@ def test_the_process_that_has_the_line_is_named(opened):
 
 def test_the_line_is_locked_against_every_program(opened):
     _, port, _ = opened
-    assert fcntl.ioctl(port.descriptor, 0x80045440, b"\0\0\0\0") == b"\1\0\0\0"  # TIOCGEXCL of asm-generic
+    assert _is_locked(port.descriptor)
     fcntl.ioctl(port.descriptor, termios.TIOCNXCL)
+
+
+def test_the_lock_goes_with_whoever_has_the_line_although_its_other_end_stays(terminal):
+    _, path, slave = terminal
+    for _ in range(2):  # simulated servos wait for the next program
+        with open_serial(path, 1_000_000):
+            assert _is_locked(slave)
+        assert not _is_locked(slave)
+    handed_over = os.dup(slave)
+    fcntl.ioctl(slave, termios.TIOCEXCL)  # by a process that was killed
+    let_go([handed_over])
+    assert not _is_locked(slave)
+
+
+def _is_locked(descriptor: int) -> bool:
+    return fcntl.ioctl(descriptor, 0x80045440, b"\0\0\0\0") == b"\1\0\0\0"  # TIOCGEXCL of asm-generic
 
 
 def test_the_same_code_drives_the_simulated_process(simulated_line, make_plan, make_rig):

@@ -7,11 +7,38 @@ import fcntl
 import os
 import termios
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
 import serial
 
 from dxlrun.errors import PortError
+
+
+class ExclusiveSerial(serial.Serial):
+    """A line that nobody else can open before it is closed.
+
+    The lock belongs to the terminal, and the kernel takes it off when nobody has the terminal open any more.
+    Simulated servos keep theirs open for the next program, so closing takes it off.
+    """
+
+    def close(self) -> None:
+        """Let go of the line."""
+        if self.is_open:
+            _unlock(self.fileno())
+        super().close()
+
+
+def let_go(descriptors: Iterable[int]) -> None:
+    """Close what is left of lines that another process opened by `open_serial`, and that is dead now."""
+    for descriptor in descriptors:
+        _unlock(descriptor)
+        os.close(descriptor)
+
+
+def _unlock(descriptor: int) -> None:
+    with suppress(OSError):  # the adapter is gone, and the lock with it
+        fcntl.ioctl(descriptor, termios.TIOCNXCL)
 
 
 def open_serial(path: str, baud_rate: int) -> serial.Serial:
@@ -22,7 +49,7 @@ def open_serial(path: str, baud_rate: int) -> serial.Serial:
     """
     try:
         # exclusive=True: pyserial takes the lock that other pyserial programs respect
-        port = serial.Serial(path, baud_rate, timeout=0, write_timeout=0, exclusive=True)
+        port = ExclusiveSerial(path, baud_rate, timeout=0, write_timeout=0, exclusive=True)
     except ValueError as error:
         raise PortError(f"{path} cannot run at {baud_rate} bit/s: {error}") from error
     except (OSError, termios.error) as error:  # serial.SerialException is an OSError
@@ -108,6 +135,7 @@ def _has_open(process: Path, device: str) -> bool:
 def _command(process: Path) -> str:
     try:
         words = (process / "cmdline").read_bytes().split(b"\0")
-        return b" ".join(words[:3]).decode(errors="replace").strip() or "a process"
+        # enough to read `python -P -m dxlrun.simulation`
+        return b" ".join(words[:5]).decode(errors="replace").strip() or "a process"
     except OSError:
         return "a process"
