@@ -28,8 +28,10 @@ commands = st.builds(
     lambda name, lease: ("command", {"name": name, "lease": lease}), st.sampled_from(NAMES), st.integers(0, 3)
 )
 waits = st.integers(1, 4).map(lambda cycles: ("wait", {"cycles": cycles}))
+lates = st.integers(1, 40).map(lambda quarters: ("late", {"ns": quarters * PERIOD_NS // 4}))
+fails = st.sampled_from(["update", "activate", "command"]).map(lambda step: ("fail", {"step": step}))
 sequences = st.lists(
-    st.one_of(switches, switches, rates, plain, loads, unloads, commands, waits, st.just(("fail", {}))),
+    st.one_of(switches, switches, rates, plain, loads, unloads, commands, waits, lates, fails),
     min_size=5,
     max_size=25,
 )
@@ -38,9 +40,13 @@ sequences = st.lists(
 class Run:
     """One robot whose controllers write their own mark, so that a goal tells who commanded it."""
 
-    def __init__(self, make_robot):
+    def __init__(self, make_robot, overrun):
         self.robot = robot = make_robot(joints=3)
-        self.failing = False
+        self.failing = ""  # the step in which c breaks its contract from now on
+        self.broken = False  # c did so in this cycle
+        self.late_ns = 0
+        self.times = {}
+        self.wrong = []  # who was told a time before the one that it had been told
         for mark, name in enumerate("abcd", start=1):
             rate = 25.0 if name == "b" else None
             fallback = "d" if name == "c" else ""
@@ -53,21 +59,32 @@ class Run:
                 rate=rate,
                 fallback=fallback,
             )
-        robot.build()
+        robot.build(overrun=overrun)
         robot.hardware.keep = False
+        robot.hardware.work_ns = self.work
         self.updated = set()
         self.written = []
 
     def writer(self, mark, name):
         def act(controller, step, time_ns, value):
+            if name == "c" and step == self.failing:
+                self.broken = True
+                raise RuntimeError("lost its way")
+            own = controller.context.name
+            if time_ns < self.times.get(own, 0) or (step == "update" and value < 0):
+                self.wrong.append((own, step, time_ns, value))  # what is raised here would be its fault
+            self.times[own] = time_ns
             if step == "update":
-                self.updated.add(controller.context.name)
-                if self.failing and name == "c":
-                    raise RuntimeError("lost its way")
+                self.updated.add(own)
                 controller.context.commands.position[:] = mark / 100
                 controller.context.commands.velocity[:] = 1.0
 
         return act
+
+    def work(self):
+        """Return how long this read takes, ns."""
+        late_ns, self.late_ns = self.late_ns, 0
+        return late_ns
 
     def plan_of(self, name):
         kind = {"x": "a", "y": "d"}[name]
@@ -100,11 +117,14 @@ class Run:
 
         def idle(deadline_ns):
             self.updated.clear()
+            self.broken = False
             kind, data = next(steps, ("end", {}))
             if kind == "end":
                 robot.stop.request()
             elif kind == "fail":
-                self.failing = True
+                self.failing = data["step"]
+            elif kind == "late":
+                self.late_ns = data["ns"]
             elif kind == "command":
                 robot.post(data["name"], "position", b"", data["lease"] * PERIOD_NS)
             elif kind == "load":
@@ -133,7 +153,7 @@ class Run:
 
     def ended(self):
         """Return who was ended by its fault in this very cycle."""
-        return {"c"} if self.failing else set()
+        return {"c"} if self.broken else set()
 
 
 @pytest.mark.campaign
@@ -144,14 +164,17 @@ class Run:
     database=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
-@given(sequence=sequences)
-def test_whatever_is_asked_claims_stay_single_and_only_active_controllers_command(make_robot, sequence):
-    run = Run(make_robot)
+@given(sequence=sequences, overrun=st.sampled_from(["skip", "catch_up", "stop"]))
+def test_whatever_is_asked_claims_stay_single_and_only_active_controllers_command(
+    make_robot, sequence, overrun
+):
+    run = Run(make_robot, overrun)
     result = run.run(sequence)
     asked, answered = run.robot._asked, run.robot.inbox.answers
     assert len(answered) + len(run.robot.inbox.waiting) == asked
     cycles = run.robot.sink.cycles
     assert result.cycles == len(cycles)
-    assert result.cycles + result.skipped == cycles[-1]["cycle"] + 1 if cycles else True
+    assert result.cycles + result.skipped == run.robot.loop._cycle
+    assert not run.wrong, "time went back"
     due = [cycle["scheduled_ns"] for cycle in cycles]
     assert due == sorted(set(due))

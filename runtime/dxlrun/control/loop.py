@@ -111,7 +111,7 @@ class Loop:
     _stood: bool = field(default=False, init=False)
     """True in a cycle that is, or was until a moment ago, in a pause: a controller may have been loaded."""
     _time_ns: int = field(default=0, init=False)
-    """The controllers' time at their last updates."""
+    """The controllers' time in the last cycle."""
     _woken_ns: int = field(default=0, init=False)
     _cycles: int = field(default=0, init=False)
     _skipped: int = field(default=0, init=False)
@@ -148,7 +148,8 @@ class Loop:
         except PortError as error:
             reason, detail = "fault", str(error)
         finally:
-            self.manager.deactivate(self.schedule.time_ns(self.clock.now_ns()))
+            # behind the last cycle of a pause, the period until the next one is left out already
+            self.manager.deactivate(max(self._time_ns, self.schedule.time_ns(self.clock.now_ns())))
         if reason != "fault" and self.manager.fault is not None:
             reason, detail = "fault", self.manager.fault
         policy: PolicyName = "on_fault" if reason == "fault" else "on_exit"
@@ -277,17 +278,15 @@ class Loop:
             record.commands.position.fill(np.nan)
             record.commands.velocity.fill(np.nan)
         else:
-            self._time_ns = time_ns
             self.manager.update(cycle - self._paused_cycles, time_ns)
 
     def _controllers_time(self) -> int:
-        """Return the time of this cycle for controllers, which never goes back: who was late when the pause
+        """Return the time of this cycle for controllers, which never goes back: who was late when a pause
         began may catch up in it."""
-        time_ns = self.schedule.time_ns(self._woken_ns)
-        if self.paused and time_ns <= self._time_ns:
-            self.schedule.paused_ns -= self._time_ns + self.schedule.period_ns - time_ns
-            time_ns = self.schedule.time_ns(self._woken_ns)
-        return time_ns
+        schedule = self.schedule
+        schedule.paused_ns -= max(0, self._time_ns - schedule.time_ns(self._woken_ns))
+        self._time_ns = schedule.time_ns(self._woken_ns)
+        return self._time_ns
 
     def _miss(self) -> None:
         """Other servos are lost than in the cycle before: do what the policy says."""
