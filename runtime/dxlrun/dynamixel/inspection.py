@@ -153,7 +153,7 @@ class Inspector:
             self.problem(
                 servo,
                 "holds torque already, so another program may be moving it: stop that one and switch the "
-                "torque off, or take the robot over on purpose",
+                "torque off, or take the robot over as it is with --take-over",
             )
 
     def neutral(self, servo: ServoPlan, item: ControlItem, raw: int, wanted: int, why: str) -> None:

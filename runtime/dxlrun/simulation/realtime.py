@@ -50,7 +50,8 @@ def _take_priority(priority: int) -> str:
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
     except (OSError, ValueError) as error:
-        return f"no real-time priority {priority}: {error}"
+        reason = getattr(error, "strerror", None) or error
+        return f"no real-time priority {priority}: {reason}; `dxlrun doctor` says how to allow it"
     return f"real-time priority {priority}"
 
 
