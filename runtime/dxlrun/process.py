@@ -8,7 +8,7 @@ import os
 import socket
 import subprocess
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 
 import msgspec
@@ -17,6 +17,12 @@ _ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM
 """Importing numpy alone starts a thread for each core otherwise."""
 _LINE_LIMIT = 1 << 20
 _MOST_DESCRIPTORS = 64
+
+
+def spare_core(taken: Collection[int]) -> int:
+    """Return the last core that this process may use and that is not taken; the last one if all are."""
+    allowed = os.sched_getaffinity(0)
+    return max(allowed.difference(taken) or allowed)
 
 
 def start(

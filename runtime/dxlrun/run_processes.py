@@ -107,15 +107,15 @@ def _ready(child: Child) -> Mapping[str, object]:
 def start_simulation(plan: Plan, ledger: Path | None, memory: Memory) -> tuple[Child, dict[str, str]]:
     """Start the simulated servos; return the process and the pseudo-terminal of each simulated bus.
 
-    With a loop in real time they get a priority above loop and guardian, and the last core: a servo's
-    electronics do not wait for the host's processor.
+    With a loop in real time they get a priority above loop and guardian, and the last core that the loop was
+    not given: a servo's electronics do not wait for the host's processor.
     """
     told = SimulationConfig(simulated_buses(plan), bodies=simulated_bodies(plan))
     config = process.memory_file("dxlrun-simulation", encode_config(told))
     arguments = ["--config-fd", str(config)] + (["--ledger", str(ledger)] if ledger else [])
     scheduler = plan.loop.scheduler
     if scheduler.policy != "other":
-        core = max(os.sched_getaffinity(0))
+        core = process.spare_core(scheduler.cores)
         arguments += ["--priority", str(min(scheduler.priority + 2, 99)), "--core", str(core)]
     child = Child("simulated bus", "dxlrun.simulation", arguments, [config], memory.stderr)
     os.close(config)

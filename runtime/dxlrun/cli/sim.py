@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shlex
 import sys
 from dataclasses import dataclass, replace
@@ -119,6 +118,7 @@ def sim(
     buses = tuple(with_adapter(bus, wishes, seed) for bus in told.buses)
     refuse_what_cannot_be(buses, planned, seed)
     from dxlrun.cli.sim_views import Shown, ending
+    from dxlrun.process import spare_core
     from dxlrun.simulation.process import SimulationConfig
     from dxlrun.simulation_front import FrontOptions
 
@@ -131,7 +131,7 @@ def sim(
         bodies=told.bodies,
     )
     shown = Shown(title, buses, links, told.hint)
-    options = FrontOptions(ledger, told.priority, core=max(os.sched_getaffinity(0)))
+    options = FrontOptions(ledger, told.priority, spare_core(told.loop_cores))
     served = _serve(config, options, shown, as_json=as_json)
     if not as_json:
         out().print(ending(title, served.elapsed_s, served.look), markup=False, soft_wrap=True)
@@ -154,6 +154,8 @@ class _Told:
     """What their servos move together; None: each joint by itself."""
     priority: int = _PRIORITY
     """Real-time priority above the loop's."""
+    loop_cores: tuple[int, ...] = ()
+    """Where the loop may run; empty: anywhere."""
     hint: str | None = None
     """A command line that uses it when the port is added."""
 
@@ -193,6 +195,7 @@ def _told(
         buses=simulated_buses(everywhere),
         bodies=simulated_bodies(everywhere),
         priority=min(plan.loop.scheduler.priority + _ABOVE_LOOP, 99),
+        loop_cores=plan.loop.scheduler.cores,
         hint=hint if takes_port else None,
     )
 
