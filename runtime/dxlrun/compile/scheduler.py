@@ -18,7 +18,14 @@ _HIGHEST = 98
 def check_scheduler(description: Description, problems: Problems) -> None:
     """Find wishes that contradict each other; whether this machine grants them is seen at the start."""
     loop, marks = description.robot.loop, description.marks
-    wish = loop.scheduler
+    wish, timeout_ns = loop.scheduler, description.robot.policies.exit_timeout
+    if 1e9 / loop.rate >= timeout_ns:
+        problems.warning(
+            marks.value("loop", "rate"),
+            f"at {loop.rate:g} Hz a wish to stop is seen up to {1 / loop.rate:.3g} s late, when the guardian "
+            f"has ended the loop, as exit_timeout is {timeout_ns * 1e-9:g} s",
+            "raise policies.exit_timeout, or the rate",
+        )
     if wish.policy != "other" and wish.priority > _HIGHEST:
         problems.warning(
             marks.value("loop", "scheduler", "priority"),
