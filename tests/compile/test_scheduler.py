@@ -88,6 +88,6 @@ def test_a_wish_that_cannot_be_is_told_with_its_place(problems_in, robot_text, l
 def test_a_rate_at_which_nobody_can_stop_the_loop_in_time_is_a_warning(problems_in, robot_text):
     (warning,) = problems_in(with_loop(robot_text, "{rate: 0.25}").replace(", rate: 25", ""))
     assert str(warning).split("robot.yaml:")[1] == (
-        "4:14: warning: at 0.25 Hz a wish to stop is seen up to 4 s late, when the guardian has ended the loop, as "
-        "exit_timeout is 2 s; raise policies.exit_timeout, or the rate"
+        "4:14: warning: at 0.25 Hz a wish to stop is seen up to 4 s late, when the guardian has "
+        "ended the loop, as exit_timeout is 2 s; raise policies.exit_timeout, or the rate"
     )
