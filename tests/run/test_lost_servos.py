@@ -66,9 +66,9 @@ def give_up(controller: Any, time_ns: int) -> None:
 def built(tmp_path: Path) -> Callable[..., VirtualRobot]:
     """Build the robot on virtual time, with a log."""
 
-    def build(duration_s: float = 2.5) -> VirtualRobot:
+    def build(duration_s: float = 2.5, more: str = "") -> VirtualRobot:
         path = tmp_path / "three.yaml"
-        path.write_text(ROBOT)
+        path.write_text(ROBOT + more)
         return simulated_robot(path, duration_s=duration_s, log=tmp_path / "run.mcap")
 
     return build
@@ -205,3 +205,35 @@ def test_nobody_takes_over_from_a_controller_that_fails_while_it_leaves(
     result = robot.run()
     assert result.reason == "fault"
     assert robot.robot.manager.active == ()
+
+
+def test_a_servo_that_flickers_holds_and_frees_its_controllers_each_time_and_moves_slowly(
+    built: Callable[..., VirtualRobot], acts: dict[str, Act], tmp_path: Path
+) -> None:
+    acts |= {"pair": sway, "single": sway}
+    robot = built()
+    servo = robot.buses[0].servo(7)
+    for turn in range(5):  # five replies are lost, and a few come
+        robot.buses[0].at(GONE_NS + turn * 200_000_000, servo.silence)
+        robot.buses[0].at(GONE_NS + turn * 200_000_000 + 100_000_000, lambda: servo.silence(False))
+    assert robot.run().reason == "ended"
+    told = [event.text for event in read_log(tmp_path / "run.mcap").events if event.code == EventCode.POLICY]
+    assert told == ["is held until all its joints answer again", "goes on: all its joints answer again"] * 5
+    sent = [one for one in goals(robot, 3) if GONE_NS + 100_000_000 < one[0] < GONE_NS + 1_000_000_000]
+    speeds = [abs(b - a) / (t - s) * 1e9 for (s, a), (t, b) in itertools.pairwise(sent)]
+    assert 1.0 < max(speeds) < 1.5 + TICK * 50
+
+
+def test_a_pose_at_the_end_does_not_wait_for_a_servo_that_is_lost(
+    built: Callable[..., VirtualRobot], acts: dict[str, Act], tmp_path: Path
+) -> None:
+    more = "poses: {home: {pan: 20 deg, tilt: 20 deg, yaw: 20 deg}}\n"
+    more += "policies: {on_exit: [{pose: home, speed: 60 deg/s}, limp], exit_timeout: 8 s}\n"
+    robot = built(more=more)
+    robot.buses[0].at(GONE_NS, robot.buses[0].servo(7).silence)
+    robot.buses[0].at(BACK_NS, robot.stop.request)
+    result = robot.run()
+    assert (result.reason, result.last) == ("stopped", "limp")
+    assert robot.clock.now_ns() < BACK_NS + 1_500_000_000, "it waited for the lost one"
+    ended = round(math.radians(170) / TICK) * TICK
+    assert [goals(robot, servo)[-1][1] for servo in (3, 9)] == pytest.approx([ended, ended])
