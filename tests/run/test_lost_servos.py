@@ -220,8 +220,10 @@ def test_a_servo_that_flickers_holds_and_frees_its_controllers_each_time_and_mov
     told = [event.text for event in read_log(tmp_path / "run.mcap").events if event.code == EventCode.POLICY]
     assert told == ["is held until all its joints answer again", "goes on: all its joints answer again"] * 5
     sent = [one for one in goals(robot, 3) if GONE_NS + 100_000_000 < one[0] < GONE_NS + 1_000_000_000]
-    speeds = [abs(b - a) / (t - s) * 1e9 for (s, a), (t, b) in itertools.pairwise(sent)]
-    assert 1.0 < max(speeds) < 1.5 + TICK * 50
+    steps = [
+        abs(b - a) for (_, a), (_, b) in itertools.pairwise(sent)
+    ]  # one a cycle, however late it is sent
+    assert 0.02 < max(steps) < 0.03 + TICK
 
 
 def test_a_pose_at_the_end_does_not_wait_for_a_servo_that_is_lost(
