@@ -8,19 +8,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-StateName = Literal["position", "velocity", "effort"]
 CommandName = Literal["position", "velocity"]
 
-STATE_INTERFACES: tuple[StateName, ...] = ("position", "velocity", "effort")
 COMMAND_INTERFACES: tuple[CommandName, ...] = ("position", "velocity")
 
 Floats = NDArray[np.float64]
 """Shape (joints,): rad, rad/s, Nm, or the fraction of maximum where the servo measures no torque."""
-
-
-def interface_name(joint: str, interface: str) -> str:
-    """Return the field's name of an interface: `<joint>/<interface>`."""
-    return f"{joint}/{interface}"
 
 
 @dataclass(frozen=True, slots=True)

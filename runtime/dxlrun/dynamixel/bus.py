@@ -80,7 +80,6 @@ class Bus:
         "failure",
         "name",
         "noise_bytes",
-        "stray_packets",
     )
 
     def __init__(self, index: int, plan: BusPlan, port: Port, clock: Clock, packets: PacketSink) -> None:
@@ -89,8 +88,6 @@ class Bus:
         """Why the line is gone; a bus with a failure does nothing more."""
         self.noise_bytes = 0
         """Bytes that belonged to no intact packet, since the start."""
-        self.stray_packets = 0
-        """Intact packets that nobody awaited, since the start."""
         self._index = index
         self._port = port
         self._now_ns = clock.now_ns
@@ -287,7 +284,6 @@ class Bus:
         return self._refusal(status.error, len(status.parameters), length)
 
     def _stray(self, packet: memoryview) -> None:
-        self.stray_packets += 1
         self._reply.strays += 1
         if self._awaited is not None and packet == self._awaited.packet:
             self._reply.echoed = True
