@@ -274,18 +274,18 @@ class Manager:
     def _activate_all(self, wanted: Sequence[Managed], time_ns: int) -> None:
         """Activate controllers whose claims were checked together, then the fallbacks of those that failed:
         a fallback that came first could have a joint that belongs to one of the others."""
-        failed: list[tuple[Managed, ControllerFault]] = []
+        failed: list[tuple[Managed, str]] = []  # no faults, which hold this frame: nobody collects circles
         for managed in wanted:
             try:
                 managed.activate(time_ns)
             except ControllerFault as fault:
                 self._take_out(managed, fault)
-                failed.append((managed, fault))
+                failed.append((managed, str(fault)))
             else:
                 self._record.active |= managed.bit
                 self._tell(EventCode.CONTROLLER_ACTIVATED, managed, "active")
-        for managed, breach in failed:
-            self._fall_back(managed, breach, time_ns)
+        for managed, why in failed:
+            self._fall_back(managed, why, time_ns)
 
     def _deactivate(self, managed: Managed, time_ns: int) -> None:
         self._record.active &= ~managed.bit
@@ -322,7 +322,7 @@ class Manager:
     def _end(self, managed: Managed, fault: ControllerFault, time_ns: int) -> None:
         """Take a controller that broke its contract out of the robot, say so, let its fallback take over."""
         self._take_out(managed, fault)
-        self._fall_back(managed, fault, time_ns)
+        self._fall_back(managed, str(fault), time_ns)
 
     def _take_out(self, managed: Managed, fault: ControllerFault) -> None:
         managed.release()
@@ -331,12 +331,12 @@ class Manager:
         self._events.emit(EventCode.CONTROLLER_FAULT, Severity.ERROR, managed.plan.name, text)
         self._failed.add(managed.plan.name)
 
-    def _fall_back(self, managed: Managed, fault: ControllerFault, time_ns: int) -> None:
+    def _fall_back(self, managed: Managed, why: str, time_ns: int) -> None:
         """Let a fallback take over, but for one that broke its own contract before: two that fall back on
         each other would do so for ever."""
         name = managed.plan.fallback
         if not name or name in self._failed or self.switch((name,), (), time_ns):
-            self.fault = self.fault or str(fault)
+            self.fault = self.fault or why
 
     def _tell_loaded(self, managed: Managed, what: str, begin_ns: int) -> None:
         text = f"{what} in {(self._clock.now_ns() - begin_ns) / 1e6:.1f} ms, while the loop stood still"
