@@ -285,9 +285,11 @@ def _progress(plan: Plan, status: Status, began: float) -> Callable[[Heartbeat],
         if heartbeat.phase is Phase.SETUP:
             status.update(f"{plan.robot}: checking servos, torque on")
         elif heartbeat.phase is Phase.RUNNING:
-            end = f" of {plan.loop.end_ns / 1e9:.1f}" if plan.loop.end_ns else ""
+            ran_ns, end_ns = heartbeat.cycles * plan.loop.period_ns, plan.loop.end_ns
+            # no end is told beside a policy's steps, which come after it
+            end = f" of {end_ns / 1e9:.1f}" if end_ns and ran_ns <= end_ns else ""
             status.update(
-                f"{plan.robot}: {heartbeat.cycles * plan.loop.period_ns / 1e9:.1f}{end} s, "
+                f"{plan.robot}: {ran_ns / 1e9:.1f}{end} s, "
                 f"cycle {heartbeat.cycles}, {counted(heartbeat.skipped, 'period', 'periods')} skipped "
                 f"({time.monotonic() - began:.0f} s; Ctrl-C stops)"
             )
