@@ -24,7 +24,7 @@ _CREDENTIALS = struct.Struct("3i")
 class Connection(H11Protocol):
     """HTTP/1.1 on one connection, closed when it is silent for too long, or the oldest of too many."""
 
-    def connection_made(  # type: ignore[override]
+    def connection_made(  # type: ignore[override]  # uvicorn leaves its type open
         self, transport: asyncio.Transport
     ) -> None:
         """Begin, unless it is somebody else's; let another one go when there are too many."""
