@@ -181,7 +181,7 @@ def test_what_no_motion_is_made_of_is_sent_as_it_was_written(
         ("send head possvel", "head takes no command possvel; did you mean posvel?"),
         ("send joint_state_broadcaster go", "joint_state_broadcaster takes no command go; there is none"),
         ("send head posvel positions=[30,0]", "positions[0]: 30 has no unit; write an angle with its unit"),
-        ("send head posvel positions=[30deg,0deg]", "posvel of head: velocities: Field required"),
+        ("send head posvel positions=[30deg,0deg]", "posvel of head has no velocities; add"),
         ("send joint_state_broadcaster go now=.nan", "takes no command go"),
         ("send head posvel positions=[1deg] force=.nan", "this cannot be sent"),
         ("send head posvel positions=[1deg] velocities=[1rpm]", "1 positions for 2 joints"),

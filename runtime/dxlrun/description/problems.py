@@ -11,7 +11,7 @@ from pydantic_core import ErrorDetails
 from dxlrun.description.fields import Field, field_at, keys_at
 from dxlrun.description.marks import KeyPath, Marks
 from dxlrun.description.scalars import plain_value, text_of
-from dxlrun.errors import Problem
+from dxlrun.errors import Mark, Problem
 
 
 def problems_of(
@@ -27,8 +27,18 @@ def problems_of(
     `prefix` is where the model's data stands in the file. With `model`, unknown keys get the nearest known
     one and missing keys an example. Nothing is said about `unknown` paths and what is below them.
     """
+    return _problems(error.errors(include_url=False), marks, prefix, model, unknown)
+
+
+def _problems(
+    errors: Iterable[ErrorDetails],
+    marks: Marks,
+    prefix: KeyPath,
+    model: type[BaseModel] | None,
+    unknown: Set[KeyPath] = frozenset(),
+) -> list[Problem]:
     found: dict[KeyPath, list[_Complaint]] = {}
-    for details in error.errors(include_url=False):
+    for details in errors:
         complaint = _Complaint(details, marks, prefix, model)
         if complaint.meant and not any(
             complaint.path[:end] in unknown for end in range(len(complaint.path) + 1)
@@ -36,6 +46,20 @@ def problems_of(
             found.setdefault(complaint.path, []).append(complaint)
     problems = [_merged(complaints, marks) for complaints in found.values()]
     return sorted(problems, key=lambda problem: problem.mark)
+
+
+def sentences_of(error: ValidationError, what: str, model: type[BaseModel], most: int) -> list[str]:
+    """Return one sentence for each of the first places that a model refused in data without a file.
+
+    `what` is what the data are called: `posvel of head has no velocities; add ...`.
+    """
+    errors = error.errors(include_url=False)[:most]
+    places: dict[KeyPath, Mark] = {}
+    for details in errors:
+        location = details["loc"]
+        places |= {(what, *location[:end]): Mark(what) for end in range(len(location) + 1)}
+    problems = _problems(errors, Marks(what, places, places), (what,), model)
+    return [f"{problem.what}; {problem.mend}" for problem in problems]
 
 
 def places_of(error: ValidationError, marks: Marks) -> list[KeyPath]:
@@ -254,6 +278,10 @@ def _tell_own(complaint: _Complaint) -> tuple[str, str]:
     return f"{complaint.name}: {what}", mend or "correct it"
 
 
+def _tell_json(complaint: _Complaint) -> tuple[str, str]:
+    return f"{complaint.name} is no JSON ({complaint.context.get('error')})", "correct it"
+
+
 def _tell_pattern(complaint: _Complaint) -> tuple[str, str]:
     pattern = complaint.context.get("pattern")
     return f"{complaint.name} is {shown(complaint.input)}, which does not match {pattern}", "correct it"
@@ -268,6 +296,7 @@ _TELLERS: Mapping[str, Callable[[_Complaint], tuple[str, str]]] = {
     "string_too_short": _tell_length,
     "string_too_long": _tell_length,
     "string_pattern_mismatch": _tell_pattern,
+    "json_invalid": _tell_json,
     "value_error": _tell_own,
     "assertion_error": _tell_own,
     "dxlrun": _tell_own,

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import numpy as np
-from pydantic import TypeAdapter, ValidationError
+from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from dxlrun.compile.problems import suggestion
 from dxlrun.control.contract import interfaces_breach
@@ -20,6 +20,7 @@ from dxlrun.control.controller import Interfaces
 from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.control.plugins import Offer, PlugIns
 from dxlrun.description.form import Name
+from dxlrun.description.problems import sentences_of
 from dxlrun.description.robot import ControllerEntry
 
 LONGEST_NAME = 64
@@ -27,7 +28,7 @@ LONGEST_NAME = 64
 BUDGET_S = 5.0
 """How long a plug-in may think about one wish, while every other client waits, who wants to stop too."""
 _MOST_MISTAKES = 5
-_LONGEST_PLACE = 80
+_LONGEST_SENTENCE = 300
 _NAME: TypeAdapter[str] = TypeAdapter(Name)
 
 
@@ -112,7 +113,7 @@ class Preparation:
         except Refusal:
             raise
         except ValidationError as error:
-            raise Refusal(422, f"{kind} of {plan.name}: {told(error)}") from error
+            raise Refusal(422, told(error, f"{kind} of {plan.name}", model)) from error
         except ValueError as error:  # the way in which a plug-in refuses
             raise Refusal(422, f"{kind} of {plan.name}: {_one_line(str(error))}") from error
         except (Exception, SystemExit) as error:  # a plug-in's mistake
@@ -127,7 +128,7 @@ class Preparation:
             name = _NAME.validate_python(wish.get("name", ""))
             entry = ControllerEntry.model_validate({k: v for k, v in wish.items() if k != "name"})
         except ValidationError as error:
-            raise Refusal(422, f"a controller's entry does not fit: {told(error)}") from error
+            raise Refusal(422, told(error, "the controller's entry", ControllerEntry)) from error
         if len(name) > LONGEST_NAME:
             raise Refusal(422, f"a name has at most {LONGEST_NAME} characters; choose a shorter one")
         if name in others:
@@ -165,7 +166,7 @@ class Preparation:
         except Refusal:
             raise
         except ValidationError as error:
-            raise Refusal(422, f"{name}: {told(error)}") from error
+            raise Refusal(422, told(error, name, offer.controller.Parameters)) from error
         except (Exception, SystemExit) as error:  # a plug-in's code
             raise Refusal(422, f"{name} cannot say what it needs: {_raised(error)}") from error
         if breach := interfaces_breach(interfaces):
@@ -177,14 +178,11 @@ class Preparation:
         return interfaces
 
 
-def told(error: ValidationError) -> str:
-    """Return the mistakes of an input in one sentence; of many, the first."""
-    mistakes = error.errors(include_url=False, include_context=False, include_input=False)
-    sentences = [
-        f"{'.'.join(str(part) for part in one['loc'])[:_LONGEST_PLACE] or 'the whole'}: {one['msg']}"
-        for one in mistakes[:_MOST_MISTAKES]
-    ]
-    left = len(mistakes) - len(sentences)
+def told(error: ValidationError, what: str, model: type[BaseModel]) -> str:
+    """Return the mistakes of an input called `what` in one sentence; of many, the first."""
+    mistakes = sentences_of(error, what, model, _MOST_MISTAKES)
+    sentences = [sentence[:_LONGEST_SENTENCE] for sentence in mistakes]
+    left = max(0, error.error_count() - _MOST_MISTAKES)
     return "; ".join(sentences) + (f"; and {left} more" if left else "")
 
 
