@@ -108,6 +108,14 @@ def test_a_pose_of_a_joint_that_was_left_out_is_not_said_again(problems_in: Find
     assert said == ["joints.right_arm_joint.id is 999, but must be at most 253"]
 
 
+def test_a_pose_that_is_not_there_is_said_beside_a_wrong_joint(problems_in: Find, robot_text: str) -> None:
+    text = (robot_text + POLICIES).replace("id: 2\n", "id: 999\n").replace("pose: home", "pose: hme")
+    said = [problem.what for problem in problems_in(text)]
+    assert said[0] == "joints.right_arm_joint.id is 999, but must be at most 253"
+    assert len(said) > 1
+    assert all(what.endswith("has pose hme, which the file does not have") for what in said[1:])
+
+
 def test_the_check_tells_each_policy_and_what_is_left_without_the_loop(
     compile_text: Callable[..., Compiled], robot_text: str
 ) -> None:

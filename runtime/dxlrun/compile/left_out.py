@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-from dxlrun.compile.places import policy_marks, texts
+from dxlrun.compile.places import policy_marks, pose_marks, texts
 from dxlrun.description import Description
 from dxlrun.errors import Mark, Problem
 
@@ -32,8 +32,11 @@ def _silent(description: Description) -> Iterator[Mark]:
             yield marks.value("joints", name, "bus")
     for name, pose in robot.poses.items():
         yield from (marks.key("poses", name, joint) for joint in pose if joint in joints)
-    if ("poses",) in description.left_out or left_out_names(description, "poses") or joints:
-        yield from policy_marks(description)  # they may point at what was left out, or be short without it
+    poses = ("poses",) in description.left_out or left_out_names(description, "poses")
+    if poses:
+        yield from pose_marks(description)
+    if poses or joints:
+        yield from policy_marks(description)  # they may be short without what was left out
     yield from (
         marks.value("controllers", name, "fallback")
         for name, controller in robot.controllers.items()

@@ -23,7 +23,13 @@ def policy_marks(description: Description) -> Iterator[Mark]:
         if isinstance(policy, tuple):
             for index in range(len(policy)):
                 yield description.marks.value("policies", name, index)
-                yield description.marks.value("policies", name, index, "pose")
+
+
+def pose_marks(description: Description) -> Iterator[Mark]:
+    """Yield where the policies of the file name poses."""
+    for name, policy in description.robot.policies:
+        for index in range(len(policy) if isinstance(policy, tuple) else 0):
+            yield description.marks.value("policies", name, index, "pose")
 
 
 def texts(value: object, path: KeyPath) -> Iterator[tuple[KeyPath, str]]:

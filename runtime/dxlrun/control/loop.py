@@ -124,9 +124,7 @@ class Loop:
         self.schedule = Schedule(self.plan.period_ns)
         self._overruns = Overruns(self.plan.overrun, self.overrun_hooks, self.events)
         self._lost = LostServos(len(self.plan.joints))
-        self.steering = Steering(
-            self.inbox, self, self.manager, self.record, self.events, self.commands, self.clock
-        )
+        self.steering = Steering(self.inbox, self, self.manager, self.record, self.events, self.commands)
 
     def run(self) -> LoopResult:
         """Activate the controllers, run until the plan's end, a stop or a fault, deactivate them; then go

@@ -8,7 +8,6 @@ from typing import Protocol
 import msgspec
 import numpy as np
 
-from dxlrun.clock import Clock
 from dxlrun.commands import CommandSink, TakenCommand
 from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.control.manager import Manager
@@ -84,7 +83,6 @@ class Steering:
     record: CycleRecord
     events: EventSink
     taken: CommandSink
-    clock: Clock
 
     def take(self, time_ns: int) -> int:
         """Do what waits, and end streams whose lease ran out; return how many commands controllers took."""
