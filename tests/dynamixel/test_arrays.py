@@ -4,7 +4,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dxlrun.dynamixel import protocol1
-from dxlrun.dynamixel.arrays import GoalArrays, StateArrays
+from dxlrun.dynamixel.goal_arrays import GoalArrays
+from dxlrun.dynamixel.state_arrays import StateArrays
 from dxlrun.dynamixel.units import goal_ticks, joint_position, speed_ticks
 from dxlrun.interfaces import Commands, States
 

@@ -8,14 +8,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dxlrun.dynamixel.arrays import GoalArrays, StateArrays
 from dxlrun.dynamixel.bus import Bus
 from dxlrun.dynamixel.bus_plan import BusPlan
 from dxlrun.dynamixel.dialect import dialect_of
 from dxlrun.dynamixel.exchange import CyclicReads
+from dxlrun.dynamixel.goal_arrays import GoalArrays
 from dxlrun.dynamixel.line import SHORT_PATIENCE_NS
 from dxlrun.dynamixel.plan import plan_line
 from dxlrun.dynamixel.protocol2 import describe_hardware_error
+from dxlrun.dynamixel.state_arrays import StateArrays
 from dxlrun.dynamixel.transaction import Program, ProgramJob, Reply, Transaction
 from dxlrun.events import EventCode, EventSink, Severity
 from dxlrun.hardware import LOST_CYCLES
