@@ -61,6 +61,28 @@ def test_an_adapter_that_is_gone_is_a_port_error(opened):
         port.write(b"x")
 
 
+def test_a_line_that_is_back_has_the_place_and_the_number_of_the_one_that_is_gone(opened):
+    master, port, path = opened
+    again = []
+    ports = SerialPorts([port], lambda index: again.pop() if again else None)
+    os.close(master)
+    ports.wait(time.monotonic_ns() + 5_000_000_000)
+    assert not ports.reopen(0)
+    # nobody here has the device open any more, and nobody waits for it
+    assert os.readlink(f"/proc/self/fd/{port.descriptor}") == os.devnull
+    assert ports.wait(time.monotonic_ns() + 1_000_000) == ()
+    master, slave = pty.openpty()
+    again.append(slave)
+    assert ports.reopen(0)
+    (renewed,) = ports.ports
+    assert (renewed.descriptor, renewed.name) == (port.descriptor, path)
+    os.write(master, b"hello\n")
+    assert ports.wait(time.monotonic_ns() + 5_000_000_000) == [0]
+    buffer = memoryview(bytearray(10))
+    assert bytes(buffer[: renewed.read_into(buffer)]) == b"hello\n"
+    os.close(master)
+
+
 def test_a_line_that_takes_nothing_is_a_port_error(opened):
     _, port, _ = opened
     while select.select([], [port.descriptor], [], 0)[1]:

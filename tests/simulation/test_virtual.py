@@ -75,3 +75,30 @@ def test_a_planned_fault_happens_while_somebody_waits(make_line: Callable[..., A
     line = make_line()
     line.bus.at(3_000_000, lambda: line.bus.inject_noise(b"\x55", 3_000_000))
     assert line.hear() == b"\x55"
+
+
+def test_a_lost_line_is_back_when_its_adapter_is_and_holds_nobody_up_meanwhile() -> None:
+    clock, ports, virtual = two_buses()
+    virtual.ports[0].unplug()
+    assert ports.wait(5_000) == [0]
+    assert not ports.reopen(0)
+    assert ports.wait(5_000) == []
+    assert clock.now_ns() == 5_000
+    with pytest.raises(PortError):
+        ports.ports[0].write(PING_1)
+    virtual._buses[0].plug_in()
+    assert ports.reopen(0)
+    ports.ports[0].write(PING_1)
+    assert ports.wait(10**9) == [0]
+    assert read(ports, 0) == PONG_1
+
+
+def test_time_passes_on_a_lost_line() -> None:
+    clock, ports, virtual = two_buses()
+    (bus, _) = virtual._buses
+    bus.unplug()
+    assert not ports.reopen(0)
+    bus.at(2_000_000, bus.plug_in)
+    assert ports.wait(3_000_000) == []
+    assert bus.plugged
+    assert clock.now_ns() == 3_000_000

@@ -118,6 +118,14 @@ class Bus:
         """True while a job is under way."""
         return self._job is not None
 
+    def renew(self, port: Port) -> None:
+        """Go on with a line that is back in the place of one that is gone; its job is forgotten."""
+        self._port = port
+        self.failure = None
+        self._job = self._awaited = None
+        self._state = _READY
+        self._receiver.flush()  # the half of a packet that the lost line brought is nobody's
+
     def load(self, job: Job) -> None:
         """Take a job; the next `step` begins it. What an aborted job left behind is forgotten."""
         self._awaited = None

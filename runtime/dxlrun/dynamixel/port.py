@@ -5,13 +5,16 @@ from __future__ import annotations
 import os
 import select
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from dxlrun.errors import PortError
 
 _WRITE_PATIENCE_NS = 20_000_000
 """A goal packet for 50 servos takes 2.6 ms at 1 Mbit/s; a line that does not take it in 20 ms is stuck."""
+
+Reopened = Callable[[int], int | None]
+"""Asks whoever opens lines for one of them again; returns its descriptor once there is one; never waits."""
 
 
 class Port(Protocol):
@@ -39,6 +42,14 @@ class Ports(Protocol):
 
         Empty when time is up. Advances virtual time where time is virtual. `deadline_ns` is on the run's
         Clock; a deadline in the past only looks.
+        """
+        ...
+
+    def reopen(self, index: int) -> bool:
+        """Ask for a line that is gone again; say whether it is back, in its place in `ports`. Never waits.
+
+        From the first call on the line that is gone is not waited for any more. What stands behind a line
+        that is back was without a host, and maybe without power: all its servos count as rebooted.
         """
         ...
 
@@ -104,14 +115,18 @@ class SerialPort:
 
 
 class SerialPorts:
-    """The serial lines of a robot on the machine's monotonic time."""
+    """The serial lines of a robot on the machine's monotonic time.
 
-    __slots__ = ("_descriptors", "_index", "_ports")
+    `reopened` asks for a line that is gone; without it such a line stays gone.
+    """
 
-    def __init__(self, ports: Sequence[SerialPort]) -> None:
-        self._ports = tuple(ports)
-        self._descriptors = [port.descriptor for port in ports]
+    __slots__ = ("_index", "_ports", "_reopened", "_waited")
+
+    def __init__(self, ports: Sequence[SerialPort], reopened: Reopened = lambda _: None) -> None:
+        self._ports = list(ports)
+        self._waited = [port.descriptor for port in ports]
         self._index = {port.descriptor: index for index, port in enumerate(ports)}
+        self._reopened = reopened
 
     @property
     def ports(self) -> Sequence[SerialPort]:
@@ -122,10 +137,35 @@ class SerialPorts:
         """Wait for bytes on any line until `deadline_ns` of CLOCK_MONOTONIC; a past deadline only looks."""
         left = (deadline_ns - time.monotonic_ns()) * 1e-9
         # select and not epoll: its time-out has microseconds
-        ready, _, _ = select.select(self._descriptors, [], [], max(left, 0.0))
+        ready, _, _ = select.select(self._waited, [], [], max(left, 0.0))
         if not ready:
             return ()
         indices = [self._index[descriptor] for descriptor in ready]
         for index in indices:
             self._ports[index].announce()
         return indices
+
+    def reopen(self, index: int) -> bool:
+        """Ask for a line that is gone again; its descriptor keeps its number, and is of nothing meanwhile."""
+        gone = self._ports[index]
+        if gone.descriptor in self._waited:
+            self._waited.remove(gone.descriptor)
+            set_aside(gone.descriptor)
+        descriptor = self._reopened(index)
+        if descriptor is None:
+            return False
+        put_in_place(descriptor, gone.descriptor)
+        self._ports[index] = SerialPort(gone.descriptor, gone.name)
+        self._waited.append(gone.descriptor)
+        return True
+
+
+def set_aside(descriptor: int) -> None:
+    """Let go of a line that is gone: its device gets its old name again only when nobody has it open."""
+    put_in_place(os.open(os.devnull, os.O_RDWR | os.O_CLOEXEC), descriptor)
+
+
+def put_in_place(new: int, descriptor: int) -> None:
+    """Let `descriptor` be what `new` is, which is closed: whoever knows the number need not be told."""
+    os.dup2(new, descriptor, inheritable=False)
+    os.close(new)

@@ -57,7 +57,8 @@ class VirtualPorts:
     def __init__(self, clock: VirtualClock, buses: Sequence[SimulatedBus]) -> None:
         self._clock = clock
         self._buses = tuple(buses)
-        self._ports = tuple(VirtualPort(clock, bus) for bus in buses)
+        self._ports = [VirtualPort(clock, bus) for bus in buses]
+        self._lost: set[int] = set()
 
     @property
     def ports(self) -> Sequence[VirtualPort]:
@@ -67,9 +68,21 @@ class VirtualPorts:
     def wait(self, deadline_ns: int) -> Sequence[int]:
         """Let virtual time pass until bytes arrive or `deadline_ns`; return the lines with bytes."""
         while True:
-            ready = [index for index, port in enumerate(self._ports) if port.collect()]
+            # time passes for the servos of a lost line, too
+            heard = [index for index, port in enumerate(self._ports) if port.collect()]
+            ready = [index for index in heard if index not in self._lost]
             now_ns = self._clock.now_ns()
             if ready or now_ns >= deadline_ns:
                 return ready
             due = [due_ns for bus in self._buses if (due_ns := bus.next_due_ns()) is not None]
             self._clock.wait_until(min([deadline_ns, *due]))
+
+    def reopen(self, index: int) -> bool:
+        """Ask for a lost line again: it is back as soon as its adapter is plugged in."""
+        self._lost.add(index)
+        bus = self._buses[index]
+        if not bus.plugged:
+            return False
+        self._lost.remove(index)
+        self._ports[index] = VirtualPort(self._clock, bus)
+        return True
