@@ -55,6 +55,26 @@ class TorqueLimit:
 
 
 @dataclass(frozen=True, slots=True)
+class RegisterValue:
+    """One item of a servo's memory and what it shall hold."""
+
+    address: int
+    size: int
+    """1, 2 or 4"""
+    value: int
+    """The integer on the wire; one below 0 in two's complement."""
+    name: str
+    """As the control table has it: `position_p_gain`."""
+    eeprom: bool = False
+    """True where it survives power-off, and is written only while torque is off."""
+
+    @property
+    def data(self) -> bytes:
+        """What is written, little-endian."""
+        return self.value.to_bytes(self.size, "little", signed=self.value < 0)
+
+
+@dataclass(frozen=True, slots=True)
 class ServoPlan:
     """One servo and the joint that it moves: q = direction * (theta - reference)."""
 
@@ -85,6 +105,8 @@ class ServoPlan:
     """Where hardware error status stands, one byte; None where the model has none."""
     torque_limit: TorqueLimit | None = None
     """None where the model has none that limits position control."""
+    registers: tuple[RegisterValue, ...] = ()
+    """What the robot file declares, in the order in which it is written: EEPROM first."""
 
 
 @dataclass(frozen=True, slots=True)

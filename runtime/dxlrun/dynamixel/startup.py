@@ -17,6 +17,7 @@ from dxlrun.dynamixel.inspection1 import Inspector1
 from dxlrun.dynamixel.inspection2 import Inspector2
 from dxlrun.dynamixel.line import Line, listen
 from dxlrun.dynamixel.plan import readable, state_read
+from dxlrun.dynamixel.registers import settle_registers
 from dxlrun.dynamixel.transaction import Outcome, Program, Reply
 from dxlrun.dynamixel.units import goal_bytes, joint_position, speed_ticks, ticks_in
 
@@ -180,6 +181,46 @@ def _engage_one(plan: BusPlan, servo: ServoPlan, result: Engagement) -> Program[
     if not problem:
         result.goals.append(goal)
     return problem
+
+
+@dataclass(frozen=True, slots=True)
+class Rejoined:
+    """What came of a servo that answers again."""
+
+    problems: tuple[str, ...]
+    """Why it may take no part, one sentence each."""
+    torqued: bool
+    """True when torque enable was read back as 1, and its goal as `goal`."""
+    goal: int | None
+    """Goal position in ticks as it was written; None: none was, because it is limp."""
+    written: tuple[tuple[str, str], ...]
+    """Joint, and what was written into its registers."""
+
+
+def rejoin(plan: BusPlan, servo_index: int, torque: bool) -> Program[Rejoined]:
+    """Take one servo back that was lost or was reset, as at the start: look, mend registers, then hold it.
+
+    `torque`: switch it on; without, who is limp stays limp and gets no goal, as a goal may switch torque on
+    (protocol.md), and who holds torque still gets its present position for a goal.
+    """
+    servo = plan.servos[servo_index]
+    inspector = _INSPECTORS[plan.protocol](plan, True)
+    found = inspector.found
+    if (yield from inspector.registers(servo)):
+        yield from _Surveyor(plan, inspector).states([servo])
+    if found.problems:
+        return Rejoined(tuple(found.problems), False, None, ())
+    settled = yield from settle_registers(plan, servo)
+    written = tuple(settled.written)
+    enabled = yield from persist(plan.torque_reads[servo_index])
+    if not enabled.answered:
+        settled.problems.append(f"{who(plan, servo)} did not answer when its torque was asked for")
+    if settled.problems or not (torque or enabled.parameters[0]):
+        return Rejoined(tuple(settled.problems), False, None, written)
+    held = Engagement()
+    if problem := (yield from _engage_one(plan, servo, held)):
+        return Rejoined((f"{who(plan, servo)} {problem}",), False, None, written)
+    return Rejoined((), True, held.goals[0], written)
 
 
 def confirm(plan: BusPlan) -> Program[list[str]]:

@@ -1,0 +1,123 @@
+"""Registers as the robot file declares them: compared, only differences written, each read back.
+
+Programs of transactions; nothing here waits. EEPROM wears, and a servo of Protocol 2.0 refuses to write it
+while it holds torque (e-Manual XM430-W350, Control Table of EEPROM Area), so then it is never written.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from dxlrun.control_table import ControlItem, control_table
+from dxlrun.dynamixel.bus_plan import BusPlan, RegisterValue, ServoPlan
+from dxlrun.dynamixel.inspection import called, persist, setup_line, who
+from dxlrun.dynamixel.transaction import Outcome, Program, Reply
+
+
+@dataclass(slots=True)
+class Settled:
+    """What came of the declared registers of one servo."""
+
+    problems: list[str] = field(default_factory=list)
+    """Why it does not have them, one sentence each."""
+    written: list[tuple[str, str]] = field(default_factory=list)
+    """Joint, and what was written: `Position P Gain (84) was 640 and is 800`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """A declared register and what the servo has there."""
+
+    register: RegisterValue
+    found: int | None
+    """The integer on the wire, signed where the item is; None: it could not be read."""
+
+    @property
+    def differs(self) -> bool:
+        """True when it has to be written."""
+        return self.found is not None and self.found != self.register.value
+
+
+def compare(plan: BusPlan, servo: ServoPlan) -> Program[tuple[Difference, ...]]:
+    """Read every declared register of one servo; writes nothing."""
+    line, found = setup_line(plan), []
+    for register in servo.registers:
+        reply = yield from persist(line.read(servo.servo_id, register.address, register.size))
+        found.append(Difference(register, _integer(_item(plan, servo, register), reply)))
+    return tuple(found)
+
+
+def settle_registers(plan: BusPlan, servo: ServoPlan) -> Program[Settled]:
+    """Write the registers of one servo that differ from the robot file, and read them back.
+
+    Nothing is written when one cannot be read, and no EEPROM while the servo holds torque.
+    """
+    settled = Settled()
+    if not servo.registers:
+        return settled
+    differences = yield from compare(plan, servo)
+    silent = [one.register for one in differences if one.found is None]
+    if silent:
+        settled.problems.append(
+            f"{who(plan, servo)} did not answer when {_names(plan, servo, silent)} was read"
+        )
+        return settled
+    differing = [one for one in differences if one.differs]
+    stored = [one.register for one in differing if one.register.eeprom]
+    if stored and (problem := (yield from _torqued(plan, servo, stored))):
+        settled.problems.append(f"{who(plan, servo)} {problem}")
+        return settled
+    for one in differing:
+        problem = yield from write_register(plan, servo, one.register)
+        text = called(_item(plan, servo, one.register))
+        if problem:
+            settled.problems.append(f"{who(plan, servo)} {problem}")
+        else:
+            settled.written.append((servo.joint, f"{text} was {one.found} and is {one.register.value}"))
+    return settled
+
+
+def write_register(plan: BusPlan, servo: ServoPlan, register: RegisterValue) -> Program[str]:
+    """Write one register and read it back; return what went wrong, or nothing.
+
+    The read-back decides: an acknowledgement may be lost, or may be switched off by Status Return Level.
+    """
+    line, item = setup_line(plan), _item(plan, servo, register)
+    written = yield from persist(line.write(servo.servo_id, register.address, register.data))
+    if written.outcome is Outcome.REFUSED:
+        return f"refuses {called(item)} = {register.value}: {line.dialect.describe_error(written.error)}"
+    back = yield from persist(line.read(servo.servo_id, register.address, register.size))
+    found = _integer(item, back)
+    if found is None:
+        return f"did not answer when {called(item)} was read back"
+    if found != register.value:
+        return f"was given {called(item)} = {register.value}, but has {found}"
+    return ""
+
+
+def _torqued(plan: BusPlan, servo: ServoPlan, stored: Sequence[RegisterValue]) -> Program[str]:
+    reply = yield from persist(setup_line(plan).read(servo.servo_id, servo.torque_address, 1))
+    names = _names(plan, servo, stored)
+    if not reply.answered:
+        return f"did not answer when its torque was asked for, so {names} was not written"
+    if reply.parameters[0]:
+        return (
+            f"holds torque, so {names} in its EEPROM was not written: switch its torque off and start again, "
+            "without --take-over"
+        )
+    return ""
+
+
+def _item(plan: BusPlan, servo: ServoPlan, register: RegisterValue) -> ControlItem:
+    return control_table(servo.model, plan.protocol).items[register.name]
+
+
+def _integer(item: ControlItem, reply: Reply) -> int | None:
+    if not reply.answered:
+        return None
+    return int.from_bytes(reply.parameters[: item.size], "little", signed=item.signed)
+
+
+def _names(plan: BusPlan, servo: ServoPlan, registers: Sequence[RegisterValue]) -> str:
+    return ", ".join(called(_item(plan, servo, register)) for register in registers)

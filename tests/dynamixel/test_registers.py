@@ -1,0 +1,129 @@
+import math
+from dataclasses import replace
+
+import pytest
+
+from dxlrun.control_table import control_table
+from dxlrun.dynamixel.bus import Bus, run
+from dxlrun.dynamixel.bus_plan import RegisterValue
+from dxlrun.dynamixel.registers import compare, settle_registers
+from dxlrun.dynamixel.startup import rejoin
+from dxlrun.packets import NoPackets
+
+WRITE = {1.0: (4, 3), 2.0: (7, 3)}
+"""Where the instruction stands in a packet, and the number of a write."""
+
+
+def register(table, name, value):
+    item = table.items[name]
+    return RegisterValue(item.address, item.size, value, name, item.area == "EEPROM")
+
+
+def declared(plan, index=0, **values):
+    """Return the plan with registers of one servo declared, EEPROM first."""
+    servo = plan.servos[index]
+    table = control_table(servo.model, plan.protocol)
+    wanted = sorted((register(table, *one) for one in values.items()), key=lambda one: not one.eeprom)
+    servos = list(plan.servos)
+    servos[index] = replace(servo, registers=tuple(wanted))
+    return replace(plan, servos=tuple(servos))
+
+
+@pytest.fixture
+def make_x(make_plan):
+    def make(ids=(11, 12), **change):
+        middle = {"model": "XM430-W350", "reference": math.pi, "lower": -2.5, "upper": 2.5}
+        return make_plan(ids, **{"name": "arm", "protocol": 2.0, "return_delay_ns": 0} | middle | change)
+
+    return make
+
+
+@pytest.fixture
+def bench(make_rig):
+    """Build a rig and a bus of ours on it; gives the rig and what runs a program there."""
+
+    def build(plan, **change):
+        rig = make_rig(plan, **change)
+        bus = Bus(0, plan, rig.ports.ports[0], rig.clock, NoPackets())
+
+        def execute(program):
+            (result,) = run([program], [bus], rig.ports, rig.clock)
+            assert result is not None
+            return result
+
+        return rig, execute
+
+    return build
+
+
+def writes(rig):
+    at, number = WRITE[rig.plans[0].protocol]
+    return [packet for packet in rig.into_bus() if packet[at] == number]
+
+
+def held(rig, name, index=0):
+    item = rig.buses[0].servos[index].registers.table.items[name]
+    return item.decode(rig.buses[0].servos[index].registers.read(item.address, item.size))
+
+
+def test_only_what_differs_is_written_and_it_is_read_back(bench, make_x):
+    plan = declared(make_x(), return_delay_time=250, position_p_gain=900, position_d_gain=0)
+    rig, execute = bench(plan)
+    rig.buses[0].servo(11).poke("return_delay_time", 0)
+    settled = execute(settle_registers(plan, plan.servos[0]))
+    assert settled.problems == []
+    assert [text for _, text in settled.written] == [
+        "Return Delay Time (9) was 0 and is 250",
+        "Position P Gain (84) was 800 and is 900",
+    ]
+    assert len(writes(rig)) == 2
+    assert (held(rig, "return_delay_time"), held(rig, "position_p_gain")) == (250, 900)
+    assert execute(settle_registers(plan, plan.servos[0])).written == []
+    assert len(writes(rig)) == 2
+
+
+def test_comparing_writes_nothing(bench, make_x):
+    plan = declared(make_x(), position_p_gain=900, position_d_gain=0)
+    rig, execute = bench(plan)
+    found = execute(compare(plan, plan.servos[0]))
+    assert [(one.register.name, one.found, one.differs) for one in found] == [
+        ("position_p_gain", 800, True),
+        ("position_d_gain", 0, False),
+    ]
+    assert writes(rig) == []
+
+
+def test_no_eeprom_is_written_while_a_servo_holds_torque(bench, make_x):
+    plan = declared(make_x(), return_delay_time=250, position_p_gain=900)
+    rig, execute = bench(plan)
+    rig.buses[0].servo(11).poke("return_delay_time", 0)
+    rig.buses[0].servo(11).poke("torque_enable", 1)
+    (problem,) = execute(settle_registers(plan, plan.servos[0])).problems
+    assert "holds torque, so Return Delay Time (9) in its EEPROM was not written" in problem
+    assert writes(rig) == []
+
+
+def test_a_servo_that_was_reset_gets_its_registers_and_its_torque_again(bench, make_x):
+    plan = declared(make_x(), position_p_gain=900)
+    rig, execute = bench(plan)
+    execute(settle_registers(plan, plan.servos[0]))
+    rig.buses[0].servo(11).reset()
+    rig.clock.wait_until(rig.clock.now_ns() + 2_000_000_000)
+    assert held(rig, "position_p_gain") == 800
+    back = execute(rejoin(plan, 0, torque=True))
+    assert (back.problems, back.torqued) == ((), True)
+    assert back.written == (("arm_11_joint", "Position P Gain (84) was 800 and is 900"),)
+    assert rig.torque() == [True, False]
+    assert abs(back.goal * plan.servos[0].rad_per_tick - rig.buses[0].servo(11).position) < 0.002
+
+
+def test_a_limp_servo_that_may_not_have_torque_gets_no_goal(bench, make_plan):
+    plan = make_plan((1, 3))
+    rig, execute = bench(plan)
+    back = execute(rejoin(plan, 0, torque=False))
+    assert (back.problems, back.torqued, back.goal) == ((), False, None)
+    assert writes(rig) == []
+    rig.buses[0].servo(1).poke("torque_enable", 1)
+    back = execute(rejoin(plan, 0, torque=False))
+    assert back.torqued
+    assert back.goal is not None
