@@ -9,6 +9,7 @@ from dxlrun.clock import Clock
 from dxlrun.dynamixel import startup, torque_limit
 from dxlrun.dynamixel.bus import Bus, pump, run
 from dxlrun.dynamixel.bus_plan import BusPlan
+from dxlrun.dynamixel.gaps import Gaps
 from dxlrun.dynamixel.health import Servos
 from dxlrun.dynamixel.limp import LimpOutcome, limp_buses
 from dxlrun.dynamixel.port import Ports
@@ -64,8 +65,10 @@ class DynamixelHardware:
             Bus(index, plan, port, clock, packets)
             for index, (plan, port) in enumerate(zip(self._plans, ports.ports, strict=True))
         )
+        self._gaps = tuple(Gaps(plan, events, clock.now_ns) for plan in self._plans)
         self._servos = tuple(
-            Servos(plan, bus, events) for plan, bus in zip(self._plans, self._buses, strict=True)
+            Servos(plan, bus, gaps, events)
+            for plan, bus, gaps in zip(self._plans, self._buses, self._gaps, strict=True)
         )
 
     def start(self) -> None:
@@ -86,7 +89,7 @@ class DynamixelHardware:
             raise
 
     def read(self) -> None:
-        """Read every servo once, on all lines at once. Raises PortError when a line is gone."""
+        """Read every servo once, on all lines at once; of a line that is gone every row is invalid."""
         for bus, servos in zip(self._buses, self._servos, strict=True):
             servos.reads.begin()
             bus.load(servos.reads)
@@ -94,17 +97,16 @@ class DynamixelHardware:
         now = self._clock.now_ns()
         for servos in self._servos:
             servos.settle(self._states, now)
-        self._raise_failures()
+        self._tell_failures()
 
     def write(self) -> None:
-        """Send the goals, one sync write a line and layout. Raises PortError when a line is gone."""
+        """Send the goals, one sync write a line and layout, on every line that is there."""
         for bus, servos in zip(self._buses, self._servos, strict=True):
             for packet in servos.goal_packets(self._goals, self._states):
                 if bus.failure is None:
-                    # what it raises does not name the bus, and the other lines shall have their goals
-                    with suppress(PortError):
+                    with suppress(PortError):  # told below; the other lines shall have their goals
                         bus.send(packet)
-        self._raise_failures()
+        self._tell_failures()
 
     def limit_torque(self, fraction: float) -> None:
         """Let no servo exert more than a fraction of its own limit; `restore_torque` takes that back."""
@@ -114,19 +116,17 @@ class DynamixelHardware:
                     bus.send(packet)
 
     def idle(self, until_ns: int) -> None:
-        """Ask one servo a line what its cyclic reads do not tell, if there is time and need for it.
-
-        Who waits for its goals longer than `health.STARVED` cycles is asked without the time, too.
-        """
+        """Do on each line what waits for a gap and fits this one; see `gaps` for what is done even so."""
+        self._ask_for_lines()
         latest = until_ns - IDLE_MARGIN_NS
-        probing = [
-            servos.probe(bus, latest - self._clock.now_ns())
-            for bus, servos in zip(self._buses, self._servos, strict=True)
-        ]
-        if any(probing):
+        working = False
+        for bus, servos, gaps in zip(self._buses, self._servos, self._gaps, strict=True):
+            servos.ask()
+            if gaps.begin(latest):
+                bus.load(gaps)
+                working = True
+        if working:
             pump(self._buses, self._ports, self._clock, self._beat)
-            for servos in self._servos:
-                servos.probed()
 
     def stop(self) -> tuple[str, ...]:
         """Switch torque off on every servo, and read it back; return a sentence per failure."""
@@ -143,7 +143,15 @@ class DynamixelHardware:
             )
         return failures
 
+    def _ask_for_lines(self) -> None:
+        """Go on with every line that was gone and is back."""
+        for index, (bus, servos) in enumerate(zip(self._buses, self._servos, strict=True)):
+            if bus.failure is not None and self._ports.reopen(index):
+                bus.renew(self._ports.ports[index])
+                servos.found()
+
     def _limp(self) -> tuple[LimpOutcome, ...]:
+        self._ask_for_lines()
         for bus, servos in zip(self._buses, self._servos, strict=True):
             servos.torqued[:] = False
             bus.failure = None  # a line that is back, or was only stuck, gets its chance
@@ -217,9 +225,17 @@ class DynamixelHardware:
         if problems := [problem for one in found if one is not None for problem in one]:
             raise StartUpError("\n".join(problems))
 
-    def _raise_failures(self) -> None:
+    def _tell_failures(self) -> PortError | None:
+        """Tell of each line that is gone, once; return the first of them."""
+        first: PortError | None = None
         for plan, bus, servos in zip(self._plans, self._buses, self._servos, strict=True):
             if bus.failure is not None:
                 text = f"bus {plan.name} on {plan.port}: {bus.failure}"
                 servos.lost(text)
-                raise PortError(text) from bus.failure
+                first = first or PortError(text)
+        return first
+
+    def _raise_failures(self) -> None:
+        """Raise PortError when a line is gone: there is no set-up without it."""
+        if error := self._tell_failures():
+            raise error

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -12,12 +12,12 @@ from dxlrun.dynamixel.bus import Bus
 from dxlrun.dynamixel.bus_plan import BusPlan
 from dxlrun.dynamixel.dialect import dialect_of
 from dxlrun.dynamixel.exchange import CyclicReads
+from dxlrun.dynamixel.gaps import Gaps, Urgency
 from dxlrun.dynamixel.goal_arrays import GoalArrays
-from dxlrun.dynamixel.line import SHORT_PATIENCE_NS
 from dxlrun.dynamixel.plan import plan_line
 from dxlrun.dynamixel.protocol2 import describe_hardware_error
 from dxlrun.dynamixel.state_arrays import StateArrays
-from dxlrun.dynamixel.transaction import Program, ProgramJob, Reply, Transaction
+from dxlrun.dynamixel.transaction import Program, Reply, Transaction
 from dxlrun.events import EventCode, EventSink, Severity
 from dxlrun.hardware import LOST_CYCLES
 from dxlrun.interfaces import Commands, States
@@ -25,10 +25,6 @@ from dxlrun.plurals import counted
 
 NOISE_EVENT_NS = 1_000_000_000
 """A noisy line has at most one event in this time."""
-
-STARVED = 50
-"""Cycles after which a servo is asked though the gap is too short: a skipped period is better than a joint
-that gets no goals for the rest of the run."""
 
 ALERT_AGAIN = 50
 """Cycles after which a standing alert is read again: a second error does not change the alert bit."""
@@ -43,6 +39,7 @@ class _Question(NamedTuple):
     """What one servo is asked in a gap, and who takes the answer."""
 
     servo: int
+    what: str
     read: Transaction
     take: Callable[[int, Reply], None]
 
@@ -53,10 +50,12 @@ class Servos:
     __slots__ = (
         "_alert_cycles",
         "_alerts",
+        "_asking",
         "_bus",
         "_ceiling",
         "_dialect",
         "_events",
+        "_gaps",
         "_hardware_errors",
         "_limp",
         "_lost",
@@ -64,23 +63,21 @@ class Servos:
         "_noise_at_ns",
         "_noise_seen",
         "_plan",
-        "_probe",
         "_probed",
-        "_question",
         "_returning",
         "_rows",
         "_said_errors",
-        "_starved",
         "_states",
         "goals",
         "reads",
         "torqued",
     )
 
-    def __init__(self, plan: BusPlan, bus: Bus, events: EventSink) -> None:
+    def __init__(self, plan: BusPlan, bus: Bus, gaps: Gaps, events: EventSink) -> None:
         count = len(plan.servos)
         self._plan = plan
         self._bus = bus
+        self._gaps = gaps
         self._events = events
         self._states = StateArrays(plan)
         self.goals = GoalArrays(plan)
@@ -99,10 +96,8 @@ class Servos:
         self._alerts: list[int] = []  # who has a hardware error that was not read yet
         self._alert_cycles = 0
         self._hardware_errors = [0] * count
-        self._probe: ProgramJob[Reply] | None = None
-        self._question: _Question | None = None
+        self._asking = False
         self._probed = 0
-        self._starved = 0  # cycles in a row without time for a question
         self._noise_seen = 0
         self._noise_at_ns = -NOISE_EVENT_NS
         self._lost = False
@@ -146,36 +141,29 @@ class Servos:
                 self._ceiling[index] = np.nan
         return self.goals.packets(goals, self.torqued, self._ceiling)
 
-    def probe(self, bus: Bus, left_ns: int) -> bool:
-        """Load the one read that a servo is owed beside its cyclic ones; False when there is none.
+    def ask(self) -> None:
+        """Let the next gap ask one servo what it is owed beside its cyclic reads, if one is owed anything.
 
         That is torque enable of a servo that waits for its goals, or the hardware error status of one that
-        raised an alert. `left_ns`: how long it may take, but see STARVED. Only a servo that answers is asked;
-        of a limp one the torque is known.
+        raised an alert. Only a servo that answers is asked; of a limp one the torque is known.
         """
-        question = self._owed()
+        question = None if self._asking else self._owed()
         if question is None:
-            self._starved = 0
-            return False
-        timeout = question.read.due_ns + self._plan.latency_ns + SHORT_PATIENCE_NS
-        if timeout > left_ns:
-            self._starved += 1
-            if self._starved <= STARVED:
-                return False
-            need, left = timeout * 1e-6, max(left_ns, 0) * 1e-6
-            text = f"waits to be read beside the cycle: that takes {need:.1f} ms, the gap has {left:.1f} ms"
-            self._say(EventCode.OVERRUN, Severity.WARNING, question.servo, f"{text}; a period may be skipped")
-        self._starved = 0
-        self._question, self._probed = question, question.servo
-        self._probe = ProgramJob(_once(replace(question.read, timeout_ns=timeout)))
-        bus.load(self._probe)
-        return True
+            return
+        self._asking = True
+        self._probed = question.servo
+        what = f"{question.what} of {self._who(question.servo)}"
+        self._gaps.add(
+            _once(question.read),
+            partial(self._answered, question),
+            Urgency.REPAIR,
+            what,
+            question.servo,
+        )
 
-    def probed(self) -> None:
-        """Take what came of the probe."""
-        reply = None if self._probe is None else self._probe.result
-        question, self._probe, self._question = self._question, None, None
-        if question is not None and reply is not None and reply.answered:
+    def _answered(self, question: _Question, reply: Reply) -> None:
+        self._asking = False
+        if reply.answered:
             question.take(question.servo, reply)
 
     def _alert_again(self) -> None:
@@ -194,14 +182,15 @@ class Servos:
             address = self._plan.servos[index].hardware_error_address
             if address is not None and self.reads.fresh[index]:
                 read = plan_line(self._plan).read(self._plan.servos[index].servo_id, address, 1)
-                return _Question(index, read, self._take_hardware_error)
+                return _Question(index, "hardware error status", read, self._take_hardware_error)
         if self.torqued.all():
             return None
         count = len(self._plan.servos)
         for offset in range(1, count + 1):
             index = (self._probed + offset) % count
             if not (self.torqued[index] or self._limp[index]) and self.reads.fresh[index]:
-                return _Question(index, self._plan.torque_reads[index], self._take_torque)
+                read = self._plan.torque_reads[index]
+                return _Question(index, "torque enable", read, self._take_torque)
         return None
 
     def _take_torque(self, index: int, reply: Reply) -> None:
@@ -236,6 +225,16 @@ class Servos:
         if not self._lost:
             self._lost = True
             self._emit(EventCode.PORT_LOST, Severity.ERROR, self._plan.name, text)
+
+    def found(self) -> None:
+        """Tell that the line is back: whoever stands behind it was without a host, and maybe without power."""
+        self._lost = False
+        for index in range(len(self._missed)):
+            self._missed[index] = max(self._missed[index], LOST_CYCLES)
+            self._limp[index] = False
+        self.torqued[:] = False
+        text = f"bus {self._plan.name} is back; its servos count as rebooted"
+        self._emit(EventCode.PORT_BACK, Severity.WARNING, self._plan.name, text)
 
     def _count_losses(self) -> None:
         for index, fresh in enumerate(self.reads.fresh.tolist()):
