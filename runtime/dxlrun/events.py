@@ -45,6 +45,7 @@ class EventCode(IntEnum):
     """Torque enable reads 0 where 1 was expected: the servo was reset or its torque was cut."""
     BUS_NOISE = 24
     PORT_LOST = 25
+    PORT_BACK = 26
     COMMAND = 30
     """A command was handed to a controller."""
     COMMAND_REFUSED = 31

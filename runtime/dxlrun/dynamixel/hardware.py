@@ -204,6 +204,7 @@ class DynamixelHardware:
     def _first_states(self) -> None:
         for _ in range(FIRST_READS):
             self.read()
+            self._raise_failures()
             if all(servos.all_fresh for servos in self._servos):
                 break
         silent = [name for servos in self._servos for name in servos.silent]
