@@ -1,0 +1,49 @@
+"""Modes: what a servo makes of its goals, and which command interfaces go together.
+
+Without numpy, because the guardian reads a bus' plan and shall be light.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from enum import IntEnum, unique
+
+
+@unique
+class Mode(IntEnum):
+    """What a servo makes of its goals; the number is in the log."""
+
+    UNKNOWN = 0
+    """Not known, or changing now: the joint gets no goals."""
+    POSITION = 1
+    """Goes to a position, as fast as it can or at a speed; of a continuous joint over many turns."""
+    VELOCITY = 2
+    """Turns at a speed, for ever."""
+    EFFORT = 3
+    """Exerts a torque, or draws a current."""
+    PWM = 4
+    """Gets a fraction of the full voltage."""
+    EFFORT_POSITION = 5
+    """Goes to a position with no more effort than is commanded."""
+
+
+_MODES: dict[frozenset[str], Mode] = {
+    frozenset({"position"}): Mode.POSITION,
+    frozenset({"position", "velocity"}): Mode.POSITION,
+    frozenset({"velocity"}): Mode.VELOCITY,
+    frozenset({"effort"}): Mode.EFFORT,
+    frozenset({"pwm"}): Mode.PWM,
+    frozenset({"position", "effort"}): Mode.EFFORT_POSITION,
+    frozenset({"position", "velocity", "effort"}): Mode.EFFORT_POSITION,
+}
+
+
+def mode_of(names: Collection[str]) -> Mode:
+    """Return the mode in which a joint follows these command interfaces together.
+
+    Raises ValueError for interfaces that no mode has together, and for none.
+    """
+    mode = _MODES.get(frozenset(names))
+    if mode is None:
+        raise ValueError(f"no servo follows {' and '.join(names) or 'nothing'} together")
+    return mode
