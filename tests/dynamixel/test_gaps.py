@@ -1,0 +1,163 @@
+import math
+from dataclasses import dataclass
+
+import pytest
+
+from dxlrun.dynamixel import protocol2
+from dxlrun.dynamixel.bus import Bus, pump
+from dxlrun.dynamixel.gaps import STARVED, STARVED_AGAIN, Gaps, Urgency
+from dxlrun.dynamixel.line import listen
+from dxlrun.dynamixel.plan import plan_line
+from dxlrun.dynamixel.transaction import Outcome
+from dxlrun.events import EventCode
+
+READ_NS = 270_000
+"""14 bytes there, 13 back, 1 Mbit/s, no return delay: what one of the reads below takes."""
+
+
+@dataclass
+class Rounds:
+    """One bus whose gaps are given one after the other, each a millisecond after the one before."""
+
+    rig: object
+    bus: Bus
+    gaps: Gaps
+
+    def gap(self, length_ns):
+        until = self.rig.clock.now_ns() + length_ns
+        count = len(self.rig.into_bus())
+        if self.gaps.begin(until):
+            self.bus.load(self.gaps)
+            pump([self.bus], self.rig.ports, self.rig.clock, lambda: None)
+        self.over_ns = self.rig.clock.now_ns() - until
+        self.rig.clock.wait_until(until + 1_000_000)
+        return self.rig.into_bus()[count:]
+
+    def read(self, servo_id, address, size=1):
+        return plan_line(self.rig.plans[0]).read(servo_id, address, size)
+
+
+@pytest.fixture
+def rounds(make_rig, make_plan):
+    plan = make_plan(
+        (11, 12),
+        protocol=2.0,
+        model="XM430-W350",
+        reference=math.pi,
+        lower=-2.5,
+        upper=2.5,
+        return_delay_ns=0,
+    )
+    rig = make_rig(plan)
+    bus = Bus(0, plan, rig.ports.ports[0], rig.clock, rig.packets)
+    return Rounds(rig, bus, Gaps(plan, rig.events, rig.clock.now_ns))
+
+
+def reading(rounds, servo_id, *addresses):
+    found = []
+    for address in addresses:
+        reply = yield rounds.read(servo_id, address)
+        found.append(reply.parameters[0] if reply.answered else reply.outcome)
+    return found
+
+
+def test_a_program_goes_on_from_gap_to_gap(rounds):
+    found = []
+    rounds.gaps.add(reading(rounds, 11, 7, 11, 64), found.append, Urgency.SLOW, "three reads")
+    sent = [rounds.gap(READ_NS + 150_000) for _ in range(4)]
+    assert sent == [[protocol2.read(11, address, 1)] for address in (7, 11, 64)] + [[]]
+    assert found == [[11, 3, 0]]
+    assert rounds.gaps.waiting == 0
+
+
+def test_a_gap_takes_as_many_transactions_as_fit_and_ends_in_time(rounds):
+    found = []
+    rounds.gaps.add(reading(rounds, 11, *[7] * 9), found.append, Urgency.SLOW, "nine reads")
+    assert len(rounds.gap(1_000_000)) == 3
+    assert rounds.over_ns <= 0
+    rounds.rig.buses[0].servo(11).silence()
+    rounds.gap(1_000_000)
+    assert rounds.over_ns <= 0
+
+
+def test_the_more_urgent_goes_first_even_between_two_transactions(rounds):
+    ended = []
+    for urgency in (Urgency.SLOW, Urgency.STEERED, Urgency.REPAIR):
+        rounds.gaps.add(reading(rounds, 11, 7, 11), lambda _, u=urgency: ended.append(u), urgency, "two")
+    rounds.gap(READ_NS + 150_000)
+    rounds.gaps.add(reading(rounds, 12, 7), lambda _: ended.append(Urgency.MODE), Urgency.MODE, "one")
+    for _ in range(8):
+        rounds.gap(READ_NS + 150_000)
+    assert ended == [Urgency.MODE, Urgency.REPAIR, Urgency.STEERED, Urgency.SLOW]
+
+
+def test_of_one_servo_the_program_that_began_ends_first(rounds):
+    ended = []
+    for name, urgency, servo in (("a", Urgency.REPAIR, 0), ("b", Urgency.MODE, 0), ("c", Urgency.MODE, 1)):
+        servo_id = rounds.rig.plans[0].servos[servo].servo_id
+        program = reading(rounds, servo_id, 7, 11, 64)
+        rounds.gaps.add(program, lambda _, name=name: ended.append(name), urgency, name, servo)
+        rounds.gap(READ_NS + 150_000)
+    for _ in range(9):
+        rounds.gap(READ_NS + 150_000)
+    assert ended == ["a", "b", "c"]
+
+
+def test_a_pause_of_one_program_leaves_the_line_to_the_others(rounds):
+    ended = []
+
+    def pausing():
+        yield rounds.read(11, 7)
+        before = rounds.rig.clock.now_ns()
+        reply = yield listen(5_000_000)
+        assert reply.outcome is Outcome.SENT
+        return rounds.rig.clock.now_ns() - before
+
+    rounds.gaps.add(pausing(), ended.append, Urgency.MODE, "pausing")
+    rounds.gaps.add(reading(rounds, 12, 7), ended.append, Urgency.SLOW, "reading")
+    for _ in range(8):
+        rounds.gap(1_000_000)
+    assert ended[0] == [12]
+    assert 5_000_000 <= ended[1] <= 7_000_000
+
+
+@pytest.mark.parametrize(("urgency", "done"), [(Urgency.REPAIR, True), (Urgency.SLOW, False)])
+def test_what_is_urgent_is_done_at_last_in_a_gap_too_short_and_what_is_slow_never(rounds, urgency, done):
+    found = []
+    name = "torque enable of arm_11_joint"
+    rounds.gaps.add(reading(rounds, 11, 7, 7, 7), found.append, urgency, name, servo=0)
+    sent = [len(rounds.gap(READ_NS)) for _ in range(STARVED + 3 * STARVED_AGAIN)]
+    assert sum(sent[:STARVED]) == 0
+    assert found == ([[11, 11, 11]] if done else [])
+    told = rounds.rig.events.of(EventCode.OVERRUN)
+    assert len(told) == done
+    if done:
+        ((source, text),) = told
+        assert source == rounds.rig.plans[0].servos[0].joint
+        assert text.startswith(f"{name} waits for time beside the cycle: it takes 0.4 ms, the gap has 0.3 ms")
+
+
+def test_every_program_of_a_line_that_is_gone_ends_with_time_outs(rounds):
+    found = []
+    rounds.gaps.add(reading(rounds, 11, 7, 11), found.append, Urgency.MODE, "begun")
+    rounds.gap(READ_NS + 150_000)
+
+    def adding(result):
+        found.append(result)
+        rounds.gaps.add(reading(rounds, 12, 7), found.append, Urgency.SLOW, "added")
+
+    rounds.gaps.add(reading(rounds, 12, 7), adding, Urgency.SLOW, "not begun")
+    rounds.gaps.abandon()
+    assert found == [[11, Outcome.TIMEOUT], [Outcome.TIMEOUT]]
+    assert rounds.gaps.waiting == 1
+
+
+def test_a_transaction_that_a_cycle_cut_off_is_asked_again(rounds):
+    found = []
+    rounds.gaps.add(reading(rounds, 11, 7), found.append, Urgency.MODE, "one")
+    assert rounds.gaps.begin(rounds.rig.clock.now_ns() + 5_000_000)
+    rounds.bus.load(rounds.gaps)
+    rounds.bus.step(rounds.rig.clock.now_ns())  # sent, and nobody waits for the reply
+    rounds.rig.clock.wait_until(rounds.rig.clock.now_ns() + 5_000_000)
+    assert rounds.gap(1_000_000) == [protocol2.read(11, 7, 1)]
+    assert found == [[11]]
