@@ -244,12 +244,57 @@ class Bus:
         return min(self._last_byte_ns + self._quiet_ns, self._drain_end_ns)
 
     def _noise(self, data: memoryview, first_ns: int, last_ns: int) -> None:
-        self.noise_bytes += len(data)
-        self._reply.strays += 1
         self._sink.packet(self._index, PacketKind.NOISE, BROADCAST_ID, first_ns, last_ns, data)
+        # a status of a fast form that is cut off, or spoilt at a place: the parts before it are good
+        unused = len(data) - (self._shared(data, last_ns) if self._shares(data) else 0)
+        if unused:
+            self.noise_bytes += unused
+            self._reply.strays += 1
+
+    def _shares(self, data: memoryview) -> bool:
+        """Say whether a fast form is awaited, and this looks like its one status, whole or not."""
+        awaited = self._awaited
+        return (
+            awaited is not None
+            and awaited.fast
+            and self._state == _AWAITING
+            and len(data) > self._id_at
+            and data[: self._id_at] == self._dialect.HEADER
+            and data[self._id_at] == BROADCAST_ID
+        )
+
+    def _shared(self, data: memoryview, last_ns: int) -> int:
+        """Take what is good of the one status of a fast form; return the number of its bytes."""
+        awaited = self._awaited
+        if (
+            awaited is None
+            or self._job is None
+            or self._dialect.size_at(data, 0, len(data)) != awaited.widest
+        ):
+            return 0
+        lengths = [one.length for one in awaited.awaited]
+        parts = self._dialect.fast_answers(data, lengths)
+        used = self._dialect.fast_size(sum(lengths[: len(parts)]), len(parts)) if parts else 0
+        if last_ns < self._started_ns + (len(awaited.packet) + used) * self._byte_ns:
+            return 0  # sooner than the wire allows: left over from before
+        reply = self._reply
+        for index, (one, part) in enumerate(zip(awaited.awaited, parts, strict=False)):
+            if part.servo_id != one.servo_id:
+                return 0 if index == 0 else used
+            reply.error, reply.parameters, reply.last_ns = part.error, part.parameters, last_ns
+            self._open &= ~(1 << index)
+            self._job.status(index, reply)
+        if not self._open:
+            reply.outcome = Outcome.OK
+            self._state = _READY
+        return used
 
     def _status(self, packet: memoryview, first_ns: int, last_ns: int) -> None:
         self._sink.packet(self._index, PacketKind.STATUS, packet[self._id_at], first_ns, last_ns, packet)
+        if self._shares(packet):
+            if not self._shared(packet, last_ns):
+                self._stray(packet)
+            return
         status = self._opened(packet) if self._state == _AWAITING else None
         index = -1 if status is None else self._turn(status, last_ns)
         if status is None or index < 0 or self._job is None:

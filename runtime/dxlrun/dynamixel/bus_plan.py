@@ -131,6 +131,16 @@ class Budget:
 
 
 @dataclass(frozen=True, slots=True)
+class ReadWay:
+    """One way to read every servo of a bus once a cycle, and what a cycle then costs."""
+
+    name: str
+    """As the e-Manual calls it: `fast sync read`."""
+    budget: Budget
+    chosen: bool = False
+
+
+@dataclass(frozen=True, slots=True)
 class BusPlan:
     """One serial line: its servos, its prepared packets, its budget."""
 
@@ -145,9 +155,16 @@ class BusPlan:
     groups: tuple[tuple[int, ...], ...]
     """Who is read by one instruction: indices into `servos`; a group of one is read by itself."""
     reads: tuple[Transaction, ...]
-    """The state read of each group, when all its servos answer."""
+    """The state read of each group, when all its servos answer, in the form that every firmware knows."""
     limp: tuple[Transaction, ...]
     """Torque off, to be sent at any moment: to everybody first, then servo by servo, acknowledged."""
     torque_reads: tuple[Transaction, ...]
     """Read torque enable, in the order of `servos`."""
     budget: Budget
+    """Of a cycle with the reads that were chosen: the fast forms where `fast` says so."""
+    fast: tuple[bool, ...] = ()
+    """Of each group: it is to be read by a fast form, if that is answered at the start."""
+    ways: tuple[ReadWay, ...] = ()
+    """How the bus could be read, the chosen one among them."""
+    split: bool = False
+    """The next read request leaves right behind the goals, so that the replies wait when a cycle begins."""

@@ -64,8 +64,16 @@ class Dialect(Protocol):
         """Return the packet that writes a part of the control table."""
         ...
 
-    def read_many(self, requests: Sequence[tuple[int, int, int]]) -> bytes:
+    def read_many(self, requests: Sequence[tuple[int, int, int]], *, fast: bool = False) -> bytes:
         """Return the one packet that asks several servos, each by (ID, address, length)."""
+        ...
+
+    def fast_size(self, length: int, count: int) -> int:
+        """Return the bytes of the one status by which `count` servos answer a fast form."""
+        ...
+
+    def fast_answers(self, packet: Bytes, lengths: Sequence[int]) -> list[Status]:
+        """Return the servos' parts of such a status, those before the first broken one."""
         ...
 
     def sync_write_records(self, address: int, length: int, records: Bytes) -> bytes:

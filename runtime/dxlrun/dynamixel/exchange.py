@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from dxlrun.dynamixel.bus_plan import BusPlan
-from dxlrun.dynamixel.line import PATIENCE_NS, SHORT_PATIENCE_NS
+from dxlrun.dynamixel.line import PATIENCE_NS, SHORT_PATIENCE_NS, Line
 from dxlrun.dynamixel.plan import plan_line, state_read
 from dxlrun.dynamixel.transaction import Outcome, Reply, Transaction
 
@@ -30,12 +30,12 @@ class _Request:
 
     __slots__ = ("group", "indices", "patient", "short")
 
-    def __init__(self, plan: BusPlan, group: int, indices: tuple[int, ...]) -> None:
-        line = plan_line(plan)
+    def __init__(self, plan: BusPlan, line: Line, group: int, indices: tuple[int, ...], fast: bool) -> None:
         servos = [plan.servos[index] for index in indices]
+        spare = min(servo.state.spare for servo in servos)
         self.group = group
         self.indices = indices
-        self.patient = [state_read(line, servos, more) for more in range(1 + servos[0].state.spare)]
+        self.patient = [state_read(line, servos, more, fast=fast) for more in range(1 + spare)]
         self.short = [
             replace(read, timeout_ns=read.timeout_ns - PATIENCE_NS + SHORT_PATIENCE_NS)
             for read in self.patient
@@ -48,6 +48,7 @@ class CyclicReads:
     __slots__ = (
         "_current",
         "_groups",
+        "_line",
         "_lossy",
         "_made",
         "_patient",
@@ -58,7 +59,9 @@ class CyclicReads:
         "_replies",
         "_shape",
         "arrived_ns",
+        "away",
         "errors",
+        "fast",
         "fresh",
         "garbled",
         "missed",
@@ -75,7 +78,12 @@ class CyclicReads:
         """Error byte of the newest reply."""
         self.garbled = [False] * count
         """True when the newest loss had bytes."""
+        self.away = [False] * count
+        """Who is lost and not asked any more; see `leave`."""
+        self.fast = list(plan.fast)
+        """Which groups are read by a fast form; `plain` ends that."""
         self._plan = plan
+        self._line = plan_line(plan)
         self._groups = plan.groups
         self._replies = tuple(replies)
         self._made: dict[tuple[int, ...], _Request] = {}
@@ -103,8 +111,25 @@ class CyclicReads:
             self._queue = [
                 self._request(number, indices)
                 for number, group in enumerate(self._groups)
-                for indices in _turns(group, silent)
+                for indices in _turns([index for index in group if not self.away[index]], silent)
             ]
+
+    def leave(self, servo: int) -> None:
+        """Ask a servo no more: it is lost, and its silence would cost the others their time."""
+        self.away[servo] = True
+        self._queue_of = None
+
+    def join(self, servo: int) -> None:
+        """Ask a servo again from the next cycle on, with the others: it was found in order."""
+        self.away[servo] = False
+        self.missed[servo] = 0
+        self._queue_of = None
+
+    def plain(self, group: int) -> None:
+        """Read a group by the form that every firmware knows from the next cycle on."""
+        self.fast[group] = False
+        self._made.clear()
+        self._queue_of = None
 
     def advance(self, reply: Reply | None) -> Transaction | None:
         """Judge what came of a read, return the next."""
@@ -144,11 +169,12 @@ class CyclicReads:
         if request is None:
             if len(self._made) >= MOST_CHAINS:
                 self._made.clear()
-            request = self._made[indices] = _Request(self._plan, group, indices)
+            fast = self.fast[group] and len(indices) > 1
+            request = self._made[indices] = _Request(self._plan, self._line, group, indices, fast)
         return request
 
 
-def _turns(group: tuple[int, ...], silent: Sequence[bool]) -> list[tuple[int, ...]]:
+def _turns(group: Sequence[int], silent: Sequence[bool]) -> list[tuple[int, ...]]:
     """Return who is read together: all that answered last time, and then each silent one by itself."""
     together = tuple(index for index in group if not silent[index])
     alone: list[tuple[int, ...]] = [(index,) for index in group if silent[index]]

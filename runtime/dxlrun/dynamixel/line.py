@@ -50,12 +50,22 @@ class Line:
         packet = self.dialect.read(servo_id, address, length)
         return self._answered(packet, servo_id, Awaited(servo_id, length))
 
-    def read_many(self, requests: Sequence[tuple[int, int, int]]) -> Transaction:
-        """Return the read of several servos, each by (ID, address, length); of one alone a plain read."""
+    def read_many(self, requests: Sequence[tuple[int, int, int]], *, fast: bool = False) -> Transaction:
+        """Return the read of several servos, each by (ID, address, length); of one alone a plain read.
+
+        `fast`: by a fast form, which all answer by one status. Raises ValueError where a protocol has none.
+        """
         if len(requests) == 1:
             return self.read(*requests[0])
-        awaited = [Awaited(servo_id, length) for servo_id, _, length in requests]
-        return self._answered(self.dialect.read_many(requests), BROADCAST_ID, *awaited)
+        awaited = tuple(Awaited(servo_id, length) for servo_id, _, length in requests)
+        packet = self.dialect.read_many(requests, fast=fast)
+        if not fast:
+            return self._answered(packet, BROADCAST_ID, *awaited)
+        size = self.dialect.fast_size(sum(one.length for one in awaited), len(awaited))
+        # only the first one waits before it speaks: the others add their parts at once (protocol.md, Time)
+        due_ns = self.wire_ns(len(packet) + size) + self.return_delay_ns
+        timeout_ns = due_ns + self.latency_ns + PATIENCE_NS
+        return Transaction(packet, BROADCAST_ID, awaited, due_ns, timeout_ns, size, fast=True)
 
     def write(self, servo_id: int, address: int, data: bytes) -> Transaction:
         """Return a write that the servo acknowledges; to everybody: without reply."""

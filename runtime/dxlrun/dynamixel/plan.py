@@ -54,6 +54,7 @@ def bus_plan(
     return_delay_ns: int,
     joints: Sequence[Wiring],
     protocol: float = 1.0,
+    split: bool = False,
 ) -> BusPlan:
     """Prepare everything that goes over one serial line.
 
@@ -81,6 +82,8 @@ def bus_plan(
         ),
         torque_reads=tuple(line.read(servo.servo_id, servo.torque_address, 1) for servo in servos),
         budget=_budget(line, reads, goals),
+        fast=tuple(False for _ in groups),
+        split=split,
     )
 
 
@@ -96,10 +99,10 @@ def readable(table: ControlTable, start: int, end: int) -> bool:
     return known.issuperset(range(start, end))
 
 
-def state_read(line: Line, servos: Sequence[ServoPlan], more: int = 0) -> Transaction:
+def state_read(line: Line, servos: Sequence[ServoPlan], more: int = 0, *, fast: bool = False) -> Transaction:
     """Return the one read of several servos' states, each `more` bytes longer than needed."""
     return line.read_many(
-        [(servo.servo_id, servo.state.address, servo.state.length + more) for servo in servos]
+        [(servo.servo_id, servo.state.address, servo.state.length + more) for servo in servos], fast=fast
     )
 
 

@@ -29,6 +29,7 @@ MOST_GOAL_BYTES = 0xFF - 4
 """Parameters of a sync write behind address and length: LEN is one byte."""
 ALERT = 0
 """No bit of the error byte asks to read more: it says everything itself."""
+NO_FAST_FORM = "Protocol 1.0 has no fast sync read and no fast bulk read"
 _MOST_PARAMETERS = 0xFF - 2
 
 
@@ -173,17 +174,30 @@ def factory_reset(servo_id: int) -> bytes:
     return instruction_packet(servo_id, Instruction.FACTORY_RESET)
 
 
-def bulk_read(requests: Sequence[tuple[int, int, int]]) -> bytes:
+def bulk_read(requests: Sequence[tuple[int, int, int]], *, fast: bool = False) -> bytes:
     """Return the packet that asks two or more MX servos, each by (ID, address, length); they answer in turn.
 
-    Each waits for the status of the one before it, so an absent servo ends the chain.
+    Each waits for the status of the one before it, so an absent servo ends the chain. Raises ValueError when
+    a fast form is asked for.
     """
+    if fast:
+        raise ValueError(NO_FAST_FORM)
     parameters = b"\0" + b"".join(bytes((length, one, address)) for one, address, length in requests)
     return instruction_packet(BROADCAST_ID, Instruction.BULK_READ, parameters)
 
 
 read_many = bulk_read
 """The one packet that asks several servos, as every protocol has one."""
+
+
+def fast_size(length: int, count: int) -> int:
+    """Raise ValueError: only Protocol 2.0 has fast forms."""
+    raise ValueError(NO_FAST_FORM)
+
+
+def fast_answers(packet: Bytes, lengths: Sequence[int]) -> list[Status]:
+    """Raise ValueError: only Protocol 2.0 has fast forms."""
+    raise ValueError(NO_FAST_FORM)
 
 
 def sync_write_records(address: int, length: int, records: Bytes) -> bytes:

@@ -209,6 +209,14 @@ def parse_status(packet: Bytes) -> Status:
     return status
 
 
+def fast_size(length: int, count: int) -> int:
+    """Return the bytes of the one status of a fast form: `length` bytes of data of `count` servos.
+
+    Each part has an error byte, an ID and a CRC beside its data (e-Manual, "Fast Sync Read (0x8A)").
+    """
+    return 8 + length + 4 * count
+
+
 def fast_answers(packet: Bytes, lengths: Sequence[int]) -> list[Status]:
     """Return the servos' parts of the status of a fast form, in their order.
 
@@ -322,12 +330,12 @@ def bulk_read(requests: Iterable[tuple[int, int, int]], *, fast: bool = False) -
     return instruction_packet(BROADCAST_ID, instruction, parameters)
 
 
-def read_many(requests: Sequence[tuple[int, int, int]]) -> bytes:
+def read_many(requests: Sequence[tuple[int, int, int]], *, fast: bool = False) -> bytes:
     """Return the one packet that asks several servos, each by (ID, address, length); they answer in turn."""
     _, address, length = requests[0]
     if all(request[1:] == (address, length) for request in requests):
-        return sync_read(address, length, (servo_id for servo_id, _, _ in requests))
-    return bulk_read(requests)
+        return sync_read(address, length, (servo_id for servo_id, _, _ in requests), fast=fast)
+    return bulk_read(requests, fast=fast)
 
 
 def sync_write_records(address: int, length: int, records: Bytes) -> bytes:

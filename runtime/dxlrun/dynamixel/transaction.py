@@ -45,6 +45,8 @@ class Transaction:
     """From the start of the write to giving up; 0 without reply."""
     widest: int = 0
     """The most bytes that one of the replies has on the line, stuffing included."""
+    fast: bool = False
+    """All that answer share one status packet of the broadcast ID, which is not stuffed."""
 
 
 @unique
