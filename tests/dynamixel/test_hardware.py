@@ -3,7 +3,7 @@ import pytest
 
 from dxlrun.dynamixel import protocol1
 from dxlrun.dynamixel.units import goal_ticks, joint_position
-from dxlrun.errors import PortError, StartUpError
+from dxlrun.errors import StartUpError
 from dxlrun.events import EventCode
 from dxlrun.simulation import ServoConfig
 
@@ -291,9 +291,10 @@ def test_a_line_that_goes_between_read_and_write_is_named_and_the_others_get_the
     rig.hardware.start()
     rig.hardware.read()
     rig.ports.ports[0].unplug()
-    with pytest.raises(PortError, match="bus left on sim: "):
-        rig.hardware.write()
-    assert [source for source, _ in rig.events.of(EventCode.PORT_LOST)] == ["left"]
+    rig.hardware.write()
+    ((source, text),) = rig.events.of(EventCode.PORT_LOST)
+    assert source == "left"
+    assert text.startswith("bus left on sim: ")
     assert rig.into_bus(1)[-1][4] == 0x83
 
 

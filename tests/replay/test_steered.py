@@ -388,6 +388,6 @@ def test_a_bus_that_is_gone_before_the_policy(steer: Callable[..., Path]) -> Non
         (port,) = robot.robot.hardware._ports.ports  # no face of a run pulls adapters
         robot.buses[0].at(500 * MS, port.unplug)
 
-    policies = "policies: {exit_timeout: 4 s, on_fault: [{pose: home, speed: 60 deg/s}, limp]}\n"
+    policies = "policies: {exit_timeout: 4 s, on_lost_servo: [{pose: home, speed: 60 deg/s}, limp]}\n"
     log = whole(steer({5: [rate(100)]}, "poses: {home: {pan: 0 deg}}\n" + policies, pull))
     assert policy_begun(log) is not None

@@ -326,15 +326,14 @@ def test_a_rate_at_which_the_policies_would_not_end_in_time_is_refused(
 
 
 @pytest.mark.parametrize("steps", ["pose", "less torque"])
-def test_without_a_line_the_steps_are_left_out_and_the_last_one_counts(
+def test_without_a_line_its_servos_are_lost_and_the_policy_for_them_ends_the_run(
     built: Callable[..., VirtualRobot], steps: str
 ) -> None:
-    robot = built(on_fault=STEPS[steps])
-    (port,) = robot.robot.hardware._ports.ports
-    robot.buses[0].at(START_NS, port.unplug)  # type: ignore[attr-defined]
+    robot = built(on_lost_servo=STEPS[steps])
+    robot.buses[0].at(START_NS, robot.buses[0].unplug)
     result = robot.run()
     assert (result.reason, result.last) == ("fault", "limp" if steps == "pose" else "hold")
-    assert "adapter of bus main is gone" in result.detail
+    assert "pan, tilt, yaw missed 3 replies in a row" in result.detail
     assert limits(robot, 3) == []
     assert len(robot.failures) == (3 if steps == "pose" else 0)
 
