@@ -11,6 +11,7 @@ from importlib import metadata
 from cyclopts import App, CycloptsError
 
 from dxlrun.cli.analyze import analyze
+from dxlrun.cli.bench import bench
 from dxlrun.cli.check import check
 from dxlrun.cli.doctor import doctor
 from dxlrun.cli.models import models
@@ -54,6 +55,7 @@ def build() -> App:
     app.command(schema)
     app.command(models)
     app.command(doctor)
+    app.command(bench)
     app.command(list_robots, name="list", group=RUNNING)
     for verb in (switch, send, rate, pause, resume, load, unload, stop):
         app.command(verb, group=RUNNING)

@@ -1,0 +1,155 @@
+"""Canned responder: a process that answers counted bytes with fixed bytes, so that only the host is measured.
+
+It has one pseudo-terminal a host. While a host rehearses, simulated servos answer it, as fast as they can and
+not at the speed of a wire. What they answered during one exchange is kept: after so many bytes these bytes.
+From then on nothing is parsed, computed or waited for: bytes are counted, and what was kept is written.
+
+Its starter talks to it in lines of JSON: `{"do": "rehearse" | "learn" | "play", "port": number}`; each is
+answered, `play` by the kept steps, `{"steps": [[bytes that come, bytes that are answered], ...]}`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import os
+import select
+import signal
+import socket
+import sys
+import time
+import tty
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Literal
+
+from dxlrun import process
+from dxlrun.simulation import BusConfig, Ledger, SimulatedBus
+from dxlrun.simulation.configuration import decode_config
+
+Does = Literal["rehearse", "learn", "play"]
+_MOST = 1 << 16
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """After so many bytes of the host, these bytes."""
+
+    count: int
+    reply: bytes
+
+
+class Terminal:
+    """One host's line: servos while it rehearses, counted bytes afterwards."""
+
+    def __init__(self, config: BusConfig) -> None:
+        self._bus = SimulatedBus(config, Ledger(keep=False), time.monotonic_ns())
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self._playing = self._learning = False
+        self._steps: list[Step] = []
+        self._position = self._waiting = 0
+
+    @property
+    def path(self) -> str:
+        """The device that the host opens."""
+        return os.ttyname(self._slave)
+
+    def fileno(self) -> int:
+        """Return the descriptor that becomes readable when the host has written."""
+        return self._master
+
+    def do(self, what: Does) -> tuple[Step, ...]:
+        """Let servos answer, remember what they answer from now on, or answer that from now on."""
+        self.receive()  # what the host wrote last, and nobody answers, may still be on its way
+        if what == "play":
+            if self._waiting:  # the host ends its exchange with what nobody answers
+                self._steps.append(Step(self._waiting, b""))
+            self._playing, self._learning = bool(self._steps), False
+        else:
+            self._playing, self._learning = False, what == "learn"
+            self._steps = []
+        self._position = self._waiting = 0
+        return tuple(self._steps)
+
+    def receive(self) -> None:
+        """Take what the host has written, and answer it."""
+        try:
+            data = os.read(self._master, _MOST)
+        except BlockingIOError:
+            return
+        if not self._playing:
+            self._rehearse(data)
+            return
+        self._waiting += len(data)
+        while self._waiting >= (step := self._steps[self._position]).count:
+            self._waiting -= step.count
+            self._position = (self._position + 1) % len(self._steps)
+            if step.reply:
+                os.write(self._master, step.reply)
+
+    def _rehearse(self, data: bytes) -> None:
+        bus = self._bus
+        bus.receive(data, max(time.monotonic_ns(), bus.now_ns))
+        reply = bytearray()
+        while (due_ns := bus.next_due_ns()) is not None:
+            reply += bus.take(due_ns)
+        if reply:
+            os.write(self._master, reply)
+        if self._learning:
+            self._waiting += len(data)
+            if reply:
+                self._steps.append(Step(self._waiting, bytes(reply)))
+                self._waiting = 0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Answer until the control socket ends; the ports are told on it first."""
+    parser = argparse.ArgumentParser(prog="dxlrun.bench.responder", description=__doc__)
+    parser.add_argument("--config-fd", type=int, required=True, help="the buses, one a host")
+    parser.add_argument("--control-fd", type=int, required=True, help="socket: its end ends the process")
+    parser.add_argument("--core", type=int, default=-1, help="core to stay on; -1: any")
+    options = parser.parse_args(arguments)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # only the front process takes it
+    if options.core >= 0:
+        with suppress(OSError):
+            os.sched_setaffinity(0, {options.core})
+    with os.fdopen(options.config_fd, "rb") as file:
+        buses = decode_config(file.read()).buses
+    control = process.Line(socket.socket(fileno=options.control_fd))
+    terminals = [Terminal(config) for config in buses]
+    control.send({"ports": [terminal.path for terminal in terminals]})
+    gc.collect()
+    gc.freeze()
+    _serve(control, terminals)
+    return 0
+
+
+def _serve(control: process.Line, terminals: Sequence[Terminal]) -> None:
+    by_descriptor = {terminal.fileno(): terminal for terminal in terminals}
+    with select.epoll() as waiting:
+        for descriptor in (control.fileno(), *by_descriptor):
+            waiting.register(descriptor, select.EPOLLIN)
+        while not control.closed:
+            for descriptor, _ in waiting.poll():
+                terminal = by_descriptor.get(descriptor)
+                if terminal is not None:
+                    terminal.receive()
+                    continue
+                for message in control.receive():
+                    _obey(control, terminals, message)
+
+
+def _obey(control: process.Line, terminals: Sequence[Terminal], message: dict[str, object]) -> None:
+    port, what = message["port"], message["do"]
+    assert isinstance(port, int)  # noqa: S101  our own starter says so
+    for known in ("rehearse", "learn", "play"):
+        if what == known:
+            steps = terminals[port].do(known)
+            control.send({"steps": [[step.count, len(step.reply)] for step in steps]})
+
+
+if __name__ == "__main__":
+    sys.exit(main())
