@@ -227,7 +227,7 @@ class Servos:
             self._emit(EventCode.PORT_LOST, Severity.ERROR, self._plan.name, text)
 
     def found(self) -> None:
-        """Tell that the line is back: whoever stands behind it was without a host, and maybe without power."""
+        """Tell that the line is back: its servos were without a host, and maybe without power."""
         self._lost = False
         for index in range(len(self._missed)):
             self._missed[index] = max(self._missed[index], LOST_CYCLES)
