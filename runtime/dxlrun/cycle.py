@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.interfaces import Commands, Floats, States
+from dxlrun.interfaces import COMMAND_INTERFACES, Commands, Floats, States
 from dxlrun.ring import RING_SECONDS
 
 MOST_CONTROLLERS = 63
@@ -42,11 +42,19 @@ SEQUENCES: tuple[tuple[str, str, str], ...] = (
     ("age_ns", "int64", "joints"),
     ("command_position", "float64", "joints"),
     ("command_velocity", "float64", "joints"),
+    ("command_effort", "float64", "joints"),
+    ("command_pwm", "float64", "joints"),
     ("goal_position", "float64", "joints"),
     ("goal_velocity", "float64", "joints"),
+    ("goal_effort", "float64", "joints"),
+    ("goal_pwm", "float64", "joints"),
+    ("temperature", "float64", "joints"),
+    ("voltage", "float64", "joints"),
     ("controller_ns", "int64", "controllers"),
     ("valid", "bool", "joints"),
     ("clamped", "uint8", "joints"),
+    ("hardware_error", "uint8", "joints"),
+    ("mode", "uint8", "joints"),
 )
 """Name, element type and what it has one element of."""
 
@@ -65,6 +73,12 @@ class Clamp(IntFlag):
     """The velocity was cut to the velocity limit."""
     NOT_FINITE = 16
     """NaN after a finite value, or infinite: the last goal was kept, the controller is at fault."""
+    EFFORT = 32
+    """The effort was cut to the effort limit."""
+    PWM = 64
+    """The PWM was cut to the full voltage."""
+    OUTWARD = 128
+    """A velocity, an effort or a PWM that leads out of the position limits was cut, at the end to 0."""
 
 
 class CycleLayout:
@@ -167,20 +181,23 @@ class CycleRecord:
             effort=_row(array, "effort"),
             valid=array["valid"][0],
             age_ns=array["age_ns"][0],
+            temperature=_row(array, "temperature"),
+            voltage=_row(array, "voltage"),
+            hardware_error=array["hardware_error"][0],
+            mode=array["mode"][0],
         )
         """What the servos said."""
-        self.commands = Commands(
-            position=_row(array, "command_position"), velocity=_row(array, "command_velocity")
-        )
+        self.commands = Commands(*(_row(array, f"command_{name}") for name in COMMAND_INTERFACES))
         """What the controllers want, merged; NaN = not commanded."""
-        self.goals = Commands(position=_row(array, "goal_position"), velocity=_row(array, "goal_velocity"))
+        self.goals = Commands(*(_row(array, f"goal_{name}") for name in COMMAND_INTERFACES))
         """What goes to the servos, after the last gate."""
         self.controller_ns: NDArray[np.int64] = array["controller_ns"][0]
         """How long each controller's update took; 0 where it was not updated in this cycle."""
         self.clamped: NDArray[np.uint8] = array["clamped"][0]
         """Bits of Clamp, one element a joint."""
-        for values in (*_floats(self.states), *_floats(self.commands), *_floats(self.goals)):
-            values[:] = np.nan
+        for name, kind, per in SEQUENCES:
+            if kind == "float64" and per == "joints":
+                array[name] = np.nan
         self.states.age_ns[:] = -1
 
     @property
@@ -197,12 +214,6 @@ class CycleRecord:
 def _row(array: NDArray[np.void], name: str) -> Floats:
     row: Floats = array[name][0]
     return row
-
-
-def _floats(rows: States | Commands) -> tuple[Floats, ...]:
-    if isinstance(rows, States):
-        return rows.position, rows.velocity, rows.effort
-    return rows.position, rows.velocity
 
 
 def cycle_slots(period_ns: int) -> int:

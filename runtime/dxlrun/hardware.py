@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 LOST_CYCLES = 3
 """A servo that missed so many replies in a row is lost, until it answers again."""
 
@@ -25,6 +28,15 @@ class Hardware(Protocol):
 
     def write(self) -> None:
         """Send the goal arrays."""
+        ...
+
+    def set_modes(self, modes: NDArray[np.uint8]) -> None:
+        """Bring joints into these modes (interfaces.Mode, shape (joints,), UNKNOWN = leave it as it is).
+
+        Returns at once: it is done in the gaps between cycles. Meanwhile `states.mode` of such a joint is
+        UNKNOWN and it gets no goal; it becomes the new mode when that was read back, or what it was before
+        when the servo refused, which an event tells. A later call replaces what is still waiting.
+        """
         ...
 
     def limit_torque(self, fraction: float) -> None:

@@ -8,12 +8,16 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-CommandName = Literal["position", "velocity"]
+from dxlrun.mode import Mode, mode_of
 
-COMMAND_INTERFACES: tuple[CommandName, ...] = ("position", "velocity")
+__all__ = ["COMMAND_INTERFACES", "CommandName", "Commands", "Floats", "Mode", "States", "mode_of"]
+
+CommandName = Literal["position", "velocity", "effort", "pwm"]
+
+COMMAND_INTERFACES: tuple[CommandName, ...] = ("position", "velocity", "effort", "pwm")
 
 Floats = NDArray[np.float64]
-"""Shape (joints,): rad, rad/s, Nm, or the fraction of maximum where the servo measures no torque."""
+"""Shape (joints,): rad, rad/s, Nm, A, or the fraction of maximum where the servo measures no torque."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,29 +31,60 @@ class States:
     """True where this cycle's reply arrived intact."""
     age_ns: NDArray[np.int64]
     """Time since the reply that the row shows arrived; -1 while none ever did."""
+    temperature: Floats
+    """deg C, read now and then; NaN until it was."""
+    voltage: Floats
+    """V at the servo, read now and then; NaN until it was."""
+    hardware_error: NDArray[np.uint8]
+    """Bits of the e-Manual's Hardware Error Status; Protocol 1.0: those of ERR that are states; 0: none."""
+    mode: NDArray[np.uint8]
+    """A Mode: in which the servo is known to be; UNKNOWN while that changes."""
 
     @classmethod
     def empty(cls, joints: int) -> States:
-        """Return arrays of NaN, invalid, of no age."""
+        """Return arrays of NaN, invalid, of no age and of unknown mode."""
         return cls(
             position=np.full(joints, np.nan),
             velocity=np.full(joints, np.nan),
             effort=np.full(joints, np.nan),
             valid=np.zeros(joints, dtype=np.bool_),
             age_ns=np.full(joints, -1, dtype=np.int64),
+            temperature=np.full(joints, np.nan),
+            voltage=np.full(joints, np.nan),
+            hardware_error=np.zeros(joints, dtype=np.uint8),
+            mode=np.zeros(joints, dtype=np.uint8),
         )
 
 
 @dataclass(frozen=True, slots=True)
 class Commands:
-    """What somebody wants of the joints: one row a joint, NaN = not commanded."""
+    """What somebody wants of the joints: one row a joint, NaN = not commanded.
+
+    Which of them count depends on the joint's mode, see `mode_of`.
+    """
 
     position: Floats
     """rad"""
     velocity: Floats
-    """rad/s, magnitude of the speed toward the position; NaN = as fast as the servo can"""
+    """rad/s. Beside a position: magnitude of the speed toward it, NaN = as fast as the servo can. Alone: the
+    speed at which the joint turns, with its sign."""
+    effort: Floats
+    """In the unit of the state's effort: Nm, A, or the fraction of maximum. Beside a position: the most that
+    the servo may exert, a magnitude. Alone: with its sign."""
+    pwm: Floats
+    """Fraction of the full voltage, -1..1"""
 
     @classmethod
     def empty(cls, joints: int) -> Commands:
         """Return arrays of NaN."""
-        return cls(position=np.full(joints, np.nan), velocity=np.full(joints, np.nan))
+        return cls(*(np.full(joints, np.nan) for _ in COMMAND_INTERFACES))
+
+    @property
+    def arrays(self) -> tuple[Floats, Floats, Floats, Floats]:
+        """All of them, in the order of COMMAND_INTERFACES."""
+        return self.position, self.velocity, self.effort, self.pwm
+
+    def clear(self) -> None:
+        """Command nothing any more."""
+        for values in self.arrays:
+            values.fill(np.nan)

@@ -26,6 +26,7 @@ from dxlrun.control.plugins import Offer, PlugIns
 from dxlrun.cycle import CycleLayout, CycleRecord
 from dxlrun.events import EventCode, Severity
 from dxlrun.inbox import LOOP, Command, QueueInbox
+from dxlrun.mode import Mode
 
 PERIOD_NS = 20_000_000
 
@@ -73,10 +74,12 @@ class Hardware:
     work_ns: Callable[[], int] = lambda: 0
     written: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
     keep: bool = True
+    asked: list[list[int]] = field(default_factory=list)
 
     def start(self) -> None:
         self.record.states.position[:] = 0.25
         self.record.states.valid[:] = True
+        self.record.states.mode[:] = Mode.POSITION
         self.record.goals.position[:] = self.record.states.position
 
     def read(self) -> None:
@@ -90,6 +93,10 @@ class Hardware:
 
     def idle(self, until_ns: int) -> None:
         pass
+
+    def set_modes(self, modes: np.ndarray) -> None:
+        self.asked.append(modes.tolist())
+        np.copyto(self.record.states.mode, modes, where=modes != Mode.UNKNOWN)
 
     def stop(self) -> tuple[str, ...]:
         return ()

@@ -6,12 +6,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from dxlrun.compile.problems import Problems, suggestion
-from dxlrun.compile.reach import Interval, degrees, joint_reach
+from dxlrun.compile.reach import Interval, degrees, joint_reach, many_turns
 from dxlrun.control.loop_plan import JointPlan
 from dxlrun.control_table import ControlTable, control_table, model_names, perhaps_meant
 from dxlrun.description import Description
 from dxlrun.description.robot import Joint
+from dxlrun.description.units import EffortUnit
 
+_UNITS: Mapping[EffortUnit, str] = {"Nm": "Nm", "A": "A", "1": "% of its highest load"}
+_EXAMPLES: Mapping[EffortUnit, str] = {"Nm": "0.3 Nm", "A": "800 mA", "1": "40 %"}
 AUTO = "auto"
 """Instead of a model: the servo is asked."""
 _HIGHEST_ID_OF_PROTOCOL_2 = 252
@@ -48,11 +51,21 @@ def compile_joints(
         table = _table(description, name, joint, model, problems)
         if table is None:
             continue
-        reach = joint_reach(table.max_tick * table.rad_per_tick, joint.reference, joint.direction)
-        _check_reference(description, name, joint, table, problems)
+        reach = _reach(joint, table)
+        if not joint.continuous:
+            _check_reference(description, name, joint, table, problems)
+        effort = _effort(description, name, joint, table, problems)
         allowed = _allowed(description, name, reach, table.model, problems)
         if known_bus and allowed is not None:
-            plan = JointPlan(name, allowed.lower, allowed.upper, joint.limits.velocity)
+            plan = JointPlan(
+                name,
+                allowed.lower,
+                allowed.upper,
+                joint.limits.velocity,
+                effort,
+                joint.continuous,
+                bounded=not joint.continuous or joint.limits.position is not None,
+            )
             compiled[name] = CompiledJoint(plan, joint, table, reach)
     return compiled
 
@@ -122,6 +135,29 @@ def _table(
             "put it on a bus of its own protocol; a bus cannot be mixed",
         )
     return control_table(model, spoken[0])
+
+
+def _reach(joint: Joint, table: ControlTable) -> Interval:
+    if joint.continuous:
+        return many_turns(table.protocol, joint.reference, joint.direction)
+    return joint_reach(table.max_tick * table.rad_per_tick, joint.reference, joint.direction)
+
+
+def _effort(
+    description: Description, name: str, joint: Joint, table: ControlTable, problems: Problems
+) -> float | None:
+    """Return the limit of the effort in the unit in which the model measures it."""
+    if joint.limits.effort is None:
+        return None
+    value, unit = joint.limits.effort
+    if unit != table.effort_unit:
+        problems.error(
+            description.marks.value("joints", name, "limits", "effort"),
+            f"the effort limit of {name} is in {_UNITS[unit]}, but an {table.model} measures "
+            f"{_UNITS[table.effort_unit]} ({table.effort_item.replace('_', ' ')})",
+            f"write it in {_UNITS[table.effort_unit]}, such as {_EXAMPLES[table.effort_unit]}",
+        )
+    return value
 
 
 def _check_reference(

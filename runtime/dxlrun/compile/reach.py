@@ -29,6 +29,19 @@ class Interval:
         return f"{degrees(self.lower, signed=True)}..{degrees(self.upper, signed=True)} deg"
 
 
+MANY_TURNS = {1.0: 7, 2.0: 256}
+"""Turns that a goal position can be away from raw 0, by protocol: Multi-turn Mode of MX (e-Manual MX-64, Goal
+Position (30): -28,672..28,672), Extended Position Control Mode (e-Manual XM430-W350, Goal Position (116):
+-1,048,575..1,048,575)."""
+
+
+def many_turns(protocol: float, reference: float, direction: int) -> Interval:
+    """Return the reach of a continuous joint, rad: how far its goal positions go."""
+    turns = 2 * math.pi * MANY_TURNS[protocol]
+    middle = -direction * reference
+    return Interval(middle - turns, middle + turns)
+
+
 def joint_reach(travel: float, reference: float, direction: int) -> Interval:
     """Return the reach of a joint, rad, of a servo that turns from 0 to `travel` rad.
 

@@ -6,6 +6,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Protocol
 
+from dxlrun.control.loop_plan import ControllerPlan, JointPlan
+from dxlrun.mode import Mode, mode_of
+
 
 class Claimant(Protocol):
     """Somebody that may claim joints; a ControllerPlan is one."""
@@ -64,3 +67,23 @@ def told(found: Iterable[Conflict]) -> str:
     return "; ".join(
         str(many[0]) + (f" and {len(many) - 1} more" if many[1:] else "") for many in pairs.values()
     )
+
+
+def claimed_modes(claimants: Iterable[Claimant]) -> dict[str, Mode]:
+    """Return the mode that each claimed joint needs, by its name; joints that nobody claims are not in it.
+
+    Raises ValueError for command interfaces that no mode has together.
+    """
+    return {
+        joint: mode_of(claimant.command)
+        for claimant in claimants
+        if claimant.command
+        for joint in claimant.joints
+    }
+
+
+def start_modes(joints: Iterable[JointPlan], controllers: Iterable[ControllerPlan]) -> dict[str, Mode]:
+    """Return the mode in which each joint begins a run, by its name: what the controllers need that are
+    active from the start, else its rest mode."""
+    claimed = claimed_modes(controller for controller in controllers if controller.active)
+    return {joint.name: claimed.get(joint.name, joint.rest) for joint in joints}

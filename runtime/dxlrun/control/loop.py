@@ -6,8 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
-import numpy as np
-
 from dxlrun.clock import Clock
 from dxlrun.commands import CommandSink, NoCommands, TakenCommand
 from dxlrun.control.gate import Gate
@@ -273,8 +271,7 @@ class Loop:
             self._miss()
         record.command_count = self.steering.take(time_ns)
         if self.paused:
-            record.commands.position.fill(np.nan)
-            record.commands.velocity.fill(np.nan)
+            record.commands.clear()
         else:
             self.manager.update(cycle - self._paused_cycles, time_ns)
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from dxlrun.control.policy_plan import PolicyPlan
+from dxlrun.mode import Mode
 
 Policy = Literal["other", "fifo", "round_robin"]
 OverrunPolicy = Literal["skip", "catch_up", "stop"]
@@ -37,6 +38,18 @@ class JointPlan:
     upper: float
     velocity: float | None
     """rad/s; None: no limit in the file"""
+    effort: float | None = None
+    """Nm, A or the fraction of maximum, as the model measures it; None: no limit in the file"""
+    continuous: bool = False
+    """A wheel, or a joint of many turns."""
+    bounded: bool = True
+    """`lower` and `upper` bind velocity, effort and PWM too; not those of a continuous joint whose limits the
+    file does not give: a wheel turns for ever."""
+
+    @property
+    def rest(self) -> Mode:
+        """The mode into which a joint is brought that nobody commands and that would not hold still."""
+        return Mode.VELOCITY if self.continuous else Mode.POSITION
 
 
 @dataclass(frozen=True, slots=True)

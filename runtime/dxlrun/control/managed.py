@@ -208,4 +208,5 @@ class _Claim:
 
 
 def _array(commands: Commands, interface: str) -> Floats:
-    return commands.position if interface == "position" else commands.velocity
+    array: Floats = getattr(commands, interface)
+    return array

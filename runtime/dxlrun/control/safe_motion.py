@@ -61,8 +61,7 @@ class SafeMotion:
         """Command this cycle's part of the step; the robot's commands are empty when there is none left."""
         record = self.record
         now_ns = record.woken_ns
-        record.commands.position.fill(np.nan)
-        record.commands.velocity.fill(np.nan)
+        record.commands.clear()
         if self._began_ns < 0:
             self._began_ns = self._step_ns = now_ns
         if now_ns - self._began_ns >= self.limit_ns:

@@ -19,6 +19,7 @@ from dxlrun.description.units import (
     AngularVelocity,
     AutoDuration,
     Duration,
+    Effort,
     Inertia,
     Torque,
 )
@@ -165,6 +166,11 @@ class Limits(Form):
     velocity: Annotated[AngularVelocity, Field(gt=0)] | None = Field(
         default=None, description="Highest speed.", examples=["2 rad/s"]
     )
+    effort: Effort | None = Field(
+        default=None,
+        description="Highest effort that may be commanded, in what the servo measures: Nm, A or %.",
+        examples=["800 mA"],
+    )
 
 
 class JointSimulation(Form):
@@ -199,6 +205,11 @@ class Joint(Form):
     )
     direction: Annotated[Literal[1, -1], BeforeValidator(_whole)] = Field(
         description="1: the joint's angle grows as the servo's does, -1: against it.", examples=["1"]
+    )
+    continuous: bool = Field(
+        default=False,
+        description="A wheel, or a joint of many turns; it needs no position limits.",
+        examples=["true"],
     )
     limits: Limits = Field(
         default=Limits(),

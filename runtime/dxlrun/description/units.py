@@ -1,8 +1,8 @@
 """Units: angles, speeds and times as a person writes them, `60 deg` or `500 us`, held in SI.
 
-Use `Angle`, `AngularVelocity`, `AngularAcceleration`, `Torque`, `Inertia` and `Duration` as types of a
-model's fields. They take text with a unit; a bare number is an error, because nobody can see whether `60`
-was meant in deg or rad. In JSON they are written back as text that they read to the same value.
+Use `Angle`, `AngularVelocity`, `AngularAcceleration`, `Torque`, `Effort`, `Inertia` and `Duration` as types
+of a model's fields. They take text with a unit; a bare number is an error, because nobody can see whether
+`60` was meant in deg or rad. In JSON they are written back as text that they read to the same value.
 """
 
 from __future__ import annotations
@@ -18,15 +18,26 @@ from pydantic_core import PydanticCustomError
 
 # at most three digits of exponent: Fraction("1e-999999999") would fill the memory
 _QUANTITY = re.compile(
-    r"([-+]?(?:\d+(?:_\d+)*)?(?:\.\d*)?(?:[eE][-+]?\d{1,3})?)\s*([A-Za-z/^0-9 ]*)", re.ASCII
+    r"([-+]?(?:\d+(?:_\d+)*)?(?:\.\d*)?(?:[eE][-+]?\d{1,3})?)\s*([A-Za-z/^0-9% ]*)", re.ASCII
 )
 _LONGEST = 64
+
+EffortUnit = Literal["Nm", "A", "1"]
+"""As in the control tables; `1`: the fraction of the maximum."""
+
 _REV = 2 * math.pi
 
 _ANGLE: Mapping[str, float] = {"deg": math.pi / 180, "rad": 1.0}
 _ANGULAR_VELOCITY: Mapping[str, float] = {"rad/s": 1.0, "deg/s": math.pi / 180, "rpm": _REV / 60}
 _ANGULAR_ACCELERATION: Mapping[str, float] = {"rad/s^2": 1.0, "deg/s^2": math.pi / 180}
 _TORQUE: Mapping[str, float] = {"Nm": 1.0, "mNm": 1e-3}
+_EFFORT: Mapping[str, tuple[float, EffortUnit]] = {
+    "Nm": (1.0, "Nm"),
+    "mNm": (1e-3, "Nm"),
+    "A": (1.0, "A"),
+    "mA": (1e-3, "A"),
+    "%": (1e-2, "1"),
+}
 _INERTIA: Mapping[str, float] = {"kg m^2": 1.0, "kg cm^2": 1e-4, "g cm^2": 1e-7}
 _DURATION_NS: Mapping[str, int] = {
     "ns": 1,
@@ -57,6 +68,21 @@ def angular_acceleration(text: str) -> float:
 def torque(text: str) -> float:
     """Return a torque, Nm, from `0.3 Nm` or `20 mNm`; raises ValueError that says how to write one."""
     return _si(text, "a torque", _TORQUE, "0.3 Nm or 20 mNm")
+
+
+def effort(text: str) -> tuple[float, EffortUnit]:
+    """Return an effort and what it is counted in, from `0.3 Nm`, `800 mA` or `40 %`; raises ValueError.
+
+    Which of them fits is a matter of the servo: some measure their current, most only the share of their
+    highest load.
+    """
+    written = "0.3 Nm, 800 mA or 40 %"
+    number, unit = _split(text, "an effort", _EFFORT, written)
+    scale, counted = _EFFORT[unit]
+    value = float(number) * scale
+    if not 0 < value < math.inf:
+        raise _refusal(f"{text!r} is no effort above 0", f"write one such as {written}")
+    return value, counted
 
 
 def inertia(text: str) -> float:
@@ -155,6 +181,18 @@ Torque = Annotated[
     _text_schema("0.3 Nm", _TORQUE),
 ]
 """Nm, from `0.3 Nm` or `20 mNm`."""
+
+Effort = Annotated[
+    tuple[float, EffortUnit],
+    BeforeValidator(effort),
+    PlainSerializer(
+        lambda value: f"{value[0]!r} {value[1]}" if value[1] != "1" else f"{value[0] * 100!r} %",
+        return_type=str,
+        when_used="json",
+    ),
+    _text_schema("800 mA", _EFFORT),
+]
+"""A number above 0 and its unit, from `0.3 Nm`, `800 mA` or `40 %`."""
 
 Inertia = Annotated[
     float,

@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 
+import numpy as np
+from numpy.typing import NDArray
+
 from dxlrun.clock import Clock
 from dxlrun.dynamixel import startup, torque_limit
 from dxlrun.dynamixel.bus import Bus, pump, run
@@ -18,6 +21,7 @@ from dxlrun.dynamixel.units import joint_position
 from dxlrun.errors import PortError, StartUpError
 from dxlrun.events import EventCode, EventSink, Severity
 from dxlrun.interfaces import Commands, States
+from dxlrun.mode import Mode
 from dxlrun.packets import PacketSink
 
 STOP_LIMIT_NS = 1_000_000_000
@@ -107,6 +111,9 @@ class DynamixelHardware:
                     with suppress(PortError):  # told below; the other lines shall have their goals
                         bus.send(packet)
         self._tell_failures()
+
+    def set_modes(self, modes: NDArray[np.uint8]) -> None:
+        """Leave every joint in position mode: whoever waits for another one waits in vain."""
 
     def limit_torque(self, fraction: float) -> None:
         """Let no servo exert more than a fraction of its own limit; `restore_torque` takes that back."""
@@ -215,6 +222,7 @@ class DynamixelHardware:
         self._torque_lasts()
         for servos in self._servos:
             servos.torqued[:] = True
+        self._states.mode[:] = Mode.POSITION  # the survey let no servo pass that is in another one
         # goal = present: none of the goals has a speed yet
         self._goals.velocity[:] = float("nan")
 

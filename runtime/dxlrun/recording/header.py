@@ -69,7 +69,10 @@ def to_metadata(header: LogHeader) -> dict[str, str]:
 def from_metadata(text: dict[str, str]) -> LogHeader:
     """Return the header that `to_metadata` wrote. Raises ValueError when something is missing or wrong."""
     if text.get("format") != FORMAT:
-        raise ValueError(f"format {text.get('format')!r} where {FORMAT!r} is understood")
+        raise ValueError(
+            f"it has format {text.get('format', 'none')}, this version reads format {FORMAT}; "
+            "read it with the dxlrun that made it"
+        )
     try:
         return LogHeader(
             robot=text["robot"],

@@ -31,7 +31,7 @@ METADATA_NAME = "dxlrun"
 SUMMARY_NAME = "dxlrun_summary"
 """The metadata record that a finished log ends with."""
 HEADER_ATTACHMENT = "header.json"
-FORMAT = "2"
+FORMAT = "3"
 """Grows when a reader of the version before would misread a log."""
 
 _RULE = "=" * 80
@@ -116,8 +116,12 @@ def _cycle_text() -> str:
     lines = [
         "# One cycle of the loop. Times: ns of the run's clock; wall time = that + epoch_offset_ns",
         "# of the metadata. Rows: in the order of the metadata's joints and controllers; rad, rad/s;",
+        "# effort: Nm, A or the fraction of maximum; pwm: fraction of the full voltage; deg C, V.",
         "# NaN = not known or not commanded. active, published: bit i is controller i. clamped:",
-        "# 1 lower, 2 upper, 4 step, 8 velocity, 16 not finite. Records + skipped = elapsed periods.",
+        "# 1 lower, 2 upper, 4 step, 8 velocity, 16 not finite, 32 effort, 64 pwm, 128 outward.",
+        "# hardware_error: bits of Hardware Error Status, or states of Protocol 1.0's ERR. mode: 0 not",
+        "# known, 1 position, 2 velocity, 3 effort, 4 pwm, 5 position with an effort limit.",
+        "# Records + skipped = elapsed periods.",
     ]
     lines += [f"{kind} {name}" for name, kind in SCALARS]
     lines += [f"{kind}[] {name}" for name, kind, _ in SEQUENCES]
@@ -127,7 +131,7 @@ def _cycle_text() -> str:
 CYCLE = MessageType(
     "dxlrun_msgs/msg/Cycle",
     _cycle_text(),
-    "RIHS01_72c5439dcf2ac631fb4b21e3253cd0c483d39ff8d7dfffa1906ed8aa53ab1c32",
+    "RIHS01_10c0e4036b7ed80a34c95410e76aefc8bbdff6fb7693d76c4c1107fc25373d6c",
 )
 
 BUS_PACKET = MessageType(

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.control.loop import StopFlag
 from dxlrun.cycle import CycleRecord
 from dxlrun.errors import PortError
+from dxlrun.interfaces import COMMAND_INTERFACES, States
 
-_STATES = ("position", "velocity", "effort", "valid", "age_ns")
+_STATES = tuple(field.name for field in fields(States))
 
 
 class RecordedClock:
@@ -70,8 +73,8 @@ class RecordedHardware:
         record = self._record
         for name in _STATES:
             np.copyto(getattr(record.states, name), self._activation[name])
-        np.copyto(record.goals.position, self._activation["goal_position"])
-        np.copyto(record.goals.velocity, self._activation["goal_velocity"])
+        for interface in COMMAND_INTERFACES:
+            np.copyto(getattr(record.goals, interface), self._activation[f"goal_{interface}"])
 
     def idle(self, until_ns: int) -> None:
         """Let the coming wait end when it ended then. Raises PortError behind the last cycle."""
@@ -95,6 +98,9 @@ class RecordedHardware:
         if following == self._ends:
             self._stop.request()
         self._index = following
+
+    def set_modes(self, modes: NDArray[np.uint8]) -> None:
+        """Switch nothing: when the servos were in which mode is in their states."""
 
     def limit_torque(self, fraction: float) -> None:
         """Limit nothing: what the servos did then is in their states."""
