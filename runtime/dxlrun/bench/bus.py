@@ -66,6 +66,8 @@ def bench_bus(
     cases: Sequence[Case],
     hosts: Sequence[HostKind],
     seconds: float,
+    *,
+    values: bool = True,
     progress: Callable[[str, float], None] = lambda *_: None,
 ) -> BusBench:
     """Measure each case against canned replies for `seconds`; `progress` takes words and the share done."""
@@ -79,12 +81,18 @@ def bench_bus(
             def told(share: float, words: str = words, number: int = number) -> None:
                 progress(words, (number + share) / len(cases))
 
-            found.append(_canned(case, here, seconds, theirs, told))
+            found.append(_canned(case, here, seconds, core=theirs, values=values, progress=told))
     return BusBench((ours, theirs), tuple(found), tuple(kind.name for kind in hosts if kind.missing))
 
 
 def _canned(
-    case: Case, kinds: Sequence[HostKind], seconds: float, core: int, progress: Callable[[float], None]
+    case: Case,
+    kinds: Sequence[HostKind],
+    seconds: float,
+    *,
+    core: int,
+    values: bool,
+    progress: Callable[[float], None],
 ) -> CaseFigures:
     plan = case.plan(wire=False)
     with ExitStack() as stack:
@@ -92,7 +100,7 @@ def _canned(
         stack.callback(responder.close)
         hosts: dict[str, Host] = {}
         for kind, port in zip(kinds, responder.ports, strict=True):
-            hosts[kind.name] = kind.make(port, case, plan)
+            hosts[kind.name] = kind.make(port, case, plan, values)
             stack.callback(hosts[kind.name].close)
         steps = {
             name: responder.rehearse(number, host, first=True)

@@ -74,22 +74,32 @@ class Registers:
 
     read_address: int
     read_length: int
+    values: tuple[tuple[int, int], ...]
+    """Offset and size in what is read: position, velocity, effort."""
     write_address: int
-    goals: tuple[bytes, bytes]
+    write_length: int
+    goal: tuple[int, int]
+    """Offset and size of the goal position in what is written; the rest is 0, as fast as the servo can."""
+    ticks: tuple[int, int]
     """Two goals in turn, so that every exchange writes something new."""
 
     @classmethod
     def of(cls, plan: Plan) -> Registers:
         """Return what our plan reads and writes."""
         servo = plan.buses[0].servos[0]
+        state, goal = servo.state, servo.goal
+        position = goal.position
+        assert position is not None  # noqa: S101  nobody commands the joints of a case: they hold positions
         middle = (servo.lower_tick + servo.upper_tick) // 2
-        field = servo.goal.position
-        goals = []
-        for tick in (middle, middle + 1):
-            goal = bytearray(servo.goal.length)
-            goal[field.offset : field.offset + field.size] = tick.to_bytes(field.size, "little")
-            goals.append(bytes(goal))
-        return cls(servo.state.address, servo.state.length, servo.goal.address, (goals[0], goals[1]))
+        return cls(
+            read_address=state.address,
+            read_length=state.length,
+            values=tuple((each.offset, each.size) for each in (state.position, state.velocity, state.effort)),
+            write_address=goal.address,
+            write_length=goal.length,
+            goal=(position.offset, position.size),
+            ticks=(middle, middle + 1),
+        )
 
 
 def _without_wire(description: Description) -> Description:

@@ -27,6 +27,7 @@ def bench_bus(
     peers: List = "ours,unrecorded,sdk,rustypot",
     against: List = "canned",
     seconds: float = 4.0,
+    raw: Flag = False,
     as_json: JsonFlag = False,
     debug: Flag = False,
 ) -> int:
@@ -47,6 +48,8 @@ def bench_bus(
         Who answers: canned (another process that answers at once, without a wire and without thinking).
     seconds
         How long each case is measured, s.
+    raw
+        Let the peers leave raw bytes as they come and send bytes made before; ours goes on to SI units.
     as_json
         Print the result as JSON.
     debug
@@ -63,7 +66,7 @@ def bench_bus(
     cases = [Case(each, count) for each in protocols for count in _counts(servos)]
     if not 0.01 <= seconds <= 3600:
         raise InputError(f"--seconds {seconds:g}: give from 0.01 to 3600")
-    result = bus.bench_bus(cases, bus.chosen_hosts(names), seconds)
+    result = bus.bench_bus(cases, bus.chosen_hosts(names), seconds, values=not raw)
     for name in result.missing:
         say_warning(f"{name} is not installed and was left out; `pip install 'dxlrun[bench]'` installs it")
     if as_json:
