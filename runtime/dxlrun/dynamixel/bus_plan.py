@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from dxlrun.dynamixel.transaction import Transaction
+from dxlrun.mode import Mode
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,13 +34,23 @@ class StateLayout:
 
 @dataclass(frozen=True, slots=True)
 class GoalLayout:
-    """The block that is written to a servo each cycle."""
+    """A block that is written to a servo each cycle, with the goals of a mode that stand in it."""
 
     address: int
     length: int
-    position: Field
-    speed: Field | None
-    """None: the model has no speed beside its goal position."""
+    position: Field | None = None
+    speed: Field | None = None
+    """Beside a position: of the way to it, None where it does not stand there; alone: the goal itself."""
+    effort: Field | None = None
+    """Beside a position's block: the most that the way to it may take; alone: the goal itself."""
+    pwm: Field | None = None
+
+    @property
+    def position_place(self) -> Field:
+        """Where the position stands; raises LookupError for a block without."""
+        if self.position is None:
+            raise LookupError("no goal position stands in this block")
+        return self.position
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +86,46 @@ class RegisterValue:
 
 
 @dataclass(frozen=True, slots=True)
+class Scale:
+    """Unit and reach of a goal."""
+
+    per_tick: float
+    """rad/s, the unit of the state's effort, or fraction of the full voltage"""
+    most: int
+    """Highest tick without its sign, by the manual; the servo's own limit may be lower."""
+
+
+@dataclass(frozen=True, slots=True)
+class OwnLimit:
+    """Where a servo keeps the limit beyond which it refuses a goal as a whole."""
+
+    of: Literal["speed", "effort", "pwm"]
+    name: str
+    address: int
+    size: int
+
+
+@dataclass(frozen=True, slots=True)
+class ModePlan:
+    """One mode of one servo: what selects it, which goals it follows; see `mode_plan` for the sources."""
+
+    mode: Mode
+    operating: tuple[RegisterValue, ...]
+    """What selects the mode, in the order in which it is written, with torque off."""
+    goals: tuple[GoalLayout, ...]
+    """The blocks of its goals, in the order in which they are sent."""
+    lower_tick: int
+    """Lowest goal position."""
+    upper_tick: int
+    """Highest goal position."""
+    present_rad_s_per_tick: float
+    """Unit of the present speed in this mode."""
+    speed: Scale | None = None
+    effort: Scale | None = None
+    pwm: Scale | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class ServoPlan:
     """One servo and the joint that it moves: q = direction * (theta - reference)."""
 
@@ -107,6 +158,20 @@ class ServoPlan:
     """None where the model has none that limits position control."""
     registers: tuple[RegisterValue, ...] = ()
     """What the robot file declares, in the order in which it is written: EEPROM first."""
+    modes: tuple[ModePlan, ...] = ()
+    """The modes in which the servo can be."""
+    start_mode: Mode = Mode.POSITION
+    """In which it is brought at the start; one of `modes`."""
+    own_limits: tuple[OwnLimit, ...] = ()
+    continuous: bool = False
+    """The joint is a wheel, or one of many turns."""
+
+    def mode_plan(self, mode: int) -> ModePlan:
+        """Return one of its modes; raises LookupError when the servo does not have it."""
+        for plan in self.modes:
+            if plan.mode == mode:
+                return plan
+        raise LookupError(f"{self.model} of {self.joint} has no mode {Mode(mode).name.lower()}")
 
 
 @dataclass(frozen=True, slots=True)

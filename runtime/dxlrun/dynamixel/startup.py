@@ -243,7 +243,7 @@ def confirm(plan: BusPlan) -> Program[list[str]]:
 
 def _read_back(plan: BusPlan, servo: ServoPlan, goal: int) -> Program[str]:
     """Make sure that the servo has what was written."""
-    line, place = setup_line(plan), servo.goal.position
+    line, place = setup_line(plan), servo.goal.position_place
     goal_address, torque = servo.goal.address + place.offset, servo.torque_address
     if readable(control_table(servo.model, plan.protocol), torque, goal_address + place.size):
         back = yield from persist(line.read(servo.servo_id, torque, goal_address + place.size - torque))
