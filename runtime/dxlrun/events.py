@@ -46,6 +46,11 @@ class EventCode(IntEnum):
     BUS_NOISE = 24
     PORT_LOST = 25
     PORT_BACK = 26
+    SERVO_LOST = 27
+    """A servo missed several replies in a row: it leaves the exchange and is asked once a second."""
+    SERVO_BACK = 28
+    """A servo that was lost was looked at as at the start, and takes part again."""
+    SERVO_REBOOTED = 29
     COMMAND = 30
     """A command was handed to a controller."""
     COMMAND_REFUSED = 31
@@ -64,6 +69,12 @@ class EventCode(IntEnum):
     """A policy of the robot file begins or ends: what for, and what it does."""
     GATE = 40
     """A command was clamped at the last gate; the text names joint, controller and limit."""
+    IMPLAUSIBLE = 41
+    """A servo's position jumped further than it can turn: the sample is not valid."""
+    SERVO_HOT = 42
+    """A servo is near its Temperature Limit, or has cooled down again."""
+    WATCHDOG = 43
+    """The Bus Watchdog of servos was armed, disarmed, or has stopped them."""
     GUARDIAN = 50
     RECORDER = 60
     RECORDER_GAP = 61

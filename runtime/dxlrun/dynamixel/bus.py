@@ -208,6 +208,7 @@ class Bus:
             self._write(transaction.packet, transaction.servo_id)
         else:
             self._started_ns = self._now_ns()
+        reply.sent_ns = self._started_ns
         if not transaction.awaited:
             reply.outcome = Outcome.SENT
             self._deadline_ns = self._started_ns + transaction.due_ns

@@ -163,6 +163,8 @@ class ServoPlan:
     start_mode: Mode = Mode.POSITION
     """In which it is brought at the start; one of `modes`."""
     own_limits: tuple[OwnLimit, ...] = ()
+    torque_on_return: bool = False
+    """Torque is given back after a reboot (policy `on_returned_servo: hold`)."""
     continuous: bool = False
     """The joint is a wheel, or one of many turns."""
 
@@ -233,3 +235,5 @@ class BusPlan:
     """How the bus could be read, the chosen one among them."""
     split: bool = False
     """The next read request leaves right behind the goals, so that the replies wait when a cycle begins."""
+    watchdog_ticks: int = 0
+    """Bus Watchdog of each servo that has one, steps of 20 ms; 0: not armed."""

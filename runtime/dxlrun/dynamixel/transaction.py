@@ -83,6 +83,8 @@ class Reply:
     """Intact packets that nobody awaited, and bytes of noise, since the transaction before."""
     echoed: bool
     """True when the instruction itself came back: the adapter echoes."""
+    sent_ns: int = 0
+    """Start of the write of the instruction."""
 
     @property
     def answered(self) -> bool:
