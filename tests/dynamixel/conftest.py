@@ -9,7 +9,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import pytest
 
@@ -123,7 +123,7 @@ def _plan(
         )
         for index, servo_id in enumerate(ids)
     ]
-    return bus_plan(
+    plan = bus_plan(
         name=name,
         port="sim",
         baud_rate=1_000_000,
@@ -131,7 +131,9 @@ def _plan(
         return_delay_ns=return_delay_ns,
         joints=wiring,
         protocol=protocol,
+        split=change.get("split", False),
     )
+    return plan if change.get("fast") else replace(plan, fast=(False,) * len(plan.groups))
 
 
 @pytest.fixture

@@ -26,8 +26,9 @@ def test_the_budget_of_protocol_md_for_eight_x_servos(make_plan):
     budget = make_plan(protocol=2.0, model="XM430-W350", latency_ns=1_000_000).budget
     goals = 14 + 8 * 9
     assert budget.request_bytes == 22 + goals
-    assert budget.wire_ns == 220_000 + 8 * 210_000 + goals * 10_000
-    assert budget.return_delay_ns == 8 * 500_000
+    # fast sync read: 0.22 + 1.2 ms, and one return delay
+    assert budget.wire_ns == 220_000 + 1_200_000 + goals * 10_000
+    assert budget.return_delay_ns == 500_000
     assert budget.latency_ns == 1_000_000
 
 

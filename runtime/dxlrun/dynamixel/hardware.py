@@ -16,6 +16,7 @@ from dxlrun.dynamixel.gaps import Gaps
 from dxlrun.dynamixel.health import Servos
 from dxlrun.dynamixel.limp import LimpOutcome, limp_buses
 from dxlrun.dynamixel.port import Ports
+from dxlrun.dynamixel.probing import extra_ns, probe_reads
 from dxlrun.dynamixel.torque_limit import reduced
 from dxlrun.dynamixel.units import joint_position
 from dxlrun.errors import PortError, StartUpError
@@ -82,6 +83,7 @@ class DynamixelHardware:
         given is taken back, and a note of the exception says whether every servo confirmed that.
         """
         self._survey()
+        self._probe_reads()
         try:
             self._engage()
             if self._restore_torque:
@@ -181,6 +183,27 @@ class DynamixelHardware:
                     self._events.emit(EventCode.REGISTER_DIFFERS, Severity.WARNING, joint, text)
         if problems:
             raise StartUpError("\n".join(problems))
+
+    def _probe_reads(self) -> None:
+        """Find out when replies are due, and read plainly whoever does not answer the fast forms."""
+        programs = [probe_reads(plan) for plan in self._plans]
+        found = run(programs, self._buses, self._ports, self._clock, self._beat)
+        self._raise_failures()
+        for plan, servos, probed in zip(self._plans, self._servos, found, strict=True):
+            if probed is None:
+                continue
+            servos.reads.learn(probed.return_delays)
+            for group in probed.refused:
+                servos.reads.plain(group)
+            if probed.refused:
+                total_ns = plan.budget.total_ns + extra_ns(plan, probed.refused)
+                why = "; ".join(probed.refused.values())
+                text = (
+                    f"bus {plan.name} is not read by a fast form, {why}: a cycle "
+                    f"takes {total_ns / 1e6:.2f} ms instead of {plan.budget.total_ns / 1e6:.2f} ms, at most "
+                    f"{1e9 / total_ns:.0f} Hz"
+                )
+                self._events.emit(EventCode.SETUP, Severity.WARNING, plan.name, text)
 
     def _restore_limits(self) -> None:
         """Give the servos the torque again that a policy of an earlier run may have left them without."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 from dxlrun.dynamixel import protocol1
 from dxlrun.dynamixel.dialect import Dialect
@@ -35,10 +35,16 @@ class Line:
     """Of the adapter, once per request."""
     return_delay_ns: int
     dialect: Dialect = protocol1
+    return_delays: Mapping[int, int] = field(default_factory=dict)
+    """Of servos of which it is known, by ID, ns; `return_delay_ns` is that of all others."""
 
     def wire_ns(self, count: int) -> int:
         """Return the time that `count` bytes take on the wire, ns."""
         return count * BITS_PER_BYTE * 1_000_000_000 // self.baud_rate
+
+    def delay_ns(self, servo_id: int) -> int:
+        """Return what a servo waits before it answers, ns."""
+        return self.return_delays.get(servo_id, self.return_delay_ns)
 
     def ping(self, servo_id: int) -> Transaction:
         """Return a ping."""
@@ -63,7 +69,7 @@ class Line:
             return self._answered(packet, BROADCAST_ID, *awaited)
         size = self.dialect.fast_size(sum(one.length for one in awaited), len(awaited))
         # only the first one waits before it speaks: the others add their parts at once (protocol.md, Time)
-        due_ns = self.wire_ns(len(packet) + size) + self.return_delay_ns
+        due_ns = self.wire_ns(len(packet) + size) + self.delay_ns(awaited[0].servo_id)
         timeout_ns = due_ns + self.latency_ns + PATIENCE_NS
         return Transaction(packet, BROADCAST_ID, awaited, due_ns, timeout_ns, size, fast=True)
 
@@ -81,7 +87,7 @@ class Line:
     def _answered(self, packet: bytes, servo_id: int, *awaited: Awaited) -> Transaction:
         """Return a transaction whose replies come one after the other, each after a return delay."""
         replies = sum(self.dialect.OVERHEAD + one.length for one in awaited)
-        due_ns = self.wire_ns(len(packet) + replies) + len(awaited) * self.return_delay_ns
+        due_ns = self.wire_ns(len(packet) + replies) + sum(self.delay_ns(one.servo_id) for one in awaited)
         widest = self.dialect.widest(max(one.length for one in awaited))
         return Transaction(packet, servo_id, awaited, due_ns, due_ns + self.latency_ns + PATIENCE_NS, widest)
 

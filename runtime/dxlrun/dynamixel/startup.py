@@ -16,7 +16,8 @@ from dxlrun.dynamixel.inspection import Inspector, Survey, persist, setup_line, 
 from dxlrun.dynamixel.inspection1 import Inspector1
 from dxlrun.dynamixel.inspection2 import Inspector2
 from dxlrun.dynamixel.line import Line, listen
-from dxlrun.dynamixel.plan import readable, state_read
+from dxlrun.dynamixel.plan import readable
+from dxlrun.dynamixel.reads import state_read
 from dxlrun.dynamixel.registers import settle_registers
 from dxlrun.dynamixel.transaction import Outcome, Program, Reply
 from dxlrun.dynamixel.units import goal_bytes, joint_position, speed_ticks, ticks_in
