@@ -109,8 +109,15 @@ def _by_operating_mode(table: ControlTable, ends: tuple[int, int], continuous: b
         found.append(replace(change, operating=(_value(table, "operating_mode", number),)))
 
     position = replace(plain, mode=Mode.POSITION, goals=(position_layout(table),), speed=to_goal)
-    if not continuous:
-        add(_POSITION if _POSITION in listed else _CURRENT_BASED, position)
+    limited = position
+    if _CURRENT_BASED in listed:
+        # the effort first: a position without its limit would be pursued with the limit of before
+        goals = (_alone(items["goal_current"], "effort"), *position.goals)
+        limited = replace(position, goals=goals, effort=current)
+    if not continuous and _POSITION in listed:
+        add(_POSITION, position)
+    elif not continuous:
+        add(_CURRENT_BASED, limited)
     elif _EXTENDED in listed:
         add(_EXTENDED, position)
     if _VELOCITY in listed:
@@ -120,11 +127,7 @@ def _by_operating_mode(table: ControlTable, ends: tuple[int, int], continuous: b
         layout = _alone(items["goal_current"], "effort")
         add(_CURRENT, replace(plain, mode=Mode.EFFORT, goals=(layout,), effort=current))
         if _CURRENT_BASED in listed and not continuous:
-            # the effort first: a position without its limit would be pursued with the limit of before
-            both = replace(
-                position, mode=Mode.EFFORT_POSITION, goals=(layout, *position.goals), effort=current
-            )
-            add(_CURRENT_BASED, both)
+            add(_CURRENT_BASED, replace(limited, mode=Mode.EFFORT_POSITION))
     if _PWM in listed:
         layout, scale = _alone(items["goal_pwm"], "pwm"), _scale(table, "goal_pwm")
         add(_PWM, replace(plain, mode=Mode.PWM, goals=(layout,), pwm=scale))

@@ -3,8 +3,8 @@
 Programs of transactions, at the start and in the gaps between cycles; nothing here waits. A switch leaves the
 torque as it was: on again only where it had been on, and off where anything went wrong meanwhile.
 
-Sources: e-Manual XM430-W350, Operating Mode (11), for what a change needs and what it resets; MX-64, CW/CCW Angle
-Limit (6, 8) and Torque Control Mode Enable (70).
+Sources: e-Manual XM430-W350, Operating Mode (11), for what a change needs and what it resets; MX-64, CW/CCW
+Angle Limit (6, 8) and Torque Control Mode Enable (70).
 """
 
 from __future__ import annotations

@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from dxlrun.control_table import ControlItem, ControlTable
 from dxlrun.dynamixel.bus_plan import (
     BusPlan,
     Field,
     GoalLayout,
+    ModePlan,
+    RegisterValue,
     ServoPlan,
     StateLayout,
     TorqueLimit,
 )
 from dxlrun.dynamixel.dialect import dialect_of
 from dxlrun.dynamixel.line import Line
+from dxlrun.dynamixel.mode_plan import LACKS, mode_plans, own_limits, position_layout, position_reach
 from dxlrun.dynamixel.reads import choose_reads
 from dxlrun.dynamixel.transaction import BROADCAST_ID, Transaction
+from dxlrun.mode import Mode
 
 MOST_SPARE = 2
 """Two longer forms of a read tell its late replies from the newest (`exchange`)."""
@@ -40,6 +44,12 @@ class Wiring:
     """rad, joint angle"""
     upper: float
     """rad, joint angle"""
+    registers: tuple[RegisterValue, ...] = ()
+    """What its memory shall hold, in the order in which it is written."""
+    continuous: bool = False
+    """A wheel, or a joint of many turns, which positions count; without limits `lower`, `upper` are inf."""
+    start_mode: Mode | None = None
+    """In which the servo is brought at the start; None: VELOCITY for a wheel, else POSITION."""
 
 
 def bus_plan(
@@ -97,13 +107,13 @@ def readable(table: ControlTable, start: int, end: int) -> bool:
 
 
 def goal_layouts(servos: Sequence[ServoPlan]) -> tuple[GoalLayout, ...]:
-    """Return the different goal layouts of servos; each needs a sync write of its own."""
-    return tuple(dict.fromkeys(servo.goal for servo in servos))
+    """Return the different goal blocks of servos in their first modes; each needs a sync write of its own."""
+    return tuple(dict.fromkeys(goal for servo in servos for goal in servo.mode_plan(servo.start_mode).goals))
 
 
 def _empty_goals(name: str, line: Line, layout: GoalLayout, servos: Sequence[ServoPlan]) -> bytes:
     """Return a sync write of zeros to everybody of one layout, to know its size; it is never sent."""
-    count = sum(servo.goal == layout for servo in servos)
+    count = sum(layout in servo.mode_plan(servo.start_mode).goals for servo in servos)
     most = line.dialect.MOST_GOAL_BYTES // (layout.length + 1)
     if count > most:
         raise ValueError(
@@ -137,9 +147,12 @@ def _servo(joint: Wiring) -> ServoPlan:
         (joint.direction * angle + joint.reference) / table.rad_per_tick
         for angle in (joint.lower, joint.upper)
     )
+    reach = position_reach(table, joint.continuous)
     # inwards, so that no goal is outside; 1e-6 ticks forgive the rounding of degrees
-    lower, upper = math.ceil(ends[0] - 1e-6), math.floor(ends[1] + 1e-6)
+    lower = math.ceil(max(ends[0], reach[0]) - 1e-6)
+    upper = math.floor(min(ends[1], reach[1]) + 1e-6)
     hardware_error = table.items.get("hardware_error_status")
+    modes = mode_plans(table, lower, upper, joint.continuous)
     return ServoPlan(
         joint=joint.joint,
         row=joint.row,
@@ -153,14 +166,27 @@ def _servo(joint: Wiring) -> ServoPlan:
         rad_s_per_tick=table.rad_s_per_tick,
         max_speed_tick=table.max_speed_tick,
         effort_per_tick=table.effort_per_tick,
-        lower_tick=max(table.min_tick, lower),
-        upper_tick=min(table.max_tick, upper),
-        state=_state_layout(table),
-        goal=_goal_layout(table),
+        lower_tick=lower,
+        upper_tick=upper,
+        state=_state_layout(table, counts_turns=joint.continuous),
+        goal=position_layout(table),
         torque_address=table.items["torque_enable"].address,
         hardware_error_address=None if hardware_error is None else hardware_error.address,
         torque_limit=_torque_limit(table),
+        modes=modes,
+        start_mode=_start_mode(joint, modes),
+        own_limits=own_limits(table),
+        continuous=joint.continuous,
+        registers=joint.registers,
     )
+
+
+def _start_mode(joint: Wiring, modes: Sequence[ModePlan]) -> Mode:
+    """Return the first mode; raises ValueError when the model does not have it."""
+    wanted = joint.start_mode or (Mode.VELOCITY if joint.continuous else Mode.POSITION)
+    if any(plan.mode == wanted for plan in modes):
+        return wanted
+    raise ValueError(f"{joint.table.model} of {joint.joint} {LACKS[wanted]}")
 
 
 def _torque_limit(table: ControlTable) -> TorqueLimit | None:
@@ -173,7 +199,7 @@ def _torque_limit(table: ControlTable) -> TorqueLimit | None:
     return None
 
 
-def _state_layout(table: ControlTable) -> StateLayout:
+def _state_layout(table: ControlTable, *, counts_turns: bool) -> StateLayout:
     """Return the one block that holds position, speed and load or current.
 
     Raises ValueError when they do not stand together: an address without an item cannot be read.
@@ -185,20 +211,13 @@ def _state_layout(table: ControlTable) -> StateLayout:
     if not readable(table, start, end):
         raise ValueError(f"{table.model}: {', '.join(names)} do not stand in one block, so no read gets all")
     position, velocity, effort = (_field(item, start) for item in items)
+    if counts_turns:
+        # turns below 0 are in two's complement, also in the 16 bits of multi-turn mode
+        position = replace(position, encoding="twos_complement")
     spare = 0
     while spare < MOST_SPARE and readable(table, start, end + spare + 1):
         spare += 1
     return StateLayout(start, end - start, position, velocity, effort, spare)
-
-
-def _goal_layout(table: ControlTable) -> GoalLayout:
-    """Return the block of goal position and, when it stands beside it, of the speed toward it."""
-    position, speed = table.items["goal_position"], table.items[table.goal_speed_item]
-    start = min(position.address, speed.address)
-    if abs(position.address - speed.address) != (speed.size if start == speed.address else position.size):
-        return GoalLayout(position.address, position.size, _field(position, position.address), None)
-    length = position.size + speed.size
-    return GoalLayout(start, length, _field(position, start), _field(speed, start))
 
 
 def _field(item: ControlItem, start: int) -> Field:
