@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from dxlrun.clock import Clock
+from dxlrun.dynamixel.burst import Burst
 from dxlrun.dynamixel.bus_plan import BusPlan
 from dxlrun.dynamixel.dialect import dialect_of
 from dxlrun.dynamixel.line import BITS_PER_BYTE
@@ -99,7 +100,7 @@ class Bus:
         self._refusal = self._dialect.refused
         self._overhead = self._dialect.OVERHEAD
         self._id_at = self._dialect.ID_AT
-        self._receiver = Receiver(self._status, self._noise, self._dialect)
+        self._receiver = Receiver(self._status, self._noise, self._dialect, self._whole)
         self._parameters = memoryview(bytearray(self._dialect.LONGEST))
         self._views: dict[int, memoryview] = {}
         self._reply = Reply(Outcome.SENT, 0, b"", 0, 0, False)
@@ -117,6 +118,11 @@ class Bus:
     def busy(self) -> bool:
         """True while a job is under way."""
         return self._job is not None
+
+    @property
+    def room(self) -> int:
+        """The most bytes that a burst of replies may have."""
+        return self._receiver.room
 
     def renew(self, port: Port) -> None:
         """Go on with a line that is back in the place of one that is gone; its job is forgotten."""
@@ -153,11 +159,17 @@ class Bus:
         """Take what the line has; called when it has bytes."""
         if self.failure is None:
             try:
-                if self._receiver.read_from(self._port, self._now_ns):
-                    self._last_byte_ns = self._now_ns()
+                receiver = self._receiver
+                if not receiver.read_from(self._port, self._now_ns):
+                    return
+                self._last_byte_ns = self._now_ns()
                 # as many bytes as an awaited reply has, and it is not whole: its header is a false one
-                while self._state == _AWAITING and self._receiver.pending >= self._reply_size:
-                    self._receiver.skip_header()
+                while (
+                    self._state == _AWAITING
+                    and receiver.pending >= self._reply_size
+                    and not receiver.gathering
+                ):
+                    receiver.skip_header()
             except PortError as error:
                 self._fail(error)
 
@@ -201,6 +213,7 @@ class Bus:
             return
         if self._receiver.pending:
             self._receiver.flush()
+        self._receiver.expect(job.burst)
         reply.parameters = b""
         reply.error = reply.strays = 0
         reply.echoed = False
@@ -243,6 +256,35 @@ class Bus:
 
     def _quiet_at(self) -> int:
         return min(self._last_byte_ns + self._quiet_ns, self._drain_end_ns)
+
+    def _whole(self, burst: Burst, ends: list[int], times: list[int]) -> bool:
+        """Take all replies of a transaction at once; return False when some came too soon to be of now."""
+        transaction, job = self._awaited, self._job
+        if self._state != _AWAITING or transaction is None or job is None:
+            return False
+        first_ns = last_ns = times[0]
+        spans: list[tuple[int, int]] = []
+        if len(times) > 1:
+            spans = _spans(burst, ends, times)
+            first_ns, last_ns = spans[0][1], spans[-1][1]
+        sent = len(transaction.packet)
+        # an echo, or left over from before, comes sooner than the wire allows
+        if first_ns < self._started_ns + (sent + burst.first_size) * self._byte_ns:
+            return False
+        packet, index = self._sink.packet, self._index
+        if spans:
+            for (servo_id, data), (first, last) in zip(burst.packets, spans, strict=True):
+                packet(index, PacketKind.STATUS, servo_id, first, last, data)
+        else:
+            for servo_id, data in burst.packets:
+                packet(index, PacketKind.STATUS, servo_id, last_ns, last_ns, data)
+        reply = self._reply
+        reply.outcome, reply.last_ns = Outcome.OK, last_ns
+        self._open = 0
+        self._state = _READY
+        moments = [last for _, last in spans]
+        job.take(burst, moments if len(moments) == burst.count else last_ns)
+        return True
 
     def _noise(self, data: memoryview, first_ns: int, last_ns: int) -> None:
         self._sink.packet(self._index, PacketKind.NOISE, BROADCAST_ID, first_ns, last_ns, data)
@@ -341,6 +383,20 @@ class Bus:
         self._reply.strays += 1
         if self._awaited is not None and packet == self._awaited.packet:
             self._reply.echoed = True
+
+
+def _spans(burst: Burst, ends: list[int], times: list[int]) -> list[tuple[int, int]]:
+    """Return of each status packet when the read() of its first and of its last byte was."""
+    found: list[tuple[int, int]] = []
+    start = first = last = 0
+    for _, data in burst.packets:
+        while ends[first] <= start:
+            first += 1
+        start += len(data)
+        while ends[last] < start:
+            last += 1
+        found.append((times[first], times[last]))
+    return found
 
 
 def pump(buses: Sequence[Bus], ports: Ports, clock: Clock, beat: Callable[[], None]) -> None:

@@ -52,6 +52,10 @@ class Dialect(Protocol):
         """Return the most bytes that a status of `length` parameters has on the line."""
         ...
 
+    def status_packet(self, servo_id: int, error: int = 0, parameters: bytes = b"") -> bytes:
+        """Return the status packet that a servo would send."""
+        ...
+
     def ping(self, servo_id: int) -> bytes:
         """Return the packet that asks whether a servo is there."""
         ...

@@ -16,10 +16,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from dxlrun.dynamixel.burst import Burst
 from dxlrun.dynamixel.bus_plan import BusPlan
 from dxlrun.dynamixel.line import PATIENCE_NS, SHORT_PATIENCE_NS, Line
 from dxlrun.dynamixel.plan import plan_line
 from dxlrun.dynamixel.reads import state_read
+from dxlrun.dynamixel.state_arrays import StateArrays, rows_of
 from dxlrun.dynamixel.transaction import Outcome, Reply, Transaction
 
 MOST_CHAINS = 64
@@ -29,9 +31,18 @@ MOST_CHAINS = 64
 class _Request:
     """One read of servos of one group: in each length, patient and short."""
 
-    __slots__ = ("group", "indices", "patient", "short")
+    __slots__ = ("bursts", "data", "group", "indices", "patient", "rows", "servos", "short")
 
-    def __init__(self, plan: BusPlan, line: Line, group: int, indices: tuple[int, ...], fast: bool) -> None:
+    def __init__(  # noqa: PLR0917
+        self,
+        plan: BusPlan,
+        line: Line,
+        group: int,
+        indices: tuple[int, ...],
+        fast: bool,
+        arrays: StateArrays,
+        room: int,
+    ) -> None:
         servos = [plan.servos[index] for index in indices]
         spare = min(servo.state.spare for servo in servos)
         self.group = group
@@ -41,13 +52,19 @@ class _Request:
             replace(read, timeout_ns=read.timeout_ns - PATIENCE_NS + SHORT_PATIENCE_NS)
             for read in self.patient
         ]
+        alike = len({servo.state for servo in servos}) == 1
+        self.bursts = [Burst.of(line.dialect, read, room) if alike else None for read in self.patient]
+        self.servos = rows_of(indices)
+        self.data, self.rows = arrays.place(indices if alike else indices[:1])
 
 
 class CyclicReads:
     """The job that reads the state of every servo of one bus once."""
 
     __slots__ = (
+        "_arrays",
         "_current",
+        "_erring",
         "_groups",
         "_line",
         "_lossy",
@@ -58,9 +75,11 @@ class CyclicReads:
         "_queue",
         "_queue_of",
         "_replies",
+        "_room",
         "_shape",
         "arrived_ns",
         "away",
+        "burst",
         "errors",
         "fast",
         "fresh",
@@ -68,7 +87,7 @@ class CyclicReads:
         "missed",
     )
 
-    def __init__(self, plan: BusPlan, replies: Sequence[memoryview]) -> None:
+    def __init__(self, plan: BusPlan, arrays: StateArrays, room: int) -> None:
         count = len(plan.servos)
         self.fresh = np.zeros(count, dtype=np.bool_)
         """Whose reply arrived intact in this cycle."""
@@ -86,7 +105,11 @@ class CyclicReads:
         self._plan = plan
         self._line = plan_line(plan)
         self._groups = plan.groups
-        self._replies = tuple(replies)
+        self._replies = arrays.replies
+        self._arrays = arrays
+        self._room = room
+        self._erring = False  # somebody's newest error byte is not 0
+        self.burst: Burst | None = None
         self._made: dict[tuple[int, ...], _Request] = {}
         self._shape = [0] * len(self._groups)
         self._lossy = [False] * len(self._groups)  # whose reply was lost in this cycle
@@ -151,7 +174,9 @@ class CyclicReads:
         request = self._current = self._queue[self._position]
         # the first silence of a cycle has cost its patience: the others keep their time
         reads = request.patient if self._patient and not self.missed[request.indices[0]] else request.short
-        return reads[self._shape[request.group] % len(reads)]
+        shape = self._shape[request.group] % len(reads)
+        self.burst = request.bursts[shape]
+        return reads[shape]
 
     def status(self, index: int, reply: Reply) -> None:
         """Keep the state of one servo of the current read."""
@@ -162,6 +187,20 @@ class CyclicReads:
         self.fresh[servo] = True
         self.arrived_ns[servo] = reply.last_ns
         self.errors[servo] = reply.error
+        self._erring = True
+
+    def take(self, burst: Burst, times_ns: int | list[int]) -> None:
+        """Keep the states of all servos of the current read."""
+        request = self._current
+        assert request is not None  # noqa: S101  a burst belongs to a read
+        request.data[request.rows] = burst.data[:, : request.data.shape[1]]
+        self.fresh[request.servos] = True
+        self.arrived_ns[request.servos] = times_ns
+        errors = burst.errors
+        if self._erring or any(errors):
+            for servo, error in zip(request.indices, errors, strict=True):
+                self.errors[servo] = error
+            self._erring = any(self.errors)
 
     def _count_out(self, outcome: Outcome) -> None:
         assert self._current is not None  # noqa: S101  something was read
@@ -177,7 +216,9 @@ class CyclicReads:
             if len(self._made) >= MOST_CHAINS:
                 self._made.clear()
             fast = self.fast[group] and len(indices) > 1
-            request = self._made[indices] = _Request(self._plan, self._line, group, indices, fast)
+            request = self._made[indices] = _Request(
+                self._plan, self._line, group, indices, fast, self._arrays, self._room
+            )
         return request
 
 

@@ -82,7 +82,7 @@ class Servos:
         self._states = StateArrays(plan)
         self.goals = GoalArrays(plan)
         """Builds the sync write."""
-        self.reads = CyclicReads(plan, self._states.replies)
+        self.reads = CyclicReads(plan, self._states, bus.room)
         """The job that reads every servo once."""
         self.torqued = np.zeros(count, dtype=np.bool_)
         """Shape (servos,): who has torque for certain and missed no reply since; they get goals."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from dxlrun.dynamixel.burst import Burst
 from dxlrun.dynamixel.dialect import Dialect
 from dxlrun.dynamixel.port import Port
 
@@ -16,6 +17,9 @@ Taker = Callable[[memoryview, int, int], None]
 The view is only good during the call.
 """
 
+BurstTaker = Callable[[Burst, list[int], list[int]], bool]
+"""Takes whole replies with where each read() ended, and when; False: they are to be taken one by one."""
+
 _GOOD_READ = 765
 """Bytes that one read may bring beside an unfinished packet."""
 
@@ -24,12 +28,14 @@ class Receiver:
     """Takes packets out of a stream; decides on a header only when its whole packet is there.
 
     A false header in noise can announce up to the protocol's longest packet and so hold back what follows
-    it; `flush` ends that when a deadline has passed.
+    it; `flush` ends that when a deadline has passed. Replies that are awaited as a burst are taken as one,
+    as long as what arrives looks like them.
     """
 
     __slots__ = (
         "_beginnings",
         "_buffer",
+        "_burst",
         "_end",
         "_ends",
         "_header",
@@ -37,11 +43,14 @@ class Receiver:
         "_noise",
         "_packet",
         "_size_at",
+        "_taken",
         "_times",
         "_view",
     )
 
-    def __init__(self, packet: Taker, noise: Taker, dialect: Dialect) -> None:
+    def __init__(
+        self, packet: Taker, noise: Taker, dialect: Dialect, taken: BurstTaker = lambda *_: False
+    ) -> None:
         header = dialect.HEADER
         self._header = header
         self._beginnings = tuple(header[:count] for count in range(len(header) - 1, 0, -1))
@@ -54,6 +63,24 @@ class Receiver:
         self._times: list[int] = []
         self._packet = packet
         self._noise = noise
+        self._taken = taken
+        self._burst: Burst | None = None
+
+    def expect(self, burst: Burst | None) -> None:
+        """Take the next bytes as a whole if they are these replies; call it when nothing is pending."""
+        self._burst = burst
+        if burst is not None:
+            burst.bind(self._buffer)
+
+    @property
+    def room(self) -> int:
+        """The most bytes that a burst may have, so that one read() fits behind it."""
+        return len(self._buffer) - _GOOD_READ // 3
+
+    @property
+    def gathering(self) -> bool:
+        """True while what has come can become the burst that is awaited."""
+        return self._burst is not None
 
     @property
     def pending(self) -> int:
@@ -65,7 +92,7 @@ class Receiver:
 
         Raises PortError when the adapter is gone.
         """
-        count = port.read_into(self._view[self._end :])
+        count = port.read_into(self._view[self._end :] if self._end else self._view)
         if count:
             self._accept(count, now_ns())
         return count
@@ -79,11 +106,13 @@ class Receiver:
 
     def skip_header(self) -> None:
         """Give up the header that is being waited for, as false; what follows it gets its chance."""
+        self._scatter()
         if self._end:
             self._forget(self._scan(1))
 
     def flush(self) -> None:
         """Give up waiting for the rest of an unfinished packet: scan again behind its header."""
+        self._scatter()
         while self._end:
             if self._buffer.startswith(self._header, 0, self._end):
                 self._forget(self._scan(1))
@@ -95,7 +124,23 @@ class Receiver:
         self._end += count
         self._ends.append(self._end)
         self._times.append(at_ns)
+        burst = self._burst
+        if burst is not None:
+            if self._end < burst.size:
+                if burst.begun(self._end):
+                    return
+            elif burst.whole() and self._taken(burst, self._ends, self._times):
+                self._forget(burst.size)
+            self._burst = None
+            if not self._end:
+                return
         self._forget(self._scan(0))
+
+    def _scatter(self) -> None:
+        """Take what has come of a burst packet by packet."""
+        if self._burst is not None:
+            self._burst = None
+            self._forget(self._scan(0))
 
     def _emit(self, taker: Taker, start: int, stop: int) -> None:
         times = self._times

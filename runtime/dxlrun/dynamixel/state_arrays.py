@@ -14,6 +14,16 @@ _MAGNITUDE = 0x3FF
 _CLOCKWISE = 0x400
 
 Integers = NDArray[np.integer]
+Rows = slice | NDArray[np.intp]
+"""Some rows of an array: a slice where they stand one behind the other, which is quicker."""
+
+
+def rows_of(indices: Sequence[int]) -> Rows:
+    """Return rows by their numbers."""
+    first = indices[0]
+    if list(indices) == list(range(first, first + len(indices))):
+        return slice(first, first + len(indices))
+    return np.array(indices, dtype=np.intp)
 
 
 class StateArrays:
@@ -37,6 +47,12 @@ class StateArrays:
         """Where each servo's bytes belong, in the order of the plan's servos."""
         self._rows = np.array([servo.row for servo in plan.servos], dtype=np.intp)
         self._arrived = np.full(len(plan.servos), -1, dtype=np.int64)
+
+    def place(self, indices: Sequence[int]) -> tuple[NDArray[np.uint8], Rows]:
+        """Return the bytes of all servos of one layout, one row a servo, and the rows of some of them."""
+        block = next(block for block in self._blocks if indices[0] in block.replies)
+        rows = list(block.replies)
+        return block.data, rows_of([rows.index(index) for index in indices])
 
     def decode(
         self, states: States, fresh: NDArray[np.bool_], arrived_ns: NDArray[np.int64], now_ns: int
@@ -67,6 +83,7 @@ class _StateBlock:
         "_reference",
         "_rows",
         "_speed",
+        "data",
         "replies",
     )
 
@@ -78,6 +95,7 @@ class _StateBlock:
         self.replies = {
             index: view[number * length : (number + 1) * length] for number, index in enumerate(members)
         }
+        self.data: NDArray[np.uint8] = np.frombuffer(buffer, np.uint8).reshape(len(mine), length)
         fields = (layout.position, layout.velocity, layout.effort)
         record = np.dtype(
             {

@@ -1,0 +1,144 @@
+"""Burst: the replies to one read, taken as a whole when they come as they should.
+
+What is awaited is known to the byte: whose status stands where, and what its header says. So the replies of a
+chain, or the one status of a fast form, are compared and checked where they lie in the receive buffer, and
+their data leave it as one array. Whatever does not fit (a servo that is silent or refuses, noise, stuffing,
+another order) is none, and the receiver takes the same bytes packet by packet.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from fastcrc import crc16
+from numpy.typing import NDArray
+
+from dxlrun.dynamixel.dialect import Dialect
+from dxlrun.dynamixel.transaction import BROADCAST_ID, Transaction
+
+_STUFFING = b"\xff\xff\xfd\xfd"
+_FAST_HEAD = 8
+_FAST_TAIL = 2
+_NUMBERS = bytes(number for number in range(256) if number & 0x7F)
+"""Error bytes of Protocol 2.0 that say more than that there is an alert."""
+
+
+class Burst:
+    """The replies to one transaction, all of one length, and their place at the start of a buffer."""
+
+    __slots__ = (
+        "_bodies",
+        "_buffer",
+        "_end",
+        "_expected",
+        "_fast",
+        "_head",
+        "_heads",
+        "_no_errors",
+        "_step",
+        "_tails",
+        "_two",
+        "count",
+        "data",
+        "first_size",
+        "ids",
+        "packets",
+        "size",
+    )
+
+    def __init__(self, dialect: Dialect, transaction: Transaction) -> None:
+        awaited = transaction.awaited
+        length = awaited[0].length
+        self.ids = tuple(one.servo_id for one in awaited)
+        """Who answers, in the order of their turns."""
+        self.count = len(awaited)
+        self._two = dialect.PROTOCOL == 2.0
+        self._fast = transaction.fast
+        whole = [dialect.status_packet(servo_id, 0, bytes(length)) for servo_id in self.ids]
+        self._head = 8 if self._two else 4
+        self._step = length + 4 if self._fast else len(whole[0])
+        self.size = _FAST_HEAD + self._step * self.count if self._fast else self._step * self.count
+        """Bytes of all replies."""
+        self.first_size = self.size if self._fast else self._step
+        """Bytes of the first status packet."""
+        if self._fast:
+            lead = (self.size - 7).to_bytes(2, "little")
+            whole = [dialect.HEADER + bytes((BROADCAST_ID,)) + lead + whole[0][7:8]]
+        self._expected = [int.from_bytes(packet[: self._head], "little") for packet in whole]
+        self._no_errors = bytes(self.count)
+        self._buffer = bytearray()
+        self.bind(bytearray(self.size))
+
+    @classmethod
+    def of(cls, dialect: Dialect, transaction: Transaction, room: int) -> Burst | None:
+        """Return the burst of a read; None when its replies differ in length, or a buffer has no room."""
+        lengths = {one.length for one in transaction.awaited}
+        if len(lengths) != 1 or 0 in lengths:
+            return None
+        burst = cls(dialect, transaction)
+        return burst if burst.size <= room else None
+
+    def bind(self, buffer: bytearray) -> None:
+        """Look for the replies at the start of a buffer from now on."""
+        if buffer is self._buffer:
+            return
+        self._buffer = buffer
+        view, step, count = memoryview(buffer), self._step, self.count
+        data_at = self._head + (_FAST_TAIL if self._fast else 1)
+        length = self.size - (count - 1) * step - data_at - (2 if self._two else 1)
+        self.data: NDArray[np.uint8] = np.ndarray(
+            (count, length), np.uint8, buffer, offset=data_at, strides=(step, 1)
+        )
+        """What they say, one row a servo; good until the buffer is filled again."""
+        heads = 1 if self._fast else count
+        self._heads = np.ndarray((heads,), f"<u{self._head}", buffer, strides=(step,))
+        ends = [self.size - (count - 1 - number) * step for number in range(count)]
+        self._tails = np.ndarray((count,), "<u2", buffer, offset=ends[0] - 2, strides=(step,))
+        if self._fast:
+            # each CRC goes on where the one before it ended, and covers that one, too
+            starts = [0, *(end - 2 for end in ends[:-1])]
+            self._bodies = [view[start : end - 2] for start, end in zip(starts, ends, strict=True)]
+            self.packets = [(BROADCAST_ID, view[: self.size])]
+            """Each status packet and who sent it, where they lie."""
+        else:
+            self.packets = [
+                (servo_id, view[end - step : end]) for servo_id, end in zip(self.ids, ends, strict=True)
+            ]
+            skip, tail = (0, 2) if self._two else (2, 0)
+            self._bodies = [packet[skip : step - tail] for _, packet in self.packets]
+
+    @property
+    def errors(self) -> bytes:
+        """The error bytes, one a servo."""
+        return bytes(self._buffer[self._head : self.size : self._step])
+
+    def begun(self, end: int) -> bool:
+        """Say whether the first `end` bytes of the buffer can become these replies."""
+        known = 0 if end < self._head else 1 if self._fast else (end - self._head) // self._step + 1
+        return list(self._heads[:known]) == self._expected[:known]
+
+    def whole(self) -> bool:
+        """Say whether the buffer begins with exactly these replies, every checksum right, no refusal."""
+        if self._heads.tolist() != self._expected:
+            return False
+        if not self._two:
+            # the checksum is the complement of the sum of what stands before it (protocol1)
+            return all([sum(body) & 0xFF == 0xFF for body in self._bodies])  # noqa: C419  twice as quick
+        errors = self._buffer[self._head : self.size : self._step]
+        if errors != self._no_errors and len(errors.translate(None, _NUMBERS)) != self.count:
+            return False
+        return self._chained() if self._fast else self._separate()
+
+    def _separate(self) -> bool:
+        if [crc16.umts(body) for body in self._bodies] != self._tails.tolist():
+            return False
+        return self._buffer.find(_STUFFING, 0, self.size) < 0
+
+    def _chained(self) -> bool:
+        if bytes(self._buffer[self._head + 1 : self.size : self._step]) != bytes(self.ids):
+            return False
+        crc = 0
+        for body, tail in zip(self._bodies, self._tails.tolist(), strict=True):
+            crc = crc16.umts(body, crc)
+            if crc != tail:
+                return False
+        return True
