@@ -2,48 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
 
 import msgspec
 import numpy as np
 
 from dxlrun.bench.canned import CannedResponder
 from dxlrun.bench.case import Case
+from dxlrun.bench.figures import CaseFigures, WireFigures, host_figures, wire_figures
 from dxlrun.bench.hosts import HOSTS, Host, HostKind
 from dxlrun.bench.rounds import Measured, cores, measure, on_core
+from dxlrun.bench.simulated import SimulatedServos
+from dxlrun.bench.wire import Sent, judge, transactions
+from dxlrun.simulation import LedgerEntry, read_ledger
+
+Against = Literal["canned", "simulated"]
+Progress = Callable[[str, float], None]
+"""Takes words and the share that is done."""
+_BITS_A_BYTE = 10
+_MOST_MENDS = 100
 
 
 @dataclass(frozen=True, slots=True)
-class HostFigures:
-    """One host in one case; microseconds."""
+class Wish:
+    """How each case is measured."""
 
-    host: str
-    exchanges: int
-    lost: int
-    """Exchanges in which a reply was lost; they count in nothing else."""
-    sent_bytes: int
-    received_bytes: int
-    median_us: float
-    p99_us: float
-    processor_us: float
-    """Processor time of the host's process, an exchange; median of the rounds."""
-    wall_ratio: dict[str, float]
-    """By other host: our median as a share of its, median of the rounds."""
-    processor_ratio: dict[str, float]
-
-
-@dataclass(frozen=True, slots=True)
-class CaseFigures:
-    """All hosts in one case."""
-
-    against: str
-    """canned, simulated"""
-    protocol: float
-    model: str
-    servos: int
-    hosts: tuple[HostFigures, ...]
+    hosts: Sequence[HostKind]
+    seconds: float
+    """Of each case, for all hosts together."""
+    values: bool = True
+    """The peers turn bytes into values."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,100 +56,106 @@ def chosen_hosts(names: Sequence[str]) -> list[HostKind]:
 
 
 def bench_bus(
-    cases: Sequence[Case],
-    hosts: Sequence[HostKind],
-    seconds: float,
-    *,
-    values: bool = True,
-    progress: Callable[[str, float], None] = lambda *_: None,
+    cases: Sequence[tuple[Against, Case]], wish: Wish, progress: Progress = lambda *_: None
 ) -> BusBench:
-    """Measure each case against canned replies for `seconds`; `progress` takes words and the share done."""
-    here = [kind for kind in hosts if not kind.missing]
+    """Measure each case, against canned replies or simulated servos with a wire."""
+    missing = tuple(kind.name for kind in wish.hosts if kind.missing)
+    here = Wish([kind for kind in wish.hosts if not kind.missing], wish.seconds, wish.values)
     ours, theirs = cores()
     found: list[CaseFigures] = []
     with on_core(ours):
-        for number, case in enumerate(cases):
-            words = f"Protocol {case.protocol:.1f}, {case.servos} x {case.model}"
+        for number, (against, case) in enumerate(cases):
+            words = f"{against}: Protocol {case.protocol:.1f}, {case.servos} x {case.model}"
 
             def told(share: float, words: str = words, number: int = number) -> None:
                 progress(words, (number + share) / len(cases))
 
-            found.append(_canned(case, here, seconds, core=theirs, values=values, progress=told))
-    return BusBench((ours, theirs), tuple(found), tuple(kind.name for kind in hosts if kind.missing))
-
-
-def _canned(
-    case: Case,
-    kinds: Sequence[HostKind],
-    seconds: float,
-    *,
-    core: int,
-    values: bool,
-    progress: Callable[[float], None],
-) -> CaseFigures:
-    plan = case.plan(wire=False)
-    with ExitStack() as stack:
-        responder = CannedResponder([case.simulated(kind.name) for kind in kinds], core)
-        stack.callback(responder.close)
-        hosts: dict[str, Host] = {}
-        for kind, port in zip(kinds, responder.ports, strict=True):
-            hosts[kind.name] = kind.make(port, case, plan, values)
-            stack.callback(hosts[kind.name].close)
-        steps = {
-            name: responder.rehearse(number, host, first=True)
-            for number, (name, host) in enumerate(hosts.items())
-        }
-        numbers = {name: number for number, name in enumerate(hosts)}
-        found = measure(
-            hosts,
-            seconds,
-            recover=lambda name: _again(responder, numbers[name], hosts[name]),
-            progress=progress,
-        )
-    sizes = {
-        name: (sum(sent for sent, _ in each), sum(got for _, got in each)) for name, each in steps.items()
-    }
-    return CaseFigures("canned", case.protocol, case.model, case.servos, figures(found, sizes))
-
-
-def _again(responder: CannedResponder, number: int, host: Host) -> None:
-    responder.rehearse(number, host, first=False)
-
-
-def figures(found: dict[str, Measured], sizes: dict[str, tuple[int, int]]) -> tuple[HostFigures, ...]:
-    """Return what was measured in figures; ratios are taken round by round, as the machine changes."""
-    return tuple(_figures(name, one, found, sizes[name]) for name, one in found.items())
-
-
-def _figures(name: str, one: Measured, found: dict[str, Measured], sizes: tuple[int, int]) -> HostFigures:
-    walls = np.concatenate(one.walls_ns) / 1e3 if one.walls_ns else np.array([np.nan])
-    others = {other: each for other, each in found.items() if other != name}
-    return HostFigures(
-        host=name,
-        exchanges=sum(map(len, one.walls_ns)),
-        lost=one.lost,
-        sent_bytes=sizes[0],
-        received_bytes=sizes[1],
-        median_us=round(float(np.median(walls)), 1),
-        p99_us=round(float(np.quantile(walls, 0.99)), 1),
-        processor_us=round(float(np.median(one.processor_ns or [np.nan])) / 1e3, 1),
-        wall_ratio={
-            other: _ratio(one.wall_medians_ns, each.wall_medians_ns) for other, each in others.items()
-        },
-        processor_ratio={
-            other: _ratio(np.array(one.processor_ns), np.array(each.processor_ns))
-            for other, each in others.items()
-        },
-    )
-
-
-def _ratio(
-    ours: np.ndarray[tuple[int], np.dtype[np.float64]], theirs: np.ndarray[tuple[int], np.dtype[np.float64]]
-) -> float:
-    rounds = min(len(ours), len(theirs))  # a round that lost a reply is missing: then neighbours are compared
-    return round(float(np.median(ours[:rounds] / theirs[:rounds])), 3) if rounds else float("nan")
+            measured = _canned if against == "canned" else _simulated
+            found.append(measured(case, here, theirs, told))
+    return BusBench((ours, theirs), tuple(found), missing)
 
 
 def to_json(result: BusBench) -> bytes:
     """Encode what was found."""
     return msgspec.json.format(msgspec.json.encode(result))
+
+
+@contextmanager
+def _made(case: Case, wish: Wish, ports: Sequence[str], *, wire: bool) -> Iterator[dict[str, Host]]:
+    plan = case.plan(wire=wire)
+    with ExitStack() as stack:
+        hosts: dict[str, Host] = {}
+        for kind, port in zip(wish.hosts, ports, strict=True):
+            hosts[kind.name] = kind.make(port, case, plan, wish.values)
+            stack.callback(hosts[kind.name].close)
+        yield hosts
+
+
+def _canned(case: Case, wish: Wish, core: int, progress: Callable[[float], None]) -> CaseFigures:
+    with ExitStack() as stack:
+        responder = CannedResponder([case.simulated(kind.name) for kind in wish.hosts], core)
+        stack.callback(responder.close)
+        hosts = stack.enter_context(_made(case, wish, responder.ports, wire=False))
+        numbers = {name: number for number, name in enumerate(hosts)}
+        steps = {name: responder.rehearse(numbers[name], host, first=True) for name, host in hosts.items()}
+
+        def recover(name: str) -> None:
+            responder.rehearse(numbers[name], hosts[name], first=False)
+
+        found = measure(hosts, wish.seconds, recover=recover, progress=progress)
+    sizes = {
+        name: (float(sum(sent for sent, _ in each)), float(sum(got for _, got in each)))
+        for name, each in steps.items()
+    }
+    hosts_ = host_figures(found, sizes, {})
+    return CaseFigures("canned", case.protocol, case.model, case.servos, None, hosts_)
+
+
+def _simulated(case: Case, wish: Wish, core: int, progress: Callable[[float], None]) -> CaseFigures:
+    with tempfile.TemporaryDirectory(prefix="dxlrun-bench-") as folder, ExitStack() as stack:
+        ledger = Path(folder) / "ledger.jsonl"
+        with SimulatedServos([case.simulated(kind.name) for kind in wish.hosts], core, ledger) as servos:
+            hosts = stack.enter_context(_made(case, wish, servos.ports, wire=True))
+            for host in hosts.values():
+                host.start()
+
+            def recover(name: str) -> None:
+                for _ in range(_MOST_MENDS):
+                    hosts[name].mend()
+                    if hosts[name].exchange():
+                        return
+
+            found = measure(hosts, wish.seconds, recover=recover, progress=progress)
+            sent = {name: host.sent() for name, host in hosts.items()}
+        entries = read_ledger(ledger)
+    sizes: dict[str, tuple[float, float]] = dict.fromkeys(found, (0.0, 0.0))
+    wires: dict[str, WireFigures] = {}
+    for name, one in found.items():
+        if one.walls_ns:
+            mine = [entry for entry in entries if entry.bus == name]
+            sizes[name], wires[name] = _judged(case, one, mine, sent[name])
+    return CaseFigures(
+        "simulated",
+        case.protocol,
+        case.model,
+        case.servos,
+        case.baud_rate,
+        host_figures(found, sizes, wires),
+    )
+
+
+def _judged(
+    case: Case, one: Measured, entries: Sequence[LedgerEntry], sent: Sent
+) -> tuple[tuple[float, float], WireFigures]:
+    """Return the bytes of an exchange by the ledger, and the exchange against their wire time."""
+    byte_ns = _BITS_A_BYTE * 1e9 / case.baud_rate
+    walls = np.concatenate(one.walls_ns)
+    starts = np.concatenate(
+        [
+            start + np.cumsum([0, *walls_[:-1]])
+            for start, walls_ in zip(one.starts_ns, one.walls_ns, strict=True)
+        ]
+    )
+    told = judge(transactions(entries, sent, byte_ns), starts, walls)
+    size = told.sent_bytes, told.received_bytes
+    return size, wire_figures(walls.astype(float), told.late_ns.astype(float), sum(size) * byte_ns)

@@ -13,6 +13,7 @@ from typing import Protocol
 from dxlrun.assembly import assemble
 from dxlrun.bench.case import Case, Registers
 from dxlrun.bench.peers import Rustypot, Sdk
+from dxlrun.bench.wire import Sent
 from dxlrun.clock import MonotonicClock
 from dxlrun.commands import NoCommands
 from dxlrun.compile.plan import Plan
@@ -21,8 +22,8 @@ from dxlrun.control.plugins import load_plugins
 from dxlrun.cycle import CycleRecord
 from dxlrun.dynamixel.port import SerialPort, SerialPorts
 from dxlrun.events import EventCode, Severity
-from dxlrun.packets import PACKET_SLOT, NoPackets, PacketBatch, packet_slots
-from dxlrun.ring import RingWriter, create
+from dxlrun.packets import PACKET_SLOT, NoPackets, PacketBatch, PacketKind, decode_packets, packet_slots
+from dxlrun.ring import Gap, RingReader, RingWriter, create
 
 _IDLE_NS = 50_000_000
 
@@ -40,6 +41,10 @@ class Host(Protocol):
 
     def mend(self) -> None:
         """Come back to whole exchanges after a lost reply; servos answer."""
+        ...
+
+    def sent(self) -> Sent:
+        """Return when it wrote what since it was asked last; nothing when it does not know."""
         ...
 
     def close(self) -> None:
@@ -92,11 +97,13 @@ class Ours:
         self._descriptor = os.open(path, os.O_RDWR | os.O_NOCTTY)
         tty.setraw(self._descriptor)
         self._ring = -1
+        self._recorded: RingReader | None = None
         packets: PacketBatch | NoPackets = NoPackets()
         if recorded:
             servos = sum(len(bus.servos) for bus in plan.buses)
             self._ring = create("bench", PACKET_SLOT, packet_slots(1_000_000, servos))
             packets = PacketBatch(RingWriter(self._ring))
+            self._recorded = RingReader(self._ring)
         self._commit = packets.commit
         robot = assemble(
             plan,
@@ -132,6 +139,19 @@ class Ours:
         """Exchange, and use the gap for what is owed to a servo that was silent."""
         self.exchange()
         self._hardware.idle(time.monotonic_ns() + _IDLE_NS)
+
+    def sent(self) -> Sent:
+        """Return what the log would say of instructions; nothing when more was written than a ring holds."""
+        found: list[tuple[int, int]] = []
+        while self._recorded is not None and (record := self._recorded.read()) is not None:
+            if isinstance(record, Gap):
+                return ()  # bytes are counted: without some of them nothing can be said
+            found += [
+                (packet.first_ns, len(packet.data))
+                for packet in decode_packets(record)
+                if packet.kind is PacketKind.INSTRUCTION
+            ]
+        return found
 
     def close(self) -> None:
         """Close the line and the ring."""

@@ -9,6 +9,7 @@ of goals; ours has SI units at both ends. With `values=False` they leave the byt
 from __future__ import annotations
 
 from dxlrun.bench.case import Case, Registers
+from dxlrun.bench.wire import Sent
 from dxlrun.errors import InputError
 
 PATIENCE_S = 1.0
@@ -57,6 +58,10 @@ class Sdk:
         """Throw away what is left, and exchange."""
         self._port.clearPort()
         self.exchange()
+
+    def sent(self) -> Sent:
+        """Nothing is known."""
+        return ()
 
     def close(self) -> None:
         """Close the line."""
@@ -132,6 +137,10 @@ class Rustypot:
     def mend(self) -> None:
         """Exchange; it throws away what is left by itself."""
         self.exchange()
+
+    def sent(self) -> Sent:
+        """Nothing is known."""
+        return ()
 
     def close(self) -> None:
         """Close the line."""

@@ -19,14 +19,20 @@ WARM = 3
 
 @dataclass(slots=True)
 class Measured:
-    """What one host took, round by round."""
+    """What one host took, round by round; of exchanges in which a reply was lost only their number counts."""
 
     walls_ns: list[list[int]] = field(default_factory=list)
     """Of each round, the duration of each exchange."""
+    starts_ns: list[int] = field(default_factory=list)
+    """When the first exchange of each round began; the others follow each other."""
     processor_ns: list[float] = field(default_factory=list)
     """Of each round, this process' processor time an exchange."""
     lost: int = 0
-    """Exchanges in which a reply was lost; they count in nothing else."""
+
+    @property
+    def exchanges(self) -> int:
+        """How many count."""
+        return sum(map(len, self.walls_ns))
 
     @property
     def wall_medians_ns(self) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
@@ -73,7 +79,7 @@ def _turn(host: Host, found: Measured, most: int, turn_ns: int) -> bool:
     walls: list[int] = []
     end_ns = now_ns() + turn_ns
     processor = time.process_time_ns()
-    before = now_ns()
+    before = began_ns = now_ns()
     while len(walls) < most and before < end_ns:
         if not exchange():
             found.lost += 1
@@ -83,6 +89,7 @@ def _turn(host: Host, found: Measured, most: int, turn_ns: int) -> bool:
         before = after
     found.processor_ns.append((time.process_time_ns() - processor) / len(walls))
     found.walls_ns.append(walls)
+    found.starts_ns.append(began_ns)
     return True
 
 

@@ -26,6 +26,7 @@ def bench_bus(
     protocol: List = "1.0,2.0",
     peers: List = "ours,unrecorded,sdk,rustypot",
     against: List = "canned",
+    baud: int = 1_000_000,
     seconds: float = 4.0,
     raw: Flag = False,
     as_json: JsonFlag = False,
@@ -45,7 +46,10 @@ def bench_bus(
         Who is measured: ours (dxlrun, every packet kept for a log), unrecorded (the same without a log), sdk,
         rustypot. Who is not installed is left out.
     against
-        Who answers: canned (another process that answers at once, without a wire and without thinking).
+        Who answers: canned (another process that answers at once, without a wire and without thinking), or
+        simulated (servos on a bus with wire times, whose own lateness is taken out by their ledger).
+    baud
+        Rate of the simulated bus, bit/s.
     seconds
         How long each case is measured, s.
     raw
@@ -59,14 +63,18 @@ def bench_bus(
     from dxlrun.bench.case import Case
     from dxlrun.bench.hosts import HOSTS
 
-    if against != "canned":
-        raise InputError(f"--against {against}: only canned can be measured against")
     names = _words("--peers", peers, [kind.name for kind in HOSTS])
     protocols = [float(word) for word in _words("--protocol", protocol, ["1.0", "2.0"])]
-    cases = [Case(each, count) for each in protocols for count in _counts(servos)]
+    opponents = _words("--against", against, ["canned", "simulated"])
     if not 0.01 <= seconds <= 3600:
         raise InputError(f"--seconds {seconds:g}: give from 0.01 to 3600")
-    result = bus.bench_bus(cases, bus.chosen_hosts(names), seconds, values=not raw)
+    lines = [Case(each, count, baud) for each in protocols for count in _counts(servos)]
+    cases: list[tuple[bus.Against, Case]] = []
+    if "canned" in opponents:
+        cases += [("canned", case) for case in lines]
+    if "simulated" in opponents:
+        cases += [("simulated", case) for case in lines]
+    result = bus.bench_bus(cases, bus.Wish(bus.chosen_hosts(names), seconds, not raw))
     for name in result.missing:
         say_warning(f"{name} is not installed and was left out; `pip install 'dxlrun[bench]'` installs it")
     if as_json:
@@ -96,31 +104,6 @@ def _counts(text: str) -> list[int]:
 
 
 def _print(result: BusBench) -> None:
-    from rich.table import Table
+    from dxlrun.cli.bench_table import bus_table
 
-    table = Table(box=None, pad_edge=False)
-    for head in ("protocol", "servos", "host"):
-        table.add_column(head)
-    for head in ("median us", "p99 us", "processor us", "bytes", "wall", "processor", "lost"):
-        table.add_column(head, justify="right")
-    for case in result.cases:
-        first = case.hosts[0]
-        for one in case.hosts:
-            ratios = ("", "")
-            if one is not first:
-                ratios = (
-                    f"{first.wall_ratio[one.host]:.2f} of it",
-                    f"{first.processor_ratio[one.host]:.2f} of it",
-                )
-            table.add_row(
-                f"{case.protocol:.1f}",
-                f"{case.servos} x {case.model}",
-                one.host,
-                f"{one.median_us:.0f}",
-                f"{one.p99_us:.0f}",
-                f"{one.processor_us:.0f}",
-                f"{one.sent_bytes} + {one.received_bytes}",
-                *ratios,
-                str(one.lost),
-            )
-    out().print(table)
+    out().print(bus_table(result))
