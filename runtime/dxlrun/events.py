@@ -35,6 +35,8 @@ class EventCode(IntEnum):
     TORQUE_OFF = 12
     SHUTDOWN_FAILED = 13
     REGISTER_DIFFERS = 14
+    REGISTER_WRITTEN = 15
+    """A register was written because the robot file declares it or a client wants it; read back, too."""
     READ_LOST = 20
     """The first of a row of missed replies of one servo."""
     READ_BACK = 21

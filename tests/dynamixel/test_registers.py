@@ -8,6 +8,8 @@ from dxlrun.dynamixel.bus import Bus, run
 from dxlrun.dynamixel.bus_plan import RegisterValue
 from dxlrun.dynamixel.registers import compare, settle_registers
 from dxlrun.dynamixel.startup import rejoin
+from dxlrun.errors import StartUpError
+from dxlrun.events import EventCode
 from dxlrun.packets import NoPackets
 
 WRITE = {1.0: (4, 3), 2.0: (7, 3)}
@@ -127,3 +129,54 @@ def test_a_limp_servo_that_may_not_have_torque_gets_no_goal(bench, make_plan):
     back = execute(rejoin(plan, 0, torque=False))
     assert back.torqued
     assert back.goal is not None
+
+
+def test_a_factory_return_delay_is_mended_before_anybody_gets_torque(make_rig, make_x):
+    plan = declared(make_x(), 1, return_delay_time=0, position_p_gain=850)
+    rig = make_rig(plan)
+    rig.buses[0].servo(12).poke("return_delay_time", 250)
+    rig.hardware.start()
+    assert rig.events.of(EventCode.REGISTER_WRITTEN) == [
+        ("arm_12_joint", "Return Delay Time (9) was 250 and is 0"),
+        ("arm_12_joint", "Position P Gain (84) was 800 and is 850"),
+    ]
+    assert rig.events.of(EventCode.REGISTER_DIFFERS) == []
+    assert (held(rig, "return_delay_time", 1), held(rig, "position_p_gain", 1)) == (0, 850)
+    addresses = [int.from_bytes(packet[8:10], "little") for packet in writes(rig)]
+    assert addresses[:2] == [9, 84]
+    assert set(addresses[2:]) == {plan.servos[0].goal.address, plan.servos[0].torque_address}
+    assert rig.torque() == [True, True]
+
+
+def test_a_servo_that_refuses_a_register_gets_no_torque(make_rig, make_x):
+    plan = declared(make_x(), 1, position_p_gain=850)
+    plan = declared(plan, 0, velocity_p_gain=1 << 15)  # beyond what the manual allows
+    rig = make_rig(plan)
+    with pytest.raises(StartUpError) as caught:
+        rig.hardware.start()
+    (problem,) = str(caught.value).splitlines()
+    assert problem.startswith("arm_11_joint (ID 11 on bus arm) refuses Velocity P Gain (78) = 32768: ")
+    assert rig.torque() == [False, False]
+    assert held(rig, "position_p_gain", 1) == 850
+
+
+def test_a_difference_that_the_start_mends_does_not_forbid_it(make_rig, make_plan):
+    plan = declared(make_plan((1, 3)), 1, status_return_level=2, return_delay_time=0)
+    rig = make_rig(plan)
+    rig.buses[0].servo(3).poke("status_return_level", 1)
+    rig.hardware.start()
+    assert (held(rig, "status_return_level", 1), held(rig, "return_delay_time", 1)) == (2, 0)
+    assert [text for _, text in rig.events.of(EventCode.REGISTER_WRITTEN)] == [
+        "Status Return Level (16) was 1 and is 2",
+        "Return Delay Time (5) was 250 and is 0",
+    ]
+    eeprom = [packet[5] for packet in writes(rig) if packet[5] < 24]
+    assert eeprom == [16, 5]  # each once, though nobody acknowledged the first
+
+
+def test_nothing_is_written_to_anybody_while_one_servo_is_not_what_the_file_says(make_rig, make_x):
+    rig = make_rig(declared(make_x(), 0, position_p_gain=900))
+    rig.buses[0].servo(12).poke("model_number", 29)
+    with pytest.raises(StartUpError, match="is model number 29"):
+        rig.hardware.start()
+    assert writes(rig) == []

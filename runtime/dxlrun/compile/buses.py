@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 from dxlrun.compile.joints import CompiledJoint
 from dxlrun.compile.problems import Problems
+from dxlrun.compile.registers import check_position_limits
 from dxlrun.description import Description
 from dxlrun.dynamixel.bus_plan import Budget, BusPlan
 from dxlrun.dynamixel.plan import Wiring, bus_plan
@@ -46,6 +47,7 @@ def compile_buses(
             problems.error(mark, str(error), "change the joints of this bus")
             continue
         _check_ticks(description, plan, problems)
+        check_position_limits(description, plan, problems)
         _check_budget(description, plan, problems)
         plans.append(plan)
     return plans
@@ -73,6 +75,7 @@ def _wiring(joint: CompiledJoint, rows: Mapping[str, int]) -> Wiring:
         direction=joint.described.direction,
         lower=joint.plan.lower,
         upper=joint.plan.upper,
+        registers=joint.registers,
     )
 
 

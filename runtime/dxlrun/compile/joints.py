@@ -7,11 +7,13 @@ from dataclasses import dataclass
 
 from dxlrun.compile.problems import Problems, suggestion
 from dxlrun.compile.reach import Interval, degrees, joint_reach, many_turns
+from dxlrun.compile.registers import compile_registers
 from dxlrun.control.loop_plan import JointPlan
 from dxlrun.control_table import ControlTable, control_table, model_names, perhaps_meant
 from dxlrun.description import Description
 from dxlrun.description.robot import Joint
 from dxlrun.description.units import EffortUnit
+from dxlrun.dynamixel.bus_plan import RegisterValue
 
 _UNITS: Mapping[EffortUnit, str] = {"Nm": "Nm", "A": "A", "1": "% of its highest load"}
 _EXAMPLES: Mapping[EffortUnit, str] = {"Nm": "0.3 Nm", "A": "800 mA", "1": "40 %"}
@@ -32,6 +34,8 @@ class CompiledJoint:
     table: ControlTable
     reach: Interval
     """rad, in the joint's coordinate"""
+    registers: tuple[RegisterValue, ...] = ()
+    """What is declared of its servo's memory, in the order in which it is written."""
 
 
 def compile_joints(
@@ -56,6 +60,9 @@ def compile_joints(
             _check_reference(description, name, joint, table, problems)
         effort = _effort(description, name, joint, table, problems)
         allowed = _allowed(description, name, reach, table.model, problems)
+        # of a servo that is still to be asked for its model nobody knows which registers it has
+        known_model = joint.model != AUTO or name in models
+        registers = compile_registers(description, name, joint, table, problems) if known_model else ()
         if known_bus and allowed is not None:
             plan = JointPlan(
                 name,
@@ -66,7 +73,7 @@ def compile_joints(
                 joint.continuous,
                 bounded=not joint.continuous or joint.limits.position is not None,
             )
-            compiled[name] = CompiledJoint(plan, joint, table, reach)
+            compiled[name] = CompiledJoint(plan, joint, table, reach, registers)
     return compiled
 
 

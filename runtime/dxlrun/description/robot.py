@@ -9,6 +9,7 @@ from pydantic import (
     AfterValidator,
     BeforeValidator,
     Field,
+    WithJsonSchema,
     model_validator,
 )
 
@@ -50,6 +51,14 @@ def _ordered(value: tuple[float, float]) -> tuple[float, float]:
 def _timer(value: int) -> int:
     if value > _LONGEST_TIMER_NS:
         raise refuse("no adapter gathers bytes for so long", "write 255 ms at most")
+    return value
+
+
+def _register(value: object) -> object:
+    if isinstance(value, bool) or not isinstance(value, int | str):
+        raise refuse(
+            "this is no value of a register", "write the raw integer, or a quantity with its unit: 500 us"
+        )
     return value
 
 
@@ -192,6 +201,10 @@ class JointSimulation(Form):
     )
 
 
+Register = Annotated[int | str, BeforeValidator(_register), WithJsonSchema({"type": ["integer", "string"]})]
+"""A raw integer, or a quantity with its unit as text: its item's unit is in the control table."""
+
+
 class Joint(Form):
     """One joint and its servo: q = direction * (theta - reference)."""
 
@@ -215,6 +228,11 @@ class Joint(Form):
         default=Limits(),
         description="Where it may go, and how fast.",
         examples=["{position: [-90 deg, 90 deg]}"],
+    )
+    registers: dict[Name, Register] = Field(
+        default={},
+        description="What its servo's control table shall hold: written at the start where it differs.",
+        examples=["{position_p_gain: 800, return_delay_time: 0 us}"],
     )
     simulation: JointSimulation = Field(
         default=JointSimulation(),

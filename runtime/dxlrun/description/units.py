@@ -47,6 +47,17 @@ _DURATION_NS: Mapping[str, int] = {
     "min": 60_000_000_000,
     "h": 3_600_000_000_000,
 }
+_TABLE_UNITS: Mapping[str, tuple[str, Mapping[str, float], str]] = {
+    "rad": ("an angle", _ANGLE, "60 deg or 1.05 rad"),
+    "rad/s": ("an angular velocity", _ANGULAR_VELOCITY, "2 rad/s, 30 deg/s or 5 rpm"),
+    "rad/s^2": ("an angular acceleration", _ANGULAR_ACCELERATION, "10 rad/s^2 or 90 deg/s^2"),
+    "s": ("a time", {"us": 1e-6, "ms": 1e-3, "s": 1.0}, "500 us or 1 ms"),
+    "V": ("a voltage", {"V": 1.0, "mV": 1e-3}, "9.5 V"),
+    "A": ("a current", {"A": 1.0, "mA": 1e-3}, "800 mA"),
+    "Nm": ("a torque", _TORQUE, "0.3 Nm or 20 mNm"),
+    "degC": ("a temperature", {"degC": 1.0}, "70 degC"),
+    "1": ("a share of the maximum", {"%": 1e-2}, "40 %"),
+}
 _LONGEST_NS = 10**9 * _DURATION_NS["s"]  # 31 years; stays inside 64 bits when a few are added
 
 
@@ -98,6 +109,15 @@ def duration(text: str) -> int:
     if not 0 <= value <= _LONGEST_NS:
         raise _refusal(f"{text!r} is no duration from 0 s to 31 years", f"write one such as {written}")
     return value
+
+
+def quantity(text: str, unit: str) -> float:
+    """Return a quantity in an SI unit of the control tables, from text with any unit of its kind.
+
+    `unit` is rad, rad/s, rad/s^2, s, V, A, Nm, degC or 1 (a fraction: `40 %`). Raises ValueError that says
+    how to write one.
+    """
+    return _si(text, *_TABLE_UNITS[unit])
 
 
 def _si(text: str, what: str, units: Mapping[str, float], written: str) -> float:

@@ -17,6 +17,7 @@ from dxlrun.dynamixel.health import Servos
 from dxlrun.dynamixel.limp import LimpOutcome, limp_buses
 from dxlrun.dynamixel.port import Ports
 from dxlrun.dynamixel.probing import extra_ns, probe_reads
+from dxlrun.dynamixel.registers import settle_bus
 from dxlrun.dynamixel.torque_limit import reduced
 from dxlrun.dynamixel.units import joint_position
 from dxlrun.errors import PortError, StartUpError
@@ -83,6 +84,7 @@ class DynamixelHardware:
         given is taken back, and a note of the exception says whether every servo confirmed that.
         """
         self._survey()
+        self._settle_registers()
         self._probe_reads()
         try:
             self._engage()
@@ -182,6 +184,17 @@ class DynamixelHardware:
                 for joint, text in survey.differences:
                     self._events.emit(EventCode.REGISTER_DIFFERS, Severity.WARNING, joint, text)
         if problems:
+            raise StartUpError("\n".join(problems))
+
+    def _settle_registers(self) -> None:
+        """Write what the robot file declares and a servo has otherwise, before anybody gets torque."""
+        programs = [settle_bus(plan) for plan in self._plans]
+        found = run(programs, self._buses, self._ports, self._clock, self._beat)
+        self._raise_failures()
+        settled = [one for one in found if one is not None]
+        for joint, text in (written for one in settled for written in one.written):
+            self._events.emit(EventCode.REGISTER_WRITTEN, Severity.INFO, joint, text)
+        if problems := [problem for one in settled for problem in one.problems]:
             raise StartUpError("\n".join(problems))
 
     def _probe_reads(self) -> None:

@@ -81,6 +81,10 @@ class Inspector:
         """Return the control table of a servo."""
         return control_table(servo.model, self.plan.protocol)
 
+    def after_start(self, servo: ServoPlan, name: str, raw: int) -> int:
+        """Return what an item will hold when the start has written the registers that the file declares."""
+        return next((one.value for one in servo.registers if one.name == name), raw)
+
     def unreadable(self, servo: ServoPlan, reply: Reply) -> None:
         """Say why a servo that answers pings cannot be read."""
         if reply.outcome is Outcome.TIMEOUT:

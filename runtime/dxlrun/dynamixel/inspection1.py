@@ -43,8 +43,9 @@ class Inspector1(Inspector):
             self.problem(servo, f"reports an error: {describe_error(error)}")
         self.identity(servo, blocks["model_number"].word(), blocks["model_number"].parameters[2])
         self._angle_limits(servo, blocks["return_delay_time"])
-        self.return_delay(servo, blocks["return_delay_time"].parameters[0])
-        self.return_level(servo, blocks["status_return_level"].parameters[0])
+        delay, level = (blocks[name].parameters[0] for name in ("return_delay_time", "status_return_level"))
+        self.return_delay(servo, self.after_start(servo, "return_delay_time", delay))
+        self.return_level(servo, self.after_start(servo, "status_return_level", level))
         self._torque(servo, table, blocks["torque_enable"])
         return (yield from self._neutral(servo, table))
 
@@ -57,7 +58,8 @@ class Inspector1(Inspector):
             if not reply.answered:
                 self.unreadable(servo, reply)
                 return False
-            self.neutral(servo, item, item.decode(reply.parameters), wanted, why)
+            raw = self.after_start(servo, name, item.decode(reply.parameters))
+            self.neutral(servo, item, raw, wanted, why)
         return True
 
     def _angle_limits(self, servo: ServoPlan, block: Reply) -> None:

@@ -61,7 +61,7 @@ class Inspector2(Inspector):
             if not reply.answered:
                 self.unreadable(servo, reply)
                 return False
-            found[name] = item.decode(reply.parameters)
+            found[name] = self.after_start(servo, name, item.decode(reply.parameters))
         self.identity(servo, found["model_number"], found["firmware_version"])
         self.return_delay(servo, found["return_delay_time"])
         self.return_level(servo, found["status_return_level"])

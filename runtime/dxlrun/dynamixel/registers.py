@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 from dxlrun.control_table import ControlItem, control_table
 from dxlrun.dynamixel.bus_plan import BusPlan, RegisterValue, ServoPlan
-from dxlrun.dynamixel.inspection import called, persist, setup_line, who
+from dxlrun.dynamixel.inspection import ATTEMPTS, called, persist, setup_line, who
 from dxlrun.dynamixel.transaction import Outcome, Program, Reply
 
 
@@ -78,22 +78,36 @@ def settle_registers(plan: BusPlan, servo: ServoPlan) -> Program[Settled]:
     return settled
 
 
+def settle_bus(plan: BusPlan) -> Program[Settled]:
+    """Do so with every servo of a bus, whatever became of the one before."""
+    together = Settled()
+    for servo in plan.servos:
+        settled = yield from settle_registers(plan, servo)
+        together.problems += settled.problems
+        together.written += settled.written
+    return together
+
+
 def write_register(plan: BusPlan, servo: ServoPlan, register: RegisterValue) -> Program[str]:
     """Write one register and read it back; return what went wrong, or nothing.
 
-    The read-back decides: an acknowledgement may be lost, or may be switched off by Status Return Level.
+    The read-back decides, and whether to try again: an acknowledgement may be lost, or switched off by Status
+    Return Level, and EEPROM wears.
     """
     line, item = setup_line(plan), _item(plan, servo, register)
-    written = yield from persist(line.write(servo.servo_id, register.address, register.data))
-    if written.outcome is Outcome.REFUSED:
-        return f"refuses {called(item)} = {register.value}: {line.dialect.describe_error(written.error)}"
-    back = yield from persist(line.read(servo.servo_id, register.address, register.size))
-    found = _integer(item, back)
-    if found is None:
-        return f"did not answer when {called(item)} was read back"
-    if found != register.value:
-        return f"was given {called(item)} = {register.value}, but has {found}"
-    return ""
+    problem = ""
+    for _ in range(ATTEMPTS):
+        written = yield line.write(servo.servo_id, register.address, register.data)
+        if written.outcome is Outcome.REFUSED:
+            return f"refuses {called(item)} = {register.value}: {line.dialect.describe_error(written.error)}"
+        back = yield from persist(line.read(servo.servo_id, register.address, register.size))
+        found = _integer(item, back)
+        if found == register.value:
+            return ""
+        problem = f"was given {called(item)} = {register.value}, but has {found}"
+        if found is None:
+            problem = f"did not answer when {called(item)} was read back"
+    return problem
 
 
 def _torqued(plan: BusPlan, servo: ServoPlan, stored: Sequence[RegisterValue]) -> Program[str]:
