@@ -72,10 +72,14 @@ class Rig:
     hardware: DynamixelHardware
     beats: list[int]
     period_ns: int = 20_000_000
+    restless: float = 0.0
+    """rad by which every goal goes to and fro, so that each is sent in every cycle: what stays is not."""
 
     def cycle(self, *, idle=True):
         start = self.clock.now_ns()
         self.hardware.read()
+        self.restless = -self.restless
+        self.goals.position[:] += self.restless
         self.hardware.write()
         deadline = start + self.period_ns
         if idle:

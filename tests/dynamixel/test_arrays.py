@@ -39,6 +39,9 @@ def test_a_smaller_packet_after_a_bigger_one_is_whole(plan8):
     arrays, goals = GoalArrays(plan8), Commands(np.zeros(8), np.ones(8), np.zeros(8), np.zeros(8))
     (everybody,) = arrays.packets(goals, np.ones(8, dtype=bool))
     (one,) = arrays.packets(goals, np.arange(8) == 7)
+    goals.position[:] = 0.1
+    arrays.packets(goals, np.ones(8, dtype=bool))
+    goals.position[:] = 0.0
     (again,) = arrays.packets(goals, np.ones(8, dtype=bool))
     assert protocol1.parse_status(one).parameters[:3] == bytes((30, 4, 21))
     assert len(one) == 13

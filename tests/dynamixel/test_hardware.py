@@ -118,6 +118,7 @@ def test_a_silent_servo_is_invalid_and_ages_and_the_others_go_on(started):
 
 
 def test_a_silent_servo_gets_no_goal_until_its_torque_was_read(started):
+    started.restless = 0.006
     servo = started.buses[0].servo(5)
     servo.silence()
     before = len(started.into_bus())
@@ -138,6 +139,7 @@ def test_a_silent_servo_gets_no_goal_until_its_torque_was_read(started):
 def test_a_servo_whose_torque_fits_no_gap_gets_its_goals_back_all_the_same(make_rig, make_plan):
     rig = make_rig(make_plan((1, 2), latency_ns=19_000_000))
     rig.hardware.start()
+    rig.restless = 0.006
     rig.buses[0].servo(2).silence()
     before = len(rig.into_bus())
     rig.cycle(idle=False)
@@ -155,6 +157,7 @@ def test_a_servo_whose_torque_fits_no_gap_gets_its_goals_back_all_the_same(make_
 
 
 def test_a_servo_that_was_lost_goes_slowly_to_a_goal_that_went_on(started):
+    started.restless = 0.006
     servo = started.buses[0].servo(5)
     servo.silence()
     for _ in range(20):

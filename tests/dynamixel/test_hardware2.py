@@ -122,6 +122,7 @@ def test_an_absent_servo_costs_the_others_one_cycle_at_most(started, others_answ
     lost = {source for source, _ in started.events.of(EventCode.READ_LOST)}
     assert "arm_13_joint" in lost
     assert len(lost) == (1 if others_answer else 6)
+    started.restless = 0.002
     for _ in range(10):  # whoever missed a turn is asked for its torque before it gets goals again
         started.cycle()
     goals = [packet for packet in started.into_bus() if packet[7] == 0x83][-1]
@@ -156,6 +157,7 @@ def test_a_robot_whose_loop_died_becomes_limp(started):
 
 
 def test_an_overload_cuts_the_torque_and_the_servo_gets_no_more_goals(started):
+    started.restless = 0.002
     started.cycle()
     started.buses[0].servo(14).trigger_overload()
     for _ in range(6):
