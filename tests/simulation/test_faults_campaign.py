@@ -50,6 +50,7 @@ REPLY_NS = 2 * MS
 PING, READ, WRITE, SYNC_WRITE, SYNC_READ, FAST_SYNC_READ, BULK_READ = 0x01, 0x02, 0x03, 0x83, 0x82, 0x8A, 0x92
 HOST_SAYS = frozenset((PING, READ, WRITE, SYNC_WRITE, SYNC_READ, FAST_SYNC_READ, BULK_READ))
 EVERYBODY, STATUS = 254, 0x55
+HEADER = b"\xff\xff\xfd\x00"
 
 
 def storms() -> list[Any]:
@@ -102,7 +103,7 @@ class Witness:
         def seen(servo_id: int, text: str, change: Any, *, delay_ns: int = 0, copies: int = 1) -> None:
             def held_back(reply: bytes) -> bytes:
                 if delay_ns:
-                    data = reply[5:-1] if bus.protocol == 1.0 else reply[9:-2]
+                    data = _data_of(reply, bus.protocol)
                     self.delayed.append(Told(bus.now_ns + delay_ns, servo_id, data, bus.now_ns))
                 return bytes(change(reply))
 
@@ -119,6 +120,15 @@ class Witness:
                 self.found.append((bus.now_ns, servo.servo_id))
             self.torque[servo] = torque
         bus.at(bus.now_ns + 2 * MS, self.look)
+
+
+def _data_of(reply: bytes, protocol: float) -> bytes:
+    """Return the data in what a servo sends: a status, or its part of the one of a fast form."""
+    if protocol == 1.0:
+        return reply[5:-1]
+    if not reply.startswith(HEADER):
+        return reply[2:-2]
+    return reply[10:-2] if reply[4] == EVERYBODY else reply[9:-2]
 
 
 def alone(bus: SimulatedBus) -> list[SimulatedServo]:
@@ -312,9 +322,11 @@ def states(entries: Sequence[LedgerEntry], bus: BusPlan) -> Iterator[Told]:
     state = bus.servos[0].state
     lengths = range(state.length, state.length + state.spare + 1)
     of_protocol = _states1 if bus.protocol == 1.0 else _states2
-    for entry in entries:
-        if entry.direction == "out":
-            yield from (each for each in of_protocol(entry) if len(each.data) in lengths)
+    sent = [entry for entry in entries if entry.direction == "out"]
+    found = [each for entry in sent for each in of_protocol(entry) if len(each.data) in lengths]
+    if bus.protocol == 2.0:
+        found += _shared(sent, lengths)
+    yield from sorted(found)
 
 
 def _states1(entry: LedgerEntry) -> Iterator[Told]:
@@ -337,6 +349,27 @@ def _states2(entry: LedgerEntry) -> Iterator[Told]:
             if instruction == STATUS:
                 yield Told(entry.t_ns, servo_id, parameters[1:])
         rest = rest[4:]
+
+
+def _shared(sent: Sequence[LedgerEntry], lengths: Sequence[int]) -> Iterator[Told]:
+    """Return the parts of the statuses of fast forms, up to the first broken one of each."""
+    stream = b"".join(entry.data for entry in sent)
+    times = [entry.t_ns for entry in sent for _ in entry.data]
+    start = -1
+    while (start := stream.find(HEADER + bytes((EVERYBODY,)), start + 1)) >= 0:
+        size = int.from_bytes(stream[start + 5 : start + 7], "little")
+        for length in lengths:
+            if (size - 1) % (length + 4):
+                continue
+            at = start + 8
+            while at < start + 7 + size:
+                end = at + 2 + length
+                if end + 2 > len(stream) or crc(stream[start:end]) != int.from_bytes(
+                    stream[end : end + 2], "little"
+                ):
+                    break
+                yield Told(times[end + 1], stream[at + 1], stream[at + 2 : end])
+                at = end + 2
 
 
 # Invariants 5 and 8
