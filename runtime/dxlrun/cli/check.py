@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,11 +12,13 @@ from cyclopts import Parameter
 
 from dxlrun.cli.flags import Flag, JsonFlag, Motions
 from dxlrun.cli.inputs import compiled
-from dxlrun.cli.terminal import out, say_warning
+from dxlrun.cli.terminal import out, say_error, say_warning
 from dxlrun.errors import InputError, Problem
 
 if TYPE_CHECKING:
     from dxlrun.compile import Compiled
+    from dxlrun.dynamixel.bus_plan import BusPlan
+    from dxlrun.identification import Found
 
 
 def check(
@@ -24,12 +27,14 @@ def check(
     *assignments: Annotated[str, Parameter(name="arg:=value")],
     play: Motions = (),
     duration: float | None = None,
+    online: Flag = False,
     as_json: JsonFlag = False,
     debug: Flag = False,
 ) -> int:
     """Check a robot file: joints, reach, controllers, claims, the time budget of each bus.
 
-    No port is opened. Exit code 0, or 2 with every error as `file:line:column: what; how to mend it`.
+    Without --online no port is opened. Exit code 0, or 2 with every error as `file:line:column: what; how
+    to mend it`; with --online 1 where a servo holds another register than the file declares, or is not ready.
 
     Parameters
     ----------
@@ -41,13 +46,15 @@ def check(
         Check this motion file too; may be given several times.
     duration
         As for a run: stop after this many seconds.
+    online
+        Look at the servos too, and compare their registers with those of the file; nothing is written.
     as_json
         Print the result as JSON.
     debug
         Print the traceback of an error.
     """
     try:
-        result = compiled(robot, assignments, play, duration)
+        result = compiled(robot, assignments, play, duration, _asked if online else None)
     except InputError as error:
         if as_json:
             problems = error.problems
@@ -58,15 +65,44 @@ def check(
             )
             return error.exit_code
         raise
+    found = _look(result) if online else None
     if as_json:
-        _print_json(
-            {"ok": True, "errors": [], "warnings": _warnings(result.warnings), **asdict(result.report)}
-        )
-        return 0
-    _print_tables(result)
+        report: dict[str, object] = {"ok": True, "errors": [], "warnings": _warnings(result.warnings)}
+        report |= asdict(result.report)
+        if found is not None:
+            report["online"] = {"as_declared": found.as_declared, **asdict(found)}
+        _print_json(report)
+        return 0 if found is None or found.as_declared else 1
+    _print_tables(result, found)
     for warning in result.warnings:
         say_warning(str(warning))
-    return 0
+    if found is None:
+        return 0
+    for remark in found.remarks:
+        say_warning(remark)
+    for problem in found.problems:
+        say_error(problem)
+    return 0 if found.as_declared else 1
+
+
+def _asked(buses: Sequence[BusPlan], joints: Sequence[str]) -> Mapping[str, str]:
+    from dxlrun.identification import ask_servos  # not above: most checks open no port
+
+    return ask_servos(buses, joints)
+
+
+def _look(result: Compiled) -> Found:
+    """Look at the servos on real ports; raises InputError where there are none."""
+    from dxlrun.compile.buses import SIMULATED
+    from dxlrun.identification import look
+
+    buses = [bus for bus in result.plan.buses if bus.port != SIMULATED]
+    if not buses:
+        raise InputError(
+            f"every bus of {result.plan.robot} is simulated, so there is nobody to look at; "
+            "give it a port, such as port:=/dev/ttyUSB0"
+        )
+    return look(buses)
 
 
 def _print_json(value: dict[str, object]) -> None:
@@ -88,10 +124,12 @@ def _problem(problem: Problem) -> dict[str, object]:
     }
 
 
-def _print_tables(result: Compiled) -> None:
-    from dxlrun.cli.check_tables import tables, verdict
+def _print_tables(result: Compiled, found: Found | None) -> None:
+    from dxlrun.cli.check_tables import registers, tables, verdict
 
     console = out()
     console.print(verdict(result), soft_wrap=True)
     for table in tables(result.report, console.width):
         console.print(table)
+    if found is not None and found.registers:
+        console.print(registers(found.registers, console.width))

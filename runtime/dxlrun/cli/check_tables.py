@@ -5,6 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from rich import box
 from rich.console import Console, RenderableType
@@ -16,6 +17,9 @@ from dxlrun.compile import Compiled
 from dxlrun.compile.reach import degrees
 from dxlrun.compile.report import BusRow, CheckReport, ControllerRow, JointRow, MotionRow, PolicyRow
 from dxlrun.plurals import counted
+
+if TYPE_CHECKING:
+    from dxlrun.identification import RegisterRow
 
 
 def verdict(result: Compiled) -> str:
@@ -151,6 +155,18 @@ def _buses(rows: Sequence[BusRow], rate: float) -> _Sheet:
             f"{row.share:.0%}",
         )
     return table
+
+
+def registers(rows: Sequence[RegisterRow], width: int) -> RenderableType:
+    """Return the table of declared registers and what the servos hold, for a terminal of `width` columns."""
+    table = _Sheet(
+        "Registers", ["joint", "item", "area"], ["address", "declared", "found", "a run would"], []
+    )
+    for row in rows:
+        found = "no answer" if row.found is None else str(row.found)
+        action = {"nothing": "leave it", "write": "write it", "": "not start"}[row.action]
+        table.add_row(row.joint, row.item, row.area, str(row.address), str(row.declared), found, action)
+    return table.shown(width)
 
 
 def _policies(rows: Sequence[PolicyRow]) -> _Sheet:
