@@ -316,7 +316,10 @@ class Bus:
         ):
             return 0
         lengths = [one.length for one in awaited.awaited]
-        parts = self._dialect.fast_answers(data, lengths)
+        try:
+            parts = self._dialect.fast_answers(data, lengths)
+        except ValueError:  # spoilt before its first part
+            return 0
         used = self._dialect.fast_size(sum(lengths[: len(parts)]), len(parts)) if parts else 0
         if last_ns < self._started_ns + (len(awaited.packet) + used) * self._byte_ns:
             return 0  # sooner than the wire allows: left over from before
