@@ -3,7 +3,8 @@
 A small process, one priority above the loop. It opens, locks and keeps the ports' descriptors, executes the
 loop's process on them as its child, and watches that child: by its pidfd, which tells at once that it ended,
 and by its heartbeat, which tells that it hangs. A loop that is gone before it reported DONE, or that stands
-still, is killed and reaped, and then every servo is made limp with the packets that the plan prepared.
+still, is killed and reaped, and then every servo is made limp with the packets that the plan prepared. A line
+that the loop has lost is opened again and handed over.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -27,7 +28,7 @@ from dxlrun.control.policy_plan import TORQUE_STAYS, Last
 from dxlrun.dynamixel.bus_plan import BusPlan
 from dxlrun.dynamixel.limp import limp
 from dxlrun.dynamixel.port import SerialPort, SerialPorts
-from dxlrun.dynamixel.serial_open import open_serial
+from dxlrun.dynamixel.reopening import KeptLines, Wanted
 from dxlrun.errors import PortError
 from dxlrun.events import EventCode, EventRing, Severity
 from dxlrun.heartbeat import Heartbeat, Phase, Standstill
@@ -126,6 +127,37 @@ class LastHand:
         self._events.emit(EventCode.GUARDIAN, severity, "guardian", text)
 
 
+class Handing:
+    """Opens the lines again that the loop has lost, and hands them to the loop and to the terminal."""
+
+    def __init__(self, lines: KeptLines, loop: process.Line, terminal: process.Line, hand: LastHand) -> None:
+        self._lines = lines
+        self._loop = loop
+        self._terminal = terminal
+        self._hand = hand
+
+    @property
+    def watched(self) -> list[int]:
+        """What can wake the guardian for it; a loop that is gone asks for nothing."""
+        return [self._lines.fileno()] + ([] if self._loop.closed else [self._loop.fileno()])
+
+    def look(self, ready: Collection[int]) -> None:
+        """Take what the loop asks for, and hand over what is back."""
+        if self._loop.fileno() in ready:
+            for message in self._loop.receive():
+                self._terminal.send(message)
+                if not self._lines.lost(int(str(message["gone"]))):
+                    self._hand.tell("a line is gone and is not opened again", Severity.ERROR)
+        if self._lines.fileno() in ready:
+            for opened in self._lines.returned():
+                if opened.done:
+                    self._hand.tell(opened.done, Severity.INFO)
+                if opened.wrong:
+                    self._hand.tell(opened.wrong, Severity.ERROR)
+                for line in (self._loop, self._terminal):
+                    line.send({"back": opened.index}, [self._lines.descriptors[opened.index]])
+
+
 class Guardian:
     """Watches one loop process from its start to its end."""
 
@@ -140,18 +172,23 @@ class Guardian:
 
     def run(self) -> None:
         """Open the ports, execute the loop, watch it, and see that the robot is limp when it is gone."""
-        opened = [
-            open_serial(path, bus.baud_rate)
-            for path, bus in zip(self._job.ports, self._job.buses, strict=True)
-        ]
-        descriptors = [port.fileno() for port in opened]
+        lines = KeptLines(
+            [
+                Wanted(path, bus.baud_rate, bus.latency_ns)
+                for path, bus in zip(self._job.ports, self._job.buses, strict=True)
+            ]
+        )
         # before the loop is executed, which inherits none of it: whoever starts us is told at once
         grants = realtime.apply_to_guardian(self._job.priority, self._job.lock_memory)
         self._hand.tell_grants(grants)
-        loop = self._execute(descriptors)
+        for sentence in lines.done:
+            self._hand.tell(sentence, Severity.INFO)
+        loop_line, theirs = process.line_pair()
+        loop = self._execute(lines.descriptors, theirs.fileno())
+        theirs.close()
         # whoever asked gets the ports too: should this process die, they are still held, and still open
-        self._control.send({"loop": loop.pid, "grants": msgspec.to_builtins(grants)}, descriptors)
-        ending = self._watch(loop)
+        self._control.send({"loop": loop.pid, "grants": msgspec.to_builtins(grants)}, lines.descriptors)
+        ending = self._watch(loop, Handing(lines, loop_line, self._control, self._hand))
         outcome: list[str] = []
         if ending == "unused":
             outcome = [f"{self._how(ending, loop)}; nothing had been sent to the robot"]
@@ -159,30 +196,32 @@ class Guardian:
         elif ending != "done":
             how = self._how(ending, loop)
             if ending == "cut":
-                outcome = self._hand.limp(descriptors, how, Severity.WARNING)
+                outcome = self._hand.limp(lines.descriptors, how, Severity.WARNING)
             else:
-                outcome = self._hand.end(descriptors, how, Severity.ERROR)
+                outcome = self._hand.end(lines.descriptors, how, Severity.ERROR)
+        lines.close()
         self._control.send({"ended": ending, "outcome": outcome})
 
-    def _execute(self, descriptors: list[int]) -> subprocess.Popen[bytes]:
-        job = self._job.loop | {"ports": descriptors, "guardian": os.getpid()}
+    def _execute(self, descriptors: list[int], line: int) -> subprocess.Popen[bytes]:
+        job = self._job.loop | {"ports": descriptors, "line": line, "guardian": os.getpid()}
         return process.start(
             "dxlrun.loop_process",
             ["--job", msgspec.json.encode(job).decode()],
-            [*self._job.loop_descriptors, *descriptors],
+            [*self._job.loop_descriptors, *descriptors, line],
             self._job.stderr,
         )
 
-    def _watch(self, loop: subprocess.Popen[bytes]) -> Ending:
+    def _watch(self, loop: subprocess.Popen[bytes], handing: Handing) -> Ending:
         """Return how the loop ended; it is dead and reaped then."""
         watched = os.pidfd_open(loop.pid)
         nap = min(self._job.period_ns, 10_000_000) * 1e-9
         killed: Ending | None = None
         while True:
-            ready, _, _ = select.select(self._watched(watched), [], [], nap)
+            ready, _, _ = select.select([*self._watched(watched), *handing.watched], [], [], nap)
             self._heartbeat.look()
             if watched in ready:
                 return self._ending(loop.wait(), killed)
+            handing.look(ready)
             wish = self._wish() if self._control.fileno() in ready else None
             if wish == "stop":
                 self._stop_by_ns = min(self._stop_by_ns, self._clock.now_ns() + self._job.exit_timeout_ns)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import ctypes
 import os
 import signal
+import socket
 import sys
 import traceback
 from collections.abc import Callable
@@ -29,6 +30,7 @@ from dxlrun.control.policy_plan import TORQUE_STAYS, Last
 from dxlrun.cycle import CycleRecord
 from dxlrun.dynamixel.hardware import TAKEN_BACK
 from dxlrun.dynamixel.port import SerialPort, SerialPorts
+from dxlrun.dynamixel.reopening import LinesAgain
 from dxlrun.errors import DxlrunError, PlugInError
 from dxlrun.events import EventCode, EventRing, Severity
 from dxlrun.heartbeat import Heartbeat, Phase
@@ -59,8 +61,10 @@ class LoopJob:
     """Where it leaves what the operating system granted."""
     take_over: bool
     ports: tuple[int, ...] = ()
+    line: int = 0
+    """To the guardian, which opens lines that are gone again."""
     guardian: int = 0
-    """Process ID. Filled in by the guardian, like the ports."""
+    """Process ID. Filled in by the guardian, like ports and line."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +150,8 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: RingSinks) -> Ou
     stop = StopFlag()
     signal.signal(signal.SIGTERM, lambda *_: stop.request())
     ports = SerialPorts(
-        [SerialPort(descriptor, bus.port) for descriptor, bus in zip(job.ports, plan.buses, strict=True)]
+        [SerialPort(descriptor, bus.port) for descriptor, bus in zip(job.ports, plan.buses, strict=True)],
+        LinesAgain(process.Line(socket.socket(fileno=job.line))),
     )
     clock = MonotonicClock()
     pacing = Pacing(clock, plan.loop.scheduler.polling_ns)

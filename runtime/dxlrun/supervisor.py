@@ -21,6 +21,7 @@ from dxlrun import process
 from dxlrun.child import END_TIMEOUT_S, Child
 from dxlrun.compile.plan import Plan
 from dxlrun.control.realtime import Grant
+from dxlrun.dynamixel.port import put_in_place, set_aside
 from dxlrun.dynamixel.serial_open import let_go
 from dxlrun.errors import ProcessFault
 from dxlrun.events import Severity
@@ -140,13 +141,36 @@ class _Run:
             show(heartbeat)
             self._look_at_grants()
             self._look_after_gateway(heartbeat)
+            self._look_after_simulation(guardian)
             message = guardian.poll(_POLL_S)
-            if message and "ended" in message:
-                self.ended = message
+            if message:
+                self._heed(message, guardian.line.descriptors)
             elif still.ns(heartbeat.looks, time.monotonic_ns()) > _GUARDIAN_PATIENCE_NS:
                 self.sentences.append("the guardian did not look after the loop any more and was killed")
                 guardian.kill()
                 break
+
+    def _look_after_simulation(self, guardian: Child) -> None:
+        """End the run when the simulated servos are gone: unlike an adapter they do not come back."""
+        if self.simulation and self.simulation.process.poll() is not None:
+            self.sentences.append("the simulated bus ended before the run did")
+            self.simulation.end()
+            self.simulation = None
+            guardian.line.send({"stop": True})
+
+    def _heed(self, message: Mapping[str, object], descriptors: list[int]) -> None:
+        """Take the guardian's last word, let go of a line that is gone, hold the one that is back."""
+        if "ended" in message:
+            self.ended = message
+        elif "gone" in message:
+            set_aside(descriptors[int(str(message["gone"]))])
+        elif "back" in message:
+            put_in_place(descriptors.pop(len(self.plan.buses)), descriptors[int(str(message["back"]))])
+
+    def _heed_last_words(self, guardian: Child) -> None:
+        """Heed what a guardian that is gone said before; one that was killed here says no more."""
+        while guardian.line.fileno() >= 0 and (message := guardian.poll(0)):
+            self._heed(message, guardian.line.descriptors)
 
     def _look_at_grants(self) -> None:
         """Show what the operating system granted, and let the log keep it, once the loop has said it."""
@@ -216,6 +240,7 @@ class _Run:
         """End what is left, in order: guardian, recorder, simulated bus, gateway."""
         self._look_at_grants()
         if self.guardian:
+            self._heed_last_words(self.guardian)
             self.guardian.end()
             if self.loop is not None and self.ended is None and self.job is not None:
                 self._without_guardian(self.loop, self.guardian, self.job)

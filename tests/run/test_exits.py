@@ -187,7 +187,8 @@ def test_the_loop_holds_nobodys_lines(start: Start) -> None:
     run.wait_until_moving()
     held = Path(f"/proc/{run.child('dxlrun.loop_process')}/fd")
     targets = sorted(os.readlink(one) for one in held.iterdir())
-    assert not [target for target in targets if target.startswith(("socket:", "pipe:", "anon_inode:"))]
+    assert not [target for target in targets if target.startswith(("pipe:", "anon_inode:"))]
+    assert sum(target.startswith("socket:") for target in targets) == 1  # its own one to the guardian
     assert sum(target.startswith("/dev/pts/") for target in targets) == 1
     run.finish()
 
@@ -285,3 +286,16 @@ def test_the_loop_grows_no_memory_and_collects_no_garbage(
     told = {line for line in err.splitlines() if line.startswith("collector")}
     assert len(told) == 1
     assert "False" in told.pop()
+
+
+def test_simulated_servos_that_are_gone_end_the_run(start: Start, wait_for: Callable[..., Any]) -> None:
+    run = start()
+    run.wait_until_moving()
+    os.kill(run.child("dxlrun.simulation"), signal.SIGKILL)
+    code, _, err = run.finish()
+    assert code == 1
+    assert "the simulated bus ended before the run did" in err
+    assert "torque off could not be sent" in err
+    assert "Traceback" not in err
+    wait_for(run.gone, "the end of every process")
+    assert run.log().complete

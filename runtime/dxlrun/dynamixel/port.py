@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import select
 import time
@@ -110,7 +111,7 @@ class SerialPort:
         self._announced = True
 
     def _gone(self, error: OSError | None) -> PortError:
-        why = f" ({error.strerror})" if error is not None else ""
+        why = f" ({error.strerror})" if error is not None and error.errno != errno.EBADF else ""  # set aside
         return PortError(f"{self.name} is gone{why}: was the adapter unplugged?")
 
 
@@ -162,7 +163,7 @@ class SerialPorts:
 
 def set_aside(descriptor: int) -> None:
     """Let go of a line that is gone: its device gets its old name again only when nobody has it open."""
-    put_in_place(os.open(os.devnull, os.O_RDWR | os.O_CLOEXEC), descriptor)
+    put_in_place(os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC), descriptor)  # whoever writes is told
 
 
 def put_in_place(new: int, descriptor: int) -> None:

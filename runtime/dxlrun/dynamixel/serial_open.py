@@ -30,7 +30,7 @@ class ExclusiveSerial(serial.Serial):
 
 
 def let_go(descriptors: Iterable[int]) -> None:
-    """Close what is left of lines that another process opened by `open_serial`, and that is dead now."""
+    """Close lines that are `kept`, by this process or by one that is dead now."""
     for descriptor in descriptors:
         _unlock(descriptor)
         os.close(descriptor)
@@ -57,6 +57,13 @@ def open_serial(path: str, baud_rate: int) -> serial.Serial:
     # and the lock that every program meets, but for root's
     fcntl.ioctl(port.fileno(), termios.TIOCEXCL)
     return port
+
+
+def kept(port: serial.Serial) -> int:
+    """Return the descriptor of a line of `open_serial`, alone; `let_go` lets go of it."""
+    descriptor = os.dup(port.fileno())
+    serial.Serial.close(port)  # the locks stay with the descriptor
+    return descriptor
 
 
 def _sentence(path: str, baud_rate: int, error: Exception) -> str:

@@ -1,0 +1,62 @@
+"""Latency timer: how long an FTDI adapter keeps the last bytes of a reply back, and how to shorten that.
+
+Sources: FTDI AN232B-04; Linux, drivers/usb/serial/ftdi_sio.c, which has the timer in sysfs and shortens it to
+1 ms for whoever sets ASYNC_LOW_LATENCY on the open line. Other adapters have no such timer.
+"""
+
+from __future__ import annotations
+
+import os
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import serial
+
+SYSTEM = Path("/sys")
+
+
+@dataclass(frozen=True, slots=True)
+class LatencyTimer:
+    """The timer of one adapter."""
+
+    found_ms: int
+    place: Path
+    """Where the kernel shows it."""
+
+    @property
+    def mend(self) -> str:
+        """The command that shortens it until the adapter is unplugged."""
+        return f"echo 1 | sudo tee {self.place}"
+
+
+def latency_timer(path: str, system: Path = SYSTEM) -> LatencyTimer | None:
+    """Return the timer of the adapter whose device is `path`; None: it has none, or nobody may see it."""
+    place = system / "class/tty" / Path(os.path.realpath(path)).name / "device/latency_timer"
+    try:
+        return LatencyTimer(int(place.read_text()), place)
+    except (OSError, ValueError):
+        return None
+
+
+def shorten(line: serial.Serial, path: str, most_ns: int, system: Path = SYSTEM) -> tuple[str, str]:
+    """Shorten the timer of an open line that is longer than `most_ns`, as far as this user may.
+
+    Return what was done, and what is wrong still; both are empty where nothing is to be done.
+    """
+    before = latency_timer(path, system)
+    if before is None or before.found_ms * 1_000_000 <= most_ns:
+        return "", ""
+    with suppress(OSError, ValueError, NotImplementedError):  # also what has no such flag
+        line.set_low_latency_mode(True)
+    now = latency_timer(path, system) or before
+    if now.found_ms * 1_000_000 > most_ns:
+        with suppress(OSError):
+            now.place.write_text("1")
+        now = latency_timer(path, system) or now
+    if now.found_ms * 1_000_000 > most_ns:
+        return "", (
+            f"{path} keeps replies back for {now.found_ms} ms, and the robot file says adapter: {{latency: "
+            f"{most_ns * 1e-6:g} ms}}: `{now.mend}` shortens that, or write what is true"
+        )
+    return f"{path}: latency timer set from {before.found_ms} ms to {now.found_ms} ms", ""

@@ -1,0 +1,145 @@
+"""Lines that go and come back: who keeps them, and who asks for them; on pseudo-terminals behind a link."""
+
+import os
+import select
+import socket
+
+import pytest
+
+from dxlrun.dynamixel.port import SerialPort, SerialPorts
+from dxlrun.dynamixel.reopening import KeptLines, LinesAgain, Wanted, lasting_name
+from dxlrun.errors import PortError
+from dxlrun.process import Line
+
+PATIENCE_S = 20.0
+
+
+class Adapter:
+    """A pseudo-terminal behind a link, as udev's are."""
+
+    def __init__(self, link):
+        self.link = link
+        self.master, self._slave = os.openpty()
+        self._point()
+
+    def unplug(self):
+        os.close(self.master)
+        os.close(self._slave)
+        self.link.unlink()
+
+    def plug_in(self):
+        self.master, self._slave = os.openpty()
+        self._point()
+
+    def heard(self):
+        assert select.select([self.master], [], [], PATIENCE_S)[0]
+        return os.read(self.master, 100)
+
+    def _point(self):
+        self.link.symlink_to(os.ttyname(self._slave))
+
+
+@pytest.fixture
+def adapters(tmp_path):
+    both = [Adapter(tmp_path / "left"), Adapter(tmp_path / "right")]
+    yield both
+    for adapter in both:
+        adapter.unplug()
+
+
+@pytest.fixture
+def kept(adapters):
+    lines = KeptLines([Wanted(str(adapter.link), 1_000_000, 0) for adapter in adapters])
+    yield lines
+    lines.close()
+
+
+def returned(lines):
+    assert select.select([lines], [], [], PATIENCE_S)[0]
+    return [one.index for one in lines.returned()]
+
+
+def test_a_line_that_is_back_under_another_name_has_its_old_descriptor(adapters, kept):
+    before = list(kept.descriptors)
+    adapters[1].unplug()
+    assert kept.lost(1)
+    assert kept.returned() == []
+    adapters[1].plug_in()
+    assert returned(kept) == [1]
+    assert kept.descriptors == before
+    os.write(kept.descriptors[1], b"right")
+    assert adapters[1].heard() == b"right"
+    os.write(kept.descriptors[0], b"left")
+    assert adapters[0].heard() == b"left"
+
+
+def test_while_a_line_is_gone_nobody_has_its_old_device_open(adapters, kept):
+    adapters[0].unplug()
+    kept.lost(0)
+    assert os.readlink(f"/proc/self/fd/{kept.descriptors[0]}") == os.devnull
+    adapters[0].plug_in()
+    assert returned(kept) == [0]
+
+
+def test_both_lines_may_be_gone_at_once_and_come_back_in_any_order(adapters, kept):
+    for index in (0, 1):
+        adapters[index].unplug()
+        kept.lost(index)
+    adapters[1].plug_in()
+    assert returned(kept) == [1]
+    adapters[0].plug_in()
+    assert returned(kept) == [0]
+
+
+def test_a_line_that_is_back_is_locked_against_every_other_program(adapters, kept):
+    adapters[0].unplug()
+    kept.lost(0)
+    adapters[0].plug_in()
+    returned(kept)
+    with pytest.raises(PortError, match="in use"):
+        KeptLines([Wanted(str(adapters[0].link), 1_000_000, 0)])
+
+
+def test_of_two_lines_of_which_one_is_missing_neither_is_kept(adapters):
+    left = str(adapters[0].link)
+    with pytest.raises(PortError, match="there is no /dev/ttyNOPE"):
+        KeptLines([Wanted(left, 1_000_000, 0), Wanted("/dev/ttyNOPE", 1_000_000, 0)])
+    KeptLines([Wanted(left, 1_000_000, 0)]).close()
+
+
+def test_whoever_asks_gets_the_line_in_the_place_of_the_old_one(adapters, kept):
+    ours, theirs = socket.socketpair()
+    keeper = Line(theirs)
+    ports = SerialPorts(
+        [SerialPort(os.dup(one), "a line") for one in kept.descriptors], LinesAgain(Line(ours))
+    )
+    adapters[0].unplug()
+    assert not ports.reopen(0)
+    assert not ports.reopen(0)
+    assert keeper.receive() == [{"gone": 0}]  # asked once
+    kept.lost(0)
+    adapters[0].plug_in()
+    assert returned(kept) == [0]
+    keeper.send({"back": 0}, [kept.descriptors[0]])
+    assert ports.reopen(0)
+    ports.ports[0].write(b"again")
+    assert adapters[0].heard() == b"again"
+    adapters[0].unplug()
+    assert not ports.reopen(0)
+    assert keeper.receive() == [{"gone": 0}]  # it was lost anew
+    adapters[0].plug_in()
+    keeper.close()
+    assert not ports.reopen(0)  # nobody is there to ask
+    ours.close()
+
+
+def test_the_name_by_which_an_adapter_is_found_again(tmp_path):
+    device, stranger = tmp_path / "ttyUSB0", tmp_path / "ttyUSB1"
+    device.touch()
+    (tmp_path / "by-id").mkdir()
+    link = tmp_path / "by-id/usb-FTDI_FT9HDA1"
+    link.symlink_to(device)
+    assert lasting_name(str(device), tmp_path) == str(link)
+    assert lasting_name(str(link), tmp_path) == str(link)
+    assert lasting_name(str(stranger), tmp_path) == str(stranger)
+    assert lasting_name("/dev/pts/7", tmp_path) == ""
