@@ -63,6 +63,6 @@ def test_a_person_reads_it_in_a_table_and_a_sentence(
 
     assert report.same
     said = "The loop overran 1 time, 1 time with a simulated reply that was more than 1 ms late."
-    assert report.sentences[-1] == said
+    assert said in report.sentences
     titles = [item.table.title for item in render_comparison(report).renderables if hasattr(item, "table")]
-    assert titles == ["Buses", "How late the simulated buses were"]
+    assert titles[:2] == ["Buses", "How late the simulated buses were"]

@@ -17,6 +17,7 @@ from dxlrun.analysis.bus import joints_of
 from dxlrun.analysis.ledger_alignment import Span, differing
 from dxlrun.analysis.ledger_faults import FaultAnswers, answered, faults_in
 from dxlrun.analysis.ledger_lateness import Lateness, lateness
+from dxlrun.analysis.ledger_overruns import OverrunCauses, overrun_causes
 from dxlrun.analysis.ledger_streams import WAYS, Stream, Way, logged, seen
 from dxlrun.errors import InputError
 from dxlrun.events import EventCode
@@ -80,6 +81,8 @@ class LedgerReport:
     """What was injected during the run."""
     lateness: Lateness | None
     """None where no servo said anything."""
+    causes: OverrunCauses | None
+    """Why the loop overran; None where it had no cycle."""
 
 
 def compare(log: Log, entries: Sequence[LedgerEntry], ledger: Path) -> LedgerReport:
@@ -108,15 +111,17 @@ def compare(log: Log, entries: Sequence[LedgerEntry], ledger: Path) -> LedgerRep
         differences += found
     faults = answered(faults_in(of_run), log.events, joints_of(log), begin_ns)
     late = lateness(log, of_run)
+    causes = overrun_causes(log, by_bus)
     return LedgerReport(
         log=str(log.path),
         ledger=str(ledger),
         same=not any(bus.differences for bus in buses),
-        sentences=(*_sentences(buses, faults), *_said_of(late)),
+        sentences=(*_sentences(buses, faults), *_said_of(late, causes)),
         buses=tuple(buses),
         differences=tuple(sorted(differences, key=lambda difference: difference.seconds)),
         faults=faults,
         lateness=late,
+        causes=causes,
     )
 
 
@@ -249,10 +254,17 @@ def _sentences(buses: Sequence[ComparedBus], faults: Sequence[FaultAnswers]) -> 
     return said
 
 
-def _said_of(late: Lateness | None) -> list[str]:
+def _said_of(late: Lateness | None, causes: OverrunCauses | None) -> list[str]:
     """Return what a person must know of the simulation before they blame the loop."""
     if late is None or not late.overruns:
         return []
     overran = f"The loop overran {counted(late.overruns, 'time', 'times')}"
     beside = "never" if not late.overruns_beside else counted(late.overruns_beside, "time", "times")
-    return [f"{overran}, {beside} with a simulated reply that was more than 1 ms late."]
+    said = [f"{overran}, {beside} with a simulated reply that was more than 1 ms late."]
+    if causes is not None and causes.overruns:
+        said.append(
+            f"The cause was the simulated servos {counted(causes.simulation, 'time', 'times')}, a late "
+            f"wake-up {counted(causes.wake_up, 'time', 'times')}, and our own work "
+            f"{counted(causes.own_work, 'time', 'times')}: {causes.own_share:.3%} of {causes.cycles} cycles."
+        )
+    return said

@@ -9,6 +9,7 @@ from rich.text import Text
 
 from dxlrun.analysis.ledger_faults import FaultAnswers
 from dxlrun.analysis.ledger_lateness import Lateness
+from dxlrun.analysis.ledger_overruns import OverrunCauses
 from dxlrun.analysis.ledger_report import ComparedBus, Difference, LedgerReport
 from dxlrun.analysis.tables import Cell, Column, Table, once
 from dxlrun.analysis.terminal import Shown
@@ -28,6 +29,7 @@ def render_comparison(report: LedgerReport) -> Group:
         differences_table(report.differences),
         faults_table(report.faults),
         lateness_table(report.lateness),
+        overruns_table(report.causes),
     )
     return Group(
         Text(first, style=style),
@@ -122,6 +124,37 @@ def lateness_table(late: Lateness | None) -> Table:
     )
     cells = tuple((Cell(name), Cell(value)) for name, value in rows)
     return Table("How late the simulated buses were", columns, cells)
+
+
+def overruns_table(causes: OverrunCauses | None) -> Table:
+    """Return the worst overruns, each split into what was late; empty where there was none."""
+    columns = (
+        Column("at, s"),
+        Column("cause", "name"),
+        Column("periods left out"),
+        Column("late servos"),
+        Column("late wake-up"),
+        Column("own work beyond the usual"),
+    )
+    if causes is None or not causes.overruns:
+        return Table("", columns, ())
+    worst = sorted(
+        causes.overruns, key=lambda one: one.simulation_us + one.wake_up_us + one.own_us, reverse=True
+    )
+    rows = tuple(
+        (
+            Cell(f"{one.seconds:.6f}"),
+            Cell(one.cause, "warning" if one.cause == "own work" else "plain"),
+            Cell(str(one.skipped)),
+            Cell(microseconds(one.simulation_us)),
+            Cell(microseconds(one.wake_up_us)),
+            Cell(microseconds(max(0.0, one.own_us))),
+        )
+        for one in worst[:MOST_SHOWN]
+    )
+    title = f"Why the loop overran; a cycle usually takes {microseconds(causes.usual_us)}"
+    more = "" if len(worst) <= MOST_SHOWN else f"; the worst {MOST_SHOWN} of {len(worst)}, --json has all"
+    return Table(title + more, columns, rows)
 
 
 def _title(what: str, number: int) -> str:

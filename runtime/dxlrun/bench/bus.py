@@ -12,13 +12,14 @@ from typing import Literal
 import msgspec
 import numpy as np
 
+from dxlrun.analysis.ledger_waits import Sent, transactions
 from dxlrun.bench.canned import CannedResponder
 from dxlrun.bench.case import Case
 from dxlrun.bench.figures import CaseFigures, WireFigures, host_figures, wire_figures
 from dxlrun.bench.hosts import HOSTS, Host, HostKind
 from dxlrun.bench.rounds import Measured, cores, measure, on_core
 from dxlrun.bench.simulated import SimulatedServos
-from dxlrun.bench.wire import Sent, judge, transactions
+from dxlrun.bench.wire import judge
 from dxlrun.simulation import LedgerEntry, read_ledger
 
 Against = Literal["canned", "simulated"]

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Protocol
 
+from dxlrun.analysis.ledger_waits import Sent
 from dxlrun.assembly import assemble
 from dxlrun.bench.case import Case, Registers
 from dxlrun.bench.peers import Rustypot, Sdk
-from dxlrun.bench.wire import Sent
 from dxlrun.clock import MonotonicClock
 from dxlrun.commands import NoCommands
 from dxlrun.compile.plan import Plan

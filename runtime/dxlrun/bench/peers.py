@@ -8,8 +8,8 @@ of goals; ours has SI units at both ends. With `values=False` they leave the byt
 
 from __future__ import annotations
 
+from dxlrun.analysis.ledger_waits import Sent
 from dxlrun.bench.case import Case, Registers
-from dxlrun.bench.wire import Sent
 from dxlrun.errors import InputError
 
 PATIENCE_S = 1.0

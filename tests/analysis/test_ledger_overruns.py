@@ -1,0 +1,134 @@
+"""Why a loop on simulated buses overran: its servos, its wake-up, or its own work."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from dxlrun.analysis.ledger_overruns import overrun_causes
+from dxlrun.analysis.ledger_report import compare
+from dxlrun.analysis.ledger_tables import render_comparison
+from dxlrun.analysis.ledger_waits import transactions
+from dxlrun.packets import PacketKind
+from dxlrun.recording.reader import read_log
+from dxlrun.simulation import LedgerEntry
+
+BEGIN_NS = 10**9
+PERIOD_US = 20_000
+ASKED = b"\xff\xff\x05\x04\x02\x24\x02\xcc"
+LATE = 15
+"""The cycle that overran."""
+
+
+def entry(direction: str, at_us: float, data: bytes = ASKED, late_us: int = 0) -> LedgerEntry:
+    return LedgerEntry(round(at_us * 1000), "main", direction, data, "", late_us * 1000)  # type: ignore[arg-type]
+
+
+def asked_us(n: int, woke_us: int = 0) -> int:
+    return BEGIN_NS // 1000 + n * PERIOD_US + 10 + (woke_us if n == LATE else 0)
+
+
+def ledger(handed_late_us: int = 0, taken_late_us: int = 0, woke_us: int = 0) -> list[LedgerEntry]:
+    """A question and a reply 1 ms after it in each cycle; one of them is late, us."""
+    found = []
+    for n in range(30):
+        taken = asked_us(n, woke_us) + (taken_late_us if n == LATE else 0)
+        found.append(entry("in", taken))
+        found.append(entry("out", taken + 1000, late_us=handed_late_us if n == LATE else 0))
+    return found
+
+
+@pytest.fixture
+def causes_of(write: Callable[..., Path], cycle: type, wire: type) -> Callable[..., object]:
+    """Return the causes in a run of 30 cycles, of which the 16th took more of something, us."""
+
+    def causes(entries: list[LedgerEntry], **more: int) -> object:
+        cycles = [cycle(n, **(more if n == LATE else {}), skipped=n == LATE + 1) for n in range(30)]
+        woke = more.get("late", 0)
+        asked = [wire(PacketKind.INSTRUCTION, 5, asked_us(n, woke), ASKED) for n in range(30)]
+        return overrun_causes(read_log(write(cycles, asked)), {"main": entries})
+
+    return causes
+
+
+def counts(found: object) -> tuple[int, int, int]:
+    return found.simulation, found.wake_up, found.own_work  # type: ignore[attr-defined]
+
+
+def test_a_reply_that_came_late_is_the_simulation_s(causes_of: Callable[..., object]) -> None:
+    found = causes_of(ledger(handed_late_us=17_000), read=22_000)
+    assert counts(found) == (1, 0, 0)
+    (one,) = found.overruns  # type: ignore[attr-defined]
+    assert (one.simulation_us, one.wake_up_us, one.own_us) == (17_000, 0, 0)
+
+
+def test_a_question_that_was_taken_late_is_the_simulation_s(causes_of: Callable[..., object]) -> None:
+    assert counts(causes_of(ledger(taken_late_us=17_000), read=22_000)) == (1, 0, 0)
+
+
+def test_a_late_reply_of_another_cycle_is_no_excuse(causes_of: Callable[..., object]) -> None:
+    entries = ledger()
+    entries[2 * LATE - 1] = entry("out", asked_us(LATE - 1) + 1000, late_us=3_000)
+    assert counts(causes_of(entries, update=17_000)) == (0, 0, 1)
+
+
+@pytest.mark.parametrize(
+    ("late", "update", "expected"), [(16_000, 100, (0, 1, 0)), (2_000, 16_000, (0, 0, 1))]
+)
+def test_a_late_wake_up_is_told_from_work(
+    causes_of: Callable[..., object], late: int, update: int, expected: tuple[int, int, int]
+) -> None:
+    assert counts(causes_of(ledger(woke_us=late), late=late, update=update)) == expected
+
+
+def test_the_largest_of_three_is_the_cause_and_the_share_is_of_all_cycles(
+    causes_of: Callable[..., object],
+) -> None:
+    found = causes_of(ledger(handed_late_us=4_000, woke_us=3_000), read=9_000, late=3_000, update=9_000)
+    assert counts(found) == (0, 0, 1)
+    assert found.own_share == pytest.approx(1 / 30)  # type: ignore[attr-defined]
+    (one,) = found.overruns  # type: ignore[attr-defined]
+    assert (one.simulation_us, one.wake_up_us, one.own_us) == (4_000, 3_000, 8_900)
+
+
+def test_a_reply_that_was_asked_for_before_counts_only_as_long_as_it_was_waited_for(
+    causes_of: Callable[..., object],
+) -> None:
+    entries = ledger()
+    at = BEGIN_NS // 1000 + LATE * PERIOD_US
+    entries[2 * LATE + 1] = entry("out", at - 6_000, late_us=8_000)  # handed over 2 ms after the cycle woke
+    (one,) = causes_of(entries, update=17_000).overruns  # type: ignore[attr-defined]
+    assert one.simulation_us == 2_000
+
+
+def test_bytes_that_wait_for_the_line_are_not_late() -> None:
+    goals, question = bytes(100), bytes(10)
+    sent = [(0, 100), (100_000, 10)]
+    entries = [
+        entry("in", 50, goals),  # taken 50 us late: the line is free 50 us later, too
+        entry("in", 100, question),
+        entry("out", 1_500, late_us=7),
+    ]
+    (one,) = transactions(entries, sent, 10_000.0)
+    assert one.late_ns == 57_000
+    (one,) = transactions(entries, (), 10_000.0)  # a host that does not say when it wrote
+    assert one.late_ns == 7_000
+
+
+def test_a_person_reads_the_causes_and_the_worst_of_them(
+    write: Callable[..., Path], cycle: type, wire: type
+) -> None:
+    entries = ledger(handed_late_us=17_000)
+    cycles = [cycle(n, read=22_000 if n == LATE else 5_000, skipped=n == LATE + 1) for n in range(30)]
+    wires = [wire(PacketKind.INSTRUCTION, 5, asked_us(n), ASKED) for n in range(30)]
+    wires += [wire(PacketKind.STATUS, 5, asked_us(n) + 1000, ASKED) for n in range(30)]
+    report = compare(read_log(write(cycles, wires)), entries, Path("seen.jsonl"))
+    assert report.sentences[-1] == (
+        "The cause was the simulated servos 1 time, a late wake-up 0 times, and our own work 0 times: "
+        "0.000% of 30 cycles."
+    )
+    tables = [item.table for item in render_comparison(report).renderables if hasattr(item, "table")]
+    assert tables[-1].title == "Why the loop overran; a cycle usually takes 5400 us"
+    assert [cell.text for cell in tables[-1].rows[0]][1:4] == ["simulation", "1", "17.00 ms"]
