@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from dxlrun.control_table import ControlItem, control_table
 from dxlrun.dynamixel.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.inspection import persist, setup_line, who
+from dxlrun.dynamixel.plan import plan_line
 from dxlrun.dynamixel.reads import state_read
 from dxlrun.dynamixel.transaction import Program
 
@@ -47,7 +48,7 @@ def probe_reads(plan: BusPlan) -> Program[Probed]:
 
 def extra_ns(plan: BusPlan, refused: Mapping[int, str]) -> int:
     """Return how much longer a cycle takes when these groups are read by the form that every servo knows."""
-    line = setup_line(plan)
+    line = plan_line(plan)
     both = [
         (state_read(line, servos), state_read(line, servos, fast=True))
         for servos in ([plan.servos[index] for index in plan.groups[number]] for number in refused)

@@ -1,0 +1,208 @@
+"""Fast sync and bulk reads: all servos in one status, fewer bytes, and nobody's value is another's."""
+
+import math
+
+import pytest
+
+from dxlrun.dynamixel import protocol2
+from dxlrun.events import Severity
+
+IDS = (11, 12, 13, 14, 15, 16, 17, 18)
+
+
+@pytest.fixture
+def make_x(make_plan):
+    def make(ids=IDS, **change):
+        told = {
+            "name": "arm",
+            "protocol": 2.0,
+            "model": "XM430-W350",
+            "reference": math.pi,
+            "lower": -2.5,
+            "upper": 2.5,
+            "return_delay_ns": 0,
+            "fast": True,
+        }
+        return make_plan(ids, **told | change)
+
+    return make
+
+
+@pytest.fixture
+def started(make_rig, make_x):
+    rig = make_rig(make_x())
+    rig.hardware.start()
+    return rig
+
+
+def read_bytes(rig, cycles=20):
+    """Return how many bytes of reads and of replies the ledger has of some cycles."""
+    since = len(rig.ledger.entries)
+    for _ in range(cycles):
+        rig.cycle()
+    entries = rig.ledger.entries[since:]
+    return sum(len(e.data) for e in entries if not (e.direction == "in" and e.data[7] == 0x83))
+
+
+def truth(rig, row):
+    """Return where a joint stands, as the simulated servo itself knows, rad."""
+    servo = rig.plans[0].servos[row]
+    rig.buses[0].advance(rig.clock.now_ns())
+    return servo.direction * (rig.buses[0].servo(servo.servo_id).position - servo.reference)
+
+
+def test_a_cycle_is_one_fast_sync_read_with_one_status(started):
+    since, start = len(started.ledger.entries), started.clock.now_ns()
+    started.hardware.read()
+    took_ns = started.clock.now_ns() - start
+    asked = [e.data for e in started.ledger.entries[since:] if e.direction == "in"]
+    told = b"".join(e.data for e in started.ledger.entries[since:] if e.direction == "out")
+    assert asked == [protocol2.sync_read(126, 10, IDS, fast=True)]
+    assert len(told) == 8 + 8 * 14
+    assert took_ns == (22 + 120) * 10_000
+    assert started.states.valid.all()
+
+
+def test_a_fast_sync_read_saves_a_fifth_of_the_bytes_at_least(make_rig, make_x):
+    fast, plain = make_rig(make_x()), make_rig(make_x(fast=False))
+    for rig in (fast, plain):
+        rig.hardware.start()
+    assert read_bytes(fast) <= 0.8 * read_bytes(plain)
+    assert fast.states.position == pytest.approx(plain.states.position, abs=0.002)
+
+
+def test_the_budget_is_what_the_ledger_has(started):
+    since = len(started.ledger.entries)
+    started.cycle()
+    entries = started.ledger.entries[since:]
+    budget = started.plans[0].budget
+    assert sum(len(e.data) for e in entries if e.direction == "in") == budget.request_bytes
+    assert sum(len(e.data) for e in entries if e.direction == "out") == budget.reply_bytes
+
+
+def test_who_comes_before_an_absent_servo_keeps_its_sample(started):
+    started.cycle()
+    started.buses[0].servo(14).silence()
+    started.cycle()
+    assert started.states.valid.tolist() == [True] * 3 + [False] * 5
+    for _ in range(3):
+        started.cycle()
+    assert started.states.valid.tolist() == [True] * 3 + [False] + [True] * 4
+    started.buses[0].servo(14).silence(False)
+    for _ in range(3):
+        started.cycle()
+    assert started.states.valid.all()
+    assert started.packets.received() == started.out_of_bus()
+
+
+@pytest.mark.parametrize("index", range(14))
+def test_a_spoilt_byte_costs_that_servo_and_those_behind_it(started, index):
+    started.cycle()
+    started.buses[0].corrupt_next(14, index=index)
+    started.cycle()
+    assert started.states.valid.tolist() == [True] * 3 + [False] * 5
+    for _ in range(2):
+        started.cycle()
+    assert started.states.valid.all()
+
+
+@pytest.mark.parametrize("index", range(22))
+def test_a_spoilt_byte_of_the_first_part_is_never_taken(started, index):
+    started.cycle()
+    started.buses[0].corrupt_next(11, index=index)
+    started.cycle()
+    assert not started.states.valid.any()
+    for _ in range(2):
+        started.cycle()
+    assert started.states.valid.all()
+
+
+@pytest.mark.parametrize(
+    "late_ms", [12.5, 19.8, 20.1, 20.6, 21.1, 21.2, 21.25, 21.3, 21.35, 33.3, 40.5, 60.2]
+)
+@pytest.mark.parametrize("servo_id", [11, 15])
+def test_a_late_part_is_never_taken_as_current(started, late_ms, servo_id):
+    started.goals.position[:] = [-2.0, 2.0] * 4
+    started.goals.velocity[:] = 1.0
+    for _ in range(10):
+        started.cycle()  # from here on each joint turns by 0.02 rad a cycle
+    started.buses[0].delay_next(servo_id, int(late_ms * 1e6))
+    missed = 0
+    for _ in range(8):
+        deadline = started.clock.now_ns() + started.period_ns
+        started.hardware.read()
+        for row in range(len(IDS)):
+            if started.states.valid[row]:
+                aged = 1.1 * started.states.age_ns[row] * 1e-9  # rad that it turned since it answered
+                assert started.states.position[row] == pytest.approx(truth(started, row), abs=aged + 0.005)
+        missed += not started.states.valid[IDS.index(servo_id)]
+        started.hardware.write()
+        started.hardware.idle(deadline)
+        started.clock.wait_until(deadline)
+    assert missed >= 1
+    assert started.packets.received() == started.out_of_bus()
+
+
+def test_servos_of_old_firmware_are_read_plainly_and_it_is_told(make_rig, make_x):
+    rig = make_rig(make_x())
+    for servo_id in (13, 17):
+        rig.buses[0].servo(servo_id).poke("firmware_version", 44)
+    rig.hardware.start()
+    since = len(rig.ledger.entries)
+    rig.cycle()
+    assert rig.ledger.entries[since].data == protocol2.sync_read(126, 10, IDS)
+    assert rig.states.valid.all()
+    ((_, severity, _, text),) = [e for e in rig.events.list if e[1] is Severity.WARNING]
+    assert severity is Severity.WARNING
+    assert "needs firmware 45" in text
+    assert "arm_13_joint (ID 13 on bus arm) has 44" in text
+    assert "arm_17_joint (ID 17 on bus arm) has 44" in text
+    assert "2.76 ms instead of 2.28 ms, at most 362 Hz" in text
+
+
+def test_models_of_two_layouts_are_read_by_one_fast_bulk_read(make_rig, make_x):
+    models = ["XM430-W350"] * 3 + ["PM42-010-S260"] * 3
+    rig = make_rig(make_x((11, 12, 13, 21, 22, 23), models=models, reference=0.0, lower=-3.1, upper=3.1))
+    (chosen,) = [way for way in rig.plans[0].ways if way.chosen]
+    assert chosen.name == "fast bulk read"
+    rig.hardware.start()
+    since = len(rig.ledger.entries)
+    rig.cycle()
+    requests = [(one, 126, 10) for one in (11, 12, 13)] + [(one, 574, 10) for one in (21, 22, 23)]
+    assert rig.ledger.entries[since].data == protocol2.bulk_read(requests, fast=True)
+    assert rig.states.valid.all()
+
+
+def test_who_has_no_fast_form_is_read_beside_those_who_have_one(make_x):
+    plan = make_x(
+        (1, 2, 3, 4, 5, 6), models=["XM430-W350"] * 4 + ["2XL430-W250"] * 2, return_delay_ns=100_000
+    )
+    assert plan.groups == ((0, 1, 2, 3), (4, 5))
+    assert plan.fast == (True, False)
+
+
+def test_replies_are_due_by_the_return_delays_that_the_servos_have(make_rig, make_plan):
+    plan = make_plan((1, 2), return_delay_ns=100_000)
+    rig = make_rig(plan)
+    rig.buses[0].servo(2).poke("return_delay_time", 250)
+    rig.hardware.start()
+    (reads,) = [servos.reads for servos in rig.hardware._servos]
+    first = reads.advance(None)
+    assert first.due_ns == plan.reads[0].due_ns
+    reads._queue_of = None
+    reads.begin()
+    assert [request.patient[0].due_ns for request in reads._queue] == [300_000, 700_000]
+
+
+def test_no_way_of_protocol_1_is_a_fast_one(make_plan):
+    plan = make_plan((1, 2, 3), models=("MX-28", "MX-64", "AX-12A"))
+    assert {way.name for way in plan.ways} == {"read", "bulk read + read"}
+
+
+def test_the_cheapest_way_is_chosen(make_x):
+    plan = make_x(latency_ns=1_000_000)
+    assert [way.name for way in plan.ways] == ["read", "sync read", "fast sync read"]
+    costs = {way.name: way.budget.total_ns for way in plan.ways}
+    (chosen,) = [way for way in plan.ways if way.chosen]
+    assert chosen.budget == plan.budget
+    assert chosen.budget.total_ns == min(costs.values())
