@@ -23,7 +23,7 @@ def line():
 @pytest.fixture
 def timer(tmp_path, line):
     """Return the file in which the kernel would show the timer of the line's adapter, which is 16 ms."""
-    place = tmp_path / "class/tty" / os.path.basename(line) / "device/latency_timer"
+    place = tmp_path / "bus/usb-serial/devices" / os.path.basename(line) / "latency_timer"
     place.parent.mkdir(parents=True)
     place.write_text("16\n")
     return place

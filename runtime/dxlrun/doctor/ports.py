@@ -6,6 +6,7 @@ from pathlib import Path
 
 from dxlrun.doctor.finding import Finding
 from dxlrun.doctor.machine import Machine
+from dxlrun.dynamixel.latency_timer import mend, timer_ms
 
 _PATTERNS = ("dev/ttyUSB*", "dev/ttyACM*")
 _TIMERS = "sys/bus/usb-serial/devices/*/latency_timer"
@@ -65,10 +66,9 @@ def latency_timers(machine: Machine) -> tuple[Finding, ...]:
 def _timer(name: str, where: str, path: Path) -> Finding:
     what = f"latency timer of {name}"
     why = "the adapter keeps the last bytes of each reply back for so long"
-    try:
-        found = int(path.read_text())
-    except (OSError, ValueError):
+    found = timer_ms(path)
+    if found is None:
         return Finding(what, "worse", "it cannot be read", why, f"cat {where}")
     if found <= FAST_MS:
         return Finding(what, "good", f"{found} ms", why)
-    return Finding(what, "worse", f"{found} ms where 1 ms is possible", why, f"echo 1 | sudo tee {where}")
+    return Finding(what, "worse", f"{found} ms where 1 ms is possible", why, mend(where))

@@ -27,16 +27,27 @@ class LatencyTimer:
     @property
     def mend(self) -> str:
         """The command that shortens it until the adapter is unplugged."""
-        return f"echo 1 | sudo tee {self.place}"
+        return mend(str(self.place))
+
+
+def mend(place: str) -> str:
+    """Return the command that makes a timer as short as it can be, 1 ms, until the adapter is unplugged."""
+    return f"echo 1 | sudo tee {place}"
+
+
+def timer_ms(place: Path) -> int | None:
+    """Return what the kernel shows at a place, ms; None: no number, or nobody may see it."""
+    try:
+        return int(place.read_text())
+    except (OSError, ValueError):
+        return None
 
 
 def latency_timer(path: str, system: Path = SYSTEM) -> LatencyTimer | None:
     """Return the timer of the adapter whose device is `path`; None: it has none, or nobody may see it."""
-    place = system / "class/tty" / Path(os.path.realpath(path)).name / "device/latency_timer"
-    try:
-        return LatencyTimer(int(place.read_text()), place)
-    except (OSError, ValueError):
-        return None
+    place = system / "bus/usb-serial/devices" / Path(os.path.realpath(path)).name / "latency_timer"
+    found = timer_ms(place)
+    return None if found is None else LatencyTimer(found, place)
 
 
 def shorten(line: serial.Serial, path: str, most_ns: int, system: Path = SYSTEM) -> tuple[str, str]:
