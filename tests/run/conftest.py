@@ -132,11 +132,11 @@ class Running:
         return read_log(path)
 
     def wait_until_moving(self) -> None:
-        """Wait until the loop has sent goals."""
+        """Wait until the loop has sent goals, and has gone on for a few cycles: goals that stay are rare."""
 
         def goals() -> bool:
-            sent = (entry.data for entry in self.ledger() if entry.direction == "in")
-            return sum(data[4:5] == b"\x83" for data in sent) >= 10
+            sent = [entry.data[4:5] for entry in self.ledger() if entry.direction == "in"]
+            return b"\x83" in sent and len(sent) - sent.index(b"\x83") >= 30
 
         await_truth(goals, "goals in the ledger")
 

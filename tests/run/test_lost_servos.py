@@ -89,9 +89,9 @@ def goals(robot: VirtualRobot, servo: int) -> list[tuple[int, float]]:
 
 
 def swing(sent: list[tuple[int, float]], begin_ns: int, end_ns: int) -> float:
-    """Return how far goals went from one another between two times, rad."""
+    """Return how far goals went from one another between two times, rad; one that stays is sent rarely."""
     angles = [angle for t, angle in sent if begin_ns < t < end_ns]
-    return max(angles) - min(angles)
+    return max(angles) - min(angles) if angles else 0.0
 
 
 def lose_tilt(robot: VirtualRobot) -> None:
