@@ -86,7 +86,9 @@ def assemble(
         take_over=take_over,
         restore_torque=plan.loop.policies.reduces_torque,
     )
-    manager = Manager(plan.loop, plugins, record, sinks.events, clock, commands=sinks.commands)
+    manager = Manager(
+        plan.loop, plugins, record, sinks.events, clock, commands=sinks.commands, set_modes=hardware.set_modes
+    )
     gate = Gate(plan.loop, record, sinks.events)
     loop = Loop(
         clock=clock,

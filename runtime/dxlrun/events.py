@@ -71,6 +71,8 @@ class EventCode(IntEnum):
     """A policy of the robot file begins or ends: what for, and what it does."""
     GATE = 40
     """A command was clamped at the last gate; the text names joint, controller and limit."""
+    MODE = 45
+    """A joint goes into another mode, or controllers wait until theirs have."""
     IMPLAUSIBLE = 41
     """A servo's position jumped further than it can turn: the sample is not valid."""
     SERVO_HOT = 42

@@ -83,7 +83,8 @@ class Hardware:
         self.record.goals.position[:] = self.record.states.position
 
     def read(self) -> None:
-        self.record.states.position[:] = self.record.goals.position
+        goal = self.record.goals.position
+        np.copyto(self.record.states.position, goal, where=np.isfinite(goal))
         self.clock.wait_until(self.clock.now_ns() + self.work_ns())
 
     def write(self) -> None:
@@ -208,7 +209,9 @@ class Robot:
         self.record = CycleRecord(layout)
         self.hardware = Hardware(self.record, self.clock)
         plugins = PlugIns(self._offers, {"broken_one": "plug-in broken_one of x 1 cannot be imported"})
-        self.manager = Manager(self.plan, plugins, self.record, self.events, self.clock)
+        self.manager = Manager(
+            self.plan, plugins, self.record, self.events, self.clock, set_modes=self.hardware.set_modes
+        )
         self.gate = Gate(self.plan, self.record, self.events)
         self.loop = Loop(
             clock=self.clock,

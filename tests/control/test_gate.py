@@ -9,6 +9,7 @@ from dxlrun.control.gate import SLOW_SPEED, SLOW_START_NS, Gate
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan, LoopPlan, SchedulerPlan
 from dxlrun.cycle import Clamp, CycleLayout, CycleRecord
 from dxlrun.events import EventCode
+from dxlrun.mode import Mode
 
 DT_NS = 20_000_000
 DT = DT_NS * 1e-9
@@ -29,6 +30,7 @@ class Rig:
             None,
         )
         self.record = CycleRecord(CycleLayout(names, ("a", "b")))
+        self.record.states.mode[:] = Mode.POSITION
         self.record.active = 2
         self.record.goals.position[:] = start
         self.events = []
@@ -141,7 +143,7 @@ def test_each_beginning_of_a_clamping_is_told_once():
     for position in (3.0, 3.0, 0.0, 3.0, -3.0):
         rig.apply(position)
     assert [text.split()[3] for _, text in rig.events] == ["lowered", "lowered", "raised"]
-    assert rig.gate.counts[0].tolist() == [1, 3, 0, 0, 0]
+    assert rig.gate.counts[0].tolist() == [1, 3, 0, 0, 0, 0, 0, 0]
 
 
 def test_the_first_second_is_slow_even_without_a_velocity_limit():

@@ -264,7 +264,7 @@ def test_a_controller_is_loaded_with_the_period_that_the_loop_has_now(watched):
     ]
     watched.run(4)
     assert robot.inbox.answers == {1: "", 2: "", 3: "its rate 30 Hz does not divide the loop's 100 Hz", 4: ""}
-    assert robot.manager._named["extra"]._context.period_ns == 40_000_000
+    assert robot.manager._named["extra"]._controller.context.period_ns == 40_000_000
 
 
 def test_a_fallback_takes_over_in_the_cycle_of_the_fault(make_robot):

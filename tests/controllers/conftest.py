@@ -32,7 +32,7 @@ class Stage:
             name="tested",
             joints=joints,
             period_ns=20_000_000,
-            limits=JointLimits(free, free, np.full(count, self.speed)),
+            limits=JointLimits(free, free, np.full(count, self.speed), free),
             states=States.empty(count),
             goals=Commands.empty(count),
             commands=Commands.empty(count),

@@ -131,7 +131,8 @@ ASKED = {
     ),
     '("position",))': (
         '("torque",))',
-        "asks for the command interface torque; tell its author: command interfaces are position, velocity",
+        "asks for the command interface torque; tell its author: command interfaces are position, velocity, "
+        "effort, pwm",
     ),
 }
 

@@ -15,6 +15,7 @@ import pluggy
 from dxlrun.control.controller import CommandModel, Controller, Interfaces, ParametersModel
 from dxlrun.control.hookspecs import HookSpecs
 from dxlrun.interfaces import COMMAND_INTERFACES
+from dxlrun.mode import mode_of
 
 ControllerClass = type[Controller[Any]]
 Breach = tuple[str, str]
@@ -84,6 +85,13 @@ def interfaces_breach(interfaces: object) -> Breach | None:
         return (
             f"asks for the command interface {', '.join(unknown)}",
             f"command interfaces are {', '.join(COMMAND_INTERFACES)}",
+        )
+    try:
+        mode_of(interfaces.command or ("position",))
+    except ValueError as error:
+        return (
+            f"asks for command interfaces that do not go together: {error}",
+            "ask for position (with velocity or effort beside it), or for velocity, effort or pwm alone",
         )
     return None
 

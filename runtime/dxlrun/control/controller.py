@@ -37,7 +37,9 @@ class Interfaces:
     """What a controller asks of the robot, decided by its parameters.
 
     `command` interfaces are claimed on every joint of `joints`: no other active controller may have one of
-    the same joint. `state` lists nothing that must be claimed, so everybody sees every state.
+    the same joint. They say in which mode the joints are driven (`interfaces.mode_of`): `position` alone or
+    with `velocity` (the speed toward it); `velocity`, `effort` or `pwm` alone; or `position` with `effort`
+    (the most that the servo may exert). Nothing needs to be claimed to be read: everybody sees every state.
     """
 
     joints: tuple[str, ...]
@@ -51,11 +53,16 @@ class JointLimits:
     lower: Floats
     upper: Floats
     velocity: Floats
+    effort: Floats
 
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """What a controller gets when it is configured; the arrays are its own, in the order of its joints."""
+    """What a controller gets when it is configured; the arrays are in the order of its joints.
+
+    `commands` is its own; states and goals are to be read only, and a copy must be made of what is to be
+    compared with a later cycle.
+    """
 
     name: str
     joints: tuple[str, ...]

@@ -7,10 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.control.drive_gate import DriveGate
 from dxlrun.control.loop_plan import LoopPlan
 from dxlrun.cycle import Clamp, CycleRecord
 from dxlrun.events import EventCode, EventSink, Severity
 from dxlrun.interfaces import Commands, Floats
+from dxlrun.mode import Mode
 
 SLOW_SPEED = 1.5
 """rad/s; a goal moves no faster in the first second after torque was switched on. A quarter of an AX-12's
@@ -24,12 +26,20 @@ _WHAT = {
     Clamp.STEP: "held to the step limit",
     Clamp.VELOCITY: "held to the velocity limit",
     Clamp.NOT_FINITE: "was not finite, the last goal is kept",
+    Clamp.EFFORT: "held to the effort limit",
+    Clamp.PWM: "held to the full voltage",
+    Clamp.OUTWARD: "led out of the position limits",
 }
+_STILL = {Mode.VELOCITY: "velocity", Mode.EFFORT: "effort", Mode.PWM: "pwm"}
+"""What is 0 where a joint in this mode shall not move by its own."""
 _NOT_FINITE = np.uint8(Clamp.NOT_FINITE)
 
 
 class Gate:
     """Turns merged commands into goals that are finite, inside the limits, and near the last goal.
+
+    Each joint by the mode that it is in; one whose mode is not known has goals of NaN. Velocity, effort and
+    PWM: see DriveGate. Positions:
 
     - A position of NaN was not commanded: the last goal, position and speed, is kept. Infinity too, and is
       flagged.
@@ -41,7 +51,7 @@ class Gate:
       the servo can. No speed outlives the command that it came with.
 
     `record.clamped` tells what was done, bits of Clamp; an event tells when it begins. `counts`, shape
-    (joints, 5), counts cycles by joint and bit.
+    (joints, 8), counts cycles by joint and bit.
     """
 
     def __init__(self, plan: LoopPlan, record: CycleRecord, events: EventSink) -> None:
@@ -62,6 +72,38 @@ class Gate:
         self._flags = np.zeros(count, dtype=np.uint8)
         self._wanted, self._inside, self._step, self._low, self._high = (np.empty(count) for _ in range(5))
         self._finite, self._mask = (np.empty(count, dtype=np.bool_) for _ in range(2))
+        self._drive = DriveGate(plan.joints, self._flag_rows)
+        self._modes = np.zeros(count, dtype=np.uint8)
+        self._led = np.ones(count, dtype=np.bool_)
+        """Joints that are led to positions."""
+        self._all_led = True
+        self.begin()
+
+    def begin(self) -> None:
+        """Take the joints' modes as they are: their goals belong to them already."""
+        np.copyto(self._modes, self._record.states.mode)
+        np.logical_or(self._modes == Mode.POSITION, self._modes == Mode.EFFORT_POSITION, out=self._led)
+        self._all_led = bool(self._led.all())
+        self._drive.take(self._modes)
+
+    def enter_modes(self) -> None:
+        """Give the joints whose mode has changed goals that move nothing in the new one; after each read.
+
+        Who is led to a position holds where it is, and comes slowly to what it is told then.
+        """
+        modes = self._record.states.mode
+        if modes.tobytes() == self._modes.tobytes():
+            return
+        changed = modes != self._modes
+        self.begin()
+        record, goals = self._record, self._record.goals
+        for values in goals.arrays:
+            values[changed] = np.nan
+        np.copyto(goals.position, record.states.position, where=changed & self._led)
+        for mode, interface in _STILL.items():
+            values = getattr(goals, interface)
+            values[changed & (modes == mode)] = 0.0
+        self.ease_in(np.flatnonzero(changed).tolist())
 
     def ease_in(self, rows: Sequence[int] | None = None) -> None:
         """Limit the steps of the coming second to SLOW_SPEED, of all joints or of these rows.
@@ -76,17 +118,23 @@ class Gate:
         """Move `goals` toward `commands` in place; `dt_ns` is the time since the cycle before."""
         flags = self._flags
         np.bitwise_and(self._record.clamped, _NOT_FINITE, out=flags)  # what the manager found
-        self._position(commands.position, goals.position, dt_ns)
+        speed = self._highest(dt_ns)
+        self._position(commands.position, goals.position, speed, dt_ns)
         self._velocity(commands.velocity, goals.velocity)
+        if self._drive.any:
+            self._drive.apply(commands, goals, self._record.states, speed, dt_ns)
         np.copyto(self._record.clamped, flags)
         if np.count_nonzero(flags):
             self._note(flags & ~self._before)
         np.copyto(self._before, flags)
 
-    def _position(self, wanted: Floats, goal: Floats, dt_ns: int) -> None:
+    def _position(self, wanted: Floats, goal: Floats, speed: Floats, dt_ns: int) -> None:
         finite, inside, step, low, high = self._finite, self._inside, self._step, self._low, self._high
         np.isfinite(wanted, out=finite)
         np.isinf(wanted, out=self._mask)
+        if not self._all_led:
+            np.logical_and(finite, self._led, out=finite)
+            np.logical_and(self._mask, self._led, out=self._mask)
         self._flag(Clamp.NOT_FINITE)
         np.copyto(self._wanted, goal)
         np.copyto(self._wanted, wanted, where=finite)
@@ -98,7 +146,7 @@ class Gate:
         self._flag(Clamp.UPPER)
         np.maximum(self._wanted, low, out=inside)
         np.minimum(inside, high, out=inside)
-        np.multiply(self._highest(dt_ns), max(dt_ns, 1) * 1e-9, out=step)
+        np.multiply(speed, max(dt_ns, 1) * 1e-9, out=step)
         np.subtract(goal, step, out=low)
         np.add(goal, step, out=high)
         np.less(inside, low, out=self._mask)
@@ -135,6 +183,10 @@ class Gate:
     def _flag(self, bit: Clamp) -> None:
         if np.count_nonzero(self._mask):  # a tenth of the time of any()
             self._flags[self._mask] |= np.uint8(bit)
+
+    def _flag_rows(self, rows: NDArray[np.intp], bit: Clamp) -> None:
+        if rows.size:
+            self._flags[rows] |= np.uint8(bit)
 
     def _note(self, begun: NDArray[np.uint8]) -> None:
         for column, (bit, what) in enumerate(_WHAT.items()):

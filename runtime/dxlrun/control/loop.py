@@ -136,6 +136,7 @@ class Loop:
         self.events.emit(
             EventCode.LOOP_STARTED, Severity.INFO, "loop", f"loop started, period {period_ns / 1e6:g} ms"
         )
+        self.gate.begin()
         self.gate.ease_in()
         self._tell_start()
         self.manager.activate(0)
@@ -250,6 +251,7 @@ class Loop:
         self._stood = self.paused
         self.hardware.read()
         record.read_ns = now_ns()
+        self.gate.enter_modes()
         self.manager.begin()
         if self._motion:
             self.steering.refuse("the run is ending")

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import traceback
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.control.controller import Context, Controller
+from dxlrun.control.gathering import place_of
 from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.cycle import Clamp, CycleRecord
 from dxlrun.errors import ControllerFault
@@ -33,8 +34,10 @@ class Managed:
         rows: NDArray[np.intp],
         record: CycleRecord,
         *,
+        gather: Callable[[], None],
         bit: int,
     ) -> None:
+        """`gather` brings the context's states and goals up to date."""
         self.plan = plan
         self.bit = bit
         """Of the record's mask of active controllers."""
@@ -42,8 +45,9 @@ class Managed:
         self.until_ns = 0
         """When its stream of commands runs out, ns of the clock; 0: there is none."""
         self._controller = controller
-        self._context = context
+        self.gather = gather
         self._rows = rows
+        self._place = place_of(rows)
         self._record = record
         self._nominal_ns = context.period_ns
         self._every = plan.every
@@ -88,7 +92,7 @@ class Managed:
 
     def _withdraw(self) -> None:
         for claim in self._claimed:
-            claim.merged[self._rows] = np.nan
+            claim.merged[self._place] = np.nan
 
     def command(self, kind: str, data: NDArray[np.float64], time_ns: int, until_ns: int = 0) -> None:
         """Hand over a prepared command, which runs out at `until_ns` unless that is 0. Raises
@@ -149,24 +153,12 @@ class Managed:
             else:
                 self._judge(claim)
         for claim in self._claimed:
-            claim.merged[self._rows] = claim.own
+            claim.merged[self._place] = claim.own
 
     @property
     def rows(self) -> NDArray[np.intp]:
         """Rows of its joints in the robot's arrays."""
         return self._rows
-
-    def gather(self) -> None:
-        """Copy the robot's states and goals into the controller's own arrays."""
-        rows, record, context = self._rows, self._record, self._context
-        states, own = record.states, context.states
-        states.position.take(rows, out=own.position, mode="clip")
-        states.velocity.take(rows, out=own.velocity, mode="clip")
-        states.effort.take(rows, out=own.effort, mode="clip")
-        states.valid.take(rows, out=own.valid, mode="clip")
-        states.age_ns.take(rows, out=own.age_ns, mode="clip")
-        record.goals.position.take(rows, out=context.goals.position, mode="clip")
-        record.goals.velocity.take(rows, out=context.goals.velocity, mode="clip")
 
     def _judge(self, claim: _Claim) -> None:
         """Accept NaN where nothing was commanded yet. Raises ControllerFault for everything else."""

@@ -10,16 +10,17 @@ from numpy.typing import NDArray
 
 from dxlrun.clock import Clock
 from dxlrun.commands import CommandSink, NoCommands, TakenCommand
-from dxlrun.control.claims import conflicts, told
-from dxlrun.control.controller import Context, JointLimits
+from dxlrun.control.claims import conflicts
+from dxlrun.control.context import new_context
+from dxlrun.control.gathering import Gathering
 from dxlrun.control.loop_plan import ControllerPlan, LoopPlan, ScheduledCommand
 from dxlrun.control.managed import Managed
+from dxlrun.control.mode_switch import ModeSwitch, SetModes
 from dxlrun.control.plugins import PlugIns
 from dxlrun.control.turns import every, fits
 from dxlrun.cycle import MOST_CONTROLLERS, CycleRecord
 from dxlrun.errors import ControllerFault, PlugInError
 from dxlrun.events import EventCode, EventSink, Severity
-from dxlrun.interfaces import Commands, States
 
 
 class Manager:
@@ -37,7 +38,9 @@ class Manager:
         clock: Clock,
         *,
         commands: CommandSink | None = None,
+        set_modes: SetModes | None = None,
     ) -> None:
+        """`set_modes` asks the hardware for other modes of joints; without it they stay as they are."""
         self.fault: str | None = None
         self._plan = plan
         self._plugins = plugins
@@ -52,6 +55,7 @@ class Manager:
         self._commands: tuple[tuple[ScheduledCommand, NDArray[np.float64]], ...] = ()
         self._next = 0
         self._lost: Collection[int] = ()
+        self._modes = ModeSwitch(plan.joints, record.states.mode, set_modes)
         self._failed: set[str] = set()
 
     def configure(self) -> None:
@@ -73,11 +77,11 @@ class Manager:
 
     def activate(self, time_ns: int) -> None:
         """Activate what the plan wants active; states and goals must be fresh. A fault is in `fault`."""
-        wanted = [one for one in self._managed if one.plan.active and not one.active]
-        self._activate_all(wanted, time_ns)
+        self._enter([one for one in self._managed if one.plan.active and not one.active], time_ns, "")
 
     def begin(self) -> None:
         """Begin a cycle: nobody was updated in it yet."""
+        self._modes.ask(one for one in self._managed if one.active)
         record = self._record
         record.published = 0
         record.command_count = 0
@@ -92,6 +96,7 @@ class Manager:
         held by the gate; the others go on. Returns `fault`.
         """
         record, now_ns = self._record, self._clock.now_ns
+        self._admit(time_ns)
         record.command_count += self._hand_over(time_ns)
         for index, managed in enumerate(self._managed):
             if managed.active and managed.due(turn):
@@ -122,7 +127,8 @@ class Manager:
         if managed is None:
             return f"there is no such controller as {controller}"
         if not managed.active:
-            return f"{controller} is not active; switch to it first"
+            waits = managed in self._modes.entering
+            return f"{controller} is not active{' yet' if waits else '; switch to it first'}"
         streaming = until_ns and managed.until_ns
         try:
             managed.command(kind, data, time_ns, until_ns)
@@ -169,30 +175,45 @@ class Manager:
     def switch(self, activate: Sequence[str], deactivate: Sequence[str], time_ns: int) -> str:
         """Deactivate and activate controllers in one step; return why nothing was done, empty when it was.
 
-        A controller in both lists begins anew. Claims are those of everybody who is active afterwards.
+        A controller in both lists begins anew. Claims are those of everybody who is active afterwards. Where
+        joints must change their mode first, those that leave do so at once, and those that enter do together
+        in the first cycle in which all of theirs have (see ModeSwitch); an event tells when they never do.
         """
-        if refusal := self._refuse_switch(activate, deactivate):
+        return self._switch(activate, deactivate, time_ns, "")
+
+    def _switch(self, activate: Sequence[str], deactivate: Sequence[str], time_ns: int, why: str) -> str:
+        active = [one for one in self._managed if one.active]
+        if refusal := self._modes.refuse(activate, deactivate, self._named, active):
             return refusal
-        for name in deactivate:
-            self._deactivate(self._named[name], time_ns)
-        self._activate_all([self._named[name] for name in activate], time_ns)
+        for managed in (self._named[name] for name in deactivate):
+            leave = self._deactivate if managed.active else self._modes.drop
+            leave(managed, time_ns)
+        self._enter([self._named[name] for name in activate], time_ns, why)
         return ""
 
-    def _refuse_switch(self, activate: Sequence[str], deactivate: Sequence[str]) -> str:
-        for names in (activate, deactivate):
-            for name in names:
-                if name not in self._named:
-                    return f"there is no controller {name}"
-            if len(set(names)) != len(names):
-                return "a controller is named twice"
-        if idle := [name for name in deactivate if not self._named[name].active]:
-            return f"{', '.join(idle)} is not active"
-        leaving = set(deactivate)
-        if busy := [name for name in activate if self._named[name].active and name not in leaving]:
-            return f"{', '.join(busy)} is active already"
-        staying = [one.plan for one in self._managed if one.active and one.plan.name not in leaving]
-        clash = told(conflicts([*staying, *(self._named[name].plan for name in activate)]))
-        return f"{clash}; deactivate whoever is in the way in the same switch" if clash else ""
+    def _enter(self, wanted: Sequence[Managed], time_ns: int, why: str) -> None:
+        """Activate controllers whose claims were checked together, at once or when their modes are there."""
+        self._modes.changed()
+        if self._modes.ready(wanted):
+            self._activate_all(wanted, time_ns)
+            return
+        self._modes.await_modes(wanted, time_ns, why)
+        for managed in wanted:
+            self._tell(EventCode.MODE, managed, "waits until its joints are in their modes")
+
+    def _admit(self, time_ns: int) -> None:
+        """Activate who waited for modes that are there now; give up who waited too long."""
+        ready, late = self._modes.due(time_ns)
+        for group in ready:
+            self._activate_all(group.entering, time_ns)
+        for group in late:
+            excuse = self._modes.excuse(group)
+            for managed in group.entering:
+                name = managed.plan.name
+                self._events.emit(
+                    EventCode.COMMAND_REFUSED, Severity.WARNING, name, f"{name} is not activated: {excuse}"
+                )
+            self.fault = self.fault or group.why or None
 
     def load(self, plan: ControllerPlan) -> str:
         """Configure one more controller, inactive; return why not. Only while the loop is paused."""
@@ -235,7 +256,7 @@ class Manager:
         managed = self._named.get(name)
         if managed is None:
             return f"there is no controller {name}"
-        if managed.active:
+        if managed.active or managed in self._modes.entering:
             return f"{name} is active; deactivate it first"
         begin_ns = self._clock.now_ns()
         del self._named[name]
@@ -270,6 +291,7 @@ class Manager:
         for managed in reversed(self._managed):
             if managed.active:
                 self._deactivate(managed, time_ns)
+        self._modes.end()
 
     def _activate_all(self, wanted: Sequence[Managed], time_ns: int) -> None:
         """Activate controllers whose claims were checked together, then the fallbacks of those that failed:
@@ -289,6 +311,7 @@ class Manager:
 
     def _deactivate(self, managed: Managed, time_ns: int) -> None:
         self._record.active &= ~managed.bit
+        self._modes.changed()
         try:
             managed.deactivate(time_ns)
         except ControllerFault as fault:
@@ -327,6 +350,7 @@ class Manager:
     def _take_out(self, managed: Managed, fault: ControllerFault) -> None:
         managed.release()
         self._record.active &= ~managed.bit
+        self._modes.changed()
         text = "\n".join([str(fault), *getattr(fault, "__notes__", ())])
         self._events.emit(EventCode.CONTROLLER_FAULT, Severity.ERROR, managed.plan.name, text)
         self._failed.add(managed.plan.name)
@@ -335,7 +359,7 @@ class Manager:
         """Let a fallback take over, but for one that broke its own contract before: two that fall back on
         each other would do so for ever."""
         name = managed.plan.fallback
-        if not name or name in self._failed or self.switch((name,), (), time_ns):
+        if not name or name in self._failed or self._switch((name,), (), time_ns, why):
             self.fault = self.fault or why
 
     def _tell_loaded(self, managed: Managed, what: str, begin_ns: int) -> None:
@@ -347,7 +371,11 @@ class Manager:
 
     def _configured(self, index: int, plan: ControllerPlan) -> Managed:
         controller = self._plugins.built(plan)
-        context = self._context(index, plan)
+        rows = np.array([self._rows[joint] for joint in plan.joints], dtype=np.intp)
+        joints = [self._plan.joints[row] for row in rows]
+        gathering = Gathering(self._record, rows)
+        say, publish = self._sayer(plan.name), self._publisher(1 << index)
+        context = new_context(plan, joints, gathering, period_ns=self._period_ns, say=say, publish=publish)
         try:
             controller.on_configure(context)
         except (Exception, SystemExit) as error:  # foreign code: one sentence instead of its traceback
@@ -355,30 +383,8 @@ class Manager:
                 f"controller {plan.name} raised in on_configure: {type(error).__name__}: {error}"
             ) from error
         self._plugins.after_each(f"of controller {plan.name}")
-        rows = np.array([self._rows[joint] for joint in plan.joints], dtype=np.intp)
-        return Managed(plan, controller, context, rows, self._record, bit=1 << index)
-
-    def _context(self, index: int, plan: ControllerPlan) -> Context:
-        joints = [self._plan.joints[self._rows[joint]] for joint in plan.joints]
-        count = len(joints)
-        return Context(
-            name=plan.name,
-            joints=plan.joints,
-            period_ns=plan.every * self._period_ns,
-            limits=JointLimits(
-                lower=np.array([joint.lower for joint in joints], dtype=np.float64),
-                upper=np.array([joint.upper for joint in joints], dtype=np.float64),
-                velocity=np.array(
-                    [np.nan if joint.velocity is None else joint.velocity for joint in joints],
-                    dtype=np.float64,
-                ),
-            ),
-            states=States.empty(count),
-            goals=Commands.empty(count),
-            commands=Commands.empty(count),
-            say=self._sayer(plan.name),
-            publish=self._publisher(1 << index),
-        )
+        gather, bit = gathering.gather, 1 << index
+        return Managed(plan, controller, context, rows, self._record, gather=gather, bit=bit)
 
     def _sayer(self, name: str) -> Callable[[str], None]:
         def say(text: str) -> None:
