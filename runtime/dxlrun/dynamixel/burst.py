@@ -39,6 +39,7 @@ class Burst:
         "_two",
         "count",
         "data",
+        "first",
         "first_size",
         "ids",
         "packets",
@@ -89,6 +90,8 @@ class Burst:
             (count, length), np.uint8, buffer, offset=data_at, strides=(step, 1)
         )
         """What they say, one row a servo; good until the buffer is filled again."""
+        self.first = view[data_at : data_at + length]
+        """What the first one says."""
         heads = 1 if self._fast else count
         self._heads = np.ndarray((heads,), f"<u{self._head}", buffer, strides=(step,))
         ends = [self.size - (count - 1 - number) * step for number in range(count)]

@@ -52,6 +52,7 @@ class Bus:
 
     __slots__ = (
         "_awaited",
+        "_burst",
         "_byte_ns",
         "_deadline_ns",
         "_dialect",
@@ -74,10 +75,12 @@ class Bus:
         "_refused",
         "_reply",
         "_reply_size",
+        "_room",
+        "_sent_ns",
         "_sink",
-        "_started_ns",
         "_state",
         "_views",
+        "due_ns",
         "failure",
         "name",
         "noise_bytes",
@@ -100,14 +103,18 @@ class Bus:
         self._refusal = self._dialect.refused
         self._overhead = self._dialect.OVERHEAD
         self._id_at = self._dialect.ID_AT
-        self._receiver = Receiver(self._status, self._noise, self._dialect, self._whole)
+        self._receiver = Receiver(self._status, self._noise, self._dialect, self._gathered)
         self._parameters = memoryview(bytearray(self._dialect.LONGEST))
         self._views: dict[int, memoryview] = {}
         self._reply = Reply(Outcome.SENT, 0, b"", 0, 0, False)
         self._job: Job | None = None
         self._awaited: Transaction | None = None
         self._state = _READY
-        self._started_ns = self._earliest_ns = self._deadline_ns = self._free_ns = 0
+        self.due_ns = 0
+        """When the replies of the newest transaction are due by the wire."""
+        self._burst: Burst | None = None  # until anything came
+        self._room = self._receiver.space
+        self._sent_ns = self._earliest_ns = self._deadline_ns = self._free_ns = 0
         self._drain_end_ns = 0
         self._reply_size = 0
         self._open = 0  # a bit for each status that is still awaited
@@ -128,13 +135,13 @@ class Bus:
         """Go on with a line that is back in the place of one that is gone; its job is forgotten."""
         self._port = port
         self.failure = None
-        self._job = self._awaited = None
+        self._job = self._awaited = self._burst = None
         self._state = _READY
         self._receiver.flush()  # the half of a packet that the lost line brought is nobody's
 
     def load(self, job: Job) -> None:
         """Take a job; the next `step` begins it. What an aborted job left behind is forgotten."""
-        self._awaited = None
+        self._awaited = self._burst = None
         self._state = _READY
         self.receive()  # what came since the last job belongs to nobody
         if self.failure is not None:
@@ -159,19 +166,36 @@ class Bus:
         """Take what the line has; called when it has bytes."""
         if self.failure is None:
             try:
-                receiver = self._receiver
-                if not receiver.read_from(self._port, self._now_ns):
-                    return
-                self._last_byte_ns = self._now_ns()
-                # as many bytes as an awaited reply has, and it is not whole: its header is a false one
-                while (
-                    self._state == _AWAITING
-                    and receiver.pending >= self._reply_size
-                    and not receiver.gathering
-                ):
-                    receiver.skip_header()
+                self._take_bytes()
             except PortError as error:
                 self._fail(error)
+
+    def _take_bytes(self) -> None:
+        receiver = self._receiver
+        burst = self._burst
+        if burst is not None and not receiver.pending:
+            # nearly always all replies are there at once: no need to keep book of what came when
+            count = self._port.read_into(self._room)
+            if not count:
+                return
+            at_ns = self._last_byte_ns = self._now_ns()
+            if (
+                count == burst.size
+                and self._state == _AWAITING
+                and burst.whole()
+                and self._in_time(burst, at_ns)
+            ):
+                self._burst = None
+                self._take_all(burst, at_ns, [])
+                return
+            receiver.expect(burst)
+            self._burst = None
+            receiver.accept(count, at_ns)
+        elif receiver.read_from(self._port, self._now_ns):
+            self._last_byte_ns = self._now_ns()
+        # as many bytes as an awaited reply has, and it is not whole: its header is a false one
+        while self._state == _AWAITING and receiver.pending >= self._reply_size and not receiver.gathering:
+            receiver.skip_header()
 
     def step(self, now_ns: int) -> int:
         """Do what is due; return when to come back at the latest, NEVER when there is nothing to do."""
@@ -180,69 +204,76 @@ class Bus:
                 if self._state == _READY:
                     if now_ns < self._free_ns:
                         return self._free_ns
-                    self._begin(self._job)
-                    now_ns = self._now_ns()
-                    continue
-                if now_ns < self._deadline_ns:
+                    now_ns = self._begin(self._job)
+                elif now_ns < self._deadline_ns:
                     return self._deadline_ns
-                # bytes may have come while this process was not running: look before giving up
-                self.receive()
-                if self._state == _AWAITING:
-                    self._give_up(now_ns)
-                elif self._state == _DRAINING and self._quiet_at() > now_ns:
-                    self._deadline_ns = self._quiet_at()
-                elif self._state in (_RESTING, _DRAINING):
-                    self._receiver.flush()
-                    self._state = _READY
+                else:
+                    self._end(now_ns)
         except PortError as error:
             self._fail(error)
         return NEVER
+
+    def _end(self, now_ns: int) -> None:
+        """Do what is due at a transaction's deadline."""
+        # bytes may have come while this process was not running: look before giving up
+        self.receive()
+        if self._state == _AWAITING:
+            self._give_up(now_ns)
+        elif self._state == _DRAINING and self._quiet_at() > now_ns:
+            self._deadline_ns = self._quiet_at()
+        elif self._state in (_RESTING, _DRAINING):
+            self._receiver.flush()
+            self._state = _READY
 
     def _fail(self, error: PortError) -> None:
         self.failure = error
         self._job = None
 
-    def _begin(self, job: Job) -> None:
-        """Hand the reply to the job and start its next transaction."""
+    def _begin(self, job: Job) -> int:
+        """Hand the reply to the job and start its next transaction; return the time after that."""
         reply = self._reply
-        first = self._awaited is None
-        transaction = job.advance(None if first else reply)
-        self._awaited = transaction
+        self._awaited = transaction = job.advance(None if self._awaited is None else reply)
         if transaction is None:
             self._job = None
-            return
+            return 0
         if self._receiver.pending:
             self._receiver.flush()
-        self._receiver.expect(job.burst)
+        self._receiver.expect(None)
+        burst = self._burst = job.burst
         reply.parameters = b""
         reply.error = reply.strays = 0
         reply.echoed = False
-        if transaction.packet:
-            self._write(transaction.packet, transaction.servo_id)
-        else:
-            self._started_ns = self._now_ns()
-        reply.sent_ns = self._started_ns
-        if not transaction.awaited:
-            reply.outcome = Outcome.SENT
-            self._deadline_ns = self._started_ns + transaction.due_ns
-            self._state = _RESTING
-        else:
+        packet = transaction.packet
+        now_ns = self._write(packet, transaction.servo_id) if packet else self._now_ns()
+        started_ns = reply.sent_ns = self._sent_ns if packet else now_ns
+        if transaction.awaited:
             reply.outcome = Outcome.TIMEOUT
-            count = len(transaction.packet) + self._overhead
-            self._earliest_ns = self._started_ns + count * self._byte_ns
-            self._deadline_ns = self._started_ns + transaction.timeout_ns
+            self._state = _AWAITING
+            self._earliest_ns = started_ns + (len(packet) + self._overhead) * self._byte_ns
+            self._deadline_ns = started_ns + transaction.timeout_ns
             self._reply_size = transaction.widest
             self._open = (1 << len(transaction.awaited)) - 1
             self._refused = False
-            self._state = _AWAITING
+            if burst is not None:
+                burst.bind(self._receiver.buffer)
+        else:
+            reply.outcome = Outcome.SENT
+            self._state = _RESTING
+            self._deadline_ns = started_ns + transaction.due_ns
+        self.due_ns = started_ns + transaction.due_ns
+        return now_ns
 
-    def _write(self, packet: bytes | bytearray | memoryview, servo_id: int) -> None:
-        before = self._now_ns()
+    def _write(self, packet: bytes | bytearray | memoryview, servo_id: int) -> int:
+        """Send a packet; return the time after that."""
+        now_ns = self._now_ns
+        before = self._sent_ns = now_ns()
         self._port.write(packet)
-        self._sink.packet(self._index, PacketKind.INSTRUCTION, servo_id, before, self._now_ns(), packet)
-        self._started_ns = before
+        after = now_ns()
+        self._sink.packet(self._index, PacketKind.INSTRUCTION, servo_id, before, after, packet)
         # a second packet waits in the adapter until the first is off the wire
-        self._free_ns = max(self._free_ns, before) + len(packet) * self._byte_ns
+        start = self._free_ns if self._free_ns > before else before
+        self._free_ns = start + len(packet) * self._byte_ns
+        return after
 
     def _give_up(self, now_ns: int) -> None:
         """End a transaction of which not every reply came in time."""
@@ -257,20 +288,23 @@ class Bus:
     def _quiet_at(self) -> int:
         return min(self._last_byte_ns + self._quiet_ns, self._drain_end_ns)
 
-    def _whole(self, burst: Burst, ends: list[int], times: list[int]) -> bool:
-        """Take all replies of a transaction at once; return False when some came too soon to be of now."""
-        transaction, job = self._awaited, self._job
-        if self._state != _AWAITING or transaction is None or job is None:
+    def _gathered(self, burst: Burst, ends: list[int], times: list[int]) -> bool:
+        """Take all replies of a transaction that came in pieces; False: some came too soon to be of now."""
+        spans = _spans(burst, ends, times)
+        if self._state != _AWAITING or not self._in_time(burst, spans[0][1]):
             return False
-        first_ns = last_ns = times[0]
-        spans: list[tuple[int, int]] = []
-        if len(times) > 1:
-            spans = _spans(burst, ends, times)
-            first_ns, last_ns = spans[0][1], spans[-1][1]
-        sent = len(transaction.packet)
-        # an echo, or left over from before, comes sooner than the wire allows
-        if first_ns < self._started_ns + (sent + burst.first_size) * self._byte_ns:
-            return False
+        self._take_all(burst, spans[-1][1], spans)
+        return True
+
+    def _in_time(self, burst: Burst, first_ns: int) -> bool:
+        """Say whether the first reply is of now: an older one, or an echo, comes sooner than the wire does."""
+        return first_ns >= self._earliest_ns + (burst.first_size - self._overhead) * self._byte_ns
+
+    def _take_all(self, burst: Burst, last_ns: int, spans: list[tuple[int, int]]) -> None:
+        """Take all replies of a transaction; `spans`: of each status packet, when they came in pieces."""
+        job = self._job
+        if job is None:
+            return
         packet, index = self._sink.packet, self._index
         if spans:
             for (servo_id, data), (first, last) in zip(burst.packets, spans, strict=True):
@@ -284,7 +318,6 @@ class Bus:
         self._state = _READY
         moments = [last for _, last in spans]
         job.take(burst, moments if len(moments) == burst.count else last_ns)
-        return True
 
     def _noise(self, data: memoryview, first_ns: int, last_ns: int) -> None:
         self._sink.packet(self._index, PacketKind.NOISE, BROADCAST_ID, first_ns, last_ns, data)
@@ -321,7 +354,7 @@ class Bus:
         except ValueError:  # spoilt before its first part
             return 0
         used = self._dialect.fast_size(sum(lengths[: len(parts)]), len(parts)) if parts else 0
-        if last_ns < self._started_ns + (len(awaited.packet) + used) * self._byte_ns:
+        if last_ns < self._sent_ns + (len(awaited.packet) + used) * self._byte_ns:
             return 0  # sooner than the wire allows: left over from before
         reply = self._reply
         for index, (one, part) in enumerate(zip(awaited.awaited, parts, strict=False)):
@@ -408,21 +441,28 @@ def pump(buses: Sequence[Bus], ports: Ports, clock: Clock, beat: Callable[[], No
     `beat` is called at least once a transaction. Raises nothing: a line that is gone has its `failure`, and
     the others go on.
     """
-    while True:
-        now = clock.now_ns()
-        deadline = NEVER
-        for bus in buses:
-            deadline = min(deadline, bus.step(now))
+    clock_ns = clock.now_ns
+    now_ns = clock_ns()
+    deadlines = [bus.step(now_ns) for bus in buses]
+    while (deadline := min(deadlines)) != NEVER:
         beat()
-        if deadline == NEVER:
-            return
         ready = ports.wait(deadline)
-        if ready and all(buses[index].failure is not None for index in ready):
-            # a line that is gone is ready for ever: look at the others now and then instead of waiting
-            clock.wait_until(min(deadline, now + LOST_LINE_STEP_NS))
-            ready = range(len(buses))
+        heard = not ready
         for index in ready:
-            buses[index].receive()
+            bus = buses[index]
+            if bus.failure is None:
+                heard = True
+                bus.receive()
+                deadlines[index] = bus.step(clock_ns())
+        if not heard:
+            # a line that is gone is ready for ever: look at the others now and then instead of waiting
+            clock.wait_until(min(deadline, clock_ns() + LOST_LINE_STEP_NS))
+            for bus in buses:
+                bus.receive()
+        now_ns = clock_ns()
+        if now_ns >= deadline or not heard:
+            deadlines = [bus.step(now_ns) for bus in buses]
+    beat()
 
 
 def run(

@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dxlrun.dynamixel.burst import Burst
 from dxlrun.dynamixel.bus_plan import BusPlan
@@ -63,12 +64,15 @@ class CyclicReads:
 
     __slots__ = (
         "_arrays",
+        "_arrived",
         "_current",
         "_erring",
+        "_fresh",
         "_groups",
         "_line",
         "_lossy",
         "_made",
+        "_none",
         "_patient",
         "_plan",
         "_position",
@@ -89,11 +93,14 @@ class CyclicReads:
 
     def __init__(self, plan: BusPlan, arrays: StateArrays, room: int) -> None:
         count = len(plan.servos)
-        self.fresh = np.zeros(count, dtype=np.bool_)
+        self._fresh = bytearray(count)
+        self._none = bytes(count)
+        self.fresh: NDArray[np.bool_] = np.frombuffer(self._fresh, dtype=np.bool_)
         """Whose reply arrived intact in this cycle."""
         self.arrived_ns = np.full(count, -1, dtype=np.int64)
         self.missed = [0] * count
         """How many replies in a row did not arrive."""
+        self._arrived = self.arrived_ns.data
         self.errors = [0] * count
         """Error byte of the newest reply."""
         self.garbled = [False] * count
@@ -127,7 +134,7 @@ class CyclicReads:
                 # once a cycle: if each loss counted, three silent servos of a group would ask alike for ever
                 self._shape[number] += 1
                 self._lossy[number] = False
-        self.fresh[:] = False
+        self._fresh[:] = self._none
         self._patient = True
         silent = tuple(map(bool, self.missed))
         if silent != self._queue_of:
@@ -193,11 +200,19 @@ class CyclicReads:
         """Keep the states of all servos of the current read."""
         request = self._current
         assert request is not None  # noqa: S101  a burst belongs to a read
-        request.data[request.rows] = burst.data[:, : request.data.shape[1]]
-        self.fresh[request.servos] = True
-        self.arrived_ns[request.servos] = times_ns
+        if burst.count == 1 and isinstance(times_ns, int):
+            # one by one, plain bytes are quicker than arrays
+            servo = request.indices[0]
+            state = self._replies[servo]
+            state[:] = burst.first[: len(state)]
+            self._fresh[servo] = 1
+            self._arrived[servo] = times_ns
+        else:
+            request.data[request.rows] = burst.data[:, : request.data.shape[1]]
+            self.fresh[request.servos] = True
+            self.arrived_ns[request.servos] = times_ns
         errors = burst.errors
-        if self._erring or any(errors):
+        if self._erring or errors.count(0) != burst.count:
             for servo, error in zip(request.indices, errors, strict=True):
                 self.errors[servo] = error
             self._erring = any(self.errors)

@@ -46,6 +46,8 @@ class Receiver:
         "_taken",
         "_times",
         "_view",
+        "buffer",
+        "space",
     )
 
     def __init__(
@@ -56,8 +58,10 @@ class Receiver:
         self._beginnings = tuple(header[:count] for count in range(len(header) - 1, 0, -1))
         self._size_at = dialect.size_at
         self._intact = dialect.intact
-        self._buffer = bytearray(dialect.LONGEST + _GOOD_READ)
-        self._view = memoryview(self._buffer)
+        self.buffer = self._buffer = bytearray(dialect.LONGEST + _GOOD_READ)
+        """Where replies lie; a burst at its start."""
+        self.space = self._view = memoryview(self._buffer)
+        """All of it; for who reads himself while nothing is pending."""
         self._end = 0
         self._ends: list[int] = []  # where each read() ended in the buffer; as many as unfinished reads
         self._times: list[int] = []
@@ -69,8 +73,6 @@ class Receiver:
     def expect(self, burst: Burst | None) -> None:
         """Take the next bytes as a whole if they are these replies; call it when nothing is pending."""
         self._burst = burst
-        if burst is not None:
-            burst.bind(self._buffer)
 
     @property
     def room(self) -> int:
@@ -94,7 +96,7 @@ class Receiver:
         """
         count = port.read_into(self._view[self._end :] if self._end else self._view)
         if count:
-            self._accept(count, now_ns())
+            self.accept(count, now_ns())
         return count
 
     def feed(self, data: bytes, now_ns: int) -> None:
@@ -102,7 +104,7 @@ class Receiver:
         for start in range(0, len(data), _GOOD_READ):
             chunk = data[start : start + _GOOD_READ]
             self._view[self._end : self._end + len(chunk)] = chunk
-            self._accept(len(chunk), now_ns)
+            self.accept(len(chunk), now_ns)
 
     def skip_header(self) -> None:
         """Give up the header that is being waited for, as false; what follows it gets its chance."""
@@ -120,7 +122,8 @@ class Receiver:
                 self._emit(self._noise, 0, self._end)
                 self._forget(self._end)
 
-    def _accept(self, count: int, at_ns: int) -> None:
+    def accept(self, count: int, at_ns: int) -> None:
+        """Take bytes that were put into `space`, deliver what became whole."""
         self._end += count
         self._ends.append(self._end)
         self._times.append(at_ns)

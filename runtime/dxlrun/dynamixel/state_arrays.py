@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.dynamixel.bus_plan import BusPlan, Field, ServoPlan, StateLayout
-from dxlrun.interfaces import States
+from dxlrun.interfaces import Floats, States
 
-_MAGNITUDE = 0x3FF
-_CLOCKWISE = 0x400
+_SIGNED_MASK = 0x7FF
+_SIGNED = np.concatenate((np.arange(0x400), -np.arange(0x400))).astype(np.float64)
+"""Sign-magnitude of eleven bits -> ticks: the highest one is the sign."""
 
 Integers = NDArray[np.integer]
 Rows = slice | NDArray[np.intp]
@@ -35,7 +36,7 @@ class StateArrays:
     in Protocol 2.0 (e-Manual XM430-W350, Present Velocity (128)).
     """
 
-    __slots__ = ("_arrived", "_blocks", "_rows", "replies")
+    __slots__ = ("_arrived", "_blocks", "_everybody", "_rows", "replies")
 
     def __init__(self, plan: BusPlan) -> None:
         layouts = dict.fromkeys(servo.state for servo in plan.servos)
@@ -45,7 +46,8 @@ class StateArrays:
             for index in range(len(plan.servos))
         )
         """Where each servo's bytes belong, in the order of the plan's servos."""
-        self._rows = np.array([servo.row for servo in plan.servos], dtype=np.intp)
+        self._rows = rows_of([servo.row for servo in plan.servos])
+        self._everybody = b"\1" * len(plan.servos)
         self._arrived = np.full(len(plan.servos), -1, dtype=np.int64)
 
     def place(self, indices: Sequence[int]) -> tuple[NDArray[np.uint8], Rows]:
@@ -64,28 +66,22 @@ class StateArrays:
         """
         rows = self._rows
         states.valid[rows] = fresh
+        if fresh.tobytes() == self._everybody:
+            self._arrived[:] = arrived_ns
+            states.age_ns[rows] = now_ns - arrived_ns
+            for block in self._blocks:
+                block.decode(states)
+            return
         np.copyto(self._arrived, arrived_ns, where=fresh)
         states.age_ns[rows] = np.where(self._arrived < 0, -1, now_ns - self._arrived)
         for block in self._blocks:
-            block.decode(states, fresh)
+            block.decode_some(states, fresh)
 
 
 class _StateBlock:
     """The servos of one bus that have one layout."""
 
-    __slots__ = (
-        "_decoders",
-        "_direction",
-        "_effort",
-        "_members",
-        "_position",
-        "_raw",
-        "_reference",
-        "_rows",
-        "_speed",
-        "data",
-        "replies",
-    )
+    __slots__ = ("_effort", "_members", "_position", "_reference", "_rows", "_velocity", "data", "replies")
 
     def __init__(self, layout: StateLayout, servos: Sequence[ServoPlan]) -> None:
         members = [index for index, servo in enumerate(servos) if servo.state == layout]
@@ -96,50 +92,62 @@ class _StateBlock:
             index: view[number * length : (number + 1) * length] for number, index in enumerate(members)
         }
         self.data: NDArray[np.uint8] = np.frombuffer(buffer, np.uint8).reshape(len(mine), length)
-        fields = (layout.position, layout.velocity, layout.effort)
-        record = np.dtype(
-            {
-                "names": ["position", "velocity", "effort"],
-                "formats": [_format(field) for field in fields],
-                "offsets": [field.offset for field in fields],
-                "itemsize": length,
-            }
-        )
-        self._raw = np.frombuffer(buffer, dtype=record)
-        self._decoders = tuple(_signed if field.encoding == "sign_magnitude" else _plain for field in fields)
+        direction = np.array([float(servo.direction) for servo in mine])
         self._members = np.array(members, dtype=np.intp)
-        self._rows = np.array([servo.row for servo in mine], dtype=np.intp)
-        self._direction = np.array([float(servo.direction) for servo in mine])
-        self._reference = np.array([servo.reference for servo in mine])
-        self._position = np.array([servo.rad_per_tick for servo in mine])
-        self._speed = self._direction * np.array([servo.rad_s_per_tick for servo in mine])
-        self._effort = self._direction * np.array([servo.effort_per_tick for servo in mine])
+        self._rows = rows_of([servo.row for servo in mine])
+        self._reference = direction * np.array([servo.reference for servo in mine])
+        self._position = _Column(
+            self.data, layout.position, direction * np.array([servo.rad_per_tick for servo in mine])
+        )
+        self._velocity = _Column(
+            self.data, layout.velocity, direction * np.array([servo.rad_s_per_tick for servo in mine])
+        )
+        self._effort = _Column(
+            self.data, layout.effort, direction * np.array([servo.effort_per_tick for servo in mine])
+        )
 
-    def decode(self, states: States, all_fresh: NDArray[np.bool_]) -> None:
-        rows, raw = self._rows, self._raw
+    def decode(self, states: States) -> None:
+        """Fill the rows of all servos."""
+        rows = self._rows
+        states.position[rows] = np.subtract(self._position.values(), self._reference, self._position.work)
+        states.velocity[rows] = self._velocity.values()
+        states.effort[rows] = self._effort.values()
+
+    def decode_some(self, states: States, all_fresh: NDArray[np.bool_]) -> None:
+        """Fill the rows of those whose reply arrived."""
         fresh = all_fresh[self._members]
-        ticks = [
-            decoder(raw[name])
-            for name, decoder in zip(("position", "velocity", "effort"), self._decoders, strict=True)
-        ]
-        position = self._direction * (ticks[0] * self._position - self._reference)
-        velocity = ticks[1] * self._speed
-        effort = ticks[2] * self._effort
-        if not fresh.all():
-            rows, position, velocity, effort = rows[fresh], position[fresh], velocity[fresh], effort[fresh]
-        states.position[rows] = position
-        states.velocity[rows] = velocity
-        states.effort[rows] = effort
+        position = self._position.values() - self._reference
+        for values, column in (
+            (states.position, position),
+            (states.velocity, self._velocity.values()),
+            (states.effort, self._effort.values()),
+        ):
+            values[self._rows] = np.where(fresh, column, values[self._rows])
+
+
+class _Column:
+    """One item of all servos of a block, in its unit."""
+
+    __slots__ = ("_index", "_per_tick", "_raw", "work")
+
+    def __init__(self, data: NDArray[np.uint8], field: Field, per_tick: Floats) -> None:
+        rows, length = data.shape
+        self._raw: Integers = np.ndarray(
+            (rows,), _format(field), data, offset=field.offset, strides=(length,)
+        )
+        self._per_tick = per_tick
+        self._index = np.zeros(rows, dtype=np.intp) if field.encoding == "sign_magnitude" else None
+        self.work = np.zeros(rows)
+
+    def values(self) -> Floats:
+        """Return the values; good until the next call."""
+        work = self.work
+        if self._index is None:
+            return np.multiply(self._raw, self._per_tick, work)
+        np.bitwise_and(self._raw, _SIGNED_MASK, self._index)
+        _SIGNED.take(self._index, out=work, mode="clip")
+        return np.multiply(work, self._per_tick, work)
 
 
 def _format(field: Field) -> str:
     return f"<{'i' if field.encoding == 'twos_complement' else 'u'}{field.size}"
-
-
-def _plain(raw: Integers) -> Integers:
-    return raw
-
-
-def _signed(raw: Integers) -> Integers:
-    magnitude = (raw & _MAGNITUDE).astype(np.int32)
-    return np.where(raw & _CLOCKWISE, -magnitude, magnitude)
