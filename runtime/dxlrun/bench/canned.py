@@ -15,6 +15,8 @@ from dxlrun.simulation import BusConfig
 from dxlrun.simulation.configuration import encode_config
 
 _MOST_REHEARSALS = 500
+_ALIKE = 3
+"""Two goals in turn are written, so of two alike there would be only one of each."""
 _TIMEOUT_S = 5.0
 
 Steps = tuple[tuple[int, int], ...]
@@ -41,24 +43,28 @@ class CannedResponder:
         """The devices, one a bus."""
 
     def rehearse(self, port: int, host: Host, *, first: bool) -> Steps:
-        """Let a host exchange with servos until it does so twice alike, then answer alike for ever.
+        """Let a host exchange with servos until it does so alike, then answer alike for ever.
 
         Returns the steps. Raises ProcessFault when its exchanges never become alike.
         """
         self._do(port, "rehearse")
         host.start() if first else host.mend()
         before: Steps = ()
+        alike = 0
         for _ in range(_MOST_REHEARSALS):
             self._do(port, "learn")
             good = host.exchange()
             steps = self._do(port, "play")
-            if good and steps and steps == before:
+            alike = alike + 1 if good and steps and steps == before else 0
+            if alike == _ALIKE:
                 return steps
             before = steps if good else ()
             if not good:
                 self._do(port, "rehearse")
                 host.mend()
-        raise ProcessFault("no two exchanges were alike while the servos answered; nothing can be measured")
+        raise ProcessFault(
+            "the exchanges were never alike while the servos answered; nothing can be measured"
+        )
 
     def close(self) -> None:
         """End the process."""

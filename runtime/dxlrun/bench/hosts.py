@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Protocol
 
+import numpy as np
+
 from dxlrun.analysis.ledger_waits import Sent
 from dxlrun.assembly import assemble
 from dxlrun.bench.case import Case, Registers
@@ -26,6 +28,8 @@ from dxlrun.packets import PACKET_SLOT, NoPackets, PacketBatch, PacketKind, deco
 from dxlrun.ring import Gap, RingReader, RingWriter, create
 
 _IDLE_NS = 50_000_000
+_TICKS = 2
+"""By so much two goals in turn differ: a goal that does not change need not be written."""
 
 
 class Host(Protocol):
@@ -119,12 +123,14 @@ class Ours:
         self._valid = robot.record.states.valid
         self._goal = robot.record.goals.position
         self._goals = self._goal.copy(), self._goal.copy()
+        ticks = {servo.row: servo.rad_per_tick for bus in plan.buses for servo in bus.servos}
+        self._step = np.array([_TICKS * ticks[row] for row in range(len(self._goal))])
         self._turn = 0
 
     def start(self) -> None:
         """Run the start-up of a run."""
         self._hardware.start()
-        self._goals = self._goal.copy(), self._goal + 0.002  # rad: more than a tick
+        self._goals = self._goal.copy(), self._goal + self._step
 
     def exchange(self) -> bool:
         """Read, set other goals, write, and hand the packets on, as a cycle does."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
 from dxlrun.cli.flags import Flag, JsonFlag
-from dxlrun.cli.terminal import out, say_warning
+from dxlrun.cli.terminal import out, say_error, say_warning
 from dxlrun.errors import InputError
 
 if TYPE_CHECKING:
@@ -81,7 +82,69 @@ def bench_bus(
         out().file.write(bus.to_json(result).decode() + "\n")
     else:
         _print(result)
-    return 0
+    unmeasured = [
+        f"{one.host} ({case.servos} x {case.model}, {case.against})"
+        for case in result.cases
+        for one in case.hosts
+        if not one.exchanges
+    ]
+    if unmeasured:
+        say_error(f"without a whole exchange, so not measured: {', '.join(unmeasured)}")
+    return 1 if unmeasured else 0
+
+
+@bench.command(name="rate")
+def bench_rate(
+    robot: Path,
+    /,
+    *assignments: Annotated[str, Parameter(name="arg:=value")],
+    seconds: float = 3.0,
+    as_json: JsonFlag = False,
+    debug: Flag = False,
+) -> int:
+    """Find the highest rate that a robot keeps, by running it at one rate after another.
+
+    The robot holds still where it stands: its servos get torque. At the kept rate at most one cycle in a
+    thousand overruns; those that simulated servos cause do not count. Exit code 1 when no rate is kept.
+
+    Parameters
+    ----------
+    robot
+        The robot file.
+    assignments
+        Arguments of the robot file, for example port:=/dev/ttyUSB0.
+    seconds
+        How long each run lasts, s.
+    as_json
+        Print the result as JSON.
+    debug
+        Print the traceback of an error.
+    """
+    if not robot.is_file():
+        raise InputError(f"there is no robot file {robot}; check the path")
+    if not 0.1 <= seconds <= 3600:
+        raise InputError(f"--seconds {seconds:g}: give from 0.1 to 3600")
+    from dxlrun.bench.rate import bench_rate as measure
+    from dxlrun.bench.rate import to_json
+    from dxlrun.bench.real_run import runs
+    from dxlrun.cli.bench_table import rate_table, rate_verdict
+    from dxlrun.cli.inputs import parse_assignments
+    from dxlrun.description import read_robot
+
+    description = read_robot(robot, parse_assignments(assignments))
+    with runs() as run:
+        result = measure(
+            description,
+            seconds,
+            run,
+            lambda rate: None if as_json else out().print(f"running at {rate:g} Hz"),
+        )
+    if as_json:
+        out().file.write(to_json(result).decode() + "\n")
+    else:
+        out().print(rate_table(result))
+        out().print(rate_verdict(result), soft_wrap=True)
+    return 0 if result.kept_hz else 1
 
 
 def _words(option: str, text: str, known: list[str]) -> list[str]:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 from rich.table import Table
 
 from dxlrun.bench.bus import BusBench
 from dxlrun.bench.figures import HostFigures
+from dxlrun.bench.rate import RateBench
+from dxlrun.plurals import counted
 
 
 def bus_table(result: BusBench) -> Table:
@@ -26,9 +30,7 @@ def bus_table(result: BusBench) -> Table:
                 f"{case.protocol:.1f}",
                 f"{case.servos} x {case.model}",
                 one.host,
-                f"{one.median_us:.0f}",
-                f"{one.p99_us:.0f}",
-                f"{one.processor_us:.0f}",
+                *(_number(value, 0) for value in (one.median_us, one.p99_us, one.processor_us)),
                 f"{one.sent_bytes:g} + {one.received_bytes:g}",
                 *_ratios(case.hosts[0], one),
                 str(one.lost),
@@ -40,10 +42,42 @@ def bus_table(result: BusBench) -> Table:
 def _ratios(first: HostFigures, one: HostFigures) -> tuple[str, str]:
     if one is first:
         return "", ""
-    return f"{first.wall_ratio[one.host]:.2f} of it", f"{first.processor_ratio[one.host]:.2f} of it"
+    wall, processor = first.wall_ratio[one.host], first.processor_ratio[one.host]
+    return f"{_number(wall, 2)} of it", f"{_number(processor, 2)} of it"
+
+
+def _number(value: float, digits: int) -> str:
+    """Write a figure; of a host that never exchanged whole there is none."""
+    return "-" if math.isnan(value) else f"{value:.{digits}f}"
 
 
 def _wire(one: HostFigures) -> tuple[str, str, str]:
     if one.wire is None:
         return "", "", ""
     return f"{one.wire.wire_us:.0f}", f"{one.wire.late_us:.0f}", f"{one.wire.ratio:.2f}"
+
+
+def rate_table(result: RateBench) -> Table:
+    """Return the table of the runs at each rate."""
+    table = Table(box=None, pad_edge=False)
+    for head in ("rate Hz", "cycles", "overruns", "by simulated servos", "median us", "99.9 % us", "kept"):
+        table.add_column(head, justify="right")
+    for one in result.tries:
+        table.add_row(
+            f"{one.rate_hz:g}",
+            str(one.cycles),
+            str(one.overruns),
+            str(one.by_simulation),
+            f"{one.median_us:.0f}",
+            f"{one.p999_us:.0f}",
+            "yes" if one.kept else "no",
+        )
+    return table
+
+
+def rate_verdict(result: RateBench) -> str:
+    """Return what was found in a sentence."""
+    computed = f"its buses alone allow {result.computed_hz:g} Hz"
+    if result.kept_hz is None:
+        return f"{result.robot} kept no rate in {counted(len(result.tries), 'run', 'runs')}; {computed}"
+    return f"{result.robot} keeps {result.kept_hz:g} Hz on this machine; {computed}"
