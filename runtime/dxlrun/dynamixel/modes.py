@@ -11,11 +11,11 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from dxlrun.control_table import ControlItem, control_table
 from dxlrun.dynamixel.bus_plan import BusPlan, GoalLayout, ModePlan, OwnLimit, ServoPlan
-from dxlrun.dynamixel.inspection import called, persist
+from dxlrun.dynamixel.inspection import called, persist, who
 from dxlrun.dynamixel.plan import plan_line, readable
 from dxlrun.dynamixel.transaction import Outcome, Program, Reply
 from dxlrun.dynamixel.units import ticks_in
@@ -69,6 +69,46 @@ def enter(plan: BusPlan, servo: ServoPlan, mode: Mode) -> Program[str]:
     return (yield from hold(plan, servo, wanted)).problem
 
 
+@dataclass(slots=True)
+class SettledModes:
+    """What came of the modes of one bus' servos before they get torque."""
+
+    problems: list[str] = field(default_factory=list)
+    """Why a servo is not in its first mode, one sentence each."""
+    switched: list[tuple[str, str]] = field(default_factory=list)
+    """Joint, and what its mode had been."""
+    limits: list[Mapping[OwnLimit, int]] = field(default_factory=list)
+    """Of each servo, in the order of the plan's: the limits beyond which it refuses goals, ticks."""
+
+
+def settle_modes(plan: BusPlan) -> Program[SettledModes]:
+    """Bring every servo into its first mode, where it is in another one, and read its own limits."""
+    settled = SettledModes()
+    for servo in plan.servos:
+        settled.limits.append((yield from read_limits(plan, servo)))
+        wanted = servo.mode_plan(servo.start_mode)
+        found = yield from _read_items(plan, servo, [register.name for register in wanted.operating])
+        if found is not None and in_mode(wanted, found):
+            continue
+        problem = yield from enter(plan, servo, servo.start_mode)
+        if problem or found is None:
+            problem = problem or "did not answer when its mode was asked for"
+            settled.problems.append(f"{who(plan, servo)} {problem}")
+            continue
+        items = _items(plan, servo)
+        was = ", ".join(f"{called(items[name])} was {value}" for name, value in found.items())
+        words = servo.start_mode.name.lower().replace("_", "-")
+        settled.switched.append((servo.joint, f"{was}: {who(plan, servo)} was brought into {words} mode"))
+    return settled
+
+
+def mode_now(plan: BusPlan, servo: ServoPlan) -> Program[Mode]:
+    """Read in which mode a servo is; UNKNOWN where it does not answer, or the plan has none for it."""
+    names = dict.fromkeys(register.name for mode in servo.modes for register in mode.operating)
+    found = yield from _read_items(plan, servo, list(names))
+    return Mode.UNKNOWN if found is None else mode_in(servo, found)
+
+
 def mode_in(servo: ServoPlan, found: Mapping[str, int]) -> Mode:
     """Return the mode that a servo's registers select, UNKNOWN where the plan has none for them.
 
@@ -112,7 +152,7 @@ def hold(plan: BusPlan, servo: ServoPlan, mode: ModePlan) -> Program[Held]:
         present = ticks_in(servo.state.position, state.parameters)
         position = min(max(present, mode.lower_tick), mode.upper_tick)
         if abs(position - present) > 1:
-            return Held("left its limits before torque was switched on")
+            return Held("stands outside its limits, or left them before torque was switched on")
     most_effort = 0
     if position is not None and len(mode.goals) > 1:
         limits = yield from read_limits(plan, servo)
