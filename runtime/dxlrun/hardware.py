@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -36,6 +37,15 @@ class Hardware(Protocol):
         Returns at once: it is done in the gaps between cycles. Meanwhile `states.mode` of such a joint is
         UNKNOWN and it gets no goal; it becomes the new mode when that was read back, or what it was before
         when the servo refused, which an event tells. A later call replaces what is still waiting.
+        """
+        ...
+
+    def set_register(self, row: int, item: str, value: int, done: Callable[[str], None]) -> None:
+        """Write a RAM item of a joint's servo in the gaps between cycles and read it back.
+
+        Returns at once. `done` is called once, here or in a later gap: with an empty text when the servo has
+        it, else with what went wrong. `item` and `value` (the integer on the wire) were checked against the
+        control table. A servo that is reset gets it again, with what the robot file declares.
         """
         ...
 

@@ -11,6 +11,7 @@ from dxlrun.control_table import control_table
 from dxlrun.dynamixel.bus import Bus, run
 from dxlrun.dynamixel.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.identify import identify
+from dxlrun.dynamixel.inspection import setup_line
 from dxlrun.dynamixel.port import SerialPort, SerialPorts
 from dxlrun.dynamixel.registers import Difference, compare
 from dxlrun.dynamixel.serial_open import open_serial
@@ -103,7 +104,7 @@ def _look(plan: BusPlan) -> Program[Found]:
     for servo in plan.servos:
         differences = [Difference(register, None) for register in servo.registers]
         if servo.joint in answered:
-            differences = list((yield from compare(plan, servo)))
+            differences = list((yield from compare(plan, servo, servo.registers, setup_line(plan))))
         found.registers += [_row(plan, servo, one) for one in differences]
     return found
 

@@ -6,6 +6,7 @@ import pytest
 from dxlrun.control_table import control_table
 from dxlrun.dynamixel.bus import Bus, run
 from dxlrun.dynamixel.bus_plan import RegisterValue
+from dxlrun.dynamixel.inspection import setup_line
 from dxlrun.dynamixel.registers import compare, settle_registers
 from dxlrun.dynamixel.startup import rejoin
 from dxlrun.errors import StartUpError
@@ -87,7 +88,7 @@ def test_only_what_differs_is_written_and_it_is_read_back(bench, make_x):
 def test_comparing_writes_nothing(bench, make_x):
     plan = declared(make_x(), position_p_gain=900, position_d_gain=0)
     rig, execute = bench(plan)
-    found = execute(compare(plan, plan.servos[0]))
+    found = execute(compare(plan, plan.servos[0], plan.servos[0].registers, setup_line(plan)))
     assert [(one.register.name, one.found, one.differs) for one in found] == [
         ("position_p_gain", 800, True),
         ("position_d_gain", 0, False),

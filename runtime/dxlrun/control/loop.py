@@ -199,6 +199,14 @@ class Loop:
         self.beat()
         return refusal
 
+    def set_register(self, joint: str, item: str, value: int, done: Callable[[str], None]) -> str:
+        """Have a RAM item of a joint's servo written in the gaps between cycles; return why not."""
+        for row, one in enumerate(self.plan.joints):
+            if one.name == joint:
+                self.hardware.set_register(row, item, value, done)
+                return ""
+        return f"there is no joint {joint}"
+
     def finish(self) -> str:
         """End the run in order after this cycle."""
         self.stop.request()

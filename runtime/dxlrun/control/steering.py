@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import msgspec
@@ -33,6 +35,10 @@ class Steered(Protocol):
 
     def load(self, plan: ControllerPlan) -> str:
         """Configure one more controller; the guardian has patience for each of them."""
+        ...
+
+    def set_register(self, joint: str, item: str, value: int, done: Callable[[str], None]) -> str:
+        """Have a RAM item of a joint's servo written; `done` is called when it is, or with why it is not."""
         ...
 
     def finish(self) -> str:
@@ -69,13 +75,23 @@ class Unload(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     controller: str
 
 
-KINDS = ("switch", "rate", "pause", "resume", "load", "unload", "stop")
+class Register(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Data of `register`; what may be written was checked before it came here."""
+
+    joint: str
+    item: str
+    value: int
+    """The integer on the wire, signed where the item is."""
+
+
+KINDS = ("switch", "rate", "pause", "resume", "load", "unload", "register", "stop")
 """Commands for the loop itself; `load` carries a ControllerPlan, `pause`, `resume` and `stop` nothing."""
 
 
 @dataclass(slots=True)
 class Steering:
-    """Takes commands out of an inbox and answers each of them once."""
+    """Takes commands out of an inbox and answers each of them once: at once, but for registers, which take
+    some gaps between cycles."""
 
     inbox: Inbox
     loop: Steered
@@ -100,7 +116,8 @@ class Steering:
                 self.events.emit(EventCode.STEERED, Severity.INFO, "loop", f"{text} from {command.origin}")
             else:
                 count += 1
-            self.inbox.answer(command.number, refusal)
+            if refusal is not None:
+                self.inbox.answer(command.number, refusal)
         self._expire()
         return count
 
@@ -124,7 +141,7 @@ class Steering:
             )
         )
 
-    def _hand(self, command: Command, time_ns: int) -> str:
+    def _hand(self, command: Command, time_ns: int) -> str | None:
         if len(command.data) % 8:
             return f"{len(command.data)} bytes are no array of numbers"
         data = np.frombuffer(command.data, dtype="<f8")
@@ -137,14 +154,16 @@ class Steering:
             text = f"the stream of commands ended; {self.loop.expire(name)}"
             self.events.emit(EventCode.STALE_COMMAND, Severity.WARNING, name, text)
 
-    def _obey(self, command: Command, time_ns: int) -> str:
+    def _obey(self, command: Command, time_ns: int) -> str | None:
+        """Return why a command for the loop is refused, empty when it is done, None while it is not yet."""
         try:
             return self._do(command, time_ns)
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
             return f"its data does not fit: {error}"
 
-    def _do(self, command: Command, time_ns: int) -> str:
+    def _do(self, command: Command, time_ns: int) -> str | None:
         loop, manager, data = self.loop, self.manager, command.data
+        refusal: str | None
         match command.kind:
             case "switch":
                 switch = msgspec.json.decode(data, type=Switch)
@@ -163,6 +182,10 @@ class Steering:
                 refusal = loop.load(msgspec.json.decode(data, type=ControllerPlan))
             case "unload":
                 refusal = manager.unload(msgspec.json.decode(data, type=Unload).controller)
+            case "register":
+                wish = msgspec.json.decode(data, type=Register)
+                done = partial(self.inbox.answer, command.number)
+                refusal = loop.set_register(wish.joint, wish.item, wish.value, done) or None
             case _:
                 refusal = f"the loop knows {', '.join(KINDS)}"
         return refusal

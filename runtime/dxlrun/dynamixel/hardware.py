@@ -18,6 +18,7 @@ from dxlrun.dynamixel.limp import LimpOutcome, limp_buses
 from dxlrun.dynamixel.port import Ports
 from dxlrun.dynamixel.probing import extra_ns, probe_reads
 from dxlrun.dynamixel.registers import settle_bus
+from dxlrun.dynamixel.steered_registers import SteeredRegisters
 from dxlrun.dynamixel.torque_limit import reduced
 from dxlrun.dynamixel.units import joint_position
 from dxlrun.errors import PortError, StartUpError
@@ -72,6 +73,9 @@ class DynamixelHardware:
             for index, (plan, port) in enumerate(zip(self._plans, ports.ports, strict=True))
         )
         self._gaps = tuple(Gaps(plan, events, clock.now_ns) for plan in self._plans)
+        self._registers = tuple(
+            SteeredRegisters(plan, gaps, events) for plan, gaps in zip(self._plans, self._gaps, strict=True)
+        )
         self._servos = tuple(
             Servos(plan, bus, gaps, events)
             for plan, bus, gaps in zip(self._plans, self._buses, self._gaps, strict=True)
@@ -118,6 +122,13 @@ class DynamixelHardware:
 
     def set_modes(self, modes: NDArray[np.uint8]) -> None:
         """Leave every joint in position mode: whoever waits for another one waits in vain."""
+
+    def set_register(self, row: int, item: str, value: int, done: Callable[[str], None]) -> None:
+        """Write a RAM item of a joint's servo in the gaps, and read it back; see `steered_registers`."""
+        for plan, registers in zip(self._plans, self._registers, strict=True):
+            for index, servo in enumerate(plan.servos):
+                if servo.row == row:
+                    registers.write(index, item, value, done)
 
     def limit_torque(self, fraction: float) -> None:
         """Let no servo exert more than a fraction of its own limit; `restore_torque` takes that back."""

@@ -63,11 +63,11 @@ def called(item: ControlItem) -> str:
 class Inspector:
     """Looks at the servos of one bus, one after the other, and collects what it finds."""
 
-    def __init__(self, plan: BusPlan, take_over: bool) -> None:
+    def __init__(self, plan: BusPlan, take_over: bool, line: Line | None = None) -> None:
         self.found = Survey()
         self.plan = plan
         self.take_over = take_over
-        self.line = setup_line(plan)
+        self.line = setup_line(plan) if line is None else line
 
     def registers(self, servo: ServoPlan) -> Program[bool]:
         """Read what must fit the plan; return False when the servo cannot be read."""

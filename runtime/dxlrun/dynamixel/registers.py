@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from dxlrun.control_table import ControlItem, control_table
 from dxlrun.dynamixel.bus_plan import BusPlan, RegisterValue, ServoPlan
 from dxlrun.dynamixel.inspection import ATTEMPTS, called, persist, setup_line, who
+from dxlrun.dynamixel.line import Line
 from dxlrun.dynamixel.transaction import Outcome, Program, Reply
 
 
@@ -39,10 +40,12 @@ class Difference:
         return self.found is not None and self.found != self.register.value
 
 
-def compare(plan: BusPlan, servo: ServoPlan) -> Program[tuple[Difference, ...]]:
-    """Read every declared register of one servo; writes nothing."""
-    line, found = setup_line(plan), []
-    for register in servo.registers:
+def compare(
+    plan: BusPlan, servo: ServoPlan, registers: Sequence[RegisterValue], line: Line
+) -> Program[tuple[Difference, ...]]:
+    """Read registers of one servo; writes nothing."""
+    found = []
+    for register in registers:
         reply = yield from persist(line.read(servo.servo_id, register.address, register.size))
         found.append(Difference(register, _integer(_item(plan, servo, register), reply)))
     return tuple(found)
@@ -53,10 +56,15 @@ def settle_registers(plan: BusPlan, servo: ServoPlan) -> Program[Settled]:
 
     Nothing is written when one cannot be read, and no EEPROM while the servo holds torque.
     """
+    return (yield from settle(plan, servo, servo.registers, setup_line(plan)))
+
+
+def settle(
+    plan: BusPlan, servo: ServoPlan, registers: Sequence[RegisterValue], line: Line
+) -> Program[Settled]:
+    """Do so with these registers. `line`: how long a reply may take; before the start the longest time."""
     settled = Settled()
-    if not servo.registers:
-        return settled
-    differences = yield from compare(plan, servo)
+    differences = yield from compare(plan, servo, registers, line)
     silent = [one.register for one in differences if one.found is None]
     if silent:
         settled.problems.append(
@@ -65,17 +73,24 @@ def settle_registers(plan: BusPlan, servo: ServoPlan) -> Program[Settled]:
         return settled
     differing = [one for one in differences if one.differs]
     stored = [one.register for one in differing if one.register.eeprom]
-    if stored and (problem := (yield from _torqued(plan, servo, stored))):
+    if stored and (problem := (yield from _torqued(plan, servo, stored, line))):
         settled.problems.append(f"{who(plan, servo)} {problem}")
         return settled
     for one in differing:
-        problem = yield from write_register(plan, servo, one.register)
+        problem = yield from write_register(plan, servo, one.register, line)
         text = called(_item(plan, servo, one.register))
         if problem:
             settled.problems.append(f"{who(plan, servo)} {problem}")
         else:
             settled.written.append((servo.joint, f"{text} was {one.found} and is {one.register.value}"))
     return settled
+
+
+def merged(registers: Sequence[RegisterValue], newer: RegisterValue) -> tuple[RegisterValue, ...]:
+    """Return registers with one of them changed, or one more behind the others."""
+    found = {one.name: one for one in registers}
+    found[newer.name] = newer
+    return tuple(found.values())
 
 
 def settle_bus(plan: BusPlan) -> Program[Settled]:
@@ -88,13 +103,13 @@ def settle_bus(plan: BusPlan) -> Program[Settled]:
     return together
 
 
-def write_register(plan: BusPlan, servo: ServoPlan, register: RegisterValue) -> Program[str]:
+def write_register(plan: BusPlan, servo: ServoPlan, register: RegisterValue, line: Line) -> Program[str]:
     """Write one register and read it back; return what went wrong, or nothing.
 
     The read-back decides, and whether to try again: an acknowledgement may be lost, or switched off by Status
     Return Level, and EEPROM wears.
     """
-    line, item = setup_line(plan), _item(plan, servo, register)
+    item = _item(plan, servo, register)
     problem = ""
     for _ in range(ATTEMPTS):
         written = yield line.write(servo.servo_id, register.address, register.data)
@@ -110,8 +125,8 @@ def write_register(plan: BusPlan, servo: ServoPlan, register: RegisterValue) -> 
     return problem
 
 
-def _torqued(plan: BusPlan, servo: ServoPlan, stored: Sequence[RegisterValue]) -> Program[str]:
-    reply = yield from persist(setup_line(plan).read(servo.servo_id, servo.torque_address, 1))
+def _torqued(plan: BusPlan, servo: ServoPlan, stored: Sequence[RegisterValue], line: Line) -> Program[str]:
+    reply = yield from persist(line.read(servo.servo_id, servo.torque_address, 1))
     names = _names(plan, servo, stored)
     if not reply.answered:
         return f"did not answer when its torque was asked for, so {names} was not written"

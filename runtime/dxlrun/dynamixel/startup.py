@@ -1,26 +1,28 @@
 """Start-up on one bus, as failures.md has it: look at everything first, then torque on in groups.
 
-Programs of transactions; nothing here waits, nothing writes a register that survives power-off.
+Programs of transactions; nothing here waits. What the robot file declares is written by `registers`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
 from dxlrun.control_table import control_table
-from dxlrun.dynamixel.bus_plan import BusPlan, ServoPlan
+from dxlrun.dynamixel import modes
+from dxlrun.dynamixel.bus_plan import BusPlan, RegisterValue, ServoPlan
 from dxlrun.dynamixel.inspection import Inspector, Survey, persist, setup_line, who
 from dxlrun.dynamixel.inspection1 import Inspector1
 from dxlrun.dynamixel.inspection2 import Inspector2
 from dxlrun.dynamixel.line import Line, listen
-from dxlrun.dynamixel.plan import readable
+from dxlrun.dynamixel.plan import plan_line, readable
 from dxlrun.dynamixel.reads import state_read
-from dxlrun.dynamixel.registers import settle_registers
+from dxlrun.dynamixel.registers import settle
 from dxlrun.dynamixel.transaction import Outcome, Program, Reply
 from dxlrun.dynamixel.units import goal_bytes, joint_position, speed_ticks, ticks_in
+from dxlrun.mode import Mode
 
 PINGS = 3
 """Two servos of one ID collide in most of three answers."""
@@ -193,35 +195,45 @@ class Rejoined:
     torqued: bool
     """True when torque enable was read back as 1, and its goal as `goal`."""
     goal: int | None
-    """Goal position in ticks as it was written; None: none was, because it is limp."""
+    """Goal position in ticks as it was written; None: it is limp, or in a mode without one."""
     written: tuple[tuple[str, str], ...]
     """Joint, and what was written into its registers."""
 
 
-def rejoin(plan: BusPlan, servo_index: int, torque: bool) -> Program[Rejoined]:
+def rejoin(
+    plan: BusPlan,
+    servo_index: int,
+    torque: bool,
+    mode: Mode | None = None,
+    registers: Sequence[RegisterValue] | None = None,
+) -> Program[Rejoined]:
     """Take one servo back that was lost or was reset, as at the start: look, mend registers, then hold it.
 
     `torque`: switch it on; without, who is limp stays limp and gets no goal, as a goal may switch torque on
-    (protocol.md), and who holds torque still gets its present position for a goal.
+    (protocol.md), and who holds torque still is held where it stands. `mode`: in which it shall be, None: its
+    first one. `registers`: what it shall hold, None: what the robot file declares; see `SteeredRegisters`.
     """
     servo = plan.servos[servo_index]
-    inspector = _INSPECTORS[plan.protocol](plan, True)
+    line, mode = plan_line(plan), servo.start_mode if mode is None else mode
+    inspector = _INSPECTORS[plan.protocol](plan, True, line)
     found = inspector.found
     if (yield from inspector.registers(servo)):
         yield from _Surveyor(plan, inspector).states([servo])
     if found.problems:
         return Rejoined(tuple(found.problems), False, None, ())
-    settled = yield from settle_registers(plan, servo)
+    settled = yield from settle(plan, servo, servo.registers if registers is None else registers, line)
     written = tuple(settled.written)
+    if not settled.problems and (problem := (yield from modes.enter(plan, servo, mode))):
+        settled.problems.append(f"{who(plan, servo)} {problem}")
     enabled = yield from persist(plan.torque_reads[servo_index])
     if not enabled.answered:
         settled.problems.append(f"{who(plan, servo)} did not answer when its torque was asked for")
     if settled.problems or not (torque or enabled.parameters[0]):
         return Rejoined(tuple(settled.problems), False, None, written)
-    held = Engagement()
-    if problem := (yield from _engage_one(plan, servo, held)):
-        return Rejoined((f"{who(plan, servo)} {problem}",), False, None, written)
-    return Rejoined((), True, held.goals[0], written)
+    held = yield from modes.hold(plan, servo, servo.mode_plan(mode))
+    if held.problem:
+        return Rejoined((f"{who(plan, servo)} {held.problem}",), False, None, written)
+    return Rejoined((), True, held.goal, written)
 
 
 def confirm(plan: BusPlan) -> Program[list[str]]:

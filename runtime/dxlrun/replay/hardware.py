@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import fields
 
 import numpy as np
@@ -101,6 +102,9 @@ class RecordedHardware:
 
     def set_modes(self, modes: NDArray[np.uint8]) -> None:
         """Switch nothing: when the servos were in which mode is in their states."""
+
+    def set_register(self, row: int, item: str, value: int, done: Callable[[str], None]) -> None:
+        """Write nothing, and say nothing of it: what came of it is in the states."""
 
     def limit_torque(self, fraction: float) -> None:
         """Limit nothing: what the servos did then is in their states."""

@@ -1,0 +1,105 @@
+import math
+
+import pytest
+
+from dxlrun.events import EventCode
+
+WRITE = 3
+
+
+@pytest.fixture
+def make_x(make_plan):
+    def make(ids=(11, 12)):
+        return make_plan(
+            ids,
+            name="arm",
+            protocol=2.0,
+            model="XM430-W350",
+            reference=math.pi,
+            lower=-2.5,
+            upper=2.5,
+            return_delay_ns=0,
+        )
+
+    return make
+
+
+@pytest.fixture
+def started(make_rig, make_x):
+    rig = make_rig(make_x())
+    rig.hardware.start()
+    return rig
+
+
+def gain_of(rig, index):
+    registers = rig.buses[0].servos[index].registers
+    return registers.table.items["position_p_gain"].decode(registers.read(84, 2))
+
+
+def writes(rig, since=0):
+    """Return what single servos were told to write: ID, address and data."""
+    sent = [packet for packet in rig.into_bus()[since:] if packet[7] == WRITE]
+    return [(packet[4], int.from_bytes(packet[8:10], "little"), packet[10:-2]) for packet in sent]
+
+
+def test_a_gain_is_changed_between_cycles_read_back_and_told(started):
+    answers, before = [], len(started.into_bus())
+    started.hardware.set_register(1, "position_p_gain", 900, answers.append)
+    assert answers == []
+    for _ in range(3):
+        started.cycle()
+    assert answers == [""]
+    assert (gain_of(started, 0), gain_of(started, 1)) == (800, 900)
+    assert started.events.of(EventCode.REGISTER_WRITTEN) == [
+        ("arm_12_joint", "Position P Gain (84) was 800 and is 900")
+    ]
+    assert writes(started, before) == [(12, 84, b"\x84\x03")]
+    assert started.states.valid.all()
+    assert started.torque() == [True, True]
+
+
+def test_what_a_servo_has_already_is_not_written(started):
+    answers, before = [], len(started.into_bus())
+    started.hardware.set_register(0, "position_p_gain", 800, answers.append)
+    started.cycle()
+    assert answers == [""]
+    assert writes(started, before) == []
+
+
+def test_a_servo_that_refuses_is_told_and_keeps_what_it_had(started):
+    answers = []
+    started.hardware.set_register(0, "velocity_p_gain", 20_000, answers.append)
+    for _ in range(3):
+        started.cycle()
+    (answer,) = answers
+    assert answer.startswith("arm_11_joint (ID 11 on bus arm) refuses Velocity P Gain (78) = 20000: ")
+    assert started.events.of(EventCode.REGISTER_DIFFERS) == [("arm_11_joint", answer)]
+
+
+def test_a_servo_that_is_silent_is_told(started):
+    answers = []
+    started.buses[0].servo(11).silence()
+    started.hardware.set_register(0, "position_p_gain", 900, answers.append)
+    for _ in range(5):
+        started.cycle()
+    assert answers == ["arm_11_joint (ID 11 on bus arm) did not answer when Position P Gain (84) was read"]
+
+
+@pytest.mark.parametrize("item", ["temperature_limit", "present_position", "nonsense"])
+def test_nothing_else_than_ram_is_written_whatever_comes_out_of_the_mailbox(started, item):
+    answers = []
+    started.hardware.set_register(0, item, 60, answers.append)
+    assert answers == [f"arm_11_joint has no register {item} that could be written now"]
+
+
+def test_many_wishes_are_done_in_their_order_and_no_cycle_is_late(started):
+    answers = []
+    for value in (500, 600, 700):
+        for row in (0, 1):
+            started.hardware.set_register(
+                row, "position_p_gain", value, lambda why, at=(row, value): answers.append((*at, why))
+            )
+    for _ in range(6):
+        started.cycle()  # asserts that it ends in its period
+    assert answers == [(row, value, "") for value in (500, 600, 700) for row in (0, 1)]
+    assert (gain_of(started, 0), gain_of(started, 1)) == (700, 700)
