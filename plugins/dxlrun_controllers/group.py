@@ -37,6 +37,15 @@ class PosVelCommand(CommandModel):
     """rad/s, shape (joints,); the magnitude counts"""
 
 
+class PosEffortCommand(CommandModel):
+    """One goal and the highest effort on the way there and at it, a joint."""
+
+    positions: tuple[float, ...]
+    """rad, shape (joints,)"""
+    efforts: tuple[float, ...]
+    """Nm, A or the fraction of maximum, as the model measures it; shape (joints,); the magnitude counts"""
+
+
 def check_size(what: str, found: int, joints: tuple[str, ...]) -> None:
     """Raise ValueError when a command does not have one value a joint."""
     if found != len(joints):
@@ -112,6 +121,44 @@ class JointGroupPosVelController(Controller[GroupParameters]):
         joints = len(commands.position)
         np.copyto(commands.position, data[:joints])
         np.copyto(commands.velocity, data[joints:])
+
+    def update(self, time_ns: int, period_ns: int) -> None:
+        """Keep the last command: the manager takes it as it stands."""
+
+
+class JointGroupPosEffortController(Controller[GroupParameters]):
+    """Forwards positions, and how much effort the servos may take to be there: a gripper holds gently.
+
+    Until the first command a servo may take as much as its own limit lets it.
+    """
+
+    Parameters = GroupParameters
+    Commands: ClassVar[Mapping[str, type[CommandModel]]] = {"poseffort": PosEffortCommand}
+
+    @classmethod
+    def interfaces(cls, parameters: GroupParameters, joints: tuple[str, ...]) -> Interfaces:
+        """Claim position and effort of the parameters' joints."""
+        return Interfaces(parameters.joints, ("position", "effort"))
+
+    @classmethod
+    def prepare(cls, kind: str, command: CommandModel, parameters: GroupParameters) -> NDArray[np.float64]:
+        """Return positions, then efforts, shape (2 * joints,). Raises ValueError for a wrong size."""
+        if not isinstance(command, PosEffortCommand):
+            return super().prepare(kind, command, parameters)
+        check_size("positions", len(command.positions), parameters.joints)
+        check_size("efforts", len(command.efforts), parameters.joints)
+        return np.array((*command.positions, *command.efforts), dtype=np.float64)
+
+    def on_activate(self, time_ns: int) -> None:
+        """Hold where the joints are."""
+        hold(self.context)
+
+    def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
+        """Take new positions and efforts."""
+        commands = self.context.commands
+        joints = len(commands.position)
+        np.copyto(commands.position, data[:joints])
+        np.copyto(commands.effort, data[joints:])
 
     def update(self, time_ns: int, period_ns: int) -> None:
         """Keep the last command: the manager takes it as it stands."""

@@ -6,7 +6,16 @@ from collections.abc import Mapping
 from typing import Any
 
 from dxlrun import CONTRACT_VERSION, Controller, hookimpl
-from dxlrun_controllers.group import JointGroupPositionController, JointGroupPosVelController
+from dxlrun_controllers.drive import (
+    JointGroupEffortController,
+    JointGroupPwmController,
+    JointGroupVelocityController,
+)
+from dxlrun_controllers.group import (
+    JointGroupPosEffortController,
+    JointGroupPositionController,
+    JointGroupPosVelController,
+)
 from dxlrun_controllers.joint_state_broadcaster import JointStateBroadcaster
 from dxlrun_controllers.joint_trajectory_controller import JointTrajectoryController
 
@@ -21,8 +30,12 @@ def dxlrun_contract() -> int:
 def dxlrun_controllers() -> Mapping[str, type[Controller[Any]]]:
     """Return the standard controllers by their type in the robot file."""
     return {
+        "joint_group_effort_controller": JointGroupEffortController,
+        "joint_group_poseffort_controller": JointGroupPosEffortController,
         "joint_group_position_controller": JointGroupPositionController,
         "joint_group_posvel_controller": JointGroupPosVelController,
+        "joint_group_pwm_controller": JointGroupPwmController,
+        "joint_group_velocity_controller": JointGroupVelocityController,
         "joint_state_broadcaster": JointStateBroadcaster,
         "joint_trajectory_controller": JointTrajectoryController,
     }

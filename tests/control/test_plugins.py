@@ -46,8 +46,12 @@ def install(tmp_path, monkeypatch):
 
 
 STANDARD = {
+    "joint_group_effort_controller",
+    "joint_group_poseffort_controller",
     "joint_group_position_controller",
     "joint_group_posvel_controller",
+    "joint_group_pwm_controller",
+    "joint_group_velocity_controller",
     "joint_state_broadcaster",
     "joint_trajectory_controller",
 }

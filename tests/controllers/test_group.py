@@ -4,7 +4,16 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from dxlrun_controllers.group import JointGroupPositionController, JointGroupPosVelController
+from dxlrun_controllers.drive import (
+    JointGroupEffortController,
+    JointGroupPwmController,
+    JointGroupVelocityController,
+)
+from dxlrun_controllers.group import (
+    JointGroupPosEffortController,
+    JointGroupPositionController,
+    JointGroupPosVelController,
+)
 from dxlrun_controllers.joint_state_broadcaster import JointStateBroadcaster
 
 TWO = {"joints": ["a", "b"]}
@@ -20,7 +29,43 @@ def test_what_they_claim():
     assert (looks.joints, looks.command) == (("a", "b", "c"), ())
 
 
-@pytest.mark.parametrize("group", [JointGroupPositionController, JointGroupPosVelController])
+DRIVES = [
+    (JointGroupVelocityController, "velocity", "velocities", "velocities"),
+    (JointGroupEffortController, "effort", "efforts", "efforts"),
+    (JointGroupPwmController, "pwm", "pwm", "pwm"),
+]
+
+
+@pytest.mark.parametrize(("group", "claimed", "kind", "field"), DRIVES)
+def test_drives_are_zero_until_a_command_comes_and_forward_it(stage, group, claimed, kind, field):
+    robot = stage(group, TWO)
+    assert group.interfaces(robot.model, ("a", "b", "c")).command == (claimed,)
+    robot.controller.on_activate(0)
+    commands = robot.context.commands
+    assert getattr(commands, claimed).tolist() == [0.0, 0.0]
+    robot.send(0.0, kind, **{field: [0.5, -0.25]})
+    for time in (0.0, 0.02):
+        robot.update(time, follow=False)
+        assert getattr(commands, claimed).tolist() == [0.5, -0.25]
+    assert np.isnan(commands.position).all()
+    with pytest.raises(ValueError, match=rf"1 {field} for 2 joints \(a, b\)"):
+        robot.prepare(kind, **{field: [1.0]})
+
+
+def test_positions_and_efforts_are_forwarded_together(stage):
+    robot = stage(JointGroupPosEffortController, TWO)
+    assert JointGroupPosEffortController.interfaces(robot.model, ()).command == ("position", "effort")
+    robot.controller.on_activate(0)
+    np.testing.assert_array_equal(robot.update(0.0), [0.3, -0.2])
+    assert np.isnan(robot.context.commands.effort).all()
+    robot.send(0.0, "poseffort", positions=[0.5, 0.6], efforts=[0.1, 0.2])
+    np.testing.assert_array_equal(robot.update(0.0), [0.5, 0.6])
+    np.testing.assert_array_equal(robot.context.commands.effort, [0.1, 0.2])
+
+
+@pytest.mark.parametrize(
+    "group", [JointGroupPositionController, JointGroupPosVelController, JointGroupPosEffortController]
+)
 def test_they_start_by_holding_the_present_goal_and_never_drive_to_zero(stage, group):
     robot = stage(group, TWO)
     robot.context.states.position[:] = 0.31, -0.19
