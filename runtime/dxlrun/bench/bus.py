@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -61,7 +61,6 @@ def bench_bus(
 ) -> BusBench:
     """Measure each case, against canned replies or simulated servos with a wire."""
     missing = tuple(kind.name for kind in wish.hosts if kind.missing)
-    here = Wish([kind for kind in wish.hosts if not kind.missing], wish.seconds, wish.values)
     ours, theirs = cores()
     found: list[CaseFigures] = []
     with on_core(ours):
@@ -71,8 +70,10 @@ def bench_bus(
             def told(share: float, words: str = words, number: int = number) -> None:
                 progress(words, (number + share) / len(cases))
 
-            measured = _canned if against == "canned" else _simulated
-            found.append(measured(case, here, theirs, told))
+            able = [kind for kind in wish.hosts if not kind.missing and case.protocol in kind.protocols]
+            if able:
+                measured = _canned if against == "canned" else _simulated
+                found.append(measured(case, replace(wish, hosts=able), theirs, told))
     return BusBench((ours, theirs), tuple(found), missing)
 
 

@@ -7,6 +7,7 @@ import time
 import tty
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib.util import find_spec
 from typing import Protocol
 
@@ -65,6 +66,8 @@ class HostKind:
     """What must be installed for it."""
     make: Callable[[str, Case, Plan, bool], Host]
     """Takes the device, the case, its plan, and whether the peers shall turn bytes into values."""
+
+    protocols: tuple[float, ...] = (1.0, 2.0)
 
     @property
     def missing(self) -> bool:
@@ -166,18 +169,20 @@ class Ours:
             os.close(self._ring)
 
 
+def _sdk(path: str, case: Case, plan: Plan, values: bool, *, fast: bool = False) -> Host:
+    return Sdk(path, case, Registers.of(plan), values=values, fast=fast)
+
+
+def _rustypot(path: str, case: Case, plan: Plan, values: bool, *, fast: bool = False) -> Host:
+    return Rustypot(path, case, Registers.of(plan), values=values, fast=fast)
+
+
 HOSTS: Sequence[HostKind] = (
     HostKind("ours", "dxlrun", lambda path, case, plan, _: Ours(path, plan, recorded=True)),
     HostKind("unrecorded", "dxlrun", lambda path, case, plan, _: Ours(path, plan, recorded=False)),
-    HostKind(
-        "sdk",
-        "dynamixel_sdk",
-        lambda path, case, plan, values: Sdk(path, case, Registers.of(plan), values=values),
-    ),
-    HostKind(
-        "rustypot",
-        "rustypot",
-        lambda path, case, plan, values: Rustypot(path, case, Registers.of(plan), values=values),
-    ),
+    HostKind("sdk", "dynamixel_sdk", _sdk),
+    HostKind("sdk-fast", "dynamixel_sdk", partial(_sdk, fast=True), (2.0,)),
+    HostKind("rustypot", "rustypot", _rustypot),
+    HostKind("rustypot-fast", "rustypot", partial(_rustypot, fast=True), (2.0,)),
 )
 """Who can be measured."""

@@ -2,6 +2,7 @@
 
 They use the same registers as we do, by the quickest calls they have for that [i]: groups of the SDK,
 raw addresses of rustypot. Protocol 1.0 has no sync read and an AX no bulk read, so there they ask one by one.
+In Protocol 2.0 both can ask by sync read, and by fast sync read when they are told to.
 Each ends with what a program works with, integers of position, velocity and effort, and begins with integers
 of goals; ours has SI units at both ends. With `values=False` they leave the bytes as they are.
 """
@@ -19,7 +20,7 @@ PATIENCE_S = 1.0
 class Sdk:
     """The groups of dynamixel-sdk."""
 
-    def __init__(self, path: str, case: Case, registers: Registers, *, values: bool) -> None:
+    def __init__(self, path: str, case: Case, registers: Registers, *, values: bool, fast: bool) -> None:
         import dynamixel_sdk as sdk
 
         self._good = sdk.COMM_SUCCESS
@@ -40,6 +41,7 @@ class Sdk:
         self._turn = 0
         self._prepared = [self._goal(tick) for tick in registers.ticks]
         self._ask = self._one_by_one if case.protocol == 1.0 else self._together
+        self._exchange = self._read.fastSyncRead if fast else self._read.txRxPacket
         self.positions: list[int] = []
 
     def start(self) -> None:
@@ -75,7 +77,7 @@ class Sdk:
         return goal
 
     def _together(self) -> bool:
-        good = bool(self._read.txRxPacket() == self._good)
+        good = bool(self._exchange() == self._good)
         if good and self._values:
             get, start = self._read.getData, self._registers.read_address
             self.positions = [
@@ -107,11 +109,15 @@ class Sdk:
 class Rustypot:
     """rustypot's raw-address calls."""
 
-    def __init__(self, path: str, case: Case, registers: Registers, *, values: bool) -> None:
+    def __init__(self, path: str, case: Case, registers: Registers, *, values: bool, fast: bool) -> None:
         import rustypot
 
-        make = rustypot.AxPyController if case.protocol == 1.0 else rustypot.Xl430PyController
-        self._bus = make(path, case.baud_rate, PATIENCE_S)
+        self._bus: rustypot.AxPyController | rustypot.Xl430PyController
+        if case.protocol == 1.0:
+            self._bus = rustypot.AxPyController(path, case.baud_rate, PATIENCE_S)
+        else:
+            self._bus = rustypot.Xl430PyController(path, case.baud_rate, PATIENCE_S)
+            self._bus.set_fast_sync_read(fast)
         self._ids, self._registers, self._values = list(case.ids), registers, values
         self._turn = 0
         self._prepared = [self._goals(tick) for tick in registers.ticks]

@@ -25,7 +25,7 @@ def bench_bus(
     *,
     servos: List = "1,8,20",
     protocol: List = "1.0,2.0",
-    peers: List = "ours,unrecorded,sdk,rustypot",
+    peers: List = "ours,unrecorded,sdk,sdk-fast,rustypot,rustypot-fast",
     against: List = "canned",
     baud: int = 1_000_000,
     seconds: float = 4.0,
@@ -45,7 +45,8 @@ def bench_bus(
         Protocols, 1.0 (AX-12A) and 2.0 (XM430-W350).
     peers
         Who is measured: ours (dxlrun, every packet kept for a log), unrecorded (the same without a log), sdk,
-        rustypot. Who is not installed is left out.
+        rustypot; sdk-fast and rustypot-fast use fast sync read (Protocol 2.0). Who is not installed is left
+        out.
     against
         Who answers: canned (another process that answers at once, without a wire and without thinking), or
         simulated (servos on a bus with wire times, whose own lateness is taken out by their ledger).
@@ -63,6 +64,7 @@ def bench_bus(
     from dxlrun.bench import bus
     from dxlrun.bench.case import Case
     from dxlrun.bench.hosts import HOSTS
+    from dxlrun.cli.bench_table import progress_bar
 
     names = _words("--peers", peers, [kind.name for kind in HOSTS])
     protocols = [float(word) for word in _words("--protocol", protocol, ["1.0", "2.0"])]
@@ -75,7 +77,8 @@ def bench_bus(
         cases += [("canned", case) for case in lines]
     if "simulated" in opponents:
         cases += [("simulated", case) for case in lines]
-    result = bus.bench_bus(cases, bus.Wish(bus.chosen_hosts(names), seconds, not raw))
+    with progress_bar(hidden=as_json) as progress:
+        result = bus.bench_bus(cases, bus.Wish(bus.chosen_hosts(names), seconds, not raw), progress)
     for name in result.missing:
         say_warning(f"{name} is not installed and was left out; `pip install 'dxlrun[bench]'` installs it")
     if as_json:

@@ -1,15 +1,46 @@
-"""The tables of `dxlrun bench`."""
+"""The tables of `dxlrun bench`, and how far it has come."""
 
 from __future__ import annotations
 
 import math
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 from rich.table import Table
 
 from dxlrun.bench.bus import BusBench
 from dxlrun.bench.figures import HostFigures
 from dxlrun.bench.rate import RateBench
 from dxlrun.plurals import counted
+
+_REFRESH_S = 0.25
+
+
+@contextmanager
+def progress_bar(*, hidden: bool) -> Iterator[Callable[[str, float], None]]:
+    """Give what shows words and a share that is done, where a person looks.
+
+    Nothing runs beside the measurement: the bar is drawn between two rounds.
+    """
+    if hidden or not sys.stderr.isatty():
+        yield lambda *_: None
+        return
+    columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn()
+    with Progress(*columns, console=Console(stderr=True), auto_refresh=False, transient=True) as progress:
+        task = progress.add_task("", total=1.0)
+        drawn = 0.0
+
+        def show(words: str, share: float) -> None:
+            nonlocal drawn
+            if time.monotonic() - drawn > _REFRESH_S:
+                drawn = time.monotonic()
+                progress.update(task, description=words, completed=share, refresh=True)
+
+        yield show
 
 
 def bus_table(result: BusBench) -> Table:
