@@ -175,8 +175,6 @@ def test_an_overload_cuts_the_torque_and_the_servo_gets_no_more_goals(started):
         ("model_number", 1030, "is model number 1030, not a XM430-W350"),
         ("status_return_level", 1, "Status Return Level (68) = 1"),
         ("status_return_level", 0, "Status Return Level (68) is 0"),
-        ("operating_mode", 1, "Operating Mode (11) = 1, which is not position control: write 3"),
-        ("operating_mode", 4, "Operating Mode (11) = 4"),
         ("drive_mode", 1, "Drive Mode (10) = 1, so it turns the other way round: write 0"),
         ("drive_mode", 4, "takes profiles for times"),
         ("homing_offset", -100, "Homing Offset (20) = -100, which shifts every position: write 0"),

@@ -46,12 +46,18 @@ def test_a_register_that_does_not_fit(make_rig, register, value, said):
     assert said in problem
 
 
-def test_wheel_mode_is_refused(make_rig):
+def test_a_servo_in_wheel_mode_is_brought_back_to_joint_mode_before_it_gets_torque(make_rig):
     rig = make_rig()
-    rig.buses[0].servo(6).poke("cw_angle_limit", 0)
-    rig.buses[0].servo(6).poke("ccw_angle_limit", 0)
-    (problem,) = refusal(rig)
-    assert "wheel mode" in problem
+    for limit in ("cw_angle_limit", "ccw_angle_limit"):
+        rig.buses[0].servo(6).poke(limit, 0)
+    rig.hardware.start()
+    servo, plan = rig.buses[0].servo(6), rig.plans[0].servos[3]
+    found = (servo.registers["cw_angle_limit"], servo.registers["ccw_angle_limit"])
+    assert found == (plan.lower_tick, plan.upper_tick)
+    ((source, text),) = rig.events.of(EventCode.MODE)
+    assert (source, "CW Angle Limit (6) was 0" in text) == ("main_6_joint", True)
+    writes = [packet for packet in rig.into_bus() if packet[2] == 6 and packet[4] == 3]
+    assert [packet[5] for packet in writes] == [8, 30, 24]  # the lower limit is 0 already
 
 
 def test_one_servo_may_have_several_problems(make_rig):

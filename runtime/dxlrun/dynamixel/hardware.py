@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 from dxlrun.clock import Clock
 from dxlrun.dynamixel import startup, torque_limit
 from dxlrun.dynamixel.bus import Bus, pump, run
-from dxlrun.dynamixel.bus_plan import BusPlan
+from dxlrun.dynamixel.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.gaps import Gaps
 from dxlrun.dynamixel.health import Servos
 from dxlrun.dynamixel.limp import LimpOutcome, limp_buses
+from dxlrun.dynamixel.mode_changes import ModeChanges
+from dxlrun.dynamixel.modes import settle_modes
 from dxlrun.dynamixel.port import Ports
 from dxlrun.dynamixel.probing import extra_ns, probe_reads
 from dxlrun.dynamixel.registers import settle_bus
@@ -80,6 +82,10 @@ class DynamixelHardware:
             Servos(plan, bus, gaps, events)
             for plan, bus, gaps in zip(self._plans, self._buses, self._gaps, strict=True)
         )
+        self._modes = tuple(
+            ModeChanges(plan, gaps, servos.goals, states.mode, events)
+            for plan, gaps, servos in zip(self._plans, self._gaps, self._servos, strict=True)
+        )
 
     def start(self) -> None:
         """Look at every servo, hold each where it stands, fill the first states and goals.
@@ -89,6 +95,7 @@ class DynamixelHardware:
         """
         self._survey()
         self._settle_registers()
+        self._settle_modes()
         self._probe_reads()
         try:
             self._engage()
@@ -121,7 +128,9 @@ class DynamixelHardware:
         self._tell_failures()
 
     def set_modes(self, modes: NDArray[np.uint8]) -> None:
-        """Leave every joint in position mode: whoever waits for another one waits in vain."""
+        """Bring joints into modes in the gaps between cycles; UNKNOWN leaves one as it is."""
+        for changes in self._modes:
+            changes.want(modes)
 
     def set_register(self, row: int, item: str, value: int, done: Callable[[str], None]) -> None:
         """Write a RAM item of a joint's servo in the gaps, and read it back; see `steered_registers`."""
@@ -208,6 +217,20 @@ class DynamixelHardware:
         if problems := [problem for one in settled for problem in one.problems]:
             raise StartUpError("\n".join(problems))
 
+    def _settle_modes(self) -> None:
+        """Bring every servo into its first mode, before anybody gets torque, and learn its own limits."""
+        programs = [settle_modes(plan) for plan in self._plans]
+        found = run(programs, self._buses, self._ports, self._clock, self._beat)
+        self._raise_failures()
+        settled = [one for one in found if one is not None]
+        for joint, text in (switched for one in settled for switched in one.switched):
+            self._events.emit(EventCode.MODE, Severity.WARNING, joint, text)
+        if problems := [problem for one in settled for problem in one.problems]:
+            raise StartUpError("\n".join(problems))
+        for servos, one in zip(self._servos, settled, strict=True):
+            for index, limits in enumerate(one.limits):
+                servos.goals.set_limits(index, limits)
+
     def _probe_reads(self) -> None:
         """Find out when replies are due, and read plainly whoever does not answer the fast forms."""
         programs = [probe_reads(plan) for plan in self._plans]
@@ -251,9 +274,17 @@ class DynamixelHardware:
         for plan, one in zip(self._plans, engaged, strict=True):
             assert one is not None  # noqa: S101  no line has failed
             for servo, raw in zip(plan.servos, one.goals, strict=True):
-                self._goals.position[servo.row] = joint_position(servo, raw)
+                self._first_goals(servo, raw)
             names = ", ".join(servo.joint for servo in plan.servos)
             self._events.emit(EventCode.TORQUE_ON, Severity.INFO, plan.name, f"torque is on: {names}")
+
+    def _first_goals(self, servo: ServoPlan, raw: int | None) -> None:
+        """Let the goals be what the servo was given: where it stands, without a speed, or 0."""
+        row, mode = servo.row, servo.start_mode
+        self._goals.position[row] = float("nan") if raw is None else joint_position(servo, raw)
+        self._goals.velocity[row] = 0.0 if mode is Mode.VELOCITY else float("nan")
+        self._goals.effort[row] = 0.0 if mode is Mode.EFFORT else float("nan")
+        self._goals.pwm[row] = 0.0 if mode is Mode.PWM else float("nan")
 
     def _first_states(self) -> None:
         for _ in range(FIRST_READS):
@@ -269,9 +300,9 @@ class DynamixelHardware:
         self._torque_lasts()
         for servos in self._servos:
             servos.torqued[:] = True
-        self._states.mode[:] = Mode.POSITION  # the survey let no servo pass that is in another one
-        # goal = present: none of the goals has a speed yet
-        self._goals.velocity[:] = float("nan")
+        for plan, changes in zip(self._plans, self._modes, strict=True):
+            for index, servo in enumerate(plan.servos):
+                changes.entered(index, servo.start_mode)
 
     def _torque_lasts(self) -> None:
         """Read torque enable of everybody again: who was reset by the inrush of others may get no goal."""

@@ -6,14 +6,17 @@ Programs of transactions; nothing here waits, nothing writes a register.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from dxlrun.control_table import ControlItem, ControlTable, control_table
 from dxlrun.dynamixel.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.dialect import dialect_of
 from dxlrun.dynamixel.line import LONGEST_RETURN_DELAY_NS, Line
+from dxlrun.dynamixel.mode_plan import mode_in
 from dxlrun.dynamixel.transaction import Outcome, Program, Reply, Transaction
 from dxlrun.dynamixel.units import joint_position
+from dxlrun.mode import Mode
 
 ATTEMPTS = 3
 RETURN_ALL = 2
@@ -30,6 +33,8 @@ class Survey:
     """Joint, and what its registers have that the robot file assumes otherwise."""
     servos: list[tuple[str, str]] = field(default_factory=list)
     """Joint, and what answered."""
+    modes: dict[int, Mode] = field(default_factory=dict)
+    """ID, and the mode in which the servo is; it is brought into its first one before it gets torque."""
 
 
 def setup_line(plan: BusPlan) -> Line:
@@ -159,6 +164,10 @@ class Inspector:
                 "holds torque already, so another program may be moving it: stop that one and switch the "
                 "torque off, or take the robot over as it is with --take-over",
             )
+
+    def mode(self, servo: ServoPlan, found: Mapping[str, int]) -> None:
+        """Note the mode that registers, by name, select."""
+        self.found.modes[servo.servo_id] = mode_in(servo, found)
 
     def neutral(self, servo: ServoPlan, item: ControlItem, raw: int, wanted: int, why: str) -> None:
         """Refuse a register that has not the one value that the plan counts on."""

@@ -20,7 +20,6 @@ _NEUTRAL = (
     ("multi_turn_offset", 0, "which shifts every position"),
     ("resolution_divider", 1, "which changes what a tick is"),
     ("drive_mode", 0, "so it turns the other way round or follows another servo"),
-    ("torque_ctrl_mode_enable", 0, "so it follows a torque and no goal position"),
 )
 """Registers that only some models (MX, EX) have."""
 
@@ -64,13 +63,10 @@ class Inspector1(Inspector):
 
     def _angle_limits(self, servo: ServoPlan, block: Reply) -> None:
         clockwise, counter = block.word(2, 1), block.word(2, 3)
-        if clockwise == counter == 0:
-            self.problem(
-                servo,
-                "is in wheel mode (CW and CCW Angle Limit are 0) and would turn without end: write 0 to (6) "
-                f"and {servo.max_tick} to (8)",
-            )
-        else:
+        # the torque control mode is RAM and only of some models: it is not asked for here
+        found = {"cw_angle_limit": clockwise, "ccw_angle_limit": counter, "torque_ctrl_mode_enable": 0}
+        self.mode(servo, found)
+        if clockwise != counter and not servo.continuous:
             self.limits(servo, clockwise, counter, "angle limits")
 
     def _torque(self, servo: ServoPlan, table: ControlTable, block: Reply) -> None:

@@ -33,8 +33,6 @@ ITEMS = (
     "bus_watchdog",
 )
 """What is looked at, where a model has it."""
-_POSITION_MODES: Mapping[str, int] = MappingProxyType({"operating_mode": 3, "control_mode": 2})
-"""Position control (e-Manual XM430-W350, Operating Mode (11)); joint mode (XL-320, Control Mode (11))."""
 _DRIVE_BITS: Mapping[int, str] = MappingProxyType(
     {
         0x01: "turns the other way round",
@@ -75,9 +73,7 @@ class Inspector2(Inspector):
 
     def _modes(self, servo: ServoPlan, found: Mapping[str, int]) -> None:
         items = self.table(servo).items
-        for name, wanted in _POSITION_MODES.items():
-            if name in found:
-                self.neutral(servo, items[name], found[name], wanted, "which is not position control")
+        self.mode(servo, found)
         drive = found.get("drive_mode", 0)
         if drive:
             what = " and ".join(words for bit, words in _DRIVE_BITS.items() if drive & bit) or "is unknown"
@@ -87,6 +83,8 @@ class Inspector2(Inspector):
             self.neutral(servo, items["homing_offset"], offset, 0, "which shifts every position")
 
     def _limits(self, servo: ServoPlan, found: Mapping[str, int]) -> None:
+        if servo.continuous:
+            return
         for low, high, names in (
             ("min_position_limit", "max_position_limit", "position limits"),
             ("cw_angle_limit", "ccw_angle_limit", "angle limits"),

@@ -18,7 +18,7 @@ from types import MappingProxyType
 from typing import Literal
 
 from dxlrun.control_table import ControlItem, ControlTable
-from dxlrun.dynamixel.bus_plan import Field, GoalLayout, ModePlan, OwnLimit, RegisterValue, Scale
+from dxlrun.dynamixel.bus_plan import Field, GoalLayout, ModePlan, OwnLimit, RegisterValue, Scale, ServoPlan
 from dxlrun.mode import Mode
 
 _CURRENT, _VELOCITY, _POSITION, _EXTENDED, _CURRENT_BASED, _PWM = 0, 1, 3, 4, 5, 16
@@ -69,6 +69,28 @@ def mode_plans(
     if "operating_mode" in table.items:
         return tuple(_by_operating_mode(table, ends, continuous))
     return tuple(_by_angle_limits(table, ends, continuous))
+
+
+def mode_in(servo: ServoPlan, found: Mapping[str, int]) -> Mode:
+    """Return the mode that a servo's registers select, UNKNOWN where the plan has none for them.
+
+    Where two modes are selected alike, as velocity and PWM in wheel mode, that of the start goes first.
+    """
+    for plan in sorted(servo.modes, key=lambda plan: plan.mode != servo.start_mode):
+        if in_mode(plan, found):
+            return plan.mode
+    return Mode.UNKNOWN
+
+
+def in_mode(wanted: ModePlan, found: Mapping[str, int]) -> bool:
+    """Say whether registers, by name, select a mode; any angle limits that differ are joint mode."""
+    values = {register.name: register.value for register in wanted.operating}
+    low, high = values.pop("cw_angle_limit", None), values.pop("ccw_angle_limit", None)
+    if any(found.get(name) != value for name, value in values.items()):
+        return False
+    if low != high:
+        return found.get("cw_angle_limit") != found.get("ccw_angle_limit")
+    return low is None or found.get("cw_angle_limit") == found.get("ccw_angle_limit") == low
 
 
 def own_limits(table: ControlTable) -> tuple[OwnLimit, ...]:

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from dxlrun.control_table import ControlItem, control_table
 from dxlrun.dynamixel.bus_plan import BusPlan, GoalLayout, ModePlan, OwnLimit, ServoPlan
 from dxlrun.dynamixel.inspection import called, persist, who
+from dxlrun.dynamixel.mode_plan import in_mode, mode_in
 from dxlrun.dynamixel.plan import plan_line, readable
 from dxlrun.dynamixel.transaction import Outcome, Program, Reply
 from dxlrun.dynamixel.units import ticks_in
@@ -107,28 +108,6 @@ def mode_now(plan: BusPlan, servo: ServoPlan) -> Program[Mode]:
     names = dict.fromkeys(register.name for mode in servo.modes for register in mode.operating)
     found = yield from _read_items(plan, servo, list(names))
     return Mode.UNKNOWN if found is None else mode_in(servo, found)
-
-
-def mode_in(servo: ServoPlan, found: Mapping[str, int]) -> Mode:
-    """Return the mode that a servo's registers select, UNKNOWN where the plan has none for them.
-
-    Where two modes are selected alike, as velocity and PWM in wheel mode, that of the start goes first.
-    """
-    for plan in sorted(servo.modes, key=lambda plan: plan.mode != servo.start_mode):
-        if in_mode(plan, found):
-            return plan.mode
-    return Mode.UNKNOWN
-
-
-def in_mode(wanted: ModePlan, found: Mapping[str, int]) -> bool:
-    """Say whether registers, by name, select a mode; any angle limits that differ are joint mode."""
-    values = {register.name: register.value for register in wanted.operating}
-    low, high = values.pop("cw_angle_limit", None), values.pop("ccw_angle_limit", None)
-    if any(found.get(name) != value for name, value in values.items()):
-        return False
-    if low != high:
-        return found.get("cw_angle_limit") != found.get("ccw_angle_limit")
-    return low is None or found.get("cw_angle_limit") == found.get("ccw_angle_limit") == low
 
 
 def read_limits(plan: BusPlan, servo: ServoPlan) -> Program[dict[OwnLimit, int]]:

@@ -10,18 +10,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
-from dxlrun.control_table import control_table
 from dxlrun.dynamixel import modes
 from dxlrun.dynamixel.bus_plan import BusPlan, RegisterValue, ServoPlan
-from dxlrun.dynamixel.inspection import Inspector, Survey, persist, setup_line, who
+from dxlrun.dynamixel.inspection import Inspector, Survey, persist, who
 from dxlrun.dynamixel.inspection1 import Inspector1
 from dxlrun.dynamixel.inspection2 import Inspector2
-from dxlrun.dynamixel.line import Line, listen
-from dxlrun.dynamixel.plan import plan_line, readable
+from dxlrun.dynamixel.line import listen
+from dxlrun.dynamixel.plan import plan_line
 from dxlrun.dynamixel.reads import state_read
 from dxlrun.dynamixel.registers import settle
 from dxlrun.dynamixel.transaction import Outcome, Program, Reply
-from dxlrun.dynamixel.units import goal_bytes, joint_position, speed_ticks, ticks_in
+from dxlrun.dynamixel.units import joint_position, ticks_in
 from dxlrun.mode import Mode
 
 PINGS = 3
@@ -31,8 +30,6 @@ LISTEN_NS = 2_000_000
 GROUP = 3
 """Servos that get torque before the next ones do: eight at once could pull the supply down."""
 GROUP_PAUSE_NS = 20_000_000
-ENGAGE_SPEED = 0.5
-"""rad/s. The goal is where the servo stands; should that be misread, it goes there slowly."""
 _INSPECTORS: Mapping[float, type[Inspector]] = MappingProxyType({1.0: Inspector1, 2.0: Inspector2})
 
 
@@ -41,8 +38,8 @@ class Engagement:
     """What came of torque on."""
 
     problems: list[str] = field(default_factory=list)
-    goals: list[int] = field(default_factory=list)
-    """Goal position in ticks, in the order of the plan's servos, as it was written."""
+    goals: list[int | None] = field(default_factory=list)
+    """Goal position in ticks as it was written, in the order of the plan's servos; None: there is none."""
 
 
 def survey(plan: BusPlan, take_over: bool) -> Program[Survey]:
@@ -123,7 +120,9 @@ class _Surveyor:
                     self._place(servo, raw)
 
     def _place(self, servo: ServoPlan, raw: int) -> None:
-        if raw > servo.max_tick:
+        if self.found.modes.get(servo.servo_id) != servo.start_mode:
+            return  # what it says counts in another mode; it is looked at again before it gets torque
+        if raw > servo.max_tick and not servo.continuous:
             self._problem(servo, f"says that it stands at {raw}, beyond its {servo.max_tick} ticks")
         elif not servo.lower_tick - 1 <= raw <= servo.upper_tick + 1:
             limits = servo.lower_tick, servo.upper_tick
@@ -163,27 +162,10 @@ def engage(plan: BusPlan) -> Program[Engagement]:
 
 def _engage_one(plan: BusPlan, servo: ServoPlan, result: Engagement) -> Program[str]:
     """Hold one servo where it stands; return what went wrong, or nothing."""
-    line = setup_line(plan)
-    state = yield from persist(state_read(line, [servo]))
-    if not state.answered:
-        return "did not answer when torque was to be switched on"
-    present = ticks_in(servo.state.position, state.parameters)
-    goal = min(max(present, servo.lower_tick), servo.upper_tick)
-    if abs(goal - present) > 1:
-        return "left its limits before torque was switched on"
-    wanted = goal_bytes(servo, goal, speed_ticks(servo, ENGAGE_SPEED))
-    # the goal comes first: torque on a stale goal would move the joint
-    for name, address, data in (
-        ("goal position", servo.goal.address, wanted),
-        ("torque enable", servo.torque_address, b"\x01"),
-    ):
-        reply = yield from persist(line.write(servo.servo_id, address, data))
-        if not reply.answered:
-            return f"did not acknowledge {name}" + _reason(line, reply)
-    problem = yield from _read_back(plan, servo, goal)
-    if not problem:
-        result.goals.append(goal)
-    return problem
+    held = yield from modes.hold(plan, servo, servo.mode_plan(servo.start_mode))
+    if not held.problem:
+        result.goals.append(held.goal)
+    return held.problem
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,32 +234,6 @@ def confirm(plan: BusPlan) -> Program[list[str]]:
                 f"({servo.torque_address}) is {reply.parameters[0]}): is its supply strong enough?"
             )
     return problems
-
-
-def _read_back(plan: BusPlan, servo: ServoPlan, goal: int) -> Program[str]:
-    """Make sure that the servo has what was written."""
-    line, place = setup_line(plan), servo.goal.position_place
-    goal_address, torque = servo.goal.address + place.offset, servo.torque_address
-    if readable(control_table(servo.model, plan.protocol), torque, goal_address + place.size):
-        back = yield from persist(line.read(servo.servo_id, torque, goal_address + place.size - torque))
-        replies = [back]
-    else:
-        replies = [
-            (yield from persist(line.read(servo.servo_id, torque, 1))),
-            (yield from persist(line.read(servo.servo_id, goal_address, place.size))),
-        ]
-    if not all(reply.answered for reply in replies):
-        return "did not answer when its torque was read back"
-    enabled, found = replies[0].parameters[0], bytes(replies[-1].parameters[-place.size :])
-    raw = int.from_bytes(found, "little", signed=place.encoding == "twos_complement")
-    if enabled != 1 or raw != goal:
-        return f"was given goal {goal} and torque, but has goal {raw} and torque enable {enabled}"
-    return ""
-
-
-def _reason(line: Line, reply: Reply) -> str:
-    refused = reply.outcome is Outcome.REFUSED
-    return f": {line.dialect.describe_error(reply.error)}" if refused else ""
 
 
 def _lost(reply: Reply) -> str:
