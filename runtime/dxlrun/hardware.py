@@ -60,3 +60,7 @@ class Hardware(Protocol):
     def stop(self) -> tuple[str, ...]:
         """Switch torque off on every servo, read it back, raise nothing; return a sentence per failure."""
         ...
+
+    def release(self) -> None:
+        """Leave the robot holding with its torque on, in place of `stop`: nothing is sent any more."""
+        ...

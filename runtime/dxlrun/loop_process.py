@@ -191,6 +191,8 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: RingSinks) -> Ou
         if last == "limp":
             heartbeat.enter(Phase.STOPPING)
             failures = robot.hardware.stop()
+        else:
+            robot.hardware.release()
     detail = (result.detail,) if result.detail else ()
     remarks = (TORQUE_STAYS,) if last == "hold" else ()
     return Outcome(result.reason, result.cycles, result.skipped, (*detail, *failures), remarks)

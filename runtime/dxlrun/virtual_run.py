@@ -140,6 +140,8 @@ class VirtualRobot:
             finally:
                 if last == "limp":
                     self.failures = self.robot.hardware.stop()
+                else:
+                    self.robot.hardware.release()
         except DxlrunError as error:
             self._sinks.events.emit(EventCode.SETUP, Severity.ERROR, "loop", "\n".join(error.sentences))
             raise

@@ -56,8 +56,8 @@ def test_an_absent_servo_breaks_the_chain_for_one_cycle(started):
         started.cycle()
         assert started.states.valid.tolist() == [True, True, False, True, True]
     started.buses[0].servo(3).silence(False)
-    started.cycle()
-    started.cycle()
+    for _ in range(20):  # it was lost, and is looked at as at the start
+        started.cycle()
     assert started.states.valid.all()
 
 

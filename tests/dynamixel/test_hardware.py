@@ -164,6 +164,10 @@ def test_a_servo_that_was_lost_goes_slowly_to_a_goal_that_went_on(started):
         started.goals.position[2] += 0.05  # each step is small, and the servo sees none of them
         started.cycle()
     servo.silence(False)
+    for _ in range(80):
+        started.cycle()
+        if started.states.valid[2]:
+            break
     before = len(started.into_bus())
     standing = servo.position
     for _ in range(20):

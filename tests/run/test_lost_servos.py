@@ -213,13 +213,13 @@ def test_a_servo_that_flickers_holds_and_frees_its_controllers_each_time_and_mov
     acts |= {"pair": sway, "single": sway}
     robot = built()
     servo = robot.buses[0].servo(7)
-    for turn in range(5):  # five replies are lost, and a few come
-        robot.buses[0].at(GONE_NS + turn * 200_000_000, servo.silence)
-        robot.buses[0].at(GONE_NS + turn * 200_000_000 + 100_000_000, lambda: servo.silence(False))
+    for turn in range(4):  # five replies are lost, then it is looked at, and a few come
+        robot.buses[0].at(GONE_NS + turn * 400_000_000, servo.silence)
+        robot.buses[0].at(GONE_NS + turn * 400_000_000 + 100_000_000, lambda: servo.silence(False))
     assert robot.run().reason == "ended"
     told = [event.text for event in read_log(tmp_path / "run.mcap").events if event.code == EventCode.POLICY]
-    assert told == ["is held until all its joints answer again", "goes on: all its joints answer again"] * 5
-    sent = [one for one in goals(robot, 3) if GONE_NS + 100_000_000 < one[0] < GONE_NS + 1_000_000_000]
+    assert told == ["is held until all its joints answer again", "goes on: all its joints answer again"] * 4
+    sent = [one for one in goals(robot, 3) if GONE_NS + 100_000_000 < one[0] < GONE_NS + 1_600_000_000]
     steps = [
         abs(b - a) for (_, a), (_, b) in itertools.pairwise(sent)
     ]  # one a cycle, however late it is sent

@@ -93,12 +93,12 @@ class Gaps:
     and `done` is called with what it returned: a line that is gone answers with time-outs (`abandon`).
     """
 
-    __slots__ = ("_count", "_current", "_events", "_latency_ns", "_now_ns", "_plan", "_tasks", "_until_ns")
+    __slots__ = ("_count", "_current", "_events", "_latency_ns", "_plan", "_tasks", "_until_ns", "now_ns")
 
     def __init__(self, plan: BusPlan, events: EventSink, now_ns: Callable[[], int]) -> None:
         self._plan = plan
         self._events = events
-        self._now_ns = now_ns
+        self.now_ns = now_ns
         self._latency_ns = plan.latency_ns
         self._tasks: list[_Task] = []  # in the order of their turns
         self._current: _Task | None = None
@@ -171,7 +171,7 @@ class Gaps:
 
     def _ready(self) -> _Task | None:
         """Return whose turn it is; of one servo that is who has begun."""
-        now = self._now_ns()
+        now = self.now_ns()
         for task in self._tasks:
             chosen = task
             if task.servo != WHOLE_BUS and not task.begun:
@@ -187,14 +187,14 @@ class Gaps:
 
     def _pause(self, task: _Task, pause: Transaction) -> None:
         if not task.paused:
-            task.paused, task.wake_ns = True, self._now_ns() + pause.due_ns
+            task.paused, task.wake_ns = True, self.now_ns() + pause.due_ns
         else:
             task.paused = False
             self._resume(task, _nothing(Outcome.SENT))
 
     def _timed(self, task: _Task, wanted: Transaction, first: bool) -> Transaction | None:
         """Return the transaction with no more patience than the gap allows; None: it has to wait."""
-        left_ns = self._until_ns - self._now_ns()
+        left_ns = self._until_ns - self.now_ns()
         latest_ns = wanted.due_ns
         if wanted.awaited:
             latest_ns += self._latency_ns + LEAST_PATIENCE_NS

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.clock import Clock
-from dxlrun.dynamixel import startup, torque_limit
+from dxlrun.dynamixel import bus_watchdog, startup, torque_limit
 from dxlrun.dynamixel.bus import Bus, pump, run
 from dxlrun.dynamixel.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.gaps import Gaps
@@ -22,6 +22,7 @@ from dxlrun.dynamixel.probing import extra_ns, probe_reads
 from dxlrun.dynamixel.registers import settle_bus
 from dxlrun.dynamixel.steered_registers import SteeredRegisters
 from dxlrun.dynamixel.torque_limit import reduced
+from dxlrun.dynamixel.transaction import Program
 from dxlrun.dynamixel.units import joint_position
 from dxlrun.errors import PortError, StartUpError
 from dxlrun.events import EventCode, EventSink, Severity
@@ -97,11 +98,13 @@ class DynamixelHardware:
         self._settle_registers()
         self._settle_modes()
         self._probe_reads()
+        self._carry_out([bus_watchdog.disarm_all(plan) for plan in self._plans])
         try:
             self._engage()
             if self._restore_torque:
                 self._restore_limits()
             self._first_states()
+            self._carry_out([servos.watch() for servos in self._servos])
         except BaseException as error:  # also an interrupt: nothing may leave here with torque on
             for sentence in self.stop() or (TAKEN_BACK,):
                 error.add_note(sentence)
@@ -110,6 +113,7 @@ class DynamixelHardware:
     def read(self) -> None:
         """Read every servo once, on all lines at once; of a line that is gone every row is invalid."""
         for bus, servos in zip(self._buses, self._servos, strict=True):
+            servos.feed()
             servos.reads.begin()
             bus.load(servos.reads)
         pump(self._buses, self._ports, self._clock, self._beat)
@@ -152,6 +156,9 @@ class DynamixelHardware:
         latest = until_ns - IDLE_MARGIN_NS
         working = False
         for bus, servos, gaps in zip(self._buses, self._servos, self._gaps, strict=True):
+            if bus.failure is not None:
+                gaps.abandon()
+                continue
             servos.ask()
             if gaps.begin(latest):
                 bus.load(gaps)
@@ -162,6 +169,7 @@ class DynamixelHardware:
     def stop(self) -> tuple[str, ...]:
         """Switch torque off on every servo, and read it back; return a sentence per failure."""
         failures = tuple(f"{one}" for one in self._limp() if not one.confirmed)
+        self._disarm()
         for sentence in failures:
             self._events.emit(EventCode.SHUTDOWN_FAILED, Severity.ERROR, "hardware", sentence)
         if not failures:
@@ -173,6 +181,23 @@ class DynamixelHardware:
                 f"torque is off on {'the servo' if count == 1 else f'all {count} servos'}",
             )
         return failures
+
+    def release(self) -> None:
+        """Leave the robot with its torque on: nobody sends any more, and nothing may stop it for that."""
+        self._disarm()
+        run(
+            [bus_watchdog.disarm_all(plan) for plan in self._plans],
+            self._buses,
+            self._ports,
+            self._clock,
+            self._beat,
+        )
+
+    def _disarm(self) -> None:
+        for plan, bus in zip(self._plans, self._buses, strict=True):
+            for packet in bus_watchdog.disarming(plan):
+                with suppress(PortError):  # a servo that stops without a host stays as it is
+                    bus.send(packet)
 
     def _ask_for_lines(self) -> None:
         """Go on with every line that was gone and is back."""
@@ -306,7 +331,10 @@ class DynamixelHardware:
 
     def _torque_lasts(self) -> None:
         """Read torque enable of everybody again: who was reset by the inrush of others may get no goal."""
-        programs = [startup.confirm(plan) for plan in self._plans]
+        self._carry_out([startup.confirm(plan) for plan in self._plans])
+
+    def _carry_out(self, programs: Sequence[Program[list[str]]]) -> None:
+        """Run one program a bus; raise StartUpError with all that went wrong."""
         found = run(programs, self._buses, self._ports, self._clock, self._beat)
         self._raise_failures()
         if problems := [problem for one in found if one is not None for problem in one]:

@@ -8,6 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from dxlrun.dynamixel import bus_watchdog
+from dxlrun.dynamixel.absent import FIRST_PROBE_NS, NEVER, Absent
 from dxlrun.dynamixel.bus import Bus
 from dxlrun.dynamixel.bus_plan import BusPlan
 from dxlrun.dynamixel.dialect import dialect_of
@@ -16,6 +18,7 @@ from dxlrun.dynamixel.gaps import Gaps, Urgency
 from dxlrun.dynamixel.goal_arrays import GoalArrays
 from dxlrun.dynamixel.plan import plan_line
 from dxlrun.dynamixel.protocol2 import describe_hardware_error
+from dxlrun.dynamixel.startup import Rejoined
 from dxlrun.dynamixel.state_arrays import StateArrays
 from dxlrun.dynamixel.transaction import Program, Reply, Transaction
 from dxlrun.events import EventCode, EventSink, Severity
@@ -31,6 +34,7 @@ ALERT_AGAIN = 50
 RETURN_SPEED = 1.5
 """rad/s, no faster does a servo that was lost go to its goal, which may have gone on: a step that no gate saw
 is to be a slow one."""
+_LOST = f"missed {LOST_CYCLES} replies in a row; it is asked once a second until it is in order"
 RETURNED = 0.05
 """rad from the goal: the servo has caught up."""
 
@@ -48,6 +52,7 @@ class Servos:
     """The servos of one bus: their cyclic reads, their goals, and who may get a goal."""
 
     __slots__ = (
+        "_absent",
         "_alert_cycles",
         "_alerts",
         "_asking",
@@ -55,6 +60,7 @@ class Servos:
         "_ceiling",
         "_dialect",
         "_events",
+        "_fed_ns",
         "_gaps",
         "_hardware_errors",
         "_limp",
@@ -68,6 +74,7 @@ class Servos:
         "_rows",
         "_said_errors",
         "_states",
+        "_watchdog_ns",
         "goals",
         "reads",
         "torqued",
@@ -101,6 +108,9 @@ class Servos:
         self._noise_seen = 0
         self._noise_at_ns = -NOISE_EVENT_NS
         self._lost = False
+        self._watchdog_ns = plan.watchdog_ticks * bus_watchdog.UNIT_NS or NEVER
+        self._fed_ns = 0
+        self._absent = Absent(plan, gaps, self._say, self._back)
 
     @property
     def all_fresh(self) -> bool:
@@ -130,6 +140,45 @@ class Servos:
                 f"{counted(count, 'byte', 'bytes')} belonged to no packet",
             )
 
+    def watch(self) -> Program[list[str]]:
+        """Read every servo's clock for the first time, and arm the Bus Watchdogs; return what went wrong.
+
+        The last step of the start: from now on the exchange must not stop.
+        """
+        for index in range(len(self._rows)):
+            yield from self._absent.tick(index)
+        problems = yield from bus_watchdog.arm_all(self._plan)
+        self._fed_ns = self._gaps.now_ns()
+        return problems
+
+    def feed(self) -> None:
+        """Note that the cyclic reads go out now; who was not fed for too long has stopped, and is revived."""
+        now = self._gaps.now_ns()
+        if self._fed_ns and now - self._fed_ns > self._watchdog_ns:
+            self._revive((now - self._fed_ns) // 1_000_000)
+        self._fed_ns = now
+
+    def _revive(self, silent_ms: int) -> None:
+        fed = [
+            index
+            for index, servo in enumerate(self._plan.servos)
+            if bus_watchdog.has_one(self._plan, servo) and not self.reads.away[index]
+        ]
+        for index in fed:
+            self.torqued[index] = False  # no goals until its torque was read behind this
+            self._slow_down(index)
+            program = bus_watchdog.revive(self._plan, self._plan.servos[index])
+            name = f"the Bus Watchdog of {self._who(index)}"
+            self._gaps.add(program, partial(self._revived, index), Urgency.REPAIR, name, index)
+        text = f"no instruction for {silent_ms} ms: the Bus Watchdog has stopped the servos; they are revived"
+        if fed:
+            self._emit(EventCode.WATCHDOG, Severity.ERROR, self._plan.name, text)
+
+    def _revived(self, index: int, problem: str) -> None:
+        if problem and not self.reads.away[index]:
+            self._emit(EventCode.WATCHDOG, Severity.ERROR, self._plan.servos[index].joint, problem)
+            self._leave(index, 0)
+
     def goal_packets(self, goals: Commands, states: States) -> list[bytes]:
         """Return the packets with the goals of everybody who may get one; who was lost comes back slowly."""
         if not self._returning:
@@ -145,8 +194,10 @@ class Servos:
         """Let the next gap ask one servo what it is owed beside its cyclic reads, if one is owed anything.
 
         That is torque enable of a servo that waits for its goals, or the hardware error status of one that
-        raised an alert. Only a servo that answers is asked; of a limp one the torque is known.
+        raised an alert. Only a servo that answers is asked; of a limp one the torque is known. Who left the
+        exchange is asked by itself, see `absent`.
         """
+        self._absent.look()
         question = None if self._asking else self._owed()
         if question is None:
             return
@@ -198,15 +249,9 @@ class Servos:
         if reply.parameters[0] == 1:
             self.torqued[index] = True
             return
-        self._limp[index] = True
-        servo = self._plan.servos[index]
-        self._emit(
-            EventCode.SERVO_LIMP,
-            Severity.ERROR,
-            servo.joint,
-            f"{self._who(index)} has Torque Enable ({servo.torque_address}) = {reply.parameters[0]}: it was "
-            "reset or its torque was cut; it gets no more goals in this run",
-        )
+        if not (self._hardware_errors[index] or self._said_errors[index] & self._dialect.ALERT):
+            self._leave(index, 0)  # a shutdown has a reason, this one may have started anew
+        self._tell_limp(index, reply.parameters[0])
 
     def _take_hardware_error(self, index: int, reply: Reply) -> None:
         self._alerts.remove(index)
@@ -230,9 +275,7 @@ class Servos:
         """Tell that the line is back: its servos were without a host, and maybe without power."""
         self._lost = False
         for index in range(len(self._missed)):
-            self._missed[index] = max(self._missed[index], LOST_CYCLES)
-            self._limp[index] = False
-        self.torqued[:] = False
+            self._leave(index, 0)
         text = f"bus {self._plan.name} is back; its servos count as rebooted"
         self._emit(EventCode.PORT_BACK, Severity.WARNING, self._plan.name, text)
 
@@ -241,18 +284,51 @@ class Servos:
             if not fresh:
                 self._missed[index] += 1
                 self.torqued[index] = False
-                if self._missed[index] == LOST_CYCLES and index not in self._returning:
-                    self._returning.append(index)
-                    self._ceiling[index] = RETURN_SPEED
                 if self._missed[index] == 1:
                     how = "sent a garbled reply" if self.reads.garbled[index] else "did not answer"
                     self._say(EventCode.READ_LOST, Severity.WARNING, index, how)
+                elif self._missed[index] == LOST_CYCLES and not self.reads.away[index]:
+                    self._say(EventCode.SERVO_LOST, Severity.ERROR, index, _LOST)
+                    self._leave(index, FIRST_PROBE_NS)
             elif self._missed[index]:
                 missed = self._missed[index]
                 lost = "1 reply was" if missed == 1 else f"{missed} replies in a row were"
                 text = f"answers again; {lost} lost"
                 self._missed[index] = 0
                 self._say(EventCode.READ_BACK, Severity.INFO, index, text)
+
+    def _leave(self, index: int, probe_after_ns: int) -> None:
+        """Take a servo out of the exchange until it was found in order."""
+        self.reads.leave(index)
+        self.torqued[index] = False
+        self._slow_down(index)
+        self._absent.lose(index, not self._limp[index], probe_after_ns)
+
+    def _back(self, index: int, rejoined: Rejoined) -> None:
+        """Let a servo take part again that was looked at as at the start."""
+        self.reads.join(index)
+        for joint, text in rejoined.written:
+            self._emit(EventCode.REGISTER_WRITTEN, Severity.INFO, joint, text)
+        self.torqued[index] = rejoined.torqued
+        how = "holding where it stands" if rejoined.torqued else "limp: it gets no goals"
+        self._say(EventCode.SERVO_BACK, Severity.INFO, index, f"is in order and takes part again, {how}")
+        if rejoined.torqued:
+            self._limp[index] = False
+        elif not self._limp[index]:
+            self._tell_limp(index, 0)
+
+    def _slow_down(self, index: int) -> None:
+        if index not in self._returning:
+            self._returning.append(index)
+            self._ceiling[index] = RETURN_SPEED
+
+    def _tell_limp(self, index: int, enabled: int) -> None:
+        self._limp[index] = True
+        address = self._plan.servos[index].torque_address
+        text = (
+            f"has Torque Enable ({address}) = {enabled}: it was reset or its torque was cut; it gets no goals"
+        )
+        self._say(EventCode.SERVO_LIMP, Severity.ERROR, index, text)
 
     def _say_errors(self) -> None:
         for index, error in enumerate(self.reads.errors):

@@ -49,10 +49,11 @@ class Held:
     """Goal position in ticks; None where the mode has none."""
 
 
-def enter(plan: BusPlan, servo: ServoPlan, mode: Mode) -> Program[str]:
+def enter(plan: BusPlan, servo: ServoPlan, mode: Mode, *, again: bool = True) -> Program[str]:
     """Bring one servo into a mode in which it then stands still; return what went wrong, or nothing.
 
-    Raises LookupError when the model does not have the mode.
+    `again`: also one that has torque in this mode is held anew; without, it is left alone. Raises LookupError
+    when the model does not have the mode.
     """
     wanted, line = servo.mode_plan(mode), plan_line(plan)
     torque = yield from persist(line.read(servo.servo_id, servo.torque_address, 1))
@@ -61,7 +62,10 @@ def enter(plan: BusPlan, servo: ServoPlan, mode: Mode) -> Program[str]:
     if not torque.answered or found is None:
         return "did not answer when its mode was asked for"
     enabled = bool(torque.parameters[0])
-    if not in_mode(wanted, found):
+    if in_mode(wanted, found):
+        if not again:
+            return ""
+    else:
         problem = yield from _change(plan, servo, wanted, found, enabled=enabled)
         if problem:
             return problem

@@ -175,9 +175,9 @@ class Rejoined:
     problems: tuple[str, ...]
     """Why it may take no part, one sentence each."""
     torqued: bool
-    """True when torque enable was read back as 1, and its goal as `goal`."""
+    """True when torque enable was read as 1, and a goal that was written as `goal`."""
     goal: int | None
-    """Goal position in ticks as it was written; None: it is limp, or in a mode without one."""
+    """Goal position in ticks as it was written; None: it is limp, its mode has none, or none was."""
     written: tuple[tuple[str, str], ...]
     """Joint, and what was written into its registers."""
 
@@ -192,7 +192,8 @@ def rejoin(
     """Take one servo back that was lost or was reset, as at the start: look, mend registers, then hold it.
 
     `torque`: switch it on; without, who is limp stays limp and gets no goal, as a goal may switch torque on
-    (protocol.md), and who holds torque still is held where it stands. `mode`: in which it shall be, None: its
+    (protocol.md), and who holds torque still goes on: were torque written to it, a reboot a moment ago would
+    be a way to torque that no policy gave. `mode`: in which it shall be, None: its
     first one. `registers`: what it shall hold, None: what the robot file declares; see `SteeredRegisters`.
     """
     servo = plan.servos[servo_index]
@@ -205,13 +206,14 @@ def rejoin(
         return Rejoined(tuple(found.problems), False, None, ())
     settled = yield from settle(plan, servo, servo.registers if registers is None else registers, line)
     written = tuple(settled.written)
-    if not settled.problems and (problem := (yield from modes.enter(plan, servo, mode))):
+    if not settled.problems and (problem := (yield from modes.enter(plan, servo, mode, again=False))):
         settled.problems.append(f"{who(plan, servo)} {problem}")
     enabled = yield from persist(plan.torque_reads[servo_index])
     if not enabled.answered:
         settled.problems.append(f"{who(plan, servo)} did not answer when its torque was asked for")
-    if settled.problems or not (torque or enabled.parameters[0]):
-        return Rejoined(tuple(settled.problems), False, None, written)
+    if settled.problems or not torque:
+        holds = not settled.problems and enabled.parameters[0] == 1
+        return Rejoined(tuple(settled.problems), holds, None, written)
     held = yield from modes.hold(plan, servo, servo.mode_plan(mode))
     if held.problem:
         return Rejoined((f"{who(plan, servo)} {held.problem}",), False, None, written)

@@ -112,3 +112,6 @@ class RecordedHardware:
     def stop(self) -> tuple[str, ...]:
         """Do nothing: no servo has torque."""
         return ()
+
+    def release(self) -> None:
+        """Do nothing: there is nobody who holds."""

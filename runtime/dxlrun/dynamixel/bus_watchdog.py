@@ -1,0 +1,94 @@
+"""Bus Watchdog: a servo of Protocol 2.0 stops by itself when nobody sends instructions any more.
+
+Armed last at the start, so that nothing but a cyclic exchange feeds it, and disarmed at the end. After it has
+stopped a servo it reads -1, and the servo refuses goals until 0 is written (e-Manual XM430-W350, Bus Watchdog
+(98)). Protocol 1.0 has none: there the guardian cuts the torque when the loop dies.
+"""
+
+from __future__ import annotations
+
+from dxlrun.control_table import ControlItem, control_table
+from dxlrun.dynamixel.bus_plan import BusPlan, ServoPlan
+from dxlrun.dynamixel.dialect import dialect_of
+from dxlrun.dynamixel.inspection import called, persist, who
+from dxlrun.dynamixel.plan import plan_line
+from dxlrun.dynamixel.transaction import Program
+
+UNIT_NS = 20_000_000
+"""One step of the register (e-Manual XM430-W350, Bus Watchdog (98))."""
+MOST_TICKS = 127
+"""The longest time; beyond it stand the values that say that it has stopped."""
+LEAST_PERIODS = 3
+"""It must bear two cycles that come to nothing (failures.md)."""
+
+
+def arm(plan: BusPlan, servo: ServoPlan) -> Program[str]:
+    """Arm a servo's watchdog, where the plan wants it and the model has one; return what went wrong."""
+    if not plan.watchdog_ticks or (item := _item(plan, servo)) is None:
+        return ""
+    return (yield from _write(plan, servo, item, plan.watchdog_ticks))
+
+
+def disarm(plan: BusPlan, servo: ServoPlan) -> Program[str]:
+    """Clear a servo's watchdog if it is armed or has stopped the servo; return what went wrong."""
+    if not plan.watchdog_ticks or (item := _item(plan, servo)) is None:
+        return ""
+    reply = yield from persist(plan_line(plan).read(servo.servo_id, item.address, item.size))
+    if reply.answered and reply.parameters[0] == 0:
+        return ""
+    return (yield from _write(plan, servo, item, 0))
+
+
+def revive(plan: BusPlan, servo: ServoPlan) -> Program[str]:
+    """Clear and arm a servo's watchdog again after nobody sent anything for too long."""
+    return (yield from disarm(plan, servo)) or (yield from arm(plan, servo))
+
+
+def arm_all(plan: BusPlan) -> Program[list[str]]:
+    """Arm every servo of a bus; return what went wrong."""
+    found = []
+    for servo in plan.servos:
+        found.append((yield from arm(plan, servo)))
+    return [problem for problem in found if problem]
+
+
+def disarm_all(plan: BusPlan) -> Program[list[str]]:
+    """Clear every servo of a bus, before anybody gets torque or after; return what went wrong."""
+    found = []
+    for servo in plan.servos:
+        found.append((yield from disarm(plan, servo)))
+    return [problem for problem in found if problem]
+
+
+def disarming(plan: BusPlan) -> list[bytes]:
+    """Return the packets that clear all servos of a bus at once; nobody answers."""
+    if not plan.watchdog_ticks:
+        return []
+    places: dict[int, list[int]] = {}
+    for servo in plan.servos:
+        if item := _item(plan, servo):
+            places.setdefault(item.address, []).append(servo.servo_id)
+    records = dialect_of(plan.protocol).sync_write_records
+    return [
+        records(address, 1, b"".join(bytes((each, 0)) for each in ids)) for address, ids in places.items()
+    ]
+
+
+def has_one(plan: BusPlan, servo: ServoPlan) -> bool:
+    """Say whether a servo's watchdog is armed by the plan."""
+    return bool(plan.watchdog_ticks) and _item(plan, servo) is not None
+
+
+def _item(plan: BusPlan, servo: ServoPlan) -> ControlItem | None:
+    return control_table(servo.model, plan.protocol).items.get("bus_watchdog")
+
+
+def _write(plan: BusPlan, servo: ServoPlan, item: ControlItem, ticks: int) -> Program[str]:
+    line = plan_line(plan)
+    yield from persist(line.write(servo.servo_id, item.address, bytes((ticks,))))
+    back = yield from persist(line.read(servo.servo_id, item.address, item.size))
+    if not back.answered:
+        return f"{who(plan, servo)} did not answer when its {called(item)} was read back"
+    if back.parameters[0] != ticks:
+        return f"{who(plan, servo)} was given {called(item)} = {ticks}, but has {back.parameters[0]}"
+    return ""

@@ -1,0 +1,271 @@
+"""Servos that are lost, reboot, come back, and what the Bus Watchdog does: judged by the simulated bus."""
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from dxlrun.dynamixel import protocol1, protocol2
+from dxlrun.dynamixel.reboots import RealtimeTicks
+from dxlrun.dynamixel.transaction import Outcome, Reply
+from dxlrun.events import EventCode
+
+X_IDS = (11, 12, 13, 14)
+
+
+@pytest.fixture
+def make_x(make_plan):
+    def make(ids=X_IDS, *, returning=False, watchdog=0, **change):
+        plan = make_plan(
+            ids,
+            name="arm",
+            protocol=2.0,
+            model="XM430-W350",
+            reference=math.pi,
+            lower=-2.5,
+            upper=2.5,
+            return_delay_ns=0,
+            **change,
+        )
+        return _with(plan, returning, watchdog)
+
+    return make
+
+
+def _with(plan, returning, watchdog=0):
+    servos = tuple(replace(servo, torque_on_return=returning) for servo in plan.servos)
+    return replace(plan, servos=servos, watchdog_ticks=watchdog)
+
+
+@pytest.fixture
+def start(make_rig):
+    def build(*plans):
+        rig = make_rig(*plans)
+        rig.hardware.start()
+        return rig
+
+    return build
+
+
+def cycles(rig, count):
+    for _ in range(count):
+        rig.cycle()
+
+
+def until_valid(rig, most=150):
+    for count in range(most):
+        rig.cycle()
+        if rig.states.valid.all():
+            return count
+    raise AssertionError("not every servo came back")
+
+
+def test_a_lost_servo_leaves_the_exchange_and_is_asked_once_a_second(start, make_x):
+    rig = start(make_x())
+    rig.buses[0].servo(13).silence()
+    cycles(rig, 10)
+    count = len(rig.into_bus())
+    cycles(rig, 500)  # ten seconds
+    sent = rig.into_bus()[count:]
+    to_it = [packet for packet in sent if packet[4] == 13]
+    assert set(to_it) == {protocol2.ping(13)}
+    assert 9 <= len(to_it) <= 11
+    reads = [packet for packet in sent if packet[7] in (0x82, 0x8A)]
+    assert len(reads) == 500
+    assert all(13 not in packet[12:-2] for packet in reads)
+    ((source, text),) = rig.events.of(EventCode.SERVO_LOST)
+    assert source == "arm_13_joint"
+    assert "missed 3 replies in a row" in text
+
+
+def test_a_dead_servo_of_eight_costs_the_others_no_time(start, make_plan):
+    rig = start(make_plan())
+    before = rig.clock.now_ns()
+    rig.hardware.read()
+    healthy = rig.clock.now_ns() - before
+    rig.buses[0].servo(5).silence()
+    cycles(rig, 5)
+    before = rig.clock.now_ns()
+    rig.hardware.read()
+    assert rig.clock.now_ns() - before < healthy
+
+
+def test_a_servo_whose_plug_was_loose_comes_back_with_the_torque_it_kept(start, make_x):
+    rig = start(make_x())
+    servo = rig.buses[0].servo(13)
+    servo.silence()
+    cycles(rig, 8)
+    servo.silence(False)
+    until_valid(rig)
+    cycles(rig, 3)
+    assert rig.torque() == [True] * 4
+    assert [source for source, _ in rig.events.of(EventCode.SERVO_BACK)] == ["arm_13_joint"]
+    assert rig.events.of(EventCode.SERVO_REBOOTED) == []
+    torque_on = protocol2.write(13, 64, b"\1")
+    goals = [packet for packet in rig.into_bus() if packet[7] == 0x83][-1]
+    assert 13 in goals[12:-2:9]
+    assert rig.into_bus().count(torque_on) <= 2  # at the start, and as it was: on
+
+
+@pytest.mark.parametrize("returning", [False, True])
+@pytest.mark.parametrize("protocol", [1.0, 2.0])
+def test_a_servo_that_rebooted_gets_torque_back_only_by_the_policy(
+    start, make_plan, make_x, returning, protocol
+):
+    rig = start(make_x(returning=returning) if protocol == 2.0 else _with(make_plan((1, 3, 5)), returning))
+    servo = rig.buses[0].servos[1]
+    servo.silence()
+    cycles(rig, 4)
+    servo.reset()
+    servo.silence(False)
+    assert rig.torque()[1] is False
+    until_valid(rig)
+    cycles(rig, 5)
+    assert rig.torque()[1] is returning
+    assert len(rig.events.of(EventCode.SERVO_REBOOTED)) == 1
+    assert len(rig.events.of(EventCode.SERVO_LIMP)) == (not returning)
+    held = servo.position
+    cycles(rig, 20)
+    assert servo.position == pytest.approx(held, abs=0.01)
+
+
+def test_a_servo_that_reboots_twice_in_a_minute_gets_no_torque_again(start, make_x):
+    rig = start(make_x(returning=True))
+    servo = rig.buses[0].servo(12)
+    for expected in (True, False):
+        cycles(rig, 100)
+        servo.silence()
+        cycles(rig, 4)
+        servo.reset()
+        servo.silence(False)
+        until_valid(rig)
+        cycles(rig, 5)
+        assert rig.torque() == [True, expected, True, True]
+    texts = [text for _, text in rig.events.of(EventCode.SERVO_REBOOTED)]
+    assert len(texts) == 3
+    assert "rebooted twice within a minute" in texts[-1]
+
+
+def test_registers_that_a_reboot_took_are_written_again(start, make_x):
+    from dxlrun.dynamixel.bus_plan import RegisterValue
+
+    plan = make_x()
+    gain = RegisterValue(84, 2, 555, "position_p_gain")
+    plan = replace(plan, servos=tuple(replace(servo, registers=(gain,)) for servo in plan.servos))
+    rig = start(plan)
+    servo = rig.buses[0].servo(13)
+    assert servo.registers["position_p_gain"] == 555
+    servo.silence()
+    cycles(rig, 4)
+    servo.reset()
+    servo.silence(False)
+    assert servo.registers["position_p_gain"] != 555
+    until_valid(rig)
+    assert servo.registers["position_p_gain"] == 555
+    assert len(rig.events.of(EventCode.REGISTER_WRITTEN)) == 5
+
+
+def test_a_servo_with_a_hardware_error_does_not_come_back_and_says_so_once(start, make_x):
+    rig = start(make_x(returning=True))
+    servo = rig.buses[0].servo(13)
+    servo.silence()
+    cycles(rig, 4)
+    servo.trigger_overload()
+    servo.silence(False)
+    cycles(rig, 250)
+    assert rig.states.valid.tolist() == [True, True, False, True]
+    texts = [text for _, text in rig.events.of(EventCode.SERVO_LOST)]
+    assert len(texts) == 2
+    assert "cannot take part" in texts[1]
+    assert "overload error" in texts[1]
+
+
+def test_the_watchdog_is_armed_at_the_start_and_disarmed_at_the_end(start, make_x):
+    rig = start(make_x(watchdog=10))
+    assert [servo.registers["bus_watchdog"] for servo in rig.buses[0].servos] == [10] * 4
+    cycles(rig, 50)
+    assert rig.events.of(EventCode.WATCHDOG) == []
+    rig.hardware.stop()
+    rig.torque()
+    assert [servo.registers["bus_watchdog"] for servo in rig.buses[0].servos] == [0] * 4
+
+
+def test_servos_that_are_left_holding_are_not_stopped_by_the_watchdog(start, make_x):
+    rig = start(make_x(watchdog=10))
+    cycles(rig, 5)
+    rig.hardware.release()
+    rig.clock.wait_until(rig.clock.now_ns() + 1_000_000_000)
+    assert rig.torque() == [True] * 4
+    assert [servo.registers["bus_watchdog"] for servo in rig.buses[0].servos] == [0] * 4
+
+
+def test_a_loop_that_was_silent_for_too_long_revives_the_servos_that_stopped(start, make_x):
+    rig = start(make_x(watchdog=10))
+    cycles(rig, 5)
+    rig.clock.wait_until(rig.clock.now_ns() + 300_000_000)
+    rig.torque()
+    stopped = [servo.registers["bus_watchdog"] for servo in rig.buses[0].servos]
+    assert stopped == [0xFF] * 4
+    rig.goals.position[:] = 0.2
+    cycles(rig, 100)
+    assert [servo.registers["bus_watchdog"] for servo in rig.buses[0].servos] == [10] * 4
+    assert rig.states.position == pytest.approx(0.2, abs=0.01)
+    ((source, text),) = rig.events.of(EventCode.WATCHDOG)
+    assert source == "arm"
+    assert "the Bus Watchdog has stopped the servos" in text
+
+
+def test_a_watchdog_that_an_earlier_run_left_is_cleared(make_rig, make_x):
+    rig = make_rig(make_x(watchdog=10))
+    rig.buses[0].servo(12).poke("bus_watchdog", -1)
+    rig.hardware.start()
+    assert rig.torque() == [True] * 4
+
+
+def test_a_lost_servo_that_its_watchdog_stopped_comes_back(start, make_x):
+    rig = start(make_x(watchdog=10, returning=True))
+    servo = rig.buses[0].servo(13)
+    servo.silence()
+    cycles(rig, 30)
+    servo.poke("bus_watchdog", -1)
+    servo.silence(False)
+    until_valid(rig)
+    assert servo.registers["bus_watchdog"] == 10
+    assert rig.torque() == [True] * 4
+
+
+def _tick(tick, sent_ns, last_ns=None):
+    last_ns = sent_ns if last_ns is None else last_ns
+    return Reply(Outcome.OK, 0, (tick % 32768).to_bytes(2, "little"), last_ns, 0, False, sent_ns)
+
+
+@pytest.mark.parametrize(
+    ("tick", "after_ms", "rebooted"),
+    [
+        (31_000, 1_000, False),  # in step
+        (31_039, 1_000, False),  # 2 % and 20 ms fast
+        (30_961, 1_000, False),
+        (31_041, 1_000, True),
+        (400, 1_000, True),  # back at 0 before
+        (30_000 + 15_000, 15_000, False),  # across the turn
+        (100, 15_000, True),
+        (100, 17_000, None),  # unseen for too long
+    ],
+)
+def test_a_tick_tells_a_reboot(tick, after_ms, rebooted):
+    ticks = RealtimeTicks(1)
+    assert ticks.rebooted(0, _tick(30_000, 0)) is None
+    assert ticks.rebooted(0, _tick(tick, after_ms * 1_000_000)) is rebooted
+
+
+def test_a_reply_that_was_long_under_way_is_no_reboot():
+    ticks = RealtimeTicks(1)
+    ticks.rebooted(0, _tick(0, 0))
+    assert ticks.rebooted(0, _tick(1_000, 1_000_000_000, 1_150_000_000)) is False
+
+
+def test_a_ping_of_protocol_1_is_what_a_lost_servo_is_asked(start, make_plan):
+    rig = start(make_plan((1, 3)))
+    rig.buses[0].servo(3).silence()
+    cycles(rig, 120)
+    assert protocol1.ping(3) in rig.into_bus()
