@@ -310,11 +310,12 @@ class Loop:
     def _wind_up(self, name: PolicyName) -> Last:
         """Go through the steps of a policy in more cycles; return how it leaves the robot."""
         policy = self.plan.policies.named(name)
-        if policy.steps:
+        limit_ns = self.plan.policies.limit_ns
+        motion = SafeMotion(policy, limit_ns, self.record, self.plan.joints, self.hardware)
+        if not motion.over:
             self._tell_policy(name, policy.text)
             if self.paused:
                 self.resume()
-            motion = SafeMotion(policy, self.plan.policies.limit_ns, self.record, self.hardware.limit_torque)
             self._motion = motion
             try:
                 while not motion.over:

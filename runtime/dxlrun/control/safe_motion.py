@@ -5,20 +5,40 @@ Nothing here reads a clock: times are those of the cycles, so that a replay does
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dxlrun.control.gate import SLOW_SPEED, SLOW_START_NS
+from dxlrun.control.loop_plan import JointPlan
 from dxlrun.control.policy_plan import Policy, Step
 from dxlrun.cycle import CycleRecord
 from dxlrun.interfaces import Floats
+from dxlrun.mode import Mode
 
 ARRIVED = 0.05
 """rad; so near to its pose a joint counts as there. Ten ticks of an AX-12: friction holds it off by some."""
 SETTLE_NS = 300_000_000
 """A joint that has its pose as goal for so long and is not there will not come: it is blocked or too weak."""
+
+MODES_NS = 500_000_000
+"""How long a policy waits for modes: its own time runs on. Some twenty transactions a servo. [i]"""
+STAND_NS = 100_000_000
+"""How long at least goals of 0 rad/s are sent to who is left with torque on: one write may be lost."""
+
+
+class MotionHardware(Protocol):
+    """What a policy asks of the hardware beside goals."""
+
+    def limit_torque(self, fraction: float) -> None:
+        """Let no servo exert more than a fraction of its own limit."""
+        ...
+
+    def set_modes(self, modes: NDArray[np.uint8]) -> None:
+        """Bring joints into other modes."""
+        ...
 
 
 def longest_ns(distance: float, speed: float) -> int:
@@ -36,6 +56,8 @@ def longest_ns(distance: float, speed: float) -> int:
 class SafeMotion:
     """A policy under way; `over` when its last step has ended, or its time has.
 
+    Joints that would not hold still, and those that a pose moves, are brought into other modes first; joints
+    in velocity mode stand from the first cycle on.
     A pose: goals move toward it at the step's speed, from where they are, and it is reached when the joints
     are there, or SETTLE_NS later. Less torque: so many times within the step's time a smaller limit, from the
     servos' own one down to `fraction` of it.
@@ -44,7 +66,8 @@ class SafeMotion:
     policy: Policy
     limit_ns: int
     record: CycleRecord
-    limit_torque: Callable[[float], None]
+    joints: tuple[JointPlan, ...]
+    hardware: MotionHardware
     over: bool = field(default=False, init=False)
     unfinished: str = field(default="", init=False)
     """Which step ended before it was done, and why; empty: none."""
@@ -53,9 +76,19 @@ class SafeMotion:
     _step_ns: int = field(default=0, init=False)
     _there_ns: int = field(default=-1, init=False)
     _level: int = field(default=0, init=False)
+    _modes: NDArray[np.uint8] = field(init=False)
+    """That joints need first; UNKNOWN: any will do."""
+    _wait_ns: int = field(default=0, init=False)
+    """How long the steps wait for modes, and for joints in velocity mode to stand."""
 
     def __post_init__(self) -> None:
-        self.over = not self.policy.steps
+        now = self.record.states.mode.tolist()
+        self._modes = np.array(
+            [self._needed(row, Mode(mode)) for row, mode in enumerate(now)], dtype=np.uint8
+        )
+        turning = self.policy.last == "hold" and Mode.VELOCITY in now
+        self._wait_ns = MODES_NS if self._modes.any() else STAND_NS if turning else 0
+        self.over = not self.policy.steps and not self._wait_ns
 
     def command(self) -> None:
         """Command this cycle's part of the step; the robot's commands are empty when there is none left."""
@@ -64,8 +97,12 @@ class SafeMotion:
         record.commands.clear()
         if self._began_ns < 0:
             self._began_ns = self._step_ns = now_ns
+            if self._modes.any():
+                self.hardware.set_modes(self._modes)
         if now_ns - self._began_ns >= self.limit_ns:
             self.give_up("its time is over")
+        if self._changing(now_ns):
+            return
         while not self.over and self._ended(self.policy.steps[self._index], now_ns):
             self._index += 1
             self._step_ns, self._there_ns, self._level = now_ns, -1, 0
@@ -75,7 +112,28 @@ class SafeMotion:
         """End before the steps are done."""
         if not self.over:
             self.over = True
-            self.unfinished = f"{self.policy.steps[self._index].text} ends early: {why}"
+            step = self.policy.steps[self._index].text if self.policy.steps else "the change of modes"
+            self.unfinished = f"{step} ends early: {why}"
+
+    def _needed(self, row: int, mode: Mode) -> Mode:
+        """Return into which mode a joint must be brought before the steps."""
+        if self.policy.last == "limp" and not self.policy.steps:
+            return Mode.UNKNOWN
+        if any(step.targets and step.targets[row] is not None for step in self.policy.steps):
+            return Mode.UNKNOWN if mode == Mode.POSITION else Mode.POSITION
+        return Mode.UNKNOWN if mode in {Mode.POSITION, Mode.VELOCITY} else self.joints[row].rest
+
+    def _changing(self, now_ns: int) -> bool:
+        """Say whether the steps wait for modes still; they begin when the time for that is over, too."""
+        if not self._wait_ns:
+            return False
+        away = (self._modes != Mode.UNKNOWN) & (self._modes != self.record.states.mode)
+        if now_ns - self._began_ns < (self._wait_ns if away.any() else STAND_NS):
+            return True
+        self._wait_ns = 0
+        self._step_ns = now_ns
+        self.over = self.over or not self.policy.steps
+        return self.over
 
     def _ended(self, step: Step, now_ns: int) -> bool:
         """Do a step's part of this cycle; return whether the step has ended."""
@@ -101,5 +159,5 @@ class SafeMotion:
         level = min(step.levels, 1 + passed_ns * step.levels // max(step.longest_ns, 1))
         if level != self._level:
             self._level = level
-            self.limit_torque(1.0 - (1.0 - step.fraction) * level / step.levels)
+            self.hardware.limit_torque(1.0 - (1.0 - step.fraction) * level / step.levels)
         return passed_ns >= step.longest_ns

@@ -1,0 +1,74 @@
+"""The end of a run whose joints are not in position mode: they rest before a pose, and never turn on."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dxlrun.control.policy_plan import HOLD, LIMP, Policy, PolicyPlan, Step
+from dxlrun.control.safe_motion import MODES_NS, STAND_NS
+from dxlrun.mode import Mode
+
+PERIOD_NS = 20_000_000
+POSE = Policy((Step("pose home at 60 deg/s", 10**9, (0.3, None), 1.0),), "limp")
+
+
+def drives(self: Any, step: str, time_ns: int, _: object) -> None:
+    if step == "update":
+        self.context.commands.velocity[:] = 0.5
+        self.context.commands.effort[:] = 0.2
+
+
+def ended(robot: Any, command: str, policy: Policy, slow: bool = False) -> list[list[float]]:
+    """Return velocity and effort goals of the cycles after the last one of the controllers."""
+    robot.script("drive", drives, command=(command,))
+    robot.build(end_ns=10 * PERIOD_NS, policies=PolicyPlan(on_exit=policy))
+    robot.record.states.mode[:] = Mode.VELOCITY if command == "velocity" else Mode.EFFORT
+    if slow:
+        robot.hardware.set_modes = lambda modes: robot.hardware.asked.append(modes.tolist())
+    seen: list[list[float]] = []
+    write = robot.hardware.write
+
+    def watched() -> None:
+        write()
+        if not robot.record.active:
+            goals = robot.record.goals
+            seen.append([*goals.velocity, *goals.effort, *goals.position])
+
+    robot.hardware.write = watched
+    assert robot.loop.run().reason == "ended"
+    return seen
+
+
+def test_a_run_that_ends_limp_sends_nothing_more(robot: Any) -> None:
+    assert ended(robot, "velocity", LIMP) == []
+
+
+def test_wheels_stand_before_they_are_left_with_torque_on(robot: Any) -> None:
+    seen = ended(robot, "velocity", HOLD)
+    assert len(seen) == STAND_NS // PERIOD_NS + 1
+    assert np.array(seen)[:, :2].tolist() == [[0.0, 0.0]] * len(seen)
+    assert robot.hardware.asked == []
+
+
+def test_joints_that_would_give_way_hold_before_they_are_left_with_torque_on(robot: Any) -> None:
+    seen = ended(robot, "effort", HOLD)
+    assert robot.hardware.asked == [[Mode.POSITION, Mode.POSITION]]
+    assert seen[0][2:4] == [0.0, 0.0]
+    assert seen[-1][4:] == robot.record.states.position.tolist()
+
+
+def test_a_pose_begins_when_all_joints_that_it_moves_are_in_position_mode(robot: Any) -> None:
+    seen = ended(robot, "velocity", POSE)
+    assert robot.hardware.asked == [[Mode.POSITION, 0]]
+    assert seen[-1][4] == pytest.approx(0.3)
+    assert seen[-1][0] == 1.0  # the speed of the pose, no velocity
+    assert seen[-1][1] == 0.0
+
+
+def test_a_policy_does_not_wait_for_modes_for_ever(robot: Any) -> None:
+    seen = ended(robot, "effort", HOLD, slow=True)
+    assert len(seen) == MODES_NS // PERIOD_NS + 1
+    assert np.array(seen)[:, 2:4].tolist() == [[0.0, 0.0]] * len(seen)
