@@ -154,6 +154,20 @@ def test_send_moves_the_joints_that_are_named_with_units(dxlrun, torso: RemoteRo
     until(torso, "head_pitch_joint", 0.3491)
 
 
+def test_a_register_is_set_while_the_robot_runs(dxlrun, torso: RemoteRobot) -> None:
+    last = torso.events()["last"]
+    said = dxlrun("set", "head_yaw_joint", "ccw_compliance_slope", "64", "--debug")
+    assert said == (0, "bioloid_torso: ccw_compliance_slope of head_yaw_joint is 64\n", "")
+    told = [event["text"] for event in torso.events(last)["events"] if event["name"] == "register_written"]
+    assert told == ["CCW Compliance Slope (29) was 32 and is 64"]
+    assert dxlrun("set", "head_yaw_joint", "ccw_compliance_slope", "64").code == 0
+    said = dxlrun("set", "head_yaw_joint", "temperature_limit", "70 degC")
+    assert said.code == 2
+    assert (
+        "Temperature Limit (11) stands in the EEPROM, which no servo writes while it holds torque" in said.err
+    )
+
+
 def test_send_takes_a_file(dxlrun, torso: RemoteRobot, tmp_path: Path) -> None:
     file = tmp_path / "wave.yaml"
     file.write_text("points:\n  - {time: 200 ms, positions: [0.1 rad, 0 deg, 10 deg]}\n")

@@ -53,6 +53,10 @@ def rate(hz: float) -> Command:
     return ask("rate", {"rate": hz})
 
 
+def register(joint: str, item: str, value: int) -> Command:
+    return ask("register", {"joint": joint, "item": item, "value": value})
+
+
 def send(controller: str, kind: str, *numbers: float, lease_ns: int = 0) -> Command:
     """Return a command for a controller."""
     return Command(0, controller, kind, np.array(numbers).tobytes(), "anna", lease_ns)
@@ -86,6 +90,10 @@ STORIES: dict[str, Asked] = {
         26: [ask("unload", {"controller": "guest"}), ask("load", LOADED), ask("resume")],
     },
     "a fallback": {5: [rate(100)], 15: [rate(50)]},
+    "registers": {
+        4: [register("nod", "cw_compliance_slope", 64), register("nod", "ccw_compliance_slope", 16)],
+        9: [register("nobody", "punch", 40), register("tilt", "temperature_limit", 60)],
+    },
     "a stop in a pause": {10: [ask("pause")], 20: [ask("stop")]},
     "rubbish": {4: [Command(0, "", "switch", b'{"activate": ["\xff"]}', "mallory"), ask("policy")]},
 }
@@ -176,6 +184,12 @@ def test_a_steered_run(tell: Callable[[str], Path], story: str) -> None:
 def test_the_stories_do_what_they_are_there_for(tell: Callable[[str], Path]) -> None:
     log = read_log(tell("rates"))
     assert set(np.diff(log.cycles["scheduled_ns"]).tolist()) == {20 * MS, 10 * MS, 5 * MS}
+    log = read_log(tell("registers"))
+    written = [(one.source, one.text) for one in log.events if one.name == "register_written"]
+    assert written == [
+        ("nod", "CW Compliance Slope (28) was 32 and is 64"),
+        ("nod", "CCW Compliance Slope (29) was 32 and is 16"),
+    ]
     log = read_log(tell("a fallback"))
     assert {int(mask) for mask in log.cycles["active"]} == {0b0111, 0b1011}
     log = read_log(tell("a controller that is loaded"))

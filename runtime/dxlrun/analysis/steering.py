@@ -24,6 +24,9 @@ class _Data(msgspec.Struct):
     name: str = ""
     controller: str = ""
     policy: str = ""
+    joint: str = ""
+    item: str = ""
+    value: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,6 +157,7 @@ def _words(command: TakenCommand) -> str:
         "rate": rate,
         "load": data.name,
         "unload": data.controller,
+        "register": f"{data.item} of {data.joint} = {data.value}",
         "policy": data.policy,
     }
     return f"{command.kind} {known.get(command.kind, '')}".strip()

@@ -29,6 +29,7 @@ _KINDS = {
     "pause": "pause",
     "load": "controller loaded",
     "unload": "controller unloaded",
+    "register": "register written",
     "stop": "stop",
 }
 _MANY = {
@@ -36,6 +37,7 @@ _MANY = {
     "change of the rate": "changes of the rate",
     "controller loaded": "controllers loaded",
     "controller unloaded": "controllers unloaded",
+    "register written": "registers written",
 }
 
 

@@ -20,7 +20,7 @@ from dxlrun.cli.robots import list_robots
 from dxlrun.cli.run import run
 from dxlrun.cli.schema import schema
 from dxlrun.cli.sim import sim
-from dxlrun.cli.steer import load, pause, rate, resume, send, stop, switch, unload
+from dxlrun.cli.steer import load, pause, rate, resume, send, set_register, stop, switch, unload
 from dxlrun.cli.terminal import say_error, say_warning
 from dxlrun.errors import DxlrunError, InputError
 
@@ -57,6 +57,7 @@ def build() -> App:
     app.command(doctor)
     app.command(bench)
     app.command(list_robots, name="list", group=RUNNING)
+    app.command(set_register, name="set", group=RUNNING)
     for verb in (switch, send, rate, pause, resume, load, unload, stop):
         app.command(verb, group=RUNNING)
     return app

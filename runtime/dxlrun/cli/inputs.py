@@ -13,7 +13,18 @@ if TYPE_CHECKING:
     from dxlrun.compile import Ask, Compiled
 
 COMMANDS = ("analyze", "bench", "check", "doctor", "models", "replay", "schema", "sim")
-COMMANDS_WHILE_IT_RUNS = ("list", "switch", "send", "rate", "pause", "resume", "load", "unload", "stop")
+COMMANDS_WHILE_IT_RUNS = (
+    "list",
+    "set",
+    "switch",
+    "send",
+    "rate",
+    "pause",
+    "resume",
+    "load",
+    "unload",
+    "stop",
+)
 
 
 SHORTEST_S, LONGEST_S = 1e-6, 1e9

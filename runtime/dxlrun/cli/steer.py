@@ -104,6 +104,29 @@ def send(
         return _done(robot, whom, f"{robot.name}: {controller} has taken {kind}")
 
 
+def set_register(joint: str, item: str, value: str, /, *, whom: Whom = ONLY_ONE) -> int:
+    """Change a register of a servo while the robot runs: `dxlrun set elbow_joint position_p_gain 900`.
+
+    Items of the RAM that no controller commands; returns when the servo has it. `dxlrun models` lists them.
+
+    Parameters
+    ----------
+    joint
+        Name of the joint.
+    item
+        Item of its servo's control table.
+    value
+        Whole number as in the e-Manual, or a quantity with its unit, such as '10 rad/s^2'.
+    """
+    from dxlrun.description.scalars import plain_value
+
+    number = plain_value(value)
+    wanted = number if isinstance(number, int) and not isinstance(number, bool) else value
+    with _robot(whom, "set") as robot:
+        robot.set_register(joint, item, wanted)
+        return _done(robot, whom, f"{robot.name}: {item} of {joint} is {wanted}")
+
+
 def rate(hz: float, /, *, whom: Whom = ONLY_ONE) -> int:
     """Let the loop of a running robot run at another rate.
 

@@ -133,6 +133,14 @@ class RemoteRobot:
         """Activate and deactivate controllers in one cycle, or not at all."""
         self._post("/switch", {"activate": list(activate), "deactivate": list(deactivate)})
 
+    def set_register(self, joint: str, item: str, value: int | str) -> None:
+        """Write a RAM item of a joint's servo, such as a gain; returns when it was read back.
+
+        `value` is the integer of the e-Manual, or a quantity with its unit: `10 rad/s^2`. A servo that is
+        reset in the run gets it again.
+        """
+        self._post(f"/joints/{_quoted(joint)}/registers/{_quoted(item)}", {"value": value})
+
     def rate(self, rate: float) -> None:
         """Let the loop run at another rate, Hz."""
         self._post("/rate", {"rate": rate})

@@ -6,6 +6,7 @@
     POST /controllers/NAME/commands/KIND        a typed command
     POST /controllers/NAME/set-points/KIND      one of a stream; the newest wins; ?lease=0.2 (seconds)
     POST /switch {activate, deactivate}         controllers, in one cycle or not at all
+    POST /joints/NAME/registers/ITEM {value}    a RAM item of a joint's servo; answered when it is there
     POST /rate {rate}, /pause, /resume, /stop
     POST /controllers {name, type, ...}         load one, DELETE /controllers/NAME unload it; in a pause only
 
@@ -34,6 +35,7 @@ from dxlrun.cycle import CycleRecord
 from dxlrun.remote.asking import Allowance, body, number, origin, peer, typed
 from dxlrun.remote.link import Link, Loaded
 from dxlrun.remote.preparation import Preparation, Refusal
+from dxlrun.remote.registers import Value, register_wish
 
 MOST_OPERATIONS = 200.0
 MOST_SET_POINTS = 4000.0
@@ -79,6 +81,7 @@ class Gateway:
             route("/controllers/{name}", self.unload, "DELETE", operations),
             route("/controllers", self.load, "POST", operations),
             route("/switch", self.switch, "POST", operations),
+            route("/joints/{name}/registers/{item}", self.register, "POST", operations),
             route("/rate", self.rate, "POST", operations),
             route("/pause", self.pause, "POST", operations),
             route("/resume", self.resume, "POST", operations),
@@ -180,6 +183,13 @@ class Gateway:
                 self._named(name)
         done = partial(self._link.switched, wish.activate, wish.deactivate)
         return await self._ask(request, "switch", wish, done)
+
+    async def register(self, request: Request) -> Response:
+        """Have a RAM item of a joint's servo written, and answer when it was read back."""
+        wish = await typed(request, Value, '{"value": 800}')
+        joint, item = request.path_params["name"], request.path_params["item"]
+        prepared = register_wish(self._link.plan, joint, item, wish.value)
+        return await self._ask(request, "register", prepared, None)
 
     async def rate(self, request: Request) -> Response:
         """Run the loop at another rate."""
