@@ -80,7 +80,7 @@ def _turn(host: Host, found: Measured, most: int, turn_ns: int) -> bool:
     end_ns = now_ns() + turn_ns
     processor = time.process_time_ns()
     before = began_ns = now_ns()
-    while len(walls) < most and before < end_ns:
+    while not walls or (len(walls) < most and before < end_ns):
         if not exchange():
             found.lost += 1
             return False

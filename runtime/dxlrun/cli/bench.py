@@ -71,6 +71,8 @@ def bench_bus(
     opponents = _words("--against", against, ["canned", "simulated"])
     if not 0.01 <= seconds <= 3600:
         raise InputError(f"--seconds {seconds:g}: give from 0.01 to 3600")
+    if not 9600 <= baud <= 4_500_000:
+        raise InputError(f"--baud {baud}: give from 9600 to 4500000")
     lines = [Case(each, count, baud) for each in protocols for count in _counts(servos)]
     cases: list[tuple[bus.Against, Case]] = []
     if "canned" in opponents:

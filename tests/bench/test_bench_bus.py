@@ -1,0 +1,210 @@
+"""The benchmark of the exchange: who is measured exchanges what, judged by byte counts and by the ledger.
+
+How fast anybody is decides nothing here.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import select
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dxlrun.analysis.ledger_waits import Transaction
+from dxlrun.bench.bus import Wish, bench_bus, chosen_hosts, to_json
+from dxlrun.bench.case import Case, Registers
+from dxlrun.bench.figures import host_figures, wire_figures
+from dxlrun.bench.hosts import HOSTS, HostKind
+from dxlrun.bench.responder import Terminal
+from dxlrun.bench.rounds import Measured, measure
+from dxlrun.bench.wire import judge
+from dxlrun.dynamixel import protocol1
+
+SECONDS = 0.2
+ALL = [kind.name for kind in HOSTS]
+
+
+def by_name(hosts: Any) -> dict[str, Any]:
+    return {one.host: one for one in hosts}
+
+
+@pytest.mark.parametrize("protocol", [1.0, 2.0])
+def test_every_host_exchanges_the_same_bytes_with_the_canned_responder(protocol: float) -> None:
+    case = Case(protocol, 3)
+    (found,) = bench_bus([("canned", case)], Wish(chosen_hosts(ALL), SECONDS)).cases
+    hosts = by_name(found.hosts)
+    assert set(hosts) == set(ALL) if protocol == 2.0 else set(hosts) == {n for n in ALL if "fast" not in n}
+    registers = Registers.of(case.plan(wire=False))
+    assert hosts["ours"].sent_bytes == hosts["unrecorded"].sent_bytes
+    for name in ("sdk", "rustypot"):
+        one = hosts[name]
+        assert one.sent_bytes == hosts["sdk"].sent_bytes
+        assert one.received_bytes == 3 * (registers.read_length + (6 if protocol == 1.0 else 11))
+    if protocol == 2.0:  # one status for all: 4 bytes a servo beside its data instead of 11
+        assert hosts["sdk-fast"].received_bytes == 8 + 3 * (registers.read_length + 4)
+        assert hosts["rustypot-fast"].received_bytes == hosts["sdk-fast"].received_bytes
+    ours, budget = hosts["ours"], case.plan(wire=False).buses[0].budget
+    assert ours.sent_bytes + ours.received_bytes == budget.request_bytes + budget.reply_bytes
+
+
+def test_on_simulated_servos_the_ledger_says_how_many_bytes_an_exchange_has() -> None:
+    case = Case(2.0, 2)
+    wish = Wish(chosen_hosts(["ours", "rustypot"]), 2 * SECONDS)
+    (found,) = bench_bus([("simulated", case)], wish).cases
+    budget = case.plan(wire=True).buses[0].budget
+    ours = by_name(found.hosts)["ours"]
+    assert (found.against, found.baud_rate) == ("simulated", 1_000_000)
+    assert ours.sent_bytes + ours.received_bytes == budget.request_bytes + budget.reply_bytes
+    assert ours.wire.wire_us == budget.wire_ns / 1e3
+
+
+def test_a_host_that_is_not_installed_is_left_out_and_said() -> None:
+    nobody = HostKind("nobody", "no_such_module_at_all", HOSTS[0].make)
+    told: list[tuple[str, float]] = []
+    wish = Wish([nobody, *chosen_hosts(["unrecorded"])], 0.05)
+    found = bench_bus([("canned", Case(2.0, 1))], wish, lambda *words: told.append(words))
+    assert found.missing == ("nobody",)
+    assert [one.host for one in found.cases[0].hosts] == ["unrecorded"]
+    assert told[-1] == ("canned: Protocol 2.0, 1 x XM430-W350", 1.0)
+    assert b'"exchanges"' in to_json(found)
+
+
+def test_the_core_is_given_back() -> None:
+    before = os.sched_getaffinity(0)
+    bench_bus([("canned", Case(2.0, 1))], Wish(chosen_hosts(["unrecorded"]), 0.02))
+    assert os.sched_getaffinity(0) == before
+
+
+# The canned responder
+
+
+@pytest.fixture
+def learned() -> tuple[Terminal, Callable[[bytes], bytes]]:
+    """A responder that learned to answer a ping, then goals that nobody answers."""
+    terminal = Terminal(Case(1.0, 1).simulated("main"))
+    host = os.open(terminal.path, os.O_RDWR | os.O_NOCTTY)
+
+    def say(data: bytes) -> bytes:
+        os.write(host, data)
+        while select.select([terminal], [], [], 0)[0]:
+            terminal.receive()
+        return os.read(host, 1000) if select.select([host], [], [], 0)[0] else b""
+
+    terminal.do("rehearse")
+    assert say(protocol1.ping(1))[2] == 1
+    terminal.do("learn")
+    assert say(protocol1.ping(1))
+    assert say(protocol1.write(0xFE, 30, b"\0\2")) == b""
+    (first, last) = terminal.do("play")
+    assert (first.count, len(first.reply)) == (6, 6)
+    assert (last.count, last.reply) == (9, b"")
+    return terminal, say
+
+
+def test_the_responder_answers_after_so_many_bytes_whatever_they_are(learned: Any) -> None:
+    _, say = learned
+    assert say(b"12345") == b""
+    answer = say(b"6")
+    assert answer[2] == 1
+    assert say(b"123456789") == b""
+    assert say(b"123456") == answer
+
+
+def test_bytes_that_come_together_are_answered_together(learned: Any) -> None:
+    _, say = learned
+    assert len(say(b"?" * (6 + 9 + 6))) == 12
+
+
+def test_the_responder_is_a_servo_again_when_it_is_rehearsed(learned: Any) -> None:
+    terminal, say = learned
+    say(b"123")
+    terminal.do("rehearse")
+    assert say(protocol1.ping(7)) == b""
+    assert say(protocol1.ping(1))[2] == 1
+
+
+# The rounds, and the figures made of them
+
+
+class Made:
+    """A host whose exchanges are lost when they are told to."""
+
+    def __init__(self, lost: set[int]) -> None:
+        self.count = 0
+        self.lost = lost
+
+    def start(self) -> None:
+        pass
+
+    def exchange(self) -> bool:
+        self.count += 1
+        return self.count not in self.lost
+
+    def mend(self) -> None:
+        pass
+
+    def sent(self) -> tuple[()]:
+        return ()
+
+    def close(self) -> None:
+        pass
+
+
+def test_a_turn_with_a_lost_reply_counts_only_as_lost_and_the_host_is_mended() -> None:
+    mended: list[str] = []
+    hosts = {"good": Made(set()), "bad": Made({2, 6})}
+    found = measure(hosts, 1e-6, most=5, recover=mended.append)
+    assert mended == ["bad", "bad"]
+    assert (found["good"].lost, found["bad"].lost) == (0, 2)
+    assert found["good"].exchanges > 0
+    assert found["bad"].walls_ns == []
+
+
+def measured(walls_us: list[list[int]], processor_us: list[int]) -> Measured:
+    walls = [[each * 1000 for each in round_] for round_ in walls_us]
+    return Measured(walls, [0] * len(walls), [each * 1000.0 for each in processor_us])
+
+
+def test_ratios_are_of_neighbouring_rounds_so_that_a_busy_moment_hits_both() -> None:
+    ours = measured([[100, 110, 120], [1000, 1100, 1200]], [50, 500])
+    theirs = measured([[200, 220, 240], [2000, 2200, 2400]], [100, 1000])
+    first, _ = host_figures({"ours": ours, "theirs": theirs}, {"ours": (1, 2), "theirs": (1, 2)}, {})
+    assert first.wall_ratio == {"theirs": 0.5}
+    assert first.processor_ratio == {"theirs": 0.5}
+    assert (first.median_us, first.exchanges) == (560.0, 6)
+
+
+def test_a_host_without_a_whole_exchange_has_no_figures() -> None:
+    first, other = host_figures(
+        {"ours": measured([], []), "theirs": measured([[10]], [5])}, {"ours": (0, 0), "theirs": (1, 2)}, {}
+    )
+    assert math.isnan(first.median_us)
+    assert math.isnan(other.wall_ratio["ours"])
+
+
+def test_the_servos_lateness_is_taken_out_before_the_exchange_is_compared_with_its_wire() -> None:
+    found = wire_figures(np.array([1200.0, 1300.0]) * 1e3, np.array([100.0, 200.0]) * 1e3, 1e6)
+    assert (found.beyond_us, found.late_us, found.ratio) == (1100.0, 150.0, 1.1)
+
+
+def test_a_transaction_belongs_to_the_exchange_that_waited_for_it() -> None:
+    answered = [
+        Transaction(handed_ns=150, late_ns=3, taken=10, given=20),
+        Transaction(handed_ns=250, late_ns=4, taken=30, given=40),
+        Transaction(handed_ns=270, late_ns=5, taken=31, given=41),
+        Transaction(handed_ns=990, late_ns=90, taken=99, given=99),  # behind the last of them
+    ]
+    found = judge(answered, np.array([100, 200, 300]), np.array([100, 100, 100]))
+    assert found.late_ns.tolist() == [3, 9, 0]
+    assert (found.sent_bytes, found.received_bytes) == (20, 20)
+
+
+def test_both_goals_of_a_case_stay_within_the_servo_and_differ(tmp_path: Path) -> None:
+    registers = Registers.of(Case(1.0, 1).plan(wire=True))
+    assert 0 < registers.ticks[0] < registers.ticks[1] < 1024
+    assert [size for _, size in registers.values] == [2, 2, 2]
