@@ -145,8 +145,12 @@ class DynamixelHardware:
 
     def limit_torque(self, fraction: float) -> None:
         """Let no servo exert more than a fraction of its own limit; `restore_torque` takes that back."""
-        for plan, bus, full in zip(self._plans, self._buses, self._full_torque, strict=False):
-            for packet in reduced(plan, full, fraction):
+        for servos in self._servos:
+            servos.goals.weaken(fraction)
+        for plan, bus, servos, full in zip(
+            self._plans, self._buses, self._servos, self._full_torque, strict=False
+        ):
+            for packet in reduced(plan, full, fraction, servos.goals.modes):
                 with suppress(PortError):  # as with goals: the next read names the bus
                     bus.send(packet)
 

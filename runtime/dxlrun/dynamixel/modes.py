@@ -1,7 +1,7 @@
 """Mode switches of one servo: torque off, what selects the mode, what that resets, a goal that moves nothing.
 
 Programs of transactions, at the start and in the gaps between cycles; nothing here waits. A switch leaves the
-torque as it was: on again only where it had been on, and off where anything went wrong meanwhile.
+torque as it was: on again only where it had been on, where a servo refuses in the mode that it keeps.
 
 Sources: e-Manual XM430-W350, Operating Mode (11), for what a change needs and what it resets; MX-64, CW/CCW
 Angle Limit (6, 8) and Torque Control Mode Enable (70).
@@ -62,16 +62,20 @@ def enter(plan: BusPlan, servo: ServoPlan, mode: Mode, *, again: bool = True) ->
     if not torque.answered or found is None:
         return "did not answer when its mode was asked for"
     enabled = bool(torque.parameters[0])
-    if in_mode(wanted, found):
-        if not again:
-            return ""
-    else:
+    problem = ""
+    if not in_mode(wanted, found):
         problem = yield from _change(plan, servo, wanted, found, enabled=enabled)
-        if problem:
-            return problem
-    if not enabled:
+    elif not again:
         return ""
-    return (yield from hold(plan, servo, wanted)).problem
+    if problem and enabled:
+        # a joint that does not change shall not fall for that
+        now = yield from mode_now(plan, servo)
+        if now is not Mode.UNKNOWN:
+            back = yield from hold(plan, servo, servo.mode_plan(now))
+            problem += f", and {back.problem}" if back.problem else ""
+    elif enabled:
+        problem = (yield from hold(plan, servo, wanted)).problem
+    return problem
 
 
 @dataclass(slots=True)

@@ -14,6 +14,7 @@ from dxlrun.dynamixel.bus_plan import BusPlan, ServoPlan, TorqueLimit
 from dxlrun.dynamixel.dialect import dialect_of
 from dxlrun.dynamixel.inspection import persist, setup_line, who
 from dxlrun.dynamixel.transaction import Program
+from dxlrun.mode import Mode
 
 
 @dataclass(slots=True)
@@ -46,7 +47,7 @@ def restore(plan: BusPlan) -> Program[TorqueLimits]:
             continue
         wanted, present = (int.from_bytes(reply.parameters[: place.size], "little") for reply in (full, now))
         found.full[-1] = wanted
-        if present != wanted:
+        if present != wanted and _limits(servo, servo.start_mode):
             data = wanted.to_bytes(place.size, "little")
             written = yield from persist(line.write(servo.servo_id, place.address, data))
             if written.answered:
@@ -57,10 +58,15 @@ def restore(plan: BusPlan) -> Program[TorqueLimits]:
     return found
 
 
-def reduced(plan: BusPlan, full: Sequence[int], fraction: float) -> list[bytes]:
-    """Return the packets that leave each servo a fraction of its own limit, one tick at least."""
+def reduced(plan: BusPlan, full: Sequence[int], fraction: float, modes: Sequence[Mode] = ()) -> list[bytes]:
+    """Return the packets that leave each servo a fraction of its own limit, one tick at least.
+
+    `modes`: in which the servos are; one whose mode is changing is left alone.
+    """
     by_place: dict[TorqueLimit, list[tuple[ServoPlan, int]]] = {}
-    for servo, own in zip(plan.servos, full, strict=True):
+    for index, (servo, own) in enumerate(zip(plan.servos, full, strict=True)):
+        if modes and not _limits(servo, modes[index]):
+            continue
         if servo.torque_limit is not None and own:
             by_place.setdefault(servo.torque_limit, []).append((servo, max(1, round(own * fraction))))
     packets = []
@@ -70,3 +76,11 @@ def reduced(plan: BusPlan, full: Sequence[int], fraction: float) -> list[bytes]:
         )
         packets.append(dialect_of(plan.protocol).sync_write_records(place.address, place.size, records))
     return packets
+
+
+def _limits(servo: ServoPlan, mode: Mode) -> bool:
+    """Say whether what limits the torque does so in a mode: where Goal PWM is the goal it would drive it."""
+    place = servo.torque_limit
+    if place is None or mode is Mode.UNKNOWN:
+        return False
+    return all(goal.address != place.address for goal in servo.mode_plan(mode).goals)
