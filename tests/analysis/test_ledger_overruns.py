@@ -93,6 +93,13 @@ def test_the_largest_of_three_is_the_cause_and_the_share_is_of_all_cycles(
     assert (one.simulation_us, one.wake_up_us, one.own_us) == (4_000, 3_000, 8_900)
 
 
+def test_a_cycle_that_was_too_long_without_the_late_reply_is_our_own(
+    causes_of: Callable[..., object],
+) -> None:
+    found = causes_of(ledger(handed_late_us=30_000), read=35_000, update=16_000)
+    assert counts(found) == (0, 0, 1)
+
+
 def test_a_reply_that_was_asked_for_before_counts_only_as_long_as_it_was_waited_for(
     causes_of: Callable[..., object],
 ) -> None:

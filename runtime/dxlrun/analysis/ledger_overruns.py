@@ -1,7 +1,8 @@
 """Why a loop on simulated buses overran: late servos, a late wake-up, or our own work.
 
 A cycle that ended behind the next deadline is split into what its servos were late (by the ledger), what it
-woke late, and what its own work took beyond the median of all cycles. The largest of them is the cause.
+woke late, and what its own work took beyond the median of all cycles. The largest of them is the cause; but a
+cycle that would have overrun with punctual servos and a punctual wake-up, too, is our own.
 
 - A servo's lateness counts as far as the loop waited for it: within the read, or in the gap behind the
   deadline. Several buses are waited for at once, so the latest one counts.
@@ -95,6 +96,7 @@ def overrun_causes(log: Log, by_bus: Mapping[str, Sequence[LedgerEntry]]) -> Ove
                 int(woken[index] - scheduled[index] - gap[index]),
                 int(work[index]) - usual,
             ),
+            too_long=bool(work[index] > log.period_ns),
         )
         for index in late
     )
@@ -127,10 +129,10 @@ def _baud_rates(log: Log) -> dict[str, int]:
     return {bus.name: bus.baud_rate for bus in plan.buses}
 
 
-def _overrun(seconds: float, skipped: int, parts: tuple[int, int, int]) -> Overrun:
+def _overrun(seconds: float, skipped: int, parts: tuple[int, int, int], *, too_long: bool) -> Overrun:
     simulation, wake_up, own = parts
     causes: tuple[Cause, ...] = ("own work", "wake-up", "simulation")  # in doubt it is our own
-    cause = causes[int(np.argmax((own, wake_up, simulation)))]
+    cause = "own work" if too_long else causes[int(np.argmax((own, wake_up, simulation)))]
     return Overrun(seconds, skipped, cause, simulation / 1e3, wake_up / 1e3, own / 1e3)
 
 
