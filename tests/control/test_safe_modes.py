@@ -56,7 +56,7 @@ def test_wheels_stand_before_they_are_left_with_torque_on(robot: Any) -> None:
 def test_joints_that_would_give_way_hold_before_they_are_left_with_torque_on(robot: Any) -> None:
     seen = ended(robot, "effort", HOLD)
     assert robot.hardware.asked == [[Mode.POSITION, Mode.POSITION]]
-    assert seen[0][2:4] == [0.0, 0.0]
+    assert np.isnan(np.array(seen)[:, :4]).all()
     assert seen[-1][4:] == robot.record.states.position.tolist()
 
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from dxlrun.compile.joints import CompiledJoint
-from dxlrun.compile.problems import Problems
-from dxlrun.compile.registers import check_position_limits
 from dxlrun.description import Description
 from dxlrun.dynamixel.bus_plan import Budget, BusPlan
 from dxlrun.dynamixel.plan import Wiring, bus_plan
+from dxlrun.mode import Mode
+
+from dxlrun.compile.joints import CompiledJoint
+from dxlrun.compile.problems import Problems
+from dxlrun.compile.registers import check_position_limits
 
 SIMULATED = "sim"
 FAST_LATENCY_NS = 1_000_000
@@ -20,9 +22,15 @@ _COMFORTABLE = 0.9
 
 
 def compile_buses(
-    description: Description, joints: Mapping[str, CompiledJoint], problems: Problems
+    description: Description,
+    joints: Mapping[str, CompiledJoint],
+    modes: Mapping[str, Mode],
+    problems: Problems,
 ) -> list[BusPlan]:
-    """Return the plans of the buses that have joints, in the order of the file."""
+    """Return the plans of the buses that have joints, in the order of the file.
+
+    `modes`: in which mode each joint begins a run, by its name.
+    """
     _own_ports(description, problems)
     plans: list[BusPlan] = []
     rows = {name: row for row, name in enumerate(joints)}
@@ -30,7 +38,7 @@ def compile_buses(
         mark = description.marks.key("buses", name)
         if not any(joint.bus == name for joint in description.robot.joints.values()):
             problems.warning(mark, f"no joint stands on bus {name}", "it will not be opened; take it out")
-        wirings = [_wiring(joint, rows) for joint in joints.values() if joint.described.bus == name]
+        wirings = [_wiring(joint, rows, modes) for joint in joints.values() if joint.described.bus == name]
         if not wirings:
             continue
         try:
@@ -65,7 +73,7 @@ def _own_ports(description: Description, problems: Problems) -> None:
             )
 
 
-def _wiring(joint: CompiledJoint, rows: Mapping[str, int]) -> Wiring:
+def _wiring(joint: CompiledJoint, rows: Mapping[str, int], modes: Mapping[str, Mode]) -> Wiring:
     return Wiring(
         joint=joint.plan.name,
         row=rows[joint.plan.name],
@@ -76,6 +84,8 @@ def _wiring(joint: CompiledJoint, rows: Mapping[str, int]) -> Wiring:
         lower=joint.plan.lower,
         upper=joint.plan.upper,
         registers=joint.registers,
+        continuous=joint.plan.continuous,
+        start_mode=modes[joint.plan.name],
     )
 
 

@@ -21,6 +21,7 @@ from dxlrun.compile.scheduler import check_scheduler, least_period_ns, scheduler
 from dxlrun.compile.simulation import compile_simulation
 from dxlrun.compile.twins import check_twins
 from dxlrun.compile.urdf import compile_urdf
+from dxlrun.control.claims import start_modes
 from dxlrun.control.loop_plan import LoopPlan
 from dxlrun.control.plugins import load_plugins
 from dxlrun.description import Description, MotionDescription, read_motion, survey_robot
@@ -114,10 +115,11 @@ def compile_robot(
     joints = compile_joints(description, problems, models or {})
     check_scheduler(description, problems)
     check_twins(description, {name: joint.table for name, joint in joints.items()}, problems)
-    buses = compile_buses(description, joints, problems)
     urdf = compile_urdf(description, joints, problems)
     simulation = compile_simulation(description, joints, problems)
     controllers = compile_controllers(description, plugins, problems)
+    plans = [joint.plan for joint in joints.values()], [one.plan for one in controllers.values()]
+    buses = compile_buses(description, joints, start_modes(*plans), problems)
     policies = compile_policies(description, joints, buses, problems)
     names = (*description.robot.controllers, *left_out_names(description, "controllers"))
     parts = [

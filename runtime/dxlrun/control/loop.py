@@ -257,10 +257,12 @@ class Loop:
         record.woken_ns = woken_ns
         record.period_ns = dt_ns
         self._stood = self.paused
+        self.manager.begin()
+        if self._motion:
+            self._motion.begin()
         self.hardware.read()
         record.read_ns = now_ns()
         self.gate.enter_modes()
-        self.manager.begin()
         if self._motion:
             self.steering.refuse("the run is ending")
             self._motion.command()

@@ -80,7 +80,7 @@ class Manager:
         self._enter([one for one in self._managed if one.plan.active and not one.active], time_ns, "")
 
     def begin(self) -> None:
-        """Begin a cycle: nobody was updated in it yet."""
+        """Begin a cycle, before its states are read: ask for modes; nobody was updated in it yet."""
         self._modes.ask(one for one in self._managed if one.active)
         record = self._record
         record.published = 0

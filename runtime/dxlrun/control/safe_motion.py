@@ -90,6 +90,11 @@ class SafeMotion:
         self._wait_ns = MODES_NS if self._modes.any() else STAND_NS if turning else 0
         self.over = not self.policy.steps and not self._wait_ns
 
+    def begin(self) -> None:
+        """Begin a cycle, before its states are read: ask for the modes that joints need, once."""
+        if self._began_ns < 0 and self._modes.any():
+            self.hardware.set_modes(self._modes)
+
     def command(self) -> None:
         """Command this cycle's part of the step; the robot's commands are empty when there is none left."""
         record = self.record
@@ -97,8 +102,6 @@ class SafeMotion:
         record.commands.clear()
         if self._began_ns < 0:
             self._began_ns = self._step_ns = now_ns
-            if self._modes.any():
-                self.hardware.set_modes(self._modes)
         if now_ns - self._began_ns >= self.limit_ns:
             self.give_up("its time is over")
         if self._changing(now_ns):

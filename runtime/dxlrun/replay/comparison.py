@@ -11,15 +11,18 @@ from numpy.typing import NDArray
 from dxlrun.control.loop_plan import ControllerPlan, LoopPlan
 from dxlrun.cycle import CycleRecord
 from dxlrun.errors import LogError
-from dxlrun.interfaces import Floats
+from dxlrun.interfaces import COMMAND_INTERFACES, Floats
 
-_COMPARED = ("command_position", "command_velocity", "goal_position", "goal_velocity")
+_COMMANDS = tuple(f"command_{interface}" for interface in COMMAND_INTERFACES)
+_GOALS = tuple(f"goal_{interface}" for interface in COMMAND_INTERFACES)
+_COMPARED = (*_COMMANDS, *_GOALS)
 """In the order in which they come to be: what differs first is the cause of the rest."""
 _WHAT = {
-    "command_position": "command of the position",
-    "command_velocity": "command of the velocity",
-    "goal_position": "goal of the position, after the last gate",
-    "goal_velocity": "goal of the velocity, after the last gate",
+    **{f"command_{interface}": f"command of the {interface}" for interface in COMMAND_INTERFACES},
+    **{
+        f"goal_{interface}": f"goal of the {interface}, after the last gate"
+        for interface in COMMAND_INTERFACES
+    },
 }
 _Words = NDArray[np.uint64]
 
@@ -90,8 +93,10 @@ class Comparison:
     def joints(self) -> tuple[JointDifferences, ...]:
         """Return the joints of which anything differs, in the order of rows."""
         differs = self._differs
-        commands = (differs["command_position"] | differs["command_velocity"]).sum(axis=0)
-        goals = (differs["goal_position"] | differs["goal_velocity"]).sum(axis=0)
+        commands, goals = (
+            np.logical_or.reduce([differs[name] for name in names]).sum(axis=0)
+            for names in (_COMMANDS, _GOALS)
+        )
         return tuple(
             JointDifferences(joint.name, int(command), int(goal))
             for joint, command, goal in zip(self._plan.joints, commands, goals, strict=True)
@@ -162,9 +167,8 @@ class Comparison:
         return None
 
 
-def _values(record: CycleRecord) -> tuple[Floats, Floats, Floats, Floats]:
-    commands, goals = record.commands, record.goals
-    return commands.position, commands.velocity, goals.position, goals.velocity
+def _values(record: CycleRecord) -> tuple[Floats, ...]:
+    return *record.commands.arrays, *record.goals.arrays
 
 
 def _told(bits: int) -> str:
