@@ -1,8 +1,10 @@
 import math
 
+import numpy as np
 import pytest
 
 from dxlrun.events import EventCode
+from dxlrun.mode import Mode
 
 WRITE = 3
 
@@ -103,3 +105,58 @@ def test_many_wishes_are_done_in_their_order_and_no_cycle_is_late(started):
         started.cycle()  # asserts that it ends in its period
     assert answers == [(row, value, "") for value in (500, 600, 700) for row in (0, 1)]
     assert (gain_of(started, 0), gain_of(started, 1)) == (700, 700)
+
+
+def until_back(rig, most=200):
+    for _ in range(most):
+        rig.cycle()
+        if rig.states.valid.all() and rig.states.mode.all():
+            return
+    raise AssertionError("a servo did not come back")
+
+
+def test_what_was_set_in_the_run_is_set_again_after_a_reset(started):
+    servo, answers = started.buses[0].servo(12), []
+    started.hardware.set_register(1, "position_p_gain", 900, answers.append)
+    for _ in range(3):
+        started.cycle()
+    servo.silence()
+    for _ in range(5):
+        started.cycle()
+    servo.reset()
+    servo.silence(False)
+    assert gain_of(started, 1) == 800
+    until_back(started)
+    assert gain_of(started, 1) == 900
+    assert [text for _, text in started.events.of(EventCode.REGISTER_WRITTEN)] == [
+        "Position P Gain (84) was 800 and is 900"
+    ] * 2
+
+
+def test_a_servo_comes_back_into_the_mode_in_which_it_was(started):
+    started.hardware.set_modes(np.array([Mode.VELOCITY, Mode.UNKNOWN], dtype=np.uint8))
+    until_back(started)
+    assert started.states.mode.tolist() == [Mode.VELOCITY, Mode.POSITION]
+    before = len(started.into_bus())
+    started.buses[0].servo(11).silence()
+    for _ in range(5):
+        started.cycle()
+    started.buses[0].servo(11).silence(False)
+    until_back(started)
+    assert started.states.mode.tolist() == [Mode.VELOCITY, Mode.POSITION]
+    assert started.buses[0].servo(11).registers["operating_mode"] == 1
+    assert [write for write in writes(started, before) if write[1] == 11] == []
+
+
+def test_a_mode_that_was_wanted_while_a_servo_was_away_is_entered_when_it_is_back(started):
+    started.buses[0].servo(11).silence()
+    for _ in range(5):
+        started.cycle()
+    started.hardware.set_modes(np.array([Mode.VELOCITY, Mode.UNKNOWN], dtype=np.uint8))
+    for _ in range(20):
+        started.cycle()
+    started.buses[0].servo(11).silence(False)
+    until_back(started)
+    assert started.states.mode.tolist() == [Mode.VELOCITY, Mode.POSITION]
+    assert started.buses[0].servo(11).registers["operating_mode"] == 1
+    assert started.torque() == [True, True]

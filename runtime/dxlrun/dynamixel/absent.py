@@ -15,6 +15,7 @@ from dxlrun.dynamixel.plan import plan_line
 from dxlrun.dynamixel.reboots import RealtimeTicks, RebootCount
 from dxlrun.dynamixel.startup import Rejoined, rejoin
 from dxlrun.dynamixel.transaction import Outcome, Program, Transaction
+from dxlrun.dynamixel.wanted import Wanted
 from dxlrun.events import EventCode, Severity
 
 PROBE_NS = 1_000_000_000
@@ -43,8 +44,9 @@ class _Outcome(NamedTuple):
 class Absent:
     """Knows who left the exchange, asks them, and hands them back when they are in order.
 
-    `back` takes the servo and what came of its return; it has torque only when it kept it, or when the
-    policy for returned servos gives it back after a reboot and the servo is not latched.
+    One returns into the mode and with the registers that are `wanted` of it. `back` takes the servo and what
+    came of its return; it has torque only when it kept it, or when the policy for returned servos gives it
+    back after a reboot and the servo is not latched.
     """
 
     __slots__ = (
@@ -61,18 +63,21 @@ class Absent:
         "_say",
         "_tick_reads",
         "_ticks",
+        "_wanted",
     )
 
     def __init__(
         self,
         plan: BusPlan,
         gaps: Gaps,
+        wanted: Wanted,
         say: Voice,
         back: Callable[[int, Rejoined], None],
     ) -> None:
         count = len(plan.servos)
         self._plan = plan
         self._gaps = gaps
+        self._wanted = wanted
         self._now_ns = gaps.now_ns
         self._say = say
         self._back = back
@@ -126,7 +131,8 @@ class Absent:
                 self._count(index)
         yield from bus_watchdog.disarm(plan, servo)
         torque = self._anew[index] and servo.torque_on_return and not self._reboots.latched[index]
-        rejoined = yield from rejoin(plan, index, torque)
+        mode, registers = self._wanted.modes.wanted(index), self._wanted.registers.wanted(index)
+        rejoined = yield from rejoin(plan, index, torque, mode, registers)
         if not rejoined.problems and (problem := (yield from bus_watchdog.arm(plan, servo))):
             rejoined = Rejoined((problem,), False, None, rejoined.written)
         return _Outcome(True, False, rejoined)

@@ -15,15 +15,14 @@ from dxlrun.dynamixel.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.gaps import Gaps
 from dxlrun.dynamixel.health import Servos
 from dxlrun.dynamixel.limp import LimpOutcome, limp_buses
-from dxlrun.dynamixel.mode_changes import ModeChanges
 from dxlrun.dynamixel.modes import settle_modes
 from dxlrun.dynamixel.port import Ports
 from dxlrun.dynamixel.probing import extra_ns, probe_reads
 from dxlrun.dynamixel.registers import settle_bus
-from dxlrun.dynamixel.steered_registers import SteeredRegisters
 from dxlrun.dynamixel.torque_limit import reduced
 from dxlrun.dynamixel.transaction import Program
 from dxlrun.dynamixel.units import joint_position
+from dxlrun.dynamixel.wanted import Wanted
 from dxlrun.errors import PortError, StartUpError
 from dxlrun.events import EventCode, EventSink, Severity
 from dxlrun.interfaces import Commands, States
@@ -76,16 +75,15 @@ class DynamixelHardware:
             for index, (plan, port) in enumerate(zip(self._plans, ports.ports, strict=True))
         )
         self._gaps = tuple(Gaps(plan, events, clock.now_ns) for plan in self._plans)
-        self._registers = tuple(
-            SteeredRegisters(plan, gaps, events) for plan, gaps in zip(self._plans, self._gaps, strict=True)
-        )
+        wanted = [
+            Wanted.of(plan, gaps, states.mode, events)
+            for plan, gaps in zip(self._plans, self._gaps, strict=True)
+        ]
+        self._registers = tuple(one.registers for one in wanted)
+        self._modes = tuple(one.modes for one in wanted)
         self._servos = tuple(
-            Servos(plan, bus, gaps, events)
-            for plan, bus, gaps in zip(self._plans, self._buses, self._gaps, strict=True)
-        )
-        self._modes = tuple(
-            ModeChanges(plan, gaps, servos.goals, states.mode, events)
-            for plan, gaps, servos in zip(self._plans, self._gaps, self._servos, strict=True)
+            Servos(plan, bus, gaps, one, events)
+            for plan, bus, gaps, one in zip(self._plans, self._buses, self._gaps, wanted, strict=True)
         )
 
     def start(self) -> None:

@@ -15,12 +15,12 @@ from dxlrun.dynamixel.bus_plan import BusPlan
 from dxlrun.dynamixel.dialect import dialect_of
 from dxlrun.dynamixel.exchange import CyclicReads
 from dxlrun.dynamixel.gaps import Gaps, Urgency
-from dxlrun.dynamixel.goal_arrays import GoalArrays
 from dxlrun.dynamixel.plan import plan_line
 from dxlrun.dynamixel.protocol2 import describe_hardware_error
 from dxlrun.dynamixel.startup import Rejoined
 from dxlrun.dynamixel.state_arrays import StateArrays
 from dxlrun.dynamixel.transaction import Program, Reply, Transaction
+from dxlrun.dynamixel.wanted import Wanted
 from dxlrun.events import EventCode, EventSink, Severity
 from dxlrun.hardware import LOST_CYCLES
 from dxlrun.interfaces import Commands, States
@@ -66,6 +66,7 @@ class Servos:
         "_limp",
         "_lost",
         "_missed",
+        "_modes",
         "_noise_at_ns",
         "_noise_seen",
         "_plan",
@@ -80,14 +81,14 @@ class Servos:
         "torqued",
     )
 
-    def __init__(self, plan: BusPlan, bus: Bus, gaps: Gaps, events: EventSink) -> None:
+    def __init__(self, plan: BusPlan, bus: Bus, gaps: Gaps, wanted: Wanted, events: EventSink) -> None:
         count = len(plan.servos)
         self._plan = plan
         self._bus = bus
         self._gaps = gaps
         self._events = events
         self._states = StateArrays(plan)
-        self.goals = GoalArrays(plan)
+        self.goals = wanted.goals
         """Builds the sync write."""
         self.reads = CyclicReads(plan, self._states, bus.room)
         """The job that reads every servo once."""
@@ -110,7 +111,8 @@ class Servos:
         self._lost = False
         self._watchdog_ns = plan.watchdog_ticks * bus_watchdog.UNIT_NS or NEVER
         self._fed_ns = 0
-        self._absent = Absent(plan, gaps, self._say, self._back)
+        self._modes = wanted.modes
+        self._absent = Absent(plan, gaps, wanted, self._say, self._back)
 
     @property
     def all_fresh(self) -> bool:
@@ -307,6 +309,7 @@ class Servos:
     def _back(self, index: int, rejoined: Rejoined) -> None:
         """Let a servo take part again that was looked at as at the start."""
         self.reads.join(index)
+        self._modes.returned(index, rejoined.mode)
         for joint, text in rejoined.written:
             self._emit(EventCode.REGISTER_WRITTEN, Severity.INFO, joint, text)
         self.torqued[index] = rejoined.torqued

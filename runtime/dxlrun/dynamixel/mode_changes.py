@@ -49,6 +49,15 @@ class ModeChanges:
         self._goals.set_mode(index, mode)
         self._mode[self._rows[index]] = mode
 
+    def returned(self, index: int, mode: Mode) -> None:
+        """Take note that a servo came back in a mode; another one that was wanted meanwhile follows."""
+        if self._queued[index]:
+            return  # its change is next, and takes note of what is there then
+        if mode == self._wanted[index]:
+            self.entered(index, mode)
+        else:
+            self._queue(index)
+
     def want(self, wanted: NDArray[np.uint8]) -> None:
         """Let servos change into modes, shape (joints,), UNKNOWN: none; a later wish replaces this one."""
         for index, row in enumerate(self._rows):

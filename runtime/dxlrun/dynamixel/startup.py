@@ -180,6 +180,8 @@ class Rejoined:
     """Goal position in ticks as it was written; None: it is limp, its mode has none, or none was."""
     written: tuple[tuple[str, str], ...]
     """Joint, and what was written into its registers."""
+    mode: Mode = Mode.UNKNOWN
+    """In which it is; UNKNOWN where there are problems."""
 
 
 def rejoin(
@@ -213,11 +215,11 @@ def rejoin(
         settled.problems.append(f"{who(plan, servo)} did not answer when its torque was asked for")
     if settled.problems or not torque:
         holds = not settled.problems and enabled.parameters[0] == 1
-        return Rejoined(tuple(settled.problems), holds, None, written)
+        return Rejoined(tuple(settled.problems), holds, None, written, mode)
     held = yield from modes.hold(plan, servo, servo.mode_plan(mode))
     if held.problem:
         return Rejoined((f"{who(plan, servo)} {held.problem}",), False, None, written)
-    return Rejoined((), True, held.goal, written)
+    return Rejoined((), True, held.goal, written, mode)
 
 
 def confirm(plan: BusPlan) -> Program[list[str]]:
