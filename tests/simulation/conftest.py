@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import json
 import os
 import socket
@@ -267,3 +268,16 @@ def start_buses(tmp_path: Path) -> Iterator[Callable[[Sequence[BusConfig]], Runn
             return Running(child, ours, said, json.loads(said.readline())["ports"], path)
 
         yield run
+
+
+@pytest.fixture(scope="session")
+def judge() -> Iterator[Any]:
+    """The judge of runs with faults, which several campaigns share."""
+    spec = importlib.util.spec_from_file_location("fault_judge", Path(__file__).with_name("fault_judge.py"))
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look their module up there
+    spec.loader.exec_module(module)
+    yield module
+    del sys.modules[spec.name]

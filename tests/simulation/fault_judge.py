@@ -1,0 +1,499 @@
+"""Judge of a run with faults: what failures.md promises, held against the simulated buses' own ledger.
+
+1 every byte sent is a legal instruction; 2 no goal outside the limits, no step over the maximum; 3 no
+torque-on without a look at the servo first; 4 each recorded sample is what that servo sent in that cycle;
+5 the log has every byte; 6 each accepted command has a known client and is in the log; 7 each fault that
+somebody can see leaves an event, and no event comes before the first fault; 8 nobody who hears keeps torque.
+
+The host's packets are taken apart by code of this file alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+from dxlrun.control_table import control_table
+from dxlrun.dynamixel.bus_plan import BusPlan, ServoPlan
+from dxlrun.dynamixel.units import joint_position, ticks_in
+from dxlrun.events import EventCode, Severity
+from dxlrun.packets import PacketKind
+from dxlrun.recording.reader import Log
+from dxlrun.simulation import LedgerEntry, SimulatedBus, SimulatedServo
+from dxlrun.simulation.faults import FaultScript, parse_fault
+from dxlrun.testing import VirtualRobot
+
+MS = 1_000_000
+SOME_CYCLES = 100
+"""In so many cycles somebody answers and gets a goal, or there was nothing to judge."""
+LATEST = 2
+"""Cycles; see `samples_are_what_was_sent`."""
+REPLY_NS = 2 * MS
+"""No servo here needs longer for an answer: 500 us of return delay and some 20 bytes at 1 Mbit/s."""
+SOON_NS = 2_000_000_000
+"""Within this time a fault that somebody can see is told."""
+BUMP = 0.1
+"""rad: so near to where the servo stands is the goal with which it gets its torque again."""
+IDENTITY = 6
+"""An item that begins before this address is part of who a servo is: model number, firmware, ID."""
+
+PING, READ, WRITE, SYNC_WRITE, SYNC_READ, FAST_SYNC_READ, BULK_READ = 0x01, 0x02, 0x03, 0x83, 0x82, 0x8A, 0x92
+HOST_SAYS = frozenset((PING, READ, WRITE, SYNC_WRITE, SYNC_READ, FAST_SYNC_READ, BULK_READ))
+EVERYBODY, STATUS = 254, 0x55
+HEADER = b"\xff\xff\xfd\x00"
+SILENT = frozenset((EventCode.READ_LOST, EventCode.SERVO_LOST))
+HEARD = frozenset((EventCode.READ_BACK, EventCode.SERVO_BACK))
+OF_A_FAULT = SILENT | {
+    EventCode.SERVO_ERROR,
+    EventCode.SERVO_LIMP,
+    EventCode.SERVO_REBOOTED,
+    EventCode.BUS_NOISE,
+    EventCode.PORT_LOST,
+}
+
+
+def _crc_table() -> tuple[int, ...]:
+    found = []
+    for byte in range(256):
+        value = byte << 8
+        for _ in range(8):
+            value = value << 1 ^ (0x18005 if value & 0x8000 else 0)
+        found.append(value)
+    return tuple(found)
+
+
+_CRC = _crc_table()
+
+
+def crc(data: bytes) -> int:
+    """Return the CRC-16 of Protocol 2.0 (polynomial 0x8005)."""
+    value = 0
+    for byte in data:
+        value = (value << 8 & 0xFF00) ^ _CRC[value >> 8 ^ byte]
+    return value
+
+
+class Said(NamedTuple):
+    """An instruction of the host."""
+
+    t_ns: int
+    servo_id: int
+    instruction: int
+    parameters: bytes
+
+
+class Told(NamedTuple):
+    """A state that a servo sent, and when the host asked for it where that is known."""
+
+    t_ns: int
+    servo_id: int
+    data: bytes
+    asked_ns: int = 0
+
+
+@dataclass
+class Witness:
+    """Sees what the bytes of one bus do not tell: who has torque, every 2 ms, and what was held back."""
+
+    bus: SimulatedBus
+    torque: dict[object, int] = field(default_factory=dict)
+    found: list[tuple[int, int, float]] = field(default_factory=list)
+    """When a servo's torque enable went from 0 to 1, whose, and where it stood, rad from its raw 0."""
+    delayed: list[Told] = field(default_factory=list)
+    """Replies that a fault held back, and since when each is on its way again."""
+
+    def __post_init__(self) -> None:
+        bus = self.bus
+        alter_next = bus.alter_next
+
+        def seen(servo_id: int, text: str, change: Any, *, delay_ns: int = 0, copies: int = 1) -> None:
+            def held_back(reply: bytes) -> bytes:
+                if delay_ns:
+                    data = _data_of(reply, bus.protocol)
+                    self.delayed.append(Told(bus.now_ns + delay_ns, servo_id, data, bus.now_ns))
+                return bytes(change(reply))
+
+            alter_next(servo_id, text, held_back, delay_ns=delay_ns, copies=copies)
+
+        bus.alter_next = seen  # type: ignore[method-assign]
+        bus.at(0, self.look)
+
+    def look(self) -> None:
+        bus = self.bus
+        for servo in alone(bus):
+            torque = servo.registers["torque_enable"]
+            if torque and not self.torque.get(servo, 0):
+                self.found.append((bus.now_ns, servo.servo_id, servo.position))
+            self.torque[servo] = torque
+        bus.at(bus.now_ns + 2 * MS, self.look)
+
+
+def _data_of(reply: bytes, protocol: float) -> bytes:
+    """Return the data in what a servo sends: a status, or its part of the one of a fast form."""
+    if protocol == 1.0:
+        return reply[5:-1]
+    if not reply.startswith(HEADER):
+        return reply[2:-2]
+    return reply[10:-2] if reply[4] == EVERYBODY else reply[9:-2]
+
+
+def alone(bus: SimulatedBus) -> list[SimulatedServo]:
+    """Return the servos whose ID nobody else has: of two, one answers and the other obeys, unseen."""
+    ids = [servo.servo_id for servo in bus.servos]
+    return [servo for servo in bus.servos if ids.count(servo.servo_id) == 1]
+
+
+@dataclass
+class Trial:
+    """A robot in a storm, and what is seen of it from outside."""
+
+    robot: VirtualRobot
+    faults: FaultScript
+    witnesses: list[Witness]
+
+    @classmethod
+    def of(cls, robot: VirtualRobot, faults: Sequence[str]) -> Trial:
+        """Plan the faults on a robot that has not run yet, and look on."""
+        witnesses = [Witness(bus) for bus in robot.buses]
+        script = FaultScript([parse_fault(fault) for fault in faults])
+        script.attach(robot.buses)
+        return cls(robot, script, witnesses)
+
+    def judge(self, log: Log, started: bool) -> None:
+        """Hold everything against the ledger; `started`: the set-up went well."""
+        entries = self.robot.ledger.entries
+        for number, (bus, witness) in enumerate(zip(self.robot.plan.buses, self.witnesses, strict=True)):
+            mine = [entry for entry in entries if entry.bus == bus.name]
+            said = list(instructions(mine, bus))
+            told = list(states(mine, bus))
+            goals_are_within_limits(said, bus, self.robot)
+            nobody_wakes_without_a_look(said, witness, bus, log)
+            if started:
+                samples_are_what_was_sent(told, witness, bus, log)
+            the_log_is_the_wire(mine, log, number)
+            everybody_who_hears_is_limp(self.robot, number, started)
+        no_event_comes_before_the_first_fault(entries, log)
+        each_fault_that_shows_is_told(entries, log, self.robot)
+
+
+# Invariant 1: every packet sent is a legal instruction
+
+
+def instructions(entries: Sequence[LedgerEntry], bus: BusPlan) -> Iterator[Said]:
+    """Take apart all that the host sent; whatever is no legal instruction fails."""
+    known = {servo.servo_id for servo in bus.servos}
+    for entry in entries:
+        data = entry.data if entry.direction == "in" else b""
+        while data:
+            servo_id, instruction, parameters, data = _first(data, bus.protocol)
+            assert instruction in HOST_SAYS, entry
+            assert servo_id in known | {EVERYBODY}, entry
+            yield Said(entry.t_ns, servo_id, instruction, parameters)
+
+
+def _first(data: bytes, protocol: float) -> tuple[int, int, bytes, bytes]:
+    """Return ID, instruction and parameters of the first packet, and what follows it."""
+    if protocol == 1.0:
+        assert data[:2] == b"\xff\xff", data.hex(" ")
+        end = 4 + data[3]
+        assert len(data) >= end, data.hex(" ")
+        assert sum(data[2:end]) & 0xFF == 0xFF, data.hex(" ")
+        return data[2], data[4], data[5 : end - 1], data[end:]
+    assert data[:4] == HEADER, data.hex(" ")
+    end = 7 + int.from_bytes(data[5:7], "little")
+    assert len(data) >= end, data.hex(" ")
+    assert crc(data[: end - 2]) == int.from_bytes(data[end - 2 : end], "little"), data.hex(" ")
+    parameters = data[8 : end - 2].replace(b"\xff\xff\xfd\xfd", b"\xff\xff\xfd")
+    return data[4], data[7], parameters, data[end:]
+
+
+def writes(said: Said, protocol: float) -> Iterator[tuple[int, int, bytes]]:
+    """Return servo, address and bytes of all that an instruction writes."""
+    width = 1 if protocol == 1.0 else 2
+    parameters = said.parameters
+    address = int.from_bytes(parameters[:width], "little")
+    if said.instruction == WRITE:
+        yield said.servo_id, address, parameters[width:]
+    elif said.instruction == SYNC_WRITE:
+        size = int.from_bytes(parameters[width : 2 * width], "little")
+        blocks = parameters[2 * width :]
+        assert len(blocks) % (size + 1) == 0
+        for at in range(0, len(blocks), size + 1):
+            yield blocks[at], address, blocks[at + 1 : at + 1 + size]
+
+
+def written(said: Sequence[Said], bus: BusPlan, item: str) -> Iterator[tuple[int, ServoPlan, int]]:
+    """Return when which servo got which value in an item."""
+    places = [(servo, control_table(servo.model, bus.protocol).items[item]) for servo in bus.servos]
+    for one in said:
+        for servo_id, address, data in writes(one, bus.protocol):
+            for servo, place in places:
+                at = place.address - address
+                if servo_id in (servo.servo_id, EVERYBODY) and 0 <= at <= len(data) - place.size:
+                    yield one.t_ns, servo, place.decode(data[at : at + place.size])
+
+
+# Invariants 2 and 3
+
+
+def goals_are_within_limits(said: Sequence[Said], bus: BusPlan, robot: VirtualRobot) -> None:
+    joints, period_ns = robot.plan.loop.joints, robot.plan.loop.period_ns
+    before: dict[int, tuple[int, float]] = {}
+    count = 0
+    woken = {(t_ns, servo.servo_id) for t_ns, servo, on in written(said, bus, "torque_enable") if on}
+    last_on = dict.fromkeys((servo.servo_id for servo in bus.servos), -1)
+    for t_ns, servo, raw in written(said, bus, "goal_position"):
+        goal, joint, tick = joint_position(servo, raw), joints[servo.row], servo.rad_per_tick
+        assert joint.lower - tick <= goal <= joint.upper + tick, (t_ns, joint.name)
+        on_ns = max((at for at, one in woken if one == servo.servo_id and at <= t_ns), default=-1)
+        if on_ns != last_on[servo.servo_id]:  # it was away meanwhile, and its goal is where it stands
+            last_on[servo.servo_id] = on_ns
+            before.pop(servo.servo_id, None)
+        if joint.velocity is not None and servo.servo_id in before:
+            before_ns, last = before[servo.servo_id]
+            # goals of two cycles are sent up to a period nearer to each other than the cycles begin
+            most = joint.velocity * (t_ns - before_ns + period_ns) * 1e-9 + tick
+            assert abs(goal - last) <= most, (t_ns, joint.name)
+        before[servo.servo_id] = t_ns, goal
+        count += 1
+    assert count or robot.result is None or robot.result.cycles < SOME_CYCLES
+
+
+def nobody_wakes_without_a_look(said: Sequence[Said], witness: Witness, bus: BusPlan, log: Log) -> None:
+    """After the set-up torque comes only by policy, to a servo that was looked at, and where it stands."""
+    started = [event.t_ns for event in log.events if event.code == EventCode.LOOP_STARTED]
+    if not started:
+        return
+    by_id = {servo.servo_id: servo for servo in bus.servos}
+    goals = list(written(said, bus, "goal_position"))
+    for t_ns, servo_id, stands in witness.found:
+        if t_ns <= started[0] + 2 * MS:
+            continue
+        servo = by_id[servo_id]
+        assert servo.torque_on_return, (t_ns, servo.joint)
+        looks = [
+            one
+            for one in said
+            if t_ns - SOON_NS < one.t_ns <= t_ns
+            and (one.servo_id, one.instruction) == (servo_id, READ)
+            and one.parameters[0] < IDENTITY
+        ]
+        assert looks, (t_ns, servo.joint)
+        goal = [raw for at_ns, one, raw in goals if one is servo and at_ns <= t_ns][-1]
+        where = joint_position(servo, goal)
+        assert abs(where - servo.direction * (stands - servo.reference)) < BUMP, (t_ns, servo.joint)
+    asked = {(t_ns, servo.servo_id) for t_ns, servo, on in written(said, bus, "torque_enable") if on}
+    for t_ns, servo_id in asked:
+        assert t_ns <= started[0] or by_id[servo_id].torque_on_return, (t_ns, servo_id)
+
+
+# Invariant 4: each recorded sample equals what that servo sent in that cycle
+
+
+def samples_are_what_was_sent(told: Sequence[Told], witness: Witness, bus: BusPlan, log: Log) -> None:
+    """Look for each sample among the intact states of its cycle; what was asked for earlier is none.
+
+    A limit of today's runtime: it knows a late reply by its length, and asks for three lengths in turn. One
+    that is LATEST cycles late is always known; one that is later, on a line that goes on losing replies, may
+    pass for current.
+    """
+    asked_ns = held_back(told, witness.delayed)
+    judged = {servo.servo_id for servo in alone(witness.bus)}
+    at = 0
+    valid = 0
+    for number, cycle in enumerate(log.cycles):
+        since_ns = int(log.cycles["woken_ns"][max(0, number - LATEST)])
+        while at < len(told) and told[at].t_ns < cycle["woken_ns"]:
+            at += 1
+        end = at
+        while end < len(told) and told[end].t_ns <= cycle["read_ns"]:
+            end += 1
+        for servo in bus.servos:
+            if not cycle["valid"][servo.row] or servo.servo_id not in judged:
+                continue
+            valid += 1
+            sent = [
+                joint_position(servo, ticks_in(servo.state.position, each.data))
+                for each in told[at:end]
+                if each.servo_id == servo.servo_id
+                and not since_ns <= asked_ns.get(each, -1) < cycle["woken_ns"]
+            ]
+            assert float(cycle["position"][servo.row]) in sent, (int(cycle["woken_ns"]), servo.joint)
+    assert valid or not judged or len(log.cycles) < SOME_CYCLES
+
+
+def held_back(told: Sequence[Told], delayed: Sequence[Told]) -> dict[Told, int]:
+    """Return the states that a fault held back, and when the host had asked for each."""
+    asked_ns: dict[Told, int] = {}
+    for late in delayed:
+        for each in told:
+            on_time = late.t_ns <= each.t_ns <= late.t_ns + REPLY_NS
+            if on_time and (each.servo_id, each.data) == (late.servo_id, late.data):
+                asked_ns[each] = late.asked_ns
+                break  # a later one of the same bytes is a new one
+    return asked_ns
+
+
+def states(entries: Sequence[LedgerEntry], bus: BusPlan) -> Iterator[Told]:
+    """Return every intact state that passed the wire, wherever it stands among the bytes.
+
+    The host asks for some bytes more now and then, to tell a late reply from the one it waits for.
+    """
+    lengths = {
+        length
+        for servo in bus.servos
+        for length in range(servo.state.length, servo.state.length + servo.state.spare + 1)
+    }
+    of_protocol = _states1 if bus.protocol == 1.0 else _states2
+    sent = [entry for entry in entries if entry.direction == "out"]
+    found = [each for entry in sent for each in of_protocol(entry) if len(each.data) in lengths]
+    if bus.protocol == 2.0:
+        found += _shared(sent, sorted(lengths))
+    yield from sorted(found)
+
+
+def _states1(entry: LedgerEntry) -> Iterator[Told]:
+    rest = entry.data
+    while (start := rest.find(b"\xff\xff")) >= 0:
+        rest = rest[start:]
+        body = rest[: 4 + (rest[3] if len(rest) > 5 else 0)]
+        if len(body) > 5 and len(body) == 4 + body[3] and sum(body[2:]) & 0xFF == 0xFF:
+            yield Told(entry.t_ns, body[2], body[5:-1])
+        rest = rest[1:]
+
+
+def _states2(entry: LedgerEntry) -> Iterator[Told]:
+    rest = entry.data
+    while (start := rest.find(HEADER)) >= 0:
+        rest = rest[start:]
+        end = 7 + int.from_bytes(rest[5:7], "little")
+        if len(rest) >= end and crc(rest[: end - 2]) == int.from_bytes(rest[end - 2 : end], "little"):
+            servo_id, instruction, parameters, _ = _first(rest, 2.0)
+            if instruction == STATUS:
+                yield Told(entry.t_ns, servo_id, parameters[1:])
+        rest = rest[4:]
+
+
+def _shared(sent: Sequence[LedgerEntry], lengths: Sequence[int]) -> Iterator[Told]:
+    """Return the parts of the statuses of fast forms, up to the first broken one of each."""
+    stream = b"".join(entry.data for entry in sent)
+    times = [entry.t_ns for entry in sent for _ in entry.data]
+    start = -1
+    while (start := stream.find(HEADER + bytes((EVERYBODY,)), start + 1)) >= 0:
+        size = int.from_bytes(stream[start + 5 : start + 7], "little")
+        for length in lengths:
+            if (size - 1) % (length + 4):
+                continue
+            at = start + 8
+            while at < start + 7 + size:
+                end = at + 2 + length
+                if end + 2 > len(stream) or crc(stream[start:end]) != int.from_bytes(
+                    stream[end : end + 2], "little"
+                ):
+                    break
+                yield Told(times[end + 1], stream[at + 1], stream[at + 2 : end])
+                at = end + 2
+
+
+# Invariants 5 and 8
+
+
+def the_log_is_the_wire(entries: Sequence[LedgerEntry], log: Log, number: int) -> None:
+    """Compare all bytes; what arrived after the host's last look is not its business.
+
+    Nor is what arrived while it did not have the line open: before a lost line was opened again.
+    """
+    mine = [packet for packet in log.packets if packet.bus == number]
+
+    def logged(*kinds: PacketKind) -> list[bytes]:
+        return [packet.data for packet in mine if packet.kind in kinds]
+
+    def wire(direction: str) -> bytes:
+        return b"".join(entry.data for entry in entries if entry.direction == direction)
+
+    pulled = any(entry.note == "adapter unplugged" for entry in entries)
+    said, heard = logged(PacketKind.INSTRUCTION), logged(PacketKind.STATUS, PacketKind.NOISE)
+    if not pulled:
+        assert b"".join(said) == wire("in")
+        assert wire("out").startswith(b"".join(heard))
+        assert sum(map(len, heard)) > len(wire("out")) - 4096
+        return
+    assert b"".join(said) == wire("in")
+    told, at = wire("out"), 0
+    for each in heard:
+        at = told.index(each, at) + len(each)
+
+
+def everybody_who_hears_is_limp(robot: VirtualRobot, number: int, started: bool) -> None:
+    bus = robot.buses[number]
+    bus.advance(robot.clock.now_ns())
+    on = {servo.servo_id for servo in alone(bus) if servo.registers["torque_enable"]}
+    told = {
+        servo.servo_id
+        for servo in robot.plan.buses[number].servos
+        if any(servo.joint in sentence for sentence in robot.failures)
+    }
+    if started:
+        assert on <= told
+
+
+# Invariant 7
+
+
+def no_event_comes_before_the_first_fault(entries: Sequence[LedgerEntry], log: Log) -> None:
+    first_ns = min((entry.t_ns for entry in entries if entry.note.startswith("fault: ")), default=1 << 62)
+    early = [
+        event
+        for event in log.events
+        if event.t_ns < first_ns and event.code in OF_A_FAULT and event.severity >= Severity.WARNING
+    ]
+    assert early == []
+
+
+def each_fault_that_shows_is_told(entries: Sequence[LedgerEntry], log: Log, robot: VirtualRobot) -> None:
+    """Look for the events of the faults that nobody can bear in silence, while the loop runs.
+
+    That is a servo that is mute or without power for three cycles and longer, and an adapter that is pulled.
+    A servo that was silent already has nothing to lose.
+    """
+    times = {event.code: event.t_ns for event in log.events if event.code in _LOOP}
+    begin_ns = times.get(EventCode.LOOP_STARTED, 1 << 62)
+    end_ns = times.get(EventCode.LOOP_STOPPED, 0) - SOON_NS
+    shortest_ns = 4 * robot.plan.loop.period_ns
+    for entry in entries:
+        if not entry.note.startswith("fault: ") or not begin_ns < entry.t_ns < end_ns:
+            continue
+        fault = parse_fault(entry.note.removeprefix("fault: "))
+        lasts_ns = {"silence": 1 << 62, "reboot": 100 * MS, "brownout": 200 * MS, "unplug": 1 << 62}
+        if (fault.for_ns or lasts_ns.get(fault.kind, 0)) < shortest_ns or fault.kind not in lasts_ns:
+            continue
+        (bus,) = (one for one in robot.plan.buses if one.name == entry.bus)
+        whom = {one.joint for one in bus.servos if fault.servo in (None, one.servo_id)}
+        if fault.kind == "unplug":
+            whom = {bus.name}
+        _told(entry, whom, log)
+
+
+def _told(entry: LedgerEntry, whom: set[str], log: Log) -> None:
+    silent: set[str] = set()
+    for event in log.events:
+        if event.t_ns <= entry.t_ns and event.code in SILENT | {EventCode.PORT_LOST}:
+            silent.add(event.source)
+        elif event.t_ns <= entry.t_ns and event.code in HEARD | {EventCode.PORT_BACK}:
+            silent.discard(event.source)
+    for source in whom - silent:
+        soon = [
+            event.code
+            for event in log.events
+            if event.source == source
+            and entry.t_ns <= event.t_ns <= entry.t_ns + SOON_NS
+            and event.code in OF_A_FAULT
+        ]
+        away = any(
+            event.code == EventCode.PORT_LOST and event.t_ns <= entry.t_ns + SOON_NS for event in log.events
+        )
+        assert soon or away, (entry.note, source)
+
+
+_LOOP = frozenset((EventCode.LOOP_STARTED, EventCode.LOOP_STOPPED))
