@@ -124,6 +124,8 @@ def _plan(
             direction=1 if index % 2 else -1,
             lower=change.get("lower", -MIDDLE),
             upper=change.get("upper", MIDDLE),
+            continuous=change.get("continuous", False),
+            start_mode=change.get("start_mode"),
         )
         for index, servo_id in enumerate(ids)
     ]

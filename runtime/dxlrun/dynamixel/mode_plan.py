@@ -184,7 +184,11 @@ def _by_angle_limits(table: ControlTable, ends: tuple[int, int], continuous: boo
     found: list[ModePlan] = []
     if many or not continuous:
         limits = (table.max_tick, table.max_tick) if many else ends
-        to_goal, goals = Scale(table.rad_s_per_tick, table.max_speed_tick), (position_layout(table),)
+        to_goal, layout = Scale(table.rad_s_per_tick, table.max_speed_tick), position_layout(table)
+        if many:
+            # turns below 0 are in two's complement (e-Manual MX-28, Goal Position (30), Multi-turn Mode)
+            layout = replace(layout, position=replace(layout.position_place, encoding="twos_complement"))
+        goals = (layout,)
         joint = replace(plain, mode=Mode.POSITION, operating=_selected(table, limits), goals=goals)
         found.append(replace(joint, speed=to_goal))
     goals = (_alone(items["moving_speed"], "speed"),)

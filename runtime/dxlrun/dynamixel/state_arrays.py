@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from dxlrun.dynamixel.bus_plan import BusPlan, Field, ServoPlan, StateLayout
 from dxlrun.interfaces import Floats, States
+from dxlrun.mode import Mode
 
 _SIGNED_MASK = 0x7FF
 _SIGNED = np.concatenate((np.arange(0x400), -np.arange(0x400))).astype(np.float64)
@@ -33,7 +34,8 @@ class StateArrays:
     Position: q = direction * (raw * rad_per_tick - reference), rad. The sign of velocity and effort follows
     the joint's direction, so positive effort is torque toward growing q. They are sign-magnitude in Protocol
     1.0, bit 10 set = clockwise (e-Manual AX-12A, Present Speed (38), Present Load (40)), and two's complement
-    in Protocol 2.0 (e-Manual XM430-W350, Present Velocity (128)).
+    in Protocol 2.0 (e-Manual XM430-W350, Present Velocity (128)). In wheel mode the speed of a model that
+    controls none is a fraction of full output (AX-12A, Present Speed (38)), see `mode_plan`.
     """
 
     __slots__ = ("_arrived", "_blocks", "_everybody", "_rows", "replies")
@@ -81,7 +83,17 @@ class StateArrays:
 class _StateBlock:
     """The servos of one bus that have one layout."""
 
-    __slots__ = ("_effort", "_members", "_position", "_reference", "_rows", "_velocity", "data", "replies")
+    __slots__ = (
+        "_effort",
+        "_members",
+        "_position",
+        "_reference",
+        "_rows",
+        "_velocity",
+        "_wheel",
+        "data",
+        "replies",
+    )
 
     def __init__(self, layout: StateLayout, servos: Sequence[ServoPlan]) -> None:
         members = [index for index, servo in enumerate(servos) if servo.state == layout]
@@ -102,6 +114,9 @@ class _StateBlock:
         self._velocity = _Column(
             self.data, layout.velocity, direction * np.array([servo.rad_s_per_tick for servo in mine])
         )
+        ratio = np.array([_in_wheel_mode(servo) for servo in mine])
+        self._wheel = ratio if (ratio != 1.0).any() else None
+        """By what a speed has to be multiplied in wheel mode; None: every mode has the same unit."""
         self._effort = _Column(
             self.data, layout.effort, direction * np.array([servo.effort_per_tick for servo in mine])
         )
@@ -110,7 +125,7 @@ class _StateBlock:
         """Fill the rows of all servos."""
         rows = self._rows
         states.position[rows] = np.subtract(self._position.values(), self._reference, self._position.work)
-        states.velocity[rows] = self._velocity.values()
+        states.velocity[rows] = self._velocities(states)
         states.effort[rows] = self._effort.values()
 
     def decode_some(self, states: States, all_fresh: NDArray[np.bool_]) -> None:
@@ -119,10 +134,25 @@ class _StateBlock:
         position = self._position.values() - self._reference
         for values, column in (
             (states.position, position),
-            (states.velocity, self._velocity.values()),
+            (states.velocity, self._velocities(states)),
             (states.effort, self._effort.values()),
         ):
             values[self._rows] = np.where(fresh, column, values[self._rows])
+
+    def _velocities(self, states: States) -> Floats:
+        values = self._velocity.values()
+        if self._wheel is not None:
+            mode = states.mode[self._rows]
+            turning = (mode == Mode.VELOCITY) | (mode == Mode.PWM)
+            if turning.any():
+                np.multiply(values, self._wheel, values, where=turning)
+        return values
+
+
+def _in_wheel_mode(servo: ServoPlan) -> float:
+    """Return the unit of the present speed in wheel mode as a part of the one in joint mode."""
+    units = [mode.present_rad_s_per_tick for mode in servo.modes if mode.mode == Mode.VELOCITY]
+    return units[0] / servo.rad_s_per_tick if units else 1.0
 
 
 class _Column:
