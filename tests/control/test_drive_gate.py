@@ -122,6 +122,7 @@ def test_a_wheel_turns_for_ever():
 def test_a_joint_in_velocity_mode_begins_slowly():
     rig = Rig(Mode.VELOCITY, eased=False)
     assert rig.apply(velocity=2.0)["velocity"] == SLOW_SPEED
+    assert rig.clamped == Clamp.STEP
 
 
 def test_an_effort_beside_a_position_is_a_limit_and_is_kept():

@@ -86,7 +86,7 @@ def test_a_servo_follows_in_every_mode_what_its_controller_wants(told: tuple[Log
     changes = arm[np.flatnonzero(np.diff(arm, prepend=0))]
     wanted = [Mode.POSITION, Mode.EFFORT, Mode.PWM, Mode.EFFORT_POSITION, Mode.POSITION]
     assert [mode for mode in changes.tolist() if mode] == wanted
-    assert cycles["velocity"][118, :2] == pytest.approx([3.0, -2.0], abs=0.1)
+    assert cycles["velocity"][225, :2] == pytest.approx([3.0, -2.0], abs=0.1)
     assert cycles["position"][110, ARM] == pytest.approx(0.4, abs=0.02)
     assert cycles["position"][-1] == pytest.approx([12.0, -9.0, 0.2], abs=0.05)
     assert np.nanmin(cycles["goal_effort"][:, ARM]) == -0.05

@@ -35,7 +35,7 @@ class DriveGate:
     - In mode EFFORT_POSITION the effort is a limit: its magnitude counts, NaN keeps the last one.
     """
 
-    __slots__ = ("_effort", "_flag", "_free", "_limiting", "_lower", "_rows", "_upper", "any")
+    __slots__ = ("_effort", "_flag", "_free", "_limiting", "_lower", "_rows", "_speed", "_upper", "any")
 
     def __init__(self, joints: Sequence[JointPlan], flag: Flag) -> None:
         self.any = False
@@ -44,6 +44,7 @@ class DriveGate:
         self._lower = np.array([joint.lower for joint in joints], dtype=np.float64)
         self._upper = np.array([joint.upper for joint in joints], dtype=np.float64)
         self._effort = np.array([np.inf if joint.effort is None else joint.effort for joint in joints])
+        self._speed = np.array([np.inf if joint.velocity is None else joint.velocity for joint in joints])
         self._free = np.array([not joint.bounded for joint in joints], dtype=np.bool_)
         none = np.empty(0, dtype=np.intp)
         self._rows: dict[Mode, _Rows] = dict.fromkeys(_DRIVEN, none)
@@ -73,7 +74,12 @@ class DriveGate:
         """Return finite values of at most this magnitude."""
         self._flag(rows[np.isinf(wanted)], Clamp.NOT_FINITE)
         values = np.where(np.isfinite(wanted), wanted, 0.0)
-        self._flag(rows[np.abs(values) > most], clamp)
+        beyond = np.abs(values) > most
+        if clamp == Clamp.VELOCITY:  # the slow start holds it lower than the file's limit
+            slow = beyond & (most < self._speed[rows])
+            self._flag(rows[slow], Clamp.STEP)
+            beyond &= ~slow
+        self._flag(rows[beyond], clamp)
         return np.clip(values, -most, most)
 
     def _inward(self, rows: _Rows, values: Floats, position: Floats, mode: Mode, dt_ns: int) -> Floats:
