@@ -13,7 +13,7 @@ from dxlrun.compile.joints import CompiledJoint
 from dxlrun.compile.plan import AdapterPlan, LoadPlan, SimulationPlan
 from dxlrun.compile.problems import Problems
 from dxlrun.description import Description
-from dxlrun.description.robot import BusSimulation
+from dxlrun.description.robot import Bus
 from dxlrun.simulation.mujoco_plant import INSTALL_MUJOCO, NEEDS_MUJOCO
 
 NEEDS_URDF = "physics: mujoco moves the bodies of a URDF, and the file names none"
@@ -31,12 +31,17 @@ def compile_simulation(
     return SimulationPlan(
         loads={name: load for name, joint in joints.items() if (load := _load(joint)) != LoadPlan()},
         adapters={
-            name: AdapterPlan(told.latency_timer, told.split, told.echo, told.absent)
+            name: told
             for name, bus in description.robot.buses.items()
-            if (told := bus.simulation) != BusSimulation()
+            if (told := _adapter(bus)) != AdapterPlan()
         },
         physics=description.robot.simulation.physics,
     )
+
+
+def _adapter(bus: Bus) -> AdapterPlan:
+    told = bus.simulation
+    return AdapterPlan(bus.latency_timer, told.split, told.echo, told.absent)
 
 
 def _load(joint: CompiledJoint) -> LoadPlan:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import (
@@ -68,14 +69,30 @@ def _cores(value: tuple[int, ...]) -> tuple[int, ...]:
     return value
 
 
-class Adapter(Form):
-    """The USB adapter of a bus."""
+_LEAST_LATENCY_NS: Mapping[str, int] = MappingProxyType({"ftdi": 1_000_000, "direct": 0})
+"""Kind of adapter -> what it keeps bytes back for at best (protocol.md, Time budget)."""
 
+
+class Adapter(Form):
+    """The adapter of a bus."""
+
+    kind: Literal["ftdi", "direct"] | None = Field(
+        default=None,
+        description="An FTDI chip with its latency timer at 1 ms, or one that hands bytes over at once.",
+        examples=["direct"],
+    )
     latency: Duration = Field(
         default=16_000_000,
-        description="How long it may keep bytes back before it hands them over.",
+        description="How long it may keep bytes back before it hands them over; kind says it, too.",
         examples=["1 ms"],
     )
+
+    @property
+    def assumed_latency(self) -> int:
+        """What it adds to each request, ns: as written, else by its kind, else as an FTDI is shipped."""
+        if self.kind is None or "latency" in self.model_fields_set:
+            return self.latency
+        return _LEAST_LATENCY_NS[self.kind]
 
 
 class BusSimulation(Form):
@@ -113,11 +130,23 @@ class Bus(Form):
     return_delay_time: Duration = Field(
         default=500_000, description="How long a servo waits before it answers.", examples=["500 us"]
     )
+    read: Literal["together", "split"] = Field(
+        default="together",
+        description="Servos are asked when a cycle begins, or already behind the goals of the one before.",
+        examples=["split"],
+    )
     simulation: BusSimulation = Field(
         default=BusSimulation(),
         description="What the bus does when it is simulated.",
         examples=["{latency_timer: 4 ms}"],
     )
+
+    @property
+    def latency_timer(self) -> int:
+        """How long the simulated adapter gathers bytes, ns: as it is written, else as an FTDI does, or 0."""
+        if "latency_timer" in self.simulation.model_fields_set or self.adapter.kind != "ftdi":
+            return self.simulation.latency_timer
+        return self.adapter.assumed_latency
 
 
 class Scheduler(Form):

@@ -149,6 +149,22 @@ class Bus:
         self._job = job
         self._reply.strays = 0
 
+    def begin_behind(self) -> None:
+        """Send the first instruction of the loaded job at once, though the line may not be free yet.
+
+        It waits in the adapter behind what was sent before, and its times count from when the line is free.
+        """
+        if self._job is not None:
+            try:
+                self._begin(self._job)
+            except PortError as error:
+                self._fail(error)
+
+    def drop(self) -> None:
+        """Forget the loaded job; what still comes for it belongs to nobody."""
+        self._job = self._awaited = self._burst = None
+        self._state = _READY
+
     def send(self, packet: bytes | bytearray | memoryview) -> None:
         """Send a prepared packet that nobody answers, between two jobs; does not wait.
 
@@ -266,12 +282,12 @@ class Bus:
     def _write(self, packet: bytes | bytearray | memoryview, servo_id: int) -> int:
         """Send a packet; return the time after that."""
         now_ns = self._now_ns
-        before = self._sent_ns = now_ns()
+        before = now_ns()
         self._port.write(packet)
         after = now_ns()
         self._sink.packet(self._index, PacketKind.INSTRUCTION, servo_id, before, after, packet)
         # a second packet waits in the adapter until the first is off the wire
-        start = self._free_ns if self._free_ns > before else before
+        start = self._sent_ns = self._free_ns if self._free_ns > before else before
         self._free_ns = start + len(packet) * self._byte_ns
         return after
 
@@ -435,17 +451,21 @@ def _spans(burst: Burst, ends: list[int], times: list[int]) -> list[tuple[int, i
     return found
 
 
-def pump(buses: Sequence[Bus], ports: Ports, clock: Clock, beat: Callable[[], None]) -> None:
+def pump(
+    buses: Sequence[Bus], ports: Ports, clock: Clock, beat: Callable[[], None], until_ns: int = NEVER
+) -> None:
     """Execute the jobs of all buses side by side: one wait over all ports, until every job is finished.
 
-    `beat` is called at least once a transaction. Raises nothing: a line that is gone has its `failure`, and
-    the others go on.
+    Ends at `until_ns` in any case, and a job that is not finished then goes on in the next call. `beat` is
+    called at least once a transaction. Raises nothing: a line that is gone has its `failure`, and the others
+    go on.
     """
     clock_ns = clock.now_ns
     now_ns = clock_ns()
     deadlines = [bus.step(now_ns) for bus in buses]
-    while (deadline := min(deadlines)) != NEVER:
+    while (deadline := min(deadlines)) != NEVER and now_ns < until_ns:
         beat()
+        deadline = min(deadline, until_ns)
         ready = ports.wait(deadline)
         heard = not ready
         for index in ready:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from dxlrun.clock import Clock
 from dxlrun.dynamixel import bus_watchdog, startup, torque_limit
-from dxlrun.dynamixel.bus import Bus, pump, run
+from dxlrun.dynamixel.bus import NEVER, Bus, pump, run
 from dxlrun.dynamixel.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.gaps import Gaps
 from dxlrun.dynamixel.health import Servos
@@ -70,6 +70,8 @@ class DynamixelHardware:
         self._take_over = take_over
         self._restore_torque = restore_torque
         self._full_torque: list[list[int]] = []
+        self._asked = [False] * len(self._plans)
+        """Whose reads began behind the goals of the cycle before."""
         self._buses = tuple(
             Bus(index, plan, port, clock, packets)
             for index, (plan, port) in enumerate(zip(self._plans, ports.ports, strict=True))
@@ -109,11 +111,16 @@ class DynamixelHardware:
             raise
 
     def read(self) -> None:
-        """Read every servo once, on all lines at once; of a line that is gone every row is invalid."""
-        for bus, servos in zip(self._buses, self._servos, strict=True):
-            servos.feed()
-            servos.reads.begin()
-            bus.load(servos.reads)
+        """Read every servo once, on all lines at once; of a line that is gone every row is invalid.
+
+        A split bus was asked behind the goals before: only what is not there yet is waited for.
+        """
+        for index, (bus, servos) in enumerate(zip(self._buses, self._servos, strict=True)):
+            if not self._asked[index]:
+                servos.feed()
+                servos.reads.begin()
+                bus.load(servos.reads)
+            self._asked[index] = False
         pump(self._buses, self._ports, self._clock, self._beat)
         now = self._clock.now_ns()
         for servos in self._servos:
@@ -121,12 +128,21 @@ class DynamixelHardware:
         self._tell_failures()
 
     def write(self) -> None:
-        """Send the goals, one sync write a line and layout, on every line that is there."""
-        for bus, servos in zip(self._buses, self._servos, strict=True):
+        """Send the goals, one sync write a line and layout, on every line that is there.
+
+        Of a split bus the servos are asked at once for their next states.
+        """
+        for index, (plan, bus, servos) in enumerate(zip(self._plans, self._buses, self._servos, strict=True)):
             for packet in servos.goal_packets(self._goals, self._states):
                 if bus.failure is None:
                     with suppress(PortError):  # told below; the other lines shall have their goals
                         bus.send(packet)
+            if plan.split and bus.failure is None:
+                servos.feed()
+                servos.reads.begin()
+                bus.load(servos.reads)
+                bus.begin_behind()
+                self._asked[index] = True
         self._tell_failures()
 
     def set_modes(self, modes: NDArray[np.uint8]) -> None:
@@ -153,20 +169,29 @@ class DynamixelHardware:
                     bus.send(packet)
 
     def idle(self, until_ns: int) -> None:
-        """Do on each line what waits for a gap and fits this one; see `gaps` for what is done even so."""
+        """Do on each line what waits for a gap and fits this one; see `gaps` for what is done even so.
+
+        On a split bus the states come first.
+        """
         self._ask_for_lines()
         latest = until_ns - IDLE_MARGIN_NS
-        working = False
+        if any(self._asked):
+            pump(self._buses, self._ports, self._clock, self._beat, latest)
+        end = latest if any(bus.busy for bus in self._buses) else NEVER  # states that are late may be awaited
+        working: list[Bus] = []
         for bus, servos, gaps in zip(self._buses, self._servos, self._gaps, strict=True):
             if bus.failure is not None:
                 gaps.abandon()
                 continue
             servos.ask()
-            if gaps.begin(latest):
+            if not bus.busy and gaps.begin(latest):
                 bus.load(gaps)
-                working = True
+                working.append(bus)
         if working:
-            pump(self._buses, self._ports, self._clock, self._beat)
+            pump(self._buses, self._ports, self._clock, self._beat, end)
+            for bus in working:
+                if bus.busy:
+                    bus.drop()
 
     def stop(self) -> tuple[str, ...]:
         """Switch torque off on every servo, and read it back; return a sentence per failure."""
