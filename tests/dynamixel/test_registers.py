@@ -1,9 +1,11 @@
 import math
+from contextlib import suppress
 from dataclasses import replace
 
 import pytest
 
-from dxlrun.control_table import control_table
+from dxlrun.compile.registers import UnfitRegister, declarable, register_value
+from dxlrun.control_table import all_tables, control_table
 from dxlrun.dynamixel.bus import Bus, run
 from dxlrun.dynamixel.bus_plan import RegisterValue
 from dxlrun.dynamixel.inspection import setup_line
@@ -181,3 +183,29 @@ def test_nothing_is_written_to_anybody_while_one_servo_is_not_what_the_file_says
     with pytest.raises(StartUpError, match="is model number 29"):
         rig.hardware.start()
     assert writes(rig) == []
+
+
+def others(table):
+    """Return for each declarable item of a model a value that it has not at first, where there is one."""
+    for name in declarable(table):
+        item = table.items[name]
+        for value in (item.maximum, item.minimum, (item.minimum + item.maximum) // 2):
+            with suppress(UnfitRegister):
+                if value != item.initial:
+                    yield register_value(table, name, value)
+                    break
+
+
+@pytest.mark.parametrize("protocol", [1.0, 2.0])
+def test_whatever_may_be_declared_of_any_model_is_written_once_and_then_there(bench, make_plan, protocol):
+    for table in [table for table in all_tables() if table.protocol == protocol]:
+        plan = make_plan((5,), protocol=protocol, model=table.model, reference=1.5, lower=-0.1, upper=0.1)
+        wanted = sorted(others(table), key=lambda one: not one.eeprom)
+        plan = replace(plan, servos=(replace(plan.servos[0], registers=tuple(wanted)),))
+        rig, execute = bench(plan, position=1.5)
+        settled = execute(settle_registers(plan, plan.servos[0]))
+        assert settled.problems == []
+        assert len(settled.written) == len(writes(rig)) > 5, table.model
+        assert execute(settle_registers(plan, plan.servos[0])).written == []
+        memory = rig.buses[0].servos[0].registers
+        assert all(memory.read(one.address, one.size) == one.data for one in wanted)
