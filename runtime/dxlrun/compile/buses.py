@@ -45,10 +45,11 @@ def compile_buses(
                 name=name,
                 port=bus.port,
                 baud_rate=bus.baud_rate,
-                latency_ns=bus.simulation.latency_timer if bus.port == SIMULATED else bus.adapter.latency,
+                latency_ns=bus.latency_timer if bus.port == SIMULATED else bus.adapter.assumed_latency,
                 return_delay_ns=bus.return_delay_time,
                 joints=wirings,
                 protocol=bus.protocol,
+                split=bus.read == "split",
             )
         except ValueError as error:
             problems.error(mark, str(error), "change the joints of this bus")
