@@ -93,6 +93,19 @@ def test_the_largest_of_three_is_the_cause_and_the_share_is_of_all_cycles(
     assert (one.simulation_us, one.wake_up_us, one.own_us) == (4_000, 3_000, 8_900)
 
 
+def test_a_late_reply_in_the_gap_that_holds_up_the_wake_up_is_the_simulation_s(
+    write: Callable[..., Path], cycle: type, wire: type
+) -> None:
+    at = BEGIN_NS // 1000 + LATE * PERIOD_US
+    entries = ledger(woke_us=16_000)
+    entries[2 * LATE : 2 * LATE] = [entry("in", at - 300), entry("out", at - 100, late_us=16_000)]
+    cycles = [cycle(n, late=16_000 if n == LATE else 0, skipped=n == LATE + 1) for n in range(30)]
+    found = overrun_causes(read_log(write(cycles)), {"main": entries})
+    assert counts(found) == (1, 0, 0)
+    (one,) = found.overruns  # type: ignore[union-attr]
+    assert (one.simulation_us, one.wake_up_us) == (15_900, 100)
+
+
 def test_a_cycle_that_was_too_long_without_the_late_reply_is_our_own(
     causes_of: Callable[..., object],
 ) -> None:
