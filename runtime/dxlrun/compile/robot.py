@@ -12,6 +12,7 @@ from dxlrun.compile.buses import SIMULATED, compile_buses
 from dxlrun.compile.controllers import compile_controllers
 from dxlrun.compile.joints import AUTO, compile_joints
 from dxlrun.compile.left_out import left_out_names, still_true
+from dxlrun.compile.modes import compile_modes
 from dxlrun.compile.motions import compile_motion
 from dxlrun.compile.plan import Plan, SimulationPlan
 from dxlrun.compile.policies import compile_policies
@@ -21,7 +22,6 @@ from dxlrun.compile.scheduler import check_scheduler, least_period_ns, scheduler
 from dxlrun.compile.simulation import compile_simulation
 from dxlrun.compile.twins import check_twins
 from dxlrun.compile.urdf import compile_urdf
-from dxlrun.control.claims import start_modes
 from dxlrun.control.loop_plan import LoopPlan
 from dxlrun.control.plugins import load_plugins
 from dxlrun.description import Description, MotionDescription, read_motion, survey_robot
@@ -118,8 +118,8 @@ def compile_robot(
     urdf = compile_urdf(description, joints, problems)
     simulation = compile_simulation(description, joints, problems)
     controllers = compile_controllers(description, plugins, problems)
-    plans = [joint.plan for joint in joints.values()], [one.plan for one in controllers.values()]
-    buses = compile_buses(description, joints, start_modes(*plans), problems)
+    modes = compile_modes(description, joints, controllers, problems)
+    buses = compile_buses(description, joints, modes, problems)
     policies = compile_policies(description, joints, buses, problems)
     names = (*description.robot.controllers, *left_out_names(description, "controllers"))
     parts = [

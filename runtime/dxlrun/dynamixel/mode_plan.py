@@ -82,6 +82,16 @@ def mode_in(servo: ServoPlan, found: Mapping[str, int]) -> Mode:
     return Mode.UNKNOWN
 
 
+def model_modes(table: ControlTable, continuous: bool) -> tuple[Mode, ...]:
+    """Return the modes that a model has."""
+    return tuple(plan.mode for plan in mode_plans(table, table.min_tick, table.max_tick, continuous))
+
+
+def controls_speed(table: ControlTable) -> bool:
+    """Say whether a model keeps a speed that it is given; in wheel mode only MX do."""
+    return "operating_mode" in table.items or "resolution_divider" in table.items
+
+
 def in_mode(wanted: ModePlan, found: Mapping[str, int]) -> bool:
     """Say whether registers, by name, select a mode; any angle limits that differ are joint mode."""
     values = {register.name: register.value for register in wanted.operating}
@@ -177,7 +187,7 @@ def _by_angle_limits(table: ControlTable, ends: tuple[int, int], continuous: boo
     """Return the modes of a model whose angle limits, or Control Mode, choose between joint and wheel."""
     items = table.items
     many = continuous and "multi_turn_offset" in items
-    controlled = "resolution_divider" in items
+    controlled = controls_speed(table)
     wheel_unit = table.rad_s_per_tick if controlled else table.max_speed / _FULL
     plain = ModePlan(Mode.UNKNOWN, (), (), *ends, table.rad_s_per_tick)
     wheel = replace(plain, operating=_selected(table, (0, 0)), present_rad_s_per_tick=wheel_unit)
