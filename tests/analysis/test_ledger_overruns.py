@@ -19,7 +19,10 @@ BEGIN_NS = 10**9
 PERIOD_US = 20_000
 ASKED = b"\xff\xff\x05\x04\x02\x24\x02\xcc"
 LATE = 15
-"""The cycle that overran."""
+"""The cycle that overran; the one after it is the last."""
+GONE = 3
+"""Periods that were left out behind it."""
+COUNT = LATE + 2
 
 
 def entry(direction: str, at_us: float, data: bytes = ASKED, late_us: int = 0) -> LedgerEntry:
@@ -33,7 +36,7 @@ def asked_us(n: int, woke_us: int = 0) -> int:
 def ledger(handed_late_us: int = 0, taken_late_us: int = 0, woke_us: int = 0) -> list[LedgerEntry]:
     """A question and a reply 1 ms after it in each cycle; one of them is late, us."""
     found = []
-    for n in range(30):
+    for n in range(LATE + 1):
         taken = asked_us(n, woke_us) + (taken_late_us if n == LATE else 0)
         found.append(entry("in", taken))
         found.append(entry("out", taken + 1000, late_us=handed_late_us if n == LATE else 0))
@@ -42,12 +45,13 @@ def ledger(handed_late_us: int = 0, taken_late_us: int = 0, woke_us: int = 0) ->
 
 @pytest.fixture
 def causes_of(write: Callable[..., Path], cycle: type, wire: type) -> Callable[..., object]:
-    """Return the causes in a run of 30 cycles, of which the 16th took more of something, us."""
+    """Return the causes in a run, one cycle of which took more of something, us."""
 
     def causes(entries: list[LedgerEntry], **more: int) -> object:
-        cycles = [cycle(n, **(more if n == LATE else {}), skipped=n == LATE + 1) for n in range(30)]
+        cycles = [cycle(n, **(more if n == LATE else {})) for n in range(LATE + 1)]
+        cycles.append(cycle(LATE + 1 + GONE, skipped=GONE))
         woke = more.get("late", 0)
-        asked = [wire(PacketKind.INSTRUCTION, 5, asked_us(n, woke), ASKED) for n in range(30)]
+        asked = [wire(PacketKind.INSTRUCTION, 5, asked_us(n, woke), ASKED) for n in range(LATE + 1)]
         return overrun_causes(read_log(write(cycles, asked)), {"main": entries})
 
     return causes
@@ -88,7 +92,7 @@ def test_the_largest_of_three_is_the_cause_and_the_share_is_of_all_cycles(
 ) -> None:
     found = causes_of(ledger(handed_late_us=4_000, woke_us=3_000), read=9_000, late=3_000, update=9_000)
     assert counts(found) == (0, 0, 1)
-    assert found.own_share == pytest.approx(1 / 30)  # type: ignore[attr-defined]
+    assert found.own_share == pytest.approx(1 / COUNT)  # type: ignore[attr-defined]
     (one,) = found.overruns  # type: ignore[attr-defined]
     assert (one.simulation_us, one.wake_up_us, one.own_us) == (4_000, 3_000, 8_900)
 
@@ -99,7 +103,8 @@ def test_a_late_reply_in_the_gap_that_holds_up_the_wake_up_is_the_simulation_s(
     at = BEGIN_NS // 1000 + LATE * PERIOD_US
     entries = ledger(woke_us=16_000)
     entries[2 * LATE : 2 * LATE] = [entry("in", at - 300), entry("out", at - 100, late_us=16_000)]
-    cycles = [cycle(n, late=16_000 if n == LATE else 0, skipped=n == LATE + 1) for n in range(30)]
+    cycles = [cycle(n, late=16_000 if n == LATE else 0) for n in range(LATE + 1)]
+    cycles.append(cycle(LATE + 1 + GONE, skipped=GONE))
     found = overrun_causes(read_log(write(cycles)), {"main": entries})
     assert counts(found) == (1, 0, 0)
     (one,) = found.overruns  # type: ignore[union-attr]
@@ -141,14 +146,15 @@ def test_a_person_reads_the_causes_and_the_worst_of_them(
     write: Callable[..., Path], cycle: type, wire: type
 ) -> None:
     entries = ledger(handed_late_us=17_000)
-    cycles = [cycle(n, read=22_000 if n == LATE else 5_000, skipped=n == LATE + 1) for n in range(30)]
-    wires = [wire(PacketKind.INSTRUCTION, 5, asked_us(n), ASKED) for n in range(30)]
-    wires += [wire(PacketKind.STATUS, 5, asked_us(n) + 1000, ASKED) for n in range(30)]
+    cycles = [cycle(n, read=22_000 if n == LATE else 5_000) for n in range(LATE + 1)]
+    cycles.append(cycle(LATE + 1 + GONE, skipped=GONE))
+    wires = [wire(PacketKind.INSTRUCTION, 5, asked_us(n), ASKED) for n in range(LATE + 1)]
+    wires += [wire(PacketKind.STATUS, 5, asked_us(n) + 1000, ASKED) for n in range(LATE + 1)]
     report = compare(read_log(write(cycles, wires)), entries, Path("seen.jsonl"))
     assert report.sentences[-1] == (
         "The cause was the simulated servos 1 time, a late wake-up 0 times, and our own work 0 times: "
-        "0.000% of 30 cycles."
+        f"0.000% of {COUNT} cycles."
     )
     tables = [item.table for item in render_comparison(report).renderables if hasattr(item, "table")]
     assert tables[-1].title == "Why the loop overran; a cycle usually takes 5400 us"
-    assert [cell.text for cell in tables[-1].rows[0]][1:4] == ["simulation", "1", "17.00 ms"]
+    assert [cell.text for cell in tables[-1].rows[0]][1:4] == ["simulation", str(GONE), "17.00 ms"]
