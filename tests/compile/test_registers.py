@@ -1,6 +1,11 @@
 # ruff: noqa: E501 (a mistake and its sentence are read best side by side)
 
+import re
+from pathlib import Path
+
 import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 
 from dxlrun.compile.registers import declarable, register_value, steered_value
 from dxlrun.control_table import all_tables, control_table
@@ -88,6 +93,51 @@ def test_a_register_that_cannot_be_declared_is_refused_with_the_reason(problems_
 def test_all_mistakes_come_at_once(problems_in):
     text = "{id: 3, position_p_gain: 99999, punch: 4, return_delay_time: 500 us}"
     assert len(problems_in(ROBOT.format(registers=text, model="XM430-W350"))) == 4
+
+
+def outcome(table, name, value):
+    try:
+        return register_value(table, name, value)
+    except ValueError as error:
+        return str(error)
+
+
+@given(
+    st.one_of(
+        st.integers(), st.text(), st.from_regex(r"[-+0-9.e]{1,8} ?(V|deg|rpm|us|mA|%|degC)", fullmatch=True)
+    )
+)
+@example("1e308 V")
+@settings(max_examples=40)
+def test_any_value_is_taken_or_refused_with_a_sentence(value):
+    table = control_table("XM430-W350", 2.0)
+    for name in ("max_voltage_limit", "homing_offset", "velocity_limit", "return_delay_time", "shutdown"):
+        found = outcome(table, name, value)
+        assert "; " in found if isinstance(found, str) else found.value in range(-(1 << 31), 1 << 32)
+
+
+PAGE = (Path(__file__).parents[2] / "docs" / "registers.md").read_text()
+
+
+def test_the_page_names_what_cannot_be_declared():
+    named = set(re.findall(r"`([a-z_0-9]+\*?)`", PAGE))
+    stems = {name[:-1] for name in named if name.endswith("*")}
+    for table in all_tables():
+        for item in table.items.values():
+            if item.access == "RW" and item.name not in declarable(table):
+                assert item.name in named or any(item.name.startswith(stem) for stem in stems), item.name
+
+
+def test_what_the_page_declares_is_declared(compile_text):
+    (block,) = re.findall(r"registers: (\{.*\})\n", PAGE)
+    found, _ = declared(compile_text, block)
+    assert [one.name for one in found] == ["return_delay_time", "temperature_limit", "position_p_gain"]
+
+
+def test_a_wheel_knows_no_position_limits(problems_in):
+    text = ROBOT.format(registers="{max_position_limit: 2100}", model="XM430-W350")
+    text = text.replace("    limits: {position: [-90 deg, 90 deg]}", "    continuous: true")
+    assert [one.what for one in problems_in(text) if one.severity == "error"] == []
 
 
 def test_angle_limits_of_protocol_1_choose_the_mode_and_those_of_an_xl320_do_not(problems_in, compile_text):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from types import MappingProxyType
 
@@ -162,8 +163,13 @@ def compile_registers(
 
 
 def check_position_limits(description: Description, plan: BusPlan, problems: Problems) -> None:
-    """Refuse position limits that are declared narrower than those of the joint: goals would be refused."""
+    """Refuse position limits that are declared narrower than those of the joint: goals would be refused.
+
+    Multi-turn modes know no limits (e-Manual XM430-W350, Min/Max Position Limit (52, 48)).
+    """
     for servo in plan.servos:
+        if servo.continuous:
+            continue
         for register, needed in _narrow(servo):
             problems.error(
                 description.marks.value("joints", servo.joint, "registers", register.name),
@@ -186,7 +192,10 @@ def _raw(item: ControlItem, value: int | str) -> int:
         return value
     if not item.unit:
         raise UnfitRegister(f"{called(item)} has no unit, but is {value!r}", "write a whole number")
-    return round(quantity(value, item.unit) / item.scale)
+    ticks = quantity(value, item.unit) / item.scale
+    if not math.isfinite(ticks):
+        raise UnfitRegister(f"{value} is too much for {called(item)}", f"it takes {_range(item)}")
+    return round(ticks)
 
 
 def _range(item: ControlItem) -> str:
