@@ -88,6 +88,7 @@ def test_mcap_ros2_support_decodes_every_topic(
         "/cycle": 10,
         "/joint_commands": 10,
         "/joint_states": 5,
+        "/diagnostics": 1,
         "/bus/main": 2,
         "/bus/second": 1,
         "/events": len(by_topic["/events"]),
@@ -116,7 +117,7 @@ def test_rosbags_decodes_every_topic(
                 assert (decoded.name, decoded.msg) == ("loop", "50 Hz")
                 stamp = decoded.stamp.sec * 1_000_000_000 + decoded.stamp.nanosec
                 assert stamp == message.log_time == 7_000 + header.epoch_offset_ns
-    assert len(topics) == 7
+    assert len(topics) == 8
 
 
 def test_states_that_are_not_valid_are_not_a_number(
@@ -273,7 +274,7 @@ def test_a_full_disk_stops_the_writing_and_leaves_a_readable_log(
         summary = log.close()
     assert path.stat().st_size == whole == summary.bytes
     assert summary.error is not None
-    assert summary.messages == 3  # cycle, states, commands of the first
+    assert summary.messages == 4  # cycle, states, commands, diagnostics of the first
     assert summary.unwritten > 2
     read = read_log(path)
     assert len(read.cycles) == 1

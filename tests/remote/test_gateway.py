@@ -317,12 +317,17 @@ def test_states_are_those_of_the_newest_cycle_and_what_is_not_there_is_null(desk
     desk.record.states.position[:] = (0.5, np.nan)
     desk.record.states.valid[:] = (True, False)
     desk.record.states.age_ns[:] = (0, 40_000_000)
+    desk.record.states.mode[:] = (3, 0)
+    desk.record.states.temperature[0] = 41.0
+    desk.record.states.hardware_error[1] = 0x20
     desk.finish_cycle()
     status, told = desk.ask("GET", "/states")
     assert (status, told["cycle"], told["time"]) == (200, 1, 1.02)
     pan, tilt = told["joints"]["pan"], told["joints"]["tilt"]
     assert (pan["position"], pan["valid"], pan["age"]) == (0.5, True, 0.0)
     assert (tilt["position"], tilt["valid"], tilt["age"]) == (None, False, 0.04)
+    assert (pan["mode"], pan["temperature"], pan["hardware_error"]) == ("effort", 41.0, 0)
+    assert (tilt["mode"], tilt["temperature"], tilt["hardware_error"]) == ("unknown", None, 0x20)
 
 
 def test_events_of_both_processes_are_whole_and_are_told_once_to_who_asks_after_the_last(desk):

@@ -19,13 +19,13 @@ from dxlrun.packets import split_packets
 from dxlrun.plurals import counted
 from dxlrun.recording import schemas
 from dxlrun.recording.cdr import ENCAPSULATION, Codec
+from dxlrun.recording.diagnostics import Diagnostics
 from dxlrun.recording.header import LogHeader, LogSummary, to_metadata
 from dxlrun.recording.log_file import LogFile
 from dxlrun.recording.schemas import MessageType
 from dxlrun.ring import Payload
 
 CHUNK_BYTES = 256 * 1024
-_NO_NUMBERS = np.zeros(0)
 _PACKET = struct.Struct("<4sqqBBxxI")
 """What precedes the bytes of a BUS_PACKET, as Codec packs it: nine of ten messages are packets."""
 _LIBRARY = "dxlrun"
@@ -56,6 +56,7 @@ class LogWriter:
         )
         self._sequences: dict[int, int] = {}
         self._pieces = CommandPieces()
+        self._diagnostics = Diagnostics(header.joints)
         self._event, self._ros_log, self._joint_state, self._command = (
             Codec(message)
             for message in (
@@ -88,6 +89,7 @@ class LogWriter:
         self._taken_channel = self._channel(known, schemas.COMMANDS_TOPIC, schemas.COMMAND)
         self._states_channel = self._channel(known, schemas.JOINT_STATES_TOPIC, schemas.JOINT_STATE)
         self._commands_channel = self._channel(known, schemas.JOINT_COMMANDS_TOPIC, schemas.JOINT_STATE)
+        self._diagnostics_channel = self._channel(known, schemas.DIAGNOSTICS_TOPIC, schemas.DIAGNOSTICS)
         self._event_channel = self._channel(known, schemas.EVENT_TOPIC, schemas.EVENT)
         self._rosout_channel = self._channel(known, schemas.ROSOUT_TOPIC, schemas.ROS_LOG)
         self._bus_channels = [
@@ -182,9 +184,12 @@ class LogWriter:
             self.header.joints,
             record["goal_position"],
             record["goal_velocity"],
-            _NO_NUMBERS,
+            record["goal_effort"],
         )
         self._add(self._commands_channel, written_ns, goals)
+        diagnostics = self._diagnostics.of(record, written_ns, self._stamp(written_ns))
+        if diagnostics is not None:
+            self._add(self._diagnostics_channel, written_ns, diagnostics)
 
     def _joint_states(
         self, t_ns: int, joints: tuple[str, ...], record: np.void, rows: NDArray[np.int_]

@@ -23,6 +23,7 @@ EVENT_TOPIC = "/events"
 ROSOUT_TOPIC = "/rosout"
 JOINT_STATES_TOPIC = "/joint_states"
 JOINT_COMMANDS_TOPIC = "/joint_commands"
+DIAGNOSTICS_TOPIC = "/diagnostics"
 ROBOT_DESCRIPTION_TOPIC = "/robot_description"
 BUS_PREFIX = "/bus/"
 
@@ -88,6 +89,31 @@ uint32 line
     "RIHS01_e28ce254ca8abc06abf92773b74602cdbf116ed34fbaf294fb9f81da9f318eac",
 )
 
+
+DIAGNOSTICS = MessageType(
+    "diagnostic_msgs/msg/DiagnosticArray",
+    f"""std_msgs/Header header
+diagnostic_msgs/DiagnosticStatus[] status
+{_RULE}
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+{_TIME.strip()}
+{_RULE}
+MSG: diagnostic_msgs/DiagnosticStatus
+# 0 OK, 1 warning, 2 error, 3 stale
+byte level
+string name
+string message
+string hardware_id
+diagnostic_msgs/KeyValue[] values
+{_RULE}
+MSG: diagnostic_msgs/KeyValue
+string key
+string value
+""",
+    "RIHS01_5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e",
+)
 
 STRING = MessageType(
     "std_msgs/msg/String",

@@ -112,7 +112,8 @@ class RemoteRobot:
         return self._ask("GET", "/robot")
 
     def states(self) -> dict[str, object]:
-        """Return the newest cycle: each joint's position (rad), velocity (rad/s), effort, age (s), goals."""
+        """Return the newest cycle: of each joint position (rad), velocity (rad/s), effort, age (s), goals,
+        temperature (deg C), voltage (V; both None until read), bits of its hardware error, its mode."""
         return self._ask("GET", "/states")
 
     def events(self, after: int = 0) -> dict[str, object]:

@@ -32,6 +32,7 @@ from starlette.routing import Route
 from dxlrun.compile.problems import suggestion
 from dxlrun.control.steering import Rate, Switch
 from dxlrun.cycle import CycleRecord
+from dxlrun.mode import Mode
 from dxlrun.remote.asking import Allowance, body, number, origin, peer, typed
 from dxlrun.remote.link import Link, Loaded
 from dxlrun.remote.preparation import Preparation, Refusal
@@ -269,6 +270,12 @@ def _state(record: CycleRecord, row: int) -> dict[str, object]:
         "age": int(states.age_ns[row]) * 1e-9,
         "goal_position": _number(goals.position[row]),
         "goal_velocity": _number(goals.velocity[row]),
+        "goal_effort": _number(goals.effort[row]),
+        "goal_pwm": _number(goals.pwm[row]),
+        "temperature": _number(states.temperature[row]),
+        "voltage": _number(states.voltage[row]),
+        "hardware_error": int(states.hardware_error[row]),
+        "mode": Mode(int(states.mode[row])).name.lower(),
     }
 
 

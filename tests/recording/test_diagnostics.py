@@ -1,0 +1,58 @@
+"""/diagnostics: how each servo is, at most once a second, in words that any ROS tool shows."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from dxlrun.cycle import CycleLayout, CycleRecord
+from dxlrun.mode import Mode
+from dxlrun.recording import schemas
+from dxlrun.recording.cdr import Codec
+from dxlrun.recording.diagnostics import PERIOD_NS, Diagnostics
+
+JOINTS = ("elbow", "wheel", "head")
+
+
+def record_of() -> CycleRecord:
+    record = CycleRecord(CycleLayout(JOINTS, ()))
+    states = record.states
+    states.temperature[:] = 41.0, np.nan, 70.0
+    states.voltage[:] = 12.04, np.nan, 11.0
+    states.valid[:] = True, False, True
+    states.hardware_error[:] = 0, 0, 0x24
+    states.mode[:] = Mode.POSITION, Mode.UNKNOWN, Mode.EFFORT
+    return record
+
+
+def said(data: bytes | None) -> Any:
+    assert data is not None
+    return Codec(schemas.DIAGNOSTICS).unpack(data)
+
+
+def test_each_joint_says_how_its_servo_is() -> None:
+    record = record_of()
+    row = np.frombuffer(bytes(record.raw), dtype=record.layout.dtype)[0]
+    message = said(Diagnostics(JOINTS).of(row, 5, (7, 8)))
+    assert message["header"]["stamp"] == {"sec": 7, "nanosec": 8}
+    told = [(one["level"], one["name"], one["message"]) for one in message["status"]]
+    assert told == [
+        (0, "elbow", "answers"),
+        (3, "wheel", "did not answer in this cycle"),
+        (2, "head", "hardware error 0x24"),
+    ]
+    values = [[pair["value"] for pair in one["values"]] for one in message["status"]]
+    assert values == [
+        ["41.0 deg C", "12.0 V", "0x00", "position"],
+        ["not read yet", "not read yet", "0x00", "unknown"],
+        ["70.0 deg C", "11.0 V", "0x24", "effort"],
+    ]
+
+
+def test_it_is_said_once_a_second() -> None:
+    record = record_of()
+    row = np.frombuffer(bytes(record.raw), dtype=record.layout.dtype)[0]
+    diagnostics = Diagnostics(JOINTS)
+    times = [time for time in range(0, 5 * PERIOD_NS, PERIOD_NS // 50) if diagnostics.of(row, time, (0, 0))]
+    assert times == [second * PERIOD_NS for second in range(5)]
