@@ -2,7 +2,7 @@
 
 Judged by the simulated buses' ledger alone, see fault_judge.py: the eight promises of a robot in trouble.
 
-CI runs 6 short storms from a fixed seed. The full campaign before a release, 30 s of the robots' time each:
+CI runs 8 short storms from a fixed seed. The full campaign before a release, 30 s of the robots' time each:
 
     DXLRUN_STORMS=500 python -m pytest tests/simulation/test_faults_campaign.py -q
 
@@ -33,13 +33,21 @@ name: {name}
 loop: {{rate: 50}}
 buses:
 """
-BUS = "  {bus}: {{port: sim, protocol: {protocol}, baud_rate: 1_000_000, return_delay_time: 100 us}}\n"
+BUS = (
+    "  {bus}: {{port: sim, protocol: {protocol}, baud_rate: 1_000_000, return_delay_time: 100 us, "
+    "read: {read}}}\n"
+)
 JOINT = (
     "  j{number}: {{bus: {bus}, id: {number}, model: {model}, reference: {middle} deg, "
     "direction: {direction}, limits: {{position: [-1.2 rad, 1.2 rad], velocity: 4 rad/s}}}}\n"
 )
 MODELS = {1.0: ("AX-12A", 150), 2.0: ("XM430-W350", 180)}
-ROBOT_OF = {"torso": None, "eight_x": {"main": (2.0, 8)}, "two_buses": {"left": (1.0, 4), "right": (2.0, 4)}}
+ROBOT_OF = {
+    "torso": None,
+    "eight_x": {"main": (2.0, 8)},
+    "two_buses": {"left": (1.0, 4), "right": (2.0, 4)},
+    "split_x": {"main": (2.0, 8)},
+}
 LASTING = ",".join(name for name in KINDS if name not in {"storm", "unplug"})
 ALL = f"{LASTING},unplug"
 FULL = "DXLRUN_STORMS" in os.environ
@@ -51,7 +59,7 @@ def storms() -> list[Any]:
     """Return robots in turn, and what happens to them."""
     chance = random.Random(int(os.environ.get("DXLRUN_STORM_SEED", "1")))
     drawn = []
-    for index in range(int(os.environ.get("DXLRUN_STORMS", "6"))):
+    for index in range(int(os.environ.get("DXLRUN_STORMS", "8"))):
         robot = tuple(ROBOT_OF)[index % len(ROBOT_OF)]
         kinds = chance.choice(("", f" kinds={LASTING}", f" kinds={ALL}", f" kinds={ALL}"))
         begin = chance.choice((0, 300, 300, 300))  # the set-up is over after some 200 ms
@@ -71,7 +79,7 @@ def built(name: str, directory: Path, policies: str = "") -> VirtualRobot:
     text, joints, number = HEAD.format(name=name), "joints:\n", 0
     for bus, (protocol, count) in lines.items():
         model, middle = MODELS[protocol]
-        text += BUS.format(bus=bus, protocol=protocol)
+        text += BUS.format(bus=bus, protocol=protocol, read="split" if name == "split_x" else "together")
         for _ in range(count):
             number += 1
             joints += JOINT.format(
