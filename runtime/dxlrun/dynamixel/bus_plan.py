@@ -163,6 +163,8 @@ class ServoPlan:
     start_mode: Mode = Mode.POSITION
     """In which it is brought at the start; one of `modes`."""
     own_limits: tuple[OwnLimit, ...] = ()
+    slow: tuple[str, ...] = ()
+    """Items that are read slowly, by name."""
     torque_on_return: bool = False
     """Torque is given back after a reboot (policy `on_returned_servo: hold`)."""
     continuous: bool = False
@@ -237,3 +239,5 @@ class BusPlan:
     """The next read request leaves right behind the goals, so that the replies wait when a cycle begins."""
     watchdog_ticks: int = 0
     """Bus Watchdog of each servo that has one, steps of 20 ms; 0: not armed."""
+    slow_period_ns: int = 0
+    """In which time each slow register is read once; 0: none is."""

@@ -14,6 +14,7 @@ from dxlrun.dynamixel.bus import NEVER, Bus, pump, run
 from dxlrun.dynamixel.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.gaps import Gaps
 from dxlrun.dynamixel.health import Servos
+from dxlrun.dynamixel.jumps import Jumps
 from dxlrun.dynamixel.limp import LimpOutcome, limp_buses
 from dxlrun.dynamixel.modes import settle_modes
 from dxlrun.dynamixel.port import Ports
@@ -35,7 +36,7 @@ TAKEN_BACK = "torque was switched off again on every servo"
 """Note of what `start` raises when every servo confirmed that."""
 FIRST_READS = 3
 """The first states must all be fresh; noise may spoil a reading or two."""
-IDLE_MARGIN_NS = 300_000
+IDLE_MARGIN_NS = 150_000
 """The gap is left so long before the deadline: a stock kernel wakes some 50-100 us late."""
 
 
@@ -84,9 +85,10 @@ class DynamixelHardware:
         self._registers = tuple(one.registers for one in wanted)
         self._modes = tuple(one.modes for one in wanted)
         self._servos = tuple(
-            Servos(plan, bus, gaps, one, events)
+            Servos(plan, bus, gaps, one, events, states)
             for plan, bus, gaps, one in zip(self._plans, self._buses, self._gaps, wanted, strict=True)
         )
+        self._jumps = Jumps(self._plans, len(states.position), events)
 
     def start(self) -> None:
         """Look at every servo, hold each where it stands, fill the first states and goals.
@@ -125,6 +127,7 @@ class DynamixelHardware:
         now = self._clock.now_ns()
         for servos in self._servos:
             servos.settle(self._states, now)
+        self._jumps.sift(self._states, now)
         self._tell_failures()
 
     def write(self) -> None:

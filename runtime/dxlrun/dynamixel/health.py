@@ -16,7 +16,9 @@ from dxlrun.dynamixel.dialect import dialect_of
 from dxlrun.dynamixel.exchange import CyclicReads
 from dxlrun.dynamixel.gaps import Gaps, Urgency
 from dxlrun.dynamixel.plan import plan_line
+from dxlrun.dynamixel.protocol1 import StatusError
 from dxlrun.dynamixel.protocol2 import describe_hardware_error
+from dxlrun.dynamixel.slow_registers import SlowRegisters
 from dxlrun.dynamixel.startup import Rejoined
 from dxlrun.dynamixel.state_arrays import StateArrays
 from dxlrun.dynamixel.transaction import Program, Reply, Transaction
@@ -34,9 +36,13 @@ ALERT_AGAIN = 50
 RETURN_SPEED = 1.5
 """rad/s, no faster does a servo that was lost go to its goal, which may have gone on: a step that no gate saw
 is to be a slow one."""
-_LOST = f"missed {LOST_CYCLES} replies in a row; it is asked once a second until it is in order"
 RETURNED = 0.05
 """rad from the goal: the servo has caught up."""
+_STATES = StatusError.INPUT_VOLTAGE | StatusError.OVERHEATING | StatusError.OVERLOAD
+"""Bits of Protocol 1.0's error byte that tell the servo's state and not of one instruction."""
+_SHUTS_DOWN = StatusError.OVERHEATING | StatusError.OVERLOAD
+"""After them Torque Limit may be 0 (e-Manual AX-12A, Alarm Shutdown (18))."""
+_LOST = f"missed {LOST_CYCLES} replies in a row; it is asked once a second until it is in order"
 
 
 class _Question(NamedTuple):
@@ -74,14 +80,19 @@ class Servos:
         "_returning",
         "_rows",
         "_said_errors",
+        "_shown",
+        "_slow",
         "_states",
+        "_strained",
         "_watchdog_ns",
         "goals",
         "reads",
         "torqued",
     )
 
-    def __init__(self, plan: BusPlan, bus: Bus, gaps: Gaps, wanted: Wanted, events: EventSink) -> None:
+    def __init__(  # noqa: PLR0917  what a bus has, and whom it tells
+        self, plan: BusPlan, bus: Bus, gaps: Gaps, wanted: Wanted, events: EventSink, states: States
+    ) -> None:
         count = len(plan.servos)
         self._plan = plan
         self._bus = bus
@@ -104,6 +115,8 @@ class Servos:
         self._alerts: list[int] = []  # who has a hardware error that was not read yet
         self._alert_cycles = 0
         self._hardware_errors = [0] * count
+        self._shown = states.hardware_error
+        self._strained: list[int] = []  # Protocol 1.0: who may have shut down
         self._asking = False
         self._probed = 0
         self._noise_seen = 0
@@ -113,6 +126,9 @@ class Servos:
         self._fed_ns = 0
         self._modes = wanted.modes
         self._absent = Absent(plan, gaps, wanted, self._say, self._back)
+        self._slow = SlowRegisters(
+            plan, gaps, self._absent, self.reads.away, self._say, states, lambda index: self._leave(index, 0)
+        )
 
     @property
     def all_fresh(self) -> bool:
@@ -200,6 +216,7 @@ class Servos:
         exchange is asked by itself, see `absent`.
         """
         self._absent.look()
+        self._slow.look()
         question = None if self._asking else self._owed()
         if question is None:
             return
@@ -236,6 +253,13 @@ class Servos:
             if address is not None and self.reads.fresh[index]:
                 read = plan_line(self._plan).read(self._plan.servos[index].servo_id, address, 1)
                 return _Question(index, "hardware error status", read, self._take_hardware_error)
+        for index in self._strained:
+            limit = self._plan.servos[index].torque_limit
+            if limit is not None and self.reads.fresh[index]:
+                read = plan_line(self._plan).read(
+                    self._plan.servos[index].servo_id, limit.address, limit.size
+                )
+                return _Question(index, limit.name, read, self._take_torque_limit)
         if self.torqued.all():
             return None
         count = len(self._plan.servos)
@@ -255,11 +279,21 @@ class Servos:
             self._leave(index, 0)  # a shutdown has a reason, this one may have started anew
         self._tell_limp(index, reply.parameters[0])
 
+    def _take_torque_limit(self, index: int, reply: Reply) -> None:
+        """Give no more goals to a servo of Protocol 1.0 that shut down: its torque enable stays 1."""
+        self._strained.remove(index)
+        limit = self._plan.servos[index].torque_limit
+        if limit is not None and not any(reply.parameters):
+            self.torqued[index], self._limp[index] = False, True
+            text = f"has {limit.name} = 0: it shut down, and gets no goals until the next run"
+            self._say(EventCode.SERVO_LIMP, Severity.ERROR, index, text)
+
     def _take_hardware_error(self, index: int, reply: Reply) -> None:
         self._alerts.remove(index)
         if reply.parameters[0] == self._hardware_errors[index]:
             return  # read again, and nothing is new
         self._hardware_errors[index] = reply.parameters[0]
+        self._shown[self._rows[index]] = reply.parameters[0]
         address = self._plan.servos[index].hardware_error_address
         words = describe_hardware_error(reply.parameters[0])
         # shutdown may have cut the torque: no goal until it was read
@@ -283,13 +317,15 @@ class Servos:
 
     def _count_losses(self) -> None:
         for index, fresh in enumerate(self.reads.fresh.tolist()):
+            if self.reads.away[index]:
+                continue
             if not fresh:
                 self._missed[index] += 1
                 self.torqued[index] = False
                 if self._missed[index] == 1:
                     how = "sent a garbled reply" if self.reads.garbled[index] else "did not answer"
                     self._say(EventCode.READ_LOST, Severity.WARNING, index, how)
-                elif self._missed[index] == LOST_CYCLES and not self.reads.away[index]:
+                elif self._missed[index] == LOST_CYCLES:
                     self._say(EventCode.SERVO_LOST, Severity.ERROR, index, _LOST)
                     self._leave(index, FIRST_PROBE_NS)
             elif self._missed[index]:
@@ -327,10 +363,8 @@ class Servos:
 
     def _tell_limp(self, index: int, enabled: int) -> None:
         self._limp[index] = True
-        address = self._plan.servos[index].torque_address
-        text = (
-            f"has Torque Enable ({address}) = {enabled}: it was reset or its torque was cut; it gets no goals"
-        )
+        item = f"Torque Enable ({self._plan.servos[index].torque_address})"
+        text = f"has {item} = {enabled}: it was reset or its torque was cut; it gets no goals"
         self._say(EventCode.SERVO_LIMP, Severity.ERROR, index, text)
 
     def _say_errors(self) -> None:
@@ -338,9 +372,13 @@ class Servos:
             if error != self._said_errors[index]:
                 if error & ~self._said_errors[index] & self._dialect.ALERT and index not in self._alerts:
                     self._alerts.append(index)
+                if not self._dialect.ALERT:
+                    self._shown[self._rows[index]] = error & _STATES
+                    if error & ~self._said_errors[index] & _SHUTS_DOWN and index not in self._strained:
+                        self._strained.append(index)
+                elif not error & self._dialect.ALERT:
+                    self._hardware_errors[index] = self._shown[self._rows[index]] = 0
                 self._said_errors[index] = error
-                if not error & self._dialect.ALERT:
-                    self._hardware_errors[index] = 0
                 severity = Severity.ERROR if error else Severity.INFO
                 self._say(
                     EventCode.SERVO_ERROR, severity, index, f"reports {self._dialect.describe_error(error)}"

@@ -1,0 +1,179 @@
+"""Slow registers, reboots that nobody missed, jumps, and shutdowns: judged by the simulated bus."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dxlrun.dynamixel.jumps import SAY_AGAIN_NS, Jumps
+from dxlrun.dynamixel.slow_registers import slow_items
+from dxlrun.events import EventCode
+from dxlrun.interfaces import States
+
+SECOND_NS = 1_000_000_000
+
+
+@pytest.fixture
+def start(make_rig, make_plan):
+    def build(model="XM430-W350", ids=(11, 12), *, protocol=2.0, period_ns=SECOND_NS, items=(), **change):
+        x = {"reference": math.pi, "lower": -2.5, "upper": 2.5, "return_delay_ns": 0}
+        plan = make_plan(ids, protocol=protocol, model=model, **(x if protocol == 2.0 else {}) | change)
+        slow = items or slow_items(model, protocol)
+        servos = tuple(replace(servo, slow=slow) for servo in plan.servos)
+        rig = make_rig(replace(plan, servos=servos, slow_period_ns=period_ns))
+        rig.hardware.start()
+        return rig
+
+    return build
+
+
+def cycles(rig, count):
+    for _ in range(count):
+        rig.cycle()
+
+
+@pytest.mark.parametrize(("model", "protocol"), [("XM430-W350", 2.0), ("AX-12A", 1.0), ("XL-320", 2.0)])
+def test_temperature_and_voltage_come_into_the_states_at_their_own_rate(start, model, protocol):
+    change = {"reference": 2.6, "lower": -2.0, "upper": 2.0} if model == "XL-320" else {}
+    rig = start(model, protocol=protocol, **change)
+    servo = rig.buses[0].servos[1]
+    cycles(rig, 60)
+    assert rig.states.temperature[1] == pytest.approx(servo.temperature, abs=0.6)
+    assert rig.states.voltage[1] == pytest.approx(servo.voltage, abs=0.2)
+    count = len(rig.into_bus())
+    cycles(rig, 500)
+    sent = rig.into_bus()[count:]
+    reading = [packet for packet in sent if packet[4] == servo.servo_id]
+    blocks = {bytes(packet) for packet in reading}
+    assert len(blocks) <= 3
+    for block in blocks:
+        assert 9 <= reading.count(block) <= 11  # once a second
+
+
+def test_slow_registers_make_no_cycle_late_and_wait_for_ever_where_there_is_no_time(start):
+    rig = start(period_ns=20_000_000)
+    rig.period_ns = 2_000_000
+    cycles(rig, 200)  # `cycle` asserts that it ends in time
+    assert not np.isnan(rig.states.voltage).any()
+    rig = start(period_ns=20_000_000)
+    rig.period_ns = 1_000_000  # the exchange takes 0.85 ms of it
+    cycles(rig, 300)
+    assert np.isnan(rig.states.voltage).all()
+    assert rig.events.of(EventCode.OVERRUN) == []
+
+
+def test_a_hot_servo_is_told_ten_degrees_before_its_limit_and_when_it_has_cooled(start):
+    rig = start()
+    servo = rig.buses[0].servo(12)
+    cycles(rig, 100)
+    assert rig.events.of(EventCode.SERVO_HOT) == []
+    servo._body.temperature = servo.registers["temperature_limit"] - 8
+    cycles(rig, 70)
+    ((source, text),) = rig.events.of(EventCode.SERVO_HOT)
+    assert source == "main_12_joint"
+    assert "its Temperature Limit (31) is 80 deg C" in text
+    servo._body.temperature = 40.0
+    cycles(rig, 70)
+    assert len(rig.events.of(EventCode.SERVO_HOT)) == 2
+
+
+def test_another_item_is_told_when_it_changes(start):
+    rig = start(items=("position_p_gain",))
+    cycles(rig, 120)
+    rig.buses[0].servo(12).poke("position_p_gain", 640)
+    cycles(rig, 60)
+    ((source, text),) = rig.events.of(EventCode.REGISTER_DIFFERS)
+    assert source == "main_12_joint"
+    assert "Position P Gain (84) was 800, is 640" in text
+
+
+def test_a_reboot_that_no_read_missed_is_seen_by_the_tick(start):
+    rig = start()
+    rig.period_ns = 250_000_000  # it boots between two reads
+    cycles(rig, 12)
+    rig.buses[0].servo(12).boot_ns = 0
+    rig.buses[0].servo(12).reset()
+    cycles(rig, 12)
+    assert [source for source, _ in rig.events.of(EventCode.SERVO_REBOOTED)] == ["main_12_joint"]
+    assert rig.events.of(EventCode.READ_LOST) == []
+    assert rig.torque() == [True, False]
+    assert rig.states.valid.all()
+    rig.goals.position[:] += 0.05
+    cycles(rig, 2)
+    goals = [packet for packet in rig.into_bus() if packet[7] == 0x83][-1]
+    assert 12 not in goals[12:-2:9]
+
+
+def test_ten_minutes_pass_without_a_false_reboot(start):
+    rig = start(ids=(11,), period_ns=SECOND_NS)
+    rig.period_ns = 500_000_000  # the tick does not care how often the states are read
+    cycles(rig, 10 * 60 * 2)
+    assert rig.events.of(EventCode.SERVO_REBOOTED) == []
+    assert rig.events.of(EventCode.SERVO_LIMP) == []
+
+
+def test_a_hardware_error_is_in_the_states_as_long_as_it_stands(start):
+    rig = start()
+    cycles(rig, 5)
+    rig.buses[0].servo(12).poke("hardware_error_status", 0x20)
+    cycles(rig, 5)
+    assert rig.states.hardware_error.tolist() == [0, 0x20]
+
+
+def test_a_servo_of_protocol_1_that_shut_down_gets_no_goals(start):
+    rig = start("AX-12A", (1, 3), protocol=1.0)
+    cycles(rig, 5)
+    rig.buses[0].servo(3).trigger_overload()
+    cycles(rig, 10)
+    assert rig.states.hardware_error[1] & 0x20
+    ((source, text),) = rig.events.of(EventCode.SERVO_LIMP)
+    assert source == "main_3_joint"
+    assert "Torque Limit (34) = 0" in text
+    count = len(rig.into_bus())
+    rig.goals.position[:] += 0.1
+    cycles(rig, 5)
+    goals = [packet for packet in rig.into_bus()[count:] if packet[4] == 0x83]
+    assert goals
+    assert all(3 not in packet[7:-1:5] for packet in goals)
+
+
+class TestJumps:
+    """Positions that no servo can reach."""
+
+    @pytest.fixture
+    def sift(self, make_plan, make_rig):
+        plan = make_plan((1, 3))
+        states = States.empty(2)
+        rig = make_rig(plan)
+        jumps = Jumps([plan], 2, rig.events)
+        clock = [0]
+
+        def cycle(first, second, *, after_ms=10):
+            clock[0] += after_ms * 1_000_000
+            states.position[:] = first, second
+            states.valid[:] = True
+            jumps.sift(states, clock[0])
+            return states.valid.tolist(), states.position.tolist()
+
+        cycle.events = rig.events
+        return cycle
+
+    def test_a_fast_servo_is_believed(self, sift):
+        for step in range(20):
+            assert sift(step * 0.11, -step * 0.11)[0] == [True, True]  # 11 rad/s
+
+    def test_a_jump_is_invalid_and_the_row_keeps_its_value_until_it_can_be_true(self, sift):
+        sift(0.0, 0.0)
+        assert sift(0.0, 1.5) == ([True, False], [0.0, 0.0])
+        seen = [sift(0.0, 1.5)[0][1] for _ in range(20)]
+        assert seen.index(True) in range(8, 14)  # 1.5 rad at 11.9 rad/s
+        assert all(seen[seen.index(True) :])
+        ((source, text),) = sift.events.of(EventCode.IMPLAUSIBLE)
+        assert source == "main_3_joint"
+        assert "jumped by 86 deg in 10 ms" in text
+        assert SAY_AGAIN_NS == SECOND_NS
+
+    def test_who_was_not_seen_for_long_may_be_elsewhere(self, sift):
+        sift(0.0, 0.0)
+        assert sift(2.0, 0.0, after_ms=500)[0] == [True, True]
