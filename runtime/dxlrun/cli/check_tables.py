@@ -15,7 +15,15 @@ from rich.text import Text
 
 from dxlrun.compile import Compiled
 from dxlrun.compile.reach import degrees
-from dxlrun.compile.report import BusRow, CheckReport, ControllerRow, JointRow, MotionRow, PolicyRow
+from dxlrun.compile.report import (
+    BusRow,
+    CheckReport,
+    ControllerRow,
+    JointRow,
+    MotionRow,
+    PolicyRow,
+    WayRow,
+)
 from dxlrun.plurals import counted
 
 if TYPE_CHECKING:
@@ -41,6 +49,7 @@ def tables(report: CheckReport, width: int) -> Iterator[RenderableType]:
     if report.controllers:
         sheets.append(_controllers(report.controllers, len(report.joints)))
     sheets.append(_buses(report.buses, report.rate))
+    sheets.append(_ways(report.ways))
     sheets.append(_policies(report.policies))
     if report.motions:
         sheets.append(_motions(report.motions, report.duration))
@@ -167,6 +176,27 @@ def registers(rows: Sequence[RegisterRow], width: int) -> RenderableType:
         action = {"nothing": "leave it", "write": "write it", "": "not start"}[row.action]
         table.add_row(row.joint, row.item, row.area, str(row.address), str(row.declared), found, action)
     return table.shown(width)
+
+
+def _ways(rows: Sequence[WayRow]) -> _Sheet:
+    table = _Sheet(
+        "Ways to read the servos",
+        ["bus", "read by", "asked", "chosen"],
+        ["bytes out + in", "total", "highest rate", "waits", "states are old"],
+    )
+    asked = {"together": "when a cycle begins", "split": "behind the goals"}
+    for row in rows:
+        table.add_row(
+            row.bus,
+            row.way,
+            asked[row.asked],
+            "yes" if row.chosen else "",
+            f"{row.request_bytes} + {row.reply_bytes}",
+            f"{row.total * 1e3:.2f} ms",
+            f"{row.highest_rate:.0f} Hz",
+            *(f"{value * 1e3:.2f} ms" for value in (row.wait, row.age)),
+        )
+    return table
 
 
 def _policies(rows: Sequence[PolicyRow]) -> _Sheet:

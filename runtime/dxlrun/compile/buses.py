@@ -111,7 +111,7 @@ def _check_budget(description: Description, plan: BusPlan, problems: Problems) -
         problems.error(
             mark,
             f"{cycle}, but {rate:g} Hz{given} leave {1e3 / rate:.3g} ms; the highest possible rate is "
-            f"{_floor(budget.highest_rate_hz)} Hz",
+            f"{_floor(budget.highest_rate_hz)} Hz, with read: split and without",
             "; ".join(["lower the rate", *_what_would_help(plan)]),
         )
     elif share > _COMFORTABLE:
@@ -131,6 +131,8 @@ def _what_would_help(plan: BusPlan) -> list[str]:
         rate = _rate(budget, latency_ns=budget.latency_ns * FAST_LATENCY_NS // plan.latency_ns)
         old = f"{plan.latency_ns * 1e-6:g} ms"
         found.append(f"an adapter latency of 1 ms instead of {old} would allow {rate} Hz")
+    elif plan.latency_ns and (rate := _rate(budget, latency_ns=0)) != now:
+        found.append(f"an adapter without a latency timer would allow {rate} Hz")
     if (rate := _rate(budget, return_delay_ns=0)) != now:
         old = f"{plan.return_delay_ns * 1e-3:g} us"
         found.append(f"a return delay time of 0 us instead of {old} would allow {rate} Hz")

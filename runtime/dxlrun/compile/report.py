@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 from dxlrun.compile.controllers import CompiledController
 from dxlrun.compile.joints import CompiledJoint
 from dxlrun.compile.motions import CompiledPart
 from dxlrun.control.policy_plan import POLICIES, PolicyPlan
 from dxlrun.description import Description
-from dxlrun.dynamixel.bus_plan import BusPlan
+from dxlrun.dynamixel.bus_plan import BusPlan, ReadWay
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +80,28 @@ class BusRow:
 
 
 @dataclass(frozen=True, slots=True)
+class WayRow:
+    """One way to read the servos of a bus; times in s."""
+
+    bus: str
+    way: str
+    """The e-Manual's names of the instructions."""
+    asked: Literal["together", "split"]
+    """As the robot file has it: when a cycle begins, or behind the goals of the one before."""
+    request_bytes: int
+    reply_bytes: int
+    total: float
+    """What a cycle takes on the line. To ask earlier changes nothing about it."""
+    highest_rate: float
+    """Hz"""
+    wait: float
+    """How long a cycle waits for the states before controllers can work, and their goals can leave."""
+    age: float
+    """How old the states are by then, from the last byte of the last reply on."""
+    chosen: bool
+
+
+@dataclass(frozen=True, slots=True)
 class PolicyRow:
     """What happens when something does not go on as planned."""
 
@@ -113,6 +136,7 @@ class CheckReport:
     joints: tuple[JointRow, ...]
     controllers: tuple[ControllerRow, ...]
     buses: tuple[BusRow, ...]
+    ways: tuple[WayRow, ...]
     policies: tuple[PolicyRow, ...]
     motions: tuple[MotionRow, ...]
     duration: float | None
@@ -128,6 +152,7 @@ def check_report(checked: Checked) -> CheckReport:
         joints=tuple(_joint_row(joint) for joint in checked.joints.values()),
         controllers=tuple(_controller_row(controller, rate) for controller in checked.controllers.values()),
         buses=tuple(_bus_row(bus, rate) for bus in checked.buses),
+        ways=tuple(row for bus in checked.buses for row in _way_rows(bus, rate)),
         policies=_policy_rows(checked.policies),
         motions=tuple(_motion_row(part) for part in checked.parts),
         duration=None if checked.end_ns is None else checked.end_ns * 1e-9,
@@ -179,6 +204,31 @@ def _bus_row(bus: BusPlan, rate: float) -> BusRow:
         total=budget.total_ns * 1e-9,
         highest_rate=budget.highest_rate_hz,
         share=budget.total_ns * 1e-9 * rate,
+    )
+
+
+def _way_rows(bus: BusPlan, rate: float) -> Iterator[WayRow]:
+    """Yield the ways that a bus could be read, and the chosen one asked at the other moment, too."""
+    for way in bus.ways:
+        for split in (False, True):
+            if way.chosen or split is bus.split:
+                yield _way_row(bus, way, split, 1.0 / rate)
+
+
+def _way_row(bus: BusPlan, way: ReadWay, split: bool, period: float) -> WayRow:
+    budget = way.budget
+    total, goals = budget.total_ns * 1e-9, budget.goals_ns * 1e-9
+    return WayRow(
+        bus=bus.name,
+        way=way.name,
+        asked="split" if split else "together",
+        request_bytes=budget.request_bytes,
+        reply_bytes=budget.reply_bytes,
+        total=total,
+        highest_rate=budget.highest_rate_hz,
+        wait=max(total - period, 0.0) if split else total - goals,
+        age=max(period - total, 0.0) if split else 0.0,
+        chosen=way.chosen and split is bus.split,
     )
 
 

@@ -187,6 +187,13 @@ class Budget:
     wire_ns: int
     return_delay_ns: int
     latency_ns: int
+    goal_bytes: int = 0
+    """Those of `request_bytes` that are goals, which nobody answers."""
+
+    @property
+    def goals_ns(self) -> int:
+        """Time of the goals on the wire, ns."""
+        return self.wire_ns * self.goal_bytes // max(self.request_bytes + self.reply_bytes, 1)
 
     @property
     def total_ns(self) -> int:

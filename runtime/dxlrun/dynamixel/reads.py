@@ -94,6 +94,7 @@ def read_budget(line: Line, reads: Sequence[Transaction], goals: Sequence[bytes]
         wire_ns=line.wire_ns(request_bytes + reply_bytes),
         return_delay_ns=delays * line.return_delay_ns,
         latency_ns=len(reads) * line.latency_ns,
+        goal_bytes=sum(map(len, goals)),
     )
 
 
