@@ -113,6 +113,19 @@ def test_joints_that_never_come_into_their_modes_keep_the_controller_out(story: 
     assert story.robot.hardware.asked == [[0, EFFORT], [0, POSITION]]
 
 
+def test_a_joint_that_refuses_its_mode_keeps_the_controller_out_at_once(story: Story) -> None:
+    def refuse() -> None:
+        story.robot.manager._modes._set_modes = story.robot.hardware.asked.append
+        story.switch(["wheels"], ["arm"])
+
+    story.at[2] = refuse
+    story.run(6)
+    (text,) = story.text(EventCode.COMMAND_REFUSED)
+    told = "j0 stays in position mode instead of velocity mode, nor did 1 more"
+    assert text == f"wheels: wheels is not activated: {told}"
+    assert len(story.robot.hardware.asked) == 1
+
+
 def test_what_waits_can_be_called_off_and_its_joints_go_to_rest(story: Story) -> None:
     story.at[2] = lambda: story.switch(["press"], ["arm"])
     story.at[4] = lambda: story.switch(["arm"], ["press"])

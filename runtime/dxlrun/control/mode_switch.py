@@ -12,7 +12,6 @@ from dxlrun.control.claims import claimed_modes, conflicts, told
 from dxlrun.control.loop_plan import JointPlan
 from dxlrun.control.managed import Managed
 from dxlrun.mode import Mode
-from dxlrun.plurals import counted
 
 PATIENCE_NS = 5_000_000_000
 """How long controllers wait for modes: twenty servos that take their turns in short gaps need less than one
@@ -74,11 +73,21 @@ class ModeSwitch:
         return not self._missing(entering)
 
     def due(self, time_ns: int) -> tuple[list[Group], list[Group]]:
-        """Return the groups that may enter now, and those that waited too long; both wait no more."""
+        """Return the groups that may enter now, and those whose modes will not come; both wait no more.
+
+        They will not when the time is over, and when a joint is in another mode although it was asked: on the
+        way it would be in none.
+        """
         if not self._groups:
             return [], []
-        ready = [group for group in self._groups if self.ready(group.entering)]
-        late = [group for group in self._groups if group not in ready and time_ns >= group.until_ns]
+        ready, late = [], []
+        for group in self._groups:
+            missing = self._missing(group.entering)
+            refused = self._asked and any(now != Mode.UNKNOWN for _, now in missing.values())
+            if not missing:
+                ready.append(group)
+            elif refused or time_ns >= group.until_ns:
+                late.append(group)
         self._groups = [group for group in self._groups if group not in ready and group not in late]
         if late:
             self._asked = False
@@ -87,9 +96,17 @@ class ModeSwitch:
     def excuse(self, group: Group) -> str:
         """Say which joints did not come into their modes."""
         missing = self._missing(group.entering)
-        first, mode = next(iter(missing.items()), ("its joints", Mode.UNKNOWN))
-        more = f" and {counted(len(missing) - 1, 'other joint', 'other joints')}" if len(missing) > 1 else ""
-        return f"{first}{more} did not come into {_said(mode)} mode within {PATIENCE_NS * 1e-9:g} s"
+        stays = [
+            f"{joint} stays in {_said(now)} mode instead of {_said(mode)} mode"
+            for joint, (mode, now) in missing.items()
+            if now != Mode.UNKNOWN
+        ]
+        late = [
+            f"{joint} did not come into {_said(mode)} mode within {PATIENCE_NS * 1e-9:g} s"
+            for joint, (mode, now) in missing.items()
+            if now == Mode.UNKNOWN
+        ]
+        return (stays or late)[0] + (f", nor did {len(missing) - 1} more" if len(missing) > 1 else "")
 
     def drop(self, managed: Managed, _time_ns: int) -> None:
         """Let one controller wait no more."""
@@ -145,9 +162,11 @@ class ModeSwitch:
         clash = told(conflicts([*staying, *(named[name].plan for name in activate)]))
         return f"{clash}; deactivate whoever is in the way in the same switch" if clash else ""
 
-    def _missing(self, entering: Iterable[Managed]) -> dict[str, Mode]:
+    def _missing(self, entering: Iterable[Managed]) -> dict[str, tuple[Mode, Mode]]:
+        """Return the joints that are not in their modes, with the mode that they need and theirs."""
         claimed = claimed_modes(managed.plan for managed in entering)
-        return {joint: mode for joint, mode in claimed.items() if self._modes[self._rows[joint]] != mode}
+        now = {joint: Mode(int(self._modes[self._rows[joint]])) for joint in claimed}
+        return {joint: (mode, now[joint]) for joint, mode in claimed.items() if mode != now[joint]}
 
 
 def _said(mode: Mode) -> str:
