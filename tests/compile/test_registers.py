@@ -181,3 +181,9 @@ def test_a_client_may_change_only_ram_of_its_own(name, said):
     assert steered_value(table, "position_p_gain", 640).value == 640
     with pytest.raises(ValueError, match=said):
         steered_value(table, name, 2)
+
+
+def test_of_a_model_that_is_still_to_be_asked_what_fits_the_usual_one_is_taken(compile_text):
+    found, warnings = declared(compile_text, "{position_p_gain: 900, p_gain: 3}", model="auto")
+    assert [one.name for one in found] == ["position_p_gain"]
+    assert "is asked for its model at the start" in " ".join(one.what for one in warnings)
