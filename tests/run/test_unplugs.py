@@ -2,7 +2,8 @@
 
 Everything is real but the servos: processes, pseudo-terminals, a link to each as udev makes it, time. Judged
 by the simulated buses' ledger: the other bus goes on, whoever is back is read again, the log has every byte,
-and everybody ends limp.
+and everybody ends limp: by the loop, by the guardian when the loop is killed, or by the terminal's process
+when both are.
 
 CI pulls 2 times from a fixed seed. The full campaign before a release:
 
@@ -16,6 +17,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -31,6 +33,8 @@ from dxlrun.simulation import LedgerEntry, read_ledger
 
 DXLRUN = Path(sys.executable).with_name("dxlrun")
 A_RUN = 10
+ENDS = {"loop": ("loop_process",), "both": ("guardian", "loop_process"), "nobody": ()}
+"""Who is killed at the end; without a loop and a guardian the terminal's process has the last hand."""
 ROBOT = """\
 name: pulled
 arguments:
@@ -50,6 +54,7 @@ controllers:
 """
 NAMES = ("left", "right")
 IDS = {"left": (3, 7), "right": (11, 12)}
+LONG_NS = 600_000_000
 ON_THE_WAY = 4
 """Packets that a host sends before it sees that its adapter is gone: in one exchange, at most."""
 MARK = {"left": b"\xff\xff", "right": b"\xff\xff\xfd\x00"}
@@ -61,7 +66,10 @@ def pulls() -> list[Any]:
     count = int(os.environ.get("DXLRUN_UNPLUGS", "2"))
     drawn = [(chance.choice(NAMES), chance.randint(0, 400), chance.randint(1, 900)) for _ in range(count)]
     runs = [drawn[at : at + A_RUN] for at in range(0, count, A_RUN)]
-    return [pytest.param(run, id=f"{number}-{len(run)}-pulls") for number, run in enumerate(runs)]
+    return [
+        pytest.param(run, tuple(ENDS)[number % len(ENDS)], id=f"{number}-{len(run)}-pulls")
+        for number, run in enumerate(runs)
+    ]
 
 
 @dataclass
@@ -115,12 +123,13 @@ def servos(tmp_path: Path) -> Iterator[Servos]:
 
 
 @pytest.mark.campaign
-@pytest.mark.parametrize("drawn", pulls())
-def test_an_adapter_that_is_pulled_costs_the_other_bus_nothing_and_comes_back(
+@pytest.mark.parametrize(("drawn", "killed"), pulls())
+def test_an_adapter_that_is_pulled_costs_the_other_bus_nothing_and_comes_back(  # noqa: PLR0917  fixtures
     start: Callable[..., Any],
     servos: Servos,
     tmp_path: Path,
     drawn: list[tuple[str, int, int]],
+    killed: str,
     wait_for: Callable[..., Any],
 ) -> None:
     run = start(*(f"{bus}:={link}" for bus, link in servos.links.items()), robot=tmp_path / "pulled.yaml")
@@ -131,14 +140,23 @@ def test_an_adapter_that_is_pulled_costs_the_other_bus_nothing_and_comes_back(
     for name in NAMES:
         count = len(servos.of(name, "in"))
         wait_for(lambda name=name, count=count: len(servos.of(name, "in")) > count + 20, f"more on {name}")
-    run.process.terminate()
+    pids = [run.child(f"dxlrun.{victim}") for victim in ENDS[killed]]
+    for pid in pids:
+        os.kill(pid, signal.SIGSTOP)  # nobody sees another one die
+    for pid in reversed(pids):
+        os.kill(pid, signal.SIGKILL)
+    if not pids:
+        run.process.terminate()
     code, _, err = run.finish()
     assert "Traceback" not in err
-    assert code == 130, err
+    assert code == (1 if pids else 130), err
+    assert "torque off was confirmed by all 4 servos" in err or not pids
     servos.end()
+    the_other_bus_goes_on(servos)
     everybody_is_limp(servos)
     the_log_tells_each_loss_and_return(run, drawn)
-    the_log_is_the_wire(run, servos, drawn)
+    if not pids:  # a loop that is killed takes a packet along
+        the_log_is_the_wire(run, servos, drawn)
 
 
 def pull(servos: Servos, bus: str, pause_ms: int, gone_ms: int, wait_for: Callable[..., Any]) -> None:
@@ -150,6 +168,18 @@ def pull(servos: Servos, bus: str, pause_ms: int, gone_ms: int, wait_for: Callab
     servos.fault(f"unplug bus={bus} for={gone_ms}ms")
     wait_for(lambda: servos.plugged_in(bus) > before, f"the adapter of {bus}")
     wait_for(lambda: servos.heard_since_return(bus), f"the servos of {bus}")
+
+
+def the_other_bus_goes_on(servos: Servos) -> None:
+    """Judge by what it heard while an adapter was away for so long that a loop that waits would be killed."""
+    for entry in (entry for name in NAMES for entry in servos.of(name, "note")):
+        if entry.note != "adapter unplugged":
+            continue
+        (other,) = (name for name in NAMES if name != entry.bus)
+        back = (one.t_ns for one in servos.of(entry.bus, "note") if one.note == "adapter plugged in")
+        back_ns = next(t_ns for t_ns in back if t_ns > entry.t_ns)
+        heard = [one for one in servos.of(other, "in") if entry.t_ns < one.t_ns < back_ns]
+        assert heard or back_ns - entry.t_ns < LONG_NS
 
 
 def everybody_is_limp(servos: Servos) -> None:
