@@ -60,8 +60,8 @@ def compile_joints(
             _check_reference(description, name, joint, table, problems)
         effort = _effort(description, name, joint, table, problems)
         allowed = _allowed(description, name, reach, table.model, problems)
-        # of a servo that is still to be asked for its model nobody knows which registers it has: what fits the
-        # assumed one is taken, for a simulated servo is that one
+        # of a servo that is still to be asked for its model nobody knows which registers it has: what fits
+        # the assumed one is taken, for a simulated servo is that one
         told = problems if joint.model != AUTO or name in models else Problems()
         registers = compile_registers(description, name, joint, table, told)
         if known_bus and allowed is not None:
