@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import os
 import time
@@ -13,6 +14,8 @@ import numpy as np
 
 from dxlrun.bench.hosts import Host
 
+_PR_SET_TIMERSLACK, _PR_GET_TIMERSLACK = 29, 30
+"""linux/prctl.h"""
 WARM = 3
 """Exchanges at the beginning of a turn that do not count: the caches are still another host's."""
 
@@ -95,13 +98,17 @@ def _turn(host: Host, found: Measured, most: int, turn_ns: int) -> bool:
 
 @contextmanager
 def _undisturbed() -> Iterator[None]:
-    """Keep the collector away, as the loop does."""
+    """Keep the collector away and let sleeps end in time, as the loop does."""
     gc.collect()
     gc.freeze()
     gc.disable()
+    libc = ctypes.CDLL(None)
+    slack_ns = libc.prctl(_PR_GET_TIMERSLACK, 0, 0, 0, 0)
+    libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
     try:
         yield
     finally:
+        libc.prctl(_PR_SET_TIMERSLACK, slack_ns, 0, 0, 0)
         gc.enable()
         gc.unfreeze()
 
