@@ -21,6 +21,8 @@ class ScriptedLine:
         self.coming = []
         self.written = []
 
+    polling = None
+
     @property
     def ports(self):
         return [self]

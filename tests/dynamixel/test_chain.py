@@ -21,6 +21,8 @@ class Script:
         self.clock = VirtualClock(1_000)
         self.said = [(1_000 + at, data) for at, data in said]
 
+    polling = None
+
     @property
     def ports(self):
         return [self]

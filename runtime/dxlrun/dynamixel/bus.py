@@ -15,6 +15,7 @@ from dxlrun.dynamixel.dialect import dialect_of
 from dxlrun.dynamixel.line import BITS_PER_BYTE
 from dxlrun.dynamixel.port import Port, Ports
 from dxlrun.dynamixel.receiver import Receiver
+from dxlrun.dynamixel.reply_polling import ReplyPolling
 from dxlrun.dynamixel.transaction import (
     BROADCAST_ID,
     Job,
@@ -130,6 +131,11 @@ class Bus:
     def room(self) -> int:
         """The most bytes that a burst of replies may have."""
         return self._receiver.room
+
+    @property
+    def complete(self) -> bool:
+        """True when everything that the newest transaction awaits has come."""
+        return self._state == _READY and self._reply.outcome is Outcome.OK
 
     def renew(self, port: Port) -> None:
         """Go on with a line that is back in the place of one that is gone; its job is forgotten."""
@@ -313,7 +319,7 @@ class Bus:
         return True
 
     def _in_time(self, burst: Burst, first_ns: int) -> bool:
-        """Say whether the first reply is of now: an older one, or an echo, comes sooner than the wire does."""
+        """Say whether the first reply is of now: one of before, or an echo, comes sooner than the wire."""
         return first_ns >= self._earliest_ns + (burst.first_size - self._overhead) * self._byte_ns
 
     def _take_all(self, burst: Burst, last_ns: int, spans: list[tuple[int, int]]) -> None:
@@ -451,6 +457,27 @@ def _spans(burst: Burst, ends: list[int], times: list[int]) -> list[tuple[int, i
     return found
 
 
+def _look(
+    buses: Sequence[Bus], ports: Ports, clock: Clock, polling: ReplyPolling, deadline_ns: int
+) -> Sequence[int]:
+    """Sleep until shortly before replies are due and look for them again and again; return who has bytes."""
+    now_ns = clock.now_ns()
+    dues = [bus.due_ns for bus in buses if bus.busy]
+    # those that should be there since long wait for theirs
+    due_ns = min((due for due in dues if due > now_ns), default=max(dues, default=0))
+    until_ns = polling.await_until(due_ns, now_ns, deadline_ns)
+    if not until_ns:
+        return ()
+    since_ns, looks = clock.now_ns(), 0
+    ready: Sequence[int] = ()
+    while not ready and now_ns < until_ns:
+        ready = ports.wait(0)
+        now_ns = clock.now_ns()
+        looks += 1
+    polling.spent(now_ns - since_ns, looks)
+    return ready
+
+
 def pump(
     buses: Sequence[Bus], ports: Ports, clock: Clock, beat: Callable[[], None], until_ns: int = NEVER
 ) -> None:
@@ -460,20 +487,24 @@ def pump(
     called at least once a transaction. Raises nothing: a line that is gone has its `failure`, and the others
     go on.
     """
-    clock_ns = clock.now_ns
+    clock_ns, polling = clock.now_ns, ports.polling
     now_ns = clock_ns()
     deadlines = [bus.step(now_ns) for bus in buses]
     while (deadline := min(deadlines)) != NEVER and now_ns < until_ns:
         beat()
         deadline = min(deadline, until_ns)
-        ready = ports.wait(deadline)
+        ready = _look(buses, ports, clock, polling, deadline) if polling else ()
+        ready = ready or ports.wait(deadline)
         heard = not ready
         for index in ready:
             bus = buses[index]
             if bus.failure is None:
                 heard = True
                 bus.receive()
-                deadlines[index] = bus.step(clock_ns())
+                now_ns = clock_ns()
+                if polling and bus.complete:
+                    polling.came(bus.due_ns, now_ns)
+                deadlines[index] = bus.step(now_ns)
         if not heard:
             # a line that is gone is ready for ever: look at the others now and then instead of waiting
             clock.wait_until(min(deadline, clock_ns() + LOST_LINE_STEP_NS))

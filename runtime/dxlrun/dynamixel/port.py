@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
+from dxlrun.dynamixel.reply_polling import ReplyPolling
 from dxlrun.errors import PortError
 
 _WRITE_PATIENCE_NS = 20_000_000
@@ -32,6 +33,11 @@ class Port(Protocol):
 
 class Ports(Protocol):
     """All lines of a robot, waited for together."""
+
+    @property
+    def polling(self) -> ReplyPolling | None:
+        """How replies are awaited; None: in the kernel alone."""
+        ...
 
     @property
     def ports(self) -> Sequence[Port]:
@@ -121,9 +127,18 @@ class SerialPorts:
     `reopened` asks for a line that is gone; without it such a line stays gone.
     """
 
-    __slots__ = ("_index", "_ports", "_reopened", "_waited")
+    __slots__ = ("_index", "_poll", "_ports", "_reopened", "_waited", "polling")
 
-    def __init__(self, ports: Sequence[SerialPort], reopened: Reopened = lambda _: None) -> None:
+    def __init__(
+        self,
+        ports: Sequence[SerialPort],
+        reopened: Reopened = lambda _: None,
+        polling: ReplyPolling | None = None,
+    ) -> None:
+        self.polling = polling
+        self._poll = select.poll()
+        for port in ports:
+            self._poll.register(port.descriptor, select.POLLIN)
         self._ports = list(ports)
         self._waited = [port.descriptor for port in ports]
         self._index = {port.descriptor: index for index, port in enumerate(ports)}
@@ -136,12 +151,24 @@ class SerialPorts:
 
     def wait(self, deadline_ns: int) -> Sequence[int]:
         """Wait for bytes on any line until `deadline_ns` of CLOCK_MONOTONIC; a past deadline only looks."""
-        left = (deadline_ns - time.monotonic_ns()) * 1e-9
-        # select and not epoll: its time-out has microseconds
-        ready, _, _ = select.select(self._waited, [], [], max(left, 0.0))
-        if not ready:
+        left_ns = deadline_ns - time.monotonic_ns()
+        if left_ns <= 0:
+            return self._look(0)
+        # poll has milliseconds, select has microseconds: what is left of a millisecond
+        ready = self._look(left_ns // 1_000_000) if left_ns >= 1_000_000 else ()
+        if ready:
+            return ready
+        left_ns = deadline_ns - time.monotonic_ns()
+        if left_ns > 0:
+            select.select(self._waited, (), (), left_ns * 1e-9)
+        return self._look(0)
+
+    def _look(self, timeout_ms: int) -> Sequence[int]:
+        """Return the lines that have bytes, or are gone, within a time."""
+        found = self._poll.poll(timeout_ms)
+        if not found:
             return ()
-        indices = [self._index[descriptor] for descriptor in ready]
+        indices = [self._index[descriptor] for descriptor, _ in found]
         for index in indices:
             self._ports[index].announce()
         return indices
@@ -151,6 +178,7 @@ class SerialPorts:
         gone = self._ports[index]
         if gone.descriptor in self._waited:
             self._waited.remove(gone.descriptor)
+            self._poll.unregister(gone.descriptor)
             set_aside(gone.descriptor)
         descriptor = self._reopened(index)
         if descriptor is None:
@@ -158,6 +186,7 @@ class SerialPorts:
         put_in_place(descriptor, gone.descriptor)
         self._ports[index] = SerialPort(gone.descriptor, gone.name)
         self._waited.append(gone.descriptor)
+        self._poll.register(gone.descriptor, select.POLLIN)
         return True
 
 

@@ -55,6 +55,8 @@ class VirtualPorts:
     """All simulated lines of a robot, waited for together; a Ports of the dynamixel package by its form."""
 
     def __init__(self, clock: VirtualClock, buses: Sequence[SimulatedBus]) -> None:
+        self.polling = None
+        """As on a SerialPorts: on virtual time nobody wakes late."""
         self._clock = clock
         self._buses = tuple(buses)
         self._ports = [VirtualPort(clock, bus) for bus in buses]
