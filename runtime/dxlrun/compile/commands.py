@@ -1,8 +1,8 @@
 """Commands: what the samples of a motion are called in the typed commands of a controller.
 
 A controller can be played when it takes a command `trajectory` (points: time s, positions, velocities,
-accelerations; start_in s) or one whose fields are `positions` and, if it wants, `velocities`: values in rad
-and rad/s in the order of its joints. The standard controllers do; anybody's may.
+accelerations; start_in s) or one whose fields are `positions`, `velocities` or both: values in rad and rad/s
+in the order of its joints. The standard controllers do; anybody's may.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def command_kind(controller: type[Controller[Any]]) -> str | None:
     if TRAJECTORY in controller.Commands:
         return TRAJECTORY
     for kind, model in controller.Commands.items():
-        if "positions" in model.model_fields and set(model.model_fields) <= {"positions", "velocities"}:
+        if model.model_fields and set(model.model_fields) <= {"positions", "velocities"}:
             return kind
     return None
 
