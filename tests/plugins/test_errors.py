@@ -129,6 +129,12 @@ ASKED = {
         "asks for joints ['pan_joint', 'tilt_joint']; "
         "tell its author: joints of dxlrun.Interfaces is a tuple of names",
     ),
+    ', ("position",))': (
+        ', ("position", "pwm"))',
+        "asks for command interfaces that do not go together: no servo follows position and pwm together; "
+        "tell its author: ask for position (with velocity or effort beside it), or for velocity, effort or "
+        "pwm alone",
+    ),
     '("position",))': (
         '("torque",))',
         "asks for the command interface torque; tell its author: command interfaces are position, velocity, "
