@@ -87,3 +87,17 @@ def test_nobody_sleeps_beyond_the_next_deadline():
     line.naps.clear()
     assert line.polling.await_until(line.now_ns + 400_000, line.now_ns, line.now_ns + 300_000) == 0
     assert line.naps == []
+
+
+def test_one_reply_that_is_very_late_does_not_let_the_next_ones_be_slept_through():
+    line = Line()
+    settled(line)
+    line.polling.came(line.now_ns - 15_000_000, line.now_ns)
+    assert sum(line.cycle() for _ in range(20)) / 20 < 25_000
+
+
+def test_replies_that_begin_to_come_much_sooner_are_found_soon():
+    line = Line(after_ns=900_000)
+    settled(line, due_ns=900_000)
+    line.after_ns = 100_000
+    assert [line.cycle(due_ns=900_000) for _ in range(8)][-1] < 25_000

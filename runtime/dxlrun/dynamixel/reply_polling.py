@@ -46,6 +46,7 @@ class ReplyPolling:
         "_nap",
         "_share",
         "_slept",
+        "_step_ns",
         "_updated_ns",
         "margin_ns",
     )
@@ -69,6 +70,7 @@ class ReplyPolling:
         self._updated_ns: int | None = None
         self._late_ns = 0
         self._slept = False
+        self._step_ns = _USUAL_MARGIN_NS
         self.margin_ns = _USUAL_MARGIN_NS
         """How long before a reply is expected sleeping ends; as sleeps were measured to overshoot."""
 
@@ -100,8 +102,15 @@ class ReplyPolling:
     def came(self, due_ns: int, at_ns: int) -> None:
         """Take note that all of the replies that were due at `due_ns` were there at `at_ns`."""
         late_ns = at_ns - due_ns
-        if self._slept:
-            late_ns -= self.margin_ns  # they were there before: since when, nobody knows
-        change_ns = late_ns - self._late_ns
-        late_ns = self._late_ns + (change_ns // 2 if change_ns < 0 else change_ns // 16)
+        if self._slept and late_ns >= self._late_ns - self.margin_ns:
+            # they were there before: since when, nobody knows, so sleep less and less until it is seen
+            late_ns = self._late_ns - self._step_ns
+            self._step_ns *= 2
+        else:
+            self._step_ns = self.margin_ns
+            change_ns = late_ns - self._late_ns
+            # one that is very late says nothing of the next
+            late_ns = self._late_ns + (
+                change_ns // 2 if change_ns < 0 else min(change_ns, self.margin_ns) // 8
+            )
         self._late_ns = max(_EARLIEST_NS, min(late_ns, _LATEST_NS))
