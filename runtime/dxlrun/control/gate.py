@@ -76,14 +76,14 @@ class Gate:
         self._modes = np.zeros(count, dtype=np.uint8)
         self._led = np.ones(count, dtype=np.bool_)
         """Joints that are led to positions."""
-        self._all_led = True
+        self._all_led = self._any_led = True
         self.begin()
 
     def begin(self) -> None:
         """Take the joints' modes as they are: their goals belong to them already."""
         np.copyto(self._modes, self._record.states.mode)
         np.logical_or(self._modes == Mode.POSITION, self._modes == Mode.EFFORT_POSITION, out=self._led)
-        self._all_led = bool(self._led.all())
+        self._all_led, self._any_led = bool(self._led.all()), bool(self._led.any())
         self._drive.take(self._modes)
 
     def enter_modes(self) -> None:
@@ -119,8 +119,9 @@ class Gate:
         flags = self._flags
         np.bitwise_and(self._record.clamped, _NOT_FINITE, out=flags)  # what the manager found
         speed = self._highest(dt_ns)
-        self._position(commands.position, goals.position, speed, dt_ns)
-        self._velocity(commands.velocity, goals.velocity)
+        if self._any_led:
+            self._position(commands.position, goals.position, speed, dt_ns)
+            self._velocity(commands.velocity, goals.velocity)
         if self._drive.any:
             self._drive.apply(commands, goals, self._record.states, speed, dt_ns)
         np.copyto(self._record.clamped, flags)
