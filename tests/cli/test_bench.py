@@ -19,7 +19,7 @@ FEW = ("--servos", "1", "--protocol", "2.0", "--seconds", "0.05")
     [
         (
             ("--peers", "ours,theirs"),
-            "--peers: there is no theirs; there are ours, unrecorded, sdk, sdk-fast",
+            "--peers: there is no theirs; there are ours, polled, unrecorded, sdk",
         ),
         (("--peers", ""), "--peers says nothing; there are ours"),
         (("--protocol", "3.0"), "--protocol: there is no 3.0; there are 1.0, 2.0"),

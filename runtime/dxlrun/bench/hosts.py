@@ -24,6 +24,7 @@ from dxlrun.control.loop import StopFlag
 from dxlrun.control.plugins import load_plugins
 from dxlrun.cycle import CycleRecord
 from dxlrun.dynamixel.port import SerialPort, SerialPorts
+from dxlrun.dynamixel.reply_polling import ReplyPolling
 from dxlrun.events import EventCode, Severity
 from dxlrun.packets import PACKET_SLOT, NoPackets, PacketBatch, PacketKind, decode_packets, packet_slots
 from dxlrun.ring import Gap, RingReader, RingWriter, create
@@ -100,7 +101,7 @@ class _Sinks:
 class Ours:
     """The exchange of our loop: `DynamixelHardware` as a run assembles it, on a real descriptor."""
 
-    def __init__(self, path: str, plan: Plan, *, recorded: bool) -> None:
+    def __init__(self, path: str, plan: Plan, *, recorded: bool = True, polled: bool = False) -> None:
         self._descriptor = os.open(path, os.O_RDWR | os.O_NOCTTY)
         tty.setraw(self._descriptor)
         self._ring = -1
@@ -115,7 +116,10 @@ class Ours:
         robot = assemble(
             plan,
             load_plugins(),
-            ports=SerialPorts([SerialPort(self._descriptor, path)]),
+            # exchanges follow each other without a pause, so a share of the time would not be one of a period
+            ports=SerialPorts(
+                [SerialPort(self._descriptor, path)], polling=ReplyPolling(share=1.0) if polled else None
+            ),
             clock=MonotonicClock(),
             sinks=_Sinks(packets, _Events(), NoCommands()),
             beat=lambda: None,
@@ -178,7 +182,8 @@ def _rustypot(path: str, case: Case, plan: Plan, values: bool, *, fast: bool = F
 
 
 HOSTS: Sequence[HostKind] = (
-    HostKind("ours", "dxlrun", lambda path, case, plan, _: Ours(path, plan, recorded=True)),
+    HostKind("ours", "dxlrun", lambda path, case, plan, _: Ours(path, plan)),
+    HostKind("polled", "dxlrun", lambda path, case, plan, _: Ours(path, plan, polled=True)),
     HostKind("unrecorded", "dxlrun", lambda path, case, plan, _: Ours(path, plan, recorded=False)),
     HostKind("sdk", "dynamixel_sdk", _sdk),
     HostKind("sdk-fast", "dynamixel_sdk", partial(_sdk, fast=True), (2.0,)),

@@ -25,7 +25,7 @@ def bench_bus(
     *,
     servos: List = "1,8,20",
     protocol: List = "1.0,2.0",
-    peers: List = "ours,unrecorded,sdk,sdk-fast,rustypot,rustypot-fast",
+    peers: List = "ours,polled,unrecorded,sdk,sdk-fast,rustypot,rustypot-fast",
     against: List = "canned",
     baud: int = 1_000_000,
     seconds: float = 4.0,
@@ -44,9 +44,9 @@ def bench_bus(
     protocol
         Protocols, 1.0 (AX-12A) and 2.0 (XM430-W350).
     peers
-        Who is measured: ours (dxlrun, every packet kept for a log), unrecorded (the same without a log), sdk,
-        rustypot; sdk-fast and rustypot-fast use fast sync read (Protocol 2.0). Who is not installed is left
-        out.
+        Who is measured: ours (dxlrun, every packet kept for a log), polled (the same, polling for replies),
+        unrecorded (ours without a log), sdk, rustypot; sdk-fast and rustypot-fast use fast sync read
+        (Protocol 2.0). Who is not installed is left out.
     against
         Who answers: canned (another process that answers at once, without a wire and without thinking), or
         simulated (servos on a bus with wire times, whose own lateness is taken out by their ledger).
