@@ -1,0 +1,46 @@
+"""One dead servo of eight costs the others less than 5 % of their rate, on lines that never rest."""
+
+import math
+
+import pytest
+
+SECONDS = 1.5
+X = {
+    "protocol": 2.0,
+    "model": "XM430-W350",
+    "reference": math.pi,
+    "lower": -2.5,
+    "upper": 2.5,
+    "return_delay_ns": 0,
+}
+
+
+def states_in(rig, rows):
+    """Return how many valid states joints got in some seconds of cycles without a gap between them."""
+    end_ns = rig.clock.now_ns() + round(SECONDS * 1e9)
+    count = 0
+    while rig.clock.now_ns() < end_ns:
+        rig.goals.position[:] += 1e-3 * math.sin(rig.clock.now_ns() * 1e-9)
+        rig.hardware.read()
+        count += int(rig.states.valid[rows].sum())
+        rig.hardware.write()
+        # what the goals take on the wire, and a little for controllers
+        deadline = rig.clock.now_ns() + rig.plans[0].budget.goals_ns + 100_000
+        rig.hardware.idle(deadline)
+        rig.clock.wait_until(max(deadline, rig.clock.now_ns()))
+    return count
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{}, X | {"fast": True}, X | {"fast": False}, X | {"fast": True, "split": True}],
+    ids=["AX one by one", "X fast sync read", "X sync read", "X split"],
+)
+def test_a_dead_servo_costs_the_others_less_than_a_twentieth(make_rig, make_plan, change):
+    rig = make_rig(make_plan(**change))
+    rig.hardware.start()
+    others = list(range(1, 8))  # the first one is the worst to lose: a chain ends there
+    before = states_in(rig, others)
+    rig.buses[0].servo(rig.plans[0].servos[0].servo_id).silence()
+    after = states_in(rig, others)
+    assert after > 0.95 * before
