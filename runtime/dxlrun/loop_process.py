@@ -31,6 +31,7 @@ from dxlrun.cycle import CycleRecord
 from dxlrun.dynamixel.hardware import TAKEN_BACK
 from dxlrun.dynamixel.port import SerialPort, SerialPorts
 from dxlrun.dynamixel.reopening import LinesAgain
+from dxlrun.dynamixel.reply_polling import ReplyPolling
 from dxlrun.errors import DxlrunError, PlugInError
 from dxlrun.events import EventCode, EventRing, Severity
 from dxlrun.heartbeat import Heartbeat, Phase
@@ -145,6 +146,10 @@ class Pulse:
             raise AskedToStop
 
 
+def _reply_polling(wish_ns: int | None) -> ReplyPolling | None:
+    return None if wish_ns == 0 else ReplyPolling(wish_ns)
+
+
 def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: RingSinks) -> Outcome:
     """Execute the plan from plug-ins to torque off."""
     stop = StopFlag()
@@ -152,6 +157,7 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: RingSinks) -> Ou
     ports = SerialPorts(
         [SerialPort(descriptor, bus.port) for descriptor, bus in zip(job.ports, plan.buses, strict=True)],
         LinesAgain(process.Line(socket.socket(fileno=job.line))),
+        _reply_polling(plan.loop.scheduler.reply_polling_ns),
     )
     clock = MonotonicClock()
     pacing = Pacing(clock, plan.loop.scheduler.polling_ns)
@@ -181,6 +187,8 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: RingSinks) -> Ou
         grants = realtime.apply(plan.loop.scheduler)
         heartbeat.beat()
         grants = (*grants, pacing.measure(plan.loop.period_ns, heartbeat.beat))
+        if ports.polling:
+            ports.polling.margin_ns = pacing.wanted_ns
         realtime.tell(grants, "loop", sinks.events)
         os.pwrite(job.grants, msgspec.json.encode(grants), 0)
         heartbeat.beat()

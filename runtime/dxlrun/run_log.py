@@ -57,6 +57,9 @@ def log_header(plan: Plan, epoch_offset_ns: int, *, virtual: bool) -> LogHeader:
                 "lock_memory": str(scheduler.lock_memory).lower(),
                 "cores": ", ".join(map(str, scheduler.cores)),
                 "polling": "auto" if scheduler.polling_ns is None else f"{scheduler.polling_ns} ns",
+                "reply_polling": "auto"
+                if scheduler.reply_polling_ns is None
+                else f"{scheduler.reply_polling_ns} ns",
                 "idle_latency": str(scheduler.idle_latency).lower(),
                 "overrun": plan.loop.overrun,
             },

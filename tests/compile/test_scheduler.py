@@ -91,3 +91,11 @@ def test_a_rate_at_which_nobody_can_stop_the_loop_in_time_is_a_warning(problems_
         "4:14: warning: at 0.25 Hz a wish to stop is seen up to 4 s late, when the guardian has "
         "ended the loop, as exit_timeout is 2 s; raise policies.exit_timeout, or the rate"
     )
+
+
+@pytest.mark.parametrize(
+    ("wish", "plan_ns"), [("auto", None), ("off", 0), ("250 us", 250_000)], ids=["auto", "off", "duration"]
+)
+def test_how_long_replies_are_polled_for_is_handed_to_the_loop(compile_text, robot_text, wish, plan_ns):
+    text = with_loop(robot_text, f"{{rate: 50, scheduler: {{reply_polling: {wish}}}}}")
+    assert compile_text(text).plan.loop.scheduler.reply_polling_ns == plan_ns

@@ -49,6 +49,7 @@ def scheduler_plan(loop: Loop) -> SchedulerPlan:
         lock_memory=wish.lock_memory,
         cores=wish.cores or (),
         polling_ns=None if wish.polling == "auto" else wish.polling,
+        reply_polling_ns=None if wish.reply_polling == "auto" else wish.reply_polling,
         idle_latency=wish.idle_latency,
     )
 

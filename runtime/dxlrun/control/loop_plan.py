@@ -24,6 +24,8 @@ class SchedulerPlan:
     """Where the loop may run; empty: anywhere."""
     polling_ns: int | None = None
     """Longest time that the clock is polled before a deadline; None: a tenth of the period."""
+    reply_polling_ns: int | None = None
+    """Longest time that a reply is polled for, 0: never; None: as a tenth of a core allows."""
     idle_latency: bool = False
     """Keep the cores from deep idle states."""
 

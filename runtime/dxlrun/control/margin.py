@@ -33,7 +33,8 @@ class Pacing:
     def __init__(self, clock: MonotonicClock, most_ns: int | None) -> None:
         self._clock = clock
         self._most_ns = most_ns
-        self._wanted_ns = clock.spin_ns
+        self.wanted_ns = clock.spin_ns
+        """The margin that was measured, without the bounds."""
 
     def measure(
         self, period_ns: int, beat: Callable[[], None], nap: Callable[[int], int] = overshoot_ns
@@ -47,7 +48,7 @@ class Pacing:
             late.append(nap(min(_NAP_NS, period_ns)))
             beat()
         usual_ns = sorted(late)[int(_QUANTILE * _TRIES)]
-        self._wanted_ns = round(_RESERVE * usual_ns)
+        self.wanted_ns = round(_RESERVE * usual_ns)
         self(period_ns)
         margin_ns = self._clock.spin_ns
         return Grant(
@@ -61,4 +62,4 @@ class Pacing:
     def __call__(self, period_ns: int) -> None:
         """Keep the margin within its share of another period, ns."""
         most_ns = period_ns // AUTO_SHARE if self._most_ns is None else self._most_ns
-        self._clock.spin_ns = min(self._wanted_ns, most_ns, period_ns // MOST_SHARE)
+        self._clock.spin_ns = min(self.wanted_ns, most_ns, period_ns // MOST_SHARE)

@@ -23,6 +23,7 @@ from dxlrun.description.units import (
     Duration,
     Effort,
     Inertia,
+    Polling,
     Torque,
 )
 
@@ -172,6 +173,11 @@ class Scheduler(Form):
     polling: AutoDuration = Field(
         default="auto",
         description="Longest time that the clock is polled before a deadline; auto: a tenth of the period.",
+        examples=["100 us"],
+    )
+    reply_polling: Polling = Field(
+        default="auto",
+        description="Longest time that a servo's reply is polled for, at most half of a core; auto: a tenth.",
         examples=["100 us"],
     )
     idle_latency: bool = Field(

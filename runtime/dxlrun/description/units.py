@@ -162,6 +162,16 @@ def _auto_duration(value: str) -> int | str:
         raise _refusal(str(context["what"]), f"{context['mend']}, or auto") from error
 
 
+def _polling(value: str) -> int | str:
+    if value in ("auto", "off"):
+        return 0 if value == "off" else value
+    try:
+        return duration(value)
+    except PydanticCustomError as error:
+        context = error.context or {}
+        raise _refusal(str(context["what"]), f"{context['mend']}, auto or off") from error
+
+
 def _text_schema(example: str, units: Mapping[str, object], *others: dict[str, object]) -> WithJsonSchema:
     # an escaped space is none of the escapes that JSON Schema allows
     names = "|".join(re.escape(unit).replace("\\ ", " ") for unit in units)
@@ -239,6 +249,16 @@ AutoDuration = Annotated[
     _text_schema("500 us", _DURATION_NS, {"type": "string", "const": "auto"}),
 ]
 """ns as Duration, or the word `auto`."""
+
+Polling = Annotated[
+    int | Literal["auto"],
+    BeforeValidator(_polling),
+    PlainSerializer(
+        lambda value: value if value == "auto" else f"{value} ns", return_type=str, when_used="json"
+    ),
+    _text_schema("500 us", _DURATION_NS, {"type": "string", "enum": ["auto", "off"]}),
+]
+"""ns as Duration, or the word `auto`; `off` is 0."""
 
 Angles = Annotated[tuple[Angle, ...], Field(strict=False)]
 """Several angles, rad, from `[60 deg, 1 rad]`; shape (written ones,)."""
