@@ -1,0 +1,144 @@
+"""Mode changes while the line and the servos fail: no servo ever gets a goal that another mode would follow.
+
+`DXLRUN_MODE_STORMS` is the number of seeds, 9 in CI; a storm is 8 s of a robot at 50 Hz.
+"""
+
+import os
+import random
+
+import numpy as np
+import pytest
+
+from dxlrun.dynamixel.mode_plan import in_mode
+from dxlrun.events import EventCode
+from dxlrun.mode import Mode
+
+STORMS = int(os.environ.get("DXLRUN_MODE_STORMS", "9"))
+FOLLOWED = {
+    2.0: {100: {16}, 102: {0, 5}, 104: {1}, 112: {3, 4, 5}},
+    1.0: {30: {"joint"}, 32: {"wheel"}, 71: {"torque"}},
+}
+"""First address of a block of goals -> the modes that follow it (e-Manual XM430-W350, MX-64)."""
+ROBOTS = {
+    "x": (
+        "XM430-W350",
+        2.0,
+        (Mode.POSITION, Mode.VELOCITY, Mode.EFFORT, Mode.PWM, Mode.EFFORT_POSITION),
+    ),
+    "mx": ("MX-64", 1.0, (Mode.POSITION, Mode.VELOCITY, Mode.EFFORT)),
+    "ax": ("AX-12A", 1.0, (Mode.POSITION, Mode.VELOCITY, Mode.PWM)),
+}
+
+
+def selected(servo, protocol):
+    """Return what a simulated servo's registers select."""
+    registers = servo.registers
+    if protocol == 2.0:
+        return registers["operating_mode"]
+    if registers.get("torque_ctrl_mode_enable"):
+        return "torque"
+    return "wheel" if registers["cw_angle_limit"] == registers["ccw_angle_limit"] == 0 else "joint"
+
+
+def goals_in(packet, protocol):
+    """Return the address of a sync write and whom it names."""
+    if protocol == 2.0:
+        if packet[7] != 0x83:
+            return None, ()
+        width, ids = (packet[10] | packet[11] << 8) + 1, packet[12:-2]
+        return packet[8] | packet[9] << 8, list(ids[::width])
+    if packet[4] != 0x83:
+        return None, ()
+    return packet[5], list(packet[7:-1][:: packet[6] + 1])
+
+
+def fault(rig, chance):
+    """Do something to the line or to a servo."""
+    bus, servo_id = rig.buses[0], chance.choice((1, 2, 3))
+    servo = bus.servo(servo_id)
+    kind = chance.randrange(5)
+    if kind == 0:
+        bus.truncate_next(servo_id, chance.randrange(3))
+    elif kind == 1:
+        bus.corrupt_next(servo_id)
+    elif kind == 2:
+        servo.silence()
+        bus.at(rig.clock.now_ns() + chance.randrange(1, 300) * 1_000_000, lambda: servo.silence(False))
+    elif kind == 3:
+        bus.inject_noise(bytes(chance.randrange(256) for _ in range(6)), rig.clock.now_ns() + 100_000)
+    else:
+        servo.cut_power(rig.clock.now_ns() + chance.randrange(150, 400) * 1_000_000)
+
+
+def wishes(rig, chance, modes):
+    wanted = np.zeros(3, dtype=np.uint8)
+    wanted[chance.randrange(3)] = chance.choice(modes)
+    rig.hardware.set_modes(wanted)
+
+
+def follow(rig, goal):
+    """Give each joint a goal of the mode that it is in; while that changes the old one stays."""
+    for row, mode in enumerate(rig.states.mode):
+        if mode != Mode.UNKNOWN:
+            for array in (rig.goals.velocity, rig.goals.effort, rig.goals.pwm, rig.goals.position):
+                array[row] = np.nan
+            leading = {
+                Mode.VELOCITY: rig.goals.velocity,
+                Mode.EFFORT: rig.goals.effort,
+                Mode.PWM: rig.goals.pwm,
+            }
+            leading.get(Mode(mode), rig.goals.position)[row] = goal
+
+
+def judge(rig, sent):
+    """Every servo that a sync write of goals names is in a mode that follows them."""
+    protocol = rig.plans[0].protocol
+    for packet in sent:
+        address, named = goals_in(packet, protocol)
+        for servo_id in named if address in FOLLOWED[protocol] else ():
+            mode = selected(rig.buses[0].servo(servo_id), protocol)
+            assert mode in FOLLOWED[protocol][address], (address, servo_id, mode)
+
+
+@pytest.fixture
+def storm(make_rig, make_plan):
+    """Let a robot change modes in a storm, judged on the way; returns it at rest again."""
+
+    def run(name, seed):
+        model, protocol, modes = ROBOTS[name]
+        change = {"reference": np.pi} if protocol == 2.0 else {}
+        rig = make_rig(make_plan((1, 2, 3), model=model, protocol=protocol, return_delay_ns=0, **change))
+        rig.hardware.start()
+        chance = random.Random(f"{name} {seed}")
+        for cycle in range(400):
+            if cycle < 250 and chance.random() < 0.08:
+                wishes(rig, chance, modes)
+            if cycle < 250 and chance.random() < 0.05:
+                fault(rig, chance)
+            follow(rig, -0.02 if cycle % 2 else 0.02)  # one that stays is not sent
+            seen = len(rig.into_bus())
+            rig.hardware.read()
+            rig.hardware.write()
+            judge(rig, rig.into_bus()[seen:])
+            rig.hardware.idle(rig.clock.now_ns() + chance.choice((2_000_000, 12_000_000)))
+            rig.clock.wait_until(2_000_000_000 + cycle * rig.period_ns)
+        return rig
+
+    return run
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("seed", range(STORMS // 3))
+def test_a_servo_gets_only_goals_that_its_mode_follows_and_its_mode_is_known_in_the_end(storm, name, seed):
+    rig = storm(name, seed)
+    out = (EventCode.SERVO_LIMP, EventCode.SERVO_LOST, EventCode.SERVO_REBOOTED)
+    excused = {source for code in out for source, _ in rig.events.of(code)}
+    for servo in rig.plans[0].servos:
+        registers = rig.buses[0].servo(servo.servo_id).registers
+        found = {value.name: registers[value.name] for mode in servo.modes for value in mode.operating}
+        known = Mode(int(rig.states.mode[servo.row]))
+        if known is not Mode.UNKNOWN:
+            assert in_mode(servo.mode_plan(known), found), (known, found)
+        if servo.joint not in excused:
+            assert known is not Mode.UNKNOWN, f"nobody knows in which mode {servo.joint} is"
+            assert rig.torque()[servo.row], f"{servo.joint} lost its torque over a change"
