@@ -101,9 +101,11 @@ class Receiver:
 
     def feed(self, data: bytes, now_ns: int) -> None:
         """Take bytes that arrived at `now_ns`, deliver what became whole."""
-        for start in range(0, len(data), _GOOD_READ):
-            chunk = data[start : start + _GOOD_READ]
+        start = 0
+        while start < len(data):
+            chunk = data[start : start + min(_GOOD_READ, len(self._view) - self._end)]
             self._view[self._end : self._end + len(chunk)] = chunk
+            start += len(chunk)
             self.accept(len(chunk), now_ns)
 
     def skip_header(self) -> None:
