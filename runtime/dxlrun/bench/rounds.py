@@ -63,8 +63,9 @@ def measure(
         number = 0
         while (share := (time.monotonic_ns() - began_ns) / (seconds * 1e9)) < 1 or number < 2:
             progress(min(1.0, share))
-            for place in range(len(names)):
-                name = names[(place + number) % len(names)]  # nobody is always first
+            first = number // 2 % len(names)
+            order = names[first:] + names[:first]
+            for name in order[:: 1 if number % 2 else -1]:  # nobody is always first, or always behind another
                 if not _turn(hosts[name], found[name], most, turn_ns):
                     recover(name)
             number += 1

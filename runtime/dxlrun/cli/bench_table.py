@@ -49,19 +49,20 @@ def bus_table(result: BusBench) -> Table:
     table = Table(box=None, pad_edge=False)
     for head in ("against", "protocol", "servos", "host"):
         table.add_column(head)
-    for head in ("median us", "p99 us", "processor us", "bytes", "wall", "processor", "lost"):
+    for head in ("10 % us", "median us", "99 % us", "processor us", "bytes", "wall", "processor", "lost"):
         table.add_column(head, justify="right")
     for head in ("wire us", "late us", "x wire") if wired else ():
         table.add_column(head, justify="right")
     for case in result.cases:
         against = "canned" if case.baud_rate is None else f"{case.baud_rate / 1e6:g} Mbit/s"
         for one in case.hosts:
+            times = (one.p10_us, one.median_us, one.p99_us, one.processor_us)
             table.add_row(
                 against,
                 f"{case.protocol:.1f}",
                 f"{case.servos} x {case.model}",
                 one.host,
-                *(_number(value, 0) for value in (one.median_us, one.p99_us, one.processor_us)),
+                *(_number(value, 0) for value in times),
                 f"{one.sent_bytes:g} + {one.received_bytes:g}",
                 *_ratios(case.hosts[0], one),
                 str(one.lost),
