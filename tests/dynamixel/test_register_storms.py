@@ -1,0 +1,115 @@
+"""Registers while line and servos fail: each wish is answered once, and what was answered well is there.
+
+`DXLRUN_REGISTER_STORMS` is the number of seeds, 3 in CI; a storm is 8 s of a robot at 50 Hz.
+"""
+
+import math
+import os
+import random
+from dataclasses import replace
+
+import pytest
+
+from dxlrun.dynamixel.bus_plan import RegisterValue
+
+STORMS = int(os.environ.get("DXLRUN_REGISTER_STORMS", "3"))
+GAINS = {
+    2.0: {"position_p_gain": (84, 2), "position_d_gain": (80, 2), "led": (65, 1)},
+    1.0: {"p_gain": (28, 1), "d_gain": (26, 1), "led": (25, 1)},
+}
+RAM = {2.0: 64, 1.0: 24}
+"""First address (e-Manual XM430-W350, MX-64)."""
+
+
+def fault(rig, chance):
+    """Do something to the line or to a servo."""
+    bus, servo_id = rig.buses[0], chance.choice((1, 2, 3))
+    servo = bus.servo(servo_id)
+    kind = chance.randrange(5)
+    if kind == 0:
+        bus.truncate_next(servo_id, chance.randrange(3))
+    elif kind == 1:
+        bus.corrupt_next(servo_id)
+    elif kind == 2:
+        servo.silence()
+        bus.at(rig.clock.now_ns() + chance.randrange(1, 300) * 1_000_000, lambda: servo.silence(False))
+    elif kind == 3:
+        bus.inject_noise(bytes(chance.randrange(256) for _ in range(6)), rig.clock.now_ns() + 100_000)
+    else:  # no servo boots in less; one of Protocol 1.0 that did would be seen by nothing
+        servo.cut_power(rig.clock.now_ns() + chance.randrange(150, 400) * 1_000_000)
+
+
+class Wishes:
+    """What was asked of each servo's registers, and what came of it."""
+
+    def __init__(self, rig, declared):
+        self.rig = rig
+        self.answers = []
+        self.possible = {(row, name): {value} for row in range(3) for name, value in declared.items()}
+        """What each register may hold: what was answered well last, and what was tried since without."""
+
+    def ask(self, row, name, value):
+        number = len(self.answers)
+        self.answers.append([])
+        self.possible.setdefault((row, name), {0}).add(value)
+
+        def done(problem):
+            self.answers[number].append(problem)
+            if not problem:
+                self.possible[row, name] = {value}
+
+        self.rig.hardware.set_register(row, name, value, done)
+
+
+def writes_below(rig, address, since):
+    """Return the writes of single servos below an address, which are those of the EEPROM."""
+    protocol = rig.plans[0].protocol
+    at, start = (7, 8) if protocol == 2.0 else (4, 5)
+    width = 2 if protocol == 2.0 else 1
+    return [
+        packet
+        for packet in rig.into_bus()[since:]
+        if packet[at] == 3 and int.from_bytes(packet[start : start + width], "little") < address
+    ]
+
+
+@pytest.fixture
+def storm(make_rig, make_plan):
+    """Let clients change registers in a storm; return the robot at rest again, and the wishes."""
+
+    def run(protocol, seed):
+        places = GAINS[protocol]
+        declared = dict.fromkeys(tuple(places)[:2], 20)
+        registers = tuple(RegisterValue(*places[name], value, name) for name, value in declared.items())
+        change = {"model": "XM430-W350", "reference": math.pi} if protocol == 2.0 else {"model": "MX-64"}
+        plan = make_plan((1, 2, 3), protocol=protocol, return_delay_ns=0, **change)
+        plan = replace(plan, servos=tuple(replace(one, registers=registers) for one in plan.servos))
+        rig = make_rig(plan)
+        rig.hardware.start()
+        started, wishes = len(rig.into_bus()), Wishes(rig, declared)
+        chance = random.Random(f"{protocol} {seed}")
+        for cycle in range(400):
+            if cycle < 250 and chance.random() < 0.15:
+                name = chance.choice(tuple(places))
+                most = 2 if name == "led" else 250
+                wishes.ask(chance.randrange(3), name, chance.randrange(most))
+            if cycle < 250 and chance.random() < 0.05:
+                fault(rig, chance)
+            rig.cycle()
+        return rig, wishes, started
+
+    return run
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("protocol", [1.0, 2.0])
+@pytest.mark.parametrize("seed", range(STORMS))
+def test_a_storm_of_wishes(storm, protocol, seed):
+    rig, wishes, started = storm(protocol, seed)
+    assert all(len(answers) == 1 for answers in wishes.answers)
+    assert writes_below(rig, RAM[protocol], started) == []
+    assert rig.states.valid.all()
+    for row, servo in enumerate(rig.buses[0].servos):
+        for (owner, name), possible in wishes.possible.items():
+            if owner == row:
+                assert servo.registers[name] in possible, (row, name)
