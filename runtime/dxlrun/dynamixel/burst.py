@@ -33,6 +33,7 @@ class Burst:
         "_fast",
         "_head",
         "_heads",
+        "_lead",
         "_no_errors",
         "_step",
         "_tails",
@@ -65,6 +66,7 @@ class Burst:
             lead = (self.size - 7).to_bytes(2, "little")
             whole = [dialect.HEADER + bytes((BROADCAST_ID,)) + lead + whole[0][7:8]]
         self._expected = [int.from_bytes(packet[: self._head], "little") for packet in whole]
+        self._lead = whole[0][: self._head]
         self._no_errors = bytes(self.count)
         self._buffer = bytearray()
         self.bind(bytearray(self.size))
@@ -116,7 +118,9 @@ class Burst:
 
     def begun(self, end: int) -> bool:
         """Say whether the first `end` bytes of the buffer can become these replies."""
-        known = 0 if end < self._head else 1 if self._fast else (end - self._head) // self._step + 1
+        if end < self._head:
+            return self._buffer.startswith(self._lead[:end])
+        known = 1 if self._fast else (end - self._head) // self._step + 1
         return list(self._heads[:known]) == self._expected[:known]
 
     def whole(self) -> bool:
