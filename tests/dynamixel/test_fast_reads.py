@@ -4,6 +4,7 @@ import math
 
 import pytest
 
+from dxlrun.control_table import model_names
 from dxlrun.dynamixel import protocol2
 from dxlrun.events import Severity
 
@@ -206,3 +207,40 @@ def test_the_cheapest_way_is_chosen(make_x):
     (chosen,) = [way for way in plan.ways if way.chosen]
     assert chosen.budget == plan.budget
     assert chosen.budget.total_ns == min(costs.values())
+
+
+def test_a_servo_that_forgets_the_fast_form_makes_its_group_be_read_plainly(started):
+    started.buses[0].servo(15).poke("firmware_version", 44)  # as after another one took its place
+    for _ in range(20):
+        started.cycle()
+    ((_, _, source, text),) = [e for e in started.events.list if "fast reads in a row" in e[3]]
+    assert source == "arm"
+    assert "arm_15_joint" in text
+    since = len(started.ledger.entries)
+    for _ in range(5):
+        started.cycle()
+        assert started.states.valid.all()
+    asked = [entry.data[7] for entry in started.ledger.entries[since:] if entry.direction == "in"]
+    assert asked.count(protocol2.Instruction.SYNC_READ) == 5
+    assert protocol2.Instruction.FAST_SYNC_READ not in asked
+
+
+def test_a_servo_that_is_silent_now_and_then_leaves_its_group_the_fast_form(started):
+    for _ in range(8):
+        started.buses[0].servo(15).silence()
+        started.cycle()
+        started.buses[0].servo(15).silence(False)
+        for _ in range(3):
+            started.cycle()
+    since = len(started.ledger.entries)
+    started.cycle()
+    assert started.ledger.entries[since].data[7] == protocol2.Instruction.FAST_SYNC_READ
+    assert [e for e in started.events.list if "fast reads in a row" in e[3]] == []
+
+
+@pytest.mark.parametrize("protocol", [1.0, 2.0])
+def test_no_model_has_a_state_that_indirect_addresses_would_shorten(make_plan, protocol):
+    for model in model_names(protocol):
+        plan = make_plan((1,), model=model, protocol=protocol, reference=0.0, lower=-9.0, upper=9.0)
+        layout = plan.servos[0].state
+        assert layout.length == layout.position.size + layout.velocity.size + layout.effort.size, model

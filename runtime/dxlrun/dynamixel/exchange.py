@@ -28,6 +28,10 @@ from dxlrun.dynamixel.transaction import Outcome, Reply, Transaction
 MOST_CHAINS = 64
 """Chains without this or that servo are kept; on a line that loses others every cycle they are made anew."""
 
+MOST_BROKEN = 5
+"""So many fast reads of a group that stay incomplete, with no complete one among them, are no accident:
+somebody answers when it is asked by itself, and not in the shared status."""
+
 
 class _Request:
     """One read of servos of one group: in each length, patient and short."""
@@ -65,6 +69,7 @@ class CyclicReads:
     __slots__ = (
         "_arrays",
         "_arrived",
+        "_broken",
         "_current",
         "_erring",
         "_fresh",
@@ -88,6 +93,7 @@ class CyclicReads:
         "fast",
         "fresh",
         "garbled",
+        "given_up",
         "missed",
     )
 
@@ -109,6 +115,9 @@ class CyclicReads:
         """Who is lost and not asked any more; see `leave`."""
         self.fast = list(plan.fast)
         """Which groups are read by a fast form; `plain` ends that."""
+        self.given_up: list[int] = []
+        """Groups whose fast reads stayed incomplete, so that they are read plainly now; to be told."""
+        self._broken = [0] * len(plan.groups)  # incomplete fast reads since the last complete one
         self._plan = plan
         self._line = plan_line(plan)
         self._groups = plan.groups
@@ -134,6 +143,8 @@ class CyclicReads:
                 # once a cycle: if each loss counted, three silent servos of a group would ask alike for ever
                 self._shape[number] += 1
                 self._lossy[number] = False
+            elif self._broken[number] and not self._apart(number):
+                self._broken[number] = 0
         self._fresh[:] = self._none
         self._patient = True
         silent = tuple(map(bool, self.missed))
@@ -144,6 +155,11 @@ class CyclicReads:
                 for number, group in enumerate(self._groups)
                 for indices in _turns([index for index in group if not self.away[index]], silent)
             ]
+
+    def _apart(self, number: int) -> bool:
+        """Say whether somebody of a group was asked by itself in this cycle."""
+        silent = self._queue_of
+        return silent is None or any(silent[one] and not self.away[one] for one in self._groups[number])
 
     def leave(self, servo: int) -> None:
         """Ask a servo no more: it is lost, and its silence would cost the others their time."""
@@ -220,7 +236,13 @@ class CyclicReads:
     def _count_out(self, outcome: Outcome) -> None:
         assert self._current is not None  # noqa: S101  something was read
         self._patient = False
-        self._lossy[self._current.group] = True
+        group = self._current.group
+        self._lossy[group] = True
+        if self._current.patient[0].fast:
+            self._broken[group] += 1
+            if self._broken[group] == MOST_BROKEN:
+                self.plain(group)
+                self.given_up.append(group)
         for servo in self._current.indices:
             if not self.fresh[servo]:
                 self.garbled[servo] = outcome is not Outcome.TIMEOUT

@@ -12,6 +12,7 @@ from dxlrun.clock import Clock
 from dxlrun.dynamixel import bus_watchdog, startup, torque_limit
 from dxlrun.dynamixel.bus import NEVER, Bus, pump, run
 from dxlrun.dynamixel.bus_plan import BusPlan, ServoPlan
+from dxlrun.dynamixel.exchange import MOST_BROKEN
 from dxlrun.dynamixel.gaps import Gaps
 from dxlrun.dynamixel.health import Servos
 from dxlrun.dynamixel.jumps import Jumps
@@ -127,6 +128,8 @@ class DynamixelHardware:
         now = self._clock.now_ns()
         for servos in self._servos:
             servos.settle(self._states, now)
+            if servos.reads.given_up:
+                self._tell_plain_reads()
         self._jumps.sift(self._states, now)
         self._tell_failures()
 
@@ -306,6 +309,17 @@ class DynamixelHardware:
                     f"{1e9 / total_ns:.0f} Hz"
                 )
                 self._events.emit(EventCode.SETUP, Severity.WARNING, plan.name, text)
+
+    def _tell_plain_reads(self) -> None:
+        for plan, servos in zip(self._plans, self._servos, strict=True):
+            for group in servos.reads.given_up:
+                names = ", ".join(plan.servos[index].joint for index in plan.groups[group])
+                text = (
+                    f"bus {plan.name}: {MOST_BROKEN} fast reads in a row stayed incomplete, so {names} are "
+                    "read without them from now on: does one have another firmware, or a loose contact?"
+                )
+                self._events.emit(EventCode.SETUP, Severity.WARNING, plan.name, text)
+            servos.reads.given_up.clear()
 
     def _restore_limits(self) -> None:
         """Give the servos the torque again that a policy of an earlier run may have left them without."""
