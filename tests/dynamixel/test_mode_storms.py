@@ -1,6 +1,6 @@
 """Mode changes while the line and the servos fail: no servo ever gets a goal that another mode would follow.
 
-`DXLRUN_MODE_STORMS` is the number of seeds, 9 in CI; a storm is 8 s of a robot at 50 Hz.
+`DXLRUN_MODE_STORMS` is the number of seeds, 6 in CI; a storm is 8 s of a robot at 50 Hz.
 """
 
 import os
@@ -13,7 +13,7 @@ from dxlrun.dynamixel.mode_plan import in_mode
 from dxlrun.events import EventCode
 from dxlrun.mode import Mode
 
-STORMS = int(os.environ.get("DXLRUN_MODE_STORMS", "9"))
+STORMS = int(os.environ.get("DXLRUN_MODE_STORMS", "6"))
 FOLLOWED = {
     2.0: {100: {16}, 102: {0, 5}, 104: {1}, 112: {3, 4, 5}},
     1.0: {30: {"joint"}, 32: {"wheel"}, 71: {"torque"}},

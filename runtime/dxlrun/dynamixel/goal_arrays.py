@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.dynamixel.bus_plan import BusPlan, Field, GoalLayout, ModePlan, OwnLimit, ServoPlan
 from dxlrun.dynamixel.dialect import dialect_of
+from dxlrun.dynamixel.state_arrays import rows_of
 from dxlrun.interfaces import Commands, Floats
 from dxlrun.mode import Mode
 
@@ -17,7 +18,7 @@ _CLOCKWISE = 0x400
 REPEATED = 50
 """Cycles after which a goal that stays is sent again: nobody acknowledges a sync write."""
 _OFTEN = 2
-"""A goal that changed is sent so many times: in this cycle and in the next."""
+"""So many times a goal that changed is sent: in this cycle and in the next."""
 
 Bools = NDArray[np.bool_]
 
@@ -34,7 +35,7 @@ class GoalArrays:
     beside a position: the most that it may take, NaN = all that the servo's own limit lets it.
     """
 
-    __slots__ = ("_blocks", "_fraction", "_limits", "_modes", "_plan")
+    __slots__ = ("_blocks", "_cycle", "_fraction", "_limits", "_modes", "_next", "_plan", "_seen", "_still")
 
     def __init__(self, plan: BusPlan) -> None:
         self._plan = plan
@@ -42,6 +43,10 @@ class GoalArrays:
         self._limits: list[dict[str, int]] = [{} for _ in plan.servos]
         self._fraction = 1.0
         self._blocks: tuple[_Block, ...] = ()
+        self._cycle = 0
+        self._next = 0  # cycle in which a goal that stays is due again
+        self._still = 0  # cycles since anything was another than before
+        self._seen: tuple[bytes, ...] = ()
         self._rebuild()
 
     @property
@@ -75,7 +80,24 @@ class GoalArrays:
 
         `ceiling`, shape (servos,): the highest speed toward a position, rad/s; NaN: no other than the goal's.
         """
-        return [packet for block in self._blocks for packet in block.packets(goals, included, ceiling)]
+        self._cycle += 1
+        seen = (
+            goals.position.tobytes(),
+            goals.velocity.tobytes(),
+            goals.effort.tobytes(),
+            goals.pwm.tobytes(),
+            included.tobytes(),
+            b"" if ceiling is None else ceiling.tobytes(),
+        )
+        self._still = self._still + 1 if seen == self._seen else 0
+        if self._still >= _OFTEN and self._cycle < self._next:
+            return []
+        self._seen = seen
+        found: list[bytes] = []
+        for block in self._blocks:
+            block.packets(self._cycle, goals, included, ceiling, found)
+        self._next = min((block.next for block in self._blocks), default=self._cycle) + REPEATED
+        return found
 
     def _rebuild(self) -> None:
         groups: dict[tuple[Mode, tuple[GoalLayout, ...]], list[int]] = {}
@@ -86,12 +108,15 @@ class GoalArrays:
             _Block(self._plan, mode, members, self._limits, self._fraction)
             for (mode, _), members in groups.items()
         )
+        self._still, self._seen = 0, ()
 
 
 class _Block:
     """The servos of one bus that are in one mode and have one layout of its goals."""
 
     __slots__ = (
+        "_all",
+        "_chosen",
         "_direction",
         "_effort",
         "_highest",
@@ -107,6 +132,8 @@ class _Block:
         "_reference",
         "_rows",
         "_speed",
+        "_velocity",
+        "_work",
     )
 
     def __init__(
@@ -122,8 +149,8 @@ class _Block:
         own = [limits[index] for index in members]
         self._mode = mode
         self._records = tuple(_Records(plan, layout, mine) for layout in modes[0].goals)
-        self._members = np.array(members, dtype=np.intp)
-        self._rows = np.array([servo.row for servo in mine], dtype=np.intp)
+        self._members = rows_of(members)
+        self._rows = rows_of([servo.row for servo in mine])
         self._direction = np.array([float(servo.direction) for servo in mine])
         self._reference = np.array([servo.reference for servo in mine])
         self._position = np.array([servo.rad_per_tick for servo in mine])
@@ -132,33 +159,46 @@ class _Block:
         self._speed, self._most_speed = _scale("speed", modes, own)
         self._effort, self._most_effort = _scale("effort", modes, own, fraction)
         self._pwm, self._most_pwm = _scale("pwm", modes, own, fraction)
+        self._work = np.zeros(len(mine))
+        self._chosen = np.zeros(len(mine), dtype=np.bool_)
+        self._all = b"\1" * len(mine)
+        self._velocity: tuple[bytes, bytes] | None = None
 
-    def packets(self, goals: Commands, included: Bools, ceiling: Floats | None) -> Iterator[bytes]:
-        """Return the packets, in the order of the mode's blocks of goals."""
-        goal = self._goal(goals)
-        chosen = included[self._members] & ~np.isnan(goal)
-        if not chosen.any():
+    @property
+    def next(self) -> int:
+        """The cycle in which the oldest goal was sent."""
+        return min(records.oldest for records in self._records)
+
+    def packets(
+        self, cycle: int, goals: Commands, included: Bools, ceiling: Floats | None, found: list[bytes]
+    ) -> None:
+        """Add the packets, in the order of the mode's blocks of goals."""
+        goal, chosen = self._goal(goals), self._chosen
+        np.isnan(goal, chosen)
+        np.greater(included[self._members], chosen, chosen)  # included and not NaN
+        who = chosen.tobytes()
+        if 1 not in who:
             for records in self._records:
                 records.nobody()
             return
+        some = None if who == self._all else chosen
         for records in self._records:
             fields = records.fields
             if "position" in fields:
-                ticks = np.rint((self._direction * goal + self._reference) / self._position)
-                records.put("position", np.clip(ticks, self._lowest, self._highest), chosen)
-                if "speed" in fields:
-                    records.put("speed", self._speeds(goals, ceiling), chosen)
+                records.put("position", self._ticks(goal), some)
+                if "speed" in fields and self._other_speeds(goals, ceiling, who):
+                    records.put("speed", self._speeds(goals, ceiling), some)
             elif "speed" in fields:
-                records.put("speed", self._signed(goal, self._speed, self._most_speed), chosen)
+                records.put("speed", self._signed(goal, self._speed, self._most_speed), some)
             elif "pwm" in fields:
-                records.put("pwm", self._signed(goal, self._pwm, self._most_pwm), chosen)
+                records.put("pwm", self._signed(goal, self._pwm, self._most_pwm), some)
             elif self._mode is Mode.EFFORT:
-                records.put("effort", self._signed(goal, self._effort, self._most_effort), chosen)
+                records.put("effort", self._signed(goal, self._effort, self._most_effort), some)
             else:
-                records.put("effort", self._efforts(goals), chosen)
-            packet = records.packet(chosen)
+                records.put("effort", self._efforts(goals), some)
+            packet = records.packet(cycle, who, some)
             if packet is not None:
-                yield packet
+                found.append(packet)
 
     def _goal(self, goals: Commands) -> Floats:
         """Return the goals by which the mode goes."""
@@ -170,8 +210,33 @@ class _Block:
             return goals.pwm[self._rows]
         return goals.position[self._rows]
 
+    def _ticks(self, goal: Floats) -> Floats:
+        work = self._work
+        np.multiply(self._direction, goal, work)
+        np.add(work, self._reference, work)
+        np.divide(work, self._position, work)
+        np.rint(work, work)
+        np.maximum(work, self._lowest, out=work)
+        return np.minimum(work, self._highest, out=work)
+
     def _signed(self, goal: Floats, unit: Floats, most: Floats) -> Floats:
-        return np.clip(np.rint(self._direction * goal / unit), -most, most)
+        work = self._work
+        np.multiply(self._direction, goal, work)
+        np.divide(work, unit, work)
+        np.rint(work, work)
+        np.maximum(work, -most, out=work)
+        return np.minimum(work, most, out=work)
+
+    def _other_speeds(self, goals: Commands, ceiling: Floats | None, who: bytes) -> bool:
+        """Say whether the speeds toward positions are other ones than before: mostly they are not."""
+        if ceiling is not None:
+            self._velocity = None
+            return True
+        now = goals.velocity.tobytes(), who
+        if now == self._velocity:
+            return False
+        self._velocity = now
+        return True
 
     def _speeds(self, goals: Commands, ceiling: Floats | None) -> Floats:
         """Return the speeds toward a position: 0 rad/s is 1 tick, NaN is 0."""
@@ -191,15 +256,18 @@ class _Records:
     """One block of goals of several servos as it is sent, and what of it was sent before."""
 
     __slots__ = (
-        "_age",
-        "_bytes",
+        "_changed",
         "_chosen",
         "_layout",
         "_magnitude",
         "_records",
+        "_rows",
         "_sent",
+        "_sent_at",
         "_sync_write",
+        "_views",
         "fields",
+        "oldest",
     )
 
     def __init__(self, plan: BusPlan, layout: GoalLayout, servos: Sequence[ServoPlan]) -> None:
@@ -222,41 +290,58 @@ class _Records:
             }
         )
         self.fields = frozenset(places)
+        self.oldest = 0
+        """The cycle in which that goal was sent whose sending is longest ago."""
         self._magnitude = {name for name, place in places.items() if place.encoding == "sign_magnitude"}
         self._layout = layout
         self._sync_write = dialect_of(plan.protocol).sync_write_records
         self._records = np.zeros(len(servos), dtype=record)
         self._records["id"] = [servo.servo_id for servo in servos]
-        self._bytes = self._records.view(np.uint8).reshape(len(servos), -1)
-        self._sent = self._bytes.copy()
-        self._chosen = np.zeros(len(servos), dtype=np.bool_)
-        self._age = np.zeros(len(servos), dtype=np.int64)
+        self._views = {name: self._records[name] for name in places}
+        self._rows = self._records.view(np.dtype((np.void, record.itemsize)))
+        self._sent = self._rows.copy()
+        self._changed = np.zeros(len(servos), dtype=np.bool_)
+        self._chosen = b""
+        self._sent_at = np.zeros(len(servos), dtype=np.int64)
 
-    def put(self, name: str, ticks: Floats, chosen: Bools) -> None:
-        """Fill in one goal of everybody who is chosen."""
-        ticks = np.where(chosen, ticks, 0)
+    def put(self, name: str, ticks: Floats, some: Bools | None) -> None:
+        """Fill in one goal of everybody, or of some; the others have 0."""
+        if some is not None:
+            ticks = np.where(some, ticks, 0)
         if name in self._magnitude:
             ticks = np.where(ticks < 0, _CLOCKWISE - ticks, ticks)
-        self._records[name] = ticks
+        np.copyto(self._views[name], ticks, casting="unsafe")
 
-    def packet(self, chosen: Bools) -> bytes | None:
+    def packet(self, cycle: int, who: bytes, some: Bools | None) -> bytes | None:
         """Return the packet with the goals that are due; None: none is."""
-        changed = (self._bytes != self._sent).any(axis=1)
-        changed |= chosen & ~self._chosen
-        self._sent[:] = self._bytes
-        self._chosen = chosen
-        age = self._age
-        age += 1
-        age[changed] = 0
-        due = chosen & ((age < _OFTEN) | (age % REPEATED == 0))
-        if not due.any():
+        changed = self._rows != self._sent
+        if who != self._chosen:
+            now, before = (
+                np.frombuffer(who, np.bool_),
+                np.frombuffer(self._chosen or bytes(len(who)), np.bool_),
+            )
+            changed |= now & ~before
+            self._chosen = who
+        self._sent[:] = self._rows
+        due = changed | self._changed
+        due |= self._sent_at <= cycle - REPEATED
+        self._changed = changed
+        if some is not None:
+            due &= some
+        flags = due.tobytes()
+        if 1 not in flags:
             return None
-        sent = self._records if due.all() else self._records[due]
+        every = 0 not in flags
+        sent = self._records if every else self._records[due]
+        self._sent_at[due] = cycle
+        self.oldest = (
+            cycle if every else int(self._sent_at.min() if some is None else self._sent_at[some].min())
+        )
         return self._sync_write(self._layout.address, self._layout.length, sent.tobytes())
 
     def nobody(self) -> None:
         """Take note that nobody is chosen: whoever is next gets its goal at once."""
-        self._chosen[:] = False
+        self._chosen = b""
 
 
 def _scale(
