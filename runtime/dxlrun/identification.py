@@ -8,11 +8,12 @@ from dataclasses import dataclass, field, replace
 
 from dxlrun.clock import MonotonicClock
 from dxlrun.control_table import control_table
-from dxlrun.dynamixel.bus import Bus, run
+from dxlrun.dynamixel.bus import Bus
 from dxlrun.dynamixel.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.identify import identify
 from dxlrun.dynamixel.inspection import setup_line
 from dxlrun.dynamixel.port import SerialPort, SerialPorts
+from dxlrun.dynamixel.pump import run
 from dxlrun.dynamixel.registers import Difference, compare
 from dxlrun.dynamixel.serial_open import open_serial
 from dxlrun.dynamixel.startup import survey

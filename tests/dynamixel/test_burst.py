@@ -7,8 +7,9 @@ import pytest
 from dxlrun.clock import VirtualClock
 from dxlrun.dynamixel import protocol1, protocol2
 from dxlrun.dynamixel.burst import Burst
-from dxlrun.dynamixel.bus import Bus, pump
+from dxlrun.dynamixel.bus import Bus
 from dxlrun.dynamixel.line import Line
+from dxlrun.dynamixel.pump import pump
 from dxlrun.dynamixel.transaction import Outcome
 from dxlrun.packets import PacketKind
 

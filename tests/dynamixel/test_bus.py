@@ -2,8 +2,9 @@ import pytest
 
 from dxlrun.clock import VirtualClock
 from dxlrun.dynamixel import protocol1
-from dxlrun.dynamixel.bus import Bus, run
+from dxlrun.dynamixel.bus import Bus
 from dxlrun.dynamixel.line import Line, listen
+from dxlrun.dynamixel.pump import run
 from dxlrun.dynamixel.transaction import Outcome
 from dxlrun.packets import PacketKind
 

@@ -4,8 +4,9 @@ import pytest
 
 from dxlrun.clock import VirtualClock
 from dxlrun.dynamixel import protocol2
-from dxlrun.dynamixel.bus import Bus, pump
+from dxlrun.dynamixel.bus import Bus
 from dxlrun.dynamixel.line import Line
+from dxlrun.dynamixel.pump import pump
 from dxlrun.dynamixel.transaction import Outcome
 from dxlrun.packets import NoPackets
 

@@ -4,10 +4,11 @@ from dataclasses import dataclass
 import pytest
 
 from dxlrun.dynamixel import protocol2
-from dxlrun.dynamixel.bus import Bus, pump
+from dxlrun.dynamixel.bus import Bus
 from dxlrun.dynamixel.gaps import STARVED, STARVED_AGAIN, Gaps, Urgency
 from dxlrun.dynamixel.line import listen
 from dxlrun.dynamixel.plan import plan_line
+from dxlrun.dynamixel.pump import pump
 from dxlrun.dynamixel.transaction import Outcome
 from dxlrun.events import EventCode
 

@@ -6,9 +6,10 @@ import pytest
 
 from dxlrun.compile.registers import UnfitRegister, declarable, register_value
 from dxlrun.control_table import all_tables, control_table
-from dxlrun.dynamixel.bus import Bus, run
+from dxlrun.dynamixel.bus import Bus
 from dxlrun.dynamixel.bus_plan import RegisterValue
 from dxlrun.dynamixel.inspection import setup_line
+from dxlrun.dynamixel.pump import run
 from dxlrun.dynamixel.registers import compare, settle_registers
 from dxlrun.dynamixel.startup import rejoin
 from dxlrun.errors import StartUpError

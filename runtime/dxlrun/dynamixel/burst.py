@@ -13,7 +13,7 @@ from fastcrc import crc16
 from numpy.typing import NDArray
 
 from dxlrun.dynamixel.dialect import Dialect
-from dxlrun.dynamixel.transaction import BROADCAST_ID, Transaction
+from dxlrun.dynamixel.transaction import BROADCAST_ID, Status, Transaction
 
 _STUFFING = b"\xff\xff\xfd\xfd"
 _FAST_HEAD = 8
@@ -149,3 +149,35 @@ class Burst:
             if crc != tail:
                 return False
         return True
+
+    def spans(self, ends: list[int], times: list[int]) -> list[tuple[int, int]]:
+        """Return of each status packet when the read() of its first and of its last byte was.
+
+        `ends`, `times`: where each read() ended in the buffer, and when it was.
+        """
+        found: list[tuple[int, int]] = []
+        start = first = last = 0
+        for _, data in self.packets:
+            while ends[first] <= start:
+                first += 1
+            start += len(data)
+            while ends[last] < start:
+                last += 1
+            found.append((times[first], times[last]))
+        return found
+
+
+def good_parts(dialect: Dialect, transaction: Transaction, data: memoryview) -> tuple[list[Status], int]:
+    """Return what is good of the one status of a fast form that is cut off or spoilt, and its bytes."""
+    if dialect.size_at(data, 0, len(data)) != transaction.widest:
+        return [], 0
+    awaited = transaction.awaited
+    try:
+        parts = dialect.fast_answers(data, [one.length for one in awaited])
+    except ValueError:  # spoilt before its first part
+        return [], 0
+    count = 0
+    while count < len(parts) and parts[count].servo_id == awaited[count].servo_id:
+        count += 1
+    used = dialect.fast_size(sum(one.length for one in awaited[:count]), count) if count else 0
+    return parts[:count], used

@@ -1,4 +1,4 @@
-"""Bus: one resumable transaction machine per serial line, and the one wait that pumps all of them.
+"""Bus: one resumable transaction machine per serial line; `pump` is the one wait that serves all of them.
 
 A machine never waits: it writes an instruction, is fed the bytes that arrive, and is told the time. Whoever
 pumps it decides when: read, write, or the gap before the next deadline.
@@ -6,24 +6,18 @@ pumps it decides when: read, write, or the gap before the next deadline.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-
 from dxlrun.clock import Clock
-from dxlrun.dynamixel.burst import Burst
+from dxlrun.dynamixel.burst import Burst, good_parts
 from dxlrun.dynamixel.bus_plan import BusPlan
 from dxlrun.dynamixel.dialect import dialect_of
 from dxlrun.dynamixel.line import BITS_PER_BYTE
-from dxlrun.dynamixel.port import Port, Ports
+from dxlrun.dynamixel.port import Port
 from dxlrun.dynamixel.receiver import Receiver
-from dxlrun.dynamixel.reply_polling import ReplyPolling
 from dxlrun.dynamixel.transaction import (
     BROADCAST_ID,
     Job,
     Outcome,
-    Program,
-    ProgramJob,
     Reply,
-    Result,
     Status,
     Transaction,
 )
@@ -36,9 +30,6 @@ QUIET_BYTES = 20
 LEAST_QUIET_NS = 200_000
 DRAIN_LIMIT_NS = 5_000_000
 """A line that babbles longer than this is not waited for."""
-
-LOST_LINE_STEP_NS = 200_000
-"""How often the other lines are looked at while one is gone."""
 
 _READY, _AWAITING, _RESTING, _DRAINING = range(4)
 
@@ -60,19 +51,15 @@ class Bus:
         "_drain_end_ns",
         "_earliest_ns",
         "_free_ns",
-        "_id_at",
         "_index",
         "_job",
         "_last_byte_ns",
         "_now_ns",
         "_open",
-        "_opened",
         "_overhead",
-        "_parameters",
         "_port",
         "_quiet_ns",
         "_receiver",
-        "_refusal",
         "_refused",
         "_reply",
         "_reply_size",
@@ -80,11 +67,11 @@ class Bus:
         "_sent_ns",
         "_sink",
         "_state",
-        "_views",
         "due_ns",
         "failure",
         "name",
         "noise_bytes",
+        "room",
     )
 
     def __init__(self, index: int, plan: BusPlan, port: Port, clock: Clock, packets: PacketSink) -> None:
@@ -100,13 +87,8 @@ class Bus:
         self._byte_ns = BITS_PER_BYTE * 1_000_000_000 // plan.baud_rate
         self._quiet_ns = max(QUIET_BYTES * self._byte_ns, LEAST_QUIET_NS) + plan.latency_ns
         self._dialect = dialect_of(plan.protocol)
-        self._opened = self._dialect.opened
-        self._refusal = self._dialect.refused
         self._overhead = self._dialect.OVERHEAD
-        self._id_at = self._dialect.ID_AT
         self._receiver = Receiver(self._status, self._noise, self._dialect, self._gathered)
-        self._parameters = memoryview(bytearray(self._dialect.LONGEST))
-        self._views: dict[int, memoryview] = {}
         self._reply = Reply(Outcome.SENT, 0, b"", 0, 0, False)
         self._job: Job | None = None
         self._awaited: Transaction | None = None
@@ -115,6 +97,8 @@ class Bus:
         """When the replies of the newest transaction are due by the wire."""
         self._burst: Burst | None = None  # until anything came
         self._room = self._receiver.space
+        self.room = self._receiver.room
+        """The most bytes that a burst of replies may have."""
         self._sent_ns = self._earliest_ns = self._deadline_ns = self._free_ns = 0
         self._drain_end_ns = 0
         self._reply_size = 0
@@ -126,11 +110,6 @@ class Bus:
     def busy(self) -> bool:
         """True while a job is under way."""
         return self._job is not None
-
-    @property
-    def room(self) -> int:
-        """The most bytes that a burst of replies may have."""
-        return self._receiver.room
 
     @property
     def complete(self) -> bool:
@@ -312,7 +291,7 @@ class Bus:
 
     def _gathered(self, burst: Burst, ends: list[int], times: list[int]) -> bool:
         """Take all replies of a transaction that came in pieces; False: some came too soon to be of now."""
-        spans = _spans(burst, ends, times)
+        spans = burst.spans(ends, times)
         if self._state != _AWAITING or not self._in_time(burst, spans[0][1]):
             return False
         self._take_all(burst, spans[-1][1], spans)
@@ -328,12 +307,9 @@ class Bus:
         if job is None:
             return
         packet, index = self._sink.packet, self._index
-        if spans:
-            for (servo_id, data), (first, last) in zip(burst.packets, spans, strict=True):
-                packet(index, PacketKind.STATUS, servo_id, first, last, data)
-        else:
-            for servo_id, data in burst.packets:
-                packet(index, PacketKind.STATUS, servo_id, last_ns, last_ns, data)
+        for number, (servo_id, data) in enumerate(burst.packets):
+            first, last = spans[number] if spans else (last_ns, last_ns)
+            packet(index, PacketKind.STATUS, servo_id, first, last, data)
         reply = self._reply
         reply.outcome, reply.last_ns = Outcome.OK, last_ns
         self._open = 0
@@ -356,63 +332,44 @@ class Bus:
             awaited is not None
             and awaited.fast
             and self._state == _AWAITING
-            and len(data) > self._id_at
-            and data[: self._id_at] == self._dialect.HEADER
-            and data[self._id_at] == BROADCAST_ID
+            and bytes(data[: self._dialect.ID_AT + 1]) == self._dialect.HEADER + bytes((BROADCAST_ID,))
         )
 
     def _shared(self, data: memoryview, last_ns: int) -> int:
         """Take what is good of the one status of a fast form; return the number of its bytes."""
-        awaited = self._awaited
-        if (
-            awaited is None
-            or self._job is None
-            or self._dialect.size_at(data, 0, len(data)) != awaited.widest
-        ):
+        awaited, job = self._awaited, self._job
+        if awaited is None or job is None:
             return 0
-        lengths = [one.length for one in awaited.awaited]
-        try:
-            parts = self._dialect.fast_answers(data, lengths)
-        except ValueError:  # spoilt before its first part
-            return 0
-        used = self._dialect.fast_size(sum(lengths[: len(parts)]), len(parts)) if parts else 0
+        parts, used = good_parts(self._dialect, awaited, data)
         if last_ns < self._sent_ns + (len(awaited.packet) + used) * self._byte_ns:
             return 0  # sooner than the wire allows: left over from before
         reply = self._reply
-        for index, (one, part) in enumerate(zip(awaited.awaited, parts, strict=False)):
-            if part.servo_id != one.servo_id:
-                return 0 if index == 0 else used
+        for index, part in enumerate(parts):
             reply.error, reply.parameters, reply.last_ns = part.error, part.parameters, last_ns
             self._open &= ~(1 << index)
-            self._job.status(index, reply)
+            job.status(index, reply)
         if not self._open:
             reply.outcome = Outcome.OK
             self._state = _READY
         return used
 
     def _status(self, packet: memoryview, first_ns: int, last_ns: int) -> None:
-        self._sink.packet(self._index, PacketKind.STATUS, packet[self._id_at], first_ns, last_ns, packet)
+        self._sink.packet(
+            self._index, PacketKind.STATUS, packet[self._dialect.ID_AT], first_ns, last_ns, packet
+        )
         if self._shares(packet):
             if not self._shared(packet, last_ns):
                 self._stray(packet)
             return
-        status = self._opened(packet) if self._state == _AWAITING else None
+        status = self._dialect.opened(packet) if self._state == _AWAITING else None
         index = -1 if status is None else self._turn(status, last_ns)
         if status is None or index < 0 or self._job is None:
             self._stray(packet)
             return
-        error, parameters = status.error, status.parameters
-        length = len(parameters)
-        view = self._views.get(length)
-        if view is None:
-            view = self._views[length] = self._parameters[:length]
-        view[:] = parameters
         reply = self._reply
-        reply.error = error
-        reply.parameters = view
-        reply.last_ns = last_ns
+        reply.error, reply.parameters, reply.last_ns = status.error, bytes(status.parameters), last_ns
         self._open &= ~(1 << index)
-        if error and self._refuses(status, index):
+        if status.error and self._refuses(status, index):
             self._refused = True
         else:
             self._job.status(index, reply)
@@ -435,100 +392,9 @@ class Bus:
     def _refuses(self, status: Status, index: int) -> bool:
         assert self._awaited is not None  # noqa: S101  a status has its turn
         length = self._awaited.awaited[index].length
-        return self._refusal(status.error, len(status.parameters), length)
+        return self._dialect.refused(status.error, len(status.parameters), length)
 
     def _stray(self, packet: memoryview) -> None:
         self._reply.strays += 1
         if self._awaited is not None and packet == self._awaited.packet:
             self._reply.echoed = True
-
-
-def _spans(burst: Burst, ends: list[int], times: list[int]) -> list[tuple[int, int]]:
-    """Return of each status packet when the read() of its first and of its last byte was."""
-    found: list[tuple[int, int]] = []
-    start = first = last = 0
-    for _, data in burst.packets:
-        while ends[first] <= start:
-            first += 1
-        start += len(data)
-        while ends[last] < start:
-            last += 1
-        found.append((times[first], times[last]))
-    return found
-
-
-def _look(
-    buses: Sequence[Bus], ports: Ports, clock: Clock, polling: ReplyPolling, deadline_ns: int
-) -> Sequence[int]:
-    """Sleep until shortly before replies are due and look for them again and again; return who has bytes."""
-    now_ns = clock.now_ns()
-    dues = [bus.due_ns for bus in buses if bus.busy]
-    # those that should be there since long wait for theirs
-    due_ns = min((due for due in dues if due > now_ns), default=max(dues, default=0))
-    until_ns = polling.await_until(due_ns, now_ns, deadline_ns)
-    if not until_ns:
-        return ()
-    since_ns, looks = clock.now_ns(), 0
-    ready: Sequence[int] = ()
-    while not ready and now_ns < until_ns:
-        ready = ports.wait(0)
-        now_ns = clock.now_ns()
-        looks += 1
-    polling.spent(now_ns - since_ns, looks)
-    return ready
-
-
-def pump(
-    buses: Sequence[Bus], ports: Ports, clock: Clock, beat: Callable[[], None], until_ns: int = NEVER
-) -> None:
-    """Execute the jobs of all buses side by side: one wait over all ports, until every job is finished.
-
-    Ends at `until_ns` in any case, and a job that is not finished then goes on in the next call. `beat` is
-    called at least once a transaction. Raises nothing: a line that is gone has its `failure`, and the others
-    go on.
-    """
-    clock_ns, polling = clock.now_ns, ports.polling
-    now_ns = clock_ns()
-    deadlines = [bus.step(now_ns) for bus in buses]
-    while (deadline := min(deadlines)) != NEVER and now_ns < until_ns:
-        beat()
-        deadline = min(deadline, until_ns)
-        ready = _look(buses, ports, clock, polling, deadline) if polling else ()
-        ready = ready or ports.wait(deadline)
-        heard = not ready
-        for index in ready:
-            bus = buses[index]
-            if bus.failure is None:
-                heard = True
-                bus.receive()
-                now_ns = clock_ns()
-                if polling and bus.complete:
-                    polling.came(bus.due_ns, now_ns)
-                deadlines[index] = bus.step(now_ns)
-        if not heard:
-            # a line that is gone is ready for ever: look at the others now and then instead of waiting
-            clock.wait_until(min(deadline, clock_ns() + LOST_LINE_STEP_NS))
-            for bus in buses:
-                bus.receive()
-        now_ns = clock_ns()
-        if now_ns >= deadline or not heard:
-            deadlines = [bus.step(now_ns) for bus in buses]
-    beat()
-
-
-def run(
-    programs: Sequence[Program[Result]],
-    buses: Sequence[Bus],
-    ports: Ports,
-    clock: Clock,
-    beat: Callable[[], None] = lambda: None,
-) -> list[Result | None]:
-    """Run one program a bus to its end, blocking, side by side; for set-up and tools, never in the loop.
-
-    Returns what each program returned; None where the line is gone, and the bus' `failure` says why.
-    """
-    jobs = [ProgramJob(program) for program in programs]
-    for bus, job in zip(buses, jobs, strict=True):
-        bus.load(job)
-    pump(buses, ports, clock, beat)
-    return [job.result for job in jobs]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from dxlrun.clock import Clock
 from dxlrun.dynamixel import bus_watchdog, startup, torque_limit
-from dxlrun.dynamixel.bus import NEVER, Bus, pump, run
+from dxlrun.dynamixel.bus import NEVER, Bus
 from dxlrun.dynamixel.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.exchange import MOST_BROKEN
 from dxlrun.dynamixel.gaps import Gaps
@@ -20,6 +20,7 @@ from dxlrun.dynamixel.limp import LimpOutcome, limp_buses
 from dxlrun.dynamixel.modes import settle_modes
 from dxlrun.dynamixel.port import Ports
 from dxlrun.dynamixel.probing import extra_ns, probe_reads
+from dxlrun.dynamixel.pump import pump, run
 from dxlrun.dynamixel.registers import settle_bus
 from dxlrun.dynamixel.torque_limit import reduced
 from dxlrun.dynamixel.transaction import Program

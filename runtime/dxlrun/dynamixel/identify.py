@@ -7,11 +7,12 @@ from dataclasses import dataclass
 
 from dxlrun.clock import Clock
 from dxlrun.control_table import models_by_number
-from dxlrun.dynamixel.bus import Bus, run
+from dxlrun.dynamixel.bus import Bus
 from dxlrun.dynamixel.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.inspection import persist, setup_line, who
 from dxlrun.dynamixel.line import listen
 from dxlrun.dynamixel.port import Ports
+from dxlrun.dynamixel.pump import run
 from dxlrun.dynamixel.startup import LISTEN_NS
 from dxlrun.dynamixel.transaction import Outcome, Program, Reply
 from dxlrun.packets import NoPackets, PacketSink

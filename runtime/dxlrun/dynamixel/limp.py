@@ -9,10 +9,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from dxlrun.clock import Clock
-from dxlrun.dynamixel.bus import Bus, run
+from dxlrun.dynamixel.bus import Bus
 from dxlrun.dynamixel.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.line import listen
 from dxlrun.dynamixel.port import Ports
+from dxlrun.dynamixel.pump import run
 from dxlrun.dynamixel.transaction import Outcome, Program, Reply
 from dxlrun.packets import PacketSink
 
