@@ -300,3 +300,28 @@ def test_a_torque_limit_weakens_a_servo_that_follows_a_pwm_and_does_not_drive_it
     command(rig, Mode.PWM, 1.0)
     moved(rig, 2)
     assert abs(rig.buses[0].servo(1).registers.ticks("goal_pwm")) == 88
+
+
+def test_a_joint_that_coasted_over_its_limits_is_led_back_slowly_and_does_not_fall(arm):
+    servo, plan = arm.buses[0].servo(1), arm.plans[0].servos[0]
+    change(arm, Mode.EFFORT)
+    servo.turn_by_hand((plan.upper_tick + 100) * plan.rad_per_tick)
+    change(arm, Mode.POSITION)
+    assert arm.torque() == [True, True]
+    assert servo.registers["goal_position"] == plan.upper_tick
+    assert 0 < servo.registers["profile_velocity"] * plan.rad_s_per_tick <= 0.51
+
+
+def test_a_servo_that_lost_its_torque_over_a_change_gets_no_goal_which_would_switch_it_on(make_one):
+    rig = make_one("AX-12A", 1.0)
+    rig.buses[0].servo(1).poke("lock", 1)
+    since = len(rig.into_bus())
+    rig.hardware.set_modes(np.array([Mode.VELOCITY, 0], dtype=np.uint8))
+    rig.hardware.read()
+    rig.hardware.write()
+    rig.hardware.idle(rig.clock.now_ns() + 15_000_000)
+    assert rig.states.mode[0] == Mode.POSITION
+    rig.hardware.read()
+    rig.hardware.write()
+    writes = [data for data in rig.into_bus()[since:] if data[4] == 0x83]
+    assert [1 in data[7:-1:5] for data in writes] == [False, False], "a goal before torque enable was read"

@@ -199,6 +199,9 @@ class Servos:
 
     def goal_packets(self, goals: Commands, states: States) -> list[bytes]:
         """Return the packets with the goals of everybody who may get one; who was lost comes back slowly."""
+        if self._modes.doubtful:
+            self.torqued[self._modes.doubtful] = False
+            self._modes.doubtful.clear()
         if not self._returning:
             return self.goals.packets(goals, self.torqued)
         for index in self._returning[:]:

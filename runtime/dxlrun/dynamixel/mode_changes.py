@@ -24,7 +24,7 @@ class ModeChanges:
     until it is taken back (`entered`).
     """
 
-    __slots__ = ("_events", "_gaps", "_goals", "_mode", "_plan", "_queued", "_rows", "_wanted")
+    __slots__ = ("_events", "_gaps", "_goals", "_mode", "_plan", "_queued", "_rows", "_wanted", "doubtful")
 
     def __init__(
         self, plan: BusPlan, gaps: Gaps, goals: GoalArrays, mode: NDArray[np.uint8], events: EventSink
@@ -38,6 +38,8 @@ class ModeChanges:
         self._rows = [servo.row for servo in plan.servos]
         self._wanted = [servo.start_mode for servo in plan.servos]
         self._queued = [False] * len(plan.servos)
+        self.doubtful: list[int] = []
+        """Whose change failed, maybe without torque: no goal until that was read. Whoever minds clears it."""
 
     def wanted(self, index: int) -> Mode:
         """Return the mode in which a servo is, or shall be as soon as it can."""
@@ -85,7 +87,7 @@ class ModeChanges:
         """Change into the newest mode that is wanted; return the mode that is there, and what failed."""
         servo, wanted = self._plan.servos[index], self._wanted[index]
         try:
-            problem = yield from modes.enter(self._plan, servo, wanted)
+            problem = yield from modes.enter(self._plan, servo, wanted, inward=True)
         except LookupError as error:
             problem = f"cannot follow: {error}"
         if not problem:
@@ -102,6 +104,7 @@ class ModeChanges:
             self._goals.set_mode(index, mode)
             self._mode[self._rows[index]] = mode
             self._wanted[index] = mode or wanted
+            self.doubtful.append(index)
             return
         if wanted != mode:  # another wish came meanwhile
             self._queue(index)

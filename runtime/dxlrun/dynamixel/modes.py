@@ -49,11 +49,13 @@ class Held:
     """Goal position in ticks; None where the mode has none."""
 
 
-def enter(plan: BusPlan, servo: ServoPlan, mode: Mode, *, again: bool = True) -> Program[str]:
+def enter(
+    plan: BusPlan, servo: ServoPlan, mode: Mode, *, again: bool = True, inward: bool = False
+) -> Program[str]:
     """Bring one servo into a mode in which it then stands still; return what went wrong, or nothing.
 
-    `again`: also one that has torque in this mode is held anew; without, it is left alone. Raises LookupError
-    when the model does not have the mode.
+    `again`: also one that has torque in this mode is held anew; without, it is left alone. `inward`: as in
+    `hold`. Raises LookupError when the model does not have the mode.
     """
     wanted, line = servo.mode_plan(mode), plan_line(plan)
     torque = yield from persist(line.read(servo.servo_id, servo.torque_address, 1))
@@ -71,10 +73,10 @@ def enter(plan: BusPlan, servo: ServoPlan, mode: Mode, *, again: bool = True) ->
         # a joint that does not change shall not fall for that
         now = yield from mode_now(plan, servo)
         if now is not Mode.UNKNOWN:
-            back = yield from hold(plan, servo, servo.mode_plan(now))
+            back = yield from hold(plan, servo, servo.mode_plan(now), inward=inward)
             problem += f", and {back.problem}" if back.problem else ""
     elif enabled:
-        problem = (yield from hold(plan, servo, wanted)).problem
+        problem = (yield from hold(plan, servo, wanted, inward=inward)).problem
     return problem
 
 
@@ -128,8 +130,12 @@ def read_limits(plan: BusPlan, servo: ServoPlan) -> Program[dict[OwnLimit, int]]
     return found
 
 
-def hold(plan: BusPlan, servo: ServoPlan, mode: ModePlan) -> Program[Held]:
-    """Hold a servo where it stands: a goal that moves nothing, torque on, both read back."""
+def hold(plan: BusPlan, servo: ServoPlan, mode: ModePlan, *, inward: bool = False) -> Program[Held]:
+    """Hold a servo where it stands: a goal that moves nothing, torque on, both read back.
+
+    One that stands outside its limits is refused; `inward`: it goes back to them, slowly, because one that
+    was led by an effort may have coasted over them, and without torque it would fall.
+    """
     line, position = plan_line(plan), None
     if mode.goals[-1].position is not None:
         block = servo.state
@@ -138,7 +144,7 @@ def hold(plan: BusPlan, servo: ServoPlan, mode: ModePlan) -> Program[Held]:
             return Held("did not answer when torque was to be switched on")
         present = ticks_in(servo.state.position, state.parameters)
         position = min(max(present, mode.lower_tick), mode.upper_tick)
-        if abs(position - present) > 1:
+        if abs(position - present) > 1 and not inward:
             return Held("stands outside its limits, or left them before torque was switched on")
     most_effort = 0
     if position is not None and len(mode.goals) > 1:
