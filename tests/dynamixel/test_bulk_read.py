@@ -76,7 +76,6 @@ def test_a_cut_reply_in_a_chain_is_lost_alone(started):
     ("model", "register", "value", "said"),
     [
         ("MX-64", "multi_turn_offset", 100, r"Multi Turn Offset \(20\) = 100, which shifts every position"),
-        ("MX-64", "torque_ctrl_mode_enable", 1, r"\(70\) = 1, so it follows a torque and no goal position"),
         ("MX-106", "drive_mode", 1, r"Drive Mode \(10\) = 1, so it turns the other way round"),
         ("EX-106+", "drive_mode", 1, r"Drive Mode \(10\) = 1, so it turns the other way round"),
     ],
@@ -87,6 +86,16 @@ def test_a_register_that_changes_what_a_goal_means(make_rig, make_plan, model, r
     with pytest.raises(RuntimeError, match=r"\(ID 2 on bus main\).*" + said):
         rig.hardware.start()
     assert [packet for packet in rig.into_bus() if packet[4] not in (1, 2)] == []
+
+
+def test_a_servo_that_follows_a_torque_is_brought_into_position_mode(make_rig, make_plan):
+    rig = make_rig(make_plan((1, 2), models=("AX-12A", "MX-64")))
+    rig.buses[0].servo(2).poke("torque_ctrl_mode_enable", 1)
+    rig.hardware.start()
+    assert rig.buses[0].servo(2).registers["torque_ctrl_mode_enable"] == 0
+    ((joint, text),) = rig.events.of(EventCode.MODE)
+    assert joint == "main_2_joint"
+    assert "Torque Ctrl Mode Enable (70) was 1" in text
 
 
 def test_the_budget_counts_one_latency_a_request(make_plan):
