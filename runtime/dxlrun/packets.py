@@ -13,6 +13,7 @@ PACKET_SLOT = 2048
 """Bytes of one slot of the packets' ring: a batch, usually the packets of one cycle."""
 
 _HEADER = struct.Struct("<BBBxI qq")
+_HEADER_SIZE = _HEADER.size
 _USED, _NUMBER = 0, 1
 _WORDS = 2
 _DESK_HEADER = 8 * _WORDS
@@ -90,12 +91,13 @@ class PacketBatch:
         """Record bytes that were sent or received; times in ns of the run's clock."""
         length = len(data)
         start = self._used
-        end = start + _HEADER.size + length
+        body = start + _HEADER_SIZE
+        end = body + length
         if end > self._room:
             self._overfull((bus, kind, servo_id, first_ns, last_ns), data)
             return
         _HEADER.pack_into(self._buffer, start, bus, kind, servo_id, length, first_ns, last_ns)
-        self._buffer[start + _HEADER.size : end] = data
+        self._buffer[body:end] = data
         self._used = self._words[_USED] = end
 
     def _overfull(self, head: tuple[int, PacketKind, int, int, int], data: Payload) -> None:

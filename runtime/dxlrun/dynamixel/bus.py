@@ -32,6 +32,9 @@ DRAIN_LIMIT_NS = 5_000_000
 """A line that babbles longer than this is not waited for."""
 
 _READY, _AWAITING, _RESTING, _DRAINING = range(4)
+# to look into an Enum takes as long as to pack a packet's record
+_SENT, _OK, _TIMEOUT = Outcome.SENT, Outcome.OK, Outcome.TIMEOUT
+_INSTRUCTION, _STATUS = PacketKind.INSTRUCTION, PacketKind.STATUS
 
 
 class Bus:
@@ -89,7 +92,7 @@ class Bus:
         self._dialect = dialect_of(plan.protocol)
         self._overhead = self._dialect.OVERHEAD
         self._receiver = Receiver(self._status, self._noise, self._dialect, self._gathered)
-        self._reply = Reply(Outcome.SENT, 0, b"", 0, 0, False)
+        self._reply = Reply(_SENT, 0, b"", 0, 0, False)
         self._job: Job | None = None
         self._awaited: Transaction | None = None
         self._state = _READY
@@ -114,7 +117,7 @@ class Bus:
     @property
     def complete(self) -> bool:
         """True when everything that the newest transaction awaits has come."""
-        return self._state == _READY and self._reply.outcome is Outcome.OK
+        return self._state == _READY and self._reply.outcome is _OK
 
     def renew(self, port: Port) -> None:
         """Go on with a line that is back in the place of one that is gone; its job is forgotten."""
@@ -180,12 +183,8 @@ class Bus:
             if not count:
                 return
             at_ns = self._last_byte_ns = self._now_ns()
-            if (
-                count == burst.size
-                and self._state == _AWAITING
-                and burst.whole()
-                and self._in_time(burst, at_ns)
-            ):
+            whole = count == burst.size and self._state == _AWAITING and burst.whole()
+            if whole and self._in_time(burst, at_ns):
                 self._burst = None
                 self._take_all(burst, at_ns, [])
                 return
@@ -248,7 +247,7 @@ class Bus:
         now_ns = self._write(packet, transaction.servo_id) if packet else self._now_ns()
         started_ns = reply.sent_ns = self._sent_ns if packet else now_ns
         if transaction.awaited:
-            reply.outcome = Outcome.TIMEOUT
+            reply.outcome = _TIMEOUT
             self._state = _AWAITING
             self._earliest_ns = started_ns + (len(packet) + self._overhead) * self._byte_ns
             self._deadline_ns = started_ns + transaction.timeout_ns
@@ -258,7 +257,7 @@ class Bus:
             if burst is not None:
                 burst.bind(self._receiver.buffer)
         else:
-            reply.outcome = Outcome.SENT
+            reply.outcome = _SENT
             self._state = _RESTING
             self._deadline_ns = started_ns + transaction.due_ns
         self.due_ns = started_ns + transaction.due_ns
@@ -270,7 +269,7 @@ class Bus:
         before = now_ns()
         self._port.write(packet)
         after = now_ns()
-        self._sink.packet(self._index, PacketKind.INSTRUCTION, servo_id, before, after, packet)
+        self._sink.packet(self._index, _INSTRUCTION, servo_id, before, after, packet)
         # a second packet waits in the adapter until the first is off the wire
         start = self._sent_ns = self._free_ns if self._free_ns > before else before
         self._free_ns = start + len(packet) * self._byte_ns
@@ -281,7 +280,7 @@ class Bus:
         self._receiver.flush()  # the reply may stand behind a false header
         if self._state != _AWAITING:
             return
-        self._reply.outcome = Outcome.GARBLED if self._reply.strays else Outcome.TIMEOUT
+        self._reply.outcome = Outcome.GARBLED if self._reply.strays else _TIMEOUT
         self._drain_end_ns = now_ns + DRAIN_LIMIT_NS
         self._deadline_ns = self._quiet_at()
         self._state = _DRAINING if self._deadline_ns > now_ns else _READY
@@ -309,9 +308,9 @@ class Bus:
         packet, index = self._sink.packet, self._index
         for number, (servo_id, data) in enumerate(burst.packets):
             first, last = spans[number] if spans else (last_ns, last_ns)
-            packet(index, PacketKind.STATUS, servo_id, first, last, data)
+            packet(index, _STATUS, servo_id, first, last, data)
         reply = self._reply
-        reply.outcome, reply.last_ns = Outcome.OK, last_ns
+        reply.outcome, reply.last_ns = _OK, last_ns
         self._open = 0
         self._state = _READY
         moments = [last for _, last in spans]
@@ -349,14 +348,12 @@ class Bus:
             self._open &= ~(1 << index)
             job.status(index, reply)
         if not self._open:
-            reply.outcome = Outcome.OK
+            reply.outcome = _OK
             self._state = _READY
         return used
 
     def _status(self, packet: memoryview, first_ns: int, last_ns: int) -> None:
-        self._sink.packet(
-            self._index, PacketKind.STATUS, packet[self._dialect.ID_AT], first_ns, last_ns, packet
-        )
+        self._sink.packet(self._index, _STATUS, packet[self._dialect.ID_AT], first_ns, last_ns, packet)
         if self._shares(packet):
             if not self._shared(packet, last_ns):
                 self._stray(packet)
@@ -374,7 +371,7 @@ class Bus:
         else:
             self._job.status(index, reply)
         if not self._open:
-            reply.outcome = Outcome.REFUSED if self._refused else Outcome.OK
+            reply.outcome = Outcome.REFUSED if self._refused else _OK
             self._state = _READY
 
     def _turn(self, status: Status, last_ns: int) -> int:

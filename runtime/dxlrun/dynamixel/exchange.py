@@ -32,6 +32,9 @@ MOST_BROKEN = 5
 """So many fast reads of a group that stay incomplete, with no complete one among them, are no accident:
 somebody answers when it is asked by itself, and not in the shared status."""
 
+# to look into an Enum takes longer than the rest of a call
+_OK, _TIMEOUT = Outcome.OK, Outcome.TIMEOUT
+
 
 class _Request:
     """One read of servos of one group: in each length, patient and short."""
@@ -190,7 +193,7 @@ class CyclicReads:
             self._position = 0
         else:
             self._position += 1
-            if reply.outcome is not Outcome.OK:
+            if reply.outcome is not _OK:
                 self._count_out(reply.outcome)
         if self._position == len(self._queue):
             return None
@@ -245,7 +248,7 @@ class CyclicReads:
                 self.given_up.append(group)
         for servo in self._current.indices:
             if not self.fresh[servo]:
-                self.garbled[servo] = outcome is not Outcome.TIMEOUT
+                self.garbled[servo] = outcome is not _TIMEOUT
 
     def _request(self, group: int, indices: tuple[int, ...]) -> _Request:
         request = self._made.get(indices)
