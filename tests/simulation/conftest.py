@@ -273,11 +273,13 @@ def start_buses(tmp_path: Path) -> Iterator[Callable[[Sequence[BusConfig]], Runn
 @pytest.fixture(scope="session")
 def judge() -> Iterator[Any]:
     """The judge of runs with faults, which several campaigns share."""
-    spec = importlib.util.spec_from_file_location("fault_judge", Path(__file__).with_name("fault_judge.py"))
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses look their module up there
-    spec.loader.exec_module(module)
+    names = ("fault_wire", "fault_judge")  # the second one imports the first
+    for name in names:
+        spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
+        assert spec is not None
+        assert spec.loader is not None
+        sys.modules[name] = module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
     yield module
-    del sys.modules[spec.name]
+    for name in names:
+        del sys.modules[name]

@@ -5,17 +5,18 @@ torque-on without a look at the servo first; 4 each recorded sample is what that
 5 the log has every byte; 6 each accepted command has a known client and is in the log; 7 each fault that
 somebody can see leaves an event, and no event comes before the first fault; 8 nobody who hears keeps torque.
 
-The host's packets are taken apart by code of this file alone.
+The packets are taken apart by fault_wire.py, which knows nothing of the host's code.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
-from dxlrun.control_table import control_table
-from dxlrun.dynamixel.bus_plan import BusPlan, ServoPlan
+from fault_wire import READ, Said, Told, data_of, instructions, states, written
+
+from dxlrun.dynamixel.bus_plan import BusPlan
 from dxlrun.dynamixel.units import joint_position, ticks_in
 from dxlrun.events import EventCode, Severity
 from dxlrun.packets import PacketKind
@@ -38,10 +39,6 @@ BUMP = 0.1
 IDENTITY = 6
 """An item that begins before this address is part of who a servo is: model number, firmware, ID."""
 
-PING, READ, WRITE, SYNC_WRITE, SYNC_READ, FAST_SYNC_READ, BULK_READ = 0x01, 0x02, 0x03, 0x83, 0x82, 0x8A, 0x92
-HOST_SAYS = frozenset((PING, READ, WRITE, SYNC_WRITE, SYNC_READ, FAST_SYNC_READ, BULK_READ))
-EVERYBODY, STATUS = 254, 0x55
-HEADER = b"\xff\xff\xfd\x00"
 SILENT = frozenset((EventCode.READ_LOST, EventCode.SERVO_LOST))
 HEARD = frozenset((EventCode.READ_BACK, EventCode.SERVO_BACK))
 OF_A_FAULT = SILENT | {
@@ -51,45 +48,6 @@ OF_A_FAULT = SILENT | {
     EventCode.BUS_NOISE,
     EventCode.PORT_LOST,
 }
-
-
-def _crc_table() -> tuple[int, ...]:
-    found = []
-    for byte in range(256):
-        value = byte << 8
-        for _ in range(8):
-            value = value << 1 ^ (0x18005 if value & 0x8000 else 0)
-        found.append(value)
-    return tuple(found)
-
-
-_CRC = _crc_table()
-
-
-def crc(data: bytes) -> int:
-    """Return the CRC-16 of Protocol 2.0 (polynomial 0x8005)."""
-    value = 0
-    for byte in data:
-        value = (value << 8 & 0xFF00) ^ _CRC[value >> 8 ^ byte]
-    return value
-
-
-class Said(NamedTuple):
-    """An instruction of the host."""
-
-    t_ns: int
-    servo_id: int
-    instruction: int
-    parameters: bytes
-
-
-class Told(NamedTuple):
-    """A state that a servo sent, and when the host asked for it where that is known."""
-
-    t_ns: int
-    servo_id: int
-    data: bytes
-    asked_ns: int = 0
 
 
 @dataclass
@@ -110,7 +68,7 @@ class Witness:
         def seen(servo_id: int, text: str, change: Any, *, delay_ns: int = 0, copies: int = 1) -> None:
             def held_back(reply: bytes) -> bytes:
                 if delay_ns:
-                    data = _data_of(reply, bus.protocol)
+                    data = data_of(reply, bus.protocol)
                     self.delayed.append(Told(bus.now_ns + delay_ns, servo_id, data, bus.now_ns))
                 return bytes(change(reply))
 
@@ -127,15 +85,6 @@ class Witness:
                 self.found.append((bus.now_ns, servo.servo_id, servo.position))
             self.torque[servo] = torque
         bus.at(bus.now_ns + 2 * MS, self.look)
-
-
-def _data_of(reply: bytes, protocol: float) -> bytes:
-    """Return the data in what a servo sends: a status, or its part of the one of a fast form."""
-    if protocol == 1.0:
-        return reply[5:-1]
-    if not reply.startswith(HEADER):
-        return reply[2:-2]
-    return reply[10:-2] if reply[4] == EVERYBODY else reply[9:-2]
 
 
 def alone(bus: SimulatedBus) -> list[SimulatedServo]:
@@ -175,63 +124,6 @@ class Trial:
             everybody_who_hears_is_limp(self.robot, number, started)
         no_event_comes_before_the_first_fault(entries, log)
         each_fault_that_shows_is_told(entries, log, self.robot)
-
-
-# Invariant 1: every packet sent is a legal instruction
-
-
-def instructions(entries: Sequence[LedgerEntry], bus: BusPlan) -> Iterator[Said]:
-    """Take apart all that the host sent; whatever is no legal instruction fails."""
-    known = {servo.servo_id for servo in bus.servos}
-    for entry in entries:
-        data = entry.data if entry.direction == "in" else b""
-        while data:
-            servo_id, instruction, parameters, data = _first(data, bus.protocol)
-            assert instruction in HOST_SAYS, entry
-            assert servo_id in known | {EVERYBODY}, entry
-            yield Said(entry.t_ns, servo_id, instruction, parameters)
-
-
-def _first(data: bytes, protocol: float) -> tuple[int, int, bytes, bytes]:
-    """Return ID, instruction and parameters of the first packet, and what follows it."""
-    if protocol == 1.0:
-        assert data[:2] == b"\xff\xff", data.hex(" ")
-        end = 4 + data[3]
-        assert len(data) >= end, data.hex(" ")
-        assert sum(data[2:end]) & 0xFF == 0xFF, data.hex(" ")
-        return data[2], data[4], data[5 : end - 1], data[end:]
-    assert data[:4] == HEADER, data.hex(" ")
-    end = 7 + int.from_bytes(data[5:7], "little")
-    assert len(data) >= end, data.hex(" ")
-    assert crc(data[: end - 2]) == int.from_bytes(data[end - 2 : end], "little"), data.hex(" ")
-    parameters = data[8 : end - 2].replace(b"\xff\xff\xfd\xfd", b"\xff\xff\xfd")
-    return data[4], data[7], parameters, data[end:]
-
-
-def writes(said: Said, protocol: float) -> Iterator[tuple[int, int, bytes]]:
-    """Return servo, address and bytes of all that an instruction writes."""
-    width = 1 if protocol == 1.0 else 2
-    parameters = said.parameters
-    address = int.from_bytes(parameters[:width], "little")
-    if said.instruction == WRITE:
-        yield said.servo_id, address, parameters[width:]
-    elif said.instruction == SYNC_WRITE:
-        size = int.from_bytes(parameters[width : 2 * width], "little")
-        blocks = parameters[2 * width :]
-        assert len(blocks) % (size + 1) == 0
-        for at in range(0, len(blocks), size + 1):
-            yield blocks[at], address, blocks[at + 1 : at + 1 + size]
-
-
-def written(said: Sequence[Said], bus: BusPlan, item: str) -> Iterator[tuple[int, ServoPlan, int]]:
-    """Return when which servo got which value in an item."""
-    places = [(servo, control_table(servo.model, bus.protocol).items[item]) for servo in bus.servos]
-    for one in said:
-        for servo_id, address, data in writes(one, bus.protocol):
-            for servo, place in places:
-                at = place.address - address
-                if servo_id in (servo.servo_id, EVERYBODY) and 0 <= at <= len(data) - place.size:
-                    yield one.t_ns, servo, place.decode(data[at : at + place.size])
 
 
 # Invariants 2 and 3
@@ -336,67 +228,6 @@ def held_back(told: Sequence[Told], delayed: Sequence[Told]) -> dict[Told, int]:
     return asked_ns
 
 
-def states(entries: Sequence[LedgerEntry], bus: BusPlan) -> Iterator[Told]:
-    """Return every intact state that passed the wire, wherever it stands among the bytes.
-
-    The host asks for some bytes more now and then, to tell a late reply from the one it waits for.
-    """
-    lengths = {
-        length
-        for servo in bus.servos
-        for length in range(servo.state.length, servo.state.length + servo.state.spare + 1)
-    }
-    of_protocol = _states1 if bus.protocol == 1.0 else _states2
-    sent = [entry for entry in entries if entry.direction == "out"]
-    found = [each for entry in sent for each in of_protocol(entry) if len(each.data) in lengths]
-    if bus.protocol == 2.0:
-        found += _shared(sent, sorted(lengths))
-    yield from sorted(found)
-
-
-def _states1(entry: LedgerEntry) -> Iterator[Told]:
-    rest = entry.data
-    while (start := rest.find(b"\xff\xff")) >= 0:
-        rest = rest[start:]
-        body = rest[: 4 + (rest[3] if len(rest) > 5 else 0)]
-        if len(body) > 5 and len(body) == 4 + body[3] and sum(body[2:]) & 0xFF == 0xFF:
-            yield Told(entry.t_ns, body[2], body[5:-1])
-        rest = rest[1:]
-
-
-def _states2(entry: LedgerEntry) -> Iterator[Told]:
-    rest = entry.data
-    while (start := rest.find(HEADER)) >= 0:
-        rest = rest[start:]
-        end = 7 + int.from_bytes(rest[5:7], "little")
-        if len(rest) >= end and crc(rest[: end - 2]) == int.from_bytes(rest[end - 2 : end], "little"):
-            servo_id, instruction, parameters, _ = _first(rest, 2.0)
-            if instruction == STATUS:
-                yield Told(entry.t_ns, servo_id, parameters[1:])
-        rest = rest[4:]
-
-
-def _shared(sent: Sequence[LedgerEntry], lengths: Sequence[int]) -> Iterator[Told]:
-    """Return the parts of the statuses of fast forms, up to the first broken one of each."""
-    stream = b"".join(entry.data for entry in sent)
-    times = [entry.t_ns for entry in sent for _ in entry.data]
-    start = -1
-    while (start := stream.find(HEADER + bytes((EVERYBODY,)), start + 1)) >= 0:
-        size = int.from_bytes(stream[start + 5 : start + 7], "little")
-        for length in lengths:
-            if (size - 1) % (length + 4):
-                continue
-            at = start + 8
-            while at < start + 7 + size:
-                end = at + 2 + length
-                if end + 2 > len(stream) or crc(stream[start:end]) != int.from_bytes(
-                    stream[end : end + 2], "little"
-                ):
-                    break
-                yield Told(times[end + 1], stream[at + 1], stream[at + 2 : end])
-                at = end + 2
-
-
 # Invariants 5 and 8
 
 
@@ -456,7 +287,7 @@ def each_fault_that_shows_is_told(entries: Sequence[LedgerEntry], log: Log, robo
     """Look for the events of the faults that nobody can bear in silence, while the loop runs.
 
     That is a servo that is mute or without power for three cycles and longer, and an adapter that is pulled.
-    A servo that was silent already has nothing to lose.
+    A servo that was silent already has nothing to lose, and of two with one ID the other one answers.
     """
     times = {event.code: event.t_ns for event in log.events if event.code in _LOOP}
     begin_ns = times.get(EventCode.LOOP_STARTED, 1 << 62)
@@ -469,8 +300,11 @@ def each_fault_that_shows_is_told(entries: Sequence[LedgerEntry], log: Log, robo
         lasts_ns = {"silence": 1 << 62, "reboot": 100 * MS, "brownout": 200 * MS, "unplug": 1 << 62}
         if (fault.for_ns or lasts_ns.get(fault.kind, 0)) < shortest_ns or fault.kind not in lasts_ns:
             continue
-        (bus,) = (one for one in robot.plan.buses if one.name == entry.bus)
-        whom = {one.joint for one in bus.servos if fault.servo in (None, one.servo_id)}
+        ((bus, simulated),) = (
+            pair for pair in zip(robot.plan.buses, robot.buses, strict=True) if pair[0].name == entry.bus
+        )
+        ids = {one.servo_id for one in alone(simulated)} & {fault.servo or one.servo_id for one in bus.servos}
+        whom = {one.joint for one in bus.servos if one.servo_id in ids}
         if fault.kind == "unplug":
             whom = {bus.name}
         _told(entry, whom, log)
