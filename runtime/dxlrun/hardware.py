@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -59,6 +59,10 @@ class Hardware(Protocol):
 
     def stop(self) -> tuple[str, ...]:
         """Switch torque off on every servo, read it back, raise nothing; return a sentence per failure."""
+        ...
+
+    def let_go(self, rows: Sequence[int]) -> None:
+        """Switch the torque of these joints off in the coming gaps, for the rest of the run."""
         ...
 
     def release(self) -> None:

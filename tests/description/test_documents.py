@@ -10,7 +10,7 @@ import pytest
 
 from dxlrun.description.form import Form
 from dxlrun.description.motion import Formula, FormulaPart, Motion, Point, PointsPart, Target
-from dxlrun.description.policies import Policies, PoseStep, TorqueStep
+from dxlrun.description.policies import GroupPolicies, Policies, PoseStep, TorqueStep
 from dxlrun.description.robot import (
     Adapter,
     Bus,
@@ -27,6 +27,7 @@ from dxlrun.description.robot import (
     RobotModel,
     Scheduler,
     Simulation,
+    SlowRegisters,
 )
 
 PAGE = (Path(__file__).parents[2] / "docs" / "robot-file.md").read_text()
@@ -55,7 +56,7 @@ def test_the_examples_of_the_page_are_read(desk: Any) -> None:
 @pytest.mark.parametrize(
     ("prefix", "part"),
     [("", Robot), ("", Bus), ("adapter.", Adapter), ("", Joint), ("limits.", Limits), ("", Loop), ("", Policies), ("", PoseStep), ("", TorqueStep),
-     ("scheduler.", Scheduler), ("simulation.", BusSimulation), ("simulation.", JointSimulation), ("simulation.", Simulation), ("", ControllerEntry), ("", Recording), ("", Processes), ("gateway.", Gateway), ("", RobotModel), ("", Motion), ("", PointsPart),
+     ("scheduler.", Scheduler), ("slow_registers.", SlowRegisters), ("groups.*.", GroupPolicies), ("simulation.", BusSimulation), ("simulation.", JointSimulation), ("simulation.", Simulation), ("", ControllerEntry), ("", Recording), ("", Processes), ("gateway.", Gateway), ("", RobotModel), ("", Motion), ("", PointsPart),
      ("", FormulaPart), ("points[].", Point)],
 )  # fmt: skip
 def test_every_key_is_on_the_page(prefix: str, part: type[Form]) -> None:
@@ -82,7 +83,18 @@ def test_the_defaults_of_a_bus_are_the_pages(desk: Any, row: str, text: str) -> 
     assert bus(f", {written}") == bus("")
 
 
-@pytest.mark.parametrize("row", ["on_exit", "on_fault", "on_lost_servo", "on_stale_command", "exit_timeout"])
+@pytest.mark.parametrize(
+    "row",
+    [
+        "on_exit",
+        "on_fault",
+        "on_lost_servo",
+        "on_returned_servo",
+        "groups",
+        "on_stale_command",
+        "exit_timeout",
+    ],
+)
 def test_the_defaults_of_the_policies_are_the_pages(desk: Any, robot_text: str, row: str) -> None:
     head = robot_text[: robot_text.index("policies:")]
     assert (

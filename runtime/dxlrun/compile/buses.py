@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+from dxlrun.compile.health import with_health
 from dxlrun.compile.joints import CompiledJoint
 from dxlrun.compile.problems import Problems
 from dxlrun.compile.registers import check_position_limits
@@ -57,7 +58,7 @@ def compile_buses(
         _check_ticks(description, plan, problems)
         check_position_limits(description, plan, problems)
         _check_budget(description, plan, problems)
-        plans.append(plan)
+        plans.append(with_health(description, plan, problems))
     return plans
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from dxlrun.compile.health import group_policies
 from dxlrun.compile.joints import CompiledJoint
 from dxlrun.compile.problems import Problems, suggestion
 from dxlrun.compile.reach import Interval, degrees
@@ -39,6 +40,7 @@ def compile_policies(
         on_fault=found["on_fault"],
         on_lost_servo=found["on_lost_servo"],
         on_stale_command=found["on_stale_command"],
+        groups=group_policies(description, {name: row for row, name in enumerate(joints)}, problems),
         limit_ns=max(0, limit_ns),
     )
 

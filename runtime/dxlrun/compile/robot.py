@@ -10,6 +10,7 @@ from typing import TypeAlias
 
 from dxlrun.compile.buses import SIMULATED, compile_buses
 from dxlrun.compile.controllers import compile_controllers
+from dxlrun.compile.health import slowest_period_ns
 from dxlrun.compile.joints import AUTO, compile_joints
 from dxlrun.compile.left_out import left_out_names, still_true
 from dxlrun.compile.modes import compile_modes
@@ -146,6 +147,7 @@ def _plan(checked: Checked, urdf: str | None, simulation: SimulationPlan) -> Pla
         policies=checked.policies,
         overrun=robot.loop.overrun,
         least_period_ns=least_period_ns(robot.loop, checked.buses),
+        slowest_period_ns=slowest_period_ns(checked.buses),
     )
     return Plan(
         robot=robot.name,

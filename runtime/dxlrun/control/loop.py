@@ -167,6 +167,8 @@ class Loop:
         period_ns = round(1e9 / rate)
         if period_ns < self.plan.least_period_ns:
             return f"the buses allow at most {1e9 / self.plan.least_period_ns:.4g} Hz"
+        if 0 < self.plan.slowest_period_ns < period_ns:
+            return f"the Bus Watchdog needs at least {1e9 / self.plan.slowest_period_ns:.4g} Hz"
         if refusal := self.plan.policies.refuse_period(period_ns, self.plan.period_ns):
             return refusal
         if refusal := self.manager.change_period(period_ns):
@@ -297,12 +299,16 @@ class Loop:
 
     def _miss(self) -> None:
         """Other servos are lost than in the cycle before: do what the policy says."""
-        policy, rows = self.plan.policies.on_lost_servo, self._lost.rows
-        if policy.goes_on:
-            self.gate.ease_in(self.manager.wait_for(rows))
-        elif rows:
-            names = ", ".join(self.plan.joints[row].name for row in sorted(rows))
-            self._give_up("on_lost_servo", f"{names} missed {LOST_CYCLES} replies in a row")
+        ending, limp = self._lost.judge(self.plan.policies)
+        for group in limp:
+            self.hardware.let_go(sorted(group.rows))
+            text = f"group {group.name} lost a servo: it gets no torque any more"
+            self.events.emit(EventCode.POLICY, Severity.ERROR, "loop", text)
+        for policy, rows in ending.items():
+            names = ", ".join(self.plan.joints[row].name for row in rows)
+            self._give_up(policy, f"{names} missed {LOST_CYCLES} replies in a row")
+        if not ending:
+            self.gate.ease_in(self.manager.wait_for(self._lost.rows))
 
     def _give_up(self, policy: PolicyName, why: str) -> None:
         """End the run after this cycle, by another policy than on_exit."""

@@ -106,4 +106,6 @@ class LoopPlan:
     overrun: OverrunPolicy = "skip"
     least_period_ns: int = 0
     """The shortest period that the buses allow, by the time budget; 0: not computed."""
+    slowest_period_ns: int = 0
+    """The longest period in which no Bus Watchdog stops its servos; 0: any."""
     policies: PolicyPlan = field(default_factory=PolicyPlan)

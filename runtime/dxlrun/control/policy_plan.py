@@ -62,6 +62,17 @@ HOLD = Policy(last="hold")
 
 
 @dataclass(frozen=True, slots=True)
+class GroupPolicy:
+    """What happens when a servo of a group of joints is lost."""
+
+    name: str
+    rows: frozenset[int]
+    """Rows of its joints."""
+    on_lost_servo: Literal["hold", "limp", "stop"]
+    """Its controllers wait, the group loses its torque, or the run ends."""
+
+
+@dataclass(frozen=True, slots=True)
 class PolicyPlan:
     """The four policies of a robot."""
 
@@ -71,6 +82,8 @@ class PolicyPlan:
     """When the loop or a bus failed, or a controller whose fallback did not take over."""
     on_lost_servo: Policy = HOLD
     on_stale_command: Policy = HOLD
+    groups: tuple[GroupPolicy, ...] = ()
+    """For joints that stand in one of them, in place of `on_lost_servo`."""
     limit_ns: int = 1_500_000_000
     """The steps are cut short after this time: what is left of the exit timeout is for torque off."""
 
@@ -92,6 +105,10 @@ class PolicyPlan:
             return ""
         what = "its policies need" if longest_ns else "it takes"
         return f"{what} at least {1e9 / slowest_ns:.2g} Hz to end the run within exit_timeout"
+
+    def of_lost(self, row: int) -> GroupPolicy | None:
+        """Return the group whose policy counts when this joint is lost; None: `on_lost_servo` does."""
+        return next((group for group in self.groups if row in group.rows), None)
 
     def named(self, name: PolicyName) -> Policy:
         """Return one of the four."""

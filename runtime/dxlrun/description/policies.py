@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Discriminator, Field, Tag
 
-from dxlrun.description.form import Form
+from dxlrun.description.form import Form, Name
 from dxlrun.description.units import AngularVelocity, Duration
 
 
@@ -61,6 +61,22 @@ Policy = Annotated[
 """What is done, in order; after the last step the robot is limp, unless that is `hold`."""
 
 
+class GroupPolicies(Form):
+    """What a group of joints does otherwise than the rest of the robot."""
+
+    joints: Annotated[tuple[Name, ...], Field(strict=False, min_length=1)] = Field(
+        description="Its joints; each is in one group at most.", examples=["[left_wheel, right_wheel]"]
+    )
+    on_lost_servo: Literal["hold", "limp", "stop"] | None = Field(
+        default=None,
+        description="hold: its controllers wait; limp: the group loses its torque; stop: the run ends.",
+        examples=["limp"],
+    )
+    on_returned_servo: Word | None = Field(
+        default=None, description="As the policy of that name, for this group.", examples=["hold"]
+    )
+
+
 class Policies(Form):
     """What happens when something does not go on as planned."""
 
@@ -76,6 +92,16 @@ class Policies(Form):
         default="hold",
         description="When a servo stopped answering; hold: its controllers wait, the others go on.",
         examples=["hold"],
+    )
+    on_returned_servo: Word = Field(
+        default="limp",
+        description="When a servo answers again that has rebooted; hold: it gets torque where it stands.",
+        examples=["hold"],
+    )
+    groups: dict[Name, GroupPolicies] = Field(
+        default={},
+        description="Groups of joints with policies of their own for lost servos.",
+        examples=["{wheels: {joints: [left_wheel, right_wheel], on_lost_servo: limp}}"],
     )
     on_stale_command: Policy = Field(
         default="hold",

@@ -117,6 +117,19 @@ class BusSimulation(Form):
     )
 
 
+class SlowRegisters(Form):
+    """What is read of the servos of a bus now and then, between the cycles."""
+
+    items: Annotated[tuple[Name, ...], Field(strict=False)] | None = Field(
+        default=None,
+        description="Items by the names of the control table; without: temperature and voltage.",
+        examples=["[present_temperature]"],
+    )
+    rate: float = Field(
+        default=1.0, gt=0, le=100, description="How often each of them is read, Hz.", examples=["1"]
+    )
+
+
 class Bus(Form):
     """One serial line with its servos."""
 
@@ -135,6 +148,16 @@ class Bus(Form):
         default="together",
         description="Servos are asked when a cycle begins, or already behind the goals of the one before.",
         examples=["split"],
+    )
+    bus_watchdog: AutoDuration = Field(
+        default="auto",
+        description="After this time without instructions a servo of Protocol 2.0 stops; 0 ms: never.",
+        examples=["200 ms"],
+    )
+    slow_registers: SlowRegisters = Field(
+        default=SlowRegisters(),
+        description="What is read now and then, between the cycles.",
+        examples=["{rate: 2}"],
     )
     simulation: BusSimulation = Field(
         default=BusSimulation(),

@@ -96,6 +96,10 @@ class Absent:
         self._said[index] = ""
         self._plan_probe(index, after_ns)
 
+    def latch(self, index: int) -> None:
+        """Give a servo no torque back after a reboot."""
+        self._reboots.latched[index] = True
+
     def look(self) -> None:
         """Let the coming gaps ask everybody who is due; called once a cycle."""
         if self._earliest_ns == NEVER:
@@ -173,6 +177,17 @@ class Absent:
         if self._reboots.add(index, self._now_ns()):
             text = "rebooted twice within a minute: it gets no torque again in this run; check its supply"
             self._say(EventCode.SERVO_REBOOTED, Severity.ERROR, index, text)
+
+
+def switch_off(plan: BusPlan, index: int) -> Program[bool]:
+    """Switch a servo's torque off; return whether that was read back."""
+    servo = plan.servos[index]
+    for _ in range(3):
+        yield plan_line(plan).write(servo.servo_id, servo.torque_address, b"\0")
+        back = yield plan.torque_reads[index]
+        if back.answered and back.parameters[0] == 0:
+            return True
+    return False
 
 
 def _tick_read(plan: BusPlan, index: int) -> Transaction | None:

@@ -121,7 +121,7 @@ class DynamixelHardware:
         """
         for index, (bus, servos) in enumerate(zip(self._buses, self._servos, strict=True)):
             if not self._asked[index]:
-                servos.feed()
+                servos.feeding.feed()
                 servos.reads.begin()
                 bus.load(servos.reads)
             self._asked[index] = False
@@ -145,7 +145,7 @@ class DynamixelHardware:
                     with suppress(PortError):  # told below; the other lines shall have their goals
                         bus.send(packet)
             if plan.split and bus.failure is None:
-                servos.feed()
+                servos.feeding.feed()
                 servos.reads.begin()
                 bus.load(servos.reads)
                 bus.begin_behind()
@@ -215,6 +215,11 @@ class DynamixelHardware:
                 f"torque is off on {'the servo' if count == 1 else f'all {count} servos'}",
             )
         return failures
+
+    def let_go(self, rows: Sequence[int]) -> None:
+        """Switch the torque of these joints off in the coming gaps; they get no goals in this run."""
+        for servos in self._servos:
+            servos.let_go(rows)
 
     def release(self) -> None:
         """Leave the robot with its torque on: nobody sends any more, and nothing may stop it for that."""

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from dxlrun.dynamixel import bus_watchdog
-from dxlrun.dynamixel.absent import FIRST_PROBE_NS, NEVER, Absent
+from dxlrun.dynamixel.absent import FIRST_PROBE_NS, Absent, switch_off
 from dxlrun.dynamixel.bus import Bus
 from dxlrun.dynamixel.bus_plan import BusPlan
 from dxlrun.dynamixel.dialect import dialect_of
 from dxlrun.dynamixel.exchange import CyclicReads
+from dxlrun.dynamixel.feeding import Feeding
 from dxlrun.dynamixel.gaps import Gaps, Urgency
+from dxlrun.dynamixel.inspection1 import FORBIDDEN
 from dxlrun.dynamixel.plan import plan_line
 from dxlrun.dynamixel.protocol1 import StatusError
 from dxlrun.dynamixel.protocol2 import describe_hardware_error
-from dxlrun.dynamixel.slow_registers import SlowRegisters
+from dxlrun.dynamixel.slow_registers import SlowRegisters, once
 from dxlrun.dynamixel.startup import Rejoined
 from dxlrun.dynamixel.state_arrays import StateArrays
 from dxlrun.dynamixel.transaction import Program, Reply, Transaction
@@ -38,8 +40,6 @@ RETURN_SPEED = 1.5
 is to be a slow one."""
 RETURNED = 0.05
 """rad from the goal: the servo has caught up."""
-_STATES = StatusError.INPUT_VOLTAGE | StatusError.OVERHEATING | StatusError.OVERLOAD
-"""Bits of Protocol 1.0's error byte that tell the servo's state and not of one instruction."""
 _SHUTS_DOWN = StatusError.OVERHEATING | StatusError.OVERLOAD
 """After them Torque Limit may be 0 (e-Manual AX-12A, Alarm Shutdown (18))."""
 _LOST = f"missed {LOST_CYCLES} replies in a row; it is asked once a second until it is in order"
@@ -66,8 +66,8 @@ class Servos:
         "_ceiling",
         "_dialect",
         "_events",
-        "_fed_ns",
         "_gaps",
+        "_gone",
         "_hardware_errors",
         "_limp",
         "_lost",
@@ -84,7 +84,7 @@ class Servos:
         "_slow",
         "_states",
         "_strained",
-        "_watchdog_ns",
+        "feeding",
         "goals",
         "reads",
         "torqued",
@@ -122,8 +122,11 @@ class Servos:
         self._noise_seen = 0
         self._noise_at_ns = -NOISE_EVENT_NS
         self._lost = False
-        self._watchdog_ns = plan.watchdog_ticks * bus_watchdog.UNIT_NS or NEVER
-        self._fed_ns = 0
+        self._gone: set[int] = set()  # who gets no torque any more, as its group's policy says
+        self.feeding = Feeding(
+            plan, gaps, self.reads.away, events, self._stopped, lambda index: self._leave(index, 0)
+        )
+        """Whether the Bus Watchdogs hear enough."""
         self._modes = wanted.modes
         self._absent = Absent(plan, gaps, wanted, self._say, self._back)
         self._slow = SlowRegisters(
@@ -166,36 +169,13 @@ class Servos:
         for index in range(len(self._rows)):
             yield from self._absent.tick(index)
         problems = yield from bus_watchdog.arm_all(self._plan)
-        self._fed_ns = self._gaps.now_ns()
+        self.feeding.begin()
         return problems
 
-    def feed(self) -> None:
-        """Note that the cyclic reads go out now; who was not fed for too long has stopped, and is revived."""
-        now = self._gaps.now_ns()
-        if self._fed_ns and now - self._fed_ns > self._watchdog_ns:
-            self._revive((now - self._fed_ns) // 1_000_000)
-        self._fed_ns = now
-
-    def _revive(self, silent_ms: int) -> None:
-        fed = [
-            index
-            for index, servo in enumerate(self._plan.servos)
-            if bus_watchdog.has_one(self._plan, servo) and not self.reads.away[index]
-        ]
-        for index in fed:
-            self.torqued[index] = False  # no goals until its torque was read behind this
-            self._slow_down(index)
-            program = bus_watchdog.revive(self._plan, self._plan.servos[index])
-            name = f"the Bus Watchdog of {self._who(index)}"
-            self._gaps.add(program, partial(self._revived, index), Urgency.REPAIR, name, index)
-        text = f"no instruction for {silent_ms} ms: the Bus Watchdog has stopped the servos; they are revived"
-        if fed:
-            self._emit(EventCode.WATCHDOG, Severity.ERROR, self._plan.name, text)
-
-    def _revived(self, index: int, problem: str) -> None:
-        if problem and not self.reads.away[index]:
-            self._emit(EventCode.WATCHDOG, Severity.ERROR, self._plan.servos[index].joint, problem)
-            self._leave(index, 0)
+    def _stopped(self, index: int) -> None:
+        """Send a servo that its watchdog stopped no goal before its torque was read again."""
+        self.torqued[index] = False
+        self._slow_down(index)
 
     def goal_packets(self, goals: Commands, states: States) -> list[bytes]:
         """Return the packets with the goals of everybody who may get one; who was lost comes back slowly."""
@@ -227,7 +207,7 @@ class Servos:
         self._probed = question.servo
         what = f"{question.what} of {self._who(question.servo)}"
         self._gaps.add(
-            _once(question.read),
+            once(question.read),
             partial(self._answered, question),
             Urgency.REPAIR,
             what,
@@ -356,8 +336,24 @@ class Servos:
         self._say(EventCode.SERVO_BACK, Severity.INFO, index, f"is in order and takes part again, {how}")
         if rejoined.torqued:
             self._limp[index] = False
+            if index in self._gone:
+                self._switch_off(index)
         elif not self._limp[index]:
             self._tell_limp(index, 0)
+
+    def let_go(self, rows: Collection[int]) -> None:
+        """Switch the torque of joints off for the rest of the run, of who is lost as soon as it is back."""
+        for index, row in enumerate(self._rows):
+            if row in rows:
+                self._gone.add(index)
+                self._absent.latch(index)
+                if not self.reads.away[index]:
+                    self._switch_off(index)
+
+    def _switch_off(self, index: int) -> None:
+        self.torqued[index], self._limp[index] = False, True
+        name = f"torque off of {self._who(index)}"
+        self._gaps.add(switch_off(self._plan, index), lambda _: None, Urgency.REPAIR, name, index)
 
     def _slow_down(self, index: int) -> None:
         if index not in self._returning:
@@ -376,7 +372,7 @@ class Servos:
                 if error & ~self._said_errors[index] & self._dialect.ALERT and index not in self._alerts:
                     self._alerts.append(index)
                 if not self._dialect.ALERT:
-                    self._shown[self._rows[index]] = error & _STATES
+                    self._shown[self._rows[index]] = error & FORBIDDEN
                     if error & ~self._said_errors[index] & _SHUTS_DOWN and index not in self._strained:
                         self._strained.append(index)
                 elif not error & self._dialect.ALERT:
@@ -396,8 +392,3 @@ class Servos:
     def _who(self, index: int) -> str:
         servo = self._plan.servos[index]
         return f"{servo.joint} (ID {servo.servo_id} on bus {self._plan.name})"
-
-
-def _once(transaction: Transaction) -> Program[Reply]:
-    reply = yield transaction
-    return reply

@@ -99,7 +99,7 @@ class SlowRegisters:
             self._gaps.add(self._absent.tick(index), partial(self._ticked, index), Urgency.SLOW, name, index)
             return
         read = self._read(index, block)
-        self._gaps.add(_once(read), partial(self._take, index, block), Urgency.SLOW, name, index)
+        self._gaps.add(once(read), partial(self._take, index, block), Urgency.SLOW, name, index)
 
     def _read(self, index: int, block: _Block) -> Transaction:
         start, end = block[0].address, block[-1].address + block[-1].size
@@ -188,6 +188,7 @@ def _limit_item(plan: BusPlan, index: int) -> ControlItem | None:
     return next((items[name] for name in _LIMITS if name in items), None)
 
 
-def _once(transaction: Transaction) -> Program[Reply]:
+def once(transaction: Transaction) -> Program[Reply]:
+    """Return the program of one transaction."""
     reply = yield transaction
     return reply

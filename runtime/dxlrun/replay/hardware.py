@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import fields
 
 import numpy as np
@@ -112,6 +112,9 @@ class RecordedHardware:
     def stop(self) -> tuple[str, ...]:
         """Do nothing: no servo has torque."""
         return ()
+
+    def let_go(self, rows: Sequence[int]) -> None:
+        """Do nothing: what the servos did then is in their states."""
 
     def release(self) -> None:
         """Do nothing: there is nobody who holds."""

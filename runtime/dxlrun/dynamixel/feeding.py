@@ -1,0 +1,68 @@
+"""Feeding: whether the exchange kept the Bus Watchdogs of one bus satisfied; who was stopped is revived."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+from dxlrun.dynamixel import bus_watchdog
+from dxlrun.dynamixel.absent import NEVER
+from dxlrun.dynamixel.bus_plan import BusPlan
+from dxlrun.dynamixel.gaps import Gaps, Urgency
+from dxlrun.events import EventCode, EventSink, Severity
+
+
+class Feeding:
+    """Knows when the servos were last sent anything.
+
+    `stopped` is told who gets no goal before its torque was read again, `failed` who could not be revived.
+    """
+
+    __slots__ = ("_away", "_events", "_failed", "_fed_ns", "_gaps", "_longest_ns", "_plan", "_stopped")
+
+    def __init__(  # noqa: PLR0917  whom it looks after, whom it tells
+        self,
+        plan: BusPlan,
+        gaps: Gaps,
+        away: list[bool],
+        events: EventSink,
+        stopped: Callable[[int], None],
+        failed: Callable[[int], None],
+    ) -> None:
+        self._plan = plan
+        self._gaps = gaps
+        self._away = away
+        self._events = events
+        self._stopped = stopped
+        self._failed = failed
+        self._longest_ns = plan.watchdog_ticks * bus_watchdog.UNIT_NS or NEVER
+        self._fed_ns = 0
+
+    def begin(self) -> None:
+        """Note that the watchdogs were armed."""
+        self._fed_ns = self._gaps.now_ns()
+
+    def feed(self) -> None:
+        """Note that the cyclic reads go out now; who was not fed for too long has stopped, and is revived."""
+        now = self._gaps.now_ns()
+        if self._fed_ns and now - self._fed_ns > self._longest_ns:
+            self._revive((now - self._fed_ns) // 1_000_000)
+        self._fed_ns = now
+
+    def _revive(self, silent_ms: int) -> None:
+        plan, here = self._plan, [index for index, away in enumerate(self._away) if not away]
+        fed = [index for index in here if bus_watchdog.has_one(plan, plan.servos[index])]
+        for index in fed:
+            self._stopped(index)
+            program = bus_watchdog.revive(plan, plan.servos[index])
+            name = f"the Bus Watchdog of {plan.servos[index].joint}"
+            self._gaps.add(program, partial(self._revived, index), Urgency.REPAIR, name, index)
+        if fed:
+            text = f"no instruction for {silent_ms} ms: the Bus Watchdog has stopped the servos"
+            text = f"{text}; they are revived"
+            self._events.emit(EventCode.WATCHDOG, Severity.ERROR, plan.name, text)
+
+    def _revived(self, index: int, problem: str) -> None:
+        if problem and not self._away[index]:
+            self._events.emit(EventCode.WATCHDOG, Severity.ERROR, self._plan.servos[index].joint, problem)
+            self._failed(index)

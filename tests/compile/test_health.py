@@ -1,0 +1,114 @@
+"""Bus Watchdog, slow registers and policies of lost servos in a robot file, and in a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dxlrun.compile.health import slowest_period_ns
+from dxlrun.events import EventCode
+from dxlrun.testing import read_log, simulated_robot
+
+ROBOT = """\
+name: two
+buses: {{arm: {{port: sim, protocol: {protocol}, baud_rate: 1_000_000, return_delay_time: 0 us{bus}}}}}
+loop: {{rate: {rate}}}
+joints:
+  pan: {{bus: arm, id: 3, model: {model}, reference: {reference}, direction: 1}}
+  tilt: {{bus: arm, id: 7, model: {model}, reference: {reference}, direction: 1}}
+  yaw: {{bus: arm, id: 9, model: {model}, reference: {reference}, direction: 1}}
+controllers:
+  states: {{type: joint_state_broadcaster}}
+  pair: {{type: joint_group_position_controller, joints: [pan, tilt]}}
+  single: {{type: joint_group_position_controller, joints: [yaw]}}
+policies: {{exit_timeout: 2 s{policies}}}
+"""
+
+
+def text(*, protocol: float = 2.0, bus: str = "", rate: float = 100, policies: str = "") -> str:
+    model, reference = ("XM430-W350", "180 deg") if protocol == 2.0 else ("AX-12A", "150 deg")
+    return ROBOT.format(
+        protocol=protocol,
+        bus=bus and f", {bus}",
+        rate=rate,
+        model=model,
+        reference=reference,
+        policies=policies and f", {policies}",
+    )
+
+
+@pytest.mark.parametrize(
+    ("more", "ticks"),
+    [
+        ({}, 10),
+        ({"rate": 10}, 15),  # three periods
+        ({"rate": 1}, 0),  # beyond 2.54 s
+        ({"protocol": 1.0}, 0),
+        ({"bus": "bus_watchdog: 0 ms"}, 0),
+        ({"bus": "bus_watchdog: 90 ms"}, 5),
+        ({"bus": "bus_watchdog: auto"}, 10),
+    ],
+)
+def test_the_watchdog_of_a_bus(compile_text: Any, more: dict[str, Any], ticks: int) -> None:
+    (bus,) = compile_text(text(**more)).plan.buses
+    assert bus.watchdog_ticks == ticks
+    assert slowest_period_ns([bus]) == ticks * 20_000_000 // 3
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        ({"bus": "bus_watchdog: 20 ms"}, "40 ms at least"),
+        ({"bus": "bus_watchdog: 3 s"}, "2.54 s at most"),
+        ({"bus": "bus_watchdog: 200 ms", "protocol": 1.0}, "Protocol 1.0, which has no Bus Watchdog"),
+        ({"bus": "slow_registers: {items: [present_temprature]}"}, "present_temperature"),
+        ({"policies": "groups: {a: {joints: [pam]}}"}, "group a has joint pam"),
+        ({"policies": "groups: {a: {joints: [pan]}, b: {joints: [yaw, pan]}}"}, "pan is in group a already"),
+    ],
+)
+def test_what_cannot_be_is_said_with_its_remedy(compile_text: Any, more: dict[str, Any], said: str) -> None:
+    with pytest.raises(Exception, match=r".") as caught:
+        compile_text(text(**more))
+    assert said in str(caught.value)
+
+
+def test_slow_registers_and_who_gets_torque_back(compile_text: Any) -> None:
+    policies = "on_returned_servo: hold, groups: {a: {joints: [tilt], on_returned_servo: limp}}"
+    bus_text = "slow_registers: {items: [present_temperature, position_p_gain], rate: 4}"
+    (bus,) = compile_text(text(bus=bus_text, policies=policies)).plan.buses
+    assert bus.slow_period_ns == 250_000_000
+    assert {servo.slow for servo in bus.servos} == {("present_temperature", "position_p_gain")}
+    assert [servo.torque_on_return for servo in bus.servos] == [True, False, True]
+    (bus,) = compile_text(text()).plan.buses
+    assert bus.servos[0].slow == ("present_input_voltage", "present_temperature")
+
+
+@pytest.mark.parametrize(
+    ("word", "ended", "torque"),
+    [("hold", "ended", [True, True, True]), ("limp", "ended", [False, False, True]), ("stop", "fault", None)],
+)
+def test_a_group_has_its_own_policy_for_a_lost_servo(
+    tmp_path: Path, word: str, ended: str, torque: list[bool] | None
+) -> None:
+    path = tmp_path / "two.yaml"
+    path.write_text(text(policies=f"groups: {{pair: {{joints: [pan, tilt], on_lost_servo: {word}}}}}"))
+    robot = simulated_robot(path, duration_s=2.5, log=tmp_path / "run.mcap")
+    servos = robot.buses[0].servos
+    seen: list[list[bool]] = []
+    robot.buses[0].at(500_000_000, servos[1].silence)
+    robot.buses[0].at(900_000_000, lambda: servos[1].silence(False))
+    robot.buses[0].at(2_400_000_000, lambda: seen.append([servo.torque_on for servo in servos]))
+    assert robot.run().reason == ended
+    assert seen == ([] if torque is None else [torque])
+    events = read_log(tmp_path / "run.mcap").events
+    assert any(event.code == EventCode.SERVO_LOST and event.source == "tilt" for event in events)
+
+
+def test_a_rate_at_which_the_watchdog_would_stop_the_servos_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "two.yaml"
+    path.write_text(text())
+    robot = simulated_robot(path, duration_s=0.1)
+    assert robot.robot.loop.change_rate(10) == "the Bus Watchdog needs at least 15 Hz"
+    assert robot.robot.loop.change_rate(50) == ""
