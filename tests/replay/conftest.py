@@ -127,9 +127,15 @@ def robot_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def run(robot_file: Path, tmp_path: Path) -> Callable[..., Path]:
     """Run the robot for a second on virtual time, return its log; `before` sees the robot before it runs."""
 
-    def begin(before: Callable[[VirtualRobot], None] | None = None, robot: Path = robot_file) -> Path:
+    def begin(
+        before: Callable[[VirtualRobot], None] | None = None,
+        robot: Path = robot_file,
+        duration_s: float = 1.0,
+    ) -> Path:
         path = tmp_path / "run.mcap"
-        one = simulated_robot(robot, play=[robot_file.with_name("look.yaml")], duration_s=1.0, log=path)
+        one = simulated_robot(
+            robot, play=[robot_file.with_name("look.yaml")], duration_s=duration_s, log=path
+        )
         if before:
             before(one)
         one.run()
