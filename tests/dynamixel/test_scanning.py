@@ -1,0 +1,154 @@
+"""Scanning on virtual time, judged by the ledger."""
+
+import pytest
+
+from dxlrun.clock import VirtualClock
+from dxlrun.dynamixel import scanning
+from dxlrun.dynamixel.scanning import Wish, find, known_rates, scan
+from dxlrun.dynamixel.tool_line import ToolLine
+from dxlrun.errors import PortError
+from dxlrun.simulation import AdapterConfig, BusConfig, Ledger, ServoConfig, SimulatedBus, VirtualPorts
+
+
+class VirtualLine:
+    """A line on virtual time; `cannot`: rates that its adapter does not have."""
+
+    def __init__(self, *servos, protocol=2.0, rate=57_600, cannot=(), adapter=AdapterConfig()):  # noqa: B008
+        self.name, self.latency_ns, self.cannot = "virtual", 0, cannot
+        self.clock, self.ledger = VirtualClock(1_000_000), Ledger()
+        self.bus = SimulatedBus(BusConfig("main", rate, servos, protocol, adapter=adapter), self.ledger, 0)
+        self.ports = VirtualPorts(self.clock, [self.bus])
+
+    def tune(self, baud_rate):
+        if baud_rate in self.cannot:
+            return False
+        self.bus.change_rate(baud_rate)
+        return True
+
+    @property
+    def heard(self):
+        return [entry.data for entry in self.ledger.entries if entry.direction == "in"]
+
+
+def two(servo_id, model="XM430-W350", **more):
+    return ServoConfig(servo_id, model, 2.0, **more)
+
+
+def names(scanned):
+    return [(one.protocol, one.baud_rate, one.servo_id, one.model) for one in scanned.servos]
+
+
+def test_one_broadcast_ping_finds_all_servos_of_protocol_2():
+    line = VirtualLine(two(1), two(7, "XL430-W250"), two(252, "XL-320"))
+    found = scan(ToolLine(line), Wish((2.0,), (57_600,)))
+    assert names(found) == [
+        (2.0, 57_600, 1, "XM430-W350"),
+        (2.0, 57_600, 7, "XL430-W250"),
+        (2.0, 57_600, 252, "XL-320"),
+    ]
+    assert [one.remarks for one in found.servos] == [(), (), ()]
+    assert sum(data[4] == 0xFE for data in line.heard) == 1
+    assert {data[7] for data in line.heard} == {1, 2}  # pings and reads: nothing is written
+
+
+def test_a_servo_at_another_rate_is_found_at_its_own():
+    line = VirtualLine(two(3))
+    line.bus.servo(3).poke("baud_rate", 3)  # 1 Mbit/s
+    found = scan(ToolLine(line), Wish((2.0,), ()))
+    assert names(found) == [(2.0, 1_000_000, 3, "XM430-W350")]
+
+
+def test_protocol_1_is_asked_id_by_id():
+    line = VirtualLine(two(1, "AX-12A"), two(253, "MX-64"), protocol=1.0, rate=1_000_000)
+    found = scan(ToolLine(line), Wish((1.0,), (1_000_000,)))
+    assert names(found) == [(1.0, 1_000_000, 1, "AX-12A"), (1.0, 1_000_000, 253, "MX-64")]
+    assert (found.servos[0].lowest, found.servos[0].highest) == (0, 1023)
+    assert found.servos[0].return_delay == 500_000
+    assert {data[4] for data in line.heard} == {1, 2}
+
+
+def test_a_late_answer_is_noticed_and_asked_again():
+    line = VirtualLine(two(5, "AX-12A"), protocol=1.0, rate=1_000_000)
+    line.bus.delay_next(5, 3_000_000)  # it comes while the next ID is asked
+    found = scan(ToolLine(line), Wish((1.0,), (1_000_000,)))
+    assert names(found) == [(1.0, 1_000_000, 5, "AX-12A")]
+
+
+def test_two_servos_of_one_id_are_named():
+    line = VirtualLine(two(2), ServoConfig(2, "XM430-W350", 1.0))
+    (found,) = scan(ToolLine(line), Wish((2.0,), (57_600,))).servos
+    assert "do two servos have this ID?" in found.remarks[0]
+
+
+def test_two_servos_of_different_models_and_one_id_do_not_hide_each_other():
+    line = VirtualLine(two(2), two(2, "XL430-W250"), two(3))
+    found = scan(ToolLine(line), Wish((2.0,), (57_600,)))
+    assert [one.servo_id for one in found.servos] == [2, 3]
+    assert "garbled" in found.servos[0].remarks[0]
+
+
+def test_a_servo_that_answers_no_reads_is_listed_with_the_reason():
+    line = VirtualLine(two(4, "AX-12A"), protocol=1.0, rate=1_000_000)
+    line.bus.servo(4).poke("status_return_level", 0)
+    (found,) = scan(ToolLine(line), Wish((1.0,), (1_000_000,), (4,))).servos
+    assert (found.model, found.model_number) == ("", -1)
+    assert found.remarks == ("answers pings but no read: its Status Return Level (16) is 0",)
+
+
+def test_an_unknown_model_is_listed_with_its_number():
+    line = VirtualLine(two(4))
+    line.bus.servo(4).poke("model_number", 999)
+    (found,) = scan(ToolLine(line), Wish((2.0,), (57_600,), (4,))).servos
+    assert found.model == ""
+    assert "model number 999" in found.remarks[0]
+
+
+def test_rates_that_the_adapter_cannot_are_left_out_and_told():
+    line = VirtualLine(two(4), cannot=(10_500_000, 6_000_000))
+    found = scan(ToolLine(line), Wish((2.0,), (), (4,)))
+    assert found.left_out == (10_500_000, 6_000_000)
+    assert len(found.servos) == 1
+
+
+@pytest.mark.parametrize("protocol", [1.0, 2.0])
+@pytest.mark.parametrize("ids", [(), (1, 2)])
+def test_an_adapter_that_echoes_is_refused(protocol, ids):
+    line = VirtualLine(protocol=protocol, adapter=AdapterConfig(echo=True))
+    with pytest.raises(PortError, match="echoes what it sends"):
+        scan(ToolLine(line), Wish((protocol,), (57_600,), ids))
+
+
+def test_a_line_that_is_gone_ends_the_scan():
+    line = VirtualLine(two(4))
+    line.ports.ports[0].unplug()
+    with pytest.raises(PortError):
+        scan(ToolLine(line))
+
+
+def test_one_id_is_found_wherever_it_is():
+    line = VirtualLine(two(9), rate=4_000_000)
+    (found,) = find(ToolLine(line), 9)
+    assert (found.protocol, found.baud_rate, found.model) == (2.0, 4_000_000, "XM430-W350")
+    assert find(ToolLine(line), 8) == ()
+
+
+def test_the_rates_are_those_of_the_tables_and_the_usual_ones_come_first():
+    assert known_rates(2.0)[:3] == (1_000_000, 115_200, 57_600)
+    assert {9_600, 4_500_000, 10_500_000} <= set(known_rates(2.0))
+    assert {9_600, 200_000, 2_250_000, 3_000_000} <= set(known_rates(1.0))
+
+
+def test_progress_goes_from_nothing_to_everything():
+    shares = []
+    scan(ToolLine(VirtualLine()), Wish((1.0, 2.0), (57_600,), (1, 2)), lambda _, share: shares.append(share))
+    assert shares[0] == 0.0
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+
+
+def test_few_ids_are_asked_one_by_one():
+    few = tuple(range(scanning.FEW))
+    line = VirtualLine(two(3), two(11))
+    found = scan(ToolLine(line), Wish((2.0,), (57_600,), few))
+    assert [one.servo_id for one in found.servos] == [3, 11]
+    assert all(data[4] != 0xFE for data in line.heard)
