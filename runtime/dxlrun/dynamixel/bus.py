@@ -6,8 +6,9 @@ pumps it decides when: read, write, or the gap before the next deadline.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from dxlrun.clock import Clock
-from dxlrun.dynamixel.burst import Burst, good_parts
 from dxlrun.dynamixel.bus_plan import BusPlan
 from dxlrun.dynamixel.dialect import dialect_of
 from dxlrun.dynamixel.line import BITS_PER_BYTE
@@ -23,6 +24,9 @@ from dxlrun.dynamixel.transaction import (
 )
 from dxlrun.errors import PortError
 from dxlrun.packets import PacketKind, PacketSink
+
+if TYPE_CHECKING:  # the guardian makes servos limp without numpy
+    from dxlrun.dynamixel.burst import Burst
 
 NEVER = 1 << 62
 QUIET_BYTES = 20
@@ -339,6 +343,8 @@ class Bus:
         awaited, job = self._awaited, self._job
         if awaited is None or job is None:
             return 0
+        from dxlrun.dynamixel.burst import good_parts  # not above: see there
+
         parts, used = good_parts(self._dialect, awaited, data)
         if last_ns < self._sent_ns + (len(awaited.packet) + used) * self._byte_ns:
             return 0  # sooner than the wire allows: left over from before

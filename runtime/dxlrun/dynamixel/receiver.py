@@ -6,10 +6,13 @@ One preallocated buffer, no growth. Each byte leaves it exactly once: inside an 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
-from dxlrun.dynamixel.burst import Burst
 from dxlrun.dynamixel.dialect import Dialect
 from dxlrun.dynamixel.port import Port
+
+if TYPE_CHECKING:  # the guardian makes servos limp without numpy
+    from dxlrun.dynamixel.burst import Burst
 
 Taker = Callable[[memoryview, int, int], None]
 """Takes bytes with the times (ns) of the read() calls that brought the first and the last of them.
@@ -17,7 +20,7 @@ Taker = Callable[[memoryview, int, int], None]
 The view is only good during the call.
 """
 
-BurstTaker = Callable[[Burst, list[int], list[int]], bool]
+BurstTaker = Callable[["Burst", list[int], list[int]], bool]
 """Takes whole replies with where each read() ended, and when; False: they are to be taken one by one."""
 
 _GOOD_READ = 765

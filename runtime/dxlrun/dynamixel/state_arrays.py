@@ -22,7 +22,7 @@ Rows = slice | NDArray[np.intp]
 
 def rows_of(indices: Sequence[int]) -> Rows:
     """Return rows by their numbers."""
-    first = indices[0]
+    first = indices[0] if indices else 0
     if list(indices) == list(range(first, first + len(indices))):
         return slice(first, first + len(indices))
     return np.array(indices, dtype=np.intp)
