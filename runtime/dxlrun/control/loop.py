@@ -341,17 +341,9 @@ class Loop:
     def _tell_policy(self, name: PolicyName, text: str) -> None:
         """Leave in the log in which cycle a policy begins."""
         self.events.emit(EventCode.POLICY, Severity.INFO, "loop", f"{name}: {text}")
-        self.commands.take(
-            TakenCommand(
-                t_ns=self.record.woken_ns,
-                cycle=self._cycle,
-                planned=-1,
-                controller=LOOP,
-                kind="policy",
-                origin="loop",
-                data=f'{{"policy":"{name}"}}'.encode(),
-            )
-        )
+        data = f'{{"policy":"{name}"}}'.encode()
+        begun = TakenCommand(self.record.woken_ns, self._cycle, -1, LOOP, "policy", "loop", data)
+        self.commands.take(begun)
 
     def _next(self) -> bool:
         """Go to the next cycle, past those that are declared skipped; say whether that is to end the run."""
