@@ -7,6 +7,7 @@ Exception
     │   └── PlugInError (ImportError)   a plug-in is missing, broken on import, or of another contract
     ├── PortError (OSError)        a serial line cannot be opened, or is gone
     ├── StartUpError               a servo is not what the robot file says; no torque was given
+    ├── ServoFault                 a servo does not do what a tool asks, or is not there
     ├── ControllerFault            a controller raised, or broke its contract
     ├── ProcessFault               a process of the run ended or hung
     ├── Refused                    a running robot does not do what it was asked; 2: a wrong wish
@@ -87,6 +88,10 @@ class Refused(DxlrunError):
 
 class StartUpError(DxlrunError, RuntimeError):
     """A servo is not what the robot file says; no torque was given, or what was given was taken back."""
+
+
+class ServoFault(DxlrunError, RuntimeError):
+    """A servo does not do what a tool asks of it, or is not there; the message names it."""
 
 
 class ControllerFault(DxlrunError, RuntimeError):

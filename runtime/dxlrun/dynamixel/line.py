@@ -80,6 +80,10 @@ class Line:
             return self.unanswered(packet)
         return self._answered(packet, servo_id, Awaited(servo_id, 0))
 
+    def instruct(self, servo_id: int, packet: bytes) -> Transaction:
+        """Return the transaction of an instruction that one servo acknowledges without data."""
+        return self._answered(packet, servo_id, Awaited(servo_id, 0))
+
     def unanswered(self, packet: bytes) -> Transaction:
         """Return a transaction without reply."""
         return Transaction(packet, BROADCAST_ID, (), self.wire_ns(len(packet)), 0)

@@ -1,0 +1,267 @@
+"""What `dxlrun servo` does to one servo, on virtual time, judged by the simulated servo and the ledger."""
+
+import pytest
+
+from dxlrun.clock import VirtualClock
+from dxlrun.control_table import all_tables
+from dxlrun.dynamixel import changing
+from dxlrun.dynamixel.one_servo import OneServo
+from dxlrun.dynamixel.protocol2 import Reset
+from dxlrun.dynamixel.scanning import Wish, find
+from dxlrun.dynamixel.tool_line import ToolLine
+from dxlrun.errors import ServoFault
+from dxlrun.simulation import BusConfig, Ledger, ServoConfig, SimulatedBus, VirtualPorts
+
+RATE = 57_600
+
+
+class VirtualLine:
+    def __init__(self, servos, protocol, cannot=()):
+        self.name, self.latency_ns, self.cannot = "/dev/ttyVirtual", 0, cannot
+        self.clock, self.ledger = VirtualClock(1_000_000), Ledger()
+        self.bus = SimulatedBus(BusConfig("main", RATE, servos, protocol), self.ledger, 0)
+        self.ports = VirtualPorts(self.clock, [self.bus])
+
+    def tune(self, baud_rate):
+        if baud_rate not in self.cannot:
+            self.bus.change_rate(baud_rate)
+        return baud_rate not in self.cannot
+
+
+class Rig:
+    """One servo to deal with, and perhaps others beside it."""
+
+    def __init__(self, model="XM430-W350", protocol=2.0, others=(), cannot=()):
+        servos = (ServoConfig(1, model, 2.0), *(ServoConfig(each, model, 1.5) for each in others))
+        self.line = VirtualLine(servos, protocol, cannot)
+        self.tool = ToolLine(self.line)
+        (found,) = find(self.tool, 1, Wish((protocol,), (RATE,)))
+        self.one = OneServo(self.tool, found)
+        self.start = len(self.line.ledger.entries)
+
+    @property
+    def servo(self):
+        self.line.bus.advance(self.line.clock.now_ns())
+        return self.line.bus.servos[0]
+
+    def instructions(self):
+        """Return what was sent since: 2 is read, 3 write, 6 factory reset, 8 reboot."""
+        sent = [e.data for e in self.line.ledger.entries[self.start :] if e.direction == "in"]
+        return [data[7] if data[2] == 0xFD else data[4] for data in sent]
+
+
+PROTOCOLS = [("AX-12A", 1.0), ("MX-64", 1.0), ("XM430-W350", 2.0), ("XL-320", 2.0)]
+
+
+@pytest.mark.parametrize(("model", "protocol"), PROTOCOLS)
+def test_a_servo_gets_another_id_and_is_looked_for_there(model, protocol):
+    rig = Rig(model, protocol)
+    assert changing.change_id(rig.one, 42) == "has ID 42; it had 1"
+    assert rig.servo.registers["id"] == 42
+    assert rig.one.read(["id"]) == {"id": 42}
+    assert rig.instructions().count(3) == 1  # EEPROM wears
+
+
+def test_an_id_that_somebody_has_is_not_given():
+    rig = Rig(others=(2,))
+    with pytest.raises(ServoFault, match="somebody else has ID 2 at 57600 bit/s; nothing was changed"):
+        changing.change_id(rig.one, 2)
+    assert 3 not in rig.instructions()
+
+
+def test_a_lost_acknowledgement_of_an_id_decides_nothing():
+    rig = Rig()
+    rig.servo.poke("status_return_level", 1)
+    assert changing.change_id(rig.one, 5) == "has ID 5; it had 1"
+
+
+@pytest.mark.parametrize(("model", "protocol"), PROTOCOLS)
+def test_a_servo_talks_at_another_rate(model, protocol):
+    rig = Rig(model, protocol)
+    assert changing.change_rate(rig.one, 1_000_000) == "talks at 1000000 bit/s; it did at 57600"
+    assert rig.servo.baud_rate == 1_000_000
+    assert rig.one.baud_rate == 1_000_000
+
+
+@pytest.mark.parametrize(("model", "protocol"), PROTOCOLS)
+def test_every_rate_of_the_table_can_be_set(model, protocol):
+    rig = Rig(model, protocol)
+    for rate in rig.one.table.baud_rates.values():
+        changing.change_rate(rig.one, rate)
+        assert rig.servo.baud_rate == pytest.approx(rate, rel=0.03)
+
+
+def test_a_rate_is_not_given_that_the_adapter_or_the_model_does_not_have_or_somebody_listens_at():
+    rig = Rig(others=(1,), cannot=(4_500_000,))
+    rig.line.bus.servos[1].poke("baud_rate", 3)
+    with pytest.raises(ServoFault, match="cannot run at 4500000 bit/s; nothing was changed"):
+        changing.change_rate(rig.one, 4_500_000)
+    with pytest.raises(LookupError):
+        changing.change_rate(rig.one, 12_345)
+    with pytest.raises(ServoFault, match="somebody else has ID 1 at 1000000 bit/s"):
+        changing.change_rate(rig.one, 1_000_000)
+    assert 3 not in rig.instructions()
+    assert rig.one.read(["id"]) == {"id": 1}  # and it is still talked to at its own
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda one: changing.change_id(one, 7),
+        lambda one: changing.change_rate(one, 1_000_000),
+        lambda one: changing.factory_reset(one, Reset.ALL),
+        lambda one: one.write([one.register("return_delay_time", 0)]),
+        changing.back_up,
+    ],
+)
+def test_nothing_in_the_eeprom_changes_while_the_servo_holds_torque(change):
+    rig = Rig()
+    rig.servo.poke("torque_enable", 1)
+    with pytest.raises(ServoFault, match="dxlrun servo /dev/ttyVirtual 1 torque off"):
+        change(rig.one)
+    assert set(rig.instructions()) == {2}
+
+
+def test_a_locked_eeprom_is_named():
+    rig = Rig("AX-12A", 1.0)
+    rig.servo.poke("lock", 1)
+    with pytest.raises(ServoFault, match=r"Lock \(47\) is 1"):
+        changing.change_id(rig.one, 7)
+    assert 3 not in rig.instructions()
+
+
+def test_a_register_is_written_only_where_it_differs():
+    rig = Rig()
+    wanted = [rig.one.register("return_delay_time", 0), rig.one.register("position_p_gain", 800)]
+    assert rig.one.write(wanted) == ("Return Delay Time (9) was 250 and is 0",)
+    assert rig.servo.registers["return_delay_time"] == 0
+    assert rig.instructions().count(3) == 1
+
+
+def test_a_reboot_is_waited_for():
+    rig = Rig()
+    rig.servo.boot_ns = 1_500_000_000
+    rig.servo.poke("position_p_gain", 3)
+    assert changing.reboot(rig.one) == "started anew, and holds no torque"
+    assert rig.servo.registers["position_p_gain"] == 800
+
+
+def test_a_servo_that_does_not_come_back_is_missed():
+    rig = Rig()
+    rig.servo.boot_ns = 60_000_000_000
+    with pytest.raises(ServoFault, match="does not answer since 5 s; look for it: dxlrun scan"):
+        changing.reboot(rig.one)
+
+
+def test_a_reboot_that_did_not_happen_is_noticed():
+    rig = Rig()
+    rig.line.clock.wait_until(rig.line.clock.now_ns() + 9_000_000_000)
+    rig.line.bus.advance(rig.line.clock.now_ns())
+    rig.line.bus.alter_next_instruction("lost", lambda data: b"")
+    with pytest.raises(ServoFault, match="did not start anew: its Realtime Tick is"):
+        changing.reboot(rig.one)
+
+
+def test_protocol_1_has_no_reboot_and_no_backup_of_its_own():
+    rig = Rig("AX-12A", 1.0)
+    with pytest.raises(ServoFault, match="knows no reboot"):
+        changing.reboot(rig.one)
+    with pytest.raises(ServoFault, match="no backup of their own"):
+        changing.back_up(rig.one)
+
+
+@pytest.mark.parametrize(
+    ("keep", "address"),
+    [
+        (Reset.ALL, (1, 57_600)),
+        (Reset.KEEP_ID, (9, 57_600)),
+        (Reset.KEEP_ID_AND_BAUD_RATE, (9, 1_000_000)),
+    ],
+)
+def test_a_factory_reset_keeps_what_it_shall(keep, address):
+    rig = Rig()
+    rig.one.write([rig.one.register("return_delay_time", 7)])
+    changing.change_id(rig.one, 9)
+    changing.change_rate(rig.one, 1_000_000)
+    said = changing.factory_reset(rig.one, keep)
+    assert said == f"has the factory's values, ID {address[0]} at {address[1]} bit/s"
+    assert (rig.servo.registers["id"], rig.servo.baud_rate) == address
+    assert rig.servo.registers["return_delay_time"] == 250
+
+
+def test_a_factory_reset_of_protocol_1_keeps_nothing():
+    rig = Rig("AX-12A", 1.0)
+    changing.change_id(rig.one, 9)
+    assert changing.factory_reset(rig.one, Reset.ALL) == "has the factory's values, ID 1 at 1000000 bit/s"
+
+
+def test_a_factory_reset_beside_a_servo_as_shipped_is_refused():
+    rig = Rig(others=(2,))
+    changing.change_id(rig.one, 9)
+    rig.line.bus.servos[1].poke("id", 1)
+    with pytest.raises(ServoFault, match="somebody else has ID 1"):
+        changing.factory_reset(rig.one, Reset.ALL)
+    assert 6 not in rig.instructions()
+
+
+def test_a_servo_keeps_and_takes_back_its_own_backup():
+    rig = Rig()
+    rig.one.write([rig.one.register("return_delay_time", 7)])
+    assert changing.back_up(rig.one) == "stored its control table in its own backup"
+    rig.one.write([rig.one.register("return_delay_time", 9)])
+    changing.take_back(rig.one)
+    assert rig.servo.registers["return_delay_time"] == 7
+
+
+def test_a_servo_without_a_backup_refuses_to_take_it_back():
+    with pytest.raises(ServoFault, match="refuses the restoring: result fail"):
+        changing.take_back(Rig().one)
+
+
+@pytest.mark.parametrize(("model", "protocol"), PROTOCOLS)
+def test_torque_comes_where_the_servo_stands(model, protocol):
+    rig = Rig(model, protocol)
+    before = rig.servo.position
+    assert "holds torque in position mode at tick" in rig.one.torque(True)
+    rig.line.clock.wait_until(rig.line.clock.now_ns() + 1_000_000_000)
+    assert rig.servo.torque_on
+    assert rig.servo.position == pytest.approx(before, abs=0.01)
+    assert rig.one.torque(True) == "holds torque, as before"
+    assert rig.one.torque(False) == "holds no torque"
+    assert not rig.servo.torque_on
+
+
+@pytest.mark.parametrize(
+    ("value", "mode"), [(1, "velocity"), (4, "position"), (16, "pwm"), (0, "effort"), (5, "effort-position")]
+)
+def test_torque_comes_in_every_mode_and_moves_nothing(value, mode):
+    rig = Rig()
+    rig.one.write([rig.one.register("operating_mode", value)])
+    before = rig.servo.position
+    assert f"holds torque in {mode} mode" in rig.one.torque(True)
+    rig.line.clock.wait_until(rig.line.clock.now_ns() + 1_000_000_000)
+    assert rig.servo.torque_on
+    assert rig.servo.position == pytest.approx(before, abs=0.01)
+
+
+def test_the_led_blinks_and_is_left_as_it_was():
+    rig = Rig()
+    rig.servo.poke("led", 1)
+    assert rig.one.blink(2) == "blinked 2 times"
+    assert rig.servo.registers["led"] == 1
+    assert rig.instructions().count(3) == 4
+
+
+def test_a_servo_without_led_says_so():
+    with pytest.raises(ServoFault, match="has no LED"):
+        Rig("XW540-T260").one.blink(1)
+
+
+@pytest.mark.parametrize("protocol", [1.0, 2.0])
+def test_the_whole_control_table_of_every_model_can_be_read(protocol):
+    for table in all_tables():
+        if table.protocol != protocol or RATE not in table.baud_rates.values() or table.firmware:
+            continue
+        one = Rig(table.model, protocol).one
+        names = [name for name in table.items if not name.startswith("indirect_")]
+        assert list(one.read(names, refused=True)) == names
