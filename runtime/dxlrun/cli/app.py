@@ -18,6 +18,7 @@ from dxlrun.cli.models import models
 from dxlrun.cli.replay import replay
 from dxlrun.cli.robots import list_robots
 from dxlrun.cli.run import run
+from dxlrun.cli.scan import scan
 from dxlrun.cli.schema import schema
 from dxlrun.cli.sim import sim
 from dxlrun.cli.steer import load, pause, rate, resume, send, set_register, stop, switch, unload
@@ -54,6 +55,7 @@ def build() -> App:
     app.command(sim)
     app.command(schema)
     app.command(models)
+    app.command(scan)
     app.command(doctor)
     app.command(bench)
     app.command(list_robots, name="list", group=RUNNING)

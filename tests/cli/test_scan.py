@@ -1,0 +1,100 @@
+"""`dxlrun scan`: its words, and a pseudo-terminal with simulated servos, judged by the ledger."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+import yaml
+
+from dxlrun.simulation import BusConfig, ServoConfig
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("--protocol", "3"), "there is no Protocol 3; --protocol is 1.0 or 2.0"),
+        (("--baud", "300"), "--baud 300 is no rate of a servo; give bit/s from 9600 to 10500000"),
+        (("--ids", "1-300"), "--ids 1-300: 1-300 is no ID of a servo; they are 0..253"),
+        (("--ids", "5-2"), "--ids 5-2: 5-2 is no ID of a servo"),
+        (("--ids", "one"), "--ids one: 'one' is no ID; give for example 1-20 or 1,4,7"),
+        (("--write", "robot.txt"), "robot.txt is no name for a robot file; end it in .yaml"),
+    ],
+)
+def test_a_wrong_word_is_told_before_the_port_is_opened(dxlrun, words, sentence):
+    said = dxlrun("scan", "/dev/ttyNowhere", *words)
+    assert said.code == 2
+    assert sentence in said.err
+
+
+def test_a_port_that_is_not_there_is_one_sentence(dxlrun):
+    said = dxlrun("scan", "/dev/ttyNowhere")
+    assert said.code == 1
+    assert said.errors == [said.errors[0]]
+    assert "there is no /dev/ttyNowhere" in said.err
+
+
+def servos(*models):
+    return tuple(ServoConfig(number + 1, model, 2.0) for number, model in enumerate(models))
+
+
+NARROW = ("--baud", "1000000", "--ids", "1-4")
+
+
+def test_the_servos_are_a_table_and_a_robot_file_that_check_accepts(dxlrun, simulated_line, tmp_path):
+    path, finish = simulated_line(BusConfig("main", 1_000_000, servos("XM430-W350", "XL430-W250"), 2.0))
+    robot = tmp_path / "arm.yaml"
+    said = dxlrun("scan", path, "--protocol", "2.0", *NARROW, "--write", robot)
+    assert (said.code, said.err) == (0, "")
+    head, first, second, written = said.out.splitlines()
+    assert head.split()[:2] == ["ID", "model"]
+    assert first.split()[:2] == ["1", "XM430-W350"]
+    assert second.split()[:6] == ["2", "XL430-W250", "1060", "45", "2.0", "1000000"]
+    assert written.startswith(f"robot file: {robot}; complete it")
+    assert yaml.safe_load(robot.read_text())["joints"]["joint_2"]["model"] == "XL430-W250"
+    assert dxlrun("check", robot).code == 0
+    online = dxlrun("check", robot, "--online", "--json")
+    assert online.code == 0, online.out
+    assert {entry.data[7] for entry in finish() if entry.direction == "in"} == {1, 2}
+
+
+def test_both_protocols_are_looked_at_and_told_as_json(dxlrun, simulated_line):
+    path, finish = simulated_line(BusConfig("main", 1_000_000, servos("AX-12A")))
+    said = dxlrun("scan", path, *NARROW, "--json")
+    assert said.code == 0
+    result = json.loads(said.out)
+    assert result["port"] == path
+    (servo,) = result["servos"]
+    assert (servo["model"], servo["protocol"], servo["baud_rate"]) == ("AX-12A", 1.0, 1_000_000)
+    heard = [entry.data for entry in finish() if entry.direction == "in"]
+    assert {data[4] for data in heard if data[2] != 0xFD} == {1, 2}
+    assert sum(data[2] == 0xFD for data in heard) == 4
+
+
+def test_nobody_is_an_answer_too(dxlrun, simulated_line):
+    path, _ = simulated_line(BusConfig("main", 1_000_000, (), 2.0))
+    said = dxlrun("scan", path, *NARROW)
+    assert said.code == 1
+    assert f"nobody answers at {path}" in said.err
+
+
+HOLD = """
+import sys
+from dxlrun.dynamixel.serial_open import open_serial
+port = open_serial(sys.argv[1], 57_600)
+print("open", flush=True)
+sys.stdin.read()
+"""
+
+
+def test_a_port_that_somebody_has_is_not_touched_and_who_has_it_is_named(dxlrun, simulated_line):
+    path, finish = simulated_line(BusConfig("main", 1_000_000, servos("XM430-W350"), 2.0))
+    command = [sys.executable, "-c", HOLD, path]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout.readline() == "open\n"
+        said = dxlrun("scan", path, *NARROW)
+        other.stdin.close()
+    assert said.code == 1
+    assert f"{path} is in use by" in said.err
+    assert f"(process {other.pid})" in said.err
+    assert [entry for entry in finish() if entry.direction == "in"] == []
