@@ -20,6 +20,7 @@ from dxlrun.cli.robots import list_robots
 from dxlrun.cli.run import run
 from dxlrun.cli.scan import scan
 from dxlrun.cli.schema import schema
+from dxlrun.cli.servo import servo
 from dxlrun.cli.sim import sim
 from dxlrun.cli.steer import load, pause, rate, resume, send, set_register, stop, switch, unload
 from dxlrun.cli.terminal import say_error, say_warning
@@ -56,6 +57,7 @@ def build() -> App:
     app.command(schema)
     app.command(models)
     app.command(scan)
+    app.command(servo)
     app.command(doctor)
     app.command(bench)
     app.command(list_robots, name="list", group=RUNNING)

@@ -12,7 +12,7 @@ from dxlrun.errors import InputError
 if TYPE_CHECKING:
     from dxlrun.compile import Ask, Compiled
 
-COMMANDS = ("analyze", "bench", "check", "doctor", "models", "replay", "scan", "schema", "sim")
+COMMANDS = ("analyze", "bench", "check", "doctor", "models", "replay", "scan", "schema", "servo", "sim")
 COMMANDS_WHILE_IT_RUNS = (
     "list",
     "set",

@@ -66,7 +66,7 @@ def scan(
         from dxlrun.robot_draft import may_be_written
 
         may_be_written(write)
-    _load_models()
+    load_models()
     with TunablePort(port) as line, progress_bar(hidden=as_json) as progress:
         scanned = scanning.scan(ToolLine(line), wish, progress)
         latency_ns = line.latency_ns
@@ -118,10 +118,11 @@ def read_ids(text: str) -> tuple[int, ...]:
     return tuple(sorted(found))
 
 
-def _load_models() -> None:
+def load_models() -> None:
+    """Know the models that plug-ins bring along, too."""
     from dxlrun.control.plugins import load_plugins
 
-    load_plugins()  # they may bring servo models along
+    load_plugins()
 
 
 def _show(port: str, scanned: Scanned, *, as_json: bool) -> None:

@@ -89,6 +89,20 @@ def register_value(table: ControlTable, name: str, value: int | str) -> Register
         raise UnfitRegister(f"an {table.model} has no register {name}", suggestion(name, declarable(table)))
     if reason := own_reason(table, item):
         raise UnfitRegister(f"{called(item)} is not to be declared: {reason[0]}", reason[1])
+    wanted = any_value(table, name, value)
+    _check_meaning(item, wanted.value)
+    return wanted
+
+
+def any_value(table: ControlTable, name: str, value: int | str) -> RegisterValue:
+    """Return what a tool writes into any item that can be written; raises UnfitRegister.
+
+    `value` is what `register_value` takes.
+    """
+    item = table.items.get(name)
+    if item is None:
+        names = tuple(each.name for each in table.items.values() if each.access == "RW")
+        raise UnfitRegister(f"an {table.model} has no register {name}", suggestion(name, names))
     if item.access == "R":
         raise UnfitRegister(f"{called(item)} can only be read", "take it out")
     raw = _raw(item, value)
@@ -97,7 +111,6 @@ def register_value(table: ControlTable, name: str, value: int | str) -> Register
             f"{called(item)} of an {table.model} is {_range(item)}, not {_shown(value, raw)}",
             "write a value in this range",
         )
-    _check_meaning(item, raw)
     return RegisterValue(item.address, item.size, raw, name, item.area == "EEPROM")
 
 

@@ -33,7 +33,7 @@ class OneServo:
     """A servo that a tool was told to deal with; blocks, and raises ServoFault or PortError."""
 
     def __init__(self, tool: ToolLine, found: FoundServo) -> None:
-        if not found.model:
+        if not found.model or found.garbled:
             raise ServoFault(f"ID {found.servo_id} at {found.baud_rate} bit/s {'; '.join(found.remarks)}")
         self.tool = tool
         self.found = found
@@ -97,10 +97,8 @@ class OneServo:
         self.writable(wanted)
         settled: Settled = self.tool.run(settle(self.plan, self._servo, wanted, self.tool.line))
         if settled.problems:
-            error = ServoFault("\n".join(settled.problems))
-            for _, text in settled.written:
-                error.add_note(f"written before that: {text}")
-            raise error
+            before = [f"written before that: {text}" for _, text in settled.written]
+            raise ServoFault("\n".join([*settled.problems, *before]))
         return tuple(text for _, text in settled.written)
 
     # Torque and LED

@@ -51,6 +51,8 @@ class FoundServo:
     lowest: int | None = None
     """Its own limits of the position, ticks; both 0 in wheel mode."""
     highest: int | None = None
+    garbled: bool = False
+    """True when it answers garbled, as two servos of one ID do."""
     remarks: tuple[str, ...] = ()
     """What a person should know."""
 
@@ -191,7 +193,8 @@ def look(line: Line, servo_id: int) -> Program[FoundServo]:
     if ping.answered and dialect.PING_LENGTH < _WHO_LENGTH:
         said = yield from persist(line.read(servo_id, 0, _WHO_LENGTH))
     if not said.answered:
-        return replace(servo, remarks=(_mute(ping, said, line),))
+        garbled = Outcome.GARBLED in (ping.outcome, said.outcome)
+        return replace(servo, garbled=garbled, remarks=(_mute(ping, said, line),))
     number, firmware = said.word(), said.parameters[2]
     remarks = [dialect.describe_error(said.error)] if said.error else []
     table = _table(number, firmware, dialect.PROTOCOL)
@@ -230,6 +233,7 @@ def _look_closer(line: Line, table: ControlTable, servo: FoundServo) -> Program[
         return_delay=None if delay is None else delay * 2_000,
         lowest=values.get(lowest),
         highest=values.get(highest),
+        garbled=garbled,
         remarks=tuple(remarks),
     )
 

@@ -1,0 +1,220 @@
+"""`dxlrun servo`: its words, and every verb on a pseudo-terminal, judged by the simulated bus' ledger."""
+
+import io
+import json
+import sys
+
+import pytest
+
+from dxlrun.simulation import BusConfig, ServoConfig
+
+NEW = ("--protocol", "2.0", "--baud", "1000000")
+OLD = ("--protocol", "1.0", "--baud", "1000000")
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("300", "get"), "300 is no ID of a servo; they are 0..253"),
+        (("1", "rebot"), "a servo cannot rebot; did you mean reboot?"),
+        (("1", "set", "led"), "set takes ITEM VALUE, not led"),
+        (("1", "id"), "id takes NEW, not nothing"),
+        (("1", "id", "two"), "'two' is no ID; give a whole number from 0 to 253"),
+        (("1", "baud", "300"), "'300' is no baud rate; give a whole number from 9600 to 10500000"),
+        (("1", "torque", "maybe"), "torque is switched on or off, not 'maybe'"),
+        (("1", "reboot", "now"), "reboot takes no words, not now"),
+        (("1", "get", "--keep", "id"), "--keep belongs to factory-reset, not to get"),
+        (("1", "restore", "missing.json"), "missing.json cannot be read"),
+        (("1", "get", "--protocol", "3"), "there is no Protocol 3"),
+    ],
+)
+def test_a_wrong_word_is_told_before_the_port_is_opened(dxlrun, words, sentence):
+    said = dxlrun("servo", "/dev/ttyNowhere", *words)
+    assert said.code == 2
+    assert sentence in said.err
+
+
+def test_a_port_that_is_not_there_is_one_sentence(dxlrun):
+    said = dxlrun("servo", "/dev/ttyNowhere", "1", "get")
+    assert (said.code, len(said.errors)) == (1, 1)
+    assert "there is no /dev/ttyNowhere" in said.err
+
+
+@pytest.fixture
+def one(dxlrun, simulated_line):
+    """Serve servos of one model, ID 1 and perhaps others; gives the command, and the end with the ledger."""
+
+    def start(model="XM430-W350", protocol=2.0, rate=1_000_000, ids=(1,)):
+        servos = tuple(ServoConfig(each, model, 2.0) for each in ids)
+        path, finish = simulated_line(BusConfig("main", rate, servos, protocol))
+
+        def command(servo_id, *words):
+            return dxlrun("servo", path, servo_id, *words)
+
+        return command, finish
+
+    return start
+
+
+def writes(entries):
+    """Return what was written: parameters of each write instruction."""
+    sent = [entry.data for entry in entries if entry.direction == "in"]
+    new = [data[8:-2] for data in sent if data[2] == 0xFD and data[7] == 3]
+    return new + [data[5:-1] for data in sent if data[2] != 0xFD and data[4] == 3]
+
+
+def test_registers_are_read_and_written_and_the_eeprom_only_when_it_was_asked_for(one):
+    servo, finish = one()
+    table = servo(1, "get", *NEW)
+    assert table.code == 0, table.err
+    assert ["return_delay_time", "9", "EEPROM", "RW", "250", "0.0005", "s"] in [
+        line.split() for line in table.out.splitlines()
+    ]
+    assert servo(1, "set", "position_p_gain", "900", *NEW).out.strip().endswith("was 800 and is 900")
+    refused = servo(1, "set", "return_delay_time", "0", *NEW)
+    assert refused.code == 2
+    assert "Return Delay Time (9) is 250 and becomes 0 (EEPROM): nobody can be asked here" in refused.err
+    assert "give --yes" in refused.err
+    done = servo(1, "set", "return_delay_time", "100 us", "--yes", "--json", *NEW)
+    result = json.loads(done.out)
+    assert result["done"] == ["Return Delay Time (9) was 250 and is 50"]
+    assert result["servo"]["model"] == "XM430-W350"
+    again = servo(1, "set", "return_delay_time", "100 us", *NEW)  # nothing to confirm
+    assert (again.code, "is 50 already" in again.out) == (0, True)
+    offset = servo(1, "set", "homing_offset", "-100", "--yes", *NEW)
+    assert (offset.code, "was 0 and is -100" in offset.out) == (0, True)
+    read = json.loads(servo(1, "get", "return_delay_time", "homing_offset", "--json", *NEW).out)
+    assert read["registers"] == {"return_delay_time": 50, "homing_offset": -100}
+    assert len(writes(finish())) == 3
+
+
+REFUSED = [
+    (("set", "id", "7"), "`dxlrun servo PORT ID id NEW` changes it"),
+    (("set", "position_gain", "7"), "has no register position_gain; did you mean position_p_gain?"),
+    (("set", "position_p_gain", "99999"), "is 0..16383, not 99999"),
+    (("set", "present_position", "7"), "Present Position (132) can only be read"),
+    (("set", "goal_position", "fast"), "fast"),
+    (("get", "gaol"), "has no gaol"),
+    (("baud", "12345"), "has no rate of 12345 bit/s; it has 9600, 57600"),
+    (("id", "253"), "253 is no ID of Protocol 2.0; they are 0..252"),
+]
+
+
+def test_what_the_model_does_not_have_is_told(one):
+    servo, finish = one()
+    for words, sentence in REFUSED:
+        said = servo(1, *words, *NEW)
+        assert said.code == 2
+        assert sentence in said.err
+    assert writes(finish()) == []
+
+
+def test_a_servo_moves_to_another_id_and_rate_and_is_started_anew_and_reset(one):
+    servo, finish = one()
+    assert "has ID 9; it had 1" in servo(1, "id", "9", "--yes", *NEW).out
+    assert "talks at 2000000 bit/s; it did at 1000000" in servo(9, "baud", "2000000", "--yes", *NEW).out
+    fast = ("--protocol", "2.0", "--baud", "2000000")
+    assert "started anew, and holds no torque" in servo(9, "reboot", *fast).out
+    reset = servo(9, "factory-reset", "--keep", "id", "--yes", *fast)
+    assert "has the factory's values, ID 9 at 57600 bit/s" in reset.out
+    missing = servo(9, "get", *fast)
+    assert missing.code == 1
+    assert "nobody with ID 9 answers at" in missing.err
+    assert len(writes(finish())) == 2
+
+
+def test_a_servo_is_found_without_being_told_where(one):
+    servo, _ = one("AX-12A", 1.0, 1_000_000)
+    said = servo(1, "get", "model_number", "--json")
+    assert json.loads(said.out)["servo"] == {
+        "id": 1,
+        "model": "AX-12A",
+        "firmware": 24,
+        "protocol": 1.0,
+        "baud_rate": 1_000_000,
+    }
+
+
+def test_torque_and_led_need_no_question_and_torque_guards_the_eeprom(one):
+    servo, _ = one()
+    assert "holds torque in position mode at tick 1304, where it stood" in servo(1, "torque", "on", *NEW).out
+    refused = servo(1, "id", "5", "--yes", *NEW)
+    assert refused.code == 1
+    assert "holds torque, so ID (7) in its EEPROM is not written; switch the torque off" in refused.err
+    assert "holds torque: its torque goes off" in servo(1, "reboot", *NEW).err
+    assert "holds no torque" in servo(1, "torque", "off", *NEW).out
+    assert "blinked 1 times" in servo(1, "blink", "1", *NEW).out
+
+
+@pytest.mark.parametrize(("model", "protocol", "words"), [("XM430-W350", 2.0, NEW), ("AX-12A", 1.0, OLD)])
+def test_a_backup_goes_into_a_file_and_back_into_another_servo(one, tmp_path, model, protocol, words):
+    servo, _ = one(model, protocol, int(words[-1]), (1, 2))
+    path = tmp_path / "servo.json"
+    servo(1, "set", "return_delay_time", "20", "--yes", *words)
+    servo(1, "set", "temperature_limit", "60", "--yes", *words)
+    assert f"registers are in {path}" in servo(1, "backup", path, *words).out
+    kept = json.loads(path.read_text())
+    assert (kept["model"], kept["id"], kept["registers"]["return_delay_time"]) == (model, 1, 20)
+    assert "is there already" in servo(1, "backup", path, *words).err
+    back = servo(2, "restore", path, "--yes", *words)
+    assert back.code == 0, back.err
+    assert "Return Delay Time" in back.out
+    assert "Temperature Limit" in back.out
+    one_, two = (json.loads(servo(each, "get", "--json", *words).out)["registers"] for each in (1, 2))
+    differing = {name for name in one_ if one_[name] != two[name] and not name.startswith("present_")}
+    assert differing <= {"id", "realtime_tick", "goal_position", "position_trajectory", "torque_limit"}
+    assert "has everything that" in servo(2, "restore", path, *words).out
+
+
+def test_a_backup_of_another_model_is_refused(one, tmp_path):
+    servo, finish = one("XL430-W250")
+    path = tmp_path / "servo.json"
+    servo(1, "backup", path, *NEW)
+    kept = json.loads(path.read_text())
+    path.write_text(json.dumps(kept | {"model_number": 1020, "model": "XM430-W350"}))
+    said = servo(1, "restore", path, "--yes", *NEW)
+    assert said.code == 2
+    assert "is of a XM430-W350 of Protocol 2.0, not of a XL430-W250" in said.err
+    path.write_text(json.dumps(kept | {"registers": {"led": 7, "lde": 1, "temperature_limit": "hot"}}))
+    assert "is no backup of a servo" in servo(1, "restore", path, "--yes", *NEW).err
+    path.write_text(json.dumps(kept | {"registers": {"led": 7, "lde": 1}}))
+    said = servo(1, "restore", path, "--yes", *NEW)
+    assert "led is 7, not in 0..1" in said.err
+    assert "has no register lde to be written" in said.err
+    assert writes(finish()) == []
+
+
+def test_a_servo_keeps_a_backup_of_its_own(one):
+    servo, _ = one()
+    assert "stored its control table in its own backup" in servo(1, "backup", "--yes", *NEW).out
+    servo(1, "set", "return_delay_time", "0", "--yes", *NEW)
+    assert "took its EEPROM back" in servo(1, "restore", "--yes", *NEW).out
+    said = servo(1, "get", "return_delay_time", "--json", *NEW)
+    assert json.loads(said.out)["registers"] == {"return_delay_time": 250}
+
+
+class Terminal(io.StringIO):
+    """A terminal at which somebody answers."""
+
+    def isatty(self):
+        return True
+
+
+def test_a_person_is_asked_and_only_yes_is_yes(one, monkeypatch):
+    servo, finish = one()
+    for answer in ("n\n", "", "\n", "y\n"):
+        monkeypatch.setattr(sys, "stdin", Terminal(answer))
+        said = servo(1, "id", "3", *NEW)
+        assert said.code == (0 if answer == "y\n" else 1)
+        assert "XM430-W350, ID 1 at 1000000 bit/s: its ID becomes 3 (EEPROM). Go on? [y/N]" in said.err
+        assert ("nothing was changed" in said.out) == bool(said.code)
+    assert len(writes(finish())) == 1
+
+
+def test_two_servos_of_one_id_are_not_dealt_with(one, simulated_line, dxlrun):
+    servos = (ServoConfig(1, "XM430-W350", 2.0), ServoConfig(1, "XM430-W350", 1.0))
+    path, finish = simulated_line(BusConfig("main", 1_000_000, servos, 2.0))
+    said = dxlrun("servo", path, 1, "id", "5", "--yes", *NEW)
+    assert said.code == 1
+    assert "do two servos have this ID?" in said.err
+    assert writes(finish()) == []
