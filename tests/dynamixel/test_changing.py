@@ -92,8 +92,9 @@ def test_every_rate_of_the_table_can_be_set(model, protocol):
 
 
 def test_a_rate_is_not_given_that_the_adapter_or_the_model_does_not_have_or_somebody_listens_at():
-    rig = Rig(others=(1,), cannot=(4_500_000,))
+    rig = Rig(others=(2,), cannot=(4_500_000,))
     rig.line.bus.servos[1].poke("baud_rate", 3)
+    rig.line.bus.servos[1].poke("id", 1)
     with pytest.raises(ServoFault, match="cannot run at 4500000 bit/s; nothing was changed"):
         changing.change_rate(rig.one, 4_500_000)
     with pytest.raises(LookupError):
@@ -250,6 +251,21 @@ def test_the_led_blinks_and_is_left_as_it_was():
     assert rig.one.blink(2) == "blinked 2 times"
     assert rig.servo.registers["led"] == 1
     assert rig.instructions().count(3) == 4
+
+
+def test_two_servos_of_one_id_are_not_dealt_with():
+    with pytest.raises(ServoFault, match="garbled now and then: do two servos have this ID"):
+        Rig(others=(1,))
+
+
+def test_torque_comes_to_a_wheel_of_protocol_1_and_moves_nothing():
+    rig = Rig("AX-12A", 1.0)
+    for name in ("cw_angle_limit", "ccw_angle_limit"):
+        rig.one.write([rig.one.register(name, 0)])
+    before = rig.servo.position
+    assert "holds torque in" in rig.one.torque(True)
+    rig.line.clock.wait_until(rig.line.clock.now_ns() + 1_000_000_000)
+    assert rig.servo.position == pytest.approx(before, abs=0.01)
 
 
 def test_a_servo_without_led_says_so():
