@@ -274,8 +274,9 @@ def test_the_loop_grows_no_memory_and_collects_no_garbage(
     tell = "import gc; print('collector', gc.isenabled(), [one['collections'] for one in gc.get_stats()])"
     run = odd("--duration", "4", "--debug", update=tell)
 
-    def resident_kb(goals: int) -> int:
-        wait_for(lambda: sent(run).count(b"\x83\x1e") >= goals, f"{goals} goals")
+    def resident_kb(cycles: int) -> int:
+        # one read of the state of servo 3 a cycle; goals are sent when they change
+        wait_for(lambda: sent(run).count(b"\xff\xff\x03\x04\x02\x24") >= cycles, f"{cycles} cycles")
         status = Path(f"/proc/{run.child('dxlrun.loop_process')}/status").read_text()
         return int(status.split("VmRSS:")[1].split()[0])
 
