@@ -29,6 +29,9 @@ _USUAL = (1_000_000, 57_600, 115_200)
 _WHO_LENGTH = 3
 _LIMITS = (("min_position_limit", "max_position_limit"), ("cw_angle_limit", "ccw_angle_limit"))
 _TRIES = 2
+"""Of a ping at a rate that is one of many."""
+_TRIES_ALONE = 6
+"""Where somebody said where the servo is: there a busy machine may be late, too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,14 +123,16 @@ def scan(tool: ToolLine, wish: Wish = EVERYWHERE, progress: Progress = lambda *_
 def find(tool: ToolLine, servo_id: int, wish: Wish = EVERYWHERE) -> tuple[FoundServo, ...]:
     """Look for one ID in every protocol and at every rate; raises PortError as `scan` does."""
     found: list[FoundServo] = []
-    for protocol, baud_rate in wish.lines():
+    lines = wish.lines()
+    tries = _TRIES_ALONE if len(lines) == 1 else _TRIES
+    for protocol, baud_rate in lines:
         if servo_id <= dialect_of(protocol).HIGHEST_ID and tool.speak(protocol, baud_rate):
-            found += tool.run(_find(tool, servo_id))
+            found += tool.run(_find(tool, servo_id, tries))
     return tuple(found)
 
 
-def _find(tool: ToolLine, servo_id: int) -> Program[list[FoundServo]]:
-    for _ in range(_TRIES):
+def _find(tool: ToolLine, servo_id: int, tries: int) -> Program[list[FoundServo]]:
+    for _ in range(tries):
         reply = yield tool.line.ping(servo_id)
         refuse_echo(tool.port.name, reply)
         if reply.outcome is not Outcome.TIMEOUT:
