@@ -23,6 +23,10 @@ PROBE_NS = 1_000_000_000
 FIRST_PROBE_NS = 200_000_000
 """The first time a little earlier: most losses are a loose plug or a boot, which is over by then."""
 NEVER = 1 << 62
+_TURNS = (
+    "forgot over that in which turn it stood, so its goal would be turns away: it gets no torque again in "
+    "this mode; start the run anew"
+)
 
 
 class Voice(Protocol):
@@ -136,6 +140,9 @@ class Absent:
         yield from bus_watchdog.disarm(plan, servo)
         torque = self._anew[index] and servo.torque_on_return and not self._reboots.latched[index]
         mode, registers = self._wanted.modes.wanted(index), self._wanted.registers.wanted(index)
+        if torque and servo.continuous and servo.mode_plan(mode).goals[-1].position is not None:
+            torque = False  # it came back in another turn: its goal is turns away
+            self._say(EventCode.SERVO_LIMP, Severity.ERROR, index, _TURNS)
         rejoined = yield from rejoin(plan, index, torque, mode, registers)
         if not rejoined.problems and (problem := (yield from bus_watchdog.arm(plan, servo))):
             rejoined = Rejoined((problem,), False, None, rejoined.written)

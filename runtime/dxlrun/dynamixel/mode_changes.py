@@ -11,7 +11,7 @@ from dxlrun.dynamixel import modes
 from dxlrun.dynamixel.bus_plan import BusPlan
 from dxlrun.dynamixel.gaps import Gaps, Urgency
 from dxlrun.dynamixel.goal_arrays import GoalArrays
-from dxlrun.dynamixel.inspection import who
+from dxlrun.dynamixel.inspection import persist, who
 from dxlrun.dynamixel.transaction import Program
 from dxlrun.events import EventCode, EventSink, Severity
 from dxlrun.mode import Mode
@@ -39,7 +39,7 @@ class ModeChanges:
         self._wanted = [servo.start_mode for servo in plan.servos]
         self._queued = [False] * len(plan.servos)
         self.doubtful: list[int] = []
-        """Whose change failed, maybe without torque: no goal until that was read. Whoever minds clears it."""
+        """Who may be without torque after a change: no goal until that was read. Whoever minds clears it."""
 
     def wanted(self, index: int) -> Mode:
         """Return the mode in which a servo is, or shall be as soon as it can."""
@@ -91,6 +91,9 @@ class ModeChanges:
         except LookupError as error:
             problem = f"cannot follow: {error}"
         if not problem:
+            torque = yield from persist(self._plan.torque_reads[index])
+            if not (torque.answered and torque.parameters[0] == 1):
+                self.doubtful.append(index)  # it lost its torque unnoticed, and a goal may switch it on
             return wanted, ""
         return (yield from modes.mode_now(self._plan, servo)), problem
 

@@ -1,0 +1,73 @@
+"""Servos of which something is not as it was, unnoticed: they get no goal that could hurt."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dxlrun.events import EventCode
+from dxlrun.mode import Mode
+
+
+@pytest.fixture
+def make_wheel(make_rig, make_plan):
+    """Two continuous joints, the first of which is tested."""
+
+    def make(model="XM430-W350", protocol=2.0, **change):
+        ends = {"lower": -math.inf, "upper": math.inf, "reference": math.pi, "return_delay_ns": 0}
+        plan = make_plan((1, 2), model=model, protocol=protocol, continuous=True, **ends, **change)
+        servos = tuple(replace(servo, torque_on_return=True) for servo in plan.servos)
+        rig = make_rig(replace(plan, servos=servos))
+        rig.hardware.start()
+        return rig
+
+    return make
+
+
+def change(rig, mode, cycles=30):
+    wanted = np.zeros(len(rig.states.mode), dtype=np.uint8)
+    wanted[0] = mode
+    rig.hardware.set_modes(wanted)
+    for _ in range(cycles):
+        rig.cycle()
+
+
+def test_a_joint_that_forgot_its_turns_over_a_reboot_does_not_wind_them_up_again(make_wheel):
+    rig = make_wheel(start_mode=Mode.POSITION)
+    for _ in range(300):
+        rig.goals.position[0] += 0.04
+        rig.cycle()
+    servo = rig.buses[0].servo(1)
+    servo.cut_power(rig.clock.now_ns() + 300_000_000)
+    standing = servo.position
+    for _ in range(150):
+        rig.cycle()
+    assert rig.states.valid[0]
+    assert servo.position == pytest.approx(standing, abs=0.1), "it wound up the turns that it had forgotten"
+    assert rig.torque() == [False, True]
+    assert "in which turn it stood" in rig.events.of(EventCode.SERVO_LIMP)[0][1]
+
+
+def test_a_wheel_that_is_led_by_its_velocity_gets_torque_again_after_a_reboot(make_wheel):
+    rig = make_wheel()
+    for _ in range(20):
+        rig.cycle()
+    rig.buses[0].servo(1).cut_power(rig.clock.now_ns() + 300_000_000)
+    for _ in range(150):
+        rig.cycle()
+    assert rig.torque() == [True, True]
+
+
+def test_a_servo_that_lost_its_torque_unnoticed_gets_it_by_no_change_of_modes(make_rig, make_plan):
+    rig = make_rig(make_plan((1, 2), model="MX-64", reference=math.pi, lower=-2, upper=2, return_delay_ns=0))
+    rig.hardware.start()
+    rig.cycle()
+    rig.buses[0].servo(1).poke("torque_enable", 0)
+    change(rig, Mode.VELOCITY)
+    change(rig, Mode.POSITION)
+    for _ in range(5):
+        rig.goals.position[:] += 0.01  # to an MX a goal position is torque on
+        rig.cycle()
+    assert rig.torque() == [False, True]
+    assert [source for source, _ in rig.events.of(EventCode.SERVO_LIMP)] == ["main_1_joint"]
