@@ -136,7 +136,7 @@ def test_the_torso_as_tables(dxlrun, torso, three_parts):
     assert said.code == 0
     assert said.out.startswith("bioloid_torso: good. 8 joints, 4 of 7 controllers active, 50 Hz, 1 warning\n")
     (row,) = [line.split() for line in said.out.splitlines() if "right_shoulder_lateral_joint   main" in line]
-    assert row[2:8] == ["AX-12A", "2", "240", "+1", "-180..+60", "-240..+60"]
+    assert row[2:9] == ["AX-12A", "position", "2", "240", "+1", "-180..+60", "-240..+60"]
     (bus,) = [line for line in said.out.splitlines() if "/dev/ttyUSB0" in line]
     assert "14.1 ms" in bus
     assert "71 Hz" in bus
@@ -181,3 +181,12 @@ def test_a_simulated_adapter_does_not_wait(dxlrun, torso):
 
     assert bus["latency"] == 0
     assert bus["total"] == pytest.approx(6.08e-3)
+
+
+def test_a_wheel_has_no_limits_and_starts_in_velocity_mode(dxlrun, torso):
+    said = dxlrun("check", torso.with_name("diff_drive.yaml"))
+
+    assert said.code == 0
+    (row,) = [line.split() for line in said.out.splitlines() if "left_wheel" in line and "XL430" in line]
+    assert row[3:4] == ["velocity"]
+    assert row[7:11] == ["none", "turns", "for", "ever"]

@@ -95,22 +95,25 @@ _UNBOUNDED = Console(width=10_000)
 
 
 def _joints(rows: Sequence[JointRow]) -> _Sheet:
+    efforts = any(row.effort is not None for row in rows)
     table = _Sheet(
         "Joints (deg)",
-        ["joint", "bus", "model"],
-        ["ID", "reference", "direction", "limits", "reach", "velocity limit"],
+        ["joint", "bus", "model", "mode"],
+        ["ID", "reference", "direction", "limits", "reach", "velocity limit", *["effort limit"] * efforts],
     )
     for row in rows:
         table.add_row(
             row.name,
             row.bus,
             row.model,
+            row.mode,
             str(row.id),
             degrees(row.reference),
             f"{row.direction:+d}",
-            _interval(row.lower, row.upper),
-            _interval(row.reach_lower, row.reach_upper),
+            _interval(row.lower, row.upper) if row.bounded else "none",
+            _interval(row.reach_lower, row.reach_upper) if row.bounded else "turns for ever",
             "none" if row.velocity is None else f"{degrees(row.velocity)}/s",
+            *["none" if row.effort is None else f"{row.effort:g} {row.effort_unit}".rstrip()] * efforts,
         )
     return table
 

@@ -12,6 +12,7 @@ from dxlrun.compile.motions import CompiledPart
 from dxlrun.control.policy_plan import POLICIES, PolicyPlan
 from dxlrun.description import Description
 from dxlrun.dynamixel.bus_plan import BusPlan, ReadWay
+from dxlrun.mode import Mode
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,8 +43,16 @@ class JointRow:
     upper: float
     velocity: float | None
     """rad/s; None: no limit in the file."""
+    effort: float | None
+    """In `effort_unit`; None: no limit in the file."""
+    effort_unit: str
+    """As the model measures effort: Nm, A, or empty for the fraction of its maximum."""
     reach_lower: float
     reach_upper: float
+    bounded: bool
+    """False: a wheel, which turns for ever."""
+    mode: str
+    """In which the run begins."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,10 +155,11 @@ class CheckReport:
 def check_report(checked: Checked) -> CheckReport:
     """Return the rows of what was checked."""
     rate = checked.description.robot.loop.rate
+    modes = {servo.joint: servo.start_mode for bus in checked.buses for servo in bus.servos}
     return CheckReport(
         robot=checked.description.robot.name,
         rate=rate,
-        joints=tuple(_joint_row(joint) for joint in checked.joints.values()),
+        joints=tuple(_joint_row(joint, modes[joint.plan.name]) for joint in checked.joints.values()),
         controllers=tuple(_controller_row(controller, rate) for controller in checked.controllers.values()),
         buses=tuple(_bus_row(bus, rate) for bus in checked.buses),
         ways=tuple(row for bus in checked.buses for row in _way_rows(bus, rate)),
@@ -159,7 +169,7 @@ def check_report(checked: Checked) -> CheckReport:
     )
 
 
-def _joint_row(joint: CompiledJoint) -> JointRow:
+def _joint_row(joint: CompiledJoint, mode: Mode) -> JointRow:
     described = joint.described
     return JointRow(
         name=joint.plan.name,
@@ -171,8 +181,12 @@ def _joint_row(joint: CompiledJoint) -> JointRow:
         lower=joint.plan.lower,
         upper=joint.plan.upper,
         velocity=joint.plan.velocity,
+        effort=joint.plan.effort,
+        effort_unit=joint.table.effort_unit.replace("1", ""),
         reach_lower=joint.reach.lower,
         reach_upper=joint.reach.upper,
+        bounded=joint.plan.bounded,
+        mode=mode.name.lower().replace("_", " "),
     )
 
 
