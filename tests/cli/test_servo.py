@@ -124,7 +124,7 @@ def test_a_servo_moves_to_another_id_and_rate_and_is_started_anew_and_reset(one)
 
 
 def test_a_servo_is_found_without_being_told_where(one):
-    servo, _ = one("AX-12A", 1.0, 1_000_000)
+    servo, _ = one("AX-12A", 1.0, 1_000_000, (1, 2))
     said = servo(1, "get", "model_number", "--json")
     assert json.loads(said.out)["servo"] == {
         "id": 1,
@@ -133,6 +133,11 @@ def test_a_servo_is_found_without_being_told_where(one):
         "protocol": 1.0,
         "baud_rate": 1_000_000,
     }
+    assert servo(2, "baud", "57600", "--yes", *OLD).code == 0
+    assert servo(2, "id", "1", "--yes", "--protocol", "1.0", "--baud", "57600").code == 0
+    twice = servo(1, "get", "model_number", "--protocol", "1.0")
+    assert twice.code == 1
+    assert "ID 1 answers more than once (Protocol 1.0 at 1000000 bit/s; Protocol 1.0 at 57600" in twice.err
 
 
 def test_torque_and_led_need_no_question_and_torque_guards_the_eeprom(one):

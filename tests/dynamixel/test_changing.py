@@ -17,7 +17,8 @@ RATE = 57_600
 
 class VirtualLine:
     def __init__(self, servos, protocol, cannot=()):
-        self.name, self.latency_ns, self.cannot = "/dev/ttyVirtual", 0, cannot
+        self.name, self.cannot = "/dev/ttyVirtual", cannot
+        self.latency_ns, self.most_latency_ns = 0, 16_000_000
         self.clock, self.ledger = VirtualClock(1_000_000), Ledger()
         self.bus = SimulatedBus(BusConfig("main", RATE, servos, protocol), self.ledger, 0)
         self.ports = VirtualPorts(self.clock, [self.bus])

@@ -14,7 +14,8 @@ class VirtualLine:
     """A line on virtual time; `cannot`: rates that its adapter does not have."""
 
     def __init__(self, *servos, protocol=2.0, rate=57_600, cannot=(), adapter=AdapterConfig()):  # noqa: B008
-        self.name, self.latency_ns, self.cannot = "virtual", 0, cannot
+        self.name, self.cannot = "virtual", cannot
+        self.latency_ns, self.most_latency_ns = 0, 16_000_000
         self.clock, self.ledger = VirtualClock(1_000_000), Ledger()
         self.bus = SimulatedBus(BusConfig("main", rate, servos, protocol, adapter=adapter), self.ledger, 0)
         self.ports = VirtualPorts(self.clock, [self.bus])
@@ -72,6 +73,18 @@ def test_a_late_answer_is_noticed_and_asked_again():
     line.bus.delay_next(5, 3_000_000)  # it comes while the next ID is asked
     found = scan(ToolLine(line), Wish((1.0,), (1_000_000,)))
     assert names(found) == [(1.0, 1_000_000, 5, "AX-12A")]
+
+
+@pytest.mark.parametrize(("model", "protocol"), [("AX-12A", 1.0), ("XM430-W350", 2.0)])
+@pytest.mark.parametrize("ids", [(), (1, 2, 3, 4)])
+def test_an_adapter_that_keeps_replies_back_for_longer_than_is_known_makes_no_twins(model, protocol, ids):
+    adapter = AdapterConfig(latency_timer_ns=16_000_000)
+    line = VirtualLine(two(1, model), two(3, model), protocol=protocol, rate=1_000_000, adapter=adapter)
+    found = scan(ToolLine(line), Wish((protocol,), (1_000_000,), ids))
+    assert [(one.servo_id, one.model, one.remarks) for one in found.servos] == [
+        (1, model, ()),
+        (3, model, ()),
+    ]
 
 
 def test_two_servos_of_one_id_are_named():

@@ -181,7 +181,7 @@ class OneServo:
             name=name,
             port=name,
             baud_rate=self.baud_rate,
-            latency_ns=self.tool.port.latency_ns,
+            latency_ns=self.tool.port.most_latency_ns,
             return_delay_ns=LONGEST_RETURN_DELAY_NS,
             joints=[wiring],
             protocol=table.protocol,

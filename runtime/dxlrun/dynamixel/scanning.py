@@ -170,7 +170,7 @@ def _one_by_one(
     suspected: list[int] = []
     for index, servo_id in enumerate(ids):
         ping = line.ping(servo_id)
-        reply = yield ping if patience_ns is None else _hurried(ping, line, patience_ns)
+        reply = yield ping if patience_ns is None else _hurried(tool, ping, patience_ns)
         refuse_echo(tool.port.name, reply)
         if reply.answered:
             there.add(servo_id)
@@ -185,8 +185,8 @@ def _one_by_one(
     return there | (heard.ids & set(ids))
 
 
-def _hurried(transaction: Transaction, line: Line, patience_ns: int) -> Transaction:
-    return replace(transaction, timeout_ns=transaction.due_ns + line.latency_ns + patience_ns)
+def _hurried(tool: ToolLine, transaction: Transaction, patience_ns: int) -> Transaction:
+    return replace(transaction, timeout_ns=transaction.due_ns + tool.port.latency_ns + patience_ns)
 
 
 def look(line: Line, servo_id: int) -> Program[FoundServo]:

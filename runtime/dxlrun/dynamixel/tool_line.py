@@ -18,13 +18,15 @@ from dxlrun.dynamixel.pump import run
 from dxlrun.dynamixel.serial_open import open_serial
 from dxlrun.dynamixel.transaction import Program, Reply, Result
 from dxlrun.errors import PortError
-from dxlrun.packets import PacketKind
+from dxlrun.packets import NoPackets, PacketKind, decode_packets
 from dxlrun.ring import Payload
 
 FIRST_RATE = 57_600
 """At which a port is opened, bit/s; every adapter has it."""
 LATENCY_NS = 1_000_000
-"""What an adapter without a readable latency timer is given: a frame of USB at full speed."""
+"""What an adapter adds whose latency timer is not known: a frame of USB at full speed."""
+MOST_LATENCY_NS = 16_000_000
+"""What it may add then: the latency timer of an FTDI chip as shipped (FTDI AN232B-04)."""
 _NOTHING = Budget(0, 0, 0, 0, 0)
 
 
@@ -48,7 +50,12 @@ class Tunable(Protocol):
 
     @property
     def latency_ns(self) -> int:
-        """What the adapter adds to each request."""
+        """What the adapter adds to each request, as far as that is known."""
+        ...
+
+    @property
+    def most_latency_ns(self) -> int:
+        """What it may add; a servo that is known to be there is awaited for so long."""
         ...
 
     def tune(self, baud_rate: int) -> bool:
@@ -69,7 +76,9 @@ class TunablePort:
         self.ports: Ports = SerialPorts([SerialPort(self._serial.fileno(), path)])
         shorten(self._serial, path, LATENCY_NS)
         timer = latency_timer(path)
-        self.latency_ns = LATENCY_NS if timer is None else max(LATENCY_NS, timer.found_ms * 1_000_000)
+        found_ns = 0 if timer is None else timer.found_ms * 1_000_000
+        self.latency_ns = max(LATENCY_NS, found_ns)
+        self.most_latency_ns = found_ns or MOST_LATENCY_NS
 
     def __enter__(self) -> TunablePort:
         return self
@@ -92,8 +101,8 @@ class TunablePort:
         return True
 
 
-class Heard:
-    """Keeps who was heard on a line, whether awaited or not; a PacketSink."""
+class Heard(NoPackets):
+    """Keeps who was heard on a line, whether awaited or not."""
 
     def __init__(self) -> None:
         self.ids: set[int] = set()
@@ -107,13 +116,20 @@ class Heard:
         self.noise = 0
 
     def packet(  # noqa: PLR0917  the contract of PacketSink
-        self, bus: int, kind: PacketKind, servo_id: int, first_ns: int, last_ns: int, data: Payload
+        self, bus: int, kind: int, servo_id: int, first_ns: int, last_ns: int, data: Payload
     ) -> None:
         """Take what was sent or received."""
         if kind == PacketKind.STATUS:
             self.ids.add(servo_id)
         elif kind == PacketKind.NOISE:
             self.noise += len(data)
+
+    def records(self, records: memoryview) -> None:
+        """Take packets from their records."""
+        for packet in decode_packets(records):
+            self.packet(
+                packet.bus, packet.kind, packet.servo_id, packet.first_ns, packet.last_ns, packet.data
+            )
 
 
 class ToolLine:
@@ -124,7 +140,7 @@ class ToolLine:
         self.heard = Heard()
         self.protocol = 0.0
         self.baud_rate = 0
-        self.line: Line = Line(FIRST_RATE, port.latency_ns, LONGEST_RETURN_DELAY_NS)
+        self.line: Line = Line(FIRST_RATE, port.most_latency_ns, LONGEST_RETURN_DELAY_NS)
         """Makes transactions for the protocol and the rate that are spoken."""
         self._bus: Bus | None = None
 
@@ -132,7 +148,7 @@ class ToolLine:
         """Go on in a protocol, at a rate; say whether the adapter can, and stay as it was where not."""
         if not self.port.tune(baud_rate):
             return False
-        port, latency_ns = self.port, self.port.latency_ns
+        port, latency_ns = self.port, self.port.most_latency_ns
         delay_ns = LONGEST_RETURN_DELAY_NS
         plan = BusPlan(
             port.name, port.name, protocol, baud_rate, latency_ns, delay_ns, (), (), (), (), (), _NOTHING
