@@ -345,6 +345,24 @@ def test_a_shorter_watchdog_counts_at_once_and_a_longer_one_too(line2: Any) -> N
     assert line2.get("torque_enable") == 1
 
 
+def test_a_servo_at_rest_shows_at_once_who_turns_it_and_what_is_written(line2: Any) -> None:
+    line2.wait(1.0)
+    resting = line2.get("present_position")
+    assert line2.servo()._body.shaft.mechanics.still, "this test is about a servo at rest"
+    assert line2.get("present_position") == resting
+    line2.servo().turn_by_hand(line2.servo().position + 0.5)
+    turned = line2.get("present_position")
+    assert turned == pytest.approx(resting + 0.5 / 0.001534, abs=2)
+    line2.wait(1.0)
+    assert line2.get("present_position") == turned
+    assert line2.set("homing_offset", 100) == 0
+    assert line2.get("present_position") == turned + 100
+    line2.set("torque_enable", 1)
+    line2.set("goal_position", turned + 400)
+    line2.wait(2.0)
+    assert line2.get("present_position") == pytest.approx(turned + 400, abs=20)
+
+
 # Indirect addresses
 
 

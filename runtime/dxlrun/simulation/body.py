@@ -19,6 +19,18 @@ BOOT_NS = 100_000_000
 _READS_KEPT = 1024
 """So many reads are looked up only once: a host reads few places, rubbish goes everywhere."""
 
+_STILL = frozenset(
+    (
+        "present_position",
+        "present_velocity",
+        "present_speed",
+        "present_load",
+        "present_current",
+        "present_pwm",
+    )
+)
+"""What shows the same again while no servo moves and nothing is written."""
+
 _SECONDARY_IDS = ("secondary_shadow_id", "secondary_id")
 
 
@@ -43,6 +55,8 @@ class Body(ABC):
         shaft.mechanics.watch(shaft.index, self._strained)
         self._live = {name: show for name, show in self._live_items().items() if name in memory}
         self._live_in: dict[tuple[int, int], LiveItems] = {}
+        self._kept: tuple[int, int, int, int] = (0, 0, 0, 0)  # of what: pause, changes, address, length
+        self._kept_data = b""
         self.answers_damaged = False
         """True: a packet with a wrong checksum is answered by the manual's error; False: never [?]."""
         self._registered: tuple[int, bytes] | None = None
@@ -108,14 +122,20 @@ class Body(ABC):
 
     def read(self, address: int, length: int) -> bytes | None:
         """Return bytes of the table, None where it has none."""
-        memory = self.memory
+        memory, still = self.memory, self.shaft.mechanics.still
+        if still and self._kept == (still, memory.changes, address, length):
+            return self._kept_data
         if address + length > memory.size:
             return None
         if memory.cells(address, length).direct:
-            memory.show_all(self._live_in.get((address, length)) or self._look_up(address, length))
-        else:
-            for target, first, last in memory.places(address, length):
-                memory.show_all(self._look_up(target, last - first))
+            live = self._live_in.get((address, length)) or self._look_up(address, length)
+            memory.show_all(live)
+            data = memory.read(address, length)
+            if still and data is not None and all(name in _STILL for name, _ in live):
+                self._kept, self._kept_data = (still, memory.changes, address, length), data
+            return data
+        for target, first, last in memory.places(address, length):
+            memory.show_all(self._look_up(target, last - first))
         return memory.read(address, length)
 
     def _look_up(self, address: int, length: int) -> LiveItems:

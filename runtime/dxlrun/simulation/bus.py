@@ -361,7 +361,8 @@ class SimulatedBus:
                 continue
             counts.answer(reply.error)
             if reading.fast and entry is not reading.entries[0]:
-                reply = reply._replace(delay_ns=0)  # only the first one of a shared status waits
+                # only the first one of a shared status waits
+                reply = Reply(reply.servo_id, reply.error, reply.parameters, 0)
             replies.append(reply)
         return replies
 

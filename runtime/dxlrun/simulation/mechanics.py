@@ -55,7 +55,9 @@ class Mechanics:
         self._order = itertools.count()
         self._busy = False
         self._commanded = False
-        self._rests = False
+        self._pauses = 0
+        self.still = 0
+        """Number of the pause in which all servos rest, uncommanded; 0 while one of them moves."""
         self._build(np.zeros(0), np.zeros(0))
 
     # Servos
@@ -107,7 +109,7 @@ class Mechanics:
         """Change the goal of a servo and its profile, and nothing else; as in `Command`."""
         self.strain.calm = False
         self.profiles.aim(index, goal, speed, acceleration)
-        self._rests = False
+        self.still = 0
 
     def place(self, index: int, angle: float) -> None:
         """Put a shaft somewhere, rad, at rest; its trajectory begins there."""
@@ -116,7 +118,7 @@ class Mechanics:
         if self._commands[ROWS["limit"], index] == 0.0:
             self._commands[ROWS["goal"], index] = angle
         self.profiles.arrived = False
-        self._rests = False
+        self.still = 0
 
     def heat(self, index: int, celsius: float) -> None:
         """Bring a servo to a temperature, degrees C; it goes back to that of its load."""
@@ -137,7 +139,7 @@ class Mechanics:
         """Return when it should be let go on in real time, though nobody asks; None: it has nothing to do."""
         if not self._motors:
             return None
-        if not self._rests:
+        if not self.still:
             return self.grid_ns + EAGER_NS
         agenda_ns = self._agenda[0][0] + STEP_NS if self._agenda else None
         if self.strain.calm:
@@ -160,7 +162,7 @@ class Mechanics:
         """Take one step, or as many as nothing happens in."""
         while self._agenda and self._agenda[0][0] <= self.grid_ns:
             heapq.heappop(self._agenda)[2]()
-        if self._rests or not self._motors:
+        if self.still or not self._motors:
             self._skip(now_ns)
         else:
             self._step()
@@ -196,7 +198,8 @@ class Mechanics:
         still = profiles.arrived and np.abs(plant.velocity).max() < _STILL
         if still and np.abs(before - plant.velocity).max() < _UNDRIVEN:
             plant.velocity.fill(0.0)
-            self._rests = True
+            self._pauses += 1
+            self.still = self._pauses
 
     def _feel(self) -> None:
         if not self._motors:
@@ -208,7 +211,7 @@ class Mechanics:
 
     def _wake(self) -> None:
         self._commanded = True
-        self._rests = False
+        self.still = 0
         self.strain.calm = False
 
     def _build(self, angle: Floats, velocity: Floats) -> None:

@@ -75,6 +75,8 @@ class Memory:
             for item in table.items.values()
         }
         self._watchers: dict[str, list[Callable[[], None]]] = {}
+        self.changes = 0
+        """How often an item was changed, but for what it shows by itself (`show_all`)."""
         self.restore_factory_values()
 
     def restore_factory_values(self, keep: tuple[str, ...] = ()) -> None:
@@ -110,6 +112,7 @@ class Memory:
             return
         self._memory[start:end] = wire.to_bytes(size, "little")
         self._values[name] = wire
+        self.changes += 1
         if name in self._watchers:
             self._tell((name,))
 
@@ -247,6 +250,7 @@ class Memory:
         """Write bytes that were not refused."""
         self._memory[run.address : run.address + len(run.data)] = run.data
         self._values.update(run.after)
+        self.changes += 1
         if not self._watchers.keys().isdisjoint(run.after):
             self._tell(run.after)
 

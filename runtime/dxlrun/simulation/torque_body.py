@@ -76,8 +76,8 @@ class TorqueBody(Body):
         self._backup: dict[str, int] = {}
         self._shut_down = False
         self._heard_ns = shaft.now_ns
-        self._guarded = False
-        """False while Bus Watchdog is 0."""
+        self._guarded = self._retimed = False
+        """False while Bus Watchdog is 0, and while its time is the one that is looked after."""
         memory.watch(("bus_watchdog",), self._guard)
         self._looked_after_ns: int | None = None
         """When the Bus Watchdog is looked after next; None: never."""
@@ -90,16 +90,18 @@ class TorqueBody(Body):
         shaft = self.shaft
         shaft.advance(now_ns)
         self._heard_ns = shaft.now_ns
-        if self._guarded:
+        if self._guarded and (self._looked_after_ns is None or self._retimed):
             self._watch()
 
     def _guard(self) -> None:
         self._guarded = self.memory.get("bus_watchdog") != 0
+        self._retimed = True
 
     def _watch(self) -> None:
         """See to it that the Bus Watchdog is looked after when its time runs out, or before."""
         if not (units := self._watchdog_units()):
             return
+        self._retimed = False
         end_ns = self._heard_ns + units * WATCHDOG_UNIT_NS
         if self._looked_after_ns is None or end_ns < self._looked_after_ns:
             self._looked_after_ns = end_ns
