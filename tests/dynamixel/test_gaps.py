@@ -162,3 +162,17 @@ def test_a_transaction_that_a_cycle_cut_off_is_asked_again(rounds):
     rounds.rig.clock.wait_until(rounds.rig.clock.now_ns() + 5_000_000)
     assert rounds.gap(1_000_000) == [protocol2.read(11, 7, 1)]
     assert found == [[11]]
+
+
+def test_a_gap_begins_nothing_on_a_line_that_was_late_until_that_is_forgotten(rounds):
+    found = []
+    now = rounds.rig.clock.now_ns()
+    rounds.gaps.came(now, now - 400_000)  # its cyclic reply came so late
+    rounds.gaps.add(reading(rounds, 11, 7), found.append, Urgency.SLOW, "a read")
+    assert rounds.gap(READ_NS + 150_000) == []
+    assert rounds.gaps.late_ns == 400_000
+    for _ in range(200):
+        rounds.gaps.came(now, now)
+    assert rounds.gaps.late_ns < 50_000
+    assert len(rounds.gap(READ_NS + 150_000)) == 1
+    assert found == [[11]]

@@ -19,6 +19,8 @@ from dxlrun.events import EventCode, EventSink, Severity
 
 LEAST_PATIENCE_NS = 100_000
 """A reply is awaited at least so long beyond the moment at which it is due; a servo is late by less."""
+_FORGOTTEN = 6
+"""By 2 ** -6 of itself the lateness of a line is forgotten with each reply that is less late."""
 STARVED = 50
 """Cycles after which an urgent program goes on though the gap is too short: a skipped period is better than a
 joint that gets no goals for the rest of the run."""
@@ -93,13 +95,25 @@ class Gaps:
     and `done` is called with what it returned: a line that is gone answers with time-outs (`abandon`).
     """
 
-    __slots__ = ("_count", "_current", "_events", "_latency_ns", "_plan", "_tasks", "_until_ns", "now_ns")
+    __slots__ = (
+        "_count",
+        "_current",
+        "_events",
+        "_latency_ns",
+        "_plan",
+        "_tasks",
+        "_until_ns",
+        "late_ns",
+        "now_ns",
+    )
 
     def __init__(self, plan: BusPlan, events: EventSink, now_ns: Callable[[], int]) -> None:
         self._plan = plan
         self._events = events
         self.now_ns = now_ns
         self._latency_ns = plan.latency_ns
+        self.late_ns = 0
+        """How late replies on this line came at worst in the last moment, beside the adapter's latency."""
         self._tasks: list[_Task] = []  # in the order of their turns
         self._current: _Task | None = None
         self._until_ns = 0
@@ -121,6 +135,15 @@ class Gaps:
         self._count += 1
         insort(self._tasks, _Task(_ended(program, done), (urgency, self._count), name, servo), key=_turn)
 
+    def came(self, at_ns: int, due_ns: int) -> None:
+        """Take note of when a reply came and when it was due: a gap begins nothing that would end as late.
+
+        Who answers behind its gap talks into the next cyclic read, which costs far more than it brings.
+        """
+        late_ns = at_ns - due_ns - self._latency_ns
+        forgotten_ns = self.late_ns - (self.late_ns >> _FORGOTTEN) - 1
+        self.late_ns = max(late_ns, forgotten_ns, 0)
+
     @property
     def waiting(self) -> int:
         """How many programs have not come to their end."""
@@ -137,6 +160,8 @@ class Gaps:
     def advance(self, reply: Reply | None) -> Transaction | None:
         """Give a reply to the program that waits for it, return the next transaction that fits the gap."""
         if reply is not None and self._current is not None:
+            if reply.answered and (asked := self._current.next) is not None:
+                self.came(reply.last_ns, reply.sent_ns + asked.due_ns)
             self._resume(self._current, replace(reply, parameters=bytes(reply.parameters)))
         first = reply is None
         while (task := self._ready()) is not None:
@@ -197,11 +222,11 @@ class Gaps:
         left_ns = self._until_ns - self.now_ns()
         latest_ns = wanted.due_ns
         if wanted.awaited:
-            latest_ns += self._latency_ns + LEAST_PATIENCE_NS
+            latest_ns += self._latency_ns + max(self.late_ns, LEAST_PATIENCE_NS)
         if latest_ns > left_ns:
             if not first or not self._forced(task, latest_ns, left_ns):
                 return None
-            left_ns = latest_ns - LEAST_PATIENCE_NS + SHORT_PATIENCE_NS
+            left_ns = latest_ns + SHORT_PATIENCE_NS
         task.starved = 0
         return replace(wanted, timeout_ns=min(wanted.timeout_ns, left_ns))
 

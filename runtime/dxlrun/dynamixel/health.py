@@ -101,7 +101,7 @@ class Servos:
         self._states = StateArrays(plan)
         self.goals = wanted.goals
         """Builds the sync write."""
-        self.reads = CyclicReads(plan, self._states, bus.room)
+        self.reads = CyclicReads(plan, self._states, bus)
         """The job that reads every servo once."""
         self.torqued = np.zeros(count, dtype=np.bool_)
         """Shape (servos,): who has torque for certain and missed no reply since; they get goals."""
@@ -149,6 +149,8 @@ class Servos:
         self._states.decode(states, reads.fresh, reads.arrived_ns, now_ns)
         if not reads.fresh.all() or any(self._missed):
             self._count_losses()
+        elif self._rows:
+            self._gaps.came(int(reads.arrived_ns[-1]), self._bus.due_ns)
         if reads.errors != self._said_errors:
             self._say_errors()
         if self._bus.noise_bytes != self._noise_seen and now_ns - self._noise_at_ns >= NOISE_EVENT_NS:
