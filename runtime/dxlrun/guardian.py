@@ -43,6 +43,8 @@ LEAST_PATIENCE_NS = 50_000_000
 SETUP_PATIENCE_NS = 1_000_000_000
 """Set-up and shutdown beat once a transaction; a transaction ends within milliseconds."""
 
+LEAST_NAP_NS, LONGEST_NAP_NS = 5_000_000, 10_000_000
+"""It looks at the loop once a period within these bounds: a look takes some 60 us from a loop on its core."""
 LONGEST_LOOK_NS = 20_000_000
 """One look of the guardian counts for at most this: when it was not running, the loop may not have been."""
 
@@ -214,7 +216,7 @@ class Guardian:
     def _watch(self, loop: subprocess.Popen[bytes], handing: Handing) -> Ending:
         """Return how the loop ended; it is dead and reaped then."""
         watched = os.pidfd_open(loop.pid)
-        nap = min(self._job.period_ns, 10_000_000) * 1e-9
+        nap = min(max(self._job.period_ns, LEAST_NAP_NS), LONGEST_NAP_NS) * 1e-9
         killed: Ending | None = None
         while True:
             ready, _, _ = select.select([*self._watched(watched), *handing.watched], [], [], nap)

@@ -13,7 +13,7 @@ import socket
 import sys
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import msgspec
 
@@ -24,6 +24,7 @@ from dxlrun.commands import CommandRing
 from dxlrun.compile.plan import Plan, from_json
 from dxlrun.control import realtime
 from dxlrun.control.loop import StopFlag
+from dxlrun.control.loop_plan import SchedulerPlan
 from dxlrun.control.margin import Pacing
 from dxlrun.control.plugins import load_plugins
 from dxlrun.control.policy_plan import TORQUE_STAYS, Last
@@ -150,6 +151,16 @@ def _reply_polling(wish_ns: int | None) -> ReplyPolling | None:
     return None if wish_ns == 0 else ReplyPolling(wish_ns)
 
 
+def _beside_simulation(plan: Plan) -> SchedulerPlan:
+    """Return the scheduler's wishes: off the core of simulated servos, whose process goes before the loop."""
+    scheduler = plan.loop.scheduler
+    others = os.sched_getaffinity(0) - {process.spare_core(())}
+    if scheduler.policy == "other" or scheduler.cores or not others:
+        return scheduler
+    simulated = any(bus.port == "sim" for bus in plan.buses)
+    return replace(scheduler, cores=tuple(sorted(others))) if simulated else scheduler
+
+
 def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: RingSinks) -> Outcome:
     """Execute the plan from plug-ins to torque off."""
     stop = StopFlag()
@@ -184,7 +195,7 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: RingSinks) -> Ou
     failures: tuple[str, ...] = ()
     last: Last = "limp"
     try:
-        grants = realtime.apply(plan.loop.scheduler)
+        grants = realtime.apply(_beside_simulation(plan))
         heartbeat.beat()
         grants = (*grants, pacing.measure(plan.loop.period_ns, heartbeat.beat))
         if ports.polling:
