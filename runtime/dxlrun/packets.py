@@ -13,7 +13,8 @@ PACKET_SLOT = 2048
 """Bytes of one slot of the packets' ring: a batch, usually the packets of one cycle."""
 
 _HEADER = struct.Struct("<BBBxI qq")
-_HEADER_SIZE = _HEADER.size
+RECORD_HEADER = _HEADER.size
+"""Bytes in front of the packet in its record; its two times, 64-bit each, are the last of them."""
 _USED, _NUMBER = 0, 1
 _WORDS = 2
 _DESK_HEADER = 8 * _WORDS
@@ -59,6 +60,10 @@ class PacketSink(Protocol):
         """Record bytes that were sent or received; `data` is copied before the call returns."""
         ...
 
+    def records(self, records: memoryview) -> None:
+        """Record packets whose records were made by `record`, one behind the other; they are copied."""
+        ...
+
 
 class PacketBatch:
     """Collects packets in a buffer made before real time; one `commit` a cycle hands them on together.
@@ -86,12 +91,12 @@ class PacketBatch:
             raise ValueError(f"a slot of {self._room} bytes holds no packet")
 
     def packet(  # noqa: PLR0917  called for every packet in the loop: positional is quickest
-        self, bus: int, kind: PacketKind, servo_id: int, first_ns: int, last_ns: int, data: Payload
+        self, bus: int, kind: int, servo_id: int, first_ns: int, last_ns: int, data: Payload
     ) -> None:
         """Record bytes that were sent or received; times in ns of the run's clock."""
         length = len(data)
         start = self._used
-        body = start + _HEADER_SIZE
+        body = start + RECORD_HEADER
         end = body + length
         if end > self._room:
             self._overfull((bus, kind, servo_id, first_ns, last_ns), data)
@@ -100,7 +105,18 @@ class PacketBatch:
         self._buffer[body:end] = data
         self._used = self._words[_USED] = end
 
-    def _overfull(self, head: tuple[int, PacketKind, int, int, int], data: Payload) -> None:
+    def records(self, records: memoryview) -> None:
+        """Record packets whose records were made by `record`, one behind the other."""
+        start = self._used
+        end = start + len(records)
+        if end > self._room:
+            for packet in split_packets(records):
+                self.packet(*packet)
+            return
+        self._buffer[start:end] = records
+        self._used = self._words[_USED] = end
+
+    def _overfull(self, head: tuple[int, int, int, int, int], data: Payload) -> None:
         self.commit()
         most = self._room - _HEADER.size
         for start in range(0, len(data), most):
@@ -142,8 +158,16 @@ class NoPackets:
     ) -> None:
         """Forget it."""
 
+    def records(self, records: memoryview) -> None:
+        """Forget them."""
+
     def commit(self) -> None:
         """Nothing to hand on."""
+
+
+def record(bus: int, kind: PacketKind, servo_id: int, data: Payload) -> bytes:
+    """Return the record of a packet as it lies in a batch, its times 0."""
+    return _HEADER.pack(bus, kind, servo_id, len(data), 0, 0) + bytes(data)
 
 
 def decode_packets(payload: Payload) -> list[LoggedPacket]:

@@ -20,7 +20,7 @@ from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.plan import Wiring, bus_plan
 from dxlrun.events import EventCode, Severity
 from dxlrun.interfaces import Commands, States
-from dxlrun.packets import LoggedPacket, PacketKind
+from dxlrun.packets import LoggedPacket, PacketKind, decode_packets
 from dxlrun.simulation import BusConfig, Ledger, ServoConfig, SimulatedBus, VirtualPorts, read_ledger
 from dxlrun.simulation.process import encode_config
 
@@ -35,6 +35,9 @@ class Packets:
 
     def packet(self, bus, kind, servo_id, first_ns, last_ns, data):  # noqa: PLR0917  the contract of PacketSink
         self.list.append(LoggedPacket(bus, kind, servo_id, first_ns, last_ns, bytes(data)))
+
+    def records(self, records):
+        self.list += decode_packets(records)
 
     def sent(self, bus=0):
         return [p.data for p in self.list if p.bus == bus and p.kind is PacketKind.INSTRUCTION]

@@ -26,25 +26,30 @@ class Burst:
     """The replies to one transaction, all of one length, and their place at the start of a buffer."""
 
     __slots__ = (
+        "_alone",
         "_bodies",
         "_buffer",
         "_end",
+        "_errors_at",
         "_expected",
         "_fast",
         "_head",
         "_heads",
+        "_ids",
         "_lead",
         "_no_errors",
-        "_step",
+        "_quiet_lead",
         "_tails",
         "_two",
         "count",
         "data",
+        "data_at",
         "first",
         "first_size",
         "ids",
         "packets",
         "size",
+        "step",
     )
 
     def __init__(self, dialect: Dialect, transaction: Transaction) -> None:
@@ -57,16 +62,23 @@ class Burst:
         self._fast = transaction.fast
         whole = [dialect.status_packet(servo_id, 0, bytes(length)) for servo_id in self.ids]
         self._head = 8 if self._two else 4
-        self._step = length + 4 if self._fast else len(whole[0])
-        self.size = _FAST_HEAD + self._step * self.count if self._fast else self._step * self.count
+        self.step = length + 4 if self._fast else len(whole[0])
+        """Bytes from one servo's data to those of the next."""
+        self.data_at = self._head + (_FAST_TAIL if self._fast else 1)
+        """Where the data of the first one begin."""
+        self.size = _FAST_HEAD + self.step * self.count if self._fast else self.step * self.count
         """Bytes of all replies."""
-        self.first_size = self.size if self._fast else self._step
+        self.first_size = self.size if self._fast else self.step
         """Bytes of the first status packet."""
         if self._fast:
             lead = (self.size - 7).to_bytes(2, "little")
             whole = [dialect.HEADER + bytes((BROADCAST_ID,)) + lead + whole[0][7:8]]
         self._expected = [int.from_bytes(packet[: self._head], "little") for packet in whole]
         self._lead = whole[0][: self._head]
+        self._quiet_lead = self._lead + b"\0"
+        self._errors_at = slice(self._head, self.size, self.step)
+        self._ids = bytes(self.ids)
+        self._alone = self.count == 1 and not self._two
         self._no_errors = bytes(self.count)
         self._buffer = bytearray()
         self.bind(bytearray(self.size))
@@ -85,8 +97,8 @@ class Burst:
         if buffer is self._buffer:
             return
         self._buffer = buffer
-        view, step, count = memoryview(buffer), self._step, self.count
-        data_at = self._head + (_FAST_TAIL if self._fast else 1)
+        view, step, count = memoryview(buffer), self.step, self.count
+        data_at = self.data_at
         length = self.size - (count - 1) * step - data_at - (2 if self._two else 1)
         self.data: NDArray[np.uint8] = np.ndarray(
             (count, length), np.uint8, buffer, offset=data_at, strides=(step, 1)
@@ -114,14 +126,20 @@ class Burst:
     @property
     def errors(self) -> bytes:
         """The error bytes, one a servo."""
-        return bytes(self._buffer[self._head : self.size : self._step])
+        return bytes(self._buffer[self._errors_at])
 
     def begun(self, end: int) -> bool:
         """Say whether the first `end` bytes of the buffer can become these replies."""
         if end < self._head:
             return self._buffer.startswith(self._lead[:end])
-        known = 1 if self._fast else (end - self._head) // self._step + 1
+        known = 1 if self._fast else (end - self._head) // self.step + 1
         return list(self._heads[:known]) == self._expected[:known]
+
+    def clean(self) -> bool:
+        """Say whether these replies are `whole`, and nobody reports anything."""
+        if self._alone:
+            return self._buffer.startswith(self._quiet_lead) and sum(self._bodies[0]) & 0xFF == 0xFF
+        return self._buffer[self._errors_at] == self._no_errors and self.whole()
 
     def whole(self) -> bool:
         """Say whether the buffer begins with exactly these replies, every checksum right, no refusal."""
@@ -130,7 +148,7 @@ class Burst:
         if not self._two:
             # the checksum is the complement of the sum of what stands before it (protocol1)
             return all([sum(body) & 0xFF == 0xFF for body in self._bodies])  # noqa: C419  twice as quick
-        errors = self._buffer[self._head : self.size : self._step]
+        errors = self._buffer[self._errors_at]
         if errors != self._no_errors and len(errors.translate(None, _NUMBERS)) != self.count:
             return False
         return self._chained() if self._fast else self._separate()
@@ -141,7 +159,7 @@ class Burst:
         return self._buffer.find(_STUFFING, 0, self.size) < 0
 
     def _chained(self) -> bool:
-        if bytes(self._buffer[self._head + 1 : self.size : self._step]) != bytes(self.ids):
+        if self._buffer[self._head + 1 : self.size : self.step] != self._ids:
             return False
         crc = 0
         for body, tail in zip(self._bodies, self._tails.tolist(), strict=True):

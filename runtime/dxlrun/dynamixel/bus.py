@@ -6,13 +6,14 @@ pumps it decides when: read, write, or the gap before the next deadline.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from dxlrun.clock import Clock
 from dxlrun.dynamixel.bus_plan import BusPlan
 from dxlrun.dynamixel.dialect import dialect_of
 from dxlrun.dynamixel.line import BITS_PER_BYTE
-from dxlrun.dynamixel.port import Port
+from dxlrun.dynamixel.port import Port, Ports
 from dxlrun.dynamixel.receiver import Receiver
 from dxlrun.dynamixel.transaction import (
     BROADCAST_ID,
@@ -27,6 +28,7 @@ from dxlrun.packets import PacketKind, PacketSink
 
 if TYPE_CHECKING:  # the guardian makes servos limp without numpy
     from dxlrun.dynamixel.burst import Burst
+    from dxlrun.dynamixel.lane import Lane
 
 NEVER = 1 << 62
 QUIET_BYTES = 20
@@ -52,14 +54,13 @@ class Bus:
     __slots__ = (
         "_awaited",
         "_burst",
-        "_byte_ns",
         "_deadline_ns",
         "_dialect",
         "_drain_end_ns",
         "_earliest_ns",
         "_free_ns",
-        "_index",
         "_job",
+        "_lane",
         "_last_byte_ns",
         "_now_ns",
         "_open",
@@ -74,8 +75,11 @@ class Bus:
         "_sent_ns",
         "_sink",
         "_state",
+        "buffer",
+        "byte_ns",
         "due_ns",
         "failure",
+        "index",
         "name",
         "noise_bytes",
         "room",
@@ -87,17 +91,20 @@ class Bus:
         """Why the line is gone; a bus with a failure does nothing more."""
         self.noise_bytes = 0
         """Bytes that belonged to no intact packet, since the start."""
-        self._index = index
+        self.index = index
+        """Its number in the log."""
         self._port = port
         self._now_ns = clock.now_ns
         self._sink = packets
-        self._byte_ns = BITS_PER_BYTE * 1_000_000_000 // plan.baud_rate
-        self._quiet_ns = max(QUIET_BYTES * self._byte_ns, LEAST_QUIET_NS) + plan.latency_ns
+        self.byte_ns = BITS_PER_BYTE * 1_000_000_000 // plan.baud_rate
+        """What a byte takes on the wire, ns."""
+        self._quiet_ns = max(QUIET_BYTES * self.byte_ns, LEAST_QUIET_NS) + plan.latency_ns
         self._dialect = dialect_of(plan.protocol)
         self._overhead = self._dialect.OVERHEAD
         self._receiver = Receiver(self._status, self._noise, self._dialect, self._gathered)
         self._reply = Reply(_SENT, 0, b"", 0, 0, False)
         self._job: Job | None = None
+        self._lane: Lane | None = None
         self._awaited: Transaction | None = None
         self._state = _READY
         self.due_ns = 0
@@ -106,6 +113,8 @@ class Bus:
         self._room = self._receiver.space
         self.room = self._receiver.room
         """The most bytes that a burst of replies may have."""
+        self.buffer = self._receiver.buffer
+        """Where replies lie."""
         self._sent_ns = self._earliest_ns = self._deadline_ns = self._free_ns = 0
         self._drain_end_ns = 0
         self._reply_size = 0
@@ -131,15 +140,47 @@ class Bus:
         self._state = _READY
         self._receiver.flush()  # the half of a packet that the lost line brought is nobody's
 
-    def load(self, job: Job) -> None:
-        """Take a job; the next `step` begins it. What an aborted job left behind is forgotten."""
+    def load(self, job: Job, lane: Lane | None = None) -> None:
+        """Take a job; the next `step` begins it. What an aborted job left behind is forgotten.
+
+        `lane`: the quick way through it, if there is one; see `straight`.
+        """
         self._awaited = self._burst = None
         self._state = _READY
         self.receive()  # what came since the last job belongs to nobody
         if self.failure is not None:
             return
-        self._job = job
+        self._job, self._lane = job, lane
         self._reply.strays = 0
+
+    def straight(self, ports: Ports, beat: Callable[[], None]) -> None:
+        """Go the quick way through a job that was just loaded; `step` does what is left of it.
+
+        The line is the only one.
+        """
+        lane, self._lane = self._lane, None
+        if lane is None or self._job is None:
+            return
+        if self._receiver.pending:
+            self._receiver.flush()
+        while self._now_ns() < self._free_ns:
+            if ports.wait(self._free_ns):
+                return  # nobody was asked
+        try:
+            lane.run(self._port, ports, self._room, self._now_ns, self._sink, beat)
+        except PortError as error:
+            lane.end()
+            self._fail(error)
+            return
+        self._last_byte_ns = lane.at_ns
+        transaction = lane.end()
+        if transaction is None:
+            self._job = None
+            return
+        self._burst = self._job.burst
+        self._await(transaction, lane.sent_ns)
+        self._free_ns = lane.sent_ns + len(transaction.packet) * self.byte_ns
+        self._hear(lane.count, lane.at_ns)
 
     def begin_behind(self) -> None:
         """Send the first instruction of the loaded job at once, though the line may not be free yet.
@@ -180,24 +221,31 @@ class Bus:
 
     def _take_bytes(self) -> None:
         receiver = self._receiver
-        burst = self._burst
-        if burst is not None and not receiver.pending:
-            # nearly always all replies are there at once: no need to keep book of what came when
-            count = self._port.read_into(self._room)
-            if not count:
-                return
-            at_ns = self._last_byte_ns = self._now_ns()
-            whole = count == burst.size and self._state == _AWAITING and burst.whole()
-            if whole and self._in_time(burst, at_ns):
-                self._burst = None
-                self._take_all(burst, at_ns, [])
-                return
-            receiver.expect(burst)
-            self._burst = None
-            receiver.accept(count, at_ns)
-        elif receiver.read_from(self._port, self._now_ns):
-            self._last_byte_ns = self._now_ns()
+        if self._burst is None or receiver.pending:
+            if receiver.read_from(self._port, self._now_ns):
+                self._last_byte_ns = self._now_ns()
+                self._skip_headers()
+        # nearly always all replies are there at once: no need to keep book of what came when
+        elif count := self._port.read_into(self._room):
+            self._hear(count, self._now_ns())
+
+    def _hear(self, count: int, at_ns: int) -> None:
+        """Take the first bytes of a burst."""
+        burst, self._burst = self._burst, None
+        if burst is None or not count:
+            self._burst = burst
+            return
+        self._last_byte_ns = at_ns
+        if count == burst.size and self._state == _AWAITING and burst.whole() and self._in_time(burst, at_ns):
+            self._take_all(burst, at_ns, [])
+            return
+        self._receiver.expect(burst)
+        self._receiver.accept(count, at_ns)
+        self._skip_headers()
+
+    def _skip_headers(self) -> None:
         # as many bytes as an awaited reply has, and it is not whole: its header is a false one
+        receiver = self._receiver
         while self._state == _AWAITING and receiver.pending >= self._reply_size and not receiver.gathering:
             receiver.skip_header()
 
@@ -242,30 +290,36 @@ class Bus:
             return 0
         if self._receiver.pending:
             self._receiver.flush()
+        self._burst = job.burst
+        packet = transaction.packet
+        now_ns = self._write(packet, transaction.servo_id) if packet else self._now_ns()
+        self._await(transaction, self._sent_ns if packet else now_ns)
+        return now_ns
+
+    def _await(self, transaction: Transaction, started_ns: int) -> None:
+        """Await the replies to a transaction whose instruction is on its way."""
+        reply, burst = self._reply, self._burst
+        self._awaited = transaction
         self._receiver.expect(None)
-        burst = self._burst = job.burst
         reply.parameters = b""
         reply.error = reply.strays = 0
         reply.echoed = False
-        packet = transaction.packet
-        now_ns = self._write(packet, transaction.servo_id) if packet else self._now_ns()
-        started_ns = reply.sent_ns = self._sent_ns if packet else now_ns
+        reply.sent_ns = self._sent_ns = started_ns
         if transaction.awaited:
             reply.outcome = _TIMEOUT
             self._state = _AWAITING
-            self._earliest_ns = started_ns + (len(packet) + self._overhead) * self._byte_ns
+            self._earliest_ns = started_ns + (len(transaction.packet) + self._overhead) * self.byte_ns
             self._deadline_ns = started_ns + transaction.timeout_ns
             self._reply_size = transaction.widest
             self._open = (1 << len(transaction.awaited)) - 1
             self._refused = False
             if burst is not None:
-                burst.bind(self._receiver.buffer)
+                burst.bind(self.buffer)
         else:
             reply.outcome = _SENT
             self._state = _RESTING
             self._deadline_ns = started_ns + transaction.due_ns
         self.due_ns = started_ns + transaction.due_ns
-        return now_ns
 
     def _write(self, packet: bytes | bytearray | memoryview, servo_id: int) -> int:
         """Send a packet; return the time after that."""
@@ -273,10 +327,10 @@ class Bus:
         before = now_ns()
         self._port.write(packet)
         after = now_ns()
-        self._sink.packet(self._index, _INSTRUCTION, servo_id, before, after, packet)
+        self._sink.packet(self.index, _INSTRUCTION, servo_id, before, after, packet)
         # a second packet waits in the adapter until the first is off the wire
         start = self._sent_ns = self._free_ns if self._free_ns > before else before
-        self._free_ns = start + len(packet) * self._byte_ns
+        self._free_ns = start + len(packet) * self.byte_ns
         return after
 
     def _give_up(self, now_ns: int) -> None:
@@ -302,14 +356,14 @@ class Bus:
 
     def _in_time(self, burst: Burst, first_ns: int) -> bool:
         """Say whether the first reply is of now: one of before, or an echo, comes sooner than the wire."""
-        return first_ns >= self._earliest_ns + (burst.first_size - self._overhead) * self._byte_ns
+        return first_ns >= self._earliest_ns + (burst.first_size - self._overhead) * self.byte_ns
 
     def _take_all(self, burst: Burst, last_ns: int, spans: list[tuple[int, int]]) -> None:
         """Take all replies of a transaction; `spans`: of each status packet, when they came in pieces."""
         job = self._job
         if job is None:
             return
-        packet, index = self._sink.packet, self._index
+        packet, index = self._sink.packet, self.index
         for number, (servo_id, data) in enumerate(burst.packets):
             first, last = spans[number] if spans else (last_ns, last_ns)
             packet(index, _STATUS, servo_id, first, last, data)
@@ -321,7 +375,7 @@ class Bus:
         job.take(burst, moments if len(moments) == burst.count else last_ns)
 
     def _noise(self, data: memoryview, first_ns: int, last_ns: int) -> None:
-        self._sink.packet(self._index, PacketKind.NOISE, BROADCAST_ID, first_ns, last_ns, data)
+        self._sink.packet(self.index, PacketKind.NOISE, BROADCAST_ID, first_ns, last_ns, data)
         # a status of a fast form that is cut off, or spoilt at a place: the parts before it are good
         unused = len(data) - (self._shared(data, last_ns) if self._shares(data) else 0)
         if unused:
@@ -346,7 +400,7 @@ class Bus:
         from dxlrun.dynamixel.burst import good_parts  # not above: see there
 
         parts, used = good_parts(self._dialect, awaited, data)
-        if last_ns < self._sent_ns + (len(awaited.packet) + used) * self._byte_ns:
+        if last_ns < self._sent_ns + (len(awaited.packet) + used) * self.byte_ns:
             return 0  # sooner than the wire allows: left over from before
         reply = self._reply
         for index, part in enumerate(parts):
@@ -359,7 +413,7 @@ class Bus:
         return used
 
     def _status(self, packet: memoryview, first_ns: int, last_ns: int) -> None:
-        self._sink.packet(self._index, _STATUS, packet[self._dialect.ID_AT], first_ns, last_ns, packet)
+        self._sink.packet(self.index, _STATUS, packet[self._dialect.ID_AT], first_ns, last_ns, packet)
         if self._shares(packet):
             if not self._shared(packet, last_ns):
                 self._stray(packet)
@@ -385,7 +439,7 @@ class Bus:
         servo_id, error, parameters = status
         length = len(parameters)
         # an echo, or left over from before, comes sooner than the wire allows
-        if self._awaited is None or last_ns < self._earliest_ns + length * self._byte_ns:
+        if self._awaited is None or last_ns < self._earliest_ns + length * self.byte_ns:
             return -1
         for index, one in enumerate(self._awaited.awaited):
             if one.servo_id == servo_id and self._open >> index & 1:

@@ -18,7 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.dynamixel.burst import Burst
+from dxlrun.dynamixel.bus import Bus
 from dxlrun.dynamixel.bus_plan import BusPlan
+from dxlrun.dynamixel.lane import Lane, Stretch
 from dxlrun.dynamixel.line import PATIENCE_NS, SHORT_PATIENCE_NS, Line
 from dxlrun.dynamixel.plan import plan_line
 from dxlrun.dynamixel.reads import state_read
@@ -31,6 +33,12 @@ MOST_CHAINS = 64
 MOST_BROKEN = 5
 """So many fast reads of a group that stay incomplete, with no complete one among them, are no accident:
 somebody answers when it is asked by itself, and not in the shared status."""
+
+CALM_CYCLES = 2
+"""After so many cycles in which everybody answered, and in order, a lane is laid for them."""
+
+MOST_LANES = 8
+"""Some lanes that were laid are kept: replies change their length after a loss, and after that again."""
 
 # to look into an Enum takes longer than the rest of a call
 _OK, _TIMEOUT = Outcome.OK, Outcome.TIMEOUT
@@ -65,6 +73,14 @@ class _Request:
         self.servos = rows_of(indices)
         self.data, self.rows = arrays.place(indices if alike else indices[:1])
 
+    def stretch(self, shape: int) -> Stretch | None:
+        """Return this read, patient, for a lane; None where it has no burst."""
+        burst = self.bursts[shape]
+        if burst is None:
+            return None
+        rows = tuple(np.arange(len(self.data))[self.rows].tolist())
+        return Stretch(self.patient[shape], burst, self.indices, self.data, rows)
+
 
 class CyclicReads:
     """The job that reads the state of every servo of one bus once."""
@@ -73,10 +89,13 @@ class CyclicReads:
         "_arrays",
         "_arrived",
         "_broken",
+        "_bus",
+        "_calm",
         "_current",
         "_erring",
         "_fresh",
         "_groups",
+        "_lanes",
         "_line",
         "_lossy",
         "_made",
@@ -87,8 +106,8 @@ class CyclicReads:
         "_queue",
         "_queue_of",
         "_replies",
-        "_room",
         "_shape",
+        "_smooth",
         "arrived_ns",
         "away",
         "burst",
@@ -97,10 +116,11 @@ class CyclicReads:
         "fresh",
         "garbled",
         "given_up",
+        "lane",
         "missed",
     )
 
-    def __init__(self, plan: BusPlan, arrays: StateArrays, room: int) -> None:
+    def __init__(self, plan: BusPlan, arrays: StateArrays, bus: Bus) -> None:
         count = len(plan.servos)
         self._fresh = bytearray(count)
         self._none = bytes(count)
@@ -126,7 +146,12 @@ class CyclicReads:
         self._groups = plan.groups
         self._replies = arrays.replies
         self._arrays = arrays
-        self._room = room
+        self._bus = bus
+        self._calm = 0  # cycles in a row in which nothing was lost or reported
+        self._smooth = False  # the newest one went through its lane
+        self._lanes: dict[tuple[tuple[int, ...], ...], Lane] = {}
+        self.lane: Lane | None = None
+        """The quick way through this cycle, when there is one."""
         self._erring = False  # somebody's newest error byte is not 0
         self.burst: Burst | None = None
         self._made: dict[tuple[int, ...], _Request] = {}
@@ -141,6 +166,9 @@ class CyclicReads:
 
     def begin(self) -> None:
         """Prepare for the next cycle."""
+        self._fresh[:] = self._none
+        if self._smooth:
+            return
         for number, lost in enumerate(self._lossy):
             if lost:
                 # once a cycle: if each loss counted, three silent servos of a group would ask alike for ever
@@ -148,7 +176,6 @@ class CyclicReads:
                 self._lossy[number] = False
             elif self._broken[number] and not self._apart(number):
                 self._broken[number] = 0
-        self._fresh[:] = self._none
         self._patient = True
         silent = tuple(map(bool, self.missed))
         if silent != self._queue_of:
@@ -159,6 +186,41 @@ class CyclicReads:
                 for indices in _turns([index for index in group if not self.away[index]], silent)
             ]
 
+        self.lane = self._laid(silent)
+
+    def _laid(self, silent: Sequence[bool]) -> Lane | None:
+        """Return the lane through the next cycle; None while anybody is silent, or reports an error."""
+        silence = any(missed and not away for missed, away in zip(silent, self.away, strict=True))
+        self._calm = 0 if silence or self._erring else self._calm + 1
+        if self._calm <= CALM_CYCLES:
+            return None
+        shapes = [self._shape[one.group] % len(one.patient) for one in self._queue]
+        key = (tuple(shapes), *(one.indices for one in self._queue))
+        if key not in self._lanes:
+            stretches = [one.stretch(shape) for one, shape in zip(self._queue, shapes, strict=True)]
+            known = [one for one in stretches if one is not None]
+            if len(known) < len(stretches) or not known:
+                return None
+            if len(self._lanes) >= MOST_LANES:
+                self._lanes.clear()
+            bus = self._bus
+            self._lanes[key] = Lane(
+                known, bus.index, bus.buffer, bus.byte_ns, len(self.missed), self.arrived_ns, self._went
+            )
+        return self._lanes[key]
+
+    def _went(self, lane: Lane) -> Transaction | None:
+        """Take note of who was read through a lane; return the read at which it ended, None for none."""
+        if lane.through:
+            self._fresh[:] = lane.fresh
+            self._smooth = not any(self._broken)
+            return None
+        for stretch in lane.stretches[: lane.done]:
+            for servo in stretch.servos:
+                self._fresh[servo] = 1
+        self._position = lane.done - 1
+        return self.advance(Reply(_OK, 0, b"", 0, 0, False))
+
     def _apart(self, number: int) -> bool:
         """Say whether somebody of a group was asked by itself in this cycle."""
         silent = self._queue_of
@@ -167,28 +229,36 @@ class CyclicReads:
     def leave(self, servo: int) -> None:
         """Ask a servo no more: it is lost, and its silence would cost the others their time."""
         self.away[servo] = True
-        self._queue_of = None
+        self._anew()
 
     def join(self, servo: int) -> None:
         """Ask a servo again from the next cycle on, with the others: it was found in order."""
         self.away[servo] = False
         self.missed[servo] = 0
+        self._anew()
+
+    def _anew(self) -> None:
+        """Think again about who is read how, before the next cycle."""
         self._queue_of = None
+        self._smooth = False
 
     def learn(self, return_delays: Mapping[int, int]) -> None:
         """Await replies when they are due by what the servos, by ID, were found to wait, ns."""
         self._line = replace(self._line, return_delays=dict(return_delays))
         self._made.clear()
-        self._queue_of = None
+        self._lanes.clear()
+        self._anew()
 
     def plain(self, group: int) -> None:
         """Read a group by the form that every firmware knows from the next cycle on."""
         self.fast[group] = False
         self._made.clear()
-        self._queue_of = None
+        self._lanes.clear()
+        self._anew()
 
     def advance(self, reply: Reply | None) -> Transaction | None:
         """Judge what came of a read, return the next."""
+        self._smooth = False
         if reply is None:
             self._position = 0
         else:
@@ -257,7 +327,7 @@ class CyclicReads:
                 self._made.clear()
             fast = self.fast[group] and len(indices) > 1
             request = self._made[indices] = _Request(
-                self._plan, self._line, group, indices, fast, self._arrays, self._room
+                self._plan, self._line, group, indices, fast, self._arrays, self._bus.room
             )
         return request
 

@@ -123,7 +123,7 @@ class DynamixelHardware:
             if not self._asked[index]:
                 servos.feeding.feed()
                 servos.reads.begin()
-                bus.load(servos.reads)
+                bus.load(servos.reads, servos.reads.lane)
             self._asked[index] = False
         pump(self._buses, self._ports, self._clock, self._beat)
         now = self._clock.now_ns()
