@@ -51,6 +51,36 @@ class Rig:
         return [data[7] if data[2] == 0xFD else data[4] for data in sent]
 
 
+def lose_the_write(rig):
+    """Lose the instruction behind a read of Torque Enable and three pings for somebody else: the write."""
+    rig.line.bus.after(4, lambda: rig.line.bus.alter_next_instruction("lost", lambda data: b""))
+
+
+def test_a_change_of_the_address_that_did_not_happen_is_noticed():
+    rig = Rig()
+    lose_the_write(rig)
+    with pytest.raises(ServoFault, match=r"was given ID \(7\) = 5, but still answers under its old one"):
+        changing.change_id(rig.one, 5)
+    lose_the_write(rig)
+    with pytest.raises(ServoFault, match=r"was given Baud Rate \(8\) = 3, but still answers at 57600 bit/s"):
+        changing.change_rate(rig.one, 1_000_000)
+    assert rig.one.read(["id", "baud_rate"]) == {"id": 1, "baud_rate": 1}
+
+
+def test_another_servo_at_the_new_address_is_not_taken_for_it():
+    rig = Rig()
+    other = rig.line.bus.add_servo(ServoConfig(5, "XL430-W250", 1.0))
+    other.silence()
+
+    def swap():
+        other.silence(False)
+        rig.line.bus.servos[0].silence()
+
+    rig.line.bus.after(5, swap)
+    with pytest.raises(ServoFault, match="who answers there is model number 1060, not 1020"):
+        changing.change_id(rig.one, 5)
+
+
 PROTOCOLS = [("AX-12A", 1.0), ("MX-64", 1.0), ("XM430-W350", 2.0), ("XL-320", 2.0)]
 
 
