@@ -71,3 +71,33 @@ def test_a_servo_that_lost_its_torque_unnoticed_gets_it_by_no_change_of_modes(ma
         rig.cycle()
     assert rig.torque() == [False, True]
     assert [source for source, _ in rig.events.of(EventCode.SERVO_LIMP)] == ["main_1_joint"]
+
+
+def test_a_wheel_that_made_more_turns_than_its_servo_counts_does_not_wind_them_back(make_wheel):
+    rig = make_wheel("MX-28", 1.0)
+    servo = rig.buses[0].servo(1)
+    servo.turn_by_hand(7.8 * math.tau)
+    standing = servo.position
+    change(rig, Mode.POSITION, 60)
+    assert servo.position == pytest.approx(standing, abs=0.1)
+    ((source, text),) = rig.events.of(EventCode.MODE)[-1:]
+    assert (source, "outside its limits" in text) == ("main_1_joint", True)
+
+
+def test_a_loop_that_is_late_again_and_again_asks_for_a_servos_watchdog_once(make_rig, make_plan):
+    plan = make_plan((1, 2), model="XM430-W350", protocol=2.0, reference=math.pi, return_delay_ns=0)
+    rig = make_rig(replace(plan, watchdog_ticks=10))
+    rig.hardware.start()
+    events = len(rig.events.of(EventCode.WATCHDOG))
+    for _ in range(20):
+        rig.hardware.read()
+        rig.hardware.write()
+        rig.clock.wait_until(rig.clock.now_ns() + 300_000_000)
+        rig.hardware.idle(rig.clock.now_ns())  # no time for anything in it
+    assert len(rig.events.of(EventCode.WATCHDOG)) - events == 19
+    seen = len(rig.into_bus())
+    for _ in range(10):
+        rig.cycle()
+    cleared = [data for data in rig.into_bus()[seen:] if data[7] == 3 and data[8] == 98 and data[10] == 0]
+    assert len(cleared) == 2
+    assert rig.torque() == [True, True]

@@ -177,3 +177,29 @@ class TestJumps:
     def test_who_was_not_seen_for_long_may_be_elsewhere(self, sift):
         sift(0.0, 0.0)
         assert sift(2.0, 0.0, after_ms=500)[0] == [True, True]
+
+    @pytest.fixture
+    def sifted(self, make_plan, make_rig):
+        """Return states after positions of the second joint, each with its time, age in ms, and whether it
+        came."""
+
+        def sift(*samples, **change):
+            plan = make_plan((1, 3), **change)
+            states = States.empty(2)
+            states.position[0] = 0.0
+            jumps = Jumps([plan], 2, make_rig(plan).events)
+            for now_ms, position, age_ms, came in samples:
+                states.position[1], states.age_ns[1] = position, age_ms * 1_000_000
+                states.valid[:] = True, came
+                jumps.sift(states, now_ms * 1_000_000)
+            return states
+
+        return sift
+
+    def test_a_servo_with_a_profile_is_no_faster_than_its_velocity_limit_can_be(self, sifted):
+        states = sifted((10, 0.0, 0, True), (20, 1.5, 0, True), model="XM430-W350", protocol=2.0)
+        assert (states.valid.tolist(), states.position[1]) == ([True, False], 0.0)
+
+    def test_a_row_looks_no_younger_for_a_reply_that_was_not_believed(self, sifted):
+        states = sifted((10, 0.0, 1, True), (20, 1.5, 1, True), (30, 0.0, 11, False))
+        assert (states.valid[1], states.age_ns[1]) == (False, 20_000_000)

@@ -18,7 +18,17 @@ class Feeding:
     `stopped` is told who gets no goal before its torque was read again, `failed` who could not be revived.
     """
 
-    __slots__ = ("_away", "_events", "_failed", "_fed_ns", "_gaps", "_longest_ns", "_plan", "_stopped")
+    __slots__ = (
+        "_away",
+        "_events",
+        "_failed",
+        "_fed_ns",
+        "_gaps",
+        "_longest_ns",
+        "_plan",
+        "_reviving",
+        "_stopped",
+    )
 
     def __init__(  # noqa: PLR0917  whom it looks after, whom it tells
         self,
@@ -37,6 +47,8 @@ class Feeding:
         self._failed = failed
         self._longest_ns = plan.watchdog_ticks * bus_watchdog.UNIT_NS or NEVER
         self._fed_ns = 0
+        self._reviving = [False] * len(away)
+        """Whose turn in the gaps has not come yet: a loop that is late again and again asks for no second."""
 
     def begin(self) -> None:
         """Note that the watchdogs were armed."""
@@ -54,6 +66,9 @@ class Feeding:
         fed = [index for index in here if bus_watchdog.has_one(plan, plan.servos[index])]
         for index in fed:
             self._stopped(index)
+            if self._reviving[index]:
+                continue
+            self._reviving[index] = True
             program = bus_watchdog.revive(plan, plan.servos[index])
             name = f"the Bus Watchdog of {plan.servos[index].joint}"
             self._gaps.add(program, partial(self._revived, index), Urgency.REPAIR, name, index)
@@ -63,6 +78,7 @@ class Feeding:
             self._events.emit(EventCode.WATCHDOG, Severity.ERROR, plan.name, text)
 
     def _revived(self, index: int, problem: str) -> None:
+        self._reviving[index] = False
         if problem and not self._away[index]:
             self._events.emit(EventCode.WATCHDOG, Severity.ERROR, self._plan.servos[index].joint, problem)
             self._failed(index)

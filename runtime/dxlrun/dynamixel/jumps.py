@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from dxlrun.control_table import control_table
 from dxlrun.dynamixel.bus_plan import BusPlan, ServoPlan
 from dxlrun.events import EventCode, EventSink, Severity
 from dxlrun.interfaces import States
@@ -21,7 +22,7 @@ SAY_AGAIN_NS = 1_000_000_000
 class Jumps:
     """Makes rows invalid whose position jumped; they keep their values until the new place can be true.
 
-    What is possible is the servo's highest speed setting times the time since its last good sample, so that a
+    What is possible is the servo's highest speed limit times the time since its last good sample, so that a
     servo that really stands elsewhere is believed again after a moment.
     """
 
@@ -45,7 +46,7 @@ class Jumps:
             for servo in plan.servos:
                 self._names[servo.row] = servo.joint
                 if not _wraps(servo):
-                    self._fastest[servo.row] = servo.max_speed_tick * servo.rad_s_per_tick
+                    self._fastest[servo.row] = _most_speed(plan, servo)
         # a step below this is always possible, whenever the sample before was
         self._quick = self._fastest * MARGIN_NS * 1e-9 + MARGIN_RAD
         self._last = np.full((3, joints), np.nan)
@@ -62,6 +63,10 @@ class Jumps:
         if np.count_nonzero(self._mask):
             for row in np.flatnonzero(self._mask & states.valid).tolist():
                 self._judge(states, row, now_ns)
+        if np.count_nonzero(states.valid) != states.valid.size:
+            # what was not believed made nothing younger
+            lasting = ~states.valid & (self._good_ns > 0)
+            np.maximum(states.age_ns, now_ns - self._good_ns, out=states.age_ns, where=lasting)
         self._last[0], self._last[1], self._last[2] = states.position, states.velocity, states.effort
         np.copyto(self._good_ns, now_ns, where=states.valid)
 
@@ -71,13 +76,22 @@ class Jumps:
             return
         states.valid[row] = False
         states.position[row], states.velocity[row], states.effort[row] = self._last[:, row]
-        states.age_ns[row] = elapsed_ns
         if now_ns - self._said_ns[row] >= SAY_AGAIN_NS:
             self._said_ns[row] = now_ns
             jump, time = np.degrees(self._delta[row]), elapsed_ns * 1e-6
             name = self._names[row]
             text = f"{name} jumped by {jump:.0f} deg in {time:.0f} ms, faster than it can turn: not believed"
             self._events.emit(EventCode.IMPLAUSIBLE, Severity.WARNING, name, text)
+
+
+def _most_speed(plan: BusPlan, servo: ServoPlan) -> float:
+    """Return the highest speed of a servo, rad/s: a profile may be set to more than the velocity limit.
+
+    Velocity Limit (44) of an X servo ends at 1023, Profile Velocity (112) at 32767 (e-Manual XM430-W350).
+    """
+    limit = control_table(servo.model, plan.protocol).items.get("velocity_limit")
+    ticks = servo.max_speed_tick if limit is None else min(servo.max_speed_tick, limit.maximum)
+    return ticks * servo.rad_s_per_tick
 
 
 def _wraps(servo: ServoPlan) -> bool:

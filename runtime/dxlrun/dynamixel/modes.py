@@ -24,6 +24,9 @@ from dxlrun.mode import Mode
 
 ENGAGE_SPEED = 0.5
 """rad/s. The goal is where the servo stands; should that be misread, it goes there slowly."""
+FARTHEST_INWARD = 1.0
+"""rad, no farther is a wheel led back [i]: one that made more turns than its servo counts would wind all of
+them up."""
 LONGEST_BACK = 64
 """Bytes; what stands farther apart is read back one by one."""
 _RESET = (
@@ -144,7 +147,9 @@ def hold(plan: BusPlan, servo: ServoPlan, mode: ModePlan, *, inward: bool = Fals
             return Held("did not answer when torque was to be switched on")
         present = ticks_in(servo.state.position, state.parameters)
         position = min(max(present, mode.lower_tick), mode.upper_tick)
-        if abs(position - present) > 1 and not inward:
+        beyond = abs(position - present)
+        unwound = servo.continuous and beyond * servo.rad_per_tick > FARTHEST_INWARD
+        if beyond > 1 and (unwound or not inward):
             return Held("stands outside its limits, or left them before torque was switched on")
     most_effort = 0
     if position is not None and len(mode.goals) > 1:
