@@ -102,12 +102,10 @@ def _watchdog_ticks(description: Description, plan: BusPlan, problems: Problems)
 
 def _slow_period_ns(description: Description, plan: BusPlan, problems: Problems) -> int:
     slow = description.robot.buses[plan.name].slow_registers
-    if slow.items is None:
-        return round(1e9 / slow.rate)
     tables = [control_table(servo.model, plan.protocol).items for servo in plan.servos]
     known = tuple(dict.fromkeys(name for items in tables for name in items))
-    for index, name in enumerate(slow.items):
+    for index, name in enumerate(slow.items or ()):
         if name not in known:
             mark = description.marks.value("buses", plan.name, "slow_registers", "items", index)
             problems.error(mark, f"no servo of bus {plan.name} has the item {name}", suggestion(name, known))
-    return round(1e9 / slow.rate) if slow.items else 0
+    return round(1e9 / slow.rate)

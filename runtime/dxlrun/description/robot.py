@@ -126,7 +126,7 @@ class SlowRegisters(Form):
         examples=["[present_temperature]"],
     )
     rate: float = Field(
-        default=1.0, gt=0, le=100, description="How often each of them is read, Hz.", examples=["1"]
+        default=1.0, ge=0.1, le=100, description="How often each of them is read, Hz.", examples=["1"]
     )
 
 
