@@ -87,9 +87,11 @@ def registers_to_restore(path: Path, backup: ServoBackup, table: ControlTable) -
         item = table.items.get(name)
         if item is None or item.access != "RW":
             wrong.append(f"{path}: a {table.model} has no register {name} to be written; take it out")
+        elif _stays(name):
+            continue
         elif not item.minimum <= value <= item.maximum and value != item.initial:
             wrong.append(f"{path}: {name} is {value}, not in {item.minimum}..{item.maximum}; correct it")
-        elif not _stays(name):
+        else:
             found.append(RegisterValue(item.address, item.size, value, name, item.area == "EEPROM"))
     if wrong:
         raise InputError("\n".join(wrong))

@@ -2,6 +2,7 @@
 
 import pytest
 
+from dxlrun import servo_backup
 from dxlrun.clock import VirtualClock
 from dxlrun.control_table import all_tables
 from dxlrun.dynamixel import changing
@@ -302,6 +303,26 @@ def test_torque_comes_to_a_wheel_of_protocol_1_and_moves_nothing():
 def test_a_servo_without_led_says_so():
     with pytest.raises(ServoFault, match="has no LED"):
         Rig("XW540-T260").one.blink(1)
+
+
+@pytest.mark.parametrize("protocol", [1.0, 2.0])
+def test_the_backup_of_every_model_fits_that_model_and_heals_it(tmp_path, protocol):
+    for table in all_tables():
+        if table.protocol != protocol or RATE not in table.baud_rates.values() or table.firmware:
+            continue
+        rig = Rig(table.model, protocol)
+        values = rig.one.read(servo_backup.kept_items(table), refused=True)
+        path = tmp_path / f"{table.model}.json"
+        servo_backup.write_backup(path, servo_backup.stamped(table, 1, (1, RATE), values))
+        wanted = servo_backup.registers_to_restore(path, servo_backup.read_backup(path), table)
+        assert not any(each.differs for each in rig.one.differences(wanted))
+        changed = [each for each in wanted if each.name in ("return_delay_time", "position_p_gain", "punch")]
+        assert changed
+        for each in changed:
+            rig.servo.poke(each.name, 3)
+        rig.one.write(wanted)
+        assert rig.instructions().count(3) == len(changed)
+        assert all(rig.servo.registers[each.name] == each.value for each in changed)
 
 
 @pytest.mark.parametrize("protocol", [1.0, 2.0])

@@ -3,6 +3,7 @@
 import pytest
 
 from dxlrun.clock import VirtualClock
+from dxlrun.control_table import all_tables
 from dxlrun.dynamixel import scanning
 from dxlrun.dynamixel.scanning import Wish, find, known_rates, scan
 from dxlrun.dynamixel.tool_line import ToolLine
@@ -50,6 +51,17 @@ def test_one_broadcast_ping_finds_all_servos_of_protocol_2():
     assert [one.remarks for one in found.servos] == [(), (), ()]
     assert sum(data[4] == 0xFE for data in line.heard) == 1
     assert {data[7] for data in line.heard} == {1, 2}  # pings and reads: nothing is written
+
+
+@pytest.mark.parametrize(("protocol", "rate"), [(1.0, 1_000_000), (2.0, 1_000_000)])
+def test_every_model_is_known_by_its_number_and_can_be_drafted_from(protocol, rate):
+    tables = [table for table in all_tables() if table.protocol == protocol]
+    servos = [ServoConfig(number + 1, table.model, 0.5) for number, table in enumerate(tables)]
+    found = scan(ToolLine(VirtualLine(*servos, protocol=protocol, rate=rate)), Wish((protocol,), (rate,)))
+    assert [one.model for one in found.servos] == [table.model for table in tables]
+    assert {one.return_delay for one in found.servos} == {500_000}
+    assert all(one.position is not None and one.lowest is not None for one in found.servos)
+    assert [one.remarks for one in found.servos] == [()] * len(tables)
 
 
 def test_a_servo_at_another_rate_is_found_at_its_own():
