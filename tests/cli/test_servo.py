@@ -2,10 +2,13 @@
 
 import io
 import json
+import os
 import sys
 
 import pytest
 
+from dxlrun.dynamixel import scanning
+from dxlrun.dynamixel.scanning import FoundServo
 from dxlrun.simulation import BusConfig, ServoConfig
 
 NEW = ("--protocol", "2.0", "--baud", "1000000")
@@ -124,7 +127,7 @@ def test_a_servo_moves_to_another_id_and_rate_and_is_started_anew_and_reset(one)
 
 
 def test_a_servo_is_found_without_being_told_where(one):
-    servo, _ = one("AX-12A", 1.0, 1_000_000, (1, 2))
+    servo, _ = one("AX-12A", 1.0, 1_000_000)
     said = servo(1, "get", "model_number", "--json")
     assert json.loads(said.out)["servo"] == {
         "id": 1,
@@ -133,11 +136,17 @@ def test_a_servo_is_found_without_being_told_where(one):
         "protocol": 1.0,
         "baud_rate": 1_000_000,
     }
-    assert servo(2, "baud", "57600", "--yes", *OLD).code == 0
-    assert servo(2, "id", "1", "--yes", "--protocol", "1.0", "--baud", "57600").code == 0
-    twice = servo(1, "get", "model_number", "--protocol", "1.0")
-    assert twice.code == 1
-    assert "ID 1 answers more than once (Protocol 1.0 at 1000000 bit/s; Protocol 1.0 at 57600" in twice.err
+
+
+def test_an_id_that_answers_in_two_places_is_asked_about(dxlrun, monkeypatch):
+    found = (FoundServo(2.0, 57_600, 1, "XM430-W350"), FoundServo(1.0, 1_000_000, 1, "AX-12A"))
+    monkeypatch.setattr(scanning, "find", lambda *_: found)
+    master, slave = os.openpty()
+    said = dxlrun("servo", os.ttyname(slave), 1, "get")
+    os.close(master)
+    os.close(slave)
+    assert said.code == 1
+    assert "ID 1 answers more than once (Protocol 2.0 at 57600 bit/s; Protocol 1.0 at 1000000" in said.err
 
 
 def test_torque_and_led_need_no_question_and_torque_guards_the_eeprom(one):
