@@ -176,3 +176,12 @@ def test_a_gap_begins_nothing_on_a_line_that_was_late_until_that_is_forgotten(ro
     assert rounds.gaps.late_ns < 50_000
     assert len(rounds.gap(READ_NS + 150_000)) == 1
     assert found == [[11]]
+
+
+def test_one_reply_that_came_a_second_late_does_not_close_the_gaps_of_the_next_seconds(rounds):
+    found = []
+    now = rounds.rig.clock.now_ns()
+    rounds.gaps.came(now, now - 1_000_000_000)  # the process was not running
+    rounds.gaps.add(reading(rounds, 11, 7), found.append, Urgency.MODE, "the mode of a servo")
+    assert len(rounds.gap(5_000_000)) == 1
+    assert found == [[11]]

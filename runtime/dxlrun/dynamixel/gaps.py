@@ -21,6 +21,8 @@ LEAST_PATIENCE_NS = 100_000
 """A reply is awaited at least so long beyond the moment at which it is due; a servo is late by less."""
 _FORGOTTEN = 6
 """By 2 ** -6 of itself the lateness of a line is forgotten with each reply that is less late."""
+_LATEST_NS = 1_000_000
+"""More than this is an accident of one reply, as after this process stood still, and not the line's way."""
 STARVED = 50
 """Cycles after which an urgent program goes on though the gap is too short: a skipped period is better than a
 joint that gets no goals for the rest of the run."""
@@ -140,7 +142,7 @@ class Gaps:
 
         Who answers behind its gap talks into the next cyclic read, which costs far more than it brings.
         """
-        late_ns = at_ns - due_ns - self._latency_ns
+        late_ns = min(at_ns - due_ns - self._latency_ns, _LATEST_NS)
         forgotten_ns = self.late_ns - (self.late_ns >> _FORGOTTEN) - 1
         self.late_ns = max(late_ns, forgotten_ns, 0)
 
