@@ -175,3 +175,30 @@ def test_what_the_manager_found_not_finite_stays_flagged():
     rig.record.clamped[1] = Clamp.NOT_FINITE | Clamp.STEP
     rig.apply(np.nan)
     assert rig.record.clamped.tolist() == [0, Clamp.NOT_FINITE]
+
+
+one_of_few = st.sampled_from([0.0, 0.3, 0.9, 1.5, -2.0, np.nan, np.inf])
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    velocity=st.none() | st.floats(1, 30),
+    commands=st.lists(
+        st.tuples(one_of_few, one_of_few, st.integers(1, 4), st.booleans(), st.booleans()), max_size=12
+    ),
+)
+def test_a_gate_that_looks_whether_it_stands_does_what_one_does_that_always_computes(velocity, commands):
+    quick, thorough = Rig(velocity=velocity, joints=2), Rig(velocity=velocity, joints=2)
+    for position, speed, repeats, faulty, moved in commands:
+        for repeat in range(repeats):
+            for rig in (quick, thorough):
+                rig.record.clamped[:] = Clamp.NOT_FINITE if faulty and repeat == 1 else 0
+                if moved and not repeat:
+                    rig.record.goals.position[1] = 0.1  # a servo came back where it stood
+            thorough.gate._settled = ()
+            assert str(quick.apply(position, speed)) == str(thorough.apply(position, speed))
+            for one, other in zip(quick.record.goals.arrays, thorough.record.goals.arrays, strict=True):
+                np.testing.assert_array_equal(one, other)
+            np.testing.assert_array_equal(quick.record.clamped, thorough.record.clamped)
+    assert quick.events == thorough.events
+    np.testing.assert_array_equal(quick.gate.counts, thorough.gate.counts)

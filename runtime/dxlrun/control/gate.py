@@ -77,6 +77,8 @@ class Gate:
         self._led = np.ones(count, dtype=np.bool_)
         """Joints that are led to positions."""
         self._all_led = self._any_led = True
+        self._settled: tuple[bytes, ...] = ()
+        """Commands and goals that the last cycle left as they were, with nothing to tell."""
         self.begin()
 
     def begin(self) -> None:
@@ -85,6 +87,7 @@ class Gate:
         np.logical_or(self._modes == Mode.POSITION, self._modes == Mode.EFFORT_POSITION, out=self._led)
         self._all_led, self._any_led = bool(self._led.all()), bool(self._led.any())
         self._drive.take(self._modes)
+        self._settled = ()
 
     def enter_modes(self) -> None:
         """Give the joints whose mode has changed goals that move nothing in the new one; after each read.
@@ -119,6 +122,9 @@ class Gate:
         flags = self._flags
         np.bitwise_and(self._record.clamped, _NOT_FINITE, out=flags)  # what the manager found
         speed = self._highest(dt_ns)
+        if self._rests(commands, goals):
+            np.copyto(self._record.clamped, flags)
+            return
         if self._any_led:
             self._position(commands.position, goals.position, speed, dt_ns)
             self._velocity(commands.velocity, goals.velocity)
@@ -128,6 +134,28 @@ class Gate:
         if np.count_nonzero(flags):
             self._note(flags & ~self._before)
         np.copyto(self._before, flags)
+        after = (goals.position.tobytes(), goals.velocity.tobytes())
+        calm = not (self._drive.any or np.count_nonzero(flags))
+        self._settled = (commands.position.tobytes(), commands.velocity.tobytes(), *after) if calm else ()
+
+    def _rests(self, commands: Commands, goals: Commands) -> bool:
+        """Say whether the goals are where the commands want them, as in the cycle before: nothing to do then.
+
+        A goal that no limit holds back has arrived in one cycle, unless its step is limited: so it is looked
+        whether it stands, which no other time since the last cycle changes.
+        """
+        settled = self._settled
+        return (
+            bool(settled)
+            and not np.count_nonzero(self._flags)
+            and settled
+            == (
+                commands.position.tobytes(),
+                commands.velocity.tobytes(),
+                goals.position.tobytes(),
+                goals.velocity.tobytes(),
+            )
+        )
 
     def _position(self, wanted: Floats, goal: Floats, speed: Floats, dt_ns: int) -> None:
         finite, inside, step, low, high = self._finite, self._inside, self._step, self._low, self._high
