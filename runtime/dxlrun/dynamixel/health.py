@@ -60,12 +60,14 @@ class Servos:
     __slots__ = (
         "_absent",
         "_alert_cycles",
+        "_alerting",
         "_alerts",
         "_asking",
         "_bus",
         "_ceiling",
         "_dialect",
         "_events",
+        "_everybody",
         "_gaps",
         "_gone",
         "_hardware_errors",
@@ -106,6 +108,7 @@ class Servos:
         self.torqued = np.zeros(count, dtype=np.bool_)
         """Shape (servos,): who has torque for certain and missed no reply since; they get goals."""
         self._rows = [servo.row for servo in plan.servos]
+        self._everybody = b"\1" * count
         self._returning: list[int] = []  # who catches up with its goal, slowly
         self._ceiling = np.full(count, np.nan)
         self._limp = [False] * count
@@ -114,6 +117,7 @@ class Servos:
         self._dialect = dialect_of(plan.protocol)
         self._alerts: list[int] = []  # who has a hardware error that was not read yet
         self._alert_cycles = 0
+        self._alerting = False  # somebody's alert stands
         self._hardware_errors = [0] * count
         self._shown = states.hardware_error
         self._strained: list[int] = []  # Protocol 1.0: who may have shut down
@@ -147,7 +151,7 @@ class Servos:
         """Fill the states from the replies of this cycle, and tell what changed."""
         reads = self.reads
         self._states.decode(states, reads.fresh, reads.arrived_ns, now_ns)
-        if not reads.fresh.all() or any(self._missed):
+        if reads.fresh.tobytes() != self._everybody or any(self._missed):
             self._count_losses()
         elif self._rows:
             self._gaps.came(int(reads.arrived_ns[-1]), self._bus.due_ns)
@@ -156,12 +160,8 @@ class Servos:
         if self._bus.noise_bytes != self._noise_seen and now_ns - self._noise_at_ns >= NOISE_EVENT_NS:
             count = self._bus.noise_bytes - self._noise_seen
             self._noise_seen, self._noise_at_ns = self._bus.noise_bytes, now_ns
-            self._emit(
-                EventCode.BUS_NOISE,
-                Severity.WARNING,
-                self._plan.name,
-                f"{counted(count, 'byte', 'bytes')} belonged to no packet",
-            )
+            text = f"{counted(count, 'byte', 'bytes')} belonged to no packet"
+            self._emit(EventCode.BUS_NOISE, Severity.WARNING, self._plan.name, text)
 
     def watch(self) -> Program[list[str]]:
         """Read every servo's clock for the first time, and arm the Bus Watchdogs; return what went wrong.
@@ -231,7 +231,7 @@ class Servos:
             self._alerts += [index for index in standing if index not in self._alerts]
 
     def _owed(self) -> _Question | None:
-        if self._dialect.ALERT:
+        if self._alerting or self._alert_cycles:
             self._alert_again()
         for index in self._alerts:
             address = self._plan.servos[index].hardware_error_address
@@ -245,7 +245,7 @@ class Servos:
                     self._plan.servos[index].servo_id, limit.address, limit.size
                 )
                 return _Question(index, limit.name, read, self._take_torque_limit)
-        if self.torqued.all():
+        if self.torqued.tobytes() == self._everybody:
             return None
         count = len(self._plan.servos)
         for offset in range(1, count + 1):
@@ -380,6 +380,7 @@ class Servos:
                 elif not error & self._dialect.ALERT:
                     self._hardware_errors[index] = self._shown[self._rows[index]] = 0
                 self._said_errors[index] = error
+                self._alerting = any(said & self._dialect.ALERT for said in self._said_errors)
                 severity = Severity.ERROR if error else Severity.INFO
                 self._say(
                     EventCode.SERVO_ERROR, severity, index, f"reports {self._dialect.describe_error(error)}"
