@@ -305,6 +305,24 @@ def test_a_line_that_goes_between_read_and_write_is_named_and_the_others_get_the
     assert rig.into_bus(1)[-1][4] == 0x83
 
 
+@pytest.mark.parametrize(("back_after_ns", "limp"), [(150_000_000, True), (400_000_000, False)])
+def test_an_adapter_that_is_back_soon_after_the_end_finds_torque_off_sent(
+    make_rig, make_plan, back_after_ns, limp
+):
+    rig = make_rig(make_plan((1, 2), name="left"), make_plan((1, 7), name="right", first_row=2))
+    rig.hardware.start()
+    rig.cycle()
+    bus = rig.buses[0]
+    bus.unplug()
+    bus.at(rig.clock.now_ns() + back_after_ns, bus.plug_in)
+    before = rig.clock.now_ns()
+    failures = rig.hardware.stop()
+    assert rig.torque(1) == [False, False]  # nobody waited for the line that was gone
+    assert rig.torque(0) == [not limp] * 2
+    assert bool(failures) == (not limp)
+    assert rig.clock.now_ns() - before < 500_000_000
+
+
 def test_two_buses_are_read_side_by_side(make_rig, make_plan):
     rig = make_rig(make_plan((1, 2), name="left"), make_plan((1, 7), name="right", first_row=2))
     rig.hardware.start()

@@ -9,31 +9,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.clock import Clock
-from dxlrun.dynamixel import bus_watchdog, startup, torque_limit
+from dxlrun.dynamixel import bus_watchdog
 from dxlrun.dynamixel.bus import NEVER, Bus
-from dxlrun.dynamixel.bus_plan import BusPlan, ServoPlan
+from dxlrun.dynamixel.bus_plan import BusPlan
 from dxlrun.dynamixel.exchange import MOST_BROKEN
 from dxlrun.dynamixel.gaps import Gaps
 from dxlrun.dynamixel.health import Servos
 from dxlrun.dynamixel.jumps import Jumps
 from dxlrun.dynamixel.limp import LimpOutcome, limp_buses
-from dxlrun.dynamixel.modes import settle_modes
 from dxlrun.dynamixel.port import Ports
-from dxlrun.dynamixel.probing import extra_ns, probe_reads
 from dxlrun.dynamixel.pump import pump, run
-from dxlrun.dynamixel.registers import settle_bus
+from dxlrun.dynamixel.setting_up import SetUp, tell_failures
 from dxlrun.dynamixel.torque_limit import reduced
-from dxlrun.dynamixel.transaction import Program
-from dxlrun.dynamixel.units import joint_position
 from dxlrun.dynamixel.wanted import Wanted
 from dxlrun.errors import PortError, StartUpError
 from dxlrun.events import EventCode, EventSink, Severity
 from dxlrun.interfaces import Commands, States
-from dxlrun.mode import Mode
 from dxlrun.packets import PacketSink
 
 STOP_LIMIT_NS = 1_000_000_000
 """Retries of torque off end here; half of the default exit timeout."""
+LINE_PATIENCE_NS = 300_000_000
+"""An adapter that is pulled in the last moment may be back by then."""
+LINE_STEP_NS = 10_000_000
 TAKEN_BACK = "torque was switched off again on every servo"
 """Note of what `start` raises when every servo confirmed that."""
 FIRST_READS = 3
@@ -90,6 +88,7 @@ class DynamixelHardware:
             Servos(plan, bus, gaps, one, events, states)
             for plan, bus, gaps, one in zip(self._plans, self._buses, self._gaps, wanted, strict=True)
         )
+        self._set_up = SetUp(self._plans, self._buses, self._servos, ports, clock, events, beat)
         self._jumps = Jumps(self._plans, len(states.position), events)
 
     def start(self) -> None:
@@ -98,17 +97,13 @@ class DynamixelHardware:
         Raises StartUpError with every problem of every servo, PortError when a line is gone; torque that was
         given is taken back, and a note of the exception says whether every servo confirmed that.
         """
-        self._survey()
-        self._settle_registers()
-        self._settle_modes()
-        self._probe_reads()
-        self._carry_out([bus_watchdog.disarm_all(plan) for plan in self._plans])
+        self._set_up.look(self._take_over)
         try:
-            self._engage()
+            self._set_up.engage(self._goals)
             if self._restore_torque:
-                self._restore_limits()
+                self._full_torque = self._set_up.restore_limits()
             self._first_states()
-            self._carry_out([servos.watch() for servos in self._servos])
+            self._set_up.carry_out([servos.watch() for servos in self._servos])
         except BaseException as error:  # also an interrupt: nothing may leave here with torque on
             for sentence in self.stop() or (TAKEN_BACK,):
                 error.add_note(sentence)
@@ -132,7 +127,7 @@ class DynamixelHardware:
             if servos.reads.given_up:
                 self._tell_plain_reads()
         self._jumps.sift(self._states, now)
-        self._tell_failures()
+        tell_failures(self._plans, self._buses, self._servos)
 
     def write(self) -> None:
         """Send the goals, one sync write a line and layout, on every line that is there.
@@ -150,7 +145,7 @@ class DynamixelHardware:
                 bus.load(servos.reads)
                 bus.begin_behind()
                 self._asked[index] = True
-        self._tell_failures()
+        tell_failures(self._plans, self._buses, self._servos)
 
     def set_modes(self, modes: NDArray[np.uint8]) -> None:
         """Bring joints into modes in the gaps between cycles; UNKNOWN leaves one as it is."""
@@ -246,75 +241,31 @@ class DynamixelHardware:
                 servos.found()
 
     def _limp(self) -> tuple[LimpOutcome, ...]:
-        self._ask_for_lines()
-        for bus, servos in zip(self._buses, self._servos, strict=True):
-            servos.torqued[:] = False
-            bus.failure = None  # a line that is back, or was only stuck, gets its chance
-        deadline = self._clock.now_ns() + STOP_LIMIT_NS
-        return limp_buses(
-            self._plans, self._buses, self._ports, self._clock, deadline_ns=deadline, beat=self._beat
-        )
+        """Torque off at once wherever there is a line, and once more when one that was gone is back soon."""
+        now_ns = self._clock.now_ns()
+        deadline_ns, patience_ns = now_ns + STOP_LIMIT_NS, now_ns + LINE_PATIENCE_NS
+        while True:
+            self._ask_for_lines()
+            for bus, servos in zip(self._buses, self._servos, strict=True):
+                servos.torqued[:] = False
+                bus.failure = None  # a line that is back, or was only stuck, gets its chance
+            outcomes = limp_buses(
+                self._plans, self._buses, self._ports, self._clock, deadline_ns=deadline_ns, beat=self._beat
+            )
+            gone = [index for index, bus in enumerate(self._buses) if bus.failure is not None]
+            if not gone or not self._wait_for_lines(gone, patience_ns):
+                return outcomes
 
-    def _survey(self) -> None:
-        programs = [startup.survey(plan, self._take_over) for plan in self._plans]
-        found = run(programs, self._buses, self._ports, self._clock, self._beat)
-        self._raise_failures()
-        problems: list[str] = []
-        for survey in found:
-            if survey is not None:
-                problems += survey.problems
-                for joint, text in survey.servos:
-                    self._events.emit(EventCode.SETUP, Severity.INFO, joint, text)
-                for joint, text in survey.differences:
-                    self._events.emit(EventCode.REGISTER_DIFFERS, Severity.WARNING, joint, text)
-        if problems:
-            raise StartUpError("\n".join(problems))
-
-    def _settle_registers(self) -> None:
-        """Write what the robot file declares and a servo has otherwise, before anybody gets torque."""
-        programs = [settle_bus(plan) for plan in self._plans]
-        found = run(programs, self._buses, self._ports, self._clock, self._beat)
-        self._raise_failures()
-        settled = [one for one in found if one is not None]
-        for joint, text in (written for one in settled for written in one.written):
-            self._events.emit(EventCode.REGISTER_WRITTEN, Severity.INFO, joint, text)
-        if problems := [problem for one in settled for problem in one.problems]:
-            raise StartUpError("\n".join(problems))
-
-    def _settle_modes(self) -> None:
-        """Bring every servo into its first mode, before anybody gets torque, and learn its own limits."""
-        programs = [settle_modes(plan) for plan in self._plans]
-        found = run(programs, self._buses, self._ports, self._clock, self._beat)
-        self._raise_failures()
-        settled = [one for one in found if one is not None]
-        for joint, text in (switched for one in settled for switched in one.switched):
-            self._events.emit(EventCode.MODE, Severity.WARNING, joint, text)
-        if problems := [problem for one in settled for problem in one.problems]:
-            raise StartUpError("\n".join(problems))
-        for servos, one in zip(self._servos, settled, strict=True):
-            for index, limits in enumerate(one.limits):
-                servos.goals.set_limits(index, limits)
-
-    def _probe_reads(self) -> None:
-        """Find out when replies are due, and read plainly whoever does not answer the fast forms."""
-        programs = [probe_reads(plan) for plan in self._plans]
-        found = run(programs, self._buses, self._ports, self._clock, self._beat)
-        self._raise_failures()
-        for plan, servos, probed in zip(self._plans, self._servos, found, strict=True):
-            if probed is None:
-                continue
-            servos.reads.learn(probed.return_delays)
-            for group in probed.refused:
-                servos.reads.plain(group)
-            if probed.refused:
-                total_ns = plan.budget.total_ns + extra_ns(plan, probed.refused)
-                why = "; ".join(probed.refused.values())
-                text = (
-                    f"bus {plan.name} is not read by a fast form, {why}: a cycle "
-                    f"takes {total_ns / 1e6:.2f} ms instead of {plan.budget.total_ns / 1e6:.2f} ms, at most "
-                    f"{1e9 / total_ns:.0f} Hz"
-                )
-                self._events.emit(EventCode.SETUP, Severity.WARNING, plan.name, text)
+    def _wait_for_lines(self, gone: Sequence[int], until_ns: int) -> bool:
+        """Wait for any line that is gone; say whether one is back."""
+        while (now_ns := self._clock.now_ns()) < until_ns:
+            self._clock.wait_until(now_ns + LINE_STEP_NS)
+            self._beat()
+            for index in gone:
+                if self._ports.reopen(index):
+                    self._buses[index].renew(self._ports.ports[index])
+                    return True
+        return False
 
     def _tell_plain_reads(self) -> None:
         for plan, servos in zip(self._plans, self._servos, strict=True):
@@ -327,44 +278,10 @@ class DynamixelHardware:
                 self._events.emit(EventCode.SETUP, Severity.WARNING, plan.name, text)
             servos.reads.given_up.clear()
 
-    def _restore_limits(self) -> None:
-        """Give the servos the torque again that a policy of an earlier run may have left them without."""
-        programs = [torque_limit.restore(plan) for plan in self._plans]
-        found = run(programs, self._buses, self._ports, self._clock, self._beat)
-        self._raise_failures()
-        limits = [one for one in found if one is not None]
-        if problems := [problem for one in limits for problem in one.problems]:
-            raise StartUpError("\n".join(problems))
-        self._full_torque = [one.full for one in limits]
-        for joint, text in (restored for one in limits for restored in one.restored):
-            self._events.emit(EventCode.SETUP, Severity.INFO, joint, text)
-
-    def _engage(self) -> None:
-        programs = [startup.engage(plan) for plan in self._plans]
-        engaged = run(programs, self._buses, self._ports, self._clock, self._beat)
-        self._raise_failures()
-        problems = [problem for one in engaged if one is not None for problem in one.problems]
-        if problems:
-            raise StartUpError("\n".join(problems))
-        for plan, one in zip(self._plans, engaged, strict=True):
-            assert one is not None  # noqa: S101  no line has failed
-            for servo, raw in zip(plan.servos, one.goals, strict=True):
-                self._first_goals(servo, raw)
-            names = ", ".join(servo.joint for servo in plan.servos)
-            self._events.emit(EventCode.TORQUE_ON, Severity.INFO, plan.name, f"torque is on: {names}")
-
-    def _first_goals(self, servo: ServoPlan, raw: int | None) -> None:
-        """Let the goals be what the servo was given: where it stands, without a speed, or 0."""
-        row, mode = servo.row, servo.start_mode
-        self._goals.position[row] = float("nan") if raw is None else joint_position(servo, raw)
-        self._goals.velocity[row] = 0.0 if mode is Mode.VELOCITY else float("nan")
-        self._goals.effort[row] = 0.0 if mode is Mode.EFFORT else float("nan")
-        self._goals.pwm[row] = 0.0 if mode is Mode.PWM else float("nan")
-
     def _first_states(self) -> None:
         for _ in range(FIRST_READS):
             self.read()
-            self._raise_failures()
+            self._set_up.raise_failures()
             if all(servos.all_fresh for servos in self._servos):
                 break
         silent = [name for servos in self._servos for name in servos.silent]
@@ -372,35 +289,9 @@ class DynamixelHardware:
             raise StartUpError(
                 f"{', '.join(silent)} did not answer after torque was switched on: check cable and power"
             )
-        self._torque_lasts()
+        self._set_up.torque_lasts()
         for servos in self._servos:
             servos.torqued[:] = True
         for plan, changes in zip(self._plans, self._modes, strict=True):
             for index, servo in enumerate(plan.servos):
                 changes.entered(index, servo.start_mode)
-
-    def _torque_lasts(self) -> None:
-        """Read torque enable of everybody again: who was reset by the inrush of others may get no goal."""
-        self._carry_out([startup.confirm(plan) for plan in self._plans])
-
-    def _carry_out(self, programs: Sequence[Program[list[str]]]) -> None:
-        """Run one program a bus; raise StartUpError with all that went wrong."""
-        found = run(programs, self._buses, self._ports, self._clock, self._beat)
-        self._raise_failures()
-        if problems := [problem for one in found if one is not None for problem in one]:
-            raise StartUpError("\n".join(problems))
-
-    def _tell_failures(self) -> PortError | None:
-        """Tell of each line that is gone, once; return the first of them."""
-        first: PortError | None = None
-        for plan, bus, servos in zip(self._plans, self._buses, self._servos, strict=True):
-            if bus.failure is not None:
-                text = f"bus {plan.name} on {plan.port}: {bus.failure}"
-                servos.lost(text)
-                first = first or PortError(text)
-        return first
-
-    def _raise_failures(self) -> None:
-        """Raise PortError when a line is gone: there is no set-up without it."""
-        if error := self._tell_failures():
-            raise error

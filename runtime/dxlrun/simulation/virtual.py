@@ -83,6 +83,7 @@ class VirtualPorts:
         """Ask for a lost line again: it is back as soon as its adapter is plugged in."""
         self._lost.add(index)
         bus = self._buses[index]
+        bus.advance(self._clock.now_ns())
         if not bus.plugged:
             return False
         self._lost.remove(index)
