@@ -11,9 +11,11 @@ from dxlrun.dynamixel.bus_plan import BusPlan, Field, ServoPlan, StateLayout
 from dxlrun.interfaces import Floats, States
 from dxlrun.mode import Mode
 
-_SIGNED_MASK = 0x7FF
 _SIGNED = np.concatenate((np.arange(0x400), -np.arange(0x400))).astype(np.float64)
-"""Sign-magnitude of eleven bits -> ticks: the highest one is the sign."""
+"""Sign-magnitude of eleven bits -> ticks: the highest one is the sign; further bits are not looked at."""
+
+# numpy takes ten times as long to compare with a member of an Enum
+_VELOCITY, _PWM = int(Mode.VELOCITY), int(Mode.PWM)
 
 Integers = NDArray[np.integer]
 Rows = slice | NDArray[np.intp]
@@ -85,10 +87,15 @@ class _StateBlock:
 
     __slots__ = (
         "_effort",
+        "_efforts",
+        "_in_place",
         "_members",
         "_position",
+        "_positions",
         "_reference",
         "_rows",
+        "_speeds",
+        "_states",
         "_velocity",
         "_wheel",
         "data",
@@ -106,6 +113,7 @@ class _StateBlock:
         self.data: NDArray[np.uint8] = np.frombuffer(buffer, np.uint8).reshape(len(mine), length)
         direction = np.array([float(servo.direction) for servo in mine])
         self._members = np.array(members, dtype=np.intp)
+        self._states: States | None = None
         self._rows = rows_of([servo.row for servo in mine])
         self._reference = direction * np.array([servo.reference for servo in mine])
         self._position = _Column(
@@ -123,10 +131,25 @@ class _StateBlock:
 
     def decode(self, states: States) -> None:
         """Fill the rows of all servos."""
-        rows = self._rows
-        states.position[rows] = np.subtract(self._position.values(), self._reference, self._position.work)
-        states.velocity[rows] = self._velocities(states)
-        states.effort[rows] = self._effort.values()
+        if states is not self._states:
+            self._show(states)
+        np.subtract(self._position.values(self._positions), self._reference, self._positions)
+        self._velocities(states, self._speeds)
+        self._effort.values(self._efforts)
+        if not self._in_place:
+            rows = self._rows
+            states.position[rows] = self._positions
+            states.velocity[rows] = self._speeds
+            states.effort[rows] = self._efforts
+
+    def _show(self, states: States) -> None:
+        """Decode right into the rows of these states from now on, where they stand one behind the other."""
+        self._states = states
+        self._in_place = isinstance(self._rows, slice)
+        # a copy where they do not
+        self._positions = states.position[self._rows]
+        self._speeds = states.velocity[self._rows]
+        self._efforts = states.effort[self._rows]
 
     def decode_some(self, states: States, all_fresh: NDArray[np.bool_]) -> None:
         """Fill the rows of those whose reply arrived."""
@@ -139,11 +162,11 @@ class _StateBlock:
         ):
             values[self._rows] = np.where(fresh, column, values[self._rows])
 
-    def _velocities(self, states: States) -> Floats:
-        values = self._velocity.values()
+    def _velocities(self, states: States, out: Floats | None = None) -> Floats:
+        values = self._velocity.values(out)
         if self._wheel is not None:
             mode = states.mode[self._rows]
-            turning = (mode == Mode.VELOCITY) | (mode == Mode.PWM)
+            turning = (mode == _VELOCITY) | (mode == _PWM)
             if turning.any():
                 np.multiply(values, self._wheel, values, where=turning)
         return values
@@ -158,7 +181,7 @@ def _in_wheel_mode(servo: ServoPlan) -> float:
 class _Column:
     """One item of all servos of a block, in its unit."""
 
-    __slots__ = ("_index", "_per_tick", "_raw", "work")
+    __slots__ = ("_per_tick", "_raw", "_signed", "_work")
 
     def __init__(self, data: NDArray[np.uint8], field: Field, per_tick: Floats) -> None:
         rows, length = data.shape
@@ -166,17 +189,17 @@ class _Column:
             (rows,), _format(field), data, offset=field.offset, strides=(length,)
         )
         self._per_tick = per_tick
-        self._index = np.zeros(rows, dtype=np.intp) if field.encoding == "sign_magnitude" else None
-        self.work = np.zeros(rows)
+        self._signed = field.encoding == "sign_magnitude"
+        self._work = np.zeros(rows)
 
-    def values(self) -> Floats:
-        """Return the values; good until the next call."""
-        work = self.work
-        if self._index is None:
-            return np.multiply(self._raw, self._per_tick, work)
-        np.bitwise_and(self._raw, _SIGNED_MASK, self._index)
-        _SIGNED.take(self._index, out=work, mode="clip")
-        return np.multiply(work, self._per_tick, work)
+    def values(self, out: Floats | None = None) -> Floats:
+        """Return the values, in `out` if it is there; else good until the next call."""
+        if out is None:
+            out = self._work
+        if not self._signed:
+            return np.multiply(self._raw, self._per_tick, out)
+        _SIGNED.take(self._raw, out=out, mode="wrap")
+        return np.multiply(out, self._per_tick, out)
 
 
 def _format(field: Field) -> str:
