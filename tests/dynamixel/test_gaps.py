@@ -185,3 +185,11 @@ def test_one_reply_that_came_a_second_late_does_not_close_the_gaps_of_the_next_s
     rounds.gaps.add(reading(rounds, 11, 7), found.append, Urgency.MODE, "the mode of a servo")
     assert len(rounds.gap(5_000_000)) == 1
     assert found == [[11]]
+
+
+def test_a_line_whose_reads_all_go_as_they_should_is_not_late(make_rig, make_plan):
+    rig = make_rig(make_plan((1, 2), return_delay_ns=0))
+    rig.hardware.start()
+    for _ in range(20):
+        rig.cycle()
+    assert rig.hardware._gaps[0].late_ns < 100_000

@@ -176,6 +176,7 @@ class Bus:
         transaction = lane.end()
         if transaction is None:
             self._job = None
+            self.due_ns = lane.sent_ns + lane.stretches[-1].transaction.due_ns
             return
         self._burst = self._job.burst
         self._await(transaction, lane.sent_ns)
