@@ -8,13 +8,11 @@ from typing import Any
 
 import pytest
 
+from dxlrun.description.bus import Adapter, Bus, BusSimulation, SlowRegisters
 from dxlrun.description.form import Form
 from dxlrun.description.motion import Formula, FormulaPart, Motion, Point, PointsPart, Target
 from dxlrun.description.policies import GroupPolicies, Policies, PoseStep, TorqueStep
 from dxlrun.description.robot import (
-    Adapter,
-    Bus,
-    BusSimulation,
     ControllerEntry,
     Gateway,
     Joint,
@@ -27,7 +25,6 @@ from dxlrun.description.robot import (
     RobotModel,
     Scheduler,
     Simulation,
-    SlowRegisters,
 )
 
 PAGE = (Path(__file__).parents[2] / "docs" / "robot-file.md").read_text()

@@ -8,9 +8,10 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
+from dxlrun.description.bus import Adapter, Bus
 from dxlrun.description.form import Form
 from dxlrun.description.policies import Policies, PoseStep, TorqueStep
-from dxlrun.description.robot import Adapter, Bus, ControllerEntry, Joint, Limits, Loop, Robot, Scheduler
+from dxlrun.description.robot import ControllerEntry, Joint, Limits, Loop, Robot, Scheduler
 from dxlrun.errors import Mark
 
 DAMAGES = [

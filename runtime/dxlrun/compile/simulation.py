@@ -13,7 +13,7 @@ from dxlrun.compile.joints import CompiledJoint
 from dxlrun.compile.plan import AdapterPlan, LoadPlan, SimulationPlan
 from dxlrun.compile.problems import Problems
 from dxlrun.description import Description
-from dxlrun.description.robot import Bus
+from dxlrun.description.bus import Bus
 from dxlrun.simulation.mujoco_plant import INSTALL_MUJOCO, NEEDS_MUJOCO
 
 NEEDS_URDF = "physics: mujoco moves the bodies of a URDF, and the file names none"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from types import MappingProxyType
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import (
@@ -14,27 +13,18 @@ from pydantic import (
     model_validator,
 )
 
+from dxlrun.description.bus import Bus
 from dxlrun.description.form import Form, Name, refuse
 from dxlrun.description.policies import Policies
 from dxlrun.description.units import (
     Angle,
     AngularVelocity,
     AutoDuration,
-    Duration,
     Effort,
     Inertia,
     Polling,
     Torque,
 )
-
-_LONGEST_TIMER_NS = 255_000_000
-"""The latency timer of an FTDI chip is one byte, ms (FTDI AN232B-04)."""
-
-
-def _protocol(value: float) -> float:
-    if value not in (1.0, 2.0):
-        raise refuse(f"there is no Protocol {value:g}", "write 1.0 or 2.0")
-    return value
 
 
 def _whole(value: object) -> object:
@@ -50,12 +40,6 @@ def _ordered(value: tuple[float, float]) -> tuple[float, float]:
     return value
 
 
-def _timer(value: int) -> int:
-    if value > _LONGEST_TIMER_NS:
-        raise refuse("no adapter gathers bytes for so long", "write 255 ms at most")
-    return value
-
-
 def _register(value: object) -> object:
     if isinstance(value, bool) or not isinstance(value, int | str):
         raise refuse(
@@ -68,109 +52,6 @@ def _cores(value: tuple[int, ...]) -> tuple[int, ...]:
     if not value or len(set(value)) < len(value):
         raise refuse("cores are given once each, and at least one", "write for example [3]")
     return value
-
-
-_LEAST_LATENCY_NS: Mapping[str, int] = MappingProxyType({"ftdi": 1_000_000, "direct": 0})
-"""Kind of adapter -> what it keeps bytes back for at best (protocol.md, Time budget)."""
-
-
-class Adapter(Form):
-    """The adapter of a bus."""
-
-    kind: Literal["ftdi", "direct"] | None = Field(
-        default=None,
-        description="An FTDI chip with its latency timer at 1 ms, or one that hands bytes over at once.",
-        examples=["direct"],
-    )
-    latency: Duration = Field(
-        default=16_000_000,
-        description="How long it may keep bytes back before it hands them over; kind says it, too.",
-        examples=["1 ms"],
-    )
-
-    @property
-    def assumed_latency(self) -> int:
-        """What it adds to each request, ns: as written, else by its kind, else as an FTDI is shipped."""
-        if self.kind is None or "latency" in self.model_fields_set:
-            return self.latency
-        return _LEAST_LATENCY_NS[self.kind]
-
-
-class BusSimulation(Form):
-    """What a simulated bus does beside its servos; a bus on a real port does not use it."""
-
-    latency_timer: Annotated[Duration, AfterValidator(_timer)] = Field(
-        default=0,
-        description="How long the simulated adapter gathers bytes before it hands them over, at most 255 ms.",
-        examples=["4 ms"],
-    )
-    split: Literal["whole", "byte", "random"] = Field(
-        default="whole", description="In which pieces it hands them over.", examples=["byte"]
-    )
-    echo: bool = Field(
-        default=False, description="The host hears its own bytes, as on some adapters.", examples=["true"]
-    )
-    absent: Literal["silent", "slot"] = Field(
-        default="silent",
-        description="In a sync or bulk read, the servos behind an absent one are silent, or wait its slot.",
-        examples=["slot"],
-    )
-
-
-class SlowRegisters(Form):
-    """What is read of the servos of a bus now and then, between the cycles."""
-
-    items: Annotated[tuple[Name, ...], Field(strict=False)] | None = Field(
-        default=None,
-        description="Items by the names of the control table; without: temperature and voltage.",
-        examples=["[present_temperature]"],
-    )
-    rate: float = Field(
-        default=1.0, ge=0.1, le=100, description="How often each of them is read, Hz.", examples=["1"]
-    )
-
-
-class Bus(Form):
-    """One serial line with its servos."""
-
-    port: str = Field(min_length=1, description="Device of the adapter, or sim.", examples=["/dev/ttyUSB0"])
-    protocol: Annotated[float, AfterValidator(_protocol)] = Field(
-        description="Protocol of all servos on the bus.",
-        examples=["1.0"],
-        json_schema_extra={"enum": [1.0, 2.0]},
-    )
-    baud_rate: int = Field(gt=0, le=10_000_000, description="Bits per second.", examples=["1_000_000"])
-    adapter: Adapter = Field(default=Adapter(), description="The adapter.", examples=["{latency: 1 ms}"])
-    return_delay_time: Duration = Field(
-        default=500_000, description="How long a servo waits before it answers.", examples=["500 us"]
-    )
-    read: Literal["together", "split"] = Field(
-        default="together",
-        description="Servos are asked when a cycle begins, or already behind the goals of the one before.",
-        examples=["split"],
-    )
-    bus_watchdog: AutoDuration = Field(
-        default="auto",
-        description="After this time without instructions a servo of Protocol 2.0 stops; 0 ms: never.",
-        examples=["200 ms"],
-    )
-    slow_registers: SlowRegisters = Field(
-        default=SlowRegisters(),
-        description="What is read now and then, between the cycles.",
-        examples=["{rate: 2}"],
-    )
-    simulation: BusSimulation = Field(
-        default=BusSimulation(),
-        description="What the bus does when it is simulated.",
-        examples=["{latency_timer: 4 ms}"],
-    )
-
-    @property
-    def latency_timer(self) -> int:
-        """How long the simulated adapter gathers bytes, ns: as it is written, else as an FTDI does, or 0."""
-        if "latency_timer" in self.simulation.model_fields_set or self.adapter.kind != "ftdi":
-            return self.simulation.latency_timer
-        return self.adapter.assumed_latency
 
 
 class Scheduler(Form):
