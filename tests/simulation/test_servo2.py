@@ -363,36 +363,6 @@ def test_a_servo_at_rest_shows_at_once_who_turns_it_and_what_is_written(line2: A
     assert line2.get("present_position") == pytest.approx(turned + 400, abs=20)
 
 
-# Indirect addresses
-
-
-def test_indirect_data_is_read_and_written_through(line2: Any) -> None:
-    for index, address in enumerate((132, 133, 134, 135, 65)):
-        assert line2.set(f"indirect_address_{index + 1}", address) == 0
-    position, led = line2.read_bytes(1, 132, 4), b"\x00"
-    assert line2.read_bytes(1, 224, 5) == position + led
-    assert line2.write_bytes(1, 228, b"\x01") == 0
-    assert line2.get("led") == 1
-    assert line2.write_bytes(1, 224, b"\x00") == ErrorNumber.ACCESS  # present position is read-only
-
-
-def test_a_goal_may_go_through_indirect_data(line2: Any) -> None:
-    line2.set("torque_enable", 1)
-    for index in range(4):
-        line2.set(f"indirect_address_{index + 1}", 116 + index)
-    assert line2.write_bytes(1, 224, (3000).to_bytes(4, "little")) == 0
-    line2.wait(2)
-    assert line2.get("present_position") == 3000
-    assert line2.write_bytes(1, 224, b"\x00\x00") == ErrorNumber.DATA_LENGTH
-
-
-def test_a_reboot_gives_indirect_data_another_meaning(line2: Any) -> None:
-    line2.set("indirect_address_1", 132)
-    line2.servo().reset()
-    assert line2.get("indirect_address_1") == 224
-    assert len(line2.read_bytes(1, 224, 1)) == 1
-
-
 @pytest.mark.parametrize("rate", [9_600, 57_600, 1_000_000, 4_500_000])
 def test_baud_rates_of_the_manual(rate: int) -> None:
     assert SimulatedServo(ServoConfig(1, "XM430-W350", 0.0), rate, 0, protocol=2.0).baud_rate == rate
