@@ -76,10 +76,7 @@ STORIES: dict[str, Asked] = {
     },
     "a stream that ends": {
         3: [switch(["direct"], ["all_inputs"])],
-        **{
-            cycle: [send("direct", "positions", 0.01 * cycle, 0.1, lease_ns=50 * MS)]
-            for cycle in range(4, 15)
-        },
+        **{n: [send("direct", "positions", 0.01 * n, 0.1, lease_ns=50 * MS)] for n in range(4, 15)},
         30: [send("direct", "positions", 0.2, 0.3)],
         35: [Command(0, "direct", "positions", b"thirteen byte", "mallory"), ask("what", {"is": "this"})],
     },
@@ -123,15 +120,12 @@ def steer(robot_file: Path, tmp_path: Path) -> Callable[..., Path]:
     ) -> Path:
         text = robot_file.read_text() + MORE + more
         assert edit[0] in text
-        text = text.replace(*edit, 1)
         file, log = tmp_path / "steered.yaml", tmp_path / "run.mcap"
-        file.write_text(text)
+        file.write_text(text.replace(*edit, 1))
         log.unlink(missing_ok=True)
-        motion = robot_file.with_name("look.yaml")
-        robot = simulated_robot(file, play=[motion], duration_s=1.0, log=log)
+        robot = simulated_robot(file, play=[robot_file.with_name("look.yaml")], duration_s=1.0, log=log)
         robot.robot.loop.steering.inbox = Clients(robot, asked)
-        if before:
-            before(robot)
+        (before or (lambda _: None))(robot)
         robot.run()
         return log
 
@@ -297,11 +291,7 @@ def with_command(which: str, number: int = 0, **other: Any) -> Callable[[Any], N
 
 
 FLIPPED: dict[str, tuple[str, Callable[[Any], None], int]] = {
-    "who is switched": (
-        "switches",
-        with_command("switch", data=switch([], ["all_inputs"]).data),
-        4,
-    ),
+    "who is switched": ("switches", with_command("switch", data=switch([], ["all_inputs"]).data), 4),
     "a set-point": (
         "a stream that ends",
         with_command("positions", data=np.array([0.04, 0.5]).tobytes()),
