@@ -273,6 +273,27 @@ def test_a_controller_takes_set_points_as_soon_as_its_switch_was_answered(desk):
     assert [one["active"] for one in desk.ask("GET", "/robot")[1]["controllers"]] == [False, True, False]
 
 
+@pytest.mark.parametrize("excuse", ["", "spare is not activated: pan stays in position mode"])
+def test_a_switch_that_waits_for_modes_is_answered_when_they_are_there_or_were_given_up(desk, excuse):
+    async def switch():
+        asked = asyncio.ensure_future(desk.request("POST", "/switch", {"activate": ["spare"]}))
+        desk.events.emit(EventCode.MODE, Severity.INFO, "spare", "waits until its joints are in their modes")
+        while not desk.taken:
+            desk.take()
+            await asyncio.sleep(0)
+        for _ in range(20):
+            desk.link.collect()
+            await asyncio.sleep(0)
+        waited = not asked.done()
+        code = EventCode.COMMAND_REFUSED if excuse else EventCode.CONTROLLER_ACTIVATED
+        desk.events.emit(code, Severity.INFO, "spare", excuse or "active")
+        desk.link.collect()
+        return waited, await asked
+
+    answer = (409, {"refused": excuse}) if excuse else (200, DONE)
+    assert asyncio.run(switch()) == (True, answer)
+
+
 def test_a_controller_is_loaded_into_the_place_that_the_loop_gives_it(desk):
     for name in ("more", "most"):
         assert desk.ask("POST", "/controllers", LOAD | {"name": name, "rate": 25}) == (200, DONE)

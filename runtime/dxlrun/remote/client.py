@@ -27,7 +27,7 @@ from dxlrun.remote.sockets import MOST_BYTES, alive, running, sockets
 __all__ = ["RemoteRobot", "Stream", "connect", "running"]
 
 TIMEOUT_S = 10.0
-"""How long an answer may take; the gateway answers within two seconds or so, whatever the loop does."""
+"""How long an answer may take: two seconds or so whatever the loop does, six more of a switch with modes."""
 LEASE_S = 0.2
 _IDLE_S = 20.0
 """The gateway closes silent connections after 30 s; one that was silent for so long is not used again."""
@@ -131,7 +131,10 @@ class RemoteRobot:
         return Stream(self, controller, kind, lease)
 
     def switch(self, activate: Sequence[str] = (), deactivate: Sequence[str] = ()) -> None:
-        """Activate and deactivate controllers in one cycle, or not at all."""
+        """Activate and deactivate controllers in one cycle, or not at all; returns when they are.
+
+        Where servos must change their mode first, that takes longer; raises Refused when one does not.
+        """
         self._post("/switch", {"activate": list(activate), "deactivate": list(deactivate)})
 
     def set_register(self, joint: str, item: str, value: int | str) -> None:

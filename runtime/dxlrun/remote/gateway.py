@@ -175,7 +175,7 @@ class Gateway:
         return _done(202)
 
     async def switch(self, request: Request) -> Response:
-        """Activate and deactivate controllers in one cycle."""
+        """Activate and deactivate controllers in one cycle; answer when those that wait for modes are in."""
         wish = await typed(request, Switch, '{"activate": ["head"], "deactivate": []}')
         for names in (wish.activate, wish.deactivate):
             if len(set(names)) != len(names):
@@ -183,7 +183,9 @@ class Gateway:
             for name in names:
                 self._named(name)
         done = partial(self._link.switched, wish.activate, wish.deactivate)
-        return await self._ask(request, "switch", wish, done)
+        answer = await self._ask(request, "switch", wish, done)
+        await self._link.entered(wish.activate)
+        return answer
 
     async def register(self, request: Request) -> Response:
         """Have a RAM item of a joint's servo written, and answer when it was read back."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -32,7 +33,11 @@ KEPT_TEXT = 1 << 20
 """So many of the newest events are kept for clients, and so many characters of their texts."""
 LONGEST_DATA = LARGEST - 1024
 """Bytes; what an operation of the mailbox has beside names."""
+ENTER_S = 6.0
+"""The loop gives joints five seconds to come into their modes."""
 _LOOK_S = 0.002
+_WAITS, _NOT_ACTIVATED = "waits until", "is not activated"
+"""What the events of a controller say whose joints change their modes first, and of one that was given up."""
 _HELD = {
     EventCode.STALE_COMMAND: True,
     EventCode.COMMAND: False,
@@ -51,6 +56,10 @@ class Loaded:
     held: bool = False
     switched: tuple[bool, int] | None = None
     """What a switch made of it, and how many cycles had ended then: their records do not show it yet."""
+    entering: bool = False
+    """A switch activates it when its joints are in their modes."""
+    excuse: str = ""
+    """Why the last switch that had to wait did not activate it."""
 
 
 @dataclass(slots=True)
@@ -173,6 +182,20 @@ class Link:
             for name in names:
                 if (loaded := self.controllers.get(name)) is not None:
                     loaded.switched = (active, self.heartbeat.cycles)
+                    loaded.entering = loaded.entering and active
+
+    async def entered(self, names: Sequence[str]) -> None:
+        """Wait for controllers whose joints change their modes first; raises Refusal when they do not."""
+        until = time.monotonic() + ENTER_S
+        for loaded in [self.controllers[name] for name in names if name in self.controllers]:
+            while loaded.entering:
+                if self.heartbeat.phase is not Phase.RUNNING:
+                    raise Refusal(503, "the run is at its end")
+                if time.monotonic() > until:
+                    raise Refusal(409, f"{loaded.plan.name} is not active after {ENTER_S:g} s")
+                await asyncio.sleep(_LOOK_S)
+            if loaded.excuse:
+                raise Refusal(409, loaded.excuse)
 
     def loaded(self, plan: ControllerPlan) -> None:
         """Note a controller that the loop has loaded, in the place that the loop gave it."""
@@ -218,5 +241,17 @@ class Link:
         teller.last = next(self._event_numbers)
         self.events.append((teller.last, event))
         loaded = self.controllers.get(event.source)
-        if loaded is not None and event.code in _HELD:
+        if loaded is not None:
+            self._follow(loaded, event)
+
+    def _follow(self, loaded: Loaded, event: Event) -> None:
+        """Note what an event says of its controller."""
+        if event.code in _HELD:
             loaded.held = _HELD[EventCode(event.code)]
+        if event.code == EventCode.MODE and event.text.startswith(_WAITS):
+            loaded.entering, loaded.excuse = True, ""
+        elif event.code == EventCode.CONTROLLER_ACTIVATED:
+            loaded.switched = (True, self.heartbeat.cycles)
+            loaded.entering = False
+        elif event.code == EventCode.COMMAND_REFUSED and _NOT_ACTIVATED in event.text:
+            loaded.entering, loaded.excuse = False, event.text
