@@ -103,6 +103,16 @@ def test_what_is_no_quantity_stays_as_it_was_written() -> None:
     }  # fmt: skip
 
 
+def test_efforts_and_pwm_are_numbers_and_text_there_is_explained() -> None:
+    assert Written.read(["positions=[0 deg]", "efforts=[0.1]"], None).in_si() == {
+        "positions": [0.0], "efforts": [0.1],
+    }  # fmt: skip
+    with pytest.raises(ValueError, match=r"efforts.*'100 mA' is text; write the number in what the model"):
+        Written.read(["efforts=[100 mA]"], None).in_si()
+    with pytest.raises(ValueError, match=r"pwm.*'20 %' is text; write the fraction of the full voltage"):
+        Written.read(["pwm=[20 %]"], None).in_si()
+
+
 def test_every_missing_unit_is_said_at_its_place(tmp_path: Path) -> None:
     file = tmp_path / "step.yaml"
     file.write_text("positions:\n  - 30\n  - 1 rad/s\nvelocities: [true]\n")
@@ -124,11 +134,15 @@ def test_every_missing_unit_is_said_at_its_place(tmp_path: Path) -> None:
         ("posvel", ("positions", "velocities"), True),
         ("trajectory", ("points", "start_in"), True),
         ("grip", ("positions", "force"), False),
-        ("speeds", ("velocities",), False),
+        ("speeds", ("velocities",), True),
+        ("poseffort", ("positions", "efforts"), True),
+        ("pwm", ("pwm",), True),
         ("reset", (), False),
     ],
 )
-def test_only_what_motions_are_made_of_needs_units(kind: str, keys: tuple[str, ...], played: bool) -> None:
+def test_only_what_standard_controllers_take_needs_units(
+    kind: str, keys: tuple[str, ...], played: bool
+) -> None:
     assert is_played(kind, {"properties": {key: {} for key in keys}}) is played
 
 

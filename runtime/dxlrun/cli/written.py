@@ -1,7 +1,8 @@
 """What a person writes for a running robot: `key=value` words or a YAML file, to what the gateway takes.
 
-Values are YAML. Where a controller takes what motions are made of (positions, a trajectory), quantities need
-their units, as in a motion file: nobody can see whether `positions=[60]` was meant in deg or rad.
+Values are YAML. Where a controller takes what motions are made of (positions, velocities, a trajectory),
+quantities need their units, as in a motion file: nobody can see whether `positions=[60]` was meant in deg or
+rad. Efforts and PWM are plain numbers: in which unit an effort is depends on the servo's model.
 """
 
 from __future__ import annotations
@@ -18,17 +19,35 @@ from dxlrun.description.units import angle, angular_acceleration, angular_veloci
 from dxlrun.errors import InputError, Problem
 
 _WORDS = "command line"
-_PLAYED = frozenset({"positions", "velocities"})
+_DRIVEN = frozenset({"positions", "velocities", "efforts", "pwm"})
+"""What the commands of the group controllers have."""
 
 
 def _seconds(text: str) -> float:
     return duration(text) / 1e9
 
 
-QUANTITIES: Mapping[str, Callable[[str], float]] = {
+def _effort(value: object) -> object:
+    if isinstance(value, str):
+        raise ValueError(
+            f"{value!r} is text; write the number in what the model measures (Nm, A or the fraction of its "
+            "most), such as 0.1 for 100 mA"
+        )
+    return value
+
+
+def _fraction(value: object) -> object:
+    if isinstance(value, str):
+        raise ValueError(f"{value!r} is text; write the fraction of the full voltage, such as 0.2 for 20 %")
+    return value
+
+
+QUANTITIES: Mapping[str, Callable[[str], object]] = {
     "positions": angle,
     "velocities": angular_velocity,
     "accelerations": angular_acceleration,
+    "efforts": _effort,
+    "pwm": _fraction,
     "time": _seconds,
     "start_in": _seconds,
 }
@@ -89,10 +108,10 @@ class Written:
 
 
 def is_played(kind: str, schema: Mapping[str, object]) -> bool:
-    """Say whether motions can be played by this command: then its numbers are rad, rad/s, rad/s^2 and s."""
+    """Say whether a command is like those of the standard controllers, so that its quantities have units."""
     properties = schema.get("properties")
     names = set(properties) if isinstance(properties, dict) else set()
-    return kind == "trajectory" or ("positions" in names and names <= _PLAYED)
+    return kind == "trajectory" or (bool(names) and names <= _DRIVEN)
 
 
 def _line(word: str) -> str:
