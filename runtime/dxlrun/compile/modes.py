@@ -68,12 +68,14 @@ def _check(  # noqa: PLR0917  one controller against everything that was compile
             continue
         model, mark = joints[joint].table.model, joint_mark(description, name, joint)
         if mode not in able[joint]:
-            known = ", ".join(f"{_INTERFACE[each]}" for each in able[joint])
-            problems.error(
-                mark,
-                f"{name} commands {_INTERFACE[mode]}, but {model} of {joint} {LACKS[mode]}",
-                f"use a controller that commands {known}",
-            )
+            *others, last = (_INTERFACE[each] for each in able[joint])
+            known = f"use a controller that commands {', '.join(others)}{' or ' * bool(others)}{last}"
+            lacks = f"{model} of {joint} {LACKS[mode]}"
+            within_a_turn = model_modes(joints[joint].table, continuous=False)
+            if mode is Mode.EFFORT_POSITION and mode in within_a_turn:
+                lacks = f"{joint} is continuous, for which it is not offered"
+                known = f"take `continuous` out, or {known}"
+            problems.error(mark, f"{name} commands {_INTERFACE[mode]}, but {lacks}", known)
         elif mode is Mode.VELOCITY and not controls_speed(joints[joint].table):
             problems.warning(
                 mark,
