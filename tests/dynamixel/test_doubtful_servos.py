@@ -73,6 +73,18 @@ def test_a_servo_that_lost_its_torque_unnoticed_gets_it_by_no_change_of_modes(ma
     assert [source for source, _ in rig.events.of(EventCode.SERVO_LIMP)] == ["main_1_joint"]
 
 
+@pytest.mark.parametrize("model", ["AX-12A", "MX-64"])
+def test_a_servo_whose_mode_was_changed_by_half_when_the_power_went_starts_again(make_rig, make_plan, model):
+    rig = make_rig(make_plan((1, 2), model=model, lower=-1.5, upper=1.5))
+    servo, plan = rig.buses[0].servo(1), rig.plans[0].servos[0]
+    servo.poke("cw_angle_limit", plan.lower_tick)
+    servo.poke("ccw_angle_limit", 0)
+    rig.hardware.start()
+    assert rig.torque() == [True, True]
+    limits = servo.registers["cw_angle_limit"], servo.registers["ccw_angle_limit"]
+    assert limits == (plan.lower_tick, plan.upper_tick)
+
+
 def test_a_wheel_that_made_more_turns_than_its_servo_counts_does_not_wind_them_back(make_wheel):
     rig = make_wheel("MX-28", 1.0)
     servo = rig.buses[0].servo(1)

@@ -66,7 +66,7 @@ class Inspector1(Inspector):
         # the torque control mode is RAM and only of some models: it is not asked for here
         found = {"cw_angle_limit": clockwise, "ccw_angle_limit": counter, "torque_ctrl_mode_enable": 0}
         self.mode(servo, found)
-        if clockwise != counter and not servo.continuous:
+        if clockwise < counter and not servo.continuous:  # else the start brings it into its mode
             self.limits(servo, clockwise, counter, "angle limits")
 
     def _torque(self, servo: ServoPlan, table: ControlTable, block: Reply) -> None:

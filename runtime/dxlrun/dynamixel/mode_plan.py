@@ -93,13 +93,16 @@ def controls_speed(table: ControlTable) -> bool:
 
 
 def in_mode(wanted: ModePlan, found: Mapping[str, int]) -> bool:
-    """Say whether registers, by name, select a mode; any angle limits that differ are joint mode."""
+    """Say whether registers, by name, select a mode; any angle limits in their order are joint mode.
+
+    In no order are those of a servo whose mode was half changed: one was written, and the other was not.
+    """
     values = {register.name: register.value for register in wanted.operating}
     low, high = values.pop("cw_angle_limit", None), values.pop("ccw_angle_limit", None)
     if any(found.get(name) != value for name, value in values.items()):
         return False
-    if low != high:
-        return found.get("cw_angle_limit") != found.get("ccw_angle_limit")
+    if low is not None and low != high:
+        return found.get("cw_angle_limit", 0) < found.get("ccw_angle_limit", 0)
     return low is None or found.get("cw_angle_limit") == found.get("ccw_angle_limit") == low
 
 
