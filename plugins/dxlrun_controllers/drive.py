@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from dxlrun import CommandModel, Controller, Floats, Interfaces
 from dxlrun_controllers.group import GroupParameters, check_size
@@ -29,8 +30,8 @@ class EffortsCommand(CommandModel):
 class PwmCommand(CommandModel):
     """One PWM a joint."""
 
-    pwm: tuple[float, ...]
-    """Fraction of the full voltage, -1..1, shape (joints,)"""
+    pwm: tuple[Annotated[float, Field(ge=-1, le=1)], ...]
+    """Fraction of the full voltage, -1..1, shape (joints,); who writes 20 for 20 % shall not get it all"""
 
 
 class _DriveController(Controller[GroupParameters]):

@@ -52,6 +52,12 @@ def test_drives_are_zero_until_a_command_comes_and_forward_it(stage, group, clai
         robot.prepare(kind, **{field: [1.0]})
 
 
+def test_more_pwm_than_the_full_voltage_is_refused_since_it_was_meant_in_percent(stage):
+    robot = stage(JointGroupPwmController, TWO)
+    with pytest.raises(ValueError, match="less than or equal to 1"):
+        robot.prepare("pwm", pwm=[0.2, 20])
+
+
 def test_positions_and_efforts_are_forwarded_together(stage):
     robot = stage(JointGroupPosEffortController, TWO)
     assert JointGroupPosEffortController.interfaces(robot.model, ()).command == ("position", "effort")
