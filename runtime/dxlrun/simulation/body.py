@@ -138,6 +138,11 @@ class Body(ABC):
             memory.show_all(self._look_up(target, last - first))
         return memory.read(address, length)
 
+    def keeps(self, address: int, length: int) -> bool:
+        """Return whether bytes were read since all servos rest, of which nothing changes by itself."""
+        still = self.shaft.mechanics.still
+        return still > 0 and self._kept == (still, self.memory.changes, address, length)
+
     def _look_up(self, address: int, length: int) -> LiveItems:
         """Return the items that change by themselves in some cells; looked up once."""
         live = self._live_in.get((address, length))

@@ -27,7 +27,8 @@ from dxlrun.simulation.delivery import Delivery
 from dxlrun.simulation.ledger import Ledger
 from dxlrun.simulation.listeners import Listeners
 from dxlrun.simulation.mechanics import Mechanics
-from dxlrun.simulation.packets import Codec, InstructionPacket, ReadEntry, ReadInTurn, Reply
+from dxlrun.simulation.packets import Codec, InstructionPacket, ReadInTurn, Reply
+from dxlrun.simulation.said import Repeated, Said, asked, nothing_shared, said
 from dxlrun.simulation.servo import ServoConfig, SimulatedServo
 from dxlrun.simulation.wire import STATUS_BYTES, Alteration, Chain, Change, Chunk, Wire
 
@@ -61,6 +62,7 @@ class SimulatedBus:
         """How long after its time the host got what it got last, in real time."""
         self._wedged = False
         self._chain: Chain | None = None
+        self._said: Said | None = None
         self._changes: dict[int, deque[Change]] = {}
         self._instruction_changes: deque[Change] = deque()
         self._agenda = Agenda()
@@ -247,7 +249,11 @@ class SimulatedBus:
         while True:
             t_ns = agenda.next_ns
             if passing and passing[0].due_ns <= now_ns and (t_ns is None or t_ns >= passing[0].due_ns):
-                self._arrive(passing.pop(0))
+                chain = self._chain
+                if chain and t_ns is None and not self._changes and chain.alone(self._wire):
+                    self._flow(chain, now_ns)
+                else:
+                    self._arrive(passing.pop(0))
             elif t_ns is not None and t_ns <= now_ns:
                 self._now_ns = max(self._now_ns, t_ns)
                 agenda.pop()()
@@ -255,13 +261,24 @@ class SimulatedBus:
                 break
         self._now_ns = max(self._now_ns, now_ns)
 
-    def _arrive(self, chunk: Chunk) -> None:
-        """Let the adapter have what has passed the wire, and who waits for its end answer."""
-        self._now_ns = max(self._now_ns, chunk.due_ns)
+    def _flow(self, chain: Chain, now_ns: int) -> None:
+        """Let answers pass, one after the other until a time, with nobody between them; see `_arrive`."""
+        ended_ns = chain.pass_on(self._wire, self._hand, self._status, now_ns)
+        if ended_ns is not None:
+            self._now_ns = max(self._now_ns, ended_ns)
+            self._continue(chain, ended_ns)
+
+    def _hand(self, chunk: Chunk) -> None:
+        """Let the adapter have what has passed the wire."""
         if not self.plugged or self._wedged:
             self.note(f"{len(chunk.data)} bytes to the host are lost: {chunk.data.hex(' ')}")
         elif not self._adapter.accept(chunk):
             self.note(f"{len(chunk.data)} bytes to the host are lost: it does not read")
+
+    def _arrive(self, chunk: Chunk) -> None:
+        """Let the adapter have what has passed the wire, and who waits for its end answer."""
+        self._now_ns = max(self._now_ns, chunk.due_ns)
+        self._hand(chunk)
         chain = chunk.chain
         if chain is None or chain is not self._chain:
             return
@@ -320,15 +337,20 @@ class SimulatedBus:
     def _read_in_turn(self, reading: ReadInTurn, end_ns: int) -> None:
         """Let the listed servos answer, each when it has heard the one before it."""
         slots = reading.has_slots and self.absent == "slot"
-        waiting: deque[tuple[ReadEntry, list[Reply]]] = deque()
-        for entry in reading.entries:
-            replies = self._replies_in_turn(reading, entry, end_ns)
-            waiting.append((entry, replies))
-            if not replies and not slots:
-                break
-        fast = self._codec.fast_status(reading.lengths) if reading.fast else None
-        self._chain = Chain(reading, waiting, fast, slots)
+        before = self._said
+        if before is not None and before.again(reading, end_ns):
+            fast = Repeated(before.parts) if before.parts else None
+            self._chain = Chain(reading, deque(before.answers), fast, slots)
+        else:
+            self._chain = self._asked_in_turn(reading, slots, end_ns)
         self._continue(self._chain, end_ns)
+
+    def _asked_in_turn(self, reading: ReadInTurn, slots: bool, end_ns: int) -> Chain:
+        """Return what each listed servo says."""
+        answers = asked(reading, self._listeners, self._counts, slots, end_ns)
+        empty = self._codec.fast_status if reading.fast else nothing_shared
+        self._said = said(reading, answers, empty(reading.lengths), self._listeners, self._counts)
+        return Chain(reading, deque(answers), empty(reading.lengths), slots)
 
     def _continue(self, chain: Chain, free_ns: int) -> None:
         """Let the next one answer; nobody does any more when there is none."""
@@ -348,23 +370,6 @@ class SimulatedBus:
                 self.note(f"servo {entry.servo_id} does not answer: those after it wait for it in vain")
                 break
         self._chain = None
-
-    def _replies_in_turn(self, reading: ReadInTurn, entry: ReadEntry, end_ns: int) -> list[Reply]:
-        replies = []
-        for servo in self._listeners.of(entry.servo_id):
-            if servo.servo_id != entry.servo_id:
-                continue  # only by its secondary ID, to which it never answers
-            counts = self._counts[servo]
-            counts.heard += 1
-            reply = servo.answer_in_turn(reading, entry, end_ns)
-            if reply is None:
-                continue
-            counts.answer(reply.error)
-            if reading.fast and entry is not reading.entries[0]:
-                # only the first one of a shared status waits
-                reply = Reply(reply.servo_id, reply.error, reply.parameters, 0)
-            replies.append(reply)
-        return replies
 
     def _status(self, reply: Reply) -> bytes:
         return self._codec.status_packet(reply.servo_id, reply.error, reply.parameters)

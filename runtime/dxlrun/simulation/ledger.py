@@ -20,6 +20,8 @@ _BUFFER = 1 << 16
 _LINES = 128
 """Entries that are encoded together."""
 
+_NO_TAIL = ', "note": ""'
+
 FLUSH_NS = 500_000_000
 """A ledger file is never further behind than this."""
 
@@ -71,23 +73,27 @@ class Ledger:
         if self._keep:
             self.entries.append(LedgerEntry(t_ns, bus, direction, data, note, late_ns))
         if self._file is not None:
-            self._write(t_ns, bus, direction, data.hex(), _tail(note, late_ns))
+            # put together by hand, because a busy bus has thousands of them a second
+            name = self._names.get(bus) or self._name(bus)
+            tail = (
+                _tail(note, late_ns)
+                if note
+                else f', "note": "", "late_ns": {late_ns}'
+                if late_ns
+                else _NO_TAIL
+            )
+            head = f'{{"t_ns": {t_ns}, "bus": {name}, "direction": "{direction}"'
+            self._lines.append(f'{head}, "bytes": "{data.hex()}"{tail}}}\n')
+            if self._unflushed_ns is None:
+                self._unflushed_ns = t_ns
+            if len(self._lines) >= _LINES:
+                self._write_lines()
         if direction == "note" and self.on_note is not None:
             self.on_note(note)
 
-    def _write(self, t_ns: int, bus: str, direction: Direction, data: str, tail: str) -> None:
-        """Write a line of JSON; put together by hand, because a busy bus has thousands of them a second."""
-        if self._file is None:
-            return
-        name = self._names.get(bus)
-        if name is None:
-            name = self._names[bus] = json.dumps(bus)
-        line = f'{{"t_ns": {t_ns}, "bus": {name}, "direction": "{direction}", "bytes": "{data}"{tail}}}\n'
-        if self._unflushed_ns is None:
-            self._unflushed_ns = t_ns
-        self._lines.append(line)
-        if len(self._lines) >= _LINES:
-            self._write_lines()
+    def _name(self, bus: str) -> str:
+        name = self._names[bus] = json.dumps(bus)
+        return name
 
     def _write_lines(self) -> None:
         lines = "".join(self._lines)
@@ -143,8 +149,8 @@ class Ledger:
 
 
 def _tail(note: str, late_ns: int) -> str:
-    """Return the end of a line of JSON."""
-    text = f', "note": {json.dumps(note)}' if note else ', "note": ""'
+    """Return the end of a line of JSON with a note."""
+    text = f', "note": {json.dumps(note)}'
     return f'{text}, "late_ns": {late_ns}' if late_ns else text
 
 

@@ -109,7 +109,7 @@ class SimulatedServo:
         body, instructions = self._body, self._instructions
         servo_id = body.servo_id  # a write of ID is still answered under the old one [i]
         own = packet.servo_id == servo_id
-        if not (own or self.listens_to(packet.servo_id)) or not self._hears(now_ns):
+        if not (own or self.listens_to(packet.servo_id)) or not self.hears(now_ns):
             return None
         answering = instructions.answers(packet, own)
         delay_ns = instructions.delay_ns(packet, 10_000_000_000 // self.baud_rate) if answering else 0
@@ -124,7 +124,7 @@ class SimulatedServo:
 
     def answer_in_turn(self, reading: ReadInTurn, entry: ReadEntry, now_ns: int) -> Reply | None:
         """Return its part of the answer to an instruction that ended at `now_ns`; None for silence."""
-        if not self._hears(now_ns):
+        if not self.hears(now_ns):
             return None
         answer = self._instructions.answer_in_turn(reading, entry)
         if answer is None:
@@ -133,12 +133,22 @@ class SimulatedServo:
         delay_ns = body.memory["return_delay_time"] * 2000
         return Reply(body.servo_id, answer[0] | body.state(), answer[1], delay_ns)
 
-    def _hears(self, now_ns: int) -> bool:
+    def hears(self, now_ns: int) -> bool:
+        """Take note of an instruction at a time; say whether the servo takes it in."""
         body = self._body
         if self._silent or now_ns < body.deaf_until_ns or not body.hears_protocol:
             return False
         body.hear(now_ns)
         return True
+
+    def shows_the_same(self, entry: ReadEntry) -> bool:
+        """Return whether what it was read last is the same until a servo moves or something is written."""
+        return self._body.keeps(entry.address, entry.length)
+
+    @property
+    def mechanics(self) -> Mechanics:
+        """What it moves, with others."""
+        return self._body.shaft.mechanics
 
     # What tests see and do
 

@@ -38,6 +38,30 @@ class Chain:
     slot_end_ns: int = 0
     """When the time of the one that answers now is over."""
 
+    def alone(self, wire: Wire) -> bool:
+        """Return whether one of its answers is all that is on the wire, whole."""
+        passing = wire.passing
+        return len(passing) == 1 and passing[0].chain is self and not passing[0].broken
+
+    def pass_on(
+        self, wire: Wire, hand: Callable[[Chunk], None], status: Callable[[Reply], bytes], now_ns: int
+    ) -> int | None:
+        """Let one answer after the other pass until a time; return when the last one passed that others wait
+        for, None while one is on the wire."""
+        passing, duration_ns, waiting = wire.passing, wire.duration_ns, self.waiting
+        chunk = passing[0]
+        while chunk.due_ns <= now_ns:
+            hand(chunk)
+            if not waiting or len(waiting[0][1]) != 1:
+                passing.clear()
+                return chunk.due_ns
+            entry, (reply,) = waiting.popleft()
+            first_ns = chunk.due_ns + reply.delay_ns
+            self.slot_end_ns = first_ns + duration_ns(STATUS_BYTES + entry.length)
+            data = status(reply) if self.fast is None else self.fast.part(reply)
+            chunk = passing[0] = Chunk(first_ns, first_ns + duration_ns(len(data)), data, "", self)
+        return None
+
     def heard_ns(self, due_ns: int, within_ns: int, duration_ns: Callable[[int], int]) -> int:
         """Return when the last of those has answered who do so within a time after another one's answer."""
         heard_ns = due_ns
