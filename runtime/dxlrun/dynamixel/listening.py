@@ -1,0 +1,243 @@
+"""Listener: what arrives on one line, judged: which of it is awaited, and what belongs to nobody."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from dxlrun.dynamixel.bus_plan import BusPlan
+from dxlrun.dynamixel.dialect import dialect_of
+from dxlrun.dynamixel.line import BITS_PER_BYTE
+from dxlrun.dynamixel.receiver import Receiver
+from dxlrun.dynamixel.transaction import BROADCAST_ID, Job, Outcome, Reply, Status, Transaction
+from dxlrun.packets import PacketKind, PacketSink
+
+if TYPE_CHECKING:  # the guardian makes servos limp without numpy
+    from dxlrun.dynamixel.burst import Burst
+
+NEVER = 1 << 62
+
+READY, AWAITING, RESTING, DRAINING = range(4)
+# to look into an Enum takes as long as to pack a packet's record
+_SENT, _OK, _TIMEOUT = Outcome.SENT, Outcome.OK, Outcome.TIMEOUT
+_STATUS = PacketKind.STATUS
+
+
+class Listener:
+    """The ear of a bus.
+
+    A reply counts only when ID and length are exact and when it comes no sooner than the wire allows. Of
+    several replies to one instruction each counts by itself, whatever became of the others.
+    """
+
+    __slots__ = (
+        "_awaited",
+        "_burst",
+        "_deadline_ns",
+        "_dialect",
+        "_earliest_ns",
+        "_job",
+        "_last_byte_ns",
+        "_open",
+        "_overhead",
+        "_receiver",
+        "_refused",
+        "_reply",
+        "_reply_size",
+        "_sent_ns",
+        "_sink",
+        "_state",
+        "buffer",
+        "byte_ns",
+        "due_ns",
+        "index",
+        "noise_bytes",
+        "room",
+    )
+
+    def __init__(self, index: int, plan: BusPlan, packets: PacketSink) -> None:
+        self.index = index
+        """Its number in the log."""
+        self.noise_bytes = 0
+        """Bytes that belonged to no intact packet, since the start."""
+        self._sink = packets
+        self.byte_ns = BITS_PER_BYTE * 1_000_000_000 // plan.baud_rate
+        """What a byte takes on the wire, ns."""
+        self._dialect = dialect_of(plan.protocol)
+        self._overhead = self._dialect.OVERHEAD
+        self._receiver = Receiver(self._status, self._noise, self._dialect, self._gathered)
+        self.room = self._receiver.room
+        """The most bytes that a burst of replies may have."""
+        self.buffer = self._receiver.buffer
+        """Where replies lie."""
+        self._reply = Reply(_SENT, 0, b"", 0, 0, False)
+        self._job: Job | None = None
+        self._awaited: Transaction | None = None
+        self._state = READY
+        self.due_ns = 0
+        """When the replies of the newest transaction are due by the wire."""
+        self._burst: Burst | None = None  # until anything came
+        self._sent_ns = self._earliest_ns = self._deadline_ns = 0
+        self._reply_size = 0
+        self._open = 0  # a bit for each status that is still awaited
+        self._refused = False
+        self._last_byte_ns = -NEVER
+
+    @property
+    def complete(self) -> bool:
+        """True when everything that the newest transaction awaits has come."""
+        return self._state == READY and self._reply.outcome is _OK
+
+    def _await(self, transaction: Transaction, started_ns: int) -> None:
+        """Await the replies to a transaction whose instruction is on its way."""
+        reply, burst = self._reply, self._burst
+        self._awaited = transaction
+        self._receiver.expect(None)
+        reply.parameters = b""
+        reply.error = reply.strays = 0
+        reply.echoed = False
+        reply.sent_ns = self._sent_ns = started_ns
+        if transaction.awaited:
+            reply.outcome = _TIMEOUT
+            self._state = AWAITING
+            self._earliest_ns = started_ns + (len(transaction.packet) + self._overhead) * self.byte_ns
+            self._deadline_ns = started_ns + transaction.timeout_ns
+            self._reply_size = transaction.widest
+            self._open = (1 << len(transaction.awaited)) - 1
+            self._refused = False
+            if burst is not None:
+                burst.bind(self.buffer)
+        else:
+            reply.outcome = _SENT
+            self._state = RESTING
+            self._deadline_ns = started_ns + transaction.due_ns
+        self.due_ns = started_ns + transaction.due_ns
+
+    def _hear(self, count: int, at_ns: int) -> None:
+        """Take the first bytes of a burst."""
+        burst, self._burst = self._burst, None
+        if burst is None or not count:
+            self._burst = burst
+            return
+        self._last_byte_ns = at_ns
+        if count == burst.size and self._state == AWAITING and burst.whole() and self._in_time(burst, at_ns):
+            self._take_all(burst, at_ns, [])
+            return
+        self._receiver.expect(burst)
+        self._receiver.accept(count, at_ns)
+        self._skip_headers()
+
+    def _skip_headers(self) -> None:
+        # as many bytes as an awaited reply has, and it is not whole: its header is a false one
+        receiver = self._receiver
+        while self._state == AWAITING and receiver.pending >= self._reply_size and not receiver.gathering:
+            receiver.skip_header()
+
+    def _gathered(self, burst: Burst, ends: list[int], times: list[int]) -> bool:
+        """Take all replies of a transaction that came in pieces; False: some came too soon to be of now."""
+        spans = burst.spans(ends, times)
+        if self._state != AWAITING or not self._in_time(burst, spans[0][1]):
+            return False
+        self._take_all(burst, spans[-1][1], spans)
+        return True
+
+    def _in_time(self, burst: Burst, first_ns: int) -> bool:
+        """Say whether the first reply is of now: one of before, or an echo, comes sooner than the wire."""
+        return first_ns >= self._earliest_ns + (burst.first_size - self._overhead) * self.byte_ns
+
+    def _take_all(self, burst: Burst, last_ns: int, spans: list[tuple[int, int]]) -> None:
+        """Take all replies of a transaction; `spans`: of each status packet, when they came in pieces."""
+        job = self._job
+        if job is None:
+            return
+        packet, index = self._sink.packet, self.index
+        for number, (servo_id, data) in enumerate(burst.packets):
+            first, last = spans[number] if spans else (last_ns, last_ns)
+            packet(index, _STATUS, servo_id, first, last, data)
+        reply = self._reply
+        reply.outcome, reply.last_ns = _OK, last_ns
+        self._open = 0
+        self._state = READY
+        moments = [last for _, last in spans]
+        job.take(burst, moments if len(moments) == burst.count else last_ns)
+
+    def _noise(self, data: memoryview, first_ns: int, last_ns: int) -> None:
+        self._sink.packet(self.index, PacketKind.NOISE, BROADCAST_ID, first_ns, last_ns, data)
+        # a status of a fast form that is cut off, or spoilt at a place: the parts before it are good
+        unused = len(data) - (self._shared(data, last_ns) if self._shares(data) else 0)
+        if unused:
+            self.noise_bytes += unused
+            self._reply.strays += 1
+
+    def _shares(self, data: memoryview) -> bool:
+        """Say whether a fast form is awaited, and this looks like its one status, whole or not."""
+        awaited = self._awaited
+        return (
+            awaited is not None
+            and awaited.fast
+            and self._state == AWAITING
+            and bytes(data[: self._dialect.ID_AT + 1]) == self._dialect.HEADER + bytes((BROADCAST_ID,))
+        )
+
+    def _shared(self, data: memoryview, last_ns: int) -> int:
+        """Take what is good of the one status of a fast form; return the number of its bytes."""
+        awaited, job = self._awaited, self._job
+        if awaited is None or job is None:
+            return 0
+        from dxlrun.dynamixel.burst import good_parts  # not above: see there
+
+        parts, used = good_parts(self._dialect, awaited, data)
+        if last_ns < self._sent_ns + (len(awaited.packet) + used) * self.byte_ns:
+            return 0  # sooner than the wire allows: left over from before
+        reply = self._reply
+        for index, part in enumerate(parts):
+            reply.error, reply.parameters, reply.last_ns = part.error, part.parameters, last_ns
+            self._open &= ~(1 << index)
+            job.status(index, reply)
+        if not self._open:
+            reply.outcome = _OK
+            self._state = READY
+        return used
+
+    def _status(self, packet: memoryview, first_ns: int, last_ns: int) -> None:
+        self._sink.packet(self.index, _STATUS, packet[self._dialect.ID_AT], first_ns, last_ns, packet)
+        if self._shares(packet):
+            if not self._shared(packet, last_ns):
+                self._stray(packet)
+            return
+        status = self._dialect.opened(packet) if self._state == AWAITING else None
+        index = -1 if status is None else self._turn(status, last_ns)
+        if status is None or index < 0 or self._job is None:
+            self._stray(packet)
+            return
+        reply = self._reply
+        reply.error, reply.parameters, reply.last_ns = status.error, bytes(status.parameters), last_ns
+        self._open &= ~(1 << index)
+        if status.error and self._refuses(status, index):
+            self._refused = True
+        else:
+            self._job.status(index, reply)
+        if not self._open:
+            reply.outcome = Outcome.REFUSED if self._refused else _OK
+            self._state = READY
+
+    def _turn(self, status: Status, last_ns: int) -> int:
+        """Return which of the awaited statuses this is; -1 when it is none of them."""
+        servo_id, error, parameters = status
+        length = len(parameters)
+        # an echo, or left over from before, comes sooner than the wire allows
+        if self._awaited is None or last_ns < self._earliest_ns + length * self.byte_ns:
+            return -1
+        for index, one in enumerate(self._awaited.awaited):
+            if one.servo_id == servo_id and self._open >> index & 1:
+                return index if length == one.length or (error and self._refuses(status, index)) else -1
+        return -1
+
+    def _refuses(self, status: Status, index: int) -> bool:
+        assert self._awaited is not None  # noqa: S101  a status has its turn
+        length = self._awaited.awaited[index].length
+        return self._dialect.refused(status.error, len(status.parameters), length)
+
+    def _stray(self, packet: memoryview) -> None:
+        self._reply.strays += 1
+        if self._awaited is not None and packet == self._awaited.packet:
+            self._reply.echoed = True
