@@ -29,6 +29,7 @@ from dxlrun.dynamixel.bus_plan import BusPlan
 from dxlrun.dynamixel.limp import limp
 from dxlrun.dynamixel.port import SerialPort, SerialPorts
 from dxlrun.dynamixel.reopening import KeptLines, Wanted
+from dxlrun.dynamixel.standing import stand
 from dxlrun.errors import PortError
 from dxlrun.events import EventCode, EventRing, Severity
 from dxlrun.heartbeat import Heartbeat, Phase, Standstill
@@ -97,18 +98,21 @@ class LastHand:
         """
         if self._job.last == "limp" or self._heartbeat.phase is not Phase.RUNNING:
             return self.limp(descriptors, how, severity)
-        self.tell(f"{how}; {TORQUE_STAYS}", severity)
-        return [how, TORQUE_STAYS]
+        standing = self.stand(descriptors)
+        self.tell("; ".join([how, TORQUE_STAYS, *standing]), severity)
+        return [how, TORQUE_STAYS, *standing]
+
+    def stand(self, descriptors: Sequence[int]) -> tuple[str, ...]:
+        """Stop the joints that would go on moving with their torque on; return a sentence for each."""
+        ports, packets = self._take_over(descriptors)
+        sentences = stand(self._job.buses, ports, self._clock, packets, self._heartbeat.look)
+        packets.commit()
+        return sentences
 
     def limp(self, descriptors: Sequence[int], how: str, severity: Severity) -> list[str]:
         """Send torque off to every servo; return `how` it came to that, and the result, as sentences."""
-        job = self._job
-        salvage(process.shared_memory(job.desk), RingReader(job.loop_packets).head, self._ring)
-        ports = SerialPorts(
-            [SerialPort(descriptor, path) for descriptor, path in zip(descriptors, job.ports, strict=True)]
-        )
-        packets = PacketBatch(self._ring)
-        outcome = limp(job.buses, ports, self._clock, packets, beat=self._heartbeat.look)
+        ports, packets = self._take_over(descriptors)
+        outcome = limp(self._job.buses, ports, self._clock, packets, beat=self._heartbeat.look)
         packets.commit()
         silent = [str(one) for one in outcome if not one.confirmed]
         everybody = "the servo" if len(outcome) == 1 else f"all {len(outcome)} servos"
@@ -119,6 +123,15 @@ class LastHand:
         )
         self.tell(f"{how}; {result}", Severity.ERROR if silent else severity)
         return [how, result]
+
+    def _take_over(self, descriptors: Sequence[int]) -> tuple[SerialPorts, PacketBatch]:
+        """Bring what the loop had on its desk into the log; return its lines, and where packets go now."""
+        job = self._job
+        salvage(process.shared_memory(job.desk), RingReader(job.loop_packets).head, self._ring)
+        ports = SerialPorts(
+            [SerialPort(descriptor, path) for descriptor, path in zip(descriptors, job.ports, strict=True)]
+        )
+        return ports, PacketBatch(self._ring)
 
     def tell_grants(self, grants: Sequence[realtime.Grant]) -> None:
         """Put into the log what the operating system granted to this process."""
@@ -197,6 +210,7 @@ class Guardian:
             self._hand.tell(outcome[0], Severity.ERROR)
         elif ending != "done":
             how = self._how(ending, loop)
+            lines.returned()  # one that came back in this moment is to hear it, too
             if ending == "cut":
                 outcome = self._hand.limp(lines.descriptors, how, Severity.WARNING)
             else:

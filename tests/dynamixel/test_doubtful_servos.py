@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dxlrun.dynamixel.standing import stand
 from dxlrun.events import EventCode
 from dxlrun.mode import Mode
 
@@ -113,3 +114,40 @@ def test_a_loop_that_is_late_again_and_again_asks_for_a_servos_watchdog_once(mak
     cleared = [data for data in rig.into_bus()[seen:] if data[7] == 3 and data[8] == 98 and data[10] == 0]
     assert len(cleared) == 2
     assert rig.torque() == [True, True]
+
+
+@pytest.mark.parametrize(("model", "protocol"), [("MX-28", 1.0), ("AX-12A", 1.0), ("XL430-W250", 2.0)])
+def test_wheels_of_a_robot_that_is_left_with_torque_by_a_loop_that_died_stand(make_wheel, model, protocol):
+    rig = make_wheel(model, protocol)
+    rig.goals.velocity[:] = 1.0, 0.0
+    for _ in range(20):
+        rig.cycle()
+    rig.buses[0].servo(2).poke("torque_enable", 0)
+    rig.hardware.read()  # and the loop dies
+    said = stand(rig.plans, rig.ports, rig.clock, rig.packets)
+    assert said == ("main_1_joint (ID 1 on bus main) stands: its goal is 0",)
+    rig.clock.wait_until(rig.clock.now_ns() + 500_000_000)
+    assert rig.torque() == [True, False], "who had no torque was given some"
+    standing = rig.buses[0].servo(1).position
+    rig.clock.wait_until(rig.clock.now_ns() + 500_000_000)
+    rig.torque()
+    assert rig.buses[0].servo(1).position == pytest.approx(standing, abs=0.05)
+
+
+def test_a_wheel_that_takes_no_goal_any_more_loses_its_torque_when_the_loop_died(make_wheel):
+    rig = make_wheel()
+    rig.goals.velocity[0] = 1.0
+    for _ in range(20):
+        rig.cycle()
+    rig.buses[0].servo(1).poke("bus_watchdog", -1)
+    said = stand(rig.plans, rig.ports, rig.clock, rig.packets)
+    assert "has no torque, as did not acknowledge its goal" in said[0]
+    assert rig.torque() == [False, True]
+
+
+def test_joints_that_hold_a_position_are_left_alone_when_the_loop_died(make_rig):
+    rig = make_rig()
+    rig.hardware.start()
+    rig.cycle()
+    assert stand(rig.plans, rig.ports, rig.clock, rig.packets) == ()
+    assert rig.torque() == [True] * 8

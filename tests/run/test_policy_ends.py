@@ -113,6 +113,7 @@ def test_the_guardian_holds_only_a_robot_that_was_running(
     Heartbeat(memory.heartbeat).enter(phase)
     limp: list[str] = []
     monkeypatch.setattr(LastHand, "limp", lambda hand, ports, how, severity: limp.append(how) or [how])
+    monkeypatch.setattr(LastHand, "stand", lambda hand, ports: ())
     said = LastHand(guardian_job(plan, {}, memory, take_over=False)).end((), "it died", Severity.ERROR)
     assert bool(limp) is not holds
     assert ("torque stays on" in " ".join(said)) is holds

@@ -1,0 +1,76 @@
+"""Standing: what a robot that is left with its torque on needs where a joint is led by no position.
+
+The loop lets such joints stand before it ends; when it died the guardian does. Needs no numpy, as `limp`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from dxlrun.clock import Clock
+from dxlrun.dynamixel import modes
+from dxlrun.dynamixel.bus import Bus
+from dxlrun.dynamixel.bus_plan import BusPlan
+from dxlrun.dynamixel.inspection import persist, who
+from dxlrun.dynamixel.limp import ATTEMPTS, SETTLE_NS
+from dxlrun.dynamixel.line import listen
+from dxlrun.dynamixel.port import Ports
+from dxlrun.dynamixel.pump import run
+from dxlrun.dynamixel.transaction import Program
+from dxlrun.mode import Mode
+from dxlrun.packets import PacketSink
+
+_HOLD = (Mode.POSITION, Mode.EFFORT_POSITION)
+"""Modes in which a servo holds by itself what it was told last; in the others it goes on moving."""
+
+
+def stand(
+    plans: Sequence[BusPlan],
+    ports: Ports,
+    clock: Clock,
+    packets: PacketSink,
+    beat: Callable[[], None] = lambda: None,
+) -> tuple[str, ...]:
+    """Stop every joint that has torque and is led by a velocity, an effort or a PWM; return a sentence each.
+
+    One that does not take a goal of 0 loses its torque, as one whose mode cannot be read. Raises nothing.
+    """
+    buses = [
+        Bus(index, plan, port, clock, packets)
+        for index, (plan, port) in enumerate(zip(plans, ports.ports, strict=True))
+    ]
+    found = run([_stand(plan) for plan in plans], buses, ports, clock, beat)
+    return tuple(sentence for one in found for sentence in one or ())
+
+
+def _stand(plan: BusPlan) -> Program[list[str]]:
+    yield listen(SETTLE_NS)
+    said: list[str] = []
+    for index, servo in enumerate(plan.servos):
+        mode = yield from modes.mode_now(plan, servo)
+        if mode in _HOLD:
+            continue
+        torque = yield from persist(plan.torque_reads[index])
+        if torque.answered and torque.parameters[0] == 0:
+            continue
+        problem = "its mode is not known"
+        if mode is not Mode.UNKNOWN:
+            problem = (yield from modes.hold(plan, servo, servo.mode_plan(mode))).problem
+        if not problem:
+            said.append(f"{who(plan, servo)} stands: its goal is 0")
+        elif (yield from _switch_off(plan, index)):
+            said.append(f"{who(plan, servo)} has no torque, as {problem}")
+        else:
+            said.append(f"{who(plan, servo)} may go on moving: {problem}, and torque off was not confirmed")
+    return said
+
+
+def _switch_off(plan: BusPlan, index: int) -> Program[bool]:
+    """Switch a servo's torque off; return whether that was read back."""
+    write = [write for write in plan.limp if write.awaited][index]
+    for _ in range(ATTEMPTS):
+        yield write
+        back = yield plan.torque_reads[index]
+        if back.answered and back.parameters[0] == 0:
+            return True
+    return False
