@@ -88,6 +88,14 @@ def test_slow_registers_and_who_gets_torque_back(compile_text: Any) -> None:
     assert bus.slow_period_ns == 1_000_000_000  # of the servos' clocks, which tell their reboots
 
 
+def test_check_shows_the_policies_of_groups_and_of_returned_servos(compile_text: Any) -> None:
+    pair = "pair: {joints: [pan, tilt], on_lost_servo: limp, on_returned_servo: hold}"
+    report = compile_text(text(policies=f"groups: {{{pair}}}")).report
+    shown = {row.name: row.does for row in report.policies}
+    assert shown["on_lost_servo of pair"] == "no torque for the group any more, the others go on"
+    assert shown["on_returned_servo"] == "hold pan, tilt where they stand, the others limp"
+
+
 @pytest.mark.parametrize(
     ("word", "ended", "torque"),
     [("hold", "ended", [True, True, True]), ("limp", "ended", [False, False, True]), ("stop", "fault", None)],
@@ -107,6 +115,10 @@ def test_a_group_has_its_own_policy_for_a_lost_servo(
     assert seen == ([] if torque is None else [torque])
     events = read_log(tmp_path / "run.mcap").events
     assert any(event.code == EventCode.SERVO_LOST and event.source == "tilt" for event in events)
+    back = [event.text for event in events if event.code == EventCode.SERVO_BACK]
+    assert [("limp" in said, "holding" in said) for said in back] == {
+        "hold": [(False, True)], "limp": [(True, False)], "stop": [],
+    }[word]  # fmt: skip
 
 
 def test_a_rate_at_which_the_watchdog_would_stop_the_servos_is_refused(tmp_path: Path) -> None:

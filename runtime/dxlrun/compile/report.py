@@ -163,7 +163,7 @@ def check_report(checked: Checked) -> CheckReport:
         controllers=tuple(_controller_row(controller, rate) for controller in checked.controllers.values()),
         buses=tuple(_bus_row(bus, rate) for bus in checked.buses),
         ways=tuple(row for bus in checked.buses for row in _way_rows(bus, rate)),
-        policies=_policy_rows(checked.policies),
+        policies=_policy_rows(checked.policies, checked.buses),
         motions=tuple(_motion_row(part) for part in checked.parts),
         duration=None if checked.end_ns is None else checked.end_ns * 1e-9,
     )
@@ -252,14 +252,34 @@ _WHO_IS_HELD = {
 }
 
 
-def _policy_rows(policies: PolicyPlan) -> tuple[PolicyRow, ...]:
+_WHO_IS_LOST = {
+    "hold": "hold their controllers until it answers, the others go on",
+    "limp": "no torque for the group any more, the others go on",
+    "stop": "end the run by on_fault",
+}
+
+
+def _policy_rows(policies: PolicyPlan, buses: Sequence[BusPlan]) -> tuple[PolicyRow, ...]:
     rows = []
     for name in POLICIES:
         policy = policies.named(name)
         going_on = _WHO_IS_HELD.get(name, policy.text) if policy.goes_on else policy.text
         alone = policies.on_fault.last
         rows.append(PolicyRow(name, going_on, policy.longest_ns * 1e-9, alone))
+    for group in policies.groups:
+        does = _WHO_IS_LOST[group.on_lost_servo]
+        rows.append(PolicyRow(f"on_lost_servo of {group.name}", does, 0.0, policies.on_fault.last))
+    rows.append(PolicyRow("on_returned_servo", _who_returns(buses), 0.0, policies.on_fault.last))
     return tuple(rows)
+
+
+def _who_returns(buses: Sequence[BusPlan]) -> str:
+    """Say which servos get their torque back when they had rebooted."""
+    servos = [servo for bus in buses for servo in bus.servos]
+    held = [servo.joint for servo in servos if servo.torque_on_return]
+    if len(held) in {0, len(servos)}:
+        return "hold where it stands" if held else "limp"
+    return f"hold {', '.join(held)} where they stand, the others limp"
 
 
 def _motion_row(part: CompiledPart) -> MotionRow:

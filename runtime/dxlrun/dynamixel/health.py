@@ -334,7 +334,8 @@ class Servos:
         for joint, text in rejoined.written:
             self._emit(EventCode.REGISTER_WRITTEN, Severity.INFO, joint, text)
         self.torqued[index] = rejoined.torqued
-        how = "holding where it stands" if rejoined.torqued else "limp: it gets no goals"
+        holds = rejoined.torqued and index not in self._gone
+        how = "holding where it stands" if holds else "limp: it gets no goals"
         self._say(EventCode.SERVO_BACK, Severity.INFO, index, f"is in order and takes part again, {how}")
         if rejoined.torqued:
             self._limp[index] = False
