@@ -74,6 +74,27 @@ def test_a_servo_that_lost_its_torque_unnoticed_gets_it_by_no_change_of_modes(ma
     assert [source for source, _ in rig.events.of(EventCode.SERVO_LIMP)] == ["main_1_joint"]
 
 
+@pytest.mark.parametrize("left", [10, -1])
+def test_a_watchdog_that_a_killed_run_left_keeps_no_next_run_from_taking_over(make_rig, make_plan, left):
+    plan = make_plan((1, 2), model="XM430-W350", protocol=2.0, reference=math.pi, return_delay_ns=0)
+    servos = tuple(replace(servo, start_mode=Mode.EFFORT_POSITION) for servo in plan.servos)
+    rig = make_rig(replace(plan, servos=servos, watchdog_ticks=20), take_over=True)
+    for servo in rig.buses[0].servos:
+        servo.poke("torque_enable", 1)
+        servo.poke("bus_watchdog", left)
+    rig.hardware.start()
+    assert rig.torque() == [True, True]
+    assert [servo.registers["bus_watchdog"] for servo in rig.buses[0].servos] == [20, 20]
+
+
+def test_a_watchdog_that_is_still_armed_is_off_where_the_robot_file_wants_none(make_rig, make_plan):
+    plan = make_plan((1, 2), model="XM430-W350", protocol=2.0, reference=math.pi, return_delay_ns=0)
+    rig = make_rig(plan)
+    rig.buses[0].servo(1).poke("bus_watchdog", 10)
+    rig.hardware.start()
+    assert rig.buses[0].servo(1).registers["bus_watchdog"] == 0
+
+
 @pytest.mark.parametrize("model", ["AX-12A", "MX-64"])
 def test_a_servo_whose_mode_was_changed_by_half_when_the_power_went_starts_again(make_rig, make_plan, model):
     rig = make_rig(make_plan((1, 2), model=model, lower=-1.5, upper=1.5))

@@ -30,8 +30,11 @@ def arm(plan: BusPlan, servo: ServoPlan) -> Program[str]:
 
 
 def disarm(plan: BusPlan, servo: ServoPlan) -> Program[str]:
-    """Clear a servo's watchdog if it is armed or has stopped the servo; return what went wrong."""
-    if not plan.watchdog_ticks or (item := _item(plan, servo)) is None:
+    """Clear a servo's watchdog if it is armed or has stopped the servo; return what went wrong.
+
+    Also where the plan wants none: an earlier run that was killed may have left it armed.
+    """
+    if (item := _item(plan, servo)) is None:
         return ""
     reply = yield from persist(plan_line(plan).read(servo.servo_id, item.address, item.size))
     if reply.answered and reply.parameters[0] == 0:

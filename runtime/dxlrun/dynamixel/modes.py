@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from dxlrun.control_table import ControlItem, control_table
+from dxlrun.dynamixel import bus_watchdog
 from dxlrun.dynamixel.bus_plan import BusPlan, GoalLayout, ModePlan, OwnLimit, ServoPlan
 from dxlrun.dynamixel.inspection import called, persist, who
 from dxlrun.dynamixel.mode_plan import in_mode, mode_in
@@ -104,7 +105,9 @@ def settle_modes(plan: BusPlan) -> Program[SettledModes]:
         found = yield from _read_items(plan, servo, [register.name for register in wanted.operating])
         if found is not None and in_mode(wanted, found):
             continue
-        problem = yield from enter(plan, servo, servo.start_mode)
+        # one that has torque takes no goal while its watchdog has stopped it
+        problem = yield from bus_watchdog.disarm(plan, servo)
+        problem = problem or (yield from enter(plan, servo, servo.start_mode))
         if problem or found is None:
             problem = problem or "did not answer when its mode was asked for"
             settled.problems.append(f"{who(plan, servo)} {problem}")
