@@ -29,6 +29,7 @@ class Burst:
         "_alone",
         "_bodies",
         "_buffer",
+        "_clean_marks",
         "_end",
         "_errors_at",
         "_expected",
@@ -37,6 +38,7 @@ class Burst:
         "_heads",
         "_ids",
         "_lead",
+        "_marks",
         "_no_errors",
         "_quiet_lead",
         "_tails",
@@ -78,6 +80,7 @@ class Burst:
         self._quiet_lead = self._lead + b"\0"
         self._errors_at = slice(self._head, self.size, self.step)
         self._ids = bytes(self.ids)
+        self._clean_marks = b"".join(bytes((0, one)) for one in self.ids)
         self._alone = self.count == 1 and not self._two
         self._no_errors = bytes(self.count)
         self._buffer = bytearray()
@@ -110,6 +113,7 @@ class Burst:
         self._heads = np.ndarray((heads,), f"<u{self._head}", buffer, strides=(step,))
         ends = [self.size - (count - 1 - number) * step for number in range(count)]
         self._tails = np.ndarray((count,), "<u2", buffer, offset=ends[0] - 2, strides=(step,))
+        self._marks = np.ndarray((count,), "<u2", buffer, offset=self._head, strides=(step,))
         if self._fast:
             # each CRC goes on where the one before it ended, and covers that one, too
             starts = [0, *(end - 2 for end in ends[:-1])]
@@ -139,6 +143,11 @@ class Burst:
         """Say whether these replies are `whole`, and nobody reports anything."""
         if self._alone:
             return self._buffer.startswith(self._quiet_lead) and sum(self._bodies[0]) & 0xFF == 0xFF
+        if self._fast:
+            # of each part, its error byte and its ID stand side by side
+            if self._marks.tobytes() != self._clean_marks:
+                return False
+            return self._buffer.startswith(self._lead) and self._chained()
         return self._buffer[self._errors_at] == self._no_errors and self.whole()
 
     def whole(self) -> bool:
@@ -151,7 +160,7 @@ class Burst:
         errors = self._buffer[self._errors_at]
         if errors != self._no_errors and len(errors.translate(None, _NUMBERS)) != self.count:
             return False
-        return self._chained() if self._fast else self._separate()
+        return self._theirs() and self._chained() if self._fast else self._separate()
 
     def _separate(self) -> bool:
         if [crc16.umts(body) for body in self._bodies] != self._tails.tolist():
@@ -159,14 +168,13 @@ class Burst:
         return self._buffer.find(_STUFFING, 0, self.size) < 0
 
     def _chained(self) -> bool:
-        if self._buffer[self._head + 1 : self.size : self.step] != self._ids:
-            return False
         crc = 0
-        for body, tail in zip(self._bodies, self._tails.tolist(), strict=True):
-            crc = crc16.umts(body, crc)
-            if crc != tail:
-                return False
-        return True
+        tails: list[int] = self._tails.tolist()
+        return [crc := crc16.umts(body, crc) for body in self._bodies] == tails
+
+    def _theirs(self) -> bool:
+        """Say whether the parts of the one status of a fast form are of whom they should be."""
+        return self._buffer[self._head + 1 : self.size : self.step] == self._ids
 
     def spans(self, ends: list[int], times: list[int]) -> list[tuple[int, int]]:
         """Return of each status packet when the read() of its first and of its last byte was.

@@ -12,6 +12,9 @@ from typing import Protocol
 from dxlrun.dynamixel.reply_polling import ReplyPolling
 from dxlrun.errors import PortError
 
+# found at once, some dozen times a cycle
+_readv, _write, _now_ns = os.readv, os.write, time.monotonic_ns
+
 _WRITE_PATIENCE_NS = 20_000_000
 """A goal packet for 50 servos takes 2.6 ms at 1 Mbit/s; a line that does not take it in 20 ms is stuck."""
 
@@ -64,19 +67,20 @@ class Ports(Protocol):
 class SerialPort:
     """A serial line by its descriptor, made non-blocking; opened, locked and set up by somebody else."""
 
-    __slots__ = ("_announced", "descriptor", "name")
+    __slots__ = ("announced", "descriptor", "name")
 
     def __init__(self, descriptor: int, name: str) -> None:
         os.set_blocking(descriptor, False)
         self.descriptor = descriptor
         self.name = name
         """Device path, for messages."""
-        self._announced = False
+        self.announced = False
+        """True when the line was said to have bytes: to find none then means that it is gone."""
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
         """Hand one whole packet to the line; raises PortError when the adapter is gone."""
         try:
-            count = os.write(self.descriptor, data)
+            count = _write(self.descriptor, data)
         except BlockingIOError:
             count = 0
         except OSError as error:
@@ -101,9 +105,9 @@ class SerialPort:
 
     def read_into(self, buffer: memoryview) -> int:
         """Copy what has arrived into `buffer`; raises PortError when the adapter is gone."""
-        announced, self._announced = self._announced, False
+        announced, self.announced = self.announced, False
         try:
-            count = os.readv(self.descriptor, [buffer])
+            count = _readv(self.descriptor, (buffer,))
         except BlockingIOError:
             return 0
         except OSError as error:
@@ -111,10 +115,6 @@ class SerialPort:
         if count == 0 and announced:  # ready to be read, and nothing there: the other side hung up
             raise self._gone(None)
         return count
-
-    def announce(self) -> None:
-        """Note that the line was said to have bytes: to find none then means that it is gone."""
-        self._announced = True
 
     def _gone(self, error: OSError | None) -> PortError:
         why = f" ({error.strerror})" if error is not None and error.errno != errno.EBADF else ""  # set aside
@@ -151,26 +151,20 @@ class SerialPorts:
 
     def wait(self, deadline_ns: int) -> Sequence[int]:
         """Wait for bytes on any line until `deadline_ns` of CLOCK_MONOTONIC; a past deadline only looks."""
-        left_ns = deadline_ns - time.monotonic_ns()
-        if left_ns <= 0:
-            return self._look(0)
+        left_ns = deadline_ns - _now_ns()
         # poll has milliseconds, select has microseconds: what is left of a millisecond
-        ready = self._look(left_ns // 1_000_000) if left_ns >= 1_000_000 else ()
-        if ready:
-            return ready
-        left_ns = deadline_ns - time.monotonic_ns()
-        if left_ns > 0:
+        if left_ns >= 1_000_000 and (found := self._poll.poll(left_ns // 1_000_000)):
+            return self._announced(found)
+        if left_ns > 0 and (left_ns := deadline_ns - _now_ns()) > 0:
             select.select(self._waited, (), (), left_ns * 1e-9)
-        return self._look(0)
+        found = self._poll.poll(0)
+        return self._announced(found) if found else ()
 
-    def _look(self, timeout_ms: int) -> Sequence[int]:
-        """Return the lines that have bytes, or are gone, within a time."""
-        found = self._poll.poll(timeout_ms)
-        if not found:
-            return ()
+    def _announced(self, found: list[tuple[int, int]]) -> Sequence[int]:
+        """Return the lines that have bytes, or are gone, and note that they were said to have bytes."""
         indices = [self._index[descriptor] for descriptor, _ in found]
         for index in indices:
-            self._ports[index].announce()
+            self._ports[index].announced = True
         return indices
 
     def reopen(self, index: int) -> bool:

@@ -40,7 +40,7 @@ class StateArrays:
     controls none is a fraction of full output (AX-12A, Present Speed (38)), see `mode_plan`.
     """
 
-    __slots__ = ("_arrived", "_blocks", "_everybody", "_rows", "replies")
+    __slots__ = ("_age", "_arrived", "_blocks", "_everybody", "_now", "_rows", "replies")
 
     def __init__(self, plan: BusPlan) -> None:
         layouts = dict.fromkeys(servo.state for servo in plan.servos)
@@ -53,6 +53,8 @@ class StateArrays:
         self._rows = rows_of([servo.row for servo in plan.servos])
         self._everybody = b"\1" * len(plan.servos)
         self._arrived = np.full(len(plan.servos), -1, dtype=np.int64)
+        self._age = np.zeros(len(plan.servos), dtype=np.int64)
+        self._now = np.zeros(1, dtype=np.int64)
 
     def place(self, indices: Sequence[int]) -> tuple[NDArray[np.uint8], Rows]:
         """Return the bytes of all servos of one layout, one row a servo, and the rows of some of them."""
@@ -72,7 +74,8 @@ class StateArrays:
         states.valid[rows] = fresh
         if fresh.tobytes() == self._everybody:
             self._arrived[:] = arrived_ns
-            states.age_ns[rows] = now_ns - arrived_ns
+            self._now[0] = now_ns  # quicker than to let numpy make an array of an int
+            states.age_ns[rows] = np.subtract(self._now, arrived_ns, self._age)
             for block in self._blocks:
                 block.decode(states)
             return
