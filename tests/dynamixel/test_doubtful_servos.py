@@ -172,3 +172,27 @@ def test_joints_that_hold_a_position_are_left_alone_when_the_loop_died(make_rig)
     rig.cycle()
     assert stand(rig.plans, rig.ports, rig.clock, rig.packets) == ()
     assert rig.torque() == [True] * 8
+
+
+def test_a_joint_that_is_let_go_is_limp_though_noise_hit_every_attempt_to_switch_it_off(make_rig, make_plan):
+    plan = make_plan((1, 2), model="XM430-W350", protocol=2.0, reference=math.pi, return_delay_ns=0)
+    rig = make_rig(plan)
+    rig.hardware.start()
+    rig.cycle()
+    bus = rig.buses[0]
+    write = rig.ports.ports[0].write
+
+    def lose_torque_off(data):
+        if data[4] == 1 and data[7] == 3 and data[8] == 64 and data[10] == 0:
+            bus.alter_next_instruction("lost", lambda _: b"")
+        write(data)
+
+    rig.ports.ports[0].write = lose_torque_off
+    rig.hardware.let_go([0])
+    for _ in range(10):
+        rig.cycle()
+    assert rig.torque() == [True, True]
+    rig.ports.ports[0].write = write
+    for _ in range(10):
+        rig.cycle()
+    assert rig.torque() == [False, True]

@@ -10,7 +10,7 @@ from dxlrun.control_table import control_table
 from dxlrun.dynamixel import bus_watchdog
 from dxlrun.dynamixel.bus_plan import BusPlan
 from dxlrun.dynamixel.gaps import Gaps, Urgency
-from dxlrun.dynamixel.inspection import persist
+from dxlrun.dynamixel.inspection import persist, who
 from dxlrun.dynamixel.plan import plan_line
 from dxlrun.dynamixel.reboots import RealtimeTicks, RebootCount
 from dxlrun.dynamixel.startup import Rejoined, rejoin
@@ -117,6 +117,16 @@ class Absent:
                 name = f"the return of {self._plan.servos[index].joint}"
                 self._gaps.add(self._ask(index), partial(self._asked, index), Urgency.REPAIR, name, index)
         self._earliest_ns = min(self._due_ns)
+
+    def switch_off(self, index: int, failed: Callable[[], None]) -> None:
+        """Switch a servo's torque off in the coming gaps; `failed` is called when that was not read back."""
+
+        def done(off: bool) -> None:
+            if not off:
+                failed()
+
+        name = f"torque off of {who(self._plan, self._plan.servos[index])}"
+        self._gaps.add(switch_off(self._plan, index), done, Urgency.REPAIR, name, index)
 
     def tick(self, index: int) -> Program[bool]:
         """Read a servo's Realtime Tick, if it has one; return whether it shows a reboot, which is counted."""

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dxlrun.dynamixel import bus_watchdog
-from dxlrun.dynamixel.absent import FIRST_PROBE_NS, Absent, switch_off
+from dxlrun.dynamixel.absent import FIRST_PROBE_NS, Absent
 from dxlrun.dynamixel.bus import Bus
 from dxlrun.dynamixel.bus_plan import BusPlan
 from dxlrun.dynamixel.dialect import dialect_of
@@ -355,8 +355,8 @@ class Servos:
 
     def _switch_off(self, index: int) -> None:
         self.torqued[index], self._limp[index] = False, True
-        name = f"torque off of {self._who(index)}"
-        self._gaps.add(switch_off(self._plan, index), lambda _: None, Urgency.REPAIR, name, index)
+        # who kept it is switched off again as soon as it is in order
+        self._absent.switch_off(index, lambda: self._leave(index, 0))
 
     def _slow_down(self, index: int) -> None:
         if index not in self._returning:
