@@ -73,6 +73,7 @@ class DynamixelHardware:
         self._full_torque: list[list[int]] = []
         self._asked = [False] * len(self._plans)
         """Whose reads began behind the goals of the cycle before."""
+        self._begun = False  # the others' reads are prepared
         self._buses = tuple(
             Bus(index, plan, port, clock, packets)
             for index, (plan, port) in enumerate(zip(self._plans, ports.ports, strict=True))
@@ -114,10 +115,12 @@ class DynamixelHardware:
 
         A split bus was asked behind the goals before: only what is not there yet is waited for.
         """
+        if not self._begun:
+            self._begin_reads()
+        self._begun = False
         for index, (bus, servos) in enumerate(zip(self._buses, self._servos, strict=True)):
             if not self._asked[index]:
                 servos.feeding.feed()
-                servos.reads.begin()
                 bus.load(servos.reads, servos.reads.lane)
             self._asked[index] = False
         pump(self._buses, self._ports, self._clock, self._beat)
@@ -128,6 +131,12 @@ class DynamixelHardware:
                 self._tell_plain_reads()
         self._jumps.sift(self._states, now)
         tell_failures(self._plans, self._buses, self._servos)
+
+    def _begin_reads(self) -> None:
+        for asked, servos in zip(self._asked, self._servos, strict=True):
+            if not asked:
+                servos.reads.begin()
+        self._begun = True
 
     def write(self) -> None:
         """Send the goals, one sync write a line and layout, on every line that is there.
@@ -194,6 +203,7 @@ class DynamixelHardware:
             for bus in working:
                 if bus.busy:
                     bus.drop()
+        self._begin_reads()  # here nobody waits for it
 
     def stop(self) -> tuple[str, ...]:
         """Switch torque off on every servo, and read it back; return a sentence per failure."""
