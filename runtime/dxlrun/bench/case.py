@@ -58,10 +58,12 @@ class Case:
             "direction: 1, limits: {position: [-90 deg, 90 deg]}}\n"
             for each in self.ids
         )
+        # hosts take turns, so a servo hears nothing of one for longer than a watchdog waits
+        watchdog = ", bus_watchdog: 0 ms" if self.protocol == 2.0 else ""
         return (
             "name: bench\n"
             f"buses: {{{BUS}: {{port: sim, protocol: {self.protocol:.1f}, baud_rate: {self.baud_rate}, "
-            "adapter: {latency: 0 ms}, return_delay_time: 0 us}}\n"
+            f"adapter: {{latency: 0 ms}}, return_delay_time: 0 us{watchdog}}}}}\n"
             "loop: {rate: 10}\n"
             f"joints:\n{joints}"
             "controllers: {joint_state_broadcaster: {type: joint_state_broadcaster, rate: 10}}\n"
