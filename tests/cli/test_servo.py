@@ -70,7 +70,7 @@ def test_registers_are_read_and_written_and_the_eeprom_only_when_it_was_asked_fo
     servo, finish = one()
     table = servo(1, "get", *NEW)
     assert table.code == 0, table.err
-    assert ["return_delay_time", "9", "EEPROM", "RW", "250", "0.0005", "s"] in [
+    assert ["return_delay_time", "9", "EEPROM", "RW", "250", "500", "us"] in [
         line.split() for line in table.out.splitlines()
     ]
     assert servo(1, "set", "position_p_gain", "900", *NEW).out.strip().endswith("was 800 and is 900")

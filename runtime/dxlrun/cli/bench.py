@@ -134,6 +134,7 @@ def bench_rate(
     from dxlrun.bench.real_run import runs
     from dxlrun.cli.bench_table import rate_table, rate_verdict
     from dxlrun.cli.inputs import parse_assignments
+    from dxlrun.cli.narrow import fitting
     from dxlrun.description import read_robot
 
     description = read_robot(robot, parse_assignments(assignments))
@@ -147,8 +148,9 @@ def bench_rate(
     if as_json:
         out().file.write(to_json(result).decode() + "\n")
     else:
-        out().print(rate_table(result))
-        out().print(rate_verdict(result), soft_wrap=True)
+        console = out()
+        console.print(fitting(rate_table(result), console.width))
+        console.print(rate_verdict(result), soft_wrap=True)
     return 0 if result.kept_hz else 1
 
 
@@ -173,5 +175,7 @@ def _counts(text: str) -> list[int]:
 
 def _print(result: BusBench) -> None:
     from dxlrun.cli.bench_table import bus_table
+    from dxlrun.cli.narrow import fitting
 
-    out().print(bus_table(result))
+    console = out()
+    console.print(fitting(bus_table(result), console.width))

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from rich import box
-from rich.console import Console, RenderableType
-from rich.measure import Measurement
+from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from dxlrun.cli.narrow import fitting
 from dxlrun.compile import Compiled
 from dxlrun.compile.reach import degrees
 from dxlrun.compile.report import (
@@ -79,19 +78,7 @@ class _Sheet:
             table.add_column(name, justify="right", no_wrap=True)
         for row in self.rows:
             table.add_row(*(Text(cell) for cell in row))
-        needed = Measurement.get(_UNBOUNDED, _UNBOUNDED.options, table).maximum
-        return table if needed <= width else self._paragraphs(width)
-
-    def _paragraphs(self, width: int) -> Text:
-        lines = [self.title]
-        for first, *rest in self.rows:
-            named = zip((*self.left, *self.right)[1:], rest, strict=True)
-            facts = ", ".join(f"{name} {' '.join(cell.split())}" for name, cell in named if cell)
-            lines.append(textwrap.fill(f"{first}: {facts}", max(width - 1, 20), subsequent_indent="  "))
-        return Text("\n".join(lines) + "\n")
-
-
-_UNBOUNDED = Console(width=10_000)
+        return fitting(table, width)
 
 
 def _joints(rows: Sequence[JointRow]) -> _Sheet:

@@ -72,7 +72,8 @@ def scan(
         latency_ns = line.latency_ns
     for rate in scanned.left_out:
         say_warning(f"{port} cannot run at {rate} bit/s; nobody was looked for there")
-    _show(port, scanned, as_json=as_json)
+    narrowed = protocol is not None or bool(baud) or ids is not None
+    _show(port, scanned, narrowed=narrowed, as_json=as_json)
     if write is not None and scanned.servos:
         from dxlrun.robot_draft import draft_file
 
@@ -125,7 +126,7 @@ def load_models() -> None:
     load_plugins()
 
 
-def _show(port: str, scanned: Scanned, *, as_json: bool) -> None:
+def _show(port: str, scanned: Scanned, *, narrowed: bool, as_json: bool) -> None:
     if as_json:
         servos = [asdict(servo) for servo in scanned.servos]
         text = json.dumps({"port": port, "servos": servos, "left_out": scanned.left_out}, indent=2)
@@ -135,9 +136,14 @@ def _show(port: str, scanned: Scanned, *, as_json: bool) -> None:
         say_error(
             f"nobody answers at {port}: check power, cable, and that the adapter is the one of the servos; "
             "`dxlrun doctor` lists the adapters"
+            + "; without --protocol, --baud and --ids everything is tried"
+            * narrowed
         )
         return
-    out().print(_table(scanned.servos))
+    from dxlrun.cli.narrow import fitting
+
+    console = out()
+    console.print(fitting(_table(scanned.servos), console.width))
     for servo in scanned.servos:
         for remark in servo.remarks:
             say_warning(f"ID {servo.servo_id} at {servo.baud_rate} bit/s: {remark}")

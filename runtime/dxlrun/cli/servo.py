@@ -133,7 +133,10 @@ def _tell(one: OneServo, verb: str, asked: Asked, *, as_json: bool) -> None:
         out().file.write(text + "\n")
         return
     if verb == "get":
-        out().print(_registers(asked.registers, one.table.items))
+        from dxlrun.cli.narrow import fitting
+
+        console = out()
+        console.print(fitting(_registers(asked.registers, one.table.items), console.width))
     for sentence in asked.done:
         out().print(f"{one.called}: {sentence}", markup=False, soft_wrap=True)
     if asked.declined:
@@ -157,6 +160,8 @@ def _meaning(item: ControlItem, value: int) -> str:
     if not item.unit:
         return ""
     quantity = item.decode(value.to_bytes(item.size, "little", signed=item.signed)) * item.scale
+    if item.unit == "s" and abs(quantity) < 1:
+        return f"{quantity * 1e3:.6g} ms" if abs(quantity) >= 1e-3 else f"{quantity * 1e6:.6g} us"
     if item.unit.startswith("rad"):
         return f"{math.degrees(quantity):.6g} {item.unit.replace('rad', 'deg')}"
     return f"{quantity * 100:.6g} %" if item.unit == "1" else f"{quantity:.6g} {item.unit}"

@@ -1,0 +1,33 @@
+"""Tables that are wider than their terminal."""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+from rich.console import Console
+from rich.table import Table
+
+from dxlrun.cli.narrow import fitting
+
+
+def servos() -> Table:
+    table = Table(box=None, pad_edge=False)
+    for head in ("ID", "model", "return delay"):
+        table.add_column(head)
+    table.add_row("1", "XM430-W350", "500 us")
+    table.add_row("2", "AX-12A", "")
+    return table
+
+
+@pytest.mark.parametrize(
+    ("width", "shown"),
+    [
+        (60, "ID  model       return delay\n1   XM430-W350  500 us      \n2   AX-12A                  \n"),
+        (24, "ID 1: model XM430-W350,\n  return delay 500 us\nID 2: model AX-12A\n"),
+    ],
+)
+def test_a_table_that_does_not_fit_becomes_paragraphs_in_which_nothing_is_cut(width: int, shown: str) -> None:
+    console = Console(file=io.StringIO(), width=width)
+    console.print(fitting(servos(), width))
+    assert console.file.getvalue() == shown  # type: ignore[attr-defined]
