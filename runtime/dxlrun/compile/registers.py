@@ -116,6 +116,11 @@ def any_value(table: ControlTable, name: str, value: int | str) -> RegisterValue
 
 def steered_value(table: ControlTable, name: str, value: int | str) -> RegisterValue:
     """Return what is written for a register that a client changes in the run; raises UnfitRegister."""
+    item = table.items.get(name)
+    if item is not None and item.access == "R":
+        raise UnfitRegister(f"{called(item)} can only be read", "write another item")
+    if item is not None and (reason := own_reason(table, item)):
+        raise UnfitRegister(f"{called(item)} is not to be changed: {reason[0]}", "write another item")
     wanted = register_value(table, name, value)
     item = table.items[name]
     if wanted.eeprom:
