@@ -152,7 +152,7 @@ def said(transactions, dialect, rng, accident):
     victim = rng.randrange(len(transactions)) if accident else -1
     for number, transaction in enumerate(transactions):
         packets = replies(transaction, dialect, rng)
-        stream, at, most = b"".join(packets), 1_500_000, 1_000
+        stream, at, most = b"".join(packets), 1_500_000, rng.choice((9, 1_000, 1_000))
         if number == victim:
             if rng.random() < 0.1:
                 told.append(None)

@@ -123,7 +123,10 @@ class Bus(Listener):
         self._burst = self._job.burst
         self._await(transaction, lane.sent_ns)
         self._free_ns = lane.sent_ns + len(transaction.packet) * self.byte_ns
-        self._hear(lane.count, lane.at_ns)
+        self._hear(*lane.pieces[0])
+        for count, self._last_byte_ns in lane.pieces[1:]:
+            self._receiver.accept(count, self._last_byte_ns)
+            self._skip_headers()
 
     def begin_behind(self) -> None:
         """Send the first instruction of the loaded job at once, though the line may not be free yet.

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Sequence
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -63,9 +63,9 @@ class Lane:
         "_parts",
         "_steps",
         "at_ns",
-        "count",
         "done",
         "fresh",
+        "pieces",
         "sent_ns",
         "stretches",
     )
@@ -92,8 +92,8 @@ class Lane:
         """1 for each servo that is read."""
         self.sent_ns = self.at_ns = 0
         """When the newest read was sent, and when its replies were taken."""
-        self.count = 0
-        """How many bytes came of the read that ended it."""
+        self.pieces: list[tuple[int, int]] = []
+        """What came of the newest read: how many bytes, and when."""
         self.done = 0
         """How many reads went as they should, the last time."""
         self._log, places = _laid(stretches, bus)
@@ -174,18 +174,26 @@ class Lane:
                 wait(before + timeout_ns)
                 count = read_into(room)
             at = now_ns()
-            if count != size or at < before + least_ns or not clean():
-                self.count, self.at_ns = count, at
-                return
             reply, reply_at, told_at, chain, rows = told
+            self.pieces = pieces = [(count, at)]
+            spans: Sequence[tuple[int, int]] = ((at, at),)
+            if 0 < count < size:
+                burst = self.stretches[self.done].burst
+                _gather(pieces, burst, port, wait, room, now_ns, before + timeout_ns)
+                at = pieces[-1][1]
+                count = sum(count for count, _ in pieces)
+                if count == size:
+                    spans = burst.spans([*accumulate(count for count, _ in pieces)], [at for _, at in pieces])
+            if count != size or spans[0][1] < before + least_ns or not clean():
+                return
             if chain is None:
                 log[reply_at] = reply
-                _stamp(log, told_at, at, at)
+                _stamp(log, told_at, *spans[0])
             else:
                 place, replies, times = chain
                 place[:] = replies
-                times[:] = at
-            arrived_ns[rows] = at
+                times[:] = spans
+            arrived_ns[rows] = at if len(pieces) == 1 or chain is None else [last for _, last in spans]
             if polling is not None:
                 polling.came(before + due_ns, at)
             before = at
@@ -209,6 +217,28 @@ class Lane:
                 for place, row, at in self._parts[number]:
                     place[row] = log[at : at + place.shape[1]]
         return self._ended(self)
+
+
+def _gather(  # noqa: PLR0917  positional is quickest
+    pieces: list[tuple[int, int]],
+    burst: Burst,
+    port: Port,
+    wait: Callable[[int], Sequence[int]],
+    room: memoryview,
+    now_ns: Callable[[], int],
+    deadline_ns: int,
+) -> None:
+    """Await the rest of replies that come in pieces, as long as they look like what is awaited."""
+    end = pieces[0][0]
+    while end < burst.size and burst.begun(end) and wait(deadline_ns):
+        try:
+            count = port.read_into(room[end:])
+        except PortError:
+            return  # whoever looks next is told, and what came until now is not forgotten
+        if not count:
+            return
+        end += count
+        pieces.append((count, now_ns()))
 
 
 def _polled(  # noqa: PLR0917  positional is quickest
