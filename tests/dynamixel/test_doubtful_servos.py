@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dxlrun.dynamixel import modes
 from dxlrun.dynamixel.standing import stand
 from dxlrun.events import EventCode
 from dxlrun.mode import Mode
@@ -196,3 +197,13 @@ def test_a_joint_that_is_let_go_is_limp_though_noise_hit_every_attempt_to_switch
     for _ in range(10):
         rig.cycle()
     assert rig.torque() == [False, True]
+
+
+@pytest.mark.parametrize(
+    ("model", "protocol"),
+    [("XM430-W350", 2.0), ("XL-320", 2.0), ("PH54-200-S500", 2.0), ("MX-64", 1.0), ("AX-12A", 1.0)],
+)
+def test_a_late_answer_to_the_question_for_torque_has_not_the_length_of_a_mode(make_plan, model, protocol):
+    plan = make_plan((1,), model=model, protocol=protocol, reference=1.0, lower=-0.5, upper=0.5)
+    program = modes.mode_now(plan, plan.servos[0])
+    assert next(program).awaited[0].length != plan.torque_reads[0].awaited[0].length

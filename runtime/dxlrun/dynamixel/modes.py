@@ -286,6 +286,8 @@ def _read_items(plan: BusPlan, servo: ServoPlan, names: Sequence[str]) -> Progra
     values: dict[str, int] = {}
     for block in blocks:
         start, end = block[0].address, block[-1].address + block[-1].size
+        if end - start == 1 and readable(control_table(servo.model, plan.protocol), start, end + 1):
+            end += 1  # torque enable is one byte, too: a late answer to that is none to this
         reply = yield from persist(plan_line(plan).read(servo.servo_id, start, end - start))
         if not reply.answered:
             return None
