@@ -151,7 +151,7 @@ def _reply_polling(wish_ns: int | None) -> ReplyPolling | None:
     return None if wish_ns == 0 else ReplyPolling(wish_ns)
 
 
-def _beside_simulation(plan: Plan) -> SchedulerPlan:
+def beside_simulation(plan: Plan) -> SchedulerPlan:
     """Return the scheduler's wishes: off the core of simulated servos, whose process goes before the loop."""
     scheduler = plan.loop.scheduler
     others = os.sched_getaffinity(0) - {process.spare_core(())}
@@ -195,7 +195,7 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: RingSinks) -> Ou
     failures: tuple[str, ...] = ()
     last: Last = "limp"
     try:
-        grants = realtime.apply(_beside_simulation(plan))
+        grants = realtime.apply(beside_simulation(plan))
         heartbeat.beat()
         grants = (*grants, pacing.measure(plan.loop.period_ns, heartbeat.beat))
         if ports.polling:
