@@ -80,7 +80,7 @@ class Scheduler(Form):
         examples=["100 us"],
     )
     reply_polling: Polling = Field(
-        default="auto",
+        default=0,
         description="Longest time that a servo's reply is polled for, at most half of a core; auto: a tenth.",
         examples=["100 us"],
     )

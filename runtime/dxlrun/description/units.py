@@ -254,7 +254,9 @@ Polling = Annotated[
     int | Literal["auto"],
     BeforeValidator(_polling),
     PlainSerializer(
-        lambda value: value if value == "auto" else f"{value} ns", return_type=str, when_used="json"
+        lambda value: value if value == "auto" else f"{value} ns" if value else "off",
+        return_type=str,
+        when_used="json",
     ),
     _text_schema("500 us", _DURATION_NS, {"type": "string", "enum": ["auto", "off"]}),
 ]
