@@ -186,6 +186,8 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: RingSinks) -> Ou
         pace=pacing,
     )
     heartbeat.enter(Phase.SETUP)
+    # before anybody has torque: it takes a while, and a Bus Watchdog waits for the first cycle
+    _prepare(plan, job, heartbeat, sinks, ports, pacing)
     try:
         robot.hardware.start()
     except AskedToStop as asked:
@@ -195,14 +197,6 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: RingSinks) -> Ou
     failures: tuple[str, ...] = ()
     last: Last = "limp"
     try:
-        grants = realtime.apply(beside_simulation(plan))
-        heartbeat.beat()
-        grants = (*grants, pacing.measure(plan.loop.period_ns, heartbeat.beat))
-        if ports.polling:
-            ports.polling.margin_ns = pacing.wanted_ns
-        realtime.tell(grants, "loop", sinks.events)
-        os.pwrite(job.grants, msgspec.json.encode(grants), 0)
-        heartbeat.beat()
         heartbeat.enter(Phase.RUNNING)
         result = robot.loop.run()
         last = result.last
@@ -215,6 +209,20 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: RingSinks) -> Ou
     detail = (result.detail,) if result.detail else ()
     remarks = (TORQUE_STAYS,) if last == "hold" else ()
     return Outcome(result.reason, result.cycles, result.skipped, (*detail, *failures), remarks)
+
+
+def _prepare(  # noqa: PLR0917  what a loop's process has
+    plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: RingSinks, ports: SerialPorts, pacing: Pacing
+) -> None:
+    """Ask the operating system for real time, measure how late sleeps wake, and tell both."""
+    grants = realtime.apply(beside_simulation(plan))
+    heartbeat.beat()
+    grants = (*grants, pacing.measure(plan.loop.period_ns, heartbeat.beat))
+    if ports.polling:
+        ports.polling.margin_ns = pacing.wanted_ns
+    realtime.tell(grants, "loop", sinks.events)
+    os.pwrite(job.grants, msgspec.json.encode(grants), 0)
+    heartbeat.beat()
 
 
 def main() -> None:
