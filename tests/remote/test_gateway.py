@@ -2,7 +2,6 @@
 
 import asyncio
 import json
-import signal
 import struct
 
 import msgspec
@@ -13,7 +12,7 @@ from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.events import EventCode, Severity
 from dxlrun.heartbeat import Phase
 from dxlrun.inbox import MOST_PER_CYCLE
-from dxlrun.remote import asking, link, preparation
+from dxlrun.remote import asking, link
 from dxlrun.remote.gateway import MOST_OPERATIONS, MOST_SET_POINTS
 from dxlrun.remote.sockets import MOST_BYTES
 
@@ -363,53 +362,3 @@ def test_events_of_both_processes_are_whole_and_are_told_once_to_who_asks_after_
     told = desk.ask("GET", f"/events?after={told['last']}")[1]
     assert [one["text"] for one in told["events"]] == ["more"]
     assert desk.ask("GET", f"/events?after={told['last']}")[1] == {"events": [], "last": told["last"]}
-
-
-@pytest.mark.parametrize(("text", "count"), [("x", 3000), ("x" * 7000, 300)])
-def test_a_storm_of_events_is_kept_in_bounded_memory(desk, text, count):
-    for number in range(count):
-        desk.events.emit(EventCode.GATE, Severity.WARNING, "pan", f"{number} {text}")
-        desk.link.collect()
-    kept = [event.text for _, event in desk.link.events]
-    assert len(kept) <= link.KEPT_EVENTS
-    assert sum(map(len, kept)) <= link.KEPT_TEXT
-    assert len(kept) == link.KEPT_EVENTS or sum(map(len, kept)) > link.KEPT_TEXT - 8000
-    assert kept[-1].startswith(f"{count - 1} ")
-    assert all(one.endswith(text) for one in kept)
-
-
-def test_a_controller_whose_stream_ended_is_held_until_its_next_command(desk):
-    def held():
-        desk.link.collect()
-        return desk.ask("GET", "/robot")[1]["controllers"][0]["held"]
-
-    for code, expected in (
-        (EventCode.STALE_COMMAND, True),
-        (EventCode.CONTROLLER_SAYS, True),
-        (EventCode.COMMAND, False),
-        (EventCode.STALE_COMMAND, True),
-        (EventCode.CONTROLLER_DEACTIVATED, False),
-    ):
-        desk.events.emit(code, Severity.INFO, "left", "")
-        assert held() is expected
-
-
-def test_a_plug_in_that_thinks_for_ever_is_interrupted_and_the_next_client_is_served(desk, monkeypatch):
-    monkeypatch.setattr(preparation, "BUDGET_S", 0.05)
-    status, content = desk.ask("POST", "/controllers/left/commands/brood", {"count": 1})
-    assert (status, content["refused"]) == (
-        422,
-        "left thought about this for more than 0.05 s; send less at once",
-    )
-    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
-    assert desk.ask("POST", "/stop") == (200, DONE)
-    assert [command.kind for command in desk.taken] == ["stop"]
-
-
-def test_a_failure_of_the_gateway_itself_fails_one_request_only(desk, monkeypatch, capsys):
-    monkeypatch.setattr(desk.link, "newest", lambda: 1 / 0)
-    status, content = desk.ask("GET", "/states")
-    assert status == 500
-    assert "ZeroDivisionError" in content["refused"]
-    assert "Traceback" in capsys.readouterr().err
-    assert desk.ask("POST", "/pause") == (200, DONE)

@@ -1,4 +1,4 @@
-"""Health of the servos in a bus' plan: Bus Watchdog, slow registers, and who gets torque back after a reboot."""
+"""Health in a bus' plan: Bus Watchdog, slow registers, and who gets torque back after a reboot."""
 
 from __future__ import annotations
 
