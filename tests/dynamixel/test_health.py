@@ -215,8 +215,9 @@ def test_a_loop_that_was_silent_for_too_long_revives_the_servos_that_stopped(sta
     assert "the Bus Watchdog has stopped the servos" in text
 
 
-def test_a_watchdog_that_an_earlier_run_left_is_cleared(make_rig, make_x):
-    rig = make_rig(make_x(watchdog=10))
+@pytest.mark.parametrize("watchdog", [10, 0])
+def test_a_watchdog_that_an_earlier_run_left_is_cleared(make_rig, make_x, watchdog):
+    rig = make_rig(make_x(watchdog=watchdog))
     rig.buses[0].servo(12).poke("bus_watchdog", -1)
     rig.hardware.start()
     assert rig.torque() == [True] * 4

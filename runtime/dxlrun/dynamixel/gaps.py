@@ -242,7 +242,7 @@ class Gaps:
             servos = self._plan.servos
             source = self._plan.name if task.servo == WHOLE_BUS else servos[task.servo].joint
             need, left = need_ns * 1e-6, max(left_ns, 0) * 1e-6
-            text = f"{task.name} waits for time beside the cycle: it takes {need:.1f} ms, the gap has"
+            text = f"{task.name} waits for time beside the cycle: it may take {need:.1f} ms, the gap has"
             text = f"{text} {left:.1f} ms; periods may be skipped"
             self._events.emit(EventCode.OVERRUN, Severity.WARNING, source, text)
         return True

@@ -121,12 +121,12 @@ class Inspector2(Inspector):
                 f"reports in {called(items['hardware_error_status'])}: {describe_hardware_error(error)}; "
                 "find the cause, then reboot it",
             )
-        # one that the run arms itself is cleared at the start, whatever an earlier run left
+        # whatever an earlier run left is cleared at the start; it is told where the run arms none itself
         watchdog = 0 if self.plan.watchdog_ticks else found.get("bus_watchdog", 0)
-        if watchdog in _WATCHDOG_STOPPED:
-            item = called(items["bus_watchdog"])
-            self.problem(servo, f"was stopped by its {item} and refuses goals: write 0 there")
-        elif watchdog:
-            item = called(items["bus_watchdog"])
-            text = f"{item} is {watchdog}: it stops after {watchdog * 20} ms without an instruction"
-            self.found.differences.append((servo.joint, text))
+        if watchdog:
+            what = f"it would stop after {watchdog * 20} ms without an instruction"
+            if watchdog in _WATCHDOG_STOPPED:
+                what = "it has stopped the servo"
+            self.found.differences.append(
+                (servo.joint, f"{called(items['bus_watchdog'])} is {watchdog}, {what}; it is cleared")
+            )
