@@ -202,6 +202,7 @@ def test_errors_gaps_and_a_log_without_end_are_said(write: Make, cycle: Make, sa
     report = analyze_log(write([cycle(0)], events=events, gaps=17, close=False))
     assert (report.gaps, report.complete) == (17, False)
     assert report.verdict.sentences[1] == "2 errors were logged; the first, of head: ValueError: no"
+    assert report.verdict.errors == 2
     assert "no end" in report.verdict.sentences[2]
     assert "17 records were lost" in report.verdict.sentences[2]
     assert "ValueError: no" in shown(report)

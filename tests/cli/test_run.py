@@ -7,6 +7,7 @@ from rich.console import Console
 from dxlrun.compile.plan import Plan
 from dxlrun.errors import PortError
 from dxlrun.run_summary import RunOptions, RunSummary
+from dxlrun.virtual_run import VirtualRobot
 
 GOOD = RunSummary(0, "ended", 100, 2, 2.03, (), log="logs/torso.mcap", messages=17)
 
@@ -52,6 +53,25 @@ def test_a_good_run_says_where_its_log_is(dxlrun: Callable, runs: Runs, torso: P
         "log: logs/torso.mcap (17 messages)",
         "next: dxlrun analyze logs/torso.mcap",
     ]
+
+
+def test_a_run_with_errors_in_its_log_is_not_called_good(
+    dxlrun: Callable, tmp_path: Path, torso: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(tmp_path)
+
+    def rebooting(robot: VirtualRobot, *arguments: object, **options: object) -> None:
+        born(robot, *arguments, **options)
+        servo = robot.buses[0].servos[0]
+        robot.buses[0].at(300_000_000, servo.trigger_overload)
+
+    born = VirtualRobot.__init__
+    monkeypatch.setattr(VirtualRobot, "__init__", rebooting)
+
+    said = dxlrun(torso, "--virtual", "--duration", "2")
+
+    assert said.code == 0
+    assert said.out.startswith("bioloid_torso: ended, with errors. ")
 
 
 @pytest.mark.parametrize(("code", "word"), [(1, "failed"), (130, "interrupted")])

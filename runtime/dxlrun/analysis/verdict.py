@@ -47,6 +47,8 @@ class Verdict:
 
     good: bool
     sentences: tuple[str, ...]
+    errors: int = 0
+    """How many were logged."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +78,8 @@ def verdict(timing: Timing, servos: Sequence[Servo], log: Log, lost: int) -> Ver
         _log(timing.periods, log, lost),
     ]
     said = [finding for finding in findings if finding is not None]
-    return Verdict(all(good for good, _ in said), tuple(sentence for _, sentence in said))
+    good, sentences = all(good for good, _ in said), tuple(sentence for _, sentence in said)
+    return Verdict(good, sentences, len(_grave(log.events)))
 
 
 Finding = tuple[bool, str]
@@ -190,13 +193,17 @@ def _name(servo: Servo) -> str:
 
 
 def _events(events: Sequence[Event]) -> Finding | None:
-    grave = [event for event in events if event.severity >= Severity.ERROR]
+    grave = _grave(events)
     if not grave:
         return None
     first = grave[0]
     line = first.text.strip().splitlines()[-1] if first.text.strip() else first.name
     number = "One error was" if len(grave) == 1 else f"{len(grave)} errors were"
     return False, f"{number} logged; the first, of {first.source}: {line}"
+
+
+def _grave(events: Sequence[Event]) -> list[Event]:
+    return [event for event in events if event.severity >= Severity.ERROR]
 
 
 def _log(account: Periods, log: Log, lost: int) -> Finding | None:

@@ -110,17 +110,21 @@ def _ask_servos(buses: Sequence[BusPlan], joints: Sequence[str]) -> Mapping[str,
     return ask_servos(buses, joints)
 
 
-def _verdict(log: str, summary: RunSummary) -> tuple[str, ...]:
-    """Return what the log says of the run, where reading it takes a moment only; else nothing."""
-    if not summary.cycles or summary.messages > _MOST_MESSAGES:
-        return ()
+def _verdict(summary: RunSummary) -> tuple[tuple[str, ...], int]:
+    """Return what the log says of the run, and how many errors are in it.
+
+    Nothing without a log, or where reading it would take more than a moment.
+    """
+    if summary.log is None or not summary.cycles or summary.messages > _MOST_MESSAGES:
+        return (), 0
     from dxlrun.analysis.report import analyze_log
 
     try:
-        return analyze_log(log).verdict.sentences
+        said = analyze_log(summary.log).verdict
     except LogError as error:
         say_warning(str(error))
-        return ()
+        return (), 0
+    return said.sentences, said.errors
 
 
 def show(summary: RunSummary, robot: str, console: Console) -> None:
@@ -129,14 +133,16 @@ def show(summary: RunSummary, robot: str, console: Console) -> None:
         say_warning(f"{robot}: {remark}")
     for sentence in summary.sentences:
         say_error(f"{robot}: {sentence}")
-    verdict = {0: "good", 130: "interrupted"}.get(summary.exit_code, "failed")
+    sentences, errors = _verdict(summary)
+    good = "ended, with errors" if errors else "good"
+    verdict = {0: good, 130: "interrupted"}.get(summary.exit_code, "failed")
     console.print(
         f"{robot}: {verdict}. {summary.elapsed_s:.1f} s, {counted(summary.cycles, 'cycle', 'cycles')}, "
         f"{counted(summary.skipped, 'period', 'periods')} skipped",
         soft_wrap=True,
     )
     if summary.log is not None:
-        for sentence in _verdict(summary.log, summary):
+        for sentence in sentences:
             console.print(f"  {sentence}", markup=False, soft_wrap=True)
         held = counted(summary.messages, "message", "messages")
         console.print(f"log: {summary.log} ({held})", markup=False, soft_wrap=True)
