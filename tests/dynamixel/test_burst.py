@@ -86,7 +86,7 @@ class Sink:
     def __init__(self):
         self.packets = []
 
-    def packet(self, bus, kind, servo_id, first_ns, last_ns, data):  # noqa: PLR0917
+    def packet(self, bus, kind, servo_id, first_ns, last_ns, data):  # noqa: PLR0917  as PacketSink has it
         self.packets.append((kind, servo_id, first_ns, last_ns, bytes(data)))
 
 

@@ -29,7 +29,7 @@ def test_simulated_servos_stay_off_the_cores_of_the_loop_where_they_can(monkeypa
         ("/dev/ttyUSB0", "fifo", (), {0, 1}, ()),
     ],
 )
-def test_a_loop_in_real_time_stays_off_the_core_of_simulated_servos(  # noqa: PLR0917
+def test_a_loop_in_real_time_stays_off_the_core_of_simulated_servos(  # noqa: PLR0917  fixtures
     monkeypatch, port, policy, cores, allowed, stays
 ):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: allowed)

@@ -49,7 +49,7 @@ class _Request:
 
     __slots__ = ("bursts", "data", "group", "indices", "patient", "rows", "servos", "short")
 
-    def __init__(  # noqa: PLR0917
+    def __init__(  # noqa: PLR0917  whom it reads, and where the bytes go
         self,
         plan: BusPlan,
         line: Line,
