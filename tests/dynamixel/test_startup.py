@@ -1,9 +1,11 @@
 import itertools
+from functools import partial
 
 import pytest
 
+from dxlrun.dynamixel import protocol1
 from dxlrun.errors import PortError, StartUpError
-from dxlrun.events import EventCode
+from dxlrun.events import EventCode, Severity
 from dxlrun.simulation import ServoConfig
 
 
@@ -138,6 +140,48 @@ def test_one_lost_packet_does_not_stop_the_start(make_rig):
     rig.hardware.start()
     assert rig.torque() == [True] * 8
     assert rig.packets.received() == rig.out_of_bus()
+
+
+def test_answers_that_come_late_are_those_to_what_was_asked(make_rig):
+    """A host or an adapter that stands still for 200 ms: given up, they would answer what is asked next."""
+    rig = make_rig()
+    for servo in rig.plans[0].servos:
+        for late_ns in (0, 0, 0, 200_000_000, 30_000_000, 0, 100_000_000):
+            rig.buses[0].delay_next(servo.servo_id, late_ns)
+    rig.hardware.start()
+    assert rig.torque() == [True] * 8
+    assert [code for code, severity, *_ in rig.events.list if severity >= Severity.WARNING] == []
+    asked = [packet for packet in rig.into_bus() if packet[2] == 6]
+    assert asked.count(protocol1.ping(6)) == 3  # nobody was asked twice
+
+
+def test_a_robot_without_power_is_told_within_two_seconds(make_rig):
+    rig = make_rig()
+    for servo in rig.buses[0].servos:
+        servo.silence()
+    before = rig.clock.now_ns()
+    assert len(refusal(rig)) == 8
+    assert rig.clock.now_ns() - before < 2_000_000_000
+
+
+def test_first_states_that_a_standing_host_did_not_hear_are_read_again(make_rig, monkeypatch):
+    rig = make_rig()
+    read, reads = rig.hardware.read, []
+
+    def late():
+        """Let nobody hear anything for 70 ms when the first states are read."""
+        if not reads:
+            for servo in rig.buses[0].servos:
+                servo.silence()
+                rig.buses[0].at(rig.clock.now_ns() + 70_000_000, partial(servo.silence, False))
+        reads.append(rig.clock.now_ns())
+        read()
+
+    monkeypatch.setattr(type(rig.hardware), "read", lambda _: late())
+    rig.hardware.start()
+    assert rig.torque() == [True] * 8
+    assert len(reads) > 1
+    assert rig.states.valid.all()
 
 
 def test_no_port_no_start(make_rig):

@@ -34,8 +34,9 @@ LINE_PATIENCE_NS = 300_000_000
 LINE_STEP_NS = 10_000_000
 TAKEN_BACK = "torque was switched off again on every servo"
 """Note of what `start` raises when every servo confirmed that."""
-FIRST_READS = 3
-"""The first states must all be fresh; noise may spoil a reading or two."""
+FIRST_READS_NS = (0, 60_000_000, 240_000_000)
+"""Pauses before the readings of the first states, which must all be fresh: noise, or a host or an adapter
+that stands still, may spoil one or two."""
 IDLE_MARGIN_NS = 150_000
 """The gap is left so long before the deadline: a stock kernel wakes some 50-100 us late."""
 
@@ -289,7 +290,9 @@ class DynamixelHardware:
             servos.reads.given_up.clear()
 
     def _first_states(self) -> None:
-        for _ in range(FIRST_READS):
+        for pause_ns in FIRST_READS_NS:
+            if pause_ns:
+                self._set_up.pause(pause_ns)
             self.read()
             self._set_up.raise_failures()
             if all(servos.all_fresh for servos in self._servos):

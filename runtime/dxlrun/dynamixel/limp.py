@@ -6,7 +6,7 @@ Needs neither numpy nor the loop: the guardian does it after the loop died.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from dxlrun.clock import Clock
 from dxlrun.dynamixel.bus import Bus
@@ -17,8 +17,11 @@ from dxlrun.dynamixel.pump import run
 from dxlrun.dynamixel.transaction import Outcome, Program, Reply
 from dxlrun.packets import PacketSink
 
-ATTEMPTS = 3
-"""A write and its read-back are tried so often; noise rarely hits three times, a cut cable always does."""
+LONGER_NS = (0, 60_000_000, 180_000_000)
+"""A write and its read-back are tried so often, and the read-back is awaited so much longer each time.
+
+Noise rarely hits three times, and hosts and adapters rarely stand still for so long; a cut cable always does.
+"""
 SETTLE_NS = 500_000
 """Time that a half-sent reply may still take: it would collide with the broadcast."""
 
@@ -44,26 +47,24 @@ def torque_off(
 ) -> Program[tuple[LimpOutcome, ...]]:
     """Switch torque off everywhere on one bus: all at once first, then servo by servo with read-back.
 
-    After `deadline_ns` nobody is tried again, but everybody once.
+    Who did not confirm it is tried again when everybody had a turn. After `deadline_ns` nobody is tried
+    again, but everybody once.
     """
     yield listen(SETTLE_NS)
     for everybody in plan.limp:
         if not everybody.awaited:
             yield everybody
     writes = [write for write in plan.limp if write.awaited]
-    outcomes = []
-    for servo, write, read in zip(plan.servos, writes, plan.torque_reads, strict=True):
-        detail = "it was not tried"
-        for attempt in range(ATTEMPTS):
-            if attempt and now_ns() >= deadline_ns:
+    details = dict.fromkeys(range(len(plan.servos)), "it was not tried")
+    for longer_ns in LONGER_NS:
+        for index in [index for index, detail in details.items() if detail]:
+            if longer_ns and now_ns() >= deadline_ns:
                 break
-            acknowledged = yield write
-            back = yield read
-            detail = _detail(acknowledged, back)
-            if not detail:
-                break
-        outcomes.append(_outcome(plan, servo, detail))
-    return tuple(outcomes)
+            acknowledged = yield writes[index]
+            read = plan.torque_reads[index]
+            back = yield replace(read, timeout_ns=read.timeout_ns + longer_ns)
+            details[index] = _detail(acknowledged, back)
+    return tuple(_outcome(plan, servo, details[index]) for index, servo in enumerate(plan.servos))
 
 
 def _detail(acknowledged: Reply, back: Reply) -> str:

@@ -10,12 +10,14 @@ from dxlrun.dynamixel import bus_watchdog, startup, torque_limit
 from dxlrun.dynamixel.bus import Bus
 from dxlrun.dynamixel.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.health import Servos
+from dxlrun.dynamixel.line import listen
 from dxlrun.dynamixel.modes import settle_modes
+from dxlrun.dynamixel.patience import patient
 from dxlrun.dynamixel.port import Ports
 from dxlrun.dynamixel.probing import extra_ns, probe_reads
 from dxlrun.dynamixel.pump import run
 from dxlrun.dynamixel.registers import settle_bus
-from dxlrun.dynamixel.transaction import Program
+from dxlrun.dynamixel.transaction import Program, Result
 from dxlrun.dynamixel.units import joint_position
 from dxlrun.errors import PortError, StartUpError
 from dxlrun.events import EventCode, EventSink, Severity
@@ -98,9 +100,12 @@ class SetUp:
 
     def carry_out(self, programs: Sequence[Program[list[str]]]) -> None:
         """Run one program a bus that returns what went wrong."""
-        found = run(programs, self._buses, self._ports, self._clock, self._beat)
-        self.raise_failures()
+        found = self._patiently(programs)
         _refuse(problem for one in found if one is not None for problem in one)
+
+    def pause(self, duration_ns: int) -> None:
+        """Let a moment pass, and hear what still comes."""
+        self.carry_out([_pause(duration_ns) for _ in self._plans])
 
     def raise_failures(self) -> None:
         """Raise PortError when a line is gone: there is no set-up without it."""
@@ -126,9 +131,7 @@ class SetUp:
 
     def _probe_reads(self) -> None:
         """Find out when replies are due, and read plainly whoever does not answer the fast forms."""
-        programs = [probe_reads(plan) for plan in self._plans]
-        probes = run(programs, self._buses, self._ports, self._clock, self._beat)
-        self.raise_failures()
+        probes = self._patiently([probe_reads(plan) for plan in self._plans])
         for plan, servos, probed in zip(self._plans, self._servos, probes, strict=True):
             if probed is None:
                 continue
@@ -147,9 +150,14 @@ class SetUp:
 
     def _run(self, programs: Sequence[Program[_Found]]) -> list[_Found]:
         """Run one program a bus; `_judge` comes when everything that they found was told."""
-        found = run(programs, self._buses, self._ports, self._clock, self._beat)
+        return [one for one in self._patiently(programs) if one is not None]
+
+    def _patiently(self, programs: Sequence[Program[Result]]) -> list[Result | None]:
+        """Run one program a bus with the patience of somebody who is in no hurry."""
+        slow = [patient(program) for program in programs]
+        found = run(slow, self._buses, self._ports, self._clock, self._beat)
         self.raise_failures()
-        return [one for one in found if one is not None]
+        return found
 
     def _tell(self, code: EventCode, severity: Severity, told: Iterable[tuple[str, str]]) -> None:
         for joint, text in told:
@@ -167,6 +175,11 @@ def tell_failures(
             mine.lost(text)
             first = first or PortError(text)
     return first
+
+
+def _pause(duration_ns: int) -> Program[list[str]]:
+    yield listen(duration_ns)
+    return []
 
 
 def _judge(stage: Iterable[_Stage]) -> None:

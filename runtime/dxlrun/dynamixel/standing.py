@@ -6,13 +6,14 @@ The loop lets such joints stand before it ends; when it died the guardian does. 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 from dxlrun.clock import Clock
 from dxlrun.dynamixel import modes
 from dxlrun.dynamixel.bus import Bus
 from dxlrun.dynamixel.bus_plan import BusPlan
 from dxlrun.dynamixel.inspection import persist, who
-from dxlrun.dynamixel.limp import ATTEMPTS, SETTLE_NS
+from dxlrun.dynamixel.limp import LONGER_NS, SETTLE_NS
 from dxlrun.dynamixel.line import listen
 from dxlrun.dynamixel.port import Ports
 from dxlrun.dynamixel.pump import run
@@ -68,9 +69,10 @@ def _stand(plan: BusPlan) -> Program[list[str]]:
 def _switch_off(plan: BusPlan, index: int) -> Program[bool]:
     """Switch a servo's torque off; return whether that was read back."""
     write = [write for write in plan.limp if write.awaited][index]
-    for _ in range(ATTEMPTS):
+    read = plan.torque_reads[index]
+    for longer_ns in LONGER_NS:
         yield write
-        back = yield plan.torque_reads[index]
+        back = yield replace(read, timeout_ns=read.timeout_ns + longer_ns)
         if back.answered and back.parameters[0] == 0:
             return True
     return False

@@ -116,7 +116,7 @@ class _Surveyor:
                 if again and servo.servo_id in before:
                     self._jump(servo, before[servo.servo_id], (raw, reply.last_ns))
                 elif not again:
-                    before[servo.servo_id] = raw, reply.last_ns
+                    before[servo.servo_id] = raw, reply.sent_ns
                     self._place(servo, raw)
 
     def _place(self, servo: ServoPlan, raw: int) -> None:

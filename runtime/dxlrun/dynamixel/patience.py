@@ -1,0 +1,35 @@
+"""Patience: how long a servo that should be there is awaited where nothing else waits for the line.
+
+The start is in no hurry, and an answer that is given up too early is worse than a slow start: it comes later,
+and looks like the answer to what was asked next (a status packet does not say what it answers).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from dxlrun.dynamixel.transaction import Outcome, Program, Result
+
+LONGER_NS = 240_000_000
+"""Beyond the ordinary timeout [i]: hosts, virtual machines and USB adapters stand still for tens of ms."""
+MOST_SILENCE_NS = 960_000_000
+"""So much longer all silence together is awaited: who says nothing four times is not merely late."""
+
+
+def patient(program: Program[Result]) -> Program[Result]:
+    """Execute a program of one bus, and give each reply longer, as long as few of them do not come.
+
+    A servo that answers in the end costs what it takes; a bus without any is told within about two seconds.
+    """
+    left_ns = MOST_SILENCE_NS
+    try:
+        wanted = next(program)
+        while True:
+            longer_ns = min(LONGER_NS, left_ns) if wanted.awaited else 0
+            reply = yield replace(wanted, timeout_ns=wanted.timeout_ns + longer_ns) if longer_ns else wanted
+            if reply.outcome in (Outcome.TIMEOUT, Outcome.GARBLED):
+                left_ns -= longer_ns
+            wanted = program.send(reply)
+    except StopIteration as end:
+        result: Result = end.value
+        return result
