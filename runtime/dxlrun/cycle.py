@@ -13,6 +13,7 @@ from enum import IntFlag, unique
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
 from dxlrun.interfaces import COMMAND_INTERFACES, Commands, Floats, States
@@ -176,9 +177,7 @@ class CycleRecord:
         """The bytes of the record; a view, not a copy."""
         self.words: memoryview = self.raw[: 8 * len(SCALARS)].cast("q")
         self.states = States(
-            position=_row(array, "position"),
-            velocity=_row(array, "velocity"),
-            effort=_row(array, "effort"),
+            motion=_rows(array, "position", 3),
             valid=array["valid"][0],
             age_ns=array["age_ns"][0],
             temperature=_row(array, "temperature"),
@@ -214,6 +213,12 @@ class CycleRecord:
 def _row(array: NDArray[np.void], name: str) -> Floats:
     row: Floats = array[name][0]
     return row
+
+
+def _rows(array: NDArray[np.void], first: str, count: int) -> Floats:
+    """Return float64 sequences from `first` on, which stand in equal distances: one length lies between."""
+    row = _row(array, first)
+    return as_strided(row, (count, row.size), (row.nbytes + row.itemsize, row.itemsize))
 
 
 def cycle_slots(period_ns: int) -> int:

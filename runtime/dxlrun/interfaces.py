@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -24,9 +24,11 @@ Floats = NDArray[np.float64]
 class States:
     """What the servos said: one row a joint; an invalid row keeps its last values and its age grows."""
 
-    position: Floats
-    velocity: Floats
-    effort: Floats
+    motion: Floats
+    """Shape (3, joints): position, velocity and effort, for whoever wants them at once."""
+    position: Floats = field(init=False)
+    velocity: Floats = field(init=False)
+    effort: Floats = field(init=False)
     valid: NDArray[np.bool_]
     """True where this cycle's reply arrived intact."""
     age_ns: NDArray[np.int64]
@@ -40,13 +42,15 @@ class States:
     mode: NDArray[np.uint8]
     """A Mode: in which the servo is known to be; UNKNOWN while that changes."""
 
+    def __post_init__(self) -> None:
+        for name, row in zip(("position", "velocity", "effort"), self.motion, strict=True):
+            object.__setattr__(self, name, row)
+
     @classmethod
     def empty(cls, joints: int) -> States:
         """Return arrays of NaN, invalid, of no age and of unknown mode."""
         return cls(
-            position=np.full(joints, np.nan),
-            velocity=np.full(joints, np.nan),
-            effort=np.full(joints, np.nan),
+            motion=np.full((3, joints), np.nan),
             valid=np.zeros(joints, dtype=np.bool_),
             age_ns=np.full(joints, -1, dtype=np.int64),
             temperature=np.full(joints, np.nan),

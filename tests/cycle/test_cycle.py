@@ -24,6 +24,7 @@ def test_what_is_written_to_the_arrays_is_in_the_bytes(joints: int, controllers:
     record.states.position[:] = rows + 0.5
     record.states.velocity[:] = rows + 0.25
     record.states.effort[:] = -rows
+    np.testing.assert_array_equal(record.states.motion, [rows + 0.5, rows + 0.25, -rows])
     record.age_ns[:] = rows * 10
     record.valid[:] = rows % 2 == 0
     record.commands.position[:] = rows + 1

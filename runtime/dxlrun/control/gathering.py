@@ -34,20 +34,20 @@ class Gathering:
     def __init__(self, record: CycleRecord, rows: NDArray[np.intp]) -> None:
         place = place_of(rows)
         self._pairs: list[tuple[NDArray[np.generic], NDArray[np.generic], NDArray[np.intp]]] = []
-        sources = [getattr(record.states, field.name) for field in fields(States)]
+        sources = [getattr(record.states, field.name) for field in fields(States) if field.init]
         self.states = States(*(self._shown(source, place) for source in sources))
         self.goals = Commands(*(self._shown(source, place) for source in record.goals.arrays))
 
     def gather(self) -> None:
         """Copy what must be copied."""
         for source, own, rows in self._pairs:
-            source.take(rows, out=own, mode="clip")
+            source.take(rows, axis=-1, out=own, mode="clip")
 
     def _shown(self, source: NDArray[_Element], place: Place) -> NDArray[_Element]:
         if isinstance(place, slice):
-            shown = source[place]
+            shown = source[..., place]
         else:
-            own = source[place]
+            own = source[..., place]
             self._pairs.append((source, own, place))
             shown = own.view()
         shown.flags.writeable = False
