@@ -5,10 +5,9 @@ from __future__ import annotations
 import contextlib
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Literal
+from typing import IO, Literal, NamedTuple
 
 from dxlrun.errors import LogError
 
@@ -17,17 +16,14 @@ Direction = Literal["in", "out", "note"]
 _BUFFER = 1 << 16
 """Bytes that are written out together."""
 
-_LINES = 128
-"""Entries that are encoded together."""
-
-_NO_TAIL = ', "note": ""'
+_MOST_ENTRIES = 256
+"""Entries that are encoded together at the latest."""
 
 FLUSH_NS = 500_000_000
 """A ledger file is never further behind than this."""
 
 
-@dataclass(frozen=True, slots=True)
-class LedgerEntry:
+class LedgerEntry(NamedTuple):
     """Bytes that passed the wire together, or a note about something that was done to the bus."""
 
     t_ns: int
@@ -55,8 +51,9 @@ class Ledger:
         """Who is told of each note."""
         self._keep = keep
         self._file: IO[bytes] | None = None if path is None else path.open("wb", _BUFFER)
-        self._names: dict[str, str] = {}
-        self._lines: list[str] = []
+        self._new: list[LedgerEntry] = []
+        """Entries that are not encoded yet."""
+        self._begins: dict[tuple[str, str], str] = {}
         self._unflushed_ns: int | None = None
 
     def add(
@@ -69,40 +66,42 @@ class Ledger:
         *,
         late_ns: int = 0,
     ) -> None:
-        """Enter bytes or a note; a file is flushed by `flush_if_due` and at the end."""
+        """Enter bytes or a note; a file is encoded by `encode`, and flushed by `flush_if_due` and at the end."""
+        entry = LedgerEntry(t_ns, bus, direction, data, note, late_ns)
         if self._keep:
-            self.entries.append(LedgerEntry(t_ns, bus, direction, data, note, late_ns))
+            self.entries.append(entry)
         if self._file is not None:
-            # put together by hand, because a busy bus has thousands of them a second
-            name = self._names.get(bus) or self._name(bus)
-            tail = (
-                _tail(note, late_ns)
-                if note
-                else f', "note": "", "late_ns": {late_ns}'
-                if late_ns
-                else _NO_TAIL
-            )
-            head = f'{{"t_ns": {t_ns}, "bus": {name}, "direction": "{direction}"'
-            self._lines.append(f'{head}, "bytes": "{data.hex()}"{tail}}}\n')
+            new = self._new
+            new.append(entry)
             if self._unflushed_ns is None:
                 self._unflushed_ns = t_ns
-            if len(self._lines) >= _LINES:
-                self._write_lines()
+            if len(new) >= _MOST_ENTRIES:
+                self.encode()
         if direction == "note" and self.on_note is not None:
             self.on_note(note)
 
-    def _name(self, bus: str) -> str:
-        name = self._names[bus] = json.dumps(bus)
-        return name
-
-    def _write_lines(self) -> None:
-        lines = "".join(self._lines)
-        self._lines.clear()
+    def encode(self) -> None:
+        """Make lines of what was entered: for a moment in which nothing else is to be done."""
+        if not self._new:
+            return
+        lines = []
+        for t_ns, bus, direction, data, note, late_ns in self._new:
+            # put together by hand, because a busy bus has thousands of them a second
+            begin = self._begins.get((bus, direction)) or self._begin(bus, direction)
+            told = json.dumps(note) if note else '""'
+            late = f', "late_ns": {late_ns}' if late_ns else ""
+            lines.append(f'{{"t_ns": {t_ns}{begin}{data.hex()}", "note": {told}{late}}}\n')
+        self._new.clear()
         if self._file is not None:
             try:
-                self._file.write(lines.encode("ascii"))
+                self._file.write("".join(lines).encode("ascii"))
             except OSError as error:
                 self._give_up(error)
+
+    def _begin(self, bus: str, direction: Direction) -> str:
+        begin = f', "bus": {json.dumps(bus)}, "direction": "{direction}", "bytes": "'
+        self._begins[bus, direction] = begin
+        return begin
 
     def flush_due_ns(self) -> int | None:
         """Return when the file must be flushed, ns on the clock of the entries; None: all is written."""
@@ -117,7 +116,7 @@ class Ledger:
     def flush(self) -> None:
         """Write the file out."""
         self._unflushed_ns = None
-        self._write_lines()
+        self.encode()
         if self._file is not None:
             try:
                 self._file.flush()
@@ -146,12 +145,6 @@ class Ledger:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-def _tail(note: str, late_ns: int) -> str:
-    """Return the end of a line of JSON with a note."""
-    text = f', "note": {json.dumps(note)}'
-    return f'{text}, "late_ns": {late_ns}' if late_ns else text
 
 
 def read_ledger(path: Path) -> tuple[LedgerEntry, ...]:
