@@ -5,9 +5,8 @@ from hypothesis import strategies as st
 
 from dxlrun.dynamixel import protocol1
 from dxlrun.dynamixel.goal_arrays import GoalArrays
-from dxlrun.dynamixel.state_arrays import StateArrays
-from dxlrun.dynamixel.units import goal_ticks, joint_position, speed_ticks
-from dxlrun.interfaces import Commands, States
+from dxlrun.dynamixel.units import goal_ticks, speed_ticks
+from dxlrun.interfaces import Commands
 
 angles = st.floats(-10, 10) | st.just(float("nan"))
 speeds = st.floats(-100, 100) | st.sampled_from([float("nan"), 0.0, -0.0])
@@ -46,37 +45,3 @@ def test_a_smaller_packet_after_a_bigger_one_is_whole(plan8):
     assert protocol1.parse_status(one).parameters[:3] == bytes((30, 4, 21))
     assert len(one) == 13
     assert again == everybody
-
-
-def test_signs_follow_the_joints_direction(plan8):
-    arrays, states = StateArrays(plan8), States.empty(8)
-    for reply in arrays.replies:
-        # 512; counter-clockwise 100; clockwise 200
-        reply[:] = bytes.fromhex("00 02 64 00 c8 04")
-    fresh, arrived = np.ones(8, dtype=bool), np.full(8, 70)
-    arrays.decode(states, fresh, arrived, 100)
-    servo = plan8.servos[0]
-    direction = np.array([s.direction for s in plan8.servos])
-    assert states.position == pytest.approx([joint_position(s, 512) for s in plan8.servos])
-    assert states.velocity == pytest.approx(direction * 100 * servo.rad_s_per_tick)
-    assert states.effort == pytest.approx(direction * -200 / 1023)
-    assert states.age_ns.tolist() == [30] * 8
-
-
-def test_a_lost_row_keeps_its_own_values_and_ages(plan8):
-    arrays, states = StateArrays(plan8), States.empty(8)
-    everybody = np.ones(8, dtype=bool)
-    for number, reply in enumerate(arrays.replies):
-        reply[:] = (100 + number).to_bytes(2, "little") + bytes(4)
-    arrays.decode(states, np.arange(8) != 3, np.full(8, 10), 10)
-    assert np.isnan(states.position[3])
-    assert states.age_ns[3] == -1
-    arrays.decode(states, everybody, np.full(8, 20), 20)
-    kept = states.position.copy()
-    for reply in arrays.replies:
-        reply[:] = bytes(6)
-    arrays.decode(states, np.arange(8) != 5, np.full(8, 30), 30)
-    assert states.position[5] == kept[5]
-    assert not states.valid[5]
-    assert states.age_ns[5] == 10
-    assert (states.position != kept).sum() == 7

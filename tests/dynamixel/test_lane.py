@@ -10,7 +10,7 @@ from dxlrun.dynamixel import exchange, protocol1, protocol2
 from dxlrun.dynamixel.bus import Bus
 from dxlrun.dynamixel.exchange import CyclicReads
 from dxlrun.dynamixel.pump import pump
-from dxlrun.dynamixel.state_arrays import StateArrays
+from dxlrun.dynamixel.state_arrays import Arrivals, StateArrays
 from dxlrun.errors import PortError
 from dxlrun.packets import PacketKind, decode_packets
 
@@ -75,7 +75,7 @@ class Side:
     def __init__(self, plan):
         self.line, self.sink = Line(), Sink()
         self.bus = Bus(0, plan, self.line, self.line.clock, self.sink)
-        self.arrays = StateArrays(plan)
+        self.arrays = StateArrays(plan, Arrivals.none(len(plan.servos)))
         self.reads = CyclicReads(plan, self.arrays, self.bus)
         self.straight = 0
 

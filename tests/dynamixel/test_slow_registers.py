@@ -6,10 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dxlrun.dynamixel.jumps import SAY_AGAIN_NS, Jumps
 from dxlrun.dynamixel.slow_registers import slow_items
 from dxlrun.events import EventCode
-from dxlrun.interfaces import States
 
 SECOND_NS = 1_000_000_000
 
@@ -136,70 +134,3 @@ def test_a_servo_of_protocol_1_that_shut_down_gets_no_goals(start):
     goals = [packet for packet in rig.into_bus()[count:] if packet[4] == 0x83]
     assert goals
     assert all(3 not in packet[7:-1:5] for packet in goals)
-
-
-class TestJumps:
-    """Positions that no servo can reach."""
-
-    @pytest.fixture
-    def sift(self, make_plan, make_rig):
-        plan = make_plan((1, 3))
-        states = States.empty(2)
-        rig = make_rig(plan)
-        jumps = Jumps([plan], 2, rig.events)
-        clock = [0]
-
-        def cycle(first, second, *, after_ms=10):
-            clock[0] += after_ms * 1_000_000
-            states.position[:] = first, second
-            states.valid[:] = True
-            jumps.sift(states, clock[0])
-            return states.valid.tolist(), states.position.tolist()
-
-        cycle.events = rig.events
-        return cycle
-
-    def test_a_fast_servo_is_believed(self, sift):
-        for step in range(20):
-            assert sift(step * 0.11, -step * 0.11)[0] == [True, True]  # 11 rad/s
-
-    def test_a_jump_is_invalid_and_the_row_keeps_its_value_until_it_can_be_true(self, sift):
-        sift(0.0, 0.0)
-        assert sift(0.0, 1.5) == ([True, False], [0.0, 0.0])
-        seen = [sift(0.0, 1.5)[0][1] for _ in range(20)]
-        assert seen.index(True) in range(8, 14)  # 1.5 rad at 11.9 rad/s
-        assert all(seen[seen.index(True) :])
-        ((source, text),) = sift.events.of(EventCode.IMPLAUSIBLE)
-        assert source == "main_3_joint"
-        assert "jumped by 86 deg in 10 ms" in text
-        assert SAY_AGAIN_NS == SECOND_NS
-
-    def test_who_was_not_seen_for_long_may_be_elsewhere(self, sift):
-        sift(0.0, 0.0)
-        assert sift(2.0, 0.0, after_ms=500)[0] == [True, True]
-
-    @pytest.fixture
-    def sifted(self, make_plan, make_rig):
-        """Return states after positions of the second joint, each with its time, age in ms, and whether it
-        came."""
-
-        def sift(*samples, **change):
-            plan = make_plan((1, 3), **change)
-            states = States.empty(2)
-            states.position[0] = 0.0
-            jumps = Jumps([plan], 2, make_rig(plan).events)
-            for now_ms, position, age_ms, came in samples:
-                states.position[1], states.age_ns[1] = position, age_ms * 1_000_000
-                states.valid[:] = True, came
-                jumps.sift(states, now_ms * 1_000_000)
-            return states
-
-        return sift
-
-    def test_a_servo_with_a_profile_is_no_faster_than_its_velocity_limit_can_be(self, sifted):
-        states = sifted((10, 0.0, 0, True), (20, 1.5, 0, True), model="XM430-W350", protocol=2.0)
-        assert (states.valid.tolist(), states.position[1]) == ([True, False], 0.0)
-
-    def test_a_row_looks_no_younger_for_a_reply_that_was_not_believed(self, sifted):
-        states = sifted((10, 0.0, 1, True), (20, 1.5, 1, True), (30, 0.0, 11, False))
-        assert (states.valid[1], states.age_ns[1]) == (False, 20_000_000)

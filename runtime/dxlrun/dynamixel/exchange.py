@@ -15,7 +15,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dxlrun.dynamixel.burst import Burst
 from dxlrun.dynamixel.bus import Bus
@@ -122,11 +121,11 @@ class CyclicReads:
 
     def __init__(self, plan: BusPlan, arrays: StateArrays, bus: Bus) -> None:
         count = len(plan.servos)
-        self._fresh = bytearray(count)
-        self._none = bytes(count)
-        self.fresh: NDArray[np.bool_] = np.frombuffer(self._fresh, dtype=np.bool_)
+        self.fresh = arrays.arrivals.fresh
         """Whose reply arrived intact in this cycle."""
-        self.arrived_ns = np.full(count, -1, dtype=np.int64)
+        self._fresh = self.fresh.view(np.uint8).data
+        self._none = bytes(count)
+        self.arrived_ns = arrays.arrivals.at_ns
         self.missed = [0] * count
         """How many replies in a row did not arrive."""
         self._arrived = self.arrived_ns.data

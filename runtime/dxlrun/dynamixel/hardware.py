@@ -15,10 +15,10 @@ from dxlrun.dynamixel.bus_plan import BusPlan
 from dxlrun.dynamixel.exchange import MOST_BROKEN
 from dxlrun.dynamixel.gaps import Gaps
 from dxlrun.dynamixel.health import Servos
-from dxlrun.dynamixel.jumps import Jumps
 from dxlrun.dynamixel.limp import LimpOutcome, limp_buses
 from dxlrun.dynamixel.port import Ports
 from dxlrun.dynamixel.pump import pump, run
+from dxlrun.dynamixel.samples import Samples
 from dxlrun.dynamixel.setting_up import SetUp, tell_failures
 from dxlrun.dynamixel.torque_limit import reduced
 from dxlrun.dynamixel.wanted import Wanted
@@ -86,12 +86,14 @@ class DynamixelHardware:
         ]
         self._registers = tuple(one.registers for one in wanted)
         self._modes = tuple(one.modes for one in wanted)
+        self._samples = Samples(self._plans, states, events)
         self._servos = tuple(
-            Servos(plan, bus, gaps, one, events, states)
-            for plan, bus, gaps, one in zip(self._plans, self._buses, self._gaps, wanted, strict=True)
+            Servos(plan, bus, gaps, one, events, states, arrays)
+            for plan, bus, gaps, one, arrays in zip(
+                self._plans, self._buses, self._gaps, wanted, self._samples.buses, strict=True
+            )
         )
         self._set_up = SetUp(self._plans, self._buses, self._servos, ports, clock, events, beat)
-        self._jumps = Jumps(self._plans, len(states.position), events)
 
     def start(self) -> None:
         """Look at every servo, hold each where it stands, fill the first states and goals.
@@ -126,11 +128,12 @@ class DynamixelHardware:
             self._asked[index] = False
         pump(self._buses, self._ports, self._clock, self._beat)
         now = self._clock.now_ns()
+        everybody = True
         for servos in self._servos:
-            servos.settle(self._states, now)
+            everybody &= servos.settle(now)
             if servos.reads.given_up:
                 self._tell_plain_reads()
-        self._jumps.sift(self._states, now)
+        self._samples.settle(now, everybody)
         tell_failures(self._plans, self._buses, self._servos)
 
     def _begin_reads(self) -> None:
@@ -295,7 +298,7 @@ class DynamixelHardware:
                 self._set_up.pause(pause_ns)
             self.read()
             self._set_up.raise_failures()
-            if all(servos.all_fresh for servos in self._servos):
+            if not any(servos.silent for servos in self._servos):
                 break
         silent = [name for servos in self._servos for name in servos.silent]
         if silent:

@@ -62,11 +62,12 @@ class Servos:
         "_alert_cycles",
         "_alerting",
         "_alerts",
+        "_arrived_ns",
         "_asking",
         "_bus",
         "_ceiling",
         "_dialect",
-        "_events",
+        "_emit",
         "_everybody",
         "_gaps",
         "_gone",
@@ -84,7 +85,6 @@ class Servos:
         "_said_errors",
         "_shown",
         "_slow",
-        "_states",
         "_strained",
         "feeding",
         "goals",
@@ -93,18 +93,25 @@ class Servos:
     )
 
     def __init__(  # noqa: PLR0917  what a bus has, and whom it tells
-        self, plan: BusPlan, bus: Bus, gaps: Gaps, wanted: Wanted, events: EventSink, states: States
+        self,
+        plan: BusPlan,
+        bus: Bus,
+        gaps: Gaps,
+        wanted: Wanted,
+        events: EventSink,
+        states: States,
+        arrays: StateArrays,
     ) -> None:
         count = len(plan.servos)
         self._plan = plan
         self._bus = bus
         self._gaps = gaps
-        self._events = events
-        self._states = StateArrays(plan)
+        self._emit = events.emit
         self.goals = wanted.goals
         """Builds the sync write."""
-        self.reads = CyclicReads(plan, self._states, bus)
+        self.reads = CyclicReads(plan, arrays, bus)
         """The job that reads every servo once."""
+        self._arrived_ns = self.reads.arrived_ns.data
         self.torqued = np.zeros(count, dtype=np.bool_)
         """Shape (servos,): who has torque for certain and missed no reply since; they get goals."""
         self._rows = [servo.row for servo in plan.servos]
@@ -138,23 +145,18 @@ class Servos:
         )
 
     @property
-    def all_fresh(self) -> bool:
-        """True when every reply of the newest cycle arrived."""
-        return bool(self.reads.fresh.all())
-
-    @property
     def silent(self) -> list[str]:
         """Names of the servos whose newest reply did not arrive."""
         return [self._who(index) for index, missed in enumerate(self._missed) if missed]
 
-    def settle(self, states: States, now_ns: int) -> None:
-        """Fill the states from the replies of this cycle, and tell what changed."""
+    def settle(self, now_ns: int) -> bool:
+        """Tell what changed with this cycle's replies; return whether everybody's is there."""
         reads = self.reads
-        self._states.decode(states, reads.fresh, reads.arrived_ns, now_ns)
-        if reads.fresh.tobytes() != self._everybody or any(self._missed):
+        everybody = reads.fresh.tobytes() == self._everybody
+        if not everybody or any(self._missed):
             self._count_losses()
         elif self._rows:
-            self._gaps.came(int(reads.arrived_ns[-1]), self._bus.due_ns)
+            self._gaps.came(self._arrived_ns[-1], self._bus.due_ns)
         if reads.errors != self._said_errors:
             self._say_errors()
         if self._bus.noise_bytes != self._noise_seen and now_ns - self._noise_at_ns >= NOISE_EVENT_NS:
@@ -162,6 +164,7 @@ class Servos:
             self._noise_seen, self._noise_at_ns = self._bus.noise_bytes, now_ns
             text = f"{counted(count, 'byte', 'bytes')} belonged to no packet"
             self._emit(EventCode.BUS_NOISE, Severity.WARNING, self._plan.name, text)
+        return everybody
 
     def watch(self) -> Program[list[str]]:
         """Read every servo's clock for the first time, and arm the Bus Watchdogs; return what went wrong.
@@ -389,9 +392,6 @@ class Servos:
 
     def _say(self, code: EventCode, severity: Severity, index: int, text: str) -> None:
         self._emit(code, severity, self._plan.servos[index].joint, f"{self._who(index)} {text}")
-
-    def _emit(self, code: EventCode, severity: Severity, source: str, text: str) -> None:
-        self._events.emit(code, severity, source, text)
 
     def _who(self, index: int) -> str:
         servo = self._plan.servos[index]

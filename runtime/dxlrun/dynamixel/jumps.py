@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dxlrun.control_table import control_table
 from dxlrun.dynamixel.bus_plan import BusPlan, ServoPlan
 from dxlrun.events import EventCode, EventSink, Severity
-from dxlrun.interfaces import States
+from dxlrun.interfaces import Floats
 
 MARGIN_RAD = 0.035
 """rad, two degrees: noise of a potentiometer, and what somebody's hand adds [i]."""
@@ -20,68 +21,43 @@ SAY_AGAIN_NS = 1_000_000_000
 
 
 class Jumps:
-    """Makes rows invalid whose position jumped; they keep their values until the new place can be true.
+    """Says whether positions are possible; the steps are in the order of the plans' servos.
 
     What is possible is the servo's highest speed limit times the time since its last good sample, so that a
     servo that really stands elsewhere is believed again after a moment.
     """
 
-    __slots__ = (
-        "_delta",
-        "_events",
-        "_fastest",
-        "_good_ns",
-        "_last",
-        "_mask",
-        "_names",
-        "_quick",
-        "_said_ns",
-    )
+    __slots__ = ("_events", "_fastest", "_mask", "_names", "_quick", "_said_ns", "surely_none")
 
-    def __init__(self, plans: Iterable[BusPlan], joints: int, events: EventSink) -> None:
+    def __init__(self, plans: Iterable[BusPlan], events: EventSink) -> None:
         self._events = events
-        self._fastest = np.full(joints, np.inf)
-        self._names = [""] * joints
-        for plan in plans:
-            for servo in plan.servos:
-                self._names[servo.row] = servo.joint
-                if not _wraps(servo):
-                    self._fastest[servo.row] = _most_speed(plan, servo)
+        both = [(plan, servo) for plan in plans for servo in plan.servos]
+        self._names = [servo.joint for _, servo in both]
+        speeds = [np.inf if _wraps(servo) else _most_speed(plan, servo) for plan, servo in both]
+        self._fastest = np.array(speeds, dtype=np.float64)
         # a step below this is always possible, whenever the sample before was
         self._quick = self._fastest * MARGIN_NS * 1e-9 + MARGIN_RAD
-        self._last = np.full((3, joints), np.nan)
-        self._delta = np.zeros(joints)
-        self._mask = np.zeros(joints, dtype=np.bool_)
-        self._good_ns = np.zeros(joints, dtype=np.int64)
-        self._said_ns = [-SAY_AGAIN_NS] * joints
+        self.surely_none = float(self._quick.min(initial=np.inf)) ** 2
+        """rad^2; as long as the squares of all steps are no more in sum, every one of them is possible."""
+        self._mask = np.zeros(len(both), dtype=np.bool_)
+        self._said_ns = [-SAY_AGAIN_NS] * len(both)
 
-    def sift(self, states: States, now_ns: int) -> None:
-        """Look at the positions of a cycle that was just read."""
-        np.subtract(states.position, self._last[0], out=self._delta)
-        np.abs(self._delta, out=self._delta)
-        np.greater(self._delta, self._quick, out=self._mask)
-        if np.count_nonzero(self._mask):
-            for row in np.flatnonzero(self._mask & states.valid).tolist():
-                self._judge(states, row, now_ns)
-        if np.count_nonzero(states.valid) != states.valid.size:
-            # what was not believed made nothing younger
-            lasting = ~states.valid & (self._good_ns > 0)
-            np.maximum(states.age_ns, now_ns - self._good_ns, out=states.age_ns, where=lasting)
-        self._last[0], self._last[1], self._last[2] = states.position, states.velocity, states.effort
-        np.copyto(self._good_ns, now_ns, where=states.valid)
+    def suspects(self, steps: Floats, fresh: NDArray[np.bool_]) -> list[int]:
+        """Return who of those that are `fresh` made a step that may be too far, by index; steps in rad."""
+        np.greater(np.abs(steps), self._quick, self._mask)
+        return np.flatnonzero(self._mask & fresh).tolist()
 
-    def _judge(self, states: States, row: int, now_ns: int) -> None:
-        elapsed_ns = now_ns - int(self._good_ns[row])
-        if self._delta[row] <= self._quick[row] + self._fastest[row] * elapsed_ns * 1e-9:
-            return
-        states.valid[row] = False
-        states.position[row], states.velocity[row], states.effort[row] = self._last[:, row]
-        if now_ns - self._said_ns[row] >= SAY_AGAIN_NS:
-            self._said_ns[row] = now_ns
-            jump, time = np.degrees(self._delta[row]), elapsed_ns * 1e-6
-            name = self._names[row]
+    def can_be(self, index: int, step: float, elapsed_ns: int, now_ns: int) -> bool:
+        """Say whether a servo can have made a step in this time; tell of it if it cannot."""
+        reach = self._quick[index] + self._fastest[index] * elapsed_ns * 1e-9
+        if abs(step) <= reach:
+            return True
+        if now_ns - self._said_ns[index] >= SAY_AGAIN_NS:
+            self._said_ns[index] = now_ns
+            jump, time, name = np.degrees(abs(step)), elapsed_ns * 1e-6, self._names[index]
             text = f"{name} jumped by {jump:.0f} deg in {time:.0f} ms, faster than it can turn: not believed"
             self._events.emit(EventCode.IMPLAUSIBLE, Severity.WARNING, name, text)
+        return False
 
 
 def _most_speed(plan: BusPlan, servo: ServoPlan) -> float:

@@ -1,0 +1,162 @@
+"""Samples: the ticks of a cycle -> states of the whole robot; what cannot be true is no sample."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import accumulate
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.dynamixel.bus_plan import BusPlan, ServoPlan
+from dxlrun.dynamixel.jumps import Jumps
+from dxlrun.dynamixel.state_arrays import Arrivals, StateArrays, rows_of
+from dxlrun.events import EventSink
+from dxlrun.interfaces import Floats, States
+from dxlrun.mode import Mode
+
+# numpy takes ten times as long to compare with a member of an Enum
+_VELOCITY, _PWM = int(Mode.VELOCITY), int(Mode.PWM)
+
+
+class Samples:
+    """Fills the states of all servos at once, one column a servo, in the order of the plans.
+
+    Position: q = direction * (raw * rad_per_tick - reference), rad. The sign of velocity and effort follows
+    the joint's direction, so positive effort is torque toward growing q. In wheel mode the speed of a model
+    that controls none is a fraction of full output (AX-12A, Present Speed (38)), see `mode_plan`.
+    """
+
+    __slots__ = (
+        "_age_ns",
+        "_all_valid",
+        "_arrivals",
+        "_delta",
+        "_jumps",
+        "_motion",
+        "_newest_ns",
+        "_now",
+        "_now_ns",
+        "_reference",
+        "_rows",
+        "_scale",
+        "_speeds",
+        "_states",
+        "_valid",
+        "_values",
+        "buses",
+    )
+
+    def __init__(self, plans: Sequence[BusPlan], states: States, events: EventSink) -> None:
+        servos = [servo for plan in plans for servo in plan.servos]
+        self._arrivals = Arrivals.none(len(servos))
+        counts = [len(plan.servos) for plan in plans]
+        self.buses = tuple(
+            StateArrays(plan, self._arrivals.part(end - count, count))
+            for plan, count, end in zip(plans, counts, accumulate(counts), strict=True)
+        )
+        """Where the replies of each bus go."""
+        self._jumps = Jumps(plans, events)
+        self._states = states
+        self._rows = rows_of([servo.row for servo in servos])
+        # views of the states; copies where the joints are in another order
+        self._motion = states.motion[:, self._rows]
+        self._valid = states.valid[self._rows]
+        self._age_ns = states.age_ns[self._rows]
+        self._all_valid = False  # in the cycle before
+        self._values: Floats = np.zeros((3, len(servos)))
+        self._scale: Floats = np.array([_units(servo) for servo in servos]).reshape(-1, 3).T.copy()
+        self._reference = np.array([servo.direction * servo.reference for servo in servos])
+        self._speeds = _Speeds.of(servos)
+        self._delta = np.zeros(len(servos))
+        self._now = np.zeros(1, dtype=np.int64)
+        self._now_ns = 0
+        self._newest_ns = np.zeros(len(servos), dtype=np.int64)
+
+    def settle(self, now_ns: int, everybody: bool) -> None:
+        """Fill the states from the replies of this cycle; `everybody`: that is whose reply arrived.
+
+        The row of a servo of whom nothing came, or nothing that can be true, keeps its values, is invalid,
+        and its age grows.
+        """
+        for arrays in self.buses:
+            arrays.count()
+        if self._speeds is not None:
+            self._speeds.follow(self._states.mode[self._rows], self._scale[1])
+        values, delta = self._values, self._delta
+        np.multiply(self._arrivals.ticks, self._scale, values)
+        position = values[0]
+        np.subtract(position, self._reference, position)
+        np.subtract(position, self._motion[0], delta)
+        self._now[0] = now_ns  # quicker than to let numpy make an array of an int
+        if everybody and delta.dot(delta) <= self._jumps.surely_none:
+            if not self._all_valid:
+                self._all_valid = True
+                self._valid.fill(True)
+            self._motion[...] = values
+            np.subtract(self._now, self._arrivals.at_ns, self._age_ns)
+        else:
+            self._sift(now_ns)
+        self._now_ns = now_ns
+        if not isinstance(self._rows, slice):
+            self._hand_over(self._rows)
+
+    def _sift(self, now_ns: int) -> None:
+        """Fill the columns of those that are fresh and did not jump."""
+        valid, age_ns, newest_ns = self._valid, self._age_ns, self._newest_ns
+        elapsed_ns = now_ns - self._now_ns
+        np.subtract(self._now, self._arrivals.at_ns, newest_ns)
+        valid[:] = self._arrivals.fresh
+        for index in self._jumps.suspects(self._delta, valid):
+            between_ns = int(age_ns[index] - newest_ns[index]) + elapsed_ns
+            valid[index] = self._jumps.can_be(index, self._delta[index], between_ns, now_ns)
+        self._all_valid = False not in valid.tolist()
+        np.copyto(self._motion, self._values, where=valid)
+        np.add(age_ns, elapsed_ns, age_ns, where=age_ns >= 0)
+        np.copyto(age_ns, newest_ns, where=valid)
+
+    def _hand_over(self, rows: NDArray[np.intp]) -> None:
+        """Fill the states where the joints are in another order than the servos."""
+        states = self._states
+        states.motion[:, rows] = self._motion
+        states.valid[rows] = self._valid
+        states.age_ns[rows] = self._age_ns
+
+
+class _Speeds:
+    """The units of present speeds, where any depends on the mode."""
+
+    __slots__ = ("_joint", "_seen", "_wheel")
+
+    def __init__(self, joint: Floats, wheel: Floats) -> None:
+        self._joint = joint
+        self._wheel = wheel
+        self._seen = b""
+
+    @classmethod
+    def of(cls, servos: Sequence[ServoPlan]) -> _Speeds | None:
+        """Return those of these servos; None where every mode has the same unit."""
+        joint = [servo.direction * servo.rad_s_per_tick for servo in servos]
+        wheel = [servo.direction * _in_wheel_mode(servo) for servo in servos]
+        return None if joint == wheel else cls(np.array(joint), np.array(wheel))
+
+    def follow(self, modes: NDArray[np.uint8], scale: Floats) -> None:
+        """Bring the scale to what the modes ask for."""
+        seen = modes.tobytes()
+        if seen != self._seen:
+            self._seen = seen
+            turning = (modes == _VELOCITY) | (modes == _PWM)
+            scale[:] = np.where(turning, self._wheel, self._joint)
+
+
+def _units(servo: ServoPlan) -> tuple[float, float, float]:
+    """Return what a tick of position, velocity and effort is, with the joint's sign."""
+    units = servo.rad_per_tick, servo.rad_s_per_tick, servo.effort_per_tick
+    position, velocity, effort = (servo.direction * unit for unit in units)
+    return position, velocity, effort
+
+
+def _in_wheel_mode(servo: ServoPlan) -> float:
+    """Return the unit of the present speed in wheel mode, rad/s."""
+    units = [mode.present_rad_s_per_tick for mode in servo.modes if mode.mode == Mode.VELOCITY]
+    return units[0] if units else servo.rad_s_per_tick

@@ -1,0 +1,241 @@
+"""Samples: the replies of a cycle make the states that the same rules make of one servo, in plain numbers."""
+
+import math
+import random
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dxlrun.dynamixel.jumps import MARGIN_NS, MARGIN_RAD, SAY_AGAIN_NS, Jumps
+from dxlrun.dynamixel.samples import Samples
+from dxlrun.dynamixel.units import joint_position
+from dxlrun.events import EventCode
+from dxlrun.interfaces import States
+from dxlrun.mode import Mode
+
+MS = 1_000_000
+SECOND_NS = 1_000_000_000
+
+
+class Robot:
+    """Servos that say what a test puts into their replies."""
+
+    def __init__(self, plans, events):
+        self.plans, self.events = plans, events
+        self.servos = [servo for plan in plans for servo in plan.servos]
+        self.states = States.empty(len(self.servos))
+        self.samples = Samples(plans, self.states, events)
+        self.replies = [reply for bus in self.samples.buses for reply in bus.replies]
+        self.now_ns = SECOND_NS
+
+    def put(self, index, position, velocity, effort):
+        """Put raw values into the bytes of a servo, as its control table has them."""
+        layout, reply = self.servos[index].state, self.replies[index]
+        for place, value in (
+            (layout.position, position),
+            (layout.velocity, velocity),
+            (layout.effort, effort),
+        ):
+            signed = place.encoding == "twos_complement"
+            data = value.to_bytes(place.size, "little", signed=signed)
+            reply[place.offset : place.offset + place.size] = data
+
+    def settle(self, fresh, arrived_ns, *, after_ns=10 * MS):
+        """Let the replies arrive so long before now, of those that are fresh."""
+        self.now_ns += after_ns
+        first = 0
+        for bus, plan in zip(self.samples.buses, self.plans, strict=True):
+            for index in range(len(plan.servos)):
+                bus.arrivals.fresh[index] = fresh[first + index]
+                if fresh[first + index]:
+                    bus.arrivals.at_ns[index] = self.now_ns - arrived_ns[first + index]
+            first += len(plan.servos)
+        self.samples.settle(self.now_ns, all(fresh))
+
+    def all_said(self, *raw, age_ns=0):
+        """Let every servo say the same."""
+        for index in range(len(self.servos)):
+            self.put(index, *raw)
+        count = len(self.servos)
+        self.settle([True] * count, [age_ns] * count)
+
+    def turn(self, *positions, after_ms=10, came=True):
+        """Let the servos stand at angles, rad; return who is valid, and where."""
+        for index, (servo, angle) in enumerate(zip(self.servos, positions, strict=True)):
+            raw = round((angle * servo.direction + servo.reference) / servo.rad_per_tick)
+            self.put(index, raw, 0, 0)
+        fresh = [True] * (len(positions) - 1) + [came]
+        self.settle(fresh, [0] * len(positions), after_ns=after_ms * MS)
+        return self.states.valid.tolist(), self.states.position.tolist()
+
+
+@pytest.fixture
+def make_robot(make_rig, make_plan):
+    def build(*plans):
+        return Robot(plans, make_rig(make_plan((1,))).events)
+
+    return build
+
+
+def test_signs_follow_the_joints_direction(make_robot, make_plan):
+    robot = make_robot(make_plan())
+    robot.all_said(512, 100, 1024 + 200, age_ns=30)  # counter-clockwise 100; clockwise 200
+    servo = robot.servos[0]
+    direction = np.array([one.direction for one in robot.servos])
+    assert robot.states.position == pytest.approx([joint_position(one, 512) for one in robot.servos])
+    assert robot.states.velocity == pytest.approx(direction * 100 * servo.rad_s_per_tick)
+    assert robot.states.effort == pytest.approx(direction * -200 / 1023)
+    assert robot.states.age_ns.tolist() == [30] * 8
+
+
+def test_a_lost_row_keeps_its_own_values_and_ages(make_robot, make_plan):
+    robot = make_robot(make_plan())
+    states = robot.states
+    for index in range(8):
+        robot.put(index, 100 + index, 0, 0)
+    robot.settle(np.arange(8) != 3, [0] * 8)
+    assert np.isnan(states.position[3])
+    assert states.age_ns[3] == -1
+    robot.settle([True] * 8, [0] * 8)
+    kept = states.position.copy()
+    for index in range(8):
+        robot.put(index, 90, 0, 0)
+    robot.settle(np.arange(8) != 5, [0] * 8)
+    assert states.position[5] == kept[5]
+    assert not states.valid[5]
+    assert states.age_ns[5] == 10 * MS
+    assert (states.position != kept).sum() == 7
+
+
+@pytest.mark.parametrize("mode", [Mode.VELOCITY, Mode.PWM, Mode.POSITION, Mode.UNKNOWN])
+def test_the_speed_of_a_wheel_that_controls_none_is_a_part_of_full_output(make_robot, make_plan, mode):
+    robot = make_robot(make_plan((1, 2), continuous=True))
+    robot.states.mode[0] = mode
+    robot.all_said(512, 100, 0)
+    robot.states.mode[1] = Mode.VELOCITY
+    robot.all_said(512, 100, 0)
+    wheels = [servo.mode_plan(Mode.VELOCITY).present_rad_s_per_tick for servo in robot.servos]
+    servo = robot.servos[0]
+    unit = wheels[0] if mode in (Mode.VELOCITY, Mode.PWM) else servo.rad_s_per_tick
+    assert wheels[0] != servo.rad_s_per_tick
+    assert robot.states.velocity == pytest.approx([-100 * unit, 100 * wheels[1]])
+
+
+class OneServo:
+    """The rules of the states for one servo, in plain numbers."""
+
+    def __init__(self, plan, servo):
+        self.servo = servo
+        self.fastest = float(Jumps([plan], None)._fastest[plan.servos.index(servo)])
+        self.shown, self.shown_ns, self.valid = (math.nan,) * 3, None, False
+
+    def cycle(self, raw, at_ns):
+        """Take a sample that arrived, None where none did."""
+        self.valid = False
+        if raw is None:
+            return
+        position, velocity, effort = raw
+        if self.servo.state.velocity.encoding == "sign_magnitude":
+            velocity, effort = (value % 0x400 * (-1 if value & 0x400 else 1) for value in (velocity, effort))
+        found = (
+            joint_position(self.servo, position),
+            self.servo.direction * velocity * self.servo.rad_s_per_tick,
+            self.servo.direction * effort * self.servo.effort_per_tick,
+        )
+        if self.shown_ns is not None:
+            time = (at_ns - self.shown_ns + MARGIN_NS) * 1e-9
+            if abs(found[0] - self.shown[0]) > MARGIN_RAD + self.fastest * time:
+                return
+        self.shown, self.shown_ns, self.valid = found, at_ns, True
+
+
+ROBOTS = {
+    "one bus": [("AX-12A", 8)],
+    "two layouts by turns": [("XM430-W350", "XL-320", 7)],
+    "two layouts one behind the other": [("XM430-W350", 3), ("XL430-W250", "XL-320", 2)],
+    "several buses": [("XM430-W350", 5), ("AX-12A", 3), ("XL-320", 2), ("MX-28", 1)],
+}
+
+
+@pytest.mark.parametrize("order", ["as wired", "in another order"])
+@pytest.mark.parametrize("name", ROBOTS)
+def test_states_are_what_the_rules_make_of_each_servo(make_robot, make_plan, name, order):
+    rng = random.Random(f"{name} {order}")
+    total = sum(count for *_, count in ROBOTS[name])
+    rows = rng.sample(range(total), total) if order == "in another order" else list(range(total))
+    plans = []
+    for number, (*turns, count) in enumerate(ROBOTS[name]):
+        ids, mine = range(1, count + 1), rows[:count]
+        models = [turns[index % len(turns)] for index in range(count)]
+        protocol = 1.0 if models[0] in ("AX-12A", "MX-28") else 2.0
+        plan = make_plan(ids, name=f"bus{number}", models=models, protocol=protocol)
+        servos = tuple(replace(servo, row=row) for servo, row in zip(plan.servos, mine, strict=True))
+        plans.append(replace(plan, servos=servos))
+        del rows[:count]
+    robot = make_robot(*plans)
+    ones = [OneServo(plan, servo) for plan in plans for servo in plan.servos]
+    middle = [rng.randrange(300, 700) for _ in ones]
+    quick = 0
+    for _ in range(150):
+        lost = rng.choice([0.0, 0.0, 0.0, 0.2, 0.9])
+        far = rng.choice([0.0, 0.0, 0.0, 0.3])
+        fresh = [rng.random() >= lost for _ in ones]
+        ages = [rng.randrange(4 * MS) for _ in ones]
+        raws = []
+        for index, servo in enumerate(robot.servos):
+            middle[index] += rng.randrange(-3, 4)
+            position = max(0, middle[index] + (rng.randrange(-300, 300) if rng.random() < far else 0))
+            signed = servo.state.velocity.encoding == "twos_complement"
+            speeds = [rng.randrange(-300, 300) if signed else rng.randrange(0x800) for _ in range(2)]
+            raws.append((position, *speeds))
+            if fresh[index]:
+                robot.put(index, *raws[-1])
+        robot.settle(fresh, ages, after_ns=rng.choice([5 * MS, 20 * MS, 400 * MS]))
+        for one, came, raw, age in zip(ones, fresh, raws, ages, strict=True):
+            one.cycle(raw if came else None, robot.now_ns - age)
+            row, states = one.servo.row, robot.states
+            assert states.valid[row] == one.valid
+            assert states.motion[:, row] == pytest.approx(one.shown, nan_ok=True, rel=1e-12)
+            assert states.age_ns[row] == (-1 if one.shown_ns is None else robot.now_ns - one.shown_ns)
+        quick += all(one.valid for one in ones)
+    assert 20 < quick < 145
+
+
+class TestJumps:
+    """Positions that no servo can reach."""
+
+    @pytest.fixture
+    def robot(self, make_robot, make_plan):
+        return make_robot(make_plan((1, 3)))
+
+    def test_a_fast_servo_is_believed(self, robot):
+        for step in range(20):
+            assert robot.turn(step * 0.11, -step * 0.11)[0] == [True, True]  # 11 rad/s
+
+    def test_a_jump_is_invalid_and_the_row_keeps_its_value_until_it_can_be_true(self, robot):
+        before = robot.turn(0.0, 0.0)[1]
+        assert robot.turn(0.0, 1.5) == ([True, False], before)
+        seen = [robot.turn(0.0, 1.5)[0][1] for _ in range(20)]
+        assert seen.index(True) in range(8, 14)  # 1.5 rad at 11.9 rad/s
+        assert all(seen[seen.index(True) :])
+        ((source, text),) = robot.events.of(EventCode.IMPLAUSIBLE)
+        assert source == "main_3_joint"
+        assert "jumped by 86 deg in 10 ms" in text
+        assert SAY_AGAIN_NS == SECOND_NS
+
+    def test_who_was_not_seen_for_long_may_be_elsewhere(self, robot):
+        robot.turn(0.0, 0.0)
+        assert robot.turn(2.0, 0.0, after_ms=500)[0] == [True, True]
+
+    def test_a_servo_with_a_profile_is_no_faster_than_its_velocity_limit_can_be(self, make_robot, make_plan):
+        robot = make_robot(make_plan((1, 3), model="XM430-W350", protocol=2.0))
+        before = robot.turn(0.0, 0.0)[1]
+        assert robot.turn(0.0, 1.5) == ([True, False], before)
+
+    def test_a_row_looks_no_younger_for_a_reply_that_was_not_believed(self, robot):
+        robot.turn(0.0, 0.0)
+        robot.turn(0.0, 1.5)
+        robot.turn(0.0, 0.0, came=False)
+        assert not robot.states.valid[1]
+        assert robot.states.age_ns.tolist() == [0, 20 * MS]
