@@ -13,7 +13,7 @@ from dxlrun.cycle import CycleRecord
 from dxlrun.errors import PortError
 from dxlrun.interfaces import COMMAND_INTERFACES, States
 
-_STATES = tuple(field.name for field in fields(States))
+_STATES = tuple(field.name for field in fields(States) if field.name != "motion")  # which shows three of them
 
 
 class RecordedClock:
