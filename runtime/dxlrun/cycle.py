@@ -186,9 +186,9 @@ class CycleRecord:
             mode=array["mode"][0],
         )
         """What the servos said."""
-        self.commands = Commands(*(_row(array, f"command_{name}") for name in COMMAND_INTERFACES))
+        self.commands = Commands(_rows(array, "command_position", len(COMMAND_INTERFACES)))
         """What the controllers want, merged; NaN = not commanded."""
-        self.goals = Commands(*(_row(array, f"goal_{name}") for name in COMMAND_INTERFACES))
+        self.goals = Commands(_rows(array, "goal_position", len(COMMAND_INTERFACES)))
         """What goes to the servos, after the last gate."""
         self.controller_ns: NDArray[np.int64] = array["controller_ns"][0]
         """How long each controller's update took; 0 where it was not updated in this cycle."""

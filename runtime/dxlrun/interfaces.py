@@ -67,28 +67,28 @@ class Commands:
     Which of them count depends on the joint's mode, see `mode_of`.
     """
 
-    position: Floats
+    values: Floats
+    """Shape (4, joints): all of them, in the order of COMMAND_INTERFACES, for whoever wants them at once."""
+    position: Floats = field(init=False)
     """rad"""
-    velocity: Floats
+    velocity: Floats = field(init=False)
     """rad/s. Beside a position: magnitude of the speed toward it, NaN = as fast as the servo can. Alone: the
     speed at which the joint turns, with its sign."""
-    effort: Floats
+    effort: Floats = field(init=False)
     """In the unit of the state's effort: Nm, A, or the fraction of maximum. Beside a position: the most that
     the servo may exert, a magnitude. Alone: with its sign."""
-    pwm: Floats
+    pwm: Floats = field(init=False)
     """Fraction of the full voltage, -1..1"""
+
+    def __post_init__(self) -> None:
+        for name, row in zip(COMMAND_INTERFACES, self.values, strict=True):
+            object.__setattr__(self, name, row)
 
     @classmethod
     def empty(cls, joints: int) -> Commands:
         """Return arrays of NaN."""
-        return cls(*(np.full(joints, np.nan) for _ in COMMAND_INTERFACES))
-
-    @property
-    def arrays(self) -> tuple[Floats, Floats, Floats, Floats]:
-        """All of them, in the order of COMMAND_INTERFACES."""
-        return self.position, self.velocity, self.effort, self.pwm
+        return cls(np.full((len(COMMAND_INTERFACES), joints), np.nan))
 
     def clear(self) -> None:
         """Command nothing any more."""
-        for values in self.arrays:
-            values.fill(np.nan)
+        self.values.fill(np.nan)

@@ -29,6 +29,7 @@ def test_what_is_written_to_the_arrays_is_in_the_bytes(joints: int, controllers:
     record.valid[:] = rows % 2 == 0
     record.commands.position[:] = rows + 1
     record.goals.velocity[:] = rows + 2
+    record.goals.values[3] = rows + 3
     record.clamped[:] = rows
     record.controller_ns[:] = 7
     read = np.frombuffer(bytes(record.raw), dtype=layout.dtype)[0]
@@ -43,6 +44,7 @@ def test_what_is_written_to_the_arrays_is_in_the_bytes(joints: int, controllers:
     assert np.isnan(read["command_velocity"]).all()
     assert np.isnan(read["goal_position"]).all()
     np.testing.assert_array_equal(read["goal_velocity"], rows + 2)
+    np.testing.assert_array_equal(read["goal_pwm"], rows + 3)
     np.testing.assert_array_equal(read["clamped"], rows)
     np.testing.assert_array_equal(read["controller_ns"], np.full(controllers, 7))
 

@@ -17,7 +17,7 @@ speeds = st.floats(-100, 100) | st.sampled_from([float("nan"), 0.0, -0.0])
 )
 @settings(max_examples=100, deadline=None)
 def test_the_sync_write_is_what_the_units_of_one_servo_say(plan8, positions, velocities):
-    goals = Commands(np.array(positions), np.array(velocities), np.full(8, np.nan), np.full(8, np.nan))
+    goals = Commands(np.array([positions, velocities, [np.nan] * 8, [np.nan] * 8]))
     included = np.array([True, False] + [True] * 6)
     packets = GoalArrays(plan8).packets(goals, included)
     expected = {
@@ -35,7 +35,7 @@ def plan8(module_plan):
 
 
 def test_a_smaller_packet_after_a_bigger_one_is_whole(plan8):
-    arrays, goals = GoalArrays(plan8), Commands(np.zeros(8), np.ones(8), np.zeros(8), np.zeros(8))
+    arrays, goals = GoalArrays(plan8), Commands(np.array([[0.0] * 8, [1.0] * 8, [0.0] * 8, [0.0] * 8]))
     (everybody,) = arrays.packets(goals, np.ones(8, dtype=bool))
     (one,) = arrays.packets(goals, np.arange(8) == 7)
     goals.position[:] = 0.1

@@ -90,7 +90,7 @@ def act(rig, chance, name):
 
 def cycle(rig):
     """Run one cycle with goals of nothing: every joint stands."""
-    for array in rig.goals.arrays:
+    for array in rig.goals.values:
         array[rig.states.mode == Mode.UNKNOWN] = np.nan
     for mode, array in ((2, rig.goals.velocity), (3, rig.goals.effort), (4, rig.goals.pwm)):
         array[rig.states.mode == mode] = 0.0

@@ -100,8 +100,7 @@ class Gate:
         changed = modes != self._modes
         self.begin()
         record, goals = self._record, self._record.goals
-        for values in goals.arrays:
-            values[changed] = np.nan
+        goals.values[:, changed] = np.nan
         np.copyto(goals.position, record.states.position, where=changed & self._led)
         for mode, interface in _STILL.items():
             values = getattr(goals, interface)

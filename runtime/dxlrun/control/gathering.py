@@ -36,7 +36,7 @@ class Gathering:
         self._pairs: list[tuple[NDArray[np.generic], NDArray[np.generic], NDArray[np.intp]]] = []
         sources = [getattr(record.states, field.name) for field in fields(States) if field.init]
         self.states = States(*(self._shown(source, place) for source in sources))
-        self.goals = Commands(*(self._shown(source, place) for source in record.goals.arrays))
+        self.goals = Commands(self._shown(record.goals.values, place))
 
     def gather(self) -> None:
         """Copy what must be copied."""

@@ -168,7 +168,7 @@ class Comparison:
 
 
 def _values(record: CycleRecord) -> tuple[Floats, ...]:
-    return *record.commands.arrays, *record.goals.arrays
+    return *record.commands.values, *record.goals.values
 
 
 def _told(bits: int) -> str:
