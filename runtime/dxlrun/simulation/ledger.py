@@ -66,7 +66,7 @@ class Ledger:
         *,
         late_ns: int = 0,
     ) -> None:
-        """Enter bytes or a note; a file is encoded by `encode`, and flushed by `flush_if_due` and at the end."""
+        """Enter bytes or a note; `encode` and `flush_if_due` bring it into a file, at the latest its end."""
         entry = LedgerEntry(t_ns, bus, direction, data, note, late_ns)
         if self._keep:
             self.entries.append(entry)

@@ -15,6 +15,7 @@ _TCGETS2, _TCSETS2 = 0x802C542A, 0x402C542B
 """Terminal settings with the rate as a number (Linux, asm-generic/ioctls.h): they know every rate."""
 _SETTINGS = struct.Struct("4I20s2I")
 """struct termios2 (asm-generic/termbits.h): flags of input, output, control, local; line; both rates."""
+_ROOM = bytes(_SETTINGS.size)
 _CBAUD, _BOTHER = 0o010017, 0o010000
 
 
@@ -33,6 +34,8 @@ class PseudoTerminal:
         self.bus = bus
         self._link = link
         self._master, self._slave = self._new_pair()
+        self._told = b""
+        """Settings of the terminal when the host last wrote."""
         self._times_unplugged = bus.times_unplugged
         self.plugged = True
         """False: the host saw it go, and no device is there."""
@@ -75,9 +78,12 @@ class PseudoTerminal:
             data = os.read(self._master, 4096)
         except BlockingIOError:
             return
-        rate = _rate(self._slave)
-        if rate not in (0, self.bus.baud_rate):
-            self.bus.change_rate(rate)
+        settings = _settings(self._slave)
+        if settings != self._told:  # the host's rate can only be another one then
+            self._told = settings
+            rate = _rate(settings)
+            if rate not in (0, self.bus.baud_rate):
+                self.bus.change_rate(rate)
         self.bus.receive(data, now_ns)
 
     def deliver(self, now_ns: int) -> None:
@@ -118,14 +124,17 @@ def _close(pair: tuple[int, int]) -> None:
         os.close(descriptor)
 
 
-def _rate(terminal: int) -> int:
-    """Return the rate at which a terminal would send, bit/s."""
-    settings = _SETTINGS.unpack(fcntl.ioctl(terminal, _TCGETS2, bytes(_SETTINGS.size)))
-    return int(settings[-1])
+def _settings(terminal: int) -> bytes:
+    return fcntl.ioctl(terminal, _TCGETS2, _ROOM)
+
+
+def _rate(settings: bytes) -> int:
+    """Return the rate at which a terminal of such settings would send, bit/s."""
+    return int(_SETTINGS.unpack(settings)[-1])
 
 
 def _set_rate(terminal: int, baud_rate: int) -> None:
-    settings = list(_SETTINGS.unpack(fcntl.ioctl(terminal, _TCGETS2, bytes(_SETTINGS.size))))
+    settings = list(_SETTINGS.unpack(_settings(terminal)))
     settings[2] = settings[2] & ~_CBAUD | _BOTHER
     settings[-2:] = [baud_rate, baud_rate]
     fcntl.ioctl(terminal, _TCSETS2, _SETTINGS.pack(*settings))

@@ -1,7 +1,8 @@
-"""Serving simulated buses in real time: one thread, one select, no waiting for anybody."""
+"""Serving simulated buses in real time: one thread that waits for all lines together, and for nobody else."""
 
 from __future__ import annotations
 
+import contextlib
 import select
 import signal
 import socket
@@ -29,12 +30,12 @@ MOST_BACKLOG_NS = 20_000_000
 
 So it feels the rate of its line, as with an adapter."""
 
-GATHER_NS = 125_000
-"""Answers of a read in turn that follow one so closely are handed over together with it, as in one microframe
-of USB: each hand-over costs the processor more than an answer."""
+GATHER_NS = 250_000
+"""Answers of a read in turn that follow one so closely are handed over together with it, as in two
+microframes of USB: each hand-over costs the processor, and the host's, more than an answer."""
 
-MOVE_NS = 300_000
-"""So long the mechanics of a few steps may take."""
+IDLE_NS = 300_000
+"""So long the mechanics of a few steps and the lines of the ledger may take."""
 
 
 class _Question(msgspec.Struct):
@@ -66,33 +67,39 @@ class Server:
         )
         self._patience = Patience(self.start_ns)
         self._stopped = False
+        self._waiting = select.epoll()
+        self._heard: dict[int, PseudoTerminal] = {}
+        """Whose bytes are taken, by descriptor."""
+        self._told = select.EPOLLIN
+        """What is waited for on the line to the starter."""
 
     def run(self, granted: str = "") -> None:
         """Tell the ports and what real time was granted, then serve."""
         self._ledger.on_note = self._tell_fault
-        with _wake_on_sigterm() as wake:
+        with _wake_on_sigterm() as wake, self._waiting as waiting:
+            waiting.register(wake, select.EPOLLIN)
+            waiting.register(self._line, self._told)
             self._line.send({"ports": self._ports(), "real_time": granted})
             while not self._stopped:
-                self._turn(wake)
+                self._turn(wake.fileno())
         for terminal in self._terminals:
             terminal.close()
 
-    def _turn(self, wake: socket.socket) -> None:
+    def _turn(self, wake: int) -> None:
         now_ns = time.monotonic_ns()
         dues = [bus.next_delivery_ns(GATHER_NS) for bus in self._buses]
         soonest_ns = min([due_ns for due_ns in dues if due_ns is not None], default=None)
-        if soonest_ns is None or soonest_ns - now_ns > MOVE_NS:  # no reply is about to leave
+        if soonest_ns is None or soonest_ns - now_ns > IDLE_NS:  # no reply is about to leave
             self._mechanics.advance(now_ns)
-        sources, next_ns = self._sources(now_ns, soonest_ns)
-        patience = self._patience.until(next_ns, now_ns)
-        writable = (self._line.fileno(),) if self._line.has_unsent else ()
-        readable, unsent, _ = select.select(
-            [*sources, self._line.fileno(), wake.fileno()], writable, (), patience
-        )
+            self._ledger.encode()
+            self._ledger.flush_if_due(now_ns)
+            now_ns = time.monotonic_ns()
+        next_ns = self._next_ns(now_ns, soonest_ns)
+        ready = self._wait(next_ns, now_ns)
         # What was due before the host wrote goes out first: the host could have read it.
         now_ns = time.monotonic_ns()
         self._patience.woke(now_ns)
-        heard = [sources[number] for number in readable if number in sources]
+        heard = [self._heard[number] for number, _ in ready if number in self._heard]
         for terminal, due_ns in zip(self._terminals, dues, strict=True):
             if (due_ns is not None and due_ns <= now_ns) or terminal in heard:
                 terminal.deliver(now_ns)
@@ -101,25 +108,53 @@ class Server:
         for terminal in heard:
             if terminal.plugged:
                 terminal.receive(now_ns)  # of that moment, however long the others took
-        if unsent:
-            self._line.flush()
-        if self._line.fileno() in readable:
-            self._listen(now_ns)
-        if wake.fileno() in readable:
-            self._stopped = True
-        self._ledger.flush_if_due(now_ns)
+        if len(ready) > len(heard):
+            self._answer_starter(wake, {number for number, _ in ready}, now_ns)
 
-    def _sources(self, now_ns: int, soonest_ns: int | None) -> tuple[dict[int, PseudoTerminal], int | None]:
-        """Return whose bytes are taken, by descriptor, and when something is to be done unasked."""
-        sources: dict[int, PseudoTerminal] = {}
+    def _wait(self, next_ns: int | None, now_ns: int) -> list[tuple[int, int]]:
+        """Wait until something is due, or somebody has written; return who has."""
+        sleep_s = self._patience.until(next_ns, now_ns)
+        poll = self._waiting.poll
+        if sleep_s != 0.0 or next_ns is None:
+            # no longer than asked for, to the microsecond; an epoll's own time is counted in milliseconds
+            select.select((self._waiting,), (), (), sleep_s)
+            return poll(0)
+        while not (ready := poll(0)) and time.monotonic_ns() < next_ns:
+            pass
+        return ready
+
+    def _next_ns(self, now_ns: int, soonest_ns: int | None) -> int | None:
+        """Return when something is to be done unasked; see to it that those are heard who may talk."""
         times = [soonest_ns, self._ledger.flush_due_ns(), self._mechanics.due_ns()]
+        heard = {}
         for terminal in self._terminals:
             taken_ns = terminal.bus.host_free_ns - MOST_BACKLOG_NS
             if taken_ns > now_ns:
                 times.append(taken_ns)
             elif terminal.plugged:
-                sources[terminal.fileno()] = terminal
-        return sources, min([t_ns for t_ns in times if t_ns is not None], default=None)
+                heard[terminal.fileno()] = terminal
+        if heard != self._heard:
+            self._hear(heard)
+        told = select.EPOLLIN | (select.EPOLLOUT if self._line.has_unsent else 0)
+        if told != self._told:
+            self._told = told
+            self._waiting.modify(self._line, told)
+        return min([t_ns for t_ns in times if t_ns is not None], default=None)
+
+    def _hear(self, terminals: dict[int, PseudoTerminal]) -> None:
+        """Take the bytes of other terminals from now on."""
+        for number in self._heard:
+            with contextlib.suppress(OSError):  # a terminal that was unplugged is closed
+                self._waiting.unregister(number)
+        for number in terminals:
+            self._waiting.register(number, select.EPOLLIN)
+        self._heard = terminals
+
+    def _answer_starter(self, wake: int, ready: set[int], now_ns: int) -> None:
+        if self._line.fileno() in ready:
+            self._line.flush()
+            self._listen(now_ns)
+        self._stopped = self._stopped or wake in ready
 
     def _ports(self) -> dict[str, str]:
         return {terminal.bus.name: terminal.path for terminal in self._terminals}
