@@ -9,7 +9,7 @@ from dxlrun.clock import VirtualClock
 from dxlrun.dynamixel import exchange, protocol1, protocol2
 from dxlrun.dynamixel.bus import Bus
 from dxlrun.dynamixel.exchange import CyclicReads
-from dxlrun.dynamixel.pump import pump
+from dxlrun.dynamixel.pump import clear, pump
 from dxlrun.dynamixel.state_arrays import Arrivals, StateArrays
 from dxlrun.errors import PortError
 from dxlrun.packets import PacketKind, decode_packets
@@ -22,6 +22,7 @@ BUSES = {
     "fast sync read": ("XM430-W350", 2.0),
 }
 PERIOD_NS = 20_000_000
+GOALS = b"goals that nobody answers"
 
 
 class Sink:
@@ -40,17 +41,13 @@ class Sink:
 class Line:
     """Says to the n-th instruction of a cycle what it was told: pieces of (ns after it, bytes)."""
 
-    polling = None
-
-    def __init__(self):
-        self.clock = VirtualClock(1_000_000)
+    def __init__(self, clock):
+        self.clock = clock
         self.told, self.said = [], []
 
-    @property
-    def ports(self):
-        return [self]
-
     def write(self, data):
+        if data == GOALS:
+            return
         pieces = self.told.pop(0) if self.told else []
         if pieces is None:
             raise PortError("it is gone")
@@ -58,56 +55,91 @@ class Line:
         self.said.sort(key=lambda one: one[0])
 
     def read_into(self, buffer):
-        if not self.said or self.said[0][0] > self.clock.now_ns():
+        if not self.heard:
             return 0
         _, data = self.said.pop(0)
         buffer[: len(data)] = data
         return len(data)
 
+    @property
+    def heard(self):
+        return bool(self.said) and self.said[0][0] <= self.clock.now_ns()
+
+
+class Lines:
+    """Some lines, waited for together."""
+
+    polling = None
+
+    def __init__(self, count):
+        self.clock = VirtualClock(1_000_000)
+        self.ports = [Line(self.clock) for _ in range(count)]
+
     def wait(self, deadline_ns):
-        self.clock.wait_until(min([deadline_ns, *(at for at, _ in self.said)]))
-        return [0] if self.said and self.said[0][0] <= self.clock.now_ns() else []
+        self.clock.wait_until(min([deadline_ns, *(at for line in self.ports for at, _ in line.said)]))
+        return [index for index, line in enumerate(self.ports) if line.heard]
 
 
 class Side:
-    """One bus with its cyclic reads, and what became of each cycle."""
+    """Some buses with their cyclic reads, and what became of each cycle."""
 
-    def __init__(self, plan):
-        self.line, self.sink = Line(), Sink()
-        self.bus = Bus(0, plan, self.line, self.line.clock, self.sink)
-        self.arrays = StateArrays(plan, Arrivals.none(len(plan.servos)))
-        self.reads = CyclicReads(plan, self.arrays, self.bus)
+    def __init__(self, plan, count):
+        self.lines = Lines(count)
+        self.sinks = [Sink() for _ in range(count)]
+        self.buses = [
+            Bus(index, plan, line, self.lines.clock, sink)
+            for index, (line, sink) in enumerate(zip(self.lines.ports, self.sinks, strict=True))
+        ]
+        self.arrays = [StateArrays(plan, Arrivals.none(len(plan.servos))) for _ in range(count)]
+        self.reads = [
+            CyclicReads(plan, arrays, bus) for arrays, bus in zip(self.arrays, self.buses, strict=True)
+        ]
         self.straight = 0
 
     def begin(self):
-        """Begin a cycle; return its reads."""
-        self.reads.begin()
-        return [request.patient[0] for request in self.reads._queue]
+        """Begin a cycle; return the reads of each bus."""
+        for reads in self.reads:
+            reads.begin()
+        return [[request.patient[0] for request in reads._queue] for reads in self.reads]
 
-    def cycle(self, told):
-        """Read once; return what can be told apart."""
-        self.line.told, self.line.said = list(told), []
-        self.sink.packets.clear()
-        self.bus.load(self.reads, self.reads.lane)
-        lane = self.reads.lane
-        pump([self.bus], self.line, self.line.clock, lambda: None)
-        self.straight += lane is not None and lane.through
-        reads = self.reads
-        for index, fresh in enumerate(reads.fresh.tolist()):
-            reads.missed[index] = 0 if fresh else reads.missed[index] + 1
-        intact = [packet for packet in self.sink.packets if packet[0] is not PacketKind.NOISE]
-        noise = b"".join(packet[-1] for packet in self.sink.packets if packet[0] is PacketKind.NOISE)
-        data = [bytes(reply) for reply in self.arrays.replies]
-        state = (
+    def cycle(self, told, split_ns):
+        """Read once; return what can be told apart. `split_ns`: the gap behind the requests, if any."""
+        for sink in self.sinks:
+            sink.packets.clear()
+        if split_ns is not None:
+            clear(self.buses, self.lines)
+        for bus, reads, line, mine in zip(self.buses, self.reads, self.lines.ports, told, strict=True):
+            line.told = list(mine)
+            if split_ns is not None and bus.failure is None:
+                bus.send(GOALS)
+            bus.load(reads, reads.lane)
+            if split_ns is not None:
+                bus.begin_behind()
+        clock = self.lines.clock
+        if split_ns is not None:
+            pump(self.buses, self.lines, clock, lambda: None, clock.now_ns() + split_ns)
+        pump(self.buses, self.lines, clock, lambda: None)
+        self.straight += sum(reads.lane is not None and reads.lane.through for reads in self.reads)
+        found = [self.found(index) for index in range(len(self.buses))]
+        end_ns = clock.now_ns()
+        clock.wait_until(end_ns + PERIOD_NS)
+        return found, end_ns
+
+    def found(self, index):
+        """Return what can be told apart of one bus."""
+        reads, bus, packets = self.reads[index], self.buses[index], self.sinks[index].packets
+        for servo, fresh in enumerate(reads.fresh.tolist()):
+            reads.missed[servo] = 0 if fresh else reads.missed[servo] + 1
+        return (
+            [packet for packet in packets if packet[0] is not PacketKind.NOISE],
+            b"".join(packet[-1] for packet in packets if packet[0] is PacketKind.NOISE),
             reads.fresh.tolist(),
             reads.arrived_ns.tolist(),
             list(reads.errors),
             list(reads.garbled),
-            data,
+            [bytes(reply) for reply in self.arrays[index].replies],
+            (bus.noise_bytes, str(bus.failure)),
         )
-        end = (self.bus.noise_bytes, str(self.bus.failure), self.line.clock.now_ns())
-        self.line.clock.wait_until(self.line.clock.now_ns() + PERIOD_NS)
-        return intact, noise, state, end
 
 
 def replies(transaction, dialect, rng):
@@ -170,26 +202,54 @@ def said(transactions, dialect, rng, accident):
     return told
 
 
-@pytest.mark.parametrize("name", BUSES)
-def test_a_lane_leaves_behind_what_reads_step_by_step_do(make_plan, monkeypatch, name):
+def planned(make_plan, name):
+    """Return the plan of a bus that is read in some way, and its dialect."""
     model, protocol = BUSES[name]
-    dialect = protocol1 if protocol == 1.0 else protocol2
     plan = make_plan(IDS, protocol=protocol, model=model)
     plan = replace(plan, fast=(name == "fast sync read",) * len(plan.groups))
-    rng = random.Random(name)
+    return plan, protocol1 if protocol == 1.0 else protocol2
+
+
+@pytest.mark.parametrize("count", [1, 3])
+@pytest.mark.parametrize("name", BUSES)
+def test_a_lane_leaves_behind_what_reads_step_by_step_do(make_plan, monkeypatch, name, count):
+    plan, dialect = planned(make_plan, name)
+    rng = random.Random(f"{name} {count}")
     straight = accidents = 0
-    for _ in range(25):
-        quick, slow = Side(plan), Side(plan)
+    for _ in range(25 if count == 1 else 15):
+        quick, slow = Side(plan, count), Side(plan, count)
         for number in range(60):
             with monkeypatch.context() as patch:
                 patch.setattr(exchange, "CALM_CYCLES", 1 << 30)
                 reads = slow.begin()
             assert quick.begin() == reads
-            told = said(reads, dialect, rng, number % 6 == 5)
-            assert quick.cycle(told) == slow.cycle(told)
-            accidents += number % 6 == 5
-            if quick.bus.failure is not None:
+            accident = number % 6 == 5
+            victim = rng.randrange(count)
+            told = [
+                said(mine, dialect, rng, accident and index == victim) for index, mine in enumerate(reads)
+            ]
+            split_ns = rng.choice((None, 0, 1_000_000, 5_000_000))
+            assert quick.cycle(told, split_ns) == slow.cycle(told, split_ns)
+            accidents += accident
+            if any(bus.failure for bus in quick.buses):
                 break
         assert not slow.straight
         straight += quick.straight
     assert min(straight, accidents) > 40  # neither side of the comparison is empty
+
+
+def test_a_bus_that_is_silent_costs_the_others_neither_time_nor_their_lane(make_plan):
+    plan, dialect = planned(make_plan, "fast sync read")
+    side = Side(plan, 3)
+    for number in range(20):
+        told = [
+            [[(1_500_000, b"".join(replies(one, dialect, random.Random(1))))] for one in mine]
+            for mine in side.begin()
+        ]
+        if number == 19:
+            told[1] = [[]]
+        asked_ns = side.lines.clock.now_ns()
+        side.cycle(told, None)
+    arrived_ns = [reads.arrived_ns.tolist() for reads in side.reads]
+    assert arrived_ns[0] == arrived_ns[2] == [asked_ns + 1_500_000] * len(IDS)
+    assert [reads.lane.through for reads in side.reads] == [True, False, True]

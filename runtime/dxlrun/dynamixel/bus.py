@@ -6,13 +6,12 @@ pumps it decides when: read, write, or the gap before the next deadline.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from dxlrun.clock import Clock
 from dxlrun.dynamixel.bus_plan import BusPlan
 from dxlrun.dynamixel.listening import AWAITING, DRAINING, NEVER, READY, RESTING, Listener
-from dxlrun.dynamixel.port import Port, Ports
+from dxlrun.dynamixel.port import Port
 from dxlrun.dynamixel.transaction import (
     BROADCAST_ID,
     Job,
@@ -31,6 +30,7 @@ DRAIN_LIMIT_NS = 5_000_000
 """A line that babbles longer than this is not waited for."""
 
 _INSTRUCTION = PacketKind.INSTRUCTION
+_OK = Outcome.OK
 
 __all__ = ["NEVER", "Bus"]
 
@@ -76,57 +76,25 @@ class Bus(Listener):
         """Go on with a line that is back in the place of one that is gone; its job is forgotten."""
         self._port = port
         self.failure = None
-        self._job = self._awaited = self._burst = None
-        self._state = READY
+        self.drop()
         self._receiver.flush()  # the half of a packet that the lost line brought is nobody's
 
     def load(self, job: Job, lane: Lane | None = None) -> None:
         """Take a job; the next `step` begins it. What an aborted job left behind is forgotten.
 
-        `lane`: the quick way through it, if there is one; see `straight`.
+        `lane`: the quick way through it, if there is one.
         """
-        self._awaited = self._burst = None
+        self._awaited = self._burst = self._lane = None
         self._state = READY
-        self.receive()  # what came since the last job belongs to nobody
         if self.failure is not None:
             return
-        self._job, self._lane = job, lane
+        self._job = job
         self._reply.strays = 0
-
-    def straight(self, ports: Ports, beat: Callable[[], None]) -> None:
-        """Go the quick way through a job that was just loaded; `step` does what is left of it.
-
-        The line is the only one.
-        """
-        lane, self._lane = self._lane, None
-        if lane is None or self._job is None:
-            return
-        if self._receiver.pending:
-            self._receiver.flush()
-        while self._now_ns() < self._free_ns:
-            if ports.wait(self._free_ns):
-                return  # nobody was asked
-        try:
-            lane.run(self._port, ports, self._room, self._now_ns, self._sink, beat)
-        except PortError as error:
-            lane.end()
-            self._fail(error)
-            return
-        transaction = lane.end()
-        if transaction is None:
-            self._last_byte_ns = lane.at_ns
-            self.due_ns = lane.sent_ns + lane.stretches[-1].transaction.due_ns
-            self._job = None
-            return
-        if lane.done:
-            self._last_byte_ns = lane.sent_ns  # the next was sent when the one before had come
-        self._burst = self._job.burst
-        self._await(transaction, lane.sent_ns)
-        self._free_ns = lane.sent_ns + len(transaction.packet) * self.byte_ns
-        self._hear(*lane.pieces[0])
-        for count, self._last_byte_ns in lane.pieces[1:]:
-            self._receiver.accept(count, self._last_byte_ns)
-            self._skip_headers()
+        if lane is not None:
+            self._lane = lane
+            lane.begin(self._now_ns, self._sink)
+            if self._receiver.pending:
+                self._receiver.flush()
 
     def begin_behind(self) -> None:
         """Send the first instruction of the loaded job at once, though the line may not be free yet.
@@ -135,13 +103,16 @@ class Bus(Listener):
         """
         if self._job is not None:
             try:
-                self._begin(self._job)
+                if self._lane is not None:
+                    self._ask(self._lane)
+                else:
+                    self._begin(self._job)
             except PortError as error:
                 self._fail(error)
 
     def drop(self) -> None:
         """Forget the loaded job; what still comes for it belongs to nobody."""
-        self._job = self._awaited = self._burst = None
+        self._job = self._awaited = self._burst = self._lane = None
         self._state = READY
 
     def send(self, packet: bytes | bytearray | memoryview) -> None:
@@ -157,13 +128,34 @@ class Bus(Listener):
         if self.failure is not None:
             raise self.failure
 
-    def receive(self) -> None:
-        """Take what the line has; called when it has bytes."""
-        if self.failure is None:
-            try:
+    def receive(self) -> bool:
+        """Take what the line has; called when it has bytes.
+
+        Returns whether everything that the newest transaction awaits has come now.
+        """
+        lane = self._lane
+        if self.failure is not None:
+            return False
+        try:
+            if lane is None:
                 self._take_bytes()
-            except PortError as error:
-                self._fail(error)
+            elif not lane.awaiting:
+                self._take_bytes()  # nobody was asked
+                self._receiver.flush()
+                return False
+            elif lane.take(self._port):
+                if lane.through:
+                    self._last_byte_ns = lane.at_ns
+                    self._job = self._lane = None
+                return True
+            elif lane.straight:
+                return False
+            else:
+                self._turn_aside(lane)
+        except PortError as error:
+            self._fail(error)
+            return False
+        return self._state == READY and self._reply.outcome is _OK
 
     def _take_bytes(self) -> None:
         receiver = self._receiver
@@ -178,6 +170,15 @@ class Bus(Listener):
     def step(self, now_ns: int) -> int:
         """Do what is due; return when to come back at the latest, NEVER when there is nothing to do."""
         try:
+            if (lane := self._lane) is not None:
+                if lane.awaiting:
+                    if now_ns < lane.deadline_ns:
+                        return lane.deadline_ns
+                    self._turn_aside(lane)
+                elif now_ns < self._free_ns:
+                    return self._free_ns
+                else:
+                    return self._ask(lane)
             while self._job is not None:
                 if self._state == READY:
                     if now_ns < self._free_ns:
@@ -203,7 +204,34 @@ class Bus(Listener):
             self._receiver.flush()
             self._state = READY
 
+    def _ask(self, lane: Lane) -> int:
+        """Send the next read of a lane; return when to come back at the latest."""
+        deadline_ns = lane.ask(self._port, self._free_ns)
+        self.due_ns = lane.due_ns
+        return deadline_ns
+
+    def _turn_aside(self, lane: Lane) -> None:
+        """Let the general machine go on where a lane has ended: it awaits what that awaited."""
+        self._lane = None
+        transaction = lane.end()
+        if transaction is None or self._job is None or not lane.awaiting:
+            return
+        if lane.done:
+            self._last_byte_ns = lane.sent_ns  # the next was sent when the one before had come
+        self._burst = self._job.burst
+        self._await(transaction, lane.sent_ns)
+        self._free_ns = lane.sent_ns + len(transaction.packet) * self.byte_ns
+        for number, (count, at_ns) in enumerate(lane.pieces):
+            if number:
+                self._last_byte_ns = at_ns
+                self._receiver.accept(count, at_ns)
+                self._skip_headers()
+            else:
+                self._hear(count, at_ns)
+
     def _fail(self, error: PortError) -> None:
+        if self._lane is not None:
+            self._turn_aside(self._lane)  # what came until now is not forgotten
         self.failure = error
         self._job = None
 

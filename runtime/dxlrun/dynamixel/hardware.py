@@ -17,7 +17,7 @@ from dxlrun.dynamixel.gaps import Gaps
 from dxlrun.dynamixel.health import Servos
 from dxlrun.dynamixel.limp import LimpOutcome, limp_buses
 from dxlrun.dynamixel.port import Ports
-from dxlrun.dynamixel.pump import pump, run
+from dxlrun.dynamixel.pump import clear, pump, run
 from dxlrun.dynamixel.samples import Samples
 from dxlrun.dynamixel.setting_up import SetUp, tell_failures
 from dxlrun.dynamixel.torque_limit import reduced
@@ -75,6 +75,7 @@ class DynamixelHardware:
         self._asked = [False] * len(self._plans)
         """Whose reads began behind the goals of the cycle before."""
         self._begun = False  # the others' reads are prepared
+        self._split = [index for index, plan in enumerate(self._plans) if plan.split]
         self._buses = tuple(
             Bus(index, plan, port, clock, packets)
             for index, (plan, port) in enumerate(zip(self._plans, ports.ports, strict=True))
@@ -147,18 +148,25 @@ class DynamixelHardware:
 
         Of a split bus the servos are asked at once for their next states.
         """
-        for index, (plan, bus, servos) in enumerate(zip(self._plans, self._buses, self._servos, strict=True)):
+        for bus, servos in zip(self._buses, self._servos, strict=True):
             for packet in servos.goal_packets(self._goals, self._states):
                 if bus.failure is None:
                     with suppress(PortError):  # told below; the other lines shall have their goals
                         bus.send(packet)
-            if plan.split and bus.failure is None:
+        if self._split:
+            self._ask_behind()
+        tell_failures(self._plans, self._buses, self._servos)
+
+    def _ask_behind(self) -> None:
+        clear(self._buses, self._ports)
+        for index in self._split:
+            bus, servos = self._buses[index], self._servos[index]
+            if bus.failure is None:
                 servos.feeding.feed()
                 servos.reads.begin()
-                bus.load(servos.reads)
+                bus.load(servos.reads, servos.reads.lane)
                 bus.begin_behind()
                 self._asked[index] = True
-        tell_failures(self._plans, self._buses, self._servos)
 
     def set_modes(self, modes: NDArray[np.uint8]) -> None:
         """Bring joints into modes in the gaps between cycles; UNKNOWN leaves one as it is."""

@@ -1,8 +1,9 @@
 """Lane: the cyclic reads of one bus as they nearly always go, one after the other without a turn aside.
 
-Asked, waited, looked at, recorded: what is sent and what comes is known to the byte, so all of it is
-prepared, the log's records included. A lane ends where anything is not as it should be: what was read until
-then counts, and the general machine of the bus takes over, with the bytes that came.
+What is sent and what comes is known to the byte, so all of it is prepared, the log's records included. A
+lane never waits: it asks, and takes what came, as the bus does that it belongs to, so any number of them go
+side by side. It ends where anything is not as it should be: what was read until then counts, and the general
+machine of the bus takes over, with the bytes that came.
 """
 
 from __future__ import annotations
@@ -16,15 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.dynamixel.burst import Burst
-from dxlrun.dynamixel.port import Port, Ports
-from dxlrun.dynamixel.reply_polling import ReplyPolling
+from dxlrun.dynamixel.port import Port
 from dxlrun.dynamixel.state_arrays import Rows, rows_of
 from dxlrun.dynamixel.transaction import Transaction
 from dxlrun.errors import PortError
 from dxlrun.packets import RECORD_HEADER, PacketKind, PacketSink, record
-
-BEAT_NS = 1_000_000
-"""So long, and one read more, a lane goes on without a sign of life."""
 
 _TIMES = struct.Struct("=qq")
 _TIMES_AT = RECORD_HEADER - _TIMES.size
@@ -33,8 +30,9 @@ _TIMES_AT = RECORD_HEADER - _TIMES.size
 Bytes2D = NDArray[np.uint8]
 _Copy = tuple[NDArray[np.uint8], NDArray[np.uint8]]
 _Chain = tuple[Bytes2D, Bytes2D, NDArray[np.int64]]
-_Told = tuple[memoryview, slice, int, _Chain | None, Rows]
-_Step = tuple[bytes, memoryview, int, int, int, int, int, Callable[[], bool], _Told]
+_Ask = tuple[bytes, memoryview, int, int, int]
+_Kept = tuple[memoryview, slice, int, _Chain | None, Rows]
+_Told = tuple[int, int, Callable[[], bool], _Kept]
 _stamp = _TIMES.pack_into
 
 
@@ -52,21 +50,29 @@ class Stretch(NamedTuple):
 
 
 class Lane:
-    """All reads of a cycle; `run` goes through them."""
+    """All reads of a cycle: `ask` and `take` in turn, as long as it is `straight`."""
 
     __slots__ = (
         "_arrived_ns",
+        "_asks",
         "_copies",
         "_ended",
         "_last",
         "_log",
+        "_now_ns",
         "_parts",
-        "_steps",
+        "_records",
+        "_room",
+        "_told",
         "at_ns",
+        "awaiting",
+        "deadline_ns",
         "done",
+        "due_ns",
         "fresh",
         "pieces",
         "sent_ns",
+        "straight",
         "stretches",
     )
 
@@ -90,39 +96,29 @@ class Lane:
         here = {servo for stretch in stretches for servo in stretch.servos}
         self.fresh = bytes(servo in here for servo in range(servos))
         """1 for each servo that is read."""
-        self.sent_ns = self.at_ns = 0
-        """When the newest read was sent, and when its replies were taken."""
+        self.awaiting = False
+        """True while replies are awaited; else the next read is to be asked."""
+        self.straight = False
+        """False once it ended before all reads were done."""
+        self.sent_ns = self.due_ns = self.deadline_ns = self.at_ns = 0
+        """Of the newest read: when it was sent, its replies are due, given up, and were taken."""
         self.pieces: list[tuple[int, int]] = []
-        """What came of the newest read: how many bytes, and when."""
+        """What came of a read whose replies did not come at once: how many bytes, and when."""
         self.done = 0
-        """How many reads went as they should, the last time."""
+        """How many reads went as they should."""
+        self._room = memoryview(buffer)
         self._log, places = _laid(stretches, bus)
         view, begin = memoryview(self._log), 0
-        self._steps: list[_Step] = []
+        self._asks: list[_Ask] = []
+        self._told: list[_Told] = []
         for stretch, (asked_at, told_at) in zip(stretches, places, strict=True):
-            transaction, burst = stretch.transaction, stretch.burst
-            burst.bind(buffer)
+            transaction = stretch.transaction
+            stretch.burst.bind(buffer)
             end = asked_at + RECORD_HEADER + len(transaction.packet)
-            reply_at = told_at[0] + RECORD_HEADER
-            self._steps.append(
-                (
-                    transaction.packet,
-                    view[begin:end],  # the replies before, and this instruction
-                    asked_at + _TIMES_AT,
-                    transaction.timeout_ns,
-                    transaction.due_ns,
-                    burst.size,
-                    (len(transaction.packet) + burst.first_size) * byte_ns,  # sooner is not of now
-                    burst.clean,
-                    (
-                        burst.packets[0][1],
-                        slice(reply_at, reply_at + burst.first_size),
-                        told_at[0] + _TIMES_AT,
-                        None if len(told_at) == 1 else _chain(self._log, buffer, burst, told_at),
-                        rows_of(stretch.servos),
-                    ),
-                )
-            )
+            asked = view[begin:end]  # the replies before, and this instruction
+            times = (transaction.due_ns, transaction.timeout_ns)
+            self._asks.append((transaction.packet, asked, asked_at + _TIMES_AT, *times))
+            self._told.append(self._reply(stretch, told_at, buffer, byte_ns))
             begin = end
         self._last = view[begin:]
         self._parts = [
@@ -138,129 +134,117 @@ class Lane:
             for copy in _copies(self._log, data, [part for parts in self._parts for part in parts])
         ]
 
-    def run(  # noqa: PLR0917  the way of one cycle, taken at once
-        self,
-        port: Port,
-        ports: Ports,
-        room: memoryview,
-        now_ns: Callable[[], int],
-        sink: PacketSink,
-        beat: Callable[[], None],
-    ) -> None:
-        """Read as far as all goes as it should: `done` says how far that is; the line must be free.
+    def _reply(self, stretch: Stretch, told_at: Sequence[int], buffer: bytearray, byte_ns: int) -> _Told:
+        burst, reply_at = stretch.burst, told_at[0] + RECORD_HEADER
+        least_ns = (len(stretch.transaction.packet) + burst.first_size) * byte_ns  # sooner is not of now
+        kept: _Kept = (
+            burst.packets[0][1],
+            slice(reply_at, reply_at + burst.first_size),
+            told_at[0] + _TIMES_AT,
+            None if len(told_at) == 1 else _chain(self._log, buffer, burst, told_at),
+            rows_of(stretch.servos),
+        )
+        return burst.size, least_ns, burst.clean, kept
 
+    def begin(self, now_ns: Callable[[], int], sink: PacketSink) -> None:
+        """Begin a cycle."""
+        self._now_ns, self._records = now_ns, sink.records
+        self.done = 0
+        self.awaiting = False
+        self.straight = True
+        self.pieces.clear()
+
+    def ask(self, port: Port, free_ns: int) -> int:
+        """Send the next read; return when to give it up.
+
+        `free_ns`: when the line is; until then the read waits in the adapter behind what was sent before.
         Raises PortError when the line is gone; everything that was read until then is recorded.
         """
-        log, records, wait, polling = self._log, sink.records, ports.wait, ports.polling
-        write, read_into, arrived_ns = port.write, port.read_into, self._arrived_ns
-        beat_ns = self.done = 0
+        packet, asked, asked_at, due_ns, timeout_ns = self._asks[self.done]
+        now_ns = self._now_ns
         before = now_ns()
-        for packet, asked, asked_at, timeout_ns, due_ns, size, least_ns, clean, told in self._steps:
-            self.sent_ns = before
-            try:
-                write(packet)
-            except PortError:
-                records(asked[: -RECORD_HEADER - len(packet)])
-                raise
-            _stamp(log, asked_at, before, now_ns())
-            records(asked)  # while the servos take it in
-            if before >= beat_ns:
-                beat()
-                beat_ns = before + BEAT_NS
-            count = 0
-            if polling is not None:
-                count = _polled(polling, read_into, room, now_ns, before + due_ns, before + timeout_ns)
-            if not count:
-                wait(before + timeout_ns)
-                count = read_into(room)
-            at = now_ns()
-            reply, reply_at, told_at, chain, rows = told
-            self.pieces = pieces = [(count, at)]
-            spans: Sequence[tuple[int, int]] = ((at, at),)
-            if 0 < count < size:
-                burst = self.stretches[self.done].burst
-                _gather(pieces, burst, port, wait, room, now_ns, before + timeout_ns)
-                at = pieces[-1][1]
-                count = sum(count for count, _ in pieces)
-                if count == size:
-                    spans = burst.spans([*accumulate(count for count, _ in pieces)], [at for _, at in pieces])
-            if count != size or spans[0][1] < before + least_ns or not clean():
-                return
-            if chain is None:
-                log[reply_at] = reply
-                _stamp(log, told_at, *spans[0])
-            else:
-                place, replies, times = chain
-                place[:] = replies
-                times[:] = spans
-            arrived_ns[rows] = at if len(pieces) == 1 or chain is None else [last for _, last in spans]
-            if polling is not None:
-                polling.came(before + due_ns, at)
-            before = at
-            self.done += 1
-        self.at_ns = before
-        records(self._last)
+        try:
+            port.write(packet)
+        except PortError:
+            self._records(asked[: -RECORD_HEADER - len(packet)])
+            raise
+        _stamp(self._log, asked_at, before, now_ns())
+        self._records(asked)  # while the servos take it in
+        self.awaiting = True
+        self.sent_ns = start = free_ns if free_ns > before else before
+        self.due_ns = start + due_ns
+        self.deadline_ns = deadline_ns = start + timeout_ns
+        return deadline_ns
+
+    def take(self, port: Port) -> bool:
+        """Take what the line has; return whether all replies of the newest read are taken.
+
+        Raises PortError when the line is gone.
+        """
+        if self.pieces:
+            end = sum(count for count, _ in self.pieces)
+            return self._take_piece(port.read_into(self._room[end:]), self._now_ns())
+        size, least_ns, clean, kept = self._told[self.done]
+        count = port.read_into(self._room)
+        at = self._now_ns()
+        if count != size or at < self.sent_ns + least_ns or not clean():
+            return self._take_piece(count, at)
+        self._keep(kept, at, at, None)
+        return True
+
+    def _take_piece(self, count: int, at: int) -> bool:
+        """Take some of the replies: the rest is awaited as long as they look like what is awaited."""
+        if not count:
+            return False
+        pieces, burst = self.pieces, self.stretches[self.done].burst
+        pieces.append((count, at))
+        ends = [*accumulate(count for count, _ in pieces)]
+        if ends[-1] < burst.size and burst.begun(ends[-1]):
+            return False
+        _, least_ns, clean, kept = self._told[self.done]
+        if ends[-1] == burst.size and clean():
+            spans = burst.spans(ends, [at for _, at in pieces])
+            first, last = spans[0]
+            if last >= self.sent_ns + least_ns:
+                pieces.clear()
+                self._keep(kept, first, at, spans)
+                return True
+        self.straight = False
+        return False
+
+    def _keep(self, kept: _Kept, first: int, at: int, spans: list[tuple[int, int]] | None) -> None:
+        """Keep all replies of a read; `spans`: of each status packet, when they came in pieces."""
+        reply, reply_at, told_at, chain, rows = kept
+        if chain is None:
+            self._log[reply_at] = reply
+            _stamp(self._log, told_at, first, at)
+            self._arrived_ns[rows] = at
+        else:
+            place, replies, times = chain
+            place[:] = replies
+            times[:] = at if spans is None else spans
+            self._arrived_ns[rows] = at if spans is None else [last for _, last in spans]
+        self.awaiting = False
+        self.at_ns = at
+        self.done += 1
+        if self.done == len(self._told):
+            self._records(self._last)
+            for place, data in self._copies:
+                place[:] = data
+            self._ended(self)
 
     @property
     def through(self) -> bool:
-        """True when all reads went as they should, the last time."""
-        return self.done == len(self._steps)
+        """True when all reads went as they should."""
+        return self.done == len(self._told)
 
     def end(self) -> Transaction | None:
-        """Keep what was read; return the read whose replies are still awaited, None where there is none."""
-        if self.done == len(self._steps):
-            for place, data in self._copies:
-                place[:] = data
-        else:
-            log = np.frombuffer(self._log, np.uint8)
-            for number in range(self.done):
-                for place, row, at in self._parts[number]:
-                    place[row] = log[at : at + place.shape[1]]
+        """Keep what was read before all was; return the read whose replies are still awaited."""
+        log = np.frombuffer(self._log, np.uint8)
+        for number in range(self.done):
+            for place, row, at in self._parts[number]:
+                place[row] = log[at : at + place.shape[1]]
         return self._ended(self)
-
-
-def _gather(  # noqa: PLR0917  positional is quickest
-    pieces: list[tuple[int, int]],
-    burst: Burst,
-    port: Port,
-    wait: Callable[[int], Sequence[int]],
-    room: memoryview,
-    now_ns: Callable[[], int],
-    deadline_ns: int,
-) -> None:
-    """Await the rest of replies that come in pieces, as long as they look like what is awaited."""
-    end = pieces[0][0]
-    while end < burst.size and burst.begun(end) and wait(deadline_ns):
-        try:
-            count = port.read_into(room[end:])
-        except PortError:
-            return  # whoever looks next is told, and what came until now is not forgotten
-        if not count:
-            return
-        end += count
-        pieces.append((count, now_ns()))
-
-
-def _polled(  # noqa: PLR0917  positional is quickest
-    polling: ReplyPolling,
-    read_into: Callable[[memoryview], int],
-    room: memoryview,
-    now_ns: Callable[[], int],
-    due_ns: int,
-    deadline_ns: int,
-) -> int:
-    """Sleep until shortly before a reply is due and look for it again and again; return how much came."""
-    until_ns = polling.await_until(due_ns, now_ns(), deadline_ns)
-    if not until_ns:
-        return 0
-    since_ns, looks, count = now_ns(), 1, read_into(room)
-    at_ns = now_ns()
-    while not count and at_ns < until_ns:
-        count = read_into(room)
-        at_ns = now_ns()
-        looks += 1
-    polling.spent(at_ns - since_ns, looks)
-    return count
 
 
 def _laid(stretches: Sequence[Stretch], bus: int) -> tuple[bytearray, list[tuple[int, list[int]]]]:

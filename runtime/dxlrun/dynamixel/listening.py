@@ -82,11 +82,6 @@ class Listener:
         self._refused = False
         self._last_byte_ns = -NEVER
 
-    @property
-    def complete(self) -> bool:
-        """True when everything that the newest transaction awaits has come."""
-        return self._state == READY and self._reply.outcome is _OK
-
     def _await(self, transaction: Transaction, started_ns: int) -> None:
         """Await the replies to a transaction whose instruction is on its way."""
         reply, burst = self._reply, self._burst

@@ -12,6 +12,8 @@ from dxlrun.dynamixel.transaction import Program, ProgramJob, Result
 
 LOST_LINE_STEP_NS = 200_000
 """How often the other lines are looked at while one is gone."""
+BEAT_NS = 1_000_000
+"""So long, and one wait more, nobody sees a sign of life."""
 
 
 def _look(
@@ -35,46 +37,57 @@ def _look(
     return ready
 
 
+def clear(buses: Sequence[Bus], ports: Ports) -> None:
+    """Take what lines have; on one that nobody was asked on it belongs to nobody.
+
+    What came before a request must not be taken for its reply, and replies come in the order of requests: one
+    that is too many would shift all that follow.
+    """
+    for index in ports.wait(0):
+        if buses[index].failure is None:
+            buses[index].receive()
+
+
 def pump(
     buses: Sequence[Bus], ports: Ports, clock: Clock, beat: Callable[[], None], until_ns: int = NEVER
 ) -> None:
     """Execute the jobs of all buses side by side: one wait over all ports, until every job is finished.
 
-    Ends at `until_ns` in any case, and a job that is not finished then goes on in the next call. `beat` is
-    called at least once a transaction. Raises nothing: a line that is gone has its `failure`, and the others
-    go on.
+    All that can be sent is sent before anything is awaited. Ends at `until_ns` in any case, and a job that is
+    not finished then goes on in the next call. `beat` is called before a wait, if it was not within BEAT_NS.
+    Raises nothing: a line that is gone has its `failure`, and the others go on.
     """
-    clock_ns, polling = clock.now_ns, ports.polling
-    if len(buses) == 1 and until_ns == NEVER:
-        buses[0].straight(ports, beat)
-        if not (buses[0].busy or buses[0].failure):
-            return
-    now_ns = clock_ns()
+    clock_ns, polling, wait = clock.now_ns, ports.polling, ports.wait
+    clear(buses, ports)
+    now_ns, beat_ns = clock_ns(), 0
     deadlines = [bus.step(now_ns) for bus in buses]
     while (deadline := min(deadlines)) != NEVER and now_ns < until_ns:
-        beat()
+        if now_ns >= beat_ns:
+            beat()
+            beat_ns = now_ns + BEAT_NS
         deadline = min(deadline, until_ns)
         ready = _look(buses, ports, clock, polling, deadline) if polling else ()
-        ready = ready or ports.wait(deadline)
+        ready = ready or wait(deadline)
         heard = not ready
         for index in ready:
             bus = buses[index]
             if bus.failure is None:
                 heard = True
-                bus.receive()
+                due_ns = bus.due_ns
+                complete = bus.receive()
                 now_ns = clock_ns()
-                if polling and bus.complete:
-                    polling.came(bus.due_ns, now_ns)
+                if polling and complete:
+                    polling.came(due_ns, now_ns)
                 deadlines[index] = bus.step(now_ns)
         if not heard:
             # a line that is gone is ready for ever: look at the others now and then instead of waiting
             clock.wait_until(min(deadline, clock_ns() + LOST_LINE_STEP_NS))
             for bus in buses:
                 bus.receive()
-        now_ns = clock_ns()
+        if not (ready and heard):
+            now_ns = clock_ns()
         if now_ns >= deadline or not heard:
             deadlines = [bus.step(now_ns) for bus in buses]
-    beat()
 
 
 def run(
