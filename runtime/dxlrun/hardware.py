@@ -9,7 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 LOST_CYCLES = 3
-"""A servo that missed so many replies in a row is lost, until it answers again."""
+"""A servo that missed so many replies in a row is lost, until it answers again ..."""
+LOST_AGE_NS = 50_000_000
+"""... and whose last reply is so old: at 50 Hz it is by then, but three cycles at 1 kHz are less than
+what hosts, virtual machines and USB adapters stand still for [i]."""
 
 
 class Hardware(Protocol):

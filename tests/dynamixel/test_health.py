@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import pytest
 
@@ -76,6 +77,26 @@ def test_a_lost_servo_leaves_the_exchange_and_is_asked_once_a_second(start, make
     ((source, text),) = rig.events.of(EventCode.SERVO_LOST)
     assert source == "arm_13_joint"
     assert "missed 3 replies in a row" in text
+
+
+def test_a_bus_that_stands_still_for_a_moment_loses_nobody_at_any_rate(start, make_x):
+    """Three cycles at 500 Hz are less than a USB adapter, or a machine, stands still for now and then."""
+    rig = start(make_x())
+    begun = rig.clock.now_ns()
+    for servo in rig.buses[0].servos:
+        servo.silence()
+        rig.buses[0].at(begun + 40_000_000, partial(servo.silence, False))
+        rig.buses[0].at(begun + 200_000_000, servo.silence)
+    missed = 0
+    while not (lost := rig.events.of(EventCode.SERVO_LOST)):
+        rig.hardware.read()
+        rig.hardware.write()
+        missed += not rig.states.valid.any()
+        rig.clock.wait_until(rig.clock.now_ns() + 1_000_000)
+    assert 250_000_000 <= rig.clock.now_ns() - begun < 280_000_000
+    assert missed > 2 * 3
+    assert len(lost) >= 1
+    assert len(rig.events.of(EventCode.READ_BACK)) == 4
 
 
 def test_a_dead_servo_of_eight_costs_the_others_no_time(start, make_plan):

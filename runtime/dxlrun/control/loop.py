@@ -281,7 +281,7 @@ class Loop:
     def _command(self, cycle: int, time_ns: int) -> None:
         """Take what clients want, and let the controllers command, as far as their servos answer."""
         record = self.record
-        if self._lost.look(record.states.valid):
+        if self._lost.look(record.states):
             self._miss()
         record.command_count = self.steering.take(time_ns)
         if self.paused:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dxlrun.control.policy_plan import GroupPolicy, PolicyName, PolicyPlan
-from dxlrun.hardware import LOST_CYCLES
+from dxlrun.hardware import LOST_AGE_NS, LOST_CYCLES
+from dxlrun.interfaces import States
 
 
 class LostServos:
@@ -16,17 +16,19 @@ class LostServos:
 
     def __init__(self, joints: int) -> None:
         self.rows: frozenset[int] = frozenset()
-        """Rows of the joints that are lost now: LOST_CYCLES missed replies, and none since."""
+        """Rows of the joints that are lost now, as `hardware` says it."""
         self._limp: set[str] = set()  # names of groups that a lost servo has left without torque
         self._missed = np.zeros(joints, dtype=np.int64)
 
-    def look(self, valid: NDArray[np.bool_]) -> bool:
-        """Take the states of a cycle, shape (joints,); return whether `rows` is another one now."""
+    def look(self, states: States) -> bool:
+        """Take the states of a cycle; return whether `rows` is another one now."""
+        valid, age_ns = states.valid, states.age_ns
         if np.count_nonzero(valid) == valid.size and not self._missed.any():
             return False
         self._missed += 1
         self._missed[valid] = 0
-        rows = frozenset(np.flatnonzero(self._missed >= LOST_CYCLES).tolist())
+        lost = (self._missed >= LOST_CYCLES) & ((age_ns >= LOST_AGE_NS) | (age_ns < 0))
+        rows = frozenset(np.flatnonzero(lost).tolist())
         changed = rows != self.rows
         self.rows = rows
         return changed

@@ -26,7 +26,7 @@ from dxlrun.dynamixel.state_arrays import StateArrays
 from dxlrun.dynamixel.transaction import Program, Reply, Transaction
 from dxlrun.dynamixel.wanted import Wanted
 from dxlrun.events import EventCode, EventSink, Severity
-from dxlrun.hardware import LOST_CYCLES
+from dxlrun.hardware import LOST_AGE_NS, LOST_CYCLES
 from dxlrun.interfaces import Commands, States
 from dxlrun.plurals import counted
 
@@ -154,7 +154,7 @@ class Servos:
         reads = self.reads
         everybody = reads.fresh.tobytes() == self._everybody
         if not everybody or any(self._missed):
-            self._count_losses()
+            self._count_losses(now_ns)
         elif self._rows:
             self._gaps.came(self._arrived_ns[-1], self._bus.due_ns)
         if reads.errors != self._said_errors:
@@ -303,7 +303,8 @@ class Servos:
         text = f"bus {self._plan.name} is back; its servos count as rebooted"
         self._emit(EventCode.PORT_BACK, Severity.WARNING, self._plan.name, text)
 
-    def _count_losses(self) -> None:
+    def _count_losses(self, now_ns: int) -> None:
+        arrived_ns = self.reads.arrived_ns
         for index, fresh in enumerate(self.reads.fresh.tolist()):
             if self.reads.away[index]:
                 continue
@@ -313,7 +314,7 @@ class Servos:
                 if self._missed[index] == 1:
                     how = "sent a garbled reply" if self.reads.garbled[index] else "did not answer"
                     self._say(EventCode.READ_LOST, Severity.WARNING, index, how)
-                elif self._missed[index] == LOST_CYCLES:
+                elif self._missed[index] >= LOST_CYCLES and now_ns - arrived_ns[index] >= LOST_AGE_NS:
                     self._say(EventCode.SERVO_LOST, Severity.ERROR, index, _LOST)
                     self._leave(index, FIRST_PROBE_NS)
             elif self._missed[index]:
