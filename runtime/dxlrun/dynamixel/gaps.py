@@ -142,9 +142,11 @@ class Gaps:
 
         Who answers behind its gap talks into the next cyclic read, which costs far more than it brings.
         """
-        late_ns = min(at_ns - due_ns - self._latency_ns, _LATEST_NS)
+        late_ns = at_ns - due_ns - self._latency_ns
         forgotten_ns = self.late_ns - (self.late_ns >> _FORGOTTEN) - 1
-        self.late_ns = max(late_ns, forgotten_ns, 0)
+        if late_ns > forgotten_ns:
+            forgotten_ns = min(late_ns, _LATEST_NS)
+        self.late_ns = forgotten_ns if forgotten_ns > 0 else 0  # a third of the time of max()
 
     @property
     def waiting(self) -> int:

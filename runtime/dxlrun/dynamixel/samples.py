@@ -31,12 +31,14 @@ class Samples:
         "_age_ns",
         "_all_valid",
         "_arrivals",
+        "_before",
         "_delta",
         "_jumps",
         "_motion",
         "_newest_ns",
         "_now",
         "_now_ns",
+        "_position",
         "_reference",
         "_rows",
         "_scale",
@@ -65,11 +67,13 @@ class Samples:
         self._age_ns = states.age_ns[self._rows]
         self._all_valid = False  # in the cycle before
         self._values: Floats = np.zeros((3, len(servos)))
+        self._position: Floats = self._values[0]
+        self._before: Floats = self._motion[0]
         self._scale: Floats = np.array([_units(servo) for servo in servos]).reshape(-1, 3).T.copy()
         self._reference = np.array([servo.direction * servo.reference for servo in servos])
         self._speeds = _Speeds.of(servos)
         self._delta = np.zeros(len(servos))
-        self._now = np.zeros(1, dtype=np.int64)
+        self._now = np.zeros((), dtype=np.int64)
         self._now_ns = 0
         self._newest_ns = np.zeros(len(servos), dtype=np.int64)
 
@@ -85,11 +89,11 @@ class Samples:
             self._speeds.follow(self._states.mode[self._rows], self._scale[1])
         values, delta = self._values, self._delta
         np.multiply(self._arrivals.ticks, self._scale, values)
-        position = values[0]
+        position = self._position
         np.subtract(position, self._reference, position)
-        np.subtract(position, self._motion[0], delta)
-        self._now[0] = now_ns  # quicker than to let numpy make an array of an int
-        if everybody and delta.dot(delta) <= self._jumps.surely_none:
+        np.subtract(position, self._before, delta)
+        self._now[()] = now_ns  # quicker than to let numpy make an array of an int
+        if everybody and self._jumps.surely_none(delta):
             if not self._all_valid:
                 self._all_valid = True
                 self._valid.fill(True)
