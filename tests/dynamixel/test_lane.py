@@ -127,6 +127,8 @@ class Side:
 
     def found(self, index):
         """Return what can be told apart of one bus."""
+        arrays = self.arrays[index]
+        arrays.count()
         reads, bus, packets = self.reads[index], self.buses[index], self.sinks[index].packets
         for servo, fresh in enumerate(reads.fresh.tolist()):
             reads.missed[servo] = 0 if fresh else reads.missed[servo] + 1
@@ -137,7 +139,7 @@ class Side:
             reads.arrived_ns.tolist(),
             list(reads.errors),
             list(reads.garbled),
-            [bytes(reply) for reply in self.arrays[index].replies],
+            arrays.arrivals.ticks[:, reads.fresh].tolist(),
             (bus.noise_bytes, str(bus.failure)),
         )
 

@@ -204,7 +204,7 @@ class CyclicReads:
                 self._lanes.clear()
             bus = self._bus
             self._lanes[key] = Lane(
-                known, bus.index, bus.buffer, bus.byte_ns, len(self.missed), self.arrived_ns, self._went
+                known, bus.index, bus.buffer, bus.byte_ns, len(self.missed), self._arrays, self._went
             )
         return self._lanes[key]
 
@@ -212,6 +212,7 @@ class CyclicReads:
         """Take note of who was read through a lane; return the read at which it ended, None for none."""
         if lane.through:
             self._fresh[:] = lane.fresh
+            self._arrays.counted = True
             self._smooth = not any(self._broken)
             return None
         for stretch in lane.stretches[: lane.done]:

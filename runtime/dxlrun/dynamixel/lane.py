@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from dxlrun.dynamixel.burst import Burst
 from dxlrun.dynamixel.port import Port
-from dxlrun.dynamixel.state_arrays import Rows, rows_of
+from dxlrun.dynamixel.state_arrays import Counting, Rows, Source, StateArrays, rows_of
 from dxlrun.dynamixel.transaction import Transaction
 from dxlrun.errors import PortError
 from dxlrun.packets import RECORD_HEADER, PacketKind, PacketSink, record
@@ -28,7 +28,6 @@ _TIMES_AT = RECORD_HEADER - _TIMES.size
 """The times stand at the end of a record's header."""
 
 Bytes2D = NDArray[np.uint8]
-_Copy = tuple[NDArray[np.uint8], NDArray[np.uint8]]
 _Chain = tuple[Bytes2D, Bytes2D, NDArray[np.int64]]
 _Ask = tuple[bytes, memoryview, int, int, int]
 _Kept = tuple[memoryview, slice, int, _Chain | None, Rows]
@@ -55,7 +54,7 @@ class Lane:
     __slots__ = (
         "_arrived_ns",
         "_asks",
-        "_copies",
+        "_counts",
         "_ended",
         "_last",
         "_log",
@@ -83,15 +82,15 @@ class Lane:
         buffer: bytearray,
         byte_ns: int,
         servos: int,
-        arrived_ns: NDArray[np.int64],
+        arrays: StateArrays,
         ended: Callable[[Lane], Transaction | None],
     ) -> None:
         """`bus`: its number in the log; `buffer`: where replies are read to; `byte_ns`: on its wire.
 
-        `servos`: how many the bus has; `arrived_ns`: when their replies came; `ended`: see `end`.
+        `servos`: how many the bus has; `arrays`: where what they say belongs; `ended`: see `end`.
         """
         self.stretches = tuple(stretches)
-        self._arrived_ns = arrived_ns
+        self._arrived_ns = arrays.arrivals.at_ns
         self._ended = ended
         here = {servo for stretch in stretches for servo in stretch.servos}
         self.fresh = bytes(servo in here for servo in range(servos))
@@ -128,11 +127,7 @@ class Lane:
             ]
             for stretch, (_, told) in zip(stretches, places, strict=True)
         ]
-        self._copies = [
-            copy
-            for data in {id(stretch.data): stretch.data for stretch in stretches}.values()
-            for copy in _copies(self._log, data, [part for parts in self._parts for part in parts])
-        ]
+        self._counts = _counts(self._log, self.stretches, places, arrays)
 
     def _reply(self, stretch: Stretch, told_at: Sequence[int], buffer: bytearray, byte_ns: int) -> _Told:
         burst, reply_at = stretch.burst, told_at[0] + RECORD_HEADER
@@ -229,8 +224,8 @@ class Lane:
         self.done += 1
         if self.done == len(self._told):
             self._records(self._last)
-            for place, data in self._copies:
-                place[:] = data
+            for counting in self._counts:
+                counting.count()
             self._ended(self)
 
     @property
@@ -279,13 +274,24 @@ def _data_at(burst: Burst, told_at: Sequence[int]) -> list[int]:
     return [told_at[0] + first + number * burst.step for number in range(burst.count)]
 
 
-def _copies(log: bytearray, data: Bytes2D, parts: Sequence[tuple[Bytes2D, int, int]]) -> list[_Copy]:
-    """Return how the data of one layout leave the records: at once, where they are equally far apart."""
-    mine = [(row, at) for place, row, at in parts if place is data]
-    rows = rows_of([row for row, _ in mine])
-    gaps = {after - before for (_, before), (_, after) in pairwise(mine)}
-    length = data.shape[1]
-    if isinstance(rows, slice) and len(gaps) < 2:
-        stride = next(iter(gaps), length)
-        return [(data[rows], np.ndarray((len(mine), length), np.uint8, log, mine[0][1], (stride, 1)))]
-    return [(data[row], np.ndarray((length,), np.uint8, log, at)) for row, at in mine]
+def _counts(
+    log: bytearray,
+    stretches: Sequence[Stretch],
+    places: Sequence[tuple[int, list[int]]],
+    arrays: StateArrays,
+) -> list[Counting]:
+    """Return how the data leave the records: those of one layout at once, if they are equally far apart."""
+    parts = [
+        (id(stretch.data), servo, at)
+        for stretch, (_, told) in zip(stretches, places, strict=True)
+        for servo, at in zip(stretch.servos, _data_at(stretch.burst, told), strict=True)
+    ]
+    found = []
+    for layout in dict.fromkeys(layout for layout, *_ in parts):
+        mine = [(servo, at) for one, servo, at in parts if one == layout]
+        gaps = {after - before for (_, before), (_, after) in pairwise(mine)} or {0}
+        several = [mine] if len(gaps) == 1 else [[one] for one in mine]
+        for some in several:
+            servos = [servo for servo, _ in some]
+            found.append(arrays.counting(servos, Source(log, some[0][1], max(gaps))))
+    return found

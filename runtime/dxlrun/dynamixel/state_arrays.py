@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import chain
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,29 +55,75 @@ class Arrivals:
         return Arrivals(self.ticks[:, here], self.fresh[here], self.at_ns[here])
 
 
+class Source(NamedTuple):
+    """Where bytes of several servos stand, equally far apart."""
+
+    buffer: bytearray
+    first: int
+    """Where those of the first one begin."""
+    step: int
+
+
+class Counting:
+    """How the bytes of some servos of one layout become ticks: one view for all of them; prepared once."""
+
+    __slots__ = ("_plain", "_scattered", "_signed")
+
+    def __init__(self, layout: StateLayout, servos: Sequence[int], source: Source, ticks: Floats) -> None:
+        """`servos`: their columns of `ticks`."""
+        place = rows_of(servos)
+        own = ticks[:, place]  # a copy where they do not stand side by side
+        self._scattered = None if isinstance(place, slice) else (ticks, place, own)
+        self._plain: list[_Cast] = []
+        self._signed: list[_Cast] = []
+        first = 0
+        for alike in _alike((layout.position, layout.velocity, layout.effort)):
+            field, end = alike[0], first + len(alike)
+            raw: _Raw = np.ndarray(
+                (len(alike), len(servos)),
+                f"<{'i' if field.encoding == 'twos_complement' else 'u'}{field.size}",
+                source.buffer,
+                source.first + field.offset,
+                (alike[-1].offset - alike[-2].offset if len(alike) > 1 else 0, source.step),
+            )
+            casts = self._signed if field.encoding == "sign_magnitude" else self._plain
+            casts.append((own[first:end], raw))
+            first = end
+
+    def count(self) -> None:
+        """Bring the bytes to ticks."""
+        for ticks, raw in self._plain:
+            ticks[...] = raw
+        for ticks, raw in self._signed:
+            _SIGNED.take(raw, None, ticks, "wrap")
+        if self._scattered is not None:
+            all_ticks, place, own = self._scattered
+            all_ticks[:, place] = own
+
+
 class StateArrays:
-    """The bytes of one bus's servos, and how they become ticks: one view for all servos of one layout.
+    """The bytes of one bus's servos, as their replies brought them.
 
     Velocity and effort are sign-magnitude in Protocol 1.0, bit 10 set = clockwise (e-Manual AX-12A, Present
     Speed (38), Present Load (40)), and two's complement in Protocol 2.0 (e-Manual XM430-W350, Present
     Velocity (128)).
     """
 
-    __slots__ = ("_blocks", "_plain", "_scattered", "_signed", "arrivals", "replies")
+    __slots__ = ("_blocks", "_plan", "arrivals", "counted", "replies")
 
     def __init__(self, plan: BusPlan, arrivals: Arrivals) -> None:
+        self._plan = plan
         self.arrivals = arrivals
         """What came of this bus's servos, in the order of the plan's servos."""
         layouts = dict.fromkeys(servo.state for servo in plan.servos)
         self._blocks = tuple(_Block(layout, plan.servos, arrivals.ticks) for layout in layouts)
-        self._plain = [*chain.from_iterable(block.plain for block in self._blocks)]
-        self._signed = [*chain.from_iterable(block.signed for block in self._blocks)]
-        self._scattered = [block.scattered for block in self._blocks if block.scattered is not None]
         self.replies = tuple(
             next(block.replies[index] for block in self._blocks if index in block.replies)
             for index in range(len(plan.servos))
         )
         """Where each servo's bytes belong, in the order of the plan's servos."""
+        self.counted = False
+        """True when somebody brought the ticks of this cycle up to date from where the bytes came."""
 
     def place(self, indices: Sequence[int]) -> tuple[NDArray[np.uint8], Rows]:
         """Return the bytes of all servos of one layout, one row a servo, and the rows of some of them."""
@@ -85,20 +131,22 @@ class StateArrays:
         rows = list(block.replies)
         return block.data, rows_of([rows.index(index) for index in indices])
 
+    def counting(self, servos: Sequence[int], source: Source) -> Counting:
+        """Return how bytes of servos of one layout that stand elsewhere become ticks."""
+        return Counting(self._plan.servos[servos[0]].state, servos, source, self.arrivals.ticks)
+
     def count(self) -> None:
-        """Bring the bytes to ticks, of who did not answer those of its last reply."""
-        for ticks, raw in self._plain:
-            ticks[...] = raw
-        for ticks, raw in self._signed:
-            _SIGNED.take(raw, None, ticks, "wrap")
-        for all_ticks, members, own in self._scattered:
-            all_ticks[:, members] = own
+        """Bring the ticks up to date, of who did not answer by its last reply that was kept here."""
+        if not self.counted:
+            for block in self._blocks:
+                block.counting.count()
+        self.counted = False
 
 
 class _Block:
     """The servos of one bus that have one layout."""
 
-    __slots__ = ("data", "plain", "replies", "scattered", "signed")
+    __slots__ = ("counting", "data", "replies")
 
     def __init__(self, layout: StateLayout, servos: Sequence[ServoPlan], ticks: Floats) -> None:
         members = [index for index, servo in enumerate(servos) if servo.state == layout]
@@ -109,24 +157,7 @@ class _Block:
             index: view[number * length : (number + 1) * length] for number, index in enumerate(members)
         }
         self.data: NDArray[np.uint8] = np.frombuffer(buffer, np.uint8).reshape(count, length)
-        place = rows_of(members)
-        own = ticks[:, place]  # a copy where they do not stand side by side
-        self.scattered = None if isinstance(place, slice) else (ticks, place, own)
-        self.plain: list[_Cast] = []
-        self.signed: list[_Cast] = []
-        first = 0
-        for alike in _alike((layout.position, layout.velocity, layout.effort)):
-            field, step = alike[0], alike[-1].offset - alike[0].offset
-            raw: _Raw = np.ndarray(
-                (len(alike), count),
-                f"<{'i' if field.encoding == 'twos_complement' else 'u'}{field.size}",
-                self.data,
-                field.offset,
-                (step // max(len(alike) - 1, 1), length),
-            )
-            casts = self.signed if field.encoding == "sign_magnitude" else self.plain
-            casts.append((own[first : first + len(alike)], raw))
-            first += len(alike)
+        self.counting = Counting(layout, members, Source(buffer, 0, length), ticks)
 
 
 def _alike(fields: Sequence[Field]) -> list[list[Field]]:
