@@ -88,7 +88,7 @@ class CycleLayout:
     Raises ValueError for more than 63 controllers (they are bits of a mask).
     """
 
-    __slots__ = ("controllers", "dtype", "joints", "lengths")
+    __slots__ = ("controllers", "dtype", "joints", "lengths", "places")
 
     def __init__(self, joints: Sequence[str], controllers: Sequence[str]) -> None:
         if len(controllers) > MOST_CONTROLLERS:
@@ -101,6 +101,8 @@ class CycleLayout:
         offsets = [8 * index for index in range(len(SCALARS))]
         end = 8 * len(SCALARS)
         self.lengths: dict[str, int] = {}
+        self.places: dict[str, slice] = {}
+        """The bytes of each sequence's elements in a record."""
         for name, kind, per in SEQUENCES:
             element = np.dtype(kind).newbyteorder("<")
             count = counts[per]
@@ -112,6 +114,7 @@ class CycleLayout:
             formats += [np.dtype("<u4"), (element, (count,))]
             offsets += [at, body]
             end = body + count * element.itemsize
+            self.places[name] = slice(body, end)
         self.dtype: np.dtype[np.void] = np.dtype(
             {"names": names, "formats": formats, "offsets": offsets, "itemsize": end}
         )
@@ -143,7 +146,17 @@ class CycleRecord:
     Times are int64 ns of the run's clock, shape of arrays is (joints,) or (controllers,).
     """
 
-    __slots__ = ("clamped", "commands", "controller_ns", "goals", "layout", "raw", "states", "words")
+    __slots__ = (
+        "_renewed",
+        "clamped",
+        "commands",
+        "controller_ns",
+        "goals",
+        "layout",
+        "raw",
+        "states",
+        "words",
+    )
 
     cycle = _Word(0)
     """Number of the period since the loop's first deadline, skipped ones counted."""
@@ -198,6 +211,27 @@ class CycleRecord:
             if kind == "float64" and per == "joints":
                 array[name] = np.nan
         self.states.age_ns[:] = -1
+        self._renewed = tuple(
+            (self.raw[place], bytes(place.stop - place.start))
+            for place in (layout.places["clamped"], layout.places["controller_ns"])
+        )
+
+    def renew(self) -> None:
+        """Begin a cycle: nothing was published, taken, clamped or updated in it yet."""
+        words = self.words
+        words[9] = words[10] = 0
+        for part, nothing in self._renewed:
+            part[:] = nothing
+
+    def wake(self, cycle: int, scheduled_ns: int, woken_ns: int, period_ns: int) -> None:
+        """Take what is known of a cycle when it begins."""
+        words = self.words
+        words[0], words[1], words[2], words[6] = cycle, scheduled_ns, woken_ns, period_ns
+
+    def tell(self, read_ns: int, updated_ns: int, written_ns: int) -> None:
+        """Take when the parts of a cycle ended."""
+        words = self.words
+        words[3], words[4], words[5] = read_ns, updated_ns, written_ns
 
     @property
     def valid(self) -> NDArray[np.bool_]:

@@ -71,6 +71,67 @@ def test_a_controller_sees_its_joints_in_its_own_order(robot):
     np.testing.assert_array_equal(seen[0][1], [0.2, 0.1])
 
 
+@pytest.mark.parametrize(
+    "rows",
+    [(0,), (1, 2), (0, 4), (4, 0), (0, 2, 4), (4, 2, 0), (5, 3, 1), (0, 1, 3), (3, 0, 1), (2, 5, 0, 1)],
+)
+def test_joints_in_any_order_are_seen_and_commanded_as_named(make_robot, rows):
+    robot = make_robot(joints=6)
+    seen, wanted = [], {row: 0.1 * row - 0.2 for row in rows}
+
+    def act(self, step, time_ns, _):
+        if step == "update":
+            seen.append((self.context.states.position.copy(), self.context.goals.position.copy()))
+            self.context.commands.position[:] = [wanted[row] for row in rows]
+
+    robot.script("some", act, joints=tuple(f"j{row}" for row in rows), command=("position",))
+    robot.build(end_ns=3 * PERIOD_NS)
+    robot.record.states.position[:] = robot.record.goals.position[:] = 0.01 * np.arange(6)
+    robot.loop.run()
+    np.testing.assert_array_equal(seen[0][0], 0.01 * np.array(rows))
+    np.testing.assert_array_equal(seen[0][1], 0.01 * np.array(rows))
+    expected = [wanted.get(row, np.nan) for row in range(6)]
+    for cycle in robot.sink.cycles:
+        np.testing.assert_array_equal(cycle["position"], expected)
+
+
+def test_a_command_that_stands_comes_back_behind_a_pause(robot):
+    robot.script("still", writes(0.3), joints=("j1",), command=("position",))
+    robot.build(end_ns=30 * PERIOD_NS)
+    wishes = {5: "pause", 8: "resume"}
+
+    def idle_(deadline_ns):
+        if wish := wishes.pop(len(robot.sink.cycles), None):
+            robot.ask(wish)
+
+    robot.hardware.idle = idle_
+    robot.loop.run()
+    shown = [bool(np.isfinite(cycle["position"][1])) for cycle in robot.sink.cycles[:12]]
+    assert shown == [True] * 5 + [False] * 3 + [True] * 4
+
+
+def test_nan_behind_a_pause_is_a_fault_of_whoever_was_finite_before(robot):
+    values = {"now": 0.3}
+
+    def act(self, step, time_ns, _):
+        if step == "update":
+            self.context.commands.position[:] = values["now"]
+
+    robot.script("breaks", act, joints=("j0",), command=("position",))
+    robot.build(end_ns=30 * PERIOD_NS)
+
+    def idle_(deadline_ns):
+        cycles = len(robot.sink.cycles)
+        if cycles in (5, 8):
+            robot.ask({5: "pause", 8: "resume"}[cycles])
+        if cycles == 8:
+            values["now"] = np.nan
+
+    robot.hardware.idle = idle_
+    result = robot.loop.run()
+    assert "commanded j0/position = nan after a finite value" in result.detail
+
+
 def test_an_unclaimed_interface_is_not_taken(robot):
     robot.script("position_only", writes(0.3, 0.7), command=("position",))
     run(robot, 2)

@@ -13,20 +13,24 @@ from dxlrun.interfaces import Commands, States
 
 _Element = TypeVar("_Element", bound=np.generic)
 Place = slice | NDArray[np.intp]
-"""Which rows: a slice where they stand side by side, which numpy takes in a tenth of the time."""
+"""Which rows: a slice where they are equally far apart, which numpy takes in a tenth of the time."""
 
 
 def place_of(rows: NDArray[np.intp]) -> Place:
-    """Return the rows as a slice if they follow each other."""
-    if rows.size and np.array_equal(rows, np.arange(rows[0], rows[0] + rows.size)):
-        return slice(int(rows[0]), int(rows[0]) + rows.size)
-    return rows
+    """Return the rows as a slice if they are equally far apart, in either direction: any two are."""
+    if not rows.size:
+        return rows
+    first, last = int(rows[0]), int(rows[-1])
+    step = int(rows[1]) - first if rows.size > 1 else 1
+    if not step or not np.array_equal(rows, first + step * np.arange(rows.size)):
+        return rows
+    return slice(first, last + step if last + step >= 0 else None, step)
 
 
 class Gathering:
     """States and goals of some rows, read-only to whoever gets them.
 
-    Rows that stand side by side are shown as they are; others are copied by `gather`.
+    Rows that are equally far apart are shown as they are; others are copied by `gather`.
     """
 
     __slots__ = ("_pairs", "goals", "states")

@@ -254,16 +254,13 @@ class Loop:
         woken_ns = self.clock.wait_until(deadline_ns)
         dt_ns = min(woken_ns - self._woken_ns, PERIOD_CAP * schedule.period_ns)
         self._woken_ns = woken_ns
-        record.cycle = cycle
-        record.scheduled_ns = deadline_ns
-        record.woken_ns = woken_ns
-        record.period_ns = dt_ns
+        record.wake(cycle, deadline_ns, woken_ns, dt_ns)
         self._stood = self.paused
         self.manager.begin()
         if self._motion:
             self._motion.begin()
         self.hardware.read()
-        record.read_ns = now_ns()
+        read_ns = now_ns()
         self.gate.enter_modes()
         if self._motion:
             self.steering.refuse("the run is ending")
@@ -271,9 +268,9 @@ class Loop:
         else:
             self._command(cycle, self._controllers_time())
         self.gate.apply(record.commands, record.goals, dt_ns)
-        record.updated_ns = now_ns()
+        updated_ns = now_ns()
         self.hardware.write()
-        record.written_ns = now_ns()
+        record.tell(read_ns, updated_ns, now_ns())
         self.sink.append(record)
         self._cycles += 1
         self.beat()
@@ -293,8 +290,11 @@ class Loop:
         """Return the time of this cycle for controllers, which never goes back: who was late when a pause
         began may catch up in it."""
         schedule = self.schedule
-        schedule.paused_ns -= max(0, self._time_ns - schedule.time_ns(self._woken_ns))
-        self._time_ns = schedule.time_ns(self._woken_ns)
+        time_ns = schedule.time_ns(self._woken_ns)
+        if time_ns < self._time_ns:
+            schedule.paused_ns -= self._time_ns - time_ns
+        else:
+            self._time_ns = time_ns
         return self._time_ns
 
     def _miss(self) -> None:
@@ -348,11 +348,14 @@ class Loop:
     def _next(self) -> bool:
         """Go to the next cycle, past those that are declared skipped; say whether that is to end the run."""
         cycle, schedule = self._cycle, self.schedule
-        now_ns, policy = self.clock.now_ns(), self.plan.overrun
+        now_ns, policy, next_ns = self.clock.now_ns(), self.plan.overrun, schedule.deadline_ns(cycle + 1)
         if self._stood:
             policy = "skip" if policy == "stop" else policy  # a pause may take its time
-        elif now_ns > schedule.deadline_ns(cycle + 1):
-            policy = self._overruns.decide(cycle + 1, schedule.deadline_ns(cycle + 1), now_ns)
+        elif now_ns <= next_ns:
+            self._cycle, self.record.skipped, self._late = cycle + 1, 0, False
+            return False
+        else:
+            policy = self._overruns.decide(cycle + 1, next_ns, now_ns)
         following = schedule.following(cycle, now_ns, policy)
         if self.plan.end_ns is not None and not self._motion and not self._stood:
             # nothing is skipped behind the end
@@ -366,7 +369,7 @@ class Loop:
         self._cycle = following
         self.record.skipped = skipped
         self._skipped += skipped
-        late = bool(skipped) or (policy == "catch_up" and now_ns > schedule.deadline_ns(cycle + 1))
+        late = bool(skipped) or (policy == "catch_up" and now_ns > next_ns)
         if late and not self._late:
             late_ms = (now_ns - schedule.deadline_ns(cycle)) / 1e6
             self.events.emit(

@@ -12,19 +12,24 @@ from dxlrun.interfaces import States
 class LostServos:
     """Counts the replies that each joint missed in a row."""
 
-    __slots__ = ("_limp", "_missed", "rows")
+    __slots__ = ("_all", "_limp", "_missed", "_missing", "rows")
 
     def __init__(self, joints: int) -> None:
         self.rows: frozenset[int] = frozenset()
         """Rows of the joints that are lost now, as `hardware` says it."""
         self._limp: set[str] = set()  # names of groups that a lost servo has left without torque
         self._missed = np.zeros(joints, dtype=np.int64)
+        self._missing = False
+        """Whether anybody had missed a reply when it was looked last."""
+        self._all = bytes([True]) * joints
 
     def look(self, states: States) -> bool:
         """Take the states of a cycle; return whether `rows` is another one now."""
         valid, age_ns = states.valid, states.age_ns
-        if np.count_nonzero(valid) == valid.size and not self._missed.any():
+        everybody = valid.tobytes() == self._all
+        if everybody and not self._missing:
             return False
+        self._missing = not everybody
         self._missed += 1
         self._missed[valid] = 0
         lost = (self._missed >= LOST_CYCLES) & ((age_ns >= LOST_AGE_NS) | (age_ns < 0))

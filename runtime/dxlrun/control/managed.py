@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.control.controller import Context, Controller
-from dxlrun.control.gathering import place_of
+from dxlrun.control.gathering import Place, place_of
 from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.cycle import Clamp, CycleRecord
 from dxlrun.errors import ControllerFault
@@ -47,17 +47,17 @@ class Managed:
         self._controller = controller
         self.gather = gather
         self._rows = rows
-        self._place = place_of(rows)
         self._record = record
         self._nominal_ns = context.period_ns
         self._every = plan.every
         self._held = False
         self._waiting = False
         self._last_ns = -1
-        self._last_number = -1
+        self._due_number = 0
         self._finite = np.zeros(len(rows), dtype=np.bool_)
+        place = place_of(rows)
         self._claimed = tuple(
-            _Claim(name, _array(context.commands, name), _array(record.commands, name), len(rows))
+            _Claim(name, _array(context.commands, name), _array(record.commands, name), place)
             for name in plan.command
         )
 
@@ -71,7 +71,7 @@ class Managed:
         except (Exception, SystemExit) as error:  # foreign code: it must not take the loop along
             raise self._fault("on_activate", error) from error
         self._last_ns = -1
-        self._last_number = -1
+        self._due_number = 0
         self._held = False
         self.until_ns = 0
         self.active = True
@@ -92,7 +92,7 @@ class Managed:
 
     def _withdraw(self) -> None:
         for claim in self._claimed:
-            claim.merged[self._place] = np.nan
+            claim.withdraw()
 
     def command(self, kind: str, data: NDArray[np.float64], time_ns: int, until_ns: int = 0) -> None:
         """Hand over a prepared command, which runs out at `until_ns` unless that is 0. Raises
@@ -129,31 +129,32 @@ class Managed:
         """Let it be updated in every n-th of the loop's periods."""
         self._every = every
         self._nominal_ns = every * period_ns
-        self._last_number = -1  # turns are counted anew
+        self._due_number = 0  # turns are counted anew
 
     def due(self, number: int) -> bool:
         """Say whether the controller is updated in this period; a skipped turn is made up in the next one."""
-        return not (self._held or self._waiting) and (
-            number // self._every > self._last_number // self._every
-        )
+        return number >= self._due_number and not (self._held or self._waiting)
 
     def update(self, number: int, time_ns: int) -> None:
         """Update and merge its commands into the robot's. Raises ControllerFault."""
         period_ns = self._nominal_ns if self._last_ns < 0 else time_ns - self._last_ns
-        self._last_ns, self._last_number = time_ns, number
+        self._last_ns = time_ns
+        self._due_number = (number // self._every + 1) * self._every
         self.gather()
         try:
             self._controller.update(time_ns, min(period_ns, PERIOD_CAP * self._nominal_ns))
         except (Exception, SystemExit) as error:  # see activate
             raise self._fault("update", error) from error
-        for claim in self._claimed:
-            np.isfinite(claim.own, out=self._finite)
-            if np.count_nonzero(self._finite) == self._finite.size:  # a tenth of the time of all()
-                claim.seen.fill(True)
-            else:
+        changed = [claim for claim in self._claimed if not claim.stands()]
+        for claim in changed:
+            np.isfinite(claim.own, self._finite)
+            if np.count_nonzero(self._finite) < self._finite.size:  # a tenth of the time of all()
                 self._judge(claim)
-        for claim in self._claimed:
-            claim.merged[self._place] = claim.own
+            elif not claim.all_seen:
+                claim.seen.fill(True)
+                claim.all_seen = True
+        for claim in changed:
+            claim.merge()
 
     @property
     def rows(self) -> NDArray[np.intp]:
@@ -185,18 +186,41 @@ class Managed:
 class _Claim:
     """A claimed interface: the controller's own array, the robot's, and where it was ever finite."""
 
-    __slots__ = ("interface", "merged", "own", "seen")
+    __slots__ = ("_merged", "_place", "_shown", "_taken", "all_seen", "interface", "own", "seen")
 
-    def __init__(self, interface: str, own: Floats, merged: Floats, joints: int) -> None:
+    def __init__(self, interface: str, own: Floats, merged: Floats, place: Place) -> None:
         self.interface = interface
         self.own = own
-        self.merged = merged
-        self.seen = np.zeros(joints, dtype=np.bool_)
+        self.seen = np.zeros(len(own), dtype=np.bool_)
+        self.all_seen = False
+        self._merged = merged
+        self._place = place
+        self._shown = merged[place] if isinstance(place, slice) else None
+        self._taken = b""
 
     def forget(self) -> None:
         """Begin anew: nothing was commanded yet."""
         self.own.fill(np.nan)
         self.seen.fill(False)
+        self.all_seen = False
+        self._taken = b""
+
+    def stands(self) -> bool:
+        """Say whether what is commanded is what was judged and merged before, and is still in its place."""
+        own = self.own.tobytes()
+        return own == self._taken and self._shown is not None and self._shown.tobytes() == own
+
+    def merge(self) -> None:
+        """Put what was judged into the robot's commands."""
+        self._taken = self.own.tobytes()
+        if self._shown is None:
+            self._merged[self._place] = self.own
+        else:
+            self._shown[:] = self.own
+
+    def withdraw(self) -> None:
+        """Take it out of the robot's commands."""
+        self._merged[self._place] = np.nan
 
 
 def _array(commands: Commands, interface: str) -> Floats:

@@ -54,6 +54,7 @@ class Manager:
         self._named: dict[str, Managed] = {}
         self._commands: tuple[tuple[ScheduledCommand, NDArray[np.float64]], ...] = ()
         self._next = 0
+        self._streaming = False  # nobody can have a stream of commands
         self._lost: Collection[int] = ()
         self._modes = ModeSwitch(plan.joints, record.states.mode, set_modes)
         self._failed: set[str] = set()
@@ -81,12 +82,8 @@ class Manager:
 
     def begin(self) -> None:
         """Begin a cycle, before its states are read: ask for modes; nobody was updated in it yet."""
-        self._modes.ask(one for one in self._managed if one.active)
-        record = self._record
-        record.published = 0
-        record.command_count = 0
-        record.clamped.fill(0)
-        record.controller_ns.fill(0)
+        self._modes.ask(self._managed)
+        self._record.renew()
 
     def update(self, turn: int, time_ns: int) -> str | None:
         """Hand over the commands that are due and update every active controller whose turn it is.
@@ -95,9 +92,11 @@ class Manager:
         neither. A controller that breaks its contract is ended, its fallback takes over, or its joints are
         held by the gate; the others go on. Returns `fault`.
         """
-        record, now_ns = self._record, self._clock.now_ns
-        self._admit(time_ns)
-        record.command_count += self._hand_over(time_ns)
+        now_ns, took_ns = self._clock.now_ns, self._record.controller_ns
+        if self._modes.awaited:
+            self._admit(time_ns)
+        if self._next < len(self._commands):
+            self._record.command_count += self._hand_over(time_ns)
         for index, managed in enumerate(self._managed):
             if managed.active and managed.due(turn):
                 begin_ns = now_ns()
@@ -105,8 +104,8 @@ class Manager:
                     managed.update(turn, time_ns)
                 except ControllerFault as fault:
                     self._end(managed, fault, time_ns)
-                if index < len(record.controller_ns):
-                    record.controller_ns[index] = now_ns() - begin_ns
+                if index < len(took_ns):
+                    took_ns[index] = now_ns() - begin_ns
         return self.fault
 
     def hand(  # noqa: PLR0917  a command's parts, as they come
@@ -130,6 +129,7 @@ class Manager:
             waits = managed in self._modes.entering
             return f"{controller} is not active{' yet' if waits else '; switch to it first'}"
         streaming = until_ns and managed.until_ns
+        self._streaming = self._streaming or until_ns > 0
         try:
             managed.command(kind, data, time_ns, until_ns)
         except ControllerFault as fault:
@@ -141,12 +141,13 @@ class Manager:
 
     def stale(self, now_ns: int) -> list[str]:
         """Return the controllers whose stream of commands has run out, each of them once."""
-        names: list[str] = []
-        for managed in self._managed:
-            if 0 < managed.until_ns < now_ns:
-                managed.until_ns = 0
-                names.append(managed.plan.name)
-        return names
+        if not self._streaming:
+            return []
+        stale = [managed for managed in self._managed if 0 < managed.until_ns < now_ns]
+        for managed in stale:
+            managed.until_ns = 0
+        self._streaming = any(managed.until_ns for managed in self._managed)
+        return [managed.plan.name for managed in stale]
 
     def hold(self, controller: str) -> None:
         """Withdraw what a controller commands until it gets another command; it stays active."""

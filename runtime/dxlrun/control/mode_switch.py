@@ -55,6 +55,11 @@ class ModeSwitch:
         self._asked = True
 
     @property
+    def awaited(self) -> bool:
+        """True while anybody waits."""
+        return bool(self._groups)
+
+    @property
     def entering(self) -> tuple[Managed, ...]:
         """Who waits."""
         return tuple(managed for group in self._groups for managed in group.entering)
@@ -78,8 +83,6 @@ class ModeSwitch:
         They will not when the time is over, and when a joint is in another mode although it was asked: on the
         way it would be in none.
         """
-        if not self._groups:
-            return [], []
         ready, late = [], []
         for group in self._groups:
             missing = self._missing(group.entering)
@@ -122,12 +125,13 @@ class ModeSwitch:
         self._groups = []
         self._asked = True
 
-    def ask(self, active: Iterable[Managed]) -> None:
-        """Ask the hardware for modes, once for each change of claims."""
+    def ask(self, managed: Iterable[Managed]) -> None:
+        """Ask the hardware for modes, once for each change of claims of those of them who are active."""
         if self._asked:
             return
         self._asked = True
-        claimed = claimed_modes(managed.plan for managed in (*active, *self.entering))
+        active = (one for one in managed if one.active)
+        claimed = claimed_modes(one.plan for one in (*active, *self.entering))
         wanted = np.zeros(len(self._joints), dtype=np.uint8)
         for row, joint in enumerate(self._joints):
             now = self._modes[row]
