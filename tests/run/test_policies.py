@@ -285,6 +285,23 @@ def test_a_joint_that_cannot_reach_its_pose_does_not_keep_the_robot_from_its_end
     assert not any(torque(robot).values())
 
 
+def test_a_reply_that_is_lost_as_the_pose_is_reached_does_not_end_it_before_the_servo_has_its_goal(
+    built: Callable[..., VirtualRobot], acts: dict[str, Act]
+) -> None:
+    robot = built(on_exit=STEPS["pose"])
+    stop_signal(robot, acts)
+    robot.run()
+    there_ns = next(t for t, now in goals(robot, 3) if now == HOME[3])
+    robot = built(on_exit=STEPS["pose"])
+    stop_signal(robot, acts)
+    servo = robot.buses[0].servo(3)
+    robot.buses[0].at(there_ns - 30_000_000, servo.silence)
+    robot.buses[0].at(there_ns + 10_000_000, lambda: servo.silence(False))
+    robot.run()
+    assert goals(robot, 3)[-1][1] == HOME[3]
+    assert servo.position == pytest.approx(HOME[3] * TICK, abs=0.1)
+
+
 def test_steps_are_cut_short_when_the_time_for_them_is_over(
     built: Callable[..., VirtualRobot], acts: dict[str, Act]
 ) -> None:

@@ -21,12 +21,14 @@ from dxlrun.mode import Mode
 ARRIVED = 0.05
 """rad; so near to its pose a joint counts as there. Ten ticks of an AX-12: friction holds it off by some."""
 SETTLE_NS = 300_000_000
-"""A joint that has its pose as goal for so long and is not there will not come: it is blocked or too weak."""
+"""A joint that has its pose as goal for so long and is not there will not come: it is blocked or too weak, or
+its servo is lost."""
 
 MODES_NS = 500_000_000
 """How long a policy waits for modes: its own time runs on. Some twenty transactions a servo. [i]"""
 STAND_NS = 100_000_000
-"""How long at least goals of 0 rad/s are sent to who is left with torque on: one write may be lost."""
+"""How long at least a pose, and goals of 0 rad/s to who is left with torque on, are sent: a write may be lost, and
+a servo that missed a reply gets its goal a cycle later."""
 
 
 class MotionHardware(Protocol):
@@ -58,8 +60,8 @@ class SafeMotion:
 
     Joints that would not hold still, and those that a pose moves, are brought into other modes first; joints
     in velocity mode stand from the first cycle on.
-    A pose: goals move toward it at the step's speed, from where they are, and it is reached when the joints
-    are there, or SETTLE_NS later. Less torque: so many times within the step's time a smaller limit, from the
+    A pose: goals move toward it at the step's speed, from where they are, and it is reached STAND_NS later if
+    the joints are there, or SETTLE_NS later. Less torque: so many times within the step's time a smaller limit, from the
     servos' own one down to `fraction` of it.
     """
 
@@ -150,8 +152,9 @@ class SafeMotion:
         if not np.any(named & (np.abs(target - goal) > 1e-9)):
             self._there_ns = now_ns if self._there_ns < 0 else self._there_ns
             states = record.states
-            away = named & states.valid & (np.abs(target - states.position) > ARRIVED)
-            return not away.any() or now_ns - self._there_ns >= SETTLE_NS
+            away = named & ~(states.valid & (np.abs(target - states.position) <= ARRIVED))
+            lasted_ns = now_ns - self._there_ns
+            return lasted_ns >= SETTLE_NS or (lasted_ns >= STAND_NS and not away.any())
         reach = step.speed * max(record.period_ns, 1) * 1e-9
         np.copyto(commands.position, goal + np.clip(target - goal, -reach, reach), where=named)
         commands.velocity[named] = step.speed
