@@ -12,6 +12,7 @@ from dxlrun.dynamixel.bus import Bus
 from dxlrun.dynamixel.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.identify import identify
 from dxlrun.dynamixel.inspection import setup_line
+from dxlrun.dynamixel.patience import patient
 from dxlrun.dynamixel.port import SerialPort, SerialPorts
 from dxlrun.dynamixel.pump import run
 from dxlrun.dynamixel.registers import Difference, compare
@@ -81,7 +82,7 @@ def look(buses: Sequence[BusPlan]) -> Found:
             Bus(index, plan, port, clock, NoPackets())
             for index, (plan, port) in enumerate(zip(buses, ports.ports, strict=True))
         ]
-        found = run([_look(plan) for plan in buses], lines, ports, clock)
+        found = run([patient(_look(plan)) for plan in buses], lines, ports, clock)
     for line in lines:
         if line.failure is not None:
             raise line.failure

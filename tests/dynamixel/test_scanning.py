@@ -71,6 +71,21 @@ def test_a_servo_at_another_rate_is_found_at_its_own():
     assert names(found) == [(2.0, 1_000_000, 3, "XM430-W350")]
 
 
+@pytest.mark.parametrize("protocol", [1.0, 2.0])
+def test_who_answers_late_is_found_and_not_taken_for_two(protocol):
+    """A machine that stands still for 90 ms, at the first ping and in the middle of looking closer."""
+    model = "AX-12A" if protocol == 1.0 else "XM430-W350"
+    line = VirtualLine(two(3, model), protocol=protocol, rate=1_000_000)
+    for late_ns in (90_000_000, 0, 90_000_000, 0, 90_000_000):
+        line.bus.delay_next(3, late_ns)
+    wish = Wish((protocol,), (1_000_000,), (1, 2, 3, 4))
+    found = scan(ToolLine(line), wish).servos
+    assert [(one.servo_id, one.model, one.remarks) for one in found] == [(3, model, ())]
+    line.bus.delay_next(3, 90_000_000)
+    (found,) = find(ToolLine(line), 3, wish)
+    assert (found.model, found.remarks) == (model, ())
+
+
 def test_protocol_1_is_asked_id_by_id():
     line = VirtualLine(two(1, "AX-12A"), two(253, "MX-64"), protocol=1.0, rate=1_000_000)
     found = scan(ToolLine(line), Wish((1.0,), (1_000_000,)))

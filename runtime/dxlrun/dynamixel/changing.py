@@ -158,7 +158,7 @@ def _written(one: OneServo, transaction: Transaction, what: str) -> None:
         yield listen(_STORED_NS)
         return reply
 
-    reply = one.tool.run(program())
+    reply = one.run(program())
     if reply.outcome is Outcome.REFUSED:
         raise one.fail(f"refuses {what}: {one.tool.line.dialect.describe_error(reply.error)}")
 

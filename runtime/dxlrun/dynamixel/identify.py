@@ -11,6 +11,7 @@ from dxlrun.dynamixel.bus import Bus
 from dxlrun.dynamixel.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.inspection import persist, setup_line, who
 from dxlrun.dynamixel.line import listen
+from dxlrun.dynamixel.patience import patient
 from dxlrun.dynamixel.port import Ports
 from dxlrun.dynamixel.pump import run
 from dxlrun.dynamixel.startup import LISTEN_NS
@@ -54,7 +55,7 @@ def identify(
         Bus(index, plan, port, clock, sink)
         for index, (plan, port) in enumerate(zip(plans, ports.ports, strict=True))
     ]
-    found = run([_ask(plan, joints) for plan in plans], buses, ports, clock, beat)
+    found = run([patient(_ask(plan, joints)) for plan in plans], buses, ports, clock, beat)
     for bus in buses:
         if bus.failure is not None:
             raise bus.failure

@@ -14,11 +14,12 @@ from dxlrun.dynamixel import modes
 from dxlrun.dynamixel.bus_plan import BusPlan, RegisterValue, ServoPlan
 from dxlrun.dynamixel.inspection import called, persist
 from dxlrun.dynamixel.line import LONGEST_RETURN_DELAY_NS, listen
+from dxlrun.dynamixel.patience import patient
 from dxlrun.dynamixel.plan import Wiring, bus_plan
 from dxlrun.dynamixel.registers import Difference, Settled, compare, settle
 from dxlrun.dynamixel.scanning import FoundServo
 from dxlrun.dynamixel.tool_line import ToolLine
-from dxlrun.dynamixel.transaction import Outcome, Program
+from dxlrun.dynamixel.transaction import Outcome, Program, Result
 from dxlrun.errors import ServoFault
 from dxlrun.mode import Mode
 
@@ -68,12 +69,12 @@ class OneServo:
         """
         found: dict[str, int] = {}
         for block in _blocks([self.table.items[name] for name in names]):
-            found |= self.tool.run(self._read_block(block, refused=refused))
+            found |= self.run(self._read_block(block, refused=refused))
         return {name: found[name] for name in names if name in found}
 
     def differences(self, wanted: Sequence[RegisterValue]) -> tuple[Difference, ...]:
         """Compare registers with what they shall hold; writes nothing."""
-        found = self.tool.run(compare(self.plan, self._servo, wanted, self.tool.line))
+        found = self.run(compare(self.plan, self._servo, wanted, self.tool.line))
         silent = [called(self.table.items[one.register.name]) for one in found if one.found is None]
         if silent:
             raise self.fail(f"did not answer when {', '.join(silent)} was read")
@@ -95,7 +96,7 @@ class OneServo:
     def write(self, wanted: Sequence[RegisterValue]) -> tuple[str, ...]:
         """Write the registers that differ, in order, and read each back; return what was written."""
         self.writable(wanted)
-        settled: Settled = self.tool.run(settle(self.plan, self._servo, wanted, self.tool.line))
+        settled: Settled = self.run(settle(self.plan, self._servo, wanted, self.tool.line))
         if settled.problems:
             before = [f"written before that: {text}" for _, text in settled.written]
             raise ServoFault("\n".join([*settled.problems, *before]))
@@ -115,9 +116,9 @@ class OneServo:
         if self.holds_torque():
             return "holds torque, as before"
         mode = self._mode()
-        held = self.tool.run(modes.hold(self.plan, self._servo, self._servo.mode_plan(mode)))
+        held = self.run(modes.hold(self.plan, self._servo, self._servo.mode_plan(mode)))
         if held.problem:
-            self.tool.run(settle(self.plan, self._servo, [self.register("torque_enable", 0)], self.tool.line))
+            self.run(settle(self.plan, self._servo, [self.register("torque_enable", 0)], self.tool.line))
             raise self.fail(f"{held.problem}; its torque is off")
         where = "" if held.goal is None else f" at tick {held.goal}, where it stood"
         return f"holds torque in {mode.name.lower().replace('_', '-')} mode{where}"
@@ -140,6 +141,10 @@ class OneServo:
 
     # Inside
 
+    def run(self, program: Program[Result]) -> Result:
+        """Run a program patiently: somebody knows that the servo is there."""
+        return self.tool.run(patient(program))
+
     @property
     def command(self) -> str:
         """How a command line to it begins."""
@@ -152,7 +157,7 @@ class OneServo:
                 self.plan = self._plan(continuous)
             except ValueError:  # the model has no modes without end
                 break
-            mode = self.tool.run(modes.mode_now(self.plan, self._servo))
+            mode = self.run(modes.mode_now(self.plan, self._servo))
             if mode is not Mode.UNKNOWN:
                 return mode
         self.plan = self._plan()

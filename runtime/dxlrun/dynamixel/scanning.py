@@ -14,6 +14,7 @@ from dxlrun.control_table import ControlTable, all_tables, models_by_number
 from dxlrun.dynamixel.dialect import dialect_of
 from dxlrun.dynamixel.inspection import called, persist
 from dxlrun.dynamixel.line import Line, listen
+from dxlrun.dynamixel.patience import patient
 from dxlrun.dynamixel.tool_line import ToolLine, refuse_echo
 from dxlrun.dynamixel.transaction import BROADCAST_ID, Outcome, Program, Reply, Transaction
 
@@ -23,6 +24,8 @@ SLOT_NS = 3_000_000
 """After a broadcast ping: of each ID, beside the bytes of its answer (dynamixel-sdk, broadcastPing)."""
 LATE_NS = 20_000_000
 """Behind the last question of a rate: what comes still, came late through the adapter."""
+LATE_OF_FEW_NS = 100_000_000
+"""The same where few are asked: there it may be the machine that is late."""
 FEW = 20
 """So many IDs are quicker asked one by one."""
 _USUAL = (1_000_000, 57_600, 115_200)
@@ -30,8 +33,8 @@ _WHO_LENGTH = 3
 _LIMITS = (("min_position_limit", "max_position_limit"), ("cw_angle_limit", "ccw_angle_limit"))
 _TRIES = 2
 """Of a ping at a rate that is one of many."""
-_TRIES_ALONE = 6
-"""Where somebody said where the servo is: there a busy machine may be late, too."""
+_TRIES_ALONE = 4
+"""Where somebody said where the servo is: there it is awaited patiently."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,12 +135,19 @@ def find(tool: ToolLine, servo_id: int, wish: Wish = EVERYWHERE) -> tuple[FoundS
 
 
 def _find(tool: ToolLine, servo_id: int, tries: int) -> Program[list[FoundServo]]:
+    knocked = _knock(tool, servo_id, tries)
+    if (yield from (patient(knocked) if tries == _TRIES_ALONE else knocked)):
+        return [(yield from patient(look(tool.line, servo_id)))]
+    return []
+
+
+def _knock(tool: ToolLine, servo_id: int, tries: int) -> Program[bool]:
     for _ in range(tries):
         reply = yield tool.line.ping(servo_id)
         refuse_echo(tool.port.name, reply)
         if reply.outcome is not Outcome.TIMEOUT:
-            return [(yield from look(tool.line, servo_id))]
-    return []
+            return True
+    return False
 
 
 def _search(tool: ToolLine, ids: Sequence[int], beat: Callable[[float], None]) -> Program[list[FoundServo]]:
@@ -157,7 +167,7 @@ def _search(tool: ToolLine, ids: Sequence[int], beat: Callable[[float], None]) -
         there |= yield from _one_by_one(tool, ids, None, beat)
     found: list[FoundServo] = []
     for servo_id in sorted(there):
-        found.append((yield from look(line, servo_id)))
+        found.append((yield from patient(look(line, servo_id))))
     return found
 
 
@@ -177,12 +187,19 @@ def _one_by_one(
         elif reply.outcome is not Outcome.TIMEOUT:
             suspected.append(servo_id)
         beat((index + 1) / len(ids))
-    yield listen(LATE_NS)
-    for servo_id in suspected:  # what came may have been the late answer of the one before
+    yield listen(LATE_NS if len(ids) > FEW else LATE_OF_FEW_NS)
+    there |= yield from patient(_answering(line, suspected))
+    return there | (heard.ids & set(ids))
+
+
+def _answering(line: Line, suspected: Sequence[int]) -> Program[set[int]]:
+    """Ping each again: what came may have been the late answer of the one before."""
+    there: set[int] = set()
+    for servo_id in suspected:
         reply = yield from persist(line.ping(servo_id))
         if reply.outcome is not Outcome.TIMEOUT:
             there.add(servo_id)
-    return there | (heard.ids & set(ids))
+    return there
 
 
 def _hurried(tool: ToolLine, transaction: Transaction, patience_ns: int) -> Transaction:
