@@ -27,8 +27,8 @@ its servo is lost."""
 MODES_NS = 500_000_000
 """How long a policy waits for modes: its own time runs on. Some twenty transactions a servo. [i]"""
 STAND_NS = 100_000_000
-"""How long at least a pose, and goals of 0 rad/s to who is left with torque on, are sent: a write may be lost, and
-a servo that missed a reply gets its goal a cycle later."""
+"""How long at least a pose, and goals of 0 rad/s to who is left with torque on, are sent: a write may be
+lost, and a servo that missed a reply gets its goal a cycle later."""
 
 
 class MotionHardware(Protocol):
@@ -61,8 +61,8 @@ class SafeMotion:
     Joints that would not hold still, and those that a pose moves, are brought into other modes first; joints
     in velocity mode stand from the first cycle on.
     A pose: goals move toward it at the step's speed, from where they are, and it is reached STAND_NS later if
-    the joints are there, or SETTLE_NS later. Less torque: so many times within the step's time a smaller limit, from the
-    servos' own one down to `fraction` of it.
+    the joints are there, or SETTLE_NS later. Less torque: so many times within the step's time a smaller
+    limit, from the servos' own one down to `fraction` of it.
     """
 
     policy: Policy
