@@ -106,20 +106,24 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         return (time_ns - self._start_ns) * 1e-9
 
     def _follow(self, elapsed: float) -> None:
-        commands, wanted = self.context.commands, self._wanted
-        self._trajectory.sample(elapsed, wanted)
-        np.copyto(commands.position, wanted.position)
-        if elapsed >= self._trajectory.duration_s:
+        commands, wanted, trajectory = self.context.commands, self._wanted, self._trajectory
+        if elapsed >= trajectory.duration_s:
+            trajectory.sample(elapsed, wanted)
+            np.copyto(commands.position, wanted.position)
             self._moving, self._settling = False, True
             self._close_in()
             self._settle(elapsed)
             return
         if self.parameters.command_interface == "posvel":
+            trajectory.sample(elapsed, wanted)
+            np.copyto(commands.position, wanted.position)
             np.abs(wanted.velocity, out=commands.velocity)
+        else:
+            trajectory.position(elapsed, commands.position)
         path = self.parameters.tolerances.path
         if path is not None and self._worst(silent=0.0) > path:
             self._moving = False
-            self._rest(wanted.position)
+            self._rest(commands.position)
             self._close_in()
             self.context.say(f"trajectory aborted after {elapsed:.3f} s: {self._off()}, holding")
 
@@ -147,7 +151,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
     def _worst(self, silent: float) -> float:
         """Return the largest distance from what is wanted, rad; `silent` for a joint without reply."""
         states, error = self.context.states, self._error
-        np.subtract(states.position, self._wanted.position, out=error)
+        np.subtract(states.position, self.context.commands.position, out=error)
         np.abs(error, out=error)
         np.copyto(error, silent, where=~states.valid)
         return float(error.max())

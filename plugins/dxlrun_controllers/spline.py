@@ -56,7 +56,7 @@ def solve(
     out[5] = (12 * way - 6 * (v1 + v0) * t + (a1 - a0) * t**2) / (2 * t**5)
 
 
-def evaluate(piece: Floats, t: float, sample: Sample) -> None:
+def evaluate(piece: Sequence[Floats] | Floats, t: float, sample: Sample) -> None:
     """Write the piece's value and derivatives at `t` s into `sample` (Horner's scheme)."""
     position, velocity, acceleration = sample.position, sample.velocity, sample.acceleration
     position.fill(0.0)
@@ -92,7 +92,19 @@ class Trajectory:
     `load` takes views of the flat array, so that nothing grows in the loop.
     """
 
-    __slots__ = ("_bridge", "_bridge_s", "_first", "_last", "_pieces", "_start_in", "_times", "duration_s")
+    __slots__ = (
+        "_begin_s",
+        "_bridge",
+        "_bridge_s",
+        "_end_s",
+        "_first",
+        "_last",
+        "_now",
+        "_pieces",
+        "_start_in",
+        "_times",
+        "duration_s",
+    )
 
     def __init__(self, joints: int) -> None:
         self._bridge = np.zeros((QUINTIC, joints))
@@ -101,6 +113,9 @@ class Trajectory:
         self._times = np.zeros(1)
         self._first = self._last = np.zeros((3, joints))
         self._pieces = np.zeros((0, LINEAR, joints))
+        self._now: tuple[Floats, ...] = ()
+        """Coefficients of the piece that is played, from `_begin_s` to `_end_s`, in time of the points."""
+        self._begin_s = self._end_s = 0.0
         self.duration_s = 0.0
         """From `load` to the last point, s."""
 
@@ -114,6 +129,7 @@ class Trajectory:
         self._first = data[ends : ends + 3 * joints].reshape(3, joints)
         self._last = data[ends + 3 * joints : body].reshape(3, joints)
         self._pieces = data[body:].reshape(count - 1, order, joints)
+        self._begin_s = self._end_s = 0.0
         self._bridge_s = self._start_in + float(self._times[0])
         self.duration_s = self._start_in + float(self._times[-1])
         self._bridge.fill(0.0)
@@ -123,13 +139,29 @@ class Trajectory:
 
     def sample(self, t: float, sample: Sample) -> None:
         """Write what is wanted `t` s after `load`; after the end: the last position, at rest."""
-        if t < self._bridge_s:
-            evaluate(self._bridge, max(t, 0.0), sample)
-        elif t >= self.duration_s:
+        if t >= self.duration_s:
             np.copyto(sample.position, self._last[0])
             sample.velocity.fill(0.0)
             sample.acceleration.fill(0.0)
         else:
-            t -= self._start_in
-            index = min(int(self._times.searchsorted(t, side="right")), len(self._pieces)) - 1
-            evaluate(self._pieces[max(index, 0)], t - float(self._times[max(index, 0)]), sample)
+            piece, t = self._piece(t)
+            evaluate(piece, t, sample)
+
+    def position(self, t: float, out: Floats) -> None:
+        """Write only the position that `sample` would, in a third of its time; `t` is before the end."""
+        piece, t = self._piece(t)
+        np.add(piece[-1], 0.0, out)
+        for coefficients in piece[-2::-1]:
+            np.multiply(out, t, out)
+            np.add(out, coefficients, out)
+
+    def _piece(self, t: float) -> tuple[Sequence[Floats] | Floats, float]:
+        """Return the piece that is played `t` s after `load`, and the time in it."""
+        if t < self._bridge_s:
+            return self._bridge, max(t, 0.0)
+        t -= self._start_in
+        if not self._begin_s <= t < self._end_s:
+            index = max(min(int(self._times.searchsorted(t, side="right")), len(self._pieces)) - 1, 0)
+            self._begin_s, self._end_s = float(self._times[index]), float(self._times[index + 1])
+            self._now = tuple(self._pieces[index])
+        return self._now, t - self._begin_s
