@@ -21,6 +21,7 @@ class Dialect(Protocol):
     PROTOCOL: float
     HEADER: bytes
     OVERHEAD: int
+    CHECKSUM: int
     ID_AT: int
     LONGEST: int
     HIGHEST_ID: int
@@ -78,6 +79,10 @@ class Dialect(Protocol):
 
     def fast_answers(self, packet: Bytes, lengths: Sequence[int]) -> list[Status]:
         """Return the servos' parts of such a status, those before the first broken one."""
+        ...
+
+    def sealed(self, body: bytes) -> bytes:
+        """Return a packet of everything that stands before its checksum."""
         ...
 
     def sync_write_records(self, address: int, length: int, records: Bytes) -> bytes:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -62,6 +62,7 @@ class Servos:
         "_alert_cycles",
         "_alerting",
         "_alerts",
+        "_arrays",
         "_arrived_ns",
         "_asking",
         "_bus",
@@ -75,6 +76,7 @@ class Servos:
         "_limp",
         "_lost",
         "_missed",
+        "_missing",
         "_modes",
         "_noise_at_ns",
         "_noise_seen",
@@ -107,6 +109,7 @@ class Servos:
         self._bus = bus
         self._gaps = gaps
         self._emit = events.emit
+        self._arrays = arrays
         self.goals = wanted.goals
         """Builds the sync write."""
         self.reads = CyclicReads(plan, arrays, bus)
@@ -120,6 +123,7 @@ class Servos:
         self._ceiling = np.full(count, np.nan)
         self._limp = [False] * count
         self._missed = self.reads.missed
+        self._missing = False  # somebody's newest reply is
         self._said_errors = [0] * count
         self._dialect = dialect_of(plan.protocol)
         self._alerts: list[int] = []  # who has a hardware error that was not read yet
@@ -152,18 +156,31 @@ class Servos:
     def settle(self, now_ns: int) -> bool:
         """Tell what changed with this cycle's replies; return whether everybody's is there."""
         reads = self.reads
-        everybody = reads.fresh.tobytes() == self._everybody
-        if not everybody or any(self._missed):
-            self._count_losses(now_ns)
-        elif self._rows:
+        everybody = reads.complete and not self._missing
+        if everybody:
             self._gaps.came(self._arrived_ns[-1], self._bus.due_ns)
-        if reads.errors != self._said_errors:
-            self._say_errors()
+        else:
+            everybody = self._look(now_ns)
         if self._bus.noise_bytes != self._noise_seen and now_ns - self._noise_at_ns >= NOISE_EVENT_NS:
             count = self._bus.noise_bytes - self._noise_seen
             self._noise_seen, self._noise_at_ns = self._bus.noise_bytes, now_ns
             text = f"{counted(count, 'byte', 'bytes')} belonged to no packet"
             self._emit(EventCode.BUS_NOISE, Severity.WARNING, self._plan.name, text)
+        return everybody
+
+    def _look(self, now_ns: int) -> bool:
+        """Look at everybody's reply; return whether all are there."""
+        reads = self.reads
+        if not reads.counted:
+            self._arrays.count()
+        everybody = reads.fresh.tobytes() == self._everybody
+        if self._missing or not everybody:
+            self._count_losses(now_ns)
+            self._missing = any(self._missed)
+        elif self._rows:
+            self._gaps.came(self._arrived_ns[-1], self._bus.due_ns)
+        if reads.errors != self._said_errors:
+            self._say_errors()
         return everybody
 
     def watch(self) -> Program[list[str]]:
@@ -182,7 +199,7 @@ class Servos:
         self.torqued[index] = False
         self._slow_down(index)
 
-    def goal_packets(self, goals: Commands, states: States) -> list[bytes]:
+    def goal_packets(self, goals: Commands, states: States) -> Sequence[bytes]:
         """Return the packets with the goals of everybody who may get one; who was lost comes back slowly."""
         if self._modes.doubtful:
             self.torqued[self._modes.doubtful] = False

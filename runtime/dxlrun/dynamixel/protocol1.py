@@ -20,6 +20,8 @@ OVERHEAD = 6
 """Bytes of a packet beside its parameters."""
 LONGEST = 0xFF + 4
 """Bytes of the longest packet: LEN is one byte and counts everything behind itself."""
+CHECKSUM = 1
+"""Bytes of the checksum, the last one of a packet."""
 ID_AT = 2
 """Where a packet has the ID of who is addressed, or who answers."""
 HIGHEST_ID = 0xFD
@@ -126,7 +128,7 @@ def _packet(servo_id: int, kind: int, parameters: bytes) -> bytes:
     if len(parameters) > _MOST_PARAMETERS:
         raise ValueError(f"{len(parameters)} parameter bytes do not fit one packet, {_MOST_PARAMETERS} do")
     body = bytes((servo_id, len(parameters) + 2, kind)) + parameters
-    return HEADER + body + bytes((checksum(body),))
+    return sealed(HEADER + body)
 
 
 def instruction_packet(servo_id: int, instruction: int, parameters: bytes = b"") -> bytes:
@@ -198,6 +200,11 @@ def fast_size(length: int, count: int) -> int:
 def fast_answers(packet: Bytes, lengths: Sequence[int]) -> list[Status]:
     """Raise ValueError: only Protocol 2.0 has fast forms."""
     raise ValueError(NO_FAST_FORM)
+
+
+def sealed(body: bytes) -> bytes:
+    """Return a packet of everything that stands before its checksum."""
+    return body + bytes((checksum(body[2:]),))
 
 
 def sync_write_records(address: int, length: int, records: Bytes) -> bytes:

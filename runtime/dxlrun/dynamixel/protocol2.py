@@ -27,6 +27,8 @@ LONGEST = 2048
 The protocol allows 65,542. Nobody answers with more than a control table (about 1,000 bytes), or 140 servos'
 states in a fast form, and a false header may not hold the line back for longer.
 """
+CHECKSUM = 2
+"""Bytes of the CRC, the last ones of a packet."""
 ID_AT = 4
 """Where a packet has the ID of who is addressed, or who answers."""
 HIGHEST_ID = 0xFC
@@ -336,6 +338,13 @@ def read_many(requests: Sequence[tuple[int, int, int]], *, fast: bool = False) -
     if all(request[1:] == (address, length) for request in requests):
         return sync_read(address, length, (servo_id for servo_id, _, _ in requests), fast=fast)
     return bulk_read(requests, fast=fast)
+
+
+def sealed(body: bytes) -> bytes:
+    """Return a packet of everything that stands before its CRC, which is not stuffed yet."""
+    if body.find(_PATTERN, 7) >= 0:
+        return instruction_packet(body[4], body[7], body[8:])
+    return body + crc16.umts(body).to_bytes(2, "little")
 
 
 def sync_write_records(address: int, length: int, records: Bytes) -> bytes:
