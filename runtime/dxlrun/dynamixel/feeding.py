@@ -54,9 +54,8 @@ class Feeding:
         """Note that the watchdogs were armed."""
         self._fed_ns = self._gaps.now_ns()
 
-    def feed(self) -> None:
-        """Note that the cyclic reads go out now; who was not fed for too long has stopped, and is revived."""
-        now = self._gaps.now_ns()
+    def feed(self, now: int) -> None:
+        """Note that the cyclic reads go out at `now`, ns; who was not fed for too long stopped, and is revived."""
         if self._fed_ns and now - self._fed_ns > self._longest_ns:
             self._revive((now - self._fed_ns) // 1_000_000)
         self._fed_ns = now

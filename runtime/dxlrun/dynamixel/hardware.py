@@ -94,6 +94,7 @@ class DynamixelHardware:
                 self._plans, self._buses, self._gaps, wanted, self._samples.buses, strict=True
             )
         )
+        self._lines = tuple(zip(self._buses, self._servos, strict=True))
         self._set_up = SetUp(self._plans, self._buses, self._servos, ports, clock, events, beat)
 
     def start(self) -> None:
@@ -122,20 +123,22 @@ class DynamixelHardware:
         if not self._begun:
             self._begin_reads()
         self._begun = False
-        for index, (bus, servos) in enumerate(zip(self._buses, self._servos, strict=True)):
-            if not self._asked[index]:
-                servos.feeding.feed()
+        now = self._clock.now_ns()
+        for index, (bus, servos) in enumerate(self._lines):
+            if self._asked[index]:
+                self._asked[index] = False
+            else:
+                servos.feeding.feed(now)
                 bus.load(servos.reads, servos.reads.lane)
-            self._asked[index] = False
         pump(self._buses, self._ports, self._clock, self._beat)
         now = self._clock.now_ns()
         everybody = True
-        for servos in self._servos:
+        for _, servos in self._lines:
             everybody &= servos.settle(now)
             if servos.reads.given_up:
                 self._tell_plain_reads()
         self._samples.settle(now, everybody)
-        tell_failures(self._plans, self._buses, self._servos)
+        self._tell_failures()
 
     def _begin_reads(self) -> None:
         for asked, servos in zip(self._asked, self._servos, strict=True):
@@ -148,21 +151,21 @@ class DynamixelHardware:
 
         Of a split bus the servos are asked at once for their next states.
         """
-        for bus, servos in zip(self._buses, self._servos, strict=True):
+        for bus, servos in self._lines:
             for packet in servos.goal_packets(self._goals, self._states):
                 if bus.failure is None:
                     with suppress(PortError):  # told below; the other lines shall have their goals
                         bus.send(packet)
         if self._split:
             self._ask_behind()
-        tell_failures(self._plans, self._buses, self._servos)
+        self._tell_failures()
 
     def _ask_behind(self) -> None:
         clear(self._buses, self._ports)
         for index in self._split:
-            bus, servos = self._buses[index], self._servos[index]
+            bus, servos = self._lines[index]
             if bus.failure is None:
-                servos.feeding.feed()
+                servos.feeding.feed(self._clock.now_ns())
                 servos.reads.begin()
                 bus.load(servos.reads, servos.reads.lane)
                 bus.begin_behind()
@@ -288,6 +291,12 @@ class DynamixelHardware:
                     self._buses[index].renew(self._ports.ports[index])
                     return True
         return False
+
+    def _tell_failures(self) -> None:
+        for bus in self._buses:
+            if bus.failure is not None:
+                tell_failures(self._plans, self._buses, self._servos)
+                return
 
     def _tell_plain_reads(self) -> None:
         for plan, servos in zip(self._plans, self._servos, strict=True):

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from dxlrun.dynamixel.burst import Burst
 from dxlrun.dynamixel.port import Port
-from dxlrun.dynamixel.state_arrays import Counting, Rows, Source, StateArrays, rows_of
+from dxlrun.dynamixel.state_arrays import Counting, Source, StateArrays
 from dxlrun.dynamixel.transaction import Transaction
 from dxlrun.errors import PortError
 from dxlrun.packets import RECORD_HEADER, PacketKind, PacketSink, record
@@ -30,7 +30,7 @@ _TIMES_AT = RECORD_HEADER - _TIMES.size
 Bytes2D = NDArray[np.uint8]
 _Chain = tuple[Bytes2D, Bytes2D, NDArray[np.int64]]
 _Ask = tuple[bytes, memoryview, int, int, int]
-_Kept = tuple[memoryview, slice, int, _Chain | None, Rows]
+_Kept = tuple[memoryview, slice, int, _Chain | None, tuple[int, ...]]
 _Told = tuple[int, int, Callable[[], bool], _Kept]
 _stamp = _TIMES.pack_into
 
@@ -52,7 +52,7 @@ class Lane:
     """All reads of a cycle: `ask` and `take` in turn, as long as it is `straight`."""
 
     __slots__ = (
-        "_arrived_ns",
+        "_arrived",
         "_asks",
         "_counts",
         "_ended",
@@ -90,7 +90,7 @@ class Lane:
         `servos`: how many the bus has; `arrays`: where what they say belongs; `ended`: see `end`.
         """
         self.stretches = tuple(stretches)
-        self._arrived_ns = arrays.arrivals.at_ns
+        self._arrived = arrays.arrivals.at_ns.data
         self._ended = ended
         here = {servo for stretch in stretches for servo in stretch.servos}
         self.fresh = bytes(servo in here for servo in range(servos))
@@ -137,7 +137,7 @@ class Lane:
             slice(reply_at, reply_at + burst.first_size),
             told_at[0] + _TIMES_AT,
             None if len(told_at) == 1 else _chain(self._log, buffer, burst, told_at),
-            rows_of(stretch.servos),
+            stretch.servos,
         )
         return burst.size, least_ns, burst.clean, kept
 
@@ -209,20 +209,25 @@ class Lane:
 
     def _keep(self, kept: _Kept, first: int, at: int, spans: list[tuple[int, int]] | None) -> None:
         """Keep all replies of a read; `spans`: of each status packet, when they came in pieces."""
-        reply, reply_at, told_at, chain, rows = kept
+        reply, reply_at, told_at, chain, servos = kept
+        arrived = self._arrived
         if chain is None:
             self._log[reply_at] = reply
             _stamp(self._log, told_at, first, at)
-            self._arrived_ns[rows] = at
         else:
             place, replies, times = chain
             place[:] = replies
-            times[:] = at if spans is None else spans
-            self._arrived_ns[rows] = at if spans is None else [last for _, last in spans]
+            times[:] = spans or at
+        if chain is None or spans is None:
+            for servo in servos:  # a few, so that an array is no quicker
+                arrived[servo] = at
+        else:
+            for servo, (_, last) in zip(servos, spans, strict=True):
+                arrived[servo] = last
         self.awaiting = False
         self.at_ns = at
-        self.done += 1
-        if self.done == len(self._told):
+        self.done = done = self.done + 1
+        if done == len(self._told):
             self._records(self._last)
             for counting in self._counts:
                 counting.count()

@@ -105,15 +105,16 @@ class SerialPort:
 
     def read_into(self, buffer: memoryview) -> int:
         """Copy what has arrived into `buffer`; raises PortError when the adapter is gone."""
-        announced, self.announced = self.announced, False
         try:
             count = _readv(self.descriptor, (buffer,))
         except BlockingIOError:
-            return 0
+            count = 0
         except OSError as error:
             raise self._gone(error) from error
-        if count == 0 and announced:  # ready to be read, and nothing there: the other side hung up
-            raise self._gone(None)
+        else:
+            if count == 0 and self.announced:  # ready to be read, and nothing there: the other side hung up
+                raise self._gone(None)
+        self.announced = False
         return count
 
     def _gone(self, error: OSError | None) -> PortError:
@@ -152,16 +153,17 @@ class SerialPorts:
     def wait(self, deadline_ns: int) -> Sequence[int]:
         """Wait for bytes on any line until `deadline_ns` of CLOCK_MONOTONIC; a past deadline only looks."""
         left_ns = deadline_ns - _now_ns()
+        found: list[tuple[int, int]] = []
         # poll has milliseconds, select has microseconds: what is left of a millisecond
-        if left_ns >= 1_000_000 and (found := self._poll.poll(left_ns // 1_000_000)):
-            return self._announced(found)
-        if left_ns > 0 and (left_ns := deadline_ns - _now_ns()) > 0:
-            select.select(self._waited, (), (), left_ns * 1e-9)
-        found = self._poll.poll(0)
-        return self._announced(found) if found else ()
-
-    def _announced(self, found: list[tuple[int, int]]) -> Sequence[int]:
-        """Return the lines that have bytes, or are gone, and note that they were said to have bytes."""
+        if left_ns >= 1_000_000:
+            found = self._poll.poll(left_ns // 1_000_000)
+            left_ns = 0 if found else deadline_ns - _now_ns()
+        if not found:
+            if left_ns > 0:
+                select.select(self._waited, (), (), left_ns * 1e-9)
+            found = self._poll.poll(0)
+            if not found:
+                return ()
         indices = [self._index[descriptor] for descriptor, _ in found]
         for index in indices:
             self._ports[index].announced = True
