@@ -127,9 +127,10 @@ class Side:
 
     def found(self, index):
         """Return what can be told apart of one bus."""
-        arrays = self.arrays[index]
-        arrays.count()
-        reads, bus, packets = self.reads[index], self.buses[index], self.sinks[index].packets
+        arrays, reads = self.arrays[index], self.reads[index]
+        bus, packets = self.buses[index], self.sinks[index].packets
+        if not reads.counted:
+            arrays.count()
         for servo, fresh in enumerate(reads.fresh.tolist()):
             reads.missed[servo] = 0 if fresh else reads.missed[servo] + 1
         return (

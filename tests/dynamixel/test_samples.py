@@ -51,6 +51,7 @@ class Robot:
                 if fresh[first + index]:
                     bus.arrivals.at_ns[index] = self.now_ns - arrived_ns[first + index]
             first += len(plan.servos)
+            bus.count()
         self.samples.settle(self.now_ns, all(fresh))
 
     def all_said(self, *raw, age_ns=0):

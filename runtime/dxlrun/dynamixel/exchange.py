@@ -110,6 +110,8 @@ class CyclicReads:
         "arrived_ns",
         "away",
         "burst",
+        "complete",
+        "counted",
         "errors",
         "fast",
         "fresh",
@@ -151,6 +153,10 @@ class CyclicReads:
         self._lanes: dict[tuple[tuple[int, ...], ...], Lane] = {}
         self.lane: Lane | None = None
         """The quick way through this cycle, when there is one."""
+        self.counted = False
+        """True when the ticks of this cycle are there already, and not in the bytes of `StateArrays`."""
+        self.complete = False
+        """True when everybody answered as nearly always: without an error, and all was well before."""
         self._erring = False  # somebody's newest error byte is not 0
         self.burst: Burst | None = None
         self._made: dict[tuple[int, ...], _Request] = {}
@@ -166,6 +172,7 @@ class CyclicReads:
     def begin(self) -> None:
         """Prepare for the next cycle."""
         self._fresh[:] = self._none
+        self.counted = self.complete = False
         if self._smooth:
             return
         for number, lost in enumerate(self._lossy):
@@ -212,7 +219,8 @@ class CyclicReads:
         """Take note of who was read through a lane; return the read at which it ended, None for none."""
         if lane.through:
             self._fresh[:] = lane.fresh
-            self._arrays.counted = True
+            self.counted = True
+            self.complete = 0 not in lane.fresh
             self._smooth = not any(self._broken)
             return None
         for stretch in lane.stretches[: lane.done]:

@@ -27,7 +27,7 @@ class Jumps:
     servo that really stands elsewhere is believed again after a moment.
     """
 
-    __slots__ = ("_events", "_fastest", "_mask", "_names", "_quick", "_said_ns", "_slowest")
+    __slots__ = ("_events", "_fastest", "_mask", "_names", "_quick", "_said_ns", "surely_none")
 
     def __init__(self, plans: Iterable[BusPlan], events: EventSink) -> None:
         self._events = events
@@ -37,15 +37,10 @@ class Jumps:
         self._fastest = np.array(speeds, dtype=np.float64)
         # a step below this is always possible, whenever the sample before was
         self._quick = self._fastest * MARGIN_NS * 1e-9 + MARGIN_RAD
-        self._slowest = float(self._quick.min(initial=np.inf))
+        self.surely_none = float(self._quick.min(initial=np.inf))
+        """rad; as long as all steps together, as a vector, are no longer, every one of them is possible."""
         self._mask = np.zeros(len(both), dtype=np.bool_)
         self._said_ns = [-SAY_AGAIN_NS] * len(both)
-
-    def surely_none(self, steps: Floats) -> bool:
-        """Say whether every step is possible for any of the servos; steps in rad."""
-        # of so few numbers quicker than by numpy
-        found: list[float] = steps.tolist()
-        return not found or (max(found) <= self._slowest and min(found) >= -self._slowest)
 
     def suspects(self, steps: Floats, fresh: NDArray[np.bool_]) -> list[int]:
         """Return who of those that are `fresh` made a step that may be too far, by index; steps in rad."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import accumulate
+from math import dist
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +16,7 @@ from dxlrun.events import EventSink
 from dxlrun.interfaces import Floats, States
 from dxlrun.mode import Mode
 
-# numpy takes ten times as long to compare with a member of an Enum
-_VELOCITY, _PWM = int(Mode.VELOCITY), int(Mode.PWM)
+_WHEEL_MODES = (Mode.VELOCITY, Mode.PWM)
 
 
 class Samples:
@@ -31,8 +31,7 @@ class Samples:
         "_age_ns",
         "_all_valid",
         "_arrivals",
-        "_before",
-        "_delta",
+        "_here",
         "_jumps",
         "_motion",
         "_newest_ns",
@@ -68,11 +67,10 @@ class Samples:
         self._all_valid = False  # in the cycle before
         self._values: Floats = np.zeros((3, len(servos)))
         self._position: Floats = self._values[0]
-        self._before: Floats = self._motion[0]
         self._scale: Floats = np.array([_units(servo) for servo in servos]).reshape(-1, 3).T.copy()
         self._reference = np.array([servo.direction * servo.reference for servo in servos])
         self._speeds = _Speeds.of(servos)
-        self._delta = np.zeros(len(servos))
+        self._here: list[float] = self._motion[0].tolist()  # the positions that the states show
         self._now = np.zeros((), dtype=np.int64)
         self._now_ns = 0
         self._newest_ns = np.zeros(len(servos), dtype=np.int64)
@@ -83,22 +81,20 @@ class Samples:
         The row of a servo of whom nothing came, or nothing that can be true, keeps its values, is invalid,
         and its age grows.
         """
-        for arrays in self.buses:
-            arrays.count()
         if self._speeds is not None:
-            self._speeds.follow(self._states.mode[self._rows], self._scale[1])
-        values, delta = self._values, self._delta
+            self._speeds.follow(self._states.mode.tobytes(), self._scale[1])
+        values, position = self._values, self._position
         np.multiply(self._arrivals.ticks, self._scale, values)
-        position = self._position
         np.subtract(position, self._reference, position)
-        np.subtract(position, self._before, delta)
         self._now[()] = now_ns  # quicker than to let numpy make an array of an int
-        if everybody and self._jumps.surely_none(delta):
+        here: list[float] = position.tolist()
+        if everybody and dist(here, self._here) <= self._jumps.surely_none:
             if not self._all_valid:
                 self._all_valid = True
                 self._valid.fill(True)
             self._motion[...] = values
             np.subtract(self._now, self._arrivals.at_ns, self._age_ns)
+            self._here = here
         else:
             self._sift(now_ns)
         self._now_ns = now_ns
@@ -111,13 +107,15 @@ class Samples:
         elapsed_ns = now_ns - self._now_ns
         np.subtract(self._now, self._arrivals.at_ns, newest_ns)
         valid[:] = self._arrivals.fresh
-        for index in self._jumps.suspects(self._delta, valid):
+        steps = self._position - self._motion[0]
+        for index in self._jumps.suspects(steps, valid):
             between_ns = int(age_ns[index] - newest_ns[index]) + elapsed_ns
-            valid[index] = self._jumps.can_be(index, self._delta[index], between_ns, now_ns)
+            valid[index] = self._jumps.can_be(index, steps[index], between_ns, now_ns)
         self._all_valid = False not in valid.tolist()
         np.copyto(self._motion, self._values, where=valid)
         np.add(age_ns, elapsed_ns, age_ns, where=age_ns >= 0)
         np.copyto(age_ns, newest_ns, where=valid)
+        self._here = self._motion[0].tolist()
 
     def _hand_over(self, rows: NDArray[np.intp]) -> None:
         """Fill the states where the joints are in another order than the servos."""
@@ -130,9 +128,10 @@ class Samples:
 class _Speeds:
     """The units of present speeds, where any depends on the mode."""
 
-    __slots__ = ("_joint", "_seen", "_wheel")
+    __slots__ = ("_joint", "_rows", "_seen", "_wheel")
 
-    def __init__(self, joint: Floats, wheel: Floats) -> None:
+    def __init__(self, rows: Sequence[int], joint: Floats, wheel: Floats) -> None:
+        self._rows = rows
         self._joint = joint
         self._wheel = wheel
         self._seen = b""
@@ -142,14 +141,15 @@ class _Speeds:
         """Return those of these servos; None where every mode has the same unit."""
         joint = [servo.direction * servo.rad_s_per_tick for servo in servos]
         wheel = [servo.direction * _in_wheel_mode(servo) for servo in servos]
-        return None if joint == wheel else cls(np.array(joint), np.array(wheel))
+        return (
+            None if joint == wheel else cls([servo.row for servo in servos], np.array(joint), np.array(wheel))
+        )
 
-    def follow(self, modes: NDArray[np.uint8], scale: Floats) -> None:
-        """Bring the scale to what the modes ask for."""
-        seen = modes.tobytes()
-        if seen != self._seen:
-            self._seen = seen
-            turning = (modes == _VELOCITY) | (modes == _PWM)
+    def follow(self, modes: bytes, scale: Floats) -> None:
+        """Bring the scale to what the modes of all joints ask for."""
+        if modes != self._seen:
+            self._seen = modes
+            turning = [modes[row] in _WHEEL_MODES for row in self._rows]
             scale[:] = np.where(turning, self._wheel, self._joint)
 
 

@@ -109,7 +109,7 @@ class StateArrays:
     Velocity (128)).
     """
 
-    __slots__ = ("_blocks", "_plan", "arrivals", "counted", "replies")
+    __slots__ = ("_blocks", "_plan", "arrivals", "replies")
 
     def __init__(self, plan: BusPlan, arrivals: Arrivals) -> None:
         self._plan = plan
@@ -122,8 +122,6 @@ class StateArrays:
             for index in range(len(plan.servos))
         )
         """Where each servo's bytes belong, in the order of the plan's servos."""
-        self.counted = False
-        """True when somebody brought the ticks of this cycle up to date from where the bytes came."""
 
     def place(self, indices: Sequence[int]) -> tuple[NDArray[np.uint8], Rows]:
         """Return the bytes of all servos of one layout, one row a servo, and the rows of some of them."""
@@ -137,10 +135,8 @@ class StateArrays:
 
     def count(self) -> None:
         """Bring the ticks up to date, of who did not answer by its last reply that was kept here."""
-        if not self.counted:
-            for block in self._blocks:
-                block.counting.count()
-        self.counted = False
+        for block in self._blocks:
+            block.counting.count()
 
 
 class _Block:
