@@ -20,6 +20,7 @@ from dxlrun.dynamixel.inspection1 import FORBIDDEN
 from dxlrun.dynamixel.plan import plan_line
 from dxlrun.dynamixel.protocol1 import StatusError
 from dxlrun.dynamixel.protocol2 import describe_hardware_error
+from dxlrun.dynamixel.returning import Returning
 from dxlrun.dynamixel.slow_registers import SlowRegisters, once
 from dxlrun.dynamixel.startup import Rejoined
 from dxlrun.dynamixel.state_arrays import StateArrays
@@ -35,11 +36,6 @@ NOISE_EVENT_NS = 1_000_000_000
 
 ALERT_AGAIN = 50
 """Cycles after which a standing alert is read again: a second error does not change the alert bit."""
-RETURN_SPEED = 1.5
-"""rad/s, no faster does a servo that was lost go to its goal, which may have gone on: a step that no gate saw
-is to be a slow one."""
-RETURNED = 0.05
-"""rad from the goal: the servo has caught up."""
 _SHUTS_DOWN = StatusError.OVERHEATING | StatusError.OVERLOAD
 """After them Torque Limit may be 0 (e-Manual AX-12A, Alarm Shutdown (18))."""
 _LOST = f"missed {LOST_CYCLES} replies in a row; it is asked once a second until it is in order"
@@ -66,7 +62,6 @@ class Servos:
         "_arrived_ns",
         "_asking",
         "_bus",
-        "_ceiling",
         "_dialect",
         "_emit",
         "_everybody",
@@ -119,8 +114,7 @@ class Servos:
         """Shape (servos,): who has torque for certain and missed no reply since; they get goals."""
         self._rows = [servo.row for servo in plan.servos]
         self._everybody = b"\1" * count
-        self._returning: list[int] = []  # who catches up with its goal, slowly
-        self._ceiling = np.full(count, np.nan)
+        self._returning = Returning(self._rows)
         self._limp = [False] * count
         self._missed = self.reads.missed
         self._missing = False  # somebody's newest reply is
@@ -197,21 +191,16 @@ class Servos:
     def _stopped(self, index: int) -> None:
         """Send a servo that its watchdog stopped no goal before its torque was read again."""
         self.torqued[index] = False
-        self._slow_down(index)
+        self._returning.slow_down(index)
 
     def goal_packets(self, goals: Commands, states: States) -> Sequence[bytes]:
         """Return the packets with the goals of everybody who may get one; who was lost comes back slowly."""
         if self._modes.doubtful:
             self.torqued[self._modes.doubtful] = False
             self._modes.doubtful.clear()
-        if not self._returning:
+        if not self._returning.anybody:
             return self.goals.packets(goals, self.torqued)
-        for index in self._returning[:]:
-            row = self._rows[index]
-            if self.torqued[index] and abs(goals.position[row] - states.position[row]) < RETURNED:
-                self._returning.remove(index)
-                self._ceiling[index] = np.nan
-        return self.goals.packets(goals, self.torqued, self._ceiling)
+        return self.goals.packets(goals, self.torqued, self._returning.ceiling(goals, states, self.torqued))
 
     def ask(self) -> None:
         """Let the next gap ask one servo what it is owed beside its cyclic reads, if one is owed anything.
@@ -345,7 +334,7 @@ class Servos:
         """Take a servo out of the exchange until it was found in order."""
         self.reads.leave(index)
         self.torqued[index] = False
-        self._slow_down(index)
+        self._returning.slow_down(index)
         self._absent.lose(index, not self._limp[index], probe_after_ns)
 
     def _back(self, index: int, rejoined: Rejoined) -> None:
@@ -378,11 +367,6 @@ class Servos:
         self.torqued[index], self._limp[index] = False, True
         # who kept it is switched off again as soon as it is in order
         self._absent.switch_off(index, lambda: self._leave(index, 0))
-
-    def _slow_down(self, index: int) -> None:
-        if index not in self._returning:
-            self._returning.append(index)
-            self._ceiling[index] = RETURN_SPEED
 
     def _tell_limp(self, index: int, enabled: int) -> None:
         self._limp[index] = True
