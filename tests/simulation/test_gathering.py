@@ -61,14 +61,19 @@ def disturb(bus: SimulatedBus, chance: random.Random, now_ns: int) -> None:
 
 
 def entries_of(
-    seed: int, absent: str, next_ns: Callable[[SimulatedBus], int | None]
+    seed: int, absent: str, next_ns: Callable[[SimulatedBus], int | None], *, watched: bool = False
 ) -> tuple[list[LedgerEntry], int]:
-    """Return what the ledger of random traffic says, and how often the host was given something."""
+    """Return what the ledger of random traffic says, and how often the host was given something.
+
+    `watched`: something that changes nothing is planned within each answer, so that it passes byte by byte.
+    """
     chance, ledger, now_ns, hands = random.Random(seed), Ledger(), 0, 0
     bus = bus_of(ledger, absent=absent)
     bus.receive(packet2(0xFE, 0x83, bytes((64, 0, 1, 0)) + b"".join(bytes((each, 1)) for each in IDS)), 0)
     for _ in range(60):
         disturb(bus, chance, now_ns)
+        if watched:
+            bus.at(now_ns + 1, lambda: None)
         bus.receive(question(chance), now_ns)
         end_ns = now_ns + chance.choice((200_000, 2_000_000))  # the first is within most replies
         while (due_ns := next_ns(bus)) is not None and due_ns <= end_ns:
@@ -89,6 +94,13 @@ def test_gathered_answers_stand_in_the_ledger_as_single_ones_do(seed: int, absen
     gathered, seldom = entries_of(seed, absent, lambda bus: bus.next_delivery_ns(MICROFRAME_NS))
     assert of_bus(gathered) == of_bus(single)
     assert seldom < often
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_answers_that_nobody_disturbs_are_those_that_are_decided_one_by_one(seed: int) -> None:
+    undisturbed, _ = entries_of(seed, "silent", SimulatedBus.next_due_ns)
+    one_by_one, _ = entries_of(seed, "silent", SimulatedBus.next_due_ns, watched=True)
+    assert undisturbed == one_by_one
 
 
 def test_no_answer_waits_longer_than_a_microframe_and_the_last_one_not_at_all() -> None:

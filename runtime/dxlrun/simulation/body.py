@@ -103,6 +103,10 @@ class Body(ABC):
         """Take note of an instruction on the line at a time."""
         self.advance(now_ns)
 
+    def hear_again(self, now_ns: int) -> None:
+        """Take note of an instruction to which nothing changed since it heard the one before."""
+        self.shaft.now_ns = now_ns
+
     def power_up(self) -> None:
         """Start: RAM is as it is at power-up, the shaft stays where it is."""
         self._registered = None

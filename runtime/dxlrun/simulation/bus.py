@@ -24,13 +24,14 @@ from dxlrun.simulation.adapter import Adapter
 from dxlrun.simulation.agenda import Agenda
 from dxlrun.simulation.bus_config import BusConfig, ServoCounts
 from dxlrun.simulation.delivery import Delivery
+from dxlrun.simulation.flow import Flow
 from dxlrun.simulation.ledger import Ledger
 from dxlrun.simulation.listeners import Listeners
 from dxlrun.simulation.mechanics import Mechanics
 from dxlrun.simulation.packets import Codec, InstructionPacket, ReadInTurn, Reply
-from dxlrun.simulation.said import Repeated, Said, asked, nothing_shared, said
+from dxlrun.simulation.said import Readings
 from dxlrun.simulation.servo import ServoConfig, SimulatedServo
-from dxlrun.simulation.wire import STATUS_BYTES, Alteration, Chain, Change, Chunk, Wire
+from dxlrun.simulation.wire import STATUS_BYTES, Alteration, Chain, Change, Chunk, Wire, flipped
 
 
 class SimulatedBus:
@@ -43,7 +44,6 @@ class SimulatedBus:
         self.protocol = config.protocol
         self.absent = config.absent
         self.echo = config.adapter.echo
-        """True: the adapter gives the host its own bytes back."""
         self.ledger = ledger
         self.plugged = True
         """False: nothing is between the host and the line."""
@@ -62,12 +62,14 @@ class SimulatedBus:
         """How long after its time the host got what it got last, in real time."""
         self._wedged = False
         self._chain: Chain | None = None
-        self._said: Said | None = None
+        self._flow: Flow | None = None
+        """Answers that nobody disturbs: nothing else is on the line, or planned before they end."""
         self._changes: dict[int, deque[Change]] = {}
         self._instruction_changes: deque[Change] = deque()
         self._agenda = Agenda()
         self._counts: dict[SimulatedServo, ServoCounts] = {}
         self._listeners = Listeners(config.baud_rate)
+        self._readings = Readings(self._codec, self._wire.duration_ns, self._listeners, self._counts)
         for servo in config.servos:
             self.add_servo(servo)
 
@@ -75,9 +77,9 @@ class SimulatedBus:
 
     def receive(self, data: bytes | bytearray | memoryview, at_ns: int) -> None:
         """Take bytes that the host hands to its adapter at `at_ns`; they follow those still on the wire."""
+        heard = bytes(data)
         self._pass_time(at_ns)
-        heard = bytearray(data)
-        self.ledger.add(at_ns, self.name, "in", bytes(heard))
+        self.ledger.add(at_ns, self.name, "in", heard)
         if self._wedged or not self.plugged:
             self.note(f"{len(heard)} bytes of the host do not reach the line")
             return
@@ -88,7 +90,7 @@ class SimulatedBus:
         self._host_free_ns = start_ns + self._wire.duration_ns(len(heard))
         self._hear(heard, start_ns)
         if self.echo:
-            self._wire.echo(Chunk(start_ns, self._host_free_ns, bytes(data), "echo"))
+            self._wire.echo(Chunk(start_ns, self._host_free_ns, heard, "echo"))
 
     @property
     def baud_rate(self) -> int:
@@ -97,6 +99,7 @@ class SimulatedBus:
 
     @baud_rate.setter
     def baud_rate(self, baud_rate: int) -> None:
+        self._break_up()
         self._wire.baud_rate = baud_rate
         self._listeners.change_rate(baud_rate)
 
@@ -107,6 +110,8 @@ class SimulatedBus:
 
     def next_due_ns(self) -> int | None:
         """Return when something happens by itself: bytes can be taken, a fault comes; None: nothing will."""
+        if self._flow is not None:
+            return self._flow.next_ns()  # what is planned comes later
         passing = self._wire.passing
         due_ns = None if self._wedged else self._adapter.next_ns(passing)
         if passing and (due_ns is None or passing[0].due_ns < due_ns):
@@ -116,14 +121,7 @@ class SimulatedBus:
 
     def next_delivery_ns(self, gather_ns: int) -> int | None:
         """Return `next_due_ns`, or when the last answer has passed that follows it within a time."""
-        due_ns, chain, passing = self.next_due_ns(), self._chain, self._wire.passing
-        if due_ns is None or chain is None or not (chain.waiting and self._adapter.immediate):
-            return due_ns
-        if not passing or passing[0].chain is not chain or passing[0].due_ns != due_ns:
-            return due_ns
-        planned_ns = self._agenda.next_ns
-        gathered_ns = chain.heard_ns(due_ns, gather_ns, self._wire.duration_ns)
-        return gathered_ns if planned_ns is None else min(gathered_ns, max(due_ns, planned_ns))
+        return self.next_due_ns() if self._flow is None else self._flow.gathered_ns(gather_ns)
 
     def take(self, now_ns: int, *, handed_ns: int | None = None) -> bytes:
         """Return the bytes that have reached the host by `now_ns`, each once.
@@ -131,6 +129,11 @@ class SimulatedBus:
         `handed_ns`: when the host really gets them; how late that is belongs into the ledger.
         """
         self._pass_time(now_ns)
+        if (flow := self._flow) is not None:
+            data = self._delivery.take_flow(flow, handed_ns)
+            if flow.over:
+                self._flow = None
+            return data
         passing = self._wire.passing
         if self._wedged or not (passing or self._adapter.holds):
             return b""
@@ -167,6 +170,7 @@ class SimulatedBus:
 
     def counts(self, servo: SimulatedServo) -> ServoCounts:
         """Return what a servo of this bus did so far; raises KeyError for one of another bus."""
+        self._readings.count()
         return self._counts[servo]
 
     def advance(self, now_ns: int) -> None:
@@ -177,6 +181,7 @@ class SimulatedBus:
 
     def at(self, t_ns: int, action: Callable[[], None]) -> None:
         """Plan a fault: `action` is called when the bus' time reaches `t_ns`."""
+        self._break_up()
         self._agenda.at(t_ns, action)
 
     def after(self, packets: int, action: Callable[[], None]) -> None:
@@ -191,21 +196,17 @@ class SimulatedBus:
         self, servo_id: int, text: str, change: Alteration, *, delay_ns: int = 0, copies: int = 1
     ) -> None:
         """Change a servo's next reply, let it start later or come several times; the ledger gets `text`."""
+        self._break_up()
         self._changes.setdefault(servo_id, deque()).append(Change(text, change, delay_ns, copies))
 
     def alter_next_instruction(self, text: str, change: Alteration) -> None:
-        """Change what the servos hear of the next whole instruction packet; b"" loses it."""
+        """Change what the servos hear of the next whole instruction; b"" loses it."""
         self._instruction_changes.append(Change(text, change))
 
     def corrupt_next(self, servo_id: int, index: int = -1, flip: int = 0x01) -> None:
         """Flip bits of one byte of a servo's next reply."""
-
-        def change(reply: bytes) -> bytes:
-            broken = bytearray(reply)
-            broken[index] ^= flip
-            return bytes(broken)
-
-        self.alter_next(servo_id, f"byte {index} of its reply corrupted by {flip:#04x}", change)
+        text = f"byte {index} of its reply corrupted by {flip:#04x}"
+        self.alter_next(servo_id, text, lambda reply: flipped(reply, index, flip))
 
     def truncate_next(self, servo_id: int, keep: int) -> None:
         """Let only the first `keep` bytes of a servo's next reply through; 0 loses it."""
@@ -217,12 +218,14 @@ class SimulatedBus:
 
     def inject_noise(self, data: bytes, at_ns: int) -> None:
         """Put bytes on the line that no servo sent, toward the host, beginning at `at_ns`."""
+        self._break_up()
         self.note(f"noise of {len(data)} bytes at {at_ns} ns")
         self._wire.send(Chunk(at_ns, at_ns + self._wire.duration_ns(len(data)), data, "noise"))
 
     def unplug(self) -> None:
         """Pull the adapter: what it holds is lost, and the host sees its port go."""
         if self.plugged:
+            self._break_up()
             self.note("adapter unplugged")
             self.plugged = False
             self.times_unplugged += 1
@@ -237,6 +240,7 @@ class SimulatedBus:
 
     def wedge(self, on: bool = True) -> None:
         """Let the adapter take the host's bytes and pass none on, in either direction; or mend it."""
+        self._break_up()
         self.note("adapter wedged" if on else "adapter mended")
         self._wedged = on
         self._adapter.forget()
@@ -246,27 +250,29 @@ class SimulatedBus:
     def _pass_time(self, now_ns: int) -> None:
         """Let everything happen that happens by itself until `now_ns`, in order."""
         passing, agenda = self._wire.passing, self._agenda
-        while True:
+        if self._flow is not None:
+            self._flow.pass_until(now_ns)
+        while passing or agenda.next_ns is not None:
             t_ns = agenda.next_ns
             if passing and passing[0].due_ns <= now_ns and (t_ns is None or t_ns >= passing[0].due_ns):
-                chain = self._chain
-                if chain and t_ns is None and not self._changes and chain.alone(self._wire):
-                    self._flow(chain, now_ns)
-                else:
-                    self._arrive(passing.pop(0))
+                self._arrive(passing.pop(0))
             elif t_ns is not None and t_ns <= now_ns:
+                self._break_up()
                 self._now_ns = max(self._now_ns, t_ns)
                 agenda.pop()()
             else:
                 break
         self._now_ns = max(self._now_ns, now_ns)
 
-    def _flow(self, chain: Chain, now_ns: int) -> None:
-        """Let answers pass, one after the other until a time, with nobody between them; see `_arrive`."""
-        ended_ns = chain.pass_on(self._wire, self._hand, self._status, now_ns)
-        if ended_ns is not None:
-            self._now_ns = max(self._now_ns, ended_ns)
-            self._continue(chain, ended_ns)
+    def _break_up(self) -> None:
+        """Let answers that nobody disturbed so far pass chunk by chunk."""
+        if self._flow is None:
+            return
+        arrived, passing = self._flow.break_up()
+        self._flow = None
+        self._adapter.arrived.extend(arrived)
+        self._wire.passing.extend(passing)
+        self._chain = passing[0].chain if passing else None
 
     def _hand(self, chunk: Chunk) -> None:
         """Let the adapter have what has passed the wire."""
@@ -292,20 +298,20 @@ class SimulatedBus:
 
     # Inside: instructions
 
-    def _hear(self, heard: bytearray, start_ns: int) -> None:
+    def _hear(self, heard: bytes | bytearray, start_ns: int) -> None:
         position = 0
         while position < len(heard):
+            self._break_up()
             if self._wire.passing:
+                heard = bytearray(heard)
                 self._wire.talk_over(heard, position, start_ns)
             packet = self._receiver.feed(heard, position)
             if packet is None:
                 return
             position = packet.end
             end_ns = start_ns + self._wire.duration_ns(position)
-            if self._instruction_changes:
-                self._mishear(packet, end_ns)
-            else:
-                self._execute(packet, end_ns)
+            obey = self._mishear if self._instruction_changes else self._execute
+            obey(packet, end_ns)
 
     def _mishear(self, packet: InstructionPacket, end_ns: int) -> None:
         """Let the servos hear something else than the host said."""
@@ -325,6 +331,7 @@ class SimulatedBus:
         if reading is not None:
             self._read_in_turn(reading, end_ns)
         else:
+            self._readings.count()
             for servo in self._listeners.of(packet.servo_id):
                 counts = self._counts[servo]
                 counts.heard += packet.intact
@@ -337,20 +344,20 @@ class SimulatedBus:
     def _read_in_turn(self, reading: ReadInTurn, end_ns: int) -> None:
         """Let the listed servos answer, each when it has heard the one before it."""
         slots = reading.has_slots and self.absent == "slot"
-        before = self._said
-        if before is not None and before.again(reading, end_ns):
-            fast = Repeated(before.parts) if before.parts else None
-            self._chain = Chain(reading, deque(before.answers), fast, slots)
-        else:
-            self._chain = self._asked_in_turn(reading, slots, end_ns)
+        told = self._readings.said(reading, slots, end_ns)
+        if told.flow is not None and self._undisturbed_until(end_ns + told.flow.lasts_ns):
+            self._flow = told.flow.begin(end_ns)
+            return
+        shared = self._codec.fast_status(reading.lengths) if reading.fast else None
+        self._chain = Chain(reading, deque(told.answers), shared, slots)
         self._continue(self._chain, end_ns)
 
-    def _asked_in_turn(self, reading: ReadInTurn, slots: bool, end_ns: int) -> Chain:
-        """Return what each listed servo says."""
-        answers = asked(reading, self._listeners, self._counts, slots, end_ns)
-        empty = self._codec.fast_status if reading.fast else nothing_shared
-        self._said = said(reading, answers, empty(reading.lengths), self._listeners, self._counts)
-        return Chain(reading, deque(answers), empty(reading.lengths), slots)
+    def _undisturbed_until(self, t_ns: int) -> bool:
+        """Return whether nothing but answers passes the line, and nothing is to happen to it, for a time."""
+        planned_ns = self._agenda.next_ns
+        if self._wire.passing or self._adapter.holds or (planned_ns is not None and planned_ns <= t_ns):
+            return False
+        return self._adapter.immediate and not self.echo and not any(self._changes.values())
 
     def _continue(self, chain: Chain, free_ns: int) -> None:
         """Let the next one answer; nobody does any more when there is none."""

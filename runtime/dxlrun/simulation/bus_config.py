@@ -41,8 +41,8 @@ class ServoCounts:
     last_error: int = 0
     """Of its last answer, as it stood in the packet."""
 
-    def answer(self, error: int) -> None:
-        """Count an answer."""
-        self.answered += 1
-        self.errors += error != 0
+    def answer(self, error: int, times: int = 1) -> None:
+        """Count an answer, or several alike."""
+        self.answered += times
+        self.errors += times * (error != 0)
         self.last_error = error

@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Sequence
 
 from dxlrun.simulation.adapter import Adapter
+from dxlrun.simulation.flow import Flow
 from dxlrun.simulation.ledger import Ledger
 from dxlrun.simulation.wire import Chunk
 
@@ -15,7 +16,7 @@ class Delivery:
 
     def __init__(self, adapter: Adapter, ledger: Ledger, bus: str) -> None:
         self.lateness_ns: deque[int] = deque(maxlen=1000)
-        """How long after its time the host got what it got last, in real time."""
+        """How long after its end the host got the last answer of each hand-over, in real time."""
         self._adapter = adapter
         self._ledger = ledger
         self._bus = bus
@@ -32,12 +33,27 @@ class Delivery:
             taken += part.data
         return bytes(taken)
 
+    def take_flow(self, flow: Flow, handed_ns: int | None) -> bytes:
+        """Return what has passed of answers that nobody disturbs."""
+        data, given = flow.give()
+        add, bus = self._ledger.add, self._bus
+        if handed_ns is None:
+            for due_ns, part in given:
+                add(due_ns, bus, "out", part)
+        elif given:
+            for due_ns, part in given:
+                add(due_ns, bus, "out", part, late_ns=handed_ns - due_ns)
+            self.lateness_ns.append(handed_ns - given[-1][0])
+        return data
+
     def _take_at_once(self, handed_ns: int | None) -> bytes:
         """Return all that has passed the wire: nothing is kept back or cut."""
         arrived = self._adapter.give_all()
         for chunk in arrived:
-            late_ns = self._late_ns(chunk.due_ns, handed_ns)
+            late_ns = 0 if handed_ns is None else handed_ns - chunk.due_ns
             self._ledger.add(chunk.due_ns, self._bus, "out", chunk.data, chunk.note, late_ns=late_ns)
+        if arrived and handed_ns is not None:
+            self.lateness_ns.append(handed_ns - arrived[-1].due_ns)
         return arrived[0].data if len(arrived) == 1 else b"".join([chunk.data for chunk in arrived])
 
     def _late_ns(self, planned_ns: int, handed_ns: int | None) -> int:

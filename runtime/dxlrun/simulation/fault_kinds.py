@@ -15,6 +15,7 @@ from random import Random
 from dxlrun.simulation.bus import SimulatedBus
 from dxlrun.simulation.fault_text import Fault
 from dxlrun.simulation.servo import ServoConfig, SimulatedServo
+from dxlrun.simulation.wire import flipped
 
 NOISE_BYTES = 8
 FLIPPED_BITS = 0x01
@@ -120,9 +121,7 @@ def _corrupt(injection: Injection) -> None:
     flip = injection.fault.flip or FLIPPED_BITS
 
     def corrupted(packet: bytes) -> bytes:
-        broken = bytearray(packet)
-        broken[max(-len(broken), min(index, len(broken) - 1))] ^= flip
-        return bytes(broken)
+        return flipped(packet, max(-len(packet), min(index, len(packet) - 1)), flip)
 
     _alter(injection, "corrupted", corrupted)
 

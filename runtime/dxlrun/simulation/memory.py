@@ -76,7 +76,7 @@ class Memory:
         }
         self._watchers: dict[str, list[Callable[[], None]]] = {}
         self.changes = 0
-        """How often an item was changed, but for what it shows by itself (`show_all`)."""
+        """How often something was changed of the servo, but for what it shows by itself (`show_all`)."""
         self.restore_factory_values()
 
     def restore_factory_values(self, keep: tuple[str, ...] = ()) -> None:

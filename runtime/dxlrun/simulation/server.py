@@ -68,8 +68,9 @@ class Server:
         self._patience = Patience(self.start_ns)
         self._stopped = False
         self._waiting = select.epoll()
-        self._heard: dict[int, PseudoTerminal] = {}
-        """Whose bytes are taken, by descriptor."""
+        self._by_descriptor: dict[int, PseudoTerminal] = {}
+        self._held: dict[int, int] = {}
+        """Terminals that are not read before a time, by descriptor."""
         self._told = select.EPOLLIN
         """What is waited for on the line to the starter."""
 
@@ -79,6 +80,7 @@ class Server:
         with _wake_on_sigterm() as wake, self._waiting as waiting:
             waiting.register(wake, select.EPOLLIN)
             waiting.register(self._line, self._told)
+            self._plug()
             self._line.send({"ports": self._ports(), "real_time": granted})
             while not self._stopped:
                 self._turn(wake.fileno())
@@ -89,72 +91,81 @@ class Server:
         now_ns = time.monotonic_ns()
         dues = [bus.next_delivery_ns(GATHER_NS) for bus in self._buses]
         soonest_ns = min([due_ns for due_ns in dues if due_ns is not None], default=None)
+        easy_ns = None
         if soonest_ns is None or soonest_ns - now_ns > IDLE_NS:  # no reply is about to leave
-            self._mechanics.advance(now_ns)
-            self._ledger.encode()
-            self._ledger.flush_if_due(now_ns)
+            easy_ns = self._use_pause(now_ns)
             now_ns = time.monotonic_ns()
-        next_ns = self._next_ns(now_ns, soonest_ns)
-        ready = self._wait(next_ns, now_ns)
+        ready = self._wait(soonest_ns, easy_ns, now_ns)
         # What was due before the host wrote goes out first: the host could have read it.
         now_ns = time.monotonic_ns()
         self._patience.woke(now_ns)
-        heard = [self._heard[number] for number, _ in ready if number in self._heard]
         for terminal, due_ns in zip(self._terminals, dues, strict=True):
-            if (due_ns is not None and due_ns <= now_ns) or terminal in heard:
-                terminal.deliver(now_ns)
-                if terminal.follow_adapter():
-                    self._line.send({"ports": self._ports()})
-        for terminal in heard:
-            if terminal.plugged:
-                terminal.receive(now_ns)  # of that moment, however long the others took
-        if len(ready) > len(heard):
-            self._answer_starter(wake, {number for number, _ in ready}, now_ns)
+            if due_ns is not None and due_ns <= now_ns:
+                self._deliver(terminal, now_ns)
+        for number, _ in ready:
+            terminal_heard = self._by_descriptor.get(number)
+            if terminal_heard is not None:
+                self._receive(number, terminal_heard, now_ns)  # of that moment, however long the others took
+            elif number == wake:
+                self._stopped = True
+            elif number == self._line.fileno():
+                self._line.flush()
+                self._listen(now_ns)
 
-    def _wait(self, next_ns: int | None, now_ns: int) -> list[tuple[int, int]]:
-        """Wait until something is due, or somebody has written; return who has."""
-        sleep_s = self._patience.until(next_ns, now_ns)
-        poll = self._waiting.poll
-        if sleep_s != 0.0 or next_ns is None:
-            # no longer than asked for, to the microsecond; an epoll's own time is counted in milliseconds
-            select.select((self._waiting,), (), (), sleep_s)
-            return poll(0)
-        while not (ready := poll(0)) and time.monotonic_ns() < next_ns:
-            pass
-        return ready
-
-    def _next_ns(self, now_ns: int, soonest_ns: int | None) -> int | None:
-        """Return when something is to be done unasked; see to it that those are heard who may talk."""
-        times = [soonest_ns, self._ledger.flush_due_ns(), self._mechanics.due_ns()]
-        heard = {}
-        for terminal in self._terminals:
-            taken_ns = terminal.bus.host_free_ns - MOST_BACKLOG_NS
-            if taken_ns > now_ns:
-                times.append(taken_ns)
-            elif terminal.plugged:
-                heard[terminal.fileno()] = terminal
-        if heard != self._heard:
-            self._hear(heard)
+    def _use_pause(self, now_ns: int) -> int | None:
+        """Do what nobody waits for; return when there is more of it."""
+        self._mechanics.advance(now_ns)
+        self._ledger.encode()
+        self._ledger.flush_if_due(now_ns)
+        for number in [each for each, until_ns in self._held.items() if until_ns <= now_ns]:
+            del self._held[number]
+            self._waiting.register(number, select.EPOLLIN)
         told = select.EPOLLIN | (select.EPOLLOUT if self._line.has_unsent else 0)
         if told != self._told:
             self._told = told
             self._waiting.modify(self._line, told)
+        times = [self._ledger.flush_due_ns(), self._mechanics.due_ns(), *self._held.values()]
         return min([t_ns for t_ns in times if t_ns is not None], default=None)
 
-    def _hear(self, terminals: dict[int, PseudoTerminal]) -> None:
-        """Take the bytes of other terminals from now on."""
-        for number in self._heard:
-            with contextlib.suppress(OSError):  # a terminal that was unplugged is closed
-                self._waiting.unregister(number)
-        for number in terminals:
-            self._waiting.register(number, select.EPOLLIN)
-        self._heard = terminals
+    def _wait(self, due_ns: int | None, easy_ns: int | None, now_ns: int) -> list[tuple[int, int]]:
+        """Wait until a reply is due, or something else is to be done, or somebody has written: return who."""
+        sleep_s = self._patience.until(due_ns, now_ns, easy_ns)
+        poll = self._waiting.poll
+        if sleep_s is None or sleep_s > 0.0:
+            # no longer than asked for, to the microsecond: an epoll itself counts milliseconds
+            select.select((self._waiting,), (), (), sleep_s)
+            return poll(0)
+        while not (ready := poll(0)) and due_ns is not None and time.monotonic_ns() < due_ns:
+            pass
+        return ready
 
-    def _answer_starter(self, wake: int, ready: set[int], now_ns: int) -> None:
-        if self._line.fileno() in ready:
-            self._line.flush()
-            self._listen(now_ns)
-        self._stopped = self._stopped or wake in ready
+    def _deliver(self, terminal: PseudoTerminal, now_ns: int) -> None:
+        terminal.deliver(now_ns)
+        if terminal.follow_adapter():
+            self._plug()
+            self._line.send({"ports": self._ports()})
+
+    def _receive(self, number: int, terminal: PseudoTerminal, now_ns: int) -> None:
+        bus = terminal.bus
+        due_ns = bus.next_due_ns()
+        if due_ns is not None and due_ns <= now_ns:
+            self._deliver(terminal, now_ns)
+        if not terminal.plugged or terminal.fileno() != number:
+            return
+        terminal.receive(now_ns)
+        if bus.host_free_ns - MOST_BACKLOG_NS > now_ns:
+            self._held[number] = bus.host_free_ns - MOST_BACKLOG_NS
+            self._waiting.unregister(number)
+
+    def _plug(self) -> None:
+        """Wait for the terminals that are there now."""
+        for number in self._by_descriptor:
+            with contextlib.suppress(OSError):  # of a terminal that was unplugged, or is not read for a while
+                self._waiting.unregister(number)
+        self._held.clear()
+        self._by_descriptor = {each.fileno(): each for each in self._terminals if each.plugged}
+        for number in self._by_descriptor:
+            self._waiting.register(number, select.EPOLLIN)
 
     def _ports(self) -> dict[str, str]:
         return {terminal.bus.name: terminal.path for terminal in self._terminals}

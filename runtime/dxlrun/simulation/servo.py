@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 from dxlrun.control_table import ControlTable, control_table, models_by_number
 from dxlrun.simulation.bodies import make_body
+from dxlrun.simulation.body import Body
 from dxlrun.simulation.mechanics import NO_LOAD, Load, Mechanics
 from dxlrun.simulation.memory import Memory
 from dxlrun.simulation.packets import BROADCAST, InstructionPacket, ReadEntry, ReadInTurn, Reply
@@ -77,6 +78,11 @@ class SimulatedServo:
     def registers(self) -> Memory:
         """Its control items, by name, as integers of the wire."""
         return self._body.memory
+
+    @property
+    def body(self) -> Body:
+        """What it is without its line."""
+        return self._body
 
     # What the bus asks
 
@@ -207,6 +213,7 @@ class SimulatedServo:
     def silence(self, on: bool = True) -> None:
         """Cut or mend its data line: it hears and answers nothing, and goes on with what it does."""
         self._silent = on
+        self.registers.changes += 1
         self._note(f"servo {self.servo_id}: data line {'cut' if on else 'mended'}")
 
     def reset(self) -> None:
@@ -218,6 +225,7 @@ class SimulatedServo:
         """Cut its power until a time: RAM is lost, and it neither moves nor hears anything before."""
         self.reset()
         self._body.deaf_until_ns = max(self._body.deaf_until_ns, until_ns)
+        self.registers.changes += 1
 
     def poke(self, name: str, wire: int) -> None:
         """Set a control item as if it had been so before; the integer of the wire, no refusal."""

@@ -93,6 +93,10 @@ class TorqueBody(Body):
         if self._guarded and (self._looked_after_ns is None or self._retimed):
             self._watch()
 
+    def hear_again(self, now_ns: int) -> None:
+        """Take note of an instruction to which nothing changed since it heard the one before."""
+        self._heard_ns = self.shaft.now_ns = now_ns
+
     def _guard(self) -> None:
         self._guarded = self.memory.get("bus_watchdog") != 0
         self._retimed = True
@@ -163,6 +167,7 @@ class TorqueBody(Body):
         self.note(f"servo {self.servo_id}: reboot")
         self.power_up()
         self.deaf_until_ns = self.shaft.now_ns + self.boot_ns
+        self.memory.changes += 1
 
     def power_up(self) -> None:
         """Start: RAM is as it is at power-up, and so is the angle, but for the turns of the Y series."""

@@ -19,9 +19,6 @@ MOST_PASSING = 256
 
 STATUS_BYTES = 11
 """Bytes of a status packet of Protocol 2.0 without data: the slot of an absent servo is as long [i]."""
-_STATUS_OF_FAST = 4
-"""Bytes that a servo adds to a shared status, without its data."""
-
 Alteration = Callable[[bytes], bytes]
 """What becomes of a packet's bytes."""
 
@@ -37,43 +34,6 @@ class Chain:
     """True: who does not hear the one before it answers when that one's time is over; False: never [?]."""
     slot_end_ns: int = 0
     """When the time of the one that answers now is over."""
-
-    def alone(self, wire: Wire) -> bool:
-        """Return whether one of its answers is all that is on the wire, whole."""
-        passing = wire.passing
-        return len(passing) == 1 and passing[0].chain is self and not passing[0].broken
-
-    def pass_on(
-        self, wire: Wire, hand: Callable[[Chunk], None], status: Callable[[Reply], bytes], now_ns: int
-    ) -> int | None:
-        """Let one answer after the other pass until a time; return when the last one passed that others wait
-        for, None while one is on the wire."""
-        passing, duration_ns, waiting = wire.passing, wire.duration_ns, self.waiting
-        chunk = passing[0]
-        while chunk.due_ns <= now_ns:
-            hand(chunk)
-            if not waiting or len(waiting[0][1]) != 1:
-                passing.clear()
-                return chunk.due_ns
-            entry, (reply,) = waiting.popleft()
-            first_ns = chunk.due_ns + reply.delay_ns
-            self.slot_end_ns = first_ns + duration_ns(STATUS_BYTES + entry.length)
-            data = status(reply) if self.fast is None else self.fast.part(reply)
-            chunk = passing[0] = Chunk(first_ns, first_ns + duration_ns(len(data)), data, "", self)
-        return None
-
-    def heard_ns(self, due_ns: int, within_ns: int, duration_ns: Callable[[int], int]) -> int:
-        """Return when the last of those has answered who do so within a time after another one's answer."""
-        heard_ns = due_ns
-        for entry, replies in self.waiting:
-            if len(replies) != 1:
-                break
-            size = entry.length + (_STATUS_OF_FAST if self.fast else STATUS_BYTES)
-            next_ns = heard_ns + replies[0].delay_ns + duration_ns(size)
-            if next_ns > due_ns + within_ns:
-                break
-            heard_ns = next_ns
-        return heard_ns
 
 
 @dataclass(slots=True)
@@ -179,6 +139,13 @@ class Wire:
         chain = one.chain or other.chain
         broken = bytes(mixed) != (one if chain is one.chain else other).data
         return Chunk(early.first_ns, due_ns, bytes(mixed), "collision", chain, broken, early.given)
+
+
+def flipped(packet: bytes, index: int, flip: int) -> bytes:
+    """Return a packet with bits of one byte flipped; raises IndexError when it is shorter."""
+    broken = bytearray(packet)
+    broken[index] ^= flip
+    return bytes(broken)
 
 
 def _due(chunk: Chunk) -> int:
