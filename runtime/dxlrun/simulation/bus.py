@@ -297,7 +297,6 @@ class SimulatedBus:
             self._chain = None
 
     # Inside: instructions
-
     def _hear(self, heard: bytes | bytearray, start_ns: int) -> None:
         position = 0
         while position < len(heard):
@@ -345,19 +344,20 @@ class SimulatedBus:
         """Let the listed servos answer, each when it has heard the one before it."""
         slots = reading.has_slots and self.absent == "slot"
         told = self._readings.said(reading, slots, end_ns)
-        if told.flow is not None and self._undisturbed_until(end_ns + told.flow.lasts_ns):
+        if told.flow is not None and self._undisturbed(reading, end_ns + told.flow.lasts_ns):
             self._flow = told.flow.begin(end_ns)
-            return
-        shared = self._codec.fast_status(reading.lengths) if reading.fast else None
-        self._chain = Chain(reading, deque(told.answers), shared, slots)
-        self._continue(self._chain, end_ns)
+        else:
+            shared = self._codec.fast_status(reading.lengths) if reading.fast else None
+            self._chain = Chain(reading, deque(told.answers), shared, slots)
+            self._continue(self._chain, end_ns)
 
-    def _undisturbed_until(self, t_ns: int) -> bool:
-        """Return whether nothing but answers passes the line, and nothing is to happen to it, for a time."""
-        planned_ns = self._agenda.next_ns
-        if self._wire.passing or self._adapter.holds or (planned_ns is not None and planned_ns <= t_ns):
+    def _undisturbed(self, reading: ReadInTurn, end_ns: int) -> bool:
+        """Return whether nothing but the answers passes the line, and nothing is to happen, until a time."""
+        planned_ns, changes = self._agenda.next_ns, self._changes
+        if self._wire.passing or self._adapter.holds or (planned_ns is not None and planned_ns <= end_ns):
             return False
-        return self._adapter.immediate and not self.echo and not any(self._changes.values())
+        changed = changes and any(changes.get(entry.servo_id) for entry in reading.entries)
+        return self._adapter.immediate and not self.echo and not changed
 
     def _continue(self, chain: Chain, free_ns: int) -> None:
         """Let the next one answer; nobody does any more when there is none."""
