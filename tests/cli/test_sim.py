@@ -24,7 +24,7 @@ from dxlrun.simulation import read_ledger
 CODE = "import sys; from dxlrun.cli import main; sys.exit(main(sys.argv[1:]))"
 OWN_TERMINAL = "import fcntl, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0)"
 """As a shell does it, so that Ctrl-C is a signal."""
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 """How long a test waits for what must come; it decides nothing but when to give up."""
 PING_1 = bytes.fromhex("ff ff fd 00 01 03 00 01 19 4e")
 PONG_1 = bytes.fromhex("ff ff fd 00 01 07 00 55 00 24 04 2d")

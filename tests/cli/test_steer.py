@@ -21,7 +21,7 @@ ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "steering.md").read_text()
 TORSO = ROOT / "robots" / "bioloid_torso.yaml"
 CODE = "import sys; from dxlrun.cli import main; sys.exit(main())"
-DEADLINE_S = 30.0
+DEADLINE_S = 60.0
 
 
 class Stage:

@@ -208,11 +208,11 @@ def simulated_line(tmp_path):
         children.append((child, ours))
         os.close(reader)
         theirs.close()
-        ours.settimeout(20)
+        ours.settimeout(60)
 
         def finish():
             ours.close()
-            assert child.wait(20) == 0
+            assert child.wait(60) == 0
             return read_ledger(ledger)
 
         return json.loads(ours.recv(4096))["ports"][bus.name], finish

@@ -11,7 +11,7 @@ from dxlrun.dynamixel.reopening import KeptLines, LinesAgain, Wanted, lasting_na
 from dxlrun.errors import PortError
 from dxlrun.process import Line
 
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 
 
 class Adapter:

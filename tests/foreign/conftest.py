@@ -22,7 +22,7 @@ from dynamixel_sdk import PortHandler
 from dxlrun.simulation import BusConfig, LedgerEntry, read_ledger
 from dxlrun.simulation.process import encode_config
 
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 """How long a test waits for what must come; it decides nothing but when to give up."""
 
 

@@ -27,7 +27,7 @@ ADAPTERS = {
     "pieces": AdapterConfig(split="random", seed=5),
     "echo": AdapterConfig(echo=True),
 }
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 RATE = 1_000_000
 X_SERVOS = tuple(ServoConfig(each, "XM430-W350", 2.0) for each in range(1, 7))
 MX_SERVOS = tuple(ServoConfig(each, "MX-28", 2.0) for each in (1, 2))

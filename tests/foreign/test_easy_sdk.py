@@ -30,7 +30,7 @@ MODELS = tuple(
 """Every model of which both know a table."""
 POSITION = 1.0
 """rad, of every servo at the start: also a gripper reaches it."""
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 
 
 def line(name: str, *models: str) -> BusConfig:

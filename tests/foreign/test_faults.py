@@ -17,7 +17,7 @@ from dynamixel_sdk import (
 
 from dxlrun.simulation import BusConfig, ServoConfig
 
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 ALERT = 0x80
 TORQUE, HARDWARE_ERROR = 64, 70
 """Addresses of the X series."""

@@ -16,7 +16,7 @@ import serial
 
 from dxlrun.simulation import BusConfig, ServoConfig
 
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 RATE = 1_000_000
 
 

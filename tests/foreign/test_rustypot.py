@@ -12,7 +12,7 @@ import rustypot
 from dxlrun.control_table import control_table
 from dxlrun.simulation import BusConfig, ServoConfig
 
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 RATE = 1_000_000
 POSITION = 2.0
 """rad from raw 0, of every servo at the start."""

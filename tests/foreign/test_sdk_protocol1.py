@@ -21,7 +21,7 @@ TORQUE, LED, GOAL, SPEED, PRESENT, PRESENT_SPEED, REGISTERED, LOCK = 24, 25, 30,
 """Addresses of the AX and MX series."""
 NEAR = 10
 """Ticks that the examples call arrived."""
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 BROADCAST = 0xFE
 MIDDLE = 2.617994
 """150 degrees: tick 512 of an AX, 1707 of an MX."""

@@ -19,7 +19,7 @@ from dxlrun.simulation import BusConfig, ServoConfig
 LEADER = dict.fromkeys(range(1, 7), "XL330-M077")
 FOLLOWER = {1: "XL430-W250", 2: "XL430-W250", **dict.fromkeys(range(3, 7), "XL330-M288")}
 GRIPPER = 6
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 EXTENDED_POSITION, CURRENT_BASED_POSITION = 4, 5
 
 

@@ -73,7 +73,7 @@ def start(tmp_path: Path, header: LogHeader, layout: CycleLayout) -> Iterator[St
         }
         job_fd = os.memfd_create("job")
         ours, theirs = socket.socketpair()
-        ours.settimeout(20)
+        ours.settimeout(60)
         job = RecorderJob(
             str(path),
             header,
@@ -128,7 +128,7 @@ def test_what_the_rings_carry_is_in_the_log_byte_for_byte(start: Start, cycle: C
         recording.packets.commit()
     recording.events.emit(EventCode.TORQUE_OFF, Severity.INFO, "loop", "every servo is limp")
     summary = recording.finish()
-    assert recording.process.wait(20) == 0
+    assert recording.process.wait(60) == 0
     log = read_log(recording.path)
     assert log.cycles.tobytes() == b"".join(cycle(number) for number in range(30))
     assert [packet.data for packet in log.packets] == sent
@@ -157,7 +157,7 @@ def test_what_was_overwritten_is_declared_and_counted(start: Start, cycle: Cycle
     (event,) = log.events
     assert event.code == EventCode.RECORDER_GAP
     assert "91 records of loop/cycles" in event.text
-    assert recording.process.wait(20) == 1
+    assert recording.process.wait(60) == 1
 
 
 def test_a_record_of_another_robot_is_declared_not_written(start: Start, cycle: Cycle) -> None:
@@ -189,7 +189,7 @@ def test_it_ignores_ctrl_c_and_ends_well_on_sigterm(start: Start, cycle: Cycle) 
     recording.cycles.append(cycle(0))
     recording.process.send_signal(signal.SIGTERM)
     assert recording.summary()["gaps"] == 0
-    assert recording.process.wait(20) == 0
+    assert recording.process.wait(60) == 0
     assert read_log(recording.path).complete
 
 
@@ -198,7 +198,7 @@ def test_it_finishes_when_the_supervisor_is_gone(start: Start, cycle: Cycle) -> 
     assert next(recording.lines) == {"ready": True}
     recording.cycles.append(cycle(0))
     recording.control.shutdown(socket.SHUT_RDWR)
-    assert recording.process.wait(20) == 0
+    assert recording.process.wait(60) == 0
     log = read_log(recording.path)
     assert (len(log.cycles), log.complete) == (1, True)
 
@@ -219,7 +219,7 @@ def test_a_full_disk_is_reported_once_and_the_rings_are_drained_on(start: Start,
     assert summary["messages"] == 0
     assert summary["unwritten"] > 0
     assert next(recording.lines, None) is None
-    assert recording.process.wait(20) == 1
+    assert recording.process.wait(60) == 1
     assert not read_log(recording.path).complete
 
 
@@ -228,5 +228,5 @@ def test_a_log_that_cannot_be_created_is_reported(start: Start, tmp_path: Path) 
     path.write_bytes(b"precious")
     recording = start(path=path)
     assert "cannot be written" in next(recording.lines)["error"]
-    assert recording.process.wait(20) == 1
+    assert recording.process.wait(60) == 1
     assert path.read_bytes() == b"precious"

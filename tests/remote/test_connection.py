@@ -98,7 +98,7 @@ def test_a_connection_that_says_nothing_is_closed(door, monkeypatch):
         answers = []
         for reader, writer in ends:
             try:
-                answers.append(await asyncio.wait_for(reader.read(), 10))
+                answers.append(await asyncio.wait_for(reader.read(), 60))
             except ConnectionResetError:
                 answers.append(b"")
             writer.close()

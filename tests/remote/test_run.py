@@ -38,11 +38,11 @@ controllers:
   hold: {type: joint_group_position_controller, joints: [pan, tilt]}
   solo: {type: joint_group_position_controller, joints: [pan], active: false}
 """
-DEADLINE_S = 30.0
+DEADLINE_S = 60.0
 
 
 def await_truth(look, what):
-    """Return what `look` finds; fails when it finds nothing for half a minute."""
+    """Return what `look` finds; fails when it finds nothing for a minute."""
     tick, give_up = threading.Event(), time.monotonic() + DEADLINE_S
     while time.monotonic() < give_up:
         if found := look():

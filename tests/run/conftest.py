@@ -41,12 +41,12 @@ controllers:
   states: {type: "${type}"}
   hold: {type: joint_group_position_controller, joints: [pan, tilt]}
 """
-DEADLINE_S = 30.0
+DEADLINE_S = 60.0
 T = TypeVar("T")
 
 
 def await_truth(look: Callable[[], T | None], what: str) -> T:
-    """Return what `look` finds; fails when it finds nothing for half a minute."""
+    """Return what `look` finds; fails when it finds nothing for a minute."""
     tick = threading.Event()
     give_up = time.monotonic() + DEADLINE_S
     while time.monotonic() < give_up:
@@ -135,6 +135,7 @@ class Running:
         """Wait until the loop has sent goals, and has gone on for a few cycles: goals that stay are rare."""
 
         def goals() -> bool:
+            assert self.process.poll() is None, self.finish()
             sent = [entry.data[4:5] for entry in self.ledger() if entry.direction == "in"]
             return b"\x83" in sent and len(sent) - sent.index(b"\x83") >= 30
 

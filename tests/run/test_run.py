@@ -99,7 +99,7 @@ def test_without_a_terminal_the_robot_becomes_limp(start: Start, all_limp: Calla
     run.signal(signal.SIGKILL)
     run.finish()
     for descriptor in (guardian, simulation):
-        assert select.select([descriptor], [], [], 30.0)[0]
+        assert select.select([descriptor], [], [], 60.0)[0]
         os.close(descriptor)
     assert all_limp(run)
 

@@ -88,7 +88,7 @@ class Servos:
     def end(self) -> None:
         """End the process; the ledger is whole then."""
         self.process.terminate()
-        self.process.communicate(timeout=30)
+        self.process.communicate(timeout=60)
 
     def entries(self) -> tuple[LedgerEntry, ...]:
         return read_ledger(self.ledger) if self.ledger.exists() else ()

@@ -28,7 +28,7 @@ from dxlrun.simulation.realtime import Patience
 PING_1 = bytes.fromhex("ff ff 01 02 01 fb")
 PONG_1 = bytes.fromhex("ff ff 01 02 00 fc")
 READ_1 = bytes.fromhex("ff ff 01 04 02 24 06 ce")
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 """How long a test waits for what must come; it decides nothing but when to give up."""
 
 BUSES = (
