@@ -55,7 +55,7 @@ class Feeding:
         self._fed_ns = self._gaps.now_ns()
 
     def feed(self, now: int) -> None:
-        """Note that the cyclic reads go out at `now`, ns; who was not fed for too long stopped, and is revived."""
+        """Note that the cyclic reads go out at `now`, ns; who was not fed for long has stopped."""
         if self._fed_ns and now - self._fed_ns > self._longest_ns:
             self._revive((now - self._fed_ns) // 1_000_000)
         self._fed_ns = now
