@@ -56,7 +56,7 @@ def test_instructions_of_the_manual(name: str) -> None:
     text, servo_id, instruction, parameters = GOLDEN_INSTRUCTIONS[name]
     data = bytes.fromhex(text)
     assert InstructionReceiver().feed(data) == InstructionPacket(
-        servo_id, instruction, bytes.fromhex(parameters), intact=True, end=len(data)
+        servo_id, instruction, bytes.fromhex(parameters), intact=True, end=len(data), raw=data
     )
 
 
@@ -139,9 +139,10 @@ def test_packets_are_found_however_they_are_cut(packets: Any, cuts: list[int]) -
 @settings(max_examples=200, deadline=None)
 @given(st.lists(st.sampled_from([0xFF, 0xFD, 0x01, 0x55])).map(bytes))
 def test_noise_without_a_header_hides_no_packet(noise: bytes) -> None:
-    data = noise + bytes.fromhex("fffffd00 01 0300 01 194e")
-    packet = InstructionReceiver().feed(data)
-    assert packet == InstructionPacket(1, Instruction.PING, b"", intact=True, end=len(data))
+    ping = bytes.fromhex("fffffd00 01 0300 01 194e")
+    packet = InstructionReceiver().feed(noise + ping)
+    end = len(noise + ping)
+    assert packet == InstructionPacket(1, Instruction.PING, b"", intact=True, end=end, raw=ping)
 
 
 @pytest.mark.parametrize("servo_id", [0xFD, 0xFF])

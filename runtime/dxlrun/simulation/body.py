@@ -8,8 +8,9 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from collections.abc import Set as AbstractSet
+from typing import NamedTuple
 
-from dxlrun.simulation.memory import IDENTITY, LiveItems, Memory, Run
+from dxlrun.simulation.memory import IDENTITY, LiveItem, Memory, Run
 from dxlrun.simulation.shaft import Shaft
 from dxlrun.simulation.strain import SUPPLY_OHM
 
@@ -34,6 +35,15 @@ _STILL = frozenset(
 _SECONDARY_IDS = ("secondary_shadow_id", "secondary_id")
 
 
+class _Window(NamedTuple):
+    """A row of cells that is read."""
+
+    live: tuple[LiveItem, ...]
+    """What changes by itself in it."""
+    rests: bool
+    """True: nothing of it does while no servo moves."""
+
+
 class Body(ABC):
     """One servo as its own instructions and its surroundings act on it."""
 
@@ -54,7 +64,7 @@ class Body(ABC):
         self._started_ns = shaft.now_ns
         shaft.mechanics.watch(shaft.index, self._strained)
         self._live = {name: show for name, show in self._live_items().items() if name in memory}
-        self._live_in: dict[tuple[int, int], LiveItems] = {}
+        self._windows: dict[tuple[int, int], _Window] = {}
         self._kept: tuple[int, int, int, int] = (0, 0, 0, 0)  # of what: pause, changes, address, length
         self._kept_data = b""
         self.answers_damaged = False
@@ -67,6 +77,9 @@ class Body(ABC):
         """Secondary ID (12): 253 to 255 switch it off, and the ID goes first (e-Manual, X series)."""
         self.hears_protocol = True
         """False when it was told to speak another protocol."""
+        self.delay_ns = 0
+        """Return Delay Time (5, 9), in its unit of 2 us."""
+        memory.watch(("return_delay_time",), self._time)
         memory.watch(IDENTITY, self._identify)
 
     @property
@@ -94,6 +107,9 @@ class Body(ABC):
         secondary = None if self._secondary_item is None else self.memory[self._secondary_item]
         off = secondary is None or secondary > 252 or secondary == self.servo_id
         self.secondary_id = None if off else secondary
+
+    def _time(self) -> None:
+        self.delay_ns = self.memory["return_delay_time"] * 2000
 
     def advance(self, now_ns: int) -> None:
         """Let time pass."""
@@ -129,34 +145,38 @@ class Body(ABC):
         memory, still = self.memory, self.shaft.mechanics.still
         if still and self._kept == (still, memory.changes, address, length):
             return self._kept_data
-        if address + length > memory.size:
+        if length < 1 or address + length > memory.size:
             return None
-        if memory.cells(address, length).direct:
-            live = self._live_in.get((address, length)) or self._look_up(address, length)
-            memory.show_all(live)
-            data = memory.read(address, length)
-            if still and data is not None and all(name in _STILL for name, _ in live):
-                self._kept, self._kept_data = (still, memory.changes, address, length), data
-            return data
-        for target, first, last in memory.places(address, length):
-            memory.show_all(self._look_up(target, last - first))
-        return memory.read(address, length)
+        if not memory.cells(address, length).direct:
+            for target, first, last in memory.places(address, length):
+                memory.show_all(self._look_up(target, last - first).live)
+            return memory.read(address, length)
+        window = self._windows.get((address, length)) or self._look_up(address, length)
+        memory.show_all(window.live)
+        data = memory.raw(address, length)
+        if still and window.rests:
+            self._kept, self._kept_data = (still, memory.changes, address, length), data
+        return data
 
     def keeps(self, address: int, length: int) -> bool:
         """Return whether bytes were read since all servos rest, of which nothing changes by itself."""
         still = self.shaft.mechanics.still
         return still > 0 and self._kept == (still, self.memory.changes, address, length)
 
-    def _look_up(self, address: int, length: int) -> LiveItems:
-        """Return the items that change by themselves in some cells; looked up once."""
-        live = self._live_in.get((address, length))
-        if live is None:
-            if len(self._live_in) >= _READS_KEPT:
-                self._live_in.clear()
-            live = self._live_in[address, length] = tuple(
-                each for each in self._live.items() if _overlaps(self.memory, each[0], address, length)
+    def _look_up(self, address: int, length: int) -> _Window:
+        """Return what changes by itself in some cells; looked up once."""
+        window = self._windows.get((address, length))
+        if window is None:
+            if len(self._windows) >= _READS_KEPT:
+                self._windows.clear()
+            live = tuple(
+                self.memory.live(*each)
+                for each in self._live.items()
+                if _overlaps(self.memory, each[0], address, length)
             )
-        return live
+            window = _Window(live, all(each.name in _STILL for each in live))
+            self._windows[address, length] = window
+        return window
 
     def write(self, address: int, data: bytes) -> int:
         """Write, or return the error with which it is refused; 0 when it is not."""

@@ -30,7 +30,7 @@ class Instructions1:
 
     def delay_ns(self, packet: InstructionPacket, byte_ns: int) -> int:
         """Return how long the servo waits before it answers: Return Delay Time (5)."""
-        return self._body.memory["return_delay_time"] * 2000
+        return self._body.delay_ns
 
     def describe(self, error: int) -> str:
         """Return an error in words."""

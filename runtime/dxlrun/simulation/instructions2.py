@@ -29,6 +29,15 @@ class Instructions2:
 
     def __init__(self, body: TorqueBody) -> None:
         self._body = body
+        self._reads = self._reads_fast = False
+        """Whether it answers reads in turn, and fast ones: it needs a firmware that knows them."""
+        body.memory.watch(("status_return_level", "firmware_version"), self._look)
+
+    def _look(self) -> None:
+        memory = self._body.memory
+        first = memory.table.fast_sync_read_firmware
+        self._reads = memory["status_return_level"] >= 1
+        self._reads_fast = first is not None and memory["firmware_version"] >= first
 
     def answers(self, packet: InstructionPacket, own: bool) -> bool:
         """Return whether a status packet follows (Status Return Level (68)); of broadcasts only to a ping.
@@ -47,7 +56,7 @@ class Instructions2:
 
     def delay_ns(self, packet: InstructionPacket, byte_ns: int) -> int:
         """Return how long the servo waits: Return Delay Time, after a broadcast ping also for its slot."""
-        delay = self._body.memory["return_delay_time"] * 2000
+        delay = self._body.delay_ns
         if packet.servo_id == BROADCAST and packet.instruction == Instruction.PING:
             delay += self._body.servo_id * (_PING_REPLY * byte_ns + SLOT_NS)
         return delay
@@ -84,18 +93,16 @@ class Instructions2:
     def answer_in_turn(self, reading: ReadInTurn, entry: ReadEntry) -> Answer | None:
         """Return a servo's part of a sync or bulk read; None: it says nothing.
 
-        A fast read needs a firmware that knows it, and its form has no room for an error without data [i].
+        The form of a fast read has no room for an error without data [i].
         """
-        if self._body.memory["status_return_level"] < 1:
+        if not self._reads:
             return None
         answer = _read(self._body, entry.address, entry.length)
-        if reading.fast:
-            first = self._body.memory.table.fast_sync_read_firmware
-            if first is None or self._body.memory["firmware_version"] < first or answer[0]:
-                self._body.note(
-                    f"servo {self._body.servo_id} does not answer the fast read {reading.instruction:#04x}"
-                )
-                return None
+        if reading.fast and (answer[0] or not self._reads_fast):
+            self._body.note(
+                f"servo {self._body.servo_id} does not answer the fast read {reading.instruction:#04x}"
+            )
+            return None
         return answer
 
     def _write(self, servo_id: int, address: int, data: bytes) -> int:

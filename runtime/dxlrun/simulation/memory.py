@@ -35,8 +35,18 @@ class Cells(NamedTuple):
     """True when one of the items is in the EEPROM area."""
 
 
-LiveItems = tuple[tuple[str, Callable[[], int]], ...]
-"""Items by name, each with what it shows now, in ticks."""
+class LiveItem(NamedTuple):
+    """An item that shows something else whenever it is looked at."""
+
+    name: str
+    show: Callable[[], int]
+    """Returns what it shows now, in ticks."""
+    lowest: int
+    highest: int
+    """What its bytes hold; beyond that it stays there."""
+    start: int
+    end: int
+    mask: int
 
 
 class Run(NamedTuple):
@@ -137,17 +147,21 @@ class Memory:
             lowest, highest = bounds
             self[name] = lowest if wire < lowest else min(wire, highest)
 
-    def show_all(self, live: LiveItems) -> None:
+    def live(self, name: str, show: Callable[[], int]) -> LiveItem:
+        """Return an item that shows what a function says; raises KeyError when the model has none."""
+        start, end, _, mask = self._places[name]
+        return LiveItem(name, show, *self._bounds[name], start, end, mask)
+
+    def show_all(self, items: Iterable[LiveItem]) -> None:
         """Set items of the model to what they show now, as `show` does, for what is read all the time."""
-        values, memory = self._values, self._memory
-        for name, show in live:
+        values = self._values
+        for name, show, lowest, highest, start, end, mask in items:
             wire = show()
-            lowest, highest = self._bounds[name]
-            wire = lowest if wire < lowest else min(wire, highest)
-            start, end, size, mask = self._places[name]
+            if not lowest <= wire <= highest:
+                wire = lowest if wire < lowest else highest
             wire &= mask
             if values[name] != wire:
-                memory[start:end] = wire.to_bytes(size, "little")
+                self._memory[start:end] = wire.to_bytes(end - start, "little")
                 values[name] = wire
                 if name in self._watchers:
                     self._tell((name,))
@@ -169,12 +183,16 @@ class Memory:
         if length < 1 or address + length > self.size:
             return None
         if self.cells(address, length).direct:
-            return bytes(self._memory[address : address + length])
+            return self.raw(address, length)
         data = self._memory[address : address + length]
         for cell in self._indirect.keys() & range(address, address + length):
             target = self[self._indirect[cell]]
             data[cell - address] = self._memory[target] if target < len(self._memory) else 0
         return bytes(data)
+
+    def raw(self, address: int, length: int) -> bytes:
+        """Return the bytes of cells of the table, as they stand there."""
+        return bytes(self._memory[address : address + length])
 
     def runs(self, address: int, data: bytes) -> tuple[Run, ...]:
         """Return where bytes really go: as they are, or to the cells behind Indirect Data."""

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 BROADCAST = 0xFE
 
 
-@dataclass(frozen=True, slots=True)
-class InstructionPacket:
+class InstructionPacket(NamedTuple):
     """One packet that stood on the line."""
 
     servo_id: int
@@ -19,7 +18,7 @@ class InstructionPacket:
     """False when the checksum is wrong: then nothing else of it can be trusted."""
     end: int
     """Index behind its last byte, in the bytes that completed it."""
-    raw: bytes = field(default=b"", compare=False)
+    raw: bytes = b""
     """All of its bytes, as they stood on the line."""
 
 

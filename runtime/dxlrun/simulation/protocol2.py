@@ -109,15 +109,17 @@ class FastStatusPacket:
     def __init__(self, lengths: tuple[int, ...]) -> None:
         self._head = _head(BROADCAST, _fast_length(lengths)) + bytes((STATUS,))
         self._crc = 0
+        self._told = b""
+        """The CRC so far as it was sent: it counts for the next one."""
 
     def part(self, reply: Reply) -> bytes:
         """Return the bytes that the next servo adds; the first one also sends the header."""
-        data = self._head + bytes((reply.error, reply.servo_id)) + reply.parameters
+        servo_id, error, parameters, _ = reply
+        data = b"%b%c%c%b" % (self._head, error, servo_id, parameters)
         self._head = b""
-        crc = crc16(data, self._crc)
-        data += crc.to_bytes(2, "little")
-        self._crc = crc16(data[-2:], crc)
-        return data
+        self._crc = crc = umts(self._told + data, self._crc)
+        self._told = told = crc.to_bytes(2, "little")
+        return data + told
 
 
 def fast_status(lengths: tuple[int, ...]) -> FastStatusPacket:
@@ -220,7 +222,9 @@ class InstructionReceiver:
         if not buffer and data.startswith(_PLAIN_HEAD, start):
             end = start + _OVERHEAD + int.from_bytes(data[start + 5 : start + 7], "little")
             if start + _OVERHEAD + 3 <= end <= len(data) and data[start + 4] not in _NO_ID:
-                return _packet(bytes(data[start:end]), end)  # the usual case: hosts hand over whole packets
+                # the usual case: hosts hand over whole packets, and the same ones again and again
+                known = _packet if end - start <= _LONGEST_KNOWN else _packet.__wrapped__
+                return known(bytes(data[start:end]), end)
         index = start
         while index < len(data):
             wanted = max(1, _size(buffer) - len(buffer)) if len(buffer) >= _OVERHEAD else 1
@@ -256,16 +260,13 @@ def _size(data: bytes | bytearray) -> int:
     return _OVERHEAD + _word(data, 5)
 
 
+@lru_cache(maxsize=16)
 def _packet(data: bytes, end: int) -> InstructionPacket:
-    body = unstuffed(data[_OVERHEAD:-2])
-    return InstructionPacket(
-        servo_id=data[4],
-        instruction=body[0],
-        parameters=body[1:],
-        intact=_word(data, len(data) - 2) == umts(data[:-2]),
-        end=end,
-        raw=data,
-    )
+    body = data[_OVERHEAD:-2]
+    if _STUFFED in body:
+        body = unstuffed(body)
+    intact = int.from_bytes(data[-2:], "little") == umts(data[:-2])
+    return InstructionPacket(data[4], body[0], body[1:], intact, end, data)
 
 
 def _may_begin(data: bytes | bytearray) -> bool:

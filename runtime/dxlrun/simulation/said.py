@@ -113,9 +113,6 @@ class Readings:
                 if reply is None:
                     continue
                 count.answer(reply.error)
-                if reading.fast and entry is not reading.entries[0]:
-                    # only the first one of a shared status waits
-                    reply = Reply(reply.servo_id, reply.error, reply.parameters, 0)
                 replies.append(reply)
             answers.append((entry, replies))
             if not replies and not slots:

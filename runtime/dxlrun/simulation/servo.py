@@ -136,7 +136,8 @@ class SimulatedServo:
         if answer is None:
             return None
         body = self._body
-        delay_ns = body.memory["return_delay_time"] * 2000
+        # of a status that servos share only the first one waits
+        delay_ns = 0 if reading.fast and entry is not reading.entries[0] else body.delay_ns
         return Reply(body.servo_id, answer[0] | body.state(), answer[1], delay_ns)
 
     def hears(self, now_ns: int) -> bool:

@@ -28,6 +28,7 @@ class Shaft(ABC):
         self.memory = memory
         self.mechanics = mechanics
         self.motor = motor_of(memory.table)
+        self._torque_per_ampere = self.motor.torque_per_ampere
         self.index = mechanics.add(self.motor, load, angle)
         self.now_ns = mechanics.grid_ns
         self._last: Command | None = None
@@ -48,12 +49,12 @@ class Shaft(ABC):
     @property
     def current(self) -> float:
         """Current of the motor, A, positive when it drives counter-clockwise."""
-        return self.mechanics.law.torque.item(self.index) / self.motor.torque_per_ampere
+        return self.mechanics.law.torque.item(self.index) / self._torque_per_ampere
 
     @property
     def duty(self) -> float:
         """Part of the supply's voltage that the motor gets, -1 to 1."""
-        return float(self.mechanics.law.duty[self.index])
+        return self.mechanics.law.duty.item(self.index)
 
     @property
     def moving(self) -> bool:

@@ -73,6 +73,8 @@ class TorqueBody(Body):
         self._rules = TorqueRules(memory)
         self.has_error_code = "error_code" in memory
         """True for the Y series, which keeps its turns without power, too."""
+        self._alert = 0
+        memory.watch(("error_code", "hardware_error_status"), self._alarm)
         self._backup: dict[str, int] = {}
         self._shut_down = False
         self._heard_ns = shaft.now_ns
@@ -141,8 +143,11 @@ class TorqueBody(Body):
 
     def state(self) -> int:
         """Return the alert bit while Hardware Error Status or Error Code tells of something."""
-        memory = self.memory
-        return ALERT if memory.get("error_code" if self.has_error_code else "hardware_error_status") else 0
+        return self._alert
+
+    def _alarm(self) -> None:
+        told = self.memory.get("error_code" if self.has_error_code else "hardware_error_status")
+        self._alert = ALERT if told else 0
 
     def protect(self, refused: int = 0) -> None:
         """Show what is wrong, and switch the torque off until a reboot when Shutdown lists it."""
