@@ -34,7 +34,7 @@ class Samples:
         "_here",
         "_jumps",
         "_motion",
-        "_newest_ns",
+        "_never",
         "_now",
         "_now_ns",
         "_position",
@@ -73,7 +73,7 @@ class Samples:
         self._here: list[float] = self._motion[0].tolist()  # the positions that the states show
         self._now = np.zeros((), dtype=np.int64)
         self._now_ns = 0
-        self._newest_ns = np.zeros(len(servos), dtype=np.int64)
+        self._never = True  # nothing ever came of somebody
 
     def settle(self, now_ns: int, everybody: bool) -> None:
         """Fill the states from the replies of this cycle; `everybody`: that is whose reply arrived.
@@ -83,39 +83,44 @@ class Samples:
         """
         if self._speeds is not None:
             self._speeds.follow(self._states.mode.tobytes(), self._scale[1])
-        values, position = self._values, self._position
+        values, position, at_ns = self._values, self._position, self._arrivals.at_ns
         np.multiply(self._arrivals.ticks, self._scale, values)
         np.subtract(position, self._reference, position)
-        self._now[()] = now_ns  # quicker than to let numpy make an array of an int
+        if not everybody:
+            self._keep_lost()
+        elif not self._all_valid:
+            self._all_valid = True
+            self._valid.fill(True)
         here: list[float] = position.tolist()
-        if everybody and dist(here, self._here) <= self._jumps.surely_none:
-            if not self._all_valid:
-                self._all_valid = True
-                self._valid.fill(True)
-            self._motion[...] = values
-            np.subtract(self._now, self._arrivals.at_ns, self._age_ns)
-            self._here = here
-        else:
-            self._sift(now_ns)
-        self._now_ns = now_ns
+        if not dist(here, self._here) <= self._jumps.surely_none:  # also where one is NaN
+            self._sift(here, now_ns)
+        self._here = here
+        self._motion[...] = values
+        self._now[()] = self._now_ns = now_ns  # quicker than to let numpy make an array of an int
+        np.subtract(self._now, at_ns, self._age_ns)
+        if self._never:
+            self._age_ns[at_ns < 0] = -1
+            self._never = bool((at_ns < 0).any())
         if not isinstance(self._rows, slice):
             self._hand_over(self._rows)
 
-    def _sift(self, now_ns: int) -> None:
-        """Fill the columns of those that are fresh and did not jump."""
-        valid, age_ns, newest_ns = self._valid, self._age_ns, self._newest_ns
-        elapsed_ns = now_ns - self._now_ns
-        np.subtract(self._now, self._arrivals.at_ns, newest_ns)
-        valid[:] = self._arrivals.fresh
-        steps = self._position - self._motion[0]
-        for index in self._jumps.suspects(steps, valid):
-            between_ns = int(age_ns[index] - newest_ns[index]) + elapsed_ns
-            valid[index] = self._jumps.can_be(index, steps[index], between_ns, now_ns)
-        self._all_valid = False not in valid.tolist()
-        np.copyto(self._motion, self._values, where=valid)
-        np.add(age_ns, elapsed_ns, age_ns, where=age_ns >= 0)
-        np.copyto(age_ns, newest_ns, where=valid)
-        self._here = self._motion[0].tolist()
+    def _keep_lost(self) -> None:
+        """Let those that are not fresh be invalid and where they were."""
+        fresh = self._arrivals.fresh
+        self._all_valid = False
+        self._valid[:] = fresh
+        np.copyto(self._values, self._motion, where=~fresh)
+
+    def _sift(self, here: list[float], now_ns: int) -> None:
+        """Let those that jumped be invalid and where they were, as if nothing had come of them."""
+        at_ns = self._arrivals.at_ns
+        for index in self._jumps.suspects(self._position - self._motion[0], self._valid):
+            shown_ns = self._now_ns - int(self._age_ns[index])
+            step, elapsed_ns = here[index] - self._here[index], int(at_ns[index]) - shown_ns
+            if not self._jumps.can_be(index, step, elapsed_ns, now_ns):
+                self._valid[index] = self._all_valid = False
+                self._values[:, index] = self._motion[:, index]
+                here[index], at_ns[index] = self._here[index], shown_ns
 
     def _hand_over(self, rows: NDArray[np.intp]) -> None:
         """Fill the states where the joints are in another order than the servos."""

@@ -38,7 +38,7 @@ class Arrivals:
     fresh: NDArray[np.bool_]
     """Whose reply arrived intact in this cycle."""
     at_ns: NDArray[np.int64]
-    """When the newest intact reply arrived; -1 while none ever did."""
+    """When the newest reply arrived that was intact, and can be true; -1 while none ever did."""
 
     @classmethod
     def none(cls, servos: int) -> Arrivals:
