@@ -1,4 +1,4 @@
-"""Why a loop on simulated buses overran: its servos, its wake-up, or its own work."""
+"""Why a loop on simulated buses overran: its servos, the kernel, its wake-up, or its own work."""
 
 from __future__ import annotations
 
@@ -70,6 +70,46 @@ def test_a_reply_that_came_late_is_the_simulation_s(causes_of: Callable[..., obj
 
 def test_a_question_that_was_taken_late_is_the_simulation_s(causes_of: Callable[..., object]) -> None:
     assert counts(causes_of(ledger(taken_late_us=17_000), read=22_000)) == (1, 0, 0)
+
+
+KEPT = 16_000
+"""For so long after it was handed over the last reply came to the loop, us."""
+
+
+def run_with_a_reply_kept(
+    write: Callable[..., Path], cycle: type, wire: type, *, received: bytes = ASKED, update: int = 100
+) -> object:
+    cycles = [cycle(n, read=18_000 if n == LATE else 2_000) for n in range(LATE)]
+    cycles.append(cycle(LATE, read=18_000, update=update))
+    cycles.append(cycle(LATE + 1 + GONE, skipped=GONE))
+    wires = []
+    for n in range(LATE + 1):
+        wires.append(wire(PacketKind.INSTRUCTION, 5, asked_us(n), ASKED))
+        came = asked_us(n) + 1000 + (KEPT if n == LATE else 300)
+        wires.append(wire(PacketKind.STATUS, 5, came, received if n == LATE else ASKED))
+    return overrun_causes(read_log(write(cycles, wires)), {"main": ledger()})
+
+
+def test_a_reply_that_the_kernel_kept_is_neither_the_simulation_s_nor_our_own(
+    write: Callable[..., Path], cycle: type, wire: type
+) -> None:
+    found = run_with_a_reply_kept(write, cycle, wire, update=3_000)
+    assert (found.kernel, *counts(found)) == (1, 0, 0, 0)  # type: ignore[attr-defined]
+    (one,) = found.overruns  # type: ignore[attr-defined]
+    assert (one.kernel_us, one.own_us) == (KEPT - 300, 18_000 - 2_000 + 2_900 - (KEPT - 300))
+
+
+def test_what_the_kernel_kept_is_no_excuse_for_a_cycle_that_was_too_long_without_it(
+    write: Callable[..., Path], cycle: type, wire: type
+) -> None:
+    assert counts(run_with_a_reply_kept(write, cycle, wire, update=20_000)) == (0, 0, 1)
+
+
+def test_where_log_and_ledger_differ_a_reply_that_was_kept_is_our_own(
+    write: Callable[..., Path], cycle: type, wire: type
+) -> None:
+    other = ASKED[:-1] + b"\x00"
+    assert counts(run_with_a_reply_kept(write, cycle, wire, received=other)) == (0, 0, 1)
 
 
 def test_a_late_reply_of_another_cycle_is_no_excuse(causes_of: Callable[..., object]) -> None:
@@ -152,8 +192,8 @@ def test_a_person_reads_the_causes_and_the_worst_of_them(
     wires += [wire(PacketKind.STATUS, 5, asked_us(n) + 1000, ASKED) for n in range(LATE + 1)]
     report = compare(read_log(write(cycles, wires)), entries, Path("seen.jsonl"))
     assert report.sentences[-1] == (
-        "The cause was the simulated servos 1 time, a late wake-up 0 times, and our own work 0 times: "
-        f"0.000% of {COUNT} cycles."
+        "The cause was the simulated servos 1 time, the kernel 0 times, which hands replies over, a late "
+        f"wake-up 0 times, and our own work 0 times: 0.000% of {COUNT} cycles."
     )
     tables = [item.table for item in render_comparison(report).renderables if hasattr(item, "table")]
     assert tables[-1].title == "Why the loop overran; a cycle usually takes 5400 us"

@@ -263,8 +263,9 @@ def _said_of(late: Lateness | None, causes: OverrunCauses | None) -> list[str]:
     said = [f"{overran}, {beside} with a simulated reply that was more than 1 ms late."]
     if causes is not None and causes.overruns:
         said.append(
-            f"The cause was the simulated servos {counted(causes.simulation, 'time', 'times')}, a late "
-            f"wake-up {counted(causes.wake_up, 'time', 'times')}, and our own work "
+            f"The cause was the simulated servos {counted(causes.simulation, 'time', 'times')}, the kernel "
+            f"{counted(causes.kernel, 'time', 'times')}, which hands replies over, a late wake-up "
+            f"{counted(causes.wake_up, 'time', 'times')}, and our own work "
             f"{counted(causes.own_work, 'time', 'times')}: {causes.own_share:.3%} of {causes.cycles} cycles."
         )
     return said

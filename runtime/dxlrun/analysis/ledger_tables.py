@@ -133,13 +133,16 @@ def overruns_table(causes: OverrunCauses | None) -> Table:
         Column("cause", "name"),
         Column("periods left out"),
         Column("late servos"),
+        Column("kept by the kernel"),
         Column("late wake-up"),
         Column("own work beyond the usual"),
     )
     if causes is None or not causes.overruns:
         return Table("", columns, ())
     worst = sorted(
-        causes.overruns, key=lambda one: one.simulation_us + one.wake_up_us + one.own_us, reverse=True
+        causes.overruns,
+        key=lambda one: one.simulation_us + one.kernel_us + one.wake_up_us + one.own_us,
+        reverse=True,
     )
     rows = tuple(
         (
@@ -147,6 +150,7 @@ def overruns_table(causes: OverrunCauses | None) -> Table:
             Cell(one.cause, "warning" if one.cause == "own work" else "plain"),
             Cell(str(one.skipped)),
             Cell(microseconds(one.simulation_us)),
+            Cell(microseconds(one.kernel_us)),
             Cell(microseconds(one.wake_up_us)),
             Cell(microseconds(max(0.0, one.own_us))),
         )
