@@ -82,9 +82,21 @@ def test_a_servo_that_is_silent_is_told(started):
     answers = []
     started.buses[0].servo(11).silence()
     started.hardware.set_register(0, "position_p_gain", 900, answers.append)
-    for _ in range(5):
+    for _ in range(20):
         started.cycle()
     assert answers == ["arm_11_joint (ID 11 on bus arm) did not answer when Position P Gain (84) was read"]
+
+
+def test_a_servo_that_is_silent_for_a_moment_gets_its_register(started):
+    answers = []
+    servo = started.buses[0].servo(11)
+    servo.silence()
+    started.buses[0].at(started.clock.now_ns() + 130_000_000, lambda: servo.silence(False))
+    started.hardware.set_register(0, "position_p_gain", 900, answers.append)
+    for _ in range(40):
+        started.cycle()
+    assert answers == [""]
+    assert gain_of(started, 0) == 900
 
 
 @pytest.mark.parametrize("item", ["temperature_limit", "present_position", "nonsense"])

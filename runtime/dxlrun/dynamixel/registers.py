@@ -24,6 +24,8 @@ class Settled:
     """Why it does not have them, one sentence each."""
     written: list[tuple[str, str]] = field(default_factory=list)
     """Joint, and what was written: `Position P Gain (84) was 640 and is 800`."""
+    silent: bool = False
+    """True when the servo answered nothing, so that nothing was written."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +69,7 @@ def settle(
     differences = yield from compare(plan, servo, registers, line)
     silent = [one.register for one in differences if one.found is None]
     if silent:
+        settled.silent = len(silent) == len(differences)
         settled.problems.append(
             f"{who(plan, servo)} did not answer when {_names(plan, servo, silent)} was read"
         )

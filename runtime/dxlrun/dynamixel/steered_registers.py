@@ -6,12 +6,17 @@ from collections.abc import Callable
 from functools import partial
 
 from dxlrun.control_table import control_table
-from dxlrun.dynamixel.bus_plan import BusPlan, RegisterValue
+from dxlrun.dynamixel.bus_plan import BusPlan, RegisterValue, ServoPlan
 from dxlrun.dynamixel.gaps import Gaps, Urgency
 from dxlrun.dynamixel.inspection import called, who
+from dxlrun.dynamixel.line import listen
 from dxlrun.dynamixel.plan import plan_line
 from dxlrun.dynamixel.registers import Settled, merged, settle
+from dxlrun.dynamixel.transaction import Program
 from dxlrun.events import EventCode, EventSink, Severity
+
+PAUSES_NS = (50_000_000, 150_000_000)
+"""Between tries: a client would rather wait than hear of a machine or an adapter that stood still."""
 
 
 class SteeredRegisters:
@@ -38,12 +43,21 @@ class SteeredRegisters:
             return
         register = RegisterValue(entry.address, entry.size, value, item)
         self._gaps.add(
-            settle(self._plan, servo, (register,), plan_line(self._plan)),
+            self._settle(servo, register),
             partial(self._written, index, register, done),
             Urgency.STEERED,
             f"{called(entry)} of {who(self._plan, servo)}",
             index,
         )
+
+    def _settle(self, servo: ServoPlan, register: RegisterValue) -> Program[Settled]:
+        """Write one register, and try again later while the servo is silent."""
+        for pause_ns in PAUSES_NS:
+            settled = yield from settle(self._plan, servo, (register,), plan_line(self._plan))
+            if not settled.silent:
+                return settled
+            yield listen(pause_ns)
+        return (yield from settle(self._plan, servo, (register,), plan_line(self._plan)))
 
     def _written(
         self, index: int, register: RegisterValue, done: Callable[[str], None], settled: Settled
