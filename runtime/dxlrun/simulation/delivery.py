@@ -35,16 +35,13 @@ class Delivery:
 
     def take_flow(self, flow: Flow, handed_ns: int | None) -> bytes:
         """Return what has passed of answers that nobody disturbs."""
-        data, given = flow.give()
-        add, bus = self._ledger.add, self._bus
-        if handed_ns is None:
-            for due_ns, part in given:
-                add(due_ns, bus, "out", part)
-        elif given:
-            for due_ns, part in given:
-                add(due_ns, bus, "out", part, late_ns=handed_ns - due_ns)
-            self.lateness_ns.append(handed_ns - given[-1][0])
-        return data
+        passed = flow.give(self._bus, handed_ns)
+        if not passed.parts:
+            return b""
+        self._ledger.add_passed(passed)
+        if handed_ns is not None:
+            self.lateness_ns.append(handed_ns - passed.begin_ns - passed.dues_ns[-1])
+        return b"".join(passed.parts)
 
     def _take_at_once(self, handed_ns: int | None) -> bytes:
         """Return all that has passed the wire: nothing is kept back or cut."""

@@ -10,6 +10,7 @@ from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 
+from dxlrun.simulation.ledger import Passed
 from dxlrun.simulation.packets import ReadEntry, ReadInTurn, Reply
 from dxlrun.simulation.wire import STATUS_BYTES, Chain, Chunk
 
@@ -31,7 +32,6 @@ class Flow:
         "_passed",
         "_reading",
         "_slots",
-        "_whole",
         "lasts_ns",
     )
 
@@ -50,16 +50,14 @@ class Flow:
         self._slots = slots
         self._reading = reading
         self._answers = answers
-        self._parts = parts
-        self._whole = b"".join(parts)
+        self._parts = tuple(parts)
         self._duration_ns = duration_ns
-        self._firsts: list[int] = []
-        self._dues: list[int] = []
-        free_ns = 0
+        firsts, dues, free_ns = [], [], 0
         for (_, (reply,)), part in zip(answers, parts, strict=True):
-            self._firsts.append(free_ns + reply.delay_ns)
-            free_ns = self._firsts[-1] + duration_ns(len(part))
-            self._dues.append(free_ns)
+            firsts.append(free_ns + reply.delay_ns)
+            free_ns = firsts[-1] + duration_ns(len(part))
+            dues.append(free_ns)
+        self._firsts, self._dues = firsts, tuple(dues)
         self.lasts_ns = free_ns
         """So long after the instruction the last answer ends."""
         self._begin_ns = 0
@@ -95,13 +93,13 @@ class Flow:
         passed = bisect_right(self._dues, now_ns - self._begin_ns)
         self._passed = max(passed, self._passed)
 
-    def give(self) -> tuple[bytes, Sequence[tuple[int, bytes]]]:
-        """Return what has passed since the last time, and each answer of it with the time of its end."""
+    def give(self, bus: str, handed_ns: int | None) -> Passed:
+        """Return what has passed since the last time."""
         first, last = self._given, self._passed
         self._given = last
-        begin_ns, parts = self._begin_ns, self._parts
-        given = [(begin_ns + self._dues[index], parts[index]) for index in range(first, last)]
-        return self._whole if last - first == len(parts) else b"".join(parts[first:last]), given
+        if last - first == len(self._parts):
+            return Passed(bus, self._begin_ns, self._dues, self._parts, handed_ns)
+        return Passed(bus, self._begin_ns, self._dues[first:last], self._parts[first:last], handed_ns)
 
     def break_up(self) -> tuple[list[Chunk], list[Chunk]]:
         """Return what has passed and was not given, and what is on the line: the others wait for its end."""

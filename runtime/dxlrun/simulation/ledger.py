@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Literal, NamedTuple
@@ -37,6 +38,27 @@ class LedgerEntry(NamedTuple):
     """`out`, in real time: how long after it should have been the host got the last of them."""
 
 
+class Passed(NamedTuple):
+    """Answers that passed the wire one after the other: as many entries, each of direction `out`."""
+
+    bus: str
+    begin_ns: int
+    dues_ns: tuple[int, ...]
+    """When each of them had passed, from `begin_ns` on."""
+    parts: tuple[bytes, ...]
+    handed_ns: int | None
+    """In real time: when the host got them."""
+
+    def entries(self) -> list[LedgerEntry]:
+        """Return them one by one."""
+        found = []
+        for due_ns, part in zip(self.dues_ns, self.parts, strict=True):
+            t_ns = self.begin_ns + due_ns
+            late_ns = 0 if self.handed_ns is None else self.handed_ns - t_ns
+            found.append(LedgerEntry(t_ns, self.bus, "out", part, "", late_ns))
+        return found
+
+
 class Ledger:
     """Keeps entries in memory, in a JSON-lines file, or both; `keep=False` bounds the memory of long runs.
 
@@ -51,9 +73,8 @@ class Ledger:
         """Who is told of each note."""
         self._keep = keep
         self._file: IO[bytes] | None = None if path is None else path.open("wb", _BUFFER)
-        self._new: list[LedgerEntry] = []
+        self._new: list[LedgerEntry | Passed] = []
         """Entries that are not encoded yet."""
-        self._begins: dict[tuple[str, str], str] = {}
         self._unflushed_ns: int | None = None
 
     def add(
@@ -71,37 +92,46 @@ class Ledger:
         if self._keep:
             self.entries.append(entry)
         if self._file is not None:
-            new = self._new
-            new.append(entry)
-            if self._unflushed_ns is None:
-                self._unflushed_ns = t_ns
-            if len(new) >= _MOST_ENTRIES:
-                self.encode()
+            self._enter(entry, t_ns)
         if direction == "note" and self.on_note is not None:
             self.on_note(note)
+
+    def add_passed(self, passed: Passed) -> None:
+        """Enter answers that passed one after the other, as `add` does each of them."""
+        if self._keep:
+            self.entries += passed.entries()
+        if self._file is not None:
+            self._enter(passed, passed.begin_ns + passed.dues_ns[0])
+
+    def _enter(self, new: LedgerEntry | Passed, t_ns: int) -> None:
+        self._new.append(new)
+        if self._unflushed_ns is None:
+            self._unflushed_ns = t_ns
+        if len(self._new) >= _MOST_ENTRIES:
+            self.encode()
 
     def encode(self) -> None:
         """Make lines of what was entered: for a moment in which nothing else is to be done."""
         if not self._new:
             return
         lines = []
-        for t_ns, bus, direction, data, note, late_ns in self._new:
-            # put together by hand, because a busy bus has thousands of them a second
-            begin = self._begins.get((bus, direction)) or self._begin(bus, direction)
-            told = json.dumps(note) if note else '""'
-            late = f', "late_ns": {late_ns}' if late_ns else ""
-            lines.append(f'{{"t_ns": {t_ns}{begin}{data.hex()}", "note": {told}{late}}}\n')
+        for each in self._new:
+            if isinstance(each, LedgerEntry):
+                lines.append(_line(each))
+            elif each.handed_ns is None or each.handed_ns <= each.begin_ns + each.dues_ns[-1]:
+                lines += map(_line, each.entries())  # nothing is told of a lateness of 0
+            else:
+                numbers: list[int] = []
+                for due_ns in each.dues_ns:
+                    t_ns = each.begin_ns + due_ns
+                    numbers += (t_ns, each.handed_ns - t_ns)
+                lines.append(_form(each.bus, each.parts) % tuple(numbers))
         self._new.clear()
         if self._file is not None:
             try:
                 self._file.write("".join(lines).encode("ascii"))
             except OSError as error:
                 self._give_up(error)
-
-    def _begin(self, bus: str, direction: Direction) -> str:
-        begin = f', "bus": {json.dumps(bus)}, "direction": "{direction}", "bytes": "'
-        self._begins[bus, direction] = begin
-        return begin
 
     def flush_due_ns(self) -> int | None:
         """Return when the file must be flushed, ns on the clock of the entries; None: all is written."""
@@ -145,6 +175,28 @@ class Ledger:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+# Lines are put together by hand, because a busy bus has thousands of them a second.
+
+
+@lru_cache(maxsize=64)
+def _begin(bus: str, direction: Direction) -> str:
+    return f', "bus": {json.dumps(bus)}, "direction": "{direction}", "bytes": "'
+
+
+def _line(entry: LedgerEntry) -> str:
+    t_ns, bus, direction, data, note, late_ns = entry
+    told = json.dumps(note) if note else '""'
+    late = f', "late_ns": {late_ns}' if late_ns else ""
+    return f'{{"t_ns": {t_ns}{_begin(bus, direction)}{data.hex()}", "note": {told}{late}}}\n'
+
+
+@lru_cache(maxsize=64)  # servos that rest say the same again and again
+def _form(bus: str, parts: tuple[bytes, ...]) -> str:
+    """Return the lines of some answers, with a place for the time and the lateness of each."""
+    begin = _begin(bus, "out").replace("%", "%%")
+    return "".join([f'{{"t_ns": %d{begin}{part.hex()}", "note": "", "late_ns": %d}}\n' for part in parts])
 
 
 def read_ledger(path: Path) -> tuple[LedgerEntry, ...]:
