@@ -22,6 +22,8 @@ LONGER_NS = (0, 60_000_000, 180_000_000)
 
 Noise rarely hits three times, and hosts and adapters rarely stand still for so long; a cut cable always does.
 """
+LATE_NS = 20_000_000
+"""After silence: what was asked twice is answered twice, and the log is to have all that was said."""
 SETTLE_NS = 500_000
 """Time that a half-sent reply may still take: it would collide with the broadcast."""
 
@@ -56,6 +58,7 @@ def torque_off(
             yield everybody
     writes = [write for write in plan.limp if write.awaited]
     details = dict.fromkeys(range(len(plan.servos)), "it was not tried")
+    late = False
     for longer_ns in LONGER_NS:
         for index in [index for index, detail in details.items() if detail]:
             if longer_ns and now_ns() >= deadline_ns:
@@ -64,6 +67,9 @@ def torque_off(
             read = plan.torque_reads[index]
             back = yield replace(read, timeout_ns=read.timeout_ns + longer_ns)
             details[index] = _detail(acknowledged, back)
+            late = late or not (acknowledged.answered and back.answered)
+    if late:
+        yield listen(LATE_NS)
     return tuple(_outcome(plan, servo, details[index]) for index, servo in enumerate(plan.servos))
 
 
