@@ -17,8 +17,8 @@ Direction = Literal["in", "out", "note"]
 _BUFFER = 1 << 16
 """Bytes that are written out together."""
 
-_MOST_ENTRIES = 256
-"""Entries that are encoded together at the latest."""
+SOME_ENTRIES, _MOST_ENTRIES = 24, 256
+"""So many are encoded together, where there is time for it and at the latest."""
 
 FLUSH_NS = 500_000_000
 """A ledger file is never further behind than this."""
@@ -110,9 +110,9 @@ class Ledger:
         if len(self._new) >= _MOST_ENTRIES:
             self.encode()
 
-    def encode(self) -> None:
-        """Make lines of what was entered: for a moment in which nothing else is to be done."""
-        if not self._new:
+    def encode(self, least: int = 1) -> None:
+        """Make lines of so many new entries or more: for a moment in which nothing else is to be done."""
+        if len(self._new) < least:
             return
         lines = []
         for each in self._new:

@@ -266,9 +266,11 @@ class Memory:
 
     def write(self, run: Run) -> None:
         """Write bytes that were not refused."""
-        self._memory[run.address : run.address + len(run.data)] = run.data
-        self._values.update(run.after)
-        self.changes += 1
+        start, end = run.address, run.address + len(run.data)
+        if self._memory[start:end] != run.data:
+            self._memory[start:end] = run.data
+            self._values.update(run.after)
+            self.changes += 1
         if not self._watchers.keys().isdisjoint(run.after):
             self._tell(run.after)
 

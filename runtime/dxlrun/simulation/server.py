@@ -16,7 +16,7 @@ from dxlrun.simulation.bus import SimulatedBus
 from dxlrun.simulation.configuration import SimulationConfig
 from dxlrun.simulation.control_line import ControlLine
 from dxlrun.simulation.faults import FaultScript, parse_fault
-from dxlrun.simulation.ledger import Ledger
+from dxlrun.simulation.ledger import SOME_ENTRIES, Ledger
 from dxlrun.simulation.link import Link
 from dxlrun.simulation.look import lateness_us, servo_looks
 from dxlrun.simulation.mechanics import Mechanics
@@ -102,20 +102,18 @@ class Server:
         for terminal, due_ns in zip(self._terminals, dues, strict=True):
             if due_ns is not None and due_ns <= now_ns:
                 self._deliver(terminal, now_ns)
-        for number, _ in ready:
-            terminal_heard = self._by_descriptor.get(number)
-            if terminal_heard is not None:
-                self._receive(number, terminal_heard, now_ns)  # of that moment, however long the others took
-            elif number == wake:
-                self._stopped = True
-            elif number == self._line.fileno():
-                self._line.flush()
-                self._listen(now_ns)
+        for _ in self._terminals:
+            if not ready:
+                break
+            for number, _ in ready:
+                self._hear(number, wake, now_ns)  # as of that moment, however long the others took
+            ready = self._waiting.poll(0)  # a host that drives all buses writes to them in one go
+            now_ns = time.monotonic_ns()
 
     def _use_pause(self, now_ns: int) -> int | None:
         """Do what nobody waits for; return when there is more of it."""
         self._mechanics.advance(now_ns)
-        self._ledger.encode()
+        self._ledger.encode(SOME_ENTRIES)
         self._ledger.flush_if_due(now_ns)
         for number in [each for each, until_ns in self._held.items() if until_ns <= now_ns]:
             del self._held[number]
@@ -144,6 +142,17 @@ class Server:
         if terminal.follow_adapter():
             self._plug()
             self._line.send({"ports": self._ports()})
+
+    def _hear(self, number: int, wake: int, now_ns: int) -> None:
+        """Take what somebody has written."""
+        terminal = self._by_descriptor.get(number)
+        if terminal is not None:
+            self._receive(number, terminal, now_ns)
+        elif number == wake:
+            self._stopped = True
+        elif number == self._line.fileno():
+            self._line.flush()
+            self._listen(now_ns)
 
     def _receive(self, number: int, terminal: PseudoTerminal, now_ns: int) -> None:
         bus = terminal.bus
