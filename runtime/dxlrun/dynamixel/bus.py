@@ -22,6 +22,7 @@ from dxlrun.packets import PacketKind, PacketSink
 
 if TYPE_CHECKING:  # the guardian makes servos limp without numpy
     from dxlrun.dynamixel.lane import Lane
+    from dxlrun.dynamixel.reply_polling import ReplyPolling
 
 QUIET_BYTES = 20
 """A line that was silent for so many byte times is silent (protocol.md: drain until it is)."""
@@ -92,7 +93,7 @@ class Bus(Listener):
         self._reply.strays = 0
         if lane is not None:
             self._lane = lane
-            lane.begin(self._now_ns, self._sink)
+            lane.begin(self._port, self._now_ns, self._sink)
             if self._receiver.pending:
                 self._receiver.flush()
 
@@ -128,34 +129,41 @@ class Bus(Listener):
         if self.failure is not None:
             raise self.failure
 
-    def receive(self) -> bool:
-        """Take what the line has; called when it has bytes.
+    def hear(self, polling: ReplyPolling | None = None) -> int:
+        """Take what the line has, and go on; return when to come back at the latest, as `step` does.
 
-        Returns whether everything that the newest transaction awaits has come now.
+        Called when the line has bytes. `polling` is told when everything that was awaited has come.
         """
         lane = self._lane
-        if self.failure is not None:
-            return False
+        if lane is None:
+            awaited = self._state == AWAITING
+            self._receive()
+            now_ns = self._now_ns()
+            if polling is not None and awaited and self._state == READY and self._reply.outcome is _OK:
+                polling.came(self.due_ns, now_ns)
+            return self.step(now_ns)
         try:
-            if lane is None:
-                self._take_bytes()
-            elif not lane.awaiting:
+            if not lane.awaiting:
                 self._take_bytes()  # nobody was asked
                 self._receiver.flush()
-                return False
-            elif lane.take(self._port):
-                if lane.through:
+            elif deadline_ns := lane.take(polling):
+                self.due_ns = lane.due_ns
+                if deadline_ns == NEVER:
                     self._last_byte_ns = lane.at_ns
                     self._job = self._lane = None
-                return True
-            elif lane.straight:
-                return False
+                return deadline_ns
             else:
                 self._turn_aside(lane)
         except PortError as error:
             self._fail(error)
-            return False
-        return self._state == READY and self._reply.outcome is _OK
+        return self.step(self._now_ns())
+
+    def _receive(self) -> None:
+        if self.failure is None:
+            try:
+                self._take_bytes()
+            except PortError as error:
+                self._fail(error)
 
     def _take_bytes(self) -> None:
         receiver = self._receiver
@@ -195,7 +203,7 @@ class Bus(Listener):
     def _end(self, now_ns: int) -> None:
         """Do what is due at a transaction's deadline."""
         # bytes may have come while this process was not running: look before giving up
-        self.receive()
+        self._receive()
         if self._state == AWAITING:
             self._give_up(now_ns)
         elif self._state == DRAINING and self._quiet_at() > now_ns:
@@ -206,7 +214,7 @@ class Bus(Listener):
 
     def _ask(self, lane: Lane) -> int:
         """Send the next read of a lane; return when to come back at the latest."""
-        deadline_ns = lane.ask(self._port, self._free_ns)
+        deadline_ns = lane.ask(self._free_ns)
         self.due_ns = lane.due_ns
         return deadline_ns
 

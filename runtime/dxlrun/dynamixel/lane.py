@@ -17,7 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.dynamixel.burst import Burst
+from dxlrun.dynamixel.listening import NEVER
 from dxlrun.dynamixel.port import Port
+from dxlrun.dynamixel.reply_polling import ReplyPolling
 from dxlrun.dynamixel.state_arrays import Counting, Source, StateArrays
 from dxlrun.dynamixel.transaction import Transaction
 from dxlrun.errors import PortError
@@ -49,7 +51,7 @@ class Stretch(NamedTuple):
 
 
 class Lane:
-    """All reads of a cycle: `ask` and `take` in turn, as long as it is `straight`."""
+    """All reads of a cycle: `ask` begins it, `take` goes on."""
 
     __slots__ = (
         "_arrived",
@@ -60,6 +62,7 @@ class Lane:
         "_log",
         "_now_ns",
         "_parts",
+        "_port",
         "_records",
         "_room",
         "_told",
@@ -71,7 +74,6 @@ class Lane:
         "fresh",
         "pieces",
         "sent_ns",
-        "straight",
         "stretches",
     )
 
@@ -96,9 +98,7 @@ class Lane:
         self.fresh = bytes(servo in here for servo in range(servos))
         """1 for each servo that is read."""
         self.awaiting = False
-        """True while replies are awaited; else the next read is to be asked."""
-        self.straight = False
-        """False once it ended before all reads were done."""
+        """True once it was begun, while replies are awaited."""
         self.sent_ns = self.due_ns = self.deadline_ns = self.at_ns = 0
         """Of the newest read: when it was sent, its replies are due, given up, and were taken."""
         self.pieces: list[tuple[int, int]] = []
@@ -141,15 +141,14 @@ class Lane:
         )
         return burst.size, least_ns, burst.clean, kept
 
-    def begin(self, now_ns: Callable[[], int], sink: PacketSink) -> None:
+    def begin(self, port: Port, now_ns: Callable[[], int], sink: PacketSink) -> None:
         """Begin a cycle."""
-        self._now_ns, self._records = now_ns, sink.records
+        self._port, self._now_ns, self._records = port, now_ns, sink.records
         self.done = 0
         self.awaiting = False
-        self.straight = True
         self.pieces.clear()
 
-    def ask(self, port: Port, free_ns: int) -> int:
+    def ask(self, free_ns: int) -> int:
         """Send the next read; return when to give it up.
 
         `free_ns`: when the line is; until then the read waits in the adapter behind what was sent before.
@@ -159,8 +158,9 @@ class Lane:
         now_ns = self._now_ns
         before = now_ns()
         try:
-            port.write(packet)
+            self._port.write(packet)
         except PortError:
+            self.awaiting = False
             self._records(asked[: -RECORD_HEADER - len(packet)])
             raise
         _stamp(self._log, asked_at, before, now_ns())
@@ -171,44 +171,49 @@ class Lane:
         self.deadline_ns = deadline_ns = start + timeout_ns
         return deadline_ns
 
-    def take(self, port: Port) -> bool:
-        """Take what the line has; return whether all replies of the newest read are taken.
+    def take(self, polling: ReplyPolling | None) -> int:
+        """Take what the line has, and ask the next when all replies are taken.
 
+        Returns when to give the newest read up; NEVER when it was the last, and 0 where the lane ends before.
         Raises PortError when the line is gone.
         """
         if self.pieces:
             end = sum(count for count, _ in self.pieces)
-            return self._take_piece(port.read_into(self._room[end:]), self._now_ns())
+            return self._take_piece(self._port.read_into(self._room[end:]), self._now_ns(), polling)
         size, least_ns, clean, kept = self._told[self.done]
-        count = port.read_into(self._room)
+        count = self._port.read_into(self._room)
         at = self._now_ns()
         if count != size or at < self.sent_ns + least_ns or not clean():
-            return self._take_piece(count, at)
-        self._keep(kept, at, at, None)
-        return True
+            return self._take_piece(count, at, polling)
+        return self._keep(kept, at, at, None, polling)
 
-    def _take_piece(self, count: int, at: int) -> bool:
+    def _take_piece(self, count: int, at: int, polling: ReplyPolling | None) -> int:
         """Take some of the replies: the rest is awaited as long as they look like what is awaited."""
         if not count:
-            return False
+            return self.deadline_ns
         pieces, burst = self.pieces, self.stretches[self.done].burst
         pieces.append((count, at))
         ends = [*accumulate(count for count, _ in pieces)]
         if ends[-1] < burst.size and burst.begun(ends[-1]):
-            return False
+            return self.deadline_ns
         _, least_ns, clean, kept = self._told[self.done]
         if ends[-1] == burst.size and clean():
             spans = burst.spans(ends, [at for _, at in pieces])
             first, last = spans[0]
             if last >= self.sent_ns + least_ns:
                 pieces.clear()
-                self._keep(kept, first, at, spans)
-                return True
-        self.straight = False
-        return False
+                return self._keep(kept, first, at, spans, polling)
+        return 0
 
-    def _keep(self, kept: _Kept, first: int, at: int, spans: list[tuple[int, int]] | None) -> None:
-        """Keep all replies of a read; `spans`: of each status packet, when they came in pieces."""
+    def _keep(
+        self,
+        kept: _Kept,
+        first: int,
+        at: int,
+        spans: list[tuple[int, int]] | None,
+        polling: ReplyPolling | None,
+    ) -> int:
+        """Keep all replies of a read and go on; `spans`: of each packet, when they came in pieces."""
         reply, reply_at, told_at, chain, servos = kept
         arrived = self._arrived
         if chain is None:
@@ -224,14 +229,17 @@ class Lane:
         else:
             for servo, (_, last) in zip(servos, spans, strict=True):
                 arrived[servo] = last
-        self.awaiting = False
-        self.at_ns = at
+        if polling is not None:
+            polling.came(self.due_ns, at)
         self.done = done = self.done + 1
-        if done == len(self._told):
-            self._records(self._last)
-            for counting in self._counts:
-                counting.count()
-            self._ended(self)
+        if done < len(self._told):
+            return self.ask(0)
+        self.at_ns = at
+        self._records(self._last)
+        for counting in self._counts:
+            counting.count()
+        self._ended(self)
+        return NEVER
 
     @property
     def through(self) -> bool:

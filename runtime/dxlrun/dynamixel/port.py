@@ -164,9 +164,11 @@ class SerialPorts:
             found = self._poll.poll(0)
             if not found:
                 return ()
-        indices = [self._index[descriptor] for descriptor, _ in found]
-        for index in indices:
+        indices: list[int] = []
+        for descriptor, _ in found:
+            index = self._index[descriptor]
             self._ports[index].announced = True
+            indices.append(index)
         return indices
 
     def reopen(self, index: int) -> bool:

@@ -45,7 +45,7 @@ def clear(buses: Sequence[Bus], ports: Ports) -> None:
     """
     for index in ports.wait(0):
         if buses[index].failure is None:
-            buses[index].receive()
+            buses[index].hear()
 
 
 def pump(
@@ -73,19 +73,13 @@ def pump(
             bus = buses[index]
             if bus.failure is None:
                 heard = True
-                due_ns = bus.due_ns
-                complete = bus.receive()
-                now_ns = clock_ns()
-                if polling and complete:
-                    polling.came(due_ns, now_ns)
-                deadlines[index] = bus.step(now_ns)
+                deadlines[index] = bus.hear(polling)
         if not heard:
             # a line that is gone is ready for ever: look at the others now and then instead of waiting
             clock.wait_until(min(deadline, clock_ns() + LOST_LINE_STEP_NS))
             for bus in buses:
-                bus.receive()
-        if not (ready and heard):
-            now_ns = clock_ns()
+                bus.hear(polling)
+        now_ns = clock_ns()
         if now_ns >= deadline or not heard:
             deadlines = [bus.step(now_ns) for bus in buses]
 
