@@ -20,6 +20,8 @@ BUSES = {
     "bulk read": ("MX-28", 1.0),
     "sync read": ("XM430-W350", 2.0),
     "fast sync read": ("XM430-W350", 2.0),
+    "single reads beside a bulk read": (("AX-12A", "MX-28"), 1.0),
+    "two layouts": (("XM430-W350", "XL-320"), 2.0),
 }
 PERIOD_NS = 20_000_000
 GOALS = b"goals that nobody answers"
@@ -207,8 +209,9 @@ def said(transactions, dialect, rng, accident):
 
 def planned(make_plan, name):
     """Return the plan of a bus that is read in some way, and its dialect."""
-    model, protocol = BUSES[name]
-    plan = make_plan(IDS, protocol=protocol, model=model)
+    models, protocol = BUSES[name]
+    models = (models,) if isinstance(models, str) else models
+    plan = make_plan(IDS, protocol=protocol, models=[*models * len(IDS)][: len(IDS)])
     plan = replace(plan, fast=(name == "fast sync read",) * len(plan.groups))
     return plan, protocol1 if protocol == 1.0 else protocol2
 

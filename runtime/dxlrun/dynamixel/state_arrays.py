@@ -104,9 +104,9 @@ class Counting:
 class StateArrays:
     """The bytes of one bus's servos, as their replies brought them.
 
-    Velocity and effort are sign-magnitude in Protocol 1.0, bit 10 set = clockwise (e-Manual AX-12A, Present
-    Speed (38), Present Load (40)), and two's complement in Protocol 2.0 (e-Manual XM430-W350, Present
-    Velocity (128)).
+    Velocity and effort are sign-magnitude in Protocol 1.0 and of XL-320, bit 10 set = clockwise (e-Manual
+    AX-12A, Present Speed (38), Present Load (40); XL-320, Present Speed (39)), else two's complement
+    (e-Manual XM430-W350, Present Velocity (128)).
     """
 
     __slots__ = ("_blocks", "_plan", "arrivals", "replies")
