@@ -35,7 +35,7 @@ def test_closed_streams_change_nothing_but_what_is_seen(
 ):
     said = shell(f"dxlrun {words.format(torso=torso)} {closed}", tmp_path)
 
-    assert said.returncode == code, said.stderr
+    assert said.returncode == code, said.stdout + said.stderr
     assert "Traceback" not in said.stderr
     assert said.stdout == "" or closed == "2>&-"
 
