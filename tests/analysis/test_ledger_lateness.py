@@ -37,6 +37,17 @@ def test_it_counts_what_was_late_and_how_much(write: Callable[..., Path], cycle:
     assert found.median_us == pytest.approx(50.5)
 
 
+def test_of_answers_that_came_together_the_last_one_counts(write: Callable[..., Path], cycle: type):
+    together = [
+        out(BEGIN_NS + us * 1000, 100 - us) for us in (0, 35, 70)
+    ]  # all of them 100 us after the begin
+
+    found = lateness(read_log(write([cycle(0)])), [*together, out(BEGIN_NS + 10**6, 10)])
+
+    assert found is not None
+    assert (found.deliveries, found.max_us, found.median_us) == (2, 30, 20)
+
+
 def test_an_overrun_with_a_late_reply_in_its_time_is_told_from_one_without(
     write: Callable[..., Path], cycle: type, entries
 ):

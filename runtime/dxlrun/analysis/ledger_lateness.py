@@ -16,7 +16,10 @@ ROUGH_NS = 1_000_000
 
 @dataclass(frozen=True, slots=True)
 class Lateness:
-    """How long after it was due the host got what the simulated servos sent, us; zero on virtual time."""
+    """How long after it was due the host got what the simulated servos sent, us; zero on virtual time.
+
+    Of answers that it got together the last one counts: the others waited for it.
+    """
 
     deliveries: int
     median_us: float
@@ -32,11 +35,16 @@ class Lateness:
 
 def lateness(log: Log, entries: Iterable[LedgerEntry]) -> Lateness | None:
     """Return how late the buses were; None where the ledger has no delivery. `entries` of the run."""
-    out = [entry for entry in entries if entry.direction == "out"]
-    if not out:
+    late_ns: dict[tuple[str, int], int] = {}
+    for entry in entries:
+        if entry.direction == "out":
+            handed = (entry.bus, entry.t_ns + entry.late_ns)
+            late_ns[handed] = min(late_ns.get(handed, entry.late_ns), entry.late_ns)
+    if not late_ns:
         return None
-    late = np.array([entry.late_ns for entry in out], np.int64)
-    handed_over = np.sort(np.array([e.t_ns + e.late_ns for e in out if e.late_ns > ROUGH_NS], np.int64))
+    late = np.array(list(late_ns.values()), np.int64)
+    handed_ns = np.array([at_ns for _, at_ns in late_ns], np.int64)
+    handed_over = np.sort(handed_ns[late > ROUGH_NS])
     after = log.cycles[log.cycles["skipped"] > 0]
     begins = after["scheduled_ns"] - (after["skipped"] + 1).astype(np.int64) * log.period_ns
     beside = np.searchsorted(handed_over, after["woken_ns"], side="right") > np.searchsorted(
@@ -44,7 +52,7 @@ def lateness(log: Log, entries: Iterable[LedgerEntry]) -> Lateness | None:
     )
     median, p99 = np.percentile(late, [50, 99])
     return Lateness(
-        deliveries=len(out),
+        deliveries=len(late),
         median_us=float(median) / 1e3,
         p99_us=float(p99) / 1e3,
         max_us=float(late.max()) / 1e3,
