@@ -89,8 +89,11 @@ class Server:
 
     def _turn(self, wake: int) -> None:
         now_ns = time.monotonic_ns()
-        dues = [bus.next_delivery_ns(GATHER_NS) for bus in self._buses]
-        soonest_ns = min([due_ns for due_ns in dues if due_ns is not None], default=None)
+        soonest_ns = None
+        for bus in self._buses:
+            due_ns = bus.next_delivery_ns(GATHER_NS)
+            if due_ns is not None and (soonest_ns is None or due_ns < soonest_ns):
+                soonest_ns = due_ns
         easy_ns = None
         if soonest_ns is None or soonest_ns - now_ns > IDLE_NS:  # no reply is about to leave
             easy_ns = self._use_pause(now_ns)
@@ -99,9 +102,11 @@ class Server:
         # What was due before the host wrote goes out first: the host could have read it.
         now_ns = time.monotonic_ns()
         self._patience.woke(now_ns)
-        for terminal, due_ns in zip(self._terminals, dues, strict=True):
-            if due_ns is not None and due_ns <= now_ns:
-                self._deliver(terminal, now_ns)
+        if soonest_ns is not None and soonest_ns <= now_ns:
+            for terminal in self._terminals:
+                due_ns = terminal.bus.next_delivery_ns(GATHER_NS)
+                if due_ns is not None and due_ns <= now_ns:
+                    self._deliver(terminal, now_ns)
         for _ in self._terminals:
             if not ready:
                 break
@@ -109,20 +114,22 @@ class Server:
                 self._hear(number, wake, now_ns)  # as of that moment, however long the others took
             ready = self._waiting.poll(0)  # a host that drives all buses writes to them in one go
             now_ns = time.monotonic_ns()
+        self._ledger.flush_if_due(now_ns)
 
     def _use_pause(self, now_ns: int) -> int | None:
         """Do what nobody waits for; return when there is more of it."""
         self._mechanics.advance(now_ns)
         self._ledger.encode(SOME_ENTRIES)
-        self._ledger.flush_if_due(now_ns)
-        for number in [each for each, until_ns in self._held.items() if until_ns <= now_ns]:
-            del self._held[number]
-            self._waiting.register(number, select.EPOLLIN)
-        told = select.EPOLLIN | (select.EPOLLOUT if self._line.has_unsent else 0)
+        times = [self._ledger.flush_due_ns(), self._mechanics.due_ns()]
+        if self._held:
+            for number in [each for each, until_ns in self._held.items() if until_ns <= now_ns]:
+                del self._held[number]
+                self._waiting.register(number, select.EPOLLIN)
+            times += self._held.values()
+        told = select.EPOLLIN | select.EPOLLOUT if self._line.has_unsent else select.EPOLLIN
         if told != self._told:
             self._told = told
             self._waiting.modify(self._line, told)
-        times = [self._ledger.flush_due_ns(), self._mechanics.due_ns(), *self._held.values()]
         return min([t_ns for t_ns in times if t_ns is not None], default=None)
 
     def _wait(self, due_ns: int | None, easy_ns: int | None, now_ns: int) -> list[tuple[int, int]]:
