@@ -46,6 +46,8 @@ class Line:
     def __init__(self, clock):
         self.clock = clock
         self.told, self.said = [], []
+        self.stall_ns = 0
+        """How long the host stands still behind each instruction."""
 
     def write(self, data):
         if data == GOALS:
@@ -55,6 +57,7 @@ class Line:
             raise PortError("it is gone")
         self.said += [(self.clock.now_ns() + at, piece) for at, piece in pieces]
         self.said.sort(key=lambda one: one[0])
+        self.clock.wait_until(self.clock.now_ns() + self.stall_ns)
 
     def read_into(self, buffer):
         if not self.heard:
@@ -259,3 +262,28 @@ def test_a_bus_that_is_silent_costs_the_others_neither_time_nor_their_lane(make_
     arrived_ns = [reads.arrived_ns.tolist() for reads in side.reads]
     assert arrived_ns[0] == arrived_ns[2] == [asked_ns + 1_500_000] * len(IDS)
     assert [reads.lane.through for reads in side.reads] == [True, False, True]
+
+
+@pytest.mark.parametrize("name", ["single reads", "fast sync read"])
+@pytest.mark.parametrize("split_ns", [None, 0])
+def test_a_reply_that_was_there_before_the_request_is_nobodys_however_late_the_host_looks(
+    make_plan, name, split_ns
+):
+    plan, dialect = planned(make_plan, name)
+    side = Side(plan, 1)
+    (line,) = side.lines.ports
+    before = b""
+    for number in range(8):
+        (reads,) = side.begin()
+        told = [b"".join(replies(one, dialect, random.Random(number))) for one in reads]
+        if number == 7:
+            assert side.reads[0].lane is not None
+            line.said.append((side.lines.clock.now_ns(), before))
+            line.stall_ns = 2_000_000  # longer than the wire takes for both
+        side.cycle([[[(3_000_000, one)] for one in told]], split_ns)
+        before = told[0]
+    assert side.sinks[0].packets[0][0] is not PacketKind.INSTRUCTION
+    assert side.straight > 3
+    assert side.reads[0].fresh.all()
+    answers = [packet for packet in side.sinks[0].packets[1:] if packet[0] is PacketKind.STATUS]
+    assert b"".join(packet[-1] for packet in answers) == b"".join(told)

@@ -139,3 +139,21 @@ def test_a_line_that_is_gone_between_request_and_reply_is_asked_anew(started):
         if started.states.valid.all():
             break
     assert started.states.valid.all()
+
+
+def test_what_came_before_a_read_is_asked_behind_the_goals_is_none_of_its_replies(started):
+    for _ in range(5):
+        started.goals.position[:] += 0.01
+        started.cycle()
+    started.hardware.read()
+    stray = started.packets.list[-1].data
+    started.ports.ports[0]._arrived += stray
+    since = len(started.packets.list)
+    started.goals.position[:] += 0.01
+    cycle_ends(started)
+    started.hardware.read()
+    assert [packet.data for packet in started.packets.list[since + 1 : -1]] == [
+        stray,
+        protocol2.sync_read(126, 10, IDS, fast=True),
+    ]
+    assert started.states.valid.all()

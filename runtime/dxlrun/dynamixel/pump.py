@@ -21,9 +21,15 @@ def _look(
 ) -> Sequence[int]:
     """Sleep until shortly before replies are due and look for them again and again; return who has bytes."""
     now_ns = clock.now_ns()
-    dues = [bus.due_ns for bus in buses if bus.busy]
+    soonest_ns, latest_ns = NEVER, 0
+    for bus in buses:
+        if bus.busy:
+            due_ns = bus.due_ns
+            latest_ns = max(latest_ns, due_ns)
+            if now_ns < due_ns < soonest_ns:
+                soonest_ns = due_ns
     # those that should be there since long wait for theirs
-    due_ns = min((due for due in dues if due > now_ns), default=max(dues, default=0))
+    due_ns = latest_ns if soonest_ns == NEVER else soonest_ns
     until_ns = polling.await_until(due_ns, now_ns, deadline_ns)
     if not until_ns:
         return ()
