@@ -118,14 +118,14 @@ class Ledger:
         for each in self._new:
             if isinstance(each, LedgerEntry):
                 lines.append(_line(each))
-            elif each.handed_ns is None or each.handed_ns <= each.begin_ns + each.dues_ns[-1]:
+                continue
+            bus, begin_ns, dues_ns, parts, handed_ns = each
+            if handed_ns is None or handed_ns <= begin_ns + dues_ns[-1]:
                 lines += map(_line, each.entries())  # nothing is told of a lateness of 0
             else:
-                numbers: list[int] = []
-                for due_ns in each.dues_ns:
-                    t_ns = each.begin_ns + due_ns
-                    numbers += (t_ns, each.handed_ns - t_ns)
-                lines.append(_form(each.bus, each.parts) % tuple(numbers))
+                late_ns = handed_ns - begin_ns
+                numbers = [number for due_ns in dues_ns for number in (begin_ns + due_ns, late_ns - due_ns)]
+                lines.append(_form(bus, parts) % tuple(numbers))
         self._new.clear()
         if self._file is not None:
             try:

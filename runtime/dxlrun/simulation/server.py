@@ -134,12 +134,17 @@ class Server:
 
     def _wait(self, due_ns: int | None, easy_ns: int | None, now_ns: int) -> list[tuple[int, int]]:
         """Wait until a reply is due, or something else is to be done, or somebody has written: return who."""
-        sleep_s = self._patience.until(due_ns, now_ns, easy_ns)
-        poll = self._waiting.poll
+        poll, patience = self._waiting.poll, self._patience
+        sleep_s = patience.until(due_ns, now_ns, easy_ns)
         if sleep_s is None or sleep_s > 0.0:
             # no longer than asked for, to the microsecond: an epoll itself counts milliseconds
             select.select((self._waiting,), (), (), sleep_s)
-            return poll(0)
+            if (ready := poll(0)) or due_ns is None:
+                return ready
+            now_ns = time.monotonic_ns()
+            patience.woke(now_ns)
+            if patience.until(due_ns, now_ns) != 0.0:
+                return ready
         while not (ready := poll(0)) and due_ns is not None and time.monotonic_ns() < due_ns:
             pass
         return ready
