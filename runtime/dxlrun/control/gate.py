@@ -77,8 +77,15 @@ class Gate:
         self._led = np.ones(count, dtype=np.bool_)
         """Joints that are led to positions."""
         self._all_led = self._any_led = True
-        self._settled: tuple[bytes, ...] = ()
-        """Commands and goals that the last cycle left as they were, with nothing to tell."""
+        self._unflagged = bytes(count)
+        self._everybody = bytes([True]) * count
+        self._calm: tuple[bytes, bytes] | None = None
+        """Commanded speeds and speeds of the goals, where the last cycle led nobody but to positions and had
+        nothing to tell."""
+        self._settled = (b"", b"")
+        """Commanded positions, and those of the goals, as that cycle left them."""
+        self._followed = False
+        """Whether every joint was commanded to a position in it."""
         self.begin()
 
     def begin(self) -> None:
@@ -87,7 +94,7 @@ class Gate:
         np.logical_or(self._modes == Mode.POSITION, self._modes == Mode.EFFORT_POSITION, out=self._led)
         self._all_led, self._any_led = bool(self._led.all()), bool(self._led.any())
         self._drive.take(self._modes)
-        self._settled = ()
+        self._calm = None
 
     def enter_modes(self) -> None:
         """Give the joints whose mode has changed goals that move nothing in the new one; after each read.
@@ -119,11 +126,10 @@ class Gate:
     def apply(self, commands: Commands, goals: Commands, dt_ns: int) -> None:
         """Move `goals` toward `commands` in place; `dt_ns` is the time since the cycle before."""
         flags = self._flags
-        np.bitwise_and(self._record.clamped, _NOT_FINITE, out=flags)  # what the manager found
         speed = self._highest(dt_ns)
-        if self._rests(commands, goals):
-            np.copyto(self._record.clamped, flags)
+        if self._goes_on(commands, goals, speed, dt_ns):
             return
+        np.bitwise_and(self._record.clamped, _NOT_FINITE, out=flags)  # what the manager found
         if self._any_led:
             self._position(commands.position, goals.position, speed, dt_ns)
             self._velocity(commands.velocity, goals.velocity)
@@ -133,28 +139,39 @@ class Gate:
         if np.count_nonzero(flags):
             self._note(flags & ~self._before)
         np.copyto(self._before, flags)
-        after = (goals.position.tobytes(), goals.velocity.tobytes())
-        calm = not (self._drive.any or np.count_nonzero(flags))
-        self._settled = (commands.position.tobytes(), commands.velocity.tobytes(), *after) if calm else ()
+        self._calm = None
+        if not (self._drive.any or np.count_nonzero(flags)):
+            self._calm = commands.velocity.tobytes(), goals.velocity.tobytes()
+            self._settled = commands.position.tobytes(), goals.position.tobytes()
+            self._followed = self._all_led and self._finite.tobytes() == self._everybody
 
-    def _rests(self, commands: Commands, goals: Commands) -> bool:
-        """Say whether the goals are where the commands want them, as in the cycle before: nothing to do then.
+    def _goes_on(self, commands: Commands, goals: Commands, speed: Floats, dt_ns: int) -> bool:
+        """Do as in a calm cycle before, if that can be; what `_position` and `_velocity` would do, in less.
 
-        A goal that no limit holds back has arrived in one cycle, unless its step is limited: so it is looked
-        whether it stands, which no other time since the last cycle changes.
+        Speeds stay as they are. Positions too, where the same are commanded: a goal that no limit holds back
+        has arrived in one cycle, unless its step is limited, so it is looked whether it stands. Others are
+        followed, if every joint is commanded inside of its limits and within its step.
         """
-        settled = self._settled
-        return (
-            bool(settled)
-            and not np.count_nonzero(self._flags)
-            and settled
-            == (
-                commands.position.tobytes(),
-                commands.velocity.tobytes(),
-                goals.position.tobytes(),
-                goals.velocity.tobytes(),
-            )
-        )
+        if (
+            (commands.velocity.tobytes(), goals.velocity.tobytes()) != self._calm
+            or self._record.clamped.tobytes() != self._unflagged  # the manager found something
+        ):
+            return False
+        wanted, goal = commands.position, goals.position
+        commanded = wanted.tobytes()
+        if (commanded, goal.tobytes()) == self._settled:
+            return True
+        step, low, high, mask = self._step, self._low, self._high, self._mask
+        np.multiply(speed, max(dt_ns, 1) * 1e-9, step)
+        np.maximum(np.subtract(goal, step, low), self._lower, out=low)
+        np.minimum(np.add(goal, step, high), self._upper, out=high)
+        if not self._followed or np.less_equal(low, wanted, mask).tobytes() != self._everybody:
+            return False
+        if np.less_equal(wanted, high, mask).tobytes() != self._everybody:
+            return False
+        np.copyto(goal, wanted)
+        self._settled = commanded, commanded
+        return True
 
     def _position(self, wanted: Floats, goal: Floats, speed: Floats, dt_ns: int) -> None:
         finite, inside, step, low, high = self._finite, self._inside, self._step, self._low, self._high
