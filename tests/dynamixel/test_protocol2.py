@@ -179,3 +179,11 @@ def test_an_error_number_is_a_refusal_and_the_alert_bit_alone_is_not():
 def test_reads_of_several_servos_take_the_shorter_packet():
     assert p2.read_many([(1, 126, 10), (2, 126, 10)]) == p2.sync_read(126, 10, (1, 2))
     assert p2.read_many([(1, 126, 10), (2, 37, 6)]) == p2.bulk_read([(1, 126, 10), (2, 37, 6)])
+
+
+def test_goals_that_look_like_a_header_are_stuffed_as_any_parameters():
+    records = b"\x01\xff\xff\xfd\x00\x02\x00\x00\x00\x00"
+    plain = p2.sync_write_records(116, 4, bytes(len(records)))
+    body = plain[: -p2.CHECKSUM - len(records)] + records
+    assert p2.sealed(body) == p2.sync_write_records(116, 4, records)
+    assert p2.sealed(plain[: -p2.CHECKSUM]) == plain

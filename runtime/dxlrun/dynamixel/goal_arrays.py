@@ -106,17 +106,18 @@ class GoalArrays:
         now = (goals.values[:, self._rows] if self._own is None else self._own).tobytes()
         who = included.tobytes()
         seen = now, who, b"" if ceiling is None else ceiling.tobytes()
-        if seen == self._seen:
+        if seen != self._seen:
+            self._seen, self._still = seen, 0
+        else:
             self._still += 1
             if self._still >= _OFTEN and cycle < self._next:
                 return ()
-        else:
-            self._seen, self._still = seen, 0
         slowed = None if ceiling is None else ceiling.tolist()
         found: list[bytes] = []
         for block in self._blocks:
             block.packets(cycle, now, who, slowed, found)
-        self._next = min([block.next for block in self._blocks], default=cycle) + REPEATED
+        if self._still:  # else nobody asks for it
+            self._next = min([block.next for block in self._blocks], default=cycle) + REPEATED
         return found
 
     def _rebuild(self) -> None:
