@@ -33,6 +33,8 @@ class Cells(NamedTuple):
     """True when one of the items is."""
     eeprom: bool
     """True when one of the items is in the EEPROM area."""
+    single: str
+    """Name of the item that they are, whole, where none of them stands for another cell; else empty."""
 
 
 class LiveItem(NamedTuple):
@@ -170,7 +172,8 @@ class Memory:
         """Return the signed number of ticks of an item."""
         wire, item = self._values[name], self.table.items[name]
         if item.encoding == "twos_complement":
-            return wire - (wire >> 8 * item.size - 1 << 8 * item.size)
+            bits = 8 * item.size
+            return wire - (wire >> bits - 1 << bits)
         return wire if item.encoding == "unsigned" else item.decode(self.data(name))
 
     def data(self, name: str) -> bytes:
@@ -196,7 +199,9 @@ class Memory:
 
     def runs(self, address: int, data: bytes) -> tuple[Run, ...]:
         """Return where bytes really go: as they are, or to the cells behind Indirect Data."""
-        cells = self.cells(address, len(data))
+        cells = self._cells_at.get((address, len(data))) or self.cells(address, len(data))
+        if cells.single:
+            return (Run(address, data, cells, {cells.single: int.from_bytes(data, "little")}),)
         if cells.direct:
             return (self._run(address, data, cells),)
         return tuple(
@@ -224,12 +229,15 @@ class Memory:
             owned = [item.name for cell in spanned if (item := self._item_at.get(cell)) is not None]
             names = tuple(dict.fromkeys(owned)) if len(owned) == length else ()
             items = tuple(self.table.items[name] for name in names)
+            whole = bool(items) and sum(item.size for item in items) == length
+            direct = self._indirect.keys().isdisjoint(spanned)
             cells = Cells(
                 items,
                 frozenset(names),
-                whole=bool(items) and sum(item.size for item in items) == length,
+                whole=whole,
                 touched=bool(owned),
-                direct=self._indirect.keys().isdisjoint(spanned),
+                direct=direct,
+                single=names[0] if whole and direct and len(names) == 1 else "",
                 read_only=any(item.access == "R" for item in items),
                 eeprom=any(item.area == "EEPROM" for item in items),
             )
@@ -249,8 +257,6 @@ class Memory:
     def _run(self, address: int, data: bytes, cells: Cells) -> Run:
         """Return bytes for some cells, with what would be after it."""
         items = cells.items
-        if len(items) == 1 and cells.whole:
-            return Run(address, data, cells, {items[0].name: int.from_bytes(data, "little")})
         start, all_of_them = address, data
         if items and not cells.whole:  # parts of items stay as they are
             start, end = items[0].address, items[-1].address + items[-1].size
