@@ -43,7 +43,7 @@ LEAST_PATIENCE_NS = 80_000_000
 """At high rates a few periods are less than a stock kernel's worst wake-up (thesis: 17 ms), and than a host
 of virtual machines takes a processor away [i]: a robot that falls for that was made safe for nothing."""
 SETUP_PATIENCE_NS = 1_000_000_000
-"""Set-up and shutdown beat once a transaction; a transaction ends within milliseconds."""
+"""Set-up and shutdown beat while they await replies; each wait ends within milliseconds."""
 
 LEAST_NAP_NS, LONGEST_NAP_NS = 5_000_000, 10_000_000
 """It looks at the loop once a period within these bounds: a look takes some 60 us from a loop on its core."""

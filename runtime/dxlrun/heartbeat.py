@@ -46,7 +46,7 @@ class Heartbeat:
         self._beats = 0
 
     def beat(self) -> None:
-        """Show that the loop goes on; called once a cycle, and once a transaction outside the loop."""
+        """Show that the loop goes on; called once a cycle, and while replies are awaited."""
         self._beats += 1
         self._words[_BEATS] = self._beats
 

@@ -117,8 +117,8 @@ def limp(
 ) -> tuple[LimpOutcome, ...]:
     """Drain the lines and switch torque off on every servo; for somebody who just took the ports over.
 
-    `limit_ns` bounds the retries, counted from now; `beat` is called once a transaction. Raises nothing: a
-    line that is gone is in the outcome.
+    `limit_ns` bounds the retries, counted from now; `beat` is called while replies are awaited. Raises
+    nothing: a line that is gone is in the outcome.
     """
     buses = [
         Bus(index, plan, port, clock, packets)
