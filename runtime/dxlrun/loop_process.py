@@ -134,7 +134,7 @@ class AskedToStop(Exception):
 
 @dataclass(slots=True)
 class Pulse:
-    """What is called while replies are awaited, and once a cycle: beats, and gives a set-up up that is to stop."""
+    """Called while replies are awaited, and once a cycle: beats, and gives a set-up up that is to stop."""
 
     heartbeat: Heartbeat
     stop: StopFlag
