@@ -130,9 +130,27 @@ def test_what_does_not_fit_into_the_terminal_is_lost_and_noted() -> None:
         bus.inject_noise(bytes(4000), now - 10**8)
         terminal.deliver(now)
     assert any("it does not read" in entry.note for entry in bus.ledger.entries)
-    terminal.receive(10**11)  # the host has said nothing
+    terminal.listen()  # the host has said nothing
+    terminal.receive(10**11)
     terminal.close()
     assert not [entry for entry in bus.ledger.entries if entry.direction == "in"]
+
+
+def test_what_a_host_writes_while_others_are_served_is_not_of_the_moment_before() -> None:
+    bus = SimulatedBus(BUSES[0], Ledger(), 0)
+    terminal = PseudoTerminal(bus)
+    with opened(terminal.path) as port:
+        os.write(port, READ_1)
+        select.select([terminal], [], [])
+        terminal.listen()
+        os.write(port, READ_1)
+        select.select([terminal], [], [])
+        terminal.receive(10**9)
+        terminal.listen()
+        terminal.receive(2 * 10**9)
+    terminal.close()
+    heard = [(entry.t_ns, entry.data) for entry in bus.ledger.entries if entry.direction == "in"]
+    assert heard == [(10**9, READ_1), (2 * 10**9, READ_1)]
 
 
 def test_configurations_pass_as_they_are() -> None:

@@ -7,6 +7,7 @@ import os
 import struct
 import time
 import tty
+from contextlib import suppress
 
 from dxlrun.simulation.bus import SimulatedBus
 from dxlrun.simulation.link import Link
@@ -36,6 +37,8 @@ class PseudoTerminal:
         self._master, self._slave = self._new_pair()
         self._told = b""
         """Settings of the terminal when the host last wrote."""
+        self._taken = b""
+        """What the host wrote and the bus was not handed yet."""
         self._times_unplugged = bus.times_unplugged
         self.plugged = True
         """False: the host saw it go, and no device is there."""
@@ -58,6 +61,7 @@ class PseudoTerminal:
         """
         if self._times_unplugged == self.bus.times_unplugged and self.plugged == self.bus.plugged:
             return False
+        self._taken = b""
         if self._times_unplugged != self.bus.times_unplugged:
             self._times_unplugged = self.bus.times_unplugged
             old = self._master, self._slave
@@ -72,11 +76,15 @@ class PseudoTerminal:
                 self.bus.note(f"the link does not follow the adapter: {error}")
         return True
 
+    def listen(self) -> None:
+        """Take what the host has written."""
+        with suppress(BlockingIOError):
+            self._taken += os.read(self._master, 4096)
+
     def receive(self, now_ns: int) -> None:
-        """Hand what the host has written to the bus, as if it had been written at `now_ns`."""
-        try:
-            data = os.read(self._master, 4096)
-        except BlockingIOError:
+        """Hand what was taken to the bus, as if it had been written at `now_ns`, which is no earlier."""
+        data, self._taken = self._taken, b""
+        if not data:
             return
         settings = _settings(self._slave)
         if settings != self._told:  # the host's rate can only be another one then

@@ -111,9 +111,12 @@ class Server:
             if not ready:
                 break
             for number, _ in ready:
-                self._hear(number, wake, now_ns)  # as of that moment, however long the others took
+                if number in self._by_descriptor:
+                    self._by_descriptor[number].listen()
+            now_ns = time.monotonic_ns()  # nobody is answered before it was written, though others take long
+            for number, _ in ready:
+                self._hear(number, wake, now_ns)
             ready = self._waiting.poll(0)  # a host that drives all buses writes to them in one go
-            now_ns = time.monotonic_ns()
         self._ledger.flush_if_due(now_ns)
 
     def _use_pause(self, now_ns: int) -> int | None:
