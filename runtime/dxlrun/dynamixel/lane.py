@@ -107,19 +107,9 @@ class Lane:
         """How many reads went as they should."""
         self._room = memoryview(buffer)
         self._log, places = _laid(stretches, bus)
-        view, begin = memoryview(self._log), 0
         self._asks: list[_Ask] = []
         self._told: list[_Told] = []
-        for stretch, (asked_at, told_at) in zip(stretches, places, strict=True):
-            transaction = stretch.transaction
-            stretch.burst.bind(buffer)
-            end = asked_at + RECORD_HEADER + len(transaction.packet)
-            asked = view[begin:end]  # the replies before, and this instruction
-            times = (transaction.due_ns, transaction.timeout_ns)
-            self._asks.append((transaction.packet, asked, asked_at + _TIMES_AT, *times))
-            self._told.append(self._reply(stretch, told_at, buffer, byte_ns))
-            begin = end
-        self._last = view[begin:]
+        self._last = self._prepare(places, buffer, byte_ns)
         self._parts = [
             [
                 (stretch.data, row, at)
@@ -128,6 +118,22 @@ class Lane:
             for stretch, (_, told) in zip(stretches, places, strict=True)
         ]
         self._counts = _counts(self._log, self.stretches, places, arrays)
+
+    def _prepare(
+        self, places: Sequence[tuple[int, list[int]]], buffer: bytearray, byte_ns: int
+    ) -> memoryview:
+        """Prepare how each read is asked and taken; return the records behind the last instruction."""
+        view, begin = memoryview(self._log), 0
+        for stretch, (asked_at, told_at) in zip(self.stretches, places, strict=True):
+            transaction = stretch.transaction
+            stretch.burst.bind(buffer)
+            end = asked_at + RECORD_HEADER + len(transaction.packet)
+            asked = view[begin:end]  # the replies before, and this instruction
+            times = (transaction.due_ns, transaction.timeout_ns)
+            self._asks.append((transaction.packet, asked, asked_at + _TIMES_AT, *times))
+            self._told.append(self._reply(stretch, told_at, buffer, byte_ns))
+            begin = end
+        return view[begin:]
 
     def _reply(self, stretch: Stretch, told_at: Sequence[int], buffer: bytearray, byte_ns: int) -> _Told:
         burst, reply_at = stretch.burst, told_at[0] + RECORD_HEADER
