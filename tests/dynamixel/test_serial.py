@@ -6,6 +6,7 @@ import subprocess
 import sys
 import termios
 import time
+import tty
 
 import pytest
 
@@ -48,6 +49,16 @@ def test_bytes_go_out_and_come_in_unchanged(opened):
     assert bytes(buffer[: port.read_into(buffer)]) == everything
     assert ports.wait(time.monotonic_ns()) == ()
     assert port.read_into(buffer) == 0
+
+
+def test_a_line_whose_bytes_somebody_took_is_not_gone(terminal):
+    master, _, slave = terminal
+    tty.setraw(slave)
+    port = SerialPort(slave, "line")
+    os.write(master, b"abc")
+    assert SerialPorts([port]).wait(time.monotonic_ns() + 5_000_000_000) == [0]
+    assert os.read(slave, 10) == b"abc"
+    assert port.read_into(memoryview(bytearray(10))) == 0
 
 
 def test_an_adapter_that_is_gone_is_a_port_error(opened):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 import select
 import time
@@ -13,7 +14,7 @@ from dxlrun.dynamixel.reply_polling import ReplyPolling
 from dxlrun.errors import PortError
 
 # found at once, some dozen times a cycle
-_readv, _write, _now_ns = os.readv, os.write, time.monotonic_ns
+_write, _now_ns = os.write, time.monotonic_ns
 
 _WRITE_PATIENCE_NS = 20_000_000
 """A goal packet for 50 servos takes 2.6 ms at 1 Mbit/s; a line that does not take it in 20 ms is stuck."""
@@ -67,11 +68,13 @@ class Ports(Protocol):
 class SerialPort:
     """A serial line by its descriptor, made non-blocking; opened, locked and set up by somebody else."""
 
-    __slots__ = ("announced", "descriptor", "name")
+    __slots__ = ("_read_into", "announced", "descriptor", "name")
 
     def __init__(self, descriptor: int, name: str) -> None:
         os.set_blocking(descriptor, False)
         self.descriptor = descriptor
+        # makes no exception of an empty line, and knows no more than the number either
+        self._read_into = io.FileIO(descriptor, closefd=False).readinto
         self.name = name
         """Device path, for messages."""
         self.announced = False
@@ -106,16 +109,13 @@ class SerialPort:
     def read_into(self, buffer: memoryview) -> int:
         """Copy what has arrived into `buffer`; raises PortError when the adapter is gone."""
         try:
-            count = _readv(self.descriptor, (buffer,))
-        except BlockingIOError:
-            count = 0
+            count = self._read_into(buffer)
         except OSError as error:
             raise self._gone(error) from error
-        else:
-            if count == 0 and self.announced:  # ready to be read, and nothing there: the other side hung up
-                raise self._gone(None)
+        if count == 0 and self.announced:  # ready to be read, and at its end: the other side hung up
+            raise self._gone(None)
         self.announced = False
-        return count
+        return count or 0  # None where a read would have waited
 
     def _gone(self, error: OSError | None) -> PortError:
         why = f" ({error.strerror})" if error is not None and error.errno != errno.EBADF else ""  # set aside
