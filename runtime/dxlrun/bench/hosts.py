@@ -128,6 +128,7 @@ class Ours:
         )
         self._hardware = robot.hardware
         self._valid = robot.record.states.valid
+        self._everybody = b"\1" * len(self._valid)
         self._goal = robot.record.goals.position
         self._goals = self._goal.copy(), self._goal.copy()
         ticks = {servo.row: servo.rad_per_tick for bus in plan.buses for servo in bus.servos}
@@ -146,7 +147,7 @@ class Ours:
         self._goal[:] = self._goals[self._turn]
         self._hardware.write()
         self._commit()
-        return bool(self._valid.all())
+        return self._valid.tobytes() == self._everybody  # as cheap as what the peers return
 
     def mend(self) -> None:
         """Exchange, and use the gap for what is owed to a servo that was silent."""
