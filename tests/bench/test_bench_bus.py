@@ -26,6 +26,8 @@ from dxlrun.bench.wire import judge
 from dxlrun.dynamixel import protocol1
 
 SECONDS = 0.2
+PATIENCE_S = 60.0
+"""How long a test waits for what must come; it decides nothing but when to give up."""
 ALL = [kind.name for kind in HOSTS]
 
 
@@ -87,21 +89,27 @@ def test_the_core_is_given_back() -> None:
 
 
 @pytest.fixture
-def learned() -> tuple[Terminal, Callable[[bytes], bytes]]:
+def learned() -> tuple[Terminal, Callable[..., bytes]]:
     """A responder that learned to answer a ping, then goals that nobody answers."""
     terminal = Terminal(Case(1.0, 1).simulated("main"))
     host = os.open(terminal.path, os.O_RDWR | os.O_NOCTTY)
 
-    def say(data: bytes) -> bytes:
-        os.write(host, data)
-        while select.select([terminal], [], [], 0)[0]:
-            terminal.receive()
-        return os.read(host, 1000) if select.select([host], [], [], 0)[0] else b""
+    def say(data: bytes, size: int = 0) -> bytes:
+        """Write, let the responder take all of it, and hear an answer of some size."""
+        left, heard = os.write(host, data), b""
+        while left > 0:
+            assert select.select([terminal], [], [], PATIENCE_S)[0]
+            left -= terminal.receive()
+        while len(heard) < size:
+            assert select.select([host], [], [], PATIENCE_S)[0], f"only {heard.hex(' ')} came"
+            heard += os.read(host, 1000)
+        assert not select.select([host], [], [], 0)[0]
+        return heard
 
     terminal.do("rehearse")
-    assert say(protocol1.ping(1))[2] == 1
+    assert say(protocol1.ping(1), 6)[2] == 1
     terminal.do("learn")
-    assert say(protocol1.ping(1))
+    assert say(protocol1.ping(1), 6)
     assert say(protocol1.write(0xFE, 30, b"\0\2")) == b""
     (first, last) = terminal.do("play")
     assert (first.count, len(first.reply)) == (6, 6)
@@ -112,15 +120,15 @@ def learned() -> tuple[Terminal, Callable[[bytes], bytes]]:
 def test_the_responder_answers_after_so_many_bytes_whatever_they_are(learned: Any) -> None:
     _, say = learned
     assert say(b"12345") == b""
-    answer = say(b"6")
+    answer = say(b"6", 6)
     assert answer[2] == 1
     assert say(b"123456789") == b""
-    assert say(b"123456") == answer
+    assert say(b"123456", 6) == answer
 
 
 def test_bytes_that_come_together_are_answered_together(learned: Any) -> None:
     _, say = learned
-    assert len(say(b"?" * (6 + 9 + 6))) == 12
+    assert len(say(b"?" * (6 + 9 + 6), 12)) == 12
 
 
 def test_the_responder_is_a_servo_again_when_it_is_rehearsed(learned: Any) -> None:
@@ -128,7 +136,7 @@ def test_the_responder_is_a_servo_again_when_it_is_rehearsed(learned: Any) -> No
     say(b"123")
     terminal.do("rehearse")
     assert say(protocol1.ping(7)) == b""
-    assert say(protocol1.ping(1))[2] == 1
+    assert say(protocol1.ping(1), 6)[2] == 1
 
 
 # The rounds, and the figures made of them

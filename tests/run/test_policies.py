@@ -294,9 +294,9 @@ def test_a_reply_that_is_lost_as_the_pose_is_reached_does_not_end_it_before_the_
     there_ns = next(t for t, now in goals(robot, 3) if now == HOME[3])
     robot = built(on_exit=STEPS["pose"])
     stop_signal(robot, acts)
-    servo = robot.buses[0].servo(3)
-    robot.buses[0].at(there_ns - 30_000_000, servo.silence)
-    robot.buses[0].at(there_ns + 10_000_000, lambda: servo.silence(False))
+    bus, servo = robot.buses[0], robot.buses[0].servo(3)
+    bus.at(there_ns - 30_000_000, servo.silence)
+    bus.at(there_ns + 10_000_000, lambda: servo.silence(False))
     robot.run()
     assert goals(robot, 3)[-1][1] == HOME[3]
     assert servo.position == pytest.approx(HOME[3] * TICK, abs=0.1)
@@ -381,7 +381,7 @@ def test_less_torque_is_a_fraction_of_what_the_servo_may_by_itself(
     robot.buses[0].servo(3).poke("max_torque", 500)
     stop_signal(robot, acts)
     robot.run()
-    assert limits(robot, 3) == [500, 383, 267, 150]  # the first one at the start-up
+    assert limits(robot, 3) == [500, 383, 267, 150]  # first at the start-up
 
 
 def test_on_protocol_2_the_pwm_is_reduced(tmp_path: Path) -> None:
@@ -393,11 +393,8 @@ def test_on_protocol_2_the_pwm_is_reduced(tmp_path: Path) -> None:
         "joints: {pan: {bus: main, id: 3, model: XM430-W350, reference: 180 deg, direction: 1}}\n"
         "policies: {on_exit: [{reduce_torque: 0.4, steps: 2, over: 200 ms}, hold]}\n"
     )
-    robot = simulated_robot(path, duration_s=0.2)
-    full = 885
-    robot.run()
-    head = bytes((0x83, 100, 0, 2, 0, 3))  # sync write, Goal PWM (100), two bytes, servo 3
+    (robot := simulated_robot(path, duration_s=0.2)).run()
     sent = b"".join(entry.data for entry in robot.ledger.entries if entry.direction == "in")
-    found = [int.from_bytes(part[:2], "little") for part in sent.split(head)[1:]]
-    assert found == [round(full * 0.7), round(full * 0.4)]
+    parts = sent.split(bytes((0x83, 100, 0, 2, 0, 3)))[1:]  # sync write, Goal PWM (100), two bytes, servo 3
+    assert [int.from_bytes(part[:2], "little") for part in parts] == [round(885 * 0.7), round(885 * 0.4)]
     assert robot.buses[0].servo(3).torque_on

@@ -19,8 +19,6 @@ import rustypot
 
 from dxlrun.control_table import control_table
 from dxlrun.simulation import BusConfig, Ledger, ServoConfig, SimulatedBus, read_ledger
-from dxlrun.simulation.control_line import ControlLine
-from dxlrun.simulation.link import Link
 from dxlrun.simulation.process import SimulationConfig, decode_config, encode_config
 from dxlrun.simulation.pseudo_terminal import PseudoTerminal
 from dxlrun.simulation.realtime import Patience
@@ -375,35 +373,3 @@ def test_a_host_that_floods_the_line_feels_its_rate(start_buses: Any) -> None:
                 sent += os.write(port, bytes(4096))
         assert sent < 1_000_000
     assert running.hang_up() == 0
-
-
-def test_what_nobody_reads_from_the_control_socket_is_dropped() -> None:
-    ours, theirs = socket.socketpair()
-    with ours, theirs:
-        line = ControlLine(theirs)
-        for number in range(20_000):
-            line.send({"number": number, "text": "x" * 100})
-        assert line.has_unsent
-        ours.sendall(b"one\ntw")
-        assert line.receive() == [b"one"]
-        ours.sendall(b"o\n" + bytes(70_000))
-        said = [each for _ in range(3) for each in line.receive()]
-        assert said == [b"two"]
-        ours.close()
-        line.receive()
-        line.flush()
-        assert line.closed
-
-
-def test_a_link_never_replaces_a_file_and_goes_only_where_it_was_put(tmp_path: Path) -> None:
-    file, link = tmp_path / "file", tmp_path / "link"
-    file.write_text("mine")
-    with pytest.raises(FileExistsError, match="is no link"):
-        Link(file).point("/dev/null")
-    one, other = Link(link), Link(link)
-    one.point("/dev/null")
-    other.point("/dev/zero")
-    one.remove()
-    assert os.readlink(link) == "/dev/zero"
-    other.remove()
-    assert os.listdir(tmp_path) == ["file"]

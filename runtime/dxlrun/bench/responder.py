@@ -74,21 +74,22 @@ class Terminal:
         self._position = self._waiting = 0
         return tuple(self._steps)
 
-    def receive(self) -> None:
-        """Take what the host has written, and answer it."""
+    def receive(self) -> int:
+        """Take what the host has written, and answer it; return how many bytes that were."""
         try:
             data = os.read(self._master, _MOST)
         except BlockingIOError:
-            return
+            return 0
         if not self._playing:
             self._rehearse(data)
-            return
+            return len(data)
         self._waiting += len(data)
         while self._waiting >= (step := self._steps[self._position]).count:
             self._waiting -= step.count
             self._position = (self._position + 1) % len(self._steps)
             if step.reply:
                 os.write(self._master, step.reply)
+        return len(data)
 
     def _rehearse(self, data: bytes) -> None:
         bus = self._bus

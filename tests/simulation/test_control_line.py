@@ -1,0 +1,44 @@
+"""What stands between the simulated buses and their users: the control socket, and links to the terminals."""
+
+from __future__ import annotations
+
+import os
+import socket
+from pathlib import Path
+
+import pytest
+
+from dxlrun.simulation.control_line import ControlLine
+from dxlrun.simulation.link import Link
+
+
+def test_what_nobody_reads_from_the_control_socket_is_dropped() -> None:
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        line = ControlLine(theirs)
+        for number in range(20_000):
+            line.send({"number": number, "text": "x" * 100})
+        assert line.has_unsent
+        ours.sendall(b"one\ntw")
+        assert line.receive() == [b"one"]
+        ours.sendall(b"o\n" + bytes(70_000))
+        said = [each for _ in range(3) for each in line.receive()]
+        assert said == [b"two"]
+        ours.close()
+        line.receive()
+        line.flush()
+        assert line.closed
+
+
+def test_a_link_never_replaces_a_file_and_goes_only_where_it_was_put(tmp_path: Path) -> None:
+    file, link = tmp_path / "file", tmp_path / "link"
+    file.write_text("mine")
+    with pytest.raises(FileExistsError, match="is no link"):
+        Link(file).point("/dev/null")
+    one, other = Link(link), Link(link)
+    one.point("/dev/null")
+    other.point("/dev/zero")
+    one.remove()
+    assert os.readlink(link) == "/dev/zero"
+    other.remove()
+    assert os.listdir(tmp_path) == ["file"]
