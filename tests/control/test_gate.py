@@ -57,6 +57,14 @@ class Rig:
         )
 
 
+@pytest.mark.parametrize("wanted", [np.inf, -np.inf])
+def test_infinity_is_no_goal_of_a_joint_without_limits_that_follows_its_commands(wanted):
+    rig = Rig(lower=-np.inf, upper=np.inf)
+    for position in (0.5, 0.6):
+        assert rig.apply(position)[0] == position
+    assert rig.apply(wanted)[::2] == (0.6, Clamp.NOT_FINITE)
+
+
 any_float = st.floats(allow_nan=True, allow_infinity=True, width=64)
 
 

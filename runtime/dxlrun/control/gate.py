@@ -62,6 +62,9 @@ class Gate:
         self._events = events
         self._lower = np.array([joint.lower for joint in plan.joints], dtype=np.float64)
         self._upper = np.array([joint.upper for joint in plan.joints], dtype=np.float64)
+        most = np.finfo(np.float64).max
+        self._first, self._last = np.maximum(self._lower, -most), np.minimum(self._upper, most)
+        """The same, so that infinity is beyond them where a joint has no limits."""
         self._speed = np.array(
             [np.inf if joint.velocity is None else joint.velocity for joint in plan.joints], dtype=np.float64
         )
@@ -163,8 +166,8 @@ class Gate:
             return True
         step, low, high, mask = self._step, self._low, self._high, self._mask
         np.multiply(speed, max(dt_ns, 1) * 1e-9, step)
-        np.maximum(np.subtract(goal, step, low), self._lower, out=low)
-        np.minimum(np.add(goal, step, high), self._upper, out=high)
+        np.maximum(np.subtract(goal, step, low), self._first, out=low)
+        np.minimum(np.add(goal, step, high), self._last, out=high)
         if not self._followed or np.less_equal(low, wanted, mask).tobytes() != self._everybody:
             return False
         if np.less_equal(wanted, high, mask).tobytes() != self._everybody:
