@@ -211,6 +211,49 @@ def test_the_watchdog_is_armed_at_the_start_and_disarmed_at_the_end(start, make_
     assert [servo.registers["bus_watchdog"] for servo in rig.buses[0].servos] == [0] * 4
 
 
+def _once_armed(rig, servo_id, what):
+    """Do something as soon as a servo's watchdog is armed, once."""
+    servo, left = rig.buses[0].servo(servo_id), [what]
+
+    def written():
+        if servo.registers["bus_watchdog"] == 10 and left:
+            left.pop()(servo_id)
+
+    servo.registers.watch(("bus_watchdog",), written)
+
+
+def test_nobody_is_stopped_because_the_answers_of_others_are_lost_while_they_are_armed(make_rig, make_x):
+    rig = make_rig(make_x(watchdog=10))
+    _once_armed(rig, 14, lambda servo_id: rig.buses[0].truncate_next(servo_id, 0))
+    rig.hardware.start()
+    rig.goals.position[:] = 0.5
+    cycles(rig, 100)
+    assert [servo.registers["bus_watchdog"] for servo in rig.buses[0].servos] == [10] * 4
+    assert rig.states.position == pytest.approx(0.5, abs=0.01)
+    assert rig.events.of(EventCode.WATCHDOG) == []
+
+
+def test_nobody_is_stopped_because_the_adapter_is_slow_while_they_are_armed(make_rig, make_x):
+    rig = make_rig(make_x(range(11, 23), watchdog=10))
+    for servo_id in range(11, 23):
+        _once_armed(rig, servo_id, lambda one: rig.buses[0].delay_next(one, 60_000_000))
+    rig.hardware.start()
+    assert [servo.registers["bus_watchdog"] for servo in rig.buses[0].servos] == [10] * 12
+    assert rig.events.of(EventCode.WATCHDOG) == []
+
+
+def test_who_was_stopped_while_others_were_armed_is_revived(make_rig, make_x):
+    rig = make_rig(make_x(watchdog=10))
+    _once_armed(rig, 14, lambda one: [rig.buses[0].truncate_next(one, 0) for _ in range(3)])
+    rig.hardware.start()
+    assert rig.buses[0].servo(11).registers["bus_watchdog"] == 0xFF
+    rig.goals.position[:] = 0.5
+    cycles(rig, 100)
+    assert [servo.registers["bus_watchdog"] for servo in rig.buses[0].servos] == [10] * 4
+    assert rig.states.position == pytest.approx(0.5, abs=0.01)
+    assert len(rig.events.of(EventCode.WATCHDOG)) == 1
+
+
 def test_servos_that_are_left_holding_are_not_stopped_by_the_watchdog(start, make_x):
     rig = start(make_x(watchdog=10))
     cycles(rig, 5)

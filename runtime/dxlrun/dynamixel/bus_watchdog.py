@@ -7,6 +7,8 @@ stopped a servo it reads -1, and the servo refuses goals until 0 is written (e-M
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from dxlrun.control_table import ControlItem, control_table
 from dxlrun.dynamixel.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.dialect import dialect_of
@@ -47,12 +49,29 @@ def revive(plan: BusPlan, servo: ServoPlan) -> Program[str]:
     return (yield from disarm(plan, servo)) or (yield from arm(plan, servo))
 
 
-def arm_all(plan: BusPlan) -> Program[list[str]]:
-    """Arm every servo of a bus; return what went wrong."""
+def arm_all(plan: BusPlan, fed: Callable[[], None]) -> Program[list[str]]:
+    """Arm every servo of a bus, and read each back; return what went wrong.
+
+    All of them at once, and once more before each is read: nobody is stopped because the others take long.
+    `fed` is called whenever that goes out.
+    """
     found = []
+    line, packets = plan_line(plan), _to_all(plan, plan.watchdog_ticks)
     for servo in plan.servos:
-        found.append((yield from arm(plan, servo)))
+        if not plan.watchdog_ticks or (item := _item(plan, servo)) is None:
+            continue
+        fed()
+        for packet in packets:
+            yield line.unanswered(packet)
+        back = yield line.read(servo.servo_id, item.address, item.size)
+        if not (back.answered and back.parameters[0] == plan.watchdog_ticks):
+            found.append((yield from revive(plan, servo)))
     return [problem for problem in found if problem]
+
+
+def patience_ns(plan: BusPlan) -> int:
+    """Return how much longer than usual a reply may be awaited while servos are armed."""
+    return plan.watchdog_ticks * UNIT_NS // 3
 
 
 def disarm_all(plan: BusPlan) -> Program[list[str]]:
@@ -65,6 +84,11 @@ def disarm_all(plan: BusPlan) -> Program[list[str]]:
 
 def disarming(plan: BusPlan) -> list[bytes]:
     """Return the packets that clear all servos of a bus at once; nobody answers."""
+    return _to_all(plan, 0)
+
+
+def _to_all(plan: BusPlan, ticks: int) -> list[bytes]:
+    """Return the packets that write the same to all servos; none where the plan wants no watchdog."""
     if not plan.watchdog_ticks:
         return []
     places: dict[int, list[int]] = {}
@@ -73,7 +97,7 @@ def disarming(plan: BusPlan) -> list[bytes]:
             places.setdefault(item.address, []).append(servo.servo_id)
     records = dialect_of(plan.protocol).sync_write_records
     return [
-        records(address, 1, b"".join(bytes((each, 0)) for each in ids)) for address, ids in places.items()
+        records(address, 1, b"".join(bytes((each, ticks)) for each in ids)) for address, ids in places.items()
     ]
 
 

@@ -9,6 +9,7 @@ from dxlrun.dynamixel import bus_watchdog
 from dxlrun.dynamixel.absent import NEVER
 from dxlrun.dynamixel.bus_plan import BusPlan
 from dxlrun.dynamixel.gaps import Gaps, Urgency
+from dxlrun.dynamixel.transaction import Program
 from dxlrun.events import EventCode, EventSink, Severity
 
 
@@ -50,12 +51,12 @@ class Feeding:
         self._reviving = [False] * len(away)
         """Whose turn in the gaps has not come yet: a loop that is late again and again asks for no second."""
 
-    def begin(self) -> None:
-        """Note that the watchdogs were armed."""
-        self._fed_ns = self._gaps.now_ns()
+    def begin(self) -> Program[list[str]]:
+        """Arm the watchdogs, which is the first that the servos are fed; return what went wrong."""
+        return bus_watchdog.arm_all(self._plan, lambda: self.feed(self._gaps.now_ns()))
 
     def feed(self, now: int) -> None:
-        """Note that the cyclic reads go out at `now`, ns; who was not fed for long has stopped."""
+        """Note that everybody is sent something at `now`, ns; who was not fed for long has stopped."""
         if self._fed_ns and now - self._fed_ns > self._longest_ns:
             self._revive((now - self._fed_ns) // 1_000_000)
         self._fed_ns = now

@@ -109,7 +109,7 @@ class DynamixelHardware:
             if self._restore_torque:
                 self._full_torque = self._set_up.restore_limits()
             self._first_states()
-            self._set_up.carry_out([servos.watch() for servos in self._servos])
+            self._set_up.watch()
         except BaseException as error:  # also an interrupt: nothing may leave here with torque on
             for sentence in self.stop() or (TAKEN_BACK,):
                 error.add_note(sentence)

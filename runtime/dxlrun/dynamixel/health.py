@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dxlrun.dynamixel import bus_watchdog
 from dxlrun.dynamixel.absent import FIRST_PROBE_NS, Absent
 from dxlrun.dynamixel.bus import Bus
 from dxlrun.dynamixel.bus_plan import BusPlan
@@ -184,9 +183,7 @@ class Servos:
         """
         for index in range(len(self._rows)):
             yield from self._absent.tick(index)
-        problems = yield from bus_watchdog.arm_all(self._plan)
-        self.feeding.begin()
-        return problems
+        return (yield from self.feeding.begin())
 
     def _stopped(self, index: int) -> None:
         """Send a servo that its watchdog stopped no goal before its torque was read again."""

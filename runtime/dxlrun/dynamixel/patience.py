@@ -16,7 +16,7 @@ MOST_SILENCE_NS = 960_000_000
 """So much longer all silence together is awaited: who says nothing four times is not merely late."""
 
 
-def patient(program: Program[Result]) -> Program[Result]:
+def patient(program: Program[Result], most_ns: int = LONGER_NS) -> Program[Result]:
     """Execute a program of one bus, and give each reply longer, as long as few of them do not come.
 
     A servo that answers in the end costs what it takes; a bus without any is told within about two seconds.
@@ -25,7 +25,7 @@ def patient(program: Program[Result]) -> Program[Result]:
     try:
         wanted = next(program)
         while True:
-            longer_ns = min(LONGER_NS, left_ns) if wanted.awaited else 0
+            longer_ns = min(most_ns, left_ns) if wanted.awaited else 0
             reply = yield replace(wanted, timeout_ns=wanted.timeout_ns + longer_ns) if longer_ns else wanted
             if reply.outcome in (Outcome.TIMEOUT, Outcome.GARBLED):
                 left_ns -= longer_ns

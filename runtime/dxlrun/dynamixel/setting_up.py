@@ -12,7 +12,7 @@ from dxlrun.dynamixel.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.health import Servos
 from dxlrun.dynamixel.line import listen
 from dxlrun.dynamixel.modes import settle_modes
-from dxlrun.dynamixel.patience import patient
+from dxlrun.dynamixel.patience import LONGER_NS, patient
 from dxlrun.dynamixel.port import Ports
 from dxlrun.dynamixel.probing import extra_ns, probe_reads
 from dxlrun.dynamixel.pump import run
@@ -103,6 +103,14 @@ class SetUp:
         found = self._patiently(programs)
         _refuse(problem for one in found if one is not None for problem in one)
 
+    def watch(self) -> None:
+        """Arm the Bus Watchdogs, which stop the servos where anybody is awaited for too long."""
+        found = self._patiently(
+            [servos.watch() for servos in self._servos],
+            [bus_watchdog.patience_ns(plan) or LONGER_NS for plan in self._plans],
+        )
+        _refuse(problem for one in found if one is not None for problem in one)
+
     def pause(self, duration_ns: int) -> None:
         """Let a moment pass, and hear what still comes."""
         self.carry_out([_pause(duration_ns) for _ in self._plans])
@@ -152,9 +160,12 @@ class SetUp:
         """Run one program a bus; `_judge` comes when everything that they found was told."""
         return [one for one in self._patiently(programs) if one is not None]
 
-    def _patiently(self, programs: Sequence[Program[Result]]) -> list[Result | None]:
-        """Run one program a bus with the patience of somebody who is in no hurry."""
-        slow = [patient(program) for program in programs]
+    def _patiently(
+        self, programs: Sequence[Program[Result]], most_ns: Sequence[int] = ()
+    ) -> list[Result | None]:
+        """Run one program a bus with the patience of somebody who is in no hurry; `most_ns`: for a reply."""
+        most_ns = most_ns or [LONGER_NS] * len(programs)
+        slow = [patient(program, most) for program, most in zip(programs, most_ns, strict=True)]
         found = run(slow, self._buses, self._ports, self._clock, self._beat)
         self.raise_failures()
         return found
