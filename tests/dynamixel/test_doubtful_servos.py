@@ -207,3 +207,21 @@ def test_a_late_answer_to_the_question_for_torque_has_not_the_length_of_a_mode(m
     plan = make_plan((1,), model=model, protocol=protocol, reference=1.0, lower=-0.5, upper=0.5)
     program = modes.mode_now(plan, plan.servos[0])
     assert next(program).awaited[0].length != plan.torque_reads[0].awaited[0].length
+
+
+def test_a_wheel_stands_before_silent_ones_are_awaited_for_long(make_rig, make_plan):
+    ends = {"lower": -math.inf, "upper": math.inf}
+    rig = make_rig(make_plan((1, 2, 3, 4), model="AX-12A", continuous=True, **ends))
+    rig.hardware.start()
+    rig.goals.velocity[:] = 1.0
+    for _ in range(20):
+        rig.cycle()
+    for servo_id in (1, 2, 3):
+        rig.buses[0].servo(servo_id).silence()
+    begin_ns, stood_ns = rig.clock.now_ns(), []
+    moving = rig.buses[0].servo(4).registers
+    moving.watch(("moving_speed",), lambda: stood_ns.append(rig.clock.now_ns()))
+    said = stand(rig.plans, rig.ports, rig.clock, rig.packets)
+    assert stood_ns[-1] - begin_ns < 500_000_000
+    assert [text.split()[0] for text in said] == [f"main_{one}_joint" for one in (4, 1, 2, 3)]
+    assert [" may go on moving: " in text for text in said] == [False, True, True, True]

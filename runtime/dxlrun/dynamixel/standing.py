@@ -11,7 +11,7 @@ from dataclasses import replace
 from dxlrun.clock import Clock
 from dxlrun.dynamixel import modes
 from dxlrun.dynamixel.bus import Bus
-from dxlrun.dynamixel.bus_plan import BusPlan
+from dxlrun.dynamixel.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.inspection import persist, who
 from dxlrun.dynamixel.limp import LONGER_NS, SETTLE_NS
 from dxlrun.dynamixel.line import listen
@@ -47,32 +47,49 @@ def stand(
 def _stand(plan: BusPlan) -> Program[list[str]]:
     yield listen(SETTLE_NS)
     said: list[str] = []
+    left: dict[int, str] = {}
     for index, servo in enumerate(plan.servos):
-        mode = yield from modes.mode_now(plan, servo)
-        if mode in _HOLD:
+        problem = yield from _stopped(plan, index)
+        if problem is None:
             continue
-        torque = yield from persist(plan.torque_reads[index])
-        if torque.answered and torque.parameters[0] == 0:
-            continue
-        problem = "its mode is not known"
-        if mode is not Mode.UNKNOWN:
-            problem = (yield from modes.hold(plan, servo, servo.mode_plan(mode))).problem
         if not problem:
             said.append(f"{who(plan, servo)} stands: its goal is 0")
-        elif (yield from _switch_off(plan, index)):
-            said.append(f"{who(plan, servo)} has no torque, as {problem}")
+        elif (yield from _off(plan, index, LONGER_NS[0])):
+            said.append(_cut(plan, servo, problem))
         else:
-            said.append(f"{who(plan, servo)} may go on moving: {problem}, and torque off was not confirmed")
+            left[index] = problem
+    for longer_ns in LONGER_NS[1:]:  # only now: who still moves does not wait for who is silent
+        for index, problem in list(left.items()):
+            if (yield from _off(plan, index, longer_ns)):
+                del left[index]
+                said.append(_cut(plan, plan.servos[index], problem))
+    for index, problem in left.items():
+        name = who(plan, plan.servos[index])
+        said.append(f"{name} may go on moving: {problem}, and torque off was not confirmed")
     return said
 
 
-def _switch_off(plan: BusPlan, index: int) -> Program[bool]:
+def _stopped(plan: BusPlan, index: int) -> Program[str | None]:
+    """Let a servo stand; return why it does not, empty when it does, None where nothing was to be done."""
+    servo = plan.servos[index]
+    mode = yield from modes.mode_now(plan, servo)
+    if mode in _HOLD:
+        return None
+    torque = yield from persist(plan.torque_reads[index])
+    if torque.answered and torque.parameters[0] == 0:
+        return None
+    if mode is Mode.UNKNOWN:
+        return "its mode is not known"
+    return (yield from modes.hold(plan, servo, servo.mode_plan(mode))).problem
+
+
+def _cut(plan: BusPlan, servo: ServoPlan, problem: str) -> str:
+    return f"{who(plan, servo)} has no torque, as {problem}"
+
+
+def _off(plan: BusPlan, index: int, longer_ns: int) -> Program[bool]:
     """Switch a servo's torque off; return whether that was read back."""
-    write = [write for write in plan.limp if write.awaited][index]
+    yield [write for write in plan.limp if write.awaited][index]
     read = plan.torque_reads[index]
-    for longer_ns in LONGER_NS:
-        yield write
-        back = yield replace(read, timeout_ns=read.timeout_ns + longer_ns)
-        if back.answered and back.parameters[0] == 0:
-            return True
-    return False
+    back = yield replace(read, timeout_ns=read.timeout_ns + longer_ns)
+    return back.answered and back.parameters[0] == 0
