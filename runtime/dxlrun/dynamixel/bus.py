@@ -179,14 +179,11 @@ class Bus(Listener):
         """Do what is due; return when to come back at the latest, NEVER when there is nothing to do."""
         try:
             if (lane := self._lane) is not None:
-                if lane.awaiting:
-                    if now_ns < lane.deadline_ns:
-                        return lane.deadline_ns
-                    self._turn_aside(lane)
-                elif now_ns < self._free_ns:
-                    return self._free_ns
-                else:
-                    return self._ask(lane)
+                if not lane.awaiting:
+                    return self._ask(lane)  # behind what is still on its way: sleeping until then ends late
+                if now_ns < lane.deadline_ns:
+                    return lane.deadline_ns
+                self._turn_aside(lane)
             while self._job is not None:
                 if self._state == READY:
                     if now_ns < self._free_ns:
