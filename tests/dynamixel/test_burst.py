@@ -181,3 +181,20 @@ def test_a_burst_is_what_the_receiver_makes_of_the_same_bytes(make_plan, name):
         whole += job.took
         assert not job.took or job.end[0] is Outcome.OK
     assert 25 < whole < 240  # neither side of the comparison is empty
+
+
+def test_noise_that_the_servos_behind_it_heard_as_well_is_in_no_fast_reply(make_plan):
+    name, count = "fast sync read", len(IDS)
+    rng = random.Random(2)
+    packet = next(one for (one,) in iter(lambda: replies(name, rng), []) if not any(one[8 : -1 : LENGTH + 4]))
+    assert exchange(make_plan, name, [(900_000, packet)], burst=True)[0].took
+    step = LENGTH + 4
+    for spoilt_part in range(count):
+        stream = bytearray(packet)
+        stream[8 + spoilt_part * step + 4] ^= 0x10
+        for part in range(spoilt_part + 1, count):  # each goes on with the CRC of what it heard
+            end = 8 + (part + 1) * step
+            stream[end - 2 : end] = protocol2.crc(bytes(stream[: end - 2])).to_bytes(2, "little")
+        job, *_ = exchange(make_plan, name, [(900_000, bytes(stream))], burst=True)
+        assert not job.took
+        assert not job.statuses.keys() & set(range(spoilt_part, count))

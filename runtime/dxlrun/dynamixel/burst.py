@@ -124,7 +124,9 @@ class Burst:
         """What the first one says."""
         ends = [self.size - (count - 1 - number) * step for number in range(count)]
         if self._fast:
-            self._bodies = [view[: self.size - 2]]
+            # each CRC goes on where the one before it ended, and covers that one, too
+            starts = [0, *(end - 2 for end in ends[:-1])]
+            self._bodies = [view[start : end - 2] for start, end in zip(starts, ends, strict=True)]
             self.packets = [(BROADCAST_ID, view[: self.size])]
             """Each status packet and who sent it, where they lie."""
         else:
@@ -174,8 +176,12 @@ class Burst:
         return self._buffer.find(_STUFFING, 0, self.size) < 0
 
     def _chained(self) -> bool:
-        """Say whether the last CRC is right: each covers all that stands before it, the other CRCs too."""
-        return _crc(self._bodies[0]) == self._tails(self._buffer)[-1]
+        """Say whether every CRC is right: the last one says only that the wire was as its servo heard it.
+
+        Whoever adds its part goes on with the CRC of what it heard [i], also where noise had changed that.
+        """
+        crc = 0
+        return [crc := _crc(body, crc) for body in self._bodies] == [*self._tails(self._buffer)]
 
     def _theirs(self) -> bool:
         """Say whether the parts of the one status of a fast form are of whom they should be."""
