@@ -211,6 +211,18 @@ def test_the_watchdog_is_armed_at_the_start_and_disarmed_at_the_end(start, make_
     assert [servo.registers["bus_watchdog"] for servo in rig.buses[0].servos] == [0] * 4
 
 
+def test_who_is_lost_at_a_high_rate_is_told_with_all_that_it_missed(start, make_x):
+    rig = start(make_x())
+    rig.period_ns = 4_000_000
+    rig.buses[0].servo(13).silence()
+    misses = 0
+    while not (lost := rig.events.of(EventCode.SERVO_LOST)):
+        rig.cycle(idle=False)
+        misses += 1
+    assert misses > 5
+    assert f"missed {misses} replies in a row" in lost[0][1]
+
+
 def _once_armed(rig, servo_id, what):
     """Do something as soon as a servo's watchdog is armed, once."""
     servo, left = rig.buses[0].servo(servo_id), [what]

@@ -37,7 +37,6 @@ ALERT_AGAIN = 50
 """Cycles after which a standing alert is read again: a second error does not change the alert bit."""
 _SHUTS_DOWN = StatusError.OVERHEATING | StatusError.OVERLOAD
 """After them Torque Limit may be 0 (e-Manual AX-12A, Alarm Shutdown (18))."""
-_LOST = f"missed {LOST_CYCLES} replies in a row; it is asked once a second until it is in order"
 
 
 class _Question(NamedTuple):
@@ -318,7 +317,8 @@ class Servos:
                     how = "sent a garbled reply" if self.reads.garbled[index] else "did not answer"
                     self._say(EventCode.READ_LOST, Severity.WARNING, index, how)
                 elif self._missed[index] >= LOST_CYCLES and now_ns - arrived_ns[index] >= LOST_AGE_NS:
-                    self._say(EventCode.SERVO_LOST, Severity.ERROR, index, _LOST)
+                    text = f"missed {self._missed[index]} replies in a row; it is asked once a second until"
+                    self._say(EventCode.SERVO_LOST, Severity.ERROR, index, f"{text} it is in order")
                     self._leave(index, FIRST_PROBE_NS)
             elif self._missed[index]:
                 missed = self._missed[index]
