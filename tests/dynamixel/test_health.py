@@ -76,7 +76,7 @@ def test_a_lost_servo_leaves_the_exchange_and_is_asked_once_a_second(start, make
     assert all(13 not in packet[12:-2] for packet in reads)
     ((source, text),) = rig.events.of(EventCode.SERVO_LOST)
     assert source == "arm_13_joint"
-    assert "missed 3 replies in a row" in text
+    assert "missed 4 replies in a row" in text
 
 
 def test_a_bus_that_stands_still_for_a_moment_loses_nobody_at_any_rate(start, make_x):
