@@ -306,7 +306,7 @@ class Loop:
             self.events.emit(EventCode.POLICY, Severity.ERROR, "loop", text)
         for policy, rows in ending.items():
             names = ", ".join(self.plan.joints[row].name for row in rows)
-            self._give_up(policy, f"{names} missed {LOST_CYCLES} replies in a row")
+            self._give_up(policy, f"{names} missed at least {LOST_CYCLES} replies in a row")
         if not ending:
             self.gate.ease_in(self.manager.wait_for(self._lost.rows))
 
