@@ -15,7 +15,7 @@ import pytest
 
 from dxlrun.clock import VirtualClock
 from dxlrun.control_table import control_table
-from dxlrun.dynamixel.bus_plan import BusPlan
+from dxlrun.dynamixel.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.plan import Wiring, bus_plan
 from dxlrun.events import EventCode, Severity
@@ -222,3 +222,42 @@ def simulated_line(tmp_path):
         child.kill()
         child.wait()
         ours.close()
+
+
+class Ticks:
+    """Goals of one servo, number by number: what the arrays of a whole bus are compared with."""
+
+    @staticmethod
+    def position(servo: ServoPlan, position: float) -> int:
+        """Return the goal position of a joint angle, rad: the nearest that the joint's limits allow."""
+        theta = servo.direction * position + servo.reference
+        return min(max(round(theta / servo.rad_per_tick), servo.lower_tick), servo.upper_tick)
+
+    @staticmethod
+    def speed(servo: ServoPlan, velocity: float) -> int:
+        """Return the moving speed in ticks of a speed, rad/s.
+
+        Its magnitude counts. NaN gives 0, which is the maximum in joint mode; 0 rad/s therefore gives 1 tick.
+        """
+        if math.isnan(velocity):
+            return 0
+        most = servo.max_speed_tick
+        return min(max(round(min(abs(velocity) / servo.rad_s_per_tick, most)), 1), most)
+
+    @staticmethod
+    def block(servo: ServoPlan, position: int, speed: int) -> bytes:
+        """Return the goal block of a servo; without a place for a speed, of the position alone."""
+        layout = servo.goal
+        block = bytearray(layout.length)
+        for place, value in ((layout.position, position), (layout.speed, speed)):
+            if place is not None:
+                signed = place.encoding == "twos_complement"
+                block[place.offset : place.offset + place.size] = value.to_bytes(
+                    place.size, "little", signed=signed
+                )
+        return bytes(block)
+
+
+@pytest.fixture(scope="session")
+def ticks():
+    return Ticks

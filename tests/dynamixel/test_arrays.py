@@ -5,7 +5,6 @@ from hypothesis import strategies as st
 
 from dxlrun.dynamixel import protocol1
 from dxlrun.dynamixel.goal_arrays import GoalArrays
-from dxlrun.dynamixel.units import goal_ticks, speed_ticks
 from dxlrun.interfaces import Commands
 
 angles = st.floats(-10, 10) | st.just(float("nan"))
@@ -16,13 +15,13 @@ speeds = st.floats(-100, 100) | st.sampled_from([float("nan"), 0.0, -0.0])
     positions=st.lists(angles, min_size=8, max_size=8), velocities=st.lists(speeds, min_size=8, max_size=8)
 )
 @settings(max_examples=100, deadline=None)
-def test_the_sync_write_is_what_the_units_of_one_servo_say(plan8, positions, velocities):
+def test_the_sync_write_is_what_the_units_of_one_servo_say(plan8, positions, velocities, ticks):
     goals = Commands(np.array([positions, velocities, [np.nan] * 8, [np.nan] * 8]))
     included = np.array([True, False] + [True] * 6)
     packets = GoalArrays(plan8).packets(goals, included)
     expected = {
-        servo.servo_id: goal_ticks(servo, positions[servo.row]).to_bytes(2, "little")
-        + speed_ticks(servo, velocities[servo.row]).to_bytes(2, "little")
+        servo.servo_id: ticks.position(servo, positions[servo.row]).to_bytes(2, "little")
+        + ticks.speed(servo, velocities[servo.row]).to_bytes(2, "little")
         for index, servo in enumerate(plan8.servos)
         if included[index] and positions[servo.row] == positions[servo.row]
     }

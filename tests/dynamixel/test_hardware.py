@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from dxlrun.dynamixel import protocol1
-from dxlrun.dynamixel.units import goal_ticks, joint_position
+from dxlrun.dynamixel.units import joint_position
 from dxlrun.errors import StartUpError
 from dxlrun.events import EventCode
 from dxlrun.simulation import ServoConfig
@@ -51,7 +51,7 @@ def test_start_holds_every_servo_where_it_stands(started):
     assert started.events.of(EventCode.REGISTER_DIFFERS) == []
 
 
-def test_a_cycle_is_eight_reads_and_one_sync_write(started):
+def test_a_cycle_is_eight_reads_and_one_sync_write(started, ticks):
     count = len(started.into_bus())
     started.goals.position[:] = np.linspace(-0.5, 0.5, 8)
     started.goals.velocity[:] = 1.0
@@ -59,7 +59,7 @@ def test_a_cycle_is_eight_reads_and_one_sync_write(started):
     started.cycle()
     expected = [read.packet for read in started.plans[0].reads]
     goals = {
-        servo.servo_id: goal_ticks(servo, started.goals.position[servo.row]).to_bytes(2, "little")
+        servo.servo_id: ticks.position(servo, started.goals.position[servo.row]).to_bytes(2, "little")
         + b"\x56\x00"
         for servo in started.plans[0].servos
     }

@@ -6,7 +6,7 @@ import pytest
 from dxlrun.dynamixel import protocol2
 from dxlrun.dynamixel.limp import limp
 from dxlrun.dynamixel.receiver import Receiver
-from dxlrun.dynamixel.units import goal_bytes, goal_ticks, joint_position, speed_ticks
+from dxlrun.dynamixel.units import joint_position
 from dxlrun.errors import StartUpError
 from dxlrun.events import EventCode
 
@@ -59,14 +59,14 @@ def test_start_holds_every_servo_where_it_stands(started):
     assert started.events.of(EventCode.REGISTER_DIFFERS) == []
 
 
-def test_a_cycle_is_one_sync_read_and_one_sync_write(started):
+def test_a_cycle_is_one_sync_read_and_one_sync_write(started, ticks):
     count = len(started.into_bus())
     started.goals.position[:] = np.linspace(-0.5, 0.5, 8)
     started.goals.velocity[:] = 1.0
     started.cycle()
     goals = {
-        servo.servo_id: goal_bytes(
-            servo, goal_ticks(servo, started.goals.position[servo.row]), speed_ticks(servo, 1.0)
+        servo.servo_id: ticks.block(
+            servo, ticks.position(servo, started.goals.position[servo.row]), ticks.speed(servo, 1.0)
         )
         for servo in started.plans[0].servos
     }

@@ -4,7 +4,7 @@ import pytest
 from dxlrun.control_table import control_table, model_names
 from dxlrun.dynamixel.bus_plan import BusPlan
 from dxlrun.dynamixel.line import LONGEST_RETURN_DELAY_NS, PATIENCE_NS
-from dxlrun.dynamixel.units import goal_ticks, joint_position, speed_ticks
+from dxlrun.dynamixel.units import joint_position
 
 
 def test_the_budget_of_protocol_md_at_one_millisecond_of_latency(make_plan):
@@ -89,18 +89,3 @@ def test_too_many_servos_for_one_sync_write_are_refused(make_plan):
 def test_the_middle_of_an_ax_is_exact(make_plan):
     servo = make_plan((1,)).servos[0]
     assert joint_position(servo, 1023) == pytest.approx(-2.6179938779914944)
-    assert goal_ticks(servo, 0.0) in (511, 512)
-
-
-@pytest.mark.parametrize("angle", [-1e9, -3.0, 3.0, 1e9])
-def test_goals_never_wrap(make_plan, angle):
-    servo = make_plan((1,)).servos[0]
-    assert goal_ticks(servo, angle) == (1023 if angle < 0 else 0)
-
-
-def test_speed_zero_is_not_the_maximum(make_plan):
-    servo = make_plan((1,)).servos[0]
-    assert speed_ticks(servo, 0.0) == 1
-    assert speed_ticks(servo, float("nan")) == 0
-    assert speed_ticks(servo, float("inf")) == 1023
-    assert speed_ticks(servo, -1.0) == speed_ticks(servo, 1.0) == 86
