@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -44,7 +45,7 @@ def ledger(handed_late_us: int = 0, taken_late_us: int = 0, woke_us: int = 0) ->
 
 
 @pytest.fixture
-def causes_of(write: Callable[..., Path], cycle: type, wire: type) -> Callable[..., object]:
+def causes_of(write: Callable[..., Path], cycle: type, wire: type) -> Callable[..., Any]:
     """Return the causes in a run, one cycle of which took more of something, us."""
 
     def causes(entries: list[LedgerEntry], **more: int) -> object:
@@ -57,18 +58,18 @@ def causes_of(write: Callable[..., Path], cycle: type, wire: type) -> Callable[.
     return causes
 
 
-def counts(found: object) -> tuple[int, int, int]:
-    return found.simulation, found.wake_up, found.own_work  # type: ignore[attr-defined]
+def counts(found: Any) -> tuple[int, int, int]:
+    return found.simulation, found.wake_up, found.own_work
 
 
-def test_a_reply_that_came_late_is_the_simulation_s(causes_of: Callable[..., object]) -> None:
+def test_a_reply_that_came_late_is_the_simulation_s(causes_of: Callable[..., Any]) -> None:
     found = causes_of(ledger(handed_late_us=17_000), read=22_000)
     assert counts(found) == (1, 0, 0)
-    (one,) = found.overruns  # type: ignore[attr-defined]
+    (one,) = found.overruns
     assert (one.simulation_us, one.wake_up_us, one.own_us) == (17_000, 0, 0)
 
 
-def test_a_question_that_was_taken_late_is_the_simulation_s(causes_of: Callable[..., object]) -> None:
+def test_a_question_that_was_taken_late_is_the_simulation_s(causes_of: Callable[..., Any]) -> None:
     assert counts(causes_of(ledger(taken_late_us=17_000), read=22_000)) == (1, 0, 0)
 
 
@@ -94,8 +95,8 @@ def test_a_reply_that_the_kernel_kept_is_neither_the_simulation_s_nor_our_own(
     write: Callable[..., Path], cycle: type, wire: type
 ) -> None:
     found = run_with_a_reply_kept(write, cycle, wire, update=3_000)
-    assert (found.kernel, *counts(found)) == (1, 0, 0, 0)  # type: ignore[attr-defined]
-    (one,) = found.overruns  # type: ignore[attr-defined]
+    assert (found.kernel, *counts(found)) == (1, 0, 0, 0)
+    (one,) = found.overruns
     assert (one.kernel_us, one.own_us) == (KEPT - 300, 18_000 - 2_000 + 2_900 - (KEPT - 300))
 
 
@@ -112,7 +113,7 @@ def test_where_log_and_ledger_differ_a_reply_that_was_kept_is_our_own(
     assert counts(run_with_a_reply_kept(write, cycle, wire, received=other)) == (0, 0, 1)
 
 
-def test_a_late_reply_of_another_cycle_is_no_excuse(causes_of: Callable[..., object]) -> None:
+def test_a_late_reply_of_another_cycle_is_no_excuse(causes_of: Callable[..., Any]) -> None:
     entries = ledger()
     entries[2 * LATE - 1] = entry("out", asked_us(LATE - 1) + 1000, late_us=3_000)
     assert counts(causes_of(entries, update=17_000)) == (0, 0, 1)
@@ -122,18 +123,18 @@ def test_a_late_reply_of_another_cycle_is_no_excuse(causes_of: Callable[..., obj
     ("late", "update", "expected"), [(16_000, 100, (0, 1, 0)), (2_000, 16_000, (0, 0, 1))]
 )
 def test_a_late_wake_up_is_told_from_work(
-    causes_of: Callable[..., object], late: int, update: int, expected: tuple[int, int, int]
+    causes_of: Callable[..., Any], late: int, update: int, expected: tuple[int, int, int]
 ) -> None:
     assert counts(causes_of(ledger(woke_us=late), late=late, update=update)) == expected
 
 
 def test_the_largest_of_three_is_the_cause_and_the_share_is_of_all_cycles(
-    causes_of: Callable[..., object],
+    causes_of: Callable[..., Any],
 ) -> None:
     found = causes_of(ledger(handed_late_us=4_000, woke_us=3_000), read=9_000, late=3_000, update=9_000)
     assert counts(found) == (0, 0, 1)
-    assert found.own_share == pytest.approx(1 / COUNT)  # type: ignore[attr-defined]
-    (one,) = found.overruns  # type: ignore[attr-defined]
+    assert found.own_share == pytest.approx(1 / COUNT)
+    (one,) = found.overruns
     assert (one.simulation_us, one.wake_up_us, one.own_us) == (4_000, 3_000, 8_900)
 
 
@@ -147,24 +148,24 @@ def test_a_late_reply_in_the_gap_that_holds_up_the_wake_up_is_the_simulation_s(
     cycles.append(cycle(LATE + 1 + GONE, skipped=GONE))
     found = overrun_causes(read_log(write(cycles)), {"main": entries})
     assert counts(found) == (1, 0, 0)
-    (one,) = found.overruns  # type: ignore[union-attr]
+    (one,) = found.overruns
     assert (one.simulation_us, one.wake_up_us) == (15_900, 100)
 
 
 def test_a_cycle_that_was_too_long_without_the_late_reply_is_our_own(
-    causes_of: Callable[..., object],
+    causes_of: Callable[..., Any],
 ) -> None:
     found = causes_of(ledger(handed_late_us=30_000), read=35_000, update=16_000)
     assert counts(found) == (0, 0, 1)
 
 
 def test_a_reply_that_was_asked_for_before_counts_only_as_long_as_it_was_waited_for(
-    causes_of: Callable[..., object],
+    causes_of: Callable[..., Any],
 ) -> None:
     entries = ledger()
     at = BEGIN_NS // 1000 + LATE * PERIOD_US
     entries[2 * LATE + 1] = entry("out", at - 6_000, late_us=8_000)  # handed over 2 ms after the cycle woke
-    (one,) = causes_of(entries, update=17_000).overruns  # type: ignore[attr-defined]
+    (one,) = causes_of(entries, update=17_000).overruns
     assert one.simulation_us == 2_000
 
 
