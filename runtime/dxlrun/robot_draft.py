@@ -18,6 +18,10 @@ from dxlrun.control_table import ControlTable, control_table
 from dxlrun.dynamixel.scanning import FoundServo
 from dxlrun.errors import InputError, ServoFault
 
+_SLOW = 30
+"""deg/s, the velocity limit of each drafted joint: slow enough to step back from."""
+_LONGEST_STEP = 3
+"""deg; at low rates a goal moves no further in one cycle, as a servo takes each step at its full speed."""
 _RATES = (100, 50, 25, 20, 10, 5, 2, 1)
 _SHARE = 0.5
 """Of the period, at most, that a cycle takes on the bus."""
@@ -82,7 +86,8 @@ def _text(stem: str, port: str, servos: Sequence[FoundServo], latency_ns: int, r
     first = servos[0]
     delays = [each.return_delay for each in servos if each.return_delay is not None]
     delay_ns = max(delays, default=_LONGEST_DELAY_NS)
-    joints = [line for servo in servos for line in _joint(servo)]
+    velocity = min(_SLOW, _LONGEST_STEP * rate)
+    joints = [line for servo in servos for line in _joint(servo, velocity)]
     names = ", ".join(_name(servo) for servo in servos)
     return "\n".join(
         [
@@ -105,6 +110,9 @@ def _text(stem: str, port: str, servos: Sequence[FoundServo], latency_ns: int, r
             "loop:",
             f"  rate: {rate}  # `dxlrun check` tells the highest that is possible",
             "",
+            f"# Every joint is held to {velocity} deg/s, so that the first commands move it slowly. Once its",
+            "# limits and direction are right, raise its limits.velocity; without a limit it moves as fast",
+            "# as its servo can.",
             "joints:  # names and directions are yours to choose; a reference is where a joint's 0 is",
             *joints,
             "",
@@ -121,12 +129,13 @@ def _robot_name(stem: str) -> str:
     return name if name[:1].isalpha() else f"robot_{name}"
 
 
-def _joint(servo: FoundServo) -> list[str]:
+def _joint(servo: FoundServo, velocity: int) -> list[str]:
     table = control_table(servo.model, servo.protocol)
     reference = _middle(table)
     entries = [
         f"bus: main, id: {servo.servo_id}, model: {servo.model}, reference: {reference} deg, direction: 1"
     ]
+    limits = [f"velocity: {velocity} deg/s"]
     comment = "reference: middle of the travel"
     if servo.lowest is not None and servo.highest is not None:
         if servo.lowest >= servo.highest:
@@ -135,8 +144,9 @@ def _joint(servo: FoundServo) -> list[str]:
             degrees = math.degrees(table.rad_per_tick)
             low = math.ceil((servo.lowest * degrees - reference) * 10) / 10
             high = math.floor((servo.highest * degrees - reference) * 10) / 10
-            entries.append(f"limits: {{position: [{low:g} deg, {high:g} deg]}}")
-            comment += "; limits: the servo's own"
+            limits.insert(0, f"position: [{low:g} deg, {high:g} deg]")
+            comment += "; position limits: the servo's own"
+    entries.append(f"limits: {{{', '.join(limits)}}}")
     remarks = [f"  # {_name(servo)}: {remark}" for remark in servo.remarks]
     return [*remarks, f"  {_name(servo)}: {{{', '.join(entries)}}}  # {comment}"]
 

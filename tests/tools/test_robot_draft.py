@@ -1,12 +1,18 @@
 """A drafted robot file is one that compiles, for every model there is."""
 
+import math
+from array import array
+from itertools import pairwise
+
 import pytest
 
 from dxlrun.compile import compile_files
 from dxlrun.control_table import all_tables
 from dxlrun.dynamixel.scanning import FoundServo
 from dxlrun.errors import InputError, ServoFault
+from dxlrun.inbox import Command
 from dxlrun.robot_draft import draft, draft_file
+from dxlrun.testing import simulated_robot
 
 PORT = "/dev/ttyUSB0"
 
@@ -73,3 +79,53 @@ def test_a_file_that_cannot_be_written_so_is_refused(tmp_path, name):
     with pytest.raises(InputError, match=name):
         draft_file(tmp_path / name, PORT, [found(1, "XM430-W350")], 0)
     assert (tmp_path / "there.yaml").read_text() == "mine"
+
+
+SYNC_WRITE = 0x83
+GOALS = {1.0: (30, math.radians(300 / 1023)), 2.0: (116, math.radians(360 / 4096))}
+"""By protocol: address of Goal Position of an AX-12A and an XL430-W250, and rad a tick (e-Manual)."""
+
+
+def goals(entries, protocol):
+    """Return (t_ns, servo ID, rad) of each goal position that was written by sync write."""
+    address, unit = GOALS[protocol]
+    first, size = (4, 2) if protocol == 1.0 else (7, 4)
+    for entry in entries:
+        if entry.direction != "in" or entry.data[first] != SYNC_WRITE:
+            continue
+        parameters = entry.data[first + 1 : -1 if protocol == 1.0 else -2]
+        start, width = (parameters[0], parameters[1])
+        if protocol == 2.0:
+            start, width = int.from_bytes(parameters[:2], "little"), int.from_bytes(parameters[2:4], "little")
+            parameters = parameters[2:]
+        if not start <= address < start + width:
+            continue
+        for at in range(2, len(parameters), width + 1):
+            row = parameters[at + 1 + address - start :][:size]
+            yield entry.t_ns, parameters[at], int.from_bytes(row, "little") * unit
+
+
+@pytest.mark.parametrize(("protocol", "model"), [(1.0, "AX-12A"), (2.0, "XL430-W250")])
+@pytest.mark.parametrize(("baud_rate", "slow"), [(1_000_000, 30), (9_600, 15)])
+def test_the_first_send_to_a_drafted_robot_moves_it_slowly(tmp_path, protocol, model, baud_rate, slow):
+    path = tmp_path / "arm.yaml"
+    text = draft_file(
+        path, PORT, [found(1, model, protocol, baud_rate), found(2, model, protocol, baud_rate)], 0
+    )
+    assert text.count(f"velocity: {slow} deg/s") == 2
+    assert "raise its limits.velocity" in text
+    robot = simulated_robot(path, arguments={"port": "sim"}, duration_s=5.0)
+    robot.inbox.waiting.append(
+        Command(1, "all_joints", "positions", array("d", (1.0, -1.0)).tobytes(), "anna")
+    )
+    result = robot.run()
+    assert (result.reason, result.detail, robot.inbox.answers) == ("ended", "", {1: ""})
+    written = list(goals(robot.ledger.entries, protocol))
+    unit, middle = GOALS[protocol][1], math.radians(150 if protocol == 1.0 else 180)
+    for servo_id, end in ((1, 1.0), (2, -1.0)):
+        mine = [(t_ns, rad - middle) for t_ns, servo, rad in written if servo == servo_id]
+        assert mine[-1][1] == pytest.approx(end, abs=unit)
+        for (t_ns, rad), (next_ns, following) in pairwise([(mine[0][0] - 200_000_000, 0.0), *mine]):
+            assert abs(following - rad) <= math.radians(slow) * (next_ns - t_ns) * 1e-9 + 1.5 * unit
+        arrived = next(t_ns for t_ns, rad in mine if abs(rad) > 0.95)
+        assert arrived - mine[0][0] >= 0.85 / math.radians(slow) * 1e9
