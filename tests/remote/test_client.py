@@ -185,7 +185,24 @@ def test_a_stop_whose_answer_was_lost_with_the_robot_is_a_stop(peer):
     assert one.heard[0].startswith(b"POST /stop ")
 
 
-def test_a_stop_that_a_living_robot_does_not_answer_is_an_error(peer):
+def test_a_stop_whose_connection_a_living_robot_closed_is_asked_again(peer):
     one = peer(None, OK)
-    with pytest.raises(dxlrun.DxlrunError, match="does not answer any more"):
+    one.robot.stop()
+    assert [request[:11] for request in one.heard] == [b"POST /stop "] * 2
+
+
+def test_a_stop_that_a_living_robot_never_answers_is_an_error(peer, monkeypatch):
+    monkeypatch.setattr(module, "_STOP_S", 0.0)
+    one = peer(None, None, OK)
+    with pytest.raises(dxlrun.DxlrunError, match="pair closed every connection for 0 s"):
         one.robot.stop()
+
+
+def test_a_queue_of_connections_that_stays_full_is_an_error_with_its_reason(place, monkeypatch):
+    monkeypatch.setattr(module, "TIMEOUT_S", 0.05)
+    listener, path = listen("pair")
+    listener.listen(0)
+    with listener, socket.socket(socket.AF_UNIX) as waiting:
+        waiting.connect(str(path))
+        with pytest.raises(dxlrun.DxlrunError, match=r"pair does not answer any more: .* full for 0\.05 s"):
+            module.RemoteRobot("pair", path, "anna").pause()

@@ -7,12 +7,17 @@ import os
 import random
 import socket
 import struct
+import subprocess
+import sys
 from contextlib import suppress
+from functools import partial
+from pathlib import Path
 
 import pytest
 
 from dxlrun.remote import connection
-from dxlrun.remote.connection import MOST_CONNECTIONS
+from dxlrun.remote.client import RemoteRobot
+from dxlrun.remote.connection import MOST_CONNECTIONS, MOST_OF_PROCESS
 from dxlrun.remote.process import serve
 from dxlrun.remote.sockets import MOST_BYTES
 
@@ -88,6 +93,64 @@ def test_clients_that_hang_do_not_keep_others_out(door):
 
     assert door.open(act) >= 20
     assert [command.kind for command in door.desk.taken] == ["stop"]
+
+
+FLOOD = """
+import collections, socket, sys, time
+kept, until, told = collections.deque(maxlen=300), time.monotonic() + 60, False
+while time.monotonic() < until:
+    one = socket.socket(socket.AF_UNIX)
+    one.setblocking(False)
+    try:
+        one.connect(sys.argv[1])
+        one.send(b"POST /stop")
+        kept.append(one)
+    except (BlockingIOError, ConnectionError):
+        one.close()
+        if not told:
+            print("the queue is full", flush=True)
+            told = True
+"""
+STOPS = 25
+
+
+def test_stop_is_taken_from_another_process_while_one_floods_the_socket_with_connections(door):
+    def flood_and_stop():
+        with subprocess.Popen([sys.executable, "-c", FLOOD, door.path], stdout=subprocess.PIPE) as flood:
+            try:
+                flood.stdout.readline()
+                for _ in range(STOPS):
+                    RemoteRobot("pair", Path(door.path), "test").stop(wait=False)
+            finally:
+                flood.kill()
+
+    door.open(partial(asyncio.to_thread, flood_and_stop))
+    assert [command.kind for command in door.desk.taken] == ["stop"] * STOPS
+    assert {command.origin for command in door.desk.taken} == {"test"}
+
+
+def test_a_process_has_some_connections_and_leaves_those_of_others_alone(door, monkeypatch):
+    process = iter([1, *[2] * 40, *range(3, 60)])
+    monkeypatch.setattr(connection, "_peer", lambda _: (next(process), os.getuid()))
+
+    async def remain(count, ends):
+        while (left := [end for end in ends if not end[0].at_eof()])[count:]:
+            await asyncio.sleep(0.001)
+        return left
+
+    async def act():
+        quiet = [await door.connect(GO[:9])]
+        flood = [await door.connect(GO[:9]) for _ in range(40)]
+        left = await remain(MOST_OF_PROCESS, flood)
+        assert left == flood[-MOST_OF_PROCESS:]
+        others = [await door.connect(GO[:9]) for _ in range(55)]
+        left = await remain(MOST_CONNECTIONS - 56, flood)
+        assert left == flood[-(MOST_CONNECTIONS - 56) :]
+        assert len(await remain(56, quiet + others)) == 56
+        for _, writer in (*quiet, *flood, *others):
+            writer.close()
+
+    door.open(act)
 
 
 def test_a_connection_that_says_nothing_is_closed(door, monkeypatch):

@@ -15,6 +15,7 @@ import json
 import os
 import select
 import socket
+import struct
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -44,10 +45,19 @@ class _Connection(http.client.HTTPConnection):
         self._path = path
 
     def connect(self) -> None:
-        """Connect to the socket's path."""
+        """Connect to the socket's path; where its queue of connections is full, wait in the kernel's.
+
+        The kernel serves those that wait in order (a socket with a timeout of Python does not wait: unix(7),
+        EAGAIN), so a process that floods the queue delays this one and no more.
+        """
         self.sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        timeval = struct.pack("@2l", int(TIMEOUT_S), int(TIMEOUT_S % 1 * 1e6))
+        self.sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, timeval)
+        try:
+            self.sock.connect(str(self._path))
+        except BlockingIOError:
+            raise TimeoutError(f"too many connect to it, its queue was full for {TIMEOUT_S:g} s") from None
         self.sock.settimeout(self.timeout)
-        self.sock.connect(str(self._path))
 
     @property
     def hung_up(self) -> bool:
@@ -168,23 +178,34 @@ class RemoteRobot:
     def stop(self, wait: bool = True) -> None:
         """End the run in order; with `wait`, return when it has ended and its log is closed.
 
+        A connection that is closed before the answer is opened again: to stop twice does what once does.
         Raises DxlrunError when it has not ended after 30 s.
         """
-        try:
-            self._post("/stop")
-        except Refused:
-            raise
-        except DxlrunError:
-            if alive(self._path):
-                raise
-        self.close()
         until = time.monotonic() + _STOP_S
+        while not self._stopping():
+            if time.monotonic() > until:
+                raise DxlrunError(f"{self.name} closed every connection for {_STOP_S:g} s")
+            time.sleep(0.02)
+        self.close()
         while wait and alive(self._path):
             if time.monotonic() > until:
                 raise DxlrunError(f"{self.name} did not end within {_STOP_S:g} s")
             time.sleep(0.05)
 
     # Inside
+
+    def _stopping(self) -> bool:
+        """Ask once to stop; False when the connection was closed by a gateway that is alive."""
+        try:
+            self._post("/stop")
+        except Refused:
+            raise
+        except DxlrunError as error:
+            if alive(self._path):
+                if isinstance(error.__cause__, ConnectionError):
+                    return False
+                raise
+        return True
 
     def _post(self, path: str, content: Mapping[str, object] | None = None) -> None:
         self._ask("POST", path, content)

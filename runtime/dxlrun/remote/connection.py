@@ -1,8 +1,8 @@
-"""Connections: how much patience the gateway has with each of them, and how many it keeps.
+"""Connections of the gateway: a timeout for each of them, a limit for each process and for all together.
 
-A client may hang in the middle of a request, never read its answer, or open connections without end: the
-connection that was silent longest goes, so that there is always one for who comes next, with `stop` for
-example. Who is at the other end is asked of the kernel (SO_PEERCRED, unix(7)).
+A client may hang in the middle of a request, never read its answer, or open connections without end. A
+process above its limit loses that connection of its own which was silent longest, so a flood closes none of
+another process, whose `stop` is served. The process ID comes from the kernel (SO_PEERCRED, unix(7)).
 """
 
 from __future__ import annotations
@@ -11,10 +11,13 @@ import asyncio
 import os
 import socket
 import struct
+from collections import Counter
 
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 MOST_CONNECTIONS = 64
+MOST_OF_PROCESS = 16
+"""Connections of one process: three processes that flood leave a quarter of all to others."""
 SILENCE_S = 30.0
 """After so long without a byte from the other side, whatever it waits for, a connection is closed."""
 
@@ -22,7 +25,7 @@ _CREDENTIALS = struct.Struct("3i")
 
 
 class Connection(H11Protocol):
-    """HTTP/1.1 on one connection, closed when it is silent for too long, or the oldest of too many."""
+    """HTTP/1.1 on one connection, closed when it is silent for too long, or one of too many."""
 
     def connection_made(  # type: ignore[override]  # uvicorn leaves its type open
         self, transport: asyncio.Transport
@@ -36,13 +39,25 @@ class Connection(H11Protocol):
             transport.abort()
             return
         self.client = (f"process {process}", 0)
+        crowd = self._crowd()
+        if crowd:
+            min(crowd, key=lambda one: (one.busy, one.heard)).transport.abort()
+
+    def _crowd(self) -> list[Connection]:
+        """Return the connections of which one must be closed because of this one: those of its process when
+        that has too many, of the process that has most when there are too many; none otherwise."""
         others = [
             one
             for one in self.connections
             if isinstance(one, Connection) and one is not self and not one.transport.is_closing()
         ]
-        if len(others) >= MOST_CONNECTIONS:
-            min(others, key=lambda one: (one.busy, one.heard)).transport.abort()
+        process = self.client
+        counts = Counter(one.client for one in others)
+        if counts[process] < MOST_OF_PROCESS:
+            if len(others) < MOST_CONNECTIONS:
+                return []
+            ((process, _),) = counts.most_common(1)
+        return [one for one in others if one.client == process]
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Leave nothing behind: a timer would keep all of it for as long as the patience lasts."""
