@@ -11,7 +11,7 @@ Exception
     ├── ControllerFault            a controller raised, or broke its contract
     ├── ProcessFault               a process of the run ended or hung
     ├── Refused                    a running robot does not do what it was asked; 2: a wrong wish
-    └── LogError (ValueError)      a log cannot be read
+    └── LogError (ValueError)      a log or a ledger cannot be read; exit code 2
 ```
 """
 
@@ -103,4 +103,6 @@ class ProcessFault(DxlrunError, RuntimeError):
 
 
 class LogError(DxlrunError, ValueError):
-    """A log cannot be read, or is not a log of dxlrun."""
+    """A log or a ledger cannot be read, or is not one of dxlrun."""
+
+    exit_code = 2

@@ -296,7 +296,7 @@ def run_robot(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
                 run.watch(guardian, _progress(plan, status, began))
         finally:
             run.end()
-            if run.guardian is None or not run.guardian.began:
+            if run.guardian is None or Heartbeat(run.memory.heartbeat).phase is Phase.LOADING:
                 run.discard()
             if options.debug:
                 sys.stderr.write(process.whole(run.memory.stderr).decode(errors="replace"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -68,3 +69,72 @@ def test_without_matplotlib_one_sentence_says_how_to_get_it(
     assert said.errors == [
         "dxlrun: a report needs matplotlib for its plots; `pip install 'dxlrun[report]'` installs it"
     ]
+
+
+def two_logs(log: Path) -> tuple[Path, Path]:
+    """Make another log beside one, an hour older."""
+    older = log.with_name("older.mcap")
+    older.write_bytes(log.read_bytes())
+    before = log.stat().st_mtime - 3600
+    os.utime(older, (before, before))
+    return log, older
+
+
+def test_without_an_argument_the_newest_log_of_the_directory_is_analyzed(dxlrun: Callable, log: Path):
+    newest, _ = two_logs(log)
+
+    said = dxlrun("analyze")
+
+    assert said.code == 0
+    assert said.out.splitlines()[0] == f"log: {newest.relative_to(Path.cwd())}"
+    assert json.loads(dxlrun("analyze", "--json").out)["log"] == str(newest.relative_to(Path.cwd()))
+
+
+def test_without_a_log_in_the_directory_one_sentence_says_where_it_was_looked_for(
+    dxlrun: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(tmp_path)
+
+    said = dxlrun("analyze")
+
+    assert said.code == 2
+    assert said.errors == [
+        f"dxlrun: there is no log in {tmp_path}/logs; give the path of one, or change to the directory where "
+        "the robot was run"
+    ]
+
+
+def test_several_logs_get_one_line_each(dxlrun: Callable, log: Path, tmp_path: Path):
+    first, second = two_logs(log)
+    other = tmp_path / "other.mcap"
+    other.write_bytes(b"no log")
+
+    said = dxlrun("analyze", first, other, second)
+
+    assert said.code == 2  # for the one that is no log; the others are not hidden by it
+    assert said.out.splitlines() == [
+        f"{path}: good. The loop kept 50 Hz: 0 of 10 periods skipped, on virtual time."
+        for path in (first, second)
+    ]
+    assert said.errors == [f"dxlrun: {other}: this is no MCAP file, so it is no log of dxlrun"]
+    assert [each["log"] for each in json.loads(dxlrun("analyze", first, second, "--json").out)] == [
+        str(first),
+        str(second),
+    ]
+
+
+@pytest.mark.parametrize("option", ["--report", "--ledger"])
+def test_what_is_for_one_log_is_refused_for_several(dxlrun: Callable, log: Path, option: str):
+    first, second = two_logs(log)
+
+    said = dxlrun("analyze", first, second, option, "file.html")
+
+    assert said.code == 2
+    assert said.errors == [f"dxlrun: {option} is for one log, and 2 are given; give it once for each"]
+
+
+def test_every_log_that_is_missing_is_named(dxlrun: Callable, log: Path):
+    said = dxlrun("analyze", "a.mcap", log, "b.mcap")
+
+    assert said.code == 2
+    assert [line[:26] for line in said.errors] == ["dxlrun: there is no log a.", "dxlrun: there is no log b."]

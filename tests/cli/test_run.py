@@ -90,6 +90,17 @@ def test_a_bad_run_says_why_on_stderr(dxlrun: Callable, runs: Runs, torso: Path,
     ]
 
 
+def test_a_run_without_a_cycle_suggests_no_analysis(dxlrun: Callable, runs: Runs, torso: Path):
+    runs.answer = RunSummary(
+        1, "start-up", 0, 0, 0.1, ("servo 3 does not answer",), log="logs/torso.mcap", messages=9
+    )
+
+    assert dxlrun(torso).out.splitlines() == [
+        "bioloid_torso: failed. 0.1 s, 0 cycles, 0 periods skipped",
+        "log: logs/torso.mcap (9 messages)",
+    ]
+
+
 def test_a_port_that_cannot_be_opened_is_one_sentence(dxlrun: Callable, runs: Runs, torso: Path):
     runs.answer = PortError("port /dev/ttyUSB7 does not exist; plug the adapter in")
 
@@ -148,5 +159,5 @@ def test_what_is_no_log_is_one_sentence(dxlrun: Callable, tmp_path: Path):
 
     said = dxlrun("analyze", file)
 
-    assert said.code == 1
+    assert said.code == 2
     assert len(said.errors) == 1

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from dxlrun.events import EventCode, Severity
+from dxlrun.simulation import read_ledger
 
 Running = Any
 Start = Callable[..., Any]
@@ -52,6 +53,11 @@ def odd(start: Start, tmp_path: Path) -> Callable[..., Running]:
 
 def sent(run: Running) -> bytes:
     return b"".join(entry.data for entry in run.ledger() if entry.direction == "in")
+
+
+def seen(ledger: Path) -> bytes:
+    """Return what simulated servos received, from a ledger that lies elsewhere than beside the log."""
+    return b"".join(entry.data for entry in read_ledger(ledger) if entry.direction == "in")
 
 
 def guardians_word(run: Running) -> str:
@@ -97,23 +103,34 @@ def test_a_stop_before_the_set_up_gives_no_torque(odd: Callable[..., Running], a
     assert "given up on request" in " ".join(event.text for event in run.log().events)
 
 
-def test_an_interrupt_while_plug_ins_load_touches_no_servo(odd: Callable[..., Running]) -> None:
-    run = odd(configure="signal.signal(signal.SIGTERM, signal.SIG_DFL); time.sleep(60)")
+def test_an_interrupt_while_plug_ins_load_touches_no_servo_and_leaves_no_log(
+    odd: Callable[..., Running], tmp_path: Path
+) -> None:
+    ledger = tmp_path / "seen.jsonl"
+    run = odd(
+        "--ledger",
+        str(ledger),
+        configure="signal.signal(signal.SIGTERM, signal.SIG_DFL); time.sleep(60)",
+    )
     run.child("dxlrun.loop_process")
     run.signal(signal.SIGINT)
-    code, _, err = run.finish()
+    code, out, err = run.finish()
     assert (code, err) == (130, "")
-    assert sent(run) == b""
+    assert seen(ledger) == b""
+    assert "log:" not in out
+    assert "next:" not in out
+    assert not list((tmp_path / "logs").iterdir())
 
 
-def test_a_guardian_that_dies_while_the_loop_loads_takes_it_along(start: Start) -> None:
-    run = start()
+def test_a_guardian_that_dies_while_the_loop_loads_takes_it_along(start: Start, tmp_path: Path) -> None:
+    ledger = tmp_path / "seen.jsonl"
+    run = start("--ledger", str(ledger))
     run.child("dxlrun.loop_process")
     os.kill(run.child("dxlrun.guardian"), signal.SIGKILL)
     code, _, err = run.finish()
     assert code == 1
     assert "guardian ended" in err
-    assert sent(run) == b""
+    assert seen(ledger) == b""
 
 
 def test_a_terminal_that_dies_while_the_guardian_starts_is_noticed(

@@ -1,24 +1,27 @@
-"""`dxlrun analyze LOG`: say what happened in a run."""
+"""`dxlrun analyze [LOG ...]`: report what happened in a run, or in several with one line each."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
 
 from dxlrun.cli.flags import Flag, JsonFlag
-from dxlrun.cli.terminal import out
+from dxlrun.cli.terminal import out, say_error
 from dxlrun.errors import InputError, LogError
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from dxlrun.analysis.report import Report
     from dxlrun.recording.reader import Log
 
 
 def analyze(
-    log: Path,
-    /,
-    *,
+    *logs: Annotated[Path, Parameter(name="log")],
     report: Path | None = None,
     ledger: Path | None = None,
     as_json: JsonFlag = False,
@@ -28,8 +31,9 @@ def analyze(
 
     Parameters
     ----------
-    log
-        The log of a run, an .mcap file.
+    logs
+        The log of a run, an .mcap file; without one the newest in the directory logs. Several logs get one
+        line each.
     report
         Also write a page with all numbers and plots to this file, such as report.html; it loads nothing
         from anywhere, and prints well. Needs matplotlib: `pip install 'dxlrun[report]'`.
@@ -37,14 +41,26 @@ def analyze(
         Compare the log with the ledger of the simulated buses instead, byte by byte; the exit code is 1
         when they differ, 2 when one of them cannot be read.
     as_json
-        Print the result as JSON.
+        Print the result as JSON; with several logs a list.
     debug
         Print the traceback of an error.
     """
-    if not log.is_file():
-        raise InputError(f"there is no log {log}; a run says at its end where its log is")
+    if len(logs) > 1 and (report is not None or ledger is not None):
+        option = "--report" if report is not None else "--ledger"
+        raise InputError(f"{option} is for one log, and {len(logs)} are given; give it once for each")
+    missing = [
+        f"there is no log {log}; a run prints at its end where its log is"
+        for log in logs
+        if not log.is_file()
+    ]
+    if missing:
+        raise InputError("\n".join(missing))
     if report is not None:
         _check_target(report)
+    console = out()
+    if len(logs) > 1:
+        return _analyze_each(logs, console, as_json=as_json)
+    log = logs[0] if logs else newest_log()
     if ledger is not None:
         if report is not None:
             raise InputError("a report does not hold a comparison; give --report and --ledger one at a time")
@@ -57,14 +73,57 @@ def analyze(
     result = analysis.analyze(read)
     if report is not None:
         _write(read, result, report)
-    console = out()
     if as_json:
         console.file.write(analysis.to_json(result).decode() + "\n")
         return 0
+    if not logs:
+        console.print(f"log: {log}", markup=False, soft_wrap=True)
     console.print(render(result))
     if report is not None:
         console.print(f"\nreport: {report}", markup=False, soft_wrap=True)
     return 0
+
+
+def newest_log() -> Path:
+    """Return the newest log in the directory where runs that were started here leave theirs.
+
+    It is the default of `recording: {directory: ...}`, from the working directory. Raises InputError when
+    there is none.
+    """
+    from dxlrun.description.robot import Recording
+
+    directory = Path(Recording().directory)
+    logs = sorted(directory.glob("*.mcap"), key=lambda path: (path.stat().st_mtime_ns, path.name))
+    if not logs:
+        raise InputError(
+            f"there is no log in {directory.absolute()}; give the path of one, or change to the directory "
+            "where the robot was run"
+        )
+    return logs[-1]
+
+
+def _analyze_each(logs: Sequence[Path], console: Console, *, as_json: bool) -> int:
+    """Print a line for each log, or a JSON list; one that cannot be read does not hide the others."""
+    from dxlrun.analysis import report as analysis
+
+    code = 0
+    results: list[str] = []
+    for log in logs:
+        try:
+            result = analysis.analyze_log(log)
+        except LogError as error:
+            say_error(f"dxlrun: {error}")
+            code = error.exit_code
+            continue
+        if as_json:
+            results.append(analysis.to_json(result).decode())
+            continue
+        verdict = result.verdict
+        good = "good" if verdict.good else "not good"
+        console.print(f"{log}: {good}. {' '.join(verdict.sentences[:1])}", markup=False, soft_wrap=True)
+    if as_json:
+        console.file.write(f"[{','.join(results)}]\n")
+    return code
 
 
 def _compare(log: Path, ledger: Path, *, as_json: bool) -> int:
@@ -79,10 +138,7 @@ def _compare(log: Path, ledger: Path, *, as_json: bool) -> int:
     from dxlrun.recording.reader import read_log
     from dxlrun.simulation import read_ledger
 
-    try:
-        result = compare(read_log(log), read_ledger(ledger), ledger)
-    except LogError as error:
-        raise InputError(str(error)) from error  # 1 says that they differ
+    result = compare(read_log(log), read_ledger(ledger), ledger)
     console = out()
     if as_json:
         console.file.write(to_json(result).decode() + "\n")

@@ -146,4 +146,5 @@ def show(summary: RunSummary, robot: str, console: Console) -> None:
             console.print(f"  {sentence}", markup=False, soft_wrap=True)
         held = counted(summary.messages, "message", "messages")
         console.print(f"log: {summary.log} ({held})", markup=False, soft_wrap=True)
-        console.print(f"next: dxlrun analyze {summary.log}", markup=False, soft_wrap=True)
+        if summary.cycles:
+            console.print(f"next: dxlrun analyze {summary.log}", markup=False, soft_wrap=True)
