@@ -1,9 +1,20 @@
-"""What a person decides about a run, and what they are told of it afterwards; the same on both clocks."""
+"""Options, progress and summary of a run, the same on both clocks."""
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dxlrun.plurals import counted
+
+if TYPE_CHECKING:
+    from rich.status import Status
+
+    from dxlrun.compile.plan import Plan
+
+_REFRESH_S = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,3 +47,32 @@ class RunSummary:
     log: str | None = None
     messages: int = 0
     """Messages in the log."""
+
+
+class Progress:
+    """The status line of a run: how far it has come, and on virtual time how fast."""
+
+    def __init__(self, plan: Plan, status: Status, *, virtual: bool = False) -> None:
+        self._plan = plan
+        self._status = status
+        self._virtual = virtual
+        self._began = self._shown = time.monotonic()
+
+    def setting_up(self) -> None:
+        """Show that the servos are set up."""
+        self._status.update(f"{self._plan.robot}: checking servos, torque on")
+
+    def ran(self, cycles: int, skipped: int) -> None:
+        """Show how many cycles ran and how many periods were skipped; cheap when called for every cycle."""
+        now = time.monotonic()
+        if now - self._shown < _REFRESH_S:
+            return
+        self._shown, elapsed_s = now, now - self._began
+        ran_ns, end_ns = (cycles + skipped) * self._plan.loop.period_ns, self._plan.loop.end_ns
+        # the steps of a policy come after the end: none is shown beside them
+        end = f" of {end_ns / 1e9:.1f}" if end_ns and ran_ns <= end_ns else ""
+        speed = f", {ran_ns / 1e9 / elapsed_s:.3g} times real time" if self._virtual else ""
+        self._status.update(
+            f"{self._plan.robot}: {ran_ns / 1e9:.1f}{end} s{speed}, {counted(cycles, 'cycle', 'cycles')}, "
+            f"{counted(skipped, 'period', 'periods')} skipped ({elapsed_s:.0f} s; Ctrl-C stops)"
+        )

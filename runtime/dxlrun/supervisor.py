@@ -15,7 +15,6 @@ from typing import Literal
 
 import msgspec
 from rich.console import Console
-from rich.status import Status
 
 from dxlrun import process
 from dxlrun.child import END_TIMEOUT_S, Child
@@ -39,7 +38,7 @@ from dxlrun.run_processes import (
     start_recorder,
     start_simulation,
 )
-from dxlrun.run_summary import RunOptions, RunSummary
+from dxlrun.run_summary import Progress, RunOptions, RunSummary
 
 _POLL_S = 0.1
 _LOOK_NS = 500_000_000
@@ -293,7 +292,7 @@ def run_robot(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
             with out.status(f"{plan.robot}: starting") as status:
                 guardian = run.start()
                 began = time.monotonic()
-                run.watch(guardian, _progress(plan, status, began))
+                run.watch(guardian, _watching(Progress(plan, status)))
         finally:
             run.end()
             if run.guardian is None or Heartbeat(run.memory.heartbeat).phase is Phase.LOADING:
@@ -303,21 +302,14 @@ def run_robot(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
     return _summary(run, time.monotonic() - began)
 
 
-def _progress(plan: Plan, status: Status, began: float) -> Callable[[Heartbeat], None]:
+def _watching(progress: Progress) -> Callable[[Heartbeat], None]:
     """Return what keeps the terminal's status line up to date."""
 
     def show(heartbeat: Heartbeat) -> None:
         if heartbeat.phase is Phase.SETUP:
-            status.update(f"{plan.robot}: checking servos, torque on")
+            progress.setting_up()
         elif heartbeat.phase is Phase.RUNNING:
-            ran_ns, end_ns = heartbeat.cycles * plan.loop.period_ns, plan.loop.end_ns
-            # no end is told beside a policy's steps, which come after it
-            end = f" of {end_ns / 1e9:.1f}" if end_ns and ran_ns <= end_ns else ""
-            status.update(
-                f"{plan.robot}: {ran_ns / 1e9:.1f}{end} s, "
-                f"cycle {heartbeat.cycles}, {counted(heartbeat.skipped, 'period', 'periods')} skipped "
-                f"({time.monotonic() - began:.0f} s; Ctrl-C stops)"
-            )
+            progress.ran(heartbeat.cycles, heartbeat.skipped)
 
     return show
 

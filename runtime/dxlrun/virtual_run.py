@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 import time
 import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+
+from rich.console import Console
 
 from dxlrun.assembly import assemble
 from dxlrun.clock import VirtualClock
@@ -24,7 +29,7 @@ from dxlrun.packets import NoPackets, PacketBatch
 from dxlrun.recording.log_writer import LogWriter
 from dxlrun.ring import Handover
 from dxlrun.run_log import discard_log, log_header, new_log
-from dxlrun.run_summary import RunOptions, RunSummary
+from dxlrun.run_summary import Progress, RunOptions, RunSummary
 from dxlrun.simulation import Ledger, Mechanics, SimulatedBus, VirtualPorts
 from dxlrun.simulation.mujoco_plant import mujoco_plant
 
@@ -37,15 +42,18 @@ class _LogSinks:
     packets: PacketBatch
     events: EventRing
     commands: CommandRing
+    watch: Callable[[CycleRecord], None]
 
     def begin(self, record: CycleRecord) -> None:
         """Write the packets of the start-up and what the controllers are activated with."""
-        self.append(record)
+        self.packets.commit()
+        self.writer.cycle(record.raw)
 
     def append(self, record: CycleRecord) -> None:
         """Write one finished cycle and the packets since the one before."""
         self.packets.commit()
         self.writer.cycle(record.raw)
+        self.watch(record)
 
 
 @dataclass(slots=True)
@@ -55,12 +63,14 @@ class _NoSinks:
     packets: NoPackets
     events: EventRing
     commands: NoCommands
+    watch: Callable[[CycleRecord], None]
 
     def begin(self, record: CycleRecord) -> None:
         """Forget it."""
 
     def append(self, record: CycleRecord) -> None:
-        """Forget it."""
+        """Count it."""
+        self.watch(record)
 
 
 class VirtualRobot:
@@ -96,6 +106,10 @@ class VirtualRobot:
         self.result: LoopResult | None = None
         self.failures: tuple[str, ...] = ()
         """What could not be switched off at the end, one sentence each."""
+        self.cycles = self.skipped = 0
+        """How many cycles ran, and how many periods were skipped."""
+        self.progress: Callable[[int, int], None] = lambda cycles, skipped: None
+        """Called with both after each cycle."""
         self.messages = 0
         self._writer = LogWriter(log, log_header(plan, 0, virtual=True)) if log else None
         self._sinks = self._sinks_for(self._writer)
@@ -113,13 +127,21 @@ class VirtualRobot:
 
     def _sinks_for(self, writer: LogWriter | None) -> _LogSinks | _NoSinks:
         if writer is None:
-            return _NoSinks(NoPackets(), EventRing(Handover(lambda _: None), self.clock), NoCommands())
+            return _NoSinks(
+                NoPackets(), EventRing(Handover(lambda _: None), self.clock), NoCommands(), self._count
+            )
         return _LogSinks(
             writer,
             PacketBatch(Handover(writer.packets)),
             EventRing(Handover(writer.event), self.clock),
             CommandRing(Handover(writer.command)),
+            self._count,
         )
+
+    def _count(self, record: CycleRecord) -> None:
+        self.cycles += 1
+        self.skipped += record.skipped
+        self.progress(self.cycles, self.skipped)
 
     @property
     def record(self) -> CycleRecord:
@@ -153,7 +175,24 @@ class VirtualRobot:
         return self.result
 
 
-def run_virtual(plan: Plan, options: RunOptions) -> RunSummary:
+@contextmanager
+def _stopped_by_signals(stop: StopFlag) -> Iterator[None]:
+    """Let SIGINT and SIGTERM stop the run in order, a second one at once, by KeyboardInterrupt."""
+
+    def ask(*_: object) -> None:
+        if stop.requested:
+            raise KeyboardInterrupt
+        stop.request()
+
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def run_virtual(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
     """Run a plan on virtual time for the command line; the log has the times of the virtual clock."""
     log = new_log(Path(plan.recording_directory), plan.robot) if options.record else None
     try:
@@ -166,17 +205,22 @@ def run_virtual(plan: Plan, options: RunOptions) -> RunSummary:
         raise
     began = time.monotonic()
     refused: tuple[str, ...] = ()
-    try:
-        result = robot.run()
-    except DxlrunError as error:
-        if options.debug:
-            sys.stderr.write(traceback.format_exc())
-        result, refused = LoopResult(0, 0, "fault"), error.sentences
+    with _stopped_by_signals(robot.stop), out.status(f"{plan.robot}: starting") as status:
+        robot.progress = Progress(plan, status, virtual=True).ran
+        try:
+            result = robot.run()
+        except DxlrunError as error:
+            if options.debug:
+                sys.stderr.write(traceback.format_exc())
+            result, refused = LoopResult(0, 0, "fault"), error.sentences
+        except KeyboardInterrupt:
+            result = LoopResult(robot.cycles, robot.skipped, "stopped")
     incomplete = () if ledger.error is None else (ledger.error,)
     sentences = (*refused, *((result.detail,) if result.detail else ()), *robot.failures, *incomplete)
+    interrupted = robot.stop.requested and not sentences
     return RunSummary(
-        exit_code=1 if sentences or result.reason == "fault" else 0,
-        reason=result.reason,
+        exit_code=130 if interrupted else 1 if sentences or result.reason == "fault" else 0,
+        reason="interrupted" if interrupted else result.reason,
         cycles=result.cycles,
         skipped=result.skipped,
         elapsed_s=time.monotonic() - began,

@@ -1,4 +1,7 @@
+import io
+import signal
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -6,8 +9,10 @@ from rich.console import Console
 
 from dxlrun.compile.plan import Plan
 from dxlrun.errors import PortError
-from dxlrun.run_summary import RunOptions, RunSummary
-from dxlrun.virtual_run import VirtualRobot
+from dxlrun.recording.reader import read_log
+from dxlrun.run_summary import Progress, RunOptions, RunSummary
+from dxlrun.testing import plan_of
+from dxlrun.virtual_run import VirtualRobot, run_virtual
 
 GOOD = RunSummary(0, "ended", 100, 2, 2.03, (), log="logs/torso.mcap", messages=17)
 
@@ -147,10 +152,107 @@ def test_one_skipped_period_is_one(dxlrun: Callable, runs: Runs, torso: Path):
 
 
 def test_virtual_time_refuses_a_real_port(dxlrun: Callable, torso: Path):
-    said = dxlrun(torso, "port:=/dev/ttyUSB0", "--virtual")
+    said = dxlrun(torso, "port:=/dev/ttyUSB0", "--virtual", "--duration", "1")
 
     assert said.code == 2
     assert "port:=sim" in said.err
+
+
+def test_virtual_time_without_an_end_is_refused(
+    dxlrun: Callable, torso: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(tmp_path)
+    said = dxlrun(torso, "--virtual")
+
+    assert (said.code, said.out) == (2, "")
+    assert len(said.errors) == 1
+    assert "--duration SECONDS, or --play MOTION.yaml" in said.err
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("signals", [1, 2])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_run_on_virtual_time_with_its_summary_and_log(  # noqa: PLR0917  fixtures
+    dxlrun: Callable,
+    torso: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    number: signal.Signals,
+    signals: int,
+):
+    monkeypatch.chdir(tmp_path)
+    robots = []
+
+    def interrupted(robot: VirtualRobot, *arguments: object, **options: object) -> None:
+        born(robot, *arguments, **options)
+        robots.append(robot)
+        for _ in range(signals):
+            robot.buses[0].at(1_000_000_000, lambda: signal.raise_signal(number))
+
+    born = VirtualRobot.__init__
+    monkeypatch.setattr(VirtualRobot, "__init__", interrupted)
+    before = signal.getsignal(number)
+
+    said = dxlrun(torso, "--virtual", "--duration", "1e6")
+
+    assert said.code == 130, said.err
+    assert [line for line in said.errors if "warning" not in line] == []
+    first, *_, log, _ = said.out.splitlines()
+    assert first.startswith("bioloid_torso: interrupted. ")
+    cycles = robots[0].cycles
+    assert 40 <= cycles <= 51
+    assert f" s, {cycles} cycles, 0 periods skipped" in first
+    recorded = read_log(Path(log.split()[1]))
+    assert recorded.complete
+    assert len(recorded.cycles) == cycles
+    assert not any(servo.torque_on for servo in robots[0].buses[0].servos)
+    assert signal.getsignal(number) is before
+
+
+class Line:
+    """A terminal's status line, and what it showed."""
+
+    def __init__(self) -> None:
+        self.shown: list[str] = []
+
+    def update(self, text: str) -> None:
+        self.shown.append(text)
+
+
+@pytest.mark.parametrize(
+    ("virtual", "shown"),
+    [
+        (False, "bioloid_torso: 3.0 of 9.0 s, 100 cycles, 50 periods skipped (2 s; Ctrl-C stops)"),
+        (
+            True,
+            "bioloid_torso: 3.0 of 9.0 s, 1.5 times real time, 100 cycles, 50 periods skipped "
+            "(2 s; Ctrl-C stops)",
+        ),
+    ],
+)
+def test_progress_counts_skipped_periods(
+    torso: Path, monkeypatch: pytest.MonkeyPatch, virtual: bool, shown: str
+):
+    now = iter((100.0, 100.05, 102.0))
+    monkeypatch.setattr("dxlrun.run_summary.time.monotonic", lambda: next(now))
+    line = Line()
+    progress = Progress(plan_of(torso, duration_s=9.0), line, virtual=virtual)
+    progress.ran(1, 0)
+    progress.ran(100, 50)
+
+    assert line.shown == [shown]
+
+
+def test_a_run_on_virtual_time_shows_its_progress(torso: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("dxlrun.run_summary._REFRESH_S", 0.0)
+    console = Console(file=io.StringIO())
+    line = Line()
+    monkeypatch.setattr(console, "status", lambda _: nullcontext(line))
+    run_virtual(plan_of(torso, duration_s=0.2), RunOptions(record=False), console)
+
+    assert len(line.shown) == 10
+    assert line.shown[-1].startswith("bioloid_torso: 0.2 of 0.2 s, ")
+    assert " times real time, 10 cycles, 0 periods skipped (" in line.shown[-1]
 
 
 def test_what_is_no_log_is_one_sentence(dxlrun: Callable, tmp_path: Path):

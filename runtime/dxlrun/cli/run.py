@@ -56,7 +56,8 @@ def run(
     take_over
         Start although a servo has its torque on already.
     virtual
-        Run on virtual time, as fast as the processor can; only with simulated buses.
+        Run on virtual time, as fast as the processor can; only with simulated buses, and with --duration or
+        --play.
     ledger
         Write what the simulated buses saw to this file, for `dxlrun analyze LOG --ledger FILE`; without it
         a run writes it beside its log, one on virtual time not at all.
@@ -65,6 +66,11 @@ def run(
     debug
         Print the traceback of an error, and what the processes said.
     """
+    if virtual and duration is None and not play:
+        raise InputError(
+            "on virtual time nothing ends a run, and its log would fill the disk: give "
+            "--duration SECONDS, or --play MOTION.yaml"
+        )
     result = compiled(robot, assignments, play, duration, None if virtual else _ask_servos)
     for warning in result.warnings:
         say_warning(str(warning))
@@ -79,7 +85,7 @@ def run(
     if virtual:
         from dxlrun.virtual_run import run_virtual
 
-        summary = run_virtual(result.plan, options)
+        summary = run_virtual(result.plan, options, console)
     else:
         from dxlrun.supervisor import run_robot
 
