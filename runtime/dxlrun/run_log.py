@@ -12,6 +12,7 @@ from dxlrun.compile.plan import Plan, to_json
 from dxlrun.control.controller import CONTRACT_VERSION
 from dxlrun.errors import InputError
 from dxlrun.recording.header import LoggedController, LogHeader
+from dxlrun.recording.log_file import LOG_MODE
 
 _LIBRARIES = ("dxlrun", "mcap", "msgspec", "numpy", "pluggy", "pydantic", "pyserial")
 
@@ -92,7 +93,7 @@ def new_log(directory: Path, robot: str) -> Path:
     while True:
         path = directory / f"{stem}{f'_{number}' * (number > 1)}.mcap"
         try:
-            path.touch(exist_ok=False)
+            path.touch(LOG_MODE, exist_ok=False)
         except FileExistsError:
             number += 1
         except OSError as error:

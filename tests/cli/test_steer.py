@@ -66,9 +66,6 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stage]:
     stage = Stage(directory)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_RUNTIME_DIR", str(directory))
-        patch.setattr(
-            "dxlrun.remote.sockets.places", lambda: [directory / "dxlrun"]
-        )  # other runs are not ours
         yield stage
         if stage.process is not None and stage.process.poll() is None:
             stage.process.terminate()

@@ -15,7 +15,7 @@ NOBODY = "dxlrun: no robot runs that could be steered; `dxlrun ROBOT.yaml` start
 @pytest.fixture
 def nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A computer on which no robot runs."""
-    monkeypatch.setattr("dxlrun.remote.sockets.places", lambda: [tmp_path])
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
 
 
 # Nobody runs

@@ -11,7 +11,7 @@ import pytest
 
 from dxlrun.errors import DxlrunError
 from dxlrun.remote import sockets
-from dxlrun.remote.sockets import alive, listen, places, running
+from dxlrun.remote.sockets import alive, listen, ours, running
 
 NOBODY = 65534
 CONNECT = """
@@ -29,7 +29,6 @@ except PermissionError:
 def place(tmp_path, monkeypatch):
     """The directory of this test's sockets, and no other one."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    monkeypatch.setattr(sockets, "places", lambda: places()[:1])
     return tmp_path / "dxlrun"
 
 
@@ -119,24 +118,23 @@ def test_a_directory_that_is_not_ours_alone_is_not_used(place, tmp_path, wrong):
 
 
 def test_the_runtime_directory_of_another_user_is_left_alone(tmp_path, monkeypatch):
-    assert places()[0] == tmp_path / "dxlrun"
+    assert sockets.place() == tmp_path / "dxlrun"
     monkeypatch.setattr(os, "getuid", lambda: NOBODY)  # as after `su` that keeps the environment
-    assert places() == [Path("/", "tmp", f"dxlrun-{NOBODY}")]
+    assert sockets.place() == Path("/", "tmp", f"dxlrun-{NOBODY}")
 
 
 @pytest.mark.parametrize("value", ["", "relative", "/nowhere/at/all"])
 def test_without_a_runtime_directory_it_is_one_in_tmp(monkeypatch, value):
     monkeypatch.setenv("XDG_RUNTIME_DIR", value)
-    assert places() == [Path("/", "tmp", f"dxlrun-{os.getuid()}")]
+    assert sockets.place() == Path("/", "tmp", f"dxlrun-{os.getuid()}")
 
 
-def test_runs_are_found_in_both_places(tmp_path, monkeypatch):
-    other = tmp_path / "other"
-    first, _ = listen("pair")
-    monkeypatch.setattr(sockets, "places", lambda: [other, tmp_path / "dxlrun"])
-    second, _ = listen("torso")
-    with first, second:
-        assert running() == ("pair", "torso")
+def test_with_a_runtime_directory_it_is_the_only_one(place, monkeypatch):
+    looked_at = []
+    monkeypatch.setattr(sockets, "ours", lambda directory: looked_at.append(directory) or ours(directory))
+    with listen("pair")[0]:
+        assert running() == ("pair",)
+    assert set(looked_at) == {place}
 
 
 def test_a_name_that_is_too_long_is_refused_in_plain_words():

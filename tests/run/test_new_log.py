@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from dxlrun.cli import main
+from dxlrun.cli.sim import _writable
 from dxlrun.errors import InputError
 from dxlrun.recording.log_file import LogFile
 from dxlrun.run_log import discard_log, ledger_of, new_log
+from dxlrun.simulation import Ledger
 
 Start = Callable[..., Any]
 
@@ -36,6 +41,37 @@ def test_discarding_leaves_the_other_runs_log(tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.iterdir()} == {other.name, ledger_of(other).name}
 
 
+def _virtual_run(directory: Path) -> None:
+    robot = str(Path(__file__).parents[2] / "robots" / "bioloid_torso.yaml")
+    words = [robot, "--virtual", "--duration", "0.1", "--ledger", "virtual.jsonl"]
+    with contextlib.chdir(directory):
+        assert main(words) == 0
+
+
+@pytest.mark.parametrize(
+    "create",
+    [
+        lambda directory: new_log(directory, "pair"),
+        lambda directory: LogFile(directory / "log.mcap").close(),
+        lambda directory: Ledger(directory / "bus.jsonl").close(),
+        lambda directory: _writable(directory / "sim.jsonl"),
+        _virtual_run,
+    ],
+    ids=["name", "log", "ledger", "sim", "run"],
+)
+def test_logs_and_ledgers_are_for_the_user_and_the_group(
+    tmp_path: Path, create: Callable[[Path], object]
+) -> None:
+    before = os.umask(0)
+    try:
+        create(tmp_path)
+    finally:
+        os.umask(before)
+    files = [path for path in tmp_path.rglob("*") if path.is_file()]
+    assert files
+    assert {oct(path.stat().st_mode & 0o777) for path in files} == {"0o640"}
+
+
 def test_a_log_with_something_in_it_is_never_written_over(tmp_path: Path) -> None:
     path = tmp_path / "old.mcap"
     path.write_bytes(b"old")
@@ -47,7 +83,7 @@ def test_a_log_with_something_in_it_is_never_written_over(tmp_path: Path) -> Non
 def test_a_directory_that_takes_no_file_is_an_input_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refuse(path: Path, *, exist_ok: bool) -> None:
+    def refuse(path: Path, mode: int, *, exist_ok: bool) -> None:
         raise PermissionError(errno.EACCES, "Permission denied", str(path))
 
     monkeypatch.setattr(Path, "touch", refuse)

@@ -96,6 +96,8 @@ def run(
 
 def _check_ledger(ledger: Path, plan: Plan) -> None:
     """Raise InputError where no ledger can be written, before anything starts."""
+    from dxlrun.simulation.ledger import for_group
+
     if not plan.simulated:
         raise InputError(
             f"a ledger tells what simulated buses saw, and {plan.robot} has none: give the argument "
@@ -104,7 +106,7 @@ def _check_ledger(ledger: Path, plan: Plan) -> None:
     if not ledger.parent.is_dir():
         raise InputError(f"there is no directory {ledger.parent} for the ledger; make it first")
     try:
-        ledger.open("w").close()
+        open(ledger, "w", opener=for_group).close()
     except OSError as error:
         raise InputError(f"the ledger {ledger} cannot be written: {error.strerror or error}") from error
 

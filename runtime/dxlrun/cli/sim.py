@@ -242,8 +242,10 @@ def _writable(ledger: Path | None) -> None:
     """Refuse a ledger that cannot be written with one sentence, before anything starts."""
     if ledger is None:
         return
+    from dxlrun.simulation.ledger import for_group
+
     try:
-        ledger.open("a").close()
+        open(ledger, "a", opener=for_group).close()
     except OSError as error:
         raise InputError(
             f"--ledger {ledger} cannot be written ({error.strerror}); choose another file"

@@ -6,6 +6,9 @@ import errno
 import os
 from pathlib import Path
 
+LOG_MODE = 0o640
+"""Of a new log: commands and the names of clients are for its user and group."""
+
 
 class LogFile:
     """Unbuffered bytes on a disk; every method raises OSError when the disk does not take them."""
@@ -13,7 +16,7 @@ class LogFile:
     __slots__ = ("_descriptor", "_size")
 
     def __init__(self, path: Path) -> None:
-        self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, LOG_MODE)
         if os.fstat(self._descriptor).st_size:  # empty is how a name is taken before a log begins
             os.close(self._descriptor)
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))

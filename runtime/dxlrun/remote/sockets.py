@@ -1,7 +1,8 @@
 """Where the sockets of running robots are, and which robots run; both ends of a socket know this.
 
-A socket is in `$XDG_RUNTIME_DIR/dxlrun` (XDG Base Directory Specification) where that is ours, else in
-`/tmp/dxlrun-<user ID>`. Runs are looked for in both: a service and a login shell may differ in the variable.
+A socket is in `$XDG_RUNTIME_DIR/dxlrun` (XDG Base Directory Specification) where that directory is ours, else
+in `/tmp/dxlrun-<user ID>`; never in both. A service and a login shell that differ in the variable do not see
+each other's runs: set it alike.
 """
 
 from __future__ import annotations
@@ -23,21 +24,20 @@ LONGEST_PATH = 107
 """Bytes; what Linux takes as the name of a Unix socket (unix(7)), without the final zero."""
 
 
-def places() -> list[Path]:
-    """Return the directories in which this user's sockets may be, the one for new sockets first."""
-    found = [Path(f"/tmp/dxlrun-{os.getuid()}")]  # noqa: S108  entered only when it is ours alone
+def place() -> Path:
+    """Return the directory of this user's sockets; it may not exist yet."""
     runtime = Path(os.environ.get("XDG_RUNTIME_DIR", ""))
     with suppress(OSError):
         # that of another user, left in the environment by su or sudo, is not ours to write into
         if runtime.is_absolute() and runtime.stat().st_uid == os.getuid():
-            found.insert(0, runtime / "dxlrun")
-    return found
+            return runtime / "dxlrun"
+    return Path(f"/tmp/dxlrun-{os.getuid()}")  # noqa: S108  entered only when it is ours alone
 
 
-def ours(place: Path) -> bool:
+def ours(directory: Path) -> bool:
     """Say whether a directory belongs to this user and nobody else may look into it; no link is followed."""
     try:
-        found = place.lstat()
+        found = directory.lstat()
     except OSError:
         return False
     return stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o077
@@ -49,17 +49,17 @@ def listen(robot: str) -> tuple[socket.socket, Path]:
     A second run of the same robot gets its process' number into the name. Raises DxlrunError when there is
     no safe place for a socket.
     """
-    place = places()[0]
+    directory = place()
     with suppress(OSError):
-        place.mkdir(mode=0o700)
-    if not ours(place):
+        directory.mkdir(mode=0o700)
+    if not ours(directory):
         raise DxlrunError(
-            f"{place} must be a directory that only you may enter: remove it, or set XDG_RUNTIME_DIR"
+            f"{directory} must be a directory that only you may enter: remove it, or set XDG_RUNTIME_DIR"
         )
-    with _alone(place):
-        path = place / f"{robot}{SUFFIX}"
+    with _alone(directory):
+        path = directory / f"{robot}{SUFFIX}"
         if alive(path):
-            path = place / f"{robot}-{os.getpid()}{SUFFIX}"
+            path = directory / f"{robot}-{os.getpid()}{SUFFIX}"
         if len(os.fsencode(path)) > LONGEST_PATH:
             raise DxlrunError(f"{path} is too long for a socket: give the robot a shorter name")
         path.unlink(missing_ok=True)
@@ -81,9 +81,9 @@ def _bound(path: Path) -> socket.socket:
 
 
 @contextmanager
-def _alone(place: Path) -> Iterator[None]:
+def _alone(directory: Path) -> Iterator[None]:
     """Keep others from looking between the birth of a socket and its first ear, and from removing it."""
-    descriptor = os.open(place, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
         yield
@@ -112,13 +112,13 @@ def running() -> tuple[str, ...]:
 def sockets() -> dict[str, Path]:
     """Return the living sockets by the names of their robots, and remove the dead ones."""
     found: dict[str, Path] = {}
-    for place in places():
-        if not ours(place):
-            continue
-        with _alone(place):
-            for path in place.glob(f"*{SUFFIX}"):
-                if alive(path):
-                    found.setdefault(path.stem, path)
-                elif path.is_socket():
-                    path.unlink(missing_ok=True)
+    directory = place()
+    if not ours(directory):
+        return found
+    with _alone(directory):
+        for path in directory.glob(f"*{SUFFIX}"):
+            if alive(path):
+                found[path.stem] = path
+            elif path.is_socket():
+                path.unlink(missing_ok=True)
     return found

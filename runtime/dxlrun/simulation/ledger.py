@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
@@ -14,6 +15,7 @@ from dxlrun.errors import LogError
 
 Direction = Literal["in", "out", "note"]
 
+_MODE = 0o640
 _BUFFER = 1 << 16
 """Bytes that are written out together."""
 
@@ -59,6 +61,11 @@ class Passed(NamedTuple):
         return found
 
 
+def for_group(path: str, flags: int) -> int:
+    """Open a file for `open`; a new one can be read by its user and group only."""
+    return os.open(path, flags, _MODE)
+
+
 class Ledger:
     """Keeps entries in memory, in a JSON-lines file, or both; `keep=False` bounds the memory of long runs.
 
@@ -72,7 +79,9 @@ class Ledger:
         self.on_note: Callable[[str], None] | None = None
         """Who is told of each note."""
         self._keep = keep
-        self._file: IO[bytes] | None = None if path is None else path.open("wb", _BUFFER)
+        self._file: IO[bytes] | None = None
+        if path is not None:
+            self._file = open(path, "wb", _BUFFER, opener=for_group)  # noqa: SIM115  `close` closes it
         self._new: list[LedgerEntry | Passed] = []
         """Entries that are not encoded yet."""
         self._unflushed_ns: int | None = None
