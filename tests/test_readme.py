@@ -18,9 +18,11 @@ from dxlrun.testing import simulated_robot
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 BIN = Path(sys.executable).parent
+ACTIVATE = ". .venv/bin/activate"
 COMMANDS = [line.strip() for line in README.splitlines() if line.startswith("    ")]
 RUNS = [line for line in COMMANDS if line.startswith("dxlrun") and "/dev/tty" not in line and "*" not in line]
-RUNS = [line for line in RUNS if line.split()[1] not in COMMANDS_WHILE_IT_RUNS]  # tests/cli/test_steer.py
+ELSEWHERE = {*COMMANDS_WHILE_IT_RUNS, "analyze"}  # tests/cli/test_steer.py, and behind the first run
+RUNS = [line for line in RUNS if line.split()[1] not in ELSEWHERE]
 
 
 def blocks(language: str) -> list[str]:
@@ -28,7 +30,9 @@ def blocks(language: str) -> list[str]:
 
 
 def shell(line: str, directory: Path) -> subprocess.CompletedProcess[str]:
-    environment = os.environ | {"PATH": f"{BIN}:{os.environ['PATH']}"}
+    """Run a line as in a new terminal of the reader's: no environment is active."""
+    path = ":".join(one for one in os.environ["PATH"].split(":") if Path(one) != BIN)
+    environment = os.environ | {"PATH": path}
     return subprocess.run(
         ["/bin/bash", "-c", line], cwd=directory, env=environment, capture_output=True, text=True, check=False
     )
@@ -38,6 +42,7 @@ def shell(line: str, directory: Path) -> subprocess.CompletedProcess[str]:
 def clone(tmp_path: Path) -> Path:
     """A directory that looks like the clone in which a reader types the commands."""
     (tmp_path / "robots").symlink_to(ROOT / "robots")
+    (tmp_path / ".venv").symlink_to(sys.prefix)
     return tmp_path
 
 
@@ -47,33 +52,39 @@ def test_the_first_screen_has_two_commands() -> None:
 
 
 def test_the_first_command_moves_the_robot_and_the_next_one_explains_it(clone: Path) -> None:
-    last = COMMANDS[0].split(" && ")[-1].replace(".venv/bin/", "")
-    ran = shell(last, clone)
+    ran = shell(COMMANDS[0].split(" && ")[-1], clone)
     assert ran.returncode == 0, ran.stderr
     assert "bioloid_torso: " in ran.stdout  # a busy machine delays replies until servos count as lost
     analyze = next(line for line in COMMANDS if line.startswith("dxlrun analyze"))
-    told = shell(analyze, clone)
+    told = shell(f"{ACTIVATE} && {analyze}", clone)
     assert told.returncode == 0, told.stderr
     assert "1750" in told.stdout  # periods of 20 ms in 35 s; how many were kept depends on the machine
 
 
+def test_the_environment_is_activated_before_the_first_command_that_needs_it(clone: Path) -> None:
+    bare = next(index for index, line in enumerate(COMMANDS) if line.startswith("dxlrun "))
+    assert ACTIVATE in COMMANDS[:bare]
+    assert shell("dxlrun --help", clone).returncode == 127
+    assert shell(f"{ACTIVATE} && dxlrun --help", clone).returncode == 0
+
+
 def test_the_check_for_a_real_port_opens_none(clone: Path) -> None:
     line = next(line for line in COMMANDS if line.startswith("dxlrun check"))
-    told = shell(line, clone)
+    told = shell(f"{ACTIVATE} && {line}", clone)
     assert told.returncode == 0, told.stderr
     assert "71 Hz" in told.stdout
 
 
 def test_the_run_on_a_real_port_says_that_it_is_missing(clone: Path) -> None:
     line = next(line for line in COMMANDS if line.startswith("dxlrun robots") and "/dev/tty" in line)
-    told = shell(line.replace("/dev/ttyUSB0", "/dev/ttyNowhere"), clone)
+    told = shell(f"{ACTIVATE} && " + line.replace("/dev/ttyUSB0", "/dev/ttyNowhere"), clone)
     assert told.returncode == 1
     assert "/dev/ttyNowhere" in told.stderr
 
 
 @pytest.mark.parametrize("line", RUNS)
 def test_the_other_runs_end_well(clone: Path, line: str) -> None:
-    told = shell(line, clone)
+    told = shell(f"{ACTIVATE} && {line}", clone)
     assert told.returncode == 0, told.stderr
     assert shlex.split(line)[0] == "dxlrun"
 

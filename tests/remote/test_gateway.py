@@ -3,6 +3,7 @@
 import asyncio
 import json
 import struct
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -12,7 +13,7 @@ from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.events import EventCode, Severity
 from dxlrun.heartbeat import Phase
 from dxlrun.inbox import MOST_PER_CYCLE
-from dxlrun.remote import asking, link
+from dxlrun.remote import asking, connection, gateway, link
 from dxlrun.remote.gateway import MOST_OPERATIONS, MOST_SET_POINTS
 from dxlrun.remote.sockets import MOST_BYTES
 
@@ -362,3 +363,15 @@ def test_events_of_both_processes_are_whole_and_are_told_once_to_who_asks_after_
     told = desk.ask("GET", f"/events?after={told['last']}")[1]
     assert [one["text"] for one in told["events"]] == ["more"]
     assert desk.ask("GET", f"/events?after={told['last']}")[1] == {"events": [], "last": told["last"]}
+
+
+def test_the_page_gives_the_limits_that_are_kept():
+    page = (Path(__file__).parents[2] / "docs" / "steering.md").read_text()
+    rates = f"{gateway.MOST_LOOKS:.0f} GETs, {gateway.MOST_SET_POINTS:.0f} set-points or"
+    assert f"{rates} {gateway.MOST_OPERATIONS:.0f} other requests a second" in page
+    assert f"{asking.CHARGED_BYTES >> 10} KiB of a body count as one more" in page
+    assert f"within {link.ANSWER_S:g} s and two of its periods, {2 * link.ANSWER_S:g} s at most" in page
+    assert f"of the last {link.KEPT_EVENTS} events (fewer when their texts have more than" in page
+    assert f"more than {link.KEPT_TEXT >> 20} MiB together" in page
+    assert f"A process may keep {connection.MOST_OF_PROCESS} connections, all together" in page
+    assert f"all together {connection.MOST_CONNECTIONS}." in page
