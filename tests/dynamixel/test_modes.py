@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from dxlrun.control_table import control_table
+from dxlrun.errors import StartUpError
 from dxlrun.events import EventCode
 from dxlrun.mode import Mode
 
@@ -310,6 +311,22 @@ def test_a_joint_that_coasted_over_its_limits_is_led_back_slowly_and_does_not_fa
     assert arm.torque() == [True, True]
     assert servo.registers["goal_position"] == plan.upper_tick
     assert 0 < servo.registers["profile_velocity"] * plan.rad_s_per_tick <= 0.51
+
+
+def test_a_servo_outside_its_limits_that_is_taken_over_in_another_mode_gets_no_torque(make_rig, make_plan):
+    plan = make_plan(
+        (1, 2), model="XM430-W350", protocol=2.0, reference=np.pi, lower=-1, upper=1, return_delay_ns=0
+    )
+    rig = make_rig(plan, take_over=True, position=np.pi)
+    servo = rig.buses[0].servo(2)
+    servo.poke("operating_mode", 16)
+    servo.poke("goal_pwm", 0)
+    servo.poke("torque_enable", 1)
+    servo.turn_by_hand((plan.servos[1].lower_tick - 30) * plan.servos[1].rad_per_tick)
+    with pytest.raises(StartUpError, match=r"ID 2 on bus main.* stands outside its limits"):
+        rig.hardware.start()
+    assert rig.torque() == [False, False]
+    assert [address for instruction, address in instructions(rig, 2) if instruction == 3] == [64, 11]
 
 
 def test_a_servo_that_lost_its_torque_over_a_change_gets_no_goal_which_would_switch_it_on(make_one):

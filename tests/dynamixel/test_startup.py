@@ -102,6 +102,82 @@ def test_a_joint_outside_its_limits_is_not_moved(make_rig, make_plan):
     assert "move the joint inside by hand" in problems[0]
 
 
+@pytest.mark.parametrize("end", ["lower_tick", "upper_tick"])
+@pytest.mark.parametrize(("beyond", "starts"), [(1, True), (2, False)])
+def test_a_joint_may_stand_one_tick_outside_its_limits_and_no_more(make_rig, make_plan, end, beyond, starts):
+    """The reading of a potentiometer at the limit alternates between two ticks."""
+    plan = make_plan((1, 2), lower=-1.0, upper=1.0)
+    rig = make_rig(plan)
+    servo = plan.servos[0]
+    out = beyond if end == "upper_tick" else -beyond
+    rig.buses[0].servo(1).turn_by_hand((getattr(servo, end) + out) * servo.rad_per_tick)
+    if not starts:
+        (problem,) = refusal(rig)
+        assert "main_1_joint (ID 1 on bus main) stands at" in problem
+        assert "outside its limits -57.0..57.0 deg" in problem
+        return
+    rig.hardware.start()
+    assert rig.torque() == [True, True]
+    assert rig.buses[0].servo(1).registers["goal_position"] == getattr(servo, end)
+
+
+def after_first_state(rig, servo_id, act):
+    """Do something once a servo has answered the first reading of its state, before the second one."""
+    write, seen = rig.ports.ports[0].write, []
+
+    def through(data):
+        if data[4] == 2 and data[5] == 36:  # present position of an AX-12
+            seen.append(data[2])
+            if seen.count(servo_id) == 2 and data[2] == servo_id:
+                act()
+        write(data)
+
+    rig.ports.ports[0].write = through
+
+
+@pytest.mark.parametrize(("jump", "starts"), [(0.05, True), (-0.05, True), (0.8, False), (-0.8, False)])
+def test_a_servo_that_jumps_between_two_readings_of_its_state_gets_no_torque(make_rig, jump, starts):
+    """Between them pass 5.7 ms for eight servos: at 11.9 rad/s that is 0.07 rad."""
+    rig = make_rig()
+    servo = rig.buses[0].servo(6)
+    after_first_state(rig, 6, lambda: servo.turn_by_hand(servo.position + jump))
+    if starts:
+        rig.hardware.start()
+        assert rig.torque() == [True] * 8
+        return
+    (problem,) = refusal(rig)
+    assert "ID 6 on bus main) jumped by 4" in problem
+    assert "deg between two readings" in problem
+
+
+def test_a_servo_that_is_moved_out_of_its_limits_before_its_torque_is_not_held_there(make_rig, make_plan):
+    plan = make_plan((1, 2), lower=-1.0, upper=1.0)
+    rig = make_rig(plan)
+    servo, write = rig.buses[0].servo(2), rig.ports.ports[0].write
+
+    def through(data):
+        if data[2:7] == b"\x01\x04\x03\x18\x01":  # the first one gets its torque
+            servo.turn_by_hand((plan.servos[1].upper_tick + 30) * plan.servos[1].rad_per_tick)
+        write(data)
+
+    rig.ports.ports[0].write = through
+    with pytest.raises(StartUpError, match=r"ID 2 on bus main.* left them before torque was switched on"):
+        rig.hardware.start()
+    assert [packet for packet in rig.into_bus() if packet[2:5] == b"\x02\x07\x03"] == []
+    assert rig.torque() == [False, False]
+
+
+def test_a_servo_in_another_mode_is_looked_at_again_before_it_gets_torque(make_rig, make_plan):
+    """Its position in PWM mode counts otherwise, so only the look after the change of mode can judge it."""
+    plan = make_plan((1, 2), model="XM430-W350", protocol=2.0, reference=3.14, lower=-1.0, upper=1.0)
+    rig = make_rig(plan, position=3.1)
+    rig.buses[0].servo(1).poke("operating_mode", 16)
+    rig.buses[0].servo(1).turn_by_hand((plan.servos[0].upper_tick + 30) * plan.servos[0].rad_per_tick)
+    with pytest.raises(StartUpError, match=r"ID 1 on bus main.* stands outside its limits"):
+        rig.hardware.start()
+    assert rig.torque() == [False, False]
+
+
 def test_an_overheated_servo_gets_no_torque(make_rig):
     rig = make_rig()
     rig.buses[0].servo(6).set_temperature(90.0)
@@ -127,7 +203,7 @@ def test_a_start_that_fails_half_way_takes_the_torque_back(make_rig):
 
     for step in range(4000):
         rig.buses[0].at(rig.clock.now_ns() + step * 100_000, cut)
-    with pytest.raises(StartUpError, match="ID 21"):
+    with pytest.raises(StartUpError, match=r"ID 21"):
         rig.hardware.start()
     assert seen != []
     assert rig.torque() == [False] * 8
