@@ -167,6 +167,18 @@ def test_a_wheel_that_takes_no_goal_any_more_loses_its_torque_when_the_loop_died
     assert rig.torque() == [False, True]
 
 
+def test_a_wheel_that_keeps_its_torque_whatever_is_written_is_named(make_wheel):
+    rig = make_wheel()
+    rig.goals.velocity[0] = 1.0
+    rig.cycle()
+    servo = rig.buses[0].servo(1)
+    servo.poke("bus_watchdog", -1)
+    servo.registers.watch(("torque_enable",), lambda: servo.poke("torque_enable", 1))
+    (said, _) = stand(rig.plans, rig.ports, rig.clock, rig.packets)[::-1]
+    assert said.startswith("main_1_joint (ID 1 on bus main) may go on moving: ")
+    assert said.endswith("torque off was not confirmed")
+
+
 def test_joints_that_hold_a_position_are_left_alone_when_the_loop_died(make_rig):
     rig = make_rig()
     rig.hardware.start()

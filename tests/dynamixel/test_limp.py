@@ -1,7 +1,9 @@
 import subprocess
 import sys
 
-from dxlrun.dynamixel.limp import limp
+import pytest
+
+from dxlrun.dynamixel.limp import LATE_NS, LONGER_NS, limp
 
 
 def test_a_robot_whose_loop_died_becomes_limp(make_rig):
@@ -15,6 +17,62 @@ def test_a_robot_whose_loop_died_becomes_limp(make_rig):
     assert rig.packets.sent()[recorded:][0] == rig.plans[0].limp[0].packet
     assert rig.packets.sent() == rig.into_bus()
     assert rig.packets.received() == rig.out_of_bus()
+
+
+def keep_torque(servo):
+    """Let a servo acknowledge torque off and keep its torque, as when another program writes it again."""
+    servo.registers.watch(("torque_enable",), lambda: servo.poke("torque_enable", 1))
+
+
+def lose_readbacks(rig, servo_id):
+    """Let a servo acknowledge every write and answer no read."""
+    write = rig.ports.ports[0].write
+
+    def through(data):
+        if (data[2], data[4]) == (servo_id, 2):
+            rig.buses[0].truncate_next(servo_id, 0)
+        write(data)
+
+    rig.ports.ports[0].write = through
+
+
+@pytest.mark.parametrize(
+    ("trick", "detail"),
+    [
+        (
+            lambda rig: keep_torque(rig.buses[0].servo(6)),
+            "torque enable reads 1 after torque off was written",
+        ),
+        (lambda rig: lose_readbacks(rig, 6), "torque off was acknowledged, but the read-back got no answer"),
+    ],
+)
+def test_torque_off_counts_only_when_it_was_read_back(make_rig, trick, detail):
+    rig = make_rig()
+    rig.hardware.start()
+    trick(rig)
+    outcomes = limp(rig.plans, rig.ports, rig.clock, rig.packets)
+    assert [one.servo_id for one in outcomes if not one.confirmed] == [6]
+    assert detail in str(next(one for one in outcomes if not one.confirmed))
+    off = [packet for packet in rig.into_bus() if packet[2] == 6 and packet[4:7] == b"\x03\x18\x00"]
+    assert len(off) == len(LONGER_NS), "torque off is tried again after the other servos"
+
+
+def test_what_answers_late_is_heard_before_the_ports_are_closed(make_rig, make_plan):
+    rig = make_rig(make_plan((1,)))
+    rig.hardware.start()
+    write, asked = rig.ports.ports[0].write, []
+
+    def late(data):
+        if data[4] == 2 and not asked:  # the first read-back: given up before its answer comes
+            asked.append(rig.clock.now_ns())
+            rig.buses[0].delay_next(1, LATE_NS)
+        write(data)
+
+    rig.ports.ports[0].write = late
+    (outcome,) = limp(rig.plans, rig.ports, rig.clock, rig.packets)
+    assert outcome.confirmed
+    assert rig.packets.received() == rig.out_of_bus()
+    assert rig.clock.now_ns() - asked[0] > LATE_NS
 
 
 def test_it_works_after_a_half_sent_instruction_and_a_half_read_reply(make_rig):
