@@ -7,7 +7,7 @@ from functools import partial
 import pytest
 
 from dxlrun.dynamixel import protocol1, protocol2
-from dxlrun.dynamixel.reboots import RealtimeTicks
+from dxlrun.dynamixel.reboots import RealtimeTicks, RebootCount
 from dxlrun.dynamixel.transaction import Outcome, Reply
 from dxlrun.events import EventCode
 
@@ -165,6 +165,92 @@ def test_a_servo_that_reboots_twice_in_a_minute_gets_no_torque_again(start, make
     texts = [text for _, text in rig.events.of(EventCode.SERVO_REBOOTED)]
     assert len(texts) == 3
     assert "rebooted twice within a minute" in texts[-1]
+
+
+@pytest.mark.parametrize(
+    ("times_s", "latched"),
+    [
+        ((0.0, 60.0), (False, True)),
+        ((0.0, 60.1), (False, False)),
+        ((0.0, 61.0, 122.0), (False, False, False)),
+        ((0.0, 61.0, 90.0, 95.0), (False, False, True, False)),  # it is told once
+    ],
+)
+def test_two_reboots_latch_a_servo_only_within_a_minute(times_s, latched):
+    count = RebootCount(2)
+    assert tuple(count.add(1, round(at_s * 1e9)) for at_s in times_s) == latched
+    assert count.latched == [False, any(latched)]
+
+
+def _reads_model(packet, protocol):
+    """Return whose model number a packet asks for, -1: nobody's."""
+    if protocol == 1.0:
+        return packet[2] if packet[4:6] == b"\x02\x00" else -1
+    return packet[4] if packet[7:10] == b"\x02\x00\x00" else -1
+
+
+def _goals(packet, protocol):
+    """Return who gets a goal by a packet."""
+    if protocol == 1.0:
+        return packet[7:-1:5] if packet[4] == 0x83 else b""
+    return packet[12:-2:9] if packet[7] == 0x83 else b""
+
+
+@pytest.mark.parametrize("protocol", [1.0, 2.0])
+def test_servos_of_a_bus_that_is_back_are_looked_at_again_before_they_get_a_goal(
+    start, make_plan, make_x, protocol
+):
+    rig = start(make_x() if protocol == 2.0 else make_plan((1, 3, 5)))
+    rig.restless = 0.002  # each goal is sent in every cycle
+    cycles(rig, 3)
+    rig.buses[0].unplug()
+    cycles(rig, 1)  # too short for any servo to be lost
+    rig.buses[0].plug_in()
+    count = len(rig.into_bus())
+    cycles(rig, 30)
+    since = rig.into_bus()[count:]
+    assert rig.torque() == [True] * len(rig.states.valid)
+    for servo in rig.plans[0].servos:
+        looks = [_reads_model(packet, protocol) == servo.servo_id for packet in since]
+        goals = [servo.servo_id in _goals(packet, protocol) for packet in since]
+        assert True in goals
+        assert True in looks[: goals.index(True)], "it got a goal before its model was read"
+
+
+@pytest.mark.parametrize("protocol", [1.0, 2.0])
+def test_a_servo_of_a_group_that_was_let_go_gets_no_torque_when_it_is_back(
+    start, make_plan, make_x, protocol
+):
+    """Not even for a moment: it would catch a limb that a person holds in the hand."""
+    rig = start(make_x(returning=True) if protocol == 2.0 else _with(make_plan((1, 3, 5)), True))
+    servo = rig.buses[0].servos[1]
+    servo.silence()
+    cycles(rig, 20)
+    rig.hardware.let_go([1])
+    servo.reset()
+    servo.silence(False)
+    given = []
+    servo.registers.watch(("torque_enable",), lambda: given.append(servo.registers["torque_enable"]))
+    until_valid(rig)
+    cycles(rig, 5)
+    assert not any(given)
+    assert rig.torque() == [index != 1 for index in range(len(rig.buses[0].servos))]
+
+
+def test_a_servo_that_was_turned_out_of_its_limits_while_it_was_away_gets_no_torque(start, make_x):
+    rig = start(make_x(returning=True))
+    servo, plan = rig.buses[0].servo(13), rig.plans[0].servos[2]
+    servo.silence()
+    cycles(rig, 20)
+    servo.reset()
+    servo.turn_by_hand((plan.upper_tick + 30) * plan.rad_per_tick)
+    servo.silence(False)
+    cycles(rig, 100)
+    assert rig.torque() == [True, True, False, True]
+    assert "outside its limits" in rig.events.of(EventCode.SERVO_LOST)[-1][1]
+    servo.turn_by_hand(plan.upper_tick * plan.rad_per_tick)
+    cycles(rig, 60)
+    assert rig.torque() == [True] * 4
 
 
 def test_registers_that_a_reboot_took_are_written_again(start, make_x):
