@@ -111,12 +111,14 @@ def test_what_is_inside_all_limits_passes_unchanged(position, velocity):
     assert rig.events == []
 
 
-def test_a_joint_that_hangs_outside_its_limits_may_be_held_there():
-    rig = Rig(start=1.2)
-    assert rig.apply(1.2) == (1.2, pytest.approx(np.nan, nan_ok=True), Clamp(0))
-    assert rig.apply(1.1)[0] == 1.1
-    assert rig.apply(1.2)[0] == 1.1
-    assert rig.apply(0.5)[0] == 0.5
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_joint_that_hangs_outside_its_limits_may_be_held_there(side):
+    rig = Rig(start=side * 1.2)
+    assert rig.apply(side * 1.2) == (side * 1.2, pytest.approx(np.nan, nan_ok=True), Clamp(0))
+    assert rig.apply(side * 1.1)[0] == side * 1.1
+    assert rig.apply(side * 1.2)[0] == side * 1.1
+    assert rig.apply(side * 0.5)[0] == side * 0.5
+    assert rig.apply(side * 1.1)[0] == side * 1.0
 
 
 @pytest.mark.parametrize(

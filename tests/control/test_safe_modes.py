@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dxlrun.control.policy_plan import HOLD, LIMP, Policy, PolicyPlan, Step
-from dxlrun.control.safe_motion import MODES_NS, STAND_NS
+from dxlrun.control.safe_motion import ARRIVED, MODES_NS, SETTLE_NS, STAND_NS
 from dxlrun.mode import Mode
 
 PERIOD_NS = 20_000_000
@@ -72,3 +72,33 @@ def test_a_policy_does_not_wait_for_modes_for_ever(robot: Any) -> None:
     seen = ended(robot, "effort", HOLD, slow=True)
     assert len(seen) == MODES_NS // PERIOD_NS + 1
     assert np.array(seen)[:, 2:4].tolist() == [[0.0, 0.0]] * len(seen)
+
+
+@pytest.mark.parametrize(
+    ("off", "valid_after_ns", "lasts_ns"),
+    [
+        (0.0, 0, STAND_NS),
+        (0.9 * ARRIVED, 0, STAND_NS),
+        (-0.9 * ARRIVED, 0, STAND_NS),
+        (1.1 * ARRIVED, 0, SETTLE_NS),
+        (-1.1 * ARRIVED, 0, SETTLE_NS),
+        (0.0, 1 << 60, SETTLE_NS),  # an old position is none
+        (0.0, 200_000_000, 200_000_000),
+    ],
+)
+def test_a_pose_lasts_until_its_joints_are_there_or_settle_time_is_over(
+    robot: Any, off: float, valid_after_ns: int, lasts_ns: int
+) -> None:
+    robot.build(end_ns=PERIOD_NS, policies=PolicyPlan(on_exit=POSE))
+    record, there = robot.record, []
+
+    def read() -> None:
+        goal = record.goals.position[0]
+        if goal == pytest.approx(0.3, abs=1e-12):
+            there.append(record.woken_ns)
+        record.states.position[0] = goal + off
+        record.states.valid[0] = not there or record.woken_ns - there[0] >= valid_after_ns
+
+    robot.hardware.read = read
+    assert robot.loop.run().last == "limp"
+    assert there[-1] - there[0] == lasts_ns

@@ -7,6 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from dxlrun.control.gate import SLOW_SPEED
 from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.events import EventCode
 
@@ -123,6 +124,32 @@ def test_in_a_pause_time_stands_still_and_servos_are_held(watched):
     assert set(periods) == {PERIOD_NS}
     assert [cycle["cycle"] for cycle in robot.sink.cycles] == list(range(10))
     assert all(np.isnan(cycle["position"]).all() for cycle in robot.sink.cycles[3:7])
+
+
+def test_after_a_pause_goals_that_moved_away_are_approached_slowly(make_robot):
+    robot = make_robot(joints=1)
+    wanted, goals = [0.1], []
+
+    def follow(controller, step, *_):
+        if step == "update":
+            controller.context.commands.position[:] = wanted[-1]
+
+    def idle(_):
+        cycle = len(goals)
+        if cycle in {60, 70}:  # the slow second after the start is over
+            robot.ask("pause" if cycle == 60 else "resume")
+        elif cycle == 65:
+            wanted.append(-0.9)
+        elif cycle == 75:
+            robot.stop.request()
+
+    robot.script("arm", follow)
+    robot.build()
+    robot.hardware.idle = idle
+    robot.hardware.write = lambda: goals.append(robot.record.goals.position[0])
+    robot.loop.run()
+    assert goals[59] == goals[69] == 0.1
+    assert goals[70:73] == pytest.approx([0.1 - SLOW_SPEED * 0.02 * step for step in (1, 2, 3)])
 
 
 @pytest.mark.parametrize("kind", ["pause", "resume"])
