@@ -10,11 +10,15 @@ from typing import Any
 
 import pytest
 
+from dxlrun.control.policy_plan import TORQUE_STAYS
 from dxlrun.events import Severity
 from dxlrun.guardian import LastHand
 from dxlrun.heartbeat import Heartbeat, Phase
+from dxlrun.packets import PacketBatch
+from dxlrun.ring import Handover
 from dxlrun.run_processes import Memory, guardian_job
-from dxlrun.testing import plan_of
+from dxlrun.simulation import VirtualPorts
+from dxlrun.testing import plan_of, simulated_robot
 
 Start = Callable[..., Any]
 Limp = Callable[[Any], bool]
@@ -117,3 +121,41 @@ def test_the_guardian_holds_only_a_robot_that_was_running(
     said = LastHand(guardian_job(plan, {}, memory, take_over=False)).end((), "it died", Severity.ERROR)
     assert bool(limp) is not holds
     assert ("torque stays on" in " ".join(said)) is holds
+
+
+WHEELS = """\
+name: wheels
+loop: {rate: 50}
+buses: {main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, return_delay_time: 100 us}}
+joints:
+  left: {bus: main, id: 1, model: XM430-W350, reference: 0 deg, direction: 1, continuous: true}
+  lift: {bus: main, id: 2, model: XM430-W350, reference: 180 deg, direction: 1}
+controllers:
+  drive: {type: joint_group_velocity_controller, joints: [left]}
+policies: {on_fault: hold}
+"""
+
+
+def test_a_guardian_that_leaves_torque_on_stops_what_is_led_by_a_velocity(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "wheels.yaml").write_text(WHEELS)
+    robot = simulated_robot(tmp_path / "wheels.yaml", duration_s=0.4)
+    hardware, record, wheel = robot.robot.hardware, robot.record, robot.buses[0].servo(1)
+    hardware.start()
+    record.goals.velocity[0] = 2.0
+    for _ in range(3):
+        hardware.read()
+        hardware.write()
+        hardware.idle(robot.clock.wait_until(robot.clock.now_ns() + 20_000_000))
+    assert wheel.registers["goal_velocity"] > 0  # and the loop dies
+    memory = Memory.create(robot.plan)
+    Heartbeat(memory.heartbeat).enter(Phase.RUNNING)
+    hand = LastHand(guardian_job(robot.plan, {}, memory, take_over=False))
+    hand._clock = robot.clock  # type: ignore[assignment]  # the time of the simulated servos
+    lines = VirtualPorts(robot.clock, robot.buses)
+    monkeypatch.setattr(hand, "_take_over", lambda _: (lines, PacketBatch(Handover(lambda _: None))))
+    said = hand.end((), "it died", Severity.ERROR)
+    assert said == ["it died", TORQUE_STAYS, "left (ID 1 on bus main) stands: its goal is 0"]
+    assert wheel.registers["goal_velocity"] == 0
+    assert [servo.torque_on for servo in robot.buses[0].servos] == [True, True]
