@@ -24,7 +24,7 @@ from dxlrun.events import EVENT_SLOT, EventCode, EventRing, Severity
 from dxlrun.packets import PACKET_SLOT, PacketBatch, PacketKind
 from dxlrun.recording.header import LogHeader
 from dxlrun.recording.reader import read_log
-from dxlrun.recording.recorder import RecordedRing, RecorderJob
+from dxlrun.recording.recorder import _MOST_PER_TURN, Control, RecordedRing, Recorder, RecorderJob
 from dxlrun.ring import RingWriter
 
 Cycle = Callable[[int], bytes]
@@ -158,6 +158,24 @@ def test_what_was_overwritten_is_declared_and_counted(start: Start, cycle: Cycle
     assert event.code == EventCode.RECORDER_GAP
     assert "91 records of loop/cycles" in event.text
     assert recording.process.wait(60) == 1
+
+
+def test_what_waits_at_the_end_is_drained_however_much_it_is(
+    tmp_path: Path, header: LogHeader, layout: CycleLayout, cycle: Cycle
+) -> None:
+    """A recorder that was stopped while it was behind: two turns and a half are in the ring."""
+    count = 2 * _MOST_PER_TURN + 1000
+    memory = ring.create("cycles", layout.size, count)
+    writer, record = RingWriter(memory), cycle(0)
+    for _ in range(count):
+        writer.append(record)
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        job = RecorderJob(str(tmp_path / "run.mcap"), header, (RecordedRing("cycles", memory, "loop"),))
+        summary = Recorder(job, Control(theirs.fileno())).run(lambda: True)
+    os.close(memory)
+    assert summary.gaps == 0
+    assert len(read_log(tmp_path / "run.mcap").cycles) == count
 
 
 def test_a_record_of_another_robot_is_declared_not_written(start: Start, cycle: Cycle) -> None:

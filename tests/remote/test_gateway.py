@@ -209,6 +209,13 @@ def test_many_long_commands_leave_room_for_stop_too(desk, monkeypatch):
     assert [[command.kind for command in desk.take()] for _ in range(3)] == [["many"], ["many"], ["stop"]]
 
 
+def test_what_was_answered_leaves_its_room_to_the_next_ones(desk):
+    """Each long command takes nearly half of what may wait."""
+    for number in range(8):
+        desk.now += 10.0  # so that the allowance of its process is not what refuses it
+        assert desk.ask("POST", "/controllers/left/commands/many", {"count": 30_000})[0] == 200, number
+
+
 def test_one_process_may_ask_for_so_many_operations_a_second_but_stop_is_not_counted(desk):
     told = [desk.ask("POST", "/pause")[0] for _ in range(30)]
     assert told == [200] * int(MOST_OPERATIONS / 10) + [429] * (30 - int(MOST_OPERATIONS / 10))
