@@ -261,4 +261,4 @@ def test_injected_faults_of_the_run_are_listed_with_what_the_log_says_of_them(
     report = judge(wires, [long_before, noise, *entries, lost])
 
     assert [fault.text for fault in report.faults] == ["noise bytes=4", "lose servo=5"]
-    assert report.sentences[1] == "2 faults were injected; of 2 of them the log says nothing."
+    assert report.sentences[1] == "2 faults were injected; the log has no answer to 2 of them."

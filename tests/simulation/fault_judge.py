@@ -3,7 +3,8 @@
 1 every byte sent is a legal instruction; 2 no goal outside the limits, no step over the maximum; 3 no
 torque-on without a look at the servo first; 4 each recorded sample is what that servo sent in that cycle;
 5 the log has every byte; 6 each accepted command has a known client and is in the log; 7 each fault that
-somebody can see leaves an event, and no event comes before the first fault; 8 nobody who hears keeps torque.
+no run bears in silence leaves an event of its servo or bus, and no event is without a cause; 8 nobody who
+hears keeps torque.
 
 The packets are taken apart by fault_wire.py, which knows nothing of the host's code.
 """
@@ -16,9 +17,11 @@ from typing import Any
 
 from fault_wire import READ, Said, Told, data_of, instructions, states, written
 
+from dxlrun.analysis.bus import joints_of
+from dxlrun.analysis.ledger_faults import answered, uncaused
 from dxlrun.dynamixel.bus_plan import BusPlan
 from dxlrun.dynamixel.units import joint_position, ticks_in
-from dxlrun.events import EventCode, Severity
+from dxlrun.events import EventCode
 from dxlrun.packets import PacketKind
 from dxlrun.recording.reader import Log
 from dxlrun.simulation import LedgerEntry, SimulatedBus, SimulatedServo
@@ -38,16 +41,6 @@ BUMP = 0.1
 """rad: so near to where the servo stands is the goal with which it gets its torque again."""
 IDENTITY = 6
 """An item that begins before this address is part of who a servo is: model number, firmware, ID."""
-
-SILENT = frozenset((EventCode.READ_LOST, EventCode.SERVO_LOST))
-HEARD = frozenset((EventCode.READ_BACK, EventCode.SERVO_BACK))
-OF_A_FAULT = SILENT | {
-    EventCode.SERVO_ERROR,
-    EventCode.SERVO_LIMP,
-    EventCode.SERVO_REBOOTED,
-    EventCode.BUS_NOISE,
-    EventCode.PORT_LOST,
-}
 
 
 @dataclass
@@ -122,8 +115,7 @@ class Trial:
                 samples_are_what_was_sent(told, witness, bus, log)
             the_log_is_the_wire(mine, log, number)
             everybody_who_hears_is_limp(self.robot, number, started)
-        no_event_comes_before_the_first_fault(entries, log)
-        each_fault_that_shows_is_told(entries, log, self.robot)
+        faults_and_events_answer_each_other(entries, log)
 
 
 # Invariants 2 and 3
@@ -273,62 +265,11 @@ def everybody_who_hears_is_limp(robot: VirtualRobot, number: int, started: bool)
 # Invariant 7
 
 
-def no_event_comes_before_the_first_fault(entries: Sequence[LedgerEntry], log: Log) -> None:
-    first_ns = min((entry.t_ns for entry in entries if entry.note.startswith("fault: ")), default=1 << 62)
-    early = [
-        event
-        for event in log.events
-        if event.t_ns < first_ns and event.code in OF_A_FAULT and event.severity >= Severity.WARNING
-    ]
-    assert early == []
-
-
-def each_fault_that_shows_is_told(entries: Sequence[LedgerEntry], log: Log, robot: VirtualRobot) -> None:
-    """Look for the events of the faults that nobody can bear in silence, while the loop runs.
-
-    That is a servo that is mute or without power for three cycles and longer, and an adapter that is pulled.
-    A servo that was silent already has nothing to lose, and of two with one ID the other one answers.
-    """
-    times = {event.code: event.t_ns for event in log.events if event.code in _LOOP}
-    begin_ns = times.get(EventCode.LOOP_STARTED, 1 << 62)
-    end_ns = times.get(EventCode.LOOP_STOPPED, 0) - SOON_NS
-    shortest_ns = 4 * robot.plan.loop.period_ns
-    for entry in entries:
-        if not entry.note.startswith("fault: ") or not begin_ns < entry.t_ns < end_ns:
-            continue
-        fault = parse_fault(entry.note.removeprefix("fault: "))
-        lasts_ns = {"silence": 1 << 62, "reboot": 100 * MS, "brownout": 200 * MS, "unplug": 1 << 62}
-        if (fault.for_ns or lasts_ns.get(fault.kind, 0)) < shortest_ns or fault.kind not in lasts_ns:
-            continue
-        ((bus, simulated),) = (
-            pair for pair in zip(robot.plan.buses, robot.buses, strict=True) if pair[0].name == entry.bus
-        )
-        ids = {one.servo_id for one in alone(simulated)} & {fault.servo or one.servo_id for one in bus.servos}
-        whom = {one.joint for one in bus.servos if one.servo_id in ids}
-        if fault.kind == "unplug":
-            whom = {bus.name}
-        _told(entry, whom, log)
-
-
-def _told(entry: LedgerEntry, whom: set[str], log: Log) -> None:
-    silent: set[str] = set()
-    for event in log.events:
-        if event.t_ns <= entry.t_ns and event.code in SILENT | {EventCode.PORT_LOST}:
-            silent.add(event.source)
-        elif event.t_ns <= entry.t_ns and event.code in HEARD | {EventCode.PORT_BACK}:
-            silent.discard(event.source)
-    for source in whom - silent:
-        soon = [
-            event.code
-            for event in log.events
-            if event.source == source
-            and entry.t_ns <= event.t_ns <= entry.t_ns + SOON_NS
-            and event.code in OF_A_FAULT
-        ]
-        away = any(
-            event.code == EventCode.PORT_LOST and event.t_ns <= entry.t_ns + SOON_NS for event in log.events
-        )
-        assert soon or away, (entry.note, source)
-
-
-_LOOP = frozenset((EventCode.LOOP_STARTED, EventCode.LOOP_STOPPED))
+def faults_and_events_answer_each_other(entries: Sequence[LedgerEntry], log: Log) -> None:
+    """Look for the events of the faults that no run bears in silence, and for a fault behind each event."""
+    joints = joints_of(log)
+    faults = answered(entries, log.events, joints, 0, log.period_ns)
+    unnoticed = [(fault.seconds, fault.text, fault.unanswered) for fault in faults if fault.unanswered]
+    assert not unnoticed, unnoticed
+    causeless = uncaused(entries, log.events, joints, 0)
+    assert not causeless, causeless

@@ -15,7 +15,7 @@ import msgspec
 
 from dxlrun.analysis.bus import joints_of
 from dxlrun.analysis.ledger_alignment import Span, differing
-from dxlrun.analysis.ledger_faults import FaultAnswers, answered, faults_in
+from dxlrun.analysis.ledger_faults import FaultAnswers, UncausedEvent, answered, uncaused
 from dxlrun.analysis.ledger_lateness import Lateness, lateness
 from dxlrun.analysis.ledger_overruns import OverrunCauses, overrun_causes
 from dxlrun.analysis.ledger_streams import WAYS, Stream, Way, logged, seen
@@ -73,12 +73,16 @@ class LedgerReport:
     ledger: str
     same: bool
     """No difference but declared ones."""
+    good: bool
+    """The same, and each fault was noticed that no run bears in silence, and each event has a cause."""
     sentences: tuple[str, ...]
     buses: tuple[ComparedBus, ...]
     differences: tuple[Difference, ...]
     """In order of time."""
     faults: tuple[FaultAnswers, ...]
     """What was injected during the run."""
+    uncaused: tuple[UncausedEvent, ...]
+    """Events that tell of a fault where the ledger has none."""
     lateness: Lateness | None
     """None where no servo said anything."""
     causes: OverrunCauses | None
@@ -109,17 +113,22 @@ def compare(log: Log, entries: Sequence[LedgerEntry], ledger: Path) -> LedgerRep
         outside = sum(len(e.data) for e in by_bus[name] if not begin_ns <= e.t_ns <= end_ns)
         buses.append(_bus(name, packets, found, outside))
         differences += found
-    faults = answered(faults_in(of_run), log.events, joints_of(log), begin_ns)
+    joints = joints_of(log)
+    faults = answered(of_run, log.events, joints, begin_ns, log.period_ns)
+    causeless = uncaused(of_run, log.events, joints, begin_ns)
     late = lateness(log, of_run)
     causes = overrun_causes(log, by_bus)
+    same = not any(bus.differences for bus in buses)
     return LedgerReport(
         log=str(log.path),
         ledger=str(ledger),
-        same=not any(bus.differences for bus in buses),
-        sentences=(*_sentences(buses, faults), *_said_of(late, causes)),
+        same=same,
+        good=same and not causeless and not any(fault.unanswered for fault in faults),
+        sentences=(*_sentences(buses), *_said_of_faults(faults, causeless), *_said_of(late, causes)),
         buses=tuple(buses),
         differences=tuple(sorted(differences, key=lambda difference: difference.seconds)),
         faults=faults,
+        uncaused=causeless,
         lateness=late,
         causes=causes,
     )
@@ -153,7 +162,8 @@ def _by_bus(log: Log, entries: Sequence[LedgerEntry], ledger: Path) -> dict[str,
     for entry in entries:
         found.setdefault(entry.bus, []).append(entry)
     if len(found) == 1 and len(log.buses) == 1:
-        return {log.buses[0]: next(iter(found.values()))}
+        name = log.buses[0]
+        return {name: [entry._replace(bus=name) for entry in next(iter(found.values()))]}
     missing = [name for name in log.buses if name not in found]
     if missing:
         known = ", ".join(sorted(found))
@@ -232,7 +242,7 @@ def _bus(
     )
 
 
-def _sentences(buses: Sequence[ComparedBus], faults: Sequence[FaultAnswers]) -> list[str]:
+def _sentences(buses: Sequence[ComparedBus]) -> list[str]:
     bad = [bus for bus in buses if bus.differences]
     said: list[str] = []
     if bad:
@@ -246,11 +256,29 @@ def _sentences(buses: Sequence[ComparedBus], faults: Sequence[FaultAnswers]) -> 
     declared = sum(bus.declared for bus in buses)
     if declared:
         said.append(f"The log itself explains {counted(declared, 'difference', 'differences')}.")
+    return said
+
+
+def _said_of_faults(faults: Sequence[FaultAnswers], causeless: Sequence[UncausedEvent]) -> list[str]:
+    said: list[str] = []
     if faults:
         silent = sum(1 for fault in faults if not fault.answers)
-        borne = f"; of {silent} of them the log says nothing" if silent else "; the log has an event for each"
+        borne = f"; the log has no answer to {silent} of them" if silent else "; the log answers each"
         were = "fault was" if len(faults) == 1 else "faults were"
         said.append(f"{len(faults)} {were} injected{borne}.")
+    unnoticed = [fault for fault in faults if fault.unanswered]
+    if unnoticed:
+        first = unnoticed[0]
+        what = (
+            "1 fault that had to be noticed was not"
+            if len(unnoticed) == 1
+            else (f"{len(unnoticed)} faults that had to be noticed were not")
+        )
+        said.append(f"{what}: {first.text}, by no event of {', '.join(first.unanswered)} within 2 s.")
+    if causeless:
+        first_event = causeless[0]
+        what = "1 event has" if len(causeless) == 1 else f"{len(causeless)} events have"
+        said.append(f"{what} no cause in the ledger; the first: {first_event.name} of {first_event.source}.")
     return said
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from rich.console import Group
 from rich.text import Text
 
-from dxlrun.analysis.ledger_faults import FaultAnswers
+from dxlrun.analysis.ledger_faults import FaultAnswers, UncausedEvent
 from dxlrun.analysis.ledger_lateness import Lateness
 from dxlrun.analysis.ledger_overruns import OverrunCauses
 from dxlrun.analysis.ledger_report import ComparedBus, Difference, LedgerReport
@@ -22,12 +22,13 @@ _MOST_BYTES = 16
 
 def render_comparison(report: LedgerReport) -> Group:
     """Return what a terminal shows: sentences, then one table a subject that has something."""
-    style = "green" if report.same else "red"
+    style = "green" if report.good else "red"
     first, *others = report.sentences
     found = (
         buses_table(report.buses),
         differences_table(report.differences),
         faults_table(report.faults),
+        uncaused_table(report.uncaused),
         lateness_table(report.lateness),
         overruns_table(report.causes),
     )
@@ -100,12 +101,22 @@ def faults_table(faults: Sequence[FaultAnswers]) -> Table:
                 Cell(fault.bus),
                 Cell(fault.text),
                 Cell(microseconds(first.after_ms * 1000) if first else "-"),
-                Cell(
-                    f"{first.name}: {once(f'{first.source}: {first.text}')}" if first else "none within 2 s"
-                ),
+                Cell(f"{first.name}: {once(f'{first.source}: {first.text}')}" if first else "none within 2 s")
+                if not fault.unanswered
+                else Cell(f"none of {', '.join(fault.unanswered)} within 2 s", "error"),
             )
         )
     return Table(_title("Injected faults", len(faults)), columns, tuple(rows))
+
+
+def uncaused_table(events: Sequence[UncausedEvent]) -> Table:
+    """Return the events that tell of a fault where the ledger has none."""
+    columns = (Column("at, s"), Column("event", "name"), Column("text", "text"))
+    rows = tuple(
+        (Cell(f"{one.seconds:.6f}"), Cell(one.name, "error"), Cell(once(f"{one.source}: {one.text}")))
+        for one in events[:MOST_SHOWN]
+    )
+    return Table(_title("Events without a cause", len(events)), columns, rows)
 
 
 def lateness_table(late: Lateness | None) -> Table:

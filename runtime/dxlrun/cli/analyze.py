@@ -39,7 +39,8 @@ def analyze(
         from anywhere, and prints well. Needs matplotlib: `pip install 'dxlrun[report]'`.
     ledger
         Compare the log with the ledger of the simulated buses instead, byte by byte; the exit code is 1
-        when they differ, 2 when one of them cannot be read.
+        when they differ, when a lasting fault has no event or an event no cause, 2 when one of them cannot be
+        read.
     as_json
         Print the result as JSON; with several logs a list.
     debug
@@ -127,7 +128,7 @@ def _analyze_each(logs: Sequence[Path], console: Console, *, as_json: bool) -> i
 
 
 def _compare(log: Path, ledger: Path, *, as_json: bool) -> int:
-    """Say where a log and a ledger differ; return 1 when they do."""
+    """Say where a log and a ledger differ; return 1 when they do, or do not answer each other."""
     if not ledger.is_file():
         raise InputError(
             f"there is no ledger {ledger}; a run on simulated buses in real time leaves one beside its log, "
@@ -144,7 +145,7 @@ def _compare(log: Path, ledger: Path, *, as_json: bool) -> int:
         console.file.write(to_json(result).decode() + "\n")
     else:
         console.print(render_comparison(result))
-    return 0 if result.same else 1
+    return 0 if result.good else 1
 
 
 def _check_target(target: Path) -> None:

@@ -1,0 +1,91 @@
+"""The judge of runs with faults can fail: at an answer of another servo or kind, at none, at no cause."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+
+from dxlrun.analysis.ledger_report import compare
+from dxlrun.events import Event, EventCode
+from dxlrun.recording.reader import Log, read_log
+from dxlrun.simulation import LedgerEntry
+from dxlrun.testing import simulated_robot
+
+ROBOT = """\
+name: three
+loop: {rate: 50}
+buses:
+  main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, return_delay_time: 100 us}
+joints:
+"""
+JOINT = "  j{id}: {{bus: main, id: {id}, model: XM430-W350, reference: 180 deg, direction: 1}}\n"
+FAULT = "silence servo=2 at=500ms for=200ms"
+
+
+class Run(NamedTuple):
+    log: Log
+    entries: list[LedgerEntry]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory, judge: Any) -> Run:
+    """A run in which the second of three servos is silent for a while."""
+    directory = tmp_path_factory.mktemp("judged")
+    path, log = directory / "three.yaml", directory / "run.mcap"
+    path.write_text(ROBOT + "".join(JOINT.format(id=number) for number in (1, 2, 3)))
+    robot = simulated_robot(path, duration_s=3.0, log=log)
+    trial = judge.Trial.of(robot, [FAULT])
+    robot.run()
+    read = read_log(log)
+    trial.judge(read, started=True)
+    return Run(read, list(robot.ledger.entries))
+
+
+def of_another_servo(event: Event) -> Event | None:
+    return replace(event, source="j1") if event.source == "j2" else event
+
+
+def of_a_wrong_kind(event: Event) -> Event | None:
+    silent = event.code in {EventCode.READ_LOST, EventCode.SERVO_LOST}
+    return replace(event, code=EventCode.OVERRUN) if silent else event
+
+
+def missing(event: Event) -> Event | None:
+    return None if event.source == "j2" else event
+
+
+@pytest.mark.parametrize("changed", [of_another_servo, of_a_wrong_kind, missing])
+def test_a_fault_without_its_answer_fails(run: Run, judge: Any, changed: Callable[[Event], Event | None]):
+    events = tuple(event for event in map(changed, run.log.events) if event is not None)
+    log = replace(run.log, events=events)
+
+    with pytest.raises(AssertionError, match="silence servo=2"):
+        judge.faults_and_events_answer_each_other(run.entries, log)
+    report = compare(log, run.entries, Path("ledger"))
+    assert (report.same, report.good) == (True, False)
+    assert any(
+        sentence.startswith("1 fault that had to be noticed was not: silence servo=2") and "j2" in sentence
+        for sentence in report.sentences
+    )
+
+
+def test_an_event_without_a_fault_fails(run: Run, judge: Any):
+    entries = [entry for entry in run.entries if not entry.note.startswith("fault: ")]
+
+    with pytest.raises(AssertionError, match="read_lost"):
+        judge.faults_and_events_answer_each_other(entries, run.log)
+    report = compare(run.log, entries, Path("ledger"))
+    assert (report.same, report.good) == (True, False)
+    assert {one.source for one in report.uncaused} >= {"j2"}
+    assert "no cause in the ledger; the first: read_lost of j2." in report.sentences[-1]
+
+
+def test_a_fault_that_is_answered_is_good(run: Run):
+    report = compare(run.log, run.entries, Path("ledger"))
+    assert (report.good, report.uncaused) == (True, ())
+    (fault,) = report.faults
+    assert {answer.source for answer in fault.answers} == {"j2"}
