@@ -84,8 +84,7 @@ def test_a_quantity_becomes_the_nearest_tick(compile_text, text, value):
     ],
 )  # fmt: skip
 def test_a_register_that_cannot_be_declared_is_refused_with_the_reason(problems_in, text, said):
-    model = "XC330-T181" if "startup" in text else "XM430-W350"
-    (problem,) = problems_in(ROBOT.format(registers=f"{{{text}}}", model=model))
+    (problem,) = problems_in(ROBOT.format(registers=f"{{{text}}}", model="XM430-W350"))
     assert said in f"{problem.what}; {problem.mend}"
     assert problem.mark.line == 13
 

@@ -157,7 +157,7 @@ def module_plan() -> BusPlan:
 
 @pytest.fixture
 def make_rig(make_plan) -> Callable[..., Rig]:
-    def build(*plans, take_over=False, extra=(), position=None):
+    def build(*plans, take_over=False, extra=(), position=None, firmware=None):
         plans = plans or (make_plan(),)
         ledger = Ledger()
         clock = VirtualClock(1_000_000_000)
@@ -165,7 +165,11 @@ def make_rig(make_plan) -> Callable[..., Rig]:
         for plan in plans:
             servos = tuple(
                 ServoConfig(
-                    servo.servo_id, servo.model, position or 2.0 + 0.1 * servo.row, plan.return_delay_ns
+                    servo.servo_id,
+                    servo.model,
+                    position or 2.0 + 0.1 * servo.row,
+                    plan.return_delay_ns,
+                    firmware=firmware,
                 )
                 for servo in plan.servos
             )

@@ -1,9 +1,13 @@
 import math
+import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from dxlrun.control_table import all_tables
 from dxlrun.dynamixel import protocol2
+from dxlrun.dynamixel.bus_plan import RegisterValue
 from dxlrun.dynamixel.limp import limp
 from dxlrun.dynamixel.receiver import Receiver
 from dxlrun.dynamixel.units import joint_position
@@ -185,8 +189,7 @@ def test_an_overload_cuts_the_torque_and_the_servo_gets_no_more_goals(started):
     ],
 )
 def test_a_register_that_does_not_fit(make_rig, make_x, register, value, said):
-    model = "XL330-M288" if register == "startup_configuration" else "XM430-W350"
-    rig = make_rig(make_x((11, 12), model=model))
+    rig = make_rig(make_x((11, 12)))
     rig.buses[0].servo(12).poke(register, value)
     with pytest.raises(StartUpError) as caught:
         rig.hardware.start()
@@ -194,6 +197,48 @@ def test_a_register_that_does_not_fit(make_rig, make_x, register, value, said):
     problem = str(caught.value).splitlines()[0]
     assert "arm_12_joint (ID 12 on bus arm)" in problem
     assert said in problem
+
+
+WITH_STARTUP = [table.model for table in all_tables() if "startup_configuration" in table.items]
+
+
+@pytest.mark.parametrize("model", WITH_STARTUP)
+def test_no_model_starts_that_would_switch_its_torque_on_by_itself(make_rig, make_plan, model):
+    rig = make_rig(
+        make_plan((5,), protocol=2.0, model=model, reference=1.5, lower=-0.1, upper=0.1), position=1.5
+    )
+    rig.buses[0].servo(5).poke("startup_configuration", 1)
+    with pytest.raises(StartUpError, match=r"Startup Configuration \(\d+\) = 1, so it switches torque on"):
+        rig.hardware.start()
+    assert rig.torque() == [False]
+
+
+def test_all_x_servos_but_the_xl_320_have_a_startup_configuration():
+    x = [table.model for table in all_tables() if table.protocol == 2.0 and re.match(r"2?X", table.model)]
+    assert set(x) - set(WITH_STARTUP) == {"XL-320"}
+
+
+def test_older_firmware_is_not_asked_for_what_it_does_not_have(make_rig, make_x):
+    rig = make_rig(make_x((11,)), firmware=44)
+    rig.hardware.start()
+    assert rig.torque() == [True]
+    read = {int.from_bytes(packet[8:10], "little") for packet in rig.into_bus() if packet[7] == 0x02}
+    assert 10 in read
+    assert 60 not in read
+
+
+def test_a_declared_register_that_older_firmware_does_not_have_is_refused(make_rig, make_x):
+    plan = make_x((11, 12))
+    wanted = RegisterValue(60, 1, 0, "startup_configuration", True)
+    servos = tuple(replace(servo, registers=(wanted,)) for servo in plan.servos)
+    rig = make_rig(replace(plan, servos=servos), firmware=44)
+    with pytest.raises(StartUpError) as caught:
+        rig.hardware.start()
+    assert [packet for packet in rig.into_bus() if packet[7] not in (1, 2)] == []
+    assert str(caught.value).splitlines()[1] == (
+        "arm_12_joint (ID 12 on bus arm) has firmware 44, but Startup Configuration (60), which the robot "
+        "file declares, came with firmware 45: take it out of `registers`, or update the servo"
+    )
 
 
 def test_an_overload_behind_a_standing_alert_is_told(started):

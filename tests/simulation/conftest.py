@@ -187,11 +187,12 @@ def build_line(
     return_delay_ns: int = 500_000,
     start_ns: int = 0,
     load: Load | None = None,
+    firmware: int | None = None,
 ) -> Line:
     clock = VirtualClock(start_ns)
     ledger = Ledger()
     servos = tuple(
-        ServoConfig(servo_id, model, position, return_delay_ns, load or Load()) for servo_id in ids
+        ServoConfig(servo_id, model, position, return_delay_ns, load or Load(), firmware) for servo_id in ids
     )
     bus = SimulatedBus(BusConfig("main", baud_rate, servos, protocol), ledger, start_ns)
     return kind(clock, bus, ledger, VirtualPorts(clock, (bus,)))

@@ -194,27 +194,56 @@ def test_no_backup_with_torque_and_no_restoring_of_none(line2: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("model", "firmware", "knows"),
+    ("model", "firmware", "backs_up", "reads_fast"),
     [
-        ("XM430-W350", 44, False),
-        ("XM430-W350", 45, True),
-        ("XL330-M288", 45, False),
-        ("XL330-M288", 46, True),
-        ("PH54-200-S500", 11, False),
-        ("PH54-200-S500", 12, True),
-        ("2XL430-W250", 45, False),
-        ("MX-64", 45, False),
-        ("XL-320", 45, False),
+        ("XM430-W350", 44, False, False),
+        ("XM430-W350", 45, True, True),
+        ("XL330-M288", 45, False, False),
+        ("XL330-M288", 46, True, True),
+        ("XL330-M288", 52, True, True),
+        ("PH54-200-S500", 11, False, False),
+        ("PH54-200-S500", 12, True, True),
+        ("2XL430-W250", 44, False, False),
+        ("2XL430-W250", 45, True, False),
+        ("MX-64", 45, False, False),
+        ("XL-320", 45, False, False),
     ],
 )
 def test_backup_and_fast_reads_came_with_a_firmware(
-    make_line2: Any, model: str, firmware: int, knows: bool
+    make_line2: Any, model: str, firmware: int, backs_up: bool, reads_fast: bool
 ) -> None:
-    line = make_line2((1,), model)
-    line.servo().poke("firmware_version", firmware)
-    assert line.request(1, BACKUP, BACK_UP) == (DONE if knows else UNKNOWN)
+    line = make_line2((1,), model, firmware=firmware)
+    assert line.request(1, BACKUP, BACK_UP) == (DONE if backs_up else UNKNOWN)
     line.tell(BROADCAST, FAST_SYNC_READ, bytes.fromhex("0000 0200 01"))
-    assert bool(line.hear()) == knows
+    assert bool(line.hear()) == reads_fast
+
+
+@pytest.mark.parametrize(
+    ("model", "firmware"), [("XM430-W350", 44), ("2XC430-W250", 44), ("XC330-T288", 45), ("MX-106", 60)]
+)
+def test_startup_configuration_came_with_a_firmware(make_line2: Any, model: str, firmware: int) -> None:
+    line = make_line2((1,), model, firmware=firmware)
+    assert "startup_configuration" not in line.servo().registers
+    assert line.write_bytes(1, 60, b"\x01") == ErrorNumber.ACCESS
+    line.servo().reset()
+    assert line.get("torque_enable") == 0
+
+
+@pytest.mark.parametrize(
+    "model", ["XL430-W250", "2XC430-W250", "XM430-W350", "XD540-T270", "XW540-T260", "XL330-M288-FW51"]
+)
+def test_at_power_up_the_backup_comes_back_and_the_torque_on(make_line2: Any, model: str) -> None:
+    line = make_line2((1,), model)
+    line.set("startup_configuration", 3)
+    line.set("position_p_gain", 77)
+    assert line.request(1, BACKUP, BACK_UP) == DONE
+    line.set("position_p_gain", 5)
+    line.servo().reset()
+    assert (line.get("position_p_gain"), line.get("torque_enable"), line.get("backup_ready")) == (77, 1, 1)
+    line.servo().poke("startup_configuration", 0)
+    line.servo().reset()
+    assert line.get("position_p_gain") == line.servo().registers.table.items["position_p_gain"].initial
+    assert line.get("torque_enable") == 0
 
 
 @pytest.mark.parametrize(

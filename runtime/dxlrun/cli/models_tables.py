@@ -86,7 +86,7 @@ def items_of(table: ControlTable) -> Table:
             unit_of(first),
             f"{first.minimum}..{first.maximum}",
             _initial(first) if alone or same else f"{_initial(first)}..{_initial(last)}",
-            first.page,
+            first.page + (f", from firmware {first.firmware}" if first.firmware else ""),
         )
     return shown
 

@@ -35,6 +35,8 @@ class ControlItem:
     """SI units per tick."""
     page: str
     """Section of the manual's page of this model."""
+    firmware: int = 0
+    """First firmware version that has the item; 0: every one."""
 
     def encode(self, raw: int) -> bytes:
         """Return the bytes of a signed number of ticks; raises ValueError when they do not hold it."""

@@ -182,6 +182,7 @@ def _item(name: str, entry: Entry) -> ControlItem:
         unit=unit,
         scale=scale,
         page=str(entry["page"]),
+        firmware=number("firmware") if "firmware" in entry else 0,
     )
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Literal
 
 from dxlrun.control_table.item import ControlItem
@@ -72,6 +73,11 @@ class ControlTable:
     def size(self) -> int:
         """Number of bytes from address 0 to the end of the last item."""
         return max(item.address + item.size for item in self.items.values())
+
+    def with_firmware(self, firmware: int) -> ControlTable:
+        """Return the table that a servo of a firmware version has: without the items that came later."""
+        items = {name: item for name, item in self.items.items() if item.firmware <= firmware}
+        return self if len(items) == len(self.items) else replace(self, items=MappingProxyType(items))
 
 
 CAPABILITIES: Mapping[str, str] = {

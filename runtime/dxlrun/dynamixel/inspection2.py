@@ -53,7 +53,9 @@ class Inspector2(Inspector):
         items = self.table(servo).items
         found: dict[str, int] = {}
         for name in ITEMS:
-            if (item := items.get(name)) is None:
+            if (item := items.get(name)) is None or item.firmware > found.get(
+                "firmware_version", item.firmware
+            ):
                 continue
             reply = yield from persist(self.line.read(servo.servo_id, item.address, item.size))
             if not reply.answered:
@@ -61,6 +63,7 @@ class Inspector2(Inspector):
                 return False
             found[name] = self.after_start(servo, name, item.decode(reply.parameters))
         self.identity(servo, found["model_number"], found["firmware_version"])
+        self._declared(servo, found["firmware_version"])
         self.return_delay(servo, found["return_delay_time"])
         self.return_level(servo, found["status_return_level"])
         self._modes(servo, found)
@@ -70,6 +73,17 @@ class Inspector2(Inspector):
         self._ramp(servo, found.get("profile_acceleration", 0))
         self.torque(servo, found["torque_enable"])
         return True
+
+    def _declared(self, servo: ServoPlan, firmware: int) -> None:
+        """Refuse registers of the robot file that came with a newer firmware: the servo has no such item."""
+        items = self.table(servo).items
+        for item in (items[one.name] for one in servo.registers):
+            if item.firmware > firmware:
+                self.problem(
+                    servo,
+                    f"has firmware {firmware}, but {called(item)}, which the robot file declares, came with "
+                    f"firmware {item.firmware}: take it out of `registers`, or update the servo",
+                )
 
     def _modes(self, servo: ServoPlan, found: Mapping[str, int]) -> None:
         items = self.table(servo).items

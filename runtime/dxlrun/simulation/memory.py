@@ -68,7 +68,7 @@ class Memory:
     """
 
     def __init__(self, table: ControlTable, firmware: int) -> None:
-        self.table = table
+        self.table = table = table.with_firmware(firmware)
         self.firmware = firmware
         self.size = table.size
         """Bytes from address 0 to the end of the last item."""

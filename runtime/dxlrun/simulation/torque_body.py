@@ -205,13 +205,10 @@ class TorqueBody(Body):
 
     @property
     def keeps_backup(self) -> bool:
-        """True when it knows Control Table Backup: models with fast reads, since the same firmware, and Y.
+        """True when it knows Control Table Backup: it then has Backup Ready.
 
-        e-Manual, Protocol 2.0, Control Table Backup (0x20).
+        e-Manual, Protocol 2.0, Control Table Backup (0x20), and the models' pages, Backup Ready.
         """
-        first = self.memory.table.fast_sync_read_firmware
-        if first is not None:
-            return self.memory["firmware_version"] >= first
         return "backup_ready" in self.memory
 
     def back_up(self) -> int:
