@@ -110,6 +110,7 @@ def test_a_servo_that_was_silent_is_named(write: Make, cycle: Make, wire: Make) 
         wire(PacketKind.NOISE, 254, 1500, b"\xff\x00\xff"),
         wire(PacketKind.INSTRUCTION, 254, 2000, GOALS),
         wire(PacketKind.INSTRUCTION, 21, 3000, ASK_21),
+        wire(PacketKind.INSTRUCTION, 254, 4000, GOALS),
     ]
     report = analyze_log(write([cycle(0)], packets))
     elbow, head = report.servos
@@ -123,8 +124,8 @@ def test_a_servo_that_was_silent_is_named(write: Make, cycle: Make, wire: Make) 
     assert (elbow.reply_median_us, elbow.reply_max_us) == (640, 640)
     assert (head.servo_id, head.joint, head.asked, head.lost, head.replies) == (21, "head_yaw_joint", 2, 2, 0)
     (bus,) = report.buses
-    assert (bus.instructions, bus.broadcasts, bus.replies, bus.noise_bytes) == (4, 1, 1, 3)
-    assert (bus.bytes_out, bus.bytes_in) == (3 * 8 + 5, len(ANSWER) + 3)
+    assert (bus.instructions, bus.broadcasts, bus.replies, bus.noise_bytes) == (5, 2, 1, 3)
+    assert (bus.bytes_out, bus.bytes_in) == (3 * 8 + 2 * 5, len(ANSWER) + 3)
     assert report.verdict.sentences[1] == (
         "Replies are missing: servo 21 (head_yaw_joint) 2 of 2 times (100.00%); "
         "1 of 2 servos answered every time."
@@ -139,6 +140,7 @@ def test_at_most_three_silent_servos_are_named(write: Make, wire: Make, silent: 
         wire(PacketKind.INSTRUCTION, number, number * 1000, bytes([255, 255, number, 4, 2, 36, 6, 0]))
         for number in range(1, silent + 1)
     ]
+    packets.append(wire(PacketKind.INSTRUCTION, 254, 1_000_000, GOALS))
     sentence = analyze_log(write([], packets)).verdict.sentences[1]
     assert sentence.endswith(words)
     assert sentence.count("(main)") == 3
@@ -146,6 +148,7 @@ def test_at_most_three_silent_servos_are_named(write: Make, wire: Make, silent: 
 
 def test_a_late_reply_of_another_servo_is_nobodys_answer(write: Make, wire: Make) -> None:
     packets = [wire(PacketKind.INSTRUCTION, 21, 0, ASK_21), wire(PacketKind.STATUS, 5, 500, ANSWER)]
+    packets.append(wire(PacketKind.INSTRUCTION, 254, 1000, GOALS))
     elbow, head = analyze_log(write([], packets)).servos
     assert (elbow.replies, elbow.lost) == (1, 0)
     assert head.lost == 1

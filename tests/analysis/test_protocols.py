@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import pytest
+
 from dxlrun.analysis.report import analyze_log
 from dxlrun.packets import PacketKind
 
@@ -14,6 +16,10 @@ SYNC_READ = bytes.fromhex("fffffd00fe090082840004000102cefa")
 FAST_SYNC_READ = bytes.fromhex("fffffd00fe0a008a84000400030704fab5")
 """Servos 3, 7 and 4; the log is not asked whether the CRC is right."""
 BULK_READ_1 = bytes.fromhex("fffffe09920002032402072411")
+
+
+PING_ALL = bytes.fromhex("fffffd00fe0300013142")
+"""Asks no servo in particular; what was asked before it is not open any more."""
 
 
 def asks(wire: Make, at: int, data: bytes, servo_id: int = 254) -> Any:
@@ -35,6 +41,7 @@ def test_a_sync_read_asks_each_servo_of_its_list(write: Make, wire: Make) -> Non
         answers(wire, 700, 2, status(2)),
         asks(wire, 20_000, SYNC_READ),
         answers(wire, 20_500, 1, status(1)),
+        asks(wire, 40_000, PING_ALL),
     ]
     report = analyze_log(write([], packets))
     first, second = report.servos
@@ -47,7 +54,7 @@ def test_a_sync_read_asks_each_servo_of_its_list(write: Make, wire: Make) -> Non
 def test_one_fast_status_answers_for_all(write: Make, wire: Make) -> None:
     blocks = bytes([0, 3, 166, 0, 0, 0, 0x2E, 0x90, 0x80, 7, 1, 0, 0, 0, 0x11, 0x22])
     whole = bytes([0xFF, 0xFF, 0xFD, 0, 0xFE, 1 + len(blocks), 0, 0x55]) + blocks
-    packets = [asks(wire, 0, FAST_SYNC_READ), answers(wire, 300, 254, whole)]
+    packets = [asks(wire, 0, FAST_SYNC_READ), answers(wire, 300, 254, whole), asks(wire, 600, PING_ALL)]
     third, fourth, seventh = analyze_log(write([], packets)).servos
     assert (third.asked, third.lost, third.replies, third.errors) == (1, 0, 1, 0)
     assert (seventh.replies, seventh.errors, seventh.error_names) == (1, 1, ("alert",))
@@ -56,7 +63,8 @@ def test_one_fast_status_answers_for_all(write: Make, wire: Make) -> None:
 
 def test_a_bulk_read_of_protocol_1_asks_each_servo_of_its_list(write: Make, wire: Make) -> None:
     answer = bytes.fromhex("ffff030400000000f8")
-    first, second = analyze_log(write([], [asks(wire, 0, BULK_READ_1), answers(wire, 600, 3, answer)])).servos
+    packets = [asks(wire, 0, BULK_READ_1), answers(wire, 600, 3, answer), asks(wire, 900, BULK_READ_1)]
+    first, second = analyze_log(write([], packets)).servos
     assert (first.servo_id, first.asked, first.lost, first.replies) == (3, 1, 0, 1)
     assert (second.servo_id, second.asked, second.lost, second.replies) == (7, 1, 1, 0)
 
@@ -64,7 +72,7 @@ def test_a_bulk_read_of_protocol_1_asks_each_servo_of_its_list(write: Make, wire
 def test_a_stuffed_list_is_read_as_it_was_meant(write: Make, wire: Make) -> None:
     # a sync read of 253 bytes at address 65535: no table has it, but FF FF FD lies in the list
     stuffed = bytes.fromhex("fffffd00fe0a0082fffffdfd0005cefa")
-    (servo,) = analyze_log(write([], [asks(wire, 0, stuffed)])).servos
+    (servo,) = analyze_log(write([], [asks(wire, 0, stuffed), asks(wire, 900, PING_ALL)])).servos
     assert (servo.servo_id, servo.asked, servo.lost) == (5, 1, 1)
 
 
@@ -80,15 +88,27 @@ def test_errors_of_protocol_2_are_numbers_and_the_alert_a_bit(write: Make, wire:
 
 
 def test_a_broadcast_ping_asks_nobody_in_particular(write: Make, wire: Make) -> None:
-    ping = bytes.fromhex("fffffd00fe0300013142")
-    (servo,) = analyze_log(write([], [asks(wire, 0, ping), answers(wire, 500, 1, status(1))])).servos
+    (servo,) = analyze_log(write([], [asks(wire, 0, PING_ALL), answers(wire, 500, 1, status(1))])).servos
     assert (servo.asked, servo.lost, servo.replies) == (0, 0, 1)
 
 
 def test_a_read_of_one_servo_by_protocol_2_is_paired(write: Make, wire: Make) -> None:
     read = bytes.fromhex("fffffd0001070002840004001d15")
     packets = [asks(wire, 0, read, 1), answers(wire, 640, 1, status(1)), asks(wire, 900, read, 1)]
+    packets.append(asks(wire, 1900, PING_ALL))
     report = analyze_log(write([], packets))
     (servo,) = report.servos
     assert (servo.instructions, servo.asked, servo.lost, servo.reply_max_us) == (2, 2, 1, 640)
-    assert report.buses[0].broadcasts == 0
+    assert report.buses[0].broadcasts == 1
+
+
+@pytest.mark.parametrize(("rounds", "lost"), [(1, 0), (2, 1)])
+def test_what_is_open_where_the_log_ends_is_not_lost(write: Make, wire: Make, rounds: int, lost: int) -> None:
+    packets = []
+    for at in range(0, rounds * 20_000, 20_000):
+        packets += [asks(wire, at, SYNC_READ), answers(wire, at + 400, 1, status(1))]
+    report = analyze_log(write([], packets))
+    first, second = report.servos
+    assert (first.asked, first.lost) == (rounds, 0)
+    assert (second.asked, second.lost) == (rounds - 1, lost)
+    assert ("Replies are missing" in " ".join(report.verdict.sentences)) == bool(lost)

@@ -27,7 +27,8 @@ class Servo:
     """Pings and reads, also those of several servos at once: what it has to answer at every status return
     level."""
     lost: int
-    """Of `asked`, without a status packet of this servo before the bus' next instruction."""
+    """Of `asked`, without a status packet of this servo before the bus' next instruction. What is still open
+    where the log ends is in neither: its reply may have come a moment later."""
     replies: int
     """Status packets, acknowledged writes included."""
     errors: int
@@ -104,6 +105,11 @@ class _Pairing:
             self.counts[servo_id].lost += 1
         self.open = set()
 
+    def end(self) -> None:
+        for servo_id in self.open:
+            self.counts[servo_id].asked -= 1
+        self.open = set()
+
 
 def traffic(log: Log) -> tuple[tuple[Servo, ...], tuple[BusTraffic, ...]]:
     """Return the traffic per servo and per bus. Raises LogError when a packet cannot be read."""
@@ -128,7 +134,7 @@ def _count(packets: Iterable[LoggedPacket]) -> dict[int, _Count]:
         elif packet.kind == PacketKind.STATUS:
             for reply in replies(packet.servo_id, packet.data, pairing.asked):
                 pairing.answer(reply, packet.last_ns)
-    pairing.miss()
+    pairing.end()
     return pairing.counts
 
 
