@@ -114,3 +114,8 @@ def discard_log(log: Path) -> None:
     """Remove the log of a run that never came to the robot."""
     log.unlink(missing_ok=True)
     ledger_of(log).unlink(missing_ok=True)
+
+
+def incomplete_log(error: str) -> str:
+    """Return the sentence for a log that is not whole."""
+    return f"the log is incomplete: {error}"

@@ -29,7 +29,7 @@ from dxlrun.guardian import GuardianJob, LastHand
 from dxlrun.heartbeat import Heartbeat, Phase, Standstill
 from dxlrun.loop_process import Outcome
 from dxlrun.plurals import counted
-from dxlrun.run_log import discard_log, epoch_offset_ns, ledger_of, log_header, new_log
+from dxlrun.run_log import discard_log, epoch_offset_ns, incomplete_log, ledger_of, log_header, new_log
 from dxlrun.run_processes import (
     Memory,
     guardian_job,
@@ -259,7 +259,7 @@ class _Run:
         try:
             while (message := recorder.message(END_TIMEOUT_S)) is not None:
                 if "error" in message:
-                    self.sentences.append(f"the log is incomplete: {message['error']}")
+                    self.sentences.append(incomplete_log(str(message["error"])))
                 summary = message.get("summary")
                 if isinstance(summary, dict):
                     closed = True
@@ -337,7 +337,7 @@ def _summary(run: _Run, elapsed_s: float) -> RunSummary:
         elapsed_s=elapsed_s,
         sentences=tuple(sentences),
         remarks=(*refusals(run.grants, run.out), *outcome.remarks, *run.remarks),
-        log=str(run.log) if run.log else None,
+        log=str(run.log) if run.log and run.log.exists() else None,
         messages=run.messages,
     )
 

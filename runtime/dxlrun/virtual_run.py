@@ -28,7 +28,7 @@ from dxlrun.inbox import QueueInbox
 from dxlrun.packets import NoPackets, PacketBatch
 from dxlrun.recording.log_writer import LogWriter
 from dxlrun.ring import Handover
-from dxlrun.run_log import discard_log, log_header, new_log
+from dxlrun.run_log import discard_log, incomplete_log, log_header, new_log
 from dxlrun.run_summary import Progress, RunOptions, RunSummary
 from dxlrun.simulation import Ledger, Mechanics, SimulatedBus, VirtualPorts
 from dxlrun.simulation.mujoco_plant import mujoco_plant
@@ -111,6 +111,8 @@ class VirtualRobot:
         self.progress: Callable[[int, int], None] = lambda cycles, skipped: None
         """Called with both after each cycle."""
         self.messages = 0
+        self.log_error: str | None = None
+        """Why the log is not whole."""
         self._writer = LogWriter(log, log_header(plan, 0, virtual=True)) if log else None
         self._sinks = self._sinks_for(self._writer)
         self.robot = assemble(
@@ -170,7 +172,8 @@ class VirtualRobot:
         finally:
             self._sinks.packets.commit()
             if self._writer:
-                self.messages = self._writer.close().messages
+                summary = self._writer.close()
+                self.messages, self.log_error = summary.messages, summary.error
             self.ledger.close()
         return self.result
 
@@ -215,7 +218,9 @@ def run_virtual(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
             result, refused = LoopResult(0, 0, "fault"), error.sentences
         except KeyboardInterrupt:
             result = LoopResult(robot.cycles, robot.skipped, "stopped")
-    incomplete = () if ledger.error is None else (ledger.error,)
+    incomplete = [ledger.error] if ledger.error else []
+    if robot.log_error:
+        incomplete.append(incomplete_log(robot.log_error))
     sentences = (*refused, *((result.detail,) if result.detail else ()), *robot.failures, *incomplete)
     interrupted = robot.stop.requested and not sentences
     return RunSummary(
@@ -226,6 +231,6 @@ def run_virtual(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
         elapsed_s=time.monotonic() - began,
         sentences=sentences,
         remarks=(TORQUE_STAYS,) if result.last == "hold" else (),
-        log=str(log) if log else None,
+        log=str(log) if log and log.exists() else None,
         messages=robot.messages,
     )

@@ -106,7 +106,7 @@ def test_a_report_and_a_comparison_are_made_one_at_a_time(dxlrun: Callable, run:
 def test_a_ledger_that_cannot_be_is_refused_before_the_run(
     dxlrun: Callable, torso: Path, words: tuple[str, ...], sentence: str
 ):
-    said = dxlrun(torso, "--virtual", *words)
+    said = dxlrun(torso, "--virtual", "--duration", "1", *words)
     assert said.code == 2
     assert sentence in said.err
     assert list(Path().iterdir()) == []

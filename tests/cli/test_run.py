@@ -1,4 +1,5 @@
 import io
+import resource
 import signal
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -207,6 +208,46 @@ def test_a_signal_ends_a_run_on_virtual_time_with_its_summary_and_log(  # noqa: 
     assert len(recorded.cycles) == cycles
     assert not any(servo.torque_on for servo in robots[0].buses[0].servos)
     assert signal.getsignal(number) is before
+
+
+def full_disk(log: Path) -> None:
+    """Let no file of this process grow beyond what the log has."""
+    resource.setrlimit(resource.RLIMIT_FSIZE, (log.stat().st_size, resource.RLIM_INFINITY))
+
+
+@pytest.mark.parametrize(
+    ("harm", "said_of_it"),
+    [
+        (Path.unlink, "its file was deleted or moved by another program during the run"),
+        (full_disk, "writing the log stopped: File too large"),
+    ],
+)
+def test_a_log_that_is_gone_or_not_whole_is_no_good_run(  # noqa: PLR0917  fixtures
+    dxlrun: Callable,
+    torso: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    harm: Callable[[Path], None],
+    said_of_it: str,
+):
+    monkeypatch.chdir(tmp_path)
+
+    def harmed(robot: VirtualRobot, *arguments: object, **options: object) -> None:
+        born(robot, *arguments, **options)
+        robot.buses[0].at(500_000_000, lambda: harm(next(tmp_path.glob("logs/*.mcap"))))
+
+    born = VirtualRobot.__init__
+    monkeypatch.setattr(VirtualRobot, "__init__", harmed)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        said = dxlrun(torso, "--virtual", "--duration", "1")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+    assert said.code == 1
+    assert f"bioloid_torso: the log is incomplete: {said_of_it}" in said.errors
+    assert said.out.startswith("bioloid_torso: failed. ")
+    assert ("next: dxlrun analyze" in said.out) == bool(list(tmp_path.glob("logs/*.mcap")))
 
 
 class Line:

@@ -287,3 +287,26 @@ def test_a_disk_that_is_full_at_the_end_is_said(log: LogWriter, tmp_path: Path, 
         summary = log.close()
     assert summary.error is not None
     assert summary.messages == 0
+
+
+@pytest.mark.parametrize("what", ["deleted", "moved", "replaced"])
+def test_a_file_that_is_gone_is_said(log: LogWriter, tmp_path: Path, cycle: Cycle, what: str) -> None:
+    path, elsewhere = tmp_path / "run.mcap", tmp_path / "elsewhere.mcap"
+    log.cycle(cycle(0))
+    log.flush()
+    path.rename(elsewhere)
+    if what == "deleted":
+        elsewhere.unlink()
+    if what == "replaced":
+        path.write_bytes(b"another")
+    assert log.close().error == "its file was deleted or moved by another program during the run"
+
+
+def test_a_file_that_was_cut_is_said_and_gets_no_hole(log: LogWriter, tmp_path: Path, cycle: Cycle) -> None:
+    path = tmp_path / "run.mcap"
+    log.cycle(cycle(0))
+    log.flush()
+    os.truncate(path, 100)
+    log.cycle(cycle(1))
+    assert log.close().error == "writing the log stopped: the file was cut by another program"
+    assert path.stat().st_size == 100

@@ -250,6 +250,22 @@ def test_a_directory_that_takes_no_log_is_one_sentence(start: Start, tmp_path: P
     assert "internal" not in err
 
 
+def test_a_log_that_is_deleted_in_the_run_fails_it(start: Start, all_limp: Limp) -> None:
+    run = start()
+    run.wait_until_moving()
+    log = run.one("*.mcap")
+    log.unlink()
+    run.signal(signal.SIGINT)
+    code, out, err = run.finish()
+    assert code == 1
+    assert err == (
+        "pair: the log is incomplete: its file was deleted or moved by another program during the run\n"
+    )
+    assert "good" not in out
+    assert str(log) not in out
+    assert all_limp(run)
+
+
 def test_a_closed_terminal_does_not_matter_to_the_robot(start: Start, all_limp: Limp) -> None:
     run = start("--duration", "0.5")
     assert run.process.stdout is not None

@@ -48,7 +48,7 @@ class LogSummary:
     gaps: int
     """Records that the recorder did not get from the rings."""
     error: str | None = None
-    """Why writing stopped early: a full disk."""
+    """Why the log is not whole: a full disk, a file that was deleted."""
     unwritten: int = 0
     """Messages that were lost with the unfinished chunk when writing stopped, and records that came later."""
 

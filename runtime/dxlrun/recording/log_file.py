@@ -11,19 +11,22 @@ LOG_MODE = 0o640
 
 
 class LogFile:
-    """Unbuffered bytes on a disk; every method raises OSError when the disk does not take them."""
+    """Unbuffered bytes on a disk; every method raises OSError when the disk does not take or keep them."""
 
-    __slots__ = ("_descriptor", "_size")
+    __slots__ = ("_descriptor", "_path", "_size")
 
     def __init__(self, path: Path) -> None:
         self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, LOG_MODE)
         if os.fstat(self._descriptor).st_size:  # empty is how a name is taken before a log begins
             os.close(self._descriptor)
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
+        self._path = path
         self._size = 0
 
     def write(self, data: bytes | bytearray | memoryview) -> int:
         """Write all of `data`; the kernel may take it in pieces, and the last piece tells of a full disk."""
+        if os.fstat(self._descriptor).st_size < self._size:
+            raise OSError(errno.EIO, "the file was cut by another program")
         rest = memoryview(data)
         while rest:
             rest = rest[os.write(self._descriptor, rest) :]
@@ -42,10 +45,21 @@ class LogFile:
         os.fdatasync(self._descriptor)
 
     def truncate(self, size: int) -> None:
-        """Cut what lies behind `size`."""
+        """Cut what lies behind `size`; a file that is shorter stays so."""
+        size = min(size, os.fstat(self._descriptor).st_size)
         os.ftruncate(self._descriptor, size)
         os.lseek(self._descriptor, size, os.SEEK_SET)
         self._size = size
+
+    @property
+    def gone(self) -> bool:
+        """Whether another program deleted, moved or replaced the file."""
+        ours = os.fstat(self._descriptor)
+        try:
+            there = self._path.stat()
+        except OSError:
+            return True
+        return (there.st_dev, there.st_ino) != (ours.st_dev, ours.st_ino)
 
     def close(self) -> None:
         """Let go of the file."""

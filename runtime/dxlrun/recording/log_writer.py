@@ -272,7 +272,10 @@ class LogWriter:
             self._give_up(error)
 
     def close(self) -> LogSummary:
-        """Finish the file and return what is in it; a second call returns the same."""
+        """Finish the file and return what is in it; a second call returns the same.
+
+        Its error tells too when the file is not there any more.
+        """
         if self._summary is not None:
             return self._summary
         if self.error is None:
@@ -280,6 +283,8 @@ class LogWriter:
                 self._finish()
             except OSError as error:
                 self._give_up(error)
+        if self._file.gone:
+            self.error = "its file was deleted or moved by another program during the run"
         size = self._file.tell()
         self._file.close()
         self._summary = LogSummary(self._messages, size, self._lost, self.error, self._unwritten)
