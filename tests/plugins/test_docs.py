@@ -19,6 +19,8 @@ COMMANDS = [
     line.strip() for line in PAGE.splitlines() if line.startswith("    ") and not line.startswith("     ")
 ]
 Shell = Callable[..., Any]
+pytestmark = pytest.mark.timeout(400)
+"""Each builds and installs packages, with what they depend on from an index."""
 
 
 @pytest.fixture

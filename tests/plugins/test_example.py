@@ -17,6 +17,8 @@ EXAMPLE = ROOT / "plugins" / "example"
 README = (EXAMPLE / "README.md").read_text()
 COMMANDS = [line.strip() for line in README.splitlines() if line.startswith("    dxlrun")]
 Shell = Callable[..., Any]
+pytestmark = pytest.mark.timeout(400)
+"""The first of them builds and installs packages, with what they depend on from an index."""
 
 
 @pytest.fixture

@@ -1,0 +1,100 @@
+"""The tests themselves: each has a time limit, draws the same examples at each run, and is in the sdist."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tarfile
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+ROOT = Path(__file__).parents[1]
+SHIPPED = ("docs", "plugins", "robots", "runtime", "tests")
+QUICK = ("tests/control/test_real_time_page.py", "tests/description/test_documents.py", "tests/packets")
+"""Tests that take few seconds, and read docs, robots, plugins and the runtime's own sources."""
+
+
+def run(*words: str, directory: Path = ROOT) -> subprocess.CompletedProcess[str]:
+    """Run this interpreter without the options that the tests' own run was given."""
+    environment = {key: value for key, value in os.environ.items() if not key.startswith(("PYTEST", "COV_"))}
+    return subprocess.run(
+        [sys.executable, *words], cwd=directory, env=environment, capture_output=True, text=True, check=False
+    )
+
+
+def pytest_on(source: str, directory: Path, *options: str) -> subprocess.CompletedProcess[str]:
+    """Run pytest on one test file, with the settings of this suite."""
+    path = directory / "test_made_up.py"
+    path.write_text(source)
+    config = ("-c", str(ROOT / "pyproject.toml"), f"--rootdir={directory}", "-p", "no:cacheprovider")
+    (directory / "conftest.py").write_text((ROOT / "tests/conftest.py").read_text())
+    return run("-m", "pytest", "-q", *config, *options, str(path), directory=directory)
+
+
+def test_every_test_has_a_limit(pytestconfig: pytest.Config) -> None:
+    assert 0 < float(pytestconfig.getini("timeout")) <= 120
+
+
+def test_a_test_that_hangs_is_ended(tmp_path: Path) -> None:
+    hangs = "import threading\n\n\ndef test_hang():\n    threading.Event().wait()\n"
+    ended = pytest_on(hangs, tmp_path, "--override-ini=timeout=0.3")
+    assert ended.returncode == 1
+    assert "Timeout (>0.3s) from pytest-timeout" in ended.stdout
+
+
+def test_a_property_draws_the_same_examples_again() -> None:
+    drawn: list[list[int]] = [[], []]
+
+    def draw_into(examples: list[int]) -> None:
+        @settings(max_examples=20)
+        @given(st.integers())
+        def property_(number: int) -> None:
+            examples.append(number)
+
+        property_()
+
+    for examples in drawn:
+        draw_into(examples)
+    assert drawn[0] == drawn[1]
+
+
+def test_a_random_search_prints_how_to_repeat_its_find(tmp_path: Path) -> None:
+    fails = (
+        "from hypothesis import given, strategies as st\n\n\n@given(st.integers())\n"
+        "def test_small(number):\n    assert number < 1000\n"
+    )
+    found = pytest_on(fails, tmp_path, "--hypothesis-profile=search")
+    assert found.returncode == 1
+    assert "@reproduce_failure(" in found.stdout
+
+
+@pytest.fixture(scope="module")
+def unpacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The sdist, built and unpacked."""
+    directory = tmp_path_factory.mktemp("sdist")
+    built = run("-m", "hatchling", "build", "--target", "sdist", "--directory", str(directory))
+    assert built.returncode == 0, built.stdout + built.stderr
+    (archive,) = directory.glob("*.tar.gz")
+    with tarfile.open(archive) as tar:
+        tar.extractall(directory, filter="data")
+    return directory / archive.name.removesuffix(".tar.gz")
+
+
+def test_the_sdist_has_every_file_of_its_folders(unpacked: Path) -> None:
+    def files(root: Path) -> set[Path]:
+        found = (path for folder in SHIPPED for path in (root / folder).rglob("*") if path.is_file())
+        return {path.relative_to(root) for path in found if not {"__pycache__", "logs"} & set(path.parts)}
+
+    assert files(ROOT) - files(unpacked) == set()
+
+
+def test_the_tests_of_the_sdist_are_found_and_run(unpacked: Path) -> None:
+    options = ("-q", "-p", "no:cacheprovider")
+    collected = run("-m", "pytest", *options, "--collect-only", directory=unpacked)
+    assert collected.returncode == 0, collected.stdout[-4000:]
+    ran = run("-m", "pytest", *options, *QUICK, directory=unpacked)
+    assert ran.returncode == 0, ran.stdout[-4000:]
