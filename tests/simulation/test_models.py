@@ -130,7 +130,7 @@ def verdict1(item: ControlItem, value: int) -> int:
     """Return the error of writing a value to a servo of Protocol 1.0 as the factory made it: joint mode."""
     if item.access == "R" or not item.minimum <= value <= item.maximum:
         return RANGE_BIT
-    highest = {"moving_speed": 1023, "goal_torque": 1024 + 1023}.get(item.name, item.maximum)
+    highest = {"goal_torque": 1024 + 1023}.get(item.name, item.maximum)
     return RANGE_BIT if value > highest else 0
 
 
@@ -142,8 +142,6 @@ def verdict2(table: ControlTable, item: ControlItem, value: int) -> int:
         return 0 if value in allowed(item.name, table.model) else DATA_RANGE
     if item.name == "goal_position" and fnmatch.fnmatchcase(table.model, GOALS_BOUND_BY_LIMITS):
         return 0
-    if item.name == "moving_speed":  # XL-320, in joint mode
-        return 0 if value <= 1023 else DATA_RANGE
     return 0 if item.minimum <= value <= item.maximum else DATA_RANGE
 
 

@@ -198,6 +198,7 @@ def test_a_servo_around_0_finds_itself_around_0(make_line2: Any) -> None:
 def test_an_xl320_moves_by_its_own_items(make_line2: Any) -> None:
     line = make_line2((1,), "XL-320", position=2.0)
     assert line.get("present_position") == round(2.0 / math.radians(300) * 1023)
+    assert line.write_bytes(1, 32, (1024 + 200).to_bytes(2, "little")) == 0  # the direction does not count
     assert move(line, 800) == 800
     line.set("torque_enable", 0)
     assert line.set("control_mode", 1) == 0

@@ -52,7 +52,7 @@ def test_reads_beyond_the_table_are_range_errors_without_data(line: Any, address
         (24, (2,), ErrorBit.RANGE),
         (5, (255,), ErrorBit.RANGE),
         (30, low_high(1024), ErrorBit.RANGE),
-        (32, low_high(1024), ErrorBit.RANGE),  # a direction in joint mode
+        (32, low_high(2048), ErrorBit.RANGE),
         (49, (0, 0), ErrorBit.RANGE),
         (10, (0,), ErrorBit.RANGE),  # no item has this cell
         (34, (0, 1, 0, 2), ErrorBit.RANGE),  # good torque limit, then the read-only position
@@ -257,6 +257,23 @@ def test_moving_speed_in_joint_mode(make_line: Any, ticks: int, speed: float) ->
     line.clock.wait_until(line.clock.now_ns() + 300_000_000)
     assert line.servo().velocity == pytest.approx(speed * 2 * math.pi / 60)
     assert line.read(1, 38, 2) == round(speed / 0.111)
+
+
+@pytest.mark.parametrize("model", ["AX-12A", "RX-28", "MX-28"])
+def test_a_sync_write_with_the_direction_bit_of_the_speed_moves_a_joint(make_line: Any, model: str) -> None:
+    # pypot does so with `orientation: indirect`: goal position and moving speed in one row, bit 10 set
+    line = make_line((1, 2), model, position=2.0)
+    start = line.servo(1).position
+    line.send(0xFE, 0x83, 30, 4, 1, *low_high(700), *low_high(1024 + 100), 2, *low_high(700), *low_high(100))
+    assert line.hear() == b""
+    for servo_id in (1, 2):
+        assert line.read(servo_id, 30, 2) == 700
+    line.clock.wait_until(line.clock.now_ns() + 200_000_000)
+    unit = line.servo(1).registers.table.rad_s_per_tick
+    assert abs(line.servo(1).velocity) == pytest.approx(100 * unit, rel=1e-3)
+    assert line.servo(1).velocity == pytest.approx(line.servo(2).velocity)
+    assert line.servo(1).position != start
+    assert not [note for note in line.notes() if "refuse" in note]
 
 
 def test_clockwise_speed_has_bit_10(line: Any) -> None:

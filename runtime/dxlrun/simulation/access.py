@@ -61,6 +61,9 @@ class LockRules:
 
         A cell that no item owns, a read-only item, a locked one and a value out of its range are each a range
         error [i]; a goal outside the angle limits is an angle limit error (e-Manual, Goal Position (30)).
+
+        A Moving Speed with a direction bit is taken in joint mode too [i]: the manual says only "0 ~ 1,023
+        can be used", but pypot writes the bit to every motor with `orientation: indirect`, and Poppy moves.
         """
         if not run.cells.items:
             return ErrorBit.RANGE
@@ -82,8 +85,6 @@ class LockRules:
             return ErrorBit.RANGE  # e-Manual, Goal Torque (71): it cannot be bigger than Torque Limit
         if wheel_mode(memory):
             return 0
-        if item.name == "moving_speed" and wire > memory.table.max_speed_tick:
-            return ErrorBit.RANGE  # the direction bit belongs to wheel mode: "0 ~ 1,023 can be used"
         return ErrorBit.ANGLE_LIMIT if _beyond_angle_limits(memory, item.name, wire) else 0
 
     def _in_range(self, item: ControlItem, wire: int) -> bool:
@@ -157,8 +158,6 @@ class TorqueRules:
         memory = self._memory
         if (listed := self._choices.get(item.name)) is not None:
             return wire in listed
-        if item.name == "moving_speed" and not wheel_mode(memory):
-            return wire <= memory.table.max_speed_tick  # e-Manual, XL-320: the direction is for wheel mode
         if item.name != "goal_position" or self._one_turn():
             return in_range(item, wire) or self._within_wide_limits(item, wire)
         highest = round(_TURNS * math.tau / memory.table.rad_per_tick) - 1

@@ -145,7 +145,9 @@ class JointShaft(Shaft):
             goal = ticks * table.rad_per_tick
         else:
             goal = aimed[0] * table.rad_per_tick + self._turns_apart
-        speed = abs(memory.ticks("moving_speed")) * table.rad_s_per_tick or FREE
+        speed = (
+            abs(memory.ticks("moving_speed")) * table.rad_s_per_tick or FREE
+        )  # a direction does not count [i]
         ramp = aimed[2] * table.items["goal_acceleration"].scale if aimed[2] else FREE
         return goal, speed, ramp
 
