@@ -91,6 +91,22 @@ def test_registers_are_read_and_written_and_the_eeprom_only_when_it_was_asked_fo
     assert len(writes(finish())) == 3
 
 
+def test_a_tripped_bus_watchdog_is_shown_named_and_cleared(one):
+    servo, finish = one()
+    servo(1, "torque", "on", *NEW)
+    servo(1, "set", "bus_watchdog", "1", *NEW)  # the servo is stopped before the next command comes
+    assert servo(1, "get", "bus_watchdog", *NEW).out.split()[-2:] == ["255", "tripped"]
+    done = servo(1, "set", "goal_position", "1400", *NEW)
+    assert done.code == 0, done.err
+    assert "cleared Bus Watchdog (98), which was 255 (tripped): it had stopped the servo" in done.out
+    assert done.out.strip().endswith("is 1400")
+    servo(1, "set", "bus_watchdog", "1", *NEW)
+    asked = servo(1, "torque", "on", "--json", *NEW)
+    assert len(json.loads(asked.out)["done"]) == 2, asked.err
+    assert "Bus Watchdog" in json.loads(asked.out)["done"][0]
+    finish()
+
+
 REFUSED = [
     (("set", "id", "7"), "`dxlrun servo PORT ID id NEW` changes it"),
     (("set", "position_gain", "7"), "has no register position_gain; did you mean position_p_gain?"),

@@ -255,12 +255,12 @@ def test_a_servo_without_a_backup_refuses_to_take_it_back():
 def test_torque_comes_where_the_servo_stands(model, protocol):
     rig = Rig(model, protocol)
     before = rig.servo.position
-    assert "holds torque in position mode at tick" in rig.one.torque(True)
+    assert "holds torque in position mode at tick" in rig.one.torque(True)[0]
     rig.line.clock.wait_until(rig.line.clock.now_ns() + 1_000_000_000)
     assert rig.servo.torque_on
     assert rig.servo.position == pytest.approx(before, abs=0.01)
-    assert rig.one.torque(True) == "holds torque, as before"
-    assert rig.one.torque(False) == "holds no torque"
+    assert rig.one.torque(True) == ("holds torque, as before",)
+    assert rig.one.torque(False) == ("holds no torque",)
     assert not rig.servo.torque_on
 
 
@@ -271,7 +271,7 @@ def test_torque_comes_in_every_mode_and_moves_nothing(value, mode):
     rig = Rig()
     rig.one.write([rig.one.register("operating_mode", value)])
     before = rig.servo.position
-    assert f"holds torque in {mode} mode" in rig.one.torque(True)
+    assert f"holds torque in {mode} mode" in rig.one.torque(True)[0]
     rig.line.clock.wait_until(rig.line.clock.now_ns() + 1_000_000_000)
     assert rig.servo.torque_on
     assert rig.servo.position == pytest.approx(before, abs=0.01)
@@ -295,7 +295,7 @@ def test_torque_comes_to_a_wheel_of_protocol_1_and_moves_nothing():
     for name in ("cw_angle_limit", "ccw_angle_limit"):
         rig.one.write([rig.one.register(name, 0)])
     before = rig.servo.position
-    assert "holds torque in" in rig.one.torque(True)
+    assert "holds torque in" in rig.one.torque(True)[0]
     rig.line.clock.wait_until(rig.line.clock.now_ns() + 1_000_000_000)
     assert rig.servo.position == pytest.approx(before, abs=0.01)
 
@@ -333,3 +333,68 @@ def test_the_whole_control_table_of_every_model_can_be_read(protocol):
         one = Rig(table.model, protocol).one
         names = [name for name in table.items if not name.startswith("indirect_")]
         assert list(one.read(names, refused=True)) == names
+
+
+TRIPPED = (
+    "cleared Bus Watchdog (98), which was 255 (tripped): it had stopped the servo, as no instruction came"
+)
+STOOD = "holds torque in position mode at tick 1304, where it stood"
+
+
+def trip(rig, torque):
+    """Leave the servo as a killed run does: stopped by its Bus Watchdog, with a goal elsewhere."""
+    rig.servo.poke("goal_position", 3000)
+    rig.servo.poke("bus_watchdog", -1)
+    rig.servo.poke("torque_enable", torque)
+
+
+@pytest.mark.parametrize("torque", [0, 1])
+def test_torque_on_clears_a_tripped_bus_watchdog_and_holds_where_the_servo_stands(torque):
+    rig = Rig()
+    trip(rig, torque)
+    assert rig.one.torque(True) == (TRIPPED, STOOD)
+    rig.line.clock.wait_until(rig.line.clock.now_ns() + 1_000_000_000)
+    assert rig.servo.torque_on
+    assert rig.servo.registers["bus_watchdog"] == 0
+    assert rig.servo.position == pytest.approx(2.0, abs=0.002)
+
+
+def test_torque_on_clears_a_bus_watchdog_that_would_trip():
+    rig = Rig()
+    rig.servo.poke("bus_watchdog", 10)
+    armed = "cleared Bus Watchdog (98), which was 10: it would have stopped the servo after 200 ms without"
+    done = rig.one.torque(True)
+    assert done == (f"{armed} an instruction", STOOD)
+    rig.servo.poke("bus_watchdog", 10)
+    assert rig.one.torque(True) == (f"{armed} an instruction", "holds torque, as before")
+    rig.line.clock.wait_until(rig.line.clock.now_ns() + 1_000_000_000)
+    assert rig.servo.registers["bus_watchdog"] == 0
+
+
+@pytest.mark.parametrize("torque", [0, 1])
+def test_a_goal_that_is_written_clears_a_tripped_bus_watchdog(torque):
+    rig = Rig()
+    trip(rig, torque)
+    done = rig.one.write([rig.one.register("goal_position", 1500)])
+    assert done[0] == TRIPPED
+    assert done[-1].endswith("and is 1500")
+    assert (STOOD in done) == bool(torque)
+    assert (rig.servo.registers["bus_watchdog"], rig.servo.registers["goal_position"]) == (0, 1500)
+
+
+def test_a_bus_watchdog_that_is_armed_stays_where_only_a_goal_is_written():
+    rig = Rig()
+    rig.servo.poke("bus_watchdog", 10)
+    assert len(rig.one.write([rig.one.register("goal_position", 1500)])) == 1
+    assert rig.servo.registers["bus_watchdog"] == 10
+
+
+def test_other_registers_leave_a_tripped_bus_watchdog_and_a_register_of_it_is_shown_as_tripped():
+    rig = Rig()
+    trip(rig, 0)
+    done = rig.one.write([rig.one.register("position_p_gain", 500)])
+    assert done == ("Position P Gain (84) was 800 and is 500",)
+    assert rig.one.torque(False) == ("holds no torque, as before",)
+    assert rig.servo.registers["bus_watchdog"] == 255
+    done = rig.one.write([rig.one.register("bus_watchdog", 0)])
+    assert done == ("Bus Watchdog (98) was 255 (tripped) and is 0",)

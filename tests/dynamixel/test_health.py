@@ -6,7 +6,9 @@ from functools import partial
 
 import pytest
 
+from dxlrun.control_table import control_table
 from dxlrun.dynamixel import protocol1, protocol2
+from dxlrun.dynamixel.bus_plan import RegisterValue
 from dxlrun.dynamixel.reboots import RealtimeTicks, RebootCount
 from dxlrun.dynamixel.transaction import Outcome, Reply
 from dxlrun.events import EventCode
@@ -375,6 +377,23 @@ def test_a_loop_that_was_silent_for_too_long_revives_the_servos_that_stopped(sta
     ((source, text),) = rig.events.of(EventCode.WATCHDOG)
     assert source == "arm"
     assert "the Bus Watchdog has stopped the servos" in text
+
+
+def test_a_ramp_that_the_watchdog_reset_is_written_again(make_rig, make_x):
+    plan = make_x(watchdog=10)
+    item = control_table("XM430-W350").items["profile_acceleration"]
+    ramp = RegisterValue(item.address, item.size, 100, item.name)
+    rig = make_rig(replace(plan, servos=tuple(replace(servo, registers=(ramp,)) for servo in plan.servos)))
+    rig.hardware.start()
+    cycles(rig, 5)
+    rig.clock.wait_until(rig.clock.now_ns() + 300_000_000)
+    rig.torque()
+    assert [servo.registers["profile_acceleration"] for servo in rig.buses[0].servos] == [0] * 4
+    cycles(rig, 100)
+    assert [servo.registers["profile_acceleration"] for servo in rig.buses[0].servos] == [100] * 4
+    assert [servo.registers["bus_watchdog"] for servo in rig.buses[0].servos] == [10] * 4
+    written = [text for _, text in rig.events.of(EventCode.REGISTER_WRITTEN)]
+    assert written[-4:] == ["Profile Acceleration (108) was 0 and is 100"] * 4
 
 
 @pytest.mark.parametrize("watchdog", [10, 0])

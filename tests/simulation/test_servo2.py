@@ -302,13 +302,17 @@ def test_bus_watchdog_stops_and_closes_the_goals(line2: Any) -> None:
     line2.set("operating_mode", 1)
     line2.set("torque_enable", 1)
     line2.set("goal_velocity", 50)
+    line2.set("profile_velocity", 30)
+    line2.set("profile_acceleration", 20)
     assert line2.set("bus_watchdog", 100) == 0
     line2.wait(1.9)
+    assert (line2.get("profile_velocity"), line2.get("profile_acceleration")) == (30, 20)
     assert line2.get("goal_velocity") == 50
     assert line2.servo().velocity > 0
     line2.wait(2.5)
     assert line2.servo().velocity == 0
     assert line2.get("bus_watchdog") == 0xFF
+    assert (line2.get("profile_velocity"), line2.get("profile_acceleration")) == (0, 0)
     assert line2.set("goal_velocity", 150) == ErrorNumber.DATA_RANGE
     assert line2.set("goal_position", 150) == ErrorNumber.DATA_RANGE
     assert line2.set("bus_watchdog", 0) == 0

@@ -157,6 +157,10 @@ def _registers(values: Mapping[str, int], items: Mapping[str, ControlItem]) -> T
 
 def _meaning(item: ControlItem, value: int) -> str:
     """Return a value with its unit; empty for what has none."""
+    from dxlrun.dynamixel.inspection import tripped
+
+    if tripped(item, value):
+        return "tripped"
     if not item.unit:
         return ""
     quantity = item.decode(value.to_bytes(item.size, "little", signed=item.signed)) * item.scale

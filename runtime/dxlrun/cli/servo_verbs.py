@@ -83,7 +83,7 @@ def _get(one: OneServo, asked: Asked) -> None:
 
 def _set(one: OneServo, asked: Asked) -> None:
     from dxlrun.compile.registers import any_value
-    from dxlrun.dynamixel.inspection import called
+    from dxlrun.dynamixel.inspection import called, shown
 
     name, text = asked.words
     if name in _ELSEWHERE:
@@ -99,7 +99,8 @@ def _set(one: OneServo, asked: Asked) -> None:
     if not found.differs:
         asked.done.append(f"{item} is {wanted.value} already")
         return
-    change = f"{item} is {found.found} and becomes {wanted.value}"
+    assert found.found is not None  # noqa: S101  `differs` says so
+    change = f"{item} is {shown(one.table.items[name], found.found)} and becomes {wanted.value}"
     if wanted.eeprom:
         one.writable([wanted])
         if not asked.confirmed(f"{one.called}: {change} (EEPROM)"):
@@ -233,7 +234,7 @@ def _blink(one: OneServo, asked: Asked) -> None:
 
 
 def _torque(one: OneServo, asked: Asked) -> None:
-    asked.done.append(one.torque(asked.words[0] == "on"))
+    asked.done += one.torque(asked.words[0] == "on")
 
 
 def _whole(what: str, lowest: int, highest: int) -> Callable[[Asked], None]:

@@ -20,6 +20,8 @@ UNIT_NS = 20_000_000
 """One step of the register (e-Manual XM430-W350, Bus Watchdog (98))."""
 MOST_TICKS = 127
 """The longest time; beyond it stand the values that say that it has stopped."""
+RESET = ("profile_acceleration", "profile_velocity")
+"""What is 0 after it has stopped a servo (e-Manual XM430-W350, Bus Watchdog (98), step 4 of the example)."""
 LEAST_PERIODS = 3
 """It must bear two cycles that come to nothing (failures.md)."""
 

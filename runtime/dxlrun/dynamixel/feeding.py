@@ -7,8 +7,10 @@ from functools import partial
 
 from dxlrun.dynamixel import bus_watchdog
 from dxlrun.dynamixel.absent import NEVER
-from dxlrun.dynamixel.bus_plan import BusPlan
+from dxlrun.dynamixel.bus_plan import BusPlan, RegisterValue
 from dxlrun.dynamixel.gaps import Gaps, Urgency
+from dxlrun.dynamixel.plan import plan_line
+from dxlrun.dynamixel.registers import settle
 from dxlrun.dynamixel.transaction import Program
 from dxlrun.events import EventCode, EventSink, Severity
 
@@ -16,7 +18,8 @@ from dxlrun.events import EventCode, EventSink, Severity
 class Feeding:
     """Knows when the servos were last sent anything.
 
-    `stopped` is told who gets no goal before its torque was read again, `failed` who could not be revived.
+    `stopped` is told who gets no goal before its torque was read again, `failed` who could not be revived;
+    `registers` returns what a servo shall hold.
     """
 
     __slots__ = (
@@ -27,6 +30,7 @@ class Feeding:
         "_gaps",
         "_longest_ns",
         "_plan",
+        "_registers",
         "_reviving",
         "_stopped",
     )
@@ -39,6 +43,7 @@ class Feeding:
         events: EventSink,
         stopped: Callable[[int], None],
         failed: Callable[[int], None],
+        registers: Callable[[int], tuple[RegisterValue, ...]],
     ) -> None:
         self._plan = plan
         self._gaps = gaps
@@ -46,6 +51,7 @@ class Feeding:
         self._events = events
         self._stopped = stopped
         self._failed = failed
+        self._registers = registers
         self._longest_ns = plan.watchdog_ticks * bus_watchdog.UNIT_NS or NEVER
         self._fed_ns = 0
         self._reviving = [False] * len(away)
@@ -69,13 +75,25 @@ class Feeding:
             if self._reviving[index]:
                 continue
             self._reviving[index] = True
-            program = bus_watchdog.revive(plan, plan.servos[index])
+            program = self._revival(index)
             name = f"the Bus Watchdog of {plan.servos[index].joint}"
             self._gaps.add(program, partial(self._revived, index), Urgency.REPAIR, name, index)
         if fed:
             text = f"no instruction for {silent_ms} ms: the Bus Watchdog has stopped the servos"
             text = f"{text}; they are revived"
             self._events.emit(EventCode.WATCHDOG, Severity.ERROR, plan.name, text)
+
+    def _revival(self, index: int) -> Program[str]:
+        """Clear and arm a watchdog, and write again what it reset of the declared registers."""
+        plan, servo = self._plan, self._plan.servos[index]
+        problem = yield from bus_watchdog.revive(plan, servo)
+        reset = [one for one in self._registers(index) if one.name in bus_watchdog.RESET]
+        if problem or not reset:
+            return problem
+        settled = yield from settle(plan, servo, reset, plan_line(plan))
+        for joint, text in settled.written:
+            self._events.emit(EventCode.REGISTER_WRITTEN, Severity.INFO, joint, text)
+        return "; ".join(settled.problems)
 
     def _revived(self, index: int, problem: str) -> None:
         self._reviving[index] = False

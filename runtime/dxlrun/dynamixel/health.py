@@ -131,7 +131,13 @@ class Servos:
         self._lost = False
         self._gone: set[int] = set()  # who gets no torque any more, as its group's policy says
         self.feeding = Feeding(
-            plan, gaps, self.reads.away, events, self._stopped, lambda index: self._leave(index, 0)
+            plan,
+            gaps,
+            self.reads.away,
+            events,
+            self._stopped,
+            lambda index: self._leave(index, 0),
+            wanted.registers.wanted,
         )
         """Whether the Bus Watchdogs hear enough."""
         self._modes = wanted.modes

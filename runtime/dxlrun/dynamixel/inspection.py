@@ -65,6 +65,19 @@ def called(item: ControlItem) -> str:
     return f"{' '.join(words)} ({item.address})"
 
 
+def shown(item: ControlItem, raw: int) -> str:
+    """Return a value of an item as messages show it: that of a Bus Watchdog that ran out is `255 (tripped)`.
+
+    e-Manual XM430-W350, Bus Watchdog (98): -1 is "Bus Watchdog Error Status".
+    """
+    return f"{raw} (tripped)" if tripped(item, raw) else str(raw)
+
+
+def tripped(item: ControlItem, raw: int) -> bool:
+    """Return whether a value is that of a Bus Watchdog that ran out and stopped its servo."""
+    return item.name == "bus_watchdog" and raw in (-1, 0xFF)
+
+
 class Inspector:
     """Looks at the servos of one bus, one after the other, and collects what it finds."""
 

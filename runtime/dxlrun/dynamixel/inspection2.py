@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 from dxlrun.dynamixel.bus_plan import ServoPlan
-from dxlrun.dynamixel.inspection import Inspector, called, persist
+from dxlrun.dynamixel.inspection import Inspector, called, persist, shown, tripped
 from dxlrun.dynamixel.protocol2 import describe_hardware_error
 from dxlrun.dynamixel.transaction import Program
 
@@ -42,7 +42,6 @@ _DRIVE_BITS: Mapping[int, str] = MappingProxyType(
     }
 )
 """e-Manual XM430-W350, XM540, Drive Mode (10)"""
-_WATCHDOG_STOPPED = (-1, 0xFF)
 
 
 class Inspector2(Inspector):
@@ -138,9 +137,10 @@ class Inspector2(Inspector):
         # whatever an earlier run left is cleared at the start; it is told where the run arms none itself
         watchdog = 0 if self.plan.watchdog_ticks else found.get("bus_watchdog", 0)
         if watchdog:
+            item = items["bus_watchdog"]
             what = f"it would stop after {watchdog * 20} ms without an instruction"
-            if watchdog in _WATCHDOG_STOPPED:
+            if tripped(item, watchdog):
                 what = "it has stopped the servo"
             self.found.differences.append(
-                (servo.joint, f"{called(items['bus_watchdog'])} is {watchdog}, {what}; it is cleared")
+                (servo.joint, f"{called(item)} is {shown(item, watchdog)}, {what}; it is cleared")
             )

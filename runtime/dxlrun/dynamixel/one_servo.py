@@ -10,9 +10,9 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 
 from dxlrun.control_table import ControlItem, ControlTable, control_table
-from dxlrun.dynamixel import modes
+from dxlrun.dynamixel import bus_watchdog, modes
 from dxlrun.dynamixel.bus_plan import BusPlan, RegisterValue, ServoPlan
-from dxlrun.dynamixel.inspection import called, persist
+from dxlrun.dynamixel.inspection import called, persist, shown, tripped
 from dxlrun.dynamixel.line import LONGEST_RETURN_DELAY_NS, listen
 from dxlrun.dynamixel.patience import patient
 from dxlrun.dynamixel.plan import Wiring, bus_plan
@@ -94,13 +94,42 @@ class OneServo:
             raise self.fail("its Lock (47) is 1, which keeps the EEPROM as it is until its power is cut")
 
     def write(self, wanted: Sequence[RegisterValue]) -> tuple[str, ...]:
-        """Write the registers that differ, in order, and read each back; return what was written."""
+        """Write the registers that differ, in order, and read each back; return what was written.
+
+        Before goals, which a servo refuses while its Bus Watchdog is tripped, that is cleared.
+        """
         self.writable(wanted)
+        goals = any(one.name.startswith("goal_") for one in wanted)
+        cleared = self.clear_watchdog(armed=False) if goals else ()
         settled: Settled = self.run(settle(self.plan, self._servo, wanted, self.tool.line))
         if settled.problems:
             before = [f"written before that: {text}" for _, text in settled.written]
             raise ServoFault("\n".join([*settled.problems, *before]))
-        return tuple(text for _, text in settled.written)
+        return (*cleared, *(text for _, text in settled.written))
+
+    def clear_watchdog(self, *, armed: bool) -> tuple[str, ...]:
+        """Clear a Bus Watchdog that is tripped, `armed`: or would trip; return what was done, if anything.
+
+        A run that was killed leaves it so. A servo that was stopped with torque would go on to its old goal,
+        at full speed, as its profile was reset: its torque is off until it is held where it stands. Raises
+        ServoFault.
+        """
+        item = self.table.items.get("bus_watchdog")
+        if item is None:
+            return ()
+        raw = self.read([item.name], refused=True).get(item.name, 0)
+        if not (tripped(item, raw) or (armed and raw)):
+            return ()
+        stopped = tripped(item, raw) and self.holds_torque()
+        if stopped:
+            self.torque(False)
+        if problem := self.run(bus_watchdog.disarm(self.plan, self._servo)):
+            raise ServoFault(problem)
+        why = "it had stopped the servo, as no instruction came"
+        if not tripped(item, raw):
+            why = f"it would have stopped the servo after {raw * 20} ms without an instruction"
+        done = f"cleared {called(item)}, which was {shown(item, raw)}: {why}"
+        return (done, self._hold()) if stopped else (done,)
 
     # Torque and LED
 
@@ -108,13 +137,21 @@ class OneServo:
         """Say whether Torque Enable is on."""
         return bool(self.read(["torque_enable"])["torque_enable"])
 
-    def torque(self, on: bool) -> str:
-        """Switch the torque on where the servo stands, or off; read back. Return what was done."""
+    def torque(self, on: bool) -> tuple[str, ...]:
+        """Switch the torque on where the servo stands, or off; read back. Return what was done.
+
+        For the torque a Bus Watchdog that is tripped, or would trip, is cleared.
+        """
         if not on:
             written = self.write([self.register("torque_enable", 0)])
-            return "holds no torque" + ("" if written else ", as before")
-        if self.holds_torque():
-            return "holds torque, as before"
+            return ("holds no torque" + ("" if written else ", as before"),)
+        cleared = self.clear_watchdog(armed=True)
+        if not self.holds_torque():
+            return (*cleared, self._hold())
+        return cleared if len(cleared) > 1 else (*cleared, "holds torque, as before")
+
+    def _hold(self) -> str:
+        """Hold the servo where it stands; return what was done."""
         mode = self._mode()
         held = self.run(modes.hold(self.plan, self._servo, self._servo.mode_plan(mode)))
         if held.problem:

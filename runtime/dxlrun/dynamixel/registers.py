@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 from dxlrun.control_table import ControlItem, control_table
 from dxlrun.dynamixel.bus_plan import BusPlan, RegisterValue, ServoPlan
-from dxlrun.dynamixel.inspection import ATTEMPTS, called, persist, setup_line, who
+from dxlrun.dynamixel.inspection import ATTEMPTS, called, persist, setup_line, shown, who
 from dxlrun.dynamixel.line import Line
 from dxlrun.dynamixel.transaction import Outcome, Program, Reply
 
@@ -81,11 +81,12 @@ def settle(
         return settled
     for one in differing:
         problem = yield from write_register(plan, servo, one.register, line)
-        text = called(_item(plan, servo, one.register))
-        if problem:
+        item = _item(plan, servo, one.register)
+        if problem or one.found is None:
             settled.problems.append(f"{who(plan, servo)} {problem}")
         else:
-            settled.written.append((servo.joint, f"{text} was {one.found} and is {one.register.value}"))
+            text = f"{called(item)} was {shown(item, one.found)} and is {one.register.value}"
+            settled.written.append((servo.joint, text))
     return settled
 
 

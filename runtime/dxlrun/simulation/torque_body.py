@@ -129,6 +129,9 @@ class TorqueBody(Body):
             self._watch()
             return
         self.note(f"servo {self.servo_id}: bus watchdog after {units * 20} ms")
+        for name in _PROFILE:  # e-Manual, X series, Bus Watchdog (98), step 4 of the example
+            if name in self.memory:
+                self.poke(name, 0)
         self.poke("bus_watchdog", -1)
 
     def refusal(self, run: Run) -> int:
