@@ -206,3 +206,34 @@ def test_errors_come_together_and_warnings_with_them(problems_in: Find, robot_te
 
     assert [p.severity for p in found] == ["error", "error", "warning"]
     assert [p.mark for p in found[:2]] == sorted(p.mark for p in found[:2])
+
+
+def test_servos_of_the_other_protocol_are_errors_and_hide_no_others(problems_in: Find, robot_text: str):
+    text = robot_text.replace("protocol: 1.0", "protocol: 2.0").replace(
+        "[left_arm_joint, right", "[left_jiont, right", 1
+    )
+
+    what = [problem.what for problem in problems_in(text)]
+
+    assert what == [
+        "AX-12A of left_arm_joint speaks Protocol 1.0, bus main Protocol 2.0",
+        "AX-12A of right_arm_joint speaks Protocol 1.0, bus main Protocol 2.0",
+        "arms wants joint left_jiont, which the file does not have",
+    ]
+
+
+def test_one_servo_of_the_other_protocol_hides_nothing_of_its_bus(problems_in: Find, robot_text: str):
+    """It is named by an alias, which its own protocol alone has."""
+    text = (
+        robot_text.replace("model: AX-12A", "model: AX-12", 1)
+        .replace("rate: 50", "rate: 5000")
+        .replace("rate: 25", "rate: 5000")
+    )
+    text = text.replace("protocol: 1.0", "protocol: 2.0").replace(
+        "id: 2\n    model: AX-12A", "id: 2\n    model: XL430-W250"
+    )
+
+    what = [problem.what for problem in problems_in(text)]
+
+    assert what[0].startswith("one cycle on bus main takes ")
+    assert "AX-12 of left_arm_joint speaks Protocol 1.0, bus main Protocol 2.0" in what

@@ -221,3 +221,45 @@ def test_problems_of_robot_and_motion_files_come_together(problems_in: Find, rob
     found = problems_in(robot_text.replace("id: 2", "id: 1"), POSVEL + "x: 1\n")
 
     assert sorted(Path(p.mark.file).name for p in found) == ["motion0.yaml", "robot.yaml"]
+
+
+def many(samples: int, formula: str = "sin(t)") -> str:
+    part = """
+  - controller: spare
+    start: {start} s
+    duration: 4 s
+    samples: {samples}
+    joints:
+      left_arm_joint: {{position: "{formula}"}}
+      right_arm_joint: {{position: "{formula}"}}
+"""
+    parts = "".join(
+        part.format(start=10 * number, samples=count, formula=formula)
+        for number, count in enumerate((20, samples))
+    )
+    return f"name: swing\nmotions:{parts}"
+
+
+@pytest.mark.parametrize(
+    ("motion", "says"),
+    [
+        (
+            many(1_000_000),
+            "swing has 2000040 targets (samples x joints, of all parts); 200000 are allowed",
+        ),
+        (
+            many(90_000, "+".join(["(t + t)"] * 60)),
+            "characters of formulas to evaluate (samples x length, of all parts); 20000000 are allowed",
+        ),
+    ],
+)
+def test_what_would_take_minutes_is_refused_at_once(
+    problems_in: Find, robot_text: str, monkeypatch: pytest.MonkeyPatch, motion: str, says: str
+):
+    monkeypatch.setattr("dxlrun.compile.samples.Expression.at", lambda *_: pytest.fail("evaluated"))
+
+    (problem,) = problems_in(robot_text, motion)
+
+    assert says in problem.what
+    assert problem.mark.line == 14  # the part with the most
+    assert "lower samples" in problem.mend

@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import os
 import resource
+import tracemalloc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import lz4.frame
 import numpy as np
 import pytest
+import zstandard
+from mcap.data_stream import RecordBuilder
 from mcap.reader import make_reader
+from mcap.records import Chunk
+from mcap.stream_reader import StreamReader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.typesys.store import Typestore
 
@@ -20,6 +26,7 @@ from dxlrun.cycle import CycleLayout
 from dxlrun.errors import LogError
 from dxlrun.events import Event, EventCode, EventRing, Severity
 from dxlrun.packets import LoggedPacket, PacketBatch, PacketKind
+from dxlrun.recording import reader
 from dxlrun.recording.header import LogHeader, LogSummary, to_metadata
 from dxlrun.recording.log_writer import LogWriter
 from dxlrun.recording.reader import read_log
@@ -238,6 +245,117 @@ def test_a_log_whose_metadata_is_wrong_is_refused(
     LogWriter(tmp_path / "x", header).close()
     with pytest.raises(LogError, match="cannot read"):
         read_log(tmp_path / "x")
+
+
+@pytest.fixture
+def rewritten(log: LogWriter, tmp_path: Path, cycle: Cycle) -> Callable[[Callable[[Chunk], None]], Path]:
+    """Write a log of four chunks, the third of which is changed by hand."""
+
+    def rewritten(change: Callable[[Chunk], None]) -> Path:
+        path, chunks = tmp_path / "run.mcap", []
+        for number in range(4):
+            log.cycle(cycle(number))
+            log.flush()
+        log.close()
+        with path.open("rb") as stream:
+            records = [*StreamReader(stream, emit_chunks=True).records]
+        with path.open("wb") as stream:
+            stream.write(b"\x89MCAP0\r\n")
+            for record in records:
+                if isinstance(record, Chunk):
+                    chunks.append(record)
+                    if len(chunks) == 3:
+                        change(record)
+                builder = RecordBuilder()
+                record.write(builder)
+                stream.write(builder.end())
+            stream.write(b"\x89MCAP0\r\n")
+        return path
+
+    return rewritten
+
+
+Rewritten = Callable[[Callable[[Chunk], None]], Path]
+
+
+@pytest.mark.parametrize("size", [1 << 40, 2**64 - 1])
+def test_a_chunk_that_would_fill_the_memory_is_left_out(rewritten: Rewritten, size: int) -> None:
+    def change(chunk: Chunk) -> None:
+        chunk.uncompressed_size = size
+
+    log = read_log(rewritten(change))
+
+    assert log.cycles["cycle"].tolist() == [0, 1, 3]
+    assert log.damage == (
+        f"a chunk of messages is damaged and left out: it is {size} bytes long when decompressed, and a "
+        "chunk has 67108864 at most",
+    )
+
+
+@pytest.mark.parametrize("compress", [zstandard.compress, lz4.frame.compress])
+def test_a_chunk_that_is_longer_than_it_says_is_not_decompressed_further(
+    rewritten: Rewritten, compress: Callable[[bytes], bytes]
+) -> None:
+    def change(chunk: Chunk) -> None:
+        chunk.data, chunk.uncompressed_crc = compress(bytes(40 << 20)), 0
+        chunk.compression = "lz4" if compress is lz4.frame.compress else "zstd"
+
+    path = rewritten(change)
+    tracemalloc.start()
+    try:
+        log = read_log(path)
+        most = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+    assert log.cycles["cycle"].tolist() == [0, 1, 3]
+    assert log.damage == ("a chunk of messages is damaged and left out: it is not as long as it says",)
+    assert most < 10 << 20
+
+
+def test_a_file_becomes_only_so_many_times_as_long(
+    rewritten: Rewritten, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reader, "_LARGEST_CHUNK", 2 << 20)
+    monkeypatch.setattr(reader, "_MOST_EXPANDED", 0)
+
+    def change(chunk: Chunk) -> None:
+        chunk.data, chunk.uncompressed_size = zstandard.compress(bytes(2 << 20)), 2 << 20
+        chunk.uncompressed_crc = 0
+
+    assert "becomes more than 0 times as long when decompressed" in read_log(rewritten(change)).damage[0]
+
+
+@pytest.mark.parametrize("compression", ["lz4", ""])
+def test_a_log_that_another_tool_compressed_anew_is_read(rewritten: Rewritten, compression: str) -> None:
+    def change(chunk: Chunk) -> None:
+        data = zstandard.decompress(chunk.data)
+        chunk.data = lz4.frame.compress(data) if compression else data
+        chunk.compression = compression
+
+    log = read_log(rewritten(change))
+
+    assert (log.cycles["cycle"].tolist(), log.complete) == ([0, 1, 2, 3], True)
+
+
+def test_an_unknown_compression_is_said(rewritten: Rewritten) -> None:
+    def change(chunk: Chunk) -> None:
+        chunk.compression = "rar"
+
+    assert read_log(rewritten(change)).damage == (
+        "a chunk of messages is damaged and left out: its compression 'rar' is not known",
+    )
+
+
+def test_a_mode_that_is_none_is_said(
+    log: LogWriter, tmp_path: Path, cycle: Cycle, layout: CycleLayout
+) -> None:
+    record = np.frombuffer(bytearray(cycle(7)), dtype=layout.dtype)
+    record["mode"][0, 1] = 77
+    log.cycle(record.tobytes())
+    log.close()
+    with pytest.raises(LogError, match="cycle 7 has a mode of a servo that is not known"):
+        read_log(tmp_path / "run.mcap")
 
 
 def test_a_log_is_never_overwritten(log: LogWriter, tmp_path: Path, header: LogHeader) -> None:

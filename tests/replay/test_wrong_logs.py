@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dxlrun.analysis.bus import joints_of
 from dxlrun.errors import LogError, PlugInError
 from dxlrun.recording.reader import read_log
 from dxlrun.replay import replay_log
@@ -133,6 +134,35 @@ def test_a_plan_that_is_none_or_of_another_robot(pair_log: Path, changed: Change
         content.attachments["plan.json"] = json.dumps(plan).encode()
 
     assert "other controllers" in refused(changed(pair_log, other_controllers))
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"every": 0}, "there is no rate divider 0, as controller head has it in the plan"),
+        ({"joints": ["neck"]}, "there is no joint neck, as controller head has it in the plan"),
+    ],
+)
+def test_a_plan_that_no_compiler_has_made(
+    pair_log: Path, changed: Change, change: dict[str, object], says: str
+) -> None:
+    def damage(content: Any) -> None:
+        plan = json.loads(content.attachments["plan.json"])
+        (head,) = (one for one in plan["loop"]["controllers"] if one["name"] == "head")
+        head |= change
+        content.attachments["plan.json"] = json.dumps(plan).encode()
+
+    assert says in refused(changed(pair_log, damage))
+
+
+def test_a_plan_that_is_no_text(pair_log: Path, changed: Change) -> None:
+    def damage(content: Any) -> None:
+        plan = content.attachments["plan.json"]
+        plan = plan.replace(b'"main"', b'"m\xffin"').replace(b'"robot":"pair"', b'"robot":"p\xffir"')
+        content.attachments["plan.json"] = plan
+
+    assert "the plan in the log is not one of this dxlrun" in refused(changed(pair_log, damage))
+    assert joints_of(read_log(changed(pair_log, damage))) == {}
 
 
 def test_a_command_that_the_plan_has_not(pair_log: Path, changed: Change) -> None:

@@ -55,13 +55,37 @@ def test_a_line_that_was_cut_off_is_left_out(tmp_path: Path) -> None:
     assert read_ledger(path) == ENTRIES[:2]
 
 
+def entry(t_ns: object, late_ns: object = 0, note: str = "") -> str:
+    return f'{{"t_ns":{t_ns},"bus":"m","direction":"in","bytes":"","note":"{note}","late_ns":{late_ns}}}'
+
+
 @pytest.mark.parametrize(
-    "line", ["{", "[]", '{"t_ns": 1}', '{"t_ns":1,"bus":"m","direction":"up","bytes":"","note":""}']
+    "line",
+    [
+        "{",
+        "[]",
+        "null",
+        '{"t_ns": 1}',
+        '{"t_ns":1,"bus":"m","direction":"up","bytes":"","note":""}',
+        '{"t_ns":1,"bus":"m","direction":"in","bytes":"f","note":""}',
+        "[" * 100_000,
+        entry("Infinity"),
+        entry("NaN"),
+        entry(10**30),
+        entry(1, -(10**30)),
+    ],
 )
-def test_another_file_is_refused_by_name(tmp_path: Path, line: str) -> None:
+def test_another_file_is_refused_by_name_and_line(tmp_path: Path, line: str) -> None:
     path = tmp_path / "other.jsonl"
-    path.write_text(line + "\n")
-    with pytest.raises(LogError, match=r"other\.jsonl is not a ledger"):
+    path.write_text(f"{entry(1)}\n{line}\n{entry(2)}\n")
+    with pytest.raises(LogError, match=r"other\.jsonl is not a ledger of a simulated bus: line 2: "):
+        read_ledger(path)
+
+
+def test_bytes_that_are_no_text_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "other.jsonl"
+    path.write_bytes(entry(1, note="X").encode().replace(b"X", b"\xff") + b"\n")
+    with pytest.raises(LogError, match=r"other\.jsonl is not a ledger of a simulated bus: line 1: "):
         read_ledger(path)
 
 

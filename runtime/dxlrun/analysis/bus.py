@@ -192,6 +192,6 @@ def joints_of(log: Log) -> dict[tuple[str, int], str]:
     """Return the joint of each servo, by bus and ID, from the plan in the log."""
     try:
         plan = msgspec.json.decode(log.attachments.get("plan.json", b"{}"), type=_Planned)
-    except msgspec.MsgspecError:
+    except (msgspec.MsgspecError, ValueError):
         return {}  # a log without a readable plan still has packets
     return {(bus.name, servo.servo_id): servo.joint for bus in plan.buses for servo in bus.servos}

@@ -69,7 +69,7 @@ def _run(log: Log, report: Report) -> Table:
 def _buses(log: Log) -> Table:
     try:
         plan = msgspec.json.decode(log.attachments.get("plan.json", b"{}"), type=_Plan)
-    except msgspec.MsgspecError:
+    except (msgspec.MsgspecError, ValueError):
         plan = _Plan()  # a log without a readable plan still has buses, by name
     rows: list[tuple[str, str]] = []
     planned = {bus.name: bus for bus in plan.buses}

@@ -129,7 +129,7 @@ def _baud_rates(log: Log) -> dict[str, int]:
     """Return the rate of each bus by the log's plan; a log without one leaves waiting for the line unseen."""
     try:
         plan = msgspec.json.decode(log.attachments.get("plan.json", b"{}"), type=_Plan)
-    except msgspec.MsgspecError:
+    except (msgspec.MsgspecError, ValueError):
         return {}
     return {bus.name: bus.baud_rate for bus in plan.buses}
 

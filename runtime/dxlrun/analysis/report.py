@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -100,8 +101,8 @@ def to_json(report: Report) -> bytes:
 
 def _gaps(log: Log) -> int:
     """Return the records that were lost before the recorder; from the events where the log has no end."""
-    if SUMMARY_NAME in log.metadata:
-        return int(log.metadata[SUMMARY_NAME].get("gaps", "0"))
+    with suppress(KeyError, ValueError):
+        return int(log.metadata[SUMMARY_NAME]["gaps"])
     texts = (event.text for event in log.events if event.code == EventCode.RECORDER_GAP)
     return sum(int(match[0]) for match in (re.match(r"\d+", text) for text in texts) if match)
 

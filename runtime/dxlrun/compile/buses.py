@@ -38,7 +38,11 @@ def compile_buses(
         mark = description.marks.key("buses", name)
         if not any(joint.bus == name for joint in description.robot.joints.values()):
             problems.warning(mark, f"no joint stands on bus {name}", "it will not be opened; take it out")
-        wirings = [_wiring(joint, rows, modes) for joint in joints.values() if joint.described.bus == name]
+        wirings = [
+            _wiring(joint, rows, modes)
+            for joint in joints.values()
+            if joint.described.bus == name and joint.table.protocol == bus.protocol
+        ]
         if not wirings:
             continue
         try:

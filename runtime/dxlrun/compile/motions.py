@@ -20,14 +20,18 @@ from dxlrun.compile.controllers import CompiledController
 from dxlrun.compile.joints import CompiledJoint
 from dxlrun.compile.problems import Problems, suggestion
 from dxlrun.compile.reach import Interval
-from dxlrun.compile.samples import Sample, check_limits, formula_samples, listed_samples
+from dxlrun.compile.samples import Sample, check_limits, formula_samples, formula_texts, listed_samples
 from dxlrun.control.loop_plan import ScheduledCommand
 from dxlrun.description import MotionDescription
-from dxlrun.description.motion import PointsPart
+from dxlrun.description.motion import FormulaPart, PointsPart
 from dxlrun.errors import Mark
 
 LEAD_NS = 1_000_000_000
 """From handing over a trajectory that begins at t = 0 to its first point, as in the thesis."""
+MOST_TARGETS = 200_000
+"""Of all formulas of a motion file: 20 joints for 100 s at 100 Hz. One takes some 300 bytes and 5 us."""
+MOST_CHARACTERS = 20_000_000
+"""Of formulas, as often as they are evaluated: up to 0.5 us each, so 10 s."""
 SETTLE_NS = 1_000_000_000
 """From the last target to the end of the part, where the controller's `goal_time` says nothing."""
 
@@ -54,6 +58,8 @@ def compile_motion(
     """Return the parts that could be compiled; `names` are all controllers of the robot file."""
     limits = {name: Interval(joint.plan.lower, joint.plan.upper) for name, joint in joints.items()}
     parts: list[CompiledPart] = []
+    if not _affordable(motion, problems):
+        return parts
     for index, part in enumerate(motion.motion.motions):
         samples = _samples(motion, index, problems)
         controller = _controller(motion, index, controllers, names, problems)
@@ -79,6 +85,33 @@ def compile_motion(
             CompiledPart(str(motion.path), part.controller, part.start, end_ns, len(samples), commands)
         )
     return parts
+
+
+def _affordable(motion: MotionDescription, problems: Problems) -> bool:
+    """Say whether the formulas of a motion file can be sampled in a few seconds and some 100 MB."""
+    values: dict[int, int] = {}
+    characters: dict[int, int] = {}
+    for index, part in enumerate(motion.motion.motions):
+        if isinstance(part, FormulaPart):
+            values[index] = part.samples * len(part.joints)
+            characters[index] = part.samples * sum(map(len, formula_texts(part)))
+    good = True
+    for what, per_part, most in (
+        ("targets (samples x joints, of all parts)", values, MOST_TARGETS),
+        ("characters of formulas to evaluate (samples x length, of all parts)", characters, MOST_CHARACTERS),
+    ):
+        total = sum(per_part.values())
+        if total > most:
+            good = False
+            longest = max(per_part, key=lambda index: per_part[index])
+            problems.error(
+                motion.marks.value("motions", longest, "samples"),
+                f"{motion.motion.name} has {total} {what}; {most} are allowed",
+                "lower samples: a trajectory controller goes smoothly from one to the next"
+                if per_part is values
+                else "lower samples, or shorten the formulas",
+            )
+    return good
 
 
 def _samples(motion: MotionDescription, index: int, problems: Problems) -> tuple[Sample, ...]:

@@ -70,6 +70,12 @@ def listed_samples(
     return tuple(samples)
 
 
+def formula_texts(part: FormulaPart) -> tuple[str, ...]:
+    """Return every formula of a part."""
+    texts = (_text(formula, quantity) for formula in part.joints.values() for quantity in QUANTITIES)
+    return tuple(text for text in texts if text is not None)
+
+
 def formula_samples(
     motion: MotionDescription, index: int, part: FormulaPart, problems: Problems
 ) -> tuple[Sample, ...]:

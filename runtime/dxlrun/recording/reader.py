@@ -4,24 +4,27 @@ from __future__ import annotations
 
 import os
 import struct
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import IO, cast
 
+import lz4.frame
 import numpy as np
+import zstandard
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, McapRecord, Metadata
-from mcap.stream_reader import CRCValidationError, StreamReader, get_chunk_data_stream
+from mcap.stream_reader import StreamReader
 from numpy.typing import NDArray
-from zstandard import ZstdError
 
 from dxlrun.commands import TakenCommand, data_of
 from dxlrun.cycle import CycleLayout
 from dxlrun.errors import LogError
 from dxlrun.events import Event
+from dxlrun.mode import Mode
 from dxlrun.packets import LoggedPacket, PacketKind
 from dxlrun.recording import schemas
 from dxlrun.recording.cdr import ENCAPSULATION, Codec
@@ -31,7 +34,11 @@ _MAGIC = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
 _PACKET = struct.Struct("<qqBBxxI")
-_DAMAGE = (McapError, CRCValidationError, ZstdError, struct.error, UnicodeDecodeError, EOFError)
+_DAMAGE = (McapError, zstandard.ZstdError, struct.error, UnicodeDecodeError, EOFError)
+_LARGEST_CHUNK = 64 << 20
+"""Bytes of a chunk when decompressed; ours have 256 KiB and one message, those of other writers some MiB."""
+_MOST_EXPANDED = 256
+"""Bytes that a file may become for each of its own: logs of ours become 8 to 50 times as long."""
 
 
 @dataclass(slots=True)
@@ -44,6 +51,8 @@ class _Found:
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     damage: list[str] = field(default_factory=list)
     finished: bool = False
+    room: int = 0
+    """Bytes that the chunks which follow may have when they are decompressed."""
 
 
 @dataclass(frozen=True)
@@ -151,6 +160,9 @@ def _cycles(layout: CycleLayout, messages: list[bytes]) -> NDArray[np.void]:
         raise ValueError("the messages of /cycle are not as long as joints and controllers ask")
     bodies = b"".join(message[len(ENCAPSULATION) :] for message in messages)
     array: NDArray[np.void] = np.frombuffer(bodies, dtype=layout.dtype)
+    unknown = np.flatnonzero((array["mode"] > max(Mode)).any(axis=1))
+    if len(unknown):
+        raise ValueError(f"cycle {array['cycle'][unknown[0]]} has a mode of a servo that is not known")
     return array
 
 
@@ -204,7 +216,7 @@ def _events(messages: list[bytes]) -> tuple[Event, ...]:
 
 def _walk(stream: IO[bytes], size: int) -> _Found:
     """Go through the file from its start, record by record, until its end or to what cannot be read."""
-    found = _Found()
+    found = _Found(room=_LARGEST_CHUNK + _MOST_EXPANDED * size)
     stream.seek(0)
     reader = StreamReader(stream, emit_chunks=True, record_size_limit=size)
     records: Iterator[McapRecord] = reader.records
@@ -225,16 +237,44 @@ def _walk(stream: IO[bytes], size: int) -> _Found:
 def _take(record: McapRecord, found: _Found) -> None:
     if isinstance(record, Chunk):
         try:
-            chunk, _ = get_chunk_data_stream(record, validate_crc=True)
-            _split(chunk.read(record.uncompressed_size), found)
+            _split(_decompressed(record, found), found)
         except _DAMAGE as error:
-            found.damage.append(f"a chunk of messages is damaged and left out: {_said(error)}")
+            damage = f"a chunk of messages is damaged and left out: {_said(error)}"
+            if damage not in found.damage:
+                found.damage.append(damage)
     elif isinstance(record, Attachment):
         found.attachments[record.name] = record.data
     elif isinstance(record, Metadata):
         found.metadata[record.name] = record.metadata
     elif isinstance(record, Channel):
         found.channels[record.id] = record.topic
+
+
+def _decompressed(chunk: Chunk, found: _Found) -> bytes:
+    """Return the records of a chunk; EOFError when it is not what it says, or more than a log can have."""
+    size = chunk.uncompressed_size
+    if size > _LARGEST_CHUNK:
+        raise EOFError(f"it is {size} bytes long when decompressed, and a chunk has {_LARGEST_CHUNK} at most")
+    if size > found.room:
+        raise EOFError(f"the file becomes more than {_MOST_EXPANDED} times as long when decompressed")
+    found.room -= size
+    if chunk.compression == "zstd":
+        # not decompress(): it believes the length in the frame, whatever the chunk says
+        data = zstandard.ZstdDecompressor().stream_reader(chunk.data).read(size + 1)
+    elif chunk.compression == "lz4":
+        try:
+            data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
+        except RuntimeError as error:
+            raise EOFError(str(error)) from error
+    elif chunk.compression == "":
+        data = chunk.data
+    else:
+        raise EOFError(f"its compression {chunk.compression!r} is not known")
+    if len(data) != size:
+        raise EOFError("it is not as long as it says")
+    if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
+        raise EOFError("its bytes do not agree with their CRC")
+    return data
 
 
 def _split(data: bytes, found: _Found) -> None:

@@ -143,7 +143,7 @@ def _plan(log: Log) -> RecordedPlan:
         raise LogError(f"{log.path}: the log has no attachment {PLAN}, so nobody knows its controllers")
     try:
         plan = msgspec.json.decode(data, type=RecordedPlan)
-    except msgspec.MsgspecError as error:
+    except (msgspec.MsgspecError, ValueError) as error:
         raise LogError(
             f"{log.path}: the plan in the log is not one of this dxlrun ({error}): replay it with the dxlrun "
             f"that made it, {_version(log)}"
@@ -154,7 +154,20 @@ def _plan(log: Log) -> RecordedPlan:
         controller.name for controller in log.controllers
     ):
         raise LogError(f"{log.path}: the plan in the log has other controllers than its cycles")
+    _check_controllers(log, plan.loop)
     return plan
+
+
+def _check_controllers(log: Log, loop: LoopPlan) -> None:
+    """Refuse controllers that no compiler has made: with an unknown joint, or a rate divider below 1."""
+    for controller in loop.controllers:
+        unknown = set(controller.joints) - set(log.joints)
+        if unknown or controller.every < 1:
+            what = f"no joint {min(unknown)}" if unknown else f"no rate divider {controller.every}"
+            raise LogError(
+                f"{log.path}: there is {what}, as controller {controller.name} has it in the plan: "
+                "the log is damaged"
+            )
 
 
 def _version(log: Log) -> str:

@@ -22,6 +22,9 @@ _BUFFER = 1 << 16
 SOME_ENTRIES, _MOST_ENTRIES = 24, 256
 """So many are encoded together, where there is time for it and at the latest."""
 
+_LATEST_NS = 1 << 62
+"""73 years on the clock of the machine; differences of two such times fit into 64 bits."""
+
 FLUSH_NS = 500_000_000
 """A ledger file is never further behind than this."""
 
@@ -213,23 +216,31 @@ def read_ledger(path: Path) -> tuple[LedgerEntry, ...]:
 
     Raises LogError when another line is not an entry, OSError when the file cannot be read.
     """
-    lines = path.read_text(encoding="ascii").split("\n")
+    lines = path.read_bytes().split(b"\n")
     complete = lines[:-1]  # what follows the last newline is empty, or was cut off
+    entries: list[LedgerEntry] = []
     try:
-        return tuple(_entry(json.loads(line)) for line in complete)
-    except (ValueError, KeyError, TypeError) as error:
-        raise LogError(f"{path} is not a ledger of a simulated bus: {error}") from error
+        for line in complete:
+            entries.append(_entry(json.loads(line)))
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+        raise LogError(
+            f"{path} is not a ledger of a simulated bus: line {len(entries) + 1}: {error}"
+        ) from error
+    return tuple(entries)
 
 
 def _entry(line: dict[str, str | int]) -> LedgerEntry:
     direction = str(line["direction"])
     if direction not in ("in", "out", "note"):
         raise ValueError(f"unknown direction {direction!r}")
+    t_ns, late_ns = int(line["t_ns"]), int(line.get("late_ns", 0))
+    if max(abs(t_ns), abs(late_ns)) > _LATEST_NS:
+        raise ValueError(f"{t_ns} ns is no time")
     return LedgerEntry(
-        t_ns=int(line["t_ns"]),
+        t_ns=t_ns,
         bus=str(line["bus"]),
         direction="in" if direction == "in" else "out" if direction == "out" else "note",
         data=bytes.fromhex(str(line["bytes"])),
         note=str(line["note"]),
-        late_ns=int(line.get("late_ns", 0)),
+        late_ns=late_ns,
     )
