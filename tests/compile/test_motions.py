@@ -263,3 +263,57 @@ def test_what_would_take_minutes_is_refused_at_once(
     assert says in problem.what
     assert problem.mark.line == 14  # the part with the most
     assert "lower samples" in problem.mend
+
+
+TOO_FAST = """\
+name: dash
+motions:
+  - controller: spare
+    points:
+      - time: 0 s
+        joints:
+          left_arm_joint: {position: 0 deg}
+          right_arm_joint: {position: 0 deg}
+      - time: 100 ms
+        joints:
+          left_arm_joint: {position: 57.3 deg}
+          right_arm_joint: {position: 20 deg}
+"""
+"""The left arm at 10 rad/s, an AX-12A turns at 8.2 at most; the right one at 3.5."""
+
+
+def test_a_trajectory_faster_than_the_servo_is_refused_also_without_a_velocity_limit(
+    problems_in: Find, trajectory_robot: str
+):
+    (problem,) = problems_in(trajectory_robot, TOO_FAST)
+    assert problem.severity == "error"
+    assert (problem.mark.line, problem.mark.column) == (11, 11)
+    assert problem.what == (
+        "left_arm_joint is asked for 10 rad/s at 1.100 s, more than 8.238 rad/s, the top speed of its servo"
+    )
+
+
+def test_a_trajectory_faster_than_the_files_limit_is_a_warning(problems_in: Find, trajectory_robot: str):
+    limited = trajectory_robot.replace("60 deg]}", "60 deg], velocity: 3 rad/s}")
+    (problem,) = problems_in(limited, TOO_FAST.replace("57.3", "40"))
+    assert problem.severity == "warning"
+    assert (
+        "right_arm_joint is asked for 3.491 rad/s at 1.100 s, more than 3 rad/s, its velocity" in problem.what
+    )
+
+
+def test_single_goals_of_a_group_controller_may_be_far_apart_but_their_speeds_are_checked(
+    problems_in: Find, robot_text: str
+):
+    speeds = TOO_FAST.replace("deg}", "deg, velocity: 1 rad/s}").replace("spare", "arms")
+    assert problems_in(robot_text, speeds) == ()
+    (problem,) = problems_in(robot_text, speeds.replace("1 rad/s", "9 rad/s", 1))
+    assert problem.severity == "error"
+    assert "left_arm_joint is asked for 9 rad/s at 0.000 s" in problem.what
+
+
+def test_a_formula_faster_than_the_servo_is_refused(problems_in: Find, trajectory_robot: str):
+    fast = TRAJECTORY.replace("t / 10, velocity: 0.1", "t / 10, velocity: 9")
+    (problem,) = problems_in(trajectory_robot, fast)
+    assert problem.severity == "error"
+    assert "right_arm_joint is asked for 9 rad/s" in problem.what

@@ -164,3 +164,12 @@ def test_a_joint_that_leaves_position_mode_does_not_move_by_itself():
     rig.record.states.mode[:] = Mode.EFFORT
     assert rig.apply(position=0.5)["effort"] == 0.0
     assert np.isnan(rig.record.goals.position[0])
+
+
+@pytest.mark.parametrize(("mode", "clamp"), [(Mode.VELOCITY, Clamp.VELOCITY), (Mode.EFFORT, Clamp.EFFORT)])
+@pytest.mark.parametrize(("limit", "goal"), [(None, 3.0), (2.0, 2.0), (4.0, 3.0)])
+def test_without_a_limit_of_the_file_a_drive_has_that_of_the_servo(mode, clamp, limit, goal):
+    limits = {"velocity": limit, "effort": limit, "top_speed": 3.0, "top_effort": 3.0, "bounded": False}
+    rig = Rig(mode, **limits)
+    assert rig.apply(**{DRIVEN[mode]: -1e300})[DRIVEN[mode]] == -goal
+    assert rig.clamped == clamp

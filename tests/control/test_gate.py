@@ -16,7 +16,9 @@ DT = DT_NS * 1e-9
 
 
 class Rig:
-    def __init__(self, lower=-1.0, upper=1.0, velocity=None, *, start=0.0, joints=1, eased=True):
+    def __init__(
+        self, lower=-1.0, upper=1.0, velocity=None, *, start=0.0, joints=1, eased=True, top_speed=None
+    ):
         names = tuple(f"j{row}" for row in range(joints))
         controllers = tuple(
             ControllerPlan(name, "t", "d 1", "{}", names, ("position",), (), True, 1) for name in ("a", "b")
@@ -24,7 +26,7 @@ class Rig:
         plan = LoopPlan(
             DT_NS,
             SchedulerPlan("other", 31, False),
-            tuple(JointPlan(name, lower, upper, velocity) for name in names),
+            tuple(JointPlan(name, lower, upper, velocity, top_speed=top_speed) for name in names),
             controllers,
             (),
             None,
@@ -63,6 +65,19 @@ def test_infinity_is_no_goal_of_a_joint_without_limits_that_follows_its_commands
     for position in (0.5, 0.6):
         assert rig.apply(position)[0] == position
     assert rig.apply(wanted)[::2] == (0.6, Clamp.NOT_FINITE)
+
+
+@pytest.mark.parametrize(("limit", "goal"), [(None, 8.0), (2.0, 2.0), (9.0, 8.0)])
+def test_a_speed_above_the_servos_own_is_held_to_it_and_counted_also_without_a_limit(limit, goal):
+    rig = Rig(velocity=limit, top_speed=8.0)
+    assert rig.apply(0.001, velocity=1e300)[1:] == (goal, Clamp.VELOCITY)
+    assert rig.gate.counts[0].sum() == 1
+    assert rig.apply(0.001, velocity=goal)[1:] == (goal, 0)
+
+
+def test_the_servos_own_speed_does_not_limit_the_step():
+    rig = Rig(top_speed=8.0)
+    assert rig.apply(1.0)[::2] == (1.0, 0)
 
 
 any_float = st.floats(allow_nan=True, allow_infinity=True, width=64)

@@ -132,7 +132,10 @@ class Desk:
         self.link = Link(PLAN, memory)
         plugins = PlugIns({"arm": Offer("arm", Arm, "tests 1")}, {})
         self.gateway = Gateway(
-            self.link, Preparation(("pan", "tilt"), plugins), "/logs/pair.mcap", now=lambda: self.now
+            self.link,
+            Preparation({joint.name: joint for joint in PLAN.loop.joints}, plugins),
+            "/logs/pair.mcap",
+            now=lambda: self.now,
         )
         self.app = self.gateway.app()
         self.now = 100.0  # of allowances, s

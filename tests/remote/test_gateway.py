@@ -15,9 +15,11 @@ from dxlrun.heartbeat import Phase
 from dxlrun.inbox import MOST_PER_CYCLE
 from dxlrun.remote import asking, connection, gateway, link
 from dxlrun.remote.gateway import MOST_OPERATIONS, MOST_SET_POINTS
+from dxlrun.remote.preparation import Prepared, Refusal
 from dxlrun.remote.sockets import MOST_BYTES
 
 DONE = {"done": True}
+IN_LIMITS = {"done": True, "clamped": 0}
 GO = "/controllers/left/commands/go"
 SET_POINT = "/controllers/left/set-points/go"
 
@@ -73,6 +75,11 @@ WRONG = [
     ("POST", GO, b"[" * 100_000, 422, "go of left is no JSON (recursion limit"),
     ("POST", GO, b'{"positions": [NaN]}', 422, "must be a finite number"),
     ("POST", GO, b'{"positions": [1e999]}', 422, "must be a finite number"),
+    ("POST", GO, {"positions": [True]}, 422, "positions"),
+    ("POST", GO, {"positions": ["0.5"]}, 422, "positions"),
+    ("POST", GO, {"positions": [2]}, 422, "go of left: pan is sent to 114.592 deg, outside its limits -57.3"),
+    ("POST", GO, {"positions": [-1e300]}, 422, "pan is sent to -5.72958e+301 deg, outside its limits"),
+    ("POST", SET_POINT, {"positions": [True]}, 422, "positions"),
     ("POST", GO, {"positions": [0], "speed": 1}, 422, "go of left has an unknown key 'speed'"),
     ("POST", GO, {"positions": [1, 2]}, 422, "go of left: 1 positions, please"),
     ("POST", GO, {"positions": ["x"] * 50_000}, 422, "; and 49995 more"),
@@ -152,6 +159,20 @@ def test_a_client_that_dies_in_the_middle_of_a_command_has_asked_nothing(desk):
     chunks = [chunk(b'{"positions": [0.5]}'), {"type": "http.disconnect"}]
     assert desk.ask("POST", GO, chunks=chunks)[0] == 400
     assert desk.taken == []
+
+
+def test_a_set_point_beyond_the_limits_is_passed_to_the_gate_and_the_answer_counts_it(desk):
+    for position, clamped in ((1.5, 1), (1.0, 0), (-1e9, 1)):
+        status, content = desk.ask("POST", SET_POINT, {"positions": [position]})
+        assert (status, content) == (202, {"done": True, "clamped": clamped})
+    desk.take()
+    assert struct.unpack("<d", desk.taken[-1].data) == (-1e9,)
+
+
+def test_of_many_values_beyond_the_limits_some_are_named_and_all_counted():
+    prepared = Prepared(b"", tuple(f"j{row} is beyond" for row in range(7)))
+    with pytest.raises(Refusal, match=r"^go: j0 is beyond; .*; j4 is beyond; and 2 more$"):
+        prepared.require_within_limits("go")
 
 
 def test_a_flood_of_set_points_gives_the_loop_one_a_cycle_and_takes_nothing_from_others(desk):
@@ -268,7 +289,7 @@ def test_a_controller_takes_set_points_as_soon_as_its_switch_was_answered(desk):
     wish = {"activate": ["spare"], "deactivate": ["left"]}
     assert desk.ask("POST", "/switch", wish) == (200, DONE)
     path = "/controllers/spare/set-points/go?lease=0.5"
-    assert desk.ask("POST", path, {"positions": [0.5]}) == (202, DONE)  # the cycle has not ended yet
+    assert desk.ask("POST", path, {"positions": [0.5]}) == (202, IN_LIMITS)  # the cycle has not ended yet
     assert desk.ask("POST", SET_POINT, {"positions": [0.5]})[0] == 409
     streamed = [(one.controller, one.lease_ns) for one in desk.taken if one.lease_ns]
     assert streamed == [("spare", 500_000_000)]

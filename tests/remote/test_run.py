@@ -1,6 +1,7 @@
 """Whole runs: one that is steered from Python until it is told to stop, and one whose gateway dies."""
 
 import json
+import math
 import os
 import signal
 import socket
@@ -110,11 +111,14 @@ def steered(tmp_path_factory, place):
 
     robot.send("hold", "positions", {"positions": np.array([0.1, 0.1])})
     refused(robot.send, "hold", "positions", {"positions": [0.1]})
+    refused(robot.send, "hold", "positions", {"positions": [math.radians(9999), 0.1]})
     refused(robot.switch, ["solo"])
     robot.switch(activate=["solo"], deactivate=["hold"])
     with robot.stream("solo", "positions", lease=0.1) as stream:
+        assert stream.send({"positions": [1e9]}) == 1
         for step in range(5):
-            stream.send({"positions": [0.01 * step]})
+            assert stream.send({"positions": [0.01 * step]}) == 0
+        assert stream.clamped == 1
     await_truth(lambda: robot.info()["controllers"][1]["held"], "the end of the stream's lease")
     misbehave(place / "pair.sock")
     robot.rate(100.0)
@@ -157,16 +161,17 @@ def test_the_log_has_what_was_asked_and_who_asked_it(steered):
     ]
     assert {one.origin for one in commands} == {"anna"}
     streamed = [one for one in commands if one.lease_ns]
-    assert 1 <= len(streamed) <= 5
+    assert 1 <= len(streamed) <= 6
     assert {(one.controller, one.lease_ns) for one in streamed} == {("solo", 100_000_000)}
     assert np.frombuffer(streamed[-1].data) == pytest.approx([0.04])  # the newest of them always arrives
 
 
 def test_refusals_say_why_and_whether_the_wish_itself_was_wrong(steered):
-    assert [code for _, code in steered.refused] == [2, 1, 1]
+    assert [code for _, code in steered.refused] == [2, 2, 1, 1]
     sentences = " / ".join(sentence for sentence, _ in steered.refused)
     assert "hold" in sentences
     assert "pan" in sentences
+    assert "pan is sent to 9999 deg, outside its limits -150..+150 deg" in sentences
     assert "pause the loop first" in sentences
 
 

@@ -10,7 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dxlrun.analysis.tracking import tracking
 from dxlrun.errors import InputError
+from dxlrun.events import EventCode
+from dxlrun.inbox import Command
 from dxlrun.packets import PacketKind
 from dxlrun.recording.reader import read_log
 from dxlrun.testing import plan_of, simulated_robot
@@ -143,3 +146,25 @@ def test_the_command_line_runs_on_virtual_time(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     log = read_log(next((tmp_path / "logs").glob("*.mcap")))
     assert len(log.cycles) == 300
+
+
+def test_set_points_beyond_the_limits_are_clamped_and_the_log_counts_the_cycles(tmp_path: Path) -> None:
+    robot = simulated_robot(TORSO, duration_s=2.5, log=tmp_path / "run.mcap")
+    data = np.array([0.1, np.radians(9999), 1.0, 1e300]).tobytes()  # head_pitch_joint, head_yaw_joint
+    streamed = Command(1, "head", "posvel", data, "anna", lease_ns=10_000_000_000)
+    begun_ns = 2_000_000_000  # the first second is slow
+    robot.buses[0].at(begun_ns, lambda: robot.inbox.waiting.append(streamed))
+    assert robot.run().reason == "ended"
+    log = read_log(tmp_path / "run.mcap")
+    count = {joint.name: joint.clamped for joint in tracking(log)}
+    (taken,) = np.flatnonzero(np.diff(log.cycles["command_count"])[1:] > 0) + 2
+    assert count.pop("head_yaw_joint") == len(log.cycles) - taken
+    assert set(count.values()) == {0}
+    row = log.joints.index("head_yaw_joint")
+    upper, speed = (getattr(robot.plan.loop.joints[row], name) for name in ("upper", "highest_speed"))
+    assert log.cycles["goal_position"][-1, row] == upper
+    assert log.cycles["goal_velocity"][-1, row] == speed < 10
+    told = [event.text for event in log.events if event.code == EventCode.GATE]
+    assert any(
+        "head_yaw_joint, controller head: lowered to the upper position limit" in text for text in told
+    )

@@ -14,6 +14,7 @@ from dxlrun.description import Description
 from dxlrun.description.robot import Joint
 from dxlrun.description.units import EffortUnit
 from dxlrun.dynamixel.bus_plan import RegisterValue
+from dxlrun.dynamixel.mode_plan import mode_plans
 
 _UNITS: Mapping[EffortUnit, str] = {"Nm": "Nm", "A": "A", "1": "% of its highest load"}
 _EXAMPLES: Mapping[EffortUnit, str] = {"Nm": "0.3 Nm", "A": "800 mA", "1": "40 %"}
@@ -73,6 +74,8 @@ def compile_joints(
                 effort,
                 joint.continuous,
                 bounded=not joint.continuous or joint.limits.position is not None,
+                top_speed=table.top_speed or None,
+                top_effort=_top_effort(table, continuous=joint.continuous),
             )
             compiled[name] = CompiledJoint(plan, joint, table, reach, registers)
     return compiled
@@ -166,6 +169,12 @@ def _effort(
             f"write it in {_UNITS[table.effort_unit]}, such as {_EXAMPLES[table.effort_unit]}",
         )
     return value
+
+
+def _top_effort(table: ControlTable, *, continuous: bool) -> float | None:
+    """Return the highest effort that a servo can be sent, as it measures it; None where it follows none."""
+    scales = [plan.effort for plan in mode_plans(table, table.min_tick, table.max_tick, continuous)]
+    return max((scale.per_tick * scale.most for scale in scales if scale is not None), default=None)
 
 
 def _check_reference(

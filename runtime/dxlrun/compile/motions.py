@@ -20,7 +20,14 @@ from dxlrun.compile.controllers import CompiledController
 from dxlrun.compile.joints import CompiledJoint
 from dxlrun.compile.problems import Problems, suggestion
 from dxlrun.compile.reach import Interval
-from dxlrun.compile.samples import Sample, check_limits, formula_samples, formula_texts, listed_samples
+from dxlrun.compile.samples import (
+    Sample,
+    check_limits,
+    check_speeds,
+    formula_samples,
+    formula_texts,
+    listed_samples,
+)
 from dxlrun.control.loop_plan import ScheduledCommand
 from dxlrun.description import MotionDescription
 from dxlrun.description.motion import FormulaPart, PointsPart
@@ -57,6 +64,7 @@ def compile_motion(
 ) -> list[CompiledPart]:
     """Return the parts that could be compiled; `names` are all controllers of the robot file."""
     limits = {name: Interval(joint.plan.lower, joint.plan.upper) for name, joint in joints.items()}
+    plans = {name: joint.plan for name, joint in joints.items()}
     parts: list[CompiledPart] = []
     if not _affordable(motion, problems):
         return parts
@@ -75,6 +83,7 @@ def compile_motion(
             continue
         lead_ns = LEAD_NS if kind == TRAJECTORY and samples[0].t_ns == 0 else 0
         check_limits(samples, part.start + lead_ns, limits, problems)
+        check_speeds(samples, part.start + lead_ns, plans, problems, interpolated=kind == TRAJECTORY)
         try:
             commands = _commands(controller, kind, samples, part.start, lead_ns)
         except UnfitError as error:

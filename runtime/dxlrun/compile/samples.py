@@ -9,6 +9,7 @@ from typing import Literal
 from dxlrun.compile.formula import Formula as Expression
 from dxlrun.compile.problems import Problems
 from dxlrun.compile.reach import Interval, degrees
+from dxlrun.control.loop_plan import JointPlan
 from dxlrun.description import MotionDescription
 from dxlrun.description.motion import Formula, FormulaPart, PointsPart
 from dxlrun.errors import Mark
@@ -156,3 +157,53 @@ def check_limits(
             f"outside its limits {limits[joint]}",
             "the gate will hold it at the limit; change the motion or the limits",
         )
+
+
+def check_speeds(
+    samples: Sequence[Sample],
+    start_ns: int,
+    joints: Mapping[str, JointPlan],
+    problems: Problems,
+    *,
+    interpolated: bool,
+) -> None:
+    """Refuse once for each joint a speed above the top speed of its servo; warn above the file's limit.
+
+    The speeds are the targets', and with `interpolated`, where a controller moves from sample to sample, the
+    mean speed between two samples, which every way through both reaches.
+    """
+    fastest: dict[str, tuple[float, int, Mark]] = {}
+
+    def note(joint: str, speed: float, t_ns: int, mark: Mark) -> None:
+        if abs(speed) > fastest.get(joint, (0.0, 0, mark))[0]:
+            fastest[joint] = abs(speed), t_ns, mark
+
+    before: dict[str, tuple[int, float]] = {}
+    for sample in samples:
+        for joint, target in sample.targets.items():
+            if target.velocity is not None:
+                note(joint, target.velocity, sample.t_ns, target.mark)
+            if target.position is None:
+                continue
+            t_ns, position = before.get(joint, (sample.t_ns, 0.0))
+            if interpolated and sample.t_ns > t_ns:
+                speed = (target.position - position) / ((sample.t_ns - t_ns) * 1e-9)
+                note(joint, speed, sample.t_ns, target.mark)
+            before[joint] = sample.t_ns, target.position
+    for joint, (speed, t_ns, mark) in fastest.items():
+        plan = joints.get(joint)
+        if plan is None or speed <= plan.highest_speed * (1 + 1e-9):
+            continue
+        asked = f"{joint} is asked for {speed:.4g} rad/s at {(start_ns + t_ns) * 1e-9:.3f} s"
+        if plan.top_speed is not None and speed > plan.top_speed * (1 + 1e-9):
+            problems.error(
+                mark,
+                f"{asked}, more than {plan.top_speed:.4g} rad/s, the top speed of its servo",
+                "give it more time, or a shorter way",
+            )
+        else:
+            problems.warning(
+                mark,
+                f"{asked}, more than {plan.highest_speed:.4g} rad/s, its velocity limit",
+                "the gate will hold it at the limit, so it comes late; give it more time, or raise the limit",
+            )

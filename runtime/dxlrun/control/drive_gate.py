@@ -28,7 +28,8 @@ class DriveGate:
 
     - NaN was not commanded, and infinity is flagged: the goal is 0 then. A joint without a position to hold
       goes nowhere by itself when nobody commands it any more.
-    - Velocities are cut to the speed that the gate gives, efforts to `limits.effort`, PWM to full voltage.
+    - Velocities are cut to the speed that the gate gives, efforts to `limits.effort`, PWM to full voltage;
+      all of them to what the servo has.
     - Within position limits: a velocity that leads outward becomes smaller toward the limit and is 0 there;
       an effort or a PWM that leads outward is 0 from the limit on. Where the position is not known, each of
       them is 0. A wheel (a joint that is not `bounded`) has none of this.
@@ -43,8 +44,8 @@ class DriveGate:
         self._flag = flag
         self._lower = np.array([joint.lower for joint in joints], dtype=np.float64)
         self._upper = np.array([joint.upper for joint in joints], dtype=np.float64)
-        self._effort = np.array([np.inf if joint.effort is None else joint.effort for joint in joints])
-        self._speed = np.array([np.inf if joint.velocity is None else joint.velocity for joint in joints])
+        self._effort = np.array([joint.highest_effort for joint in joints])
+        self._speed = np.array([joint.highest_speed for joint in joints])
         self._free = np.array([not joint.bounded for joint in joints], dtype=np.bool_)
         none = np.empty(0, dtype=np.intp)
         self._rows: dict[Mode, _Rows] = dict.fromkeys(_DRIVEN, none)
@@ -59,7 +60,13 @@ class DriveGate:
     def apply(self, commands: Commands, goals: Commands, states: States, speed: Floats, dt_ns: int) -> None:
         """Fill the goals of these joints; `speed`, rad/s, is the highest of each joint in this cycle."""
         for mode, wanted, goal, most, clamp in (
-            (Mode.VELOCITY, commands.velocity, goals.velocity, speed, Clamp.VELOCITY),
+            (
+                Mode.VELOCITY,
+                commands.velocity,
+                goals.velocity,
+                np.minimum(speed, self._speed),
+                Clamp.VELOCITY,
+            ),
             (Mode.EFFORT, commands.effort, goals.effort, self._effort, Clamp.EFFORT),
             (Mode.PWM, commands.pwm, goals.pwm, np.full_like(speed, FULL_PWM), Clamp.PWM),
         ):

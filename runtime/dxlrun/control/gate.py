@@ -47,8 +47,8 @@ class Gate:
       a joint that hangs there) may stay or move toward them, never further out.
     - The step from the last goal is at most `limits.velocity * dt` where the file gives a velocity, and in
       the first second after `ease_in` at most SLOW_SPEED * dt.
-    - The commanded speed is taken as a magnitude and clamped to `limits.velocity`; NaN stays NaN: as fast as
-      the servo can. No speed outlives the command that it came with.
+    - The commanded speed is taken as a magnitude and clamped to `limits.velocity` and the servo's top speed;
+      NaN stays NaN: as fast as the servo can. No speed outlives the command that it came with.
 
     `record.clamped` tells what was done, bits of Clamp; an event tells when it begins. `counts`, shape
     (joints, 8), counts cycles by joint and bit.
@@ -68,6 +68,7 @@ class Gate:
         self._speed = np.array(
             [np.inf if joint.velocity is None else joint.velocity for joint in plan.joints], dtype=np.float64
         )
+        self._fastest = np.array([joint.highest_speed for joint in plan.joints], dtype=np.float64)
         self._slow = np.minimum(self._speed, SLOW_SPEED)
         self._slow_ns = np.full(count, SLOW_START_NS, dtype=np.int64)
         self._longest_slow_ns = SLOW_START_NS
@@ -222,10 +223,10 @@ class Gate:
         np.logical_and(self._mask, self._finite, out=self._mask)
         self._flag(Clamp.NOT_FINITE)
         np.copyto(speed, np.nan, where=self._mask)
-        np.greater(speed, self._speed, out=self._mask)
+        np.greater(speed, self._fastest, out=self._mask)
         np.logical_and(self._mask, self._finite, out=self._mask)
         self._flag(Clamp.VELOCITY)
-        np.minimum(speed, self._speed, out=speed)
+        np.minimum(speed, self._fastest, out=speed)
         np.copyto(goal, speed, where=self._finite)
 
     def _flag(self, bit: Clamp) -> None:

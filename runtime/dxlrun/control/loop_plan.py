@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -47,11 +48,29 @@ class JointPlan:
     bounded: bool = True
     """`lower` and `upper` bind velocity, effort and PWM too; not those of a continuous joint whose limits the
     file does not give: a wheel turns for ever."""
+    top_speed: float | None = None
+    """The servo's own, rad/s; None: not known."""
+    top_effort: float | None = None
+    """The highest goal that the servo has, in the unit of `effort`; None: it has none, or it is not known."""
+
+    @property
+    def highest_speed(self) -> float:
+        """The lower one of the file's limit and the servo's top speed, rad/s."""
+        return min(_or_inf(self.velocity), _or_inf(self.top_speed))
+
+    @property
+    def highest_effort(self) -> float:
+        """The lower one of the file's limit and the servo's highest goal, in the unit of `effort`."""
+        return min(_or_inf(self.effort), _or_inf(self.top_effort))
 
     @property
     def rest(self) -> Mode:
         """The mode into which a joint is brought that nobody commands and that would not hold still."""
         return Mode.VELOCITY if self.continuous else Mode.POSITION
+
+
+def _or_inf(limit: float | None) -> float:
+    return math.inf if limit is None else limit
 
 
 @dataclass(frozen=True, slots=True)

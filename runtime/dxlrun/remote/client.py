@@ -133,7 +133,8 @@ class RemoteRobot:
     # Steering
 
     def send(self, controller: str, kind: str, command: Mapping[str, object]) -> None:
-        """Give a controller a typed command; returns when the loop has taken it."""
+        """Give a controller a typed command; returns when the loop has taken it. Raises Refused for values
+        beyond their joints' limits too."""
         self._post(f"/controllers/{_quoted(controller)}/commands/{_quoted(kind)}", command)
 
     def stream(self, controller: str, kind: str, lease: float = LEASE_S) -> Stream:
@@ -207,8 +208,8 @@ class RemoteRobot:
                 raise
         return True
 
-    def _post(self, path: str, content: Mapping[str, object] | None = None) -> None:
-        self._ask("POST", path, content)
+    def _post(self, path: str, content: Mapping[str, object] | None = None) -> dict[str, object]:
+        return self._ask("POST", path, content)
 
     def _ask(self, method: str, path: str, content: Mapping[str, object] | None = None) -> dict[str, object]:
         """Ask once and return the answer: nothing is ever asked twice, the first may have been heard."""
@@ -263,15 +264,23 @@ def _plain(value: object) -> object:
 
 
 class Stream:
-    """Set-points for one controller; when they cease for longer than the lease, its joints are held."""
+    """Set-points for one controller; when they cease for longer than the lease, its joints are held.
+
+    `clamped` counts the values beyond their joints' limits, which the robot clamped.
+    """
 
     def __init__(self, robot: RemoteRobot, controller: str, kind: str, lease: float) -> None:
         self._robot = robot
         self._path = f"/controllers/{_quoted(controller)}/set-points/{_quoted(kind)}?lease={lease:g}"
+        self.clamped = 0
 
-    def send(self, command: Mapping[str, object]) -> None:
-        """Leave the newest set-point; returns before the loop has taken it."""
-        self._robot._post(self._path, command)
+    def send(self, command: Mapping[str, object]) -> int:
+        """Leave the newest set-point, before the loop has taken it; return how many of its values are
+        beyond their joints' limits."""
+        clamped = self._robot._post(self._path, command).get("clamped", 0)
+        count = clamped if isinstance(clamped, int) else 0
+        self.clamped += count
+        return count
 
     def __enter__(self) -> Stream:
         return self

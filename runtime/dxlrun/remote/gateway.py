@@ -10,7 +10,8 @@
     POST /rate {rate}, /pause, /resume, /stop
     POST /controllers {name, type, ...}         load one, DELETE /controllers/NAME unload it; in a pause only
 
-`{"done": true}`, or `{"refused": "..."}` with a status of 4xx or 5xx.
+`{"done": true}`, of a set-point with `"clamped"`, the number of values beyond their joints' limits; or
+`{"refused": "..."}` with a status of 4xx or 5xx.
 """
 
 from __future__ import annotations
@@ -153,26 +154,30 @@ class Gateway:
     # Steering
 
     async def command(self, request: Request) -> Response:
-        """Check and prepare a typed command, and let the loop hand it over."""
+        """Check and prepare a typed command, within the limits, and let the loop hand it over."""
         loaded, kind = self._known(request), request.path_params["kind"]
-        data = self._preparation.command(loaded.plan, kind, await body(request))
-        await self._link.ask(loaded.plan.name, kind, data, origin(request))
+        prepared = self._preparation.command(loaded.plan, kind, await body(request))
+        prepared.require_within_limits(f"{kind} of {loaded.plan.name}")
+        await self._link.ask(loaded.plan.name, kind, prepared.data, origin(request))
         return _done()
 
     async def set_point(self, request: Request) -> Response:
-        """Leave the newest of a stream for the loop; what the loop refuses is an event, not an answer."""
+        """Leave the newest of a stream for the loop; what the loop refuses is an event, not an answer.
+
+        The last gate clamps values beyond their joints' limits; the answer counts them.
+        """
         shortest, usual, longest = LEASE_S
         lease = number(request, "lease", usual)
         if not shortest <= lease <= longest:
             raise Refusal(422, f"a lease is {shortest:g} to {longest:g} s, not {lease:g}")
         loaded, kind = self._known(request), request.path_params["kind"]
-        data = self._preparation.command(loaded.plan, kind, await body(request))
+        prepared = self._preparation.command(loaded.plan, kind, await body(request))
         if self._link.controllers.get(loaded.plan.name) is not loaded:
             raise Refusal(404, f"{loaded.plan.name} was unloaded meanwhile")
         if not self._link.active(loaded):
             raise Refusal(409, f"{loaded.plan.name} is not active; switch to it first")
-        self._link.set_point(loaded, kind, data, origin(request), round(lease * 1e9))
-        return _done(202)
+        self._link.set_point(loaded, kind, prepared.data, origin(request), round(lease * 1e9))
+        return _json({"done": True, "clamped": len(prepared.beyond)}, 202)
 
     async def switch(self, request: Request) -> Response:
         """Activate and deactivate controllers in one cycle; answer when those that wait for modes are in."""
@@ -289,8 +294,8 @@ def _json(content: object, status: int = 200) -> Response:
     return Response(msgspec.json.encode(content), status, media_type="application/json")
 
 
-def _done(status: int = 200) -> Response:
-    return _json({"done": True}, status)
+def _done() -> Response:
+    return _json({"done": True})
 
 
 def _refused(status: int, sentence: str) -> Response:

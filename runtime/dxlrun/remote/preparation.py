@@ -14,10 +14,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
+from dxlrun.compile.commands import beyond_limits
 from dxlrun.compile.problems import suggestion
 from dxlrun.control.contract import interfaces_breach
 from dxlrun.control.controller import Interfaces
-from dxlrun.control.loop_plan import ControllerPlan
+from dxlrun.control.loop_plan import ControllerPlan, JointPlan
 from dxlrun.control.plugins import Offer, PlugIns
 from dxlrun.description.form import Name
 from dxlrun.description.problems import sentences_of
@@ -68,10 +69,28 @@ def _bounded(whose: str) -> Iterator[None]:
 
 
 @dataclass(frozen=True, slots=True)
+class Prepared:
+    """A command, ready for the loop."""
+
+    data: bytes
+    """Little-endian float64"""
+    beyond: tuple[str, ...]
+    """A sentence for each value that is beyond its joint's limits."""
+
+    def require_within_limits(self, what: str) -> None:
+        """Raise Refusal when a value is beyond its joint's limits."""
+        if self.beyond:
+            left = len(self.beyond) - _MOST_MISTAKES
+            more = f"; and {left} more" if left > 0 else ""
+            raise Refusal(422, f"{what}: {'; '.join(self.beyond[:_MOST_MISTAKES])}{more}")
+
+
+@dataclass(frozen=True, slots=True)
 class Preparation:
     """Knows the controllers' classes; everything here happens outside of the loop's process."""
 
-    joints: tuple[str, ...]
+    joints: Mapping[str, JointPlan]
+    """The robot's, by name, in its order."""
     plugins: PlugIns
     _takes: dict[str, dict[str, object]] = field(default_factory=dict, init=False)
     """Controller type -> schema of each command: nobody pays twice for it."""
@@ -95,8 +114,8 @@ class Preparation:
             self._takes[plan.type] = found
         return self._takes[plan.type]
 
-    def command(self, plan: ControllerPlan, kind: str, body: bytes) -> bytes:
-        """Return the array of a typed command that came as JSON; raises Refusal."""
+    def command(self, plan: ControllerPlan, kind: str, body: bytes) -> Prepared:
+        """Return a typed command that came as JSON (`true` and "1" are no numbers there); raises Refusal."""
         controller = self.offer(plan).controller
         model = controller.Commands.get(kind)
         if model is None:
@@ -106,10 +125,12 @@ class Preparation:
             raise Refusal(404, f"{plan.name} takes no command {kind}; {suggestion(kind, known)}")
         try:
             with _bounded(plan.name):
-                command = model.model_validate_json(body)
+                command = model.model_validate_json(body, strict=True)
                 parameters = controller.Parameters.model_validate_json(plan.parameters)
                 prepared = controller.prepare(kind, command, parameters)
-                return np.ascontiguousarray(prepared, dtype="<f8").tobytes()
+                data = np.ascontiguousarray(prepared, dtype="<f8").tobytes()
+                beyond = beyond_limits([self.joints[joint] for joint in plan.joints], command)
+                return Prepared(data, tuple(beyond))
         except Refusal:
             raise
         except ValidationError as error:
@@ -162,7 +183,7 @@ class Preparation:
         try:
             with _bounded(name):
                 parameters = offer.controller.Parameters.model_validate(own)
-                interfaces = offer.controller.interfaces(parameters, self.joints)
+                interfaces = offer.controller.interfaces(parameters, tuple(self.joints))
         except Refusal:
             raise
         except ValidationError as error:
@@ -172,7 +193,9 @@ class Preparation:
         if breach := interfaces_breach(interfaces):
             raise Refusal(422, f"{name} ({offer.distribution}) {breach[0]}; tell its author: {breach[1]}")
         if unknown := [joint for joint in interfaces.joints if joint not in self.joints]:
-            raise Refusal(422, f"{name} wants joint {unknown[0]}; {suggestion(unknown[0], self.joints)}")
+            raise Refusal(
+                422, f"{name} wants joint {unknown[0]}; {suggestion(unknown[0], tuple(self.joints))}"
+            )
         if len(set(interfaces.joints)) != len(interfaces.joints):
             raise Refusal(422, f"{name} names a joint twice; name it once")
         return interfaces

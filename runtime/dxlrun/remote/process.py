@@ -86,7 +86,7 @@ def main() -> None:
     plan: Plan = from_json(process.whole(job.plan))
     try:
         link = Link(plan, job.memory)
-        joints = tuple(joint.name for joint in plan.loop.joints)
+        joints = {joint.name: joint for joint in plan.loop.joints}
         gateway = Gateway(link, Preparation(joints, load_plugins()), job.log)
         listener, path = listen(plan.robot)
     except (DxlrunError, OSError) as error:
