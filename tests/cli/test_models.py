@@ -64,6 +64,28 @@ def test_a_name_prints_its_motor_as_far_as_the_manual_gives_it(dxlrun, model, li
     assert dxlrun("models", model).out.splitlines()[2] == line
 
 
+def test_the_motor_that_is_simulated_is_told_with_its_source(dxlrun):
+    known = dxlrun("models", "MX-64", "--protocol", "1").out.splitlines()[3:7]
+    assert known == [
+        "simulated: no-load speed 68.76 rpm, time constant 15.1 ms, friction 0.1 Nm and 8% of the torque, "
+        "1.63 Nm/A",
+        "source of it: Rhoban BAM, bam/params/mx64/m3.json",
+        "P gain: 0.158 of full duty per rad of error and unit",
+        "source of it: Rhoban BAM, bam/dynamixel/actuator.py: 0.158, 5.06 at the P gain of 32",
+    ]
+    scaled = dxlrun("models", "XM430-W350").out.splitlines()[3:5]
+    assert scaled == [
+        "simulated: no-load speed 46 rpm, time constant 15.1 ms, friction 0.076 Nm and 8% of the torque, "
+        "1.78 Nm/A",
+        "source of it: [i] scaled from the MX-64: Rhoban BAM, bam/params/mx64/m3.json",
+    ]
+    (told,) = json.loads(dxlrun("models", "XL330-M077", "--json").out)
+    motor = told["simulated_motor"]
+    assert (motor["time_constant"], motor["p_gain_duty"]) == pytest.approx((0.0448, 0.0028774), rel=1e-2)
+    assert motor["source"].startswith("[i] scaled from the XL330-M288: ")
+    assert motor["gain_source"].startswith("[i] as XL330-M288; ")
+
+
 def test_a_name_of_both_protocols_prints_both_tables(dxlrun):
     both = dxlrun("models", "MX-28")
     second = dxlrun("models", "MX-28", "--protocol", "2")

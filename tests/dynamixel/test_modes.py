@@ -100,7 +100,10 @@ def test_a_model_goes_into_a_mode_follows_its_goals_there_and_comes_back(make_on
     standing = rig.buses[0].servo(1).position
     change(rig, mode)
     assert rig.buses[0].servo(1).position == pytest.approx(standing, abs=0.02), "it jumped"
-    scale = {Mode.VELOCITY: 0.4, Mode.PWM: 0.2, Mode.EFFORT_POSITION: 0.1}.get(mode, 0.0)
+    slow = (
+        3.0 if model == "XL-320" else 0.4
+    )  # of its output, which is no controlled speed, friction takes 9 %
+    scale = {Mode.VELOCITY: slow, Mode.PWM: 0.2, Mode.EFFORT_POSITION: 0.1}.get(mode, 0.0)
     plan = rig.plans[0].servos[0].mode_plan(mode)
     if mode is Mode.EFFORT:
         scale = plan.effort.per_tick * plan.effort.most * 0.15

@@ -10,9 +10,12 @@ import numpy as np
 import pytest
 
 from dxlrun.control_table import control_table
+from dxlrun.simulation.motor import motor_of
 
 MOTIONS = Path(__file__).parents[2] / "robots" / "motions"
 STEP_S = 3.0
+REST = 3
+"""Ticks from the goal at which friction lets them come to rest"""
 CASES = [("single_joint_step", "joint", "MX-64"), ("whole_body", "head_yaw_joint", "AX-12A")]
 
 
@@ -31,10 +34,11 @@ def test_a_step_of_the_position_alone_is_as_fast_as_the_servo_can(
     t, q, speed = step(played(command_of(MOTIONS / f"{name}_position.yaml")), joint)
     table = control_table(model, 1.0)
 
-    assert (q[0], q[-1]) == pytest.approx((-1.0, 1.0), abs=2 * table.rad_per_tick)
+    fastest = motor_of(table).no_load_speed
+    assert (q[0], q[-1]) == pytest.approx((-1.0, 1.0), abs=REST * table.rad_per_tick)
     on_the_way = (q > -0.5) & (q < 0.5)
-    assert np.polyfit(t[on_the_way], q[on_the_way], 1)[0] == pytest.approx(table.max_speed, rel=0.03)
-    assert speed.max() == pytest.approx(table.max_speed, rel=0.03)
+    assert np.polyfit(t[on_the_way], q[on_the_way], 1)[0] == pytest.approx(fastest, rel=0.03)
+    assert speed.max() == pytest.approx(fastest, rel=0.03)
 
 
 @pytest.mark.parametrize(("name", "joint", "model"), CASES)
@@ -44,8 +48,8 @@ def test_a_step_with_a_speed_has_that_speed_all_the_way(
     t, q, speed = step(played(command_of(MOTIONS / f"{name}_posvel.yaml")), joint)
     table = control_table(model, 1.0)
 
-    assert (q[0], q[-1]) == pytest.approx((-1.0, 1.0), abs=2 * table.rad_per_tick)
-    on_the_way = (q > -0.9) & (q < 0.9)
+    assert (q[0], q[-1]) == pytest.approx((-1.0, 1.0), abs=REST * table.rad_per_tick)
+    on_the_way = (q > -0.6) & (q < 0.9)  # by then it has come to its speed
     assert np.polyfit(t[on_the_way], q[on_the_way], 1)[0] == pytest.approx(1.0, rel=0.02)
     assert speed[on_the_way] == pytest.approx(1.0, abs=2 * table.rad_s_per_tick)
 
@@ -65,7 +69,7 @@ def test_the_tracking_motion_keeps_its_time(
     def error(delay: float) -> float:
         return float(np.sqrt(np.mean((cycles["position"][:, 0] - wanted(delay))[moving] ** 2)))
 
-    assert error(0.0) < 0.05
+    assert error(0.0) < 0.055
     assert min(np.arange(0.0, 0.1, 0.005), key=error) < 0.04
     late = t > 8.0
-    assert np.abs(cycles["position"][late, 0] - wanted(0.0)[late]).max() < 0.08
+    assert np.abs(cycles["position"][late, 0] - wanted(0.0)[late]).max() < 0.09

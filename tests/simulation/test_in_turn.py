@@ -212,5 +212,6 @@ def test_other_models_of_protocol_1_move_too(make_line: Any, model: str) -> None
     goal = table.max_tick // 2
     assert line.write(1, 30, goal & 0xFF, goal >> 8) == 0
     line.clock.wait_until(3_000_000_000)
-    assert abs(line.read(1, 36, 2) - goal) <= 2  # within the compliance margin
-    assert line.servo().position == pytest.approx(goal * table.rad_per_tick, abs=2 * table.rad_per_tick)
+    # within the compliance margin; 3 ticks of an MX-28 are what its friction leaves
+    assert abs(line.read(1, 36, 2) - goal) <= 3
+    assert line.servo().position == pytest.approx(goal * table.rad_per_tick, abs=3 * table.rad_per_tick)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import pytest
+
 from dxlrun.simulation.protocol2 import ErrorNumber
 
 
@@ -23,7 +25,7 @@ def test_a_goal_may_go_through_indirect_data(line2: Any) -> None:
         line2.set(f"indirect_address_{index + 1}", 116 + index)
     assert line2.write_bytes(1, 224, (3000).to_bytes(4, "little")) == 0
     line2.wait(2)
-    assert line2.get("present_position") == 3000
+    assert line2.get("present_position") == pytest.approx(3000, abs=3)  # what friction leaves
     assert line2.write_bytes(1, 224, b"\x00\x00") == ErrorNumber.DATA_LENGTH
 
 

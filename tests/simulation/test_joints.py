@@ -7,8 +7,9 @@ from typing import Any
 
 import pytest
 
-from dxlrun.control_table import all_tables
+from dxlrun.control_table import all_tables, control_table
 from dxlrun.simulation import Load, Mechanics, ServoConfig, SimulatedServo
+from dxlrun.simulation.motor import motor_of
 
 S = 1_000_000_000
 
@@ -38,8 +39,15 @@ def fastest(line: Any, seconds: float) -> float:
     return highest
 
 
+def held(model: str, torque: float, load: float, more_friction: float = 0.0) -> bool:
+    """Return whether friction holds a shaft between the motor's torque and the load's, Nm."""
+    motor = motor_of(control_table(model, None if model != "MX-64" else 1.0))
+    rubbing = motor.friction + more_friction + motor.load_friction * abs(torque + load)
+    return abs(torque - load) <= rubbing + 0.003
+
+
 @pytest.mark.parametrize(
-    ("model", "no_load", "low", "high"), [("MX-64", 6.597, 1396, 2700), ("AX-12A", 6.178, 318, 709)]
+    ("model", "no_load", "low", "high"), [("MX-64", 7.2, 1396, 2700), ("AX-12A", 6.178, 318, 709)]
 )
 def test_without_a_speed_it_goes_as_fast_as_it_can(
     make_line: Any, model: str, no_load: float, low: int, high: int
@@ -49,7 +57,7 @@ def test_without_a_speed_it_goes_as_fast_as_it_can(
     )
     put(line, "goal_position", high)
     assert fastest(line, 1.0) == pytest.approx(no_load, rel=0.02)
-    assert look(line, "present_position") == pytest.approx(high, abs=1)
+    assert look(line, "present_position") == pytest.approx(high, abs=2)
     assert look(line, "moving") == 0
 
 
@@ -74,10 +82,12 @@ def test_a_wider_slope_sags_more_under_the_same_load(make_line: Any) -> None:
         put(line, "goal_position", round(2.0 / math.radians(300) * 1023))
         wait(line, 3)
         sags.append(2.0 - line.servo().position)
-        assert look(line, "present_load") == pytest.approx(1023 * 0.5 * math.cos(sags[-1]) / 1.5, abs=15)
-    # (0.333 of the output - 0.031 of punch) / 0.969 of the slope, beyond a margin of 0.29 degrees
-    expected = [0.312 * slope * math.radians(300) / 1023 + 0.005 for slope in (32, 128)]
-    assert sags == pytest.approx(expected, rel=0.1)
+        output = look(line, "present_load") / 1023
+        assert held("AX-12A", output * 1.5, 0.5 * math.cos(sags[-1]))
+        # 0.031 of punch and 0.969 of the slope, beyond a margin of 0.29 degrees
+        expected = 0.031 + 0.969 * (sags[-1] - 0.0051) / (slope * math.radians(300) / 1023)
+        assert output == pytest.approx(expected, abs=0.01)
+    assert sags[1] > 2.5 * sags[0]
 
 
 def test_an_mx_servo_holds_as_hard_as_its_p_gain_and_exactly_with_an_i_gain(make_line: Any) -> None:
@@ -124,9 +134,10 @@ def test_in_torque_control_mode_goal_torque_is_the_current(make_line: Any) -> No
     line = make_line((1,), "MX-64", position=2.0, load=Load(gravity=2.0, gravity_angle=2.0, friction=0.1))
     put(line, "torque_enable", 1)
     put(line, "torque_ctrl_mode_enable", 1)
-    put(line, "goal_torque", 1024 + 200)  # clockwise, 0.9 A of the 4.1 A at 6 Nm
+    put(line, "goal_torque", 1024 + 200)  # clockwise, 0.9 A of 1.63 Nm each
     wait(line, 3)
-    assert 2.0 * math.sin(line.servo().position - 2.0) == pytest.approx(-0.9 * 6.0 / 4.1, abs=0.1)
+    pulled = 2.0 * math.sin(line.servo().position - 2.0)
+    assert held("MX-64", -0.9 * 1.6315, pulled, more_friction=0.1)
     assert look(line, "current") == pytest.approx(2048 - 200, abs=2)
 
 
@@ -136,7 +147,8 @@ def test_torque_limit_limits_what_it_holds(make_line: Any) -> None:
     put(line, "torque_limit", 341)
     put(line, "goal_position", round(2.0 / math.radians(300) * 1023))
     wait(line, 3)
-    assert math.cos(2.0 - line.servo().position) == pytest.approx(0.5, abs=0.02)
+    assert look(line, "present_load") == 341
+    assert held("AX-12A", 0.5, math.cos(2.0 - line.servo().position))
 
 
 def test_a_blocked_servo_is_overloaded_after_a_second_and_lets_go(make_line: Any) -> None:
@@ -152,7 +164,7 @@ def test_a_blocked_servo_is_overloaded_after_a_second_and_lets_go(make_line: Any
 
 def test_a_servo_that_holds_a_heavy_load_gets_hot_and_lets_go(make_line2: Any) -> None:
     line = make_line2(
-        (1,), "XM430-W350", position=2.0, load=Load(gravity=2.4, gravity_angle=2.0 - math.pi / 2)
+        (1,), "XM430-W350", position=2.0, load=Load(gravity=2.9, gravity_angle=2.0 - math.pi / 2)
     )
     line.set("torque_enable", 1)
     line.set("goal_position", round(2.0 / math.tau * 4096))
@@ -162,7 +174,7 @@ def test_a_servo_that_holds_a_heavy_load_gets_hot_and_lets_go(make_line2: Any) -
     line.wait(400)
     assert line.get("hardware_error_status") == 0x04
     assert line.get("torque_enable") == 0
-    assert line.servo().position == pytest.approx(2.0 - math.pi / 2, abs=0.01)  # it hangs
+    assert line.servo().position == pytest.approx(2.0 - math.pi / 2, abs=0.04)  # it hangs, but for friction
 
 
 def test_an_x_servo_sags_as_its_p_gain_says(make_line2: Any) -> None:
@@ -174,8 +186,9 @@ def test_an_x_servo_sags_as_its_p_gain_says(make_line2: Any) -> None:
     line.wait(2)
     sag = 2.0 - line.servo().position
     # 800 / 128 of 885 PWM units for a tick of 4096 a turn, 4.1 Nm at 885
-    assert sag == pytest.approx(1.0 * math.cos(sag) / (800 / 128 / 885 * 4096 / math.tau * 4.1), rel=0.05)
-    assert line.get("present_current") == pytest.approx(math.cos(sag) / 4.1 * 2.3 / 0.00269, abs=3)
+    torque = sag * 800 / 128 / 885 * 4096 / math.tau * 4.1
+    assert held("XM430-W350", torque, math.cos(sag))
+    assert line.get("present_current") == pytest.approx(torque / 4.1 * 2.3 / 0.00269, abs=3)
 
 
 def test_moving_status_tells_profile_and_arrival(make_line2: Any) -> None:
@@ -212,13 +225,16 @@ def test_every_model_settles_where_it_should_without_much_overshoot() -> None:
     for now in range(0, 3 * S, 10_000_000):
         mechanics.advance(now)
         highest = [max(pair) for pair in zip(highest, mechanics.plant.angle.tolist(), strict=True)]
-    for servo, goal, top in zip(servos, goals, highest, strict=True):
+    torques = mechanics.law.torque.tolist()
+    for servo, goal, top, torque in zip(servos, goals, highest, torques, strict=True):
         servo.advance(3 * S)
         table, margin = servo.registers.table, servo.registers.get("cw_compliance_margin")
-        assert servo.position == pytest.approx(
-            goal * table.rad_per_tick, abs=(1 + margin) * table.rad_per_tick
-        )
-        assert top < goal * table.rad_per_tick + 0.2 * 0.5, table.model
+        motor = motor_of(table)
+        assert abs(torque) <= 1.001 * motor.friction / (1 - motor.load_friction)
+        # so much friction leaves where gains are weakest
+        rest = math.radians(1.1) + margin * table.rad_per_tick
+        assert servo.position == pytest.approx(goal * table.rad_per_tick, abs=rest)
+        assert top < goal * table.rad_per_tick + 0.25 * 0.5, table.model  # most: the quick XL330-M077
         assert servo.registers.get("moving") == 0
 
 
@@ -228,8 +244,8 @@ def test_multi_turn_mode_counts_turns_to_either_side(make_line: Any) -> None:
         assert put(line, name, wire) == 0
     assert put(line, "goal_position", -5000) == 0
     wait(line, 4)
-    assert look(line, "present_position") == -5000 & 0xFFFF
-    assert line.servo().position == pytest.approx(-5100 * math.tau / 4096, abs=1e-3)
+    assert look(line, "present_position") == pytest.approx(-5000 & 0xFFFF, abs=2)
+    assert line.servo().position == pytest.approx(-5100 * math.tau / 4096, abs=4e-3)
     put(line, "resolution_divider", 4)
     put(line, "goal_position", 5000)
     wait(line, 20)

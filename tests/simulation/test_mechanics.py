@@ -7,13 +7,13 @@ import math
 import numpy as np
 import pytest
 
-from dxlrun.control_table import all_tables, control_table
+from dxlrun.control_table import ControlTable, all_tables, control_table
 from dxlrun.simulation.command import LIMP, Command
 from dxlrun.simulation.mechanics import EAGER_NS, EASY_NS, STEP_NS, Load, Mechanics
 from dxlrun.simulation.motor import Motor, motor_of
 from dxlrun.simulation.strain import AMBIENT_C, COOLING_S, STALLED_RISE_C
 
-MOTOR = Motor(max_speed=6.0, stall_torque=2.0, stall_current=1.0, voltage=12.0, inertia=0.003)
+MOTOR = Motor(stall_torque=2.0, damping=1 / 3, torque_per_ampere=2.0, voltage=12.0, inertia=0.003)
 S = 1_000_000_000
 
 
@@ -30,6 +30,10 @@ def state(mechanics: Mechanics) -> tuple[float, float]:
 
 def pid(p: float, goal: float, **rest: float) -> Command:
     return Command(goal=goal, p_ccw=p, p_cw=p, limit=1.0)._replace(**rest)
+
+
+def is_scaled(table: ControlTable) -> bool:
+    return "[i]" in motor_of(table).source
 
 
 # Motor
@@ -70,7 +74,13 @@ def test_every_model_has_a_motor_that_turns() -> None:
         index = mechanics.add(motor_of(table), Load(), 0.0)
         mechanics.command(index, Command(bias=1.0, limit=1.0))
     mechanics.advance(S // 2)
-    assert mechanics.plant.velocity == pytest.approx([table.max_speed for table in tables], rel=1e-3)
+    speeds = [motor_of(table).no_load_speed for table in tables]
+    assert mechanics.plant.velocity == pytest.approx(speeds, rel=1e-3)
+    manual = [
+        (speed, table.max_speed) for table, speed in zip(tables, speeds, strict=True) if is_scaled(table)
+    ]
+    assert len(manual) == len(tables) - 7  # MX-64 and MX-106 of both protocols, XL-320, XL330-M288 of two
+    assert all(speed == pytest.approx(told) for speed, told in manual)
 
 
 def test_current_control_holds_the_torque_up_to_what_the_voltage_gives() -> None:
@@ -225,9 +235,7 @@ def test_a_load_that_cannot_be_held_is_told_after_a_second_and_a_hard_start_is_n
 
 def test_torque_figures_are_those_of_the_tables() -> None:
     motor = motor_of(control_table("XM430-W350"))
-    assert (motor.max_speed, motor.stall_torque, motor.stall_current) == pytest.approx(
-        (4.817, 4.1, 2.3), rel=1e-3
-    )
+    assert (motor.no_load_speed, motor.stall_torque) == pytest.approx((4.817, 4.1), rel=1e-3)
     assert np.isclose(motor.torque_per_ampere, 4.1 / 2.3)
 
 

@@ -8,10 +8,15 @@ from typing import Any
 
 import pytest
 
+from dxlrun.control_table import control_table
 from dxlrun.simulation import Load
+from dxlrun.simulation.motor import motor_of
 
 TICK = math.tau / 4096
 RPM = math.tau / 60
+REST = 3
+"""Ticks that the friction of an XM430-W350 leaves: 1.9 % of the duty, and 8 % more of it, at 4.6 a rad"""
+MOTOR = motor_of(control_table("XM430-W350"))
 CLEAR_TURNS = bytes.fromhex("01 44584c22")
 
 
@@ -21,6 +26,17 @@ def make_loaded2(make_line2: Any) -> Callable[[Load], Any]:
         return make_line2((1,), "XM430-W350", load=load)
 
     return make
+
+
+def near(tick: int) -> object:
+    """Return what equals a position at which friction lets a servo rest."""
+    return pytest.approx(tick, abs=REST)
+
+
+def speed_at(duty: float) -> float:
+    """Return the speed of an XM430-W350 without load, rad/s: friction takes the same at each duty."""
+    lost = MOTOR.friction / (1 - MOTOR.load_friction) / MOTOR.stall_torque
+    return MOTOR.no_load_speed * (duty - lost) / (1 - lost)
 
 
 def move(line: Any, goal: int, seconds: float = 3.0) -> int:
@@ -38,10 +54,10 @@ def test_without_torque_it_stays_whatever_the_goal(line2: Any) -> None:
 
 
 def test_position_control_goes_there_and_rests(line2: Any) -> None:
-    assert move(line2, 3000) == 3000
+    assert move(line2, 3000) == near(3000)
     assert line2.get("present_velocity") == 0
     assert line2.get("moving") == 0
-    assert line2.servo().position == pytest.approx(3000 * TICK)
+    assert line2.servo().position == pytest.approx(3000 * TICK, abs=REST * TICK)
 
 
 def test_profile_velocity_is_the_speed(line2: Any) -> None:
@@ -54,7 +70,7 @@ def test_profile_velocity_is_the_speed(line2: Any) -> None:
 
 def test_profile_velocity_0_is_as_fast_as_it_can(line2: Any) -> None:
     move(line2, 4095, 0.1)
-    assert line2.servo().velocity == pytest.approx(line2.servo().registers.table.max_speed, rel=1e-3)
+    assert line2.servo().velocity == pytest.approx(line2.servo().registers.table.max_speed, rel=2e-3)
 
 
 def test_profile_acceleration_is_the_slope(line2: Any) -> None:
@@ -79,7 +95,7 @@ def test_a_time_based_profile_takes_its_time(line2: Any) -> None:
     assert line2.get("moving") == 1
     line2.wait(0.2)
     assert line2.get("moving") == 0
-    assert line2.get("present_position") == 2304
+    assert line2.get("present_position") == near(2304)
 
 
 def test_velocity_control_turns_on_and_on(line2: Any) -> None:
@@ -96,7 +112,7 @@ def test_velocity_control_turns_on_and_on(line2: Any) -> None:
 
 def test_extended_position_control_counts_turns(line2: Any) -> None:
     line2.set("operating_mode", 4)
-    assert move(line2, -3 * 4096, 20) == -3 * 4096
+    assert move(line2, -3 * 4096, 20) == near(-3 * 4096)
     assert line2.set("goal_position", 1_048_575) == 0
     assert line2.set("goal_position", 1_048_576) == 4
 
@@ -109,7 +125,7 @@ def test_clear_brings_the_turns_back_when_it_rests(line2: Any) -> None:
     line2.wait(20)
     line2.set("torque_enable", 0)
     assert line2.request(1, 0x10, CLEAR_TURNS) == (1, 0, b"")
-    assert line2.get("present_position") == 77
+    assert line2.get("present_position") == near(77)
 
 
 def test_position_control_knows_one_turn(line2: Any) -> None:
@@ -117,15 +133,15 @@ def test_position_control_knows_one_turn(line2: Any) -> None:
     move(line2, 5000, 5)
     line2.set("torque_enable", 0)
     line2.set("operating_mode", 3)
-    assert line2.get("present_position") == 5000 - 4096
-    assert line2.get("goal_position") == 5000 - 4096
+    assert line2.get("present_position") == near(5000 - 4096)
+    assert line2.get("goal_position") == line2.get("present_position")
 
 
 def test_homing_offset_shifts_what_is_told_and_wanted(line2: Any) -> None:
     line2.set("homing_offset", 100)
     assert line2.get("present_position") == round(2.0 / TICK) + 100
-    assert move(line2, 1100) == 1100
-    assert line2.servo().position == pytest.approx(1000 * TICK)
+    assert move(line2, 1100) == near(1100)
+    assert line2.servo().position == pytest.approx(1000 * TICK, abs=REST * TICK)
 
 
 def test_reverse_mode_turns_the_direction(line2: Any) -> None:
@@ -133,8 +149,8 @@ def test_reverse_mode_turns_the_direction(line2: Any) -> None:
     line2.servo().reset()
     before = line2.get("present_position")
     assert before == 4096 - round(2.0 / TICK)
-    assert move(line2, before + 100) == before + 100
-    assert line2.servo().position - (2.0 - math.tau) == pytest.approx(-100 * TICK, abs=TICK)
+    assert move(line2, before + 100) == near(before + 100)
+    assert line2.servo().position - (2.0 - math.tau) == pytest.approx(-100 * TICK, abs=(REST + 1) * TICK)
 
 
 def test_pwm_control_turns_at_its_part_of_the_no_load_speed(line2: Any) -> None:
@@ -144,8 +160,7 @@ def test_pwm_control_turns_at_its_part_of_the_no_load_speed(line2: Any) -> None:
     assert line2.servo().velocity == 0.0  # a goal that the mode obeys begins with 0
     assert line2.set("goal_pwm", -400) == 0
     line2.wait(1)
-    full = line2.servo().registers.table.max_speed
-    assert line2.servo().velocity == pytest.approx(-full * 400 / 885, rel=0.01)
+    assert line2.servo().velocity == pytest.approx(-speed_at(400 / 885), rel=0.01)
     assert line2.get("present_pwm") == pytest.approx(-400, abs=1)
 
 
@@ -156,7 +171,8 @@ def test_current_control_gives_the_torque_of_its_current(make_loaded2: Any) -> N
     assert line.set("goal_current", 100) == 0
     line.wait(3)
     ampere = 100 * 0.00269
-    assert math.sin(line.servo().position - 2.0) == pytest.approx(ampere * 4.1 / 2.3, abs=0.02)
+    torque, pulled = ampere * MOTOR.torque_per_ampere, math.sin(line.servo().position - 2.0)
+    assert abs(torque - pulled) <= MOTOR.friction + 0.02 + MOTOR.load_friction * (torque + pulled)
     assert line.get("present_current") == pytest.approx(100, abs=1)
 
 
@@ -167,7 +183,8 @@ def test_current_based_position_control_pushes_no_harder_than_its_current(make_l
     assert line.set("goal_current", 100) == 0
     assert line.set("goal_position", 4000) == 0
     line.wait(3)
-    assert math.sin(line.servo().position - 2.0) == pytest.approx(100 * 0.00269 * 4.1 / 2.3, abs=0.02)
+    torque, pulled = 100 * 0.00269 * MOTOR.torque_per_ampere, math.sin(line.servo().position - 2.0)
+    assert abs(torque - pulled) <= MOTOR.friction + 0.02 + MOTOR.load_friction * (torque + pulled)
     assert line.set("goal_current", 800) == 0
     line.wait(3)
     assert line.get("present_position") > 3900
@@ -176,8 +193,7 @@ def test_current_based_position_control_pushes_no_harder_than_its_current(make_l
 def test_goal_pwm_limits_position_control(line2: Any) -> None:
     assert line2.set("goal_pwm", 177) == 0
     move(line2, 4095, 0.3)
-    full = line2.servo().registers.table.max_speed
-    assert line2.servo().velocity == pytest.approx(full * 177 / 885, rel=0.01)
+    assert line2.servo().velocity == pytest.approx(speed_at(177 / 885), rel=0.01)
 
 
 def test_a_goal_wakes_it_only_where_drive_mode_says_so(line2: Any) -> None:
@@ -185,21 +201,22 @@ def test_a_goal_wakes_it_only_where_drive_mode_says_so(line2: Any) -> None:
     line2.set("goal_position", 3000)
     assert line2.get("torque_enable") == 1
     line2.wait(2)
-    assert line2.get("present_position") == 3000
+    assert line2.get("present_position") == near(3000)
 
 
 def test_a_servo_around_0_finds_itself_around_0(make_line2: Any) -> None:
     line = make_line2((1,), "PH54-200-S500", position=-0.5)
     tick = line.servo().registers.table.rad_per_tick
     assert line.get("present_position") == round(-0.5 / tick)
-    assert move(line, 1000) == 1000
+    assert move(line, 1000) == pytest.approx(1000, abs=0.3 / 360 * math.tau / tick)
 
 
 def test_an_xl320_moves_by_its_own_items(make_line2: Any) -> None:
     line = make_line2((1,), "XL-320", position=2.0)
     assert line.get("present_position") == round(2.0 / math.radians(300) * 1023)
     assert line.write_bytes(1, 32, (1024 + 200).to_bytes(2, "little")) == 0  # the direction does not count
-    assert move(line, 800) == 800
+    # 3.8 degrees: it is a weak controller with much friction
+    assert move(line, 800) == pytest.approx(800, abs=13)
     line.set("torque_enable", 0)
     assert line.set("control_mode", 1) == 0
     line.set("torque_enable", 1)
@@ -210,14 +227,14 @@ def test_an_xl320_moves_by_its_own_items(make_line2: Any) -> None:
 
 def test_an_rh_p12_closes(make_line2: Any) -> None:
     line = make_line2((1,), "RH-P12-RN(A)", position=0.0)
-    assert move(line, 740) == 740
+    assert move(line, 740) == near(740)
 
 
 def test_feed_forward_of_what_motor_and_rotor_take_leaves_no_lag(make_line2: Any) -> None:
     lags = {}
-    # 1 / no-load speed, and 10 ms of it per rad/s^2, in the gains' units of PWM, ticks and ms
-    unit = 4096 / math.tau / 885
-    for first, second in ((0, 0), (round(4e3 / 4.817 / unit), round(4e6 * 0.01 / 4.817 / unit))):
+    # the duty that motor and rotor take per rad/s and rad/s^2, in the gains' units of PWM, ticks and ms
+    unit = 4096 / math.tau / 885 * MOTOR.stall_torque
+    for first, second in ((0, 0), (round(4e3 * MOTOR.damping / unit), round(4e6 * MOTOR.inertia / unit))):
         line = make_line2((1,), "XM430-W350", position=1.0)
         line.set("profile_velocity", 100)
         line.set("profile_acceleration", 10)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import sys
 from collections.abc import Sequence
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 from dxlrun.errors import InputError
+from dxlrun.simulation.motor import Motor
 from dxlrun.simulation.mujoco_plant import UrdfBodies, UrdfJoint, mujoco_plant
 from dxlrun.simulation.plant import NO_LOAD, IndependentJoints, Joint, Load, Plant
 
@@ -19,7 +21,8 @@ MASS, ARM = 0.5, 0.2
 """kg and m of the pendulums: a weight at the end of an arm."""
 PULL = MASS * 9.81 * ARM
 """Nm of one where it sticks out"""
-ROTOR = 0.01
+ROTOR = Motor(stall_torque=1.0, damping=0.0, torque_per_ampere=1.0, voltage=12.0, inertia=0.01)
+RUBBING = dataclasses.replace(ROTOR, friction=0.05, load_friction=0.1, viscous_friction=0.01)
 
 
 def _link(name: str) -> str:
@@ -53,9 +56,11 @@ TWO = _urdf(
 )
 
 
-def _plant(urdf: str, *joints: UrdfJoint, angles: Sequence[float] = (), load: Load = NO_LOAD) -> Plant:
+def _plant(
+    urdf: str, *joints: UrdfJoint, angles: Sequence[float] = (), load: Load = NO_LOAD, rotor: Motor = ROTOR
+) -> Plant:
     placed = [angles[row] if angles else joint.reference for row, joint in enumerate(joints)]
-    return mujoco_plant(UrdfBodies(urdf, joints))([Joint(ROTOR, load, angle) for angle in placed])
+    return mujoco_plant(UrdfBodies(urdf, joints))([Joint(rotor, load, angle) for angle in placed])
 
 
 def _run(plant: Plant, seconds: float, drive: float | Sequence[float] = 0.0, damping: float = 0.0) -> None:
@@ -64,10 +69,11 @@ def _run(plant: Plant, seconds: float, drive: float | Sequence[float] = 0.0, dam
         plant.step(np.broadcast_to(np.asarray(drive, float), count), np.full(count, damping), STEP_S)
 
 
-def test_a_joint_without_weight_moves_as_an_independent_one() -> None:
+@pytest.mark.parametrize("rotor", [ROTOR, RUBBING], ids=["free", "rubbing"])
+def test_a_joint_without_weight_moves_as_an_independent_one(rotor: Motor) -> None:
     load = Load(inertia=MASS * ARM**2, friction=0.05)
-    bodies = _plant(FLAT, UrdfJoint("shoulder", 0.0, 1), load=load)
-    alone = IndependentJoints([Joint(ROTOR, load, 0.0)])
+    bodies = _plant(FLAT, UrdfJoint("shoulder", 0.0, 1), load=load, rotor=rotor)
+    alone = IndependentJoints([Joint(rotor, load, 0.0)])
     rng = np.random.default_rng(3)
     ways = []
     for _ in range(200):
@@ -115,6 +121,15 @@ def test_friction_holds_what_it_can_hold() -> None:
     slipping = _plant(ONE, UrdfJoint("shoulder", 0.0, 1), load=Load(friction=0.9 * PULL))
     _run(slipping, 2.0)
     assert slipping.angle[0] < -0.05
+
+
+@pytest.mark.parametrize(("pulled", "falls"), [(0.25, False), (0.35, True)])
+def test_friction_of_the_gear_grows_with_what_pulls_at_it(pulled: float, falls: bool) -> None:
+    gear = dataclasses.replace(ROTOR, load_friction=0.2)
+    # held with 1 - p of the pull: friction is 0.2 of the sum of both, which the difference must not exceed
+    plant = _plant(ONE, UrdfJoint("shoulder", 0.0, 1), rotor=gear)
+    _run(plant, 2.0, drive=(1 - pulled) * PULL, damping=0.05)
+    assert (plant.angle[0] < -0.05) == falls
 
 
 def test_damping_and_friction_of_the_urdf_are_added() -> None:

@@ -71,6 +71,21 @@ def _tables(name: str | None, protocol: float | None) -> list[ControlTable]:
     return found
 
 
+def _motor(table: ControlTable) -> dict[str, object]:
+    """Return the motor of the simulated servo, in SI units."""
+    from dxlrun.simulation.motor import motor_of
+
+    motor = motor_of(table)
+    return {
+        **asdict(motor),
+        "no_load_speed": motor.no_load_speed,
+        "time_constant": motor.time_constant,
+        "voltage": motor.voltage or None,
+        "p_gain_duty": motor.p_gain_duty or None,
+        "gain_source": motor.gain_source or None,
+    }
+
+
 def _as_json(table: ControlTable, *, items: bool) -> dict[str, object]:
     value: dict[str, object] = {
         "model": table.model,
@@ -90,6 +105,7 @@ def _as_json(table: ControlTable, *, items: bool) -> dict[str, object]:
         "stall_current": table.stall_current or None,
         "nominal_voltage": table.nominal_voltage or None,
         "gear_ratio": table.gear_ratio or None,
+        "simulated_motor": _motor(table),
         "capabilities": sorted(table.capabilities),
         "baud_rates": dict(table.baud_rates),
     }

@@ -11,6 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from dxlrun.control_table import CAPABILITIES, ControlItem, ControlTable
+from dxlrun.simulation.motor import Motor, motor_of
 
 _PER_SI = {
     "rad": ("deg", 180 / math.pi),
@@ -55,6 +56,7 @@ def facts(table: ControlTable) -> Text:
         f"{table.model}{names}: model number {table.model_number}, Protocol {table.protocol:.1f}{firmware}",
         f"travel {_travel(table)}, a tick is {math.degrees(table.rad_per_tick):.6g} deg",
         _motor(table),
+        *_simulated(motor_of(table)),
         f"effort: {_effort(table)}",
         f"can: {can}",
         f"baud rates: {', '.join(str(rate) for rate in sorted(table.baud_rates.values()))}",
@@ -149,6 +151,21 @@ def _motor(table: ControlTable) -> str:
     if table.gear_ratio:
         known.append(f"gear {table.gear_ratio:.5g} : 1")
     return ", ".join(known)
+
+
+def _simulated(motor: Motor) -> list[str]:
+    """Say how the simulated servo's motor moves, and where these figures are from."""
+    known = [
+        f"no-load speed {motor.no_load_speed * 30 / math.pi:.4g} rpm",
+        f"time constant {motor.time_constant * 1e3:.1f} ms",
+        f"friction {motor.friction:.2g} Nm and {motor.load_friction:.0%} of the torque",
+        f"{motor.torque_per_ampere:.3g} Nm/A",
+    ]
+    lines = [f"simulated: {', '.join(known)}", f"source of it: {motor.source}"]
+    if motor.p_gain_duty:
+        lines.append(f"P gain: {motor.p_gain_duty:.4g} of full duty per rad of error and unit")
+        lines.append(f"source of it: {motor.gain_source}")
+    return lines
 
 
 def _effort(table: ControlTable) -> str:

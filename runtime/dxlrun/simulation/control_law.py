@@ -17,6 +17,9 @@ from dxlrun.simulation.command import FREE, ROWS
 from dxlrun.simulation.plant import Floats
 from dxlrun.simulation.profile import Profiles
 
+_UNWOUND = 1e-6
+"""duty/s; an integral that changes the duty more slowly is as good as constant."""
+
 
 class ControlLaw:
     """All servos' controllers and motors; `step` fills `drive` and `damping` for the plant."""
@@ -44,6 +47,13 @@ class ControlLaw:
         self._outside = np.zeros(size, dtype=bool)
         self._nothing = np.zeros(size)
         self.commanded()
+
+    @property
+    def winding(self) -> bool:
+        """True while an integral changes, which may yet move a shaft that friction holds."""
+        if not self._integrates:
+            return False
+        return bool((np.abs(self._rows["i"] * self._error) * self._within > _UNWOUND).any())
 
     def commanded(self) -> None:
         """Take note that commands were changed: what nobody uses is not computed."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dxlrun.simulation.command import Command
 from dxlrun.simulation.memory import Memory
+from dxlrun.simulation.motor import Motor
 from dxlrun.simulation.shaft import critical_d
 
 SAMPLING_S = 1e-3
@@ -20,13 +21,16 @@ UNKNOWN_VELOCITY_P, UNKNOWN_VELOCITY_I = 4.0, 40.0
 """There, per part of the no-load speed that is missing, and per s of it [i]"""
 
 
-def position_gains(memory: Memory) -> Command:
-    """Return the gains of position control: KP / 128, KI / 65536, KD / 16, KFF1 / 4 and KFF2 / 4."""
+def position_gains(memory: Memory, motor: Motor) -> Command:
+    """Return the gains of position control: KP / 128, KI / 65536, KD / 16, KFF1 / 4 and KFF2 / 4.
+
+    Where the P gain was identified as another one, the others go with it [i].
+    """
     table = memory.table
     if table.items["position_p_gain"].initial is None:
-        d = critical_d(UNKNOWN_P, table.max_speed)
+        d = critical_d(UNKNOWN_P, motor)
         return Command(p_ccw=UNKNOWN_P, p_cw=UNKNOWN_P, d=d)
-    unit = table.items["goal_pwm"].scale / table.rad_per_tick
+    unit = 128 * motor.p_gain_duty or table.items["goal_pwm"].scale / table.rad_per_tick
     p = memory["position_p_gain"] / 128 * unit
     return Command(
         p_ccw=p,

@@ -16,7 +16,8 @@ SLOPE_TICK = math.radians(300) / 1023
 """Unit of Compliance Slope (28), rad: 0x40 is about 18.8 degrees (manual of the RX-28, example 17)."""
 
 SLOPE_TIMES_P = 1024
-"""P gain 32 is as stiff as slope 32, 8 as slope 128 (e-Manual, MX-28, PID Gains (26, 27, 28))."""
+"""P gain 32 is as stiff as slope 32, 8 as slope 128 (e-Manual, MX-28, PID Gains (26, 27, 28)); an identified
+P gain (`Motor.p_gain_duty`) goes before that."""
 
 _MID_OF_CURRENT = {"current": 2048, "sensed_current": 512}
 """Tick of no current: MX-64, Current (68), 4.5 mA a tick; EX-106+, Sensed Current (56), 10 mA a tick."""
@@ -190,7 +191,7 @@ class JointShaft(Shaft):
         What Punch does beside PID gains no manual says: nothing here [?].
         """
         memory = self.memory
-        unit = 8 / (SLOPE_TIMES_P * SLOPE_TICK)
+        unit = 8 * (self.motor.p_gain_duty or 1 / (SLOPE_TIMES_P * SLOPE_TICK))
         p = memory["p_gain"] / 8 * unit
         return Command(
             p_ccw=p,

@@ -23,7 +23,7 @@ from dxlrun.simulation.strain import OVERLOAD_TICKS, Strain
 __all__ = ["NO_LOAD", "STEP_NS", "Load", "Mechanics", "Motor", "Plant", "PlantMaker"]
 
 STEP_NS = 2_000_000
-"""Step of the grid. The fastest thing in a servo here is its motor's time constant of 10 ms."""
+"""Step of the grid. The fastest thing in a servo here is its motor's time constant: 13.6 ms and more."""
 
 EAGER_NS, EASY_NS = 4_000_000, 1_000_000_000
 """In real time it is let go on so often while servos move and while they only cool: to catch up with a long
@@ -195,7 +195,7 @@ class Mechanics:
         before = plant.velocity.copy()
         plant.step(law.drive, law.damping, STEP_NS * 1e-9)
         profiles.look()
-        still = profiles.arrived and np.abs(plant.velocity).max() < _STILL
+        still = profiles.arrived and np.abs(plant.velocity).max() < _STILL and not law.winding
         if still and np.abs(before - plant.velocity).max() < _UNDRIVEN:
             plant.velocity.fill(0.0)
             self._pauses += 1
@@ -218,7 +218,7 @@ class Mechanics:
         count, dt_s = len(self._motors), STEP_NS * 1e-9
         self.plant: Plant = self._make_plant(
             [
-                Joint(motor.inertia, load, float(each))
+                Joint(motor, load, float(each))
                 for motor, load, each in zip(self._motors, self._loads, angle, strict=True)
             ]
         )

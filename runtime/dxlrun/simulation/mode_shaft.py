@@ -159,7 +159,7 @@ class ModeShaft(Shaft):
             return self._turn(limit)
         if not self._controls_position:
             return LIMP  # a value that the model's manual does not name
-        command = position_gains(memory)._replace(limit=limit)
+        command = position_gains(memory, self.motor)._replace(limit=limit)
         return command._replace(torque_limit=abs(torque)) if mode == CURRENT_BASED else command
 
     def _turn(self, limit: float) -> Command:

@@ -107,6 +107,9 @@ class MujocoPlant:
         self._turn, self._speed = data.qpos, data.qvel
         self._numbers = np.array([model.joint(turned[row].name).id for row in rows], dtype=np.intp)
         self._own_damping = model.dof_damping[self._numbers]
+        self._friction, self._bias = model.dof_frictionloss, data.qfrc_bias
+        self._own_friction = model.dof_frictionloss[self._numbers]
+        self._load_friction = np.array([joints[row].motor.load_friction for row in rows])
 
     def step(self, drive: Floats, damping: Floats, dt_s: float) -> None:
         """Let a time pass in which each servo drives with `drive - damping * velocity`; Nm and Nm s/rad."""
@@ -130,6 +133,10 @@ class MujocoPlant:
         self._model.opt.timestep = dt_s
         # MuJoCo's own integrator takes damping at the end of the step, as independent joints do
         self._damping[numbers] = self._own_damping + damping[rows]
+        torque = direction * (drive[rows] - damping[rows] * self.velocity[rows])
+        # what pulls at the joint is the bodies' as it was a step ago
+        rubbing = self._load_friction * np.abs(torque + self._bias[numbers])
+        self._friction[numbers] = self._own_friction + rubbing
         self._turn[numbers] = direction * (self.angle[rows] - self._reference)
         self._speed[numbers] = direction * self.velocity[rows]
         self._force[numbers] = direction * drive[rows]
@@ -165,8 +172,9 @@ def _compiled(urdf: str, turned: Mapping[str, Joint]) -> MjModel:
     spec.option.disableflags |= int(disabled)
     for joint in spec.joints:
         if (servo := turned.get(joint.name)) is not None:
-            joint.armature = servo.rotor_inertia
-            joint.frictionloss += servo.load.friction
+            joint.armature = servo.motor.inertia
+            joint.damping[0] += servo.motor.viscous_friction
+            joint.frictionloss += servo.motor.friction + servo.load.friction
             joint.solref_friction = _FRICTION_SOLREF
             joint.solimp_friction = _FRICTION_SOLIMP
     return spec.compile()

@@ -13,6 +13,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.simulation.motor import Motor
+
 Floats = NDArray[np.float64]
 
 
@@ -23,7 +25,7 @@ class Load:
     inertia: float = 0.0
     """kg m^2, beside that of the servo's own rotor and gear"""
     friction: float = 0.0
-    """Nm, Coulomb: the same at every speed, and the most that holds the joint at rest"""
+    """Nm, Coulomb, beside the servo's own: the same at every speed, and the most that holds at rest"""
     gravity: float = 0.0
     """Nm with which gravity turns the link where it is horizontal"""
     gravity_angle: float = 0.0
@@ -37,8 +39,8 @@ NO_LOAD = Load()
 class Joint:
     """One servo's shaft as a plant takes it over."""
 
-    rotor_inertia: float
-    """kg m^2 of rotor and gear, as felt at the shaft"""
+    motor: Motor
+    """Its inertia and friction are the plant's to apply"""
     load: Load
     angle: float
     """rad from the servo's raw 0, at the start"""
@@ -69,44 +71,56 @@ PlantMaker = Callable[[Sequence[Joint]], Plant]
 class IndependentJoints:
     """Joints that do not feel one another.
 
-    Velocity first, damping taken at the end of the step: stable at any damping and any step.
+    Velocity first, damping taken at the end of the step: stable at any damping and any step. Friction is that
+    of `Motor` and of `Load`.
     """
 
     def __init__(self, joints: Sequence[Joint]) -> None:
         self.angle: Floats = np.array([joint.angle for joint in joints], dtype=np.float64)
         self.velocity: Floats = np.zeros(len(joints))
-        self._inverse_inertia = np.array([1.0 / (each.rotor_inertia + each.load.inertia) for each in joints])
-        self._friction = np.array([each.load.friction for each in joints])
+        self._inverse_inertia = np.array([1.0 / (each.motor.inertia + each.load.inertia) for each in joints])
+        self._friction = np.array([each.motor.friction + each.load.friction for each in joints])
+        self._load_friction = np.array([each.motor.load_friction for each in joints])
+        self._viscous_friction = np.array([each.motor.viscous_friction for each in joints])
         self._gravity = np.array([each.load.gravity for each in joints])
         self._down = np.array([each.load.gravity_angle for each in joints])
-        self._has_friction = bool(self._friction.any())
+        self._has_friction = bool((self._friction + self._load_friction).any())
         self._has_gravity = bool(self._gravity.any())
         self._torque, self._work, self._less = (np.zeros(len(joints)) for _ in range(3))
-        self._one, self._dt = np.ones(len(joints)), np.zeros(len(joints))
-        self._per_torque, self._most = np.zeros(len(joints)), np.zeros(len(joints))
+        self._dt, self._per_torque = np.zeros(len(joints)), np.zeros(len(joints))
+        self._least_most, self._most_per_torque = np.zeros(len(joints)), np.zeros(len(joints))
+        self._most, self._undamped = np.zeros(len(joints)), np.ones(len(joints))
         self._dt_s = 0.0
 
     def step(self, drive: Floats, damping: Floats, dt_s: float) -> None:
         """Let a time pass in which each servo drives with `drive - damping * velocity`; Nm and Nm s/rad."""
-        torque, work, velocity = self._torque, self._work, self.velocity
+        torque, work, most, velocity = self._torque, self._work, self._most, self.velocity
         if dt_s != self._dt_s:
             self._set_step(dt_s)
+        if self._has_friction:
+            np.multiply(damping, velocity, out=most)
+            np.subtract(drive, most, out=most)  # the motor's torque, which gravity's is added to
         if self._has_gravity:
             np.subtract(self.angle, self._down, out=work)
             np.sin(work, out=work)
             np.multiply(work, self._gravity, out=work)
             np.subtract(drive, work, out=torque)
             np.multiply(torque, self._per_torque, out=torque)
+            np.add(most, work, out=most)
         else:
             np.multiply(drive, self._per_torque, out=torque)
         np.add(velocity, torque, out=velocity)  # as it would be without friction and damping
         if self._has_friction:
+            np.abs(most, out=most)
+            np.multiply(most, self._most_per_torque, out=most)
+            np.add(most, self._least_most, out=most)
+            np.negative(most, out=self._less)
             # what friction takes in a step, and no more: a joint that it stops stays at rest
-            np.minimum(velocity, self._most, out=work)
+            np.minimum(velocity, most, out=work)
             np.maximum(work, self._less, out=work)
             np.subtract(velocity, work, out=velocity)
         np.multiply(self._per_torque, damping, out=work)
-        np.add(work, self._one, out=work)
+        np.add(work, self._undamped, out=work)
         np.divide(velocity, work, out=velocity)
         np.multiply(velocity, self._dt, out=work)
         np.add(self.angle, work, out=self.angle)
@@ -120,5 +134,6 @@ class IndependentJoints:
         self._dt_s = dt_s
         self._dt.fill(dt_s)
         np.multiply(self._inverse_inertia, dt_s, out=self._per_torque)
-        np.multiply(self._friction, self._per_torque, out=self._most)
-        np.negative(self._most, out=self._less)
+        np.multiply(self._friction, self._per_torque, out=self._least_most)
+        np.multiply(self._load_friction, self._per_torque, out=self._most_per_torque)
+        np.copyto(self._undamped, 1.0 + self._viscous_friction * self._per_torque)

@@ -10,7 +10,7 @@ from typing import ClassVar
 from dxlrun.simulation.command import LIMP, Command
 from dxlrun.simulation.mechanics import STEP_NS, Load, Mechanics
 from dxlrun.simulation.memory import Memory
-from dxlrun.simulation.motor import TIME_CONSTANT_S, motor_of
+from dxlrun.simulation.motor import Motor, motor_of
 
 Trajectory = tuple[float, float, float]
 """Goal, rad of the shaft, and the profile's speed, rad/s, and acceleration, rad/s^2."""
@@ -139,9 +139,11 @@ def in_turn(angle: float) -> float:
     return angle if 0 <= angle < math.tau else angle % math.tau
 
 
-def critical_d(p: float, max_speed: float) -> float:
+def critical_d(p: float, motor: Motor) -> float:
     """Return the D gain, duty per rad/s, with which a P gain, duty per rad, does not overshoot.
 
-    With the motor's time constant T and its no-load speed w the loop is T x'' + (1 + D w) x' + P w x = 0.
+    With the motor's time constant T, and w its stall torque over damping, the loop is
+    T x'' + (1 + D w) x' + P w x = 0.
     """
-    return max(0.0, 2 * math.sqrt(p * max_speed * TIME_CONSTANT_S) - 1.0) / max_speed
+    speed = motor.stall_torque / motor.damping
+    return max(0.0, 2 * math.sqrt(p * speed * motor.time_constant) - 1.0) / speed
