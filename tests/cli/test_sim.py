@@ -152,6 +152,9 @@ def test_servos_without_a_robot_file_answer_and_take_faults_that_are_typed(start
     sim.type("silence  servo=0x1")
     assert json.loads(sim.line()) == {"understood": "silence servo=1"}
     assert json.loads(sim.line()) == {"fault": "silence servo=1"}
+    sim.type("turn servo=2 by=30deg for=100ms")
+    assert json.loads(sim.line()) == {"understood": "turn servo=2 by=30deg for=100ms"}
+    assert json.loads(sim.line()) == {"fault": "turn servo=2 by=30deg for=100ms"}
     sim.type("slience servo=1")
     assert "did you mean silence?" in json.loads(sim.line())["error"]
     sim.type("help")

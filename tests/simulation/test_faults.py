@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -273,6 +274,68 @@ def test_a_hot_servo_of_protocol_2_switches_off_and_tells_it(line2: Any) -> None
     assert line2.get("hardware_error_status") == 0x04  # e-Manual, XM430-W350: bit 2, OverHeating
     assert line2.get("torque_enable") == 0
     assert happened(line2) == ["overheat servo=1"]
+
+
+@pytest.mark.parametrize(("model", "by"), [("XM430-W350", 30.0), ("XL430-W250", -90.0), ("XL-320", 20.0)])
+def test_a_hand_turns_a_limp_shaft_evenly(make_line2: Callable[..., Any], model: str, by: float) -> None:
+    line2 = make_line2((1, 2), model)
+    inject(line2, f"turn servo=1 by={by:g}deg for=1s")
+    line2.wait(0.5)
+    assert math.degrees(line2.servo(1).position - 2.0) == pytest.approx(by / 2, rel=0.02)
+    assert math.degrees(line2.servo(1).velocity) == pytest.approx(by)
+    name = "present_speed" if model == "XL-320" else "present_velocity"
+    shown = line2.get(name) * line2.servo(1).registers.table.rad_s_per_tick
+    assert math.degrees(shown) == pytest.approx(by, abs=1.0)
+    line2.wait(2.0)
+    assert math.degrees(line2.servo(1).position - 2.0) == pytest.approx(by)
+    assert line2.servo(1).velocity == 0.0
+    assert line2.get("present_position") * line2.servo(1).registers.table.rad_per_tick == pytest.approx(
+        line2.servo(1).position, abs=0.005
+    )
+    assert line2.servo(2).position == 2.0
+    assert happened(line2) == [f"turn servo=1 by={by:g}deg for=1s"]
+
+
+@pytest.mark.parametrize(("mode", "goal"), [(3, None), (4, None), (5, None), (1, None), (0, 100), (16, 100)])
+def test_a_hand_gives_way_to_a_servo_with_torque(line2: Any, mode: int, goal: int | None) -> None:
+    line2.set("operating_mode", mode)
+    line2.set("torque_enable", 1)
+    if goal is not None:
+        line2.set("goal_current" if mode == 0 else "goal_pwm", goal)
+    line2.wait(0.1)
+    before = line2.servo(1).position
+    inject(line2, "turn servo=1 by=-30deg")
+    line2.wait(0.5)
+    moved = line2.servo(1).position - before
+    assert moved == pytest.approx(0.0, abs=0.002) if goal is None else moved > 0.01
+    way = "servo 1: holds or drives its shaft, so the hand that turns it gives way after 0.0 of -30 deg"
+    assert way in line2.notes()
+
+
+@pytest.mark.parametrize(("mode", "name"), [(0, "goal_current"), (16, "goal_pwm")])
+def test_a_hand_turns_a_shaft_whose_servo_is_commanded_to_no_torque(line2: Any, mode: int, name: str) -> None:
+    line2.set("operating_mode", mode)
+    line2.set("torque_enable", 1)
+    assert line2.get(name) == 0
+    inject(line2, "turn servo=1 by=30deg")
+    line2.wait(1.5)
+    assert math.degrees(line2.servo(1).position - 2.0) == pytest.approx(30.0, abs=0.1)
+
+
+def test_torque_that_comes_on_midway_ends_the_turning(line: Any) -> None:
+    inject(line, "turn servo=1 by=30deg for=1s at=0s")
+    line.clock.wait_until(500 * MS)
+    line.write(1, 30, *line.servo(1).registers.data("present_position"))  # the goal where it is: torque on
+    line.clock.wait_until(2000 * MS)
+    assert math.degrees(line.servo(1).position - 2.0) == pytest.approx(15.0, abs=1.0)
+    (way,) = [note for note in line.notes() if "gives way" in note]
+    assert way.startswith("servo 1: holds or drives its shaft, so the hand that turns it gives way after 15.")
+
+
+def test_a_servo_that_lost_its_power_is_still_turned(line2: Any) -> None:
+    inject(line2, "turn servo=1 by=30deg for=1s", "reboot servo=1 at=500ms")
+    line2.wait(1.5)
+    assert math.degrees(line2.servo(1).position - 2.0) == pytest.approx(30.0)
 
 
 def test_two_servos_with_one_id_talk_at_once(line: Any) -> None:

@@ -7,7 +7,7 @@ from dataclasses import fields
 import pytest
 
 from dxlrun.errors import InputError
-from dxlrun.simulation.fault_text import KEYS, KINDS, Fault, fault_help, parse_fault
+from dxlrun.simulation.fault_text import KEYS, KINDS, OF_KIND, Fault, fault_help, parse_fault
 
 LINES = (
     "lose servo=3 at=2s",
@@ -26,6 +26,8 @@ LINES = (
     "voltage servo=1 volts=7.4",
     "overload servo=3",
     "overheat servo=3 celsius=81.123456789",
+    "turn servo=2 by=30deg for=1s",
+    "turn servo=2 by=-0.125deg at=1s for=500ms",
     "duplicate_id servo=253",
     "unplug bus=main at=5s for=2s",
     "wedge at=0s",
@@ -43,7 +45,8 @@ def test_every_kind_has_a_line_here() -> None:
 
 
 def test_every_field_of_a_fault_can_be_written() -> None:
-    assert {key.field for key in KEYS.values()} == {field.name for field in fields(Fault)} - {"kind"}
+    written = {key.field for key in (*KEYS.values(), *OF_KIND.values())}
+    assert written == {field.name for field in fields(Fault)} - {"kind"}
 
 
 def test_a_line_can_be_written_in_other_ways_and_has_one_canonical_text() -> None:
@@ -51,6 +54,9 @@ def test_a_line_can_be_written_in_other_ways_and_has_one_canonical_text() -> Non
     assert str(other) == "corrupt servo=3 byte=16 flip=0x01 at=500ms"
     assert other == parse_fault(str(other))
     assert str(parse_fault("lose servo=3 count=1")) == "lose servo=3"
+    radians = parse_fault("turn servo=2 by=1rad")
+    assert radians.by_deg == pytest.approx(57.29578)
+    assert parse_fault(str(radians)) == radians
 
 
 @pytest.mark.parametrize(
@@ -78,6 +84,17 @@ def test_a_line_can_be_written_in_other_ways_and_has_one_canonical_text() -> Non
         ("noise data=xy", "noise: data=xy: write 1 to 256 bytes in hex, such as ff00fd"),
         ("noise data=ff size=3", "noise has both data= and size=; leave one of them out"),
         ("unplug bus=", "unplug: bus=: write the name of a bus"),
+        ("turn servo=2", "turn needs by=; write it as in: turn servo=ID by=ANGLE [for=TIME]"),
+        ("turn by=30deg", "turn needs servo="),
+        ("turn servo=2 by=1s", "turn: by=1s: write an angle such as 30deg or -0.5rad, of at most 100 turns"),
+        ("turn servo=2 by=30", "by=30: write an angle such as 30deg or -0.5rad"),
+        ("turn servo=2 by=0deg", "by=0deg: write an angle such as 30deg"),
+        ("turn servo=2 by=nandeg", "by=nandeg: write an angle such as 30deg"),
+        (
+            "turn servo=2 by=36001deg",
+            "by=36001deg: write an angle such as 30deg or -0.5rad, of at most 100 turns",
+        ),
+        ("delay servo=3 by=30deg", "delay: by=30deg: write a time such as 2s, 500ms or 100us"),
         ("storm faults=3 within=1s kinds=storm", "storm: kinds=storm: a storm has no 'storm'"),
         ("storm faults=3 within=1s kinds=los", "a storm has no 'los'; did you mean lose?"),
     ],

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from dxlrun.errors import InputError
 from dxlrun.events import Event, EventCode, Severity
 from dxlrun.simulation import LedgerEntry
-from dxlrun.simulation.fault_kinds import BABBLE_NS, BOOT_NS, BROWNOUT_NS
+from dxlrun.simulation.fault_kinds import BABBLE_NS, BOOT_NS, BROWNOUT_NS, TURN_NS
 from dxlrun.simulation.faults import Fault, parse_fault
 
 MARK = "fault: "
@@ -62,6 +62,7 @@ _KINDS: Mapping[str, _Kind] = {
     "voltage": _Kind(_MISSED | _POWER | _ERROR, _EVER, _ERROR),
     "overload": _Kind(_ERROR, 0, _ERROR),
     "overheat": _Kind(_ERROR | {EventCode.SERVO_HOT}, _EVER, _ERROR),
+    "turn": _Kind(frozenset((EventCode.IMPLAUSIBLE,)), TURN_NS),
     "duplicate_id": _Kind(_GARBLED | {EventCode.IMPLAUSIBLE}, _EVER),
     "unplug": _Kind(frozenset((EventCode.PORT_LOST,)), _EVER, due=True),
     "wedge": _Kind(_MISSED, _EVER, due=True),

@@ -7,6 +7,7 @@ power is limp at once; a second servo with an ID stands where the first one stan
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -26,6 +27,7 @@ BOOT_NS = 100_000_000
 BROWNOUT_NS = 200_000_000
 BABBLE_NS = 200_000_000
 BABBLE_PAUSE_NS = 2_000_000
+TURN_NS = 1_000_000_000
 
 
 @dataclass(slots=True)
@@ -220,6 +222,12 @@ def _overheat(injection: Injection) -> None:
         servo.set_temperature(HOT_CELSIUS if injection.fault.celsius is None else injection.fault.celsius)
 
 
+def _turn(injection: Injection) -> None:
+    for servo in injection.servos():
+        by = math.radians(injection.fault.by_deg or 0.0)
+        servo.turn(by, injection.fault.for_ns or TURN_NS)
+
+
 def _duplicate_id(injection: Injection) -> None:
     for servo in injection.servos():
         table, delay = servo.registers.table, servo.registers["return_delay_time"]
@@ -241,6 +249,7 @@ _BEGIN: Mapping[str, Callable[[Injection], None]] = {
     "voltage": _voltage,
     "overload": _overload,
     "overheat": _overheat,
+    "turn": _turn,
     "duplicate_id": _duplicate_id,
     "unplug": _unplug,
     "wedge": _wedge,

@@ -42,6 +42,8 @@ class Fault:
     """Bytes of the packet that get through."""
     by_ns: int | None = None
     """How much later the reply starts."""
+    by_deg: float | None = None
+    """How far a shaft is turned, degrees, counter-clockwise: towards higher positions."""
     copies: int | None = None
     """How often the reply comes in all."""
     data: bytes | None = None
@@ -58,7 +60,8 @@ class Fault:
 
     def __str__(self) -> str:
         words: list[str] = [self.kind]
-        for name, key in KEYS.items():
+        for name in KEYS:
+            key = key_of(self.kind, name)
             value = getattr(self, key.field)
             if value is not None and value != key.default:
                 words.append(f"{name}={key.show(value)}")
@@ -126,6 +129,11 @@ KINDS: Mapping[str, Kind] = {
     ),
     "overload": Kind("the shaft of a servo is loaded beyond its torque", ("servo",), WHEN),
     "overheat": Kind("a servo is hot (default 90)", ("servo",), ("celsius", "for", *WHEN)),
+    "turn": Kind(
+        "a hand turns the shaft of a servo in 1 s (for=); it gives way to one that holds or drives it",
+        ("servo", "by"),
+        ("for", *WHEN),
+    ),
     "duplicate_id": Kind("a second servo of the same model has this ID", ("servo",), WHEN),
     "unplug": Kind(
         "the adapter is pulled, and comes back after for=, under another name", (), ("for", *WHEN)
@@ -158,10 +166,11 @@ def parse_fault(text: str) -> Fault:
             raise InputError(f"{name}: {word!r} is no key=value; write it as in: {usage(name)}")
         if key not in kind.keys:
             raise InputError(f"{name} takes no {key!r}; {_meant(key, kind.keys, 'it takes')}")
-        if KEYS[key].field in given:
+        reader = key_of(name, key)
+        if reader.field in given:
             raise InputError(f"{name}: {key}= is there twice; leave one of them out")
         try:
-            given[KEYS[key].field] = KEYS[key].parse(value)
+            given[reader.field] = reader.parse(value)
         except ValueError as error:
             raise InputError(f"{name}: {key}={value}: {error}") from error
     _check(name, kind, given)
@@ -171,8 +180,8 @@ def parse_fault(text: str) -> Fault:
 def usage(name: str) -> str:
     """Return how a kind is written: `lose [servo=ID] [from=host] ...`; raises KeyError for no kind."""
     kind = KINDS[name]
-    needs = [f"{key}={KEYS[key].example}" for key in kind.needs]
-    takes = [f"[{key}={KEYS[key].example}]" for key in kind.takes]
+    needs = [f"{key}={key_of(name, key).example}" for key in kind.needs]
+    takes = [f"[{key}={key_of(name, key).example}]" for key in kind.takes]
     return " ".join((name, *needs, *takes))
 
 
@@ -182,7 +191,7 @@ def fault_help() -> tuple[str, ...]:
 
 
 def _check(name: str, kind: Kind, given: Mapping[str, object]) -> None:
-    missing = [key for key in kind.needs if KEYS[key].field not in given]
+    missing = [key for key in kind.needs if key_of(name, key).field not in given]
     if missing:
         raise InputError(
             f"{name} needs {' and '.join(f'{key}=' for key in missing)}; write it as in: {usage(name)}"
@@ -274,6 +283,18 @@ def _show_number(value: object) -> str:
     return short if float(short) == value else repr(value)
 
 
+def _angle(text: str) -> float:
+    """Return degrees, to either side."""
+    number = text.removesuffix("deg").removesuffix("rad")
+    try:
+        value = float(number) * (1.0 if text.endswith("deg") else math.degrees(1.0))
+    except ValueError:
+        value = math.nan
+    if number == text or not 0.0 < abs(value) <= _MOST_DEGREES:
+        raise ValueError("write an angle such as 30deg or -0.5rad, of at most 100 turns")
+    return value
+
+
 def _hex(text: str) -> bytes:
     try:
         data = bytes.fromhex(text)
@@ -306,6 +327,7 @@ def _kinds(text: str) -> tuple[str, ...]:
 
 
 _MOST_BYTES = 256
+_MOST_DEGREES = 36_000.0
 
 KEYS: Mapping[str, Key] = {
     "bus": Key("bus", "NAME", _name),
@@ -332,3 +354,12 @@ KEYS: Mapping[str, Key] = {
     "packet": Key("packet", "NUMBER", _integer(1, 10**9)),
     "for": Key("for_ns", "TIME", _some_time, _show_time),
 }
+OF_KIND: Mapping[tuple[str, str], Key] = {
+    ("turn", "by"): Key("by_deg", "ANGLE", _angle, lambda value: f"{_show_number(value)}deg"),
+}
+"""Keys that mean something else to one kind."""
+
+
+def key_of(kind: str, name: str) -> Key:
+    """Return how a key of a kind is read and written; raises KeyError for no key."""
+    return OF_KIND.get((kind, name)) or KEYS[name]

@@ -10,6 +10,7 @@ from __future__ import annotations
 import heapq
 import itertools
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -39,6 +40,19 @@ _STILL, _UNDRIVEN = 1e-6, 1e-8
 """rad/s, and its change in a step: below both a servo rests."""
 
 
+@dataclass(slots=True)
+class _Hand:
+    """A hand that turns a shaft, as long as nothing drives it."""
+
+    speed: float
+    """rad/s"""
+    steps: int
+    """of the grid that are left"""
+    gives_way: Callable[[float], None]
+    turned: float = 0.0
+    """rad so far"""
+
+
 class Mechanics:
     """Servos that are stepped together; time comes from the callers, and going back is ignored."""
 
@@ -53,6 +67,7 @@ class Mechanics:
         self._watchers: dict[int, Callable[[], None]] = {}
         self._agenda: list[tuple[int, int, Callable[[], None]]] = []
         self._order = itertools.count()
+        self._hands: dict[int, _Hand] = {}
         self._busy = False
         self._commanded = False
         self._pauses = 0
@@ -120,6 +135,15 @@ class Mechanics:
         self.profiles.arrived = False
         self.still = 0
 
+    def turn(self, index: int, by: float, duration_ns: int, gives_way: Callable[[float], None]) -> None:
+        """Let a hand turn a shaft evenly by an angle, rad, from now on.
+
+        It gives way to a servo that drives or holds its shaft; `gives_way` is then told how far it came, rad.
+        """
+        steps = max(1, round(duration_ns / STEP_NS))
+        self._hands[index] = _Hand(by / (steps * STEP_NS * 1e-9), steps, gives_way)
+        self.still = 0
+
     def heat(self, index: int, celsius: float) -> None:
         """Bring a servo to a temperature, degrees C; it goes back to that of its load."""
         self.strain.temperature[index] = celsius
@@ -165,7 +189,10 @@ class Mechanics:
         if self.still or not self._motors:
             self._skip(now_ns)
         else:
-            self._step()
+            if self._hands:
+                self._step_with_hands()
+            else:
+                self._step()
             self.grid_ns += STEP_NS
         if self.grid_ns >= self._next_strain_ns:
             self._next_strain_ns = self._strain_after(self.grid_ns)
@@ -200,6 +227,29 @@ class Mechanics:
             plant.velocity.fill(0.0)
             self._pauses += 1
             self.still = self._pauses
+
+    def _step_with_hands(self) -> None:
+        """Take one step; what a hand turns is where the hand is."""
+        angles = {index: self.plant.angle.item(index) for index in self._hands}
+        self._step()
+        for index, angle in angles.items():
+            hand, way = self._hands[index], self._hands[index].speed * STEP_NS * 1e-9
+            if self._drives(index):
+                del self._hands[index]
+                hand.gives_way(hand.turned)
+                continue
+            hand.steps, hand.turned = hand.steps - 1, hand.turned + way
+            self.place(index, angle + way)
+            if hand.steps:
+                self.plant.velocity[index] = hand.speed
+            else:
+                del self._hands[index]
+
+    def _drives(self, index: int) -> bool:
+        """Return whether a servo is commanded to a position, a speed, or a torque that is not 0."""
+        command = Command(*self._commands[:, index].tolist())
+        able = command.limit > 0.0 and command.torque_limit > 0.0
+        return able and any((command.bias, command.turning, command.p_ccw, command.p_cw))
 
     def _feel(self) -> None:
         if not self._motors:

@@ -9,6 +9,7 @@ the control table, the fast reads, Clear and Control Table Backup.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -253,6 +254,16 @@ class SimulatedServo:
         self._body.temperature = celsius
         self._note(f"servo {self.servo_id}: temperature {celsius} degC")
         self._body.protect()
+
+    def turn(self, by: float, duration_ns: int) -> None:
+        """Let a hand turn the shaft by an angle, rad, in a time; it gives way to a servo that has torque."""
+
+        def gives_way(turned: float) -> None:
+            came = f"gives way after {math.degrees(turned):.1f} of {math.degrees(by):g} deg"
+            self._note(f"servo {self.servo_id}: holds or drives its shaft, so the hand that turns it {came}")
+
+        shaft = self._body.shaft
+        shaft.mechanics.turn(shaft.index, by, duration_ns, gives_way)
 
     def turn_by_hand(self, angle: float) -> None:
         """Turn the shaft to an angle, rad; a servo with torque goes back to its goal."""

@@ -46,6 +46,9 @@ _GIVEN: Mapping[str, Callable[[Random], Fault]] = {
     ),
     "overload": lambda random: Fault(kind="overload"),
     "overheat": lambda random: Fault(kind="overheat", for_ns=_some_ns(random, 10_000_000, 10**9)),
+    "turn": lambda random: Fault(
+        kind="turn", by_deg=float(random.randint(-90, 90) or 1), for_ns=_some_ns(random, 10_000_000, 10**9)
+    ),
     "duplicate_id": lambda random: Fault(kind="duplicate_id"),
     "unplug": lambda random: Fault(kind="unplug", for_ns=_some_ns(random, 10_000_000, 10**9)),
     "wedge": lambda random: Fault(kind="wedge", for_ns=_some_ns(random, 1_000_000, 500_000_000)),
