@@ -6,10 +6,12 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+
+from dxlrun.cli import main
 
 EXAMPLE = Path(__file__).parents[2] / "plugins" / "example"
 TYPE_MARK = "example.yaml:12:16: "
@@ -23,8 +25,11 @@ Told = Callable[..., list[str]]
 
 
 @pytest.fixture
-def told(tmp_path: Path) -> Told:
+def told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Iterator[Told]:
     """Install the example with some text replaced, check its robot file, return the lines of the errors."""
+    monkeypatch.chdir(tmp_path)
 
     def told(old: str = "", new: str = "", *, install: bool = True) -> list[str]:
         assert not old or (old in CONTROLLER) != (old in PLUGIN)
@@ -41,25 +46,15 @@ def told(tmp_path: Path) -> Told:
             (info / "METADATA").write_text("Metadata-Version: 2.1\nName: dxlrun-easing\nVersion: 0.1.0\n")
             (info / "entry_points.txt").write_text("[dxlrun]\neasing = dxlrun_easing.plugin\n")
         (tmp_path / "example.yaml").write_text((EXAMPLE / "example.yaml").read_text())
-        run = check(tmp_path)
-        assert run.stdout == ""
-        assert run.returncode == (2 if run.stderr else 0)
-        return run.stderr.splitlines()
+        monkeypatch.syspath_prepend(tmp_path)
+        code = main(["check", "example.yaml"])
+        out, err = capsys.readouterr()
+        assert (out, code) == ("", 2 if err else 0)
+        return list(err.splitlines())
 
-    return told
-
-
-def check(directory: Path, *options: str) -> subprocess.CompletedProcess[str]:
-    path = os.pathsep.join(filter(None, [str(directory), os.environ.get("PYTHONPATH")]))
-    code = "import sys; from dxlrun.cli import main; sys.exit(main(sys.argv[1:]))"
-    return subprocess.run(
-        [sys.executable, "-P", "-c", code, "check", "example.yaml", *options],
-        cwd=directory,
-        env=os.environ | {"PYTHONPATH": path},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    yield told
+    for name in [name for name in sys.modules if name.startswith("dxlrun_easing")]:
+        del sys.modules[name]
 
 
 def test_a_plugin_that_is_not_installed(told: Told) -> None:
@@ -159,7 +154,18 @@ def test_parameters_whose_model_raises(told: Told) -> None:
     )
 
 
-def test_the_same_for_programs(told: Told, tmp_path: Path) -> None:
+def test_the_same_for_programs_from_a_process_of_its_own(told: Told, tmp_path: Path) -> None:
     told("return 1", "return 7")
-    (error,) = json.loads(check(tmp_path, "--json").stdout)["errors"]
+    path = os.pathsep.join(filter(None, [str(tmp_path), os.environ.get("PYTHONPATH")]))
+    code = "import sys; from dxlrun.cli import main; sys.exit(main(sys.argv[1:]))"
+    check = subprocess.run(
+        [sys.executable, "-P", "-c", code, "check", "example.yaml", "--json"],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    (error,) = json.loads(check.stdout)["errors"]
+    assert check.returncode == 2
     assert (error["file"], error["line"], error["column"]) == ("example.yaml", 12, 16)
