@@ -48,6 +48,10 @@ def test_a_name_prints_its_control_table(dxlrun):
     assert set(control_table("AX-12A").items) <= rows.keys()
 
 
+def test_another_name_prints_it_too(dxlrun):
+    assert dxlrun("models", "xl-430").out.startswith("XL430-W250: model number 1060, Protocol 2.0")
+
+
 @pytest.mark.parametrize(
     ("model", "line"),
     [
@@ -137,7 +141,7 @@ def test_json_of_all_models_has_no_items(dxlrun):
     ("words", "sentence"),
     [
         (("XM430-W305",), "there is no model XM430-W305; did you mean XM430-W350?"),
-        (("xm430-w350",), "there is no model xm430-w350; did you mean XM430-W350?"),
+        (("xm430",), "there is no model xm430; did you mean XM430-W210 or XM430-W350?"),
         (("toaster",), "there is no model toaster; `dxlrun models` lists all"),
         (("AX-12A", "--protocol", "2.0"), "there is no model AX-12A of Protocol 2.0; "),
         (("AX-12A", "--protocol", "3"), "there is no Protocol 3; --protocol is 1.0 or 2.0"),

@@ -39,6 +39,11 @@ def test_protocol_1_has_rates_by_its_formula():
     assert servo_bus(["AX-12A:1"], 333_333, None).baud_rate == 333_333
 
 
+@pytest.mark.parametrize(("word", "model"), [("XL-430:1", "XL430-W250"), ("AX12:1", "AX-12A")])
+def test_a_model_is_understood_by_other_names(word: str, model: str):
+    assert servo_bus([word], None, None).servos[0].model == model
+
+
 def test_a_name_with_two_firmwares_follows_the_protocol():
     assert servo_bus(["MX-28:1"], None, 1.0).protocol == 1.0
     assert servo_bus(["MX-28:1"], None, 2.0).protocol == 2.0
@@ -53,11 +58,11 @@ def test_a_name_with_two_firmwares_follows_the_protocol():
         (["--servo", "AX-12A:1-99999999999999"], ["1-99999999999999 is no ID of a servo"]),
         (["--servo", "XL430-W250:253"], ["XL430-W250 cannot have ID 253; Protocol 2.0 goes to 252"]),
         (
-            ["--servo", "AX-12B:1", "--servo", "xl430:3", "--servo", "toaster:2", "--servo", "AX-12A:x"],
+            ["--servo", "AX-12B:1", "--servo", "xl330:3", "--servo", "toaster:2", "--servo", "AX-12A:x"],
             [
                 "--servo AX-12A:x: this is not MODEL:IDS",
                 "--servo: there is no model AX-12B; did you mean AX-12?",
-                "--servo: there is no model xl430; did you mean XL430-W250?",
+                "--servo: there is no model xl330; did you mean XL330-M077 or XL330-M077-FW51 or",
                 "--servo: there is no model toaster; `dxlrun models` lists all",
             ],
         ),

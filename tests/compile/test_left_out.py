@@ -1,5 +1,7 @@
 from collections.abc import Callable
 
+import pytest
+
 from dxlrun.errors import Problem
 
 Find = Callable[..., tuple[Problem, ...]]
@@ -8,7 +10,7 @@ Find = Callable[..., tuple[Problem, ...]]
 def test_mistakes_of_form_and_of_meaning_come_together(problems_in: Find, robot_text: str):
     text = (
         robot_text.replace("direction: -1", "direction: 0")  # form
-        .replace("    id: 2", "    id: 1")  # silent: the other owner of the ID has a wrong form
+        .replace("    id: 2", "    id: 1")  # meaning; the other owner of the ID has a wrong form
         .replace("rate: 25", "rate: 20")  # meaning
         .replace("posvel_controller", "posvle_controller")  # meaning
         .replace("active: false", "active: off")  # form
@@ -17,12 +19,13 @@ def test_mistakes_of_form_and_of_meaning_come_together(problems_in: Find, robot_
 
     found = [(p.mark.line, p.what) for p in problems_in(text)]
 
-    assert [line for line, _ in found] == [11, 20, 22, 26, 28]
+    assert [line for line, _ in found] == [11, 14, 20, 22, 26, 28]
     assert "direction is 0" in found[0][1]
-    assert "does not divide" in found[1][1]
-    assert "no plug-in offers" in found[2][1]
-    assert "active is the text 'off'" in found[3][1]
-    assert "unknown key 'colour'" in found[4][1]
+    assert "servo ID 1 of right_arm_joint is taken by left_arm_joint" in found[1][1]
+    assert "does not divide" in found[2][1]
+    assert "no plug-in offers" in found[3][1]
+    assert "active is the text 'off'" in found[4][1]
+    assert "unknown key 'colour'" in found[5][1]
 
 
 def test_nothing_is_said_about_what_refers_to_a_part_of_a_wrong_form(problems_in: Find, robot_text: str):
@@ -71,3 +74,74 @@ def test_a_part_of_which_nothing_is_left_does_not_hide_the_other_mistakes(proble
     text = robot_text.replace("rate: 25", "rate: 20") + "model: {urdf: 5}\n"
 
     assert [p.mark.line for p in problems_in(text)] == [20, 28]
+
+
+BUS = (
+    ("protocol: 1.0", "protocol: 3.0"),
+    ("baud_rate: 1_000_000", "baud_rate: fast"),
+    ("port: /dev/ttyUSB0", "port: 5"),
+    ("adapter: {latency: 1 ms}", "adapter: {latncy: 1 ms}"),
+)
+
+
+@pytest.mark.parametrize("change", BUS)
+def test_a_wrong_key_of_a_bus_hides_no_other_mistake(
+    problems_in: Find, robot_text: str, change: tuple[str, str]
+):
+    text = (
+        robot_text.replace(*change)
+        .replace("bus: main\n    id: 2", "bus: mian\n    id: 2")
+        .replace("reference: 60 deg", "reference: 60")
+        .replace("model: AX-12A", "model: XX-7", 1)
+        .replace("joint_state_broadcaster", "joint_state_brodcaster")
+    )
+
+    found = [(p.mark.line, p.what) for p in problems_in(text)]
+
+    assert [line for line, _ in found] == [3, 9, 10, 13, 20]
+    assert "no control table for model XX-7" in found[1][1]
+    assert "has no unit" in found[2][1]
+    assert "right_arm_joint stands on bus mian" in found[3][1]
+    assert "no plug-in offers the controller type joint_state_brodcaster" in found[4][1]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        *BUS,
+        ("loop: {rate: 50}", "loop: {rate: -50}"),
+        ("loop: {rate: 50}", "loop: {rate: quick}"),
+        ("bus: main\n    id: 2", "bus: {}\n    id: 2"),
+        ("id: 2", "id: two"),
+        ("model: AX-12A\n    reference: 240 deg", "model: [AX-12A]\n    reference: 240 deg"),
+        ("reference: 240 deg", "reference: 240"),
+        ("direction: 1\n", "direction: 0\n"),
+        ("rate: 25}", "rate: 0}"),
+        ("active: false", "active: maybe"),
+    ],
+)
+def test_a_single_mistake_of_form_is_a_single_problem(
+    problems_in: Find, robot_text: str, change: tuple[str, str]
+):
+    """What is guessed in its place is not told as another one, and neither is what depends on the guess."""
+    text = robot_text.replace("limits: {", "limits: {effort: 40 %, ") + (
+        "policies: {on_exit: [{pose: home, speed: 60 deg/s}, limp], exit_timeout: 4 s}\n"
+        "poses: {home: {right_arm_joint: 10 deg}}\n"
+    )
+    assert [problem for problem in problems_in(text) if problem.severity == "error"] == []
+    assert text.count(change[0]) == 1
+
+    (problem,) = problems_in(text.replace(*change))
+
+    assert problem.mark.line == text[: text.index(change[0])].count("\n") + 1
+
+
+def test_a_servo_of_two_firmwares_on_an_unknown_bus_is_not_judged_by_one(problems_in: Find, robot_text: str):
+    text = robot_text.replace(
+        "bus: main\n    id: 2\n    model: AX-12A",
+        "bus: mian\n    id: 2\n    model: MX-28\n    registers: {position_p_gain: 800}",
+    )
+
+    (problem,) = problems_in(text)
+
+    assert "bus mian" in problem.what

@@ -36,6 +36,32 @@ def test_a_model_of_both_protocols_is_chosen_by_the_protocol() -> None:
         control_table("MX-28")
 
 
+@pytest.mark.parametrize(
+    ("name", "model"),
+    [
+        ("XL-430", "XL430-W250"),
+        ("xl430", "XL430-W250"),
+        ("XL430-W250-T", "XL430-W250"),
+        ("XM540-W270-R", "XM540-W270"),
+        ("2XC430", "2XC430-W250"),
+        ("AX12", "AX-12A"),
+        ("ax 12a", "AX-12A"),
+        ("XL_320", "XL-320"),
+        ("EX-106", "EX-106+"),
+        ("MX64AT", "MX-64"),
+        ("XC330-M288-T", "XC330-M288"),
+    ],
+)
+def test_names_that_mean_one_model_are_understood(name: str, model: str) -> None:
+    assert control_table(name).model == model
+
+
+@pytest.mark.parametrize("name", ["XM430", "XL330", "XL", "XL-3", "AX", "XL430-W250-B", "T", "-", ""])
+def test_names_that_mean_several_models_or_none_are_not(name: str) -> None:
+    with pytest.raises(LookupError, match="no control table of the model"):
+        control_table(name)
+
+
 def test_a_protocol_that_a_model_does_not_speak_is_named() -> None:
     with pytest.raises(LookupError, match=r"AX-12A speaks Protocol 1\.0, not Protocol 2\.0"):
         control_table("AX-12A", 2.0)

@@ -234,10 +234,11 @@ def test_a_survey_keeps_what_is_right_for_further_checks(desk: Any, robot_text: 
     survey = desk.survey(text + "sensors: {}\n")
     assert len(survey.problems) == 4
     description = survey.description
-    assert set(description.robot.joints) == {"elbow"}
+    assert set(description.robot.joints) == {"elbow", "swing"}
+    assert (description.robot.joints["swing"].id, survey.otherwise.robot.joints["swing"].id) == (0, 1)
+    assert (description.robot.loop.rate, survey.otherwise.robot.loop.rate) == (1.0, 1000.0)
     assert description.robot.policies.exit_timeout == 2_000_000_000
     assert description.left_out == {
-        ("joints", "swing"),
         ("loop", "rate"),
         ("policies", "exit_timeout"),
         ("sensors",),
@@ -248,6 +249,7 @@ def test_a_survey_keeps_what_is_right_for_further_checks(desk: Any, robot_text: 
 def test_a_survey_of_a_right_file_leaves_nothing_out(desk: Any, robot_text: str) -> None:
     survey = desk.survey(robot_text)
     assert survey.problems == ()
+    assert survey.otherwise is None
     assert survey.description == desk.robot(robot_text)
     assert survey.description.left_out == frozenset()
 

@@ -57,14 +57,14 @@ def models(
 
 def _tables(name: str | None, protocol: float | None) -> list[ControlTable]:
     """Return the tables that are asked for; raises InputError when there is none."""
-    from dxlrun.control_table import all_tables, control_table, model_names, perhaps_meant
+    from dxlrun.control_table import all_tables, control_table, perhaps_meant, protocols_of
 
     if protocol not in (None, 1.0, 2.0):
         raise InputError(f"there is no Protocol {protocol:g}; --protocol is 1.0 or 2.0")
     if name is None:
         return [table for table in all_tables() if protocol in (None, table.protocol)]
     wanted = [each for each in (1.0, 2.0) if protocol in (None, each)]
-    found = [control_table(name, each) for each in wanted if name in model_names(each)]
+    found = [control_table(name, each) for each in protocols_of(name) if each in wanted]
     if not found:
         speaks = "" if protocol is None else f" of Protocol {protocol:.1f}"
         raise InputError(f"there is no model {name}{speaks}; {perhaps_meant(name, protocol)}")

@@ -76,7 +76,7 @@ def servo_bus(words: Sequence[str], baud_rate: int | None, protocol: float | Non
     tables = {model: control_table(model, spoken) for model, _ in models}
     rate = _baud_rate(list(tables.values()), baud_rate)
     servos = [
-        ServoConfig(servo_id, model, _middle(tables[model]))
+        ServoConfig(servo_id, tables[model].model, _middle(tables[model]))
         for model, servo_ids in models
         for servo_id in servo_ids
     ]
@@ -85,7 +85,7 @@ def servo_bus(words: Sequence[str], baud_rate: int | None, protocol: float | Non
         baud_rate=rate,
         servos=tuple(servos),
         protocol=spoken,
-        control_tables=added_control_tables(tables),
+        control_tables=added_control_tables(table.model for table in tables.values()),
     )
 
 
@@ -191,23 +191,22 @@ def _ids(text: str) -> list[int]:
 
 
 def _unknown(models: Sequence[str]) -> list[str]:
-    from dxlrun.control_table import model_names, perhaps_meant
+    from dxlrun.control_table import perhaps_meant, protocols_of
 
-    known = model_names()
     return [
         f"--servo: there is no model {model}; {perhaps_meant(model)}"
         for model in dict.fromkeys(models)
-        if model not in known
+        if not protocols_of(model)
     ]
 
 
 def _protocol(models: Sequence[str], wanted: float | None) -> float:
     """Return the one protocol that all models speak, or that is wanted of them."""
-    from dxlrun.control_table import model_names
+    from dxlrun.control_table import protocols_of
 
     if wanted not in (None, 1.0, 2.0):
         raise InputError(f"there is no Protocol {wanted:g}; --protocol is 1.0 or 2.0")
-    spoken = {model: [each for each in (1.0, 2.0) if model in model_names(each)] for model in models}
+    spoken = {model: protocols_of(model) for model in models}
     if wanted is not None:
         strange = [model for model, protocols in spoken.items() if wanted not in protocols]
         if strange:
@@ -220,8 +219,8 @@ def _protocol(models: Sequence[str], wanted: float | None) -> float:
         return wanted
     common = [each for each in (1.0, 2.0) if all(each in protocols for protocols in spoken.values())]
     if not common:
-        first = next(model for model, protocols in spoken.items() if protocols == [1.0])
-        second = next(model for model, protocols in spoken.items() if protocols == [2.0])
+        first = next(model for model, protocols in spoken.items() if protocols == (1.0,))
+        second = next(model for model, protocols in spoken.items() if protocols == (2.0,))
         raise InputError(
             f"{first} speaks Protocol 1.0 and {second} Protocol 2.0; a bus has one protocol, "
             "write a robot file with two buses or start two simulations"

@@ -9,7 +9,7 @@ from dxlrun.compile.problems import Problems, suggestion
 from dxlrun.compile.reach import Interval, degrees, joint_reach, many_turns
 from dxlrun.compile.registers import compile_registers
 from dxlrun.control.loop_plan import JointPlan
-from dxlrun.control_table import ControlTable, control_table, model_names, perhaps_meant
+from dxlrun.control_table import ControlTable, control_table, perhaps_meant, protocols_of
 from dxlrun.description import Description
 from dxlrun.description.robot import Joint
 from dxlrun.description.units import EffortUnit
@@ -59,11 +59,12 @@ def compile_joints(
         reach = _reach(joint, table)
         if not joint.continuous:
             _check_reference(description, name, joint, table, problems)
-        effort = _effort(description, name, joint, table, problems)
         allowed = _allowed(description, name, reach, table.model, problems)
         # of a servo that is still to be asked for its model nobody knows which registers it has: what fits
-        # the assumed one is taken, for a simulated servo is that one
-        told = problems if joint.model != AUTO or name in models else Problems()
+        # the assumed one is taken, for a simulated servo is that one; without its bus' protocol neither
+        certain = (joint.model != AUTO or name in models) and (known_bus or _one_table(model))
+        told = problems if certain else Problems()
+        effort = _effort(description, name, joint, table, told)
         registers = compile_registers(description, name, joint, table, told)
         if known_bus and allowed is not None:
             plan = JointPlan(
@@ -135,7 +136,7 @@ def _table(
     try:
         return control_table(model, wanted)
     except LookupError:
-        spoken = [protocol for protocol in _USUAL if model in model_names(protocol)]
+        spoken = protocols_of(model)
     if not spoken:
         problems.error(mark, f"no control table for model {model} of {name}", perhaps_meant(model, wanted))
         return None
@@ -146,6 +147,11 @@ def _table(
             "put it on a bus of its own protocol; a bus cannot be mixed",
         )
     return control_table(model, spoken[0])
+
+
+def _one_table(model: str) -> bool:
+    """Say whether a model speaks one protocol alone; MX servos carry one name with two firmwares."""
+    return len(protocols_of(model)) == 1
 
 
 def _reach(joint: Joint, table: ControlTable) -> Interval:

@@ -1,7 +1,7 @@
 """Left out: what cross checks may say of a robot file of which some parts have a wrong form.
 
-Those parts were reported already and are left out of the description, so that mistakes of form and of meaning
-come together. Whatever points at a part that was left out is not said again.
+Those parts were reported already and are left out of the description, or guessed where a robot needs them,
+so that mistakes of form and of meaning come together. What points at a part that was left out is skipped.
 """
 
 from __future__ import annotations
@@ -46,7 +46,3 @@ def _silent(description: Description) -> Iterator[Mark]:
         for path, text in texts(controller.parameters, ("controllers", name)):
             if text in joints:
                 yield marks.value(*path)
-    if any(path[0] == "loop" for path in description.left_out):
-        # how fast the buses must be, and what divides the rate, is unknown
-        yield marks.value("loop", "rate")
-        yield from (marks.value("controllers", name, "rate") for name in robot.controllers)

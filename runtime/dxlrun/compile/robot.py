@@ -25,7 +25,7 @@ from dxlrun.compile.twins import check_twins
 from dxlrun.compile.urdf import compile_urdf
 from dxlrun.control.loop_plan import LoopPlan
 from dxlrun.control.plugins import load_plugins
-from dxlrun.description import Description, MotionDescription, read_motion, survey_robot
+from dxlrun.description import Description, MotionDescription, Survey, read_motion, survey_robot
 from dxlrun.dynamixel.bus_plan import BusPlan
 from dxlrun.errors import InputError, Problem
 
@@ -55,11 +55,10 @@ def compile_files(
     given; what it raises goes on.
     """
     read: list[MotionDescription] = []
-    description: Description | None = None
+    survey = Survey(None, ())
     problems: list[Problem] = []
     try:
         survey = survey_robot(robot, arguments)
-        description = survey.description
         problems += survey.problems
     except InputError as error:
         problems += _placed(error)
@@ -68,6 +67,7 @@ def compile_files(
             read.append(read_motion(path))
         except InputError as error:
             problems += _placed(error)
+    description = survey.description
     if not problems and description is not None:
         compiled = compile_robot(description, read, duration_ns)
         unknown = _unknown(description)
@@ -75,11 +75,23 @@ def compile_files(
             return compiled
         return compile_robot(description, read, duration_ns, ask(compiled.plan.buses, unknown))
     if description is not None:
-        try:
-            compile_robot(description, read, duration_ns)
-        except InputError as error:
-            problems += still_true(description, _placed(error))
+        found = _problems_of(description, read, duration_ns)
+        if survey.otherwise is not None:
+            also = {(one.mark, one.what) for one in _problems_of(survey.otherwise, read, duration_ns)}
+            found = [problem for problem in found if (problem.mark, problem.what) in also]
+        problems += found
     raise InputError(sorted(problems, key=lambda problem: (problem.severity, problem.mark)))
+
+
+def _problems_of(
+    description: Description, motions: Sequence[MotionDescription], duration_ns: int | None
+) -> list[Problem]:
+    """Return the errors of a survey's description that have nothing to do with what was left out of it."""
+    try:
+        compile_robot(description, motions, duration_ns)
+    except InputError as error:
+        return [*still_true(description, _placed(error))]
+    return []
 
 
 def _unknown(description: Description) -> list[str]:

@@ -13,6 +13,7 @@ from dxlrun.control_table.models import (
     model_names,
     models_by_number,
     perhaps_meant,
+    protocols_of,
 )
 from dxlrun.control_table.sources import read_control_table
 from dxlrun.control_table.table import CAPABILITIES, ControlTable, EffortUnit
@@ -33,5 +34,6 @@ __all__ = [
     "model_names",
     "models_by_number",
     "perhaps_meant",
+    "protocols_of",
     "read_control_table",
 ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import functools
+import re
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 
@@ -16,28 +17,65 @@ _ADDED: dict[float, list[Listing]] = {1.0: [], 2.0: []}
 """Tables of plug-ins; they are added while a process starts, before its first robot is compiled."""
 _MOST_MEANT = 4
 """More names of models are no help to a person."""
+_SERIES = re.compile(r"[0-9]?[A-Z]+[0-9]{3}")
 _TEXTS: dict[str, str] = {}
 """Name -> TOML text of the tables that were added."""
 
 
 def control_table(model: str, protocol: float | None = None) -> ControlTable:
-    """Return the control table of a model or of one of its aliases.
+    """Return the control table of a model or of one of its aliases; `understood` says which names are.
 
     MX servos carry one name with two firmwares: `protocol` then decides. Raises LookupError when the model is
     unknown, does not speak the protocol, or speaks both and none was given.
     """
     if protocol is not None and (table := _table(model, protocol)) is not None:
         return table
-    found = [table for each in (1.0, 2.0) if (table := _table(model, each)) is not None]
-    if not found:
+    spoken = protocols_of(model)
+    if not spoken:
         raise LookupError(
             f"no control table of the model {model!r}; known models: {', '.join(model_names())}"
         )
-    if protocol is not None:
-        raise LookupError(f"{model} speaks Protocol {found[0].protocol}, not Protocol {protocol}")
-    if len(found) > 1:
+    if protocol is not None and protocol not in spoken:
+        raise LookupError(f"{model} speaks Protocol {spoken[0]}, not Protocol {protocol}")
+    if protocol is None and len(spoken) > 1:
         raise LookupError(f"{model} exists with Protocol 1.0 and with Protocol 2.0: say which one")
-    return found[0]
+    listing = understood(model, spoken[0] if protocol is None else protocol)
+    if listing is None:  # protocols_of has just found it
+        raise LookupError(f"no control table of the model {model!r}")
+    return listing.build()
+
+
+def protocols_of(model: str) -> tuple[float, ...]:
+    """Return the protocols of a model, by whatever name it is understood; none: there is no such model."""
+    return tuple(each for each in (1.0, 2.0) if understood(model, each) is not None)
+
+
+def understood(name: str, protocol: float) -> Listing | None:
+    """Return the model of a protocol that a name means, None when there is none or more than one.
+
+    Beside the names of models and their aliases these are understood: other case and punctuation (AX12,
+    xl_320), the product name with its connector (XL430-W250-T or -R), and the series of a model that is the
+    only one in it (XL430, XL-430).
+    """
+    known = _index(protocol)
+    if name in known:
+        return known[name]
+    key = _key(name)
+    names = [(_key(each), listing) for each, listing in known.items()]
+    series = [(_key(each.partition("-")[0]), listing) for each, listing in known.items()]
+    ways = [(key, names)]
+    ways += [(key[:-1], names)] if key.endswith(("T", "R")) else []
+    ways += [(key, series)] if _SERIES.fullmatch(key) else []
+    for wanted, keys in ways:
+        found = {listing.names[0]: listing for each, listing in keys if each == wanted}
+        if len(found) == 1:
+            return next(iter(found.values()))
+    return None
+
+
+def _key(name: str) -> str:
+    """Return a name without case and punctuation."""
+    return "".join(filter(str.isalnum, name.upper()))
 
 
 def model_names(protocol: float | None = None) -> tuple[str, ...]:
@@ -47,10 +85,11 @@ def model_names(protocol: float | None = None) -> tuple[str, ...]:
 
 def perhaps_meant(name: str, protocol: float | None = None) -> str:
     """Return how to mend a name that no model has: those that begin with it, else the closest one."""
-    known = {each.lower(): each for each in model_names(protocol)}
-    meant = sorted(each for each in known if each.startswith(name.lower()))
+    known = {_key(each): each for each in reversed(model_names(protocol))}
+    key = _key(name)
+    meant = sorted(each for each in known if key and each.startswith(key))
     if not 0 < len(meant) <= _MOST_MEANT:
-        meant = difflib.get_close_matches(name.lower(), known, n=1)
+        meant = difflib.get_close_matches(key, known, n=1)
     names = " or ".join(known[each] for each in meant)
     return f"did you mean {names}?" if names else "`dxlrun models` lists all"
 

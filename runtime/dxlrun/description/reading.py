@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,7 +14,7 @@ from dxlrun.description.including import merged, read_sources
 from dxlrun.description.marks import KeyPath, Marks
 from dxlrun.description.motion import Motion
 from dxlrun.description.problems import places_of, problems_of
-from dxlrun.description.pruning import prune
+from dxlrun.description.pruning import Guess, prune
 from dxlrun.description.robot import Robot
 from dxlrun.description.syntax import parse, read_text
 from dxlrun.description.tree import grow
@@ -32,7 +33,8 @@ class Description:
     arguments: dict[str, str]
     """All its arguments, with the values of this run."""
     left_out: frozenset[KeyPath] = frozenset()
-    """`("joints", "head")`, `("loop", "rate")`: what the file has, but in a wrong form; only in a survey."""
+    """`("controllers", "head")`, `("poses",)`: what the file has in a wrong form and no guess stands in for;
+    only in a survey."""
     included: Mapping[str, str] = field(default_factory=dict)
     """The text of each file that it includes, by name."""
 
@@ -42,8 +44,10 @@ class Survey:
     """A robot file that may be wrong: what can be checked further, and what is wrong with its form."""
 
     description: Description | None
-    """The parts whose form is right; None when too few are left."""
+    """The parts whose form is right, and guesses for what a robot needs; None when too few are left."""
     problems: tuple[Problem, ...]
+    otherwise: Description | None = None
+    """The same with other guesses, where there are any: what is wrong with both does not depend on them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,14 +87,19 @@ def survey_robot(path: Path, arguments: Mapping[str, str]) -> Survey:
     if error is not None:
         problems += problems_of(error, grown.marks, model=Robot, unknown=grown.unknown)
         wrong += places_of(error, grown.marks)
-    left_out = prune(data, wrong)
-    if wrong:
-        robot, _ = _validated(data)
-    description = None
-    if robot is not None:
+    found: list[Description] = []
+    guesses: tuple[Guess, ...] = (0, 1) if wrong else (0,)
+    for guess in guesses:
+        guessed = copy.deepcopy(data)
+        left_out = prune(guessed, wrong, guess)
+        if wrong:
+            robot, _ = _validated(guessed)
         included = {str(source.path): source.text for source in sources[:-1]}
-        description = Description(robot, grown.marks, path, sources[-1].text, run.texts, left_out, included)
-    return Survey(description, tuple(_in_order(problems)))
+        text = sources[-1].text
+        if robot is not None:
+            found.append(Description(robot, grown.marks, path, text, run.texts, left_out, included))
+    first, last = (found[0], found[-1]) if found else (None, None)
+    return Survey(first, tuple(_in_order(problems)), last if last != first else None)
 
 
 def _validated(data: dict[str, object]) -> tuple[Robot | None, ValidationError | None]:
