@@ -171,7 +171,9 @@ def test_error_bits_are_named(write: Make, cycle: Make, wire: Make) -> None:
     assert not report.verdict.good
 
 
-def test_tracking_compares_with_the_goal_of_the_cycle_before(write: Make, cycle: Make) -> None:
+def test_without_known_limits_tracking_compares_with_the_goal_of_the_cycle_before(
+    write: Make, cycle: Make
+) -> None:
     cycles = [
         cycle(0, position=0.0, goal=0.5),
         cycle(1, position=0.4, goal=0.7, clamped=2),

@@ -150,8 +150,18 @@ def buses_table(report: Report) -> Table:
 
 
 def joints_table(report: Report) -> Table:
-    """Return how fresh each joint's states were, and how it followed its goals."""
-    names = ("invalid", "oldest", "clamped", "rms, rad", "worst, rad")
+    """Return how fresh each joint's states were, and how it followed its reachable trajectory."""
+    columns = [
+        Column("joint", "name"),
+        Column("invalid"),
+        Column("oldest", detail=True),
+        Column("clamped", detail=True),
+        Column("rms"),
+        Column("worst"),
+        Column("lag"),
+        Column("settling"),
+        Column("at rest"),
+    ]
     rows = [
         (
             joint.name,
@@ -160,15 +170,22 @@ def joints_table(report: Report) -> Table:
             Cell(str(joint.clamped), "warning" if joint.clamped else "plain"),
             _radians(joint.rms_rad),
             _radians(joint.worst_rad),
+            _milliseconds(joint.lag_ms),
+            _milliseconds(joint.settling_ms),
+            _radians(joint.rest_rad),
         )
         for joint in report.joints
     ]
-    title = "Joints (error: position minus the goal of the cycle before)"
-    return _table(title, [Column("joint", "name"), *(Column(name) for name in names)], rows)
+    title = "Joints (errors in rad, of position minus what was reachable)"
+    return _table(title, columns, rows)
 
 
 def _radians(value: float | None) -> str:
     return "-" if value is None else f"{value:.4f}"
+
+
+def _milliseconds(value: float | None) -> str:
+    return "-" if value is None else f"{value:.0f} ms"
 
 
 def steering_table(acts: Sequence[Act]) -> Table:

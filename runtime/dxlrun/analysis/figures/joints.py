@@ -26,15 +26,17 @@ from dxlrun.analysis.figures.drawing import (
 )
 from dxlrun.analysis.figures.run_time import Marks, run_time_s
 from dxlrun.analysis.figures.steered import SteeringMarks
-from dxlrun.analysis.tracking import Joint
+from dxlrun.analysis.tracking import Joint, reachable
 from dxlrun.interfaces import Floats
 from dxlrun.recording.reader import Log
 
 _LEAST_RAD, _LEAST_RAD_S = 0.1, 0.5
+_APART_RAD = 1e-6
 _FEW = 60
 """So few samples are drawn with a dot each, so few skipped cycles with a line through the figure."""
 _DESIRED: dict[str, object] = {"color": GREEN, "linewidth": 2.8, "alpha": 0.55}
 _SENT: dict[str, object] = {"color": ORANGE, "linewidth": 1.3, "linestyle": (0, (4, 2))}
+_REACHABLE: dict[str, object] = {"color": PURPLE, "linewidth": 0.9, "linestyle": (0, (1, 1.5))}
 _READ: dict[str, object] = {"color": BLUE, "linewidth": 1.1}
 
 
@@ -55,6 +57,18 @@ def _spread(axes: Axes, least: float) -> None:
         axes.set_ylim(low - missing, high + missing)
 
 
+def _followed(joint: Joint) -> str:
+    """Say lag, settling and error at rest, as far as they are known."""
+    parts = []
+    if joint.lag_ms is not None:
+        parts.append(f", lag {joint.lag_ms:.0f} ms")
+    if joint.settling_ms is not None:
+        parts.append(f", settled after at most {joint.settling_ms:.0f} ms")
+    if joint.rest_rad is not None:
+        parts.append(f", at rest off by at most {joint.rest_rad:.4f} rad")
+    return "".join(parts)
+
+
 @dataclass(frozen=True, slots=True)
 class _JointPlot:
     """The figure of one joint."""
@@ -73,8 +87,8 @@ class _JointPlot:
         error = "No goal was sent, or no position was read."
         if joint.rms_rad is not None and joint.worst_rad is not None:
             error = (
-                f"Error rms {joint.rms_rad:.4f} rad, worst {joint.worst_rad:.4f} rad (position minus the "
-                "goal of the cycle before)."
+                f"Error rms {joint.rms_rad:.4f} rad, worst {joint.worst_rad:.4f} rad (position minus what "
+                f"was reachable){_followed(joint)}."
             )
         told = ", ".join(f"{name} {np.count_nonzero(flags)}" for name, flags, _ in self._reasons())
         words = Words(
@@ -128,6 +142,8 @@ class _JointPlot:
         )
         marker = "." if len(self.times) <= _FEW else ""
         drawn = False
+        if what == "position" and (way := self._detour()) is not None:
+            series = (*series, ("reachable", way, _REACHABLE))
         for name, values, style in series:
             if np.isfinite(values).any():
                 held = "steps-post" if self.columns.whole and name != "read" else "default"
@@ -140,6 +156,11 @@ class _JointPlot:
             axes.text(
                 0.5, 0.5, "nothing was read or sent", transform=axes.transAxes, ha="center", color=MUTED
             )
+
+    def _detour(self) -> Floats | None:
+        """Return the reachable trajectory where it is another one than the goals."""
+        way, goal = reachable(self.log, self.row), self.log.cycles["goal_position"][:, self.row]
+        return way if (np.abs(way[1:] - goal[:-1]) > _APART_RAD).any() else None
 
     def _strip(self, axes: Axes) -> None:
         """Draw a row of ticks for each reason to read a cycle with care."""

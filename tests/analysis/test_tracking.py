@@ -1,0 +1,177 @@
+"""Tracking against the trajectory that a servo could reach, of joints whose way is known exactly."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from dxlrun.analysis.figures.joints import joint_drawings
+from dxlrun.analysis.report import analyze, to_json
+from dxlrun.analysis.tables import joints_table
+from dxlrun.analysis.tracking import Joint, reachable, tracking
+from dxlrun.cycle import CycleLayout, CycleRecord
+from dxlrun.recording.header import LogHeader
+from dxlrun.recording.log_writer import LogWriter
+from dxlrun.recording.reader import Log, read_log
+
+DT = 0.02
+TICK = math.radians(300) / 1023
+Way = npt.NDArray[np.float64]
+Make = Callable[..., Log]
+
+
+@pytest.fixture
+def make(tmp_path: Path) -> Make:
+    """Return a log of one AX-12A that was sent these goals, and was read at these positions, one a cycle."""
+
+    def make(
+        goals: Way,
+        positions: Way,
+        speed: float = math.nan,
+        registers: dict[str, int] | None = None,
+        **joint: Any,
+    ) -> Log:
+        servo = {"joint": "neck", "model": "MX-64", "rad_per_tick": TICK, "rad_s_per_tick": 0.01}
+        servo["registers"] = [{"name": name, "value": value} for name, value in (registers or {}).items()]
+        plan = {
+            "loop": {"joints": [{"name": "neck", "top_speed": 6.0, **joint}]},
+            "buses": [{"protocol": 1.0, "servos": [servo]}],
+        }
+        attachments = {"plan.json": json.dumps(plan).encode()}
+        path = tmp_path / f"run_{len(list(tmp_path.iterdir()))}.mcap"
+        log = LogWriter(path, LogHeader("torso", ("neck",), ("main",), (), round(DT * 1e9), 0, attachments))
+        record = CycleRecord(CycleLayout(("neck",), []))
+        for number, (goal, position) in enumerate(zip(goals, positions, strict=True)):
+            record.cycle, record.scheduled_ns = number, 10**9 + number * round(DT * 1e9)
+            record.read_ns = record.updated_ns = record.written_ns = record.woken_ns = record.scheduled_ns
+            record.states.position[0], record.goals.position[0] = position, goal
+            record.goals.velocity[0] = speed
+            record.valid[0] = not math.isnan(position)
+            log.cycle(record.raw)
+        log.close()
+        return read_log(path)
+
+    return make
+
+
+def stepped(count: int, at: int, goal: float) -> Way:
+    """Return goals that are 0 before a cycle, and another one from it on."""
+    return np.where(np.arange(count) < at, 0.0, goal)
+
+
+def ramp(count: int, at: int, goal: float, speed: float, delay: int = 0) -> Way:
+    """Return the way to a goal that was sent in a cycle, at a speed, some cycles late."""
+    return np.clip((np.arange(count) - at - delay) * DT * speed, 0.0, goal)
+
+
+def only(log: Log) -> Joint:
+    (joint,) = tracking(log)
+    return joint
+
+
+def test_the_way_of_a_step_is_no_error(make: Make) -> None:
+    log = make(stepped(150, 10, 1.0), ramp(150, 10, 1.0, 0.5), speed=0.5)
+    joint = only(log)
+    assert (joint.rms_rad, joint.worst_rad) == pytest.approx((0.0, 0.0), abs=1e-9)
+    assert (joint.lag_ms, joint.settling_ms, joint.rest_rad) == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("limits", "speed"), [({}, 6.0), ({"velocity": 2.0}, 2.0), ({"top_speed": None}, None)]
+)
+def test_without_a_speed_the_lower_one_of_the_limits_counts(
+    make: Make, limits: dict[str, float | None], speed: float | None
+) -> None:
+    log = make(stepped(100, 10, 1.0), np.zeros(100), **limits)
+    expected = ramp(100, 10, 1.0, 1e9 if speed is None else speed)
+    assert reachable(log, 0) == pytest.approx(expected)
+    assert only(log).worst_rad == pytest.approx(1.0)  # it never moved, and that is an error
+
+
+def test_a_declared_acceleration_counts(make: Make) -> None:
+    # Goal Acceleration (73) of an MX-64: 8.583 deg/s^2 each
+    log = make(stepped(200, 10, 1.0), np.zeros(200), speed=2.0, registers={"goal_acceleration": 20})
+    way, ramp_rad_s2 = reachable(log, 0), 20 * math.radians(8.583)
+    faster = np.diff(np.diff(way)) / DT**2
+    assert np.abs(faster[:40]).max() == pytest.approx(ramp_rad_s2)
+    # 2 * sqrt(way / acceleration) for a triangle
+    arrived = int(np.argmax(way == 1.0)) - 10
+    assert arrived * DT == pytest.approx(2 * math.sqrt(1.0 / ramp_rad_s2), abs=4 * DT)
+    assert way.max() == 1.0
+
+
+def test_lag_is_the_delay_on_the_way(make: Make) -> None:
+    log = make(stepped(200, 10, 1.0), ramp(200, 10, 1.0, 0.5, delay=3), speed=0.5)
+    joint = only(log)
+    assert joint.lag_ms == pytest.approx(60.0, rel=0.02)
+    assert joint.worst_rad == pytest.approx(0.5 * 0.06)
+    assert joint.settling_ms == pytest.approx(20.0, abs=20.1)  # 0.03 of a way of 1 are left, and 2 % are near
+    assert joint.rest_rad == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_stream_that_the_servo_can_follow_is_its_own_way(make: Make) -> None:
+    t = np.arange(500) * DT
+    goals, late = 0.4 * np.sin(2 * t), 0.4 * np.sin(2 * (t - DT - 0.03))
+    joint = only(make(goals, late))
+    assert joint.lag_ms == pytest.approx(30.0, rel=0.02)
+    assert joint.worst_rad == pytest.approx(0.8 * 0.03, rel=0.02)
+    assert (joint.settling_ms, joint.rest_rad) == (None, None)
+
+
+def test_a_stream_that_is_too_fast_is_cut_to_the_speed_that_there_is(make: Make) -> None:
+    goals = np.concatenate((np.linspace(0.0, 4.0, 50), np.full(150, 4.0)))  # 4 rad/s
+    log = make(goals, np.zeros(200), velocity=2.0)
+    way = reachable(log, 0)
+    assert np.diff(way).max() == pytest.approx(2.0 * DT)
+    assert int(np.argmax(way == 4.0)) == pytest.approx(100, abs=2)
+
+
+def test_ringing_is_settling_and_sagging_is_error_at_rest(make: Make) -> None:
+    after = np.maximum(np.arange(300) - 110, 0) * DT  # 1 rad at 0.5 rad/s from cycle 10 on
+    rings = 0.1 * np.exp(-after / 0.2) * np.sin(20 * after) * (after > 0)
+    joint = only(make(stepped(300, 10, 1.0), ramp(300, 10, 1.0, 0.5) + rings - 0.05 * (after > 0), speed=0.5))
+    outside = after[np.abs(rings) > 0.02].max()
+    assert joint.settling_ms == pytest.approx((outside + DT) * 1e3, abs=21)
+    assert joint.settling_ms is not None
+    assert joint.settling_ms > 200
+    assert joint.rest_rad == pytest.approx(0.05, abs=2e-3)
+
+
+def test_a_way_begins_where_the_joint_stands_when_it_gets_a_goal(make: Make) -> None:
+    goals = np.concatenate((np.full(20, np.nan), np.full(80, 1.0)))
+    positions = np.full(100, 0.4)
+    positions[20:23] = np.nan  # and is read
+    log = make(goals, positions, speed=0.5)
+    way = reachable(log, 0)
+    assert np.isnan(way[:23]).all()
+    assert way[23:] == pytest.approx(np.minimum(0.4 + np.arange(77) * DT * 0.5, 1.0))
+    nothing = only(make(np.full(20, np.nan), positions[:20]))
+    assert (nothing.rms_rad, nothing.worst_rad, nothing.lag_ms, nothing.rest_rad) == (None, None, None, None)
+
+
+def test_a_speed_of_0_is_the_slowest_and_not_none(make: Make) -> None:
+    way = reachable(make(stepped(100, 10, 1.0), np.zeros(100), speed=0.0), 0)
+    assert way[-1] == pytest.approx(89 * DT * 0.01)
+
+
+def test_terminal_report_and_json_say_the_same(make: Make) -> None:
+    log = make(stepped(200, 10, 1.0), ramp(200, 10, 1.0, 0.5, delay=3), speed=0.5)
+    report = analyze(log)
+    (row,) = joints_table(report).rows
+    told = dict(zip((column.name for column in joints_table(report).columns), row, strict=True))
+    assert [told[name].text for name in ("worst", "lag", "at rest")] == ["0.0300", "59 ms", "0.0000"]
+    (as_json,) = json.loads(to_json(report))["joints"]
+    assert as_json["lag_ms"] == pytest.approx(60.0, rel=0.02)
+    assert as_json["worst_rad"] == pytest.approx(0.03)
+    (drawing,) = joint_drawings(log, report.joints)
+    assert (
+        "worst 0.0300 rad (position minus what was reachable), lag 59 ms, settled after"
+        in drawing.words.caption
+    )
