@@ -9,6 +9,7 @@ from typing import Protocol
 from dxlrun.clock import Clock
 from dxlrun.commands import CommandSink
 from dxlrun.compile.plan import Plan
+from dxlrun.control.activity import Activity
 from dxlrun.control.gate import Gate
 from dxlrun.control.loop import CycleSink, Loop, StopFlag
 from dxlrun.control.manager import Manager
@@ -71,6 +72,7 @@ def assemble(
     inbox: Inbox | None = None,
     patience: Callable[[int], None] = lambda _: None,
     pace: Callable[[int], None] = lambda _: None,
+    activity: Activity | None = None,
 ) -> Robot:
     """Build everything between the ports and the log; configures the controllers, sends nothing."""
     record = CycleRecord(cycle_layout(plan))
@@ -87,7 +89,14 @@ def assemble(
         restore_torque=plan.loop.policies.reduces_torque,
     )
     manager = Manager(
-        plan.loop, plugins, record, sinks.events, clock, commands=sinks.commands, set_modes=hardware.set_modes
+        plan.loop,
+        plugins,
+        record,
+        sinks.events,
+        clock,
+        commands=sinks.commands,
+        set_modes=hardware.set_modes,
+        activity=activity,
     )
     gate = Gate(plan.loop, record, sinks.events)
     loop = Loop(

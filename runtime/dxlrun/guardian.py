@@ -44,6 +44,10 @@ LEAST_PATIENCE_NS = 80_000_000
 of virtual machines takes a processor away [i]: a robot that falls for that was made safe for nothing."""
 SETUP_PATIENCE_NS = 1_000_000_000
 """Set-up and shutdown beat while they await replies; each wait ends within milliseconds."""
+LOADING_PATIENCE_NS = 60_000_000_000
+"""For each plug-in's import and each on_configure: a neural network on a slow card takes half of it [i]."""
+ENDING_PATIENCE_NS = 5_000_000_000
+"""For what plug-ins left to be done when the process of a loop that is done ends."""
 
 LEAST_NAP_NS, LONGEST_NAP_NS = 5_000_000, 10_000_000
 """It looks at the loop once a period within these bounds: a look takes some 60 us from a loop on its core."""
@@ -185,6 +189,8 @@ class Guardian:
         self._hand = LastHand(job)
         self._still = Standstill(LONGEST_LOOK_NS, self._clock.now_ns())
         self._stop_by_ns = _NEVER
+        self._killed: Literal["hung", "late", "cut"] | None = None
+        """Why the loop was killed."""
 
     def run(self) -> None:
         """Open the ports, execute the loop, watch it, and see that the robot is limp when it is gone."""
@@ -206,11 +212,11 @@ class Guardian:
         self._control.send({"loop": loop.pid, "grants": msgspec.to_builtins(grants)}, lines.descriptors)
         ending = self._watch(loop, Handing(lines, loop_line, self._control, self._hand))
         outcome: list[str] = []
+        how = self._how(ending, loop)
         if ending == "unused":
-            outcome = [f"{self._how(ending, loop)}; nothing had been sent to the robot"]
+            outcome = [f"{how}; nothing had been sent to the robot"]
             self._hand.tell(outcome[0], Severity.ERROR)
         elif ending != "done":
-            how = self._how(ending, loop)
             lines.returned()  # one that came back in this moment is to hear it, too
             if ending == "cut":
                 outcome = self._hand.limp(lines.descriptors, how, Severity.WARNING)
@@ -232,27 +238,28 @@ class Guardian:
         """Return how the loop ended; it is dead and reaped then."""
         watched = os.pidfd_open(loop.pid)
         nap = min(max(self._job.period_ns, LEAST_NAP_NS), LONGEST_NAP_NS) * 1e-9
-        killed: Ending | None = None
         while True:
             ready, _, _ = select.select([*self._watched(watched), *handing.watched], [], [], nap)
             self._heartbeat.look()
             if watched in ready:
-                return self._ending(loop.wait(), killed)
+                return self._ending(loop.wait())
             handing.look(ready)
             wish = self._wish() if self._control.fileno() in ready else None
             if wish == "stop":
                 self._stop_by_ns = min(self._stop_by_ns, self._clock.now_ns() + self._job.exit_timeout_ns)
                 loop.send_signal(signal.SIGTERM)
-            reason = "cut" if wish == "cut" else self._impatience()
-            if reason and not killed:
-                killed = reason
+            reason: Literal["hung", "late", "cut"] | None = "cut" if wish == "cut" else self._impatience()
+            if reason and not self._killed:
+                self._killed = reason
                 loop.kill()
 
-    def _ending(self, code: int, killed: Ending | None) -> Ending:
+    def _ending(self, code: int) -> Ending:
         """Say how a loop ended that was killed for a reason, or ended by itself."""
-        phase = self._heartbeat.phase
-        if phase is Phase.DONE and code in (0, 1):
+        phase, killed = self._heartbeat.phase, self._killed
+        if phase is Phase.DONE and (code in (0, 1) or killed == "hung"):
             return "done"
+        if phase is Phase.LOADING and killed in ("hung", "late"):
+            return "unused"
         if killed:
             return killed
         if phase is Phase.LOADING:
@@ -282,19 +289,32 @@ class Guardian:
         return "stop" if messages or self._control.closed else None
 
     def _how(self, ending: Ending, loop: subprocess.Popen[bytes]) -> str:
-        still_ms = self._patience_ns(self._heartbeat.phase) / 1e6
-        return {
-            "hung": f"the loop stood still for more than {still_ms:.0f} ms and was killed",
-            "late": f"the loop did not stop within {self._job.exit_timeout_ns / 1e9:g} s and was killed",
-            "cut": "torque was cut on request",
-        }.get(ending, f"the loop's process ended by itself ({_manner(loop.returncode)})")
+        """Say how the loop came to its end, and in which controller's code."""
+        if ending == "cut":
+            return "torque was cut on request"
+        called = self._heartbeat.activity
+        where = f" in {called}" if called else ""
+        if self._killed == "hung":
+            still = _duration(self._patience_ns(self._heartbeat.phase))
+            return f"the loop stood still for more than {still}{where} and was killed"
+        if self._killed == "late":
+            limit = _duration(self._job.exit_timeout_ns)
+            return f"the loop did not stop within {limit}{where} and was killed"
+        return f"the loop's process ended by itself ({_manner(loop.returncode)}){where}"
 
 
 def patience_ns(phase: Phase, period_ns: int) -> float:
     """Return how long the loop's counter may stand still, ns."""
     if phase is Phase.RUNNING:
         return max(SILENT_PERIODS * period_ns, LEAST_PATIENCE_NS)
-    return SETUP_PATIENCE_NS if phase in (Phase.SETUP, Phase.STOPPING) else float("inf")
+    if phase is Phase.LOADING:
+        return LOADING_PATIENCE_NS
+    return ENDING_PATIENCE_NS if phase is Phase.DONE else SETUP_PATIENCE_NS
+
+
+def _duration(time_ns: float) -> str:
+    """Write a time in the unit that a person would take."""
+    return f"{time_ns / 1e9:g} s" if time_ns >= 1e9 else f"{time_ns / 1e6:.0f} ms"
 
 
 def _manner(code: int | None) -> str:

@@ -1,4 +1,4 @@
-"""Heartbeat: one page of shared memory by which the guardian and the terminal see that the loop lives.
+"""Heartbeat: shared memory by which the guardian and the terminal see that the loop lives.
 
 A single writer a field: the loop's process, and for `looks` the guardian. Each field is one aligned 64-bit
 store through a cast memoryview, which x86-64 makes whole; that is where it was tested. (`struct.pack_into`
@@ -12,8 +12,12 @@ import mmap
 import os
 from enum import IntEnum, unique
 
-_SIZE = 4096
-_PHASE, _BEATS, _CYCLE, _SKIPPED, _LOOKS, _CYCLE_NS = range(6)
+_PHASE, _BEATS, _CYCLE, _SKIPPED, _LOOKS, _CYCLE_NS, _CALL = range(7)
+_NAMES = 4096
+_NAME_BYTES = 128
+_MOST_NAMES = 64
+_SIZE = _NAMES + _MOST_NAMES * _NAME_BYTES
+_STEP_BITS = 8
 
 
 @unique
@@ -29,8 +33,24 @@ class Phase(IntEnum):
     """The loop itself has left the robot as its policy says: limp, as far as servos answered, or holding."""
 
 
+@unique
+class Step(IntEnum):
+    """What of a controller is called."""
+
+    NONE = 0
+    INIT = 1
+    ON_CONFIGURE = 2
+    ON_ACTIVATE = 3
+    UPDATE = 4
+    ON_COMMAND = 5
+    ON_DEACTIVATE = 6
+
+    def __str__(self) -> str:
+        return "__init__" if self is Step.INIT else self.name.lower()
+
+
 def create() -> int:
-    """Return the descriptor of a fresh page (memfd): nothing is left behind in /dev/shm."""
+    """Return the descriptor of fresh memory (memfd): nothing is left behind in /dev/shm."""
     descriptor = os.memfd_create("dxlrun-heartbeat")
     os.ftruncate(descriptor, _SIZE)
     return descriptor
@@ -39,10 +59,11 @@ def create() -> int:
 class Heartbeat:
     """The page, mapped; the loop writes, everybody else only reads."""
 
-    __slots__ = ("_beats", "_words")
+    __slots__ = ("_beats", "_memory", "_words")
 
     def __init__(self, descriptor: int) -> None:
-        self._words = memoryview(mmap.mmap(descriptor, _SIZE)).cast("Q")
+        self._memory = memoryview(mmap.mmap(descriptor, _SIZE))
+        self._words = self._memory.cast("Q")
         self._beats = 0
 
     def beat(self) -> None:
@@ -63,9 +84,27 @@ class Heartbeat:
         """Show that a phase begins."""
         self._words[_PHASE] = phase
 
+    def name_controller(self, place: int, name: str) -> None:
+        """Keep the name of the controller in this place; a very long one is cut."""
+        data = name.encode()[:_NAME_BYTES].ljust(_NAME_BYTES, b"\0")
+        self._memory[_NAMES + place * _NAME_BYTES :][:_NAME_BYTES] = data
+
+    def call(self, place: int, step: int) -> None:
+        """Show which controller is called, and what of it; a step of 0: none."""
+        self._words[_CALL] = place << _STEP_BITS | step
+
     def look(self) -> None:
         """Show that the guardian watches; called by the guardian alone."""
         self._words[_LOOKS] += 1
+
+    @property
+    def activity(self) -> str:
+        """What of which controller was called and has not returned, as words; empty where there is none."""
+        place, step = divmod(self._words[_CALL], 1 << _STEP_BITS)
+        if not step:
+            return ""
+        name = bytes(self._memory[_NAMES + place * _NAME_BYTES :][:_NAME_BYTES]).rstrip(b"\0")
+        return f"{Step(step)} of controller {name.decode(errors='replace')}"
 
     @property
     def looks(self) -> int:

@@ -12,8 +12,9 @@ import signal
 import socket
 import sys
 import traceback
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, replace
 
 import msgspec
 
@@ -23,6 +24,7 @@ from dxlrun.clock import MonotonicClock
 from dxlrun.commands import CommandRing
 from dxlrun.compile.plan import Plan, from_json
 from dxlrun.control import realtime
+from dxlrun.control.activity import Activity
 from dxlrun.control.loop import StopFlag
 from dxlrun.control.loop_plan import SchedulerPlan
 from dxlrun.control.margin import Pacing
@@ -68,6 +70,12 @@ class LoopJob:
     guardian: int = 0
     """Process ID. Filled in by the guardian, like ports and line."""
 
+    @property
+    def descriptors(self) -> tuple[int, ...]:
+        """All that was inherited."""
+        fields = (value for name, value in asdict(self).items() if name not in ("take_over", "guardian"))
+        return tuple(one for value in fields for one in (value if isinstance(value, tuple) else (value,)))
+
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
@@ -110,12 +118,34 @@ class RingSinks:
         self.heartbeat.cycle(self._count, self._skipped)
 
 
-def _refuse_threads() -> Callable[[str], None]:
-    """Return the check that no plug-in brought a thread into the loop's process, the fault of the newest."""
-    before = 1
+def _keep_to_this_process(descriptors: Sequence[int]) -> None:
+    """See to it that no child process has the ports and the line to the guardian, executed or forked.
+
+    A child that kept them could write to the servos, and would hold the lock of a port after the run. A
+    forked one ends by SIGTERM again, not by a flag that only the loop looks at; it keeps what is mapped.
+    """
+    for descriptor in descriptors:
+        os.set_inheritable(descriptor, False)
+
+    def let_go() -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        for descriptor in descriptors:
+            with suppress(OSError):
+                os.close(descriptor)
+
+    os.register_at_fork(after_in_child=let_go)
+
+
+def _looked_at(heartbeat: Heartbeat) -> Callable[[str], None]:
+    """Return the check after foreign code prepared something: it took its time, and left no second thread,
+    which is the fault of the newest, and no second loop."""
+    before, own = 1, os.getpid()
 
     def check(name: str) -> None:
         nonlocal before
+        if os.getpid() != own:
+            os._exit(0)  # a child that was forked while a plug-in was imported, and came back
+        heartbeat.beat()
         more, before = realtime.thread_count() - before, max(before, realtime.thread_count())
         if more > 0:
             raise PlugInError(
@@ -174,7 +204,7 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: RingSinks) -> Ou
     pacing = Pacing(clock, plan.loop.scheduler.polling_ns)
     robot = assemble(
         plan,
-        load_plugins(_refuse_threads()),
+        load_plugins(_looked_at(heartbeat)),
         ports=ports,
         clock=clock,
         sinks=sinks,
@@ -184,6 +214,7 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: RingSinks) -> Ou
         inbox=Mailbox(job.mailbox, RingWriter(job.answers)),
         patience=heartbeat.may_take,
         pace=pacing,
+        activity=Activity(heartbeat, realtime.thread_count),
     )
     heartbeat.enter(Phase.SETUP)
     # before anybody has torque: it takes a while, and a Bus Watchdog waits for the first cycle
@@ -231,6 +262,7 @@ def main() -> None:
     sys.stdout = sys.stderr = process.Printed(sys.stderr.fileno())
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     job = msgspec.json.decode(sys.argv[2], type=LoopJob)
+    _keep_to_this_process(job.descriptors)
     clock = MonotonicClock()
     heartbeat = Heartbeat(job.heartbeat)
     events = EventRing(RingWriter(job.events), clock)

@@ -230,7 +230,9 @@ class _Run:
         if phase is Phase.DONE and not cut:
             self.sentences.append("the loop stopped and left the robot as its policy says")
         elif phase is not Phase.LOADING:
-            how = "the loop ended too" if gone else "the loop did not stop and was killed"
+            called = Heartbeat(self.memory.heartbeat).activity
+            where = f" in {called}" if called else ""
+            how = f"the loop ended too{where}" if gone else f"the loop did not stop{where} and was killed"
             hand = LastHand(job)
             leave = hand.limp if cut else hand.end
             self.sentences += leave(guardian.line.descriptors, how, Severity.ERROR)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from dxlrun.clock import VirtualClock
+from dxlrun.control.activity import Activity
 from dxlrun.control.controller import Controller, Interfaces, ParametersModel
 from dxlrun.control.gate import Gate
 from dxlrun.control.loop import Loop, StopFlag
@@ -195,7 +196,7 @@ class Robot:
         """Keep what the log gets."""
         self.taken.append(command)
 
-    def build(self, end_ns: int | None = None, **plan: Any) -> None:
+    def build(self, end_ns: int | None = None, activity: Activity | None = None, **plan: Any) -> None:
         self.plan = LoopPlan(
             period_ns=PERIOD_NS,
             scheduler=SchedulerPlan("other", 31, False),
@@ -210,7 +211,13 @@ class Robot:
         self.hardware = Hardware(self.record, self.clock)
         plugins = PlugIns(self._offers, {"broken_one": "plug-in broken_one of x 1 cannot be imported"})
         self.manager = Manager(
-            self.plan, plugins, self.record, self.events, self.clock, set_modes=self.hardware.set_modes
+            self.plan,
+            plugins,
+            self.record,
+            self.events,
+            self.clock,
+            set_modes=self.hardware.set_modes,
+            activity=activity,
         )
         self.gate = Gate(self.plan, self.record, self.events)
         self.loop = Loop(

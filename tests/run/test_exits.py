@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -239,6 +240,103 @@ def test_a_fault_of_dxlrun_itself_is_a_sentence_and_a_traceback_only_for_debug(
     assert all_limp(run)
     fatal = [event.text for event in run.log().events if event.code == EventCode.LOOP_STOPPED]
     assert "Traceback" in fatal[-1]
+
+
+DEATHS = {
+    "os._exit(7)": r"the loop's process ended by itself \(exit code 7\)",
+    "os.kill(os.getpid(), signal.SIGSEGV)": r"the loop's process ended by itself \(signal SIGSEGV\)",
+    "time.sleep(60)": r"the loop stood still for more than 100 ms",
+}
+
+
+@pytest.mark.parametrize("death", DEATHS)
+def test_the_cause_of_death_names_the_controller_whose_code_ran(
+    odd: Callable[..., Running], all_limp: Limp, death: str
+) -> None:
+    run = odd(update=death)
+    code, _, err = run.finish()
+    assert code == 1
+    cause = DEATHS[death] + " in update of controller states"
+    assert re.search(cause, err)
+    assert re.search(cause, guardians_word(run))
+    assert "torque off was confirmed by all 2 servos" in err
+    assert all_limp(run)
+
+
+@pytest.mark.parametrize(
+    ("death", "cause"),
+    [
+        ("os._exit(7)", "the loop's process ended by itself (exit code 7) in on_configure"),
+        (
+            "signal.signal(signal.SIGTERM, signal.SIG_IGN); time.sleep(60)",
+            "the loop did not stop within 2 s in on_configure",
+        ),
+    ],
+)
+def test_a_controller_at_which_loading_ends_is_named_and_no_servo_is_touched(
+    odd: Callable[..., Running], tmp_path: Path, wait_for: Callable[..., Any], death: str, cause: str
+) -> None:
+    ledger, mark = tmp_path / "seen.jsonl", tmp_path / "configured"
+    run = odd("--ledger", str(ledger), configure=f"open({str(mark)!r}, 'w').close(); {death}")
+    wait_for(mark.exists, "on_configure")
+    run.signal(signal.SIGINT)
+    _, _, err = run.finish()
+    assert f"{cause} of controller states" in err
+    assert "nothing had been sent to the robot" in err
+    assert seen(ledger) == b""
+
+
+THREAD = (
+    "import ctypes; libc = ctypes.CDLL(None); "
+    "libc.pthread_create(ctypes.byref(ctypes.c_ulong()), None, libc.sleep, ctypes.c_void_p(60))"
+)
+
+
+def test_a_thread_that_python_did_not_start_is_the_fault_of_its_controller_too(
+    odd: Callable[..., Running], all_limp: Limp
+) -> None:
+    run = odd(update=THREAD)
+    code, _, err = run.finish()
+    assert code == 1
+    assert "controller states started 1 thread in update" in err
+    assert all_limp(run)
+
+
+FORK = """
+        told = []
+        def tell(path):
+            open(path, "w").write(chr(10).join(os.readlink(one) for one in
+                [f"/proc/self/fd/{fd}" for fd in os.listdir("/proc/self/fd")] if os.path.islink(one)))
+        if os.fork() == 0:
+            tell(FORKED)
+            END
+        show = "import os; print(*[os.readlink(f'/proc/self/fd/{fd}') for fd in range(512)"
+        show += " if os.path.islink(f'/proc/self/fd/{fd}')], sep=chr(10))"
+        to = (os.POSIX_SPAWN_OPEN, 1, SPAWNED, os.O_WRONLY | os.O_CREAT, 0o600)
+        os.waitpid(os.posix_spawn(sys.executable, ["python", "-c", show], os.environ, file_actions=[to]), 0)
+"""
+
+
+@pytest.mark.parametrize("end", ["sys.exit(3)", "pass"])
+def test_a_child_process_of_a_controller_has_no_port(
+    odd: Callable[..., Running], tmp_path: Path, all_limp: Limp, end: str
+) -> None:
+    forked, spawned = tmp_path / "forked", tmp_path / "spawned"
+    text = FORK.replace("FORKED", repr(str(forked))).replace("SPAWNED", repr(str(spawned)))
+    run = odd("--duration", "0.5", configure=text.replace("END", end))
+    code, out, err = run.finish()
+    assert (code, err) == (0, ""), out
+    assert out.count("good") == 1
+    # a forked one has the memory that is mapped, and what they print goes where the loop's own output goes
+    for path, not_held in (
+        (forked, ("socket:", "/dev/pts/")),
+        (spawned, ("socket:", "/dev/pts/", "/memfd:")),
+    ):
+        held = [one for one in path.read_text().splitlines() if "dxlrun-stderr" not in one]
+        assert held
+        assert not [one for one in held if one.startswith(not_held)]
+    assert all_limp(run)
+    assert run.log().complete
 
 
 def test_a_directory_that_takes_no_log_is_one_sentence(start: Start, tmp_path: Path) -> None:

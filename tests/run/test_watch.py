@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import signal
+import subprocess
 from pathlib import Path
 
 import pytest
 
-from dxlrun import heartbeat, process
+from dxlrun import guardian, heartbeat, process
 from dxlrun.clock import VirtualClock
 from dxlrun.compile import compile_robot
 from dxlrun.compile.simulated import simulated_buses
@@ -15,14 +17,17 @@ from dxlrun.control.loop import StopFlag
 from dxlrun.description import read_robot
 from dxlrun.dynamixel import pump
 from dxlrun.dynamixel.hardware import DynamixelHardware
+from dxlrun.dynamixel.reopening import KeptLines
 from dxlrun.events import EventRing
-from dxlrun.guardian import LEAST_PATIENCE_NS, LONGEST_LOOK_NS, patience_ns
-from dxlrun.heartbeat import Heartbeat, Phase, Standstill
+from dxlrun.guardian import LEAST_PATIENCE_NS, LONGEST_LOOK_NS, Guardian, Handing, LastHand, patience_ns
+from dxlrun.heartbeat import Heartbeat, Phase, Standstill, Step
 from dxlrun.interfaces import Commands, States
 from dxlrun.loop_process import AskedToStop, Pulse
 from dxlrun.packets import NoPackets
 from dxlrun.ring import Handover
+from dxlrun.run_processes import Memory, guardian_job
 from dxlrun.simulation import Ledger, SimulatedBus, VirtualPorts
+from dxlrun.testing import plan_of
 
 MS = 1_000_000
 
@@ -56,10 +61,62 @@ def test_a_hung_loop_is_found_by_a_watcher_that_is_always_late() -> None:
 
 @pytest.mark.parametrize(
     ("phase", "rate", "patience"),
-    [(Phase.RUNNING, 50, 100 * MS), (Phase.RUNNING, 1000, 80 * MS), (Phase.SETUP, 50, 1000 * MS)],
+    [
+        (Phase.LOADING, 50, 60_000 * MS),
+        (Phase.SETUP, 50, 1000 * MS),
+        (Phase.RUNNING, 50, 100 * MS),
+        (Phase.RUNNING, 1000, 80 * MS),
+        (Phase.STOPPING, 50, 1000 * MS),
+        (Phase.DONE, 50, 5000 * MS),
+    ],
 )
 def test_patience(phase: Phase, rate: int, patience: int) -> None:
     assert patience_ns(phase, 1_000_000_000 // rate) == patience
+
+
+@pytest.mark.parametrize(
+    ("phase", "patience", "called", "ending", "how"),
+    [
+        (
+            Phase.LOADING,
+            "LOADING_PATIENCE_NS",
+            Step.ON_CONFIGURE,
+            "unused",
+            " in on_configure of controller arm",
+        ),
+        (Phase.LOADING, "LOADING_PATIENCE_NS", Step.NONE, "unused", ""),
+        (Phase.DONE, "ENDING_PATIENCE_NS", Step.NONE, "done", ""),
+    ],
+)
+def test_a_loop_that_never_gets_on_is_ended(  # noqa: PLR0917  fixtures
+    start: object,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    phase: Phase,
+    patience: str,
+    called: Step,
+    ending: str,
+    how: str,
+) -> None:
+    """Such as one whose plug-in waits for a server in on_configure, or for a child process at the end."""
+    monkeypatch.setattr(guardian, patience, 100 * MS)
+    plan = plan_of(tmp_path / "pair.yaml")
+    memory = Memory.create(plan)
+    page = Heartbeat(memory.heartbeat)
+    page.name_controller(1, "arm")
+    page.enter(phase)
+    page.call(1, called)
+    control, terminal = process.line_pair()
+    line, loops_end = process.line_pair()
+    watcher = Guardian(guardian_job(plan, {}, memory, take_over=False), control)
+    lines = KeptLines(())
+    with terminal, loops_end, subprocess.Popen(["/bin/sleep", "60"]) as loop:
+        ended = watcher._watch(loop, Handing(lines, line, control, LastHand(watcher._job)))
+        assert loop.returncode == -signal.SIGKILL
+    control.close()
+    line.close()
+    assert ended == ending
+    assert watcher._how(ended, loop) == f"the loop stood still for more than 100 ms{how} and was killed"
 
 
 def test_only_a_set_up_is_given_up_and_only_once(page: Heartbeat) -> None:

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Callable, Collection
-from typing import Any
+from typing import Any, ParamSpec
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.control.activity import Activity
 from dxlrun.control.controller import Context, Controller
 from dxlrun.control.gathering import Place, place_of
 from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.cycle import Clamp, CycleRecord
 from dxlrun.errors import ControllerFault
+from dxlrun.heartbeat import Step
 from dxlrun.interfaces import Commands, Floats
 
 PERIOD_CAP = 5
@@ -21,6 +23,7 @@ PERIOD_CAP = 5
 The guardian ends a loop that stands still for as long."""
 
 _TRACEBACK = 6000
+P = ParamSpec("P")
 
 
 class Managed:
@@ -35,12 +38,15 @@ class Managed:
         record: CycleRecord,
         *,
         gather: Callable[[], None],
-        bit: int,
+        place: int,
+        activity: Activity,
     ) -> None:
-        """`gather` brings the context's states and goals up to date."""
+        """`gather` brings the context's states and goals up to date; `place` is that of the controller."""
         self.plan = plan
-        self.bit = bit
+        self.bit = 1 << place
         """Of the record's mask of active controllers."""
+        self._place = place
+        self._activity = activity
         self.active = False
         self.until_ns = 0
         """When its stream of commands runs out, ns of the clock; 0: there is none."""
@@ -55,9 +61,9 @@ class Managed:
         self._last_ns = -1
         self._due_number = 0
         self._finite = np.zeros(len(rows), dtype=np.bool_)
-        place = place_of(rows)
+        columns = place_of(rows)
         self._claimed = tuple(
-            _Claim(name, _array(context.commands, name), _array(record.commands, name), place)
+            _Claim(name, _array(context.commands, name), _array(record.commands, name), columns)
             for name in plan.command
         )
 
@@ -66,10 +72,7 @@ class Managed:
         for claim in self._claimed:
             claim.forget()
         self.gather()
-        try:
-            self._controller.on_activate(time_ns)
-        except (Exception, SystemExit) as error:  # foreign code: it must not take the loop along
-            raise self._fault("on_activate", error) from error
+        self._call(Step.ON_ACTIVATE, "", self._controller.on_activate, time_ns)
         self._last_ns = -1
         self._due_number = 0
         self._held = False
@@ -79,10 +82,7 @@ class Managed:
     def deactivate(self, time_ns: int) -> None:
         """Let the controller let go. Raises ControllerFault; its joints are released all the same."""
         self.release()
-        try:
-            self._controller.on_deactivate(time_ns)
-        except (Exception, SystemExit) as error:  # see activate
-            raise self._fault("on_deactivate", error) from error
+        self._call(Step.ON_DEACTIVATE, "", self._controller.on_deactivate, time_ns)
 
     def release(self) -> None:
         """Take its commands out of the robot's: the gate holds what it last let through."""
@@ -100,10 +100,7 @@ class Managed:
         self._held = False
         self.until_ns = until_ns
         self.gather()
-        try:
-            self._controller.on_command(kind, data, time_ns)
-        except (Exception, SystemExit) as error:  # see activate
-            raise self._fault(f"on_command ({kind})", error) from error
+        self._call(Step.ON_COMMAND, f" ({kind})", self._controller.on_command, kind, data, time_ns)
 
     def hold(self) -> None:
         """Take its commands out of the robot's, and update it no more, until the next command."""
@@ -141,10 +138,8 @@ class Managed:
         self._last_ns = time_ns
         self._due_number = (number // self._every + 1) * self._every
         self.gather()
-        try:
-            self._controller.update(time_ns, min(period_ns, PERIOD_CAP * self._nominal_ns))
-        except (Exception, SystemExit) as error:  # see activate
-            raise self._fault("update", error) from error
+        capped_ns = min(period_ns, PERIOD_CAP * self._nominal_ns)
+        self._call(Step.UPDATE, "", self._controller.update, time_ns, capped_ns)
         changed = [claim for claim in self._claimed if not claim.stands()]
         for claim in changed:
             np.isfinite(claim.own, self._finite)
@@ -174,12 +169,32 @@ class Managed:
             )
         claim.seen |= self._finite
 
-    def _fault(self, where: str, error: BaseException) -> ControllerFault:
-        fault = ControllerFault(
-            f"controller {self.plan.name} raised in {where}: "
-            + " ".join(f"{type(error).__name__}: {error}".split())
-        )
-        fault.add_note("".join(traceback.format_exception(error))[-_TRACEBACK:])
+    def _call(
+        self, step: Step, what: str, call: Callable[P, object], *arguments: P.args, **named: P.kwargs
+    ) -> None:
+        """Call a method of the controller. Raises ControllerFault for what it raises and what it starts."""
+        self._activity.begin(self._place, step)
+        raised: BaseException | None = None
+        try:
+            call(*arguments, **named)
+        except (Exception, SystemExit) as error:  # foreign code: it must not take the loop along
+            raised = error
+        finally:
+            breach = self._activity.end()
+        if breach:
+            raise self._fault(
+                f"{breach} in {step}{what}: while the robot runs that would stop the loop; "
+                "start a process in on_configure instead",
+                raised,
+            ) from raised
+        if raised is not None:
+            told = " ".join(f"{type(raised).__name__}: {raised}".split())
+            raise self._fault(f"raised in {step}{what}: {told}", raised) from raised
+
+    def _fault(self, what: str, raised: BaseException | None) -> ControllerFault:
+        fault = ControllerFault(f"controller {self.plan.name} {what}")
+        if raised is not None:
+            fault.add_note("".join(traceback.format_exception(raised))[-_TRACEBACK:])
         return fault
 
 

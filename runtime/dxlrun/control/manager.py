@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from dxlrun.clock import Clock
 from dxlrun.commands import CommandSink, NoCommands, TakenCommand
+from dxlrun.control.activity import Activity
 from dxlrun.control.claims import conflicts
 from dxlrun.control.context import new_context
 from dxlrun.control.gathering import Gathering
@@ -21,6 +22,7 @@ from dxlrun.control.turns import every, fits
 from dxlrun.cycle import MOST_CONTROLLERS, CycleRecord
 from dxlrun.errors import ControllerFault, PlugInError
 from dxlrun.events import EventCode, EventSink, Severity
+from dxlrun.heartbeat import Step
 
 
 class Manager:
@@ -39,8 +41,12 @@ class Manager:
         *,
         commands: CommandSink | None = None,
         set_modes: SetModes | None = None,
+        activity: Activity | None = None,
     ) -> None:
-        """`set_modes` asks the hardware for other modes of joints; without it they stay as they are."""
+        """`set_modes` asks the hardware for other modes of joints; without it they stay as they are.
+
+        `activity` is where the controller is shown whose code runs.
+        """
         self.fault: str | None = None
         self._plan = plan
         self._plugins = plugins
@@ -48,6 +54,7 @@ class Manager:
         self._events = events
         self._clock = clock
         self._taken = commands or NoCommands()
+        self._activity = activity or Activity()
         self._rows = {joint.name: row for row, joint in enumerate(plan.joints)}
         self._period_ns = plan.period_ns
         self._managed: tuple[Managed, ...] = ()
@@ -371,21 +378,37 @@ class Manager:
         self._events.emit(code, Severity.INFO, managed.plan.name, text)
 
     def _configured(self, index: int, plan: ControllerPlan) -> Managed:
-        controller = self._plugins.built(plan)
+        self._activity.name_controller(index, plan.name)
+        self._activity.begin(index, Step.INIT)
+        try:
+            controller = self._plugins.built(plan)
+        finally:
+            self._activity.end()
         rows = np.array([self._rows[joint] for joint in plan.joints], dtype=np.intp)
         joints = [self._plan.joints[row] for row in rows]
         gathering = Gathering(self._record, rows)
         say, publish = self._sayer(plan.name), self._publisher(1 << index)
         context = new_context(plan, joints, gathering, period_ns=self._period_ns, say=say, publish=publish)
+        self._activity.begin(index, Step.ON_CONFIGURE)
         try:
             controller.on_configure(context)
         except (Exception, SystemExit) as error:  # foreign code: one sentence instead of its traceback
             raise ControllerFault(
                 f"controller {plan.name} raised in on_configure: {type(error).__name__}: {error}"
             ) from error
+        finally:
+            self._activity.end()
         self._plugins.after_each(f"of controller {plan.name}")
-        gather, bit = gathering.gather, 1 << index
-        return Managed(plan, controller, context, rows, self._record, gather=gather, bit=bit)
+        return Managed(
+            plan,
+            controller,
+            context,
+            rows,
+            self._record,
+            gather=gathering.gather,
+            place=index,
+            activity=self._activity,
+        )
 
     def _sayer(self, name: str) -> Callable[[str], None]:
         def say(text: str) -> None:

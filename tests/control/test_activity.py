@@ -1,0 +1,197 @@
+"""What a controller's code must not start while the robot runs, and how others see whose code it is."""
+
+import _thread
+import ctypes
+import multiprocessing
+import os
+import subprocess
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+
+import pytest
+
+from dxlrun.control import realtime
+from dxlrun.control.activity import Activity
+from dxlrun.events import EventCode
+from dxlrun.heartbeat import Heartbeat, Step, create
+
+CALLS = {
+    "activate": "on_activate",
+    "update": "update",
+    "command": "on_command (go)",
+    "deactivate": "on_deactivate",
+}
+
+
+def thread():
+    threading.Thread(target=int).start()
+
+
+def pool():
+    with ThreadPoolExecutor(1) as workers:
+        workers.submit(int).result()
+
+
+def swallowed():
+    with suppress(RuntimeError):
+        os.fork()
+
+
+STARTS = [
+    (thread, "a thread"),
+    (pool, "a thread"),
+    (os.fork, "a child process"),
+    (os.forkpty, "a child process"),
+    (swallowed, "a child process"),
+    (lambda: os.system("/bin/true"), "a child process"),  # noqa: S605  what is to be refused
+    (lambda: os.posix_spawn("/bin/true", ["true"], {}), "a child process"),
+    (lambda: subprocess.run(["/bin/true"], check=False), "a child process"),
+    (multiprocessing.get_context("fork").Process(target=int).start, "a child process"),
+    (multiprocessing.get_context("spawn").Process(target=int).start, "a child process"),
+    (lambda: os.execv("/bin/true", ["true"]), "another program in place of the loop"),  # noqa: S606  see above
+]
+
+
+def children():
+    return set(multiprocessing.active_children()), threading.active_count()
+
+
+@pytest.mark.parametrize("at", CALLS)
+@pytest.mark.parametrize(("start", "what"), STARTS)
+def test_what_a_controller_starts_while_the_robot_runs_is_refused_and_its_fault(robot, at, start, what):
+    before = children()
+
+    def act(controller, step, time_ns, value):
+        if step == at:
+            start()
+
+    robot.script("odd", act)
+    robot.send(40_000_000, "odd", "go", 1.0)
+    robot.build(end_ns=100_000_000)
+    result = robot.loop.run()
+    assert result.reason == "fault"
+    assert result.detail.startswith(f"controller odd tried to start {what} in {CALLS[at]}: while the robot")
+    ((_, fault),) = robot.events.of(EventCode.CONTROLLER_FAULT)
+    assert fault.startswith(result.detail)
+    assert ("Traceback" in fault) == (start is not swallowed)
+    assert children() == before
+
+
+def test_the_others_go_on_and_the_fallback_takes_over(robot):
+    def act(controller, step, time_ns, value):
+        if step == "update":
+            thread()
+
+    robot.script("odd", act, fallback="spare")
+    robot.script("spare", lambda *_: None, active=False)
+    robot.build(end_ns=100_000_000)
+    assert robot.loop.run().reason == "ended"
+    assert robot.manager.active == ()  # deactivated at the end
+    assert [cycle["active"] for cycle in robot.sink.cycles][-1] == 2
+
+
+def test_processes_are_for_on_configure_and_threads_of_others_are_theirs(robot):
+    go, done = threading.Event(), threading.Event()
+
+    def elsewhere():
+        go.wait()
+        thread()
+        done.set()
+
+    other = threading.Thread(target=elsewhere)
+    other.start()
+
+    class Good(robot.scripted()):
+        def on_configure(self, context):
+            assert subprocess.run(["/bin/true"], check=False).returncode == 0
+            thread()
+
+        def act(self, step, time_ns, value):
+            if step == "update":
+                go.set()
+                done.wait()
+
+    robot.add("good", Good)
+    robot.build(end_ns=40_000_000)
+    result = robot.loop.run()
+    other.join()
+    assert (result.reason, result.detail) == ("ended", "")
+
+
+@pytest.fixture
+def page():
+    descriptor = create()
+    made = Heartbeat(descriptor)
+    os.close(descriptor)
+    return made
+
+
+def test_a_thread_that_no_hook_sees_is_counted_once_and_only_while_the_robot_runs(page):
+    threads = [1]
+    activity = Activity(page, lambda: threads[0])
+    started = []
+    for step, count in ((Step.ON_CONFIGURE, 2), (Step.UPDATE, 2), (Step.UPDATE, 4), (Step.UPDATE, 3)):
+        activity.begin(0, step)
+        threads[0] = count
+        started.append(activity.end())
+    assert started == ["", "", "started 2 threads", ""]
+
+
+def test_the_count_sees_a_thread_of_foreign_machine_code(page):
+    libc = ctypes.CDLL(None)
+    run = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)
+    go = threading.Event()
+    body = run(lambda _: go.wait() and None)
+    handle = ctypes.c_ulong()
+    activity = Activity(page, realtime.thread_count)
+    activity.begin(0, Step.UPDATE)
+    assert libc.pthread_create(ctypes.byref(handle), None, body, None) == 0
+    assert activity.end() == "started 1 thread"
+    go.set()
+    libc.pthread_join(handle, None)
+
+
+def test_after_a_call_everything_can_be_started_again(page):
+    activity = Activity(page)
+    activity.begin(0, Step.UPDATE)
+    with pytest.raises(RuntimeError, match="a controller cannot start a thread while the robot runs"):
+        thread()
+    assert activity.end() == "tried to start a thread"
+    assert activity.end() == ""
+    thread()
+    _thread.start_new_thread(int, ())
+
+
+def test_the_page_names_what_is_called_until_it_returns(page):
+    seen = []
+    activity = Activity(page)
+    for place, name in ((0, "arm"), (62, "h\u00e4nd" * 100)):
+        activity.name_controller(place, name)
+    for place in (0, 62):
+        for step in tuple(Step)[1:]:
+            activity.begin(place, step)
+            seen.append(page.activity)
+            activity.end()
+            assert not page.activity
+    calls = ["__init__", "on_configure", "on_activate", "update", "on_command", "on_deactivate"]
+    assert seen[:6] == [f"{call} of controller arm" for call in calls]
+    assert seen[6].startswith("__init__ of controller h\u00e4ndh\u00e4nd")
+    assert page.beats == page.cycles == 0
+
+
+@pytest.mark.parametrize("at", ["activate", "update", "command", "deactivate"])
+def test_a_controller_is_shown_while_it_is_called(robot, page, at):
+    seen = []
+
+    def act(controller, step, time_ns, value):
+        if step == at:
+            seen.append(page.activity)
+
+    robot.script("arm", act)
+    robot.send(20_000_000, "arm", "go", 1.0)
+    robot.build(end_ns=60_000_000, activity=Activity(page))
+    robot.loop.run()
+    name = at if at == "update" else f"on_{at}"
+    assert set(seen) == {f"{name} of controller arm"}
+    assert not page.activity
