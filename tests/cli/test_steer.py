@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 import threading
@@ -333,6 +334,13 @@ def test_the_script_of_the_page_steers_a_torso(torso: RemoteRobot, tmp_path: Pat
     (shown,) = re.findall(r"It prints:\n\n```\n(.*?)```", PAGE, re.DOTALL)
     assert told.stdout == shown
     assert torso.info()["rate"] == 40
+
+
+@pytest.mark.skipif(shutil.which("curl") is None, reason="needs curl, which the page uses")
+def test_another_program_reads_the_robot_by_the_page(torso: RemoteRobot) -> None:
+    (line,) = re.findall(r"^    (curl .+)$", PAGE, re.MULTILINE)
+    told = subprocess.run(["/bin/bash", "-c", f"{line} --silent"], capture_output=True, check=True)
+    assert json.loads(told.stdout)["robot"] == torso.name
 
 
 def test_the_commands_of_the_page_work_in_their_order(
