@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 import subprocess
 import sys
 import tomllib
@@ -15,6 +16,8 @@ import rustypot
 from dxlrun.control_table import ControlTable, all_tables, control_table, models_by_number
 from dxlrun.control_table.protocol2 import sdk_files
 
+OWN = {"XM335-T323": 1710, "XC335-T332": 1700}
+"""Models of Protocol 2.0 that the SDK has no file of; numbers: e-Manual, dynamixel_hardware_interface."""
 Places = Callable[[ControlTable], dict[str, tuple[int, int, bool]]]
 OTHER_NAMES = {"baudrate": "baud_rate"}
 ONLY_HERE = {
@@ -86,7 +89,46 @@ def _sdk_rows(path: Path) -> dict[str, tuple[int, int]]:
 def test_every_model_of_the_sdk_is_there() -> None:
     files = sdk_files()
     assert len(files) == 67
-    assert len([table for table in all_tables() if table.protocol == 2.0]) == len(files)
+    sdk = [table for table in all_tables() if table.protocol == 2.0 and table.model not in OWN]
+    assert len(sdk) == len(files)
+
+
+def test_models_that_the_sdk_lacks_are_there_by_name_and_number() -> None:
+    for model, number in OWN.items():
+        (table,) = models_by_number(number, 2.0)
+        assert table is control_table(model)
+        assert table.model == model
+        assert model.lower().replace("-", "_") not in {path.stem for path in sdk_files()}, "it has it by now"
+
+
+@pytest.mark.parametrize(
+    ("model", "same"),
+    [
+        ("XC430-T150BB", "XC430-W150"),
+        ("XC430-W150BB", "XC430-W150"),
+        ("XC430-T240BB", "XC430-W240"),
+        ("XC430-W240BB", "XC430-W240"),
+    ],
+)
+def test_a_model_with_ball_bearings_is_the_one_without(model: str, same: str) -> None:
+    assert control_table(model) is control_table(same)
+
+
+@pytest.mark.parametrize(
+    ("patterns", "ends"),
+    [
+        (("x?430_*", "x?540_*", "2x*", "mx_*"), (1, 2)),
+        (("x?330_*",), (2, 22)),
+        (("p[hm]*", "*_ra", "rh_p12_rn"), (2, 10)),
+        (("ym*",), (2, 2)),
+    ],
+)
+def test_the_range_of_protocol_type_is_that_of_the_series(
+    patterns: tuple[str, ...], ends: tuple[int, int]
+) -> None:
+    # e-Manual, Protocol Type(13): "1 ~ 2" for X430, X540 and MX(2.0), "2 ~ 22" for X330 and X335
+    found = [_table_of(path).items.get("protocol_type") for path in _files(patterns)]
+    assert {(item.minimum, item.maximum) for item in found if item is not None} == {ends}
 
 
 def test_every_number_of_the_sdk_leads_to_a_table_with_its_cells() -> None:
@@ -129,7 +171,7 @@ def _files(patterns: tuple[str, ...]) -> list[Path]:
 
 def _table_of(path: Path) -> ControlTable:
     """Return the table of an SDK file; of two by firmware, the newer one has the plain name."""
-    name = path.stem.removesuffix("_fw52").upper().replace("_", "-")
+    name = re.sub("-RA$", "-R(A)", path.stem.removesuffix("_fw52").upper().replace("_", "-"))
     if path.stem.endswith("_fw52") or not path.with_name(f"{path.stem}_fw52.model").exists():
         return control_table({"RH-P12-RN": "RH-P12-RN(A)", "XL320": "XL-320"}.get(name, name), 2.0)
     return control_table(f"{name}-FW51", 2.0)

@@ -38,6 +38,7 @@ PROTOCOLS = (  # section "Protocol Type"
     ("RH-P12-RN(A)", {2, 10}),
     ("P[HM]*", {2, 10}),
     ("X[LC]330*", {2, 20, 21, 22}),
+    ("X[CM]335*", {2, 20, 21, 22}),
     ("*", {1, 2}),
 )
 PROFILES_BOUND_BY_LIMITS = ("P[HM]*", "[HM]*-R(A)", "RH-P12-RN(A)", "YM*")

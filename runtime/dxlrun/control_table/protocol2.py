@@ -50,19 +50,27 @@ _VELOCITIES = frozenset(
 
 
 def protocol2_listings() -> tuple[Listing, ...]:
-    """Return all models of the SDK; their tables are built when they are asked for.
+    """Return all models of the SDK and those of our own; their tables are built when they are asked for.
 
     Raises LookupError when dynamixel-sdk is not installed; `Listing.build` raises ValueError when a data file
     is broken.
     """
     numbers, files = _numbers(), sdk_files()
     stems = {path.stem for path in files}
-    return tuple(_listing(path, _own_entries(path.stem, stems, numbers)) for path in files)
+    models = [(path.stem, path) for path in files] + list(_own_models())
+    return tuple(_listing(stem, path, _own_entries(stem, stems, numbers)) for stem, path in models)
 
 
 def sdk_files() -> tuple[Path, ...]:
     """Return the SDK's data files, one a model; raises LookupError when dynamixel-sdk is not installed."""
     return tuple(path for path in sorted(_sdk_folder().glob("*.model")) if path.name != "dynamixel.model")
+
+
+def _own_models() -> Iterator[tuple[str, Path]]:
+    """Yield models that the SDK has no file of: what the patterns match, and the file that each is like."""
+    for entry in tomllib.loads((FOLDER / "own_models.toml").read_text("utf-8"))["models"]:
+        own = FOLDER / f"{entry['like']}.model"
+        yield entry["stem"], own if own.exists() else _sdk_folder() / own.name
 
 
 def layers() -> tuple[Entry, ...]:
@@ -95,12 +103,12 @@ def _numbers() -> Mapping[str, int]:
     return numbers
 
 
-def _listing(path: Path, data: dict[str, object]) -> Listing:
+def _listing(stem: str, path: Path, data: dict[str, object]) -> Listing:
     return Listing(
         names=(str(data["model"]), *words(data["aliases"])),
         model_number=whole(data, "model_number"),
         firmware=whole(data, "firmware"),
-        build=functools.cache(lambda: _table(path, data)),
+        build=functools.cache(lambda: _table(stem, path, data)),
     )
 
 
@@ -134,18 +142,18 @@ def _layers_of(stem: str) -> Iterator[Entry]:
             yield layer
 
 
-def _table(path: Path, data: Mapping[str, object]) -> ControlTable:
+def _table(stem: str, path: Path, data: Mapping[str, object]) -> ControlTable:
     facts = dict(_sections(path.read_text("utf-8")))
     items = _bare_items(facts["control table"])
     _apply_units(items, facts)
-    for layer in _layers_of(path.stem):
+    for layer in _layers_of(stem):
         _lay(layer, items)
     items["model_number"]["initial"] = data["model_number"]
     try:
         _complete(items, whole(data, "eeprom_end"))
         return build_table({**data, "items": in_order(items)})
     except (KeyError, ValueError) as error:
-        raise ValueError(f"{path.name}: {error}") from error
+        raise ValueError(f"{stem}, {path.name}: {error}") from error
 
 
 def _sections(text: str) -> Iterator[tuple[str, list[list[str]]]]:

@@ -33,10 +33,10 @@ def _operating_modes(table: ControlTable) -> tuple[int, ...]:
 
 def _protocol_types(table: ControlTable) -> tuple[int, ...]:
     item = table.items.get("protocol_type")
-    if item is None or item.maximum == 2:
+    if item is None or item.minimum == item.maximum:
         return (2,)  # Y
     if item.maximum == 10:
         return 2, 10  # P: Modbus-RTU
-    if "330-" in table.model:
-        return 2, 20, 21, 22  # S.BUS, iBUS, RC-PWM
+    if item.maximum == 22:
+        return 2, 20, 21, 22  # X330, X335: S.BUS, iBUS, RC-PWM
     return 1, 2
