@@ -16,7 +16,22 @@ import rustypot
 from dxlrun.control_table import ControlTable, all_tables, control_table, models_by_number
 from dxlrun.control_table.protocol2 import sdk_files
 
-OWN = {"XM335-T323": 1710, "XC335-T332": 1700}
+PRO = {
+    "L42-10-S300-R": 35072,
+    "L54-30-S400-R": 37928,
+    "L54-30-S500-R": 37896,
+    "L54-50-S290-R": 38176,
+    "L54-50-S500-R": 38152,
+    "M42-10-S260-R": 43288,
+    "M54-40-S250-R": 46096,
+    "M54-60-S250-R": 46352,
+    "H42-20-S300-R": 51200,
+    "H54-100-S500-R": 53768,
+    "H54-200-S500-R": 54024,
+    "RH-P12-RN": 35073,
+}
+"""PRO before (A) and the first gripper; numbers: e-Manual, dynamixel-workbench 2eb370f, dynamixel_item.h."""
+OWN = {"XM335-T323": 1710, "XC335-T332": 1700} | PRO
 """Models of Protocol 2.0 that the SDK has no file of; numbers: e-Manual, dynamixel_hardware_interface."""
 Places = Callable[[ControlTable], dict[str, tuple[int, int, bool]]]
 OTHER_NAMES = {"baudrate": "baud_rate"}
@@ -98,7 +113,25 @@ def test_models_that_the_sdk_lacks_are_there_by_name_and_number() -> None:
         (table,) = models_by_number(number, 2.0)
         assert table is control_table(model)
         assert table.model == model
-        assert model.lower().replace("-", "_") not in {path.stem for path in sdk_files()}, "it has it by now"
+        assert f"{number}\t" not in (sdk_files()[0].parent / "dynamixel.model").read_text("utf-8")
+
+
+@pytest.mark.parametrize("model", PRO)
+def test_pro_stands_where_the_maker_s_examples_address_it(model: str, places: Places) -> None:
+    # DynamixelSDK 2ded684d, c++/example/protocol2.0: read_write.cpp (PRO_SERIES), indirect_address.cpp;
+    # Dynamixel2Arduino, actuator.cpp, pro_r_control_table
+    ours = places(control_table(model))
+    assert {name: ours[name][0] for name in ("torque_enable", "led_red", "goal_position", "moving")} == {
+        "torque_enable": 562,
+        "led_red": 563,
+        "goal_position": 596,
+        "moving": 610,
+    }
+    assert ours["present_position"] == (611, 4, False)
+    assert (ours["present_velocity"][0], ours["present_current"][:2]) == (615, (621, 2))
+    assert [ours[name][0] for name in ("indirect_address_1", "indirect_address_256")] == [49, 559]
+    assert [ours[name][0] for name in ("indirect_data_1", "indirect_data_256")] == [634, 889]
+    assert ours["goal_torque"][:2] == (604, 2)
 
 
 @pytest.mark.parametrize(

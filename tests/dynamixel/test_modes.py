@@ -11,6 +11,7 @@ from dxlrun.mode import Mode
 P, V, E, W, C = Mode.POSITION, Mode.VELOCITY, Mode.EFFORT, Mode.PWM, Mode.EFFORT_POSITION
 FAMILIES = {
     ("AX-12A", 1.0): {P, V, W},
+    ("RX-10", 1.0): {P, V, W},
     ("RX-64", 1.0): {P, V, W},
     ("EX-106+", 1.0): {P, V, W},
     ("MX-28", 1.0): {P, V},
@@ -26,6 +27,13 @@ FAMILIES = {
     ("XH540-W270", 2.0): {P, V, E, W, C},
     ("PH54-200-S500", 2.0): {P, V, E, W},
     ("RH-P12-RN(A)", 2.0): {P, E, C},
+    ("XM335-T323", 2.0): {P, V, E, W, C},
+    ("XC335-T332", 2.0): {P, V, E, W, C},
+    ("H54-200-S500-R", 2.0): {P, V, E},
+    ("M42-10-S260-R", 2.0): {P, V, E},
+    ("L54-50-S290-R", 2.0): {P, V, E},
+    ("L42-10-S300-R", 2.0): {P, V},
+    ("RH-P12-RN", 2.0): {P, E, C},
 }
 """What the e-Manual's pages of the models say."""
 
@@ -36,8 +44,13 @@ def make_one(make_rig, make_plan):
 
     def make(model, protocol, **change):
         table = control_table(model, protocol)
-        middle = (table.min_tick + table.max_tick) / 2 * table.rad_per_tick
-        reach = 0.45 * (table.max_tick - table.min_tick) * table.rad_per_tick
+        limits = [table.items.get(f"{end}_position_limit") for end in ("min", "max")]
+        low, high = (
+            given if item is None else item.initial
+            for given, item in zip((table.min_tick, table.max_tick), limits, strict=True)
+        )
+        middle = (low + high) / 2 * table.rad_per_tick
+        reach = 0.45 * (high - low) * table.rad_per_tick
         given = {"reference": middle, "lower": -reach, "upper": reach, "return_delay_ns": 0} | change
         plan = make_plan((1, 2), model=model, protocol=protocol, **given)
         rig = make_rig(plan, position=middle or 0.001)

@@ -25,7 +25,9 @@ STATE = {1.0: 0x01 | 0x04 | 0x20, 2.0: 0x80}
 
 MODES = (  # section "Operating Mode" of the models' pages
     ("YM*", {0, 1, 3}),
-    ("RH-P12-RN(A)", {0, 5}),
+    ("RH-P12-RN*", {0, 5}),
+    ("L42-*", {1, 3}),
+    ("[HLM]*-R", {0, 1, 3, 4}),
     ("P[HM]*", {0, 1, 3, 4, 16}),
     ("[HM]*-R(A)", {0, 1, 3, 4, 16}),
     ("2X*", {1, 3, 4, 16}),
@@ -47,7 +49,14 @@ GOALS_BOUND_BY_LIMITS = "YM*"
 
 CHANGES_THE_LINE = ("id", "baud_rate", "baud_rate_bus", "status_return_level", "protocol_type", "lock")
 """After a write of these the servo answers otherwise, or not at all: each is set back at once."""
-LIMITS = ("pwm_limit", "current_limit", "velocity_limit", "acceleration_limit", "max_position_limit")
+LIMITS = (
+    "torque_limit",
+    "pwm_limit",
+    "current_limit",
+    "velocity_limit",
+    "acceleration_limit",
+    "max_position_limit",
+)
 MEASURED = ("current",)
 """The manual lets it be written, and the servo goes on to show what it measures (MX-64, MX-106)."""
 

@@ -11,6 +11,7 @@ import pytest
 from dxlrun.control_table import control_table
 from dxlrun.simulation import Load
 from dxlrun.simulation.motor import motor_of
+from dxlrun.simulation.protocol2 import ErrorNumber
 
 TICK = math.tau / 4096
 RPM = math.tau / 60
@@ -223,6 +224,67 @@ def test_an_xl320_moves_by_its_own_items(make_line2: Any) -> None:
     assert line.set("moving_speed", 500) == 0
     line.wait(1)
     assert line.servo().velocity > 0
+
+
+@pytest.mark.parametrize(
+    "model", ["H54-200-S500-R", "H42-20-S300-R", "M42-10-S260-R", "M54-60-S250-R", "L54-30-S400-R"]
+)
+def test_a_pro_before_a_moves_by_its_own_items(make_line2: Any, model: str) -> None:
+    line = make_line2((1,), model, position=0.0)
+    table = line.servo().registers.table
+    assert line.set("goal_velocity", line.get("velocity_limit") + 1) == ErrorNumber.DATA_LIMIT
+    assert line.set("goal_torque", line.get("torque_limit") + 1) == ErrorNumber.DATA_LIMIT
+    line.set("goal_velocity", 3000)
+    line.set("torque_enable", 1)
+    assert line.set("goal_position", 50_000) == 0
+    line.wait(0.5)
+    assert line.servo().velocity == pytest.approx(3000 * table.rad_s_per_tick, rel=0.05)
+    assert line.get("present_velocity") == pytest.approx(3000, rel=0.05)
+    line.wait(10)
+    assert line.get("present_position") == pytest.approx(50_000, abs=300)
+    line.set("torque_enable", 0)
+    assert line.set("operating_mode", 1) == 0
+    line.set("torque_enable", 1)
+    line.set("goal_velocity", -2000)
+    line.wait(1)
+    assert line.servo().velocity == pytest.approx(-2000 * table.rad_s_per_tick, rel=0.05)
+    line.set("torque_enable", 0)
+    assert line.set("operating_mode", 0) == 0
+    line.set("torque_enable", 1)
+    line.set("goal_torque", 50)
+    assert line.get("present_current") == pytest.approx(50, abs=2)
+    line.set("torque_enable", 0)
+    assert line.set("operating_mode", 16) == ErrorNumber.DATA_RANGE
+
+
+def test_a_pro_with_a_goal_torque_is_no_stronger_than_that(make_line2: Any) -> None:
+    line = make_line2((1,), "H54-200-S500-R", position=0.0)
+    line.set("goal_torque", 10)
+    line.set("torque_enable", 1)
+    line.set("goal_position", 200_000)
+    line.wait(0.05)
+    assert line.get("present_current") == 10
+    line.set("goal_torque", 0)  # the Torque Limit holds
+    line.wait(0.05)
+    assert line.get("present_current") > 15
+
+
+def test_an_l42_counts_as_an_ax_does(make_line2: Any) -> None:
+    line = make_line2((1,), "L42-10-S300-R")
+    assert move(line, 3000) == pytest.approx(3000, abs=3)
+    line.set("torque_enable", 0)
+    assert line.set("operating_mode", 0) == ErrorNumber.DATA_RANGE
+    assert line.set("operating_mode", 1) == 0
+    line.set("torque_enable", 1)
+    line.set("goal_velocity", 100)
+    line.wait(1)
+    assert line.get("present_velocity") == pytest.approx(100, abs=2)
+
+
+def test_an_rh_p12_before_a_closes(make_line2: Any) -> None:
+    line = make_line2((1,), "RH-P12-RN", position=0.0)
+    assert move(line, 740) == pytest.approx(740, abs=5)
+    assert line.set("goal_position", 1151) == ErrorNumber.DATA_RANGE
 
 
 def test_an_rh_p12_closes(make_line2: Any) -> None:

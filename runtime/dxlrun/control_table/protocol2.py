@@ -19,7 +19,15 @@ from pathlib import Path
 from dxlrun.control_table.sources import Entry, Items, Listing, build_table, in_order, section, whole, words
 from dxlrun.control_table.table import ControlTable
 
-LAYER_FILES = ("every_model.toml", "x_and_mx.toml", "p.toml", "y.toml", "models.toml", "sdk_corrections.toml")
+LAYER_FILES = (
+    "every_model.toml",
+    "x_and_mx.toml",
+    "p.toml",
+    "y.toml",
+    "pro.toml",
+    "models.toml",
+    "sdk_corrections.toml",
+)
 """In the order in which they are laid one over the other."""
 FOLDER = Path(__file__).parent.parent / "control_tables" / "protocol2"
 

@@ -65,7 +65,7 @@ def build_table(data: Entry) -> ControlTable:
     items = tuple(_item(name, section(entry)) for name, entry in section(data["items"]).items())
     _check(items)
     by_name = {item.name: item for item in items}
-    goal_speed = _first(by_name, "moving_speed", "profile_velocity")
+    goal_speed = _first(by_name, "moving_speed", "profile_velocity", "goal_velocity")
     present_speed = _first(by_name, "present_speed", "present_velocity")
     effort = _first(by_name, "present_load", "present_current")
     position, speed = by_name["goal_position"], by_name[goal_speed]

@@ -37,7 +37,7 @@ class ControlTable:
     capabilities: frozenset[str]
     """What the model can do; `CAPABILITIES` explains each word."""
     goal_speed_item: str
-    """Speed of the way to the goal: `moving_speed`, or `profile_velocity` where profiles are."""
+    """Speed of the way to the goal: `moving_speed`, `profile_velocity`, or on PRO `goal_velocity`."""
     present_speed_item: str
     effort_item: str
     """`present_load`, or `present_current` where the model measures its current."""

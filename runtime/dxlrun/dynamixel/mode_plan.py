@@ -114,7 +114,7 @@ def own_limits(table: ControlTable) -> tuple[OwnLimit, ...]:
         ("pwm", "pwm_limit"),
     ]
     if "goal_torque" in table.items:
-        places.append(("effort", "max_torque"))
+        places.append(("effort", "max_torque" if "max_torque" in table.items else "torque_limit"))
     return tuple(
         OwnLimit(of, item.name, item.address, item.size)
         for of, name in places
@@ -135,7 +135,8 @@ def position_layout(table: ControlTable) -> GoalLayout:
 def _by_operating_mode(table: ControlTable, ends: tuple[int, int], continuous: bool) -> list[ModePlan]:
     """Return the modes of a model with Operating Mode (e-Manual, section of that name, by model)."""
     items, listed = table.items, operating_modes(table)
-    current = _scale(table, "goal_current", _effort_of_ampere(table))
+    effort = "goal_current" if "goal_current" in items else "goal_torque"  # PRO; it counts current as well
+    current = _scale(table, effort, _effort_of_ampere(table))
     to_goal = Scale(table.rad_s_per_tick, table.max_speed_tick)
     plain = ModePlan(Mode.UNKNOWN, (), (), *ends, table.rad_s_per_tick)
     found: list[ModePlan] = []
@@ -147,7 +148,7 @@ def _by_operating_mode(table: ControlTable, ends: tuple[int, int], continuous: b
     limited = position
     if _CURRENT_BASED in listed:
         # the effort first: a position without its limit would be pursued with the limit of before
-        goals = (_alone(items["goal_current"], "effort"), *position.goals)
+        goals = (_alone(items[effort], "effort"), *position.goals)
         limited = replace(position, goals=goals, effort=current)
     if not continuous and _POSITION in listed:
         add(_POSITION, position)
@@ -159,7 +160,7 @@ def _by_operating_mode(table: ControlTable, ends: tuple[int, int], continuous: b
         layout, speed = _alone(items["goal_velocity"], "speed"), _scale(table, "goal_velocity")
         add(_VELOCITY, replace(plain, mode=Mode.VELOCITY, goals=(layout,), speed=speed))
     if _CURRENT in listed:
-        layout = _alone(items["goal_current"], "effort")
+        layout = _alone(items[effort], "effort")
         add(_CURRENT, replace(plain, mode=Mode.EFFORT, goals=(layout,), effort=current))
         if _CURRENT_BASED in listed and not continuous:
             add(_CURRENT_BASED, replace(limited, mode=Mode.EFFORT_POSITION))
@@ -174,11 +175,14 @@ def operating_modes(table: ControlTable) -> tuple[int, ...]:
     item = table.items.get("operating_mode")
     if item is None:
         return ()
-    highest = item.maximum
-    if highest == _POSITION:
-        return _CURRENT, _VELOCITY, _POSITION  # Y
-    if highest == _CURRENT_BASED:
-        return _CURRENT, _CURRENT_BASED  # RH-P12-RN(A)
+    ends = {
+        (_VELOCITY, _POSITION): (_VELOCITY, _POSITION),  # L42-10-S300-R
+        (_CURRENT, _POSITION): (_CURRENT, _VELOCITY, _POSITION),  # Y
+        (_CURRENT, _EXTENDED): (_CURRENT, _VELOCITY, _POSITION, _EXTENDED),  # PRO
+        (_CURRENT, _CURRENT_BASED): (_CURRENT, _CURRENT_BASED),  # RH-P12-RN, RH-P12-RN(A)
+    }
+    if (listed := ends.get((item.minimum, item.maximum))) is not None:
+        return listed
     if table.items["torque_enable"].address == _ADDRESS_OF_P:
         return _CURRENT, _VELOCITY, _POSITION, _EXTENDED, _PWM
     if "goal_current" in table.items:

@@ -22,10 +22,14 @@ def choices(table: ControlTable) -> Mapping[str, frozenset[int]]:
 
 def _operating_modes(table: ControlTable) -> tuple[int, ...]:
     item = table.items.get("operating_mode")
+    if item is not None and item.minimum == 1:
+        return 1, 3  # L42-10-S300-R
     if item is None or item.maximum == 3:
         return 0, 1, 3  # Y
+    if item.maximum == 4:
+        return 0, 1, 3, 4  # PRO
     if item.maximum == 5:
-        return 0, 5  # RH-P12-RN(A)
+        return 0, 5  # RH-P12-RN, RH-P12-RN(A)
     if table.items["torque_enable"].address == TORQUE_ENABLE_OF_P:
         return 0, 1, 3, 4, 16
     return (0, 1, 3, 4, 5, 16) if "goal_current" in table.items else (1, 3, 4, 16)

@@ -27,7 +27,7 @@ def position_gains(memory: Memory, motor: Motor) -> Command:
     Where the P gain was identified as another one, the others go with it [i].
     """
     table = memory.table
-    if table.items["position_p_gain"].initial is None:
+    if table.items["position_p_gain"].initial is None or "goal_pwm" not in table.items:
         d = critical_d(UNKNOWN_P, motor)
         return Command(p_ccw=UNKNOWN_P, p_cw=UNKNOWN_P, d=d)
     unit = 128 * motor.p_gain_duty or table.items["goal_pwm"].scale / table.rad_per_tick
@@ -45,7 +45,7 @@ def position_gains(memory: Memory, motor: Motor) -> Command:
 def velocity_gains(memory: Memory) -> Command:
     """Return the gains of velocity control, KVP / 128 and KVI / 65536, on the integrated speed."""
     table = memory.table
-    if table.items["velocity_p_gain"].initial is None:
+    if "goal_pwm" not in table.items or table.items["velocity_p_gain"].initial is None:
         p, i = UNKNOWN_VELOCITY_P / table.max_speed, UNKNOWN_VELOCITY_I / table.max_speed
         return Command(p_ccw=i, p_cw=i, d=p)
     unit = table.items["goal_pwm"].scale / table.rad_s_per_tick

@@ -43,11 +43,14 @@ class ModeShaft(Shaft):
             "goal_position",
             "goal_velocity",
             "goal_current",
+            "goal_torque",
             "goal_pwm",
+            "goal_acceleration",
             "profile_velocity",
             "profile_acceleration",
             "velocity_limit",
             "current_limit",
+            "torque_limit",
             "pwm_limit",
             "bus_watchdog",
             "position_p_gain",
@@ -59,23 +62,30 @@ class ModeShaft(Shaft):
             "feedforward_2nd_gain",
         )
     )
-    aims: ClassVar[frozenset[str]] = frozenset(("goal_position", "profile_velocity", "profile_acceleration"))
+    aims: ClassVar[frozenset[str]] = frozenset(
+        ("goal_position", "profile_velocity", "profile_acceleration", "goal_velocity", "goal_acceleration")
+    )
 
     def __init__(self, memory: Memory, mechanics: Mechanics, load: Load, angle: float) -> None:
         super().__init__(memory, mechanics, load, angle)
         self._aimed: tuple[int, int, int] = (0, 0, 0)
         self._profile_kind = 0
         items = memory.table.items
-        item = items.get("profile_acceleration")
+        self._speed_item = memory.table.goal_speed_item
+        """What the profile's speed is: on PRO Goal Velocity (600), with Goal Acceleration (606)."""
+        of_pro = self._speed_item == "goal_velocity"
+        self._ramp_item = "goal_acceleration" if of_pro else "profile_acceleration"
+        item = items.get(self._ramp_item)
         self._acceleration_unit = item.scale if item is not None else 1.0
         self._pwm_unit = items["goal_pwm"].scale if "goal_pwm" in items else 1 / 885
-        self._current_unit = items["goal_current"].scale if "goal_current" in items else 0.001
+        self._current_unit = items["present_current"].scale if "present_current" in items else 0.001
+        self._torque_item = items.get("goal_torque" if of_pro else "goal_current")
         self._scale = {name: item.scale for name, item in items.items()}
         self._rad_per_tick = memory.table.rad_per_tick
         self._sign, self._offset = 1, 0
         memory.watch(("drive_mode", "homing_offset"), self._orient)
         self._velocity_wanted, self._ramp_wanted = 0, 0
-        memory.watch(("profile_velocity", "profile_acceleration"), self._note_profile)
+        memory.watch((self._speed_item, self._ramp_item), self._note_profile)
 
     def within_a_turn(self, angle: float) -> float:
         """Return the angle within the turn that the encoder knows: 0 to 4095 ticks, or around 0."""
@@ -156,11 +166,23 @@ class ModeShaft(Shaft):
         if mode == CURRENT:
             return Command(bias=math.copysign(limit, torque), limit=limit, torque_limit=abs(torque))
         if mode == VELOCITY:
-            return self._turn(limit)
+            return self._turn(limit)._replace(torque_limit=self._most_torque(torque))
         if not self._controls_position:
             return LIMP  # a value that the model's manual does not name
-        command = position_gains(memory, self.motor)._replace(limit=limit)
-        return command._replace(torque_limit=abs(torque)) if mode == CURRENT_BASED else command
+        most = (
+            abs(torque) if mode == CURRENT_BASED and "goal_current" in memory else self._most_torque(torque)
+        )
+        return position_gains(memory, self.motor)._replace(limit=limit, torque_limit=most)
+
+    def _most_torque(self, torque: float) -> float:
+        """Return what limits the torque beside a position or a speed, Nm.
+
+        Of PRO it is Goal Torque (604), where that is 0 Torque Limit (30) (e-Manual, Goal Torque (604)); of
+        the RH-P12-RN the latter is inferred [i].
+        """
+        if self._torque_item is None or self._torque_item.name != "goal_torque":
+            return FREE
+        return abs(torque) or self.memory["torque_limit"] * self._torque_unit
 
     def _turn(self, limit: float) -> Command:
         memory = self.memory
@@ -175,10 +197,18 @@ class ModeShaft(Shaft):
 
     def _goal_torque(self) -> float:
         memory = self.memory
-        if "goal_current" not in memory:
+        if self._torque_item is None:
             return FREE
-        ampere = self._sign * memory.ticks("goal_current") * self._current_unit
-        return ampere * self.motor.torque_per_ampere
+        return self._sign * memory.ticks(self._torque_item.name) * self._torque_unit
+
+    @property
+    def _torque_unit(self) -> float:
+        """Nm per tick of the goal: it counts current, or parts of the stall torque (L42-10-S300-R)."""
+        if self._torque_item is None:
+            return 0.0
+        parts = self._torque_item.unit == "1"
+        whole = self.motor.stall_torque if parts else self.motor.torque_per_ampere
+        return self._torque_item.scale * whole
 
     def _new_trajectory(self, *, afresh: bool = False) -> Trajectory | None:
         memory, table = self.memory, self.memory.table
@@ -210,8 +240,8 @@ class ModeShaft(Shaft):
         return goal, speed, acceleration
 
     def _note_profile(self) -> None:
-        self._velocity_wanted = self._profile("profile_velocity")
-        self._ramp_wanted = self._profile("profile_acceleration")
+        self._velocity_wanted = self._profile(self._speed_item)
+        self._ramp_wanted = self._profile(self._ramp_item)
 
     def _profile(self, name: str) -> int:
         return abs(self.memory.ticks(name)) if name in self.memory else 0

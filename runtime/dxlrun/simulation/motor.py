@@ -140,8 +140,10 @@ def _scaled(table: ControlTable, like: _Identified) -> Motor:
     viscous = model.viscous_friction / model.damping
     driving = 1.0 - model.load_friction
     damping = torque * (driving - friction) / (table.max_speed * (driving + viscous))
-    limit = table.items.get("current_limit")
-    measured = limit.maximum * limit.scale if limit is not None else STALL_CURRENT_A
+    limit = table.items.get("current_limit") or table.items.get("torque_limit")  # PRO has the latter, in A
+    measured = STALL_CURRENT_A
+    if limit is not None and limit.unit == "A":
+        measured = limit.maximum * limit.scale
     return Motor(
         stall_torque=torque,
         damping=damping,
