@@ -1,11 +1,14 @@
-"""What is on the wire of a simulated bus, taken apart by code of this file alone, for fault_judge.py."""
+"""What is on the wire of a simulated bus, taken apart by code of this file alone, for fault_judge.py.
+
+Addresses and units too are those of FACTS, from the e-Manual, and not the runtime's.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Literal, NamedTuple
 
-from dxlrun.control_table import control_table
 from dxlrun.dynamixel.bus_plan import BusPlan, ServoPlan
 from dxlrun.simulation import LedgerEntry
 
@@ -13,6 +16,38 @@ PING, READ, WRITE, SYNC_WRITE, SYNC_READ, FAST_SYNC_READ, BULK_READ = 0x01, 0x02
 HOST_SAYS = frozenset((PING, READ, WRITE, SYNC_WRITE, SYNC_READ, FAST_SYNC_READ, BULK_READ))
 EVERYBODY, STATUS = 254, 0x55
 HEADER = b"\xff\xff\xfd\x00"
+Item = Literal["torque_enable", "goal_position", "present_position"]
+
+
+class Facts(NamedTuple):
+    """What the e-Manual says of a model: the angle of a tick, and address and size of each item."""
+
+    rad_per_tick: float
+    items: Mapping[Item, tuple[int, int]]
+
+
+FACTS: Mapping[str, Facts] = {
+    "AX-12A": Facts(
+        math.radians(300) / 1023,
+        {"torque_enable": (24, 1), "goal_position": (30, 2), "present_position": (36, 2)},
+    ),
+    "XM430-W350": Facts(
+        math.tau / 4096,
+        {"torque_enable": (64, 1), "goal_position": (116, 4), "present_position": (132, 4)},
+    ),
+}
+
+
+def angle(servo: ServoPlan, raw: int) -> float:
+    """Return the joint's angle, rad, of a position in ticks: direction * (theta - reference)."""
+    return servo.direction * (raw * FACTS[servo.model].rad_per_tick - servo.reference)
+
+
+def stands_at(servo: ServoPlan, state: bytes) -> float:
+    """Return the joint's angle, rad, in a block of state that begins where the plan reads it."""
+    address, size = FACTS[servo.model].items["present_position"]
+    at = address - servo.state.address
+    return angle(servo, int.from_bytes(state[at : at + size], "little", signed=size == 4))
 
 
 def _crc_table() -> tuple[int, ...]:
@@ -106,15 +141,15 @@ def writes(said: Said, protocol: float) -> Iterator[tuple[int, int, bytes]]:
             yield blocks[at], address, blocks[at + 1 : at + 1 + size]
 
 
-def written(said: Sequence[Said], bus: BusPlan, item: str) -> Iterator[tuple[int, ServoPlan, int]]:
+def written(said: Sequence[Said], bus: BusPlan, item: Item) -> Iterator[tuple[int, ServoPlan, int]]:
     """Return when which servo got which value in an item."""
-    places = [(servo, control_table(servo.model, bus.protocol).items[item]) for servo in bus.servos]
+    places = [(servo, *FACTS[servo.model].items[item]) for servo in bus.servos]
     for one in said:
         for servo_id, address, data in writes(one, bus.protocol):
-            for servo, place in places:
-                at = place.address - address
-                if servo_id in (servo.servo_id, EVERYBODY) and 0 <= at <= len(data) - place.size:
-                    yield one.t_ns, servo, place.decode(data[at : at + place.size])
+            for servo, place, size in places:
+                at = place - address
+                if servo_id in (servo.servo_id, EVERYBODY) and 0 <= at <= len(data) - size:
+                    yield one.t_ns, servo, int.from_bytes(data[at : at + size], "little", signed=size == 4)
 
 
 def states(entries: Sequence[LedgerEntry], bus: BusPlan) -> Iterator[Told]:
