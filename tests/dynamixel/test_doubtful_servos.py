@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from dxlrun.dynamixel import modes
+from dxlrun.dynamixel.limp import limp
 from dxlrun.dynamixel.standing import stand
 from dxlrun.events import EventCode
 from dxlrun.mode import Mode
@@ -237,3 +238,18 @@ def test_a_wheel_stands_before_silent_ones_are_awaited_for_long(make_rig, make_p
     assert stood_ns[-1] - begin_ns < 500_000_000
     assert [text.split()[0] for text in said] == [f"main_{one}_joint" for one in (4, 1, 2, 3)]
     assert [" may go on moving: " in text for text in said] == [False, True, True, True]
+
+
+@pytest.mark.parametrize("last_hand", [limp, stand])
+def test_the_last_hand_waits_for_the_end_of_a_reply_that_is_on_its_way(make_rig, last_hand):
+    rig = make_rig()
+    rig.hardware.start()
+    rig.clock.wait_until(rig.clock.now_ns() + 5_000_000)
+    begun_ns = rig.clock.now_ns()
+    rig.ports.ports[0].write(rig.plans[0].reads[0].packet)
+    rig.clock.wait_until(begun_ns + 640_000)  # 80 us of instruction, 500 us of delay
+    last_hand(rig.plans, rig.ports, rig.clock, rig.packets)
+    since = [entry for entry in rig.ledger.entries if entry.t_ns > begun_ns]
+    reply = next(entry for entry in since if entry.direction == "out")
+    first = [entry for entry in since if entry.direction == "in"][1]
+    assert first.t_ns - len(first.data) * 10_000 >= reply.t_ns

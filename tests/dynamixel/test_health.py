@@ -1,17 +1,22 @@
 """Servos that are lost, reboot, come back, and what the Bus Watchdog does: judged by the simulated bus."""
 
 import math
+import re
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
 import pytest
 
 from dxlrun.control_table import control_table
 from dxlrun.dynamixel import protocol1, protocol2
 from dxlrun.dynamixel.bus_plan import RegisterValue
 from dxlrun.dynamixel.reboots import RealtimeTicks, RebootCount
+from dxlrun.dynamixel.returning import RETURN_SPEED, Returning
 from dxlrun.dynamixel.transaction import Outcome, Reply
+from dxlrun.errors import StartUpError
 from dxlrun.events import EventCode
+from dxlrun.interfaces import Commands, States
 
 X_IDS = (11, 12, 13, 14)
 
@@ -127,7 +132,7 @@ def test_a_servo_whose_plug_was_loose_comes_back_with_the_torque_it_kept(start, 
     torque_on = protocol2.write(13, 64, b"\1")
     goals = [packet for packet in rig.into_bus() if packet[7] == 0x83][-1]
     assert 13 in goals[12:-2:9]
-    assert rig.into_bus().count(torque_on) <= 2  # at the start, and as it was: on
+    assert rig.into_bus().count(torque_on) == 1, "torque was written to a servo that no policy gives it"
 
 
 @pytest.mark.parametrize("returning", [False, True])
@@ -253,6 +258,90 @@ def test_a_servo_that_was_turned_out_of_its_limits_while_it_was_away_gets_no_tor
     servo.turn_by_hand(plan.upper_tick * plan.rad_per_tick)
     cycles(rig, 60)
     assert rig.torque() == [True] * 4
+
+
+def _refuse_torque(rig, servo):
+    servo.registers.watch(("torque_enable",), lambda: servo.poke("torque_enable", 0))
+
+
+def _answer_no_third_question_for_torque(rig, servo):
+    """The first two are those of the inspection and of the mode."""
+    write, asked = rig.ports.ports[0].write, []
+
+    def through(data):
+        if data == protocol2.read(servo.servo_id, 64, 1):
+            asked.append(data)
+            if 3 <= len(asked) <= 5:
+                rig.buses[0].truncate_next(servo.servo_id, 0)
+        write(data)
+
+    rig.ports.ports[0].write = through
+
+
+@pytest.mark.parametrize(
+    ("trick", "said"),
+    [
+        (_refuse_torque, "and torque enable 0"),
+        (_answer_no_third_question_for_torque, "did not answer when its torque was asked for"),
+    ],
+)
+def test_a_servo_whose_torque_is_not_certain_does_not_come_back(start, make_x, trick, said):
+    rig = start(make_x(returning=True))
+    servo = rig.buses[0].servo(13)
+    servo.silence()
+    cycles(rig, 20)
+    servo.reset()
+    trick(rig, servo)
+    servo.silence(False)
+    while len(texts := [text for _, text in rig.events.of(EventCode.SERVO_LOST)]) < 2:
+        assert not rig.events.of(EventCode.SERVO_BACK)
+        rig.cycle()
+    assert "cannot take part" in texts[1]
+    assert said in texts[1]
+    assert not rig.states.valid[2]
+
+
+def _refuse_watchdog(rig, servo):
+    servo.registers.watch(("bus_watchdog",), lambda: servo.poke("bus_watchdog", 0))
+
+
+def _answer_for_the_watchdog_once(rig, servo):
+    write, asked = rig.ports.ports[0].write, []
+
+    def through(data):
+        if data == protocol2.read(servo.servo_id, 98, 1):
+            asked.append(data)
+            if len(asked) > 1:
+                rig.buses[0].truncate_next(servo.servo_id, 0)
+        write(data)
+
+    rig.ports.ports[0].write = through
+
+
+@pytest.mark.parametrize(
+    ("trick", "said"),
+    [
+        (_refuse_watchdog, "was given Bus Watchdog (98) = 10, but has 0"),
+        (_answer_for_the_watchdog_once, "did not answer when its Bus Watchdog (98) was read back"),
+    ],
+)
+def test_a_watchdog_that_is_not_certain_to_be_armed_ends_the_start(make_rig, make_x, trick, said):
+    rig = make_rig(make_x(watchdog=10))
+    trick(rig, rig.buses[0].servo(12))
+    with pytest.raises(StartUpError, match=re.escape(f"ID 12 on bus arm) {said}")):
+        rig.hardware.start()
+    assert rig.torque() == [False] * 4
+
+
+def test_a_servo_without_torque_is_not_taken_for_one_that_has_caught_up():
+    """Its position from before it was lost may be where its goal is now."""
+    returning, goals, states = Returning([0]), Commands.empty(1), States.empty(1)
+    goals.position[0], states.position[0] = 0.3, 0.3
+    returning.slow_down(0)
+    assert returning.ceiling(goals, states, np.array([False]))[0] == RETURN_SPEED
+    assert returning.anybody == [0]
+    assert np.isnan(returning.ceiling(goals, states, np.array([True]))[0])
+    assert returning.anybody == []
 
 
 def test_registers_that_a_reboot_took_are_written_again(start, make_x):

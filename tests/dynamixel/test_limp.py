@@ -82,9 +82,13 @@ def test_it_works_after_a_half_sent_instruction_and_a_half_read_reply(make_rig):
     port.write(rig.plans[0].reads[0].packet)
     rig.clock.wait_until(rig.clock.now_ns() + 650_000)
     port.write(b"\xff\xff\xfe\x2c\x83\x1e\x04\x01")
+    off_ns = []
+    for servo in rig.buses[0].servos:
+        servo.registers.watch(("torque_enable",), lambda: off_ns.append(rig.buses[0].now_ns))
     outcomes = limp(rig.plans, rig.ports, rig.clock, rig.packets)
     assert all(one.confirmed for one in outcomes)
     assert rig.torque() == [False] * 8
+    assert len(set(off_ns[:8])) == 1, "the broadcast collided with the end of the reply"
 
 
 def test_a_silent_servo_is_named_and_time_is_bounded(make_rig):

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from dxlrun.control_table import control_table
+from dxlrun.dynamixel import protocol2
+from dxlrun.dynamixel.mode_plan import mode_in, position_reach
 from dxlrun.errors import StartUpError
 from dxlrun.events import EventCode
 from dxlrun.mode import Mode
@@ -212,6 +214,35 @@ def test_a_servo_that_refuses_keeps_its_mode_and_its_torque(make_one):
     assert "it is in position mode" in text
 
 
+def test_the_mode_of_a_servo_that_does_not_acknowledge_torque_off_is_left_alone(make_one):
+    """An MX with Protocol 1.0 takes other angle limits with torque on, and would begin to turn."""
+    rig = make_one("MX-28", 1.0)
+    servo, write = rig.buses[0].servo(1), rig.ports.ports[0].write
+    limit = servo.registers["ccw_angle_limit"]
+
+    def lose_torque_off(data):
+        if data[2] == 1 and data[4:7] == b"\x03\x18\x00":
+            rig.buses[0].alter_next_instruction("lost", lambda _: b"")
+        write(data)
+
+    rig.ports.ports[0].write = lose_torque_off
+    rig.hardware.set_modes(np.array([Mode.VELOCITY, 0], dtype=np.uint8))
+    for _ in range(30):
+        rig.cycle()
+    assert servo.registers["ccw_angle_limit"] == limit
+    assert rig.torque() == [True, True]
+    ((_, text),) = rig.events.of(EventCode.MODE)
+    assert "did not acknowledge torque off before its mode was changed; it is in position mode" in text
+
+
+def test_of_two_modes_that_are_selected_alike_the_one_of_the_start_counts(make_plan):
+    """An AX in wheel mode follows a velocity or a PWM by the same register."""
+    wheel = {"cw_angle_limit": 0, "ccw_angle_limit": 0}
+    for mode in (Mode.VELOCITY, Mode.PWM):
+        plan = make_plan((1,), continuous=True, lower=-np.inf, upper=np.inf, start_mode=mode)
+        assert mode_in(plan.servos[0], wheel) is mode
+
+
 def test_a_model_without_the_mode_says_so_and_stays(make_one):
     rig = make_one("XL430-W250", 2.0)
     rig.hardware.set_modes(np.array([Mode.EFFORT, 0], dtype=np.uint8))
@@ -319,10 +350,12 @@ def test_a_torque_limit_weakens_a_servo_that_follows_a_pwm_and_does_not_drive_it
     assert abs(rig.buses[0].servo(1).registers.ticks("goal_pwm")) == 88
 
 
-def test_a_joint_that_coasted_over_its_limits_is_led_back_slowly_and_does_not_fall(arm):
+@pytest.mark.parametrize("beyond", [100, 800])
+def test_a_joint_that_coasted_over_its_limits_is_led_back_slowly_and_does_not_fall(make_one, beyond):
+    arm = make_one("XM430-W350", 2.0, lower=-1.0, upper=1.0)
     servo, plan = arm.buses[0].servo(1), arm.plans[0].servos[0]
     change(arm, Mode.EFFORT)
-    servo.turn_by_hand((plan.upper_tick + 100) * plan.rad_per_tick)
+    servo.turn_by_hand((plan.upper_tick + beyond) * plan.rad_per_tick)
     change(arm, Mode.POSITION)
     assert arm.torque() == [True, True]
     assert servo.registers["goal_position"] == plan.upper_tick
@@ -358,3 +391,123 @@ def test_a_servo_that_lost_its_torque_over_a_change_gets_no_goal_which_would_swi
     rig.hardware.write()
     writes = [data for data in rig.into_bus()[since:] if data[4] == 0x83]
     assert [1 in data[7:-1:5] for data in writes] == [False, False], "a goal before torque enable was read"
+
+
+def when(rig, packet_is, act):
+    """Do something before a packet of the host goes out, each time."""
+    write = rig.ports.ports[0].write
+
+    def through(data):
+        if packet_is(data):
+            act()
+        write(data)
+
+    rig.ports.ports[0].write = through
+
+
+def write_of_mode(data):
+    return data[4] == 1 and data[7:10] == b"\x03\x0b\x00"
+
+
+def test_a_wish_that_comes_in_the_middle_of_a_change_is_followed(arm):
+    wish = np.array([Mode.PWM, 0], dtype=np.uint8)
+    left = [wish]
+    when(arm, write_of_mode, lambda: left and arm.hardware.set_modes(left.pop()))
+    arm.hardware.set_modes(np.array([Mode.VELOCITY, 0], dtype=np.uint8))
+    for _ in range(20):
+        arm.cycle()
+    assert arm.states.mode[0] == Mode.PWM
+    assert arm.buses[0].servo(1).registers["operating_mode"] == 16
+
+
+def test_a_wish_that_comes_while_a_servo_is_taken_back_is_carried_out_once(arm):
+    servo, left = arm.buses[0].servo(1), []
+    servo.silence()
+    for _ in range(20):
+        arm.cycle()
+    left.append(np.array([Mode.VELOCITY, 0], dtype=np.uint8))
+    looks = protocol2.read(1, 0, 2)
+    when(arm, lambda data: data == looks, lambda: left and arm.hardware.set_modes(left.pop()))
+    servo.silence(False)
+    for _ in range(80):
+        arm.cycle()
+    assert arm.states.mode[0] == Mode.VELOCITY
+    assert len([text for _, text in arm.events.of(EventCode.MODE) if "is in velocity mode" in text]) == 1
+
+
+def test_a_mode_that_was_refused_is_not_entered_after_a_reboot(make_one):
+    rig = make_one("AX-12A", 1.0)
+    servo = rig.buses[0].servo(1)
+    limit = servo.registers["ccw_angle_limit"]
+    servo.poke("lock", 1)
+    rig.hardware.set_modes(np.array([Mode.VELOCITY, 0], dtype=np.uint8))
+    for _ in range(30):
+        rig.cycle()
+    servo.cut_power(rig.clock.now_ns() + 300_000_000)  # after it, nothing is locked
+    for _ in range(100):
+        rig.cycle()
+    assert rig.states.valid[0]
+    assert servo.registers["ccw_angle_limit"] == limit
+    assert rig.states.mode[0] == Mode.POSITION
+
+
+def test_a_servo_whose_torque_could_not_be_read_after_a_change_gets_no_goal_until_it_was(arm):
+    ask, asked, goals = protocol2.read(1, 64, 1), [], []
+
+    def lose():
+        asked.append(arm.clock.now_ns())
+        if 2 <= len(asked) <= 4:  # the first one is before the change
+            arm.buses[0].truncate_next(1, 0)
+
+    when(arm, lambda data: data == ask, lose)
+    when(arm, lambda data: data[7] == 0x83 and 1 in data[12:-2:5], lambda: goals.append(len(asked)))
+    change(arm, Mode.VELOCITY)
+    arm.restless = 0.0
+    for turn in range(10):
+        arm.goals.velocity[0] = 0.01 * turn
+        arm.cycle()
+    assert goals
+    assert goals[0] == 5
+
+
+def test_the_limit_of_the_current_comes_before_the_position_that_it_limits(arm):
+    since = len(arm.into_bus())
+    change(arm, Mode.EFFORT_POSITION)
+    written = [address for instruction, address in instructions(arm, 1, since) if instruction == 3]
+    assert written.index(102) < written.index(112)
+
+
+def test_extended_positions_reach_as_far_as_the_manual_says():
+    """e-Manual XM430-W350, Goal Position (116): -1,048,575 to 1,048,575, 256 turns."""
+    assert position_reach(control_table("XM430-W350", 2.0), True) == (-1_048_575, 1_048_575)
+
+
+def test_a_start_gives_no_torque_limit_to_a_servo_that_would_be_driven_by_it(make_rig, make_plan):
+    """Goal PWM (100) is the limit in the other modes, and full voltage in this one."""
+    ends = {"lower": -np.inf, "upper": np.inf, "reference": np.pi, "return_delay_ns": 0}
+    plan = make_plan((1, 2), model="XM430-W350", protocol=2.0, continuous=True, start_mode=Mode.PWM, **ends)
+    rig = make_rig(plan)
+    rig.hardware._restore_torque = True
+    rig.hardware.start()
+    assert [servo.registers["goal_pwm"] for servo in rig.buses[0].servos] == [0, 0]
+    standing = rig.buses[0].servo(1).position
+    rig.clock.wait_until(rig.clock.now_ns() + 100_000_000)
+    assert rig.torque() == [True, True]
+    assert rig.buses[0].servo(1).position == pytest.approx(standing, abs=0.001)
+
+
+def test_no_torque_limit_is_written_while_a_mode_changes(arm):
+    arm.hardware._full_torque = [[885, 885]]
+    arm.hardware.set_modes(np.array([Mode.PWM, 0], dtype=np.uint8))
+    arm.hardware.limit_torque(0.5)
+    arm.torque()
+    assert [servo.registers["goal_pwm"] for servo in arm.buses[0].servos] == [885, 442]
+
+
+def test_a_servo_of_protocol_1_keeps_one_tick_of_torque(make_one):
+    """A servo that shut itself down has Torque Limit (34) = 0, which the next start refuses."""
+    rig = make_one("AX-12A", 1.0)
+    rig.hardware._full_torque = [[1023, 1023]]
+    rig.hardware.limit_torque(0.0)
+    rig.torque()
+    assert [servo.registers["torque_limit"] for servo in rig.buses[0].servos] == [1, 1]

@@ -78,6 +78,30 @@ def test_two_servos_of_one_id_are_named(make_rig, delay_ns):
     assert "do two servos have its ID?" in problems[0] or "two servos of one ID" in problems[0]
 
 
+@pytest.mark.parametrize(
+    ("spoil", "times", "said"),
+    [
+        ("twice", 1, ""),
+        ("twice", 2, "answers 2 of 3 pings garbled or twice"),
+        ("lost", 1, ""),
+        ("lost", 2, "answers only 1 of 3 pings"),
+    ],
+)
+def test_one_of_three_pings_may_be_spoilt_and_no_more(make_rig, spoil, times, said):
+    rig = make_rig()
+    for _ in range(times):
+        if spoil == "twice":
+            rig.buses[0].alter_next(6, "twice", bytes, copies=2)
+        else:
+            rig.buses[0].truncate_next(6, 0)
+    if not said:
+        rig.hardware.start()
+        assert rig.torque() == [True] * 8
+        return
+    (problem,) = refusal(rig)
+    assert f"ID 6 on bus main) {said}" in problem
+
+
 def test_an_adapter_that_echoes_is_named(make_rig):
     rig = make_rig()
     rig.buses[0].echo = True
@@ -284,3 +308,54 @@ def test_goal_comes_before_torque_and_is_where_the_servo_stands(make_rig):
         assert goal[2] == torque[2]
         assert goal[5] == 30
         assert torque[5:7] == b"\x18\x01"
+
+
+def silent_from(rig, packet):
+    """Silence servo 5 from the moment at which it is sent a packet."""
+    write = rig.ports.ports[0].write
+
+    def through(data):
+        if bytes(data) == packet:
+            rig.buses[0].servo(5).silence()
+        write(data)
+
+    rig.ports.ports[0].write = through
+
+
+def lose_goal(rig):
+    servo = rig.buses[0].servo(5)
+    servo.registers.watch(("goal_position",), lambda: servo.poke("goal_position", 3))
+
+
+def lose_torque(rig):
+    servo = rig.buses[0].servo(5)
+    servo.registers.watch(("torque_enable",), lambda: servo.poke("torque_enable", 0))
+
+
+@pytest.mark.parametrize(
+    ("trick", "said"),
+    [
+        (lose_goal, "but has goal 3 and torque enable 1"),
+        (lose_torque, "and torque enable 0"),
+        (
+            lambda rig: silent_from(rig, protocol1.read(5, 24, 8)),
+            "did not answer when its torque was read back",
+        ),
+    ],
+)
+def test_a_goal_and_torque_count_only_when_they_were_read_back(make_rig, trick, said):
+    rig = make_rig()
+    trick(rig)
+    with pytest.raises(StartUpError) as caught:
+        rig.hardware.start()
+    assert "main_5_joint (ID 5 on bus main) " in caught.value.sentences[0]
+    assert said in caught.value.sentences[0]
+    given = [packet[2] for packet in rig.into_bus() if packet[4:7] == b"\x03\x18\x01"]
+    assert given == [1, 3, 5], "the servos behind it got torque"
+
+
+def test_a_servo_that_is_silent_when_all_have_torque_ends_the_start(make_rig):
+    rig = make_rig()
+    silent_from(rig, protocol1.read(5, 24, 1))
+    with pytest.raises(StartUpError, match=r"ID 5 on bus main\) did not answer after torque was switched on"):
+        rig.hardware.start()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dxlrun.errors import StartUpError
 from dxlrun.inbox import LOOP, Command
 from dxlrun.testing import simulated_robot
 from dxlrun.virtual_run import VirtualRobot
@@ -365,6 +367,32 @@ def test_a_start_up_gives_back_the_torque_that_a_policy_took(built: Callable[...
     assert order[:3] == [GOAL, TORQUE_ENABLE, TORQUE_LIMIT], (
         "a weak servo may have sagged: its goal comes first"
     )
+
+
+@pytest.mark.parametrize(
+    ("instruction", "said"),
+    [
+        (b"\x02\x22\x02", "did not answer when its torque limit was read"),
+        (b"\x03\x22\xff\x03", "did not acknowledge Torque Limit (34)"),
+    ],
+)
+def test_a_start_ends_when_a_servo_may_be_left_weak(
+    built: Callable[..., VirtualRobot], instruction: bytes, said: str
+) -> None:
+    robot = built(duration_s=0.1, on_fault=STEPS["less torque"])
+    bus = robot.buses[0]
+    bus.servo(7).poke("torque_limit", 307)
+    receive = bus.receive
+
+    def heard(data: Any, at_ns: int) -> None:
+        if data[2] == 7 and data[4:-1] == instruction:
+            bus.truncate_next(7, 0)
+        receive(data, at_ns)
+
+    bus.receive = heard  # type: ignore[method-assign]
+    with pytest.raises(StartUpError, match=re.escape(f"tilt (ID 7 on bus main) {said}")):
+        robot.run()
+    assert not any(torque(robot).values())
 
 
 def test_a_torque_limit_that_no_policy_touches_is_left_alone(built: Callable[..., VirtualRobot]) -> None:
