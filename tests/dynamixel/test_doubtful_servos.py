@@ -249,7 +249,5 @@ def test_the_last_hand_waits_for_the_end_of_a_reply_that_is_on_its_way(make_rig,
     rig.ports.ports[0].write(rig.plans[0].reads[0].packet)
     rig.clock.wait_until(begun_ns + 640_000)  # 80 us of instruction, 500 us of delay
     last_hand(rig.plans, rig.ports, rig.clock, rig.packets)
-    since = [entry for entry in rig.ledger.entries if entry.t_ns > begun_ns]
-    reply = next(entry for entry in since if entry.direction == "out")
-    first = [entry for entry in since if entry.direction == "in"][1]
-    assert first.t_ns - len(first.data) * 10_000 >= reply.t_ns
+    notes = [entry.note for entry in rig.ledger.entries if entry.t_ns > begun_ns]
+    assert [note for note in notes if note.startswith("collision")] == []
