@@ -11,14 +11,14 @@ from typing import Any
 import pytest
 
 from dxlrun.control.policy_plan import TORQUE_STAYS
-from dxlrun.events import Severity
+from dxlrun.events import Severity, decode_event
 from dxlrun.guardian import LastHand
 from dxlrun.heartbeat import Heartbeat, Phase
 from dxlrun.packets import PacketBatch
-from dxlrun.ring import Handover
+from dxlrun.ring import Handover, RingReader
 from dxlrun.run_processes import Memory, guardian_job
 from dxlrun.simulation import VirtualPorts
-from dxlrun.testing import plan_of, simulated_robot
+from dxlrun.testing import VirtualRobot, plan_of, simulated_robot
 
 Start = Callable[..., Any]
 Limp = Callable[[Any], bool]
@@ -136,26 +136,52 @@ policies: {on_fault: hold}
 """
 
 
-def test_a_guardian_that_leaves_torque_on_stops_what_is_led_by_a_velocity(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def last_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[VirtualRobot, LastHand, Memory]:
+    """A robot whose loop dies in the middle of a run, and the last hand on its simulated servos."""
     (tmp_path / "wheels.yaml").write_text(WHEELS)
     robot = simulated_robot(tmp_path / "wheels.yaml", duration_s=0.4)
-    hardware, record, wheel = robot.robot.hardware, robot.record, robot.buses[0].servo(1)
+    hardware = robot.robot.hardware
     hardware.start()
-    record.goals.velocity[0] = 2.0
+    robot.record.goals.velocity[0] = 2.0
     for _ in range(3):
         hardware.read()
         hardware.write()
         hardware.idle(robot.clock.wait_until(robot.clock.now_ns() + 20_000_000))
-    assert wheel.registers["goal_velocity"] > 0  # and the loop dies
     memory = Memory.create(robot.plan)
     Heartbeat(memory.heartbeat).enter(Phase.RUNNING)
     hand = LastHand(guardian_job(robot.plan, {}, memory, take_over=False))
     hand._clock = robot.clock  # type: ignore[assignment]  # the time of the simulated servos
     lines = VirtualPorts(robot.clock, robot.buses)
     monkeypatch.setattr(hand, "_take_over", lambda _: (lines, PacketBatch(Handover(lambda _: None))))
+    return robot, hand, memory
+
+
+def test_a_guardian_that_leaves_torque_on_stops_what_is_led_by_a_velocity(
+    last_hand: tuple[VirtualRobot, LastHand, Memory],
+) -> None:
+    robot, hand, _ = last_hand
+    wheel = robot.buses[0].servo(1)
+    assert wheel.registers["goal_velocity"] > 0
     said = hand.end((), "it died", Severity.ERROR)
     assert said == ["it died", TORQUE_STAYS, "left (ID 1 on bus main) stands: its goal is 0"]
     assert wheel.registers["goal_velocity"] == 0
     assert [servo.torque_on for servo in robot.buses[0].servos] == [True, True]
+
+
+@pytest.mark.parametrize("silent", [False, True])
+def test_the_last_hand_names_who_did_not_confirm_torque_off(
+    last_hand: tuple[VirtualRobot, LastHand, Memory], silent: bool
+) -> None:
+    robot, hand, memory = last_hand
+    robot.buses[0].servo(2).silence(silent)
+    _, result = hand.limp((), "torque was cut on request", Severity.WARNING)
+    event = decode_event(RingReader(memory.guardian_events).read())
+    assert event.text == f"torque was cut on request; {result}"
+    if silent:
+        assert "not confirmed by lift (ID 2 on bus main): " in result
+        assert event.severity == Severity.ERROR
+    else:
+        assert result == "torque off was confirmed by all 2 servos"
+        assert event.severity == Severity.WARNING
+    assert [servo.torque_on for servo in robot.buses[0].servos] == [False, silent]

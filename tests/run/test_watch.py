@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -194,3 +197,93 @@ def test_a_line_whose_other_end_is_gone_still_gives_what_it_said_last() -> None:
     assert ours.receive() == []
     assert ours.closed
     ours.close()
+
+
+# The guardian's judgement, without its processes
+
+
+@pytest.fixture
+def watcher(start: object, tmp_path: Path) -> Iterator[tuple[Guardian, socket.socket, Heartbeat]]:
+    """A guardian of the robot `pair` on virtual time, the terminal's end of its line, and the loop's page."""
+    plan = compile_robot(read_robot(tmp_path / "pair.yaml", {}), [], None).plan
+    memory = Memory.create(plan)
+    control, terminal = process.line_pair()
+    made = Guardian(guardian_job(plan, {}, memory, take_over=False), control)
+    made._clock = VirtualClock(0)  # type: ignore[assignment]  # so that the test says how time passes
+    made._still = Standstill(LONGEST_LOOK_NS, 0)
+    with terminal:
+        yield made, terminal, Heartbeat(memory.heartbeat)
+    control.close()
+
+
+@pytest.mark.parametrize(
+    ("phase", "code", "killed", "ending"),
+    [
+        (Phase.DONE, 0, None, "done"),
+        (Phase.DONE, 1, None, "done"),
+        (Phase.DONE, 1, "late", "done"),  # it was through when it was killed
+        (Phase.DONE, -11, None, "died"),
+        (Phase.DONE, -9, "hung", "done"),  # torque was off before it hung at its exit
+        (Phase.DONE, -9, "cut", "cut"),
+        (Phase.LOADING, -9, "hung", "unused"),
+        (Phase.LOADING, 2, None, "unused"),
+        (Phase.LOADING, -15, None, "unused"),
+        (Phase.SETUP, 1, None, "died"),  # some servos may have torque
+        (Phase.RUNNING, 0, None, "died"),
+        (Phase.STOPPING, -9, "late", "late"),
+    ],
+)
+def test_a_loop_is_done_only_when_it_says_so_and_ends_well(
+    watcher: tuple[Guardian, socket.socket, Heartbeat], phase: Phase, code: int, killed: Any, ending: str
+) -> None:
+    made, _, page = watcher
+    page.enter(phase)
+    made._killed = killed
+    assert made._ending(code) == ending
+
+
+def test_a_loop_that_was_asked_to_stop_while_it_loads_is_done(
+    watcher: tuple[Guardian, socket.socket, Heartbeat],
+) -> None:
+    made, _, page = watcher
+    page.enter(Phase.LOADING)
+    made._stop_by_ns = 5
+    assert made._ending(-15) == "done"
+
+
+@pytest.mark.parametrize(
+    ("said", "wish"),
+    [
+        (b'{"stop": true}\n', "stop"),
+        (b'{"cut": true}\n', "cut"),
+        (b'{"stop": true}\n{"cut": true}\n', "cut"),  # two interrupts that arrive together
+        (None, "stop"),  # the terminal is gone
+    ],
+)
+def test_what_the_terminal_asks_for(
+    watcher: tuple[Guardian, socket.socket, Heartbeat], said: bytes | None, wish: str
+) -> None:
+    made, terminal, _ = watcher
+    if said is None:
+        terminal.shutdown(socket.SHUT_RDWR)
+    else:
+        terminal.sendall(said)
+    assert made._wish() == wish
+
+
+def test_a_loop_that_stands_still_hangs_and_one_that_does_not_stop_is_late(
+    watcher: tuple[Guardian, socket.socket, Heartbeat],
+) -> None:
+    made, _, page = watcher
+    page.enter(Phase.RUNNING)
+    told = []
+    for at_ms in range(0, 130, 10):
+        made._clock.wait_until(at_ms * MS)
+        told.append(made._impatience())
+    assert told == [None] * 11 + ["hung"] * 2  # five periods of 20 ms
+    page.beat()
+    assert made._impatience() is None
+    made._stop_by_ns = 125 * MS
+    page.beat()
+    made._clock.wait_until(126 * MS)
+    assert made._impatience() == "late"
