@@ -90,11 +90,14 @@ def make_log(
     *,
     gaps: int = 0,
     close: bool = True,
+    plan: object = PLAN,
+    metadata: dict[str, dict[str, str]] | None = None,
 ) -> Path:
     path = directory / "run.mcap"
     controllers = (LoggedController("head", JOINTS[1:], ()), LoggedController("idle", (), ()))
-    attachments = {"plan.json": json.dumps(PLAN).encode()}
-    log = LogWriter(path, LogHeader("torso", JOINTS, ("main",), controllers, PERIOD_NS, 0, attachments))
+    attachments = {"plan.json": json.dumps(plan).encode()}
+    header = LogHeader("torso", JOINTS, ("main",), controllers, PERIOD_NS, 0, attachments, metadata or {})
+    log = LogWriter(path, header)
     record = CycleRecord(CycleLayout(JOINTS, ["head", "idle"]))
     for cycle in cycles:
         fill(record, cycle)

@@ -20,7 +20,7 @@ from dxlrun.analysis.figures.latency import latency_drawings
 from dxlrun.analysis.figures.steered import SteeringMarks
 from dxlrun.analysis.figures.timeline import events_drawing
 from dxlrun.analysis.figures.wires import reply_drawing
-from dxlrun.analysis.latency import latency
+from dxlrun.analysis.latency import Punctuality
 from dxlrun.analysis.report import analyze
 from dxlrun.analysis.steering import Pause
 from dxlrun.events import EventCode, Severity
@@ -189,7 +189,9 @@ def late_us(log: Log) -> Data:
 
 
 def drawn_latency(figures: list[Figure], log: Log) -> tuple[Axes, Axes, Axes]:
-    statistics = latency(log)
+    punctuality = Punctuality()
+    punctuality.take(log)
+    _, statistics = punctuality.finish()
     assert statistics is not None
     latency_drawings(log, statistics)
     first, second, third = (figure.axes[0] for figure in figures)

@@ -1,4 +1,5 @@
 import io
+import json
 import resource
 import signal
 from collections.abc import Callable
@@ -12,10 +13,10 @@ from dxlrun.compile.plan import Plan
 from dxlrun.errors import PortError
 from dxlrun.recording.reader import read_log
 from dxlrun.run_summary import Progress, RunOptions, RunSummary
-from dxlrun.testing import plan_of
+from dxlrun.testing import plan_of, simulated_robot
 from dxlrun.virtual_run import VirtualRobot, run_virtual
 
-GOOD = RunSummary(0, "ended", 100, 2, 2.03, (), log="logs/torso.mcap", messages=17)
+GOOD = RunSummary(0, "ended", 100, 2, 2.03, ())
 
 
 class Runs:
@@ -50,19 +51,42 @@ def test_options_reach_plan_and_run(dxlrun: Callable, runs: Runs, torso: Path, t
     assert {c.controller for c in plan.loop.commands} == {"head", "left_arm", "right_arm"}
 
 
-def test_a_good_run_says_where_its_log_is(dxlrun: Callable, runs: Runs, torso: Path):
+@pytest.fixture
+def logged(torso: Path, tmp_path: Path) -> Path:
+    """The log of a good run."""
+    log = tmp_path / "good.mcap"
+    simulated_robot(torso, duration_s=0.2, log=log).run()
+    return log
+
+
+def test_a_good_run_says_where_its_log_is(dxlrun: Callable, runs: Runs, torso: Path, logged: Path):
+    runs.answer = RunSummary(0, "ended", 10, 0, 2.03, (), log=str(logged), messages=10**9)
+
     said = dxlrun(torso)
 
     assert said.code == 0
     assert said.out.splitlines() == [
-        "bioloid_torso: good. 2.0 s, 100 cycles, 2 periods skipped",
-        "log: logs/torso.mcap (17 messages)",
-        "next: dxlrun analyze logs/torso.mcap",
+        "bioloid_torso: good. 2.0 s, 10 cycles, 0 periods skipped",
+        "  The loop kept 50 Hz: 0 of 10 periods skipped, on virtual time.",
+        "  All 8 servos answered every time.",
+        f"log: {logged} (1000000000 messages)",
+        f"next: dxlrun analyze {logged}",
     ]
 
 
-def test_a_run_with_errors_in_its_log_is_not_called_good(
-    dxlrun: Callable, tmp_path: Path, torso: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_run_whose_log_cannot_be_read_is_not_called_good(dxlrun: Callable, runs: Runs, torso: Path):
+    runs.answer = RunSummary(0, "ended", 100, 0, 2.03, (), log="logs/torso.mcap", messages=9)
+
+    said = dxlrun(torso)
+
+    assert said.code == 1
+    assert said.out.startswith("bioloid_torso: failed. ")
+    assert "  The log cannot be read: logs/torso.mcap: " in said.out
+
+
+@pytest.mark.parametrize("code", [0, 130])
+def test_a_run_with_a_loss_in_its_log_has_failed_for_the_terminal_and_for_analyze(
+    dxlrun: Callable, tmp_path: Path, torso: Path, monkeypatch: pytest.MonkeyPatch, code: int
 ):
     monkeypatch.chdir(tmp_path)
 
@@ -70,14 +94,27 @@ def test_a_run_with_errors_in_its_log_is_not_called_good(
         born(robot, *arguments, **options)
         servo = robot.buses[0].servos[0]
         robot.buses[0].at(300_000_000, servo.trigger_overload)
+        if code == 130:
+            robot.buses[0].at(1_500_000_000, lambda: signal.raise_signal(signal.SIGINT))
 
     born = VirtualRobot.__init__
     monkeypatch.setattr(VirtualRobot, "__init__", rebooting)
 
     said = dxlrun(torso, "--virtual", "--duration", "2")
 
-    assert said.code == 0
-    assert said.out.startswith("bioloid_torso: ended, with errors. ")
+    assert said.code == 1
+    first, *sentences, log, _ = said.out.splitlines()
+    assert first.startswith("bioloid_torso: failed. ")
+    assert sentences[0].startswith("  Servos failed: left_shoulder_swing_joint lost its torque")
+    path = log.split()[1]
+    told = dxlrun("analyze", path, "--json")
+    verdict = json.loads(told.out)["verdict"]
+    assert (told.code, verdict["good"]) == (1, False)
+    assert [f"  {sentence}" for sentence in verdict["sentences"]] == sentences
+    shown = dxlrun("analyze", path, "--report", "run.html")
+    assert shown.code == 1
+    assert shown.out.splitlines()[0] == verdict["sentences"][0]
+    assert "Verdict: not good" in Path("run.html").read_text()
 
 
 @pytest.mark.parametrize(("code", "word"), [(1, "failed"), (130, "interrupted")])
@@ -103,6 +140,7 @@ def test_a_run_without_a_cycle_suggests_no_analysis(dxlrun: Callable, runs: Runs
 
     assert dxlrun(torso).out.splitlines() == [
         "bioloid_torso: failed. 0.1 s, 0 cycles, 0 periods skipped",
+        "  The log cannot be read: logs/torso.mcap: cannot be read: No such file or directory.",
         "log: logs/torso.mcap (9 messages)",
     ]
 

@@ -90,7 +90,7 @@ def test_a_plug_in_that_hides_the_wish_to_stop_is_ended_after_exit_timeout(
     run.wait_until_moving()
     run.signal(signal.SIGINT)
     code, _, err = run.finish()
-    assert code == 130
+    assert code == 1  # its torque was cut from outside
     assert "did not stop within 2 s" in err
     assert all_limp(run)
 

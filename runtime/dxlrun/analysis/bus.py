@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from bisect import bisect_left
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 import msgspec
-import numpy as np
 
+from dxlrun.analysis.latency import DISORDER_NS
 from dxlrun.analysis.wire import BROADCAST_ID, Question, Reply, error_names, question, replies
 from dxlrun.packets import LoggedPacket, PacketKind
 from dxlrun.recording.reader import Log
+
+_BYTE_NS = 10_000_000_000
+"""Ten bits a byte, over the rate in bit/s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +57,31 @@ class BusTraffic:
     """Bytes that belong to no intact packet."""
     bytes_out: int
     bytes_in: int
+    extra_us: float | None = None
+    """Median of how much longer than wire and return delay a complete exchange took: what the adapter adds;
+    None where the log's plan does not tell, and where replies wait for the next cycle."""
+    planned_latency_us: float | None = None
+    """What the plan expects of that."""
+    port: str = ""
+
+
+class _PlannedServo(msgspec.Struct):
+    joint: str
+    servo_id: int
+
+
+class _PlannedBus(msgspec.Struct):
+    name: str
+    servos: list[_PlannedServo] = []
+    port: str = ""
+    baud_rate: int = 0
+    latency_ns: int = 0
+    return_delay_ns: int = 0
+    split: bool = False
+
+
+class _Planned(msgspec.Struct):
+    buses: list[_PlannedBus] = []
 
 
 @dataclass(slots=True)
@@ -63,34 +93,86 @@ class _Count:
     errors: int = 0
     protocol: int = 1
     error_bytes: set[int] = field(default_factory=set)
-    reply_ns: list[int] = field(default_factory=list)
+    reply_us: Counter[int] = field(default_factory=Counter)
+    reply_max_ns: int = 0
 
 
 @dataclass(slots=True)
-class _Pairing:
+class _Line:
     """Pairs instructions with replies on one bus: a reply counts until the bus' next instruction."""
 
+    plan: _PlannedBus
     counts: dict[int, _Count] = field(default_factory=dict)
+    packets: Counter[PacketKind] = field(default_factory=Counter)
+    bytes: Counter[PacketKind] = field(default_factory=Counter)
+    broadcasts: int = 0
+    extra_us: Counter[int] = field(default_factory=Counter)
+    """How much longer than wire and return delay each complete exchange took."""
     asked: Question = field(default_factory=Question)
     open: set[int] = field(default_factory=set)
     """Servos that have not answered yet."""
     asked_ns: int = 0
+    free_ns: int = 0
+    """When the line has carried all that was sent."""
+    awaited_ns: int = 0
+    """When all that was asked could be there, by the wire and the return delay alone."""
+    waiting: list[LoggedPacket] = field(default_factory=list)
+    """Packets that may not be in order of time yet."""
 
-    def count(self, servo_id: int) -> _Count:
+    def take(self, packets: Iterable[LoggedPacket]) -> None:
+        """Count packets; of the newest ones it is not certain yet that none will come before them."""
+        self.waiting += packets
+        if not self.waiting:
+            return
+        newest_ns = self.waiting[-1].first_ns
+        if newest_ns - self.waiting[0].first_ns > 2 * DISORDER_NS:
+            self.waiting.sort(key=_begin)
+            certain = bisect_left(self.waiting, newest_ns - DISORDER_NS, key=_begin)
+            self._count(self.waiting[:certain])
+            del self.waiting[:certain]
+
+    def finish(self) -> None:
+        """Count what is left; what is still open then may have been answered a moment later."""
+        self.waiting.sort(key=_begin)
+        self._count(self.waiting)
+        self.waiting = []
+        for servo_id in self.open:
+            self.counts[servo_id].asked -= 1
+        self.open = set()
+
+    def _count(self, packets: Iterable[LoggedPacket]) -> None:
+        for packet in packets:
+            size = len(packet.data)
+            self.packets[packet.kind] += 1
+            self.bytes[packet.kind] += size
+            if packet.kind == PacketKind.INSTRUCTION:
+                self._instruct(packet)
+            elif packet.kind == PacketKind.STATUS:
+                self.awaited_ns += self._wire_ns(size) + self.plan.return_delay_ns
+                for reply in replies(packet.servo_id, packet.data, self.asked):
+                    self._answer(reply, packet.last_ns)
+
+    def _wire_ns(self, size: int) -> int:
+        return size * _BYTE_NS // max(self.plan.baud_rate, 1)
+
+    def _of(self, servo_id: int) -> _Count:
         return self.counts.setdefault(servo_id, _Count())
 
-    def instruct(self, packet: LoggedPacket) -> None:
-        self.miss()
-        if packet.servo_id != BROADCAST_ID:
-            self.count(packet.servo_id).instructions += 1
+    def _instruct(self, packet: LoggedPacket) -> None:
+        self._miss()
+        if packet.servo_id == BROADCAST_ID:
+            self.broadcasts += 1
+        else:
+            self._of(packet.servo_id).instructions += 1
         self.asked = question(packet.data)
         self.asked_ns = packet.first_ns
+        self.awaited_ns = self.free_ns = max(self.free_ns, packet.first_ns) + self._wire_ns(len(packet.data))
         self.open = set(self.asked.servo_ids)
         for servo_id in self.open:
-            self.count(servo_id).asked += 1
+            self._of(servo_id).asked += 1
 
-    def answer(self, reply: Reply, at_ns: int) -> None:
-        count = self.count(reply.servo_id)
+    def _answer(self, reply: Reply, at_ns: int) -> None:
+        count = self._of(reply.servo_id)
         count.replies += 1
         count.protocol = reply.protocol
         if reply.error:
@@ -98,100 +180,110 @@ class _Pairing:
             count.error_bytes.add(reply.error)
         if reply.servo_id in self.open:
             self.open.remove(reply.servo_id)
-            count.reply_ns.append(at_ns - self.asked_ns)
+            took_ns = at_ns - self.asked_ns
+            count.reply_us[took_ns // 1000] += 1
+            count.reply_max_ns = max(count.reply_max_ns, took_ns)
+            if not self.open:
+                self.extra_us[max(0, at_ns - self.awaited_ns) // 1000] += 1
 
-    def miss(self) -> None:
+    def _miss(self) -> None:
         for servo_id in self.open:
             self.counts[servo_id].lost += 1
         self.open = set()
 
-    def end(self) -> None:
-        for servo_id in self.open:
-            self.counts[servo_id].asked -= 1
-        self.open = set()
+
+class Traffic:
+    """Counts packets, slice by slice of a log, in memory that does not grow with it."""
+
+    __slots__ = ("_lines",)
+
+    def __init__(self) -> None:
+        self._lines: dict[str, _Line] = {}
+
+    def take(self, log: Log) -> None:
+        """Count the packets of the next slice. Raises LogError when one cannot be read."""
+        for name in log.buses if not self._lines else ():
+            self._lines[name] = _Line(planned(log).get(name, _PlannedBus(name)))
+        by_bus: list[list[LoggedPacket]] = [[] for _ in log.buses]
+        for packet in log.packets:
+            by_bus[packet.bus].append(packet)
+        for line, packets in zip(self._lines.values(), by_bus, strict=True):
+            line.take(packets)
+
+    def finish(self) -> tuple[tuple[Servo, ...], tuple[BusTraffic, ...]]:
+        """Return the traffic of each servo and of each bus."""
+        for line in self._lines.values():
+            line.finish()
+        servos = tuple(
+            _servo(line.plan, servo_id, count)
+            for line in self._lines.values()
+            for servo_id, count in sorted(line.counts.items())
+        )
+        return servos, tuple(_bus(line) for line in self._lines.values())
 
 
-def traffic(log: Log) -> tuple[tuple[Servo, ...], tuple[BusTraffic, ...]]:
-    """Return the traffic per servo and per bus. Raises LogError when a packet cannot be read."""
-    joints = joints_of(log)
-    servos: list[Servo] = []
-    buses: list[BusTraffic] = []
-    for index, name in enumerate(log.buses):
-        packets = sorted((p for p in log.packets if p.bus == index), key=lambda packet: packet.first_ns)
-        counts = _count(packets)
-        for servo_id, count in sorted(counts.items()):
-            servos.append(_servo(name, servo_id, joints.get((name, servo_id), ""), count))
-        buses.append(_bus(name, packets))
-    return tuple(servos), tuple(buses)
+def _begin(packet: LoggedPacket) -> int:
+    return packet.first_ns
 
 
-def _count(packets: Iterable[LoggedPacket]) -> dict[int, _Count]:
-    """Count what each servo was asked and answered; `packets` of one bus, in order of time."""
-    pairing = _Pairing()
-    for packet in packets:
-        if packet.kind == PacketKind.INSTRUCTION:
-            pairing.instruct(packet)
-        elif packet.kind == PacketKind.STATUS:
-            for reply in replies(packet.servo_id, packet.data, pairing.asked):
-                pairing.answer(reply, packet.last_ns)
-    pairing.end()
-    return pairing.counts
+def median(counts: Mapping[int, int]) -> float:
+    """Return the median of values that are counted; 0 of none."""
+    total = sum(counts.values())
+    if not total:
+        return 0.0
+    lower = upper = None
+    seen = 0
+    for value, number in sorted(counts.items()):
+        seen += number
+        if lower is None and seen > (total - 1) // 2:
+            lower = value
+        if seen > total // 2:
+            upper = value
+            break
+    return ((lower or 0) + (upper or 0)) / 2
 
 
-def _servo(bus: str, servo_id: int, joint: str, count: _Count) -> Servo:
-    times = np.array(count.reply_ns or [0]) / 1e3
+def _servo(bus: _PlannedBus, servo_id: int, count: _Count) -> Servo:
+    joints = {servo.servo_id: servo.joint for servo in bus.servos}
     return Servo(
-        bus=bus,
+        bus=bus.name,
         servo_id=servo_id,
-        joint=joint,
+        joint=joints.get(servo_id, ""),
         instructions=count.instructions,
         asked=count.asked,
         lost=count.lost,
         replies=count.replies,
         errors=count.errors,
         error_names=error_names(count.protocol, count.error_bytes),
-        reply_median_us=float(np.median(times)),
-        reply_max_us=float(times.max()),
+        reply_median_us=median(count.reply_us),
+        reply_max_us=count.reply_max_ns / 1e3,
     )
 
 
-def _bus(name: str, packets: Iterable[LoggedPacket]) -> BusTraffic:
-    number = dict.fromkeys(PacketKind, 0)
-    size = dict.fromkeys(PacketKind, 0)
-    broadcasts = 0
-    for packet in packets:
-        number[packet.kind] += 1
-        size[packet.kind] += len(packet.data)
-        broadcasts += packet.kind == PacketKind.INSTRUCTION and packet.servo_id == BROADCAST_ID
+def _bus(line: _Line) -> BusTraffic:
     return BusTraffic(
-        name=name,
-        instructions=number[PacketKind.INSTRUCTION],
-        broadcasts=broadcasts,
-        replies=number[PacketKind.STATUS],
-        noise_bytes=size[PacketKind.NOISE],
-        bytes_out=size[PacketKind.INSTRUCTION],
-        bytes_in=size[PacketKind.STATUS] + size[PacketKind.NOISE],
+        name=line.plan.name,
+        instructions=line.packets[PacketKind.INSTRUCTION],
+        broadcasts=line.broadcasts,
+        replies=line.packets[PacketKind.STATUS],
+        noise_bytes=line.bytes[PacketKind.NOISE],
+        bytes_out=line.bytes[PacketKind.INSTRUCTION],
+        bytes_in=line.bytes[PacketKind.STATUS] + line.bytes[PacketKind.NOISE],
+        extra_us=median(line.extra_us) if line.plan.baud_rate and not line.plan.split else None,
+        planned_latency_us=line.plan.latency_ns / 1e3 if line.plan.baud_rate else None,
+        port=line.plan.port,
     )
 
 
-class _PlannedServo(msgspec.Struct):
-    joint: str
-    servo_id: int
-
-
-class _PlannedBus(msgspec.Struct):
-    name: str
-    servos: list[_PlannedServo] = []
-
-
-class _Planned(msgspec.Struct):
-    buses: list[_PlannedBus] = []
+def planned(log: Log) -> dict[str, _PlannedBus]:
+    """Return the buses of the plan in the log, by name; a log without a readable plan has none."""
+    try:
+        plan = msgspec.json.decode(log.attachments.get("plan.json", b"{}"), type=_Planned)
+    except (msgspec.MsgspecError, ValueError):
+        return {}
+    return {bus.name: bus for bus in plan.buses}
 
 
 def joints_of(log: Log) -> dict[tuple[str, int], str]:
     """Return the joint of each servo, by bus and ID, from the plan in the log."""
-    try:
-        plan = msgspec.json.decode(log.attachments.get("plan.json", b"{}"), type=_Planned)
-    except (msgspec.MsgspecError, ValueError):
-        return {}  # a log without a readable plan still has packets
-    return {(bus.name, servo.servo_id): servo.joint for bus in plan.buses for servo in bus.servos}
+    return {(name, servo.servo_id): servo.joint for name, bus in planned(log).items() for servo in bus.servos}

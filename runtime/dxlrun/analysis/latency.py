@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import itertools
+import math
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.recording.reader import Log
+from dxlrun.ring import RING_SECONDS
 
 ROUGH_NS = 150_000
 """A wake-up later than this does not happen on a real-time kernel (M. A. Araujo, UFU 2017)."""
 
+DISORDER_NS = RING_SECONDS * 1_000_000_000
+"""A log has the records of several rings in the order in which the recorder got them: no further apart."""
 _MS = 1_000_000
+_LAST_BIN = 100_000
+"""us; what is later stands in the last bin."""
 _MOST_RATES = 4
 """More are not said one by one."""
 
@@ -41,6 +49,26 @@ class Duration:
     median_us: float
     p99_us: float
     max_us: float
+
+
+@dataclass(frozen=True, slots=True)
+class Slowest:
+    """A cycle that took longer than its period, ns."""
+
+    period_ns: int
+    read_ns: int
+    update_ns: int
+    write_ns: int
+
+    @property
+    def lasted_ns(self) -> int:
+        """From waking to the last write."""
+        return self.read_ns + self.update_ns + self.write_ns
+
+    @property
+    def exceeded_ns(self) -> int:
+        """By how much it was too long."""
+        return self.lasted_ns - self.period_ns
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +114,11 @@ def first_deadline_ns(log: Log) -> int:
     return log.events[0].t_ns if log.events else 0
 
 
+def begins(log: Log) -> bool:
+    """Return whether the first deadline is known from this slice of a log."""
+    return log.activation is not None or len(log.cycles) > 0
+
+
 def cycle_periods_ns(log: Log) -> NDArray[np.int64]:
     """Return the period in which each cycle ran, ns: the time to the next deadline, shape (cycles,).
 
@@ -96,23 +129,6 @@ def cycle_periods_ns(log: Log) -> NDArray[np.int64]:
         return np.full(len(numbers), log.period_ns, dtype=np.int64)
     between = np.diff(due) // np.maximum(np.diff(numbers), 1)
     return np.append(between, between[-1])
-
-
-def latency(log: Log) -> Latency | None:
-    """Return the statistics of the wake-ups; None without cycles."""
-    late = (log.cycles["woken_ns"] - log.cycles["scheduled_ns"]).astype(np.int64)
-    if not len(late):
-        return None
-    bins, counts = np.unique(late // 1000, return_counts=True)
-    return Latency(
-        max_us=float(late.max()) / 1e3,
-        mean_us=float(late.mean()) / 1e3,
-        deviation_us=float(late.std()) / 1e3,
-        mode_us=int(bins[np.argmax(counts)]),
-        share_over_150_us=float(np.mean(late > ROUGH_NS)),
-        share_over_1_ms=float(np.mean(late > _MS)),
-        share_over_period=float(np.mean(late > cycle_periods_ns(log))),
-    )
 
 
 def durations(log: Log) -> tuple[Duration, ...]:
@@ -145,21 +161,110 @@ def _duration(name: str, values: NDArray[np.int64]) -> Duration:
     return Duration(name, len(values), float(median) / 1e3, float(p99) / 1e3, float(values.max()) / 1e3)
 
 
-def periods(log: Log) -> Periods:
-    """Return the account of the periods: none may vanish."""
-    numbers, skipped = log.cycles["cycle"], log.cycles["skipped"]
-    records, declared = len(numbers), int(skipped.sum())
-    elapsed = int(numbers[-1]) + 1 if records else 0
-    steps = np.diff(numbers, prepend=-1) - 1
-    each = cycle_periods_ns(log)
-    end_ns = int(log.cycles["scheduled_ns"][-1] + each[-1]) if records else 0
-    return Periods(
-        elapsed=elapsed,
-        records=records,
-        skipped=declared,
-        missing=elapsed - records - declared,
-        agree=bool(np.array_equal(steps, skipped)),
-        rate_hz=1e9 / log.period_ns,
-        seconds=(end_ns - first_deadline_ns(log)) / 1e9 if records else 0.0,
-        rates_hz=tuple(1e9 / period for period in dict.fromkeys(each.tolist()) if period > 0),
+class Punctuality:
+    """Counts how the loop kept its time, slice by slice of a log, in memory that does not grow with it."""
+
+    __slots__ = (
+        "_agree",
+        "_begin_ns",
+        "_bins",
+        "_elapsed",
+        "_end_ns",
+        "_first",
+        "_held",
+        "_max_ns",
+        "_nominal_ns",
+        "_over",
+        "_period_ns",
+        "_rates",
+        "_records",
+        "_skipped",
+        "_squares",
+        "_sum",
+        "slowest",
     )
+
+    def __init__(self) -> None:
+        self._held: NDArray[np.void] | None = None
+        """The newest cycle: how long its period is says the next one."""
+        self._records = self._skipped = self._elapsed = 0
+        self._agree = True
+        self._first = True
+        self._begin_ns = self._end_ns = 0
+        self._nominal_ns = self._period_ns = 1
+        self._sum = self._squares = self._max_ns = 0
+        self._over = [0, 0, 0]
+        self._bins: Counter[int] = Counter()
+        self._rates: dict[int, None] = {}
+        self.slowest: Slowest | None = None
+        """The cycle that exceeded its period most; None where none did."""
+
+    def take(self, log: Log) -> None:
+        """Count the cycles of the next slice."""
+        if self._first:
+            self._begin_ns = first_deadline_ns(log)
+            self._nominal_ns = self._period_ns = log.period_ns
+            self._first = not begins(log)
+        cycles = log.cycles if self._held is None else np.concatenate([self._held, log.cycles])
+        if not len(cycles):
+            return
+        self._held = cycles[-1:].copy()
+        if len(cycles) > 1:
+            between = np.diff(cycles["scheduled_ns"]) // np.maximum(np.diff(cycles["cycle"]), 1)
+            self._count(cycles[:-1], between)
+
+    def _count(self, cycles: NDArray[np.void], each: NDArray[np.int64]) -> None:
+        numbers, skipped = cycles["cycle"], cycles["skipped"]
+        steps = np.diff(numbers, prepend=self._elapsed - 1) - 1
+        self._agree &= bool(np.array_equal(steps, skipped))
+        self._records += len(numbers)
+        self._skipped += int(skipped.sum())
+        self._elapsed = int(numbers[-1]) + 1
+        self._period_ns = int(each[-1])
+        self._end_ns = int(cycles["scheduled_ns"][-1]) + self._period_ns
+        self._rates.update(dict.fromkeys(each.tolist()))
+        late = (cycles["woken_ns"] - cycles["scheduled_ns"]).astype(np.int64)
+        values = late.tolist()
+        self._sum += sum(values)
+        self._squares += sum(value * value for value in values)
+        self._max_ns = max(self._max_ns, *values)
+        for index, limit in enumerate((ROUGH_NS, _MS, each)):
+            self._over[index] += int(np.count_nonzero(late > limit))
+        self._bins.update(np.minimum(late // 1000, _LAST_BIN).tolist())
+        exceeded = cycles["written_ns"] - cycles["woken_ns"] - each
+        worst = int(np.argmax(exceeded))
+        if exceeded[worst] > (0 if self.slowest is None else self.slowest.exceeded_ns):
+            times = [int(cycles[name][worst]) for name in ("woken_ns", "read_ns", "updated_ns", "written_ns")]
+            read, update, write = (end - begin for begin, end in itertools.pairwise(times))
+            self.slowest = Slowest(int(each[worst]), read, update, write)
+
+    def finish(self) -> tuple[Periods, Latency | None]:
+        """Return the account of the periods, of which none may vanish, and the wake-ups, None without."""
+        if self._held is not None:
+            self._count(self._held, np.full(1, self._period_ns, np.int64))
+            self._held = None
+        rates = tuple(1e9 / period for period in self._rates if period > 0)
+        account = Periods(
+            elapsed=self._elapsed,
+            records=self._records,
+            skipped=self._skipped,
+            missing=self._elapsed - self._records - self._skipped,
+            agree=self._agree,
+            rate_hz=1e9 / self._nominal_ns,
+            seconds=(self._end_ns - self._begin_ns) / 1e9 if self._records else 0.0,
+            rates_hz=rates,
+        )
+        return account, self._latency() if self._records else None
+
+    def _latency(self) -> Latency:
+        count, fullest = self._records, max(self._bins.values())
+        mean = self._sum / count
+        return Latency(
+            max_us=self._max_ns / 1e3,
+            mean_us=mean / 1e3,
+            deviation_us=math.sqrt(max(0, count * self._squares - self._sum**2)) / count / 1e3,
+            mode_us=min(late for late, number in self._bins.items() if number == fullest),
+            share_over_150_us=self._over[0] / count,
+            share_over_1_ms=self._over[1] / count,
+            share_over_period=self._over[2] / count,
+        )

@@ -71,7 +71,7 @@ def _header(log: Log, report: Report) -> Element:
     box = ET.SubElement(
         header, "section", {"class": f"verdict {'good' if good else 'look'}", "id": "verdict"}
     )
-    ET.SubElement(box, "h2").text = "Verdict: good" if good else "Verdict: look into this"
+    ET.SubElement(box, "h2").text = f"Verdict: {report.verdict.word}"
     for sentence in report.verdict.sentences:
         box.append(paragraph(sentence))
     header.append(_key_numbers(report))

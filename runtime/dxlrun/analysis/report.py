@@ -2,30 +2,26 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
-from contextlib import suppress
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
 
-from dxlrun.analysis.bus import BusTraffic, Servo, traffic
+from dxlrun.analysis.bus import BusTraffic, Servo
 from dxlrun.analysis.latency import (
     Duration,
     Latency,
     Periods,
     controller_durations,
     durations,
-    latency,
-    periods,
 )
-from dxlrun.analysis.steering import Act, Pause, acts, pauses
+from dxlrun.analysis.steering import Act, Pause
+from dxlrun.analysis.tally import Said, Tally
 from dxlrun.analysis.tracking import Joint, tracking
-from dxlrun.analysis.verdict import Timing, Verdict, verdict
-from dxlrun.events import EventCode
+from dxlrun.analysis.verdict import Verdict, judge
 from dxlrun.recording.reader import Log, read_log
-from dxlrun.recording.schemas import SUMMARY_NAME
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,24 +67,24 @@ def analyze_log(path: str | Path) -> Report:
 
 def analyze(log: Log) -> Report:
     """Analyze a log that was read. Raises LogError when a packet in it cannot be read."""
-    servos, buses = traffic(log)
-    timing = Timing(periods(log), latency(log), durations(log), acts(log), pauses(log))
-    lost = _gaps(log)
+    tally = Tally()
+    tally.take(log)
+    figures = tally.figures(log)
     return Report(
         log=str(log.path),
         robot=log.header.robot,
-        verdict=verdict(timing, servos, log, lost),
-        periods=timing.periods,
-        latency=timing.latency,
-        steps=tuple(timing.steps),
+        verdict=judge(figures),
+        periods=figures.periods,
+        latency=figures.latency,
+        steps=durations(log),
         controllers=controller_durations(log),
-        servos=servos,
-        buses=buses,
+        servos=figures.servos,
+        buses=figures.buses,
         joints=tracking(log),
-        events=_events(log),
-        steering=tuple(timing.acts),
-        pauses=tuple(timing.pauses),
-        gaps=lost,
+        events=_events(figures.events),
+        steering=figures.acts,
+        pauses=figures.pauses,
+        gaps=figures.gaps,
         complete=log.complete,
         damage=log.damage,
     )
@@ -99,21 +95,13 @@ def to_json(report: Report) -> bytes:
     return msgspec.json.format(msgspec.json.encode(report), indent=2)
 
 
-def _gaps(log: Log) -> int:
-    """Return the records that were lost before the recorder; from the events where the log has no end."""
-    with suppress(KeyError, ValueError):
-        return int(log.metadata[SUMMARY_NAME]["gaps"])
-    texts = (event.text for event in log.events if event.code == EventCode.RECORDER_GAP)
-    return sum(int(match[0]) for match in (re.match(r"\d+", text) for text in texts) if match)
-
-
-def _events(log: Log) -> tuple[EventCount, ...]:
-    counts = Counter((event.name, int(event.severity)) for event in log.events)
-    first: dict[tuple[str, int], str] = {}
-    for event in log.events:
-        first.setdefault((event.name, int(event.severity)), f"{event.source}: {event.text}")
+def _events(events: Iterable[Said]) -> tuple[EventCount, ...]:
+    """Return the events by kind, the grave ones first."""
+    counts: Counter[tuple[str, int]] = Counter()
+    first: dict[tuple[str, int], Said] = {}
+    for said in events:
+        key = (said.name, said.severity)
+        counts[key] += said.count
+        first[key] = min(first.get(key, said), said, key=lambda one: one.t_ns)
     ordered = sorted(counts, key=lambda key: (-key[1], key[0]))
-    return tuple(
-        EventCount(name, severity, counts[name, severity], first[name, severity])
-        for name, severity in ordered
-    )
+    return tuple(EventCount(*key, counts[key], f"{first[key].source}: {first[key].text}") for key in ordered)

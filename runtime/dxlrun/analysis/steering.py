@@ -6,13 +6,18 @@ from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
-from dxlrun.analysis.latency import first_deadline_ns
+from dxlrun.analysis.latency import DISORDER_NS, begins, first_deadline_ns
 from dxlrun.commands import TakenCommand
+from dxlrun.events import Event, EventCode
 from dxlrun.recording.reader import Log
 from dxlrun.recording.steered import Steered, policy_begun, steered
 
 _LONGEST = 80
+_ANSWERS = frozenset((EventCode.STEERED, EventCode.COMMAND_REFUSED))
+_CYCLE = np.dtype([(name, "i8") for name in ("cycle", "scheduled_ns", "woken_ns", "updated_ns")])
+"""What is kept of a cycle until it is known what was asked in it."""
 
 
 class _Data(msgspec.Struct):
@@ -56,55 +61,121 @@ class Pause:
     periods: int
 
 
-def acts(log: Log) -> tuple[Act, ...]:
-    """Return what was asked, in the order of the cycles, and which policy began at the end."""
-    start_ns = first_deadline_ns(log)
-    found: list[Act] = []
-    streams: dict[str, tuple[int, TakenCommand]] = {}
-    for one in steered(log):
-        command = one.command
-        index, last = streams.pop(command.controller, (-1, None))
+class Steering:
+    """Counts what was asked, slice by slice of a log; streams are one act each, so that little is kept.
+
+    An answer and its cycle may be in a later slice than the command: the newest are kept until all are there.
+    """
+
+    __slots__ = (
+        "_acts",
+        "_begun",
+        "_commands",
+        "_cycles",
+        "_events",
+        "_last",
+        "_log",
+        "_pauses",
+        "_since",
+        "_start_ns",
+        "_streams",
+    )
+
+    def __init__(self) -> None:
+        self._log: Log | None = None
+        self._start_ns = 0
+        self._begun = False
+        self._commands: list[TakenCommand] = []
+        self._events: list[Event] = []
+        self._cycles: NDArray[np.void] = np.zeros(0, _CYCLE)
+        self._acts: list[Act] = []
+        self._pauses: list[Pause] = []
+        self._since: tuple[int, int] | None = None
+        """Cycle and deadline in which a pause began that has not ended."""
+        self._streams: dict[str, tuple[int, TakenCommand]] = {}
+        self._last: TakenCommand | None = None
+
+    def take(self, log: Log) -> None:
+        """Take the next slice."""
+        if not self._begun:
+            self._start_ns = first_deadline_ns(log)
+            self._begun = begins(log)
+        self._log = replace(log, cycles=log.cycles[:0], packet_messages=(), events=(), commands=())
+        self._commands += log.commands
+        for event in log.events:
+            if event.code in _ANSWERS and not event.part:
+                self._events.append(event)
+            elif self._events and (event.t_ns, event.code) == (self._events[-1].t_ns, self._events[-1].code):
+                self._events[-1] = replace(self._events[-1], text=self._events[-1].text + event.text)
+        rows = np.zeros(len(log.cycles), _CYCLE)
+        for name in _CYCLE.names or ():
+            rows[name] = log.cycles[name]
+        self._cycles = np.concatenate([self._cycles, rows])
+        due = self._cycles["scheduled_ns"]
+        if len(due) and due[-1] - due[0] > 2 * DISORDER_NS:
+            self._digest(int(due[-1]) - DISORDER_NS)
+
+    def finish(self) -> tuple[tuple[Act, ...], tuple[Pause, ...]]:
+        """Return what was asked, in the order of the cycles, and which policy began; and the pauses.
+
+        The last pause may end with the run, or where a policy begins.
+        """
+        if self._log is None:
+            return (), ()
+        commands = self._commands[-1:] or ([self._last] if self._last is not None else [])
+        begun = policy_begun(replace(self._log, cycles=self._cycles, commands=tuple(commands)))
+        self._digest(None)
+        if begun is not None:
+            self._acts.append(_act(Steered(begun, ""), self._start_ns))
+        if self._since is not None and len(self._cycles):
+            end = int(self._cycles["cycle"][-1]) + 1 if begun is None else begun.cycle
+            if end > self._since[0]:
+                self._pause(end)
+        return tuple(self._acts), tuple(self._pauses)
+
+    def _digest(self, until_ns: int | None) -> None:
+        """Take the commands that are older than a time, all of them for None, with their answers."""
+        log = self._log
+        if log is None:
+            return
+        now = [one for one in self._commands if until_ns is None or one.t_ns < until_ns]
+        part = replace(log, cycles=self._cycles, events=tuple(self._events), commands=tuple(now))
+        for one in steered(part):
+            self._add(one)
+        self._last = now[-1] if now else self._last
+        if until_ns is not None:
+            self._commands = [one for one in self._commands if one.t_ns >= until_ns]
+            self._events = [event for event in self._events if event.t_ns >= until_ns]
+            self._cycles = self._cycles[self._cycles["updated_ns"] >= until_ns]
+
+    def _add(self, one: Steered) -> None:
+        command, found = one.command, self._acts
+        index, last = self._streams.pop(command.controller, (-1, None))
         if last is not None and found[index].refusal == one.refusal and _goes_on(last, command):
             found[index] = _one_more(found[index], command)
         else:
             index = len(found)
-            found.append(_act(one, start_ns))
+            found.append(_act(one, self._start_ns))
         if command.lease_ns:
-            streams[command.controller] = index, command
-    begun = policy_begun(log)
-    if begun is not None:
-        found.append(_act(Steered(begun, ""), start_ns))
-    return tuple(found)
+            self._streams[command.controller] = index, command
+        kind = command.kind if command.for_loop and not one.refusal else ""
+        if kind == "pause" and self._since is None:
+            self._since = command.cycle, self._due_ns(command.cycle)
+        elif kind == "resume" and self._since is not None:
+            self._pause(command.cycle)
+            self._since = None
 
+    def _pause(self, end: int) -> None:
+        if self._since is None:
+            return
+        begin, begin_ns = self._since
+        start_ns = self._start_ns
+        times = ((begin_ns - start_ns) / 1e9, (self._due_ns(end) - start_ns) / 1e9)
+        self._pauses.append(Pause(*times, end - begin))
 
-def pauses(log: Log) -> tuple[Pause, ...]:
-    """Return the pauses; the last one may end with the run, or where a policy begins."""
-    cycles = log.cycles
-    if not len(cycles):
-        return ()
-    begun = policy_begun(log)
-    end = int(cycles["cycle"][-1]) + 1 if begun is None else begun.cycle
-    found: list[Pause] = []
-    since: int | None = None
-    for one in steered(log):
-        kind = one.command.kind if one.command.for_loop and not one.refusal else ""
-        if kind == "pause" and since is None:
-            since = one.command.cycle
-        elif kind == "resume" and since is not None:
-            found.append(_pause(log, since, one.command.cycle))
-            since = None
-    if since is not None and end > since:
-        found.append(_pause(log, since, end))
-    return tuple(found)
-
-
-def _pause(log: Log, begin: int, end: int) -> Pause:
-    cycles, start_ns = log.cycles, first_deadline_ns(log)
-    due = cycles["scheduled_ns"]
-    first, last = (
-        min(int(np.searchsorted(cycles["cycle"], cycle)), len(cycles) - 1) for cycle in (begin, end)
-    )
-    return Pause((int(due[first]) - start_ns) / 1e9, (int(due[last]) - start_ns) / 1e9, end - begin)
+    def _due_ns(self, cycle: int) -> int:
+        index = min(int(np.searchsorted(self._cycles["cycle"], cycle)), len(self._cycles) - 1)
+        return int(self._cycles["scheduled_ns"][index]) if index >= 0 else self._start_ns
 
 
 def _goes_on(last: TakenCommand, command: TakenCommand) -> bool:

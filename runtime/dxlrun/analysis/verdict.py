@@ -1,27 +1,46 @@
-"""The verdict: what a person wants to know first, in sentences.
+"""The verdict: whether a run was good, and what a person wants to know first, in sentences.
 
-Thresholds: the loop *kept* its rate when it skipped no period; wake-ups are *rough* when more than 1 % are
-later than 150 us (M. A. Araujo, UFU 2017, measured 1.74 % at 1 kHz under stress on a stock kernel, none on a
-real-time kernel); a servo is *named* when a single reply of it is missing or carries an error bit.
+The one set of rules: the terminal at the end of a run, `analyze`, its page and its JSON all use it, and the
+exit code is 1 where it says that a run was not good. What hurt most comes first. A run was not good when
+
+- a line or a servo was lost, a servo rebooted or lost its torque, or the loop never ran a cycle;
+- a joint's state was invalid in more than 1 % of the cycles, and in three at least;
+- more periods were skipped than the robot file tolerates (`loop: {tolerated_skips: ...}`), of two seconds at
+  least;
+- an error was logged, a servo reported one, or the log is not whole.
+
+All else is told and forgiven: a lost packet is data. Wake-ups are *rough* when more than 1 % are later than
+150 us (M. A. Araujo, UFU 2017, measured 1.74 % at 1 kHz under stress on a stock kernel, none on a real-time
+kernel). Replies are *late* when the adapter adds 2 ms more than the plan expects.
 """
 
 from __future__ import annotations
 
-import itertools
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from enum import IntEnum, unique
+from pathlib import Path
 
-import numpy as np
-
-from dxlrun.analysis.bus import Servo
-from dxlrun.analysis.latency import Duration, Latency, Periods, cycle_periods_ns, on_virtual_time
+from dxlrun.analysis.bus import BusTraffic, Servo
 from dxlrun.analysis.steering import Act, Pause
-from dxlrun.events import Event, Severity
+from dxlrun.analysis.tally import Figures, Said
+from dxlrun.dynamixel.latency_timer import mend
+from dxlrun.events import EventCode, Severity
 from dxlrun.plurals import counted
-from dxlrun.recording.reader import Log
 
+INVALID_SHARE = 0.01
+"""More invalid states of a joint than this, and the run was not good."""
+_FEW_INVALID = 2
+"""So few tell nothing, however short the run: a servo that misses three replies in a row is lost."""
+_SHORT_RUN_S = 2.0
+"""A shorter run may skip as much as one of this: a machine that stands still once is not overloaded."""
 ROUGH_SHARE = 0.01
+_LATE_US = 2000
+_TIMER_US = 16_000
+"""Latency timer of FTDI adapters as they are shipped (FTDI AN232B-04)."""
+_TIMER_WITHIN_US = 4000
+"""The timer runs from the reply's first byte, or from the one before: how much less of it may be seen [i]."""
 _MOST_NAMED = 3
 _KINDS = {
     "switch": "switch",
@@ -43,85 +62,123 @@ _MANY = {
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Sentences for a person; `good` when there is nothing to look into."""
+    """Sentences for a person; `good` when nothing went wrong that a run may not have."""
 
     good: bool
     sentences: tuple[str, ...]
-    errors: int = 0
-    """How many were logged."""
+    """What hurt most first."""
+
+    @property
+    def word(self) -> str:
+        """The verdict in a word or two."""
+        return "good" if self.good else "not good"
+
+
+@unique
+class _Rank(IntEnum):
+    """What hurts how much; the first ones most."""
+
+    NEVER_RAN = 0
+    LINE = 1
+    SERVO = 2
+    SHARE = 3
+    """Of the time: joints and periods, the largest share first."""
+    ERROR = 4
+    LOG = 5
+    REMARK = 6
 
 
 @dataclass(frozen=True, slots=True)
-class Timing:
-    """How the loop kept its time: what the first sentences are about."""
+class _Finding:
+    rank: _Rank
+    sentence: str
+    share: float = 0.0
 
-    periods: Periods
-    latency: Latency | None
-    steps: Sequence[Duration]
-    acts: Sequence[Act] = ()
-    pauses: Sequence[Pause] = ()
-
-
-def verdict(timing: Timing, servos: Sequence[Servo], log: Log, lost: int) -> Verdict:
-    """Return the sentences: loop, servos, events, log; each says what is good as plainly as what is not.
-
-    `lost`: records that the recorder did not get.
-    """
-    findings = [
-        _loop(timing.periods, timing.latency, virtual=on_virtual_time(log)),
-        _slow(log),
-        _rough(timing.latency),
-        _steered(timing.acts, timing.pauses),
-        _silent(servos),
-        _errors(servos),
-        _events(log.events),
-        _log(timing.periods, log, lost),
-    ]
-    said = [finding for finding in findings if finding is not None]
-    good, sentences = all(good for good, _ in said), tuple(sentence for _, sentence in said)
-    return Verdict(good, sentences, len(_grave(log.events)))
+    @property
+    def order(self) -> tuple[int, float]:
+        """By it findings are sorted; those of one place keep theirs."""
+        return self.rank, -self.share
 
 
-Finding = tuple[bool, str]
+def judge(figures: Figures) -> Verdict:
+    """Return whether a run was good, and in sentences what was and what was not."""
+    found = sorted(
+        (
+            *_loop(figures),
+            *_lines(figures),
+            *_lost_servos(figures),
+            *_invalid(figures),
+            *_slow(figures),
+            *_rough(figures),
+            *_steered(figures.acts, figures.pauses),
+            *_late_replies(figures.buses),
+            *_silent(figures.servos),
+            *_errors(figures.servos),
+            *_events(figures.events),
+            *_log(figures),
+        ),
+        key=lambda finding: finding.order,
+    )
+    good = all(finding.rank == _Rank.REMARK for finding in found)
+    return Verdict(good, tuple(finding.sentence for finding in found))
 
 
-def _loop(account: Periods, wake_ups: Latency | None, *, virtual: bool) -> Finding:
+def _loop(figures: Figures) -> Iterable[_Finding]:
+    account, wake_ups = figures.periods, figures.latency
     if wake_ups is None:
-        return False, "The loop never ran a cycle."
-    good = account.skipped == 0
-    kept = "kept" if good else "did not keep"
-    wake_up = "on virtual time" if virtual else f"worst wake-up {microseconds(wake_ups.max_us)} late"
+        yield _Finding(_Rank.NEVER_RAN, "The loop never ran a cycle.")
+        return
+    share = account.skipped / account.elapsed
+    judged = max(account.elapsed, _SHORT_RUN_S * account.rate_hz)
+    tolerable = account.skipped <= figures.tolerated_skips * judged
+    kept = "kept" if tolerable else "did not keep"
+    wake_up = "on virtual time" if figures.virtual else f"worst wake-up {microseconds(wake_ups.max_us)} late"
     elapsed = counted(account.elapsed, "period", "periods")
-    return good, (
-        f"The loop {kept} {account.rates}: {account.skipped} of {elapsed} skipped"
-        f"{'' if good else f' ({account.skipped / account.elapsed:.2%})'}, "
-        f"{wake_up}."
-    )
+    tolerated = f"{figures.tolerated_skips * 100:.4g}% tolerated"
+    if judged > account.elapsed:
+        tolerated = f"{figures.tolerated_skips * judged:.0f} tolerated in a short run"
+    shares = f" ({share:.2%}; {tolerated})" if account.skipped else ""
+    sentence = f"The loop {kept} {account.rates}: {account.skipped} of {elapsed} skipped{shares}, {wake_up}."
+    yield _Finding(_Rank.REMARK if tolerable else _Rank.SHARE, sentence, 0.0 if tolerable else share)
 
 
-def _slow(log: Log) -> Finding | None:
+def _slow(figures: Figures) -> Iterable[_Finding]:
     """Say which step made a cycle longer than its period, of the cycle that exceeds it most."""
-    cycles, periods_ns = log.cycles, cycle_periods_ns(log)
-    if not len(cycles):
-        return None
-    worst = int(np.argmax(cycles["written_ns"] - cycles["woken_ns"] - periods_ns))
-    times = [int(cycles[name][worst]) for name in ("woken_ns", "read_ns", "updated_ns", "written_ns")]
-    lasted_ns, period_ns = times[-1] - times[0], int(periods_ns[worst])
-    if lasted_ns <= period_ns:
-        return None
-    steps_ns = (end - begin for begin, end in itertools.pairwise(times))
-    longest_ns, name = max(zip(steps_ns, ("read", "update", "write"), strict=True))
-    return False, (
-        f"A cycle took up to {microseconds(lasted_ns / 1e3)}, longer than its period of "
-        f"{microseconds(period_ns / 1e3)}; its {name} took {microseconds(longest_ns / 1e3)}."
+    slowest = figures.slowest
+    if slowest is None:
+        return
+    steps = ((slowest.read_ns, "read"), (slowest.update_ns, "update"), (slowest.write_ns, "write"))
+    longest_ns, name = max(steps)
+    yield _Finding(
+        _Rank.REMARK,
+        f"A cycle took up to {microseconds(slowest.lasted_ns / 1e3)}, longer than its period of "
+        f"{microseconds(slowest.period_ns / 1e3)}; its {name} took {microseconds(longest_ns / 1e3)}.",
     )
 
 
-def _steered(acts: Sequence[Act], pauses: Sequence[Pause]) -> Finding | None:
-    """Say what others asked of the loop in the run; nobody did: nothing."""
+def _rough(figures: Figures) -> Iterable[_Finding]:
+    wake_ups, real_time = figures.latency, figures.real_time
+    if wake_ups is None or wake_ups.share_over_150_us <= ROUGH_SHARE:
+        return
+    if not real_time.asked:
+        helps = "`loop: {scheduler: {policy: round_robin}}` in the robot file helps"
+    elif not real_time.granted:
+        helps = "the real-time scheduler that the robot file asks for was not granted, and would help"
+    elif not real_time.kernel:
+        helps = "the real-time scheduler was granted; a real-time kernel helps"
+    else:
+        helps = "scheduler and kernel are real-time ones, so it is the machine: see `dxlrun doctor`"
+    yield _Finding(
+        _Rank.REMARK,
+        f"Wake-ups are rough: {wake_ups.share_over_150_us:.1%} came later than 150 us; {helps}.",
+    )
+
+
+def _steered(acts: Sequence[Act], pauses: Sequence[Pause]) -> Iterable[_Finding]:
+    """Say what was asked of the loop from outside."""
     asked = [act for act in acts if act.origin != "loop"]
     if not asked:
-        return None
+        return
     done = Counter(
         _KINDS.get(act.kind, "command")
         for act in asked
@@ -136,25 +193,100 @@ def _steered(acts: Sequence[Act], pauses: Sequence[Pause]) -> Finding | None:
     parts += [f"{refused} refused"] if refused else []
     still = sum(pause.end_s - pause.begin_s for pause in pauses)
     paused = f"; it was paused for {microseconds(still * 1e6)}" if pauses else ""
-    return True, f"It was steered from outside: {', '.join(parts)}{paused}."
+    yield _Finding(_Rank.REMARK, f"It was steered from outside: {', '.join(parts)}{paused}.")
 
 
-def _rough(wake_ups: Latency | None) -> Finding | None:
-    if wake_ups is None or wake_ups.share_over_150_us <= ROUGH_SHARE:
-        return None
-    return False, (
-        f"Wake-ups are rough: {wake_ups.share_over_150_us:.1%} came later than 150 us; "
-        "a real-time kernel and a real-time scheduler help."
-    )
+# What was lost
 
 
-def _silent(servos: Sequence[Servo]) -> Finding | None:
+def _of(events: Iterable[Said], *codes: EventCode) -> list[Said]:
+    return [said for said in events if said.code in codes and said.severity >= Severity.ERROR]
+
+
+def _lines(figures: Figures) -> Iterable[_Finding]:
+    for said in _of(figures.events, EventCode.PORT_LOST):
+        times = "" if said.count == 1 else f" {said.count} times"
+        yield _Finding(_Rank.LINE, f"Bus {said.source} was lost{times}: {_line(said)}.", said.count)
+
+
+_HURTS = {
+    EventCode.SERVO_REBOOTED: "rebooted",
+    EventCode.SERVO_LOST: "was lost",
+    EventCode.SERVO_LIMP: "lost its torque",
+}
+
+
+def _lost_servos(figures: Figures) -> Iterable[_Finding]:
+    """Say of each servo that was lost, rebooted or let go what happened to it; the worst ones first."""
+    by_source: dict[str, list[Said]] = {}
+    for said in _of(figures.events, *_HURTS):
+        by_source.setdefault(said.source, []).append(said)
+    if not by_source:
+        return
+    told = []
+    for source, happened in sorted(by_source.items(), key=lambda item: -sum(said.count for said in item[1])):
+        parts = [
+            what if said.count == 1 else f"{what} {said.count} times"
+            for code, what in _HURTS.items()
+            for said in happened
+            if said.code == code
+        ]
+        told.append(f"{source} {_joined(parts)}")
+    named = "; ".join(told[:_MOST_NAMED])
+    yield _Finding(_Rank.SERVO, f"Servos failed: {named}{_more('; and', len(told))}.")
+
+
+def _joined(parts: Sequence[str]) -> str:
+    *others, last = parts
+    return f"{', '.join(others)} and {last}" if others else last
+
+
+def _invalid(figures: Figures) -> Iterable[_Finding]:
+    """Name the joints whose states were invalid too often; the cycles that were skipped have none."""
+    cycles = figures.periods.records
+    shares = [
+        (count / cycles, joint)
+        for joint, count in zip(figures.joints, figures.invalid, strict=False)
+        if cycles and count > max(_FEW_INVALID, INVALID_SHARE * cycles)
+    ]
+    if shares:
+        ordered = sorted(shares, key=lambda one: (-one[0], one[1]))
+        named = ", ".join(f"{joint} in {share:.1%}" for share, joint in ordered[:_MOST_NAMED])
+        more = _more(", and", len(ordered), "more joint", "more joints")
+        sentence = f"States were invalid: {named} of the cycles{more}; {INVALID_SHARE:.0%} tolerated."
+        yield _Finding(_Rank.SHARE, sentence, ordered[0][0])
+
+
+def _late_replies(buses: Sequence[BusTraffic]) -> Iterable[_Finding]:
+    """Compare what adapters add to the time of replies with the plan; name the usual reason."""
+    for bus in buses:
+        extra, planned = bus.extra_us, bus.planned_latency_us
+        if extra is None or planned is None or extra < planned + _LATE_US:
+            continue
+        told = (
+            f"Replies on bus {bus.name} come {microseconds(extra)} later than the wire needs, and the robot "
+            f"file says adapter: {{latency: {planned / 1e3:g} ms}}"
+        )
+        if -_TIMER_WITHIN_US <= extra - _TIMER_US <= _LATE_US and bus.port != "sim":
+            told += f": that is a latency timer of 16 ms; `{timer_command(bus.port)}` shortens it"
+        yield _Finding(_Rank.REMARK, f"{told}.")
+
+
+def timer_command(port: str) -> str:
+    """Return the command that makes the latency timer of a port's adapter 1 ms."""
+    name = Path(port).name
+    device = name if name.startswith("ttyUSB") else f"$(basename $(readlink -f {port}))"
+    return mend(f"/sys/bus/usb-serial/devices/{device}/latency_timer")
+
+
+def _silent(servos: Sequence[Servo]) -> Iterable[_Finding]:
     asked = [servo for servo in servos if servo.asked]
     if not asked:
-        return None
+        return
     losers = sorted((servo for servo in asked if servo.lost), key=lambda servo: -servo.lost)
     if not losers:
-        return True, f"{_all(len(asked))} answered every time."
+        yield _Finding(_Rank.REMARK, f"{_all(len(asked))} answered every time.")
+        return
     named = ", ".join(
         f"{_name(servo)} {servo.lost} of {servo.asked} times ({servo.lost / servo.asked:.2%})"
         for servo in losers[:_MOST_NAMED]
@@ -162,61 +294,65 @@ def _silent(servos: Sequence[Servo]) -> Finding | None:
     more = _more(", and", len(losers))
     rest = len(asked) - len(losers)
     others = f"; {rest} of {len(asked)} servos answered every time" if rest else ""
-    return False, f"Replies are missing: {named}{more}{others}."
+    yield _Finding(_Rank.REMARK, f"Replies are missing: {named}{more}{others}.")
 
 
 def _all(count: int) -> str:
     return "The servo" if count == 1 else f"All {count} servos"
 
 
-def _errors(servos: Sequence[Servo]) -> Finding | None:
+def _errors(servos: Sequence[Servo]) -> Iterable[_Finding]:
     troubled = [servo for servo in servos if servo.errors]
     if not troubled:
-        return None
+        return
     named = "; ".join(
         f"{_name(servo)}: {', '.join(servo.error_names) or 'unknown bit'} in "
         f"{counted(servo.errors, 'reply', 'replies')}"
         for servo in troubled[:_MOST_NAMED]
     )
     more = _more("; and", len(troubled))
-    return False, f"Servos reported errors: {named}{more}."
+    yield _Finding(_Rank.ERROR, f"Servos reported errors: {named}{more}.")
 
 
-def _more(joining: str, count: int) -> str:
-    """Return how many servos there are beyond those that are named."""
+def _more(joining: str, count: int, one: str = "more servo", many: str = "more servos") -> str:
+    """Return how many there are beyond those that are named."""
     beyond = count - _MOST_NAMED
-    return f"{joining} {counted(beyond, 'more servo', 'more servos')}" if beyond > 0 else ""
+    return f"{joining} {counted(beyond, one, many)}" if beyond > 0 else ""
 
 
 def _name(servo: Servo) -> str:
     return f"servo {servo.servo_id} ({servo.joint or servo.bus})"
 
 
-def _events(events: Sequence[Event]) -> Finding | None:
-    grave = _grave(events)
-    if not grave:
-        return None
-    first = grave[0]
-    line = first.text.strip().splitlines()[-1] if first.text.strip() else first.name
-    number = "One error was" if len(grave) == 1 else f"{len(grave)} errors were"
-    return False, f"{number} logged; the first, of {first.source}: {line}"
+_TOLD = frozenset((*_HURTS, EventCode.PORT_LOST, EventCode.RECORDER_GAP))
+"""Events that other rules tell of."""
 
 
-def _grave(events: Sequence[Event]) -> list[Event]:
-    return [event for event in events if event.severity >= Severity.ERROR]
+def _events(events: Sequence[Said]) -> Iterable[_Finding]:
+    grave = [said for said in events if said.severity >= Severity.ERROR and said.code not in _TOLD]
+    if grave:
+        count = sum(said.count for said in grave)
+        first = min(grave, key=lambda said: said.t_ns)
+        number = "One error was" if count == 1 else f"{count} errors were"
+        sentence = f"{number} logged; the first, of {first.source}: {_line(first)}"
+        yield _Finding(_Rank.ERROR, sentence)
 
 
-def _log(account: Periods, log: Log, lost: int) -> Finding | None:
-    faults = list(log.damage)
-    if lost:
-        faults.append(f"{counted(lost, 'record was', 'records were')} lost on the way to the recorder")
-    if not account.agree:
-        faults.append(
-            f"{counted(account.missing, 'period is', 'periods are')} neither recorded nor declared skipped"
-        )
-    if not faults:
-        return None
-    return False, f"The log is not whole: {'; '.join(faults)}."
+def _line(said: Said) -> str:
+    """Return the last line of an event's text: of a traceback what was raised."""
+    return said.text.strip().splitlines()[-1] if said.text.strip() else said.name
+
+
+def _log(figures: Figures) -> Iterable[_Finding]:
+    faults = list(figures.damage)
+    if figures.gaps:
+        lost = counted(figures.gaps, "record was", "records were")
+        faults.append(f"{lost} lost on the way to the recorder")
+    if not figures.periods.agree:
+        missing = counted(figures.periods.missing, "period is", "periods are")
+        faults.append(f"{missing} neither recorded nor declared skipped")
+    if faults:
+        yield _Finding(_Rank.LOG, f"The log is not whole: {'; '.join(faults)}.")
 
 
 def microseconds(value: float) -> str:

@@ -29,6 +29,8 @@ def analyze(
 ) -> int:
     """Analyze a log: wake-up latency, duration of each step, skipped periods, packets and errors per servo.
 
+    The exit code is 1 when the run was not good.
+
     Parameters
     ----------
     logs
@@ -76,13 +78,13 @@ def analyze(
         _write(read, result, report)
     if as_json:
         console.file.write(analysis.to_json(result).decode() + "\n")
-        return 0
+        return 0 if result.verdict.good else 1
     if not logs:
         console.print(f"log: {log}", markup=False, soft_wrap=True)
     console.print(render(result))
     if report is not None:
         console.print(f"\nreport: {report}", markup=False, soft_wrap=True)
-    return 0
+    return 0 if result.verdict.good else 1
 
 
 def newest_log() -> Path:
@@ -116,12 +118,13 @@ def _analyze_each(logs: Sequence[Path], console: Console, *, as_json: bool) -> i
             say_error(f"dxlrun: {error}")
             code = error.exit_code
             continue
+        verdict = result.verdict
+        code = code if verdict.good else max(code, 1)
         if as_json:
             results.append(analysis.to_json(result).decode())
             continue
-        verdict = result.verdict
-        good = "good" if verdict.good else "not good"
-        console.print(f"{log}: {good}. {' '.join(verdict.sentences[:1])}", markup=False, soft_wrap=True)
+        first = " ".join(verdict.sentences[:1])
+        console.print(f"{log}: {verdict.word}. {first}", markup=False, soft_wrap=True)
     if as_json:
         console.file.write(f"[{','.join(results)}]\n")
     return code

@@ -18,12 +18,10 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
+    from dxlrun.analysis.verdict import Verdict
     from dxlrun.compile.plan import Plan
     from dxlrun.dynamixel.bus_plan import BusPlan
     from dxlrun.run_summary import RunSummary
-
-_MOST_MESSAGES = 100_000
-"""A log of so many messages is analyzed in about two seconds; nobody wants to wait longer for the prompt."""
 
 
 def run(
@@ -90,8 +88,7 @@ def run(
         from dxlrun.supervisor import run_robot
 
         summary = run_robot(result.plan, options, console)
-    show(summary, result.plan.robot, console)
-    return summary.exit_code
+    return show(summary, result.plan.robot, console)
 
 
 def _check_ledger(ledger: Path, plan: Plan) -> None:
@@ -118,37 +115,38 @@ def _ask_servos(buses: Sequence[BusPlan], joints: Sequence[str]) -> Mapping[str,
     return ask_servos(buses, joints)
 
 
-def _verdict(summary: RunSummary) -> tuple[tuple[str, ...], int]:
-    """Return what the log says of the run, and how many errors are in it.
-
-    Nothing without a log, or where reading it would take more than a moment.
-    """
-    if summary.log is None or not summary.cycles or summary.messages > _MOST_MESSAGES:
-        return (), 0
-    from dxlrun.analysis.report import analyze_log
+def _verdict(summary: RunSummary, console: Console) -> Verdict | None:
+    """Return the verdict of a run's log, by the rules of `analyze`; None without a log."""
+    if summary.log is None:
+        return None
+    from dxlrun.analysis.tally import figures_of
+    from dxlrun.analysis.verdict import Verdict, judge
 
     try:
-        said = analyze_log(summary.log).verdict
+        with console.status("reading the log"):
+            return judge(figures_of(summary.log))
     except LogError as error:
-        say_warning(str(error))
-        return (), 0
-    return said.sentences, said.errors
+        return Verdict(good=False, sentences=(f"The log cannot be read: {error}.",))
 
 
-def show(summary: RunSummary, robot: str, console: Console) -> None:
-    """Print how the run went: what failed and what was not granted to stderr, the rest to stdout."""
+def show(summary: RunSummary, robot: str, console: Console) -> int:
+    """Print how the run went: what failed and what was not granted to stderr, the rest to stdout.
+
+    Return the exit code: 1 also where the verdict is that the run was not good.
+    """
     for remark in summary.remarks:
         say_warning(f"{robot}: {remark}")
     for sentence in summary.sentences:
         say_error(f"{robot}: {sentence}")
-    sentences, errors = _verdict(summary)
-    good = "ended, with errors" if errors else "good"
-    verdict = {0: good, 130: "interrupted"}.get(summary.exit_code, "failed")
+    verdict = _verdict(summary, console)
+    code = summary.exit_code if verdict is None or verdict.good else 1
+    word = {0: "good", 130: "interrupted"}.get(code, "failed")
     console.print(
-        f"{robot}: {verdict}. {summary.elapsed_s:.1f} s, {counted(summary.cycles, 'cycle', 'cycles')}, "
+        f"{robot}: {word}. {summary.elapsed_s:.1f} s, {counted(summary.cycles, 'cycle', 'cycles')}, "
         f"{counted(summary.skipped, 'period', 'periods')} skipped",
         soft_wrap=True,
     )
+    sentences = () if verdict is None else verdict.sentences
     if summary.log is not None:
         for sentence in sentences:
             console.print(f"  {sentence}", markup=False, soft_wrap=True)
@@ -156,3 +154,4 @@ def show(summary: RunSummary, robot: str, console: Console) -> None:
         console.print(f"log: {summary.log} ({held})", markup=False, soft_wrap=True)
         if summary.cycles:
             console.print(f"next: dxlrun analyze {summary.log}", markup=False, soft_wrap=True)
+    return code

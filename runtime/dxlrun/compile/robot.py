@@ -158,6 +158,7 @@ def _plan(checked: Checked, urdf: str | None, simulation: SimulationPlan) -> Pla
         end_ns=checked.end_ns,
         policies=checked.policies,
         overrun=robot.loop.overrun,
+        tolerated_skips=robot.loop.tolerated_skips,
         least_period_ns=least_period_ns(robot.loop, checked.buses),
         slowest_period_ns=slowest_period_ns(checked.buses),
     )

@@ -23,6 +23,7 @@ from dxlrun.description.units import (
     Effort,
     Inertia,
     Polling,
+    Share,
     Torque,
 )
 
@@ -100,6 +101,11 @@ class Loop(Form):
         default="skip",
         description="After a late cycle, whole periods are skipped, or caught up with, or the run ends.",
         examples=["catch_up"],
+    )
+    tolerated_skips: Share = Field(
+        default=0.1,
+        description="A run that skips more of its periods than this has failed.",
+        examples=["1 %"],
     )
 
 

@@ -101,6 +101,14 @@ def inertia(text: str) -> float:
     return _si(text, "a moment of inertia", _INERTIA, "0.01 kg m^2, 5 kg cm^2 or 300 g cm^2")
 
 
+def share(text: str) -> float:
+    """Return a share from 0 to 1 from `5 %`; raises ValueError that says how to write one."""
+    value = _si(text, "a share", {"%": 1e-2}, "5 %")
+    if not 0.0 <= value <= 1.0:
+        raise _refusal(f"{text!r} is no share from 0 % to 100 %", "write one such as 5 %")
+    return value
+
+
 def duration(text: str) -> int:
     """Return a time, ns, from `500 us`, `1 ms`, `2 s` or `1 min`; raises ValueError that says how."""
     written = "500 us, 1 ms, 2 s or 1 min"
@@ -223,6 +231,14 @@ Effort = Annotated[
     _text_schema("800 mA", _EFFORT),
 ]
 """A number above 0 and its unit, from `0.3 Nm`, `800 mA` or `40 %`."""
+
+Share = Annotated[
+    float,
+    BeforeValidator(share),
+    PlainSerializer(lambda value: f"{value * 100:.12g} %", return_type=str, when_used="json"),
+    _text_schema("5 %", {"%": 1e-2}),
+]
+"""A number from 0 to 1, from `5 %`."""
 
 Inertia = Annotated[
     float,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import struct
 import zlib
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import IO, cast
@@ -34,6 +34,16 @@ _MAGIC = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
 _PACKET = struct.Struct("<qqBBxxI")
+_FOR_OTHERS = frozenset(
+    (
+        schemas.ROSOUT_TOPIC,
+        schemas.JOINT_STATES_TOPIC,
+        schemas.JOINT_COMMANDS_TOPIC,
+        schemas.DIAGNOSTICS_TOPIC,
+        schemas.ROBOT_DESCRIPTION_TOPIC,
+    )
+)
+"""What other tools read; the same stands in the other topics."""
 _DAMAGE = (McapError, zstandard.ZstdError, struct.error, UnicodeDecodeError, EOFError)
 _LARGEST_CHUNK = 64 << 20
 """Bytes of a chunk when decompressed; ours have 256 KiB and one message, those of other writers some MiB."""
@@ -46,6 +56,8 @@ class _Found:
     """What a walk through a file collects."""
 
     channels: dict[int, str] = field(default_factory=dict)
+    needless: set[int] = field(default_factory=set)
+    """Channels whose messages are left where they are."""
     messages: dict[int, list[bytes]] = field(default_factory=dict)
     attachments: dict[str, bytes] = field(default_factory=dict)
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
@@ -53,6 +65,8 @@ class _Found:
     finished: bool = False
     room: int = 0
     """Bytes that the chunks which follow may have when they are decompressed."""
+    after: Callable[[_Found], None] = lambda found: None
+    """Called behind each chunk."""
 
 
 @dataclass(frozen=True)
@@ -109,6 +123,31 @@ class Log:
 def read_log(path: str | Path) -> Log:
     """Read a log of dxlrun. Raises LogError with one sentence when the file is none, is missing or empty."""
     path = Path(path)
+    found = _opened(path, _Found())
+    return _log_of(path, found)
+
+
+def scan_log(path: str | Path, take: Callable[[Log], None]) -> Log:
+    """Read a log slice by slice, in memory that does not grow with it: `take` gets each as a log of its own.
+
+    A slice has the cycles, packets, events and commands of a chunk of the file; an event that goes on in the
+    next one is continued there by one of `part` > 0. Return what is left: a log without them, with all that
+    the file says of itself. Raises LogError as read_log, and where a packet of a slice cannot be read.
+    """
+    path = Path(path)
+
+    def slice_of(found: _Found) -> None:
+        if schemas.METADATA_NAME in found.metadata:
+            part = _log_of(path, replace(found, damage=[], finished=True))
+            found.messages.clear()
+            take(part)
+
+    found = _opened(path, _Found(after=slice_of))
+    return _log_of(path, replace(found, messages={}))
+
+
+def _opened(path: Path, found: _Found) -> _Found:
+    """Go through a file; raises LogError with one sentence when it is none, is missing or empty."""
     try:
         with path.open("rb") as stream:
             size = os.fstat(stream.fileno()).st_size
@@ -116,9 +155,13 @@ def read_log(path: str | Path) -> Log:
                 raise LogError(f"{path}: the file is empty; its recorder never began to write")
             if stream.read(len(_MAGIC)) != _MAGIC:
                 raise LogError(f"{path}: this is no MCAP file, so it is no log of dxlrun")
-            found = _walk(stream, size)
+            _walk(stream, size, found)
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror or error}") from error
+    return found
+
+
+def _log_of(path: Path, found: _Found) -> Log:
     if schemas.METADATA_NAME not in found.metadata:
         raise LogError(f"{path}: an MCAP file, but not written by dxlrun: it has no metadata 'dxlrun'")
     try:
@@ -214,9 +257,9 @@ def _events(messages: list[bytes]) -> tuple[Event, ...]:
     return tuple(events)
 
 
-def _walk(stream: IO[bytes], size: int) -> _Found:
+def _walk(stream: IO[bytes], size: int, found: _Found) -> None:
     """Go through the file from its start, record by record, until its end or to what cannot be read."""
-    found = _Found(room=_LARGEST_CHUNK + _MOST_EXPANDED * size)
+    found.room = _LARGEST_CHUNK + _MOST_EXPANDED * size
     stream.seek(0)
     reader = StreamReader(stream, emit_chunks=True, record_size_limit=size)
     records: Iterator[McapRecord] = reader.records
@@ -227,10 +270,10 @@ def _walk(stream: IO[bytes], size: int) -> _Found:
             at = stream.tell()
             if at < size or not isinstance(error, struct.error | EOFError | McapError):
                 found.damage.append(f"what lies behind byte {at} cannot be read: {_said(error)}")
-            return found
+            return
         if record is None:
             found.finished = True  # the footer and the magic bytes behind it were read
-            return found
+            return
         _take(record, found)
 
 
@@ -242,12 +285,19 @@ def _take(record: McapRecord, found: _Found) -> None:
             damage = f"a chunk of messages is damaged and left out: {_said(error)}"
             if damage not in found.damage:
                 found.damage.append(damage)
+        found.after(found)
     elif isinstance(record, Attachment):
         found.attachments[record.name] = record.data
     elif isinstance(record, Metadata):
         found.metadata[record.name] = record.metadata
     elif isinstance(record, Channel):
-        found.channels[record.id] = record.topic
+        _open_channel(record.id, record.topic, found)
+
+
+def _open_channel(identifier: int, topic: str, found: _Found) -> None:
+    found.channels[identifier] = topic
+    if topic in _FOR_OTHERS:
+        found.needless.add(identifier)
 
 
 def _decompressed(chunk: Chunk, found: _Found) -> bytes:
@@ -280,7 +330,7 @@ def _decompressed(chunk: Chunk, found: _Found) -> bytes:
 def _split(data: bytes, found: _Found) -> None:
     """Cut a chunk into its messages; several times faster than the library's objects."""
     start, end = 0, len(data)
-    messages, head = found.messages, _RECORD.size + _MESSAGE.size
+    messages, needless, head = found.messages, found.needless, _RECORD.size + _MESSAGE.size
     while start < end:
         opcode, length = _RECORD.unpack_from(data, start)
         body = start + _RECORD.size
@@ -289,11 +339,12 @@ def _split(data: bytes, found: _Found) -> None:
             raise EOFError("a record is longer than its chunk")
         if opcode == Opcode.MESSAGE:
             (channel,) = struct.unpack_from("<H", data, body)
-            messages.setdefault(channel, []).append(data[body - _RECORD.size + head : start])
+            if channel not in needless:
+                messages.setdefault(channel, []).append(data[body - _RECORD.size + head : start])
         elif opcode == Opcode.CHANNEL:
             identifier, _ = struct.unpack_from("<HH", data, body)
             (text_length,) = struct.unpack_from("<I", data, body + 4)
-            found.channels[identifier] = data[body + 8 : body + 8 + text_length].decode()
+            _open_channel(identifier, data[body + 8 : body + 8 + text_length].decode(), found)
 
 
 def _said(error: Exception) -> str:

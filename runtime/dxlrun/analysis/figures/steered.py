@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from matplotlib.axes import Axes
 
 from dxlrun.analysis.figures.drawing import MUTED, PURPLE
-from dxlrun.analysis.steering import Pause, acts, pauses
+from dxlrun.analysis.steering import Pause, Steering
 from dxlrun.recording.reader import Log
 
 _FEW = 60
@@ -26,8 +26,11 @@ class SteeringMarks:
     @classmethod
     def of(cls, log: Log) -> SteeringMarks:
         """Return the marks of a log; of very many changes none."""
-        times = tuple(act.time_s for act in acts(log) if act.kind in _MARKED and not act.refusal)
-        return cls(times if len(times) <= _FEW else (), pauses(log))
+        steering = Steering()
+        steering.take(log)
+        acts, pauses = steering.finish()
+        times = tuple(act.time_s for act in acts if act.kind in _MARKED and not act.refusal)
+        return cls(times if len(times) <= _FEW else (), pauses)
 
     def draw(self, axes: Axes) -> None:
         """Shade the pauses, and draw a dotted line where something was changed."""

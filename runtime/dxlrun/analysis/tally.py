@@ -1,0 +1,172 @@
+"""What a verdict is found by: counted slice by slice of a log, so that its length does not matter."""
+
+from __future__ import annotations
+
+import re
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.analysis.bus import BusTraffic, Servo, Traffic
+from dxlrun.analysis.latency import Latency, Periods, Punctuality, Slowest, on_virtual_time
+from dxlrun.analysis.steering import Act, Pause, Steering
+from dxlrun.control.loop_plan import TOLERATED_SKIPS
+from dxlrun.events import Event, EventCode, Severity
+from dxlrun.recording.reader import Log, scan_log
+from dxlrun.recording.schemas import SUMMARY_NAME
+
+
+@dataclass(frozen=True, slots=True)
+class Said:
+    """Events of one kind and one source."""
+
+    code: int
+    severity: int
+    source: str
+    count: int
+    t_ns: int
+    """Of the first one; ns of the run's clock."""
+    text: str
+    """Of the first one."""
+
+    @property
+    def name(self) -> str:
+        """The name of the code."""
+        return Event(0, self.code, 0, "", "").name
+
+
+@dataclass(frozen=True, slots=True)
+class RealTime:
+    """What was asked of the operating system for the loop, and what it granted."""
+
+    asked: bool = False
+    """A real-time scheduler."""
+    granted: bool = False
+    kernel: bool = False
+    """The kernel is a real-time one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """One run in figures; everything that the rules of the verdict look at."""
+
+    periods: Periods
+    latency: Latency | None = None
+    """None where the loop never ran a cycle."""
+    slowest: Slowest | None = None
+    virtual: bool = False
+    tolerated_skips: float = TOLERATED_SKIPS
+    """Share of its periods that the run may skip."""
+    real_time: RealTime = RealTime()
+    joints: tuple[str, ...] = ()
+    invalid: tuple[int, ...] = ()
+    """Cycles in which the state of each joint was not valid."""
+    servos: tuple[Servo, ...] = ()
+    buses: tuple[BusTraffic, ...] = ()
+    events: tuple[Said, ...] = ()
+    """In the order of the first of each."""
+    acts: tuple[Act, ...] = ()
+    pauses: tuple[Pause, ...] = ()
+    gaps: int = 0
+    """Records that the recorder did not get."""
+    damage: tuple[str, ...] = ()
+
+
+class Tally:
+    """Counts a log, whole or slice by slice, in memory that does not grow with it."""
+
+    __slots__ = ("_events", "_granted", "_invalid", "_punctuality", "_steering", "_traffic", "_unread")
+
+    def __init__(self) -> None:
+        self._punctuality = Punctuality()
+        self._traffic = Traffic()
+        self._steering = Steering()
+        self._invalid: NDArray[np.int64] | None = None
+        self._events: dict[tuple[int, int, str], Said] = {}
+        self._granted = False
+        self._unread = 0
+
+    def take(self, log: Log) -> None:
+        """Count the next slice. Raises LogError when a packet in it cannot be read."""
+        self._punctuality.take(log)
+        self._traffic.take(log)
+        self._steering.take(log)
+        invalid = np.count_nonzero(~log.cycles["valid"], axis=0)
+        self._invalid = invalid if self._invalid is None else self._invalid + invalid
+        for event in log.events:
+            key = (event.code, event.severity, event.source)
+            begun = self._events.get(key)
+            if event.part and begun is not None:  # it goes on behind the end of a slice
+                if begun.t_ns == event.t_ns:
+                    self._events[key] = replace(begun, text=begun.text + event.text)
+                continue
+            said = begun or Said(*key, 0, event.t_ns, event.text)
+            self._events[key] = replace(said, count=said.count + 1)
+            if (
+                event.code == EventCode.SCHEDULER
+                and event.source == "loop"
+                and event.text.startswith("scheduler ")
+            ):
+                self._granted = event.severity < Severity.WARNING
+            number = re.match(r"\d+", event.text) if event.code == EventCode.RECORDER_GAP else None
+            self._unread += int(number[0]) if number else 0
+
+    def figures(self, log: Log) -> Figures:
+        """Return the figures of all that was taken; `log`: what the file says of itself, which comes last."""
+        account, late = self._punctuality.finish()
+        servos, buses = self._traffic.finish()
+        acts, pauses = self._steering.finish()
+        gaps = self._unread
+        with suppress(KeyError, ValueError):
+            gaps = int(log.metadata[SUMMARY_NAME]["gaps"])
+        return Figures(
+            periods=account,
+            latency=late,
+            slowest=self._punctuality.slowest,
+            virtual=on_virtual_time(log),
+            tolerated_skips=_tolerated_skips(log),
+            real_time=_real_time(log, granted=self._granted),
+            joints=log.joints,
+            invalid=() if self._invalid is None else tuple(self._invalid.tolist()),
+            servos=servos,
+            buses=buses,
+            events=tuple(self._events.values()),
+            acts=acts,
+            pauses=pauses,
+            gaps=gaps,
+            damage=log.damage,
+        )
+
+
+def figures_of(path: str | Path) -> Figures:
+    """Count the log at a path, slice by slice. Raises LogError when it cannot be read."""
+    tally = Tally()
+    return tally.figures(scan_log(path, tally.take))
+
+
+class _Loop(msgspec.Struct):
+    tolerated_skips: float = TOLERATED_SKIPS
+
+
+class _Plan(msgspec.Struct):
+    loop: _Loop = msgspec.field(default_factory=_Loop)
+
+
+def _tolerated_skips(log: Log) -> float:
+    """Return what the robot file tolerates; the default where the log has no readable plan."""
+    try:
+        plan = msgspec.json.decode(log.attachments.get("plan.json", b"{}"), type=_Plan)
+    except (msgspec.MsgspecError, ValueError):
+        return TOLERATED_SKIPS
+    return plan.loop.tolerated_skips
+
+
+def _real_time(log: Log, *, granted: bool) -> RealTime:
+    asked = log.metadata.get("scheduler", {}).get("policy", "other") != "other"
+    kernel = log.metadata.get("kernel", {})
+    real_time = any("PREEMPT_RT" in kernel.get(key, "") for key in ("version", "release"))
+    return RealTime(asked, granted, real_time)

@@ -1,0 +1,332 @@
+"""The verdict: what a run may not have to be good, what hurts most, and that nobody says it otherwise."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dxlrun.analysis import bus, latency, steering
+from dxlrun.analysis.bus import BusTraffic
+from dxlrun.analysis.latency import Latency, Periods
+from dxlrun.analysis.page import page
+from dxlrun.analysis.report import analyze, analyze_log, to_json
+from dxlrun.analysis.tally import Figures, RealTime, Tally, figures_of
+from dxlrun.analysis.verdict import Verdict, judge
+from dxlrun.events import EventCode, Severity
+from dxlrun.inbox import Command
+from dxlrun.packets import PacketKind
+from dxlrun.recording import log_writer
+from dxlrun.recording.reader import Log, read_log, scan_log
+from dxlrun.simulation.faults import FaultScript, parse_fault
+from dxlrun.testing import simulated_robot
+
+Make = Callable[..., Any]
+TORSO = Path(__file__).parents[2] / "robots/bioloid_torso.yaml"
+MS = 1_000_000
+PLANNED = {"name": "main", "port": "/dev/ttyUSB3", "baud_rate": 1_000_000, "return_delay_ns": 500_000}
+ASK = bytes.fromhex("ffff0504022406ca")
+ANSWER = bytes.fromhex("ffff05080000020000000000f0")
+
+
+def figures(**changed: Any) -> Figures:
+    """Figures of a good run, changed."""
+    account = Periods(1000, 1000, 0, 0, True, 50.0, 20.0, (50.0,))
+    good = Figures(account, Latency(80.0, 10.0, 5.0, 9, 0.0, 0.0, 0.0), joints=("elbow", "wrist"))
+    return replace(good, **changed)
+
+
+def test_a_good_run_is_good() -> None:
+    assert judge(figures()) == Verdict(
+        True, ("The loop kept 50 Hz: 0 of 1000 periods skipped, worst wake-up 80 us late.",)
+    )
+
+
+@pytest.mark.parametrize(
+    ("code", "source", "text", "sentence"),
+    [
+        (EventCode.PORT_LOST, "main", "main: the adapter is gone", "Bus main was lost: main: the adapter"),
+        (EventCode.SERVO_LOST, "elbow", "missed 3", "Servos failed: elbow was lost."),
+        (EventCode.SERVO_REBOOTED, "elbow", "started anew", "Servos failed: elbow rebooted."),
+        (EventCode.SERVO_LIMP, "elbow", "Torque Enable 0", "Servos failed: elbow lost its torque."),
+        (EventCode.CONTROLLER_FAULT, "head", "no", "One error was logged; the first, of head: no"),
+        (EventCode.WATCHDOG, "main", "stopped", "One error was logged; the first, of main: stopped"),
+    ],
+)
+def test_no_run_with_a_loss_or_an_error_is_good(  # noqa: PLR0917  what is written, and fixtures
+    write: Make, cycle: Make, said: Make, code: EventCode, source: str, text: str, sentence: str
+) -> None:
+    cycles = [cycle(number) for number in range(100)]
+    verdict = analyze_log(write(cycles, events=[said(code, Severity.ERROR, text, source)])).verdict
+    assert not verdict.good
+    assert verdict.sentences[0].startswith(sentence)
+
+
+def test_what_happened_to_one_servo_is_said_of_it_at_once(write: Make, cycle: Make, said: Make) -> None:
+    codes = [EventCode.SERVO_LOST, EventCode.SERVO_REBOOTED, EventCode.SERVO_LOST, EventCode.SERVO_LIMP]
+    events = [said(EventCode.SERVO_LOST, Severity.ERROR, "away", "wrist")]
+    events += [said(code, Severity.ERROR, "", "elbow") for code in codes]
+    events += [said(EventCode.SERVO_REBOOTED, Severity.ERROR, "", name) for name in ("knee", "toe")]
+    sentence = analyze_log(write([cycle(0)], events=events)).verdict.sentences[0]
+    assert sentence == (
+        "Servos failed: elbow rebooted, was lost 2 times and lost its torque; wrist was lost; "
+        "knee rebooted; and 1 more servo."
+    )
+
+
+@pytest.mark.parametrize(("skipped", "good"), [(0, True), (100, True), (101, False)])
+def test_as_many_periods_may_be_skipped_as_the_file_tolerates(skipped: int, good: bool) -> None:
+    account = Periods(1000, 1000 - skipped, skipped, 0, True, 50.0, 20.0, (50.0,))
+    verdict = judge(figures(periods=account))
+    assert verdict.good is good
+    assert verdict.sentences[0].startswith("The loop kept" if good else "The loop did not keep 50 Hz: 101 of")
+    assert judge(figures(periods=account, tolerated_skips=0.5)).good
+    assert judge(figures(periods=account, tolerated_skips=0.0)).good is (skipped == 0)
+
+
+def test_the_tolerance_is_that_of_the_robot_file_in_the_log(tmp_path: Path, write: Make, cycle: Make) -> None:
+    robot = tmp_path / "robot.yaml"
+    text = TORSO.read_text().replace("loop:\n", "loop:\n  tolerated_skips: 60 %\n")
+    robot.write_text(text.replace("model: {urdf", "# {"))
+    log = tmp_path / "simulated.mcap"
+    simulated_robot(robot, duration_s=0.1, log=log).run()
+    assert figures_of(log).tolerated_skips == 0.6
+
+    path = write([cycle(0), cycle(20, skipped=19)], plan={"loop": {"tolerated_skips": 0.6}})
+    assert analyze_log(path).verdict.good
+    path.unlink()
+    path = write([cycle(0), cycle(20, skipped=19)], plan={"loop": {"tolerated_skips": "all"}})
+    assert not analyze_log(path).verdict.good
+
+
+@pytest.mark.parametrize(("skipped", "good"), [(10, True), (11, False)])
+def test_a_short_run_may_skip_what_one_of_two_seconds_may(skipped: int, good: bool) -> None:
+    short = Periods(20, 20 - skipped, skipped, 0, True, 50.0, 0.4, (50.0,))
+    assert judge(figures(periods=short)).good is good
+
+
+@pytest.mark.parametrize(("invalid", "good"), [(2, True), (3, False)])
+def test_two_replies_of_a_short_run_may_be_missing(invalid: int, good: bool) -> None:
+    short = Periods(20, 20, 0, 0, True, 50.0, 0.4, (50.0,))
+    assert judge(figures(periods=short, invalid=(invalid, 0))).good is good
+
+
+@pytest.mark.parametrize(("invalid", "good"), [(0, True), (10, True), (11, False), (500, False)])
+def test_a_joint_may_be_unknown_in_one_cycle_of_a_hundred(invalid: int, good: bool) -> None:
+    verdict = judge(figures(invalid=(0, invalid)))
+    assert verdict.good is good
+    if not good:
+        assert verdict.sentences[0] == (
+            f"States were invalid: wrist in {invalid / 10:.1f}% of the cycles; 1% tolerated."
+        )
+
+
+def test_invalid_states_are_counted_by_joint(write: Make, cycle: Make) -> None:
+    path = write([cycle(number, valid=number % 2 == 0) for number in range(100)])
+    sentence = analyze_log(path).verdict.sentences[0]
+    assert sentence.startswith("States were invalid: left_elbow_joint in 50.0% of the cycles;")
+
+
+def test_what_hurt_most_comes_first(write: Make, cycle: Make, said: Make) -> None:
+    cycles = [cycle(number + number // 5, skipped=int(number % 5 == 0 < number)) for number in range(100)]
+    half = [replace(one, valid=index % 2 == 0) for index, one in enumerate(cycles)]
+    tenth = [replace(one, valid=index % 10 > 0) for index, one in enumerate(cycles)]
+    lost = said(EventCode.SERVO_LOST, Severity.ERROR, "", "elbow")
+    gone = said(EventCode.PORT_LOST, Severity.ERROR, "unplugged", "main")
+
+    def told(cycles: list[Any], *events: Any) -> list[str]:
+        path = write(cycles, events=events)
+        sentences = analyze_log(path).verdict.sentences
+        path.unlink()
+        return [sentence.split(maxsplit=2)[1] for sentence in sentences]
+
+    assert told(half) == ["were", "loop"]  # 50 % of the states, 16 % of the periods
+    assert told(tenth) == ["loop", "were"]
+    assert told(half, lost, gone) == ["main", "failed:", "were", "loop"]
+
+
+# What helps
+
+
+@pytest.mark.parametrize(
+    ("real_time", "helps"),
+    [
+        (RealTime(), "`loop: {scheduler: {policy: round_robin}}` in the robot file helps."),
+        (RealTime(asked=True), "the real-time scheduler that the robot file asks for was not granted, and"),
+        (
+            RealTime(asked=True, granted=True),
+            "the real-time scheduler was granted; a real-time kernel helps.",
+        ),
+        (RealTime(True, True, True), "scheduler and kernel are real-time ones, so it is the machine"),
+    ],
+)
+def test_no_scheduler_is_recommended_that_was_granted(real_time: RealTime, helps: str) -> None:
+    rough = Latency(900.0, 100.0, 50.0, 9, 0.03, 0.0, 0.0)
+    verdict = judge(figures(latency=rough, real_time=real_time))
+    assert verdict.good
+    assert f"3.0% came later than 150 us; {helps}" in verdict.sentences[1]
+
+
+@pytest.mark.parametrize(
+    ("severity", "text", "granted"),
+    [
+        (Severity.INFO, "scheduler round_robin, priority 31", True),
+        (Severity.WARNING, "scheduler round_robin 31 was refused", False),
+        (Severity.WARNING, "memory is not locked", False),
+    ],
+)
+def test_what_was_granted_is_read_from_the_log(
+    write: Make, said: Make, severity: Severity, text: str, granted: bool
+) -> None:
+    about = {"scheduler": {"policy": "round_robin"}, "kernel": {"version": "#1 SMP PREEMPT_RT"}}
+    path = write(events=[said(EventCode.SCHEDULER, severity, text, "loop")], metadata=about)
+    assert figures_of(path).real_time == RealTime(True, granted, True)
+
+
+def exchanges(wire: Make, took_us: int, count: int = 5) -> list[Any]:
+    packets = []
+    for at in range(0, count * 50_000, 50_000):
+        packets.append(wire(PacketKind.INSTRUCTION, 5, at, ASK))
+        packets.append(wire(PacketKind.STATUS, 5, at + took_us - 10, ANSWER, at + took_us))
+    return packets
+
+
+@pytest.mark.parametrize(
+    ("extra_us", "latency_ms", "told"),
+    [
+        (300, 1, ""),
+        (2900, 1, ""),
+        (3100, 1, "Replies on bus main come 3100 us later than the wire needs, and the robot file says"),
+        (15_800, 1, "a latency timer of 16 ms; `echo 1 | sudo tee /sys/bus/usb-serial/devices/ttyUSB3/"),
+        (15_800, 16, ""),
+    ],
+)
+def test_replies_are_compared_with_the_plan(  # noqa: PLR0917  what is written, and fixtures
+    write: Make, cycle: Make, wire: Make, extra_us: int, latency_ms: int, told: str
+) -> None:
+    wire_us = 10 * (len(ASK) + len(ANSWER)) + 500
+    plan = {"buses": [PLANNED | {"latency_ns": latency_ms * MS}]}
+    report = analyze_log(write([cycle(0)], exchanges(wire, wire_us + extra_us), plan=plan))
+    assert report.buses[0].extra_us == pytest.approx(extra_us)
+    assert report.verdict.good
+    (late,) = [one for one in report.verdict.sentences if one.startswith("Replies on")] or [""]
+    assert told in late
+    assert ("latency timer" in late) is (extra_us > 12_000 and latency_ms == 1)
+    assert "cable" not in late
+
+
+def test_a_request_that_waits_for_the_line_is_not_late(write: Make, cycle: Make, wire: Make) -> None:
+    goals = bytes.fromhex("ffffff") + bytes(500)  # 5 ms of the line
+    packets = []
+    for at in range(0, 250_000, 50_000):
+        packets.append(wire(PacketKind.INSTRUCTION, 254, at, goals))
+        packets.append(wire(PacketKind.INSTRUCTION, 5, at + 10, ASK))
+        packets.append(wire(PacketKind.STATUS, 5, at + 5900, ANSWER))
+    plan = {"buses": [PLANNED | {"latency_ns": MS}]}
+    extra_us = analyze_log(write([cycle(0)], packets, plan=plan)).buses[0].extra_us
+    assert extra_us is not None
+    assert extra_us < 500
+
+
+def test_replies_that_wait_for_the_next_cycle_are_not_late(write: Make, cycle: Make, wire: Make) -> None:
+    plan = {"buses": [PLANNED | {"latency_ns": MS, "split": True}]}
+    assert analyze_log(write([cycle(0)], exchanges(wire, 19_000), plan=plan)).buses[0].extra_us is None
+
+
+def test_the_timer_of_a_port_by_its_id_has_a_command_too() -> None:
+    line = BusTraffic("main", 9, 0, 9, 0, 90, 90, 15_900.0, 1000.0, "/dev/serial/by-id/usb-FTDI")
+    (sentence,) = [one for one in judge(figures(buses=(line,))).sentences if "timer" in one]
+    assert "devices/$(basename $(readlink -f /dev/serial/by-id/usb-FTDI))/latency_timer" in sentence
+    simulated = replace(line, port="sim")
+    assert not any("timer" in one for one in judge(figures(buses=(simulated,))).sentences)
+
+
+# One verdict
+
+
+@pytest.fixture(scope="module")
+def storm(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The log of a stormy run, in small chunks, with streams, pauses and refusals."""
+    path = tmp_path_factory.mktemp("storm") / "run.mcap"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(log_writer, "CHUNK_BYTES", 4096)
+        robot = simulated_robot(TORSO, duration_s=4.0, log=path)
+    script = FaultScript(
+        [parse_fault("storm seed=3 faults=12 within=3s kinds=lose,silence,noise,reboot at=300ms")]
+    )
+    script.attach(robot.buses)
+    asked = (
+        *((at, "rate", b'{"rate": 40}') for at in (600, 1900)),
+        *((at, "pause", b"") for at in (700, 2000)),
+        (750, "pause", b""),
+        *((at, "resume", b"") for at in (900, 2500)),
+    )
+    for number, (at_ms, kind, data) in enumerate(asked, start=1):
+        command = Command(number, "", kind, data, "anna")
+        robot.buses[0].at(at_ms * MS, lambda command=command: robot.inbox.waiting.append(command))
+    robot.run()
+    return path
+
+
+def test_a_log_counted_in_slices_is_the_log_counted_as_a_whole(
+    storm: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in (bus, latency, steering):
+        monkeypatch.setattr(module, "DISORDER_NS", 200 * MS)
+    slices: list[Log] = []
+    scan_log(storm, slices.append)
+    assert len(slices) > 20
+    assert max(len(one.cycles) for one in slices) < 20
+    tally = Tally()
+    tally.take(read_log(storm))
+    whole = tally.figures(read_log(storm))
+    assert figures_of(storm) == whole
+    assert whole.servos[0].lost
+    assert len(whole.pauses) == 2
+    assert whole.events
+
+
+def test_an_event_is_not_cut_where_a_slice_ends(
+    write: Make, said: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(log_writer, "CHUNK_BYTES", 64)
+    text = "Traceback\n" + "x" * 2000 + "\nValueError: the end"
+    events = [
+        said(EventCode.CONTROLLER_FAULT, Severity.ERROR, text),
+        said(EventCode.LOOP_STARTED, Severity.INFO, ""),
+    ]
+    path = write(events=events)
+    assert figures_of(path).events == analyze_figures(path).events
+    assert figures_of(path).events[0].text == text
+
+
+def analyze_figures(path: Path) -> Figures:
+    log = read_log(path)
+    tally = Tally()
+    tally.take(log)
+    return tally.figures(log)
+
+
+def test_page_and_json_and_run_say_the_same(storm: Path) -> None:
+    log = read_log(storm)
+    report = analyze(log)
+    said = judge(figures_of(storm))
+    assert not said.good
+    assert report.verdict == said
+    told = json.loads(to_json(report))["verdict"]
+    assert (told["good"], tuple(told["sentences"])) == (said.good, said.sentences)
+    text = page(log, report)
+    assert "Verdict: not good" in text
+    assert all(f"<p>{sentence}</p>" in text for sentence in said.sentences)
+
+
+def test_what_is_not_read_whole_is_told_of_a_scanned_log_too(storm: Path, tmp_path: Path) -> None:
+    cut = tmp_path / "cut.mcap"
+    data = storm.read_bytes()
+    cut.write_bytes(data[: len(data) * 2 // 3])
+    assert judge(figures_of(cut)) == analyze_log(cut).verdict
+    assert any("log is not whole" in sentence for sentence in judge(figures_of(cut)).sentences)
