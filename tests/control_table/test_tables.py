@@ -250,3 +250,20 @@ def test_the_motor_is_that_of_the_specifications(
 ) -> None:
     table = control_table(model, protocol)
     assert (table.gear_ratio, table.stall_current, table.nominal_voltage) == (gear, amperes, volts)
+
+
+@pytest.mark.parametrize(
+    ("model", "initial"),
+    [  # e-Manual, Control Table of each page: Max Voltage Limit, Velocity Limit, Velocity I, Position D and P
+        ("XL430-W250", (140, 265, 1000, 4000, 640)),
+        ("2XL430-W250", (140, 250, 1800, 2000, 640)),
+        ("XC430-W150", (160, 460, 1920, 0, 460)),
+        ("XC430-W240", (160, 306, 1920, 0, 700)),
+        ("2XC430-W250", (160, 275, 1920, 0, 700)),
+    ],
+)
+def test_factory_values_of_the_430s_without_current(model: str, initial: tuple[int, ...]) -> None:
+    items = control_table(model).items
+    names = ("max_voltage_limit", "velocity_limit", "velocity_i_gain", "position_d_gain", "position_p_gain")
+    assert tuple(items[name].initial for name in names) == initial
+    assert items["min_voltage_limit"].maximum == items["max_voltage_limit"].maximum == initial[0]

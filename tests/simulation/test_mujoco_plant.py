@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from dxlrun.errors import InputError
+from dxlrun.simulation.mechanics import Mechanics
 from dxlrun.simulation.motor import Motor
 from dxlrun.simulation.mujoco_plant import UrdfBodies, UrdfJoint, mujoco_plant
 from dxlrun.simulation.plant import NO_LOAD, IndependentJoints, Joint, Load, Plant
@@ -270,3 +271,16 @@ def test_mujoco_that_is_not_installed_is_named_with_its_extra(monkeypatch: pytes
     monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(InputError, match=r"pip install 'dxlrun\[physics\]'"):
         mujoco_plant(UrdfBodies(ONE, (UrdfJoint("shoulder", 0.0, 1),)))
+
+
+def test_a_hand_turns_a_body_evenly() -> None:
+    mechanics = Mechanics(0, mujoco_plant(UrdfBodies(ONE, (UrdfJoint("shoulder", 0.0, 1),))))
+    mechanics.add(ROTOR, NO_LOAD, 0.0)
+    mechanics.turn(0, 0.5, 1_000_000_000, lambda turned: pytest.fail("nothing drives it"))
+    mechanics.advance(500_000_000)
+    assert mechanics.plant.angle[0] == pytest.approx(0.25)
+    assert mechanics.plant.velocity[0] == pytest.approx(0.5)
+    mechanics.advance(1_000_000_000)
+    assert mechanics.plant.angle[0] == pytest.approx(0.5)
+    mechanics.advance(1_300_000_000)  # then the hand lets go, and it falls
+    assert mechanics.plant.angle[0] < 0.4
