@@ -79,6 +79,8 @@ class EventCode(IntEnum):
     """A servo is near its Temperature Limit, or has cooled down again."""
     WATCHDOG = 43
     """The Bus Watchdog of servos was armed, disarmed, or has stopped them."""
+    UNREQUESTED = 46
+    """Packets came that answer no request of this run: another host writes on the line."""
     GUARDIAN = 50
     RECORDER = 60
     RECORDER_GAP = 61

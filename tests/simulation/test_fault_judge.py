@@ -10,9 +10,11 @@ from typing import Any, NamedTuple
 import pytest
 
 from dxlrun.analysis.ledger_report import compare
-from dxlrun.events import Event, EventCode
+from dxlrun.dynamixel import protocol2
+from dxlrun.events import Event, EventCode, Severity
 from dxlrun.recording.reader import Log, read_log
 from dxlrun.simulation import LedgerEntry
+from dxlrun.simulation.bus import OTHER_HOST
 from dxlrun.testing import simulated_robot
 
 ROBOT = """\
@@ -89,3 +91,32 @@ def test_a_fault_that_is_answered_is_good(run: Run):
     assert (report.good, report.uncaused) == (True, ())
     (fault,) = report.faults
     assert {answer.source for answer in fault.answers} == {"j2"}
+
+
+@pytest.fixture(scope="module")
+def shared_line(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A run in which another host sends goals to the second servo, between the exchanges and into them."""
+    directory = tmp_path_factory.mktemp("shared")
+    path, log = directory / "three.yaml", directory / "run.mcap"
+    path.write_text(ROBOT + "".join(JOINT.format(id=number) for number in (1, 2, 3)))
+    robot = simulated_robot(path, duration_s=2.0, log=log)
+    for number in range(10):
+        packet = protocol2.write(2, 116, (2048).to_bytes(4, "little"))
+        robot.buses[0].other_host(packet, 1_000_000_000 + number * 31_000_000)
+    robot.run()
+    return Run(read_log(log), list(robot.ledger.entries))
+
+
+def test_another_host_on_the_line_leaves_an_event_that_has_its_cause_in_the_ledger(shared_line: Run):
+    told = [event for event in shared_line.log.events if event.code == EventCode.UNREQUESTED]
+    assert [(event.source, event.severity) for event in told] == [("main", Severity.WARNING)]
+    report = compare(shared_line.log, shared_line.entries, Path("ledger"))
+    assert (report.good, report.uncaused) == (True, ())
+
+
+def test_packets_of_another_host_that_is_not_there_fail(shared_line: Run, judge: Any):
+    entries = [entry for entry in shared_line.entries if not entry.note.startswith(OTHER_HOST)]
+    with pytest.raises(AssertionError, match="unrequested"):
+        judge.faults_and_events_answer_each_other(entries, shared_line.log)
+    report = compare(shared_line.log, entries, Path("ledger"))
+    assert "unrequested" in {one.name for one in report.uncaused}

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from dxlrun.errors import InputError
 from dxlrun.events import Event, EventCode, Severity
 from dxlrun.simulation import LedgerEntry
+from dxlrun.simulation.bus import OTHER_HOST
 from dxlrun.simulation.fault_kinds import BABBLE_NS, BOOT_NS, BROWNOUT_NS, TURN_NS
 from dxlrun.simulation.faults import Fault, parse_fault
 
@@ -28,6 +29,7 @@ _SHORTEST_PERIODS = 4
 
 _MISSED = frozenset((EventCode.READ_LOST, EventCode.SERVO_LOST))
 _GARBLED = _MISSED | {EventCode.BUS_NOISE}
+_OTHER_HOST = _GARBLED | {EventCode.UNREQUESTED}
 _POWER = frozenset((EventCode.SERVO_LIMP, EventCode.SERVO_REBOOTED))
 _ERROR = frozenset((EventCode.SERVO_ERROR, EventCode.SERVO_LIMP))
 _SENTENCES = frozenset((EventCode.SETUP, EventCode.SHUTDOWN_FAILED))
@@ -78,7 +80,7 @@ _CONSEQUENCES: Mapping[str, frozenset[EventCode]] = {
     "brownout": _GARBLED | _ERROR,  # its supply falls and rises
     "unplug": _GARBLED | _POWER | _ERROR,  # what happens meanwhile is seen when it is back
 }
-_NEEDS_CAUSE = _GARBLED | _POWER | _ERROR | {EventCode.PORT_LOST, EventCode.SHUTDOWN_FAILED}
+_NEEDS_CAUSE = _OTHER_HOST | _POWER | _ERROR | {EventCode.PORT_LOST, EventCode.SHUTDOWN_FAILED}
 _SILENT = _MISSED | {EventCode.PORT_LOST}
 _HEARD = frozenset((EventCode.READ_BACK, EventCode.SERVO_BACK, EventCode.PORT_BACK))
 _OWN = ("shutdown", "overload", "reboot", "power cycle")
@@ -296,6 +298,8 @@ def _causes(entries: Iterable[LedgerEntry]) -> list[_Cause]:
             found += _causes_of(entry)
         elif entry.note.startswith("collision: "):
             found.append(_Cause(entry.t_ns, entry.t_ns, entry.bus, None, _GARBLED))
+        elif entry.note.startswith(OTHER_HOST):
+            found.append(_Cause(entry.t_ns, entry.t_ns, entry.bus, None, _OTHER_HOST))
         elif entry.note.startswith("servo "):
             number, _, what = entry.note.removeprefix("servo ").partition(": ")
             if number.isdecimal() and what.startswith(_OWN):

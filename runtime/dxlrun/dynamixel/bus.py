@@ -85,6 +85,7 @@ class Bus(Listener):
 
         `lane`: the quick way through it, if there is one.
         """
+        self._owe()
         self._awaited = self._burst = self._lane = None
         self._state = READY
         if self.failure is not None:
@@ -113,6 +114,7 @@ class Bus(Listener):
 
     def drop(self) -> None:
         """Forget the loaded job; what still comes for it belongs to nobody."""
+        self._owe()
         self._job = self._awaited = self._burst = self._lane = None
         self._state = READY
 
@@ -243,6 +245,7 @@ class Bus(Listener):
     def _begin(self, job: Job) -> int:
         """Hand the reply to the job and start its next transaction; return the time after that."""
         reply = self._reply
+        self._before = self._awaited
         self._awaited = transaction = job.advance(None if self._awaited is None else reply)
         if transaction is None:
             self._job = None
@@ -272,6 +275,7 @@ class Bus(Listener):
         self._receiver.flush()  # the reply may stand behind a false header
         if self._state != AWAITING:
             return
+        self._owe()
         self._reply.outcome = Outcome.GARBLED if self._reply.strays else Outcome.TIMEOUT
         self._drain_end_ns = now_ns + DRAIN_LIMIT_NS
         self._deadline_ns = self._quiet_at()

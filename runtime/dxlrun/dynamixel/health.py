@@ -32,6 +32,10 @@ from dxlrun.plurals import counted
 
 NOISE_EVENT_NS = 1_000_000_000
 """A noisy line has at most one event in this time."""
+UNREQUESTED_EVENT_NS = 10_000_000_000
+LEAST_UNREQUESTED = 2
+"""Packets that no request explains, for one event: an instruction of another host, and the reply to it. One
+alone can be noise that looks like a packet: the checksum of Protocol 1.0 is a byte [i]."""
 
 ALERT_AGAIN = 50
 """Cycles after which a standing alert is read again: a second error does not change the alert bit."""
@@ -81,6 +85,8 @@ class Servos:
         "_shown",
         "_slow",
         "_strained",
+        "_unrequested_at_ns",
+        "_unrequested_seen",
         "feeding",
         "goals",
         "reads",
@@ -128,6 +134,8 @@ class Servos:
         self._probed = 0
         self._noise_seen = 0
         self._noise_at_ns = -NOISE_EVENT_NS
+        self._unrequested_seen = 0
+        self._unrequested_at_ns = -UNREQUESTED_EVENT_NS
         self._lost = False
         self._gone: set[int] = set()  # who gets no torque any more, as its group's policy says
         self.feeding = Feeding(
@@ -164,7 +172,20 @@ class Servos:
             self._noise_seen, self._noise_at_ns = self._bus.noise_bytes, now_ns
             text = f"{counted(count, 'byte', 'bytes')} belonged to no packet"
             self._emit(EventCode.BUS_NOISE, Severity.WARNING, self._plan.name, text)
+        if self._bus.unrequested != self._unrequested_seen:
+            self._tell_unrequested(now_ns)
         return everybody
+
+    def _tell_unrequested(self, now_ns: int) -> None:
+        """Tell of another host on the line, now and then."""
+        count = self._bus.unrequested - self._unrequested_seen
+        if count >= LEAST_UNREQUESTED and now_ns - self._unrequested_at_ns >= UNREQUESTED_EVENT_NS:
+            self._unrequested_seen, self._unrequested_at_ns = self._bus.unrequested, now_ns
+            text = (
+                f"{count} packets on bus {self._plan.name} answer no request of this run: another program or "
+                "another computer writes on the line; stop it, or its commands move these servos too"
+            )
+            self._emit(EventCode.UNREQUESTED, Severity.WARNING, self._plan.name, text)
 
     def _look(self, now_ns: int) -> bool:
         """Look at everybody's reply; return whether all are there."""

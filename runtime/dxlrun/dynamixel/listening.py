@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 from dxlrun.dynamixel.bus_plan import BusPlan
 from dxlrun.dynamixel.dialect import dialect_of
@@ -21,6 +21,11 @@ READY, AWAITING, RESTING, DRAINING = range(4)
 _SENT, _OK, _TIMEOUT = Outcome.SENT, Outcome.OK, Outcome.TIMEOUT
 _STATUS = PacketKind.STATUS
 
+_Shape: TypeAlias = tuple[int, int]
+"""ID and number of parameter bytes of a status packet."""
+_FAST: _Shape = (BROADCAST_ID, 0)
+"""Of the one status packet of a fast form, whatever its length."""
+
 
 class Listener:
     """The ear of a bus.
@@ -31,7 +36,9 @@ class Listener:
 
     __slots__ = (
         "_awaited",
+        "_before",
         "_burst",
+        "_cyclic",
         "_deadline_ns",
         "_dialect",
         "_earliest_ns",
@@ -39,6 +46,7 @@ class Listener:
         "_last_byte_ns",
         "_open",
         "_overhead",
+        "_owed",
         "_receiver",
         "_refused",
         "_reply",
@@ -52,6 +60,7 @@ class Listener:
         "index",
         "noise_bytes",
         "room",
+        "unrequested",
     )
 
     def __init__(self, index: int, plan: BusPlan, packets: PacketSink) -> None:
@@ -59,6 +68,18 @@ class Listener:
         """Its number in the log."""
         self.noise_bytes = 0
         """Bytes that belonged to no intact packet, since the start."""
+        self.unrequested = 0
+        """Packets since the start that no request of this host explains: instructions of another one, and the
+        replies to them."""
+        cyclic = {
+            (servo.servo_id, servo.state.length + more)  # as many as late replies are told apart by
+            for servo in plan.servos
+            for more in range(1 + servo.state.spare)
+        }
+        self._cyclic = frozenset(cyclic | {_FAST}) if any(plan.fast) else frozenset(cyclic)
+        self._before: Transaction | None = None  # the one before the awaited one
+        self._owed: dict[_Shape, int] = {}
+        """Replies that did not come in time and may come late, beside those to cyclic reads."""
         self._sink = packets
         self.byte_ns = BITS_PER_BYTE * 1_000_000_000 // plan.baud_rate
         """What a byte takes on the wire, ns."""
@@ -106,6 +127,17 @@ class Listener:
             self._state = RESTING
             self._deadline_ns = started_ns + transaction.due_ns
         self.due_ns = started_ns + transaction.due_ns
+
+    def _owe(self) -> None:
+        """Note the replies to a transaction that is given up; they may still come."""
+        if self._awaited is None:
+            return
+        self._before = self._awaited
+        if self._state == AWAITING:
+            for index, one in enumerate(self._awaited.awaited):
+                shape = one.servo_id, one.length
+                if self._open >> index & 1 and shape not in self._cyclic:
+                    self._owed[shape] = self._owed.get(shape, 0) + 1
 
     def _hear(self, count: int, at_ns: int) -> None:
         """Take the first bytes of a burst."""
@@ -236,3 +268,27 @@ class Listener:
         self._reply.strays += 1
         if self._awaited is not None and packet == self._awaited.packet:
             self._reply.echoed = True
+        elif not self._explained(packet):
+            self.unrequested += 1
+
+    def _explained(self, packet: memoryview) -> bool:
+        """Say whether a packet that is not awaited can be a reply to this host: a late one, or a second one.
+
+        Replies are told apart by ID and length, so those of another host that reads what this one reads are
+        taken for late ones.
+        """
+        status = self._dialect.opened(packet)
+        if status is None:
+            return False
+        shape = _FAST if status.servo_id == BROADCAST_ID else (status.servo_id, len(status.parameters))
+        if shape in self._cyclic or shape in _shapes(self._awaited) or shape in _shapes(self._before):
+            return True
+        owed = self._owed.pop(shape, 0)
+        if owed > 1:
+            self._owed[shape] = owed - 1
+        return owed > 0
+
+
+def _shapes(transaction: Transaction | None) -> list[_Shape]:
+    """Return ID and length of the replies to a transaction."""
+    return [] if transaction is None else [(one.servo_id, one.length) for one in transaction.awaited]

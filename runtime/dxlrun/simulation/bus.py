@@ -33,6 +33,9 @@ from dxlrun.simulation.said import Readings
 from dxlrun.simulation.servo import ServoConfig, SimulatedServo
 from dxlrun.simulation.wire import STATUS_BYTES, Alteration, Chain, Change, Chunk, Wire, flipped
 
+OTHER_HOST = "another host sends"
+"""How the note of an instruction of another host begins in the ledger."""
+
 
 class SimulatedBus:
     """One line; time comes from the caller and never goes back."""
@@ -215,6 +218,24 @@ class SimulatedBus:
     def delay_next(self, servo_id: int, delay_ns: int) -> None:
         """Let a servo's next reply start later."""
         self.alter_next(servo_id, f"its reply delayed by {delay_ns} ns", bytes, delay_ns=delay_ns)
+
+    def other_host(self, packet: bytes, at_ns: int, *, heard: bool = True) -> None:
+        """Let another host on the line send an instruction packet at a time: the servos execute it, and this
+        host gets the instruction and their replies.
+
+        `heard=False`: it sends by the adapter of this host, which gives back the replies only.
+        """
+
+        def send() -> None:
+            self.note(f"{OTHER_HOST} {packet.hex(' ')}")
+            start_ns, end_ns = self._now_ns, self._now_ns + self._wire.duration_ns(len(packet))
+            if heard:
+                self._wire.send(Chunk(start_ns, end_ns, packet, "another host"))
+            instruction = self._codec.receiver().feed(packet, 0)
+            if instruction is not None:
+                self._execute(instruction, end_ns)
+
+        self.at(at_ns, send)
 
     def inject_noise(self, data: bytes, at_ns: int) -> None:
         """Put bytes on the line that no servo sent, toward the host, beginning at `at_ns`."""

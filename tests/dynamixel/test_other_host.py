@@ -1,0 +1,141 @@
+"""Another host on the line: its packets and the replies to them leave an event, own faults leave none."""
+
+import math
+
+import pytest
+
+from dxlrun.dynamixel import protocol1, protocol2
+from dxlrun.dynamixel.health import UNREQUESTED_EVENT_NS
+from dxlrun.events import EventCode
+
+WAYS = ["plain", "bulk", "sync", "fast"]
+IDLE_NS = 15_000_000
+"""From the beginning of a cycle to when its exchange is over, and the next one has not begun."""
+
+
+@pytest.fixture
+def build(make_rig, make_plan):
+    """Start four servos that are read in a way; return them, and the dialect of their line."""
+
+    def started(way):
+        if way in ("plain", "bulk"):
+            plan = make_plan((1, 2, 3, 4), model="AX-12A" if way == "plain" else "MX-28")
+        else:
+            plan = make_plan(
+                (1, 2, 3, 4),
+                protocol=2.0,
+                model="XM430-W350",
+                reference=math.pi,
+                lower=-2.5,
+                upper=2.5,
+                fast=way == "fast",
+            )
+        rig = make_rig(plan)
+        rig.hardware.start()
+        rig.cycle()
+        return rig, protocol1 if plan.protocol == 1.0 else protocol2
+
+    return started
+
+
+def told(rig):
+    return rig.events.of(EventCode.UNREQUESTED)
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("heard", [True, False], ids=["adapter of its own", "same adapter"])
+def test_another_host_that_asks_between_the_exchanges_leaves_an_event(build, way, heard):
+    rig, dialect = build(way)
+    bus = rig.buses[0]
+    for number in range(2):
+        bus.other_host(dialect.read(2, 24, 1), rig.clock.now_ns() + IDLE_NS, heard=heard)
+        assert told(rig) == []
+        rig.cycle()
+        assert rig.states.valid.all()
+        if heard and not number:
+            rig.cycle()
+            break
+    else:
+        rig.cycle()
+    ((source, text),) = told(rig)
+    assert source == "main"
+    assert text.startswith("2 packets on bus main answer no request of this run: another program or")
+    assert rig.packets.received() == rig.out_of_bus()
+    assert rig.states.valid.all()
+    assert rig.torque() == [True] * 4
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_another_host_that_talks_into_the_exchange_leaves_an_event(build, way):
+    rig, dialect = build(way)
+    for _ in range(20):
+        rig.buses[0].other_host(dialect.write(3, 25, b"\x01"), rig.clock.now_ns() + 600_000)
+        rig.cycle()
+    assert len(told(rig)) == 1
+    assert rig.packets.received() == rig.out_of_bus()
+
+
+def test_a_host_that_goes_on_leaves_one_event_in_ten_seconds(build):
+    rig, dialect = build("sync")
+    since_ns = rig.clock.now_ns()
+    while rig.clock.now_ns() < since_ns + 1.5 * UNREQUESTED_EVENT_NS:
+        rig.buses[0].other_host(dialect.ping(4), rig.clock.now_ns() + IDLE_NS)
+        rig.cycle()
+    counts = [int(text.partition(" ")[0]) for _, text in told(rig)]
+    assert len(counts) == 2
+    assert counts[0] == 2
+    assert 900 < counts[1] < 1100  # ten seconds of 50 Hz, an instruction and a status each
+
+
+def test_one_packet_is_not_yet_another_host(build):
+    rig, dialect = build("plain")
+    rig.buses[0].other_host(dialect.read(9, 24, 1), rig.clock.now_ns() + IDLE_NS)  # there is none of this ID
+    for _ in range(3):
+        rig.cycle()
+    assert told(rig) == []
+
+
+def lose(bus, servo_id):
+    bus.truncate_next(servo_id, 0)
+
+
+def delay(bus, servo_id):
+    bus.delay_next(servo_id, 14_000_000)
+
+
+def delay_beyond_the_cycle(bus, servo_id):
+    bus.delay_next(servo_id, 31_000_000)
+
+
+def duplicate(bus, servo_id):
+    bus.alter_next(servo_id, "twice", bytes, copies=3)
+
+
+def noise(bus, servo_id):
+    bus.inject_noise(b"\xff\xff\xfd\x00\x05\x07\xff\xff\x02\x04", bus.now_ns + 600_000)
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("fault", [lose, delay, delay_beyond_the_cycle, duplicate, noise])
+def test_late_doubled_and_broken_replies_are_not_taken_for_those_to_another_host(build, way, fault):
+    rig, _ = build(way)
+    for number in range(80):
+        if number % 4 == 0:
+            fault(rig.buses[0], 1 + number // 4 % 4)
+        rig.cycle()
+    assert rig.events.of(EventCode.READ_LOST) or fault in (duplicate, noise)
+    assert told(rig) == []
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_servo_that_was_away_and_is_asked_again_is_no_other_host(build, way):
+    rig, _ = build(way)
+    servo = rig.buses[0].servo(2)
+    for number in range(300):
+        if number in (20, 150):
+            servo.silence(number == 20)
+        if 150 <= number < 190:
+            delay(rig.buses[0], 2)
+        rig.cycle()
+    assert rig.events.of(EventCode.SERVO_LOST)
+    assert told(rig) == []
