@@ -43,7 +43,7 @@ def run(tmp_path_factory: pytest.TempPathFactory, judge: Any) -> Run:
     trial = judge.Trial.of(robot, [FAULT])
     robot.run()
     read = read_log(log)
-    trial.judge(read, started=True)
+    trial.judge(read)
     return Run(read, list(robot.ledger.entries))
 
 
