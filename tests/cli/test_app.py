@@ -1,3 +1,4 @@
+import json
 import os
 import re
 import subprocess
@@ -178,3 +179,92 @@ def test_a_reader_that_goes_away_is_no_traceback(torso):
         os.close(write_end)
 
     assert (run.returncode, run.stderr) == (1, "")
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "what"),
+    [
+        (["check", "missing.yaml"], 2, "there is no robot file missing.yaml"),
+        (["analyze", "missing.mcap"], 2, "there is no log missing.mcap"),
+        (["analyze", __file__], 2, "this is no MCAP file"),
+        (["replay", __file__], 2, "this is no MCAP file"),
+        (["models", "toaster"], 2, "there is no model toaster"),
+        (["scan", "/dev/ttyNOPE"], 1, "there is no /dev/ttyNOPE"),
+        (["servo", "/dev/ttyNOPE", "1", "get"], 1, "there is no /dev/ttyNOPE"),
+        (["sim", "--servo", "toaster"], 2, "this is not MODEL:IDS"),
+        (["sim", "missing.yaml"], 2, "there is no robot file missing.yaml"),
+        (["bench", "rate", "missing.yaml"], 2, "there is no robot file missing.yaml"),
+        (["bench", "bus", "--seconds", "soon"], 2, "Invalid value"),
+        (["doctor", "--loud"], 2, "Unknown option"),
+        (["list", "--robot", "nobody"], 2, "no robot nobody runs"),
+        *(
+            ([verb, *more], 1, "no robot runs that could be steered")
+            for verb, more in (
+                ("send", ["head", "posvel"]),
+                ("set", ["pan", "led", "1"]),
+                ("switch", ["--activate", "head"]),
+                ("rate", ["50"]),
+                ("pause", []),
+                ("resume", []),
+                ("load", ["head", "type=x"]),
+                ("unload", ["head"]),
+                ("stop", []),
+            )
+        ),
+    ],
+)
+def test_a_refusal_under_json_is_json(
+    dxlrun, monkeypatch: pytest.MonkeyPatch, words: list[str], code: int, what: str
+):
+    monkeypatch.setattr("dxlrun.remote.client.running", tuple)
+
+    said = dxlrun(*words, "--json")
+
+    refusal = json.loads(said.out)
+    assert (said.code, said.err) == (code, "")
+    assert set(refusal) == {"ok", "errors", "warnings"}
+    assert refusal["ok"] is False
+    assert what in refusal["errors"][0]["what"]
+
+
+def test_an_interrupt_under_json_is_json(dxlrun, monkeypatch: pytest.MonkeyPatch):
+    def interrupt(*_: object):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("dxlrun.cli.check.compiled", interrupt)
+
+    said = dxlrun("check", "robot.yaml", "--json")
+
+    assert (said.code, json.loads(said.out)["errors"]) == (130, [{"what": "interrupted"}])
+
+
+def test_the_usage_says_that_a_robot_and_a_command_are_alternatives(dxlrun):
+    assert dxlrun("--help").out.splitlines()[:2] == [
+        "Usage: dxlrun ROBOT.yaml [ARG:=VALUE ...] [OPTIONS]",
+        "       dxlrun COMMAND ...",
+    ]
+
+
+@pytest.mark.parametrize(
+    "words", [("--help",), ("models", "AX-12A"), ("models",), ("check", "{torso}"), ("doctor",)]
+)
+def test_a_pipe_gets_no_blanks_at_the_ends_of_lines(dxlrun, torso, words: tuple[str, ...]):
+    out = dxlrun(*(word.format(torso=torso) for word in words)).out
+
+    assert [line for line in out.splitlines() if line.endswith(" ")] == []
+
+
+def test_tab_completion_is_installed_where_it_is_asked_for_and_completes(tmp_path):
+    home = os.environ | {"HOME": str(tmp_path)}
+    code = "import sys; from dxlrun.cli import main; sys.exit(main(sys.argv[1:]))"
+    words = [sys.executable, "-c", code, "--install-completion", "--shell", "bash"]
+    subprocess.run(words, env=home, check=True, capture_output=True)
+    script = tmp_path / ".local/share/bash-completion/completions/dxlrun"
+    asked = "; ".join(
+        f"COMP_WORDS=(dxlrun {words}); COMP_CWORD={number}; _dxlrun; echo ${{COMPREPLY[@]}}"
+        for words, number in (("ana", 1), ("check --on", 2), ("--vir", 1))
+    )
+    told = subprocess.run(
+        ["/bin/bash", "-c", f". {script}; {asked}"], check=True, capture_output=True, text=True, cwd=tmp_path
+    )
+    assert told.stdout.splitlines() == ["analyze", "--online", "--virtual"]

@@ -15,7 +15,7 @@ import pytest
 CODE = "import sys; from dxlrun.cli import main; sys.exit(main(sys.argv[1:]))"
 
 
-def on_terminal(columns: int, *words: str) -> str:
+def on_terminal(columns: int, *words: str, terminal: str = "xterm") -> str:
     """Return what a terminal of that width gets to show."""
     ours, theirs = pty.openpty()
     ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
@@ -25,7 +25,7 @@ def on_terminal(columns: int, *words: str) -> str:
         stdin=theirs,
         stdout=theirs,
         stderr=theirs,
-        env=environment | {"TERM": "xterm", "NO_COLOR": "1"},
+        env=environment | {"TERM": terminal, "NO_COLOR": "1"},
     )
     os.close(theirs)
     shown = b""
@@ -57,3 +57,21 @@ def test_no_fact_is_lost_on_a_narrow_terminal(torso: Path, columns: int):
 
 def test_a_wide_terminal_gets_tables(torso: Path):
     assert "─────" in on_terminal(160, "check", str(torso))
+
+
+@pytest.mark.parametrize("terminal", ["xterm", "dumb"])
+@pytest.mark.parametrize("words", [("models", "--protocol", "1.0"), ("models", "AX-12A")])
+def test_no_head_is_cut_on_80_columns(words: tuple[str, ...], terminal: str):
+    shown = on_terminal(80, *words, terminal=terminal)
+
+    assert "…" not in shown
+    assert "300 deg" in shown
+    assert max(map(len, shown.splitlines())) <= 81  # soft wraps end behind the last column
+
+
+@pytest.mark.parametrize("terminal", ["xterm", "dumb"])
+def test_a_table_with_short_heads_fits_80_columns(torso: Path, terminal: str):
+    shown = on_terminal(80, "check", str(torso), terminal=terminal).split("Time of one cycle")[1]
+
+    assert "─────" in shown
+    assert "…" not in shown

@@ -1,8 +1,9 @@
 from collections.abc import Callable
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 import pytest
+from pydantic import Field
 
 from dxlrun import CommandModel, Controller, Interfaces, ParametersModel
 from dxlrun.compile import Compiled, robot
@@ -13,7 +14,7 @@ Find = Callable[..., tuple[Problem, ...]]
 
 
 class Goals(CommandModel):
-    positions: tuple[float, ...]
+    positions: tuple[Annotated[float, Field(ge=-2)], ...]
 
 
 class Foreign(Controller[ParametersModel]):
@@ -80,6 +81,15 @@ def test_what_its_prepare_refuses_is_an_error_of_the_motion(problems_in: Find, t
 
     assert problem.what == "mine refuses this: more than one is too much"
     assert (problem.mark.line, problem.mark.column) == (4, 14)
+
+
+@pytest.mark.usefixtures("foreign_plugins")
+def test_what_its_model_refuses_is_said_in_our_words(problems_in: Find, text: str):
+    (problem,) = problems_in(text, MOTION.replace("1 rad", "-3 rad"))
+
+    assert problem.what == (
+        "mine refuses this: goals.positions[0] is -3.0, but must be at least -2; correct it"
+    )
 
 
 @pytest.mark.usefixtures("foreign_plugins")

@@ -7,13 +7,16 @@ import sys
 import termios
 import time
 import tty
+from pathlib import Path
 
 import pytest
 
 from dxlrun.clock import MonotonicClock
+from dxlrun.compile import compile_files
+from dxlrun.compile.plan import to_json
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.port import SerialPort, SerialPorts
-from dxlrun.dynamixel.serial_open import let_go, open_serial
+from dxlrun.dynamixel.serial_open import _ROBOT, let_go, open_serial
 from dxlrun.errors import PortError
 from dxlrun.interfaces import Commands, States
 from dxlrun.simulation import BusConfig, ServoConfig
@@ -127,6 +130,38 @@ def test_the_process_that_has_the_line_is_named(opened):
     said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     assert f"{path} is in use by" in said
     assert f"(process {os.getpid()})" in said
+
+
+def test_the_run_that_has_the_line_is_named_and_how_to_end_it(terminal):
+    """A guardian has the line and the plan's memory open."""
+    _, path, _ = terminal
+    code = (
+        "import sys\n"
+        "from dxlrun import process\n"
+        "from dxlrun.dynamixel.serial_open import open_serial\n"
+        "port = open_serial(sys.argv[1], 1_000_000)\n"
+        'plan = process.memory_file(\'dxlrun-plan\', b\'{"robot":"pan_tilt","loop":{}}\')\n'
+        "print('opened', flush=True)\n"
+        "sys.stdin.read()\n"
+    )
+    command = [sys.executable, "-c", code, path]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as run:
+        assert run.stdout.readline() == "opened\n"
+        fcntl.ioctl(terminal[2], termios.TIOCNXCL)  # root may open it all the same; the flock stays
+        with pytest.raises(PortError) as refused:
+            open_serial(path, 1_000_000)
+    assert str(refused.value) == (
+        f"{path} is in use by a run of pan_tilt; `dxlrun stop --robot pan_tilt` ends it, or Ctrl-C in its "
+        "terminal"
+    )
+
+
+def test_a_plan_begins_with_the_name_of_its_robot():
+    """By that a run is known from outside."""
+    torso = Path(__file__).parents[2] / "robots" / "bioloid_torso.yaml"
+    match = _ROBOT.match(to_json(compile_files(torso, {}, []).plan))
+    assert match is not None
+    assert match[1] == b"bioloid_torso"
 
 
 def test_the_line_is_locked_against_every_program(opened):

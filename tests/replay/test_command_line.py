@@ -81,6 +81,16 @@ def test_remarks_go_to_stderr(
         ([__file__], 2, "this is no MCAP file"),
         (["{log}", "fast"], 2, "'fast' is no argument of the robot file"),
         (["{log}", "--set", "neck.gain=1"], 2, "the log has no such controller"),
+        (
+            ["{log}", "--set", "all_inputs.gian=1"],
+            2,
+            "dxlrun: --set all_inputs has an unknown key 'gian'; did you mean gain?",
+        ),
+        (
+            ["{log}", "--set", "all_inputs.gain=fast"],
+            2,
+            "dxlrun: --set all_inputs.gain is the text 'fast', but must be a number; ",
+        ),
         (["{log}", "rate:=100"], 2, "change the loop's period"),
     ],
 )

@@ -110,6 +110,18 @@ def test_a_missing_plug_in(pair_log: Path, changed: Change) -> None:
     )
 
 
+def test_parameters_that_the_installed_controller_refuses(pair_log: Path, changed: Change) -> None:
+    def change(content: Any) -> None:
+        plan = json.loads(content.attachments["plan.json"])
+        (mine,) = (one for one in plan["loop"]["controllers"] if one["name"] == "all_inputs")
+        mine["parameters"] = '{"joints": ["tilt", "nod"], "gian": 1}'
+        content.attachments["plan.json"] = json.dumps(plan).encode()
+
+    assert refused(changed(pair_log, change), PlugInError) == (
+        "the parameters of a controller: all_inputs has an unknown key 'gian'; did you mean gain?"
+    )
+
+
 def test_a_plan_that_is_none_or_of_another_robot(pair_log: Path, changed: Change) -> None:
     def none(content: Any) -> None:
         del content.attachments["plan.json"]

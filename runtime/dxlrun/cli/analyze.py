@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -115,8 +116,11 @@ def _analyze_each(logs: Sequence[Path], console: Console, *, as_json: bool) -> i
         try:
             result = analysis.analyze_log(log)
         except LogError as error:
-            say_error(f"dxlrun: {error}")
             code = error.exit_code
+            if as_json:
+                results.append(json.dumps({"log": str(log), "ok": False, "errors": [{"what": str(error)}]}))
+            else:
+                say_error(f"dxlrun: {error}")
             continue
         verdict = result.verdict
         code = code if verdict.good else max(code, 1)

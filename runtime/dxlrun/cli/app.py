@@ -23,12 +23,14 @@ from dxlrun.cli.schema import schema
 from dxlrun.cli.servo import servo
 from dxlrun.cli.sim import sim
 from dxlrun.cli.steer import load, pause, rate, resume, send, set_register, stop, switch, unload
-from dxlrun.cli.terminal import say_error, say_warning
-from dxlrun.errors import DxlrunError, InputError
+from dxlrun.cli.terminal import out, print_refusal, say_error, say_warning
+from dxlrun.errors import DxlrunError, InputError, Problem
 
 INTERRUPTED = 130
 """128 + SIGINT, as shells say it."""
 
+_PIPED_HELP = 80
+"""Columns."""
 RUNNING = "Commands for a robot that runs"
 
 HELP = """Run a robot of Dynamixel servos from one YAML file.
@@ -36,6 +38,10 @@ HELP = """Run a robot of Dynamixel servos from one YAML file.
 `dxlrun ROBOT.yaml` runs it, `dxlrun check ROBOT.yaml` looks at it without touching hardware,
 `dxlrun sim ROBOT.yaml` simulates its servos for other programs,
 `dxlrun analyze LOG` says what happened in a run, `dxlrun list` shows the robots that run."""
+
+USAGE = """Usage: dxlrun ROBOT.yaml [ARG:=VALUE ...] [OPTIONS]
+       dxlrun COMMAND ...
+"""
 
 EPILOGUE = """Exit codes: 0 good, 1 the robot or the run failed, 2 the input is wrong, 130 interrupted."""
 
@@ -46,6 +52,8 @@ def build() -> App:
         name="dxlrun",
         help=HELP,
         help_epilogue=EPILOGUE,
+        usage=USAGE,
+        console=None if sys.stdout.isatty() else out(_PIPED_HELP),
         version=lambda: metadata.version("dxlrun"),
         suppress_keyboard_interrupt=False,  # an interrupt is said by us, like everything else
     )
@@ -62,6 +70,10 @@ def build() -> App:
     app.command(bench)
     app.command(list_robots, name="list", group=RUNNING)
     app.command(set_register, name="set", group=RUNNING)
+    app.register_install_completion_command(
+        help="Install tab completion for bash, zsh or fish (--shell), from the next shell on.",
+        version_flags=[],
+    )
     for verb in (switch, send, rate, pause, resume, load, unload, stop):
         app.command(verb, group=RUNNING)
     return app
@@ -77,7 +89,7 @@ def run_tokens(tokens: Sequence[str]) -> int:
         code = app(list(tokens), exit_on_error=False, print_error=False, result_action="return_value")
         sys.stdout.flush()  # a reader that went away is noticed here, not when the interpreter ends
     except KeyboardInterrupt:
-        say_error("interrupted")
+        _refuse(tokens, ("interrupted",))
         return INTERRUPTED
     except BrokenPipeError:
         # the reader went away (`dxlrun check ... | head`): nothing is left to say, not even at exit
@@ -86,29 +98,36 @@ def run_tokens(tokens: Sequence[str]) -> int:
     except Exception as error:
         if "--debug" in tokens:
             traceback.print_exc()
-        return _explain(error)
+        if isinstance(error, InputError) and error.problems:
+            _refuse(tokens, (), error.problems)
+            return error.exit_code
+        sentences, code = _explained(error)
+        _refuse(tokens, sentences)
+        return code
     return code if isinstance(code, int) else 0
 
 
-def _explain(error: Exception) -> int:
-    """Say an error in one line a problem; return the exit code."""
-    if isinstance(error, InputError) and error.problems:
-        for problem in error.problems:
-            (say_error if problem.severity == "error" else say_warning)(str(problem))
-        return error.exit_code
+def _refuse(tokens: Sequence[str], sentences: Sequence[str], problems: Sequence[Problem] = ()) -> None:
+    """Say why a command is not done: in lines for a person, or in JSON for a program that asked for it."""
+    if "--json" in tokens:
+        print_refusal(problems, sentences)
+        return
+    for problem in problems:
+        (say_error if problem.severity == "error" else say_warning)(str(problem))
+    for sentence in sentences:
+        say_error(sentence if sentence == "interrupted" else f"dxlrun: {sentence}")
+
+
+def _explained(error: Exception) -> tuple[tuple[str, ...], int]:
+    """Return an error without places in files, in one sentence a problem, and the exit code."""
     if isinstance(error, DxlrunError):
-        for line in str(error).splitlines() or [type(error).__name__]:
-            say_error(f"dxlrun: {line}")
-        return error.exit_code
+        return tuple(str(error).splitlines()) or (type(error).__name__,), error.exit_code
     if isinstance(error, CycloptsError):
         usage = " ".join(("dxlrun", *(error.command_chain or ()), "--help"))
-        say_error(f"dxlrun: {' '.join(str(error).split()).removesuffix('.')}; `{usage}` shows the usage")
-        return InputError.exit_code
+        what = " ".join(str(error).split()).removesuffix(".")
+        return (f"{what}; `{usage}` shows the usage",), InputError.exit_code
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename else ""
-        say_error(f"dxlrun: {where}{error.strerror or error}; --debug shows what was being done")
-        return 1
-    say_error(
-        f"dxlrun: internal error: {type(error).__name__}: {error}; please report it, with what --debug prints"
-    )
-    return 1
+        return (f"{where}{error.strerror or error}; --debug shows what was being done",), 1
+    what = f"internal error: {type(error).__name__}: {error}; please report it, with what --debug prints"
+    return (what,), 1

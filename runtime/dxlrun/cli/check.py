@@ -12,8 +12,8 @@ from cyclopts import Parameter
 
 from dxlrun.cli.flags import Flag, JsonFlag, Motions
 from dxlrun.cli.inputs import compiled
-from dxlrun.cli.terminal import out, say_error, say_warning
-from dxlrun.errors import InputError, Problem
+from dxlrun.cli.terminal import out, problems_json, say_error, say_warning
+from dxlrun.errors import InputError
 
 if TYPE_CHECKING:
     from dxlrun.compile import Compiled
@@ -53,21 +53,10 @@ def check(
     debug
         Print the traceback of an error.
     """
-    try:
-        result = compiled(robot, assignments, play, duration, _asked if online else None)
-    except InputError as error:
-        if as_json:
-            problems = error.problems
-            errors = [p for p in problems if p.severity == "error"]
-            unplaced = [] if errors else [{"what": str(error)}]
-            _print_json(
-                {"ok": False, "errors": [*map(_problem, errors), *unplaced], "warnings": _warnings(problems)}
-            )
-            return error.exit_code
-        raise
+    result = compiled(robot, assignments, play, duration, _asked if online else None)
     found = _look(result) if online else None
     if as_json:
-        report: dict[str, object] = {"ok": True, "errors": [], "warnings": _warnings(result.warnings)}
+        report: dict[str, object] = {"ok": True, "errors": [], "warnings": problems_json(result.warnings)}
         report |= asdict(result.report)
         if found is not None:
             report["online"] = {"as_declared": found.as_declared, **asdict(found)}
@@ -107,21 +96,6 @@ def _look(result: Compiled) -> Found:
 
 def _print_json(value: dict[str, object]) -> None:
     out().file.write(json.dumps(value, indent=2, ensure_ascii=False) + "\n")
-
-
-def _warnings(problems: tuple[Problem, ...]) -> list[dict[str, object]]:
-    return [_problem(p) for p in problems if p.severity == "warning"]
-
-
-def _problem(problem: Problem) -> dict[str, object]:
-    mark = problem.mark
-    return {
-        "file": mark.file,
-        "line": mark.line,
-        "column": mark.column,
-        "what": problem.what,
-        "mend": problem.mend,
-    }
 
 
 def _print_tables(result: Compiled, found: Found | None) -> None:

@@ -44,14 +44,15 @@ def models(
         out().file.write(json.dumps(value, indent=2, ensure_ascii=False) + "\n")
         return 0
     from dxlrun.cli.models_tables import facts, items_of, overview
+    from dxlrun.cli.narrow import fitting
 
     console = out()
     if name is None:
-        console.print(overview(tables))
+        console.print(fitting(overview(tables), console.width))
     else:
         for table in tables:
             console.print(facts(table))
-            console.print(items_of(table))
+            console.print(fitting(items_of(table), console.width))
     return 0
 
 

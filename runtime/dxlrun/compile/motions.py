@@ -31,6 +31,7 @@ from dxlrun.compile.samples import (
 from dxlrun.control.loop_plan import ScheduledCommand
 from dxlrun.description import MotionDescription
 from dxlrun.description.motion import FormulaPart, PointsPart
+from dxlrun.description.problems import sentences_of
 from dxlrun.errors import Mark
 
 LEAD_NS = 1_000_000_000
@@ -213,8 +214,7 @@ def _prepared(
         data = cls.prepare(kind, cls.Commands[kind].model_validate(payload), controller.parameters)
         flat = np.ascontiguousarray(data, dtype="<f8").tobytes()
     except ValidationError as error:
-        first = error.errors()[0]
-        reason = f"{'.'.join(str(part) for part in first['loc'])}: {first['msg']}"
+        (reason,) = sentences_of(error, kind, cls.Commands[kind], 1)
     except Exception as error:
         reason = str(error) or type(error).__name__
     else:

@@ -20,6 +20,8 @@ from dxlrun.control.overrun import Decide, OverrunHook
 from dxlrun.control_table import add_control_table
 from dxlrun.errors import ControllerFault, PlugInError
 
+_MOST_MISTAKES = 5
+
 
 @dataclass(frozen=True, slots=True)
 class Offer:
@@ -67,7 +69,10 @@ class PlugIns:
             parameters = offer.controller.Parameters.model_validate_json(plan.parameters)
             return offer.controller(parameters)
         except ValidationError as error:
-            raise PlugInError(f"parameters of controller {plan.name}: {error}") from error
+            from dxlrun.description.problems import sentences_of
+
+            wrong = "; ".join(sentences_of(error, plan.name, offer.controller.Parameters, _MOST_MISTAKES))
+            raise PlugInError(f"the parameters of a controller: {wrong}") from error
         except (Exception, SystemExit) as error:  # foreign code: one sentence instead of its traceback
             raise ControllerFault(
                 f"controller {plan.name} cannot be built: {type(error).__name__}: {error}"

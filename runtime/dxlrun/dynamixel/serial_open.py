@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
+import re
 import termios
 from collections.abc import Iterable
 from contextlib import suppress
@@ -13,6 +14,10 @@ from pathlib import Path
 import serial
 
 from dxlrun.errors import PortError
+
+_PLAN_MEMORY = "/memfd:dxlrun-plan "
+_ROBOT = re.compile(rb'\{"robot":"([^"\\]+)"')
+"""How a plan begins as JSON."""
 
 
 class ExclusiveSerial(serial.Serial):
@@ -76,7 +81,7 @@ def _sentence(path: str, baud_rate: int, error: Exception) -> str:
             "and log in again"
         )
     if number in (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK):
-        return f"{path} is in use by {_holder(path)}; stop that first"
+        return f"{path} is in use by {_holder(path)}"
     if number == errno.ENOTTY:
         return f"{path} is no serial line"
     if number == errno.EINVAL:
@@ -118,14 +123,31 @@ def _group(path: str) -> str:
 
 
 def _holder(path: str) -> str:
-    """Name the other processes that have the device open, as far as this user may see them."""
+    """Name the run, or else the processes that have the device open, and say how to stop them.
+
+    Only what this user may see is named.
+    """
     device = os.path.realpath(path)
     found = [
-        f"{_command(process)} (process {process.name})"
-        for process in _processes()
-        if process.name != str(os.getpid()) and _has_open(process, device)
+        process for process in _processes() if process.name != str(os.getpid()) and _has_open(process, device)
     ]
-    return " and ".join(found) or "another process, which this user may not see"
+    robot = next((name for name in map(_robot, found) if name), None)
+    if robot is not None:
+        return f"a run of {robot}; `dxlrun stop --robot {robot}` ends it, or Ctrl-C in its terminal"
+    named = [f"{_command(process)} (process {process.name})" for process in found]
+    return f"{' and '.join(named) or 'another process, which this user may not see'}; stop that first"
+
+
+def _robot(process: Path) -> str | None:
+    """Return the name of the robot that a process runs: guardian and loop share the plan's memory."""
+    try:
+        for descriptor in (process / "fd").iterdir():
+            if os.readlink(descriptor).startswith(_PLAN_MEMORY):
+                match = _ROBOT.match(descriptor.read_bytes())
+                return match[1].decode() if match else None
+    except (OSError, UnicodeDecodeError):
+        pass  # it has ended meanwhile, or is not ours
+    return None
 
 
 def _processes() -> Iterable[Path]:

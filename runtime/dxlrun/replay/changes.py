@@ -16,8 +16,11 @@ from dxlrun.compile.problems import suggestion
 from dxlrun.control.loop_plan import ControllerPlan, LoopPlan
 from dxlrun.control.plugins import PlugIns
 from dxlrun.description import read_robot
+from dxlrun.description.problems import sentences_of
 from dxlrun.errors import InputError
 from dxlrun.replay.recorded import RecordedPlan
+
+_MOST_SENTENCES = 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,9 +84,8 @@ def _asked(plan: ControllerPlan, joints: tuple[str, ...], plugins: PlugIns) -> C
         parameters = offer.controller.Parameters.model_validate_json(plan.parameters)
         interfaces = offer.controller.interfaces(parameters, joints)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        place = ".".join(str(part) for part in first["loc"]) or "its parameters"
-        raise InputError(f"--set {plan.name}: {place}: {first['msg']}") from error
+        wrong = sentences_of(error, plan.name, offer.controller.Parameters, _MOST_SENTENCES)
+        raise InputError("\n".join(f"--set {sentence}" for sentence in wrong)) from error
     except Exception as error:  # foreign code: one sentence instead of its traceback
         raise InputError(f"--set {plan.name}: {type(error).__name__}: {error}") from error
     unknown = [joint for joint in interfaces.joints if joint not in joints]
