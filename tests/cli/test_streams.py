@@ -20,14 +20,15 @@ def shell(line: str, directory: Path) -> "subprocess.CompletedProcess[str]":
     )
 
 
-@pytest.mark.parametrize("closed", [">&-", ">&- <&-", ">&- 2>&- <&-", "2>&-"])
+ALL = ">&- 2>&- <&-"
+
+
 @pytest.mark.parametrize(
-    ("words", "code"),
+    ("words", "code", "closed"),
     [
-        ("check {torso}", 0),
-        ("check missing.yaml", 2),
-        ("{torso} --virtual --duration 0.2 --no-record", 0),
-        ("{torso} --duration 0.2 --no-record --no-gateway", 0),
+        *(("check missing.yaml", 2, closed) for closed in (">&-", ">&- <&-", ALL, "2>&-")),
+        ("check {torso}", 0, ALL),
+        ("{torso} --virtual --duration 0.2 --no-record", 0, ALL),  # in real time: tests/run/test_exits.py
     ],
 )
 def test_closed_streams_change_nothing_but_what_is_seen(

@@ -200,22 +200,16 @@ def test_a_recorder_that_stands_still_does_not_stop_the_robot_and_is_said(
     assert run.log().cycles is not None
 
 
-def test_the_loop_holds_nobodys_lines(start: Start) -> None:
-    run = start("--duration", "2")
-    run.wait_until_moving()
-    held = Path(f"/proc/{run.child('dxlrun.loop_process')}/fd")
-    targets = sorted(os.readlink(one) for one in held.iterdir())
-    assert not [target for target in targets if target.startswith(("pipe:", "anon_inode:"))]
-    assert sum(target.startswith("socket:") for target in targets) == 1  # its own one to the guardian
-    assert sum(target.startswith("/dev/pts/") for target in targets) == 1
-    run.finish()
-
-
-def test_what_a_plug_in_prints_is_for_debug_only(odd: Callable[..., Running]) -> None:
-    run = odd("--duration", "0.3", configure="print('to out'); print('to err', file=sys.stderr)")
+def test_what_a_plug_in_prints_is_for_debug_only_and_without_a_log_no_file_is_left(
+    odd: Callable[..., Running],
+) -> None:
+    run = odd(
+        "--duration", "0.3", "--no-record", configure="print('to out'); print('to err', file=sys.stderr)"
+    )
     code, out, err = run.finish()
     assert (code, err) == (0, "")
     assert "to out" not in out
+    assert not (run.directory / "logs").exists()
 
 
 def test_debug_shows_what_a_plug_in_prints_within_bounds(odd: Callable[..., Running]) -> None:
