@@ -16,11 +16,19 @@ EXAMPLE = ROOT / "plugins" / "example"
 Shell = Callable[..., "subprocess.CompletedProcess[str]"]
 
 
-def bash(line: str, directory: Path, path: Path) -> subprocess.CompletedProcess[str]:
-    """Run one line with `path` before all other programs, far from this interpreter's own settings."""
+def bash(
+    line: str, directory: Path, path: Path, *, isolated: bool = False
+) -> subprocess.CompletedProcess[str]:
+    """Run one line with `path` before all other programs, far from this interpreter's own settings.
+
+    isolated: pip builds in an environment that it fills from an index each time, as it does by itself;
+    without it the hatchling that is there builds (and `editables`, which it asks for).
+    """
     ours = ("PYTHON", "PYTEST", "COV_")
     outside = {name: value for name, value in os.environ.items() if not name.startswith(ours)}
     environment = outside | {"PATH": f"{path}:{os.environ['PATH']}", "PIP_DISABLE_PIP_VERSION_CHECK": "1"}
+    if not isolated:
+        environment |= {"PIP_NO_BUILD_ISOLATION": "0"}  # the value of the option: no isolation
     return subprocess.run(
         ["/bin/bash", "-c", line], cwd=directory, env=environment, capture_output=True, text=True, check=False
     )
@@ -31,7 +39,7 @@ def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A directory with the wheels of dxlrun and of the example."""
     directory = tmp_path_factory.mktemp("wheels")
     built = bash(
-        f"{sys.executable} -m pip wheel --quiet --no-deps --wheel-dir . {ROOT} {EXAMPLE}",
+        f"{sys.executable} -m pip wheel -qq --no-build-isolation --no-deps --wheel-dir . {ROOT} {EXAMPLE}",
         directory,
         Path(sys.executable).parent,
     )
@@ -45,10 +53,10 @@ def fresh(wheels: Path, tmp_path_factory: pytest.TempPathFactory) -> Shell:
     environment = tmp_path_factory.mktemp("fresh") / "venv"
     venv.create(environment, with_pip=True)
 
-    def shell(line: str, directory: Path) -> subprocess.CompletedProcess[str]:
-        return bash(line, directory, environment / "bin")
+    def shell(line: str, directory: Path, *, isolated: bool = False) -> subprocess.CompletedProcess[str]:
+        return bash(line, directory, environment / "bin", isolated=isolated)
 
     ours, theirs = next(wheels.glob("dxlrun-*.whl")), next(wheels.glob("dxlrun_easing-*.whl"))
-    installed = shell(f"pip install --quiet --no-compile {ours} '{theirs}[test]'", wheels)
+    installed = shell(f"pip install --quiet --no-compile hatchling editables {ours} '{theirs}[test]'", wheels)
     assert installed.returncode == 0, installed.stderr
     return shell
