@@ -200,7 +200,7 @@ def exchanges(wire: Make, took_us: int, count: int = 5) -> list[Any]:
     [
         (300, 1, ""),
         (2900, 1, ""),
-        (3100, 1, "Replies on bus main come 3100 us later than the wire needs, and the robot file says"),
+        (3100, 1, "Replies on bus main come 3.1 ms later than the wire needs, and the robot file says"),
         (15_800, 1, "a latency timer of 16 ms; `echo 1 | sudo tee /sys/bus/usb-serial/devices/ttyUSB3/"),
         (15_800, 16, ""),
     ],

@@ -1,13 +1,15 @@
 """The latency timer of an adapter, in a directory that looks like the kernel's; no adapter is here."""
 
 import os
+from dataclasses import replace
 
 import pytest
 
-from dxlrun.dynamixel.latency_timer import latency_timer, shorten
+from dxlrun.dynamixel.latency_timer import late_replies, latency_timer, shorten
 from dxlrun.dynamixel.reopening import KeptLines, Wanted
 from dxlrun.dynamixel.serial_open import open_serial
-from dxlrun.errors import PortError
+from dxlrun.errors import PortError, StartUpError
+from dxlrun.testing import VirtualRobot, plan_of
 
 MS = 1_000_000
 
@@ -76,3 +78,71 @@ def test_a_line_is_opened_with_its_timer_set(tmp_path, line, timer):
     lines = KeptLines([Wanted(line, 1_000_000, MS)], tmp_path)
     assert lines.done == [f"{line}: latency timer set from 16 ms to 1 ms"]
     lines.close()
+
+
+ROBOT = """\
+name: pair
+loop: {rate: 20}
+buses:
+  main:
+    {port: sim, protocol: 1.0, baud_rate: 1_000_000, return_delay_time: 100 us,
+    simulation: {latency_timer: 16 ms}}
+joints:
+  pan: {bus: main, id: 3, model: AX-12A, reference: 150 deg, direction: 1}
+  tilt: {bus: main, id: 7, model: AX-12A, reference: 150 deg, direction: 1}
+"""
+
+
+def with_a_timer(tmp_path, latency_ms, port="sim"):
+    """Return a robot whose simulated adapter keeps replies back for 16 ms, and a plan that expects less."""
+    path = tmp_path / "pair.yaml"
+    path.write_text(ROBOT)
+    plan = plan_of(path, duration_s=0.2)
+    (bus,) = plan.buses
+    robot = VirtualRobot(plan)
+    for one in robot.robot.hardware._set_up._plans:
+        assert one is bus
+    robot.robot.hardware._set_up._plans = [replace(bus, latency_ns=latency_ms * MS, port=port)]
+    return robot
+
+
+def test_a_timer_of_16_ms_is_named_before_any_servo_has_torque(tmp_path):
+    robot = with_a_timer(tmp_path, 1, "/dev/ttyUSB0")
+    with pytest.raises(StartUpError) as refusal:
+        robot.run()
+    (sentence,) = refusal.value.sentences
+    assert sentence.startswith(
+        "every servo answers too late: replies on bus main come 15.3 ms later than the wire"
+    )
+    assert "adapter: {latency: 1 ms}: that is a latency timer of 16 ms" in sentence
+    assert "`echo 1 | sudo tee /sys/bus/usb-serial/devices/ttyUSB0/latency_timer` shortens it" in sentence
+    assert "cable" not in sentence
+    torque_on = bytes.fromhex("0318")  # a write to Torque Enable (24)
+    assert not any(torque_on in entry.data for entry in robot.ledger.entries if entry.direction == "in")
+
+
+@pytest.mark.parametrize("latency_ms", [7, 16])
+def test_a_timer_that_the_reads_can_wait_for_is_no_reason_not_to_start(tmp_path, latency_ms):
+    robot = with_a_timer(tmp_path, latency_ms)
+    robot.run()
+    assert robot.record.states.valid.all()
+
+
+@pytest.mark.parametrize(
+    ("port", "extra_ms", "named"),
+    [
+        ("/dev/ttyUSB0", 15.9, "devices/ttyUSB0/latency_timer"),
+        (
+            "/dev/serial/by-id/usb-FTDI",
+            12.0,
+            "devices/$(basename $(readlink -f /dev/serial/by-id/usb-FTDI))/",
+        ),
+        ("/dev/ttyUSB0", 18.1, ""),
+        ("/dev/ttyUSB0", 11.9, ""),
+        ("sim", 16.0, ""),
+    ],
+)
+def test_only_what_looks_like_the_timer_is_called_one(port, extra_ms, named):
+    sentence = late_replies("main", port, extra_ms * MS, MS)
+    assert ("latency timer" in sentence) == bool(named)
+    assert named in sentence

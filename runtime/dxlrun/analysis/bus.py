@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
@@ -102,7 +102,7 @@ class _Line:
     """Pairs instructions with replies on one bus: a reply counts until the bus' next instruction."""
 
     plan: _PlannedBus
-    counts: dict[int, _Count] = field(default_factory=dict)
+    counts: defaultdict[int, _Count] = field(default_factory=lambda: defaultdict(_Count))
     packets: Counter[PacketKind] = field(default_factory=Counter)
     bytes: Counter[PacketKind] = field(default_factory=Counter)
     broadcasts: int = 0
@@ -155,24 +155,21 @@ class _Line:
     def _wire_ns(self, size: int) -> int:
         return size * _BYTE_NS // max(self.plan.baud_rate, 1)
 
-    def _of(self, servo_id: int) -> _Count:
-        return self.counts.setdefault(servo_id, _Count())
-
     def _instruct(self, packet: LoggedPacket) -> None:
         self._miss()
         if packet.servo_id == BROADCAST_ID:
             self.broadcasts += 1
         else:
-            self._of(packet.servo_id).instructions += 1
+            self.counts[packet.servo_id].instructions += 1
         self.asked = question(packet.data)
         self.asked_ns = packet.first_ns
         self.awaited_ns = self.free_ns = max(self.free_ns, packet.first_ns) + self._wire_ns(len(packet.data))
         self.open = set(self.asked.servo_ids)
         for servo_id in self.open:
-            self._of(servo_id).asked += 1
+            self.counts[servo_id].asked += 1
 
     def _answer(self, reply: Reply, at_ns: int) -> None:
-        count = self._of(reply.servo_id)
+        count = self.counts[reply.servo_id]
         count.replies += 1
         count.protocol = reply.protocol
         if reply.error:

@@ -20,12 +20,11 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum, unique
-from pathlib import Path
 
 from dxlrun.analysis.bus import BusTraffic, Servo
 from dxlrun.analysis.steering import Act, Pause
 from dxlrun.analysis.tally import Figures, Said
-from dxlrun.dynamixel.latency_timer import mend
+from dxlrun.dynamixel.latency_timer import late_replies
 from dxlrun.events import EventCode, Severity
 from dxlrun.plurals import counted
 
@@ -37,10 +36,6 @@ _SHORT_RUN_S = 2.0
 """A shorter run may skip as much as one of this: a machine that stands still once is not overloaded."""
 ROUGH_SHARE = 0.01
 _LATE_US = 2000
-_TIMER_US = 16_000
-"""Latency timer of FTDI adapters as they are shipped (FTDI AN232B-04)."""
-_TIMER_WITHIN_US = 4000
-"""The timer runs from the reply's first byte, or from the one before: how much less of it may be seen [i]."""
 _MOST_NAMED = 3
 _KINDS = {
     "switch": "switch",
@@ -258,25 +253,13 @@ def _invalid(figures: Figures) -> Iterable[_Finding]:
 
 
 def _late_replies(buses: Sequence[BusTraffic]) -> Iterable[_Finding]:
-    """Compare what adapters add to the time of replies with the plan; name the usual reason."""
+    """Compare what adapters add to the time of replies with the plan."""
     for bus in buses:
         extra, planned = bus.extra_us, bus.planned_latency_us
         if extra is None or planned is None or extra < planned + _LATE_US:
             continue
-        told = (
-            f"Replies on bus {bus.name} come {microseconds(extra)} later than the wire needs, and the robot "
-            f"file says adapter: {{latency: {planned / 1e3:g} ms}}"
-        )
-        if -_TIMER_WITHIN_US <= extra - _TIMER_US <= _LATE_US and bus.port != "sim":
-            told += f": that is a latency timer of 16 ms; `{timer_command(bus.port)}` shortens it"
-        yield _Finding(_Rank.REMARK, f"{told}.")
-
-
-def timer_command(port: str) -> str:
-    """Return the command that makes the latency timer of a port's adapter 1 ms."""
-    name = Path(port).name
-    device = name if name.startswith("ttyUSB") else f"$(basename $(readlink -f {port}))"
-    return mend(f"/sys/bus/usb-serial/devices/{device}/latency_timer")
+        sentence = late_replies(bus.name, bus.port, extra * 1e3, planned * 1e3)
+        yield _Finding(_Rank.REMARK, f"{sentence[0].upper()}{sentence[1:]}.")
 
 
 def _silent(servos: Sequence[Servo]) -> Iterable[_Finding]:

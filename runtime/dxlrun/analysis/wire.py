@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 
 BROADCAST_ID = 0xFE
 
@@ -66,6 +67,7 @@ def is_protocol_2(data: bytes) -> bool:
     return data.startswith(_HEADER_2)
 
 
+@lru_cache(maxsize=1024)
 def question(data: bytes) -> Question:
     """Return who has to answer an instruction at every status return level: pings and reads."""
     second = is_protocol_2(data)

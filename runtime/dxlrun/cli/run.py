@@ -146,7 +146,8 @@ def show(summary: RunSummary, robot: str, console: Console) -> int:
         f"{counted(summary.skipped, 'period', 'periods')} skipped",
         soft_wrap=True,
     )
-    sentences = () if verdict is None else verdict.sentences
+    # why the loop never ran was said already
+    sentences = () if verdict is None or not summary.cycles else verdict.sentences
     if summary.log is not None:
         for sentence in sentences:
             console.print(f"  {sentence}", markup=False, soft_wrap=True)

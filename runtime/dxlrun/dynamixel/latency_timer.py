@@ -14,6 +14,12 @@ from pathlib import Path
 import serial
 
 SYSTEM = Path("/sys")
+SHIPPED_NS = 16_000_000
+"""The timer of an FTDI adapter as it is shipped (AN232B-04)."""
+_SEEN_LESS_NS = 4_000_000
+"""It runs from the reply's first byte, or from what was heard before: so much less of it may be seen [i]."""
+_SEEN_MORE_NS = 2_000_000
+"""A host that takes the bytes late [i]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +39,24 @@ class LatencyTimer:
 def mend(place: str) -> str:
     """Return the command that makes a timer as short as it can be, 1 ms, until the adapter is unplugged."""
     return f"echo 1 | sudo tee {place}"
+
+
+def late_replies(bus: str, port: str, extra_ns: float, planned_ns: float) -> str:
+    """Return a sentence, without its full stop, for replies that an adapter keeps back longer than planned.
+
+    `extra_ns`: how much later than wire and return delay they come. What looks like the timer of an FTDI
+    adapter as it is shipped is named with the command that shortens it.
+    """
+    told = (
+        f"replies on bus {bus} come {extra_ns / 1e6:.1f} ms later than the wire needs, and the robot file "
+        f"says adapter: {{latency: {planned_ns / 1e6:g} ms}}"
+    )
+    if port == "sim" or not SHIPPED_NS - _SEEN_LESS_NS <= extra_ns <= SHIPPED_NS + _SEEN_MORE_NS:
+        return told
+    name = Path(port).name
+    device = name if name.startswith("ttyUSB") else f"$(basename $(readlink -f {port}))"
+    command = mend(f"/sys/bus/usb-serial/devices/{device}/latency_timer")
+    return f"{told}: that is a latency timer of 16 ms; `{command}` shortens it"
 
 
 def timer_ms(place: Path) -> int | None:

@@ -16,10 +16,13 @@ MOST_SILENCE_NS = 960_000_000
 """So much longer all silence together is awaited: who says nothing four times is not merely late."""
 
 
-def patient(program: Program[Result], most_ns: int = LONGER_NS) -> Program[Result]:
+def patient(
+    program: Program[Result], most_ns: int = LONGER_NS, extra_ns: list[int] | None = None
+) -> Program[Result]:
     """Execute a program of one bus, and give each reply longer, as long as few of them do not come.
 
     A servo that answers in the end costs what it takes; a bus without any is told within about two seconds.
+    `extra_ns` gets how much later than it was due by the wire each reply came.
     """
     left_ns = MOST_SILENCE_NS
     try:
@@ -27,6 +30,8 @@ def patient(program: Program[Result], most_ns: int = LONGER_NS) -> Program[Resul
         while True:
             longer_ns = min(most_ns, left_ns) if wanted.awaited else 0
             reply = yield replace(wanted, timeout_ns=wanted.timeout_ns + longer_ns) if longer_ns else wanted
+            if extra_ns is not None and wanted.awaited and reply.answered:
+                extra_ns.append(reply.last_ns - reply.sent_ns - wanted.due_ns)
             if reply.outcome in (Outcome.TIMEOUT, Outcome.GARBLED):
                 left_ns -= longer_ns
             wanted = program.send(reply)

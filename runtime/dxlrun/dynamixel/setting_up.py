@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from statistics import median
 from typing import Protocol, TypeVar
 
 from dxlrun.clock import Clock
@@ -10,7 +11,8 @@ from dxlrun.dynamixel import bus_watchdog, startup, torque_limit
 from dxlrun.dynamixel.bus import Bus
 from dxlrun.dynamixel.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.health import Servos
-from dxlrun.dynamixel.line import listen
+from dxlrun.dynamixel.latency_timer import late_replies
+from dxlrun.dynamixel.line import PATIENCE_NS, listen
 from dxlrun.dynamixel.modes import settle_modes
 from dxlrun.dynamixel.patience import LONGER_NS, patient
 from dxlrun.dynamixel.port import Ports
@@ -23,6 +25,9 @@ from dxlrun.errors import PortError, StartUpError
 from dxlrun.events import EventCode, EventSink, Severity
 from dxlrun.interfaces import Commands
 from dxlrun.mode import Mode
+
+_SOME = 8
+"""Replies, from which on it is known how late they usually come: three pings a servo, and what it is."""
 
 
 class _Stage(Protocol):
@@ -60,6 +65,8 @@ class SetUp:
         self._clock = clock
         self._events = events
         self._beat = beat
+        self._late_ns: list[list[int]] = [[] for _ in plans]
+        """How much later than by the wire the replies on each bus came."""
 
     def look(self, take_over: bool) -> None:
         """Look at every servo; bring registers and modes to what the plan says; learn how each answers."""
@@ -68,6 +75,7 @@ class SetUp:
             self._tell(EventCode.SETUP, Severity.INFO, one.servos)
             self._tell(EventCode.REGISTER_DIFFERS, Severity.WARNING, one.differences)
         _judge(surveys)
+        _refuse(self._late_replies())
         self._settle_registers()
         self._settle_modes()
         self._probe_reads()
@@ -165,10 +173,21 @@ class SetUp:
     ) -> list[Result | None]:
         """Run one program a bus with the patience of somebody who is in no hurry; `most_ns`: for a reply."""
         most_ns = most_ns or [LONGER_NS] * len(programs)
-        slow = [patient(program, most) for program, most in zip(programs, most_ns, strict=True)]
+        slow = [
+            patient(program, most, late_ns)
+            for program, most, late_ns in zip(programs, most_ns, self._late_ns, strict=True)
+        ]
         found = run(slow, self._buses, self._ports, self._clock, self._beat)
         self.raise_failures()
         return found
+
+    def _late_replies(self) -> Iterable[str]:
+        """Name the buses whose replies usually come when the cyclic reads have given them up."""
+        for plan, late_ns in zip(self._plans, self._late_ns, strict=True):
+            usual_ns = median(late_ns) if len(late_ns) >= _SOME else 0.0
+            if usual_ns > plan.latency_ns + PATIENCE_NS:
+                told = late_replies(plan.name, plan.port, usual_ns, plan.latency_ns)
+                yield f"every servo answers too late: {told}"
 
     def _tell(self, code: EventCode, severity: Severity, told: Iterable[tuple[str, str]]) -> None:
         for joint, text in told:
