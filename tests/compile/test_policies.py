@@ -10,7 +10,9 @@ from collections.abc import Callable
 import pytest
 
 from dxlrun.compile import Compiled
+from dxlrun.compile.policies import MARGIN_NS
 from dxlrun.control.policy_plan import HOLD, LIMP, Policy
+from dxlrun.dynamixel import plan
 from dxlrun.errors import Problem
 
 Find = Callable[..., tuple[Problem, ...]]
@@ -126,3 +128,56 @@ def test_the_check_tells_each_policy_and_what_is_left_without_the_loop(
     assert (rows["on_fault"].does, rows["on_fault"].without_loop) == ("hold", "hold")
     assert rows["on_lost_servo"].without_loop == "hold"
     assert "until the next command" in rows["on_stale_command"].does
+
+
+def limit_ns(compile_text: Callable[..., Compiled], text: str) -> int:
+    return compile_text(text).plan.loop.policies.limit_ns
+
+
+def test_the_steps_leave_time_for_two_periods_and_for_torque_off(
+    compile_text: Callable[..., Compiled], robot_text: str
+) -> None:
+    policies = "policies: {exit_timeout: 2 s}\n"
+    at_50 = limit_ns(compile_text, robot_text + policies)
+    at_25 = limit_ns(compile_text, robot_text.replace("rate: 50", "rate: 25") + policies)
+    assert at_50 - at_25 == 2 * 20_000_000
+    slow = robot_text.replace("latency: 1 ms", "latency: 2 ms")
+    exchanges = 2 * 2  # torque off and its read-back, of two servos
+    assert at_50 - limit_ns(compile_text, slow + policies) == exchanges * 1_000_000
+    assert at_50 < 2_000_000_000 - 2 * 20_000_000 - MARGIN_NS - exchanges * 1_000_000
+
+
+def test_a_time_that_is_too_short_for_any_step_is_none(
+    compile_text: Callable[..., Compiled], robot_text: str
+) -> None:
+    slow = robot_text.replace("rate: 50", "rate: 25")
+    assert limit_ns(compile_text, slow + "policies: {exit_timeout: 150 ms}\n") == 0
+
+
+def test_steps_one_after_the_other_take_the_sum_of_their_times(problems_in: Find, robot_text: str) -> None:
+    """Each of them would end in time: 1.2 s and 2.5 s."""
+    steps = "[{pose: home, speed: 90 deg/s}, {reduce_torque: 0.25, steps: 3, over: 2500 ms}]"
+    text = robot_text + "poses: {home: {right_arm_joint: -20 deg}}\n"
+    assert problems_in(text + f"policies: {{on_exit: {steps}, exit_timeout: 6 s}}\n") == ()
+    (problem,) = problems_in(text + f"policies: {{on_exit: {steps}, exit_timeout: 3.5 s}}\n")
+    assert problem.what.startswith("on_exit may take ")
+
+
+def test_a_pose_is_no_faster_than_its_joints_may_be(
+    compile_text: Callable[..., Compiled], robot_text: str
+) -> None:
+    slow = robot_text.replace("60 deg]}", "60 deg], velocity: 0.5 rad/s}")
+    step = compile_text(slow + POLICIES).plan.loop.policies.on_lost_servo.steps[0]
+    assert step.longest_ns * 1e-9 == pytest.approx(math.radians(100) / 0.5 + 0.3, abs=1e-6)
+
+
+def test_torque_is_not_reduced_where_a_servo_has_no_limit_for_it(
+    problems_in: Find, robot_text: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every model of today's tables has one; a plug-in may add a model without."""
+    monkeypatch.setattr(plan, "_torque_limit", lambda table: None)
+    whats = [problem.what for problem in problems_in(robot_text + POLICIES)]
+    assert [what.split(" has no torque limit")[0] for what in whats] == [
+        "on_exit reduces torque, but the AX-12A of left_arm_joint",
+        "on_exit reduces torque, but the AX-12A of right_arm_joint",
+    ]

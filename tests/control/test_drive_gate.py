@@ -106,12 +106,21 @@ def test_a_velocity_ends_at_the_position_limit():
     assert rig.apply(velocity=-2.0)["velocity"] == -2.0
 
 
+@pytest.mark.parametrize("side", [1, -1])
 @pytest.mark.parametrize("mode", [Mode.EFFORT, Mode.PWM])
-def test_beyond_a_limit_only_what_leads_back_is_let_through(mode):
-    rig = Rig(mode, position=1.01)
-    assert rig.apply(**{DRIVEN[mode]: 0.3})[DRIVEN[mode]] == 0.0
+def test_beyond_a_limit_only_what_leads_back_is_let_through(mode, side):
+    rig = Rig(mode, position=side * 1.01)
+    assert rig.apply(**{DRIVEN[mode]: side * 0.3})[DRIVEN[mode]] == 0.0
     assert rig.clamped == Clamp.OUTWARD
-    assert rig.apply(**{DRIVEN[mode]: -0.3})[DRIVEN[mode]] == -0.3
+    assert rig.apply(**{DRIVEN[mode]: side * -0.3})[DRIVEN[mode]] == side * -0.3
+
+
+@pytest.mark.parametrize(("dt_ns", "most"), [(DT_NS, 0.05 / BRAKING_S), (200_000_000, 0.05 / 0.4)])
+def test_a_slow_loop_leaves_a_joint_two_periods_to_its_limit(dt_ns, most):
+    rig = Rig(Mode.VELOCITY, position=0.95)
+    rig.record.commands.velocity[:] = 2.0
+    rig.gate.apply(rig.record.commands, rig.record.goals, dt_ns)
+    assert rig.record.goals.velocity[0] == pytest.approx(most)
 
 
 def test_a_wheel_turns_for_ever():

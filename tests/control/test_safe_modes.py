@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dxlrun.control.loop import PAUSED_CYCLE_NS
 from dxlrun.control.policy_plan import HOLD, LIMP, Policy, PolicyPlan, Step
 from dxlrun.control.safe_motion import ARRIVED, MODES_NS, SETTLE_NS, STAND_NS
 from dxlrun.mode import Mode
@@ -102,3 +103,47 @@ def test_a_pose_lasts_until_its_joints_are_there_or_settle_time_is_over(
     robot.hardware.read = read
     assert robot.loop.run().last == "limp"
     assert there[-1] - there[0] == lasts_ns
+
+
+def test_the_second_of_two_poses_is_reached_as_the_first_one_was(robot: Any) -> None:
+    poses = tuple(Step(f"pose {end}", 10**9, (end, None), 1.0) for end in (0.3, 0.35))
+    robot.build(end_ns=PERIOD_NS, policies=PolicyPlan(on_exit=Policy(poses, "limp")))
+    seen: list[tuple[int, float]] = []
+    robot.hardware.write = lambda: seen.append((robot.record.woken_ns, robot.record.goals.position[0]))
+    robot.loop.run()
+    for end in (0.3, 0.35):
+        times = [t_ns for t_ns, goal in seen if goal == pytest.approx(end, abs=1e-9)]
+        assert times[-1] - times[0] >= STAND_NS - PERIOD_NS
+
+
+def test_less_torque_lasts_its_time_at_each_of_its_steps(robot: Any) -> None:
+    step = Step("torque down", 300_000_000, fraction=0.4, levels=3)
+    robot.build(end_ns=PERIOD_NS, policies=PolicyPlan(on_exit=Policy((step,), "limp")))
+    record, limits = robot.record, []
+    robot.hardware.limit_torque = lambda fraction: limits.append((record.woken_ns, round(fraction, 6)))
+    assert robot.loop.run().last == "limp"
+    assert [fraction for _, fraction in limits] == [0.8, 0.6, 0.4]
+    assert [t_ns - limits[0][0] for t_ns, _ in limits] == [0, 100_000_000, 200_000_000]
+    assert record.woken_ns - limits[0][0] == 300_000_000
+
+
+def test_a_run_that_ends_in_a_pause_leaves_the_guardian_its_usual_patience(robot: Any) -> None:
+    robot.build(policies=PolicyPlan(on_exit=POSE))
+    robot.ask("pause")
+    robot.hardware.idle = lambda _: robot.stop.request() if len(robot.sink.cycles) == 3 else None
+    robot.loop.run()
+    assert robot.patience == [PAUSED_CYCLE_NS, PERIOD_NS]
+
+
+def test_of_two_policies_that_end_a_run_the_first_one_counts(robot: Any) -> None:
+    plan = PolicyPlan(on_lost_servo=Policy(POSE.steps, "hold"), on_stale_command=LIMP)
+    robot.build(policies=plan)
+
+    def both(_: int) -> None:
+        robot.loop._give_up("on_lost_servo", "j0 is lost")
+        robot.loop._give_up("on_stale_command", "the stream ended")
+
+    robot.hardware.idle = both
+    result = robot.loop.run()
+    assert result.detail.startswith("j0 is lost; on_lost_servo: pose home")
+    assert (result.reason, result.last) == ("fault", "hold")

@@ -264,6 +264,10 @@ def _refuse_torque(rig, servo):
     servo.registers.watch(("torque_enable",), lambda: servo.poke("torque_enable", 0))
 
 
+def _refuse_watchdog(rig, servo):
+    servo.registers.watch(("bus_watchdog",), lambda: servo.poke("bus_watchdog", 0))
+
+
 def _answer_no_third_question_for_torque(rig, servo):
     """The first two are those of the inspection and of the mode."""
     write, asked = rig.ports.ports[0].write, []
@@ -283,10 +287,11 @@ def _answer_no_third_question_for_torque(rig, servo):
     [
         (_refuse_torque, "and torque enable 0"),
         (_answer_no_third_question_for_torque, "did not answer when its torque was asked for"),
+        (_refuse_watchdog, "was given Bus Watchdog (98) = 10, but has 0"),
     ],
 )
 def test_a_servo_whose_torque_is_not_certain_does_not_come_back(start, make_x, trick, said):
-    rig = start(make_x(returning=True))
+    rig = start(make_x(returning=True, watchdog=10))
     servo = rig.buses[0].servo(13)
     servo.silence()
     cycles(rig, 20)
@@ -299,10 +304,6 @@ def test_a_servo_whose_torque_is_not_certain_does_not_come_back(start, make_x, t
     assert "cannot take part" in texts[1]
     assert said in texts[1]
     assert not rig.states.valid[2]
-
-
-def _refuse_watchdog(rig, servo):
-    servo.registers.watch(("bus_watchdog",), lambda: servo.poke("bus_watchdog", 0))
 
 
 def _answer_for_the_watchdog_once(rig, servo):
@@ -540,3 +541,71 @@ def test_a_ping_of_protocol_1_is_what_a_lost_servo_is_asked(start, make_plan):
     rig.buses[0].servo(3).silence()
     cycles(rig, 120)
     assert protocol1.ping(3) in rig.into_bus()
+
+
+def test_torque_that_was_cut_without_a_reboot_is_not_given_back(start, make_x):
+    """Another program, or a hand at a tool, switched it off."""
+    rig = start(make_x(returning=True))
+    servo = rig.buses[0].servo(13)
+    servo.silence()
+    cycles(rig, 20)
+    servo.poke("torque_enable", 0)
+    servo.silence(False)
+    until_valid(rig)
+    cycles(rig, 5)
+    assert rig.torque() == [True, True, False, True]
+    assert rig.events.of(EventCode.SERVO_REBOOTED) == []
+
+
+def test_a_servo_of_protocol_1_that_was_limp_before_it_was_lost_did_not_reboot(start, make_plan):
+    """It has no clock: only torque that it had and has no more tells a reboot."""
+    rig = start(_with(make_plan((1, 3, 5)), False))
+    servo = rig.buses[0].servo(3)
+    for reset in (True, False):
+        servo.silence()
+        cycles(rig, 20)
+        if reset:
+            servo.reset()
+        servo.silence(False)
+        until_valid(rig)
+        cycles(rig, 5)
+        assert rig.torque() == [True, False, True]
+    assert len(rig.events.of(EventCode.SERVO_REBOOTED)) == 1
+
+
+def test_a_servo_that_its_watchdog_stopped_gets_no_goal_before_its_torque_was_read(start, make_x):
+    rig = start(make_x(watchdog=10))
+    rig.restless = 0.002
+    cycles(rig, 5)
+    rig.clock.wait_until(rig.clock.now_ns() + 300_000_000)
+    count = len(rig.into_bus())
+    cycles(rig, 30)
+    since = rig.into_bus()[count:]
+    for servo_id in X_IDS:
+        asked = since.index(protocol2.read(servo_id, 64, 1))
+        goals = [servo_id in _goals(packet, 2.0) for packet in since]
+        assert True in goals
+        assert goals.index(True) > asked
+
+
+def test_a_servo_of_protocol_1_that_was_let_go_gets_no_goal_which_would_switch_its_torque_on(
+    start, make_plan
+):
+    rig = start(make_plan((1, 3, 5)))
+    rig.restless = 0.02
+    cycles(rig, 3)
+    rig.hardware.let_go([1])
+    since = len(rig.into_bus())
+    cycles(rig, 30)
+    assert rig.torque() == [True, False, True]
+    goals = [list(_goals(packet, 1.0)) for packet in rig.into_bus()[since:] if _goals(packet, 1.0)]
+    assert goals == [[1, 5]] * 30
+
+
+def test_an_end_without_a_line_raises_nothing_and_names_everybody(start, make_x):
+    rig = start(make_x(watchdog=10))
+    cycles(rig, 3)
+    rig.buses[0].unplug()
+    said = rig.hardware.stop()
+    assert len(said) == 4
+    assert all("torque off could not be sent" in sentence for sentence in said)

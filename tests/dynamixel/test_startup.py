@@ -359,3 +359,22 @@ def test_a_servo_that_is_silent_when_all_have_torque_ends_the_start(make_rig):
     silent_from(rig, protocol1.read(5, 24, 1))
     with pytest.raises(StartUpError, match=r"ID 5 on bus main\) did not answer after torque was switched on"):
         rig.hardware.start()
+
+
+def test_a_servo_whose_state_cannot_be_read_once_it_has_torque_ends_the_start(make_rig):
+    """It may answer all other questions: goals without states would be blind."""
+    rig = make_rig()
+    write, plan = rig.ports.ports[0].write, rig.plans[0].servos[2]
+    block = protocol1.read(plan.servo_id, plan.state.address, plan.state.length)[:6]
+
+    def through(data):
+        if bytes(data[:6]) == block and rig.torque()[7]:
+            rig.buses[0].truncate_next(plan.servo_id, 0)
+        write(data)
+
+    rig.ports.ports[0].write = through
+    with pytest.raises(
+        StartUpError, match=r"ID 5 on bus main\) did not answer after torque was switched on: "
+    ):
+        rig.hardware.start()
+    assert rig.torque() == [False] * 8

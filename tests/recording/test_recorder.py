@@ -160,22 +160,28 @@ def test_what_was_overwritten_is_declared_and_counted(start: Start, cycle: Cycle
     assert recording.process.wait(60) == 1
 
 
+@pytest.mark.parametrize("overwritten", [0, 7])
 def test_what_waits_at_the_end_is_drained_however_much_it_is(
-    tmp_path: Path, header: LogHeader, layout: CycleLayout, cycle: Cycle
+    tmp_path: Path, header: LogHeader, layout: CycleLayout, cycle: Cycle, overwritten: int
 ) -> None:
     """A recorder that was stopped while it was behind: two turns and a half are in the ring."""
     count = 2 * _MOST_PER_TURN + 1000
     memory = ring.create("cycles", layout.size, count)
     writer, record = RingWriter(memory), cycle(0)
-    for _ in range(count):
+    for _ in range(count + overwritten):
         writer.append(record)
     ours, theirs = socket.socketpair()
     with ours, theirs:
+        control = Control(theirs.fileno())
+        control.metadata["grants"] = {"loop": "none"}  # what the supervisor said while it ran
         job = RecorderJob(str(tmp_path / "run.mcap"), header, (RecordedRing("cycles", memory, "loop"),))
-        summary = Recorder(job, Control(theirs.fileno())).run(lambda: True)
+        summary = Recorder(job, control).run(lambda: True)
     os.close(memory)
-    assert summary.gaps == 0
-    assert len(read_log(tmp_path / "run.mcap").cycles) == count
+    log = read_log(tmp_path / "run.mcap")
+    assert len(log.cycles) + summary.gaps == count + overwritten
+    assert bool(summary.gaps) is bool(overwritten)
+    assert [event.code for event in log.events] == [EventCode.RECORDER_GAP] * bool(overwritten)
+    assert log.metadata["grants"] == {"loop": "none"}
 
 
 def test_a_record_of_another_robot_is_declared_not_written(start: Start, cycle: Cycle) -> None:

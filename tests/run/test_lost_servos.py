@@ -10,8 +10,11 @@ from typing import Any
 
 import pytest
 
+from dxlrun.control.lost_servos import LostServos
+from dxlrun.control.policy_plan import GroupPolicy, PolicyPlan
 from dxlrun.events import EventCode
 from dxlrun.inbox import LOOP, Command
+from dxlrun.interfaces import States
 from dxlrun.testing import read_log, simulated_robot
 from dxlrun.virtual_run import VirtualRobot
 from dxlrun_controllers.group import JointGroupPositionController
@@ -239,3 +242,46 @@ def test_a_pose_at_the_end_does_not_wait_for_a_servo_that_is_lost(
     assert robot.clock.now_ns() < BACK_NS + 1_500_000_000, "it waited for the lost one"
     ended = round(math.radians(170) / TICK) * TICK
     assert [goals(robot, servo)[-1][1] for servo in (3, 9)] == pytest.approx([ended, ended])
+
+
+MISSED, HEARD = False, True
+
+
+@pytest.mark.parametrize(
+    ("cycles", "lost"),
+    [
+        ([(MISSED, 20), (MISSED, 40), (MISSED, 60)], [False, False, True]),
+        ([(MISSED, 47), (MISSED, 48), (MISSED, 49), (MISSED, 50)], [False, False, False, True]),  # at 1 kHz
+        (
+            [(MISSED, 100), (MISSED, 200), (HEARD, 0), (MISSED, 100), (MISSED, 200), (MISSED, 300)],
+            [False, False, False, False, False, True],
+        ),
+        ([(MISSED, -1), (MISSED, -1), (MISSED, -1)], [False, False, True]),  # never heard
+        ([(MISSED, 100), (MISSED, 200), (MISSED, 300), (HEARD, 0)], [False, False, True, False]),
+    ],
+)
+def test_a_joint_is_lost_after_three_misses_in_a_row_and_some_time(
+    cycles: list[tuple[bool, int]], lost: list[bool]
+) -> None:
+    look, states, found = LostServos(2), States.empty(2), []
+    states.valid[:] = True
+    before = frozenset[int]()
+    for heard, age_ms in cycles:
+        states.valid[1], states.age_ns[1] = heard, age_ms * 1_000_000 if age_ms > 0 else age_ms
+        assert look.look(states) is (look.rows != before)
+        before = look.rows
+        found.append(1 in look.rows)
+        assert 0 not in look.rows
+    assert found == lost
+
+
+def test_a_group_is_let_go_once_however_long_its_servo_stays_away() -> None:
+    arm = GroupPolicy("arm", frozenset({0, 1}), "limp")
+    plan, look, states = PolicyPlan(groups=(arm,)), LostServos(3), States.empty(3)
+    states.valid[2] = True
+    states.age_ns[:] = 100_000_000
+    told = []
+    for _ in range(5):
+        look.look(states)
+        told.append(look.judge(plan))
+    assert told == [({}, [])] * 2 + [({}, [arm])] + [({}, [])] * 2

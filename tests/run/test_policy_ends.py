@@ -10,12 +10,13 @@ from typing import Any
 
 import pytest
 
+from dxlrun import process
 from dxlrun.control.policy_plan import TORQUE_STAYS
 from dxlrun.events import Severity, decode_event
 from dxlrun.guardian import LastHand
 from dxlrun.heartbeat import Heartbeat, Phase
-from dxlrun.packets import PacketBatch
-from dxlrun.ring import Handover, RingReader
+from dxlrun.packets import PacketBatch, PacketKind, decode_packets
+from dxlrun.ring import Handover, RingReader, RingWriter
 from dxlrun.run_processes import Memory, guardian_job
 from dxlrun.simulation import VirtualPorts
 from dxlrun.testing import VirtualRobot, plan_of, simulated_robot
@@ -185,3 +186,15 @@ def test_the_last_hand_names_who_did_not_confirm_torque_off(
         assert result == "torque off was confirmed by all 2 servos"
         assert event.severity == Severity.WARNING
     assert [servo.torque_on for servo in robot.buses[0].servos] == [False, silent]
+
+
+def test_what_the_loop_had_on_its_desk_when_it_died_comes_into_the_log(start: Start, tmp_path: Path) -> None:
+    plan = plan_of(tmp_path / "pair.yaml")
+    memory = Memory.create(plan)
+    desk = PacketBatch(RingWriter(memory.packets), process.shared_memory(memory.desk))
+    desk.packet(0, PacketKind.INSTRUCTION, 3, 1, 2, b"half a cycle")
+    master, slave = os.openpty()
+    LastHand(guardian_job(plan, {}, memory, take_over=False))._take_over([slave])
+    (packet,) = decode_packets(memoryview(RingReader(memory.guardian_packets).read()))
+    assert packet.data == b"half a cycle"
+    os.close(master)
