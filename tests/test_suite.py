@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import tarfile
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -98,3 +99,15 @@ def test_the_tests_of_the_sdist_are_found_and_run(unpacked: Path) -> None:
     assert collected.returncode == 0, collected.stdout[-4000:]
     ran = run("-m", "pytest", *options, *QUICK, directory=unpacked)
     assert ran.returncode == 0, ran.stdout[-4000:]
+
+
+def test_the_wheel_has_every_robot_and_motion(tmp_path: Path) -> None:
+    """For `dxlrun examples`; the top level of the repository stays their only source."""
+    built = run("-m", "hatchling", "build", "--target", "wheel", "--directory", str(tmp_path))
+    assert built.returncode == 0, built.stdout + built.stderr
+    (wheel,) = tmp_path.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        names = [name for name in archive.namelist() if name.startswith("dxlrun/examples/")]
+        shipped = {Path(name).relative_to("dxlrun/examples"): archive.read(name) for name in names}
+    tracked = [path for path in (ROOT / "robots").rglob("*") if path.suffix in {".yaml", ".urdf", ".json"}]
+    assert shipped == {path.relative_to(ROOT / "robots"): path.read_bytes() for path in tracked}

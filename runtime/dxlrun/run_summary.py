@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from dxlrun.compile.plan import Plan
 
 _REFRESH_S = 0.1
+_LINE_S = 5.0
+"""Between two lines in a pipe or a file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,12 +52,16 @@ class RunSummary:
 
 
 class Progress:
-    """The status line of a run: how far it has come, and on virtual time how fast."""
+    """The status line of a run: how far it has come, and on virtual time how fast.
+
+    A console that is no terminal shows no status; it gets a line every few seconds.
+    """
 
     def __init__(self, plan: Plan, status: Status, *, virtual: bool = False) -> None:
         self._plan = plan
         self._status = status
         self._virtual = virtual
+        self._every_s = _REFRESH_S if status.console.is_terminal else _LINE_S
         self._began = self._shown = time.monotonic()
 
     def setting_up(self) -> None:
@@ -65,14 +71,19 @@ class Progress:
     def ran(self, cycles: int, skipped: int) -> None:
         """Show how many cycles ran and how many periods were skipped; cheap when called for every cycle."""
         now = time.monotonic()
-        if now - self._shown < _REFRESH_S:
+        if now - self._shown < self._every_s:
             return
         self._shown, elapsed_s = now, now - self._began
         ran_ns, end_ns = (cycles + skipped) * self._plan.loop.period_ns, self._plan.loop.end_ns
         # the steps of a policy come after the end: none is shown beside them
         end = f" of {end_ns / 1e9:.1f}" if end_ns and ran_ns <= end_ns else ""
         speed = f", {ran_ns / 1e9 / elapsed_s:.3g} times real time" if self._virtual else ""
-        self._status.update(
+        line = (
             f"{self._plan.robot}: {ran_ns / 1e9:.1f}{end} s{speed}, {counted(cycles, 'cycle', 'cycles')}, "
-            f"{counted(skipped, 'period', 'periods')} skipped ({elapsed_s:.0f} s; Ctrl-C stops)"
+            f"{counted(skipped, 'period', 'periods')} skipped"
         )
+        if self._status.console.is_terminal:
+            self._status.update(f"{line} ({elapsed_s:.0f} s; Ctrl-C stops)")
+        else:
+            self._status.console.print(line, markup=False, soft_wrap=True)
+            self._status.console.file.flush()

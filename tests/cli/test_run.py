@@ -290,8 +290,9 @@ def test_a_log_that_is_gone_or_not_whole_is_no_good_run(  # noqa: PLR0917  fixtu
 class Line:
     """A terminal's status line, and what it showed."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, terminal: bool = True) -> None:
         self.shown: list[str] = []
+        self.console = Console(file=io.StringIO(), force_terminal=terminal)
 
     def update(self, text: str) -> None:
         self.shown.append(text)
@@ -319,6 +320,24 @@ def test_progress_counts_skipped_periods(
     progress.ran(100, 50)
 
     assert line.shown == [shown]
+
+
+def test_without_a_terminal_a_line_tells_every_five_seconds_that_the_run_goes_on(
+    torso: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Timed by a clock of the test: from 100 s on, one cycle every 20 ms."""
+    now = iter([100.0, *(100 + 0.02 * cycle for cycle in range(1, 601))])
+    monkeypatch.setattr("dxlrun.run_summary.time.monotonic", lambda: next(now))
+    line = Line(terminal=False)
+    progress = Progress(plan_of(torso, duration_s=12.0), line)
+    for cycle in range(1, 601):
+        progress.ran(cycle, 0)
+
+    assert line.shown == []
+    assert line.console.file.getvalue().splitlines() == [
+        "bioloid_torso: 5.0 of 12.0 s, 250 cycles, 0 periods skipped",
+        "bioloid_torso: 10.0 of 12.0 s, 500 cycles, 0 periods skipped",
+    ]
 
 
 def test_a_run_on_virtual_time_shows_its_progress(torso: Path, monkeypatch: pytest.MonkeyPatch):

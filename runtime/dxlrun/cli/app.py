@@ -14,6 +14,7 @@ from dxlrun.cli.analyze import analyze
 from dxlrun.cli.bench import bench
 from dxlrun.cli.check import check
 from dxlrun.cli.doctor import doctor
+from dxlrun.cli.examples import examples
 from dxlrun.cli.models import models
 from dxlrun.cli.replay import replay
 from dxlrun.cli.robots import list_robots
@@ -37,7 +38,8 @@ HELP = """Run a robot of Dynamixel servos from one YAML file.
 
 `dxlrun ROBOT.yaml` runs it, `dxlrun check ROBOT.yaml` looks at it without touching hardware,
 `dxlrun sim ROBOT.yaml` simulates its servos for other programs,
-`dxlrun analyze LOG` says what happened in a run, `dxlrun list` shows the robots that run."""
+`dxlrun analyze` says what happened in a run, `dxlrun list` shows the robots that run,
+`dxlrun examples` has robots to start with."""
 
 USAGE = """Usage: dxlrun ROBOT.yaml [ARG:=VALUE ...] [OPTIONS]
        dxlrun COMMAND ...
@@ -58,6 +60,7 @@ def build() -> App:
         suppress_keyboard_interrupt=False,  # an interrupt is said by us, like everything else
     )
     app.default(run)
+    app.command(examples)
     app.command(check)
     app.command(analyze)
     app.command(replay)

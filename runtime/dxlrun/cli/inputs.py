@@ -12,7 +12,19 @@ from dxlrun.errors import InputError
 if TYPE_CHECKING:
     from dxlrun.compile import Ask, Compiled
 
-COMMANDS = ("analyze", "bench", "check", "doctor", "models", "replay", "scan", "schema", "servo", "sim")
+COMMANDS = (
+    "analyze",
+    "bench",
+    "check",
+    "doctor",
+    "examples",
+    "models",
+    "replay",
+    "scan",
+    "schema",
+    "servo",
+    "sim",
+)
 COMMANDS_WHILE_IT_RUNS = (
     "list",
     "set",

@@ -1,0 +1,180 @@
+"""`dxlrun examples`: the robots and motions that come along, to be looked at, copied and run."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dxlrun.cli.flags import Flag, JsonFlag
+from dxlrun.cli.terminal import out
+from dxlrun.errors import DxlrunError, InputError
+
+if TYPE_CHECKING:
+    from dxlrun.description import MotionDescription, Robot
+
+_HERE = Path("robots")
+_SCHEMAS = ("robot.schema.json", "motions/motion.schema.json")
+"""What the first line of each file names for editors."""
+
+
+@dataclass(frozen=True, slots=True)
+class Example:
+    """A robot that comes along."""
+
+    name: str
+    """Of its file."""
+    servos: int
+    motions: tuple[str, ...]
+    """Those for its controllers, by the names of their files; first those that can be played at once."""
+    playable: int
+    """How many can be played at once; the others need a controller that is not active at the start."""
+    about: str
+    files: tuple[str, ...]
+    """All that it needs, its own file first, from the directory of the examples."""
+
+
+def examples(
+    name: str | None = None, directory: Path = _HERE, /, *, as_json: JsonFlag = False, debug: Flag = False
+) -> int:
+    """List the robots that come along with dxlrun, or copy one and its motions, to be run and changed.
+
+    Parameters
+    ----------
+    name
+        The robot to be copied; without it all are listed.
+    directory
+        Where it is copied to; nothing there is overwritten.
+    as_json
+        Print the result as JSON.
+    debug
+        Print the traceback of an error.
+    """
+    source = examples_directory()
+    known = {path.stem: path for path in sorted(source.glob("*.yaml"))}
+    if name is None:
+        _list([_example(path) for path in known.values()], as_json=as_json)
+        return 0
+    stem = Path(name).name.removesuffix(".yaml")
+    if stem not in known:
+        from dxlrun.compile.problems import suggestion
+
+        raise InputError(f"there is no example {name}; {suggestion(stem, tuple(known))}")
+    example = _example(known[stem])
+    _copy(source, directory, example.files)
+    console = out()
+    if as_json:
+        copied = [str(directory / file) for file in example.files]
+        console.file.write(json.dumps({"robot": copied[0], "files": copied}, indent=2) + "\n")
+        return 0
+    for file in example.files:
+        console.print(str(directory / file), markup=False, soft_wrap=True)
+    motion = f" --play {directory / 'motions' / example.motions[0]}.yaml" if example.playable else ""
+    console.print(f"next: dxlrun {directory / example.files[0]}{motion}", markup=False, soft_wrap=True)
+    return 0
+
+
+def examples_directory() -> Path:
+    """Return where the examples are: in the installed package, or in the clone that it is edited in."""
+    package = Path(__file__).parents[1]
+    for place in (package / "examples", package.parents[1] / "robots"):
+        if place.is_dir():
+            return place
+    raise DxlrunError("this installation of dxlrun has no examples; install it anew")
+
+
+def _list(found: Sequence[Example], *, as_json: bool) -> None:
+    console = out()
+    if as_json:
+        console.file.write(json.dumps([asdict(one) for one in found], indent=2) + "\n")
+        return
+    from rich.table import Table
+
+    from dxlrun.cli.narrow import fitting
+
+    table = Table("example", box=None, pad_edge=False)
+    table.add_column("servos", justify="right")
+    for head in ("motions", "about"):
+        table.add_column(head, overflow="fold")
+    for one in found:
+        table.add_row(one.name, str(one.servos), ", ".join(one.motions), one.about)
+    console.print(fitting(table, console.width))
+    console.print(
+        f"`dxlrun examples NAME [DIR]` copies one and its motions into DIR, without it {_HERE}",
+        markup=False,
+        soft_wrap=True,
+    )
+
+
+def _example(path: Path) -> Example:
+    from dxlrun.description import read_motion, read_robot
+
+    description = read_robot(path, {})
+    robot, source = description.robot, path.parent
+    active = {name for name, entry in robot.controllers.items() if entry.active}
+    found = map(read_motion, sorted(source.glob("motions/*.yaml")))
+    motions = [motion for motion in found if _fits(motion, robot)]
+    at_once = [motion for motion in motions if {part.controller for part in motion.motion.motions} <= active]
+    motions = [*at_once, *(motion for motion in motions if motion not in at_once)]
+    needed = [*map(Path, description.included), *(motion.path for motion in motions)]
+    needed += [source / robot.model.urdf] if robot.model else []
+    files = [path.name, *(str(each.relative_to(source)) for each in needed)]
+    schemas = _SCHEMAS if motions else _SCHEMAS[:1]
+    return Example(
+        name=path.stem,
+        servos=len(robot.joints),
+        motions=tuple(motion.path.stem for motion in motions),
+        playable=len(at_once),
+        about=_about(description.text),
+        files=(*files, *schemas),
+    )
+
+
+def _fits(motion: MotionDescription, robot: Robot) -> bool:
+    """Say whether a motion is for controllers and joints that a robot has."""
+    from dxlrun.description.motion import FormulaPart
+
+    joints: set[str] = set()
+    for part in motion.motion.motions:
+        if isinstance(part, FormulaPart):
+            joints.update(part.joints)
+        else:
+            joints.update(*(point.joints for point in part.points))
+    controllers = {part.controller for part in motion.motion.motions}
+    return controllers <= set(robot.controllers) and joints <= set(robot.joints)
+
+
+def _about(text: str) -> str:
+    """Return the first sentence of the comment at the top of a robot file."""
+    comment: list[str] = []
+    for line in text.splitlines()[1:]:  # the first one is for editors
+        if not line.startswith("# ") or line.startswith("#  "):
+            break
+        comment.append(line.removeprefix("# "))
+    return re.split(r"(?<=\.)\s", " ".join(comment), maxsplit=1)[0]
+
+
+def _copy(source: Path, directory: Path, files: Sequence[str]) -> None:
+    """Copy files; raises InputError, before any is written, where another one has a name of theirs."""
+    texts = {directory / file: (source / file).read_bytes() for file in files}
+    taken = [path for path, text in texts.items() if path.exists() and not _holds(path, text)]
+    if taken:
+        raise InputError(
+            "\n".join(
+                f"{path} is there already, with other contents, and stays; choose another directory"
+                for path in taken
+            )
+        )
+    try:
+        for path, text in texts.items():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(text)
+    except OSError as error:
+        raise InputError(f"{error.filename} cannot be written: {error.strerror}") from error
+
+
+def _holds(path: Path, text: bytes) -> bool:
+    return path.is_file() and path.read_bytes() == text
