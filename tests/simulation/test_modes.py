@@ -241,7 +241,7 @@ def test_a_pro_before_a_moves_by_its_own_items(make_line2: Any, model: str) -> N
     assert line.servo().velocity == pytest.approx(3000 * table.rad_s_per_tick, rel=0.05)
     assert line.get("present_velocity") == pytest.approx(3000, rel=0.05)
     line.wait(10)
-    assert line.get("present_position") == pytest.approx(50_000, abs=300)
+    assert line.get("present_position") == pytest.approx(50_000, abs=20)
     line.set("torque_enable", 0)
     assert line.set("operating_mode", 1) == 0
     line.set("torque_enable", 1)
@@ -255,6 +255,28 @@ def test_a_pro_before_a_moves_by_its_own_items(make_line2: Any, model: str) -> N
     assert line.get("present_current") == pytest.approx(50, abs=2)
     line.set("torque_enable", 0)
     assert line.set("operating_mode", 16) == ErrorNumber.DATA_RANGE
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        "H54-100-S500-R",
+        "H42-20-S300-R",
+        "L54-30-S400-R",
+        "M54-60-S250-R(A)",
+        "PH42-020-S300",
+        "PH54-200-S500",
+    ],
+)
+@pytest.mark.parametrize("goal", [100_000, -100_000])
+def test_a_pro_comes_as_near_to_its_goal_as_the_makers_examples_wait_for(
+    make_line2: Any, model: str, goal: int
+) -> None:
+    line = make_line2((1,), model, position=0.0)
+    assert move(line, goal) == pytest.approx(goal, abs=20)
+    line.wait(0.5)
+    assert line.get("present_position") == pytest.approx(goal, abs=20)
+    assert line.get("moving") == 0
 
 
 def test_a_pro_with_a_goal_torque_is_no_stronger_than_that(make_line2: Any) -> None:

@@ -14,8 +14,13 @@ from dxlrun.simulation.shaft import critical_d
 
 SAMPLING_S = 1e-3
 
-UNKNOWN_P = 5.0
-"""Duty per rad where the manual gives no initial gain: about as stiff as the X series [i]"""
+UNKNOWN_P = 150.0
+"""Duty per rad where the manual gives no initial gain: the PRO, P and Y lines, and the grippers [i].
+
+ROBOTIS' own examples for the PRO line wait until at most 20 ticks are left (DynamixelSDK,
+c++/example/protocol2.0, DXL_MOVING_STATUS_THRESHOLD); friction takes 1.3 % of the duty, and 20 ticks of the
+finest model are 0.000125 rad.
+"""
 
 UNKNOWN_VELOCITY_P, UNKNOWN_VELOCITY_I = 4.0, 40.0
 """There, per part of the no-load speed that is missing, and per s of it [i]"""
