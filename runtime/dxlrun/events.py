@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum, unique
 from typing import Protocol
 
@@ -123,6 +123,50 @@ class Event:
         return known.name.lower() if isinstance(known, EventCode) else f"code_{self.code}"
 
 
+@dataclass(frozen=True, slots=True)
+class EventGroup:
+    """Events of one kind and one source."""
+
+    code: int
+    severity: int
+    source: str
+    count: int
+    t_ns: int
+    """Of the first one; ns of the run's clock."""
+    text: str
+    """Of the first one."""
+
+    @property
+    def name(self) -> str:
+        """The name of the code, in lower case."""
+        return Event(self.t_ns, self.code, self.severity, self.source, self.text).name
+
+
+class EventCounts:
+    """Counts events by kind and source: no more is kept than there are joints, controllers and processes."""
+
+    __slots__ = ("_groups",)
+
+    def __init__(self) -> None:
+        self._groups: dict[tuple[int, int, str], EventGroup] = {}
+
+    def add(self, event: Event) -> None:
+        """Count an event; one of `part` > 0 goes on with the text of the one before."""
+        key = (event.code, event.severity, event.source)
+        group = self._groups.get(key)
+        if group is None:
+            self._groups[key] = EventGroup(*key, 1, event.t_ns, event.text)
+        elif not event.part:
+            self._groups[key] = replace(group, count=group.count + 1)
+        elif group.t_ns == event.t_ns:
+            self._groups[key] = replace(group, text=group.text + event.text)
+
+    @property
+    def groups(self) -> tuple[EventGroup, ...]:
+        """All of them, in the order of the first of each."""
+        return tuple(self._groups.values())
+
+
 class _Now(Protocol):
     """The part of a Clock that an event needs."""
 
@@ -137,15 +181,19 @@ class EventRing:
     A text longer than a slot becomes several records (`part`); beyond 32 slots it is cut.
     """
 
-    __slots__ = ("_clock", "_writer")
+    __slots__ = ("_clock", "_writer", "errors")
 
     def __init__(self, writer: Appender, clock: _Now) -> None:
         self._writer = writer
         self._clock = clock
+        self.errors = EventCounts()
+        """What was emitted as an error, for a run without a log."""
 
     def emit(self, code: EventCode, severity: Severity, source: str, text: str) -> None:
         """Record that `source` (a joint, a controller, a process) has something to tell, now."""
         t_ns = self._clock.now_ns()
+        if severity >= Severity.ERROR:
+            self.errors.add(Event(t_ns, code, severity, source, text))
         name = source.encode(errors="replace")[:64]
         room = min(self._writer.slot_size, EVENT_SLOT) - _HEADER.size - len(name)
         for part, piece in enumerate(_pieces(text.encode(errors="replace"), room)):

@@ -36,7 +36,7 @@ from dxlrun.dynamixel.port import SerialPort, SerialPorts
 from dxlrun.dynamixel.reopening import LinesAgain
 from dxlrun.dynamixel.reply_polling import ReplyPolling
 from dxlrun.errors import DxlrunError, PlugInError
-from dxlrun.events import EventCode, EventRing, Severity
+from dxlrun.events import EventCode, EventGroup, EventRing, Severity
 from dxlrun.heartbeat import Heartbeat, Phase
 from dxlrun.mailbox import Mailbox
 from dxlrun.packets import PacketBatch
@@ -90,6 +90,10 @@ class Outcome:
     remarks: tuple[str, ...] = ()
     """What a person should know beside that."""
     traceback: str = ""
+    invalid: tuple[int, ...] = ()
+    """Cycles in which the state of each joint was not valid."""
+    errors: tuple[EventGroup, ...] = ()
+    """Events that were errors."""
 
 
 @dataclass(slots=True)
@@ -239,7 +243,15 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: RingSinks) -> Ou
             robot.hardware.release()
     detail = (result.detail,) if result.detail else ()
     remarks = (TORQUE_STAYS,) if last == "hold" else ()
-    return Outcome(result.reason, result.cycles, result.skipped, (*detail, *failures), remarks)
+    return Outcome(
+        result.reason,
+        result.cycles,
+        result.skipped,
+        (*detail, *failures),
+        remarks,
+        invalid=result.invalid,
+        errors=sinks.events.errors.groups,
+    )
 
 
 def _prepare(  # noqa: PLR0917  what a loop's process has

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from rich.status import Status
 
     from dxlrun.compile.plan import Plan
+    from dxlrun.events import EventGroup
 
 _REFRESH_S = 0.1
 _LINE_S = 5.0
@@ -49,6 +50,10 @@ class RunSummary:
     log: str | None = None
     messages: int = 0
     """Messages in the log."""
+    invalid: tuple[int, ...] = ()
+    """Cycles in which the state of each joint was not valid."""
+    errors: tuple[EventGroup, ...] = ()
+    """Events of the loop that were errors."""
 
 
 class Progress:

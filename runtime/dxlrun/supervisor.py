@@ -29,6 +29,7 @@ from dxlrun.guardian import GuardianJob, LastHand
 from dxlrun.heartbeat import Heartbeat, Phase, Standstill
 from dxlrun.loop_process import Outcome
 from dxlrun.plurals import counted
+from dxlrun.recording.schemas import FAILURES_NAME
 from dxlrun.run_log import discard_log, epoch_offset_ns, incomplete_log, ledger_of, log_header, new_log
 from dxlrun.run_processes import (
     Memory,
@@ -256,6 +257,8 @@ class _Run:
 
     def _end_recorder(self, recorder: Child) -> None:
         """Let the recorder drain the rings and close the log; say so when it could not."""
+        if self.sentences:  # no ring has them, and the log's verdict is to be that of the run
+            recorder.line.send({"metadata": {FAILURES_NAME: dict(enumerate(self.sentences))}})
         recorder.line.send({"finish": True})
         closed = False
         try:
@@ -341,6 +344,8 @@ def _summary(run: _Run, elapsed_s: float) -> RunSummary:
         remarks=(*refusals(run.grants, run.out), *outcome.remarks, *run.remarks),
         log=str(run.log) if run.log and run.log.exists() else None,
         messages=run.messages,
+        invalid=outcome.invalid,
+        errors=outcome.errors,
     )
 
 

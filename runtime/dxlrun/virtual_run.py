@@ -23,7 +23,7 @@ from dxlrun.control.plugins import load_plugins
 from dxlrun.control.policy_plan import TORQUE_STAYS, Last
 from dxlrun.cycle import CycleRecord
 from dxlrun.errors import DxlrunError, InputError
-from dxlrun.events import EventCode, EventRing, Severity
+from dxlrun.events import EventCode, EventGroup, EventRing, Severity
 from dxlrun.inbox import QueueInbox
 from dxlrun.packets import NoPackets, PacketBatch
 from dxlrun.recording.log_writer import LogWriter
@@ -150,6 +150,11 @@ class VirtualRobot:
         """The memory of the cycle that ran last."""
         return self.robot.record
 
+    @property
+    def errors(self) -> tuple[EventGroup, ...]:
+        """The events that were errors, by kind and source."""
+        return self._sinks.events.errors.groups
+
     def run(self) -> LoopResult:
         """Set up, run to the plan's end or a fault, switch torque off unless a policy holds, close the log.
 
@@ -233,4 +238,6 @@ def run_virtual(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
         remarks=(TORQUE_STAYS,) if result.last == "hold" else (),
         log=str(log) if log and log.exists() else None,
         messages=robot.messages,
+        invalid=result.invalid,
+        errors=robot.errors,
     )

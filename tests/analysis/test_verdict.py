@@ -78,6 +78,13 @@ def test_what_happened_to_one_servo_is_said_of_it_at_once(write: Make, cycle: Ma
     )
 
 
+def test_a_failure_beside_the_loop_is_the_runs(write: Make, cycle: Make) -> None:
+    path = write([cycle(0)], metadata={"failures": {"0": "the simulated bus ended before the run did"}})
+    verdict = analyze_log(path).verdict
+    assert not verdict.good
+    assert verdict.sentences[0] == "The run failed: the simulated bus ended before the run did."
+
+
 @pytest.mark.parametrize(("skipped", "good"), [(0, True), (100, True), (101, False)])
 def test_as_many_periods_may_be_skipped_as_the_file_tolerates(skipped: int, good: bool) -> None:
     account = Periods(1000, 1000 - skipped, skipped, 0, True, 50.0, 20.0, (50.0,))

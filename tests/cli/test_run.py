@@ -186,7 +186,42 @@ def test_a_run_says_the_verdict_of_its_log(
 def test_one_skipped_period_is_one(dxlrun: Callable, runs: Runs, torso: Path):
     runs.answer = RunSummary(0, "ended", 100, 1, 2.03, ())
 
-    assert dxlrun(torso).out.splitlines() == ["bioloid_torso: good. 2.0 s, 100 cycles, 1 period skipped"]
+    assert dxlrun(torso).out.splitlines() == [
+        "bioloid_torso: good. 2.0 s, 100 cycles, 1 period skipped",
+        "  The loop kept 50 Hz: 1 of 101 periods skipped (0.99%; 10% tolerated).",
+    ]
+
+
+def test_without_a_log_the_same_rules_hold(dxlrun: Callable, runs: Runs, torso: Path):
+    runs.answer = RunSummary(0, "ended", 700, 300, 20.0, ())
+    said = dxlrun(torso, "--no-record")
+    assert said.code == 1
+    assert said.out.splitlines() == [
+        "bioloid_torso: failed. 20.0 s, 700 cycles, 300 periods skipped",
+        "  The loop did not keep 50 Hz: 300 of 1000 periods skipped (30.00%; 10% tolerated).",
+    ]
+
+
+def test_a_loss_without_a_log_is_told_and_fails_the_run(
+    dxlrun: Callable, tmp_path: Path, torso: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(tmp_path)
+
+    def silent(robot: VirtualRobot, *arguments: object, **options: object) -> None:
+        born(robot, *arguments, **options)
+        robot.buses[0].at(1_000_000_000, lambda: robot.buses[0].servos[1].silence(True))
+
+    born = VirtualRobot.__init__
+    monkeypatch.setattr(VirtualRobot, "__init__", silent)
+
+    told = [dxlrun(torso, "--virtual", "--duration", "2", *words) for words in ((), ("--no-record",))]
+
+    assert [said.code for said in told] == [1, 1]
+    for said in told:
+        _, lost, invalid, *_ = said.out.splitlines()
+        assert lost == "  Servos failed: left_shoulder_lateral_joint was lost."
+        assert invalid.startswith("  States were invalid: left_shoulder_lateral_joint in 60.0%")
+    assert told[0].out.splitlines()[1:3] == told[1].out.splitlines()[1:3]
 
 
 def test_virtual_time_refuses_a_real_port(dxlrun: Callable, torso: Path):

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from dxlrun.analysis.report import analyze
 from dxlrun.events import EventCode, Severity
 from dxlrun.simulation import read_ledger
 
@@ -418,10 +419,13 @@ def test_simulated_servos_that_are_gone_end_the_run(start: Start, wait_for: Call
     run = start()
     run.wait_until_moving()
     os.kill(run.child("dxlrun.simulation"), signal.SIGKILL)
-    code, _, err = run.finish()
+    code, out, err = run.finish()
     assert code == 1
     assert "the simulated bus ended before the run did" in err
     assert "torque off could not be sent" in err
     assert "Traceback" not in err
     wait_for(run.gone, "the end of every process")
     assert run.log().complete
+    verdict = analyze(run.log()).verdict
+    assert "The run failed: the simulated bus ended before the run did." in verdict.sentences
+    assert [line.strip() for line in out.splitlines() if line.startswith("  ")] == list(verdict.sentences)

@@ -18,9 +18,10 @@ from dxlrun.analysis.latency import (
     durations,
 )
 from dxlrun.analysis.steering import Act, Pause
-from dxlrun.analysis.tally import Said, Tally
+from dxlrun.analysis.tally import Tally
 from dxlrun.analysis.tracking import Joint, tracking
 from dxlrun.analysis.verdict import Verdict, judge
+from dxlrun.events import EventGroup
 from dxlrun.recording.reader import Log, read_log
 
 
@@ -95,10 +96,10 @@ def to_json(report: Report) -> bytes:
     return msgspec.json.format(msgspec.json.encode(report), indent=2)
 
 
-def _events(events: Iterable[Said]) -> tuple[EventCount, ...]:
+def _events(events: Iterable[EventGroup]) -> tuple[EventCount, ...]:
     """Return the events by kind, the grave ones first."""
     counts: Counter[tuple[str, int]] = Counter()
-    first: dict[tuple[str, int], Said] = {}
+    first: dict[tuple[str, int], EventGroup] = {}
     for said in events:
         key = (said.name, said.severity)
         counts[key] += said.count

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
@@ -15,28 +15,9 @@ from dxlrun.analysis.bus import BusTraffic, Servo, Traffic
 from dxlrun.analysis.latency import Latency, Periods, Punctuality, Slowest, on_virtual_time
 from dxlrun.analysis.steering import Act, Pause, Steering
 from dxlrun.control.loop_plan import TOLERATED_SKIPS
-from dxlrun.events import Event, EventCode, Severity
+from dxlrun.events import EventCode, EventCounts, EventGroup, Severity
 from dxlrun.recording.reader import Log, scan_log
-from dxlrun.recording.schemas import SUMMARY_NAME
-
-
-@dataclass(frozen=True, slots=True)
-class Said:
-    """Events of one kind and one source."""
-
-    code: int
-    severity: int
-    source: str
-    count: int
-    t_ns: int
-    """Of the first one; ns of the run's clock."""
-    text: str
-    """Of the first one."""
-
-    @property
-    def name(self) -> str:
-        """The name of the code."""
-        return Event(0, self.code, 0, "", "").name
+from dxlrun.recording.schemas import FAILURES_NAME, SUMMARY_NAME
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +37,7 @@ class Figures:
 
     periods: Periods
     latency: Latency | None = None
-    """None where the loop never ran a cycle."""
+    """None where the loop never ran a cycle, and without a log."""
     slowest: Slowest | None = None
     virtual: bool = False
     tolerated_skips: float = TOLERATED_SKIPS
@@ -67,10 +48,12 @@ class Figures:
     """Cycles in which the state of each joint was not valid."""
     servos: tuple[Servo, ...] = ()
     buses: tuple[BusTraffic, ...] = ()
-    events: tuple[Said, ...] = ()
+    events: tuple[EventGroup, ...] = ()
     """In the order of the first of each."""
     acts: tuple[Act, ...] = ()
     pauses: tuple[Pause, ...] = ()
+    failures: tuple[str, ...] = ()
+    """What failed outside of the loop, one sentence each."""
     gaps: int = 0
     """Records that the recorder did not get."""
     damage: tuple[str, ...] = ()
@@ -86,7 +69,7 @@ class Tally:
         self._traffic = Traffic()
         self._steering = Steering()
         self._invalid: NDArray[np.int64] | None = None
-        self._events: dict[tuple[int, int, str], Said] = {}
+        self._events = EventCounts()
         self._granted = False
         self._unread = 0
 
@@ -98,14 +81,7 @@ class Tally:
         invalid = np.count_nonzero(~log.cycles["valid"], axis=0)
         self._invalid = invalid if self._invalid is None else self._invalid + invalid
         for event in log.events:
-            key = (event.code, event.severity, event.source)
-            begun = self._events.get(key)
-            if event.part and begun is not None:  # it goes on behind the end of a slice
-                if begun.t_ns == event.t_ns:
-                    self._events[key] = replace(begun, text=begun.text + event.text)
-                continue
-            said = begun or Said(*key, 0, event.t_ns, event.text)
-            self._events[key] = replace(said, count=said.count + 1)
+            self._events.add(event)
             if (
                 event.code == EventCode.SCHEDULER
                 and event.source == "loop"
@@ -134,9 +110,10 @@ class Tally:
             invalid=() if self._invalid is None else tuple(self._invalid.tolist()),
             servos=servos,
             buses=buses,
-            events=tuple(self._events.values()),
+            events=self._events.groups,
             acts=acts,
             pauses=pauses,
+            failures=tuple(log.metadata.get(FAILURES_NAME, {}).values()),
             gaps=gaps,
             damage=log.damage,
         )

@@ -3,7 +3,8 @@
 The one set of rules: the terminal at the end of a run, `analyze`, its page and its JSON all use it, and the
 exit code is 1 where it says that a run was not good. What hurt most comes first. A run was not good when
 
-- a line or a servo was lost, a servo rebooted or lost its torque, or the loop never ran a cycle;
+- a line or a servo was lost, a servo rebooted or lost its torque, the loop never ran a cycle, or another
+  process of the run failed;
 - a joint's state was invalid in more than 1 % of the cycles, and in three at least;
 - more periods were skipped than the robot file tolerates (`loop: {tolerated_skips: ...}`), of two seconds at
   least;
@@ -23,9 +24,9 @@ from enum import IntEnum, unique
 
 from dxlrun.analysis.bus import BusTraffic, Servo
 from dxlrun.analysis.steering import Act, Pause
-from dxlrun.analysis.tally import Figures, Said
+from dxlrun.analysis.tally import Figures
 from dxlrun.dynamixel.latency_timer import late_replies
-from dxlrun.events import EventCode, Severity
+from dxlrun.events import EventCode, EventGroup, Severity
 from dxlrun.plurals import counted
 
 INVALID_SHARE = 0.01
@@ -74,6 +75,7 @@ class _Rank(IntEnum):
     """What hurts how much; the first ones most."""
 
     NEVER_RAN = 0
+    """Nor to its end, where a process of the run failed."""
     LINE = 1
     SERVO = 2
     SHARE = 3
@@ -99,6 +101,7 @@ def judge(figures: Figures) -> Verdict:
     """Return whether a run was good, and in sentences what was and what was not."""
     found = sorted(
         (
+            *(_Finding(_Rank.NEVER_RAN, f"The run failed: {told}.") for told in figures.failures),
             *_loop(figures),
             *_lines(figures),
             *_lost_servos(figures),
@@ -120,20 +123,21 @@ def judge(figures: Figures) -> Verdict:
 
 def _loop(figures: Figures) -> Iterable[_Finding]:
     account, wake_ups = figures.periods, figures.latency
-    if wake_ups is None:
+    if not account.records:
         yield _Finding(_Rank.NEVER_RAN, "The loop never ran a cycle.")
         return
     share = account.skipped / account.elapsed
     judged = max(account.elapsed, _SHORT_RUN_S * account.rate_hz)
     tolerable = account.skipped <= figures.tolerated_skips * judged
     kept = "kept" if tolerable else "did not keep"
-    wake_up = "on virtual time" if figures.virtual else f"worst wake-up {microseconds(wake_ups.max_us)} late"
+    wake_up = f", worst wake-up {microseconds(wake_ups.max_us)} late" if wake_ups is not None else ""
+    wake_up = ", on virtual time" if figures.virtual else wake_up
     elapsed = counted(account.elapsed, "period", "periods")
     tolerated = f"{figures.tolerated_skips * 100:.4g}% tolerated"
     if judged > account.elapsed:
         tolerated = f"{figures.tolerated_skips * judged:.0f} tolerated in a short run"
     shares = f" ({share:.2%}; {tolerated})" if account.skipped else ""
-    sentence = f"The loop {kept} {account.rates}: {account.skipped} of {elapsed} skipped{shares}, {wake_up}."
+    sentence = f"The loop {kept} {account.rates}: {account.skipped} of {elapsed} skipped{shares}{wake_up}."
     yield _Finding(_Rank.REMARK if tolerable else _Rank.SHARE, sentence, 0.0 if tolerable else share)
 
 
@@ -194,7 +198,7 @@ def _steered(acts: Sequence[Act], pauses: Sequence[Pause]) -> Iterable[_Finding]
 # What was lost
 
 
-def _of(events: Iterable[Said], *codes: EventCode) -> list[Said]:
+def _of(events: Iterable[EventGroup], *codes: EventCode) -> list[EventGroup]:
     return [said for said in events if said.code in codes and said.severity >= Severity.ERROR]
 
 
@@ -213,7 +217,7 @@ _HURTS = {
 
 def _lost_servos(figures: Figures) -> Iterable[_Finding]:
     """Say of each servo that was lost, rebooted or let go what happened to it; the worst ones first."""
-    by_source: dict[str, list[Said]] = {}
+    by_source: dict[str, list[EventGroup]] = {}
     for said in _of(figures.events, *_HURTS):
         by_source.setdefault(said.source, []).append(said)
     if not by_source:
@@ -311,7 +315,7 @@ _TOLD = frozenset((*_HURTS, EventCode.PORT_LOST, EventCode.RECORDER_GAP))
 """Events that other rules tell of."""
 
 
-def _events(events: Sequence[Said]) -> Iterable[_Finding]:
+def _events(events: Sequence[EventGroup]) -> Iterable[_Finding]:
     grave = [said for said in events if said.severity >= Severity.ERROR and said.code not in _TOLD]
     if grave:
         count = sum(said.count for said in grave)
@@ -321,7 +325,7 @@ def _events(events: Sequence[Said]) -> Iterable[_Finding]:
         yield _Finding(_Rank.ERROR, sentence)
 
 
-def _line(said: Said) -> str:
+def _line(said: EventGroup) -> str:
     """Return the last line of an event's text: of a traceback what was raised."""
     return said.text.strip().splitlines()[-1] if said.text.strip() else said.name
 

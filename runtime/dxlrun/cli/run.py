@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
+    from dxlrun.analysis.tally import Figures
     from dxlrun.analysis.verdict import Verdict
     from dxlrun.compile.plan import Plan
     from dxlrun.dynamixel.bus_plan import BusPlan
@@ -88,7 +89,7 @@ def run(
         from dxlrun.supervisor import run_robot
 
         summary = run_robot(result.plan, options, console)
-    return show(summary, result.plan.robot, console)
+    return show(summary, result.plan, console)
 
 
 def _check_ledger(ledger: Path, plan: Plan) -> None:
@@ -115,13 +116,13 @@ def _ask_servos(buses: Sequence[BusPlan], joints: Sequence[str]) -> Mapping[str,
     return ask_servos(buses, joints)
 
 
-def _verdict(summary: RunSummary, console: Console) -> Verdict | None:
-    """Return the verdict of a run's log, by the rules of `analyze`; None without a log."""
-    if summary.log is None:
-        return None
+def _verdict(summary: RunSummary, plan: Plan, console: Console) -> Verdict:
+    """Return the verdict by the rules of `analyze`: on the log, or without one on what the loop counted."""
     from dxlrun.analysis.tally import figures_of
     from dxlrun.analysis.verdict import Verdict, judge
 
+    if summary.log is None:
+        return judge(_figures(summary, plan))
     try:
         with console.status("reading the log"):
             return judge(figures_of(summary.log))
@@ -129,28 +130,49 @@ def _verdict(summary: RunSummary, console: Console) -> Verdict | None:
         return Verdict(good=False, sentences=(f"The log cannot be read: {error}.",))
 
 
-def show(summary: RunSummary, robot: str, console: Console) -> int:
+def _figures(summary: RunSummary, plan: Plan) -> Figures:
+    from dxlrun.analysis.latency import Periods
+    from dxlrun.analysis.tally import Figures
+
+    elapsed, rate_hz = summary.cycles + summary.skipped, 1e9 / plan.loop.period_ns
+    return Figures(
+        Periods(
+            elapsed,
+            summary.cycles,
+            summary.skipped,
+            0,
+            agree=True,
+            rate_hz=rate_hz,
+            seconds=elapsed / rate_hz,
+        ),
+        tolerated_skips=plan.loop.tolerated_skips,
+        joints=tuple(joint.name for joint in plan.loop.joints),
+        invalid=summary.invalid,
+        events=summary.errors,
+    )
+
+
+def show(summary: RunSummary, plan: Plan, console: Console) -> int:
     """Print how the run went: what failed and what was not granted to stderr, the rest to stdout.
 
     Return the exit code: 1 also where the verdict is that the run was not good.
     """
+    robot = plan.robot
     for remark in summary.remarks:
         say_warning(f"{robot}: {remark}")
     for sentence in summary.sentences:
         say_error(f"{robot}: {sentence}")
-    verdict = _verdict(summary, console)
-    code = summary.exit_code if verdict is None or verdict.good else 1
+    verdict = _verdict(summary, plan, console)
+    code = 1 if summary.cycles and not verdict.good else summary.exit_code
     word = {0: "good", 130: "interrupted"}.get(code, "failed")
     console.print(
         f"{robot}: {word}. {summary.elapsed_s:.1f} s, {counted(summary.cycles, 'cycle', 'cycles')}, "
         f"{counted(summary.skipped, 'period', 'periods')} skipped",
         soft_wrap=True,
     )
-    # why the loop never ran was said already
-    sentences = () if verdict is None or not summary.cycles else verdict.sentences
+    for sentence in verdict.sentences if summary.cycles else ():  # why it never ran was said already
+        console.print(f"  {sentence}", markup=False, soft_wrap=True)
     if summary.log is not None:
-        for sentence in sentences:
-            console.print(f"  {sentence}", markup=False, soft_wrap=True)
         held = counted(summary.messages, "message", "messages")
         console.print(f"log: {summary.log} ({held})", markup=False, soft_wrap=True)
         if summary.cycles:

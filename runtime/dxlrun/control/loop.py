@@ -6,6 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from dxlrun.clock import Clock
 from dxlrun.commands import CommandSink, NoCommands, TakenCommand
 from dxlrun.control.gate import Gate
@@ -69,6 +72,8 @@ class LoopResult:
     """One sentence where the reason is a fault."""
     last: Last = "limp"
     """How the policy leaves the robot; who started the hardware sees to it."""
+    invalid: tuple[int, ...] = ()
+    """Cycles in which the state of each joint was not valid."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -112,6 +117,8 @@ class Loop:
     """The controllers' time in the last cycle."""
     _woken_ns: int = field(default=0, init=False)
     _cycles: int = field(default=0, init=False)
+    _valid: NDArray[np.int64] = field(init=False)
+    """Cycles in which each joint's state was valid."""
     _skipped: int = field(default=0, init=False)
     _late: bool = field(default=False, init=False)
     _lost: LostServos = field(init=False)
@@ -121,6 +128,7 @@ class Loop:
     def __post_init__(self) -> None:
         self.schedule = Schedule(self.plan.period_ns)
         self._overruns = Overruns(self.plan.overrun, self.overrun_hooks, self.events)
+        self._valid = np.zeros(len(self.plan.joints), np.int64)
         self._lost = LostServos(len(self.plan.joints))
         self.steering = Steering(self.inbox, self, self.manager, self.record, self.events, self.commands)
 
@@ -155,7 +163,8 @@ class Loop:
             reason, detail = "fault", detail or sentence
         last = self._wind_up(policy)
         self._tell_end(reason, detail)
-        return LoopResult(self._cycles, self._skipped, reason, detail, last)
+        invalid = tuple((self._cycles - self._valid).tolist())
+        return LoopResult(self._cycles, self._skipped, reason, detail, last, invalid)
 
     # What clients may ask for, through Steering
 
@@ -273,6 +282,7 @@ class Loop:
         record.tell(read_ns, updated_ns, now_ns())
         self.sink.append(record)
         self._cycles += 1
+        self._valid += record.valid
         self.beat()
 
     def _command(self, cycle: int, time_ns: int) -> None:
