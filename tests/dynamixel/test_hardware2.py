@@ -266,6 +266,23 @@ def test_a_ramp_of_another_program_is_told(make_rig, make_x):
     assert "Profile Acceleration (108) is 5" in text
 
 
+@pytest.mark.parametrize(
+    ("register", "value", "said"),
+    [
+        ("startup_configuration", 2, "RAM comes from the backup at power-up"),
+        ("bus_watchdog", 10, "it would stop after 200 ms without an instruction; it is cleared"),
+        ("bus_watchdog", -1, "it has stopped the servo; it is cleared"),
+    ],
+)
+def test_what_an_earlier_run_left_is_told(make_rig, make_x, register, value, said):
+    rig = make_rig(make_x((11, 12), model="XL330-M288"))
+    rig.buses[0].servo(12).poke(register, value)
+    rig.hardware.start()
+    ((joint, text),) = rig.events.of(EventCode.REGISTER_DIFFERS)
+    assert joint == "arm_12_joint"
+    assert said in text
+
+
 def test_take_over_accepts_torque(make_rig, make_x):
     rig = make_rig(make_x((11, 12)), take_over=True)
     rig.buses[0].servo(12).poke("torque_enable", 1)

@@ -36,6 +36,7 @@ def test_a_servo_that_is_not_there_is_named_with_all_the_others(make_rig):
         ("status_return_level", 1, "Status Return Level (16) = 1"),
         ("status_return_level", 0, "Status Return Level (16) is 0"),
         ("ccw_angle_limit", 800, "angle limits 0..800"),
+        ("cw_angle_limit", 100, "angle limits 100..1023"),
         ("torque_limit", 0, "Torque Limit (34) = 0"),
         ("torque_enable", 1, "holds torque already"),
     ],
@@ -202,11 +203,36 @@ def test_a_servo_in_another_mode_is_looked_at_again_before_it_gets_torque(make_r
     assert rig.torque() == [False, False]
 
 
-def test_an_overheated_servo_gets_no_torque(make_rig):
+@pytest.mark.parametrize(
+    ("hurt", "said"),
+    [
+        (lambda servo: servo.set_temperature(90.0), "overheating"),
+        (lambda servo: servo.set_voltage(5.0), "voltage"),
+        (lambda servo: servo.trigger_overload(), "overload"),
+    ],
+)
+def test_a_servo_that_reports_an_error_gets_no_torque(make_rig, hurt, said):
     rig = make_rig()
-    rig.buses[0].servo(6).set_temperature(90.0)
-    problems = refusal(rig)
-    assert any("overheating" in problem for problem in problems)
+    hurt(rig.buses[0].servo(6))
+    (problem, *_) = refusal(rig)
+    assert "ID 6 on bus main) reports an error: " in problem
+    assert said in problem
+
+
+@pytest.mark.parametrize(
+    ("register", "value", "said"),
+    [
+        ("multi_turn_offset", 100, "Multi Turn Offset (20) = 100, which shifts every position"),
+        ("resolution_divider", 2, "Resolution Divider (22) = 2, which changes what a tick is"),
+        ("drive_mode", 1, "Drive Mode (10) = 1, so it turns the other way round"),
+    ],
+)
+def test_a_register_that_changes_what_positions_mean_is_refused(make_rig, make_plan, register, value, said):
+    rig = make_rig(make_plan((1, 6), model="MX-106"))
+    rig.buses[0].servo(6).poke(register, value)
+    (problem,) = refusal(rig)
+    assert "ID 6 on bus main) has " in problem
+    assert said in problem
 
 
 def test_take_over_accepts_torque(make_rig):

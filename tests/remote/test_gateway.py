@@ -89,6 +89,7 @@ WRONG = [
     ("POST", "/controllers/left/set-points/many", {"count": 300}, 413, "send it as a command"),
     ("POST", "/controllers/spare/set-points/go", {"positions": [0]}, 409, "not active; switch to it first"),
     ("POST", SET_POINT + "?lease=0", {"positions": [0]}, 422, "a lease is 0.01 to 60 s, not 0"),
+    ("POST", SET_POINT + "?lease=61", {"positions": [0]}, 422, "a lease is 0.01 to 60 s, not 61"),
     ("POST", SET_POINT + "?lease=inf", {"positions": [0]}, 422, "lease=inf is no number"),
     ("POST", SET_POINT + "?lease=long", {"positions": [0]}, 422, "lease=long is no number"),
     ("GET", "/events?after=x", None, 422, "after=x is no number"),
@@ -320,6 +321,27 @@ def test_a_switch_that_waits_for_modes_is_answered_when_they_are_there_or_were_g
 
     answer = (409, {"refused": excuse}) if excuse else (200, DONE)
     assert asyncio.run(switch()) == (True, answer)
+
+
+def test_a_controller_that_is_unloaded_while_a_set_point_arrives_gets_none_of_it(desk):
+    """Its place may be another one's by then."""
+
+    def chunks():
+        yield {"type": "http.request", "body": b'{"positions": ', "more_body": True}
+        desk.link.controllers.pop("left")
+        yield {"type": "http.request", "body": b"[0]}"}
+
+    status, told = asyncio.run(desk.request("POST", SET_POINT, chunks=chunks()))
+    assert (status, told) == (404, {"refused": "left was unloaded meanwhile"})
+    assert list(desk.mailbox.take()) == []
+
+
+def test_a_switch_whose_modes_never_come_is_given_up(desk, monkeypatch):
+    monkeypatch.setattr(link, "ENTER_S", 0.01)
+    desk.link.controllers["spare"].entering = True
+    wish = {"activate": ["spare"], "deactivate": ["left"]}
+    desk.link.switched = lambda activate, deactivate: None  # the loop says no more of it
+    assert desk.ask("POST", "/switch", wish) == (409, {"refused": "spare is not active after 0.01 s"})
 
 
 def test_a_controller_is_loaded_into_the_place_that_the_loop_gives_it(desk):
