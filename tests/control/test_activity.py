@@ -99,7 +99,7 @@ def test_processes_are_for_on_configure_and_threads_of_others_are_theirs(robot):
         thread()
         done.set()
 
-    other = threading.Thread(target=elsewhere)
+    other = threading.Thread(target=elsewhere, daemon=True)
     other.start()
 
     class Good(robot.scripted()):
@@ -110,7 +110,7 @@ def test_processes_are_for_on_configure_and_threads_of_others_are_theirs(robot):
         def act(self, step, time_ns, value):
             if step == "update":
                 go.set()
-                done.wait()
+                assert done.wait(30)
 
     robot.add("good", Good)
     robot.build(end_ns=40_000_000)

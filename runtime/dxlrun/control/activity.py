@@ -2,8 +2,8 @@
 
 A thread beside the loop would be handed the interpreter in the middle of a cycle, and a forked child has the
 loop's memory and stops the loop while it is made. Both are refused to controllers while the robot runs: where
-Python starts them the start itself fails, and what foreign machine code starts is found by the number of
-threads. A process that a controller needs is started in on_configure.
+Python starts them the start itself fails; threads that foreign machine code starts are counted after the
+call, its processes are not seen. A process that a controller needs is started in on_configure.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Activity:
         self._threads = count_threads() if count_threads else 0
         self._process = _process()
         self.thread = 0
-        """Which thread calls the controller; 0 while it may start what it likes."""
+        """Which thread calls the controller."""
         self.refused = ""
         """What was refused to the controller in this call."""
         _guard()
@@ -89,9 +89,8 @@ class Activity:
         """
         if _process() != self._process:
             os._exit(0)
-        Activity.guarded = None
+        watched, Activity.guarded = Activity.guarded is self, None
         self._page.call(0, 0)
-        watched, self.thread = self.thread != 0, 0
         refused, self.refused = self.refused, ""
         if self._count_threads is not None:
             more = self._count_threads() - self._threads
