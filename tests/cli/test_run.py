@@ -243,6 +243,21 @@ def test_virtual_time_without_an_end_is_refused(
     assert not list(tmp_path.iterdir())
 
 
+def test_virtual_time_ends_with_the_motions(
+    dxlrun: Callable, torso: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(tmp_path)
+    motion = tmp_path / "nod.yaml"
+    motion.write_text(
+        "name: nod\nmotions:\n  - controller: head\n    points:\n"
+        "      - {time: 0.2 s, joints: {head_pitch_joint: {position: 5 deg, velocity: 30 deg/s},\n"
+        "         head_yaw_joint: {position: 0 deg, velocity: 30 deg/s}}}\n"
+    )
+    said = dxlrun(torso, "--virtual", "--play", motion, "--no-record")
+
+    assert said.code == 0, said.err
+
+
 @pytest.mark.parametrize("signals", [1, 2])
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_a_run_on_virtual_time_with_its_summary_and_log(  # noqa: PLR0917  fixtures
@@ -254,13 +269,17 @@ def test_a_signal_ends_a_run_on_virtual_time_with_its_summary_and_log(  # noqa: 
     signals: int,
 ):
     monkeypatch.chdir(tmp_path)
-    robots = []
+    robots, went_on = [], []
+
+    def interrupt() -> None:
+        for _ in range(signals):
+            signal.raise_signal(number)
+        went_on.append(True)
 
     def interrupted(robot: VirtualRobot, *arguments: object, **options: object) -> None:
         born(robot, *arguments, **options)
         robots.append(robot)
-        for _ in range(signals):
-            robot.buses[0].at(1_000_000_000, lambda: signal.raise_signal(number))
+        robot.buses[0].at(1_000_000_000, interrupt)
 
     born = VirtualRobot.__init__
     monkeypatch.setattr(VirtualRobot, "__init__", interrupted)
@@ -269,6 +288,7 @@ def test_a_signal_ends_a_run_on_virtual_time_with_its_summary_and_log(  # noqa: 
     said = dxlrun(torso, "--virtual", "--duration", "1e6")
 
     assert said.code == 130, said.err
+    assert bool(went_on) == (signals == 1)
     assert [line for line in said.errors if "warning" not in line] == []
     first, *_, log, _ = said.out.splitlines()
     assert first.startswith("bioloid_torso: interrupted. ")
