@@ -23,6 +23,7 @@ from dxlrun.analysis.figures.wires import reply_drawing
 from dxlrun.analysis.latency import Punctuality
 from dxlrun.analysis.report import analyze
 from dxlrun.analysis.steering import Pause
+from dxlrun.analysis.tracking import reachable
 from dxlrun.events import EventCode, Severity
 from dxlrun.recording.reader import Log, read_log
 
@@ -120,7 +121,15 @@ def horizontals(axes: Axes) -> list[float]:
     return [float(y[0]) for x, y in spans if x == [0, 1]]
 
 
+def fields(quantity: str) -> dict[str, str]:
+    """What each curve of a joint shows; the reachable trajectory is one of positions."""
+    curves = {"desired (command)": f"command_{quantity}", "sent (goal)": f"goal_{quantity}", "read": quantity}
+    return curves | ({"reachable": "reachable"} if quantity == "position" else {})
+
+
 def shown(log: Log, field: str, row: int) -> Data:
+    if field == "reachable":
+        return reachable(log, row)
     values = log.cycles[field][:, row]
     return np.asarray(values if "_" in field else np.where(log.cycles["valid"][:, row], values, np.nan))
 
@@ -134,13 +143,15 @@ def test_each_sample_of_a_joint_is_on_the_curve_of_its_name(
     axes = figures[row].axes[("position", "velocity").index(quantity)]
     assert axes.get_ylabel() == {"position": "position, rad", "velocity": "velocity, rad/s"}[quantity]
     curves = lines(axes)
-    assert list(curves) == ["desired (command)", "sent (goal)", "read"]
-    for label, field in zip(curves, (f"command_{quantity}", f"goal_{quantity}", quantity), strict=True):
+    assert list(curves) == list(fields(quantity))
+    for label, field in fields(quantity).items():
         x, y = curves[label]
         np.testing.assert_allclose(x, seconds(short))
         np.testing.assert_array_equal(y, shown(short, field, row))
     held = {str(line.get_label()): line.get_drawstyle() for line in axes.lines}
-    assert [held[label] for label in curves] == ["steps-post", "steps-post", "default"]
+    assert [held[label] for label in curves] == ["steps-post", "steps-post", "default", "default"][
+        : len(curves)
+    ]
 
 
 @pytest.mark.parametrize("row", [0, 1])
@@ -151,7 +162,8 @@ def test_the_curves_of_a_long_run_have_the_extremes_of_each_column(
     joint_drawings(long, analyze(long).joints)
     curves = lines(figures[row].axes[("position", "velocity").index(quantity)])
     width = -(-LONG // 900)
-    for label, field in zip(curves, (f"command_{quantity}", f"goal_{quantity}", quantity), strict=True):
+    assert list(curves) == list(fields(quantity))
+    for label, field in fields(quantity).items():
         values, (x, y) = shown(long, field, row), curves[label]
         at = np.searchsorted(seconds(long), x - 1e-9)
         np.testing.assert_array_equal(y, values[at])
