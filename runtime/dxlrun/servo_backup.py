@@ -65,7 +65,7 @@ def read_backup(path: Path) -> ServoBackup:
         return msgspec.json.decode(path.read_bytes(), type=ServoBackup)
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror}); check the path") from None
-    except msgspec.DecodeError as error:  # also a ValidationError
+    except (msgspec.DecodeError, ValueError, RecursionError) as error:  # also bytes that are no text
         raise InputError(
             f"{path} is no backup of a servo: {error}; `dxlrun servo backup` writes one"
         ) from None

@@ -9,6 +9,8 @@ import pytest
 
 from dxlrun.dynamixel import scanning
 from dxlrun.dynamixel.scanning import FoundServo
+from dxlrun.errors import InputError
+from dxlrun.servo_backup import read_backup
 from dxlrun.simulation import BusConfig, ServoConfig
 
 NEW = ("--protocol", "2.0", "--baud", "1000000")
@@ -248,3 +250,11 @@ def test_two_servos_of_one_id_are_not_dealt_with(one, simulated_line, dxlrun):
     assert said.code == 1
     assert "do two servos have this ID?" in said.err
     assert writes(finish()) == []
+
+
+@pytest.mark.parametrize("content", [b"{", b'{"model": "\xff"}', b'{"x": ' + b"[" * 200_000])
+def test_a_damaged_backup_is_one_sentence(tmp_path: Path, content: bytes):
+    path = tmp_path / "servo.json"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"servo\.json is no backup of a servo: "):
+        read_backup(path)

@@ -177,6 +177,14 @@ def test_a_plan_that_is_no_text(pair_log: Path, changed: Change) -> None:
     assert joints_of(read_log(changed(pair_log, damage))) == {}
 
 
+def test_a_plan_that_is_too_deep(pair_log: Path, changed: Change) -> None:
+    def damage(content: Any) -> None:
+        content.attachments["plan.json"] = b'{"x": ' + b"[" * 200_000
+
+    assert "the plan in the log is not one of this dxlrun" in refused(changed(pair_log, damage))
+    assert joints_of(read_log(changed(pair_log, damage))) == {}
+
+
 def test_a_command_that_the_plan_has_not(pair_log: Path, changed: Change) -> None:
     def change(content: Any) -> None:
         plan = json.loads(content.attachments["plan.json"])

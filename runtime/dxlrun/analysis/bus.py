@@ -12,7 +12,7 @@ import msgspec
 from dxlrun.analysis.latency import DISORDER_NS
 from dxlrun.analysis.wire import BROADCAST_ID, Question, Reply, error_names, question, replies
 from dxlrun.packets import LoggedPacket, PacketKind
-from dxlrun.recording.reader import Log
+from dxlrun.recording.reader import UNREADABLE, Log
 
 _BYTE_NS = 10_000_000_000
 """Ten bits a byte, over the rate in bit/s."""
@@ -276,7 +276,7 @@ def planned(log: Log) -> dict[str, _PlannedBus]:
     """Return the buses of the plan in the log, by name; a log without a readable plan has none."""
     try:
         plan = msgspec.json.decode(log.attachments.get("plan.json", b"{}"), type=_Planned)
-    except (msgspec.MsgspecError, ValueError):
+    except UNREADABLE:
         return {}
     return {bus.name: bus for bus in plan.buses}
 

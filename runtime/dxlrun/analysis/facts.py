@@ -12,7 +12,7 @@ from dxlrun.analysis.report import Report
 from dxlrun.analysis.tables import Cell, Column, Table, tone_of
 from dxlrun.events import EventCode
 from dxlrun.plurals import counted
-from dxlrun.recording.reader import Log
+from dxlrun.recording.reader import UNREADABLE, Log
 
 
 class _Servo(msgspec.Struct):
@@ -69,7 +69,7 @@ def _run(log: Log, report: Report) -> Table:
 def _buses(log: Log) -> Table:
     try:
         plan = msgspec.json.decode(log.attachments.get("plan.json", b"{}"), type=_Plan)
-    except (msgspec.MsgspecError, ValueError):
+    except UNREADABLE:
         plan = _Plan()  # a log without a readable plan still has buses, by name
     rows: list[tuple[str, str]] = []
     planned = {bus.name: bus for bus in plan.buses}

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from dxlrun.analysis.ledger_streams import logged, seen
 from dxlrun.analysis.ledger_waits import Transaction, transactions
 from dxlrun.packets import PacketKind
-from dxlrun.recording.reader import Log
+from dxlrun.recording.reader import UNREADABLE, Log
 from dxlrun.simulation import LedgerEntry
 
 Cause = Literal["simulation", "kernel", "wake-up", "own work"]
@@ -129,7 +129,7 @@ def _baud_rates(log: Log) -> dict[str, int]:
     """Return the rate of each bus by the log's plan; a log without one leaves waiting for the line unseen."""
     try:
         plan = msgspec.json.decode(log.attachments.get("plan.json", b"{}"), type=_Plan)
-    except (msgspec.MsgspecError, ValueError):
+    except UNREADABLE:
         return {}
     return {bus.name: bus.baud_rate for bus in plan.buses}
 

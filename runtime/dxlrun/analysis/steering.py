@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dxlrun.analysis.latency import DISORDER_NS, begins, first_deadline_ns
 from dxlrun.commands import TakenCommand
 from dxlrun.events import Event, EventCode
-from dxlrun.recording.reader import Log
+from dxlrun.recording.reader import UNREADABLE, Log
 from dxlrun.recording.steered import Steered, policy_begun, steered
 
 _LONGEST = 80
@@ -217,7 +217,7 @@ def _words(command: TakenCommand) -> str:
         return f"{command.kind} for {command.controller}"
     try:
         data = msgspec.json.decode(command.data or b"{}", type=_Data)
-    except (msgspec.MsgspecError, UnicodeDecodeError):
+    except UNREADABLE:
         text = f"{command.kind} {command.text}"
         return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
     parts = [f"activate {', '.join(data.activate)}"] if data.activate else []

@@ -16,7 +16,7 @@ from dxlrun.analysis.latency import Latency, Periods, Punctuality, Slowest, on_v
 from dxlrun.analysis.steering import Act, Pause, Steering
 from dxlrun.control.loop_plan import TOLERATED_SKIPS
 from dxlrun.events import EventCode, EventCounts, EventGroup, Severity
-from dxlrun.recording.reader import Log, scan_log
+from dxlrun.recording.reader import UNREADABLE, Log, scan_log
 from dxlrun.recording.schemas import FAILURES_NAME, SUMMARY_NAME
 
 
@@ -137,7 +137,7 @@ def _tolerated_skips(log: Log) -> float:
     """Return what the robot file tolerates; the default where the log has no readable plan."""
     try:
         plan = msgspec.json.decode(log.attachments.get("plan.json", b"{}"), type=_Plan)
-    except (msgspec.MsgspecError, ValueError):
+    except UNREADABLE:
         return TOLERATED_SKIPS
     return plan.loop.tolerated_skips
 

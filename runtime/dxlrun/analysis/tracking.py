@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from dxlrun.control_table import control_table
 from dxlrun.interfaces import Floats
-from dxlrun.recording.reader import Log
+from dxlrun.recording.reader import UNREADABLE, Log
 
 _REST_S = 0.3
 """A reachable trajectory that stands still for so long is at rest: its joint is to settle."""
@@ -259,7 +259,7 @@ def _limits(log: Log) -> dict[str, _Limits]:
     """Return the limits of each joint from the plan in the log; one without a readable plan has none."""
     try:
         plan = msgspec.json.decode(log.attachments.get("plan.json", b"{}"), type=_Planned)
-    except (msgspec.MsgspecError, ValueError):
+    except UNREADABLE:
         return {}
     joints = {joint.name: joint for joint in plan.loop.joints}
     return {

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import IO, cast
 
 import lz4.frame
+import msgspec
 import numpy as np
 import zstandard
 from mcap.exceptions import McapError
@@ -45,6 +46,8 @@ _FOR_OTHERS = frozenset(
 )
 """What other tools read; the same stands in the other topics."""
 _DAMAGE = (McapError, zstandard.ZstdError, struct.error, UnicodeDecodeError, EOFError)
+UNREADABLE = (msgspec.MsgspecError, ValueError, RecursionError)
+"""What msgspec raises for JSON in a log (the plan, data of a command) that is damaged or too deep."""
 _LARGEST_CHUNK = 64 << 20
 """Bytes of a chunk when decompressed; ours have 256 KiB and one message, those of other writers some MiB."""
 _MOST_EXPANDED = 256

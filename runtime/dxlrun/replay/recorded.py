@@ -18,7 +18,7 @@ from dxlrun.control.plugins import PlugIns
 from dxlrun.control.policy_plan import PolicyName, PolicyPlan
 from dxlrun.errors import LogError
 from dxlrun.events import EventCode
-from dxlrun.recording.reader import Log
+from dxlrun.recording.reader import UNREADABLE, Log
 from dxlrun.recording.steered import Steered, policy_begun, steered, untold
 
 PLAN = "plan.json"
@@ -143,7 +143,7 @@ def _plan(log: Log) -> RecordedPlan:
         raise LogError(f"{log.path}: the log has no attachment {PLAN}, so nobody knows its controllers")
     try:
         plan = msgspec.json.decode(data, type=RecordedPlan)
-    except (msgspec.MsgspecError, ValueError) as error:
+    except UNREADABLE as error:
         raise LogError(
             f"{log.path}: the plan in the log is not one of this dxlrun ({error}): replay it with the dxlrun "
             f"that made it, {_version(log)}"
@@ -292,6 +292,6 @@ def _policies(log: Log, policies: PolicyPlan) -> PolicyPlan:
         return policies
     try:
         name = msgspec.json.decode(begun.data, type=_Begun).policy
-    except msgspec.MsgspecError as error:
+    except UNREADABLE as error:
         raise LogError(f"{log.path}: the log does not say which policy began: {error}") from error
     return replace(policies, on_exit=policies.named(name))
