@@ -253,7 +253,7 @@ def test_two_servos_of_one_id_are_not_dealt_with(one, simulated_line, dxlrun):
 
 
 @pytest.mark.parametrize("content", [b"{", b'{"model": "\xff"}', b'{"x": ' + b"[" * 200_000])
-def test_a_damaged_backup_is_one_sentence(tmp_path: Path, content: bytes):
+def test_a_damaged_backup_is_one_sentence(tmp_path, content: bytes):
     path = tmp_path / "servo.json"
     path.write_bytes(content)
     with pytest.raises(InputError, match=r"servo\.json is no backup of a servo: "):
