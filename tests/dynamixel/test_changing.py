@@ -396,5 +396,24 @@ def test_other_registers_leave_a_tripped_bus_watchdog_and_a_register_of_it_is_sh
     assert done == ("Position P Gain (84) was 800 and is 500",)
     assert rig.one.torque(False) == ("holds no torque, as before",)
     assert rig.servo.registers["bus_watchdog"] == 255
-    done = rig.one.write([rig.one.register("bus_watchdog", 0)])
-    assert done == ("Bus Watchdog (98) was 255 (tripped) and is 0",)
+
+
+@pytest.mark.parametrize("ticks", [0, 100])
+@pytest.mark.parametrize("torque", [0, 1])
+def test_a_servo_whose_tripped_bus_watchdog_is_written_stays_where_it_stands(torque, ticks):
+    rig = Rig()
+    trip(rig, torque)
+    done = rig.one.write([rig.one.register("bus_watchdog", ticks)])
+    armed = ("Bus Watchdog (98) was 0 and is 100",) if ticks else ()
+    assert done == ((TRIPPED, STOOD) if torque else (TRIPPED,)) + armed
+    rig.line.clock.wait_until(rig.line.clock.now_ns() + 1_000_000_000)
+    assert rig.servo.position == pytest.approx(2.0, abs=0.002)
+
+
+def test_a_bus_watchdog_that_cannot_be_cleared_is_named_and_gets_no_torque():
+    rig = Rig()
+    trip(rig, 0)
+    rig.servo.registers.watch(("bus_watchdog",), lambda: rig.servo.poke("bus_watchdog", -1))
+    with pytest.raises(ServoFault, match=r"was given Bus Watchdog \(98\) = 0, but has 255"):
+        rig.one.torque(True)
+    assert not rig.servo.torque_on

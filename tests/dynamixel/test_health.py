@@ -486,6 +486,47 @@ def test_a_ramp_that_the_watchdog_reset_is_written_again(make_rig, make_x):
     assert written[-4:] == ["Profile Acceleration (108) was 0 and is 100"] * 4
 
 
+def _fastest(rig, servo, count):
+    """Return the highest speed of a servo in the next cycles, rad/s."""
+    speeds = []
+    for _ in range(count):
+        rig.cycle()
+        speeds.append(abs(servo.velocity))
+    return max(speeds)
+
+
+def _stopped_on_a_long_way(rig, servo):
+    """Let the watchdogs stop all servos on a slow way of 2 rad."""
+    rig.goals.position[:], rig.goals.velocity[:] = 2.0, 0.2
+    cycles(rig, 5)
+    assert 0.1 < abs(servo.velocity) < 0.25
+
+
+def test_a_servo_that_is_revived_goes_on_slowly_though_its_profile_was_reset(start, make_x):
+    rig = start(make_x(watchdog=10))
+    servo = rig.buses[0].servo(12)
+    _stopped_on_a_long_way(rig, servo)
+    rig.clock.wait_until(rig.clock.now_ns() + 300_000_000)
+    rig.torque()
+    assert (servo.registers["bus_watchdog"], servo.registers["profile_velocity"]) == (0xFF, 0)
+    rig.goals.velocity[:] = 10.0
+    assert 0.5 < _fastest(rig, servo, 50) < 1.1 * RETURN_SPEED
+    assert servo.registers["bus_watchdog"] == 10
+
+
+def test_a_lost_servo_that_is_back_goes_on_slowly_though_its_profile_was_reset(start, make_x):
+    rig = start(make_x(watchdog=10))
+    servo = rig.buses[0].servo(12)
+    _stopped_on_a_long_way(rig, servo)
+    servo.silence()
+    cycles(rig, 5)
+    for name, value in (("profile_velocity", 0), ("profile_acceleration", 0), ("bus_watchdog", -1)):
+        servo.poke(name, value)  # as the reset of a watchdog that heard nothing leaves it
+    servo.silence(False)
+    assert _fastest(rig, servo, 150) < 1.1 * RETURN_SPEED
+    assert servo.registers["bus_watchdog"] == 10
+
+
 @pytest.mark.parametrize("watchdog", [10, 0])
 def test_a_watchdog_that_an_earlier_run_left_is_cleared(make_rig, make_x, watchdog):
     rig = make_rig(make_x(watchdog=watchdog))

@@ -12,16 +12,18 @@ from collections.abc import Callable
 from dxlrun.control_table import ControlItem, control_table
 from dxlrun.dynamixel.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.dialect import dialect_of
-from dxlrun.dynamixel.inspection import called, persist, who
+from dxlrun.dynamixel.inspection import called, persist, tripped, who
 from dxlrun.dynamixel.plan import plan_line
+from dxlrun.dynamixel.returning import RETURN_SPEED
 from dxlrun.dynamixel.transaction import Program
 
 UNIT_NS = 20_000_000
 """One step of the register (e-Manual XM430-W350, Bus Watchdog (98))."""
 MOST_TICKS = 127
 """The longest time; beyond it stand the values that say that it has stopped."""
-RESET = ("profile_acceleration", "profile_velocity")
-"""What is 0 after it has stopped a servo (e-Manual XM430-W350, Bus Watchdog (98), step 4 of the example)."""
+RAMP = "profile_acceleration"
+"""It is 0 after a servo was stopped, as is Profile Velocity (e-Manual XM430-W350, Bus Watchdog (98), step 4
+of the example)."""
 LEAST_PERIODS = 3
 """It must bear two cycles that come to nothing (failures.md)."""
 
@@ -36,13 +38,20 @@ def arm(plan: BusPlan, servo: ServoPlan) -> Program[str]:
 def disarm(plan: BusPlan, servo: ServoPlan) -> Program[str]:
     """Clear a servo's watchdog if it is armed or has stopped the servo; return what went wrong.
 
-    Also where the plan wants none: an earlier run that was killed may have left it armed.
+    Also where the plan wants none: an earlier run that was killed may have left it armed. A servo that it
+    stopped with torque goes on to its old goal [i], at full speed as its profile was reset: it gets a slow
+    one before.
     """
     if (item := _item(plan, servo)) is None:
         return ""
-    reply = yield from persist(plan_line(plan).read(servo.servo_id, item.address, item.size))
+    line = plan_line(plan)
+    reply = yield from persist(line.read(servo.servo_id, item.address, item.size))
     if reply.answered and reply.parameters[0] == 0:
         return ""
+    if reply.answered and tripped(item, reply.parameters[0]):
+        speed = control_table(servo.model, plan.protocol).items["profile_velocity"]
+        slow = max(1, round(RETURN_SPEED / speed.scale))
+        yield from persist(line.write(servo.servo_id, speed.address, slow.to_bytes(speed.size, "little")))
     return (yield from _write(plan, servo, item, 0))
 
 

@@ -84,16 +84,16 @@ class Feeding:
             self._events.emit(EventCode.WATCHDOG, Severity.ERROR, plan.name, text)
 
     def _revival(self, index: int) -> Program[str]:
-        """Clear and arm a watchdog, and write again what it reset of the declared registers."""
+        """Write again what a watchdog reset of the declared registers, then clear and arm it."""
         plan, servo = self._plan, self._plan.servos[index]
-        problem = yield from bus_watchdog.revive(plan, servo)
-        reset = [one for one in self._registers(index) if one.name in bus_watchdog.RESET]
-        if problem or not reset:
-            return problem
-        settled = yield from settle(plan, servo, reset, plan_line(plan))
-        for joint, text in settled.written:
-            self._events.emit(EventCode.REGISTER_WRITTEN, Severity.INFO, joint, text)
-        return "; ".join(settled.problems)
+        ramp = [one for one in self._registers(index) if one.name == bus_watchdog.RAMP]
+        if ramp:
+            settled = yield from settle(plan, servo, ramp, plan_line(plan))
+            for joint, text in settled.written:
+                self._events.emit(EventCode.REGISTER_WRITTEN, Severity.INFO, joint, text)
+            if settled.problems:
+                return "; ".join(settled.problems)
+        return (yield from bus_watchdog.revive(plan, servo))
 
     def _revived(self, index: int, problem: str) -> None:
         self._reviving[index] = False

@@ -96,11 +96,12 @@ class OneServo:
     def write(self, wanted: Sequence[RegisterValue]) -> tuple[str, ...]:
         """Write the registers that differ, in order, and read each back; return what was written.
 
-        Before goals, which a servo refuses while its Bus Watchdog is tripped, that is cleared.
+        Before goals, which a servo refuses while its Bus Watchdog is tripped, that is cleared; so is it where
+        the watchdog itself is written.
         """
         self.writable(wanted)
-        goals = any(one.name.startswith("goal_") for one in wanted)
-        cleared = self.clear_watchdog(armed=False) if goals else ()
+        tripping = any(one.name.startswith(("goal_", "bus_watchdog")) for one in wanted)
+        cleared = self.clear_watchdog(armed=False) if tripping else ()
         settled: Settled = self.run(settle(self.plan, self._servo, wanted, self.tool.line))
         if settled.problems:
             before = [f"written before that: {text}" for _, text in settled.written]
