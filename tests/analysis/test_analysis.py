@@ -13,7 +13,7 @@ from rich.console import Console
 
 from dxlrun.analysis.report import Report, analyze_log, to_json
 from dxlrun.analysis.terminal import render
-from dxlrun.analysis.verdict import microseconds
+from dxlrun.analysis.verdict import Verdict, microseconds
 from dxlrun.errors import LogError
 from dxlrun.events import EventCode, Severity
 from dxlrun.packets import PacketKind
@@ -229,7 +229,7 @@ def test_a_finished_log_with_gaps_counts_them(write: Make, cycle: Make) -> None:
 
 def test_a_run_without_a_cycle_is_said_to_be_one(write: Make) -> None:
     report = analyze_log(write())
-    assert report.verdict.sentences == ("The loop never ran a cycle.",)
+    assert report.verdict == Verdict(False, ("The loop never ran a cycle.",))
     assert (report.latency, report.steps) == (None, ())
     assert "torso" in shown(report)
 
