@@ -212,3 +212,13 @@ def test_modes_follow_from_claims_and_the_rest_of_the_joints_rests() -> None:
 def test_interfaces_that_no_mode_has_together_are_refused(names: tuple[str, ...]) -> None:
     with pytest.raises(ValueError, match="no servo follows"):
         mode_of(names)
+
+
+def test_a_controller_that_waits_for_its_modes_is_not_unloaded(story: Story) -> None:
+    ask = story.robot.ask
+    story.at[2] = lambda: story.switch(["wheels"], ["arm"])
+    story.at[3] = lambda: (ask("pause"), ask("unload", controller="wheels"), ask("resume"))
+    story.run(10)
+    answers = story.robot.inbox.answers
+    assert answers == {1: "", 2: "", 3: "wheels is active; deactivate it first", 4: ""}
+    assert story.active[-1] == ("wheels",)

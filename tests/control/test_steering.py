@@ -257,6 +257,42 @@ def test_a_controller_is_loaded_and_unloaded_in_a_pause_only(watched):
     assert len(robot.events.of(EventCode.CONTROLLER_LOADED)) == 2
 
 
+def test_a_controller_that_is_loaded_while_its_servo_is_lost_waits_for_it(watched):
+    watched.robot.build()
+    manager = watched.robot.manager
+    manager.wait_for({0})
+    for name, joint in (("extra", "j0"), ("other", "j1")):
+        plan = ControllerPlan(name, "left", "tests 1", "{}", (joint,), ("position",), (), False, 1)
+        assert manager.load(plan) == ""
+    assert [manager._named[name].waiting for name in ("extra", "other")] == [True, False]
+
+
+def test_a_controller_that_is_loaded_anew_after_its_failure_may_stand_in_again(make_robot):
+    robot, failing = make_robot(joints=1), {"extra"}
+
+    def act(controller, step, *_):
+        if step == "update" and controller.context.name in failing:
+            raise ValueError("no way")
+
+    robot.script("left", act, fallback="extra")
+    robot.build()
+    manager = robot.manager
+    command = ("position", "velocity")
+    extra = ControllerPlan("extra", "left", "tests 1", "{}", ("j0",), command, (), False, 1, fallback="left")
+    assert manager.load(extra) == ""
+    assert manager.switch(("extra",), (), 0) == ""
+    for failed, stands_in in (("extra", "left"), ("left", "extra")):
+        failing.clear()
+        failing.add(failed)
+        manager.begin()
+        manager.update(0, 0)
+        assert manager.active == (stands_in,)
+        if stands_in == "left":
+            assert manager.unload("extra") == ""
+            assert manager.load(extra) == ""
+    assert manager.fault is None
+
+
 def test_places_of_unloaded_controllers_are_used_again(watched):
     robot = watched.robot
     watched.at[1] = [lambda: robot.ask("pause")]
