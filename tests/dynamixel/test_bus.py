@@ -11,6 +11,9 @@ from dxlrun.packets import PacketKind
 LINE = Line(1_000_000, 0, 500_000)
 READ = LINE.read(7, 36, 6)
 GOOD = protocol1.status_packet(7, 0, b"abcdef")
+QUESTION = LINE.read(7, 24, 1)
+"""Not read in each cycle."""
+ANSWER = protocol1.status_packet(7, 0, b"a")
 
 
 class ScriptedLine:
@@ -57,7 +60,7 @@ def talk(make_plan):
             def packet(self, *packet):
                 sink.append((*packet[:5], bytes(packet[5])))
 
-        bus = Bus(0, make_plan((7,)), line, line.clock, Sink())
+        line.bus = bus = Bus(0, make_plan((7,)), line, line.clock, Sink())
 
         def program():
             replies = []
@@ -133,6 +136,24 @@ def test_after_a_timeout_the_line_is_drained_until_it_is_silent(talk):
     assert after.parameters == b"abcdef"
     assert received == late + GOOD
     assert line.clock.now_ns() == 1_000 + timeout + 100_000 + 200_000 + 700_000
+
+
+def test_a_late_reply_is_explained_once_however_late_it_comes(talk):
+    late = (300_000, ANSWER)
+    line = ScriptedLine([], [(700_000, GOOD)], [late, (700_000, GOOD)], [late, (700_000, GOOD)])
+    (question, *reads), _, _ = talk(line, QUESTION, READ, READ, READ)
+    assert question.outcome is Outcome.TIMEOUT
+    assert [(read.answered, read.strays) for read in reads] == [(True, 0), (True, 1), (True, 1)]
+    assert line.bus.unrequested == 1  # the second one answers no question of this host
+
+
+def test_a_doubled_reply_is_explained_by_the_transaction_before(talk):
+    doubled = (300_000, ANSWER)
+    line = ScriptedLine([(700_000, ANSWER)], [doubled, (700_000, GOOD)], [doubled, (700_000, GOOD)])
+    (question, *reads), _, _ = talk(line, QUESTION, READ, READ)
+    assert question.answered
+    assert [(read.answered, read.strays) for read in reads] == [(True, 1), (True, 1)]
+    assert line.bus.unrequested == 1  # the one that came after another transaction
 
 
 def test_draining_ends_on_a_line_that_babbles(talk):
