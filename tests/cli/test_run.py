@@ -202,6 +202,29 @@ def test_without_a_log_the_same_rules_hold(dxlrun: Callable, runs: Runs, torso: 
     ]
 
 
+def test_an_interrupt_while_the_log_is_read_leaves_the_summary_and_its_name(
+    dxlrun: Callable, runs: Runs, torso: Path, logged: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def interrupted(_: str) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("dxlrun.analysis.tally.figures_of", interrupted)
+    runs.answer = RunSummary(0, "ended", 100, 0, 2.03, (), log=str(logged), messages=9)
+
+    said = dxlrun(torso)
+
+    assert said.code == 130
+    assert said.errors[1:] == [
+        "bioloid_torso: interrupted while the log was read, so the verdict is that of the loop's counts"
+    ]
+    assert said.out.splitlines() == [
+        "bioloid_torso: interrupted. 2.0 s, 100 cycles, 0 periods skipped",
+        "  The loop kept 50 Hz: 0 of 100 periods skipped.",
+        f"log: {logged} (9 messages)",
+        f"next: dxlrun analyze {logged}",
+    ]
+
+
 def test_a_loss_without_a_log_is_told_and_fails_the_run(
     dxlrun: Callable, tmp_path: Path, torso: Path, monkeypatch: pytest.MonkeyPatch
 ):

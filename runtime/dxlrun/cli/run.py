@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -162,7 +163,14 @@ def show(summary: RunSummary, plan: Plan, console: Console) -> int:
         say_warning(f"{robot}: {remark}")
     for sentence in summary.sentences:
         say_error(f"{robot}: {sentence}")
-    verdict = _verdict(summary, plan, console)
+    try:
+        verdict = _verdict(summary, plan, console)
+    except KeyboardInterrupt:  # a log may be long; its name is printed all the same
+        say_warning(
+            f"{robot}: interrupted while the log was read, so the verdict is that of the loop's counts"
+        )
+        summary = replace(summary, exit_code=summary.exit_code or 130)
+        verdict = _verdict(replace(summary, log=None), plan, console)
     code = 1 if summary.cycles and not verdict.good else summary.exit_code
     word = {0: "good", 130: "interrupted"}.get(code, "failed")
     console.print(
