@@ -168,6 +168,26 @@ def test_a_wheel_that_takes_no_goal_any_more_loses_its_torque_when_the_loop_died
     assert rig.torque() == [False, True]
 
 
+def test_a_wheel_whose_torque_off_was_lost_is_tried_again(make_wheel):
+    rig = make_wheel()
+    rig.goals.velocity[0] = 1.0
+    rig.cycle()
+    rig.buses[0].servo(1).poke("bus_watchdog", -1)
+    write, lost = rig.ports.ports[0].write, []
+
+    def lose_the_first(data):
+        if data[4] == 1 and data[7:11] == b"\x03\x40\x00\x00" and not lost:
+            lost.append(data)
+            rig.buses[0].alter_next_instruction("lost", lambda _: b"")
+        write(data)
+
+    rig.ports.ports[0].write = lose_the_first
+    said = stand(rig.plans, rig.ports, rig.clock, rig.packets)
+    assert lost
+    assert "main_1_joint (ID 1 on bus main) has no torque, as " in said[-1]
+    assert rig.torque()[0] is False
+
+
 def test_a_wheel_that_keeps_its_torque_whatever_is_written_is_named(make_wheel):
     rig = make_wheel()
     rig.goals.velocity[0] = 1.0
