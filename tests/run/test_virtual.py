@@ -168,3 +168,19 @@ def test_set_points_beyond_the_limits_are_clamped_and_the_log_counts_the_cycles(
     assert any(
         "head_yaw_joint, controller head: lowered to the upper position limit" in text for text in told
     )
+
+
+def test_the_progress_of_a_run_on_virtual_time_has_the_skipped_periods() -> None:
+    robot = simulated_robot(TORSO, duration_s=0.4)
+    seen: list[tuple[int, int]] = []
+
+    def fall_behind(cycles: int, skipped: int) -> None:
+        seen.append((cycles, skipped))
+        if cycles == 5:
+            robot.clock.wait_until(robot.clock.now_ns() + 70_000_000)
+
+    robot.progress = fall_behind
+    result = robot.run()
+    assert result.skipped == 3
+    assert seen[4:6] == [(5, 0), (6, 3)]
+    assert seen[-1] == (result.cycles, 3)
