@@ -25,7 +25,7 @@ def nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     "words",
     [
         ("pause",),
-        ("resume", "--json"),
+        ("resume",),
         ("stop",),
         ("rate", "100"),
         ("switch", "--activate", "head"),
