@@ -11,8 +11,9 @@ import pytest
 from dxlrun.control_table import control_table
 from dxlrun.dynamixel import protocol1, protocol2
 from dxlrun.dynamixel.bus_plan import RegisterValue
+from dxlrun.dynamixel.bus_watchdog import RETURN_SPEED
 from dxlrun.dynamixel.reboots import RealtimeTicks, RebootCount
-from dxlrun.dynamixel.returning import RETURN_SPEED, Returning
+from dxlrun.dynamixel.returning import Returning
 from dxlrun.dynamixel.transaction import Outcome, Reply
 from dxlrun.errors import StartUpError
 from dxlrun.events import EventCode

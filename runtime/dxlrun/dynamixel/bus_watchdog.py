@@ -14,7 +14,6 @@ from dxlrun.dynamixel.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.dialect import dialect_of
 from dxlrun.dynamixel.inspection import called, persist, tripped, who
 from dxlrun.dynamixel.plan import plan_line
-from dxlrun.dynamixel.returning import RETURN_SPEED
 from dxlrun.dynamixel.transaction import Program
 
 UNIT_NS = 20_000_000
@@ -24,6 +23,9 @@ MOST_TICKS = 127
 RAMP = "profile_acceleration"
 """It is 0 after a servo was stopped, as is Profile Velocity (e-Manual XM430-W350, Bus Watchdog (98), step 4
 of the example)."""
+RETURN_SPEED = 1.5
+"""rad/s, no faster does a servo that was lost go to its goal, which may have gone on: a step that no gate saw
+is to be a slow one."""
 LEAST_PERIODS = 3
 """It must bear two cycles that come to nothing (failures.md)."""
 

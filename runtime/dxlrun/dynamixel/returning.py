@@ -7,11 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.dynamixel.bus_watchdog import RETURN_SPEED
 from dxlrun.interfaces import Commands, Floats, States
 
-RETURN_SPEED = 1.5
-"""rad/s, no faster does a servo that was lost go to its goal, which may have gone on: a step that no gate saw
-is to be a slow one."""
 RETURNED = 0.05
 """rad from the goal: the servo has caught up."""
 
