@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -159,6 +160,32 @@ def test_a_way_begins_where_the_joint_stands_when_it_gets_a_goal(make: Make) -> 
 def test_a_speed_of_0_is_the_slowest_and_not_none(make: Make) -> None:
     way = reachable(make(stepped(100, 10, 1.0), np.zeros(100), speed=0.0), 0)
     assert way[-1] == pytest.approx(89 * DT * 0.01)
+
+
+def test_of_several_ways_the_longest_settling_and_the_greatest_error_at_rest_count(make: Make) -> None:
+    goals = np.concatenate((stepped(150, 10, 1.0), np.full(150, 2.0)))
+    way = np.concatenate((ramp(150, 10, 1.0, 0.5), 1.0 + ramp(150, 0, 1.0, 0.5)))
+    way[110:151] += 0.05  # the first rests farther off, the second comes there later
+    joint = only(make(goals, np.where(way > 1.5, way - 0.2 * (np.arange(300) < 280), way), speed=0.5))
+    assert joint.rest_rad == pytest.approx(0.05, abs=0.002)
+    assert joint.settling_ms is not None
+    assert joint.settling_ms > 300
+
+
+def test_states_that_are_not_valid_are_no_error_and_a_joint_that_stands_has_no_lag(make: Make) -> None:
+    positions = np.full(100, 0.001 * np.arange(100) % 2)
+    positions[50] = np.nan
+    log = make(np.zeros(100), positions)
+    cycles = log.cycles.copy()
+    cycles["position"][50, 0] = 3.0  # any value may stand there
+    joint = only(replace(log, cycles=cycles))
+    assert (joint.invalid, joint.lag_ms) == (1, None)
+    assert joint.worst_rad == pytest.approx(0.099)
+
+
+def test_a_first_goal_is_approached_from_where_the_joint_stands(make: Make) -> None:
+    way = reachable(make(np.full(100, 1.0), np.zeros(100), speed=0.5), 0)
+    assert way[1:] == pytest.approx(np.minimum(np.arange(1, 100) * DT * 0.5, 1.0), abs=DT)
 
 
 def test_terminal_report_and_json_say_the_same(make: Make) -> None:

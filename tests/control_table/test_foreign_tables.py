@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 import re
 import subprocess
 import sys
@@ -132,6 +133,14 @@ def test_pro_stands_where_the_maker_s_examples_address_it(model: str, places: Pl
     assert [ours[name][0] for name in ("indirect_address_1", "indirect_address_256")] == [49, 559]
     assert [ours[name][0] for name in ("indirect_data_1", "indirect_data_256")] == [634, 889]
     assert ours["goal_torque"][:2] == (604, 2)
+
+
+@pytest.mark.parametrize("model", sorted(PRO.keys() - {"L42-10-S300-R", "RH-P12-RN"}))
+def test_pro_counts_its_speed_in_turns_of_the_motor_a_minute(model: str) -> None:
+    # e-Manual, Goal Velocity(600): 1 is one turn a minute before the gear; Specifications, Gear Ratio
+    table = control_table(model)
+    for name in ("goal_velocity", "present_velocity", "velocity_limit", "moving_threshold"):
+        assert table.items[name].scale == pytest.approx(math.tau / 60 / table.gear_ratio, rel=3e-4), name
 
 
 @pytest.mark.parametrize(

@@ -296,6 +296,14 @@ def test_a_hand_turns_a_limp_shaft_evenly(make_line2: Callable[..., Any], model:
     assert happened(line2) == [f"turn servo=1 by={by:g}deg for=1s"]
 
 
+def test_a_hand_takes_the_time_that_is_given(line2: Any) -> None:
+    inject(line2, "turn servo=1 by=30deg for=200ms")
+    line2.wait(0.1)
+    assert math.degrees(line2.servo(1).position - 2.0) == pytest.approx(15, rel=0.05)
+    line2.wait(0.15)
+    assert math.degrees(line2.servo(1).position - 2.0) == pytest.approx(30)
+
+
 @pytest.mark.parametrize(("mode", "goal"), [(3, None), (4, None), (5, None), (1, None), (0, 100), (16, 100)])
 def test_a_hand_gives_way_to_a_servo_with_torque(line2: Any, mode: int, goal: int | None) -> None:
     line2.set("operating_mode", mode)

@@ -16,6 +16,7 @@ import pytest
 from dxlrun.control_table import all_tables, control_table
 from dxlrun.simulation import Mechanics, ServoConfig, SimulatedServo
 from dxlrun.simulation.motor import motor_of
+from dxlrun.simulation.shaft import critical_d
 
 S, STEP_NS = 1_000_000_000, 2_000_000
 START = 1.0
@@ -244,3 +245,27 @@ def test_models_that_nothing_was_published_of_keep_the_manual_s_figures_and_say_
         if not identified:
             assert motor.no_load_speed == pytest.approx(table.max_speed), table.model
             assert motor.stall_torque == table.stall_torque or not table.stall_torque, table.model
+
+
+@pytest.mark.parametrize(
+    ("like", "models"),
+    [
+        ("XL330-M288", ("XL330-M077", "XL430-W250", "2XL430-W250", "AX-12A")),
+        ("MX-106", ("EX-106+", "XM540-W270", "PH54-200-S500", "H54-200-S500-R(A)", "L54-50-S500-R")),
+        ("MX-64", ("MX-28", "XM430-W350", "XC330-T288", "RX-28", "PH42-020-S300")),
+    ],
+)
+def test_a_model_is_scaled_from_the_identified_motor_of_its_kind(like: str, models: tuple[str, ...]) -> None:
+    for model in models:
+        tables = [table for table in all_tables() if table.model == model]
+        assert tables
+        for table in tables:
+            assert motor_of(table).source.startswith(f"[i] scaled from the {like}: "), model
+
+
+@pytest.mark.parametrize("p", [5.06, 20.0])
+def test_the_gain_that_does_not_overshoot_is_the_critical_one(p: float) -> None:
+    motor = motor_of(control_table("XM430-W350"))
+    speed = motor.stall_torque / motor.damping
+    # T x'' + (1 + D w) x' + P w x = 0 has one root twice
+    assert (1 + critical_d(p, motor) * speed) ** 2 == pytest.approx(4 * motor.time_constant * p * speed)

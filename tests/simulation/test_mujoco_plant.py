@@ -124,11 +124,14 @@ def test_friction_holds_what_it_can_hold() -> None:
     assert slipping.angle[0] < -0.05
 
 
+@pytest.mark.parametrize("bodies", [True, False], ids=["bodies", "independent"])
 @pytest.mark.parametrize(("pulled", "falls"), [(0.25, False), (0.35, True)])
-def test_friction_of_the_gear_grows_with_what_pulls_at_it(pulled: float, falls: bool) -> None:
+def test_friction_of_the_gear_grows_with_what_pulls_at_it(pulled: float, falls: bool, bodies: bool) -> None:
     gear = dataclasses.replace(ROTOR, load_friction=0.2)
     # held with 1 - p of the pull: friction is 0.2 of the sum of both, which the difference must not exceed
-    plant = _plant(ONE, UrdfJoint("shoulder", 0.0, 1), rotor=gear)
+    plant: Plant = IndependentJoints([Joint(gear, Load(MASS * ARM**2, 0.0, PULL, -math.pi / 2), 0.0)])
+    if bodies:
+        plant = _plant(ONE, UrdfJoint("shoulder", 0.0, 1), rotor=gear)
     _run(plant, 2.0, drive=(1 - pulled) * PULL, damping=0.05)
     assert (plant.angle[0] < -0.05) == falls
 
