@@ -1,9 +1,9 @@
 """Campaign: fuzzed packets through the host's receiver, of both protocols.
 
 Every packet of a stream is intact, damaged, cut off or noise, and the stream arrives in pieces of any size,
-with flushes in between as after a timeout. Now and then replies are awaited as a whole (a burst), and come
-so, damaged, or not at all. Nothing may be raised, the receiver keeps no more than its one buffer, each byte
-leaves it exactly once and in order, and every intact packet is delivered exactly once.
+with flushes in between as after a timeout; now and then it has the replies to a read, whole, damaged, or not
+at all. Nothing may be raised, the receiver keeps no more than its one buffer, each byte leaves it exactly once
+and in order, and every intact packet is delivered exactly once.
 
     python tests/bench/fuzz_receiver.py 1000000
 
@@ -21,10 +21,8 @@ from dataclasses import dataclass
 from fastcrc import crc16
 
 from dxlrun.dynamixel import protocol1, protocol2
-from dxlrun.dynamixel.burst import Burst
 from dxlrun.dynamixel.dialect import Dialect
 from dxlrun.dynamixel.receiver import Receiver
-from dxlrun.dynamixel.transaction import BROADCAST_ID, Awaited, Transaction
 
 BATCH = 100
 """Packets between two flushes."""
@@ -43,8 +41,6 @@ class Tally:
     """Intact packets of which such an accident took a part."""
     noise_bytes: int = 0
     most_pending: int = 0
-    bursts: int = 0
-    """Replies that were taken as a whole."""
 
 
 class _Ear:
@@ -54,17 +50,7 @@ class _Ear:
         self.packets: list[bytes] = []
         self.noise = 0
         self.everything = bytearray()
-        self.bursts = 0
-        self.receiver = Receiver(self._packet, self._noise, dialect, self._whole)
-
-    def _whole(self, burst: Burst, ends: list[int], times: list[int]) -> bool:
-        assert len(ends) == len(times)
-        self.bursts += 1
-        said = [bytes(data) for _, data in burst.packets]
-        self.packets += said
-        self.everything += b"".join(said)
-        assert all(bytes(row.tobytes()) in b"".join(said) for row in burst.data)
-        return True
+        self.receiver = Receiver(self._packet, self._noise, dialect)
 
     def _packet(self, data: memoryview, first_ns: int, last_ns: int) -> None:
         assert first_ns <= last_ns
@@ -108,39 +94,28 @@ def noise(dialect: Dialect, rng: random.Random) -> bytes:
     return made + dialect.HEADER[: rng.randint(0, 4)] + made[:3] if rng.random() < 0.5 else made
 
 
-def replies(dialect: Dialect, rng: random.Random) -> tuple[Transaction, list[bytes]]:
-    """Return a read of some servos, and the intact packets that answer it."""
+def replies(dialect: Dialect, rng: random.Random) -> list[bytes]:
+    """Return the intact packets that answer a read of some servos, or their one packet of a fast form."""
     ids = rng.sample(range(dialect.HIGHEST_ID + 1), rng.randint(1, 9))
     length = rng.choice((1, 2, 6, 10, 27))
-    fast = dialect.PROTOCOL == 2.0 and rng.random() < 0.5
-    awaited = tuple(Awaited(servo_id, length) for servo_id in ids)
-    read = Transaction(b"", BROADCAST_ID, awaited, 0, 0, fast=fast)
-    make = protocol1.status_packet if dialect.PROTOCOL == 1.0 else protocol2.status_packet
-    if not fast:
-        return read, [make(servo_id, rng.choice((0, 0, 0, 0x80)), rng.randbytes(length)) for servo_id in ids]
+    if dialect.PROTOCOL == 1.0 or rng.random() < 0.5:
+        make = dialect.status_packet
+        return [make(servo_id, rng.choice((0, 0, 0, 0x80)), rng.randbytes(length)) for servo_id in ids]
     packet = b"\xff\xff\xfd\x00\xfe" + (1 + len(ids) * (length + 4)).to_bytes(2, "little") + b"\x55"
     for servo_id in ids:
         packet += bytes((rng.choice((0, 0x80)), servo_id)) + rng.randbytes(length)
         packet += crc16.umts(packet).to_bytes(2, "little")
-    return read, [packet]
+    return [packet]
 
 
-Stream = tuple[bytes, list[bytes], list[bytes], dict[int, Transaction]]
-
-
-def batch(dialect: Dialect, rng: random.Random) -> Stream:
-    """Return a stream, its intact packets that no rubbish stands before, all intact ones, and the reads.
-
-    A read stands at the index of the byte from which on its replies are awaited.
-    """
+def batch(dialect: Dialect, rng: random.Random) -> tuple[bytes, list[bytes], list[bytes]]:
+    """Return a stream, its intact packets that no rubbish stands before, and all intact ones."""
     stream, certain, intact = bytearray(), [], []
-    reads: dict[int, Transaction] = {}
     clean = True
-    while len(intact) + len(reads) < BATCH:
+    while len(intact) < BATCH:
         kind = rng.random()
         if kind < 0.1:
-            read, answers = replies(dialect, rng)
-            reads[len(stream)] = read
+            answers = replies(dialect, rng)
             if rng.random() < 0.7:
                 stream += b"".join(answers)
                 intact += answers
@@ -158,7 +133,7 @@ def batch(dialect: Dialect, rng: random.Random) -> Stream:
             continue
         clean = False
         stream += damaged(status(dialect, rng), rng) if kind < 0.85 else noise(dialect, rng)
-    return bytes(stream), certain, intact, reads
+    return bytes(stream), certain, intact
 
 
 def campaign(dialect: Dialect, count: int, seed: int) -> Tally:
@@ -167,20 +142,13 @@ def campaign(dialect: Dialect, count: int, seed: int) -> Tally:
     ear, tally = _Ear(dialect), Tally()
     now = 0
     while tally.packets < count:
-        stream, certain, intact, reads = batch(dialect, rng)
-        marks = [*sorted(reads), len(stream)]
+        stream, certain, intact = batch(dialect, rng)
         ear.packets.clear()
         ear.everything.clear()
         start = 0
         while start < len(stream):
             now += 1
-            if start in reads and not ear.receiver.pending:
-                burst = Burst.of(dialect, reads[start], ear.receiver.room)
-                if burst is not None:
-                    burst.bind(ear.receiver.buffer)
-                ear.receiver.expect(burst)
-            stop = next(mark for mark in marks if mark > start)
-            piece = stream[start : min(stop, start + rng.choice((1, 5, 16, 64, 64, 512, 2048)))]
+            piece = stream[start : start + rng.choice((1, 5, 16, 64, 64, 512, 2048))]
             ear.receiver.feed(piece, now)
             tally.most_pending = max(tally.most_pending, ear.receiver.pending)
             start += len(piece)
@@ -194,7 +162,6 @@ def campaign(dialect: Dialect, count: int, seed: int) -> Tally:
         tally.accidents += len(ear.packets) - whole
         tally.swallowed += len(intact) - whole
         tally.packets += BATCH
-        tally.bursts = ear.bursts
         tally.intact += len(intact)
         tally.delivered += len(ear.packets)
     tally.noise_bytes = ear.noise

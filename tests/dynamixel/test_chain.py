@@ -46,8 +46,6 @@ class Script:
 class Job:
     """Sends the sync read, keeps every status and how it ended."""
 
-    burst = None
-
     def __init__(self):
         self.statuses, self.outcome, self.strays = {}, None, 0
 

@@ -26,7 +26,7 @@ class Robot:
         self.servos = [servo for plan in plans for servo in plan.servos]
         self.states = States.empty(len(self.servos))
         self.samples = Samples(plans, self.states, events)
-        self.replies = [reply for bus in self.samples.buses for reply in bus.replies]
+        self.replies = [bytearray(servo.state.length) for servo in self.servos]
         self.now_ns = SECOND_NS
 
     def put(self, index, position, velocity, effort):
@@ -44,15 +44,15 @@ class Robot:
     def settle(self, fresh, arrived_ns, *, after_ns=10 * MS):
         """Let the replies arrive so long before now, of those that are fresh."""
         self.now_ns += after_ns
-        first = 0
+        self.samples.follow_modes()
+        self.samples.fresh[:] = False
+        said = iter(zip(fresh, self.replies, arrived_ns, strict=True))
         for bus, plan in zip(self.samples.buses, self.plans, strict=True):
             for index in range(len(plan.servos)):
-                bus.arrivals.fresh[index] = fresh[first + index]
-                if fresh[first + index]:
-                    bus.arrivals.at_ns[index] = self.now_ns - arrived_ns[first + index]
-            first += len(plan.servos)
-            bus.count()
-        self.samples.settle(self.now_ns, all(fresh))
+                came, reply, age_ns = next(said)
+                if came:
+                    bus.take(index, bytes(reply), self.now_ns - age_ns)
+        self.samples.settle(self.now_ns)
 
     def all_said(self, *raw, age_ns=0):
         """Let every servo say the same."""

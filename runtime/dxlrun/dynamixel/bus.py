@@ -20,8 +20,7 @@ from dxlrun.dynamixel.transaction import (
 from dxlrun.errors import PortError
 from dxlrun.packets import PacketKind, PacketSink
 
-if TYPE_CHECKING:  # the guardian makes servos limp without numpy
-    from dxlrun.dynamixel.lane import Lane
+if TYPE_CHECKING:  # the guardian does not need it
     from dxlrun.dynamixel.reply_polling import ReplyPolling
 
 QUIET_BYTES = 20
@@ -47,11 +46,9 @@ class Bus(Listener):
     __slots__ = (
         "_drain_end_ns",
         "_free_ns",
-        "_lane",
         "_now_ns",
         "_port",
         "_quiet_ns",
-        "_room",
         "failure",
         "name",
     )
@@ -64,8 +61,6 @@ class Bus(Listener):
         self._port = port
         self._now_ns = clock.now_ns
         self._quiet_ns = max(QUIET_BYTES * self.byte_ns, LEAST_QUIET_NS) + plan.latency_ns
-        self._lane: Lane | None = None
-        self._room = self._receiver.space
         self._free_ns = self._drain_end_ns = 0
 
     @property
@@ -80,42 +75,19 @@ class Bus(Listener):
         self.drop()
         self._receiver.flush()  # the half of a packet that the lost line brought is nobody's
 
-    def load(self, job: Job, lane: Lane | None = None) -> None:
-        """Take a job; the next `step` begins it. What an aborted job left behind is forgotten.
-
-        `lane`: the quick way through it, if there is one.
-        """
+    def load(self, job: Job) -> None:
+        """Take a job; the next `step` begins it. What an aborted job left behind is forgotten."""
         self._owe()
-        self._awaited = self._burst = self._lane = None
+        self._awaited = None
         self._state = READY
-        if self.failure is not None:
-            return
-        self._job = job
-        self._reply.strays = 0
-        if lane is not None:
-            self._lane = lane
-            lane.begin(self._port, self._now_ns, self._sink)
-            if self._receiver.pending:
-                self._receiver.flush()
-
-    def begin_behind(self) -> None:
-        """Send the first instruction of the loaded job at once, though the line may not be free yet.
-
-        It waits in the adapter behind what was sent before, and its times count from when the line is free.
-        """
-        if self._job is not None:
-            try:
-                if self._lane is not None:
-                    self._ask(self._lane)
-                else:
-                    self._begin(self._job)
-            except PortError as error:
-                self._fail(error)
+        if self.failure is None:
+            self._job = job
+            self._reply.strays = 0
 
     def drop(self) -> None:
         """Forget the loaded job; what still comes for it belongs to nobody."""
         self._owe()
-        self._job = self._awaited = self._burst = self._lane = None
+        self._job = self._awaited = None
         self._state = READY
 
     def send(self, packet: bytes | bytearray | memoryview) -> None:
@@ -136,60 +108,27 @@ class Bus(Listener):
 
         Called when the line has bytes. `polling` is told when everything that was awaited has come.
         """
-        lane = self._lane
-        if lane is None:
-            awaited = self._state == AWAITING
-            self._receive()
-            now_ns = self._now_ns()
-            if polling is not None and awaited and self._state == READY and self._reply.outcome is _OK:
-                polling.came(self.due_ns, now_ns)
-            return self.step(now_ns)
-        try:
-            if not lane.awaiting:
-                self._take_bytes()  # nobody was asked
-                self._receiver.flush()
-            elif deadline_ns := lane.take(polling):
-                self.due_ns = lane.due_ns
-                if deadline_ns == NEVER:
-                    self._last_byte_ns = lane.at_ns
-                    self._job = self._lane = None
-                return deadline_ns
-            else:
-                self._turn_aside(lane)
-        except PortError as error:
-            self._fail(error)
-        return self.step(self._now_ns())
+        awaited = self._state == AWAITING
+        self._receive()
+        now_ns = self._now_ns()
+        if polling is not None and awaited and self._state == READY and self._reply.outcome is _OK:
+            polling.came(self.due_ns, now_ns)
+        return self.step(now_ns)
 
     def _receive(self) -> None:
         if self.failure is None:
             try:
-                self._take_bytes()
+                if self._receiver.read_from(self._port, self._now_ns):
+                    self._last_byte_ns = self._now_ns()
+                    self._skip_headers()
             except PortError as error:
                 self._fail(error)
-
-    def _take_bytes(self) -> None:
-        receiver = self._receiver
-        if self._burst is None or receiver.pending:
-            if receiver.read_from(self._port, self._now_ns):
-                self._last_byte_ns = self._now_ns()
-                self._skip_headers()
-        # nearly always all replies are there at once: no need to keep book of what came when
-        elif count := self._port.read_into(self._room):
-            self._hear(count, self._now_ns())
 
     def step(self, now_ns: int) -> int:
         """Do what is due; return when to come back at the latest, NEVER when there is nothing to do."""
         try:
-            if (lane := self._lane) is not None:
-                if not lane.awaiting:
-                    return self._ask(lane)  # behind what is still on its way: sleeping until then ends late
-                if now_ns < lane.deadline_ns:
-                    return lane.deadline_ns
-                self._turn_aside(lane)
             while self._job is not None:
                 if self._state == READY:
-                    if now_ns < self._free_ns:
-                        return self._free_ns
                     now_ns = self._begin(self._job)
                 elif now_ns < self._deadline_ns:
                     return self._deadline_ns
@@ -211,34 +150,7 @@ class Bus(Listener):
             self._receiver.flush()
             self._state = READY
 
-    def _ask(self, lane: Lane) -> int:
-        """Send the next read of a lane; return when to come back at the latest."""
-        deadline_ns = lane.ask(self._free_ns)
-        self.due_ns = lane.due_ns
-        return deadline_ns
-
-    def _turn_aside(self, lane: Lane) -> None:
-        """Let the general machine go on where a lane has ended: it awaits what that awaited."""
-        self._lane = None
-        transaction = lane.end()
-        if transaction is None or self._job is None or not lane.awaiting:
-            return
-        if lane.done:
-            self._last_byte_ns = lane.sent_ns  # the next was sent when the one before had come
-        self._burst = self._job.burst
-        self._await(transaction, lane.sent_ns)
-        self._free_ns = lane.sent_ns + len(transaction.packet) * self.byte_ns
-        for number, (count, at_ns) in enumerate(lane.pieces):
-            if number:
-                self._last_byte_ns = at_ns
-                self._receiver.accept(count, at_ns)
-                self._skip_headers()
-            else:
-                self._hear(count, at_ns)
-
     def _fail(self, error: PortError) -> None:
-        if self._lane is not None:
-            self._turn_aside(self._lane)  # what came until now is not forgotten
         self.failure = error
         self._job = None
 
@@ -252,7 +164,6 @@ class Bus(Listener):
             return 0
         if self._receiver.pending:
             self._receiver.flush()
-        self._burst = job.burst
         packet = transaction.packet
         now_ns = self._write(packet, transaction.servo_id) if packet else self._now_ns()
         self._await(transaction, self._sent_ns if packet else now_ns)

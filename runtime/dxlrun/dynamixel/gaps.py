@@ -11,7 +11,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from enum import IntEnum, unique
 
-from dxlrun.dynamixel.burst import Burst
 from dxlrun.dynamixel.bus_plan import BusPlan
 from dxlrun.dynamixel.line import SHORT_PATIENCE_NS
 from dxlrun.dynamixel.transaction import Outcome, Program, Reply, Result, Transaction
@@ -181,11 +180,6 @@ class Gaps:
 
     def status(self, index: int, reply: Reply) -> None:
         """Wait for the end of the transaction: a program awaits one status at a time."""
-
-    burst: Burst | None = None
-
-    def take(self, burst: Burst, times_ns: int | list[int]) -> None:
-        """Wait for nothing: a program has no bursts."""
 
     def abandon(self) -> None:
         """Bring every program to its end without a line: whatever it asks, nobody answers.

@@ -1,29 +1,72 @@
-"""Goals -> the sync writes of one bus, in whatever mode each servo is; prepared once a change of modes."""
+"""Goals: arrays in SI units -> the sync writes of one bus, in whatever mode each servo is."""
 
 from __future__ import annotations
 
-import struct
+import math
 from collections.abc import Mapping, Sequence
-from itertools import compress
-from math import isnan
-from operator import ne, or_
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.dynamixel.bus_plan import BusPlan, Field, GoalLayout, OwnLimit
+from dxlrun.dynamixel.bus_plan import BusPlan, Field, GoalLayout, ModePlan, OwnLimit, Scale, ServoPlan
 from dxlrun.dynamixel.dialect import Dialect, dialect_of
-from dxlrun.dynamixel.goal_ticks import Ceiling, Group
-from dxlrun.dynamixel.state_arrays import rows_of
-from dxlrun.interfaces import Commands, Floats
+from dxlrun.interfaces import COMMAND_INTERFACES, CommandName, Commands, Floats
 from dxlrun.mode import Mode
 
 REPEATED = 50
-"""Cycles after which a goal that stays is sent again: nobody acknowledges a sync write."""
-_OFTEN = 2
-"""So many times a goal that changed is sent: in this cycle and in the next."""
+"""Cycles after which an unchanged goal is sent again: a sync write has no acknowledgement."""
+
+CLOCKWISE = 0x400
+"""Direction bit of sign-magnitude goals: bit 10 (e-Manual AX-12A, Moving Speed (32))."""
+
+LEADS: Mapping[Mode, CommandName] = {Mode.VELOCITY: "velocity", Mode.EFFORT: "effort", Mode.PWM: "pwm"}
+"""The goal that a mode follows, where it is not the position; without it a servo is sent none."""
+
+_VELOCITY = COMMAND_INTERFACES.index("velocity")
 
 Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One goal item of one servo: how a goal in SI units becomes the integer in its packet.
+
+    With its sign: tick = (sign * goal + offset) / unit, to the nearest, from `low` to `high`. A magnitude:
+    tick = |goal| / unit, from `low` to `high`, `free` where the goal is NaN.
+    """
+
+    place: Field
+    """Where it stands in the servo's block."""
+    interface: int
+    """Row of the goals, as COMMAND_INTERFACES counts."""
+    magnitude: bool
+    sign: float
+    offset: float
+    unit: float
+    low: int
+    high: int
+    free: int = 0
+
+    def tick(self, goal: float, ceiling: float) -> int:
+        """Return the integer on the wire; a magnitude of velocity is at most `ceiling`, NaN: no ceiling."""
+        if not self.magnitude:
+            exact = (self.sign * goal + self.offset) / self.unit
+            tick = (
+                round(exact)
+                if self.low <= exact <= self.high
+                else self.low
+                if exact < self.low
+                else self.high
+            )
+            mirrored = self.place.encoding == "sign_magnitude" and tick < 0
+            return CLOCKWISE - tick if mirrored else tick
+        if self.interface == _VELOCITY and not (math.isnan(ceiling) or abs(goal) <= ceiling):
+            goal = ceiling
+        exact = abs(goal) / self.unit
+        if self.low <= exact <= self.high:
+            return round(exact)
+        return self.low if exact < self.low else self.high if exact > self.high else self.free
 
 
 class GoalArrays:
@@ -38,34 +81,17 @@ class GoalArrays:
     beside a position: the most that it may take, NaN = all that the servo's own limit lets it.
     """
 
-    __slots__ = (
-        "_blocks",
-        "_cycle",
-        "_fraction",
-        "_goals",
-        "_limits",
-        "_modes",
-        "_next",
-        "_own",
-        "_plan",
-        "_rows",
-        "_seen",
-        "_still",
-    )
+    __slots__ = ("_cycle", "_fraction", "_limits", "_modes", "_plan", "_unlimited", "sync_writes")
 
     def __init__(self, plan: BusPlan) -> None:
         self._plan = plan
         self._modes: list[Mode] = [servo.start_mode for servo in plan.servos]
         self._limits: list[dict[str, int]] = [{} for _ in plan.servos]
         self._fraction = 1.0
-        self._blocks: tuple[_Block, ...] = ()
         self._cycle = 0
-        self._next = 0  # cycle in which a goal that stays is due again
-        self._still = 0  # cycles since anything was another than before
-        self._seen: tuple[bytes, bytes, bytes] | None = None
-        self._rows = rows_of([servo.row for servo in plan.servos])
-        self._goals: Commands | None = None
-        self._own: Floats | None = None  # the rows of this bus among these goals, where they can be shown
+        self._unlimited = [math.nan] * len(plan.servos)
+        self.sync_writes: tuple[SyncWrite, ...] = ()
+        """One for each mode and block of goals, in the order in which they are sent; new after a change."""
         self._rebuild()
 
     @property
@@ -99,26 +125,12 @@ class GoalArrays:
 
         `ceiling`, shape (servos,): the highest speed toward a position, rad/s; NaN: no other than the goal's.
         """
-        self._cycle = cycle = self._cycle + 1
-        if goals is not self._goals:
-            self._goals = goals
-            self._own = goals.values[:, self._rows] if isinstance(self._rows, slice) else None
-        now = (goals.values[:, self._rows] if self._own is None else self._own).tobytes()
-        who = included.tobytes()
-        seen = now, who, b"" if ceiling is None else ceiling.tobytes()
-        if seen != self._seen:
-            self._seen, self._still = seen, 0
-        else:
-            self._still += 1
-            if self._still >= _OFTEN and cycle < self._next:
-                return ()
-        slowed = None if ceiling is None else ceiling.tolist()
-        found: list[bytes] = []
-        for block in self._blocks:
-            block.packets(cycle, now, who, slowed, found)
-        if self._still:  # else nobody asks for it
-            self._next = min([block.next for block in self._blocks], default=cycle) + REPEATED
-        return found
+        self._cycle += 1
+        values: list[list[float]] = goals.values.tolist()
+        here: list[bool] = included.tolist()
+        most: list[float] = self._unlimited if ceiling is None else ceiling.tolist()
+        found = [one.packet(self._cycle, values, here, most) for one in self.sync_writes]
+        return [packet for packet in found if packet is not None]
 
     def _rebuild(self) -> None:
         groups: dict[tuple[Mode, tuple[GoalLayout, ...]], list[int]] = {}
@@ -126,150 +138,149 @@ class GoalArrays:
         for index, (servo, mode) in enumerate(zip(servos, self._modes, strict=True)):
             if mode is not Mode.UNKNOWN:
                 groups.setdefault((mode, servo.mode_plan(mode).goals), []).append(index)
-        self._blocks = tuple(
-            _Block(
-                dialect_of(self._plan.protocol),
-                Group(
-                    mode=mode,
-                    servos=[servos[index] for index in members],
-                    members=members,
-                    count=len(servos),
-                    limits=[self._limits[index] for index in members],
-                    fraction=self._fraction,
-                ),
+        dialect = dialect_of(self._plan.protocol)
+        self.sync_writes = tuple(
+            SyncWrite(
+                dialect,
+                layout,
+                LEADS.get(mode, "position"),
+                members,
+                [servos[index] for index in members],
+                [
+                    _cells(servos[index], mode, layout, self._limits[index], self._fraction)
+                    for index in members
+                ],
             )
-            for (mode, _), members in groups.items()
+            for (mode, layouts), members in groups.items()
+            for layout in layouts
         )
-        self._still, self._seen = 0, None
 
 
-class _Block:
-    """The servos of one bus that are in one mode and have one layout of its goals."""
-
-    __slots__ = ("_everybody", "_lead", "_members", "_records")
-
-    def __init__(self, dialect: Dialect, group: Group) -> None:
-        self._lead = group.unpack(group.lead)
-        self._members = None if len(group.members) == group.count else group.members
-        self._everybody = b"\1" * len(group.members)
-        self._records = tuple(_Records(dialect, layout, group) for layout in group.layouts)
-
-    @property
-    def next(self) -> int:
-        """The cycle in which the oldest goal was sent."""
-        return min([records.oldest for records in self._records])
-
-    def packets(self, cycle: int, goals: bytes, who: bytes, ceiling: Ceiling, found: list[bytes]) -> None:
-        """Add the packets, in the order of the mode's blocks of goals.
-
-        `goals`: those of the bus, row by row; `who`: 1 for each servo of the bus that may get one.
-        """
-        if self._members is not None:
-            who = bytes([who[member] for member in self._members])
-            ceiling = None if ceiling is None else [ceiling[member] for member in self._members]
-        lead = self._lead(goals)
-        if isnan(sum(lead)):  # nearly never; who is it?
-            who = bytes([one and not isnan(goal) for one, goal in zip(who, lead, strict=True)])
-        for records in self._records:
-            packet = records.packet(cycle, goals, who, who == self._everybody, ceiling)
-            if packet is not None:
-                found.append(packet)
-
-
-class _Records:
-    """One block of goals of several servos as it is sent, and what of it was sent before."""
+class SyncWrite:
+    """One block of goals of the servos of one bus in one mode, and when each of them was sent."""
 
     __slots__ = (
-        "_before",
+        "_again",
         "_dialect",
-        "_head",
-        "_items",
-        "_layout",
-        "_nobody",
-        "_pack",
-        "_places",
-        "_seen",
         "_sent_at",
-        "_values",
-        "_who",
-        "oldest",
+        "_served",
+        "_ticks",
+        "cells",
+        "ids",
+        "layout",
+        "lead",
+        "members",
+        "rows",
     )
 
-    def __init__(self, dialect: Dialect, layout: GoalLayout, group: Group) -> None:
-        items, count, size = group.items(layout), len(group.servos), 1 + layout.length
-        self._dialect, self._layout = dialect, layout
-        stride = 1 + len(items)
-        self._items = tuple(
-            (number, slice(1 + number, None, stride), item.span, item.slowed, item.ticks)
-            for number, item in enumerate(items)
-        )
-        self._seen = [b"" for _ in items]  # of what the ticks were made
-        self._values = [0] * (stride * count)
-        """ID and ticks of each servo, in the order of the wire."""
-        self._values[::stride] = [servo.servo_id for servo in group.servos]
-        packet = dialect.sync_write_records(layout.address, layout.length, bytes(size * count))
-        self._head = packet[: -dialect.CHECKSUM - size * count]
-        form = "<" + f"{len(self._head)}s" + _form([item.place for item in items], layout.length) * count
-        self._pack = struct.Struct(form).pack
-        first = len(self._head)
-        self._places = [slice(first + size * number, first + size * (number + 1)) for number in range(count)]
-        self._nobody = [False] * count
-        self._before = self._nobody  # whose goal changed in the cycle before
-        self._who = bytes(count)
-        self._sent_at = [0] * count
-        self.oldest = 0
-        """The cycle in which that goal was sent whose sending is longest ago."""
+    def __init__(  # noqa: PLR0917  what is written, to which servos
+        self,
+        dialect: Dialect,
+        layout: GoalLayout,
+        lead: CommandName,
+        members: Sequence[int],
+        servos: Sequence[ServoPlan],
+        cells: Sequence[Sequence[Cell]],
+    ) -> None:
+        self._dialect = dialect
+        self.layout = layout
+        self.lead = COMMAND_INTERFACES.index(lead)
+        """Row of the goals without which a servo is sent none."""
+        self.members = tuple(members)
+        """Indices of its servos on the bus."""
+        self.rows = [servo.row for servo in servos]
+        self.ids = [servo.servo_id for servo in servos]
+        self.cells = cells
+        """The items of each servo, in the order of the wire."""
+        self._ticks = [[0] * len(items) for items in cells]
+        self._again = [False] * len(servos)  # the goal changed in the cycle before
+        self._served = [False] * len(servos)  # the servo could get a goal in the cycle before
+        self._sent_at = [0] * len(servos)
 
-    def packet(self, cycle: int, goals: bytes, who: bytes, everybody: bool, ceiling: Ceiling) -> bytes | None:
-        """Return the packet with the goals that are due; None: none is."""
-        changed = self._changed(goals, ceiling)
-        if who != self._who:
-            changed = [one or new > old for one, new, old in zip(changed, who, self._who, strict=True)]
-            self._who = who
-        before, self._before = self._before, changed
-        if not everybody or False in changed:
-            latest = cycle - REPEATED
-            due = [
-                one == 1 and (now or then or at <= latest)
-                for one, now, then, at in zip(who, changed, before, self._sent_at, strict=True)
-            ]
-            if False in due:
-                return self._some(cycle, due)
-        self._sent_at = [cycle] * len(who)
-        self.oldest = cycle
-        return self._dialect.sealed(self._pack(self._head, *self._values))
+    def packet(
+        self,
+        cycle: int,
+        values: Sequence[Sequence[float]],
+        included: Sequence[bool],
+        ceiling: Sequence[float],
+    ) -> bytes | None:
+        """Return the packet with the goals that are due; None: none is.
 
-    def _changed(self, goals: bytes, ceiling: Ceiling) -> list[bool]:
-        """Take over the goals; return whose ticks are other ones than before."""
-        changed, values = self._nobody, self._values
-        for number, here, span, slowed, ticks in self._items:
-            seen = b"" if slowed and ceiling is not None else goals[span]
-            if not seen or seen != self._seen[number]:
-                self._seen[number] = seen
-                now = ticks(goals, ceiling)
-                other = list(map(ne, now, values[here]))
-                if True in other:
-                    values[here] = now
-                    changed = other if changed is self._nobody else list(map(or_, changed, other))
-        return changed
+        `values`: the goals of all joints, in the rows of COMMAND_INTERFACES; `included`, `ceiling`: of each
+        servo of the bus.
+        """
+        lead, due = values[self.lead], bytearray()
+        for number, (index, row) in enumerate(zip(self.members, self.rows, strict=True)):
+            served = included[index] and not math.isnan(lead[row])
+            ticks = [cell.tick(values[cell.interface][row], ceiling[index]) for cell in self.cells[number]]
+            changed = ticks != self._ticks[number] or (served and not self._served[number])
+            self._ticks[number], self._served[number] = ticks, served
+            if served and (changed or self._again[number] or self._sent_at[number] <= cycle - REPEATED):
+                self._sent_at[number] = cycle
+                due += self._record(number)
+            self._again[number] = changed
+        return self._dialect.sync_write_records(self.layout.address, self.layout.length, due) if due else None
 
-    def _some(self, cycle: int, due: Sequence[bool]) -> bytes | None:
-        """Return the packet with the goals of some servos, None for nobody."""
-        if True in due:
-            self._sent_at = [cycle if one else at for one, at in zip(due, self._sent_at, strict=True)]
-        self.oldest = min(compress(self._sent_at, self._who), default=cycle)  # nobody to send to: no hurry
-        if True not in due:
-            return None
-        packet = self._pack(self._head, *self._values)
-        records = b"".join([packet[place] for place in compress(self._places, due)])
-        return self._dialect.sync_write_records(self._layout.address, self._layout.length, records)
+    def _record(self, number: int) -> bytes:
+        record = bytearray(1 + self.layout.length)
+        record[0] = self.ids[number]
+        for cell, tick in zip(self.cells[number], self._ticks[number], strict=True):
+            at, size = 1 + cell.place.offset, cell.place.size
+            record[at : at + size] = (tick & ((1 << 8 * size) - 1)).to_bytes(size, "little")
+        return bytes(record)
 
 
-def _form(places: Sequence[Field], length: int) -> str:
-    """Return how the record of one servo looks, for `struct`: its ID, and the items of a block."""
-    form, end = "B", 0
-    for place in places:
-        letter = {1: "b", 2: "h", 4: "i"}[place.size]
-        form += f"{place.offset - end}x" + (letter if place.encoding == "twos_complement" else letter.upper())
-        end = place.offset + place.size
-    return form + f"{length - end}x"
+def _cells(
+    servo: ServoPlan, mode: Mode, layout: GoalLayout, limits: Mapping[str, int], fraction: float
+) -> list[Cell]:
+    """Return the goals that stand in a block, in the order of the wire.
+
+    `limits`: the servo's own, ticks, by what they limit; `fraction`: the part of an effort's or a PWM's limit
+    that may be used.
+    """
+    plan = servo.mode_plan(mode)
+
+    def signed(place: Field, scale: Scale | None, of: str) -> Cell:
+        unit, most = _reach(scale, of, limits, fraction)
+        row = COMMAND_INTERFACES.index(LEADS.get(mode, "position"))
+        return Cell(place, row, False, float(servo.direction), 0.0, unit, -most, most)
+
+    found: list[Cell] = []
+    if layout.position is not None:
+        found.append(_position(layout.position, servo, plan))
+        if layout.speed is not None:
+            unit, most = _reach(plan.speed, "speed", limits, fraction)
+            found.append(Cell(layout.speed, _VELOCITY, True, 1.0, 0.0, unit, 1, max(most, 1)))
+    elif layout.speed is not None:
+        found.append(signed(layout.speed, plan.speed, "speed"))
+    elif layout.pwm is not None:
+        found.append(signed(layout.pwm, plan.pwm, "pwm"))
+    elif layout.effort is not None and mode is Mode.EFFORT:
+        found.append(signed(layout.effort, plan.effort, "effort"))
+    elif layout.effort is not None:
+        unit, most = _reach(plan.effort, "effort", limits, fraction)
+        effort = COMMAND_INTERFACES.index("effort")
+        found.append(Cell(layout.effort, effort, True, 1.0, 0.0, unit, 0, most, most))
+    return sorted(found, key=lambda cell: cell.place.offset)
+
+
+def _position(place: Field, servo: ServoPlan, plan: ModePlan) -> Cell:
+    """Counted from the servo's raw 0, to the nearest tick, inside the joint's limits."""
+    return Cell(
+        place,
+        COMMAND_INTERFACES.index("position"),
+        False,
+        float(servo.direction),
+        servo.reference,
+        servo.rad_per_tick,
+        plan.lower_tick,
+        plan.upper_tick,
+    )
+
+
+def _reach(scale: Scale | None, of: str, limits: Mapping[str, int], fraction: float) -> tuple[float, int]:
+    """Return unit and highest tick of a goal; 1 and 0 where a mode has no such goal."""
+    if scale is None:
+        return 1.0, 0
+    used = 1.0 if of == "speed" else fraction
+    return scale.per_tick, math.floor(min(scale.most, limits.get(of, scale.most)) * used)

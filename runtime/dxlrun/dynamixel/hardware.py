@@ -129,15 +129,15 @@ class DynamixelHardware:
                 self._asked[index] = False
             else:
                 servos.feeding.feed(now)
-                bus.load(servos.reads, servos.reads.lane)
+                bus.load(servos.reads)
+        self._samples.follow_modes()
         pump(self._buses, self._ports, self._clock, self._beat)
         now = self._clock.now_ns()
-        everybody = True
         for _, servos in self._lines:
-            everybody &= servos.settle(now)
+            servos.settle(now)
             if servos.reads.given_up:
                 self._tell_plain_reads()
-        self._samples.settle(now, everybody)
+        self._samples.settle(now)
         self._tell_failures()
 
     def _begin_reads(self) -> None:
@@ -169,8 +169,8 @@ class DynamixelHardware:
             if bus.failure is None:
                 servos.feeding.feed(self._clock.now_ns())
                 servos.reads.begin()
-                bus.load(servos.reads, servos.reads.lane)
-                bus.begin_behind()
+                bus.load(servos.reads)
+                bus.step(self._clock.now_ns())
                 self._asked[index] = True
 
     def set_modes(self, modes: NDArray[np.uint8]) -> None:

@@ -20,9 +20,9 @@ from dxlrun.dynamixel.plan import plan_line
 from dxlrun.dynamixel.protocol1 import StatusError
 from dxlrun.dynamixel.protocol2 import describe_hardware_error
 from dxlrun.dynamixel.returning import Returning
+from dxlrun.dynamixel.samples import BusSamples
 from dxlrun.dynamixel.slow_registers import SlowRegisters, once
 from dxlrun.dynamixel.startup import Rejoined
-from dxlrun.dynamixel.state_arrays import StateArrays
 from dxlrun.dynamixel.transaction import Program, Reply, Transaction
 from dxlrun.dynamixel.wanted import Wanted
 from dxlrun.events import EventCode, EventSink, Severity
@@ -60,8 +60,6 @@ class Servos:
         "_alert_cycles",
         "_alerting",
         "_alerts",
-        "_arrays",
-        "_arrived_ns",
         "_asking",
         "_bus",
         "_dialect",
@@ -82,6 +80,7 @@ class Servos:
         "_returning",
         "_rows",
         "_said_errors",
+        "_samples",
         "_shown",
         "_slow",
         "_strained",
@@ -101,19 +100,18 @@ class Servos:
         wanted: Wanted,
         events: EventSink,
         states: States,
-        arrays: StateArrays,
+        samples: BusSamples,
     ) -> None:
         count = len(plan.servos)
         self._plan = plan
         self._bus = bus
         self._gaps = gaps
         self._emit = events.emit
-        self._arrays = arrays
+        self._samples = samples
         self.goals = wanted.goals
         """Builds the sync write."""
-        self.reads = CyclicReads(plan, arrays, bus)
+        self.reads = CyclicReads(plan, samples)
         """The job that reads every servo once."""
-        self._arrived_ns = self.reads.arrived_ns.data
         self.torqued = np.zeros(count, dtype=np.bool_)
         """Shape (servos,): who has torque for certain and missed no reply since; they get goals."""
         self._rows = [servo.row for servo in plan.servos]
@@ -159,14 +157,16 @@ class Servos:
         """Names of the servos whose newest reply did not arrive."""
         return [self._who(index) for index, missed in enumerate(self._missed) if missed]
 
-    def settle(self, now_ns: int) -> bool:
-        """Tell what changed with this cycle's replies; return whether everybody's is there."""
+    def settle(self, now_ns: int) -> None:
+        """Report what changed with this cycle's replies."""
         reads = self.reads
-        everybody = reads.complete and not self._missing
-        if everybody:
-            self._gaps.came(self._arrived_ns[-1], self._bus.due_ns)
-        else:
-            everybody = self._look(now_ns)
+        if self._missing or self._samples.fresh.tobytes() != self._everybody:
+            self._count_losses(now_ns)
+            self._missing = any(self._missed)
+        elif self._rows:
+            self._gaps.came(int(self._samples.at_ns[-1]), self._bus.due_ns)
+        if reads.errors != self._said_errors:
+            self._say_errors()
         if self._bus.noise_bytes != self._noise_seen and now_ns - self._noise_at_ns >= NOISE_EVENT_NS:
             count = self._bus.noise_bytes - self._noise_seen
             self._noise_seen, self._noise_at_ns = self._bus.noise_bytes, now_ns
@@ -174,7 +174,6 @@ class Servos:
             self._emit(EventCode.BUS_NOISE, Severity.WARNING, self._plan.name, text)
         if self._bus.unrequested != self._unrequested_seen:
             self._tell_unrequested(now_ns)
-        return everybody
 
     def _tell_unrequested(self, now_ns: int) -> None:
         """Tell of another host on the line, now and then."""
@@ -186,21 +185,6 @@ class Servos:
                 "another computer writes on the line; stop it, or its commands move these servos too"
             )
             self._emit(EventCode.UNREQUESTED, Severity.WARNING, self._plan.name, text)
-
-    def _look(self, now_ns: int) -> bool:
-        """Look at everybody's reply; return whether all are there."""
-        reads = self.reads
-        if not reads.counted:
-            self._arrays.count()
-        everybody = reads.fresh.tobytes() == self._everybody
-        if self._missing or not everybody:
-            self._count_losses(now_ns)
-            self._missing = any(self._missed)
-        elif self._rows:
-            self._gaps.came(self._arrived_ns[-1], self._bus.due_ns)
-        if reads.errors != self._said_errors:
-            self._say_errors()
-        return everybody
 
     def watch(self) -> Program[list[str]]:
         """Read every servo's clock for the first time, and arm the Bus Watchdogs; return what went wrong.
@@ -267,12 +251,12 @@ class Servos:
             self._alert_again()
         for index in self._alerts:
             address = self._plan.servos[index].hardware_error_address
-            if address is not None and self.reads.fresh[index]:
+            if address is not None and self._samples.fresh[index]:
                 read = plan_line(self._plan).read(self._plan.servos[index].servo_id, address, 1)
                 return _Question(index, "hardware error status", read, self._take_hardware_error)
         for index in self._strained:
             limit = self._plan.servos[index].torque_limit
-            if limit is not None and self.reads.fresh[index]:
+            if limit is not None and self._samples.fresh[index]:
                 read = plan_line(self._plan).read(
                     self._plan.servos[index].servo_id, limit.address, limit.size
                 )
@@ -282,7 +266,7 @@ class Servos:
         count = len(self._plan.servos)
         for offset in range(1, count + 1):
             index = (self._probed + offset) % count
-            if not (self.torqued[index] or self._limp[index]) and self.reads.fresh[index]:
+            if not (self.torqued[index] or self._limp[index]) and self._samples.fresh[index]:
                 read = self._plan.torque_reads[index]
                 return _Question(index, "torque enable", read, self._take_torque)
         return None
@@ -333,8 +317,8 @@ class Servos:
         self._emit(EventCode.PORT_BACK, Severity.WARNING, self._plan.name, text)
 
     def _count_losses(self, now_ns: int) -> None:
-        arrived_ns = self.reads.arrived_ns
-        for index, fresh in enumerate(self.reads.fresh.tolist()):
+        arrived_ns = self._samples.at_ns
+        for index, fresh in enumerate(self._samples.fresh.tolist()):
             if self.reads.away[index]:
                 continue
             if not fresh:

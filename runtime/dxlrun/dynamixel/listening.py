@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 from dxlrun.dynamixel.bus_plan import BusPlan
-from dxlrun.dynamixel.dialect import dialect_of
+from dxlrun.dynamixel.dialect import Dialect, dialect_of
 from dxlrun.dynamixel.line import BITS_PER_BYTE
 from dxlrun.dynamixel.receiver import Receiver
 from dxlrun.dynamixel.transaction import BROADCAST_ID, Job, Outcome, Reply, Status, Transaction
 from dxlrun.packets import PacketKind, PacketSink
-
-if TYPE_CHECKING:  # the guardian makes servos limp without numpy
-    from dxlrun.dynamixel.burst import Burst
 
 NEVER = 1 << 62
 
@@ -37,7 +34,6 @@ class Listener:
     __slots__ = (
         "_awaited",
         "_before",
-        "_burst",
         "_cyclic",
         "_deadline_ns",
         "_dialect",
@@ -54,12 +50,10 @@ class Listener:
         "_sent_ns",
         "_sink",
         "_state",
-        "buffer",
         "byte_ns",
         "due_ns",
         "index",
         "noise_bytes",
-        "room",
         "unrequested",
     )
 
@@ -85,18 +79,13 @@ class Listener:
         """What a byte takes on the wire, ns."""
         self._dialect = dialect_of(plan.protocol)
         self._overhead = self._dialect.OVERHEAD
-        self._receiver = Receiver(self._status, self._noise, self._dialect, self._gathered)
-        self.room = self._receiver.room
-        """The most bytes that a burst of replies may have."""
-        self.buffer = self._receiver.buffer
-        """Where replies lie."""
+        self._receiver = Receiver(self._status, self._noise, self._dialect)
         self._reply = Reply(_SENT, 0, b"", 0, 0, False)
         self._job: Job | None = None
         self._awaited: Transaction | None = None
         self._state = READY
         self.due_ns = 0
         """When the replies of the newest transaction are due by the wire."""
-        self._burst: Burst | None = None  # until anything came
         self._sent_ns = self._earliest_ns = self._deadline_ns = 0
         self._reply_size = 0
         self._open = 0  # a bit for each status that is still awaited
@@ -105,9 +94,8 @@ class Listener:
 
     def _await(self, transaction: Transaction, started_ns: int) -> None:
         """Await the replies to a transaction whose instruction is on its way."""
-        reply, burst = self._reply, self._burst
+        reply = self._reply
         self._awaited = transaction
-        self._receiver.expect(None)
         reply.parameters = b""
         reply.error = reply.strays = 0
         reply.echoed = False
@@ -120,8 +108,6 @@ class Listener:
             self._reply_size = transaction.widest
             self._open = (1 << len(transaction.awaited)) - 1
             self._refused = False
-            if burst is not None:
-                burst.bind(self.buffer)
         else:
             reply.outcome = _SENT
             self._state = RESTING
@@ -139,53 +125,11 @@ class Listener:
                 if self._open >> index & 1 and shape not in self._cyclic:
                     self._owed[shape] = self._owed.get(shape, 0) + 1
 
-    def _hear(self, count: int, at_ns: int) -> None:
-        """Take the first bytes of a burst."""
-        burst, self._burst = self._burst, None
-        if burst is None or not count:
-            self._burst = burst
-            return
-        self._last_byte_ns = at_ns
-        if count == burst.size and self._state == AWAITING and burst.whole() and self._in_time(burst, at_ns):
-            self._take_all(burst, at_ns, [])
-            return
-        self._receiver.expect(burst)
-        self._receiver.accept(count, at_ns)
-        self._skip_headers()
-
     def _skip_headers(self) -> None:
         # as many bytes as an awaited reply has, and it is not whole: its header is a false one
         receiver = self._receiver
-        while self._state == AWAITING and receiver.pending >= self._reply_size and not receiver.gathering:
+        while self._state == AWAITING and receiver.pending >= self._reply_size:
             receiver.skip_header()
-
-    def _gathered(self, burst: Burst, ends: list[int], times: list[int]) -> bool:
-        """Take all replies of a transaction that came in pieces; False: some came too soon to be of now."""
-        spans = burst.spans(ends, times)
-        if self._state != AWAITING or not self._in_time(burst, spans[0][1]):
-            return False
-        self._take_all(burst, spans[-1][1], spans)
-        return True
-
-    def _in_time(self, burst: Burst, first_ns: int) -> bool:
-        """Say whether the first reply is of now: one of before, or an echo, comes sooner than the wire."""
-        return first_ns >= self._earliest_ns + (burst.first_size - self._overhead) * self.byte_ns
-
-    def _take_all(self, burst: Burst, last_ns: int, spans: list[tuple[int, int]]) -> None:
-        """Take all replies of a transaction; `spans`: of each status packet, when they came in pieces."""
-        job = self._job
-        if job is None:
-            return
-        packet, index = self._sink.packet, self.index
-        for number, (servo_id, data) in enumerate(burst.packets):
-            first, last = spans[number] if spans else (last_ns, last_ns)
-            packet(index, _STATUS, servo_id, first, last, data)
-        reply = self._reply
-        reply.outcome, reply.last_ns = _OK, last_ns
-        self._open = 0
-        self._state = READY
-        moments = [last for _, last in spans]
-        job.take(burst, moments if len(moments) == burst.count else last_ns)
 
     def _noise(self, data: memoryview, first_ns: int, last_ns: int) -> None:
         self._sink.packet(self.index, PacketKind.NOISE, BROADCAST_ID, first_ns, last_ns, data)
@@ -210,9 +154,7 @@ class Listener:
         awaited, job = self._awaited, self._job
         if awaited is None or job is None:
             return 0
-        from dxlrun.dynamixel.burst import good_parts  # not above: see there
-
-        parts, used = good_parts(self._dialect, awaited, data)
+        parts, used = _good_parts(self._dialect, awaited, data)
         if last_ns < self._sent_ns + (len(awaited.packet) + used) * self.byte_ns:
             return 0  # sooner than the wire allows: left over from before
         reply = self._reply
@@ -292,3 +234,19 @@ class Listener:
 def _shapes(transaction: Transaction | None) -> list[_Shape]:
     """Return ID and length of the replies to a transaction."""
     return [] if transaction is None else [(one.servo_id, one.length) for one in transaction.awaited]
+
+
+def _good_parts(dialect: Dialect, transaction: Transaction, data: memoryview) -> tuple[list[Status], int]:
+    """Return what is good of the one status of a fast form that is cut off or spoilt, and its bytes."""
+    if dialect.size_at(data, 0, len(data)) != transaction.widest:
+        return [], 0
+    awaited = transaction.awaited
+    try:
+        parts = dialect.fast_answers(data, [one.length for one in awaited])
+    except ValueError:  # spoilt before its first part
+        return [], 0
+    count = 0
+    while count < len(parts) and parts[count].servo_id == awaited[count].servo_id:
+        count += 1
+    used = dialect.fast_size(sum(one.length for one in awaited[:count]), count) if count else 0
+    return parts[:count], used

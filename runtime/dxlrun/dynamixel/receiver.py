@@ -6,22 +6,15 @@ One preallocated buffer, no growth. Each byte leaves it exactly once: inside an 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 from dxlrun.dynamixel.dialect import Dialect
 from dxlrun.dynamixel.port import Port
-
-if TYPE_CHECKING:  # the guardian makes servos limp without numpy
-    from dxlrun.dynamixel.burst import Burst
 
 Taker = Callable[[memoryview, int, int], None]
 """Takes bytes with the times (ns) of the read() calls that brought the first and the last of them.
 
 The view is only good during the call.
 """
-
-BurstTaker = Callable[["Burst", list[int], list[int]], bool]
-"""Takes whole replies with where each read() ended, and when; False: they are to be taken one by one."""
 
 _GOOD_READ = 765
 """Bytes that one read may bring beside an unfinished packet."""
@@ -31,14 +24,12 @@ class Receiver:
     """Takes packets out of a stream; decides on a header only when its whole packet is there.
 
     A false header in noise can announce up to the protocol's longest packet and so hold back what follows
-    it; `flush` ends that when a deadline has passed. Replies that are awaited as a burst are taken as one,
-    as long as what arrives looks like them.
+    it; `flush` ends that when a deadline has passed.
     """
 
     __slots__ = (
         "_beginnings",
         "_buffer",
-        "_burst",
         "_end",
         "_ends",
         "_header",
@@ -46,46 +37,23 @@ class Receiver:
         "_noise",
         "_packet",
         "_size_at",
-        "_taken",
         "_times",
         "_view",
-        "buffer",
-        "space",
     )
 
-    def __init__(
-        self, packet: Taker, noise: Taker, dialect: Dialect, taken: BurstTaker = lambda *_: False
-    ) -> None:
+    def __init__(self, packet: Taker, noise: Taker, dialect: Dialect) -> None:
         header = dialect.HEADER
         self._header = header
         self._beginnings = tuple(header[:count] for count in range(len(header) - 1, 0, -1))
         self._size_at = dialect.size_at
         self._intact = dialect.intact
-        self.buffer = self._buffer = bytearray(dialect.LONGEST + _GOOD_READ)
-        """Where replies lie; a burst at its start."""
-        self.space = self._view = memoryview(self._buffer)
-        """All of it; for who reads himself while nothing is pending."""
+        self._buffer = bytearray(dialect.LONGEST + _GOOD_READ)
+        self._view = memoryview(self._buffer)
         self._end = 0
         self._ends: list[int] = []  # where each read() ended in the buffer; as many as unfinished reads
         self._times: list[int] = []
         self._packet = packet
         self._noise = noise
-        self._taken = taken
-        self._burst: Burst | None = None
-
-    def expect(self, burst: Burst | None) -> None:
-        """Take the next bytes as a whole if they are these replies; call it when nothing is pending."""
-        self._burst = burst
-
-    @property
-    def room(self) -> int:
-        """The most bytes that a burst may have, so that one read() fits behind it."""
-        return len(self._buffer) - _GOOD_READ // 3
-
-    @property
-    def gathering(self) -> bool:
-        """True while what has come can become the burst that is awaited."""
-        return self._burst is not None
 
     @property
     def pending(self) -> int:
@@ -99,7 +67,7 @@ class Receiver:
         """
         count = port.read_into(self._view[self._end :] if self._end else self._view)
         if count:
-            self.accept(count, now_ns())
+            self._accept(count, now_ns())
         return count
 
     def feed(self, data: bytes, now_ns: int) -> None:
@@ -109,17 +77,15 @@ class Receiver:
             chunk = data[start : start + min(_GOOD_READ, len(self._view) - self._end)]
             self._view[self._end : self._end + len(chunk)] = chunk
             start += len(chunk)
-            self.accept(len(chunk), now_ns)
+            self._accept(len(chunk), now_ns)
 
     def skip_header(self) -> None:
         """Give up the header that is being waited for, as false; what follows it gets its chance."""
-        self._scatter()
         if self._end:
             self._forget(self._scan(1))
 
     def flush(self) -> None:
         """Give up waiting for the rest of an unfinished packet: scan again behind its header."""
-        self._scatter()
         while self._end:
             if self._buffer.startswith(self._header, 0, self._end):
                 self._forget(self._scan(1))
@@ -127,28 +93,12 @@ class Receiver:
                 self._emit(self._noise, 0, self._end)
                 self._forget(self._end)
 
-    def accept(self, count: int, at_ns: int) -> None:
-        """Take bytes that were put into `space`, deliver what became whole."""
+    def _accept(self, count: int, at_ns: int) -> None:
+        """Take bytes that were put behind the pending ones, deliver what became whole."""
         self._end += count
         self._ends.append(self._end)
         self._times.append(at_ns)
-        burst = self._burst
-        if burst is not None:
-            if self._end < burst.size:
-                if burst.begun(self._end):
-                    return
-            elif burst.whole() and self._taken(burst, self._ends, self._times):
-                self._forget(burst.size)
-            self._burst = None
-            if not self._end:
-                return
         self._forget(self._scan(0))
-
-    def _scatter(self) -> None:
-        """Take what has come of a burst packet by packet."""
-        if self._burst is not None:
-            self._burst = None
-            self._forget(self._scan(0))
 
     def _emit(self, taker: Taker, start: int, stop: int) -> None:
         times = self._times

@@ -5,10 +5,7 @@ from __future__ import annotations
 from collections.abc import Generator
 from dataclasses import dataclass, replace
 from enum import IntEnum, unique
-from typing import TYPE_CHECKING, Generic, NamedTuple, Protocol, TypeAlias, TypeVar
-
-if TYPE_CHECKING:
-    from dxlrun.dynamixel.burst import Burst
+from typing import Generic, NamedTuple, Protocol, TypeAlias, TypeVar
 
 Result = TypeVar("Result")
 
@@ -106,9 +103,6 @@ Program: TypeAlias = Generator[Transaction, Reply, Result]
 class Job(Protocol):
     """What a bus executes: transactions one after the other."""
 
-    burst: Burst | None
-    """The replies to the transaction that `advance` returned last, if it wants to `take` them as a whole."""
-
     def advance(self, reply: Reply | None) -> Transaction | None:
         """Take what came of the transaction before (None at the start), return the next; None: finished."""
         ...
@@ -117,27 +111,19 @@ class Job(Protocol):
         """Take the status that the transaction awaits at `index`; the reply is good during the call."""
         ...
 
-    def take(self, burst: Burst, times_ns: int | list[int]) -> None:
-        """Take all that the transaction awaits at once, and when each came; good during the call."""
-        ...
-
 
 class ProgramJob(Generic[Result]):
     """Executes a program; for set-up, probes and shutdown, where a few objects a transaction do no harm."""
 
-    __slots__ = ("_program", "burst", "result")
+    __slots__ = ("_program", "result")
 
     def __init__(self, program: Program[Result]) -> None:
         self._program = program
-        self.burst: Burst | None = None
         self.result: Result | None = None
         """What the program returned; None until it did."""
 
     def status(self, index: int, reply: Reply) -> None:
         """Wait for the end of the transaction: a program awaits one status at a time."""
-
-    def take(self, burst: Burst, times_ns: int | list[int]) -> None:
-        """Wait for nothing: a program has no bursts."""
 
     def advance(self, reply: Reply | None) -> Transaction | None:
         """Resume the program."""
