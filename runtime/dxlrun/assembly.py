@@ -15,18 +15,19 @@ from dxlrun.control.loop import CycleSink, Loop, StopFlag
 from dxlrun.control.manager import Manager
 from dxlrun.control.plugins import PlugIns
 from dxlrun.cycle import CycleLayout, CycleRecord
+from dxlrun.dynamixel import kernel
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.port import Ports
 from dxlrun.events import EventSink
 from dxlrun.inbox import Inbox, NoInbox
-from dxlrun.packets import PacketSink
+from dxlrun.packets import PacketLog
 
 
 class Sinks(CycleSink, Protocol):
     """Where cycles, packets and events go."""
 
     @property
-    def packets(self) -> PacketSink:
+    def packets(self) -> PacketLog:
         """Takes every packet that goes over a line."""
         ...
 
@@ -87,6 +88,7 @@ def assemble(
         beat,
         take_over=take_over,
         restore_torque=plan.loop.policies.reduces_torque,
+        library=kernel.load(),
     )
     manager = Manager(
         plan.loop,

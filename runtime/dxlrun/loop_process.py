@@ -32,9 +32,8 @@ from dxlrun.control.plugins import load_plugins
 from dxlrun.control.policy_plan import TORQUE_STAYS, Last
 from dxlrun.cycle import CycleRecord
 from dxlrun.dynamixel.hardware import TAKEN_BACK
-from dxlrun.dynamixel.port import SerialPort, SerialPorts
+from dxlrun.dynamixel.port import MOST_SHARE, ReplyPolling, SerialPort, SerialPorts
 from dxlrun.dynamixel.reopening import LinesAgain
-from dxlrun.dynamixel.reply_polling import ReplyPolling
 from dxlrun.errors import DxlrunError, PlugInError
 from dxlrun.events import EventCode, EventGroup, EventRing, Severity
 from dxlrun.heartbeat import Heartbeat, Phase
@@ -182,7 +181,9 @@ class Pulse:
 
 
 def _reply_polling(wish_ns: int | None) -> ReplyPolling | None:
-    return None if wish_ns == 0 else ReplyPolling(wish_ns)
+    if wish_ns is None:
+        return ReplyPolling()
+    return ReplyPolling(wish_ns, MOST_SHARE) if wish_ns else None
 
 
 def beside_simulation(plan: Plan) -> SchedulerPlan:

@@ -51,6 +51,16 @@ class LoggedPacket:
     data: bytes
 
 
+@dataclass(frozen=True, slots=True)
+class Desk:
+    """Memory of a batch that is not committed yet."""
+
+    records: memoryview
+    """The records, one behind the other."""
+    used: memoryview
+    """One 64-bit word: how many of these bytes are used."""
+
+
 class PacketSink(Protocol):
     """Takes packets; never blocks, never raises."""
 
@@ -60,8 +70,17 @@ class PacketSink(Protocol):
         """Record bytes that were sent or received; `data` is copied before the call returns."""
         ...
 
-    def records(self, records: memoryview) -> None:
-        """Record packets whose records were made by `record`, one behind the other; they are copied."""
+
+class PacketLog(PacketSink, Protocol):
+    """Takes packets of the cyclic exchange, too."""
+
+    @property
+    def desk(self) -> Desk | None:
+        """Where the exchange's kernel appends records by itself; None: what it exchanges is not recorded."""
+        ...
+
+    def commit(self) -> None:
+        """Hand on what was collected."""
         ...
 
 
@@ -76,7 +95,7 @@ class PacketBatch:
     gets in its ring. Each is one store, because a process may be killed between any two.
     """
 
-    __slots__ = ("_buffer", "_room", "_used", "_words", "_writer")
+    __slots__ = ("_buffer", "_room", "_words", "_writer")
 
     def __init__(self, writer: Appender, desk: memoryview | None = None) -> None:
         self._writer = writer
@@ -85,7 +104,7 @@ class PacketBatch:
         self._words = desk[:_DESK_HEADER].cast("Q")
         self._buffer = desk[_DESK_HEADER : desk_size(writer)]  # shared memory may be larger
         self._room = len(self._buffer)
-        self._used = self._words[_USED] = 0
+        self._words[_USED] = 0
         self._words[_NUMBER] = writer.head
         if self._room <= _HEADER.size:
             raise ValueError(f"a slot of {self._room} bytes holds no packet")
@@ -95,7 +114,7 @@ class PacketBatch:
     ) -> None:
         """Record bytes that were sent or received; times in ns of the run's clock."""
         length = len(data)
-        start = self._used
+        start = self._words[_USED]
         body = start + RECORD_HEADER
         end = body + length
         if end > self._room:
@@ -103,18 +122,12 @@ class PacketBatch:
             return
         _HEADER.pack_into(self._buffer, start, bus, kind, servo_id, length, first_ns, last_ns)
         self._buffer[body:end] = data
-        self._used = self._words[_USED] = end
+        self._words[_USED] = end
 
-    def records(self, records: memoryview) -> None:
-        """Record packets whose records were made by `record`, one behind the other."""
-        start = self._used
-        end = start + len(records)
-        if end > self._room:
-            for packet in split_packets(records):
-                self.packet(*packet)
-            return
-        self._buffer[start:end] = records
-        self._used = self._words[_USED] = end
+    @property
+    def desk(self) -> Desk:
+        """The memory in which the batch is collected."""
+        return Desk(self._buffer, self._words[_USED : _USED + 1])
 
     def _overfull(self, head: tuple[int, int, int, int, int], data: Payload) -> None:
         self.commit()
@@ -124,9 +137,9 @@ class PacketBatch:
 
     def commit(self) -> None:
         """Hand on what was collected; without packets nothing happens."""
-        if self._used:
-            number = self._writer.append(self._buffer[: self._used])
-            self._used = self._words[_USED] = 0
+        if used := self._words[_USED]:
+            number = self._writer.append(self._buffer[:used])
+            self._words[_USED] = 0
             self._words[_NUMBER] = number + 1
 
 
@@ -158,16 +171,12 @@ class NoPackets:
     ) -> None:
         """Forget it."""
 
-    def records(self, records: memoryview) -> None:
-        """Forget them."""
+    @property
+    def desk(self) -> None:
+        """There is none."""
 
     def commit(self) -> None:
         """Nothing to hand on."""
-
-
-def record(bus: int, kind: PacketKind, servo_id: int, data: Payload) -> bytes:
-    """Return the record of a packet as it lies in a batch, its times 0."""
-    return _HEADER.pack(bus, kind, servo_id, len(data), 0, 0) + bytes(data)
 
 
 def decode_packets(payload: Payload) -> list[LoggedPacket]:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from dxlrun.compile.plan import Plan, to_json
 from dxlrun.control.controller import CONTRACT_VERSION
+from dxlrun.dynamixel import kernel
 from dxlrun.errors import InputError
 from dxlrun.recording.header import LoggedController, LogHeader
 from dxlrun.recording.log_file import LOG_MODE
@@ -44,6 +45,7 @@ def log_header(plan: Plan, epoch_offset_ns: int, *, virtual: bool) -> LogHeader:
             "run": {
                 "robot_file": plan.source_file,
                 "clock": "virtual" if virtual else "monotonic",
+                "exchange": "parser" if kernel.load() is None else "compiled kernel",
                 "epoch_offset_ns": str(epoch_offset_ns),
                 **{f"argument {name}": value for name, value in plan.arguments.items()},
             },

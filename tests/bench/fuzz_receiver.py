@@ -2,7 +2,7 @@
 
 Every packet of a stream is intact, damaged, cut off or noise, and the stream arrives in pieces of any size,
 with flushes in between as after a timeout; now and then it has the replies to a read, whole, damaged, or not
-at all. Nothing may be raised, the receiver keeps no more than its one buffer, each byte leaves it exactly once
+at all. Nothing may be raised, the receiver keeps no more than its one buffer, each byte leaves it once
 and in order, and every intact packet is delivered exactly once.
 
     python tests/bench/fuzz_receiver.py 1000000

@@ -53,6 +53,7 @@ def test_a_good_machine_has_nothing_to_mend(look: Look) -> None:
     assert not any(one.mend for one in found.values())
     assert list(found) == [
         "system",
+        "exchange",
         "/dev/ttyUSB0",
         "latency timer of ttyUSB0",
         "real-time priority",
@@ -284,3 +285,9 @@ def test_on_another_system_the_exit_code_says_so(
     said = dxlrun("doctor")
     assert said.code == 1
     assert said.out.splitlines()[-1] == "no robot runs here like this: 1 missing, 0 could be better"
+
+
+def test_an_exchange_that_was_not_compiled_is_named_with_what_compiles_it(look: Look) -> None:
+    found = look(compiled=False)["exchange"]
+    assert found.state == "worse"
+    assert "gcc" in found.mend

@@ -15,29 +15,31 @@ import pytest
 
 from dxlrun.clock import VirtualClock
 from dxlrun.control_table import control_table
+from dxlrun.dynamixel import kernel
 from dxlrun.dynamixel.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.plan import Wiring, bus_plan
 from dxlrun.events import EventCode, Severity
 from dxlrun.interfaces import Commands, States
-from dxlrun.packets import LoggedPacket, PacketKind, decode_packets
+from dxlrun.packets import LoggedPacket, PacketBatch, PacketKind, decode_packets
+from dxlrun.ring import Handover
 from dxlrun.simulation import BusConfig, Ledger, ServoConfig, SimulatedBus, VirtualPorts, read_ledger
 from dxlrun.simulation.process import encode_config
 
 MIDDLE = math.radians(150)
 
 
-@dataclass
-class Packets:
+class Packets(PacketBatch):
     """Takes packets and keeps them."""
 
-    list: list[LoggedPacket] = field(default_factory=list)
+    def __init__(self):
+        self._decoded: list[LoggedPacket] = []
+        super().__init__(Handover(lambda payload: self._decoded.extend(decode_packets(payload))))
 
-    def packet(self, bus, kind, servo_id, first_ns, last_ns, data):  # noqa: PLR0917  the contract of PacketSink
-        self.list.append(LoggedPacket(bus, kind, servo_id, first_ns, last_ns, bytes(data)))
-
-    def records(self, records):
-        self.list += decode_packets(records)
+    @property
+    def list(self) -> list[LoggedPacket]:
+        self.commit()
+        return self._decoded
 
     def sent(self, bus=0):
         return [p.data for p in self.list if p.bus == bus and p.kind is PacketKind.INSTRUCTION]
@@ -157,7 +159,7 @@ def module_plan() -> BusPlan:
 
 @pytest.fixture
 def make_rig(make_plan) -> Callable[..., Rig]:
-    def build(*plans, take_over=False, extra=(), position=None, firmware=None):
+    def build(*plans, take_over=False, extra=(), position=None, firmware=None, compiled=True):
         plans = plans or (make_plan(),)
         ledger = Ledger()
         clock = VirtualClock(1_000_000_000)
@@ -189,6 +191,7 @@ def make_rig(make_plan) -> Callable[..., Rig]:
             events,
             lambda: beats.append(clock.now_ns()),
             take_over=take_over,
+            library=kernel.load() if compiled else None,
         )
         return Rig(plans, ledger, clock, buses, ports, states, goals, packets, events, hardware, beats)
 

@@ -1,8 +1,14 @@
 """When replies are slept for, when they are polled for, and that no more than a share of a core is spent."""
 
+import ctypes
+
 import pytest
 
-from dxlrun.dynamixel.reply_polling import AUTO_SHARE, MOST_SHARE, ReplyPolling
+from dxlrun.dynamixel import kernel
+from dxlrun.dynamixel.port import AUTO_SHARE, MOST_SHARE, ReplyPolling
+
+LIBRARY = kernel.load()
+pytestmark = pytest.mark.skipif(LIBRARY is None, reason="the compiled kernel was not built: no C compiler")
 
 CYCLE_NS = 1_000_000
 WAKE_NS = 50_000
@@ -16,30 +22,43 @@ class Line:
         self.after_ns, self.overshoot_ns = after_ns, overshoot_ns
         self.naps = []
         self.polled_ns = 0
-        self.polling = ReplyPolling(*wish, nap=self._nap)
+        self.polling = kernel.Polling.of(ReplyPolling(*wish))
 
-    def _nap(self, duration_ns):
-        self.naps.append(duration_ns)
-        self.now_ns += duration_ns + self.overshoot_ns
-        return self.now_ns
+    def await_until(self, due_ns, deadline_ns):
+        """Sleep as the kernel says; return until when it polls."""
+        until = ctypes.c_int64()
+        nap = LIBRARY.handle.dxl_polling_begin
+        nap.restype, nap.argtypes = ctypes.c_int64, [ctypes.c_void_p, *[ctypes.c_int64] * 3, ctypes.c_void_p]
+        polling = ctypes.addressof(self.polling)
+        nap_ns = nap(polling, due_ns, self.now_ns, deadline_ns, ctypes.addressof(until))
+        if nap_ns:
+            self.naps.append(nap_ns)
+            self.now_ns += nap_ns + self.overshoot_ns
+        return until.value
+
+    def came(self, due_ns, at_ns):
+        came = LIBRARY.handle.dxl_polling_came
+        came(ctypes.byref(self.polling), ctypes.c_int64(due_ns), ctypes.c_int64(at_ns))
 
     def cycle(self, due_ns=400_000):
         """Ask and await; return how late the reply is taken."""
         start = self.now_ns
         due, there = start + due_ns, start + self.after_ns
-        until = self.polling.await_until(due, start, start + 10 * CYCLE_NS)
+        until = self.await_until(due, start + 10 * CYCLE_NS)
         since, looks = self.now_ns, 0
         while until and self.now_ns < until and (looks == 0 or self.now_ns < there):
             self.now_ns += 1_000
             looks += 1
         if until:
-            self.polling.spent(self.now_ns - since, looks)
+            LIBRARY.handle.dxl_polling_spent(
+                ctypes.byref(self.polling), ctypes.c_int64(self.now_ns - since), looks
+            )
             self.polled_ns += self.now_ns - since
         if self.now_ns < there:
             self.now_ns = there + WAKE_NS
         late = self.now_ns - there
         if there - start < CYCLE_NS:
-            self.polling.came(due, self.now_ns)
+            self.came(due, self.now_ns)
         self.now_ns = start + CYCLE_NS
         return late
 
@@ -77,7 +96,7 @@ def test_no_more_than_a_share_of_a_core_is_polled_even_for_replies_that_never_co
 
 def test_without_credit_a_reply_is_neither_slept_nor_polled_for():
     line = Line()
-    assert line.polling.await_until(line.now_ns + 400_000, line.now_ns, 1 << 62) == 0
+    assert line.await_until(line.now_ns + 400_000, 1 << 62) == 0
     assert line.naps == []
 
 
@@ -85,14 +104,14 @@ def test_nobody_sleeps_beyond_the_next_deadline():
     line = Line()
     settled(line)
     line.naps.clear()
-    assert line.polling.await_until(line.now_ns + 400_000, line.now_ns, line.now_ns + 300_000) == 0
+    assert line.await_until(line.now_ns + 400_000, line.now_ns + 300_000) == 0
     assert line.naps == []
 
 
 def test_one_reply_that_is_very_late_does_not_let_the_next_ones_be_slept_through():
     line = Line()
     settled(line)
-    line.polling.came(line.now_ns - 15_000_000, line.now_ns)
+    line.came(line.now_ns - 15_000_000, line.now_ns)
     assert sum(line.cycle() for _ in range(20)) / 20 < 25_000
 
 

@@ -23,8 +23,7 @@ from dxlrun.compile.plan import Plan
 from dxlrun.control.loop import StopFlag
 from dxlrun.control.plugins import load_plugins
 from dxlrun.cycle import CycleRecord
-from dxlrun.dynamixel.port import SerialPort, SerialPorts
-from dxlrun.dynamixel.reply_polling import ReplyPolling
+from dxlrun.dynamixel.port import ReplyPolling, SerialPort, SerialPorts
 from dxlrun.events import EventCode, Severity
 from dxlrun.packets import PACKET_SLOT, NoPackets, PacketBatch, PacketKind, decode_packets, packet_slots
 from dxlrun.ring import Gap, RingReader, RingWriter, create

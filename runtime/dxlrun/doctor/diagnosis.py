@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dxlrun.doctor.finding import Finding
-from dxlrun.doctor.kernel import clock_source, kernel, real_time_share, system
+from dxlrun.doctor.kernel import clock_source, exchange, kernel, real_time_share, system
 from dxlrun.doctor.machine import Machine
 from dxlrun.doctor.ports import latency_timers, ports
 from dxlrun.doctor.processor import cores, governor, idle_latency
@@ -17,6 +17,7 @@ def diagnose(machine: Machine) -> tuple[Finding, ...]:
         return (first,)
     return (
         first,
+        exchange(machine),
         *ports(machine),
         *latency_timers(machine),
         priority(machine),

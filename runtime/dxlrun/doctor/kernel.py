@@ -48,6 +48,15 @@ def kernel(machine: Machine) -> Finding:
     return Finding("kernel", "worse", f"a stock kernel ({kind})", why, _real_time_kernel(machine))
 
 
+def exchange(machine: Machine) -> Finding:
+    """Look whether the exchange with the servos is compiled: it is where a C compiler was at installation."""
+    why = "the compiled exchange takes a fraction of the processor time of the one in Python, and can poll"
+    if machine.compiled:
+        return Finding("exchange", "good", "compiled", why)
+    mend = "install a C compiler (Debian, Ubuntu: sudo apt install gcc), then dxlrun again"
+    return Finding("exchange", "worse", "in Python: no C compiler was found at installation", why, mend)
+
+
 def _real_time_kernel(machine: Machine) -> str:
     if machine.container:
         return "install a PREEMPT_RT kernel on the machine that runs this container"

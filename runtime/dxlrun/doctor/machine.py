@@ -17,6 +17,7 @@ from dxlrun.control.rights import (
     lockable_bytes,
     user,
 )
+from dxlrun.dynamixel import kernel
 
 NEEDED = ("memfd_create", "pidfd_open", "sched_setscheduler")
 """Calls of `os` without which no run starts; Linux has them all since 5.3."""
@@ -57,6 +58,8 @@ class Machine:
     """99 with the capability; 0: none."""
     lockable: int = 0
     """Bytes; UNLIMITED with the capability."""
+    compiled: bool = True
+    """dxlrun was installed with the compiled part of its exchange with servos."""
     may_schedule: Callable[[], bool] = field(default=may_schedule)
     may_write: Callable[[Path], bool] = field(default=_open_to_us)
 
@@ -72,6 +75,7 @@ class Machine:
             capabilities=tuple(name for bit, name in _CAPABILITIES.items() if has_capability(bit)),
             highest_priority=highest_priority(),
             lockable=lockable_bytes(),
+            compiled=kernel.load() is not None,
         )
 
     @property

@@ -16,12 +16,13 @@ from dxlrun.dynamixel.transaction import (
     BROADCAST_ID,
     Job,
     Outcome,
+    Transaction,
 )
 from dxlrun.errors import PortError
 from dxlrun.packets import PacketKind, PacketSink
 
-if TYPE_CHECKING:  # the guardian does not need it
-    from dxlrun.dynamixel.reply_polling import ReplyPolling
+if TYPE_CHECKING:  # the guardian makes servos limp without numpy
+    from dxlrun.dynamixel.kernel import Interrupted
 
 QUIET_BYTES = 20
 """A line that was silent for so many byte times is silent (protocol.md: drain until it is)."""
@@ -45,11 +46,11 @@ class Bus(Listener):
 
     __slots__ = (
         "_drain_end_ns",
-        "_free_ns",
         "_now_ns",
         "_port",
         "_quiet_ns",
         "failure",
+        "free_ns",
         "name",
     )
 
@@ -61,7 +62,9 @@ class Bus(Listener):
         self._port = port
         self._now_ns = clock.now_ns
         self._quiet_ns = max(QUIET_BYTES * self.byte_ns, LEAST_QUIET_NS) + plan.latency_ns
-        self._free_ns = self._drain_end_ns = 0
+        self.free_ns = 0
+        """When everything that was sent is off the wire."""
+        self._drain_end_ns = 0
 
     @property
     def busy(self) -> bool:
@@ -90,6 +93,11 @@ class Bus(Listener):
         self._job = self._awaited = None
         self._state = READY
 
+    @property
+    def pending(self) -> bool:
+        """True while the beginning of a packet has arrived, which a new request takes for noise."""
+        return self._receiver.pending > 0
+
     def send(self, packet: bytes | bytearray | memoryview) -> None:
         """Send a prepared packet that nobody answers, between two jobs; does not wait.
 
@@ -99,21 +107,31 @@ class Bus(Listener):
             try:
                 self._write(packet, BROADCAST_ID)
             except PortError as error:
-                self._fail(error)
+                self.fail(error)
         if self.failure is not None:
             raise self.failure
 
-    def hear(self, polling: ReplyPolling | None = None) -> int:
+    def hear(self) -> int:
         """Take what the line has, and go on; return when to come back at the latest, as `step` does.
 
-        Called when the line has bytes. `polling` is told when everything that was awaited has come.
+        Called when the line has bytes.
         """
-        awaited = self._state == AWAITING
         self._receive()
-        now_ns = self._now_ns()
-        if polling is not None and awaited and self._state == READY and self._reply.outcome is _OK:
-            polling.came(self.due_ns, now_ns)
-        return self.step(now_ns)
+        return self.step(self._now_ns())
+
+    def take_over(self, job: Job, transaction: Transaction, line: Interrupted) -> None:
+        """Go on with a job whose transaction the kernel has sent."""
+        self.load(job)
+        if self._job is None:
+            return
+        if self.pending:
+            self._receiver.flush()
+        self._last_byte_ns = max(self._last_byte_ns, line.heard_ns)
+        self._await(transaction, line.sent_ns)
+        for data, at_ns in line.pieces:
+            self._last_byte_ns = at_ns
+            self._receiver.feed(data, at_ns)
+            self._skip_headers()
 
     def _receive(self) -> None:
         if self.failure is None:
@@ -122,7 +140,7 @@ class Bus(Listener):
                     self._last_byte_ns = self._now_ns()
                     self._skip_headers()
             except PortError as error:
-                self._fail(error)
+                self.fail(error)
 
     def step(self, now_ns: int) -> int:
         """Do what is due; return when to come back at the latest, NEVER when there is nothing to do."""
@@ -135,7 +153,7 @@ class Bus(Listener):
                 else:
                     self._end(now_ns)
         except PortError as error:
-            self._fail(error)
+            self.fail(error)
         return NEVER
 
     def _end(self, now_ns: int) -> None:
@@ -150,7 +168,8 @@ class Bus(Listener):
             self._receiver.flush()
             self._state = READY
 
-    def _fail(self, error: PortError) -> None:
+    def fail(self, error: PortError) -> None:
+        """Take the line for gone; its job is forgotten."""
         self.failure = error
         self._job = None
 
@@ -162,7 +181,7 @@ class Bus(Listener):
         if transaction is None:
             self._job = None
             return 0
-        if self._receiver.pending:
+        if self.pending:
             self._receiver.flush()
         packet = transaction.packet
         now_ns = self._write(packet, transaction.servo_id) if packet else self._now_ns()
@@ -177,8 +196,8 @@ class Bus(Listener):
         after = now_ns()
         self._sink.packet(self.index, _INSTRUCTION, servo_id, before, after, packet)
         # a second packet waits in the adapter until the first is off the wire
-        start = self._sent_ns = self._free_ns if self._free_ns > before else before
-        self._free_ns = start + len(packet) * self.byte_ns
+        start = self._sent_ns = self.free_ns if self.free_ns > before else before
+        self.free_ns = start + len(packet) * self.byte_ns
         return after
 
     def _give_up(self, now_ns: int) -> None:

@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from dxlrun.dynamixel.bus_plan import BusPlan
+from dxlrun.dynamixel.kernel import PlannedRead, Program
 from dxlrun.dynamixel.line import PATIENCE_NS, SHORT_PATIENCE_NS
 from dxlrun.dynamixel.plan import plan_line
 from dxlrun.dynamixel.reads import state_read
@@ -23,6 +24,12 @@ from dxlrun.dynamixel.transaction import Outcome, Reply, Transaction
 
 MOST_CHAINS = 64
 """Chains without this or that servo are kept; on a line that loses others every cycle they are made anew."""
+
+CALM_CYCLES = 2
+"""Cycles of the parser in which every servo answered in order, before the kernel reads again."""
+
+MOST_PROGRAMS = 8
+"""Programs of the kernel are kept: the length of replies changes after a loss, and after that again."""
 
 MOST_BROKEN = 5
 """Fast reads of a group that stay incomplete, with no complete one among them, before the group is read
@@ -44,6 +51,7 @@ class CyclicReads:
 
     __slots__ = (
         "_broken",
+        "_calm",
         "_current",
         "_groups",
         "_line",
@@ -52,16 +60,20 @@ class CyclicReads:
         "_patient",
         "_plan",
         "_position",
+        "_programs",
         "_queue",
         "_queue_of",
         "_samples",
         "_shape",
+        "_start",
         "away",
+        "changed",
         "errors",
         "fast",
         "garbled",
         "given_up",
         "missed",
+        "program",
     )
 
     def __init__(self, plan: BusPlan, samples: BusSamples) -> None:
@@ -90,12 +102,19 @@ class CyclicReads:
         self._queue_of: tuple[bool, ...] | None = None
         self._current: Request | None = None
         self._position = 0
+        self._start = 0
         self._patient = True
-        self.begin()
+        self.changed = True
+        """True while the next cycle may differ from the one before."""
+        self._calm = 0
+        self._programs: dict[tuple[object, ...], Program] = {}
+        self.program: Program | None = None
+        """The next cycle for the kernel; None while a servo is silent, or was a moment ago."""
 
-    def begin(self) -> None:
-        """Prepare for the next cycle."""
-        self._samples.fresh[:] = False
+    def prepare(self) -> None:
+        """Plan the next cycle: nothing to do after one that the kernel has read."""
+        if not self.changed:
+            return
         for number, lost in enumerate(self._lossy):
             if lost:
                 # once a cycle: if each loss counted, three silent servos of a group would ask alike for ever
@@ -103,7 +122,6 @@ class CyclicReads:
                 self._lossy[number] = False
             elif self._broken[number] and not self._apart(number):
                 self._broken[number] = 0
-        self._patient = True
         silent = tuple(map(bool, self.missed))
         if silent != self._queue_of:
             self._queue_of = silent
@@ -112,6 +130,45 @@ class CyclicReads:
                 for number, group in enumerate(self._groups)
                 for indices in _turns([index for index in group if not self.away[index]], silent)
             ]
+        silence = any(missed and not away for missed, away in zip(silent, self.away, strict=True))
+        self._calm = 0 if silence or any(self._broken) else self._calm + 1
+        self.program = self._laid() if self._calm > CALM_CYCLES else None
+        self.changed = self.program is None
+
+    def _laid(self) -> Program | None:
+        """Return the reads of a calm cycle for the kernel; None where a servo reports more than an alert."""
+        reads = [
+            PlannedRead(
+                one.patient[self._shape[one.group] % len(one.patient)],
+                one.indices,
+                tuple(self.errors[index] for index in one.indices),
+            )
+            for one in self._queue
+        ]
+        refusals = 0xFF & ~self._line.dialect.ALERT if self._line.dialect.ALERT else 0
+        if any(error & refusals for read in reads for error in read.errors):
+            return None
+        key = tuple((read.transaction.packet, read.errors) for read in reads)
+        if key not in self._programs:
+            if len(self._programs) >= MOST_PROGRAMS:
+                self._programs.clear()
+            self._programs[key] = Program(self._plan, reads)
+        return self._programs[key]
+
+    def begin(self) -> None:
+        """Begin a cycle of the parser: no reply has come yet."""
+        self._samples.fresh[:] = False
+
+    def begin_at(self, done: int) -> None:
+        """Begin the parser's cycle behind so many reads, which the kernel has done."""
+        self._start = done
+
+    def resume(self, done: int) -> Transaction:
+        """Return the read that the kernel has sent behind so many others, to be finished by the parser."""
+        self.changed = self._patient = True
+        self._position = done
+        request = self._current = self._queue[done]
+        return request.patient[self._shape[request.group] % len(request.patient)]
 
     def _apart(self, number: int) -> bool:
         """Say whether a servo of a group was asked by itself in this cycle."""
@@ -121,30 +178,38 @@ class CyclicReads:
     def leave(self, servo: int) -> None:
         """Ask a servo no more: it is lost, and its silence would cost the others their time."""
         self.away[servo] = True
-        self._queue_of = None
+        self._anew()
 
     def join(self, servo: int) -> None:
         """Ask a servo again from the next cycle on, with the others: it was found in order."""
         self.away[servo] = False
         self.missed[servo] = 0
-        self._queue_of = None
+        self._anew()
+
+    def _anew(self) -> None:
+        """Plan the next cycle anew."""
+        self._queue_of = self.program = None
+        self.changed = True
 
     def learn(self, return_delays: Mapping[int, int]) -> None:
         """Await replies when they are due by what the servos, by ID, were found to wait, ns."""
         self._line = replace(self._line, return_delays=dict(return_delays))
         self._made.clear()
-        self._queue_of = None
+        self._programs.clear()
+        self._anew()
 
     def plain(self, group: int) -> None:
         """Read a group by the form that every firmware knows from the next cycle on."""
         self.fast[group] = False
         self._made.clear()
-        self._queue_of = None
+        self._programs.clear()
+        self._anew()
 
     def advance(self, reply: Reply | None) -> Transaction | None:
         """Take what came of a read, return the next one."""
+        self.changed = True
         if reply is None:
-            self._position = 0
+            self._position, self._start, self._patient = self._start, 0, True
         else:
             self._position += 1
             if reply.outcome is not Outcome.OK:

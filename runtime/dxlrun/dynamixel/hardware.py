@@ -15,6 +15,7 @@ from dxlrun.dynamixel.bus_plan import BusPlan
 from dxlrun.dynamixel.exchange import MOST_BROKEN
 from dxlrun.dynamixel.gaps import Gaps
 from dxlrun.dynamixel.health import Servos
+from dxlrun.dynamixel.kernel import Answer, Kernel, Library
 from dxlrun.dynamixel.limp import LimpOutcome, limp_buses
 from dxlrun.dynamixel.port import Ports
 from dxlrun.dynamixel.pump import clear, pump, run
@@ -25,7 +26,7 @@ from dxlrun.dynamixel.wanted import Wanted
 from dxlrun.errors import PortError, StartUpError
 from dxlrun.events import EventCode, EventSink, Severity
 from dxlrun.interfaces import Commands, States
-from dxlrun.packets import PacketSink
+from dxlrun.packets import PacketLog
 
 STOP_LIMIT_NS = 1_000_000_000
 """Retries of torque off end here; half of the default exit timeout."""
@@ -56,12 +57,14 @@ class DynamixelHardware:
         clock: Clock,
         states: States,
         goals: Commands,
-        packets: PacketSink,
+        packets: PacketLog,
         events: EventSink,
         beat: Callable[[], None],
         take_over: bool = False,
         restore_torque: bool = False,
+        library: Library | None = None,
     ) -> None:
+        """`library`: the compiled kernel; without it every cycle goes through the parser."""
         self._plans = tuple(plans)
         self._ports = ports
         self._clock = clock
@@ -73,8 +76,9 @@ class DynamixelHardware:
         self._restore_torque = restore_torque
         self._full_torque: list[list[int]] = []
         self._asked = [False] * len(self._plans)
-        """Whose reads began behind the goals of the cycle before."""
-        self._begun = False  # the others' reads are prepared
+        """Lines whose reads of the next cycle began already, or are done."""
+        self._prepared = False  # the next cycle is planned
+        self._planned = False  # the kernel reads in it
         self._split = [index for index, plan in enumerate(self._plans) if plan.split]
         self._buses = tuple(
             Bus(index, plan, port, clock, packets)
@@ -95,6 +99,21 @@ class DynamixelHardware:
             )
         )
         self._lines = tuple(zip(self._buses, self._servos, strict=True))
+        self._kernel: Kernel | None = None
+        if library is not None:
+            self._kernel = Kernel(
+                library,
+                self._plans,
+                self._samples,
+                states,
+                goals,
+                [servos.torqued for servos in self._servos],
+                [servos.ceiling for servos in self._servos],
+                packets,
+                ports,
+                clock,
+                beat,
+            )
         self._set_up = SetUp(self._plans, self._buses, self._servos, ports, clock, events, beat)
 
     def start(self) -> None:
@@ -104,6 +123,8 @@ class DynamixelHardware:
         given is taken back, and a note of the exception says whether every servo confirmed that.
         """
         self._set_up.look(self._take_over)
+        if self._kernel is not None:
+            self._kernel.poll_for_replies()
         try:
             self._set_up.engage(self._goals)
             if self._restore_torque:
@@ -118,56 +139,124 @@ class DynamixelHardware:
     def read(self) -> None:
         """Read every servo once, on all lines at once; of a line that is gone every row is invalid.
 
-        A split bus was asked behind the goals before: only what is not there yet is waited for.
+        The kernel does so as long as all goes as planned; from where it does not the parser goes on. A split
+        bus was asked behind the goals before: only what is not there yet is awaited.
         """
-        if not self._begun:
-            self._begin_reads()
-        self._begun = False
-        now = self._clock.now_ns()
-        for index, (bus, servos) in enumerate(self._lines):
-            if self._asked[index]:
-                self._asked[index] = False
-            else:
-                servos.feeding.feed(now)
-                bus.load(servos.reads)
+        if not self._prepared:
+            self._prepare()
+        self._prepared = False
+        now_ns = self._clock.now_ns()
+        for servos in self._servos:
+            servos.feeding.feed(now_ns)
         self._samples.follow_modes()
-        pump(self._buses, self._ports, self._clock, self._beat)
-        now = self._clock.now_ns()
-        for _, servos in self._lines:
-            servos.settle(now)
-            if servos.reads.given_up:
-                self._tell_plain_reads()
-        self._samples.settle(now)
-        self._tell_failures()
+        if self._kernel is not None and self._planned:
+            answer = self._kernel.read()
+            if answer is not Answer.UNEXPECTED:
+                for bus, servos in self._lines:
+                    if bus.failure is not None:
+                        servos.settle(self._clock.now_ns())
+                if answer is Answer.LOOK:
+                    self._samples.settle(self._clock.now_ns())
+                return
+            self._interrupt(self._kernel)
+        self._parse()
 
-    def _begin_reads(self) -> None:
-        for asked, servos in zip(self._asked, self._servos, strict=True):
+    def _prepare(self) -> None:
+        """Plan the next cycle, for the kernel if there is one and every line that is there has a plan."""
+        self._prepared = True
+        if self._planned and all(map(_is_steady, self._lines)):
+            return
+        for servos in self._servos:
+            servos.reads.prepare()
+        if self._kernel is not None:
+            programs = [
+                None if bus.failure is not None else servos.reads.program for bus, servos in self._lines
+            ]
+            self._planned = all(
+                bus.failure is not None
+                or (program is not None and not bus.pending and self._kernel.fits(program))
+                for (bus, _), program in zip(self._lines, programs, strict=True)
+            )
+            for index, program in enumerate(programs):
+                self._kernel.set_program(index, program if self._planned else None)
+
+    def _interrupt(self, kernel: Kernel) -> None:
+        """Let the parser go on where the kernel ended."""
+        self._planned = False
+        for index, line in enumerate(kernel.interrupt()):
+            bus, servos = self._lines[index]
+            bus.free_ns = kernel.free_at(index)
+            if line is None:  # it has all its replies
+                bus.due_ns, _ = kernel.arrival(index)
+            elif line.failure is not None:
+                bus.fail(line.failure)
+            elif line.awaiting:
+                transaction = servos.reads.resume(line.done)
+                bus.take_over(servos.reads, transaction, line)
+            elif line.done:
+                servos.reads.begin_at(line.done)
+                bus.load(servos.reads)
+            else:
+                continue
+            self._asked[index] = True
+
+    def _parse(self) -> None:
+        """Read packet by packet what was not read in this cycle."""
+        if not any(self._asked):
+            clear(self._buses, self._ports)
+        for asked, (bus, servos) in zip(self._asked, self._lines, strict=True):
             if not asked:
                 servos.reads.begin()
-        self._begun = True
+                bus.load(servos.reads)
+        pump(self._buses, self._ports, self._clock, self._beat)
+        self._asked = [False] * len(self._asked)
+        now_ns = self._clock.now_ns()
+        for servos in self._servos:
+            servos.settle(now_ns)
+            if servos.reads.given_up:
+                self._tell_plain_reads()
+        self._samples.settle(now_ns)
+        self._tell_failures()
 
     def write(self) -> None:
         """Send the goals, one sync write a line and layout, on every line that is there.
 
         Of a split bus the servos are asked at once for their next states.
         """
-        for bus, servos in self._lines:
-            for packet in servos.goal_packets(self._goals, self._states):
-                if bus.failure is None:
-                    try:  # noqa: SIM105  quicker, and this is done in every cycle
-                        bus.send(packet)
-                    except PortError:
-                        pass  # told below; the other lines shall have their goals
+        for servos in self._servos:
+            servos.prepare_goals(self._goals, self._states)
         if self._split:
+            self._prepare()
+        if self._kernel is not None:
+            self._write_by_kernel(self._kernel)
+        else:
+            for bus, servos in self._lines:
+                for packet in servos.goals.packets(self._goals, servos.torqued, servos.ceiling):
+                    with suppress(PortError):  # reported below; the other lines get their goals
+                        bus.send(packet)
+        if self._split and not self._planned:
             self._ask_behind()
         self._tell_failures()
+
+    def _write_by_kernel(self, kernel: Kernel) -> None:
+        for index, (bus, servos) in enumerate(self._lines):
+            kernel.set_writes(index, servos.goals.sync_writes if bus.failure is None else ())
+        answer = kernel.write()
+        if not self._planned or answer is not Answer.OK:  # the parser reads behind these goals
+            for index, bus in enumerate(self._buses):
+                bus.free_ns = kernel.free_at(index)
+        if answer is Answer.LOOK:
+            self._planned = False
+        elif answer is Answer.UNEXPECTED:
+            for index, failure in kernel.failures().items():
+                self._buses[index].fail(failure)
+                kernel.set_program(index, None)
 
     def _ask_behind(self) -> None:
         clear(self._buses, self._ports)
         for index in self._split:
             bus, servos = self._lines[index]
             if bus.failure is None:
-                servos.feeding.feed(self._clock.now_ns())
                 servos.reads.begin()
                 bus.load(servos.reads)
                 bus.step(self._clock.now_ns())
@@ -203,24 +292,43 @@ class DynamixelHardware:
         """
         self._ask_for_lines()
         latest = until_ns - IDLE_MARGIN_NS
-        if any(self._asked):
-            pump(self._buses, self._ports, self._clock, self._beat, latest)
-        end = latest if any(bus.busy for bus in self._buses) else NEVER  # states that are late may be awaited
+        self._await_states(latest)
+        end = latest if any(map(self._busy, range(len(self._buses)))) else NEVER  # late states may be awaited
         working: list[Bus] = []
-        for bus, servos, gaps in zip(self._buses, self._servos, self._gaps, strict=True):
+        for index, (bus, servos) in enumerate(self._lines):
+            gaps = self._gaps[index]
             if bus.failure is not None:
                 gaps.abandon()
                 continue
             servos.ask()
-            if not bus.busy and gaps.begin(latest):
+            if not self._busy(index) and gaps.begin(latest):
                 bus.load(gaps)
                 working.append(bus)
         if working:
+            clear(self._buses, self._ports)
             pump(self._buses, self._ports, self._clock, self._beat, end)
             for bus in working:
                 if bus.busy:
                     bus.drop()
-        self._begin_reads()  # here nobody waits for it
+        if not self._prepared:
+            self._prepare()  # here nothing waits for it
+
+    def _await_states(self, latest_ns: int) -> None:
+        """Take note of when the states came, and await those of split buses until `latest_ns`."""
+        kernel = self._kernel
+        if kernel is not None and self._planned:
+            for index, (bus, servos) in enumerate(self._lines):
+                if bus.failure is None and index not in self._split:
+                    due_ns, at_ns = kernel.arrival(index)
+                    servos.arrived(at_ns, due_ns)
+            if self._split and kernel.read(latest_ns, everything=False) is Answer.UNEXPECTED:
+                self._interrupt(kernel)
+        if any(self._asked):
+            pump(self._buses, self._ports, self._clock, self._beat, latest_ns)
+
+    def _busy(self, index: int) -> bool:
+        """Say whether replies are awaited on a line."""
+        return self._buses[index].busy or (self._kernel is not None and self._kernel.awaits(index))
 
     def stop(self) -> tuple[str, ...]:
         """Switch torque off on every servo, and read it back; return a sentence per failure."""
@@ -330,3 +438,9 @@ class DynamixelHardware:
         for plan, changes in zip(self._plans, self._modes, strict=True):
             for index, servo in enumerate(plan.servos):
                 changes.entered(index, servo.start_mode)
+
+
+def _is_steady(line: tuple[Bus, Servos]) -> bool:
+    """Say whether the next cycle of a line is planned as the one before."""
+    bus, servos = line
+    return not (servos.reads.changed or bus.pending) and bus.failure is None

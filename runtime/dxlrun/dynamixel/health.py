@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from functools import partial
 from typing import NamedTuple
 
@@ -27,7 +27,7 @@ from dxlrun.dynamixel.transaction import Program, Reply, Transaction
 from dxlrun.dynamixel.wanted import Wanted
 from dxlrun.events import EventCode, EventSink, Severity
 from dxlrun.hardware import LOST_AGE_NS, LOST_CYCLES
-from dxlrun.interfaces import Commands, States
+from dxlrun.interfaces import Commands, Floats, States
 from dxlrun.plurals import counted
 
 NOISE_EVENT_NS = 1_000_000_000
@@ -164,9 +164,15 @@ class Servos:
             self._count_losses(now_ns)
             self._missing = any(self._missed)
         elif self._rows:
-            self._gaps.came(int(self._samples.at_ns[-1]), self._bus.due_ns)
+            self.arrived(int(self._samples.at_ns[-1]), self._bus.due_ns)
         if reads.errors != self._said_errors:
             self._say_errors()
+
+    def arrived(self, at_ns: int, due_ns: int) -> None:
+        """Take note of when the last reply of a cycle came and when it was due; see `Gaps.came`."""
+        self._gaps.came(at_ns, due_ns)
+
+    def _report_noise(self, now_ns: int) -> None:
         if self._bus.noise_bytes != self._noise_seen and now_ns - self._noise_at_ns >= NOISE_EVENT_NS:
             count = self._bus.noise_bytes - self._noise_seen
             self._noise_seen, self._noise_at_ns = self._bus.noise_bytes, now_ns
@@ -200,14 +206,18 @@ class Servos:
         self.torqued[index] = False
         self._returning.slow_down(index)
 
-    def goal_packets(self, goals: Commands, states: States) -> Sequence[bytes]:
-        """Return the packets with the goals of everybody who may get one; who was lost comes back slowly."""
+    def prepare_goals(self, goals: Commands, states: States) -> None:
+        """Bring up to date which servos may get goals, and how fast those that were lost may follow them."""
         if self._modes.doubtful:
             self.torqued[self._modes.doubtful] = False
             self._modes.doubtful.clear()
-        if not self._returning.anybody:
-            return self.goals.packets(goals, self.torqued)
-        return self.goals.packets(goals, self.torqued, self._returning.ceiling(goals, states, self.torqued))
+        if self._returning.anybody:
+            self._returning.follow(goals, states, self.torqued)
+
+    @property
+    def ceiling(self) -> Floats:
+        """The highest speed of each servo toward a position, rad/s; NaN: none."""
+        return self._returning.ceiling
 
     def ask(self) -> None:
         """Let the next gap ask one servo what it is owed beside its cyclic reads, if one is owed anything.
@@ -216,6 +226,7 @@ class Servos:
         raised an alert. Only a servo that answers is asked; of a limp one the torque is known. Who left the
         exchange is asked by itself, see `absent`.
         """
+        self._report_noise(self._gaps.now_ns())
         self._absent.look()
         self._slow.look()
         question = None if self._asking else self._owed()

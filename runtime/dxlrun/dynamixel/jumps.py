@@ -27,7 +27,7 @@ class Jumps:
     servo that really stands elsewhere is believed again after a moment.
     """
 
-    __slots__ = ("_events", "_fastest", "_mask", "_names", "_quick", "_said_ns", "surely_none")
+    __slots__ = ("_events", "_fastest", "_mask", "_names", "_said_ns", "always_possible")
 
     def __init__(self, plans: Iterable[BusPlan], events: EventSink) -> None:
         self._events = events
@@ -35,21 +35,19 @@ class Jumps:
         self._names = [servo.joint for _, servo in both]
         speeds = [np.inf if _wraps(servo) else _most_speed(plan, servo) for plan, servo in both]
         self._fastest = np.array(speeds, dtype=np.float64)
-        # a step below this is always possible, whenever the sample before was
-        self._quick = self._fastest * MARGIN_NS * 1e-9 + MARGIN_RAD
-        self.surely_none = float(self._quick.min(initial=np.inf))
-        """rad; as long as all steps together, as a vector, are no longer, every one of them is possible."""
+        self.always_possible: Floats = self._fastest * MARGIN_NS * 1e-9 + MARGIN_RAD
+        """rad; a step up to this is possible, whenever the sample before was."""
         self._mask = np.zeros(len(both), dtype=np.bool_)
         self._said_ns = [-SAY_AGAIN_NS] * len(both)
 
     def suspects(self, steps: Floats, fresh: NDArray[np.bool_]) -> list[int]:
         """Return who of those that are `fresh` made a step that may be too far, by index; steps in rad."""
-        np.greater(np.abs(steps), self._quick, self._mask)
+        np.greater(np.abs(steps), self.always_possible, self._mask)
         return np.flatnonzero(self._mask & fresh).tolist()
 
     def can_be(self, index: int, step: float, elapsed_ns: int, now_ns: int) -> bool:
         """Say whether a servo can have made a step in this time; tell of it if it cannot."""
-        reach = self._quick[index] + self._fastest[index] * elapsed_ns * 1e-9
+        reach = self.always_possible[index] + self._fastest[index] * elapsed_ns * 1e-9
         if abs(step) <= reach:
             return True
         if now_ns - self._said_ns[index] >= SAY_AGAIN_NS:

@@ -8,9 +8,9 @@ import os
 import select
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
-from dxlrun.dynamixel.reply_polling import ReplyPolling
 from dxlrun.errors import PortError
 
 # found at once, some dozen times a cycle
@@ -21,6 +21,28 @@ _WRITE_PATIENCE_NS = 20_000_000
 
 Reopened = Callable[[int], int | None]
 """Asks whoever opens lines for one of them again; returns its descriptor once there is one; never waits."""
+
+
+AUTO_SHARE = 0.1
+"""Share of a core that polling for replies takes at most, if the file does not say how long to poll."""
+MOST_SHARE = 0.5
+"""The same where the file does."""
+
+
+@dataclass(slots=True)
+class ReplyPolling:
+    """How replies are polled for: asleep until shortly before they are due by the plan, then looked for.
+
+    Waking a process that blocks costs some 50 us on a stock kernel, of each reply. What is polled is credit:
+    a share of the time that passes, so that no more than that share of a core is ever spent on it. Only the
+    compiled kernel polls.
+    """
+
+    longest_ns: int = 1_000_000
+    """A reply is polled for at most so long: beyond that it is late, or lost."""
+    share: float = AUTO_SHARE
+    margin_ns: int = 60_000
+    """How long before a reply is expected sleeping ends; as sleeps were measured to overshoot."""
 
 
 class Port(Protocol):
@@ -34,13 +56,22 @@ class Port(Protocol):
         """Copy what has arrived into `buffer`; return the number of bytes, 0 when there is nothing."""
         ...
 
+    def failure(self, code: int) -> PortError:
+        """Return the error of a write that ended with an errno, or with -1: it takes no more bytes."""
+        ...
+
 
 class Ports(Protocol):
     """All lines of a robot, waited for together."""
 
     @property
     def polling(self) -> ReplyPolling | None:
-        """How replies are awaited; None: in the kernel alone."""
+        """How replies are polled for; None: not at all."""
+        ...
+
+    @property
+    def descriptors(self) -> Sequence[int] | None:
+        """The lines' file descriptors; None where there are none, on virtual time."""
         ...
 
     @property
@@ -97,7 +128,7 @@ class SerialPort:
         while data:
             left = deadline - time.monotonic_ns()
             if left <= 0:
-                raise PortError(f"{self.name} takes no more bytes: is the adapter stuck, or the line held?")
+                raise self.failure(-1)
             try:
                 select.select([], [self.descriptor], [], left * 1e-9)
                 data = data[os.write(self.descriptor, data) :]
@@ -116,6 +147,12 @@ class SerialPort:
             raise self._gone(None)
         self.announced = False
         return count or 0  # None where a read would have waited
+
+    def failure(self, code: int) -> PortError:
+        """Return the error of a write that ended with an errno, or with -1: it takes no more bytes."""
+        if code < 0:
+            return PortError(f"{self.name} takes no more bytes: is the adapter stuck, or the line held?")
+        return self._gone(OSError(code, os.strerror(code)))
 
     def _gone(self, error: OSError | None) -> PortError:
         why = f" ({error.strerror})" if error is not None and error.errno != errno.EBADF else ""  # set aside
@@ -149,6 +186,11 @@ class SerialPorts:
     def ports(self) -> Sequence[SerialPort]:
         """The lines, in the order of the plan's buses."""
         return self._ports
+
+    @property
+    def descriptors(self) -> Sequence[int]:
+        """The lines' descriptors; one that is opened again keeps its number."""
+        return [port.descriptor for port in self._ports]
 
     def wait(self, deadline_ns: int) -> Sequence[int]:
         """Wait for bytes on any line until `deadline_ns` of CLOCK_MONOTONIC; a past deadline only looks."""

@@ -7,40 +7,12 @@ from collections.abc import Callable, Sequence
 from dxlrun.clock import Clock
 from dxlrun.dynamixel.bus import NEVER, Bus
 from dxlrun.dynamixel.port import Ports
-from dxlrun.dynamixel.reply_polling import ReplyPolling
 from dxlrun.dynamixel.transaction import Program, ProgramJob, Result
 
 LOST_LINE_STEP_NS = 200_000
 """How often the other lines are looked at while one is gone."""
 BEAT_NS = 1_000_000
 """So long, and one wait more, nobody sees a sign of life."""
-
-
-def _look(
-    buses: Sequence[Bus], ports: Ports, clock: Clock, polling: ReplyPolling, deadline_ns: int
-) -> Sequence[int]:
-    """Sleep until shortly before replies are due and look for them again and again; return who has bytes."""
-    now_ns = clock.now_ns()
-    soonest_ns, latest_ns = NEVER, 0
-    for bus in buses:
-        if bus.busy:
-            due_ns = bus.due_ns
-            latest_ns = max(latest_ns, due_ns)
-            if now_ns < due_ns < soonest_ns:
-                soonest_ns = due_ns
-    # those that should be there since long wait for theirs
-    due_ns = latest_ns if soonest_ns == NEVER else soonest_ns
-    until_ns = polling.await_until(due_ns, now_ns, deadline_ns)
-    if not until_ns:
-        return ()
-    since_ns, looks = clock.now_ns(), 0
-    ready: Sequence[int] = ()
-    while not ready and now_ns < until_ns:
-        ready = ports.wait(0)
-        now_ns = clock.now_ns()
-        looks += 1
-    polling.spent(now_ns - since_ns, looks)
-    return ready
 
 
 def clear(buses: Sequence[Bus], ports: Ports) -> None:
@@ -63,8 +35,7 @@ def pump(
     not finished then goes on in the next call. `beat` is called before a wait, if it was not within BEAT_NS.
     Raises nothing: a line that is gone has its `failure`, and the others go on.
     """
-    clock_ns, polling, wait = clock.now_ns, ports.polling, ports.wait
-    clear(buses, ports)
+    clock_ns, wait = clock.now_ns, ports.wait
     now_ns, beat_ns = clock_ns(), 0
     deadlines = [bus.step(now_ns) for bus in buses]
     while (deadline := min(deadlines)) != NEVER and now_ns < until_ns:
@@ -72,19 +43,18 @@ def pump(
             beat()
             beat_ns = now_ns + BEAT_NS
         deadline = min(deadline, until_ns)
-        ready = _look(buses, ports, clock, polling, deadline) if polling else ()
-        ready = ready or wait(deadline)
+        ready = wait(deadline)
         heard = not ready
         for index in ready:
             bus = buses[index]
             if bus.failure is None:
                 heard = True
-                deadlines[index] = bus.hear(polling)
+                deadlines[index] = bus.hear()
         if not heard:
             # a line that is gone is ready for ever: look at the others now and then instead of waiting
             clock.wait_until(min(deadline, clock_ns() + LOST_LINE_STEP_NS))
             for bus in buses:
-                bus.hear(polling)
+                bus.hear()
         now_ns = clock_ns()
         if now_ns >= deadline or not heard:
             deadlines = [bus.step(now_ns) for bus in buses]
@@ -104,5 +74,6 @@ def run(
     jobs = [ProgramJob(program) for program in programs]
     for bus, job in zip(buses, jobs, strict=True):
         bus.load(job)
+    clear(buses, ports)
     pump(buses, ports, clock, beat)
     return [job.result for job in jobs]

@@ -17,12 +17,13 @@ RETURNED = 0.05
 class Returning:
     """The servos of one bus that catch up with their goals."""
 
-    __slots__ = ("_ceiling", "_rows", "anybody")
+    __slots__ = ("_rows", "anybody", "ceiling")
 
     def __init__(self, rows: Sequence[int]) -> None:
         """`rows`: of the servos' joints, in the order of the plan's servos."""
         self._rows = rows
-        self._ceiling = np.full(len(rows), np.nan)
+        self.ceiling: Floats = np.full(len(rows), np.nan)
+        """The highest speeds toward positions, rad/s, shape (servos,); NaN: as the goal says."""
         self.anybody: list[int] = []
         """Who they are, by index."""
 
@@ -30,13 +31,12 @@ class Returning:
         """Let a servo go to its goal slowly from now on."""
         if index not in self.anybody:
             self.anybody.append(index)
-            self._ceiling[index] = RETURN_SPEED
+            self.ceiling[index] = RETURN_SPEED
 
-    def ceiling(self, goals: Commands, states: States, torqued: NDArray[np.bool_]) -> Floats:
-        """Return the highest speeds toward positions, rad/s, shape (servos,); NaN: as the goal says."""
+    def follow(self, goals: Commands, states: States, torqued: NDArray[np.bool_]) -> None:
+        """Let the servos that have caught up go as fast as their goals say."""
         for index in self.anybody[:]:
             row = self._rows[index]
             if torqued[index] and abs(goals.position[row] - states.position[row]) < RETURNED:
                 self.anybody.remove(index)
-                self._ceiling[index] = np.nan
-        return self._ceiling
+                self.ceiling[index] = np.nan

@@ -18,7 +18,7 @@ from dxlrun.dynamixel.pump import run
 from dxlrun.dynamixel.serial_open import open_serial
 from dxlrun.dynamixel.transaction import Program, Reply, Result
 from dxlrun.errors import PortError
-from dxlrun.packets import NoPackets, PacketKind, decode_packets
+from dxlrun.packets import NoPackets, PacketKind
 from dxlrun.ring import Payload
 
 FIRST_RATE = 57_600
@@ -123,13 +123,6 @@ class Heard(NoPackets):
             self.ids.add(servo_id)
         elif kind == PacketKind.NOISE:
             self.noise += len(data)
-
-    def records(self, records: memoryview) -> None:
-        """Take packets from their records."""
-        for packet in decode_packets(records):
-            self.packet(
-                packet.bus, packet.kind, packet.servo_id, packet.first_ns, packet.last_ns, packet.data
-            )
 
 
 class ToolLine:

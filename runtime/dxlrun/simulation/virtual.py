@@ -32,6 +32,10 @@ class VirtualPort:
         del self._arrived[:size]
         return size
 
+    def failure(self, code: int) -> PortError:
+        """Return why a write failed: the adapter was unplugged, there is no other reason."""
+        return PortError(f"the adapter of bus {self._bus.name} is gone")
+
     def collect(self) -> bool:
         """Take what has passed the wire by now; return whether something waits, or the adapter is gone."""
         self._arrived += self._bus.take(self._clock.now_ns())
@@ -48,15 +52,15 @@ class VirtualPort:
 
     def _check(self) -> None:
         if self._gone:
-            raise PortError(f"the adapter of bus {self._bus.name} is gone")
+            raise self.failure(-1)
 
 
 class VirtualPorts:
     """All simulated lines of a robot, waited for together; a Ports of the dynamixel package by its form."""
 
     def __init__(self, clock: VirtualClock, buses: Sequence[SimulatedBus]) -> None:
-        self.polling = None
-        """As on a SerialPorts: on virtual time nobody wakes late."""
+        self.polling = self.descriptors = None
+        """As on a SerialPorts: on virtual time no wake-up is late, and there are no files."""
         self._clock = clock
         self._buses = tuple(buses)
         self._ports = [VirtualPort(clock, bus) for bus in buses]

@@ -1,0 +1,720 @@
+/* Kernel: the inner part of the exchange, for all serial lines of a robot together.
+ *
+ * It executes a plan of flat structs that `kernel.py` lays out: which bytes leave, which bytes are due, where
+ * their data belong. It writes, waits, reads, verifies, stamps, appends to the packet log, fills the states, and
+ * turns goals into sync writes. Whatever is not exactly as planned ends it with UNEXPECTED; what has arrived
+ * until then is left in the line's buffer, and the packet-by-packet parser in Python goes on from there.
+ *
+ * All lengths come from the plan, none from the wire. Arithmetic is IEEE double in the order in which
+ * `samples.py` and `goal_arrays.py` do it, so that both give the same bits; build with -ffp-contract=off.
+ */
+
+#define _GNU_SOURCE
+#include <errno.h>
+#include <math.h>
+#include <poll.h>
+#include <stdint.h>
+#include <string.h>
+#include <time.h>
+#include <unistd.h>
+
+#ifndef SOURCE_CRC
+#define SOURCE_CRC 0 /* CRC-32 of this file: kernel.py refuses an object of another one */
+#endif
+#define MOST_LINES 32
+#define MOST_PIECES 32
+#define LONGEST_SYNC_WRITE 6200
+#define RECORD_HEADER 24 /* bus, kind, ID, pad, length, two times: packets.py */
+#define REPEATED 50      /* cycles: goal_arrays.py */
+#define NEVER ((int64_t)1 << 62)
+#define WRITE_TIMEOUT_NS 20000000 /* port.py */
+#define LEAST_NAP_NS 15000
+
+enum { OK, WAITING, FULL, UNEXPECTED, LOOK };
+enum { IDLE, AWAITING, THROUGH };
+enum { INSTRUCTION = 1, STATUS = 2 };
+enum { UNSIGNED, TWOS_COMPLEMENT, SIGN_MAGNITUDE };
+
+typedef struct {
+    int32_t offset, size, encoding, unused;
+} Field;
+
+typedef struct { /* one servo: where its state is in its data, and which row of the states it has */
+    Field fields[3];
+    int64_t row;
+    double quick; /* rad; a step up to this is always plausible */
+} Servo;
+
+typedef struct { /* what one servo says in the replies to a read */
+    int32_t servo, data_at, end, unused; /* `end`: behind its checksum */
+} Part;
+
+typedef struct { /* one status packet of the replies */
+    int32_t start, end, id, unused;
+} Packet;
+
+typedef struct { /* one read instruction and its replies, to the byte */
+    const uint8_t *instruction;
+    const uint8_t *expected; /* the replies, */
+    const uint8_t *known;    /* 0xff where that is known beforehand */
+    const Packet *packets;
+    const Part *parts;
+    int32_t instruction_size, size, packet_count, part_count, id, fast;
+    int64_t due_ns, timeout_ns, least_ns, record_bytes;
+} Read;
+
+typedef struct { /* one goal item of one servo: goal_arrays.Cell */
+    int32_t at, size, interface, magnitude, mirrored, low, high, free;
+    double sign, offset, unit;
+} Cell;
+
+typedef struct { /* goal_arrays.SyncWrite */
+    const int32_t *members; /* indices on the bus */
+    const int32_t *rows;
+    const uint8_t *ids;
+    const Cell *cells; /* of the first servo, of the second */
+    int32_t *ticks;
+    uint8_t *again;  /* the goal changed in the cycle before */
+    uint8_t *served; /* the servo could get a goal in the cycle before */
+    int64_t *sent_at;
+    int64_t cycle;
+    int32_t count, items, address, length, lead, unused;
+} SyncWrite;
+
+typedef struct {
+    int64_t at_ns;
+    int32_t end, unused;
+} Piece;
+
+typedef struct { /* one serial line */
+    const Read *reads;
+    SyncWrite *writes;
+    const uint8_t *included; /* which servos may get goals */
+    const double *ceiling;   /* rad/s of each servo, NaN: none */
+    uint8_t *buffer;
+    int64_t byte_ns, free_ns, sent_ns, due_ns, deadline_ns, at_ns;
+    int32_t descriptor, bus, protocol, active, split;
+    int32_t first_servo, servo_count;
+    int32_t room, read_count, write_count;
+    int32_t state, done, have, pieces;
+    int32_t gone; /* errno of a write that failed, or -1; 0: none did */
+    int32_t unused;
+    Piece piece[MOST_PIECES];
+} Line;
+
+typedef struct { /* replies are polled for when they are due: reply_polling.py */
+    double share, credit_ns;
+    int64_t longest_ns, updated_ns, late_ns, step_ns, margin_ns, saved_ns;
+    int32_t enabled, slept;
+} Polling;
+
+typedef struct Kernel {
+    Line *lines;
+    const Servo *servos;
+    double *values;
+    const double *scale, *reference;
+    uint8_t *fresh;
+    int64_t *at_ns, *shown_ns;
+    double *position, *velocity, *effort;
+    uint8_t *valid;
+    int64_t *age_ns;
+    const double *goals[4];
+    uint8_t *desk; /* packets of the log that are not committed yet; NULL: no log */
+    uint64_t *used;
+    int64_t desk_room, reserved, beat_ns;
+    int64_t (*now)(void);
+    int32_t (*send)(int32_t line, const uint8_t *data, int32_t size);
+    int32_t (*receive)(int32_t line, uint8_t *data, int32_t room);
+    int32_t (*wait)(int64_t deadline_ns, uint8_t *ready);
+    int32_t line_count, servo_count, write_line, write_number;
+    Polling polling;
+} Kernel;
+
+/* The machine: used where the Python side gave no functions of its own (virtual time does) */
+
+static int64_t clock_ns(void)
+{
+    struct timespec t;
+    clock_gettime(CLOCK_MONOTONIC, &t);
+    return (int64_t)t.tv_sec * 1000000000 + t.tv_nsec;
+}
+
+static int64_t now_ns(const Kernel *k) { return k->now ? k->now() : clock_ns(); }
+
+/* Waits for bytes on lines in one state; `ready` has a flag a line. Returns the number of lines with bytes.
+ * Functions of the Python side look at all lines: then another line may be the one that has bytes. */
+static int32_t wait_for(Kernel *k, int32_t state, int64_t deadline_ns, uint8_t *ready)
+{
+    struct pollfd set[MOST_LINES];
+    int32_t line[MOST_LINES], count = 0, found = 0;
+    memset(ready, 0, MOST_LINES);
+    if (k->wait)
+        return k->wait(deadline_ns, ready);
+    for (int32_t i = 0; i < k->line_count; i++)
+        if (k->lines[i].active && k->lines[i].state == state) {
+            set[count] = (struct pollfd){k->lines[i].descriptor, POLLIN, 0};
+            line[count++] = i;
+        }
+    int64_t left = deadline_ns ? deadline_ns - clock_ns() : 0;
+    if (left < 0)
+        left = 0;
+    struct timespec timeout = {left / 1000000000, left % 1000000000};
+    if (ppoll(set, (nfds_t)count, &timeout, NULL) <= 0)
+        return 0;
+    for (int32_t i = 0; i < count; i++)
+        if (set[i].revents) {
+            ready[line[i]] = 1;
+            found++;
+        }
+    return found;
+}
+
+/* Hands one whole packet to a line; false when the line is gone or takes no more bytes. */
+static int send_all(Kernel *k, Line *l, const uint8_t *data, int32_t size)
+{
+    if (k->send) {
+        l->gone = k->send((int32_t)(l - k->lines), data, size) < 0 ? -1 : 0;
+        return !l->gone;
+    }
+    int64_t deadline = 0;
+    while (size > 0) {
+        ssize_t count = write(l->descriptor, data, (size_t)size);
+        if (count < 0 && errno != EAGAIN && errno != EINTR) {
+            l->gone = errno;
+            return 0;
+        }
+        if (count > 0) {
+            data += count;
+            size -= (int32_t)count;
+            continue;
+        }
+        /* the output queue is full: packets are short, so one that stays full is stuck */
+        if (!deadline)
+            deadline = clock_ns() + WRITE_TIMEOUT_NS;
+        int64_t left = deadline - clock_ns();
+        if (left <= 0) {
+            l->gone = -1;
+            return 0;
+        }
+        struct pollfd one = {l->descriptor, POLLOUT, 0};
+        struct timespec timeout = {0, (long)left};
+        ppoll(&one, 1, &timeout, NULL);
+    }
+    return 1;
+}
+
+/* Returns the number of bytes, 0 for none, -1 when the line is gone; a line that was ready and has none is. */
+static int32_t receive(Kernel *k, Line *l)
+{
+    uint8_t *place = l->buffer + l->have;
+    int32_t room = l->room - l->have;
+    if (k->receive)
+        return k->receive((int32_t)(l - k->lines), place, room);
+    ssize_t count = read(l->descriptor, place, (size_t)room);
+    if (count > 0)
+        return (int32_t)count;
+    return count < 0 && (errno == EAGAIN || errno == EINTR) ? 0 : -1;
+}
+
+/* The log */
+
+static int has_room(const Kernel *k, int64_t bytes)
+{
+    return !k->desk || (int64_t)*k->used + k->reserved + bytes <= k->desk_room;
+}
+
+static void put_record(Kernel *k, const Line *l, int32_t kind, int32_t id, int64_t first, int64_t last,
+                       const uint8_t *data, int32_t size)
+{
+    if (!k->desk)
+        return;
+    uint8_t *to = k->desk + *k->used;
+    uint8_t head[8] = {(uint8_t)l->bus, (uint8_t)kind, (uint8_t)id, 0};
+    uint32_t length = (uint32_t)size;
+    memcpy(head + 4, &length, 4);
+    memcpy(to, head, 8);
+    memcpy(to + 8, &first, 8);
+    memcpy(to + 16, &last, 8);
+    memcpy(to + RECORD_HEADER, data, (size_t)size);
+    *(volatile uint64_t *)k->used += (uint64_t)(RECORD_HEADER + size); /* last: a process may die here */
+}
+
+/* Checksums: e-Manual, Protocol 1.0 (checksum) and 2.0 (CRC-16, polynomial 8005, not reflected, from 0) */
+
+static uint16_t crc_table[256];
+
+__attribute__((constructor)) static void fill_crc_table(void)
+{
+    for (uint32_t i = 0; i < 256; i++) {
+        uint32_t crc = i << 8;
+        for (int bit = 0; bit < 8; bit++)
+            crc = crc & 0x8000 ? crc << 1 ^ 0x8005 : crc << 1;
+        crc_table[i] = (uint16_t)crc;
+    }
+}
+
+static uint16_t crc16(uint16_t crc, const uint8_t *data, int32_t size)
+{
+    for (int32_t i = 0; i < size; i++)
+        crc = (uint16_t)(crc << 8 ^ crc_table[(crc >> 8 ^ data[i]) & 0xff]);
+    return crc;
+}
+
+static int crc_is_right(uint16_t crc, const uint8_t *tail) { return crc == (tail[0] | tail[1] << 8); }
+
+static int sums_are_right(const Line *l, const Read *r)
+{
+    const uint8_t *b = l->buffer;
+    if (r->fast) { /* each CRC goes on where the one before it ended, and covers that one, too */
+        uint16_t crc = 0;
+        int32_t from = 0;
+        for (int32_t i = 0; i < r->part_count; i++) {
+            int32_t tail = r->parts[i].end - 2;
+            crc = crc16(crc, b + from, tail - from);
+            if (!crc_is_right(crc, b + tail))
+                return 0;
+            from = tail;
+        }
+        return 1;
+    }
+    for (int32_t i = 0; i < r->packet_count; i++) {
+        int32_t start = r->packets[i].start, end = r->packets[i].end;
+        if (l->protocol == 1) {
+            uint8_t sum = 0;
+            for (int32_t at = start + 2; at < end; at++)
+                sum = (uint8_t)(sum + b[at]);
+            if (sum != 0xff)
+                return 0;
+        } else {
+            if (!crc_is_right(crc16(0, b + start, end - 2 - start), b + end - 2))
+                return 0;
+            /* a stuffed reply of this length has fewer bytes of data than were asked for */
+            for (int32_t at = start + 7; at + 4 <= end; at++)
+                if (b[at] == 0xff && b[at + 1] == 0xff && b[at + 2] == 0xfd && b[at + 3] == 0xfd)
+                    return 0;
+        }
+    }
+    return 1;
+}
+
+/* Reply polling */
+
+/* Begins to await a reply: returns how long to sleep, and in `until` when to end polling; 0: no credit. */
+int64_t dxl_polling_begin(Polling *p, int64_t due_ns, int64_t now, int64_t deadline_ns, int64_t *until)
+{
+    *until = 0;
+    p->slept = 0;
+    p->credit_ns += p->share * (double)(p->updated_ns < 0 ? 0 : now - p->updated_ns);
+    if (p->credit_ns > (double)p->saved_ns)
+        p->credit_ns = (double)p->saved_ns;
+    p->updated_ns = now;
+    int64_t expected = due_ns + p->late_ns, most = (int64_t)p->credit_ns;
+    if (most > p->longest_ns)
+        most = p->longest_ns;
+    int64_t end = expected - p->margin_ns + p->longest_ns;
+    if (most < p->margin_ns || end <= now || expected >= deadline_ns)
+        return 0;
+    int64_t nap = expected - p->margin_ns - now;
+    if (nap < LEAST_NAP_NS)
+        nap = 0;
+    p->slept = nap > 0;
+    *until = end;
+    if (*until > now + nap + most)
+        *until = now + nap + most;
+    if (*until > deadline_ns)
+        *until = deadline_ns;
+    return nap;
+}
+
+/* Takes note of how long was polled, and how often. */
+void dxl_polling_spent(Polling *p, int64_t duration_ns, int32_t looks)
+{
+    p->credit_ns -= (double)duration_ns;
+    p->slept = p->slept && looks == 1;
+}
+
+/* Takes note that the replies that were due at `due_ns` were there at `at_ns`. */
+void dxl_polling_came(Polling *p, int64_t due_ns, int64_t at_ns)
+{
+    int64_t late = at_ns - due_ns;
+    if (p->slept && late >= p->late_ns - p->margin_ns) {
+        /* they may have been there for long: sleep less and less until their arrival is seen */
+        late = p->late_ns - p->step_ns;
+        p->step_ns *= 2;
+    } else {
+        p->step_ns = p->margin_ns;
+        int64_t change = late - p->late_ns;
+        if (change < 0)
+            change = (change - 1) / 2; /* rounded down, */
+        else
+            change = (change < p->margin_ns ? change : p->margin_ns) / 8; /* one that is very late says little */
+        late = p->late_ns + change;
+    }
+    p->late_ns = late < -2000000 ? -2000000 : late > 20000000 ? 20000000 : late;
+}
+
+/* Sleeps until shortly before replies are due and looks again and again; returns how many lines have bytes. */
+static int32_t poll_for_replies(Kernel *k, int64_t deadline_ns, uint8_t *ready)
+{
+    int64_t now = clock_ns(), soonest = NEVER, latest = 0, until;
+    for (int32_t i = 0; i < k->line_count; i++) {
+        const Line *l = &k->lines[i];
+        if (l->active && l->state == AWAITING) {
+            if (l->due_ns > latest)
+                latest = l->due_ns;
+            if (l->due_ns > now && l->due_ns < soonest)
+                soonest = l->due_ns;
+        }
+    }
+    int64_t nap = dxl_polling_begin(&k->polling, soonest == NEVER ? latest : soonest, now, deadline_ns, &until);
+    if (!until)
+        return 0;
+    if (nap) {
+        struct timespec length = {nap / 1000000000, nap % 1000000000};
+        nanosleep(&length, NULL);
+    }
+    int64_t since = clock_ns();
+    int32_t found = 0, looks = 0;
+    for (now = since; !found && now < until; now = clock_ns()) {
+        found = wait_for(k, AWAITING, 0, ready);
+        looks++;
+    }
+    dxl_polling_spent(&k->polling, clock_ns() - since, looks);
+    return found;
+}
+
+/* Reads */
+
+static double tick(const Field *f, const uint8_t *data)
+{
+    uint32_t raw = 0;
+    for (int32_t i = 0; i < f->size; i++)
+        raw |= (uint32_t)data[f->offset + i] << 8 * i;
+    if (f->encoding == SIGN_MAGNITUDE) /* bit 10 is the sign: e-Manual AX-12A, Present Speed (38) */
+        return raw & 0x400 ? -(double)(raw & 0x3ff) : (double)(raw & 0x3ff);
+    if (f->encoding == TWOS_COMPLEMENT)
+        return f->size == 1 ? (int8_t)raw : f->size == 2 ? (int16_t)raw : (int32_t)raw;
+    return raw;
+}
+
+static const Piece *piece_of(const Line *l, int32_t at)
+{
+    const Piece *p = l->piece;
+    while (p->end <= at)
+        p++;
+    return p;
+}
+
+static void take_state(Kernel *k, const Line *l, const Part *part, int64_t at_ns)
+{
+    int32_t i = l->first_servo + part->servo, n = k->servo_count;
+    for (int32_t f = 0; f < 3; f++)
+        k->values[f * n + i] = tick(&k->servos[i].fields[f], l->buffer + part->data_at) * k->scale[f * n + i];
+    k->values[i] -= k->reference[i];
+    k->fresh[i] = 1;
+    k->at_ns[i] = at_ns;
+}
+
+/* Sends the next read of a line; OK, FULL, or UNEXPECTED when the line is gone. */
+static int ask(Kernel *k, Line *l)
+{
+    const Read *r = &l->reads[l->done];
+    if (!has_room(k, r->record_bytes))
+        return FULL;
+    if (!l->done)
+        memset(k->fresh + l->first_servo, 0, (size_t)l->servo_count);
+    l->have = l->pieces = 0;
+    l->state = IDLE;
+    int64_t before = now_ns(k);
+    if (!send_all(k, l, r->instruction, r->instruction_size))
+        return UNEXPECTED;
+    put_record(k, l, INSTRUCTION, r->id, before, now_ns(k), r->instruction, r->instruction_size);
+    k->reserved += r->record_bytes - RECORD_HEADER - r->instruction_size;
+    /* it waits in the adapter behind what was sent before */
+    l->sent_ns = l->free_ns > before ? l->free_ns : before;
+    l->free_ns = l->sent_ns + r->instruction_size * l->byte_ns;
+    l->due_ns = l->sent_ns + r->due_ns;
+    l->deadline_ns = l->sent_ns + r->timeout_ns;
+    l->state = AWAITING;
+    return OK;
+}
+
+static int keep_replies(Kernel *k, Line *l, const Read *r, int64_t at)
+{
+    k->reserved -= r->record_bytes - RECORD_HEADER - r->instruction_size;
+    for (int32_t i = 0; i < r->packet_count; i++) {
+        const Packet *p = &r->packets[i];
+        put_record(k, l, STATUS, p->id, piece_of(l, p->start)->at_ns, piece_of(l, p->end - 1)->at_ns,
+                   l->buffer + p->start, p->end - p->start);
+    }
+    for (int32_t i = 0; i < r->part_count; i++)
+        take_state(k, l, &r->parts[i], r->fast ? at : piece_of(l, r->parts[i].end - 1)->at_ns);
+    if (k->polling.enabled)
+        dxl_polling_came(&k->polling, l->due_ns, at);
+    l->at_ns = at;
+    l->state = IDLE;
+    if (++l->done < l->read_count)
+        return ask(k, l);
+    l->state = THROUGH;
+    return OK;
+}
+
+/* Takes bytes that arrived on a line at a time; OK, FULL, or UNEXPECTED where they are not as planned. */
+static int take(Kernel *k, Line *l, int32_t count, int64_t at)
+{
+    const Read *r = &l->reads[l->done];
+    int32_t from = l->have;
+    l->have += count;
+    l->piece[l->pieces++] = (Piece){at, l->have, 0};
+    if (l->have > r->size || (l->have < r->size && l->pieces == MOST_PIECES))
+        return UNEXPECTED;
+    for (int32_t i = from; i < l->have; i++)
+        if ((l->buffer[i] ^ r->expected[i]) & r->known[i])
+            return UNEXPECTED;
+    if (l->have < r->size)
+        return OK;
+    /* what comes sooner than the wire allows is of a request before, or an echo */
+    if (piece_of(l, r->packets[0].end - 1)->at_ns < l->sent_ns + r->least_ns || !sums_are_right(l, r))
+        return UNEXPECTED;
+    return keep_replies(k, l, r, at);
+}
+
+/* Fills the states of the robot; LOOK, with nothing changed, where a position is further than is plausible. */
+static int settle(Kernel *k, int64_t now)
+{
+    int32_t n = k->servo_count;
+    for (int32_t i = 0; i < k->line_count; i++) {
+        Line *l = &k->lines[i];
+        l->state = IDLE;
+        l->done = 0;
+        if (!l->active)
+            memset(k->fresh + l->first_servo, 0, (size_t)l->servo_count);
+    }
+    for (int32_t i = 0; i < n; i++)
+        if (k->fresh[i] && fabs(k->values[i] - k->position[k->servos[i].row]) > k->servos[i].quick)
+            return LOOK;
+    for (int32_t i = 0; i < n; i++) {
+        int64_t row = k->servos[i].row;
+        if (k->fresh[i]) {
+            k->position[row] = k->values[i];
+            k->velocity[row] = k->values[n + i];
+            k->effort[row] = k->values[2 * n + i];
+        }
+        k->valid[row] = k->fresh[i];
+        k->age_ns[row] = k->at_ns[i] < 0 ? -1 : now - k->at_ns[i];
+        k->shown_ns[i] = k->at_ns[i];
+    }
+    return OK;
+}
+
+/* Reads every servo once. `all` 0: only goes on with lines that were asked before (in a gap); then nothing is
+ * settled. WAITING: `until_ns` has passed, or `beat_ns` since the call; FULL: commit the log; call again. */
+int32_t dxl_read(Kernel *k, int64_t until_ns, int32_t all)
+{
+    uint8_t ready[MOST_LINES];
+    int64_t now = now_ns(k);
+    int64_t stop = until_ns < now + k->beat_ns ? until_ns : now + k->beat_ns;
+    int32_t idle = 0;
+    for (int32_t i = 0; all && i < k->line_count; i++)
+        idle += k->lines[i].active && k->lines[i].state == IDLE && !k->lines[i].done;
+    if (idle && wait_for(k, IDLE, 0, ready)) /* what came before a request must not be taken for its reply */
+        for (int32_t i = 0; i < k->line_count; i++)
+            if (ready[i] && k->lines[i].active && k->lines[i].state == IDLE)
+                return UNEXPECTED;
+    for (int32_t i = 0; i < k->line_count; i++) {
+        Line *l = &k->lines[i];
+        if (l->active && l->state == IDLE && (all || l->done)) {
+            int answer = ask(k, l);
+            if (answer != OK)
+                return answer;
+        }
+    }
+    for (;;) {
+        int64_t deadline = NEVER;
+        for (int32_t i = 0; i < k->line_count; i++) {
+            const Line *l = &k->lines[i];
+            if (l->active && l->state == AWAITING && l->deadline_ns < deadline)
+                deadline = l->deadline_ns;
+        }
+        if (deadline == NEVER)
+            break;
+        if (now >= stop)
+            return WAITING;
+        int64_t end = deadline < stop ? deadline : stop;
+        int32_t found = k->polling.enabled && !k->wait ? poll_for_replies(k, end, ready) : 0;
+        if (!found)
+            found = wait_for(k, AWAITING, end, ready);
+        now = now_ns(k);
+        if (!found && now >= deadline && !(found = wait_for(k, AWAITING, 0, ready)))
+            return UNEXPECTED; /* looked once more: this process may have stood still meanwhile */
+        for (int32_t i = 0; i < k->line_count; i++) {
+            Line *l = &k->lines[i];
+            if (!ready[i])
+                continue;
+            if (!l->active || l->state != AWAITING)
+                return UNEXPECTED;
+            int32_t count = receive(k, l);
+            if (count < 0)
+                return UNEXPECTED;
+            int answer = count ? take(k, l, count, now_ns(k)) : OK;
+            if (answer != OK)
+                return answer;
+        }
+    }
+    return all ? settle(k, now_ns(k)) : OK;
+}
+
+/* Goals */
+
+static int32_t goal_tick(const Cell *c, double goal, double ceiling)
+{
+    if (!c->magnitude) {
+        double exact = (c->sign * goal + c->offset) / c->unit;
+        int32_t t = exact >= c->low && exact <= c->high ? (int32_t)rint(exact) : exact < c->low ? c->low : c->high;
+        return c->mirrored && t < 0 ? 0x400 - t : t; /* bit 10: e-Manual AX-12A, Moving Speed (32) */
+    }
+    if (c->interface == 1 && !(isnan(ceiling) || fabs(goal) <= ceiling))
+        goal = ceiling;
+    double exact = fabs(goal) / c->unit;
+    if (exact >= c->low && exact <= c->high)
+        return (int32_t)rint(exact);
+    return exact < c->low ? c->low : exact > c->high ? c->high : c->free;
+}
+
+/* Puts a byte behind INST with byte stuffing: FF FF FD is followed by another FD. */
+static int32_t put(uint8_t *packet, int32_t size, uint8_t byte)
+{
+    packet[size++] = byte;
+    if (byte == 0xfd && size >= 10 && packet[size - 2] == 0xff && packet[size - 3] == 0xff)
+        packet[size++] = 0xfd;
+    return size;
+}
+
+/* Builds the sync write of the goals that are due; returns its size, 0 when none is. */
+static int32_t build(Kernel *k, const Line *l, SyncWrite *w, uint8_t *packet)
+{
+    int32_t size = 0;
+    int64_t cycle = ++w->cycle;
+    for (int32_t m = 0; m < w->count; m++) {
+        int32_t index = w->members[m], row = w->rows[m], *ticks = w->ticks + m * w->items;
+        const Cell *cells = w->cells + m * w->items;
+        uint8_t served = l->included[index] && !isnan(k->goals[w->lead][row]), changed = 0;
+        for (int32_t c = 0; c < w->items; c++) {
+            int32_t t = goal_tick(&cells[c], k->goals[cells[c].interface][row], l->ceiling[index]);
+            changed |= t != ticks[c];
+            ticks[c] = t;
+        }
+        changed |= served && !w->served[m];
+        w->served[m] = served;
+        int due = served && (changed || w->again[m] || w->sent_at[m] <= cycle - REPEATED);
+        w->again[m] = changed;
+        if (!due)
+            continue;
+        w->sent_at[m] = cycle;
+        uint8_t record[64] = {w->ids[m]};
+        for (int32_t c = 0; c < w->items; c++)
+            for (int32_t b = 0; b < cells[c].size; b++)
+                record[1 + cells[c].at + b] = (uint8_t)((uint32_t)ticks[c] >> 8 * b);
+        if (l->protocol == 1) {
+            if (!size) {
+                const uint8_t head[7] = {0xff, 0xff, 0xfe, 0, 0x83, (uint8_t)w->address, (uint8_t)w->length};
+                memcpy(packet, head, 7);
+                size = 7;
+            }
+            memcpy(packet + size, record, (size_t)(1 + w->length));
+            size += 1 + w->length;
+        } else {
+            if (!size) {
+                const uint8_t head[8] = {0xff, 0xff, 0xfd, 0, 0xfe, 0, 0, 0x83};
+                memcpy(packet, head, 8);
+                size = put(packet, 8, (uint8_t)w->address);
+                size = put(packet, size, (uint8_t)(w->address >> 8));
+                size = put(packet, size, (uint8_t)w->length);
+                size = put(packet, size, (uint8_t)(w->length >> 8));
+            }
+            for (int32_t b = 0; b < 1 + w->length; b++)
+                size = put(packet, size, record[b]);
+        }
+    }
+    if (!size)
+        return 0;
+    if (l->protocol == 1) {
+        uint8_t sum = 0;
+        packet[3] = (uint8_t)(size - 3);
+        for (int32_t i = 2; i < size; i++)
+            sum = (uint8_t)(sum + packet[i]);
+        packet[size++] = (uint8_t)~sum;
+    } else {
+        packet[5] = (uint8_t)(size - 5);
+        packet[6] = (uint8_t)((size - 5) >> 8);
+        uint16_t crc = crc16(0, packet, size);
+        packet[size++] = (uint8_t)crc;
+        packet[size++] = (uint8_t)(crc >> 8);
+    }
+    return size;
+}
+
+/* Sends the goals that are due on one line; OK, or FULL. A line that takes no more bytes is `gone`. */
+static int write_goals(Kernel *k, Line *l)
+{
+    uint8_t packet[LONGEST_SYNC_WRITE];
+    for (; !l->gone && k->write_number < l->write_count; k->write_number++) {
+        SyncWrite *w = &l->writes[k->write_number];
+        if (!has_room(k, RECORD_HEADER + 16 + (w->length + 1) * w->count * 4 / 3))
+            return FULL;
+        int32_t size = build(k, l, w, packet);
+        int64_t before = now_ns(k);
+        if (!size || !send_all(k, l, packet, size))
+            continue;
+        put_record(k, l, INSTRUCTION, 0xfe, before, now_ns(k), packet, size);
+        l->free_ns = (l->free_ns > before ? l->free_ns : before) + size * l->byte_ns;
+    }
+    k->write_number = 0;
+    return OK;
+}
+
+/* Sends the goals that are due on every line, then asks split lines for their next states. FULL: commit the
+ * log and call again; LOOK: split lines have bytes that nothing asked for, and are not asked; UNEXPECTED: a
+ * line is gone, the others have their goals and are asked. */
+int32_t dxl_write(Kernel *k)
+{
+    uint8_t ready[MOST_LINES];
+    int32_t n = k->line_count, gone = 0;
+    for (; k->write_line < n; k->write_line++)
+        if (write_goals(k, &k->lines[k->write_line]) == FULL)
+            return FULL;
+    int32_t split = 0, early = 0;
+    for (int32_t i = 0; i < n; i++)
+        split += k->lines[i].split && k->lines[i].active;
+    if (split && k->write_line == n)
+        wait_for(k, IDLE, 0, ready);
+    for (int32_t i = 0; split && k->write_line == n && i < n; i++)
+        early += ready[i] && k->lines[i].active;
+    for (; split && !early && k->write_line < 2 * n; k->write_line++) {
+        Line *l = &k->lines[k->write_line - n];
+        if (l->split && l->active && !l->gone && ask(k, l) == FULL)
+            return FULL;
+    }
+    k->write_line = 0;
+    for (int32_t i = 0; i < n; i++)
+        gone += k->lines[i].gone != 0;
+    return gone ? UNEXPECTED : early ? LOOK : OK;
+}
+
+/* Ends a cycle that the parser finishes, and forgets what was asked. */
+void dxl_abandon(Kernel *k)
+{
+    k->reserved = 0;
+    for (int32_t i = 0; i < k->line_count; i++) {
+        k->lines[i].state = IDLE;
+        k->lines[i].done = k->lines[i].have = k->lines[i].pieces = 0;
+    }
+}
+
+/* Checksum of the source, then the sizes of the structs: kernel.py compares them with its own. */
+uint32_t dxl_layout(uint32_t number)
+{
+    const uint32_t sizes[] = {SOURCE_CRC,        sizeof(Servo), sizeof(Part),    sizeof(Packet), sizeof(Read), sizeof(Cell),
+                              sizeof(SyncWrite), sizeof(Line),  sizeof(Polling), sizeof(Kernel)};
+    return number < sizeof sizes / sizeof *sizes ? sizes[number] : 0;
+}

@@ -1,0 +1,358 @@
+"""Campaign: the compiled kernel and the packet-by-packet parser on the same lines.
+
+Two robots of equal plans, one with the kernel, one without, get the same bytes at the same times: replies
+that are good, cut, stuffed, late, shifted, doubled, foreign or noisy, in one piece or many. After each cycle
+everything that can be told apart is compared: bytes sent, the log, states, ages, what is known of each servo,
+events. A stream is what one line says to one read.
+
+    python tests/bench/fuzz_kernel.py 2000000
+
+CI runs a seeded sample of it (tests/dynamixel/test_kernel.py).
+"""
+
+from __future__ import annotations
+
+import math
+import random
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dxlrun.clock import VirtualClock
+from dxlrun.control_table import control_table
+from dxlrun.dynamixel import kernel, protocol1, protocol2
+from dxlrun.dynamixel.bus_plan import BusPlan
+from dxlrun.dynamixel.hardware import DynamixelHardware
+from dxlrun.dynamixel.plan import Wiring, bus_plan
+from dxlrun.errors import PortError
+from dxlrun.interfaces import Commands, States
+from dxlrun.packets import PacketBatch, PacketKind, decode_packets
+from dxlrun.ring import Handover
+
+IDS = (1, 7, 3, 20)
+ROBOTS = {
+    "single reads": ("AX-12A", 1.0),
+    "bulk read": ("MX-28", 1.0),
+    "sync read": ("XM430-W350", 2.0),
+    "fast sync read": ("XM430-W350", 2.0),
+    "single reads beside a bulk read": (("AX-12A", "MX-28"), 1.0),
+    "two layouts": (("XM430-W350", "XL-320"), 2.0),
+}
+PERIOD_NS = 20_000_000
+SYNC_WRITE = 0x83
+CYCLES = 60
+"""Cycles of one robot; the sixth of each six has an accident."""
+
+
+@dataclass(slots=True)
+class Tally:
+    """What came of a campaign."""
+
+    streams: int = 0
+    cycles: int = 0
+    by_kernel: int = 0
+    """Cycles that the kernel read to their end."""
+    interrupted: int = 0
+    """Cycles that it began and the parser ended."""
+
+
+class Line:
+    """Says to the n-th read of a cycle what it was told: pieces of (ns after it, bytes)."""
+
+    def __init__(self, clock, protocol):
+        self.clock, self.kind_at = clock, 4 if protocol == 1.0 else 7
+        self.told, self.said, self.sent = [], [], []
+        self.stall_ns = 0
+        """How long the host stands still behind each read."""
+
+    def write(self, data):
+        self.sent.append(bytes(data))
+        if data[self.kind_at] == SYNC_WRITE:
+            return
+        pieces = self.told.pop(0) if self.told else []
+        if pieces is None:
+            raise PortError("it is gone")
+        self.said += [(self.clock.now_ns() + at, piece) for at, piece in pieces]
+        self.said.sort(key=lambda one: one[0])
+        self.clock.wait_until(self.clock.now_ns() + self.stall_ns)
+
+    def read_into(self, buffer):
+        if not self.heard:
+            return 0
+        _, data = self.said.pop(0)
+        buffer[: len(data)] = data
+        return len(data)
+
+    def failure(self, code):
+        return PortError("it is gone")
+
+    @property
+    def heard(self):
+        return bool(self.said) and self.said[0][0] <= self.clock.now_ns()
+
+
+class Lines:
+    """Some lines, waited for together."""
+
+    polling = descriptors = None
+
+    def __init__(self, plans):
+        self.clock = VirtualClock(1_000_000)
+        self.ports = [Line(self.clock, plan.protocol) for plan in plans]
+
+    def wait(self, deadline_ns):
+        self.clock.wait_until(min([deadline_ns, *(at for line in self.ports for at, _ in line.said)]))
+        return [index for index, line in enumerate(self.ports) if line.heard]
+
+    def reopen(self, index):
+        return False
+
+
+class Events:
+    """Keeps events."""
+
+    def __init__(self):
+        self.list = []
+
+    def emit(self, *event):
+        self.list.append(event)
+
+
+class Side:
+    """A robot with the kernel, or without, and what became of each cycle."""
+
+    def __init__(self, plans, library):
+        self.lines = Lines(plans)
+        self.log, self.events = [], Events()
+        self.packets = PacketBatch(Handover(lambda payload: self.log.extend(decode_packets(payload))))
+        count = sum(len(plan.servos) for plan in plans)
+        self.states, self.goals = States.empty(count), Commands.empty(count)
+        self.hardware = DynamixelHardware(
+            plans,
+            self.lines,
+            self.lines.clock,
+            self.states,
+            self.goals,
+            self.packets,
+            self.events,
+            lambda: None,
+            library=library,
+        )
+        for servos in self.hardware._servos:
+            servos.torqued[:] = True
+        self.by_kernel = 0
+
+    def prepare(self):
+        """Plan the next cycle; return the reads of each bus."""
+        self.hardware._prepare()
+        found = []
+        for servos in self.hardware._servos:
+            reads = servos.reads
+            shapes = [reads._shape[one.group] % len(one.patient) for one in reads._queue]
+            found.append([one.patient[shape] for one, shape in zip(reads._queue, shapes, strict=True)])
+        return found
+
+    def cycle(self, told, goals, gap_ns):
+        """Write goals, read once; return all that can be told apart."""
+        self.log.clear()
+        self.events.list.clear()
+        hardware, clock = self.hardware, self.lines.clock
+        for line, mine in zip(self.lines.ports, told, strict=True):
+            line.told, line.sent = list(mine), []
+        self.goals.values[:] = goals
+        hardware.write()
+        if hardware._split:
+            hardware._await_states(clock.now_ns() + gap_ns)
+        hardware.read()
+        self.by_kernel += hardware._planned
+        self.packets.commit()
+        found = self.found(), clock.now_ns()
+        clock.wait_until(clock.now_ns() + PERIOD_NS)
+        return found
+
+    def found(self):
+        """Return what can be told apart."""
+        hardware = self.hardware
+        quiet = [packet for packet in self.log if packet.kind is not PacketKind.NOISE]
+        noise = [packet for packet in self.log if packet.kind is PacketKind.NOISE]
+        return (
+            [[packet for packet in quiet if packet.bus == index] for index in range(len(hardware._lines))],
+            [
+                b"".join(packet.data for packet in noise if packet.bus == index)
+                for index in range(len(hardware._lines))
+            ],
+            [line.sent for line in self.lines.ports],
+            self.states.motion.tobytes(),
+            self.states.valid.tolist(),
+            self.states.age_ns.tolist(),
+            [(one.reads.missed, one.reads.errors, one.reads.garbled) for one in hardware._servos],
+            [one.torqued.tolist() for one in hardware._servos],
+            [str(bus.failure) for bus in hardware._buses],
+            list(self.events.list),
+        )
+
+
+def replies(transaction, dialect, rng, drift):
+    """Return the replies to a read, as servos send them; their data drift, or are anything."""
+    error = rng.choice((0x80, 0x20)) if rng.random() < 0.02 else 0
+    found = []
+    for one in transaction.awaited:
+        data = bytes((drift >> 8 * at % 16 & 0xFF) for at in range(one.length))
+        if rng.random() < 0.1:
+            data = bytes(rng.choices((0xFF, 0xFF, 0xFD, 0x00, 0x12), k=one.length))
+        found.append((one.servo_id, error, data))
+    if not transaction.fast:
+        return [dialect.status_packet(*one) for one in found]
+    size = sum(one.length + 4 for one in transaction.awaited) + 1
+    packet = protocol2.HEADER + b"\xfe" + size.to_bytes(2, "little") + b"\x55"
+    for servo_id, fault, data in found:
+        packet += bytes((fault, servo_id)) + data
+        packet += protocol2.crc(packet).to_bytes(2, "little")
+    return [packet]
+
+
+def spoilt(packets, rng):
+    """Return the bytes of replies after an accident."""
+    match rng.randrange(6):
+        case 0:
+            packets.pop(rng.randrange(len(packets)))
+        case 1:
+            packets.insert(rng.randrange(len(packets) + 1), rng.randbytes(rng.randint(1, 20)))
+        case 2:
+            packets.insert(rng.randrange(len(packets) + 1), rng.choice(packets))
+    stream = bytearray(b"".join(packets))
+    if stream and rng.random() < 0.6:
+        where = rng.randrange(len(stream))
+        match rng.randrange(3):
+            case 0:
+                stream[where] ^= 1 << rng.randrange(8)
+            case 1:
+                del stream[where : where + rng.randint(1, 4)]
+            case _:
+                stream[where:where] = rng.randbytes(rng.randint(1, 4))
+    return bytes(stream)
+
+
+def said(transactions, dialect, rng, accident):
+    """Return what a line says to each read of a cycle; with an accident in one of them."""
+    told = []
+    victim = rng.randrange(len(transactions)) if accident and transactions else -1
+    drift = rng.randrange(500, 520)
+    for number, transaction in enumerate(transactions):
+        packets = replies(transaction, dialect, rng, drift)
+        stream, at, most = b"".join(packets), 1_500_000, rng.choice((9, 1_000, 1_000))
+        if number == victim:
+            if rng.random() < 0.03:
+                told.append(None)
+                continue
+            stream = spoilt(packets, rng)
+            at = rng.choice((1_000, 1_500_000, 1_500_000, 9_000_000, 30_000_000))
+            most = rng.choice((1, 5, 17, 999))
+        pieces = []
+        while stream:
+            pieces.append((at, stream[:most]))
+            stream, at = stream[most:], at + rng.choice((0, 1_000, 100_000))
+        told.append(pieces)
+    return told
+
+
+def robot(name: str, count: int, split: bool) -> tuple[list[BusPlan], object]:
+    """Return the plans of `count` buses that are read in some way, and their dialect."""
+    models, protocol = ROBOTS[name]
+    models = (models,) if isinstance(models, str) else models
+    plans = []
+    for number in range(count):
+        joints = [
+            Wiring(
+                joint=f"joint_{number}_{servo_id}",
+                row=number * len(IDS) + index,
+                servo_id=servo_id,
+                table=control_table(models[index % len(models)], protocol),
+                reference=math.radians(150),
+                direction=1 if index % 2 else -1,
+                lower=-2.5,
+                upper=2.5,
+            )
+            for index, servo_id in enumerate(IDS)
+        ]
+        plan = bus_plan(
+            name=f"bus{number}",
+            port="sim",
+            baud_rate=1_000_000,
+            latency_ns=0,
+            return_delay_ns=500_000,
+            joints=joints,
+            protocol=protocol,
+            split=split,
+        )
+        plans.append(replace(plan, fast=(name == "fast sync read",) * len(plan.groups)))
+    return plans, protocol1 if protocol == 1.0 else protocol2
+
+
+def moved(goals, rng):
+    """Return the goals of the next cycle: some move, some are odd, some are none."""
+    goals = goals.copy()
+    for row in range(goals.shape[1]):
+        if rng.random() < 0.3:
+            goals[0, row] = rng.uniform(-3, 3)
+        if rng.random() < 0.1:
+            goals[1, row] = rng.choice((math.nan, 0.0, -0.0, 1.5, -4.0, 1e300, math.inf))
+        if rng.random() < 0.02:
+            goals[0, row] = math.nan
+    return goals
+
+
+def difference(found, expected, where):
+    """Return what differs of what two robots did in a cycle."""
+    names = ["packets", "noise", "sent", "motion", "valid", "age", "known", "torqued", "failures", "events"]
+    told = [
+        f"{name}: {one} instead of {two}"
+        for name, one, two in zip(names, found[0], expected[0], strict=True)
+        if one != two
+    ]
+    return "\n".join([where, *told, f"{found[1]} {expected[1]}"])
+
+
+def campaign(streams: int, seed: int, names: Sequence[str] = tuple(ROBOTS)) -> Tally:
+    """Compare so many streams; raises AssertionError where kernel and parser differ."""
+    rng, tally = random.Random(seed), Tally()
+    library = kernel.load()
+    assert library is not None, "the kernel was not built"
+    while tally.streams < streams:
+        name, count, split = rng.choice(names), rng.choice((1, 1, 3)), rng.random() < 0.3
+        plans, dialect = robot(name, count, split)
+        ours, theirs = Side(plans, library), Side(plans, None)
+        goals = np.full_like(ours.goals.values, math.nan)
+        for number in range(CYCLES):
+            reads = theirs.prepare()
+            planned = ours.prepare()
+            assert planned == reads, (seed, tally)
+            victim = rng.randrange(count) if number % 6 == 5 else -1
+            told = [said(mine, dialect, rng, index == victim) for index, mine in enumerate(reads)]
+            goals, gap_ns = moved(goals, rng), rng.choice((0, 1_000_000, 5_000_000))
+            began = ours.hardware._planned
+            found, expected = ours.cycle(told, goals, gap_ns), theirs.cycle(told, goals, gap_ns)
+            assert found == expected, difference(found, expected, f"{seed} {name} {count} {split} {number}")
+            tally.interrupted += began and not ours.hardware._planned
+            tally.streams += sum(map(len, told))
+            tally.cycles += 1
+            if any(bus.failure for bus in ours.hardware._buses):
+                break
+        assert not theirs.by_kernel
+        tally.by_kernel += ours.by_kernel
+    return tally
+
+
+def main() -> None:
+    """Run the campaign: count of streams, seed."""
+    count = int(sys.argv[1]) if len(sys.argv) > 1 else 2_000_000
+    seed = int(sys.argv[2]) if len(sys.argv) > 2 else 1
+    began = time.monotonic()
+    print(f"{campaign(count, seed)}, {time.monotonic() - began:.0f} s")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,143 @@
+"""The compiled kernel does what the parser does, whatever arrives; and what it promises by itself."""
+
+import importlib.util
+import os
+import shutil
+import sys
+import time
+import tty
+from pathlib import Path
+from threading import Thread
+
+import pytest
+
+from dxlrun.clock import MonotonicClock
+from dxlrun.dynamixel import kernel, protocol2
+from dxlrun.dynamixel.hardware import DynamixelHardware
+from dxlrun.dynamixel.port import SerialPort, SerialPorts
+from dxlrun.interfaces import Commands, States
+from dxlrun.packets import PacketKind
+from dxlrun.testing import simulated_robot
+
+ROBOTS = Path(__file__).parents[2] / "robots"
+CAMPAIGN = Path(__file__).parent.parent / "bench" / "fuzz_kernel.py"
+pytestmark = pytest.mark.skipif(kernel.load() is None, reason="no C compiler: the kernel was not built")
+
+
+@pytest.fixture(scope="module")
+def fuzz():
+    spec = importlib.util.spec_from_file_location("fuzz_kernel", CAMPAIGN)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look their module up there
+    spec.loader.exec_module(module)
+    yield module
+    del sys.modules[spec.name]
+
+
+@pytest.mark.parametrize("name", ["single reads", "bulk read", "sync read", "fast sync read", "two layouts"])
+def test_kernel_and_parser_agree_on_whatever_lines_say(fuzz, name):
+    tally = fuzz.campaign(2_000, seed=len(name), names=[name])
+    # neither side of the comparison is empty
+    assert tally.by_kernel > 50
+    assert tally.interrupted > 20
+
+
+@pytest.mark.campaign
+def test_kernel_and_parser_agree_on_many_streams(fuzz):
+    fuzz.campaign(int(os.environ.get("DXLRUN_STREAMS", "3000")), seed=int(os.environ.get("DXLRUN_SEED", "1")))
+
+
+@pytest.mark.parametrize("name", ["bioloid_torso", "humanoid_20"])
+def test_a_run_is_the_same_with_and_without_the_kernel(monkeypatch, name):
+    def packets():
+        robot = simulated_robot(ROBOTS / f"{name}.yaml", duration_s=0.4)
+        robot.run()
+        states = robot.record.states
+        return [entry.data for entry in robot.ledger.entries], states.motion.tobytes(), states.age_ns.tolist()
+
+    compiled = packets()
+    monkeypatch.setattr(kernel, "load", lambda: None)
+    assert packets() == compiled
+
+
+def test_an_object_of_another_source_is_not_used(tmp_path, monkeypatch):
+    shutil.copy(kernel.LIBRARY, tmp_path / "libkernel.so")
+    assert kernel.load(tmp_path / "libkernel.so") is not None
+    (tmp_path / "kernel.c").write_text("int changed;")
+    monkeypatch.setattr(kernel, "SOURCE", tmp_path / "kernel.c")
+    assert kernel.load(tmp_path / "libkernel.so") is None
+    assert kernel.load(tmp_path / "absent.so") is None
+
+
+class TestOnDescriptors:
+    """A line that a test answers itself, through a pseudo-terminal."""
+
+    @pytest.fixture
+    def line(self, make_plan, make_rig, request):
+        # a reply may take as long as the adapter is said to take
+        latency_ns = getattr(request, "param", 0)
+        plan = make_plan((1, 2), model="XM430-W350", protocol=2.0, latency_ns=latency_ns)
+        ours, theirs = os.openpty()
+        for end in (ours, theirs):
+            tty.setraw(end)
+        rig = make_rig(plan)
+        states, goals = States.empty(2), Commands.empty(2)
+        ports = SerialPorts([SerialPort(theirs, "pty")])
+        hardware = DynamixelHardware(
+            [plan],
+            ports,
+            MonotonicClock(),
+            states,
+            goals,
+            rig.packets,
+            rig.events,
+            lambda: rig.beats.append(0),
+            library=kernel.load(),
+        )
+        (servos,) = hardware._servos
+        while servos.reads.program is None:  # as after some cycles in which every servo answered
+            servos.reads.changed = True
+            servos.reads.prepare()
+        yield plan, hardware, ours, states, rig
+        for end in (ours, theirs):
+            os.close(end)
+
+    @pytest.mark.parametrize("line", [10_000_000_000], indirect=True)
+    def test_a_reply_is_taken_stamped_and_logged(self, line):
+        plan, hardware, ours, states, rig = line
+        (read,) = plan.reads
+        said = [protocol2.status_packet(one.servo_id, 0, bytes(one.length)) for one in read.awaited]
+        answering = Thread(target=answer, args=(ours, len(read.packet), b"".join(said)))
+        answering.start()
+        hardware.read()
+        answering.join()
+        assert states.valid.tolist() == [True, True]
+        kinds = [packet.kind for packet in rig.packets.list]
+        assert kinds == [PacketKind.INSTRUCTION, PacketKind.STATUS, PacketKind.STATUS]
+        sent, first, _ = rig.packets.list
+        assert sent.first_ns <= sent.last_ns <= first.first_ns
+        assert hardware._planned
+
+    def test_silence_ends_in_the_parser_and_the_loop_shows_that_it_lives(self, line):
+        _, hardware, _, states, rig = line
+        hardware.read()
+        assert states.valid.tolist() == [False, False]
+        assert len(rig.beats) > 5  # a beat a millisecond while replies are awaited
+        assert not hardware._planned
+
+    def test_a_line_that_hangs_up_is_gone_and_names_its_port(self, line):
+        _, hardware, ours, states, _ = line
+        os.dup2(os.open(os.devnull, os.O_RDONLY), ours)  # the other end is closed
+        hardware.read()
+        (bus,) = hardware._buses
+        assert "pty is gone" in str(bus.failure)
+        assert not states.valid.any()
+
+
+def answer(terminal, size, replies):
+    """Answer a read on the other end, no sooner than the wire allows."""
+    got = b""
+    while len(got) < size:
+        got += os.read(terminal, size - len(got))
+    time.sleep(0.002)
+    os.write(terminal, replies)
