@@ -340,9 +340,11 @@ def test_a_servo_without_torque_is_not_taken_for_one_that_has_caught_up():
     returning, goals, states = Returning([0]), Commands.empty(1), States.empty(1)
     goals.position[0], states.position[0] = 0.3, 0.3
     returning.slow_down(0)
-    assert returning.ceiling(goals, states, np.array([False]))[0] == RETURN_SPEED
+    returning.follow(goals, states, np.array([False]))
+    assert returning.ceiling[0] == RETURN_SPEED
     assert returning.anybody == [0]
-    assert np.isnan(returning.ceiling(goals, states, np.array([True]))[0])
+    returning.follow(goals, states, np.array([True]))
+    assert np.isnan(returning.ceiling[0])
     assert returning.anybody == []
 
 

@@ -69,6 +69,29 @@ def test_an_object_of_another_source_is_not_used(tmp_path, monkeypatch):
     assert kernel.load(tmp_path / "absent.so") is None
 
 
+@pytest.mark.parametrize("call", ["wait", "write", "read_into", "now_ns"])
+def test_an_interrupt_on_virtual_time_comes_out_of_the_kernel(make_rig, make_plan, monkeypatch, call):
+    rig = make_rig(make_plan((1, 2)))
+    rig.hardware.start()
+    for _ in range(5):
+        rig.cycle()
+    assert rig.hardware._planned
+    port = rig.ports.ports[0]
+    owner = {"wait": rig.ports, "now_ns": rig.hardware._kernel}.get(call, port)
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(owner, "_now_ns" if call == "now_ns" else call, interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            rig.hardware._kernel.read()
+    rig.clock.wait_until(rig.clock.now_ns() + 100_000_000)
+    for _ in range(5):
+        rig.cycle()
+    assert rig.states.valid.all()
+
+
 class TestOnDescriptors:
     """A line that a test answers itself, through a pseudo-terminal."""
 

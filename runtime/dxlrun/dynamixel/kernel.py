@@ -364,6 +364,7 @@ class Kernel:
         self._ports = ports
         self._beat = beat
         self._now_ns = clock.now_ns
+        self._raised: BaseException | None = None
         self._kept: list[object] = [samples, states, goals, *included, *ceilings]
         self._buffers = [ctypes.create_string_buffer(_ROOM) for _ in plans]
         self._programs: list[Program | None] = [None] * len(plans)
@@ -372,7 +373,7 @@ class Kernel:
         self._kernel = _Kernel(beat_ns=BEAT_NS)
         self._lines = self._laid_lines(plans, included, ceilings)
         self._lay_states(plans, samples, states, goals)
-        self._lay_ports(clock)
+        self._lay_ports()
         desk = packets.desk
         self._room = NEVER
         if desk is not None:
@@ -420,37 +421,66 @@ class Kernel:
             setattr(kernel, name, _data(getattr(states, name)))
         kernel.goals = (c_void_p * 4)(*(_data(row) for row in goals.values))
 
-    def _lay_ports(self, clock: Clock) -> None:
+    def _lay_ports(self) -> None:
         """Let the kernel use descriptors, or functions of the ports and the clock where there are none."""
         if (descriptors := self._ports.descriptors) is not None:
             for line, descriptor in zip(self._lines, descriptors, strict=False):
                 line.descriptor = descriptor
             return
         self._kernel.beat_ns = NEVER
-        self._kernel.now = _NOW(clock.now_ns)
+        self._kernel.now = _NOW(self._now)
         self._kernel.send = _TRANSFER(self._send)
         self._kernel.receive = _TRANSFER(self._receive)
         self._kernel.wait = _WAIT(self._wait)
+
+    # What the kernel calls on virtual time. It knows no exceptions: one, such as an interrupt of the user, is
+    # kept, every later call fails, and `_raise` raises it when the kernel has returned.
+
+    def _now(self) -> int:
+        try:
+            return self._now_ns()
+        except BaseException as error:
+            self._raised = error
+            return NEVER
 
     def _send(self, line: int, data: ctypes._Pointer[c_uint8], size: int) -> int:
         try:
             self._ports.ports[line].write(bytes(data[:size]))
         except PortError:
             return -1
-        return size
+        except BaseException as error:
+            self._raised = error
+            return -1
+        return -1 if self._raised else size
 
     def _receive(self, line: int, data: ctypes._Pointer[c_uint8], room: int) -> int:
         array = ctypes.cast(data, POINTER(c_uint8 * room)).contents
         try:
-            return self._ports.ports[line].read_into(memoryview(array).cast("B"))
+            count = self._ports.ports[line].read_into(memoryview(array).cast("B"))
         except PortError:
             return -1  # the parser meets it again and has the reason
+        except BaseException as error:
+            self._raised = error
+            return -1
+        return -1 if self._raised else count
 
     def _wait(self, deadline_ns: int, ready: ctypes._Pointer[c_uint8]) -> int:
-        indices = [index for index in self._ports.wait(deadline_ns) if self._lines[index].active]
+        indices: Sequence[int] = range(len(self._plans))  # after an exception: all lines, whose calls fail
+        try:
+            if self._raised is None:
+                indices = [index for index in self._ports.wait(deadline_ns) if self._lines[index].active]
+        except BaseException as error:
+            self._raised = error
         for index in indices:
             ready[index] = 1
         return len(indices)
+
+    def _raise(self) -> None:
+        """Raise what came up while the kernel was at work."""
+        error, self._raised = self._raised, None
+        if error is not None:
+            self._library.abandon(self._pointer)
+            raise error
 
     def poll_for_replies(self) -> None:
         """Begin to poll for replies as the ports say; before real time."""
@@ -484,6 +514,8 @@ class Kernel:
         """Read every servo once; without `everything`, go on with the lines that were asked before."""
         while True:
             answer = _ANSWERS[self._library.read(self._pointer, until_ns, everything)]
+            if self._raised is not None:
+                self._raise()
             if answer is Answer.WAITING:
                 self._beat()
                 if self._now_ns() >= until_ns:
@@ -500,6 +532,8 @@ class Kernel:
         """
         while (answer := _ANSWERS[self._library.write(self._pointer)]) is Answer.FULL:
             self._packets.commit()
+        if self._raised is not None:
+            self._raise()
         return answer
 
     def failures(self) -> dict[int, PortError]:
