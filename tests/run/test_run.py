@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
-import pty
 import re
 import select
 import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -142,15 +142,24 @@ def test_a_missing_port_is_one_sentence(start: Start) -> None:
 
 
 def test_a_busy_port_is_one_sentence_that_names_the_holder(start: Start) -> None:
-    master, slave = pty.openpty()
-    fcntl.flock(slave, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    run = start(f"port:={os.ttyname(slave)}")
-    code, _, err = run.finish()
-    os.close(master)
-    os.close(slave)
+    # in a process of its own: this one may have the memory of a plan open, as a run has
+    holding = (
+        "import fcntl, os, pty\n"
+        "_, slave = pty.openpty()\n"
+        "fcntl.flock(slave, fcntl.LOCK_EX)\n"
+        "print(os.ttyname(slave), flush=True)\n"
+        "input()"
+    )
+    command = [sys.executable, "-c", holding]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as holder:
+        assert holder.stdin
+        assert holder.stdout
+        run = start(f"port:={holder.stdout.readline().strip()}")
+        code, _, err = run.finish()
+        holder.stdin.write("\n")
     assert code == 1
     assert len(err.strip().splitlines()) == 1
-    assert str(os.getpid()) in err
+    assert str(holder.pid) in err
 
 
 def plugin(directory: Path, update: str) -> Path:
