@@ -165,6 +165,7 @@ def _command(process: Path) -> str:
     try:
         words = (process / "cmdline").read_bytes().split(b"\0")
         # enough to read `python -P -m dxlrun.simulation`
-        return b" ".join(words[:5]).decode(errors="replace").strip() or "a process"
+        # one line, whatever its words are
+        return " ".join(b" ".join(words[:5]).decode(errors="replace").split())[:100] or "a process"
     except OSError:
         return "a process"
