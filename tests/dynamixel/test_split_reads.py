@@ -91,6 +91,40 @@ def test_a_silent_servo_costs_the_others_no_state(started):
     assert started.states.valid.tolist() == [True, True, False, True, True, True, True, True]
 
 
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_servo_that_returns_behind_the_request_has_not_missed_it(make_rig, make_plan, compiled):
+    """The states of the next cycle are on their way already when a lost servo is found in order."""
+    started = make_rig(make_plan(IDS, **X), compiled=compiled)
+    started.hardware.start()
+    servo = started.buses[0].servo(13)
+    servo.silence()
+    while not started.events.of(EventCode.SERVO_LOST):
+        started.cycle()
+    servo.silence(False)
+    while not started.events.of(EventCode.SERVO_BACK):
+        started.cycle()
+    since = len(started.ledger.entries)
+    while not started.states.valid[2]:
+        started.goals.position[:] += 0.001
+        started.cycle()
+    lost = [source for source, _ in started.events.of(EventCode.READ_LOST)]
+    assert lost.count("arm_13_joint") == 1
+    assert "arm_13_joint" not in {source for source, _ in started.events.of(EventCode.READ_BACK)}
+    sent = [entry.data for entry in started.ledger.entries[since:] if entry.direction == "in"]
+    first = next(at for at, data in enumerate(sent) if data[7] == 0x8A and 13 in data[14:-2])
+    goals = [data for data in sent[:first] if data[7] == 0x83]
+    assert goals
+    assert not any(13 in data[12:-2:9] for data in goals), "it got a goal before its state was asked for"
+    for _ in range(3):
+        started.goals.position[:] += 0.01
+        started.cycle()
+    assert started.states.valid.all()
+    goals = [
+        entry.data for entry in started.ledger.entries if entry.direction == "in" and entry.data[7] == 0x83
+    ]
+    assert 13 in goals[-1][12:-2:9]
+
+
 def test_servos_that_are_read_one_by_one_are_read_in_the_gap(make_rig, make_plan):
     rig = make_rig(make_plan((1, 2, 3), split=True))
     rig.hardware.start()

@@ -175,6 +175,10 @@ class CyclicReads:
         silent = self._queue_of
         return silent is None or any(silent[one] and not self.away[one] for one in self._groups[number])
 
+    def asks(self, servo: int) -> bool:
+        """Say whether a servo is asked in this cycle: not if it joined after a split bus was asked."""
+        return any(servo in request.indices for request in self._queue)
+
     def leave(self, servo: int) -> None:
         """Ask a servo no more: it is lost, and its silence would cost the others their time."""
         self.away[servo] = True

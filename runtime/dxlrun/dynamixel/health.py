@@ -333,6 +333,8 @@ class Servos:
             if self.reads.away[index]:
                 continue
             if not fresh:
+                if not self.reads.asks(index):
+                    continue
                 self._missed[index] += 1
                 self.torqued[index] = False
                 if self._missed[index] == 1:
@@ -362,7 +364,8 @@ class Servos:
         self._modes.returned(index, rejoined.mode)
         for joint, text in rejoined.written:
             self._emit(EventCode.REGISTER_WRITTEN, Severity.INFO, joint, text)
-        self.torqued[index] = rejoined.torqued
+        # the next states of a split bus were asked for without it: its torque is read again behind its state
+        self.torqued[index] = rejoined.torqued and not self._plan.split
         holds = rejoined.torqued and index not in self._gone
         how = "holding where it stands" if holds else "limp: it gets no goals"
         self._say(EventCode.SERVO_BACK, Severity.INFO, index, f"is in order and takes part again, {how}")
