@@ -158,6 +158,38 @@ def test_a_servo_that_rebooted_gets_torque_back_only_by_the_policy(
     assert servo.position == pytest.approx(held, abs=0.01)
 
 
+@pytest.mark.parametrize("rebooted", [False, True])
+def test_a_servo_whose_clock_was_not_read_has_not_started_anew_before_it_was(start, make_x, rebooted):
+    """Torque enable 0 behind a garbled clock may be the answer of a second servo with its ID."""
+    rig = start(make_x())
+    servo = rig.buses[0].servo(13)
+    servo.silence()
+    cycles(rig, 5)
+    if rebooted:
+        servo.reset()
+    servo.poke("torque_enable", 0)
+    servo.silence(False)
+    write, asked = rig.ports.ports[0].write, []
+
+    def through(data):
+        if data == protocol2.read(13, 120, 2):
+            asked.append(data)
+            if len(asked) <= 3:
+                rig.buses[0].truncate_next(13, 5)
+        write(data)
+
+    rig.ports.ports[0].write = through
+    while len(asked) < 3:
+        rig.cycle()
+    cycles(rig, 10)
+    assert rig.events.of(EventCode.SERVO_REBOOTED) == []
+    assert "answers garbled or twice" in rig.events.of(EventCode.SERVO_LOST)[-1][1]
+    until_valid(rig)
+    assert len(asked) == 4
+    assert len(rig.events.of(EventCode.SERVO_REBOOTED)) == rebooted
+    assert [source for source, _ in rig.events.of(EventCode.SERVO_LIMP)] == ["arm_13_joint"]
+
+
 def test_a_servo_that_reboots_twice_in_a_minute_gets_no_torque_again(start, make_x):
     rig = start(make_x(returning=True))
     servo = rig.buses[0].servo(12)

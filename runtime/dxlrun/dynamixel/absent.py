@@ -14,7 +14,7 @@ from dxlrun.dynamixel.inspection import persist, who
 from dxlrun.dynamixel.plan import plan_line
 from dxlrun.dynamixel.reboots import RealtimeTicks, RebootCount
 from dxlrun.dynamixel.startup import Rejoined, rejoin
-from dxlrun.dynamixel.transaction import Outcome, Program, Transaction
+from dxlrun.dynamixel.transaction import Outcome, Program, Reply, Transaction
 from dxlrun.dynamixel.wanted import Wanted
 from dxlrun.events import EventCode, Severity
 
@@ -23,6 +23,7 @@ PROBE_NS = 1_000_000_000
 FIRST_PROBE_NS = 200_000_000
 """The first time a little earlier: most losses are a loose plug or a boot, which is over by then."""
 NEVER = 1 << 62
+_UNHEARD = frozenset((Outcome.TIMEOUT, Outcome.GARBLED))
 _TURNS = (
     "forgot over that in which turn it stood, so its goal would be turns away: it gets no torque again in "
     "this mode; start the run anew"
@@ -130,8 +131,8 @@ class Absent:
 
     def tick(self, index: int) -> Program[bool]:
         """Read a servo's Realtime Tick, if it has one; return whether it shows a reboot, which is counted."""
-        rebooted = yield from self._ticked(index)
-        return bool(rebooted)
+        read = self._tick_reads[index]
+        return False if read is None else bool(self._judge_tick(index, (yield from persist(read))))
 
     def _plan_probe(self, index: int, after_ns: int) -> None:
         self._due_ns[index] = self._now_ns() + after_ns
@@ -141,9 +142,11 @@ class Absent:
         """Ping a servo; when it answers, see what became of it and take it back."""
         plan, servo = self._plan, self._plan.servos[index]
         reply = yield plan_line(plan).ping(servo.servo_id)
-        if not reply.answered:
+        if reply.answered and (read := self._tick_reads[index]) is not None:
+            reply = yield from persist(read)
+        if reply.outcome in _UNHEARD:
             return _Outcome(False, reply.outcome is Outcome.GARBLED)
-        if (yield from self._ticked(index)) is None:  # it has no tick, or was unseen for too long
+        if self._judge_tick(index, reply) is None:
             enabled = yield from persist(plan.torque_reads[index])
             if self._had_torque[index] and enabled.answered and not enabled.parameters[0]:
                 self._count(index)
@@ -174,13 +177,9 @@ class Absent:
             self._said[index] = text
             self._say(EventCode.SERVO_LOST, Severity.ERROR, index, text)
 
-    def _ticked(self, index: int) -> Program[bool | None]:
-        """Read Realtime Tick and judge it; None: nothing can be said."""
-        read = self._tick_reads[index]
-        if read is None:
-            return None
-        reply = yield from persist(read)
-        if not reply.answered:
+    def _judge_tick(self, index: int, reply: Reply) -> bool | None:
+        """Judge a reply with Realtime Tick; None: it has none, or the one before is too long ago."""
+        if self._tick_reads[index] is None or not reply.answered:
             return None
         rebooted = self._ticks.rebooted(index, reply)
         if rebooted:
