@@ -93,6 +93,22 @@ def test_a_fault_that_is_answered_is_good(run: Run):
     assert {answer.source for answer in fault.answers} == {"j2"}
 
 
+@pytest.mark.parametrize("code", [EventCode.SERVO_REBOOTED, EventCode.SERVO_LIMP])
+def test_a_second_servo_of_an_id_is_a_cause_for_what_is_read_of_that_id_alone(
+    run: Run, judge: Any, code: EventCode
+):
+    twin = LedgerEntry(1_000_000_000, "main", "note", b"", note="fault: duplicate_id servo=2 at=1s")
+    entries = [*run.entries, twin]
+    seen = [Event(2_500_000_000, code, Severity.ERROR, joint, "") for joint in ("j2", "j3")]
+    judge.faults_and_events_answer_each_other(entries, replace(run.log, events=(*run.log.events, seen[0])))
+    with pytest.raises(AssertionError, match=seen[1].name):
+        judge.faults_and_events_answer_each_other(entries, replace(run.log, events=(*run.log.events, *seen)))
+    with pytest.raises(AssertionError, match=seen[0].name):
+        judge.faults_and_events_answer_each_other(
+            run.entries, replace(run.log, events=(*run.log.events, seen[0]))
+        )
+
+
 @pytest.fixture(scope="module")
 def shared_line(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """A run in which another host sends goals to the second servo, between the exchanges and into them."""

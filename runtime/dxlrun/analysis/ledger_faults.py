@@ -65,7 +65,8 @@ _KINDS: Mapping[str, _Kind] = {
     "overload": _Kind(_ERROR, 0, _ERROR),
     "overheat": _Kind(_ERROR | {EventCode.SERVO_HOT}, _EVER, _ERROR),
     "turn": _Kind(frozenset((EventCode.IMPLAUSIBLE,)), TURN_NS),
-    "duplicate_id": _Kind(_GARBLED | {EventCode.IMPLAUSIBLE}, _EVER),
+    # the second one may be heard alone: it has a clock of its own, and no torque
+    "duplicate_id": _Kind(_GARBLED | _POWER | {EventCode.IMPLAUSIBLE}, _EVER),
     "unplug": _Kind(frozenset((EventCode.PORT_LOST,)), _EVER, due=True),
     "wedge": _Kind(_MISSED, _EVER, due=True),
 }
