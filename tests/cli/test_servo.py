@@ -4,6 +4,7 @@ import io
 import json
 import os
 import sys
+import time
 
 import pytest
 
@@ -96,13 +97,15 @@ def test_registers_are_read_and_written_and_the_eeprom_only_when_it_was_asked_fo
 def test_a_tripped_bus_watchdog_is_shown_named_and_cleared(one):
     servo, finish = one()
     servo(1, "torque", "on", *NEW)
-    servo(1, "set", "bus_watchdog", "1", *NEW)  # the servo is stopped before the next command comes
+    servo(1, "set", "bus_watchdog", "1", *NEW)
+    time.sleep(0.2)  # no instruction for more than its 20 ms
     assert servo(1, "get", "bus_watchdog", *NEW).out.split()[-2:] == ["255", "tripped"]
     done = servo(1, "set", "goal_position", "1400", *NEW)
     assert done.code == 0, done.err
     assert "cleared Bus Watchdog (98), which was 255 (tripped): it had stopped the servo" in done.out
     assert done.out.strip().endswith("is 1400")
     servo(1, "set", "bus_watchdog", "1", *NEW)
+    time.sleep(0.2)
     asked = servo(1, "torque", "on", "--json", *NEW)
     assert len(json.loads(asked.out)["done"]) == 2, asked.err
     assert "Bus Watchdog" in json.loads(asked.out)["done"][0]
