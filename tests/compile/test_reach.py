@@ -4,9 +4,49 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dxlrun.compile.reach import Interval, degrees, joint_reach
+from dxlrun.compile.reach import Interval, degrees, joint_reach, servo_travel
+from dxlrun.control_table import all_tables, control_table
 
-TRAVEL = math.radians(300)
+AX = control_table("AX-12A")
+TRAVEL = servo_travel(AX)
+INSIDE = st.floats(TRAVEL.lower, TRAVEL.upper)
+
+SPAN = """\
+name: span
+buses:
+  main: {{port: sim, protocol: {protocol}, baud_rate: 1_000_000, adapter: {{latency: 0 ms}}}}
+loop: {{rate: 50}}
+joints:
+  left_arm_joint: {{bus: main, id: 1, model: "{model}", reference: {left:.12f} rad, direction: 1}}
+  right_arm_joint: {{bus: main, id: 2, model: "{model}", reference: {right:.12f} rad, direction: -1}}
+controllers:
+  states: {{type: joint_state_broadcaster}}
+"""
+
+
+@pytest.mark.parametrize(
+    "table", [table for table in all_tables() if not table.firmware], ids=lambda table: table.model
+)
+def test_a_joint_reaches_every_goal_position_of_its_model(compile_text, table):
+    low, high = table.min_tick * table.rad_per_tick, table.max_tick * table.rad_per_tick
+    left = low + 0.25 * (high - low)
+    text = SPAN.format(protocol=table.protocol, model=table.model, left=left, right=low + high - left)
+    compiled = compile_text(text)
+    for servo in compiled.plan.buses[0].servos:
+        assert (servo.lower_tick, servo.upper_tick) == (table.min_tick, table.max_tick)
+    for joint in compiled.plan.loop.joints:
+        assert (joint.lower, joint.upper) == pytest.approx((low - left, high - left))
+    assert compiled.warnings == (), "the reference is in the travel, and the twins are mirror images"
+
+
+def test_a_reference_outside_of_a_travel_to_both_sides_of_0_is_a_warning(compile_text):
+    def warnings(left):
+        text = SPAN.format(protocol=2.0, model="PH54-200-S500", left=left, right=-left)
+        return [each.what for each in compile_text(text).warnings]
+
+    assert warnings(-3.1) == []
+    assert len(warnings(-3.2)) == 2
+    assert "(-180..180 deg), so the joint can never be at 0" in warnings(-3.2)[0]
 
 
 @pytest.mark.parametrize(
@@ -25,7 +65,7 @@ def test_reach_of_an_ax_12(reference: int, direction: int, reach: tuple[int, int
 
 
 @settings(max_examples=50, deadline=None)
-@given(theta=st.floats(0, TRAVEL), reference=st.floats(0, TRAVEL), direction=st.sampled_from([-1, 1]))
+@given(theta=INSIDE, reference=INSIDE, direction=st.sampled_from([-1, 1]))
 def test_every_angle_of_the_servo_lies_in_the_reach(theta: float, reference: float, direction: int):
     q = direction * (theta - reference)
 

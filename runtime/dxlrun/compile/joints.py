@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from dxlrun.compile.problems import Problems, suggestion
-from dxlrun.compile.reach import Interval, degrees, joint_reach, many_turns
+from dxlrun.compile.reach import Interval, degrees, joint_reach, many_turns, servo_travel
 from dxlrun.compile.registers import compile_registers
 from dxlrun.control.loop_plan import JointPlan
 from dxlrun.control_table import ControlTable, control_table, perhaps_meant, protocols_of
@@ -157,7 +157,7 @@ def _one_table(model: str) -> bool:
 def _reach(joint: Joint, table: ControlTable) -> Interval:
     if joint.continuous:
         return many_turns(table.protocol, joint.reference, joint.direction)
-    return joint_reach(table.max_tick * table.rad_per_tick, joint.reference, joint.direction)
+    return joint_reach(servo_travel(table), joint.reference, joint.direction)
 
 
 def _effort(
@@ -186,12 +186,12 @@ def _top_effort(table: ControlTable, *, continuous: bool) -> float | None:
 def _check_reference(
     description: Description, name: str, joint: Joint, table: ControlTable, problems: Problems
 ) -> None:
-    travel = table.max_tick * table.rad_per_tick
-    if not 0.0 <= joint.reference <= travel:
+    travel = servo_travel(table)
+    if not travel.lower <= joint.reference <= travel.upper:
         problems.warning(
             description.marks.value("joints", name, "reference"),
             f"reference {degrees(joint.reference)} deg of {name} lies outside the travel of an {table.model} "
-            f"(0..{degrees(travel)} deg), so the joint can never be at 0",
+            f"({degrees(travel.lower)}..{degrees(travel.upper)} deg), so the joint can never be at 0",
             "check the reference: it is the servo's angle where the joint's is 0",
         )
 

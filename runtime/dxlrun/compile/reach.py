@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from dxlrun.control_table import ControlTable
+
 _TOLERANCE = 1e-6
 """rad; far below a tick (5e-3 rad on an AX-12), far above the rounding of degrees."""
 
@@ -42,12 +44,20 @@ def many_turns(protocol: float, reference: float, direction: int) -> Interval:
     return Interval(middle - turns, middle + turns)
 
 
-def joint_reach(travel: float, reference: float, direction: int) -> Interval:
-    """Return the reach of a joint, rad, of a servo that turns from 0 to `travel` rad.
+def servo_travel(table: ControlTable) -> Interval:
+    """Return the angles that a servo's goal positions reach, rad from raw 0.
 
-    q = direction * (theta - reference), theta in 0..travel (thesis of M. Amarante Araujo, 2017, JointID).
+    From 0 on in Protocol 1.0 and on X and MX, to both sides of 0 on P, PRO and Y (e-Manual, Goal Position).
     """
-    ends = (direction * -reference, direction * (travel - reference))
+    return Interval(table.min_tick * table.rad_per_tick, table.max_tick * table.rad_per_tick)
+
+
+def joint_reach(travel: Interval, reference: float, direction: int) -> Interval:
+    """Return the reach of a joint, rad, of a servo that turns within `travel`, rad from raw 0.
+
+    q = direction * (theta - reference), theta in `travel` (thesis of M. Amarante Araujo, 2017, JointID).
+    """
+    ends = (direction * (travel.lower - reference), direction * (travel.upper - reference))
     return Interval(min(ends), max(ends))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from dxlrun.compile.problems import Problems
-from dxlrun.compile.reach import degrees
+from dxlrun.compile.reach import degrees, servo_travel
 from dxlrun.control_table import ControlTable
 from dxlrun.description import Description
 
@@ -17,7 +17,7 @@ def check_twins(description: Description, tables: dict[str, ControlTable], probl
     """Warn of each pair of joints that is no mirror image of itself.
 
     Mirrored, the right servo counts from the other end and turns the other way:
-    reference_right = travel - reference_left, direction_right = -direction_left.
+    reference_right = lowest + highest angle of the servo - reference_left, direction_right = -direction_left.
     """
     joints = description.robot.joints
     for name, left in joints.items():
@@ -25,7 +25,8 @@ def check_twins(description: Description, tables: dict[str, ControlTable], probl
         right = joints.get(twin)
         if twin == name or right is None or left.model != right.model or name not in tables:
             continue
-        expected = _travel(tables[name]) - left.reference
+        travel = servo_travel(tables[name])
+        expected = travel.lower + travel.upper - left.reference
         if abs(expected - right.reference) > _SAME:
             problems.warning(
                 description.marks.value("joints", twin, "reference"),
@@ -39,7 +40,3 @@ def check_twins(description: Description, tables: dict[str, ControlTable], probl
                 f"{twin} is no mirror image of {name}: both have direction {left.direction:+d}",
                 f"write direction: {-left.direction:+d}, or ignore this if the body is not symmetric there",
             )
-
-
-def _travel(table: ControlTable) -> float:
-    return table.max_tick * table.rad_per_tick

@@ -45,7 +45,7 @@ class ControlTable:
     min_tick: int
     """Lowest value of goal and present position; below 0 where the middle of the travel is 0."""
     max_tick: int
-    """Highest value of goal and present position; the reach is `max_tick * rad_per_tick`."""
+    """Highest value of goal and present position."""
     rad_s_per_tick: float
     max_speed_tick: int
     """Highest value of a goal speed without its direction."""
