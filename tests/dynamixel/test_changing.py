@@ -3,6 +3,7 @@
 import pytest
 
 from dxlrun import servo_backup
+from dxlrun.cli.servo_verbs import VERBS, Asked
 from dxlrun.clock import VirtualClock
 from dxlrun.control_table import all_tables
 from dxlrun.dynamixel import changing
@@ -380,6 +381,22 @@ def test_a_goal_that_is_written_clears_a_tripped_bus_watchdog(torque):
     assert done[-1].endswith("and is 1500")
     assert (STOOD in done) == bool(torque)
     assert (rig.servo.registers["bus_watchdog"], rig.servo.registers["goal_position"]) == (0, 1500)
+
+
+@pytest.mark.parametrize("torque", [0, 1])
+def test_a_goal_that_is_set_already_clears_a_tripped_bus_watchdog_too(torque):
+    rig, already = Rig(), "Goal Position (116) is 3000 already"
+    trip(rig, torque)
+    asked = Asked(("goal_position", "3000"), None, yes=False)
+    VERBS["set"].do(rig.one, asked)
+    moved = [STOOD, "Goal Position (116) was 1304 and is 3000"]
+    assert asked.done == [already, TRIPPED, *(moved if torque else [])]
+    assert (rig.servo.registers["bus_watchdog"], rig.servo.registers["goal_position"]) == (0, 3000)
+    rig.line.clock.wait_until(rig.line.clock.now_ns() + 6_000_000_000)
+    assert rig.servo.position == pytest.approx(3000 * rig.one.table.rad_per_tick if torque else 2.0, abs=0.01)
+    again = Asked(("goal_position", "3000"), None, yes=False)
+    VERBS["set"].do(rig.one, again)
+    assert again.done == [already]
 
 
 def test_a_bus_watchdog_that_is_armed_stays_where_only_a_goal_is_written():

@@ -98,6 +98,8 @@ def _set(one: OneServo, asked: Asked) -> None:
     (found,) = one.differences([wanted])
     if not found.differs:
         asked.done.append(f"{item} is {wanted.value} already")
+        if not wanted.eeprom:  # a goal that is there already is not pursued while its Bus Watchdog is tripped
+            asked.done += one.write([wanted])
         return
     assert found.found is not None  # noqa: S101  `differs` says so
     change = f"{item} is {shown(one.table.items[name], found.found)} and becomes {wanted.value}"
