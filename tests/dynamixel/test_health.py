@@ -488,6 +488,75 @@ def test_servos_that_are_left_holding_are_not_stopped_by_the_watchdog(start, mak
     assert [servo.registers["bus_watchdog"] for servo in rig.buses[0].servos] == [0] * 4
 
 
+def _wait(rig, duration_ns):
+    rig.clock.wait_until(rig.clock.now_ns() + duration_ns)
+    rig.torque()
+
+
+def test_servos_that_their_watchdogs_have_stopped_stay_stopped_when_they_are_left_holding(start, make_x):
+    rig = start(make_x(watchdog=10))
+    servos = rig.buses[0].servos
+    _stopped_on_a_long_way(rig, servos[1])
+    _wait(rig, 300_000_000)
+    stood = [servo.position for servo in servos]
+    rig.hardware.release()
+    _wait(rig, 2_000_000_000)
+    assert [servo.position for servo in servos] == pytest.approx(stood, abs=0.002)
+    assert [servo.registers["bus_watchdog"] for servo in servos] == [0xFF] * 4
+    told = [text for _, text in rig.events.of(EventCode.WATCHDOG)]
+    assert len(told) == 4
+    assert "arm_12_joint (ID 12 on bus arm) was stopped by its Bus Watchdog (98)" in told[1]
+
+
+def test_one_stopped_servo_among_others_that_are_left_holding_stays_stopped(start, make_x):
+    rig = start(make_x(watchdog=10))
+    servos = rig.buses[0].servos
+    _stopped_on_a_long_way(rig, servos[1])
+    for name, value in (("profile_velocity", 0), ("profile_acceleration", 0), ("bus_watchdog", -1)):
+        servos[1].poke(name, value)
+    _wait(rig, 100_000_000)
+    stood = servos[1].position
+    rig.hardware.release()
+    _wait(rig, 1_000_000_000)
+    assert [servo.registers["bus_watchdog"] for servo in servos] == [0, 0xFF, 0, 0]
+    assert servos[1].position == pytest.approx(stood, abs=0.002)
+
+
+def test_nobody_is_stopped_because_others_are_silent_when_all_are_left_holding(start, make_x):
+    rig = start(make_x(range(11, 23), watchdog=10))
+    cycles(rig, 5)
+    servos = rig.buses[0].servos
+    servos[3].silence()
+    rig.hardware.release()
+    _wait(rig, 1_000_000_000)
+    armed = [servo.registers["bus_watchdog"] for servo in servos]
+    assert armed == [0, 0, 0, 0xFF] + [0] * 8
+    (told,) = [text for _, text in rig.events.of(EventCode.WATCHDOG)]
+    assert "arm_14_joint (ID 14 on bus arm) did not answer when its Bus Watchdog (98) was read" in told
+
+
+def test_nobody_is_stopped_because_disarming_all_takes_longer_than_a_watchdog(start, make_plan):
+    rig = start(_with(make_plan(range(1, 25), protocol=2.0, model="XM430-W350"), False, watchdog=2))
+    rig.period_ns = 25_000_000
+    cycles(rig, 5)
+    assert [servo.registers["bus_watchdog"] for servo in rig.buses[0].servos] == [2] * 24
+    told = rig.events.of(EventCode.WATCHDOG)
+    rig.hardware.release()
+    _wait(rig, 1_000_000_000)
+    assert [servo.registers["bus_watchdog"] for servo in rig.buses[0].servos] == [0] * 24
+    assert rig.events.of(EventCode.WATCHDOG) == told
+
+
+def test_a_servo_whose_torque_could_not_be_switched_off_keeps_its_watchdog(start, make_x):
+    rig = start(make_x(watchdog=10))
+    servos = rig.buses[0].servos
+    _stopped_on_a_long_way(rig, servos[1])
+    servos[1].registers.watch(("torque_enable",), lambda: servos[1].poke("torque_enable", 1))
+    assert len(rig.hardware.stop()) == 1
+    _wait(rig, 1_000_000_000)
+    assert [servo.registers["bus_watchdog"] for servo in servos] == [0, 0xFF, 0, 0]
+
+
 def test_a_loop_that_was_silent_for_too_long_revives_the_servos_that_stopped(start, make_x):
     rig = start(make_x(watchdog=10))
     cycles(rig, 5)

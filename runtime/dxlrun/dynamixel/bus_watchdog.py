@@ -7,7 +7,7 @@ stopped a servo it reads -1, and the servo refuses goals until 0 is written (e-M
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from dxlrun.control_table import ControlItem, control_table
 from dxlrun.dynamixel.bus_plan import BusPlan, ServoPlan
@@ -48,9 +48,9 @@ def disarm(plan: BusPlan, servo: ServoPlan) -> Program[str]:
         return ""
     line = plan_line(plan)
     reply = yield from persist(line.read(servo.servo_id, item.address, item.size))
-    if reply.answered and reply.parameters[0] == 0:
+    if reply.answered and reply.word(item.size) == 0:
         return ""
-    if reply.answered and tripped(item, reply.parameters[0]):
+    if reply.answered and tripped(item, reply.word(item.size)):
         speed = control_table(servo.model, plan.protocol).items["profile_velocity"]
         slow = max(1, round(RETURN_SPEED / speed.scale))
         yield from persist(line.write(servo.servo_id, speed.address, slow.to_bytes(speed.size, "little")))
@@ -69,7 +69,7 @@ def arm_all(plan: BusPlan, fed: Callable[[], None]) -> Program[list[str]]:
     `fed` is called whenever that goes out.
     """
     found = []
-    line, packets = plan_line(plan), _to_all(plan, plan.watchdog_ticks)
+    line, packets = plan_line(plan), _to_all(plan, plan.servos, plan.watchdog_ticks)
     for servo in plan.servos:
         if not plan.watchdog_ticks or (item := _item(plan, servo)) is None:
             continue
@@ -77,7 +77,7 @@ def arm_all(plan: BusPlan, fed: Callable[[], None]) -> Program[list[str]]:
         for packet in packets:
             yield line.unanswered(packet)
         back = yield line.read(servo.servo_id, item.address, item.size)
-        if not (back.answered and back.parameters[0] == plan.watchdog_ticks):
+        if not (back.answered and back.word(item.size) == plan.watchdog_ticks):
             found.append((yield from revive(plan, servo)))
     return [problem for problem in found if problem]
 
@@ -95,22 +95,50 @@ def disarm_all(plan: BusPlan) -> Program[list[str]]:
     return [problem for problem in found if problem]
 
 
-def disarming(plan: BusPlan) -> list[bytes]:
-    """Return the packets that clear all servos of a bus at once; nobody answers."""
-    return _to_all(plan, 0)
+def release_all(plan: BusPlan) -> Program[list[str]]:
+    """Disarm the servos of a bus that go on holding; return which were not disarmed, and why.
+
+    One that its watchdog has stopped stays stopped: cleared, it would go on to its old goal [i], at full
+    speed as its profile was reset, with no loop that could stop it. One that does not answer stops by itself.
+    While all answer, a read of all that are left keeps them from tripping before their turn.
+    """
+    line, problems, all_answer = plan_line(plan), [], True
+    left = [(servo, item) for servo in plan.servos if plan.watchdog_ticks and (item := _item(plan, servo))]
+    while left:
+        if all_answer:
+            wanted = [(servo.servo_id, item.address, item.size) for servo, item in left]
+            all_answer = (yield line.read_many(wanted)).answered
+        servo, item = left.pop(0)
+        reply = yield from persist(line.read(servo.servo_id, item.address, item.size))
+        if not reply.answered:
+            problem = f"did not answer when its {called(item)} was read: it may stop by itself"
+            problems.append(f"{who(plan, servo)} {problem}")
+        elif tripped(item, reply.word(item.size)):
+            problems.append(
+                f"{who(plan, servo)} was stopped by its {called(item)} and stays where it stopped"
+            )
+        elif problem := (yield from _write(plan, servo, item, 0)):
+            problems.append(problem)
+    return problems
 
 
-def _to_all(plan: BusPlan, ticks: int) -> list[bytes]:
-    """Return the packets that write the same to all servos; none where the plan wants no watchdog."""
+def disarming(plan: BusPlan, servos: Sequence[ServoPlan]) -> list[bytes]:
+    """Return the packets that clear some servos of a bus at once; no servo answers."""
+    return _to_all(plan, servos, 0)
+
+
+def _to_all(plan: BusPlan, servos: Sequence[ServoPlan], ticks: int) -> list[bytes]:
+    """Return the packets that write the same to these servos; none where the plan wants no watchdog."""
     if not plan.watchdog_ticks:
         return []
-    places: dict[int, list[int]] = {}
-    for servo in plan.servos:
+    places: dict[tuple[int, int], list[int]] = {}
+    for servo in servos:
         if item := _item(plan, servo):
-            places.setdefault(item.address, []).append(servo.servo_id)
+            places.setdefault((item.address, item.size), []).append(servo.servo_id)
     records = dialect_of(plan.protocol).sync_write_records
     return [
-        records(address, 1, b"".join(bytes((each, ticks)) for each in ids)) for address, ids in places.items()
+        records(address, size, b"".join(bytes((each,)) + ticks.to_bytes(size, "little") for each in ids))
+        for (address, size), ids in places.items()
     ]
 
 
@@ -125,10 +153,10 @@ def _item(plan: BusPlan, servo: ServoPlan) -> ControlItem | None:
 
 def _write(plan: BusPlan, servo: ServoPlan, item: ControlItem, ticks: int) -> Program[str]:
     line = plan_line(plan)
-    yield from persist(line.write(servo.servo_id, item.address, bytes((ticks,))))
+    yield from persist(line.write(servo.servo_id, item.address, ticks.to_bytes(item.size, "little")))
     back = yield from persist(line.read(servo.servo_id, item.address, item.size))
     if not back.answered:
         return f"{who(plan, servo)} did not answer when its {called(item)} was read back"
-    if back.parameters[0] != ticks:
-        return f"{who(plan, servo)} was given {called(item)} = {ticks}, but has {back.parameters[0]}"
+    if (found := back.word(item.size)) != ticks:
+        return f"{who(plan, servo)} was given {called(item)} = {ticks}, but has {found}"
     return ""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Sequence, Set
 from contextlib import suppress
 
 import numpy as np
@@ -332,8 +332,9 @@ class DynamixelHardware:
 
     def stop(self) -> tuple[str, ...]:
         """Switch torque off on every servo, and read it back; return a sentence per failure."""
-        failures = tuple(f"{one}" for one in self._limp() if not one.confirmed)
-        self._disarm()
+        outcomes = self._limp()
+        failures = tuple(f"{one}" for one in outcomes if not one.confirmed)
+        self._disarm({(one.bus, one.servo_id) for one in outcomes if one.confirmed})
         for sentence in failures:
             self._events.emit(EventCode.SHUTDOWN_FAILED, Severity.ERROR, "hardware", sentence)
         if not failures:
@@ -352,19 +353,20 @@ class DynamixelHardware:
             servos.let_go(rows)
 
     def release(self) -> None:
-        """Leave the robot with its torque on: nobody sends any more, and nothing may stop it for that."""
-        self._disarm()
-        run(
-            [bus_watchdog.disarm_all(plan) for plan in self._plans],
-            self._buses,
-            self._ports,
-            self._clock,
-            self._beat,
-        )
+        """Leave the robot with its torque on: nothing is sent any more, and no servo may stop for that.
 
-    def _disarm(self) -> None:
+        A servo that its Bus Watchdog has stopped already stays stopped.
+        """
+        programs = [bus_watchdog.release_all(plan) for plan in self._plans]
+        for problems in run(programs, self._buses, self._ports, self._clock, self._beat):
+            for problem in problems or ():
+                self._events.emit(EventCode.WATCHDOG, Severity.WARNING, "hardware", problem)
+
+    def _disarm(self, limp: Set[tuple[str, int]]) -> None:
+        """Disarm the Bus Watchdogs of servos without torque, by (bus, ID); the others stop by themselves."""
         for plan, bus in zip(self._plans, self._buses, strict=True):
-            for packet in bus_watchdog.disarming(plan):
+            servos = [servo for servo in plan.servos if (plan.name, servo.servo_id) in limp]
+            for packet in bus_watchdog.disarming(plan, servos):
                 with suppress(PortError):  # a servo that stops without a host stays as it is
                     bus.send(packet)
 

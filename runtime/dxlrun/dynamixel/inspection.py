@@ -66,7 +66,7 @@ def called(item: ControlItem) -> str:
 
 
 def shown(item: ControlItem, raw: int) -> str:
-    """Return a value of an item as messages show it: that of a Bus Watchdog that ran out is `255 (tripped)`.
+    """Return a value of an item as messages show it: that of a tripped Bus Watchdog is `255 (tripped)`.
 
     e-Manual XM430-W350, Bus Watchdog (98): -1 is "Bus Watchdog Error Status".
     """
@@ -75,7 +75,7 @@ def shown(item: ControlItem, raw: int) -> str:
 
 def tripped(item: ControlItem, raw: int) -> bool:
     """Return whether a value is that of a Bus Watchdog that ran out and stopped its servo."""
-    return item.name == "bus_watchdog" and raw in (-1, 0xFF)
+    return item.name == "bus_watchdog" and raw in (-1, (1 << 8 * item.size) - 1)
 
 
 class Inspector:
