@@ -18,7 +18,7 @@ from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
-FOLDER = Path("runtime/dxlrun/dynamixel")
+FOLDER = Path("runtime/dxlrun/dynamixel/exchange")
 FLAGS = ("-std=c11", "-O2", "-fPIC", "-shared", "-ffp-contract=off", "-Wall", "-Wextra", "-Wconversion")
 """No contraction into fused operations: the parser computes the same bits."""
 

@@ -10,7 +10,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from dxlrun.control.controller import (
+    from dxlrun.control.controllers.controller import (
         CONTRACT_VERSION,
         CommandModel,
         Context,
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
         JointLimits,
         ParametersModel,
     )
-    from dxlrun.control.hookspecs import hookimpl
+    from dxlrun.control.controllers.hookspecs import hookimpl
     from dxlrun.description.units import Angle, AngularAcceleration, AngularVelocity, Duration
     from dxlrun.errors import (
         ControllerFault,
@@ -67,7 +67,7 @@ __all__ = [
 ]
 
 _ROOMS = {
-    "dxlrun.control.controller": (
+    "dxlrun.control.controllers.controller": (
         "CONTRACT_VERSION",
         "CommandModel",
         "Context",
@@ -76,7 +76,7 @@ _ROOMS = {
         "JointLimits",
         "ParametersModel",
     ),
-    "dxlrun.control.hookspecs": ("hookimpl",),
+    "dxlrun.control.controllers.hookspecs": ("hookimpl",),
     "dxlrun.description.units": ("Angle", "AngularAcceleration", "AngularVelocity", "Duration"),
     "dxlrun.errors": (
         "ControllerFault",

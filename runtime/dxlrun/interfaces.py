@@ -16,6 +16,12 @@ CommandName = Literal["position", "velocity", "effort", "pwm"]
 
 COMMAND_INTERFACES: tuple[CommandName, ...] = ("position", "velocity", "effort", "pwm")
 
+LOST_CYCLES = 3
+"""A servo that missed so many replies in a row is lost, until it answers again ..."""
+LOST_AGE_NS = 50_000_000
+"""... and whose last reply is so old: at 50 Hz it is by then, but three cycles at 1 kHz are less than
+what hosts, virtual machines and USB adapters stand still for [i]."""
+
 Floats = NDArray[np.float64]
 """Shape (joints,): rad, rad/s, Nm, A, or the fraction of maximum where the servo measures no torque."""
 

@@ -15,8 +15,8 @@ from pathlib import Path
 from dxlrun.compile import compile_robot
 from dxlrun.compile.plan import Plan
 from dxlrun.description import read_motion, read_robot
-from dxlrun.recording.reader import Log, read_log
-from dxlrun.virtual_run import VirtualRobot
+from dxlrun.log.reader import Log, read_log
+from dxlrun.run.virtual_run import VirtualRobot
 
 __all__ = ["Log", "VirtualRobot", "plan_of", "read_log", "simulated_robot"]
 

@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 
 from dxlrun.clock import VirtualClock
-from dxlrun.cycle import CycleLayout, CycleRecord
-from dxlrun.events import EventCode, EventRing, Severity
-from dxlrun.packets import PacketBatch, PacketKind
-from dxlrun.recording.header import LoggedController, LogHeader
-from dxlrun.recording.log_writer import LogWriter
-from dxlrun.ring import Handover
+from dxlrun.log.header import LoggedController, LogHeader
+from dxlrun.log.log_writer import LogWriter
+from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
+from dxlrun.run.channels.events import EventCode, EventRing, Severity
+from dxlrun.run.channels.packets import PacketBatch, PacketKind
+from dxlrun.run.channels.ring import Handover
 
 PERIOD_NS = 20_000_000
 JOINTS = ("left_elbow_joint", "head_yaw_joint")

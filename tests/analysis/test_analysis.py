@@ -11,12 +11,12 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from dxlrun.analysis.output.terminal import render
 from dxlrun.analysis.report import Report, analyze_log, to_json
-from dxlrun.analysis.terminal import render
 from dxlrun.analysis.verdict import Verdict, microseconds
 from dxlrun.errors import LogError
-from dxlrun.events import EventCode, Severity
-from dxlrun.packets import PacketKind
+from dxlrun.run.channels.events import EventCode, Severity
+from dxlrun.run.channels.packets import PacketKind
 
 Make = Callable[..., Any]
 ASK_5 = bytes.fromhex("ffff0504022406ca")

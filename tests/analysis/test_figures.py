@@ -24,8 +24,8 @@ from dxlrun.analysis.latency import Punctuality
 from dxlrun.analysis.report import analyze
 from dxlrun.analysis.steering import Pause
 from dxlrun.analysis.tracking import reachable
-from dxlrun.events import EventCode, Severity
-from dxlrun.recording.reader import Log, read_log
+from dxlrun.log.reader import Log, read_log
+from dxlrun.run.channels.events import EventCode, Severity
 
 Make = Callable[..., Any]
 Data = NDArray[np.float64]

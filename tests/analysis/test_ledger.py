@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.analysis.ledger_report import LedgerReport, compare, to_json
+from dxlrun.analysis.ledger.comparison import LedgerReport, compare, to_json
 from dxlrun.errors import InputError
-from dxlrun.packets import PacketKind
-from dxlrun.recording.reader import read_log
+from dxlrun.log.reader import read_log
+from dxlrun.run.channels.packets import PacketKind
 from dxlrun.simulation import LedgerEntry
 
 US = 1000

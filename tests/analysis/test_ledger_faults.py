@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from dxlrun.analysis.ledger_faults import answered, faults_in, uncaused
-from dxlrun.events import Event, EventCode, Severity
+from dxlrun.analysis.ledger.faults import answered, faults_in, uncaused
+from dxlrun.run.channels.events import Event, EventCode, Severity
 from dxlrun.simulation import LedgerEntry
 
 JOINTS = {("main", 3): "elbow", ("main", 5): "wrist", ("legs", 3): "knee"}

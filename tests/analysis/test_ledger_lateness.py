@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.analysis.ledger_lateness import lateness
-from dxlrun.analysis.ledger_report import compare
-from dxlrun.analysis.ledger_tables import render_comparison
-from dxlrun.packets import PacketKind
-from dxlrun.recording.reader import read_log
+from dxlrun.analysis.ledger.comparison import compare
+from dxlrun.analysis.ledger.lateness import lateness
+from dxlrun.analysis.ledger.ledger_tables import render_comparison
+from dxlrun.log.reader import read_log
+from dxlrun.run.channels.packets import PacketKind
 from dxlrun.simulation import LedgerEntry
 
 BEGIN_NS = 10**9

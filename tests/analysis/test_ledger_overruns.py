@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 
-from dxlrun.analysis.ledger_overruns import overrun_causes
-from dxlrun.analysis.ledger_report import compare
-from dxlrun.analysis.ledger_tables import render_comparison
-from dxlrun.analysis.ledger_waits import transactions
-from dxlrun.packets import PacketKind
-from dxlrun.recording.reader import read_log
+from dxlrun.analysis.ledger.comparison import compare
+from dxlrun.analysis.ledger.ledger_tables import render_comparison
+from dxlrun.analysis.ledger.overruns import overrun_causes
+from dxlrun.analysis.ledger.waits import transactions
+from dxlrun.log.reader import read_log
+from dxlrun.run.channels.packets import PacketKind
 from dxlrun.simulation import LedgerEntry
 
 BEGIN_NS = 10**9

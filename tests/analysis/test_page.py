@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.analysis.page import page
+from dxlrun.analysis.output.document import page
+from dxlrun.analysis.output.tables import tables
 from dxlrun.analysis.report import analyze, to_json
-from dxlrun.analysis.tables import tables
-from dxlrun.events import EventCode, Severity
-from dxlrun.packets import PacketKind
-from dxlrun.recording.reader import read_log
+from dxlrun.log.reader import read_log
+from dxlrun.run.channels.events import EventCode, Severity
+from dxlrun.run.channels.packets import PacketKind
 
 Make = Callable[..., Any]
 _VOID = {"meta", "br", "img", "input", "link", "hr"}
@@ -223,8 +223,9 @@ def test_a_single_late_wake_up_among_many_is_drawn(write: Make, cycle: Make) -> 
 
 def test_no_display_is_needed_and_nothing_is_warned_of(run: Path) -> None:
     code = (
-        "import sys; from dxlrun.analysis.page import page; from dxlrun.analysis.report import analyze;"
-        "from dxlrun.recording.reader import read_log; log = read_log(sys.argv[1]);"
+        "import sys; from dxlrun.analysis.output.document import page;"
+        "from dxlrun.analysis.report import analyze;"
+        "from dxlrun.log.reader import read_log; log = read_log(sys.argv[1]);"
         "print(len(page(log, analyze(log)))); assert 'matplotlib.pyplot' not in sys.modules"
     )
     environment = {

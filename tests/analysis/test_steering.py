@@ -13,12 +13,12 @@ import pytest
 from rich.console import Console
 
 from dxlrun.analysis.latency import cycle_periods_ns
-from dxlrun.analysis.page import page
+from dxlrun.analysis.output.document import page
+from dxlrun.analysis.output.tables import steering_table
+from dxlrun.analysis.output.terminal import render
 from dxlrun.analysis.report import Report, analyze
-from dxlrun.analysis.tables import steering_table
-from dxlrun.analysis.terminal import render
-from dxlrun.inbox import Command, QueueInbox
-from dxlrun.recording.reader import Log, read_log
+from dxlrun.log.reader import Log, read_log
+from dxlrun.run.channels.inbox import Command, QueueInbox
 from dxlrun.testing import VirtualRobot, simulated_robot
 
 MS = 1_000_000

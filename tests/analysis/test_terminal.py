@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from dxlrun.analysis.output.terminal import render
 from dxlrun.analysis.report import Report, analyze_log
-from dxlrun.analysis.terminal import render
-from dxlrun.events import EventCode, Severity
-from dxlrun.packets import PacketKind
+from dxlrun.run.channels.events import EventCode, Severity
+from dxlrun.run.channels.packets import PacketKind
 
 Make = Callable[..., Any]
 

@@ -14,13 +14,13 @@ import numpy.typing as npt
 import pytest
 
 from dxlrun.analysis.figures.joints import joint_drawings
+from dxlrun.analysis.output.tables import joints_table
 from dxlrun.analysis.report import analyze, to_json
-from dxlrun.analysis.tables import joints_table
 from dxlrun.analysis.tracking import Joint, reachable, tracking
-from dxlrun.cycle import CycleLayout, CycleRecord
-from dxlrun.recording.header import LogHeader
-from dxlrun.recording.log_writer import LogWriter
-from dxlrun.recording.reader import Log, read_log
+from dxlrun.log.header import LogHeader
+from dxlrun.log.log_writer import LogWriter
+from dxlrun.log.reader import Log, read_log
+from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
 
 DT = 0.02
 TICK = math.radians(300) / 1023

@@ -13,16 +13,16 @@ import pytest
 from dxlrun.analysis import bus, latency, steering
 from dxlrun.analysis.bus import BusTraffic
 from dxlrun.analysis.latency import Latency, Periods
-from dxlrun.analysis.page import page
+from dxlrun.analysis.output.document import page
 from dxlrun.analysis.report import analyze, analyze_log, to_json
 from dxlrun.analysis.tally import Figures, RealTime, Tally, figures_of
 from dxlrun.analysis.verdict import Verdict, judge
-from dxlrun.events import EventCode, Severity
-from dxlrun.inbox import Command
-from dxlrun.packets import PacketKind
-from dxlrun.recording import log_writer
-from dxlrun.recording.reader import Log, read_log, scan_log
-from dxlrun.simulation.faults import FaultScript, parse_fault
+from dxlrun.log import log_writer
+from dxlrun.log.reader import Log, read_log, scan_log
+from dxlrun.run.channels.events import EventCode, Severity
+from dxlrun.run.channels.inbox import Command
+from dxlrun.run.channels.packets import PacketKind
+from dxlrun.simulation.faults.planned import FaultScript, parse_fault
 from dxlrun.testing import simulated_robot
 
 Make = Callable[..., Any]

@@ -22,15 +22,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dxlrun.clock import VirtualClock
-from dxlrun.control_table import control_table
-from dxlrun.dynamixel import kernel, protocol1, protocol2
-from dxlrun.dynamixel.bus_plan import BusPlan
+from dxlrun.dynamixel.control_table import control_table
+from dxlrun.dynamixel.exchange import kernel
 from dxlrun.dynamixel.hardware import DynamixelHardware
-from dxlrun.dynamixel.plan import Wiring, bus_plan
+from dxlrun.dynamixel.plan.bus_plan import BusPlan
+from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
+from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.errors import PortError
 from dxlrun.interfaces import Commands, States
-from dxlrun.packets import PacketBatch, PacketKind, decode_packets
-from dxlrun.ring import Handover
+from dxlrun.run.channels.packets import PacketBatch, PacketKind, decode_packets
+from dxlrun.run.channels.ring import Handover
 
 IDS = (1, 7, 3, 20)
 ROBOTS = {

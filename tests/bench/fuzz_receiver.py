@@ -20,9 +20,9 @@ from dataclasses import dataclass
 
 from fastcrc import crc16
 
-from dxlrun.dynamixel import protocol1, protocol2
-from dxlrun.dynamixel.dialect import Dialect
-from dxlrun.dynamixel.receiver import Receiver
+from dxlrun.dynamixel.wire import protocol1, protocol2
+from dxlrun.dynamixel.wire.dialect import Dialect
+from dxlrun.dynamixel.wire.receiver import Receiver
 
 BATCH = 100
 """Packets between two flushes."""

@@ -22,7 +22,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from dxlrun.control_table import ControlTable, all_tables
+from dxlrun.dynamixel.control_table import ControlTable, all_tables
 from dxlrun.simulation import BusConfig, Ledger, ServoConfig, SimulatedBus
 
 PER_SERVO = 250

@@ -36,7 +36,7 @@ def loop_of(directory: Path) -> int:
         for path in Path("/proc").glob("[0-9]*"):
             try:
                 ours = os.readlink(path / "cwd") == str(directory)  # others may run robots of theirs
-                if ours and b"dxlrun.loop_process" in (path / "cmdline").read_bytes():
+                if ours and b"dxlrun.run.loop_process" in (path / "cmdline").read_bytes():
                     return int(path.name)
             except OSError:
                 continue

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import time
 
-from dxlrun.control_table import control_table
+from dxlrun.dynamixel.control_table import control_table
 from dxlrun.simulation import Load, Mechanics, ServoConfig, SimulatedServo
-from dxlrun.simulation.mechanics import STEP_NS
+from dxlrun.simulation.motion.mechanics import STEP_NS
 
 STEPS = 2000
 

@@ -25,7 +25,7 @@ from dataclasses import dataclass
 
 from dxlrun.simulation import BusConfig, ServoConfig
 from dxlrun.simulation.process import encode_config
-from dxlrun.simulation.protocol2 import crc16
+from dxlrun.simulation.wire.protocol2 import crc16
 
 RATES = (57_600, 1_000_000, 2_000_000, 4_000_000)
 RETURN_DELAY_NS = 500_000

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.analysis.ledger_waits import Transaction
+from dxlrun.analysis.ledger.waits import Transaction
 from dxlrun.bench.bus import Wish, bench_bus, chosen_hosts, to_json
 from dxlrun.bench.case import Case, Registers
 from dxlrun.bench.figures import host_figures, wire_figures
@@ -23,7 +23,7 @@ from dxlrun.bench.hosts import HOSTS, HostKind
 from dxlrun.bench.responder import Terminal
 from dxlrun.bench.rounds import Measured, measure
 from dxlrun.bench.wire import judge
-from dxlrun.dynamixel import protocol1
+from dxlrun.dynamixel.wire import protocol1
 
 SECONDS = 0.2
 PATIENCE_S = 60.0

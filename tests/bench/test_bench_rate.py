@@ -13,7 +13,7 @@ from dxlrun.bench.rate import Run, bench_rate, to_json
 from dxlrun.compile.plan import AdapterPlan, Plan
 from dxlrun.description import Description, read_robot
 from dxlrun.errors import ProcessFault
-from dxlrun.virtual_run import VirtualRobot
+from dxlrun.run.virtual_run import VirtualRobot
 
 
 @pytest.fixture

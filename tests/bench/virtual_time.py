@@ -17,9 +17,9 @@ import tempfile
 import time
 from pathlib import Path
 
+from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.simulation import Ledger
 from dxlrun.testing import plan_of
-from dxlrun.virtual_run import VirtualRobot
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 

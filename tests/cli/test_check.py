@@ -101,7 +101,7 @@ def test_a_run_refuses_the_same_file_before_any_port_is_opened(dxlrun, tmp_path,
     def never(*_: object):
         raise AssertionError("a wrong file must not be run")
 
-    monkeypatch.setattr("dxlrun.supervisor.run_robot", never)
+    monkeypatch.setattr("dxlrun.run.supervisor.run_robot", never)
 
     said = dxlrun(file)
 

@@ -13,14 +13,14 @@ from typing import Any
 
 import pytest
 
-from dxlrun.cli import sim
+from dxlrun.cli.simulated import sim
 from dxlrun.compile import compile_files
-from dxlrun.control_table import control_table
-from dxlrun.run_summary import RunOptions, RunSummary
+from dxlrun.dynamixel.control_table import control_table
+from dxlrun.run.run_summary import RunOptions, RunSummary
+from dxlrun.run.simulation_front import Look, Served
 from dxlrun.simulation import BusConfig, ServoConfig
-from dxlrun.simulation.fault_text import parse_fault
+from dxlrun.simulation.faults.fault_text import parse_fault
 from dxlrun.simulation.process import SimulationConfig
-from dxlrun.simulation_front import Look, Served
 
 ROOT = Path(__file__).parents[2]
 PAGES = {path.name: path.read_text() for path in [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md"))]}
@@ -122,7 +122,7 @@ def test_bus_md_the_simulation_and_the_robot_meet_at_the_link(
         ports.extend(one.port for one in plan.buses)
         return RunSummary(0, "ended", 1, 0, 0.1, ())
 
-    monkeypatch.setattr("dxlrun.supervisor.run_robot", run_robot)
+    monkeypatch.setattr("dxlrun.run.supervisor.run_robot", run_robot)
     assert dxlrun(*shlex.split(run)[1:]).code == 0
     assert ports == [shlex.split(simulate)[-1]]
     (fault,) = re.findall(r"then type: (.+)$", PAGES["bus.md"], re.MULTILINE)

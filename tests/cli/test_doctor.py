@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from dxlrun.control.rights import UNLIMITED
-from dxlrun.doctor import Finding, Machine, diagnose
-from dxlrun.doctor.machine import may_schedule
+from dxlrun.control.realtime.rights import UNLIMITED
+from dxlrun.run.doctor import Finding, Machine, diagnose
+from dxlrun.run.doctor.machine import may_schedule
 
 GOOD = {
     "proc/sys/kernel/osrelease": "6.12.1-rt5",

@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 from rich.table import Table
 
-from dxlrun.cli.narrow import fitting
+from dxlrun.cli.output.narrow import fitting
 
 
 def servos() -> Table:

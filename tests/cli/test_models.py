@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 import dxlrun as dxlrun_package
-from dxlrun.cli.models_tables import runs, unit_of
-from dxlrun.control.hookspecs import HookSpecs
-from dxlrun.control_table import all_tables, control_table
+from dxlrun.cli.output.models_tables import runs, unit_of
+from dxlrun.control.controllers.hookspecs import HookSpecs
+from dxlrun.dynamixel.control_table import all_tables, control_table
 
 
 def test_without_a_name_all_models_are_listed(dxlrun):
@@ -182,6 +182,6 @@ def test_the_page_shows_hooks_that_there_are():
 
 
 def test_the_page_names_files_that_there_are():
-    folder = Path(dxlrun_package.__file__).parent / "control_tables"
+    folder = Path(dxlrun_package.__file__).parent / "dynamixel" / "control_table" / "tables"
     for name in re.findall(r"`(\w[\w-]*\.toml)`", PAGE):
         assert list(folder.rglob(name)), name

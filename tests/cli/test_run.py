@@ -11,10 +11,10 @@ from rich.console import Console
 
 from dxlrun.compile.plan import Plan
 from dxlrun.errors import PortError
-from dxlrun.recording.reader import read_log
-from dxlrun.run_summary import Progress, RunOptions, RunSummary
+from dxlrun.log.reader import read_log
+from dxlrun.run.run_summary import Progress, RunOptions, RunSummary
+from dxlrun.run.virtual_run import VirtualRobot, run_virtual
 from dxlrun.testing import plan_of, simulated_robot
-from dxlrun.virtual_run import VirtualRobot, run_virtual
 
 GOOD = RunSummary(0, "ended", 100, 2, 2.03, ())
 
@@ -36,7 +36,7 @@ class Runs:
 @pytest.fixture
 def runs(monkeypatch: pytest.MonkeyPatch) -> Runs:
     runs = Runs()
-    monkeypatch.setattr("dxlrun.supervisor.run_robot", runs.run)
+    monkeypatch.setattr("dxlrun.run.supervisor.run_robot", runs.run)
     return runs
 
 
@@ -391,7 +391,7 @@ def test_progress_counts_skipped_periods(
     torso: Path, monkeypatch: pytest.MonkeyPatch, virtual: bool, shown: str
 ):
     now = iter((100.0, 100.05, 102.0))
-    monkeypatch.setattr("dxlrun.run_summary.time.monotonic", lambda: next(now))
+    monkeypatch.setattr("dxlrun.run.run_summary.time.monotonic", lambda: next(now))
     line = Line()
     progress = Progress(plan_of(torso, duration_s=9.0), line, virtual=virtual)
     progress.ran(1, 0)
@@ -405,7 +405,7 @@ def test_without_a_terminal_a_line_tells_every_five_seconds_that_the_run_goes_on
 ):
     """Timed by a clock of the test: from 100 s on, one cycle every 20 ms."""
     now = iter([100.0, *(100 + 0.02 * cycle for cycle in range(1, 601))])
-    monkeypatch.setattr("dxlrun.run_summary.time.monotonic", lambda: next(now))
+    monkeypatch.setattr("dxlrun.run.run_summary.time.monotonic", lambda: next(now))
     line = Line(terminal=False)
     progress = Progress(plan_of(torso, duration_s=12.0), line)
     for cycle in range(1, 601):
@@ -419,7 +419,7 @@ def test_without_a_terminal_a_line_tells_every_five_seconds_that_the_run_goes_on
 
 
 def test_a_run_on_virtual_time_shows_its_progress(torso: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("dxlrun.run_summary._REFRESH_S", 0.0)
+    monkeypatch.setattr("dxlrun.run.run_summary._REFRESH_S", 0.0)
     console = Console(file=io.StringIO())
     line = Line()
     monkeypatch.setattr(console, "status", lambda _: nullcontext(line))

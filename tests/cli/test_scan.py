@@ -81,7 +81,7 @@ def test_nobody_is_an_answer_too(dxlrun, simulated_line):
 
 HOLD = """
 import sys
-from dxlrun.dynamixel.serial_open import open_serial
+from dxlrun.dynamixel.port.serial_open import open_serial
 port = open_serial(sys.argv[1], 57_600)
 print("open", flush=True)
 sys.stdin.read()

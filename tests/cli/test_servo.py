@@ -8,10 +8,10 @@ import time
 
 import pytest
 
-from dxlrun.dynamixel import scanning
-from dxlrun.dynamixel.scanning import FoundServo
+from dxlrun.dynamixel.tools import scanning
+from dxlrun.dynamixel.tools.scanning import FoundServo
+from dxlrun.dynamixel.tools.servo_backup import read_backup
 from dxlrun.errors import InputError
-from dxlrun.servo_backup import read_backup
 from dxlrun.simulation import BusConfig, ServoConfig
 
 NEW = ("--protocol", "2.0", "--baud", "1000000")

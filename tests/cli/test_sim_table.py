@@ -11,9 +11,9 @@ from io import StringIO
 import pytest
 from rich.console import Console
 
-from dxlrun.cli.sim_table import TableView, page
-from dxlrun.cli.sim_views import Shown
-from dxlrun.simulation_front import Look, ServoLook, TypedLines
+from dxlrun.cli.output.sim_table import TableView, page
+from dxlrun.cli.output.sim_views import Shown
+from dxlrun.run.simulation_front import Look, ServoLook, TypedLines
 
 
 def look(count: int, **changes: float) -> Look:

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.cli.sim import link_of_each
-from dxlrun.cli.sim_inputs import AdapterWishes, read_faults, servo_bus, with_adapter
-from dxlrun.cli.sim_views import PlainView, Shown, ending
+from dxlrun.cli.output.sim_views import PlainView, Shown, ending
+from dxlrun.cli.simulated.sim import link_of_each
+from dxlrun.cli.simulated.sim_inputs import AdapterWishes, read_faults, servo_bus, with_adapter
 from dxlrun.errors import InputError
+from dxlrun.run.simulation_front import Look, ServoLook
 from dxlrun.simulation import BusConfig, ServoConfig
-from dxlrun.simulation_front import Look, ServoLook
 
 BUS = BusConfig("main", 57_600, (ServoConfig(1, "XL430-W250", 0.0),), 2.0)
 

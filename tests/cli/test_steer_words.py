@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.cli.robots import command, controllers, headline, state
-from dxlrun.cli.written import Written, is_played
+from dxlrun.cli.steering.robots import command, controllers, headline, state
+from dxlrun.cli.steering.written import Written, is_played
 
 NOBODY = "dxlrun: no robot runs that could be steered; `dxlrun ROBOT.yaml` starts one"
 

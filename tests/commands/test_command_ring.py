@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dxlrun import mailbox
-from dxlrun.commands import COMMAND_SLOT, CommandPieces, CommandRing, TakenCommand, command_slots
-from dxlrun.cycle import MOST_CONTROLLERS
-from dxlrun.inbox import Command
-from dxlrun.ring import Handover, Payload, RingReader, RingWriter, create
+from dxlrun.run.channels import mailbox
+from dxlrun.run.channels.commands import COMMAND_SLOT, CommandPieces, CommandRing, TakenCommand, command_slots
+from dxlrun.run.channels.cycle import MOST_CONTROLLERS
+from dxlrun.run.channels.inbox import Command
+from dxlrun.run.channels.ring import Handover, Payload, RingReader, RingWriter, create
 
 NAMES = st.text(st.characters(exclude_categories=["Cs"]), max_size=12)
 COMMANDS = st.builds(

@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from dxlrun.compile.commands import beyond_limits
-from dxlrun.control.controller import CommandModel
+from dxlrun.compile.motion.commands import beyond_limits
+from dxlrun.control.controllers.controller import CommandModel
 from dxlrun.control.loop_plan import JointPlan
-from dxlrun.control_table import control_table
+from dxlrun.dynamixel.control_table import control_table
 from dxlrun_controllers.drive import EffortsCommand, VelocitiesCommand
 from dxlrun_controllers.group import PosEffortCommand, PositionsCommand, PosVelCommand
 from dxlrun_controllers.trajectory_command import TrajectoryCommand

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dxlrun.compile.formula import LONGEST_FORMULA, Formula
+from dxlrun.compile.motion.formula import LONGEST_FORMULA, Formula
 
 
 @settings(max_examples=50, deadline=None)

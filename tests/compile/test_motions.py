@@ -256,7 +256,7 @@ def many(samples: int, formula: str = "sin(t)") -> str:
 def test_what_would_take_minutes_is_refused_at_once(
     problems_in: Find, robot_text: str, monkeypatch: pytest.MonkeyPatch, motion: str, says: str
 ):
-    monkeypatch.setattr("dxlrun.compile.samples.Expression.at", lambda *_: pytest.fail("evaluated"))
+    monkeypatch.setattr("dxlrun.compile.motion.samples.Expression.at", lambda *_: pytest.fail("evaluated"))
 
     (problem,) = problems_in(robot_text, motion)
 

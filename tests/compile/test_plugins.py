@@ -7,7 +7,7 @@ from pydantic import Field
 
 from dxlrun import CommandModel, Controller, Interfaces, ParametersModel
 from dxlrun.compile import Compiled, robot
-from dxlrun.control.plugins import Offer, PlugIns, load_plugins
+from dxlrun.control.controllers.plugins import Offer, PlugIns, load_plugins
 from dxlrun.errors import Problem
 
 Find = Callable[..., tuple[Problem, ...]]

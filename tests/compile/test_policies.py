@@ -12,7 +12,7 @@ import pytest
 from dxlrun.compile import Compiled
 from dxlrun.compile.policies import MARGIN_NS
 from dxlrun.control.policy_plan import HOLD, LIMP, Policy
-from dxlrun.dynamixel import plan
+from dxlrun.dynamixel.plan import planning as plan
 from dxlrun.errors import Problem
 
 Find = Callable[..., tuple[Problem, ...]]

@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dxlrun.compile.reach import Interval, degrees, joint_reach, servo_travel
-from dxlrun.control_table import all_tables, control_table
+from dxlrun.compile.joint.reach import Interval, degrees, joint_reach, servo_travel
+from dxlrun.dynamixel.control_table import all_tables, control_table
 
 AX = control_table("AX-12A")
 TRAVEL = servo_travel(AX)

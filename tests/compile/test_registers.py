@@ -7,8 +7,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from dxlrun.compile.registers import declarable, register_value, steered_value
-from dxlrun.control_table import all_tables, control_table
+from dxlrun.compile.joint.registers import declarable, register_value, steered_value
+from dxlrun.dynamixel.control_table import all_tables, control_table
 
 ROBOT = """\
 name: arm

@@ -14,7 +14,7 @@ from dxlrun.compile.plan import AdapterPlan, LoadPlan, SimulationPlan, from_json
 from dxlrun.compile.simulated import simulated_bodies, simulated_buses
 from dxlrun.errors import InputError, Problem
 from dxlrun.simulation import AdapterConfig, Load
-from dxlrun.simulation.mujoco_plant import UrdfBodies, UrdfJoint
+from dxlrun.simulation.motion.mujoco_plant import UrdfBodies, UrdfJoint
 
 Compile = Callable[..., Compiled]
 ProblemsIn = Callable[..., tuple[Problem, ...]]

@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 
 from dxlrun.clock import VirtualClock
-from dxlrun.control.activity import Activity
-from dxlrun.control.controller import Controller, Interfaces, ParametersModel
+from dxlrun.control.controllers.activity import Activity
+from dxlrun.control.controllers.controller import Controller, Interfaces, ParametersModel
+from dxlrun.control.controllers.manager import Manager
+from dxlrun.control.controllers.plugins import Offer, PlugIns
 from dxlrun.control.gate import Gate
 from dxlrun.control.loop import Loop, StopFlag
 from dxlrun.control.loop_plan import (
@@ -22,12 +24,10 @@ from dxlrun.control.loop_plan import (
     ScheduledCommand,
     SchedulerPlan,
 )
-from dxlrun.control.manager import Manager
-from dxlrun.control.plugins import Offer, PlugIns
-from dxlrun.cycle import CycleLayout, CycleRecord
-from dxlrun.events import EventCode, Severity
-from dxlrun.inbox import LOOP, Command, QueueInbox
 from dxlrun.mode import Mode
+from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
+from dxlrun.run.channels.events import EventCode, Severity
+from dxlrun.run.channels.inbox import LOOP, Command, QueueInbox
 
 PERIOD_NS = 20_000_000
 

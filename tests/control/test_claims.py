@@ -2,7 +2,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from dxlrun.control.claims import conflicts, told
+from dxlrun.control.controllers.claims import conflicts, told
 
 
 @dataclass(frozen=True)

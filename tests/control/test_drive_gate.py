@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 from dxlrun.control.drive_gate import BRAKING_S
 from dxlrun.control.gate import SLOW_SPEED, SLOW_START_NS, Gate
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan, LoopPlan, SchedulerPlan
-from dxlrun.cycle import Clamp, CycleLayout, CycleRecord
 from dxlrun.interfaces import COMMAND_INTERFACES
 from dxlrun.mode import Mode
+from dxlrun.run.channels.cycle import Clamp, CycleLayout, CycleRecord
 
 DT_NS = 20_000_000
 DRIVEN = {Mode.VELOCITY: "velocity", Mode.EFFORT: "effort", Mode.PWM: "pwm"}

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 
 from dxlrun.control.gate import SLOW_SPEED, SLOW_START_NS, Gate
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan, LoopPlan, SchedulerPlan
-from dxlrun.cycle import Clamp, CycleLayout, CycleRecord
-from dxlrun.events import EventCode
 from dxlrun.mode import Mode
+from dxlrun.run.channels.cycle import Clamp, CycleLayout, CycleRecord
+from dxlrun.run.channels.events import EventCode
 
 DT_NS = 20_000_000
 DT = DT_NS * 1e-9

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dxlrun.errors import PortError
-from dxlrun.events import EventCode, Severity
+from dxlrun.run.channels.events import EventCode, Severity
 
 PERIOD_NS = 20_000_000
 

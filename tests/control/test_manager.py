@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from dxlrun.control.claims import Conflict, conflicts
+from dxlrun.control.controllers.claims import Conflict, conflicts
 from dxlrun.errors import ControllerFault, PlugInError
-from dxlrun.events import EventCode
+from dxlrun.run.channels.events import EventCode
 
 PERIOD_NS = 20_000_000
 

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.control.claims import claimed_modes, start_modes
+from dxlrun.control.controllers.claims import claimed_modes, start_modes
+from dxlrun.control.controllers.mode_switch import PATIENCE_NS
 from dxlrun.control.loop_plan import JointPlan
-from dxlrun.control.mode_switch import PATIENCE_NS
-from dxlrun.events import EventCode
 from dxlrun.mode import Mode, mode_of
+from dxlrun.run.channels.events import EventCode
 
 PERIOD_NS = 20_000_000
 POSITION, VELOCITY, EFFORT = Mode.POSITION, Mode.VELOCITY, Mode.EFFORT

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.control.overrun import OverrunHook
-from dxlrun.control.plugins import load_plugins
-from dxlrun.events import EventCode, Severity
+from dxlrun.run.channels.events import EventCode, Severity
 
 PERIOD_NS = 20_000_000
 

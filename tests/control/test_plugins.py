@@ -4,7 +4,7 @@ import sys
 
 import pytest
 
-from dxlrun.control.plugins import load_plugins
+from dxlrun.control.controllers.plugins import load_plugins
 
 GOOD = """
 from dxlrun import Controller, Interfaces, hookimpl

@@ -7,10 +7,10 @@ from typing import get_args
 
 import pluggy
 
-from dxlrun.control import margin
-from dxlrun.control.contract import hook_breach
-from dxlrun.control.hookspecs import GROUP, HookSpecs
+from dxlrun.control.controllers.contract import hook_breach
+from dxlrun.control.controllers.hookspecs import GROUP, HookSpecs
 from dxlrun.control.loop_plan import OverrunPolicy
+from dxlrun.control.realtime import margin
 from dxlrun.control.schedule import MOST_CAUGHT_UP
 from dxlrun.description.robot import Scheduler
 

@@ -13,9 +13,10 @@ import threading
 import pytest
 
 from dxlrun.clock import MonotonicClock
-from dxlrun.control import memory, realtime, rights
 from dxlrun.control.loop_plan import SchedulerPlan
-from dxlrun.control.margin import Pacing, overshoot_ns
+from dxlrun.control.realtime import grants as realtime
+from dxlrun.control.realtime import memory, rights
+from dxlrun.control.realtime.margin import Pacing, overshoot_ns
 
 
 @pytest.fixture
@@ -257,7 +258,8 @@ def outcome(script):
 
 WISHES = """
 import gc, json, os, resource
-from dxlrun.control import realtime, rights
+from dxlrun.control.realtime import grants as realtime
+from dxlrun.control.realtime import rights
 from dxlrun.control.loop_plan import SchedulerPlan
 {before}
 plan = SchedulerPlan('round_robin', 31, True, cores=(min(os.sched_getaffinity(0)),), idle_latency=True)
@@ -313,7 +315,7 @@ def test_a_real_process_gets_what_its_rights_say():
 
 
 FAULTS = """
-from dxlrun.control import memory
+from dxlrun.control.realtime import memory
 {before}
 before = memory.page_faults()
 for size in range(100_000, 4_000_000, 100_000):
@@ -330,7 +332,7 @@ def test_touched_memory_is_there_when_it_is_needed():
 
 def test_the_collector_is_off_and_what_lives_is_frozen():
     script = (
-        "import gc, json\nfrom dxlrun.control import realtime\n"
+        "import gc, json\nfrom dxlrun.control.realtime import grants as realtime\n"
         "realtime.freeze_collector()\nprint(json.dumps([gc.isenabled(), gc.get_freeze_count() > 1000]))\n"
     )
     assert outcome(script) == [False, True]

@@ -2,7 +2,7 @@
 
 import pytest
 
-from dxlrun.events import EventCode
+from dxlrun.run.channels.events import EventCode
 
 
 @pytest.fixture

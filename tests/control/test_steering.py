@@ -9,7 +9,7 @@ import pytest
 
 from dxlrun.control.gate import SLOW_SPEED
 from dxlrun.control.loop_plan import ControllerPlan
-from dxlrun.events import EventCode
+from dxlrun.run.channels.events import EventCode
 
 PERIOD_NS = 20_000_000
 

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-import dxlrun.control_table
-from dxlrun.control_table import ControlTable
+import dxlrun.dynamixel.control_table
+from dxlrun.dynamixel.control_table import ControlTable
 
-TABLES = Path(dxlrun.control_table.__file__).parent.parent / "control_tables"
+TABLES = Path(dxlrun.dynamixel.control_table.__file__).parent / "tables"
 
 
 @pytest.fixture

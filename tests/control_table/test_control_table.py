@@ -9,12 +9,12 @@ import rustypot
 from hypothesis import given
 from hypothesis import strategies as st
 
-import dxlrun.control_table
-from dxlrun.control_table import ControlItem, control_table, model_names, read_control_table
+import dxlrun.dynamixel.control_table
+from dxlrun.dynamixel.control_table import ControlItem, control_table, model_names, read_control_table
 
 AX = control_table("AX-12A")
 AX_TEXT = (
-    Path(dxlrun.control_table.__file__).parent.parent / "control_tables" / "protocol1" / "AX-12A.toml"
+    Path(dxlrun.dynamixel.control_table.__file__).parent / "tables" / "protocol1" / "AX-12A.toml"
 ).read_text("utf-8")
 FOREIGN_NAMES = {"baudrate": "baud_rate"}
 

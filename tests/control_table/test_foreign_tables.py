@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 import rustypot
 
-from dxlrun.control_table import ControlTable, all_tables, control_table, models_by_number
-from dxlrun.control_table.protocol2 import sdk_files
+from dxlrun.dynamixel.control_table import ControlTable, all_tables, control_table, models_by_number
+from dxlrun.dynamixel.control_table.protocol2 import sdk_files
 
 PRO = {
     "L42-10-S300-R": 35072,
@@ -274,7 +274,7 @@ def test_the_sdk_is_still_wrong_about_what_we_correct() -> None:
 
 def test_tables_are_read_without_importing_the_sdk_or_anything_heavy() -> None:
     code = (
-        "import sys; from dxlrun.control_table import all_tables; assert len(all_tables()) > 60;"
+        "import sys; from dxlrun.dynamixel.control_table import all_tables; assert len(all_tables()) > 60;"
         "heavy = {'numpy', 'pydantic', 'yaml', 'serial', 'dynamixel_easy_sdk', 'dynamixel_sdk'};"
         "print(sorted(heavy & set(sys.modules)))"
     )

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-import dxlrun.control_table.models
-from dxlrun.control.plugins import load_plugins
-from dxlrun.control_table import added_control_tables, control_table
+import dxlrun.dynamixel.control_table.models
+from dxlrun.control.controllers.plugins import load_plugins
+from dxlrun.dynamixel.control_table import added_control_tables, control_table
 
 PLUGIN = """
 from pathlib import Path
@@ -56,8 +56,8 @@ def table(data_files: Path, tmp_path: Path) -> Path:
 @pytest.fixture
 def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], None]]:
     """Return a function that installs a plug-in which returns an expression as its servo models."""
-    monkeypatch.setattr(dxlrun.control_table.models, "_ADDED", {1.0: [], 2.0: []})
-    monkeypatch.setattr(dxlrun.control_table.models, "_TEXTS", {})
+    monkeypatch.setattr(dxlrun.dynamixel.control_table.models, "_ADDED", {1.0: [], 2.0: []})
+    monkeypatch.setattr(dxlrun.dynamixel.control_table.models, "_TEXTS", {})
     monkeypatch.syspath_prepend(tmp_path)
 
     def put(offer: str) -> None:

@@ -8,7 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dxlrun.control_table import CAPABILITIES, ControlTable, all_tables, control_table, models_by_number
+from dxlrun.dynamixel.control_table import (
+    CAPABILITIES,
+    ControlTable,
+    all_tables,
+    control_table,
+    models_by_number,
+)
 
 TABLES = all_tables()
 PROTOCOL1 = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dxlrun.cycle import SCALARS, SEQUENCES, CycleLayout, CycleRecord, cycle_slots
+from dxlrun.run.channels.cycle import SCALARS, SEQUENCES, CycleLayout, CycleRecord, cycle_slots
 
 SHAPES = [(0, 0), (1, 0), (3, 1), (8, 2), (18, 5)]
 

@@ -8,8 +8,8 @@ import pytest
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from dxlrun.description import Marks, problems_of
-from dxlrun.description.syntax import parse
-from dxlrun.description.tree import grow, literal
+from dxlrun.description.source.syntax import parse
+from dxlrun.description.source.tree import grow, literal
 from dxlrun.description.units import Angle
 
 

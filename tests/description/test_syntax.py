@@ -11,9 +11,10 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dxlrun.description import read_robot, syntax
-from dxlrun.description.scalars import plain_value
-from dxlrun.description.tree import grow, literal
+from dxlrun.description import read_robot
+from dxlrun.description.source import syntax
+from dxlrun.description.source.scalars import plain_value
+from dxlrun.description.source.tree import grow, literal
 from dxlrun.errors import InputError, Mark
 
 WRONG = [
@@ -120,7 +121,9 @@ def test_an_anchor_may_be_used_and_stands_where_it_was_written() -> None:
 
 @pytest.mark.usefixtures("loader")
 def test_an_anchor_bomb_is_refused_before_it_grows(desk: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dxlrun.description.tree.MOST_NODES", 10_000)  # the true limit takes seconds to reach
+    monkeypatch.setattr(
+        "dxlrun.description.source.tree.MOST_NODES", 10_000
+    )  # the true limit takes seconds to reach
     lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
     lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 20)]
     (problem,) = desk.refusals("\n".join(lines))

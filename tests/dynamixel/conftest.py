@@ -14,15 +14,15 @@ from dataclasses import dataclass, field, replace
 import pytest
 
 from dxlrun.clock import VirtualClock
-from dxlrun.control_table import control_table
-from dxlrun.dynamixel import kernel
-from dxlrun.dynamixel.bus_plan import BusPlan, ServoPlan
+from dxlrun.dynamixel.control_table import control_table
+from dxlrun.dynamixel.exchange import kernel
 from dxlrun.dynamixel.hardware import DynamixelHardware
-from dxlrun.dynamixel.plan import Wiring, bus_plan
-from dxlrun.events import EventCode, Severity
+from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
+from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
 from dxlrun.interfaces import Commands, States
-from dxlrun.packets import LoggedPacket, PacketBatch, PacketKind, decode_packets
-from dxlrun.ring import Handover
+from dxlrun.run.channels.events import EventCode, Severity
+from dxlrun.run.channels.packets import LoggedPacket, PacketBatch, PacketKind, decode_packets
+from dxlrun.run.channels.ring import Handover
 from dxlrun.simulation import BusConfig, Ledger, ServoConfig, SimulatedBus, VirtualPorts, read_ledger
 from dxlrun.simulation.process import encode_config
 

@@ -3,8 +3,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dxlrun.dynamixel import protocol1
-from dxlrun.dynamixel.goal_arrays import GoalArrays
+from dxlrun.dynamixel.exchange.goal_arrays import GoalArrays
+from dxlrun.dynamixel.wire import protocol1
 from dxlrun.interfaces import Commands
 
 angles = st.floats(-10, 10) | st.just(float("nan"))

@@ -1,12 +1,12 @@
 import pytest
 
 from dxlrun.clock import VirtualClock
-from dxlrun.dynamixel import protocol1
-from dxlrun.dynamixel.bus import Bus
-from dxlrun.dynamixel.line import Line, listen
-from dxlrun.dynamixel.pump import run
-from dxlrun.dynamixel.transaction import Outcome
-from dxlrun.packets import PacketKind
+from dxlrun.dynamixel.exchange.bus import Bus
+from dxlrun.dynamixel.exchange.pump import run
+from dxlrun.dynamixel.plan.line import Line, listen
+from dxlrun.dynamixel.wire import protocol1
+from dxlrun.dynamixel.wire.transaction import Outcome
+from dxlrun.run.channels.packets import PacketKind
 
 LINE = Line(1_000_000, 0, 500_000)
 READ = LINE.read(7, 36, 6)

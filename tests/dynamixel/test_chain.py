@@ -3,12 +3,12 @@
 import pytest
 
 from dxlrun.clock import VirtualClock
-from dxlrun.dynamixel import protocol2
-from dxlrun.dynamixel.bus import Bus
-from dxlrun.dynamixel.line import Line
-from dxlrun.dynamixel.pump import pump
-from dxlrun.dynamixel.transaction import Outcome
-from dxlrun.packets import NoPackets
+from dxlrun.dynamixel.exchange.bus import Bus
+from dxlrun.dynamixel.exchange.pump import pump
+from dxlrun.dynamixel.plan.line import Line
+from dxlrun.dynamixel.wire import protocol2
+from dxlrun.dynamixel.wire.transaction import Outcome
+from dxlrun.run.channels.packets import NoPackets
 
 LINE = Line(1_000_000, 0, 0, protocol2)
 SYNC_READ = LINE.read_many([(1, 126, 4), (2, 126, 4), (3, 126, 4)])

@@ -2,15 +2,14 @@
 
 import pytest
 
-from dxlrun import servo_backup
-from dxlrun.cli.servo_verbs import VERBS, Asked
+from dxlrun.cli.servos.servo_verbs import VERBS, Asked
 from dxlrun.clock import VirtualClock
-from dxlrun.control_table import all_tables
-from dxlrun.dynamixel import changing
-from dxlrun.dynamixel.one_servo import OneServo
-from dxlrun.dynamixel.protocol2 import Reset
-from dxlrun.dynamixel.scanning import Wish, find
-from dxlrun.dynamixel.tool_line import ToolLine
+from dxlrun.dynamixel.control_table import all_tables
+from dxlrun.dynamixel.tools import changing, servo_backup
+from dxlrun.dynamixel.tools.one_servo import OneServo
+from dxlrun.dynamixel.tools.scanning import Wish, find
+from dxlrun.dynamixel.tools.tool_line import ToolLine
+from dxlrun.dynamixel.wire.protocol2 import Reset
 from dxlrun.errors import ServoFault
 from dxlrun.simulation import BusConfig, Ledger, ServoConfig, SimulatedBus, VirtualPorts
 

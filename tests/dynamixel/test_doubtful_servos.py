@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dxlrun.dynamixel import modes
-from dxlrun.dynamixel.limp import limp
-from dxlrun.dynamixel.standing import stand
-from dxlrun.events import EventCode
+from dxlrun.dynamixel.registers import modes
+from dxlrun.dynamixel.servo.limp import limp
+from dxlrun.dynamixel.servo.standing import stand
 from dxlrun.mode import Mode
+from dxlrun.run.channels.events import EventCode
 
 
 @pytest.fixture

@@ -4,9 +4,9 @@ import math
 
 import pytest
 
-from dxlrun.control_table import control_table, model_names
-from dxlrun.dynamixel import protocol2
-from dxlrun.events import Severity
+from dxlrun.dynamixel.control_table import control_table, model_names
+from dxlrun.dynamixel.wire import protocol2
+from dxlrun.run.channels.events import Severity
 
 IDS = (11, 12, 13, 14, 15, 16, 17, 18)
 

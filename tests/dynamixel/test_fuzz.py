@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.dynamixel import protocol1, protocol2
+from dxlrun.dynamixel.wire import protocol1, protocol2
 
 BENCH = Path(__file__).parent.parent / "bench" / "fuzz_receiver.py"
 

@@ -3,14 +3,14 @@ from dataclasses import dataclass
 
 import pytest
 
-from dxlrun.dynamixel import protocol2
-from dxlrun.dynamixel.bus import Bus
-from dxlrun.dynamixel.gaps import STARVED, STARVED_AGAIN, Gaps, Urgency
-from dxlrun.dynamixel.line import listen
-from dxlrun.dynamixel.plan import plan_line
-from dxlrun.dynamixel.pump import pump
-from dxlrun.dynamixel.transaction import Outcome
-from dxlrun.events import EventCode
+from dxlrun.dynamixel.exchange.bus import Bus
+from dxlrun.dynamixel.exchange.gaps import STARVED, STARVED_AGAIN, Gaps, Urgency
+from dxlrun.dynamixel.exchange.pump import pump
+from dxlrun.dynamixel.plan.line import listen
+from dxlrun.dynamixel.plan.planning import plan_line
+from dxlrun.dynamixel.wire import protocol2
+from dxlrun.dynamixel.wire.transaction import Outcome
+from dxlrun.run.channels.events import EventCode
 
 READ_NS = 270_000
 """14 bytes there, 13 back, 1 Mbit/s, no return delay: what one of the reads below takes."""

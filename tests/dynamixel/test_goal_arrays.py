@@ -5,8 +5,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from dxlrun.dynamixel import protocol1, protocol2
-from dxlrun.dynamixel.goal_arrays import REPEATED, GoalArrays
+from dxlrun.dynamixel.exchange.goal_arrays import REPEATED, GoalArrays
+from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.interfaces import Commands
 from dxlrun.mode import Mode
 

@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from dxlrun.dynamixel import protocol1
-from dxlrun.dynamixel.units import joint_position
+from dxlrun.dynamixel.plan.units import joint_position
+from dxlrun.dynamixel.wire import protocol1
 from dxlrun.errors import StartUpError
-from dxlrun.events import EventCode
+from dxlrun.run.channels.events import EventCode
 from dxlrun.simulation import ServoConfig
 
 

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dxlrun.control_table import all_tables
-from dxlrun.dynamixel import protocol2
-from dxlrun.dynamixel.bus_plan import RegisterValue
-from dxlrun.dynamixel.limp import limp
-from dxlrun.dynamixel.receiver import Receiver
-from dxlrun.dynamixel.units import joint_position
+from dxlrun.dynamixel.control_table import all_tables
+from dxlrun.dynamixel.plan.bus_plan import RegisterValue
+from dxlrun.dynamixel.plan.units import joint_position
+from dxlrun.dynamixel.servo.limp import limp
+from dxlrun.dynamixel.wire import protocol2
+from dxlrun.dynamixel.wire.receiver import Receiver
 from dxlrun.errors import StartUpError
-from dxlrun.events import EventCode
+from dxlrun.run.channels.events import EventCode
 
 X_IDS = (11, 12, 13, 14, 15, 16, 17, 18)
 

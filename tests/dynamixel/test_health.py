@@ -8,16 +8,16 @@ from functools import partial
 import numpy as np
 import pytest
 
-from dxlrun.control_table import control_table
-from dxlrun.dynamixel import protocol1, protocol2
-from dxlrun.dynamixel.bus_plan import RegisterValue
-from dxlrun.dynamixel.bus_watchdog import RETURN_SPEED
-from dxlrun.dynamixel.reboots import RealtimeTicks, RebootCount
-from dxlrun.dynamixel.returning import Returning
-from dxlrun.dynamixel.transaction import Outcome, Reply
+from dxlrun.dynamixel.control_table import control_table
+from dxlrun.dynamixel.plan.bus_plan import RegisterValue
+from dxlrun.dynamixel.registers.bus_watchdog import RETURN_SPEED
+from dxlrun.dynamixel.servo.reboots import RealtimeTicks, RebootCount
+from dxlrun.dynamixel.servo.returning import Returning
+from dxlrun.dynamixel.wire import protocol1, protocol2
+from dxlrun.dynamixel.wire.transaction import Outcome, Reply
 from dxlrun.errors import StartUpError
-from dxlrun.events import EventCode
 from dxlrun.interfaces import Commands, States
+from dxlrun.run.channels.events import EventCode
 
 X_IDS = (11, 12, 13, 14)
 
@@ -381,7 +381,7 @@ def test_a_servo_without_torque_is_not_taken_for_one_that_has_caught_up():
 
 
 def test_registers_that_a_reboot_took_are_written_again(start, make_x):
-    from dxlrun.dynamixel.bus_plan import RegisterValue
+    from dxlrun.dynamixel.plan.bus_plan import RegisterValue
 
     plan = make_x()
     gain = RegisterValue(84, 2, 555, "position_p_gain")

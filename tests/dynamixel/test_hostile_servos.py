@@ -10,8 +10,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dxlrun.dynamixel.dialect import dialect_of
-from dxlrun.dynamixel.mode_plan import in_mode
+from dxlrun.dynamixel.plan.mode_plan import in_mode
+from dxlrun.dynamixel.wire.dialect import dialect_of
 from dxlrun.mode import Mode
 
 SEEDS = int(os.environ.get("DXLRUN_HOSTILE", "1"))

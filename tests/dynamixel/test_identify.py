@@ -4,9 +4,9 @@ import pytest
 
 from dxlrun.clock import VirtualClock
 from dxlrun.compile import compile_files
-from dxlrun.dynamixel.identify import identify
+from dxlrun.dynamixel.servo.identify import identify
 from dxlrun.errors import PortError, StartUpError
-from dxlrun.identification import ask_servos
+from dxlrun.run.identification import ask_servos
 from dxlrun.simulation import BusConfig, Ledger, ServoConfig, SimulatedBus, VirtualPorts
 
 ROBOT = """

@@ -12,11 +12,12 @@ from threading import Thread
 import pytest
 
 from dxlrun.clock import MonotonicClock
-from dxlrun.dynamixel import kernel, protocol2
+from dxlrun.dynamixel.exchange import kernel
 from dxlrun.dynamixel.hardware import DynamixelHardware
-from dxlrun.dynamixel.port import SerialPort, SerialPorts
+from dxlrun.dynamixel.port.ports import SerialPort, SerialPorts
+from dxlrun.dynamixel.wire import protocol2
 from dxlrun.interfaces import Commands, States
-from dxlrun.packets import PacketKind
+from dxlrun.run.channels.packets import PacketKind
 from dxlrun.testing import simulated_robot
 
 ROBOTS = Path(__file__).parents[2] / "robots"

@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import pytest
 
-from dxlrun.dynamixel.latency_timer import late_replies, latency_timer, shorten
-from dxlrun.dynamixel.reopening import KeptLines, Wanted
-from dxlrun.dynamixel.serial_open import open_serial
+from dxlrun.dynamixel.port.latency_timer import late_replies, latency_timer, shorten
+from dxlrun.dynamixel.port.reopening import KeptLines, Wanted
+from dxlrun.dynamixel.port.serial_open import open_serial
 from dxlrun.errors import PortError, StartUpError
 from dxlrun.testing import VirtualRobot, plan_of
 

@@ -3,7 +3,7 @@ import sys
 
 import pytest
 
-from dxlrun.dynamixel.limp import LATE_NS, LONGER_NS, limp
+from dxlrun.dynamixel.servo.limp import LATE_NS, LONGER_NS, limp
 
 
 def test_a_robot_whose_loop_died_becomes_limp(make_rig):
@@ -127,7 +127,7 @@ def test_a_babbling_line_does_not_hold_it_up(make_rig):
 
 
 def test_the_guardians_path_imports_no_numpy():
-    code = "import sys, dxlrun.guardian; print('numpy' in sys.modules)"
+    code = "import sys, dxlrun.run.guardian; print('numpy' in sys.modules)"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "False"
 

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from dxlrun.control_table import control_table
-from dxlrun.dynamixel import protocol2
-from dxlrun.dynamixel.mode_plan import mode_in, position_reach
+from dxlrun.dynamixel.control_table import control_table
+from dxlrun.dynamixel.plan.mode_plan import mode_in, position_reach
+from dxlrun.dynamixel.wire import protocol2
 from dxlrun.errors import StartUpError
-from dxlrun.events import EventCode
 from dxlrun.mode import Mode
+from dxlrun.run.channels.events import EventCode
 
 P, V, E, W, C = Mode.POSITION, Mode.VELOCITY, Mode.EFFORT, Mode.PWM, Mode.EFFORT_POSITION
 FAMILIES = {

@@ -1,10 +1,10 @@
 import msgspec
 import pytest
 
-from dxlrun.control_table import control_table, model_names
-from dxlrun.dynamixel.bus_plan import BusPlan
-from dxlrun.dynamixel.line import LONGEST_RETURN_DELAY_NS, PATIENCE_NS
-from dxlrun.dynamixel.units import joint_position
+from dxlrun.dynamixel.control_table import control_table, model_names
+from dxlrun.dynamixel.plan.bus_plan import BusPlan
+from dxlrun.dynamixel.plan.line import LONGEST_RETURN_DELAY_NS, PATIENCE_NS
+from dxlrun.dynamixel.plan.units import joint_position
 
 
 def test_the_budget_of_protocol_md_at_one_millisecond_of_latency(make_plan):

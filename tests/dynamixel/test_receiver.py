@@ -1,8 +1,8 @@
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dxlrun.dynamixel import protocol1, protocol2
-from dxlrun.dynamixel.receiver import Receiver
+from dxlrun.dynamixel.wire import protocol1, protocol2
+from dxlrun.dynamixel.wire.receiver import Receiver
 
 
 class Heard:

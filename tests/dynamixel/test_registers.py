@@ -4,17 +4,17 @@ from dataclasses import replace
 
 import pytest
 
-from dxlrun.compile.registers import UnfitRegister, declarable, register_value
-from dxlrun.control_table import all_tables, control_table
-from dxlrun.dynamixel.bus import Bus
-from dxlrun.dynamixel.bus_plan import RegisterValue
-from dxlrun.dynamixel.inspection import setup_line
-from dxlrun.dynamixel.pump import run
-from dxlrun.dynamixel.registers import compare, settle_registers
-from dxlrun.dynamixel.startup import rejoin
+from dxlrun.compile.joint.registers import UnfitRegister, declarable, register_value
+from dxlrun.dynamixel.control_table import all_tables, control_table
+from dxlrun.dynamixel.exchange.bus import Bus
+from dxlrun.dynamixel.exchange.pump import run
+from dxlrun.dynamixel.plan.bus_plan import RegisterValue
+from dxlrun.dynamixel.registers.declared import compare, settle_registers
+from dxlrun.dynamixel.registers.inspection import setup_line
+from dxlrun.dynamixel.servo.startup import rejoin
 from dxlrun.errors import StartUpError
-from dxlrun.events import EventCode
-from dxlrun.packets import NoPackets
+from dxlrun.run.channels.events import EventCode
+from dxlrun.run.channels.packets import NoPackets
 
 WRITE = {1.0: (4, 3), 2.0: (7, 3)}
 """Where the instruction stands in a packet, and the number of a write."""

@@ -6,10 +6,10 @@ import socket
 
 import pytest
 
-from dxlrun.dynamixel.port import SerialPort, SerialPorts
-from dxlrun.dynamixel.reopening import KeptLines, LinesAgain, Wanted, lasting_name
+from dxlrun.dynamixel.port.ports import SerialPort, SerialPorts
+from dxlrun.dynamixel.port.reopening import KeptLines, LinesAgain, Wanted, lasting_name
 from dxlrun.errors import PortError
-from dxlrun.process import Line
+from dxlrun.run.channels.process import Line
 
 PATIENCE_S = 60.0
 

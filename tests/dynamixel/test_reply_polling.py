@@ -4,8 +4,8 @@ import ctypes
 
 import pytest
 
-from dxlrun.dynamixel import kernel
-from dxlrun.dynamixel.port import AUTO_SHARE, MOST_SHARE, ReplyPolling
+from dxlrun.dynamixel.exchange import kernel
+from dxlrun.dynamixel.port.ports import AUTO_SHARE, MOST_SHARE, ReplyPolling
 
 LIBRARY = kernel.load()
 pytestmark = pytest.mark.skipif(LIBRARY is None, reason="the compiled kernel was not built: no C compiler")

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dxlrun.dynamixel.jumps import MARGIN_NS, MARGIN_RAD, SAY_AGAIN_NS, Jumps
-from dxlrun.dynamixel.samples import Samples
-from dxlrun.dynamixel.units import joint_position
-from dxlrun.events import EventCode
+from dxlrun.dynamixel.exchange.jumps import MARGIN_NS, MARGIN_RAD, SAY_AGAIN_NS, Jumps
+from dxlrun.dynamixel.exchange.samples import Samples
+from dxlrun.dynamixel.plan.units import joint_position
 from dxlrun.interfaces import States
 from dxlrun.mode import Mode
+from dxlrun.run.channels.events import EventCode
 
 MS = 1_000_000
 SECOND_NS = 1_000_000_000

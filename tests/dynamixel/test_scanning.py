@@ -3,10 +3,10 @@
 import pytest
 
 from dxlrun.clock import VirtualClock
-from dxlrun.control_table import all_tables
-from dxlrun.dynamixel import scanning
-from dxlrun.dynamixel.scanning import Wish, find, known_rates, scan
-from dxlrun.dynamixel.tool_line import ToolLine
+from dxlrun.dynamixel.control_table import all_tables
+from dxlrun.dynamixel.tools import scanning
+from dxlrun.dynamixel.tools.scanning import Wish, find, known_rates, scan
+from dxlrun.dynamixel.tools.tool_line import ToolLine
 from dxlrun.errors import PortError
 from dxlrun.simulation import AdapterConfig, BusConfig, Ledger, ServoConfig, SimulatedBus, VirtualPorts
 

@@ -15,8 +15,8 @@ from dxlrun.clock import MonotonicClock
 from dxlrun.compile import compile_files
 from dxlrun.compile.plan import to_json
 from dxlrun.dynamixel.hardware import DynamixelHardware
-from dxlrun.dynamixel.port import SerialPort, SerialPorts
-from dxlrun.dynamixel.serial_open import _ROBOT, let_go, open_serial
+from dxlrun.dynamixel.port.ports import SerialPort, SerialPorts
+from dxlrun.dynamixel.port.serial_open import _ROBOT, let_go, open_serial
 from dxlrun.errors import PortError
 from dxlrun.interfaces import Commands, States
 from dxlrun.simulation import BusConfig, ServoConfig
@@ -121,7 +121,7 @@ def test_the_process_that_has_the_line_is_named(opened):
     _, _, path = opened
     code = (
         "import sys\n"
-        "from dxlrun.dynamixel.serial_open import open_serial\n"
+        "from dxlrun.dynamixel.port.serial_open import open_serial\n"
         "from dxlrun.errors import PortError\n"
         "try:\n    open_serial(sys.argv[1], 1_000_000)\n"
         "except PortError as error:\n    print(error)\n"
@@ -137,8 +137,8 @@ def test_the_run_that_has_the_line_is_named_and_how_to_end_it(terminal):
     _, path, _ = terminal
     code = (
         "import sys\n"
-        "from dxlrun import process\n"
-        "from dxlrun.dynamixel.serial_open import open_serial\n"
+        "from dxlrun.run.channels import process\n"
+        "from dxlrun.dynamixel.port.serial_open import open_serial\n"
         "port = open_serial(sys.argv[1], 1_000_000)\n"
         'plan = process.memory_file(\'dxlrun-plan\', b\'{"robot":"pan_tilt","loop":{}}\')\n'
         "print('opened', flush=True)\n"

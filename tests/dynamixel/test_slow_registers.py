@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dxlrun.dynamixel.slow_registers import slow_items
-from dxlrun.events import EventCode
+from dxlrun.dynamixel.servo.slow_registers import slow_items
+from dxlrun.run.channels.events import EventCode
 
 SECOND_NS = 1_000_000_000
 

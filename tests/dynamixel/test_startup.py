@@ -3,9 +3,9 @@ from functools import partial
 
 import pytest
 
-from dxlrun.dynamixel import protocol1
+from dxlrun.dynamixel.wire import protocol1
 from dxlrun.errors import PortError, StartUpError
-from dxlrun.events import EventCode, Severity
+from dxlrun.run.channels.events import EventCode, Severity
 from dxlrun.simulation import ServoConfig
 
 

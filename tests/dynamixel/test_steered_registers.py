@@ -3,8 +3,8 @@ import math
 import numpy as np
 import pytest
 
-from dxlrun.events import EventCode
 from dxlrun.mode import Mode
+from dxlrun.run.channels.events import EventCode
 
 WRITE = 3
 

@@ -2,9 +2,9 @@
 
 import pytest
 
-from dxlrun.dynamixel import protocol1
+from dxlrun.dynamixel.wire import protocol1
 from dxlrun.errors import StartUpError
-from dxlrun.events import EventCode
+from dxlrun.run.channels.events import EventCode
 
 
 @pytest.fixture

@@ -7,8 +7,16 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from dxlrun.clock import VirtualClock
-from dxlrun.events import EVENT_SLOT, Event, EventCode, EventRing, Severity, decode_event, event_slots
-from dxlrun.ring import Handover
+from dxlrun.run.channels.events import (
+    EVENT_SLOT,
+    Event,
+    EventCode,
+    EventRing,
+    Severity,
+    decode_event,
+    event_slots,
+)
+from dxlrun.run.channels.ring import Handover
 
 
 def emitted(code: EventCode, severity: Severity, source: str, text: str, at_ns: int = 5) -> list[bytes]:

@@ -18,7 +18,7 @@ from dynamixel_easy_sdk import (
     connector,
 )
 
-from dxlrun.control_table import all_tables, control_table
+from dxlrun.dynamixel.control_table import all_tables, control_table
 from dxlrun.simulation import BusConfig, ServoConfig
 
 NUMBERS = ControlTable.parsingModelList()

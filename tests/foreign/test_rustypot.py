@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import rustypot
 
-from dxlrun.control_table import control_table
+from dxlrun.dynamixel.control_table import control_table
 from dxlrun.simulation import BusConfig, ServoConfig
 
 PATIENCE_S = 60.0

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from dynamixel_sdk import COMM_SUCCESS, GroupSyncRead, GroupSyncWrite, Protocol2PacketHandler
 
-from dxlrun.control_table import ControlItem, control_table
+from dxlrun.dynamixel.control_table import ControlItem, control_table
 from dxlrun.simulation import BusConfig, ServoConfig
 
 LEADER = dict.fromkeys(range(1, 7), "XL330-M077")

@@ -6,9 +6,9 @@ import struct
 
 import pytest
 
-from dxlrun import mailbox, ring
-from dxlrun.inbox import MOST_PER_CYCLE, Command
-from dxlrun.mailbox import LARGEST, PLACE, Answers, Mailbox, MailboxWriter, decode, encode
+from dxlrun.run.channels import mailbox, ring
+from dxlrun.run.channels.inbox import MOST_PER_CYCLE, Command
+from dxlrun.run.channels.mailbox import LARGEST, PLACE, Answers, Mailbox, MailboxWriter, decode, encode
 
 PLACES = 3
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from dxlrun.packets import (
+from dxlrun.run.channels.packets import (
     PACKET_SLOT,
     LoggedPacket,
     NoPackets,
@@ -17,7 +17,7 @@ from dxlrun.packets import (
     packet_slots,
     salvage,
 )
-from dxlrun.ring import Handover, Payload
+from dxlrun.run.channels.ring import Handover, Payload
 
 TIMES = st.integers(-(2**63), 2**63 - 1)
 PACKETS = st.builds(

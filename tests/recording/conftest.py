@@ -10,10 +10,10 @@ import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from dxlrun.cycle import CycleLayout, CycleRecord
-from dxlrun.recording import schemas
-from dxlrun.recording.header import LoggedController, LogHeader
-from dxlrun.recording.log_writer import LogWriter
+from dxlrun.log import schemas
+from dxlrun.log.header import LoggedController, LogHeader
+from dxlrun.log.log_writer import LogWriter
+from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
 
 PERIOD_NS = 20_000_000
 JOINTS = ("left_elbow_joint", "head_pitch_joint", "head_yaw_joint")

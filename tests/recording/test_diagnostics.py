@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from dxlrun.cycle import CycleLayout, CycleRecord
+from dxlrun.log import schemas
+from dxlrun.log.cdr import Codec
+from dxlrun.log.diagnostics import PERIOD_NS, Diagnostics
 from dxlrun.mode import Mode
-from dxlrun.recording import schemas
-from dxlrun.recording.cdr import Codec
-from dxlrun.recording.diagnostics import PERIOD_NS, Diagnostics
+from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
 
 JOINTS = ("elbow", "wheel", "head")
 

@@ -22,15 +22,15 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.typesys.store import Typestore
 
 from dxlrun.clock import VirtualClock
-from dxlrun.cycle import CycleLayout
 from dxlrun.errors import LogError
-from dxlrun.events import Event, EventCode, EventRing, Severity
-from dxlrun.packets import LoggedPacket, PacketBatch, PacketKind
-from dxlrun.recording import reader
-from dxlrun.recording.header import LogHeader, LogSummary, to_metadata
-from dxlrun.recording.log_writer import LogWriter
-from dxlrun.recording.reader import read_log
-from dxlrun.ring import Handover
+from dxlrun.log import reader
+from dxlrun.log.header import LogHeader, LogSummary, to_metadata
+from dxlrun.log.log_writer import LogWriter
+from dxlrun.log.reader import read_log
+from dxlrun.run.channels.cycle import CycleLayout
+from dxlrun.run.channels.events import Event, EventCode, EventRing, Severity
+from dxlrun.run.channels.packets import LoggedPacket, PacketBatch, PacketKind
+from dxlrun.run.channels.ring import Handover
 
 Cycle = Callable[[int], bytes]
 PACKETS = [
@@ -229,7 +229,7 @@ def test_a_log_of_another_format_is_refused(
     tmp_path: Path, header: LogHeader, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "dxlrun.recording.log_writer.to_metadata", lambda header: {**to_metadata(header), "format": "99"}
+        "dxlrun.log.log_writer.to_metadata", lambda header: {**to_metadata(header), "format": "99"}
     )
     LogWriter(tmp_path / "x", header).close()
     with pytest.raises(LogError, match="it has format 99, this version reads format 3"):
@@ -240,7 +240,7 @@ def test_a_log_whose_metadata_is_wrong_is_refused(
     tmp_path: Path, header: LogHeader, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "dxlrun.recording.log_writer.to_metadata", lambda header: {**to_metadata(header), "joints": "{"}
+        "dxlrun.log.log_writer.to_metadata", lambda header: {**to_metadata(header), "joints": "{"}
     )
     LogWriter(tmp_path / "x", header).close()
     with pytest.raises(LogError, match="cannot read"):

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.packets import PacketBatch, PacketKind, decode_packets
-from dxlrun.recording import schemas
-from dxlrun.recording.cdr import Codec
-from dxlrun.recording.header import LogHeader
-from dxlrun.recording.log_writer import LogWriter
-from dxlrun.recording.reader import read_log
-from dxlrun.ring import Handover
+from dxlrun.log import schemas
+from dxlrun.log.cdr import Codec
+from dxlrun.log.header import LogHeader
+from dxlrun.log.log_writer import LogWriter
+from dxlrun.log.reader import read_log
+from dxlrun.run.channels.packets import PacketBatch, PacketKind, decode_packets
+from dxlrun.run.channels.ring import Handover
 
 PACKETS = [
     (0, PacketKind.INSTRUCTION, 254, 1, 2, b"\xff\xff\xfe\x02\x01\xfe"),

@@ -17,15 +17,15 @@ from typing import Any
 import msgspec
 import pytest
 
-from dxlrun import ring
 from dxlrun.clock import VirtualClock
-from dxlrun.cycle import CycleLayout
-from dxlrun.events import EVENT_SLOT, EventCode, EventRing, Severity
-from dxlrun.packets import PACKET_SLOT, PacketBatch, PacketKind
-from dxlrun.recording.header import LogHeader
-from dxlrun.recording.reader import read_log
-from dxlrun.recording.recorder import _MOST_PER_TURN, Control, RecordedRing, Recorder, RecorderJob
-from dxlrun.ring import RingWriter
+from dxlrun.log.header import LogHeader
+from dxlrun.log.reader import read_log
+from dxlrun.log.recorder import _MOST_PER_TURN, Control, RecordedRing, Recorder, RecorderJob
+from dxlrun.run.channels import ring
+from dxlrun.run.channels.cycle import CycleLayout
+from dxlrun.run.channels.events import EVENT_SLOT, EventCode, EventRing, Severity
+from dxlrun.run.channels.packets import PACKET_SLOT, PacketBatch, PacketKind
+from dxlrun.run.channels.ring import RingWriter
 
 Cycle = Callable[[int], bytes]
 
@@ -89,7 +89,7 @@ def start(tmp_path: Path, header: LogHeader, layout: CycleLayout) -> Iterator[St
             [
                 sys.executable,
                 "-m",
-                "dxlrun.recording",
+                "dxlrun.log",
                 "--job-fd",
                 str(job_fd),
                 "--control-fd",

@@ -11,9 +11,9 @@ import yaml
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from dxlrun.recording import schemas
-from dxlrun.recording.header import LogHeader
-from dxlrun.recording.log_writer import LogWriter
+from dxlrun.log import schemas
+from dxlrun.log.header import LogHeader
+from dxlrun.log.log_writer import LogWriter
 
 TOPIC = "/robot_description"
 

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from dxlrun.cycle import SCALARS, SEQUENCES, CycleLayout, CycleRecord
-from dxlrun.recording import schemas
-from dxlrun.recording.cdr import ENCAPSULATION, Codec, parse
-from dxlrun.recording.schemas import MessageType
+from dxlrun.log import schemas
+from dxlrun.log.cdr import ENCAPSULATION, Codec, parse
+from dxlrun.log.schemas import MessageType
+from dxlrun.run.channels.cycle import SCALARS, SEQUENCES, CycleLayout, CycleRecord
 
 MESSAGES = [
     schemas.JOINT_STATE,

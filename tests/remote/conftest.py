@@ -11,18 +11,18 @@ import numpy as np
 import pytest
 
 import dxlrun
-from dxlrun import heartbeat, mailbox, ring
 from dxlrun.compile.plan import Plan
+from dxlrun.control.controllers.plugins import Offer, PlugIns
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan, LoopPlan, SchedulerPlan
-from dxlrun.control.plugins import Offer, PlugIns
-from dxlrun.cycle import CycleLayout, CycleRecord
-from dxlrun.events import EVENT_SLOT, EventRing
-from dxlrun.heartbeat import Heartbeat, Phase
-from dxlrun.mailbox import Mailbox
 from dxlrun.remote.gateway import Gateway
 from dxlrun.remote.job import Descriptors
 from dxlrun.remote.link import Link
 from dxlrun.remote.preparation import Preparation
+from dxlrun.run.channels import heartbeat, mailbox, ring
+from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
+from dxlrun.run.channels.events import EVENT_SLOT, EventRing
+from dxlrun.run.channels.heartbeat import Heartbeat, Phase
+from dxlrun.run.channels.mailbox import Mailbox
 
 PERIOD_NS = 20_000_000
 

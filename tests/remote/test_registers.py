@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import pytest
 
-from dxlrun.control_table import control_table
-from dxlrun.dynamixel.plan import Wiring, bus_plan
+from dxlrun.dynamixel.control_table import control_table
+from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
 
 GAIN = "/joints/pan/registers/position_p_gain"
 

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from dxlrun import supervisor
 from dxlrun.compile import compile_files
 from dxlrun.compile.plan import from_json, to_json
-from dxlrun.heartbeat import Heartbeat, Phase, create
-from dxlrun.run_summary import RunOptions
+from dxlrun.run import supervisor
+from dxlrun.run.channels.heartbeat import Heartbeat, Phase, create
+from dxlrun.run.run_summary import RunOptions
 
 ROBOT = Path(__file__).parents[2] / "robots" / "single_joint.yaml"
 

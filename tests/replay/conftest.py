@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from dxlrun.commands import CommandRing, TakenCommand
-from dxlrun.events import Event, EventCode, EventRing, Severity
-from dxlrun.recording.log_writer import LogWriter
-from dxlrun.recording.reader import Log, read_log
-from dxlrun.ring import Handover
+from dxlrun.log.log_writer import LogWriter
+from dxlrun.log.reader import Log, read_log
+from dxlrun.run.channels.commands import CommandRing, TakenCommand
+from dxlrun.run.channels.events import Event, EventCode, EventRing, Severity
+from dxlrun.run.channels.ring import Handover
 from dxlrun.testing import VirtualRobot, simulated_robot
 
 ROBOT = """\

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from dxlrun.errors import InputError
-from dxlrun.replay import replay_log
+from dxlrun.log.replay import replay_log
 from dxlrun.testing import simulated_robot
 
 ROBOTS = Path(__file__).parents[2] / "robots"

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from dxlrun.errors import ControllerFault, InputError
-from dxlrun.recording.reader import read_log
-from dxlrun.replay import ReplayReport, replay_log
-from dxlrun.replay.changes import Setting
+from dxlrun.log.reader import read_log
+from dxlrun.log.replay import ReplayReport, replay_log
+from dxlrun.log.replay.changes import Setting
 
 Change = Callable[..., Path]
 JOINTS = ("pan", "tilt", "nod")

@@ -8,11 +8,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from dxlrun.events import EventCode
-from dxlrun.inbox import Command, QueueInbox
+from dxlrun.log.reader import Log, read_log
+from dxlrun.log.replay import replay_log
 from dxlrun.mode import Mode
-from dxlrun.recording.reader import Log, read_log
-from dxlrun.replay import replay_log
+from dxlrun.run.channels.events import EventCode
+from dxlrun.run.channels.inbox import Command, QueueInbox
 from dxlrun.testing import VirtualRobot, simulated_robot
 
 ROBOT = """\

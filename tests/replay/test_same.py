@@ -15,8 +15,8 @@ import pytest
 
 from dxlrun.compile import compile_files
 from dxlrun.errors import InputError
-from dxlrun.recording.reader import read_log
-from dxlrun.replay import replay_log
+from dxlrun.log.reader import read_log
+from dxlrun.log.replay import replay_log
 from dxlrun.testing import VirtualRobot, plan_of, simulated_robot
 
 ROBOTS = Path(__file__).parents[2] / "robots"
@@ -139,6 +139,6 @@ def test_a_run_in_real_time(tmp_path: Path, robot_file: Path, plugin: Path) -> N
 
 
 def _plan_commands(log: Path) -> Any:
-    from dxlrun.replay.recorded import recorded
+    from dxlrun.log.replay.recorded import recorded
 
     return recorded(read_log(log)).plan.loop.commands

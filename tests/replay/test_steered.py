@@ -19,11 +19,11 @@ from hypothesis import strategies as st
 
 from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.errors import LogError
-from dxlrun.events import EventCode
-from dxlrun.inbox import Command, QueueInbox
-from dxlrun.recording.reader import Log, read_log
-from dxlrun.recording.steered import policy_begun, steered
-from dxlrun.replay import replay_log
+from dxlrun.log.reader import Log, read_log
+from dxlrun.log.replay import replay_log
+from dxlrun.log.steered import policy_begun, steered
+from dxlrun.run.channels.events import EventCode
+from dxlrun.run.channels.inbox import Command, QueueInbox
 from dxlrun.testing import VirtualRobot, simulated_robot
 
 Change = Callable[..., Path]

@@ -12,8 +12,8 @@ import pytest
 
 from dxlrun.analysis.bus import joints_of
 from dxlrun.errors import LogError, PlugInError
-from dxlrun.recording.reader import read_log
-from dxlrun.replay import replay_log
+from dxlrun.log.reader import read_log
+from dxlrun.log.replay import replay_log
 
 Change = Callable[..., Path]
 

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dxlrun import ring
-from dxlrun.ring import SLOT_HEADER, Gap, Handover, RingReader, RingWriter
+from dxlrun.run.channels import ring
+from dxlrun.run.channels.ring import SLOT_HEADER, Gap, Handover, RingReader, RingWriter
 
 HEADER = 64
 Make = Callable[[int, int], int]
@@ -162,7 +162,7 @@ def test_what_is_no_ring_is_refused() -> None:
 
 WRITER = """
 import sys
-from dxlrun.ring import RingWriter
+from dxlrun.run.channels.ring import RingWriter
 writer = RingWriter(int(sys.argv[1]))
 for number in range(int(sys.argv[2])):
     writer.append(b"%d " % number * 20)

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.recording.reader import Log, read_log
+from dxlrun.log.reader import Log, read_log
+from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import simulated_robot
-from dxlrun.virtual_run import VirtualRobot
 
 ROOT = Path(__file__).parents[2]
 

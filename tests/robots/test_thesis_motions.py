@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.control_table import control_table
-from dxlrun.simulation.motor import motor_of
+from dxlrun.dynamixel.control_table import control_table
+from dxlrun.simulation.motion.motor import motor_of
 
 MOTIONS = Path(__file__).parents[2] / "robots" / "motions"
 STEP_S = 3.0

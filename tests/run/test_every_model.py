@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from dxlrun.control_table import control_table, model_names
+from dxlrun.dynamixel.control_table import control_table, model_names
 from dxlrun.testing import simulated_robot
 
 ROBOT = """\

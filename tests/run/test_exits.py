@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from dxlrun.analysis.report import analyze
-from dxlrun.events import EventCode, Severity
+from dxlrun.run.channels.events import EventCode, Severity
 from dxlrun.simulation import read_ledger
 
 Running = Any
@@ -114,7 +114,7 @@ def test_an_interrupt_while_plug_ins_load_touches_no_servo_and_leaves_no_log(
         str(ledger),
         configure="signal.signal(signal.SIGTERM, signal.SIG_DFL); time.sleep(60)",
     )
-    run.child("dxlrun.loop_process")
+    run.child("dxlrun.run.loop_process")
     run.signal(signal.SIGINT)
     code, out, err = run.finish()
     assert (code, err) == (130, "")
@@ -127,8 +127,8 @@ def test_an_interrupt_while_plug_ins_load_touches_no_servo_and_leaves_no_log(
 def test_a_guardian_that_dies_while_the_loop_loads_takes_it_along(start: Start, tmp_path: Path) -> None:
     ledger = tmp_path / "seen.jsonl"
     run = start("--ledger", str(ledger))
-    run.child("dxlrun.loop_process")
-    os.kill(run.child("dxlrun.guardian"), signal.SIGKILL)
+    run.child("dxlrun.run.loop_process")
+    os.kill(run.child("dxlrun.run.guardian"), signal.SIGKILL)
     code, _, err = run.finish()
     assert code == 1
     assert "guardian ended" in err
@@ -139,7 +139,7 @@ def test_a_terminal_that_dies_while_the_guardian_starts_is_noticed(
     start: Start, wait_for: Callable[..., Any], all_limp: Limp
 ) -> None:
     run = start()
-    run.child("dxlrun.guardian")
+    run.child("dxlrun.run.guardian")
     run.signal(signal.SIGKILL)
     run.process.wait()
     wait_for(run.gone, "the end of every process")
@@ -151,7 +151,7 @@ def test_a_hung_loop_without_a_guardian_is_ended_by_the_terminal(
 ) -> None:
     run = start()
     run.wait_until_moving()
-    guardian, loop = run.child("dxlrun.guardian"), run.child("dxlrun.loop_process")
+    guardian, loop = run.child("dxlrun.run.guardian"), run.child("dxlrun.run.loop_process")
     os.kill(guardian, signal.SIGSTOP)
     os.kill(loop, signal.SIGSTOP)
     os.kill(guardian, signal.SIGKILL)
@@ -166,7 +166,7 @@ def test_a_hung_loop_without_a_guardian_is_ended_by_the_terminal(
 def test_guardian_and_loop_killed_together(start: Start, all_limp: Limp) -> None:
     run = start()
     run.wait_until_moving()
-    guardian, loop = run.child("dxlrun.guardian"), run.child("dxlrun.loop_process")
+    guardian, loop = run.child("dxlrun.run.guardian"), run.child("dxlrun.run.loop_process")
     os.kill(guardian, signal.SIGSTOP)
     for one in (loop, guardian):
         os.kill(one, signal.SIGKILL)
@@ -179,7 +179,7 @@ def test_guardian_and_loop_killed_together(start: Start, all_limp: Limp) -> None
 def test_a_guardian_that_stands_still_ends_the_run(start: Start, all_limp: Limp) -> None:
     run = start()
     run.wait_until_moving()
-    os.kill(run.child("dxlrun.guardian"), signal.SIGSTOP)
+    os.kill(run.child("dxlrun.run.guardian"), signal.SIGSTOP)
     code, _, err = run.finish()
     assert code == 1
     assert "did not look after the loop" in err
@@ -192,7 +192,7 @@ def test_a_recorder_that_stands_still_does_not_stop_the_robot_and_is_said(
 ) -> None:
     run = start("--duration", "1")
     run.wait_until_moving()
-    os.kill(run.child("dxlrun.recording"), signal.SIGSTOP)
+    os.kill(run.child("dxlrun.log"), signal.SIGSTOP)
     code, _, err = run.finish()
     assert code == 1
     assert "the recorder said nothing for 10 s and was killed" in err
@@ -410,7 +410,7 @@ def test_the_loop_grows_no_memory_and_collects_no_garbage(
     def resident_kb(cycles: int) -> int:
         # one read of the state of servo 3 a cycle; goals are sent when they change
         wait_for(lambda: sent(run).count(b"\xff\xff\x03\x04\x02\x24") >= cycles, f"{cycles} cycles")
-        status = Path(f"/proc/{run.child('dxlrun.loop_process')}/status").read_text()
+        status = Path(f"/proc/{run.child('dxlrun.run.loop_process')}/status").read_text()
         return int(status.split("VmRSS:")[1].split()[0])
 
     before = resident_kb(30)

@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from dxlrun.control.realtime import Grant
-from dxlrun.events import EventCode
-from dxlrun.grant_table import ProcessGrant, granted_text, refusals, show_grants
+from dxlrun.control.realtime.grants import Grant
+from dxlrun.run.channels.events import EventCode
+from dxlrun.run.grant_table import ProcessGrant, granted_text, refusals, show_grants
 
 GRANTS = (
     ProcessGrant("loop", Grant("timer slack", True, "timer slack 1 ns")),

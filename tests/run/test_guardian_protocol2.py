@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from dxlrun.simulation.protocol2 import Instruction, receiver
+from dxlrun.simulation.wire.protocol2 import Instruction, receiver
 
 ARM = Path(__file__).parents[2] / "robots/open_manipulator_x.yaml"
 IDS = (11, 12, 13, 14, 15)
@@ -45,7 +45,7 @@ def test_an_arm_whose_loop_was_killed_is_limp(
         return sum(address != TORQUE_ENABLE for _, address, _ in writes(sent())) >= 10 * len(IDS)
 
     wait_for(goals, "goals in the ledger")
-    os.kill(run.child("dxlrun.loop_process"), signal.SIGKILL)
+    os.kill(run.child("dxlrun.run.loop_process"), signal.SIGKILL)
     code, _, err = run.finish()
     assert code == 1
     assert "torque off was confirmed by all 5 servos" in err

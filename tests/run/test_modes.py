@@ -8,9 +8,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from dxlrun.inbox import Command, QueueInbox
+from dxlrun.log.reader import Log
 from dxlrun.mode import Mode
-from dxlrun.recording.reader import Log
+from dxlrun.run.channels.inbox import Command, QueueInbox
 from dxlrun.testing import VirtualRobot, read_log, simulated_robot
 
 ROBOT = """\

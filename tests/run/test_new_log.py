@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 
 from dxlrun.cli import main
-from dxlrun.cli.sim import _writable
+from dxlrun.cli.simulated.sim import _writable
 from dxlrun.errors import InputError
-from dxlrun.recording.log_file import LogFile
-from dxlrun.run_log import discard_log, ledger_of, new_log
+from dxlrun.log.log_file import LogFile
+from dxlrun.run.run_log import discard_log, ledger_of, new_log
 from dxlrun.simulation import Ledger
 
 Start = Callable[..., Any]

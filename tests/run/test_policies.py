@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from dxlrun.errors import StartUpError
-from dxlrun.inbox import LOOP, Command
+from dxlrun.run.channels.inbox import LOOP, Command
+from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import simulated_robot
-from dxlrun.virtual_run import VirtualRobot
 from dxlrun_controllers.group import JointGroupPositionController
 
 ROBOT = """\

@@ -10,14 +10,14 @@ from typing import Any
 
 import pytest
 
-from dxlrun import process
 from dxlrun.control.policy_plan import TORQUE_STAYS
-from dxlrun.events import Severity, decode_event
-from dxlrun.guardian import LastHand
-from dxlrun.heartbeat import Heartbeat, Phase
-from dxlrun.packets import PacketBatch, PacketKind, decode_packets
-from dxlrun.ring import Handover, RingReader, RingWriter
-from dxlrun.run_processes import Memory, guardian_job
+from dxlrun.run.channels import process
+from dxlrun.run.channels.events import Severity, decode_event
+from dxlrun.run.channels.heartbeat import Heartbeat, Phase
+from dxlrun.run.channels.packets import PacketBatch, PacketKind, decode_packets
+from dxlrun.run.channels.ring import Handover, RingReader, RingWriter
+from dxlrun.run.guardian import LastHand
+from dxlrun.run.run_processes import Memory, guardian_job
 from dxlrun.simulation import VirtualPorts
 from dxlrun.testing import VirtualRobot, plan_of, simulated_robot
 
@@ -69,7 +69,7 @@ def test_a_second_interrupt_counts_though_the_guardian_never_heard_of_it(
     holding: Callable[..., Any], all_limp: Limp
 ) -> None:
     run = holding("20 deg/s", "hold", "12 s")
-    guardian = run.child("dxlrun.guardian")
+    guardian = run.child("dxlrun.run.guardian")
     os.kill(guardian, signal.SIGSTOP)
     run.signal(signal.SIGINT)
     run.signal(signal.SIGTERM)
@@ -96,7 +96,7 @@ def test_the_guardian_holds_a_robot_whose_loop_is_gone_when_the_policy_says_so(
     holding: Callable[..., Any], all_limp: Limp
 ) -> None:
     run = holding("180 deg/s", "limp", "4 s")
-    os.kill(run.child("dxlrun.loop_process"), signal.SIGKILL)
+    os.kill(run.child("dxlrun.run.loop_process"), signal.SIGKILL)
     code, _, err = run.finish()
     assert code == 1
     assert "the loop's process ended by itself (signal SIGKILL)" in err

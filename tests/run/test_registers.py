@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from dxlrun.recording.reader import read_log
+from dxlrun.log.reader import read_log
 from dxlrun.testing import simulated_robot
 
 ROBOT = """\

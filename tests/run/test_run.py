@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from dxlrun.events import EventCode
+from dxlrun.run.channels.events import EventCode
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 Running = Any
@@ -57,7 +57,7 @@ def test_the_guardian_makes_the_robot_limp_when_the_loop_is_gone(
 ) -> None:
     run = start()
     run.wait_until_moving()
-    os.kill(run.child("dxlrun.loop_process"), signal.SIGKILL)
+    os.kill(run.child("dxlrun.run.loop_process"), signal.SIGKILL)
     code, out, err = run.finish()
     assert code == 1, out + err
     assert "torque off was confirmed by all 2 servos" in err
@@ -72,7 +72,7 @@ def test_without_a_guardian_the_loop_stops_by_itself(
 ) -> None:
     run = start()
     run.wait_until_moving()
-    os.kill(run.child("dxlrun.guardian"), signal.SIGKILL)
+    os.kill(run.child("dxlrun.run.guardian"), signal.SIGKILL)
     code, _, err = run.finish()
     assert code == 1
     assert "guardian ended" in err
@@ -83,7 +83,7 @@ def test_without_a_terminal_the_robot_becomes_limp(start: Start, all_limp: Calla
     run = start()
     run.wait_until_moving()
     simulation = os.pidfd_open(run.child("dxlrun.simulation"))
-    guardian = os.pidfd_open(run.child("dxlrun.guardian"))
+    guardian = os.pidfd_open(run.child("dxlrun.run.guardian"))
     run.signal(signal.SIGKILL)
     run.finish()
     for descriptor in (guardian, simulation):
@@ -103,7 +103,7 @@ def test_killing_the_recorder_does_not_stop_the_robot(
     run = start("--duration", "3")
     run.wait_until_moving()
     wait_for(lambda: len(run.log().cycles), "cycles in the log")
-    os.kill(run.child("dxlrun.recording"), signal.SIGKILL)
+    os.kill(run.child("dxlrun.log"), signal.SIGKILL)
     before = len(goals(run))
     code, out, err = run.finish()
     assert code == 1
@@ -121,7 +121,7 @@ def test_the_loops_process_has_one_thread_and_no_line_but_its_own(
 ) -> None:
     run = start()
     run.wait_until_moving()
-    process = Path(f"/proc/{run.child('dxlrun.loop_process')}")
+    process = Path(f"/proc/{run.child('dxlrun.run.loop_process')}")
     assert len(list((process / "task").iterdir())) == 1
     targets = sorted(os.readlink(one) for one in (process / "fd").iterdir())
     assert not [target for target in targets if target.startswith(("pipe:", "anon_inode:"))]

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.analysis.ledger_report import compare
+from dxlrun.analysis.ledger.comparison import compare
 from dxlrun.compile.plan import AdapterPlan, Plan
-from dxlrun.recording.reader import read_log
+from dxlrun.log.reader import read_log
+from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.simulation import Ledger, read_ledger
-from dxlrun.simulation.faults import FaultScript, parse_fault
+from dxlrun.simulation.faults.planned import FaultScript, parse_fault
 from dxlrun.testing import plan_of
-from dxlrun.virtual_run import VirtualRobot
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 TORSO = ROBOTS / "bioloid_torso.yaml"

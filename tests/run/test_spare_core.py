@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.loop_process import beside_simulation
-from dxlrun.process import spare_core
+from dxlrun.run.channels.process import spare_core
+from dxlrun.run.loop_process import beside_simulation
 from dxlrun.testing import plan_of
 
 

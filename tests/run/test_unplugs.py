@@ -27,8 +27,8 @@ from typing import Any
 
 import pytest
 
-from dxlrun.events import EventCode
-from dxlrun.packets import PacketKind
+from dxlrun.run.channels.events import EventCode
+from dxlrun.run.channels.packets import PacketKind
 from dxlrun.simulation import LedgerEntry, read_ledger
 
 DXLRUN = Path(sys.executable).with_name("dxlrun")
@@ -140,7 +140,7 @@ def test_an_adapter_that_is_pulled_costs_the_other_bus_nothing_and_comes_back(  
     for name in NAMES:
         count = len(servos.of(name, "in"))
         wait_for(lambda name=name, count=count: len(servos.of(name, "in")) > count + 20, f"more on {name}")
-    pids = [run.child(f"dxlrun.{victim}") for victim in ENDS[killed]]
+    pids = [run.child(f"dxlrun.run.{victim}") for victim in ENDS[killed]]
     for pid in pids:
         os.kill(pid, signal.SIGSTOP)  # nobody sees another one die
     for pid in reversed(pids):

@@ -12,12 +12,12 @@ import pytest
 
 from dxlrun.analysis.tracking import tracking
 from dxlrun.errors import InputError
-from dxlrun.events import EventCode
-from dxlrun.inbox import Command
-from dxlrun.packets import PacketKind
-from dxlrun.recording.reader import read_log
+from dxlrun.log.reader import read_log
+from dxlrun.run.channels.events import EventCode
+from dxlrun.run.channels.inbox import Command
+from dxlrun.run.channels.packets import PacketKind
+from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import plan_of, simulated_robot
-from dxlrun.virtual_run import VirtualRobot
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 TORSO = ROBOTS / "bioloid_torso.yaml"

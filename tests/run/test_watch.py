@@ -12,23 +12,24 @@ from typing import Any
 
 import pytest
 
-from dxlrun import guardian, heartbeat, process
 from dxlrun.clock import VirtualClock
 from dxlrun.compile import compile_robot
 from dxlrun.compile.simulated import simulated_buses
 from dxlrun.control.loop import StopFlag
 from dxlrun.description import read_robot
-from dxlrun.dynamixel import pump
+from dxlrun.dynamixel.exchange import pump
 from dxlrun.dynamixel.hardware import DynamixelHardware
-from dxlrun.dynamixel.reopening import KeptLines
-from dxlrun.events import EventRing
-from dxlrun.guardian import LEAST_PATIENCE_NS, LONGEST_LOOK_NS, Guardian, Handing, LastHand, patience_ns
-from dxlrun.heartbeat import Heartbeat, Phase, Standstill, Step
+from dxlrun.dynamixel.port.reopening import KeptLines
 from dxlrun.interfaces import Commands, States
-from dxlrun.loop_process import AskedToStop, Pulse
-from dxlrun.packets import NoPackets
-from dxlrun.ring import Handover
-from dxlrun.run_processes import Memory, guardian_job
+from dxlrun.run import guardian
+from dxlrun.run.channels import heartbeat, process
+from dxlrun.run.channels.events import EventRing
+from dxlrun.run.channels.heartbeat import Heartbeat, Phase, Standstill, Step
+from dxlrun.run.channels.packets import NoPackets
+from dxlrun.run.channels.ring import Handover
+from dxlrun.run.guardian import LEAST_PATIENCE_NS, LONGEST_LOOK_NS, Guardian, Handing, LastHand, patience_ns
+from dxlrun.run.loop_process import AskedToStop, Pulse
+from dxlrun.run.run_processes import Memory, guardian_job
 from dxlrun.simulation import Ledger, SimulatedBus, VirtualPorts
 from dxlrun.testing import plan_of
 

@@ -18,14 +18,14 @@ from typing import Any
 from fault_wire import FACTS, READ, Said, Told, angle, data_of, instructions, stands_at, states, written
 
 from dxlrun.analysis.bus import joints_of
-from dxlrun.analysis.ledger_faults import answered, uncaused
-from dxlrun.dynamixel.bus_plan import BusPlan
+from dxlrun.analysis.ledger.faults import answered, uncaused
+from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.errors import DxlrunError
-from dxlrun.events import EventCode
-from dxlrun.packets import PacketKind
-from dxlrun.recording.reader import Log
+from dxlrun.log.reader import Log
+from dxlrun.run.channels.events import EventCode
+from dxlrun.run.channels.packets import PacketKind
 from dxlrun.simulation import LedgerEntry, SimulatedBus, SimulatedServo
-from dxlrun.simulation.faults import FaultScript, parse_fault
+from dxlrun.simulation.faults.planned import FaultScript, parse_fault
 from dxlrun.testing import VirtualRobot
 
 MS = 1_000_000

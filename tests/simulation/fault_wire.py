@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Literal, NamedTuple
 
-from dxlrun.dynamixel.bus_plan import BusPlan, ServoPlan
+from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.simulation import LedgerEntry
 
 PING, READ, WRITE, SYNC_WRITE, SYNC_READ, FAST_SYNC_READ, BULK_READ = 0x01, 0x02, 0x03, 0x83, 0x82, 0x8A, 0x92

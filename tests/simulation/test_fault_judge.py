@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from dxlrun.analysis.ledger_report import compare
-from dxlrun.dynamixel import protocol2
-from dxlrun.events import Event, EventCode, Severity
-from dxlrun.recording.reader import Log, read_log
+from dxlrun.analysis.ledger.comparison import compare
+from dxlrun.dynamixel.wire import protocol2
+from dxlrun.log.reader import Log, read_log
+from dxlrun.run.channels.events import Event, EventCode, Severity
 from dxlrun.simulation import LedgerEntry
-from dxlrun.simulation.bus import OTHER_HOST
+from dxlrun.simulation.bus.simulated_bus import OTHER_HOST
 from dxlrun.testing import simulated_robot
 
 ROBOT = """\

@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.inbox import Command
-from dxlrun.recording.reader import read_log
-from dxlrun.simulation.fault_text import KINDS
+from dxlrun.log.reader import read_log
+from dxlrun.run.channels.inbox import Command
+from dxlrun.simulation.faults.fault_text import KINDS
 from dxlrun.testing import VirtualRobot, simulated_robot
 
 ROBOTS = Path(__file__).parents[2] / "robots"

@@ -11,8 +11,8 @@ import pytest
 from dxlrun.clock import VirtualClock
 from dxlrun.errors import InputError
 from dxlrun.simulation import BusConfig, Ledger, ServoConfig, SimulatedBus, VirtualPorts
-from dxlrun.simulation.faults import FaultScript, parse_fault
-from dxlrun.simulation.storm import PASSING
+from dxlrun.simulation.faults.planned import FaultScript, parse_fault
+from dxlrun.simulation.faults.storm import PASSING
 
 READ = 0x02
 MS = 1_000_000

@@ -15,8 +15,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from dxlrun.simulation.protocol1 import ErrorBit
-from dxlrun.simulation.protocol2 import crc16
+from dxlrun.simulation.wire.protocol1 import ErrorBit
+from dxlrun.simulation.wire.protocol2 import crc16
 
 CAMPAIGN = Path(__file__).parent.parent / "bench" / "fuzz_simulation.py"
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from dxlrun.simulation.protocol2 import ErrorNumber
+from dxlrun.simulation.wire.protocol2 import ErrorNumber
 
 
 def test_indirect_data_is_read_and_written_through(line2: Any) -> None:

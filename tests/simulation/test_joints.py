@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from dxlrun.control_table import all_tables, control_table
+from dxlrun.dynamixel.control_table import all_tables, control_table
 from dxlrun.simulation import Load, Mechanics, ServoConfig, SimulatedServo
-from dxlrun.simulation.motor import motor_of
+from dxlrun.simulation.motion.motor import motor_of
 
 S = 1_000_000_000
 

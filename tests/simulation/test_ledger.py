@@ -6,7 +6,7 @@ import pytest
 
 from dxlrun.errors import LogError
 from dxlrun.simulation import Ledger, LedgerEntry, read_ledger
-from dxlrun.simulation.ledger import FLUSH_NS, Passed
+from dxlrun.simulation.bus.ledger import FLUSH_NS, Passed
 
 ENTRIES = (
     LedgerEntry(5, "main", "in", b"\xff\xff\x01", ""),

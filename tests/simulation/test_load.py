@@ -9,11 +9,11 @@ from typing import Any, Literal
 import pytest
 import serial
 
-from dxlrun.control_table import control_table
+from dxlrun.dynamixel.control_table import control_table
 from dxlrun.simulation import BusConfig, Load, Mechanics, ServoConfig, SimulatedBus, VirtualPorts
 from dxlrun.simulation.configuration import SimulationConfig
-from dxlrun.simulation.motor import motor_of
-from dxlrun.simulation.mujoco_plant import UrdfBodies, UrdfJoint, mujoco_plant
+from dxlrun.simulation.motion.motor import motor_of
+from dxlrun.simulation.motion.mujoco_plant import UrdfBodies, UrdfJoint, mujoco_plant
 
 TICK = math.tau / 4096
 MASS, ARM = 0.5, 0.2

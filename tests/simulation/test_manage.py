@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from dxlrun.simulation import ServoConfig, SimulatedServo
-from dxlrun.simulation.protocol2 import ErrorNumber
+from dxlrun.simulation.wire.protocol2 import ErrorNumber
 
 PING, READ, WRITE, REG_WRITE, ACTION, RESET, REBOOT, CLEAR, BACKUP = 1, 2, 3, 4, 5, 6, 8, 0x10, 0x20
 SYNC_READ, SYNC_WRITE, FAST_SYNC_READ = 0x82, 0x83, 0x8A

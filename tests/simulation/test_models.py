@@ -10,9 +10,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from dxlrun.control_table import ControlItem, ControlTable, all_tables
+from dxlrun.dynamixel.control_table import ControlItem, ControlTable, all_tables
 from dxlrun.simulation import ServoConfig, SimulatedServo
-from dxlrun.simulation.packets import InstructionPacket
+from dxlrun.simulation.wire.packets import InstructionPacket
 
 OLD = [table for table in all_tables() if table.protocol == 1.0]
 NEW = [table for table in all_tables() if table.protocol == 2.0]

@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from dxlrun.control_table import control_table
+from dxlrun.dynamixel.control_table import control_table
 from dxlrun.simulation import Load
-from dxlrun.simulation.motor import motor_of
-from dxlrun.simulation.protocol2 import ErrorNumber
+from dxlrun.simulation.motion.motor import motor_of
+from dxlrun.simulation.wire.protocol2 import ErrorNumber
 
 TICK = math.tau / 4096
 RPM = math.tau / 60

@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from dxlrun.control_table import all_tables, control_table
+from dxlrun.dynamixel.control_table import all_tables, control_table
 from dxlrun.simulation import Mechanics, ServoConfig, SimulatedServo
-from dxlrun.simulation.motor import motor_of
-from dxlrun.simulation.shaft import critical_d
+from dxlrun.simulation.motion.motor import motor_of
+from dxlrun.simulation.motion.shaft import critical_d
 
 S, STEP_NS = 1_000_000_000, 2_000_000
 START = 1.0

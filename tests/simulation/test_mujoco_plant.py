@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from dxlrun.errors import InputError
-from dxlrun.simulation.mechanics import Mechanics
-from dxlrun.simulation.motor import Motor
-from dxlrun.simulation.mujoco_plant import UrdfBodies, UrdfJoint, mujoco_plant
-from dxlrun.simulation.plant import NO_LOAD, IndependentJoints, Joint, Load, Plant
+from dxlrun.simulation.motion.mechanics import Mechanics
+from dxlrun.simulation.motion.motor import Motor
+from dxlrun.simulation.motion.mujoco_plant import UrdfBodies, UrdfJoint, mujoco_plant
+from dxlrun.simulation.motion.plant import NO_LOAD, IndependentJoints, Joint, Load, Plant
 
 STEP_S = 0.002
 MASS, ARM = 0.5, 0.2

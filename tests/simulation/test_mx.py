@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from dxlrun.simulation.protocol1 import ErrorBit
+from dxlrun.simulation.wire.protocol1 import ErrorBit
 
 
 def low_high(value: int) -> tuple[int, int]:

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dxlrun.simulation.command import LIMP, Command
-from dxlrun.simulation.profile import Profiles
+from dxlrun.simulation.motion.command import LIMP, Command
+from dxlrun.simulation.motion.profile import Profiles
 
 DT = 0.002
 

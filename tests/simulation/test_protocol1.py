@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dxlrun.simulation.packets import InstructionPacket
-from dxlrun.simulation.protocol1 import LONGEST, InstructionReceiver, status_packet
+from dxlrun.simulation.wire.packets import InstructionPacket
+from dxlrun.simulation.wire.protocol1 import LONGEST, InstructionReceiver, status_packet
 
 # e-Manual, Protocol 1.0, "Instruction Details" and "Instruction Checksum"
 GOLDEN_INSTRUCTIONS = {

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dxlrun.simulation.packets import InstructionPacket, ReadEntry, ReadInTurn, Reply
-from dxlrun.simulation.protocol2 import (
+from dxlrun.simulation.wire.packets import InstructionPacket, ReadEntry, ReadInTurn, Reply
+from dxlrun.simulation.wire.protocol2 import (
     FastStatusPacket,
     Instruction,
     InstructionReceiver,

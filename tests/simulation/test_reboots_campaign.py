@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.recording.reader import read_log
+from dxlrun.log.reader import read_log
 from dxlrun.testing import simulated_robot
 
 BYTE_NS = 10_000

@@ -5,10 +5,10 @@ from typing import Any
 
 import pytest
 
-from dxlrun.control_table import control_table
+from dxlrun.dynamixel.control_table import control_table
 from dxlrun.simulation import ServoConfig, SimulatedServo
-from dxlrun.simulation.memory import Memory
-from dxlrun.simulation.protocol1 import ErrorBit
+from dxlrun.simulation.memory.cells import Memory
+from dxlrun.simulation.wire.protocol1 import ErrorBit
 
 PING, READ, WRITE, REG_WRITE, ACTION, FACTORY_RESET, SYNC_WRITE, BULK_READ = 1, 2, 3, 4, 5, 6, 0x83, 0x92
 BROADCAST = 0xFE

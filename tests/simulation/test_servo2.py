@@ -9,8 +9,8 @@ from unittest.mock import ANY
 import pytest
 
 from dxlrun.simulation import ServoConfig, SimulatedServo
-from dxlrun.simulation.protocol2 import ErrorNumber
-from dxlrun.simulation.torque_body import HardwareError
+from dxlrun.simulation.servo.torque_body import HardwareError
+from dxlrun.simulation.wire.protocol2 import ErrorNumber
 
 PING, READ, WRITE, REG_WRITE, ACTION, RESET, REBOOT, CLEAR = 1, 2, 3, 4, 5, 6, 8, 0x10
 SYNC_WRITE, BULK_WRITE = 0x83, 0x93

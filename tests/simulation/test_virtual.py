@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from dxlrun.clock import VirtualClock
-from dxlrun.dynamixel.port import Ports
+from dxlrun.dynamixel.port.ports import Ports
 from dxlrun.errors import PortError
 from dxlrun.simulation import BusConfig, Ledger, ServoConfig, SimulatedBus, VirtualPorts
 

@@ -6,12 +6,12 @@ from itertools import pairwise
 
 import pytest
 
+from dxlrun.cli.servos.robot_draft import draft, draft_file
 from dxlrun.compile import compile_files
-from dxlrun.control_table import all_tables
-from dxlrun.dynamixel.scanning import FoundServo
+from dxlrun.dynamixel.control_table import all_tables
+from dxlrun.dynamixel.tools.scanning import FoundServo
 from dxlrun.errors import InputError, ServoFault
-from dxlrun.inbox import Command
-from dxlrun.robot_draft import draft, draft_file
+from dxlrun.run.channels.inbox import Command
 from dxlrun.testing import simulated_robot
 
 PORT = "/dev/ttyUSB0"

@@ -11,8 +11,8 @@ import msgspec
 
 from dxlrun.analysis.latency import DISORDER_NS
 from dxlrun.analysis.wire import BROADCAST_ID, Question, Reply, error_names, question, replies
-from dxlrun.packets import LoggedPacket, PacketKind
-from dxlrun.recording.reader import UNREADABLE, Log
+from dxlrun.log.reader import UNREADABLE, Log
+from dxlrun.run.channels.packets import LoggedPacket, PacketKind
 
 _BYTE_NS = 10_000_000_000
 """Ten bits a byte, over the rate in bit/s."""

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.recording.reader import Log
-from dxlrun.ring import RING_SECONDS
+from dxlrun.log.reader import Log
+from dxlrun.run.channels.ring import RING_SECONDS
 
 ROUGH_NS = 150_000
 """A wake-up later than this does not happen on a real-time kernel (M. A. Araujo, UFU 2017)."""

@@ -21,8 +21,8 @@ from dxlrun.analysis.steering import Act, Pause
 from dxlrun.analysis.tally import Tally
 from dxlrun.analysis.tracking import Joint, tracking
 from dxlrun.analysis.verdict import Verdict, judge
-from dxlrun.events import EventGroup
-from dxlrun.recording.reader import Log, read_log
+from dxlrun.log.reader import Log, read_log
+from dxlrun.run.channels.events import EventGroup
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.analysis.latency import DISORDER_NS, begins, first_deadline_ns
-from dxlrun.commands import TakenCommand
-from dxlrun.events import Event, EventCode
-from dxlrun.recording.reader import UNREADABLE, Log
-from dxlrun.recording.steered import Steered, policy_begun, steered
+from dxlrun.log.reader import UNREADABLE, Log
+from dxlrun.log.steered import Steered, policy_begun, steered
+from dxlrun.run.channels.commands import TakenCommand
+from dxlrun.run.channels.events import Event, EventCode
 
 _LONGEST = 80
 _ANSWERS = frozenset((EventCode.STEERED, EventCode.COMMAND_REFUSED))

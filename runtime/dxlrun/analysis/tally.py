@@ -15,9 +15,9 @@ from dxlrun.analysis.bus import BusTraffic, Servo, Traffic
 from dxlrun.analysis.latency import Latency, Periods, Punctuality, Slowest, on_virtual_time
 from dxlrun.analysis.steering import Act, Pause, Steering
 from dxlrun.control.loop_plan import TOLERATED_SKIPS
-from dxlrun.events import EventCode, EventCounts, EventGroup, Severity
-from dxlrun.recording.reader import UNREADABLE, Log, scan_log
-from dxlrun.recording.schemas import FAILURES_NAME, SUMMARY_NAME
+from dxlrun.log.reader import UNREADABLE, Log, scan_log
+from dxlrun.log.schemas import FAILURES_NAME, SUMMARY_NAME
+from dxlrun.run.channels.events import EventCode, EventCounts, EventGroup, Severity
 
 
 @dataclass(frozen=True, slots=True)

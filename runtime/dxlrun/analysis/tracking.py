@@ -16,9 +16,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.control_table import control_table
+from dxlrun.dynamixel.control_table import control_table
 from dxlrun.interfaces import Floats
-from dxlrun.recording.reader import UNREADABLE, Log
+from dxlrun.log.reader import UNREADABLE, Log
 
 _REST_S = 0.3
 """A reachable trajectory that stands still for so long is at rest: its joint is to settle."""

@@ -25,9 +25,9 @@ from enum import IntEnum, unique
 from dxlrun.analysis.bus import BusTraffic, Servo
 from dxlrun.analysis.steering import Act, Pause
 from dxlrun.analysis.tally import Figures
-from dxlrun.dynamixel.latency_timer import late_replies
-from dxlrun.events import EventCode, EventGroup, Severity
+from dxlrun.dynamixel.port.latency_timer import late_replies
 from dxlrun.plurals import counted
+from dxlrun.run.channels.events import EventCode, EventGroup, Severity
 
 INVALID_SHARE = 0.01
 """More invalid states of a joint than this, and the run was not good."""

@@ -12,7 +12,7 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from dxlrun.analysis.ledger_waits import Sent, transactions
+from dxlrun.analysis.ledger.waits import Sent, transactions
 from dxlrun.bench.canned import CannedResponder
 from dxlrun.bench.case import Case
 from dxlrun.bench.figures import CaseFigures, WireFigures, host_figures, wire_figures

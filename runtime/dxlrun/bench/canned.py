@@ -7,10 +7,10 @@ from collections.abc import Sequence
 
 import msgspec
 
-from dxlrun import process
 from dxlrun.bench.hosts import Host
-from dxlrun.child import Child
 from dxlrun.errors import ProcessFault
+from dxlrun.run.channels import process
+from dxlrun.run.channels.child import Child
 from dxlrun.simulation import BusConfig
 from dxlrun.simulation.configuration import encode_config
 

@@ -13,20 +13,27 @@ from typing import Protocol
 
 import numpy as np
 
-from dxlrun.analysis.ledger_waits import Sent
-from dxlrun.assembly import assemble
+from dxlrun.analysis.ledger.waits import Sent
 from dxlrun.bench.case import Case, Registers
 from dxlrun.bench.peers import Rustypot, Sdk
 from dxlrun.clock import MonotonicClock
-from dxlrun.commands import NoCommands
 from dxlrun.compile.plan import Plan
+from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.control.loop import StopFlag
-from dxlrun.control.plugins import load_plugins
-from dxlrun.cycle import CycleRecord
-from dxlrun.dynamixel.port import ReplyPolling, SerialPort, SerialPorts
-from dxlrun.events import EventCode, Severity
-from dxlrun.packets import PACKET_SLOT, NoPackets, PacketBatch, PacketKind, decode_packets, packet_slots
-from dxlrun.ring import Gap, RingReader, RingWriter, create
+from dxlrun.dynamixel.port.ports import ReplyPolling, SerialPort, SerialPorts
+from dxlrun.run.assembly import assemble
+from dxlrun.run.channels.commands import NoCommands
+from dxlrun.run.channels.cycle import CycleRecord
+from dxlrun.run.channels.events import EventCode, Severity
+from dxlrun.run.channels.packets import (
+    PACKET_SLOT,
+    NoPackets,
+    PacketBatch,
+    PacketKind,
+    decode_packets,
+    packet_slots,
+)
+from dxlrun.run.channels.ring import Gap, RingReader, RingWriter, create
 
 _IDLE_NS = 50_000_000
 _TICKS = 2

@@ -9,7 +9,7 @@ of goals; ours has SI units at both ends. With `values=False` they leave the byt
 
 from __future__ import annotations
 
-from dxlrun.analysis.ledger_waits import Sent
+from dxlrun.analysis.ledger.waits import Sent
 from dxlrun.bench.case import Case, Registers
 from dxlrun.errors import InputError
 

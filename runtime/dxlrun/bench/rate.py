@@ -15,12 +15,12 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from dxlrun.analysis.ledger_report import compare
+from dxlrun.analysis.ledger.comparison import compare
 from dxlrun.compile import compile_robot
 from dxlrun.compile.plan import Plan
 from dxlrun.description import Description
 from dxlrun.errors import ProcessFault
-from dxlrun.recording.reader import Log, read_log
+from dxlrun.log.reader import Log, read_log
 from dxlrun.simulation import read_ledger
 
 HIGHEST_HZ = 2000.0

@@ -13,8 +13,8 @@ from rich.console import Console
 from dxlrun.bench.rate import Run
 from dxlrun.compile.plan import Plan
 from dxlrun.errors import ProcessFault
-from dxlrun.run_summary import RunOptions
-from dxlrun.supervisor import run_robot
+from dxlrun.run.run_summary import RunOptions
+from dxlrun.run.supervisor import run_robot
 
 _INTERRUPTED = 130
 

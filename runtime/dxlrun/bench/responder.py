@@ -24,7 +24,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Literal
 
-from dxlrun import process
+from dxlrun.run.channels import process
 from dxlrun.simulation import BusConfig, Ledger, SimulatedBus
 from dxlrun.simulation.configuration import decode_config
 

@@ -9,9 +9,9 @@ from types import TracebackType
 
 import msgspec
 
-from dxlrun import process
-from dxlrun.child import Child
 from dxlrun.errors import ProcessFault
+from dxlrun.run.channels import process
+from dxlrun.run.channels.child import Child
 from dxlrun.simulation import BusConfig
 from dxlrun.simulation.configuration import encode_config
 

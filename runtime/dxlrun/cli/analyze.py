@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from dxlrun.cli.flags import Flag, JsonFlag
-from dxlrun.cli.terminal import out, say_error
+from dxlrun.cli.output.flags import Flag, JsonFlag
+from dxlrun.cli.output.terminal import out, say_error
 from dxlrun.errors import InputError, LogError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from dxlrun.analysis.report import Report
-    from dxlrun.recording.reader import Log
+    from dxlrun.log.reader import Log
 
 
 def analyze(
@@ -70,8 +70,8 @@ def analyze(
             raise InputError("a report does not hold a comparison; give --report and --ledger one at a time")
         return _compare(log, ledger, as_json=as_json)
     from dxlrun.analysis import report as analysis
-    from dxlrun.analysis.terminal import render
-    from dxlrun.recording.reader import read_log
+    from dxlrun.analysis.output.terminal import render
+    from dxlrun.log.reader import read_log
 
     read = read_log(log)
     result = analysis.analyze(read)
@@ -141,9 +141,9 @@ def _compare(log: Path, ledger: Path, *, as_json: bool) -> int:
             f"there is no ledger {ledger}; a run on simulated buses in real time leaves one beside its log, "
             f"here {log.with_suffix('.ledger.jsonl')}, and `dxlrun sim` writes where its --ledger says"
         )
-    from dxlrun.analysis.ledger_report import compare, to_json
-    from dxlrun.analysis.ledger_tables import render_comparison
-    from dxlrun.recording.reader import read_log
+    from dxlrun.analysis.ledger.comparison import compare, to_json
+    from dxlrun.analysis.ledger.ledger_tables import render_comparison
+    from dxlrun.log.reader import read_log
     from dxlrun.simulation import read_ledger
 
     result = compare(read_log(log), read_ledger(ledger), ledger)
@@ -168,7 +168,7 @@ def _check_target(target: Path) -> None:
 
 
 def _write(log: Log, result: Report, target: Path) -> None:
-    from dxlrun.analysis.page import page
+    from dxlrun.analysis.output.document import page
 
     text = page(log, result)
     try:

@@ -15,16 +15,16 @@ from dxlrun.cli.bench import bench
 from dxlrun.cli.check import check
 from dxlrun.cli.doctor import doctor
 from dxlrun.cli.examples import examples
-from dxlrun.cli.models import models
+from dxlrun.cli.output.terminal import out, print_refusal, say_error, say_warning
 from dxlrun.cli.replay import replay
-from dxlrun.cli.robots import list_robots
 from dxlrun.cli.run import run
-from dxlrun.cli.scan import scan
 from dxlrun.cli.schema import schema
-from dxlrun.cli.servo import servo
-from dxlrun.cli.sim import sim
-from dxlrun.cli.steer import load, pause, rate, resume, send, set_register, stop, switch, unload
-from dxlrun.cli.terminal import out, print_refusal, say_error, say_warning
+from dxlrun.cli.servos.models import models
+from dxlrun.cli.servos.scan import scan
+from dxlrun.cli.servos.servo import servo
+from dxlrun.cli.simulated.sim import sim
+from dxlrun.cli.steering.robots import list_robots
+from dxlrun.cli.steering.steer import load, pause, rate, resume, send, set_register, stop, switch, unload
 from dxlrun.errors import DxlrunError, InputError, Problem
 
 INTERRUPTED = 130

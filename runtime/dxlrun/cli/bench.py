@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
-from dxlrun.cli.flags import Flag, JsonFlag
-from dxlrun.cli.terminal import out, say_error, say_warning
+from dxlrun.cli.output.flags import Flag, JsonFlag
+from dxlrun.cli.output.terminal import out, say_error, say_warning
 from dxlrun.errors import InputError
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ def bench_bus(
     from dxlrun.bench import bus
     from dxlrun.bench.case import Case
     from dxlrun.bench.hosts import HOSTS
-    from dxlrun.cli.bench_table import progress_bar
+    from dxlrun.cli.output.bench_table import progress_bar
 
     names = _words("--peers", peers, [kind.name for kind in HOSTS])
     protocols = [float(word) for word in _words("--protocol", protocol, ["1.0", "2.0"])]
@@ -132,9 +132,9 @@ def bench_rate(
     from dxlrun.bench.rate import bench_rate as measure
     from dxlrun.bench.rate import to_json
     from dxlrun.bench.real_run import runs
-    from dxlrun.cli.bench_table import rate_table, rate_verdict
     from dxlrun.cli.inputs import parse_assignments
-    from dxlrun.cli.narrow import fitting
+    from dxlrun.cli.output.bench_table import rate_table, rate_verdict
+    from dxlrun.cli.output.narrow import fitting
     from dxlrun.description import read_robot
 
     description = read_robot(robot, parse_assignments(assignments))
@@ -174,8 +174,8 @@ def _counts(text: str) -> list[int]:
 
 
 def _print(result: BusBench) -> None:
-    from dxlrun.cli.bench_table import bus_table
-    from dxlrun.cli.narrow import fitting
+    from dxlrun.cli.output.bench_table import bus_table
+    from dxlrun.cli.output.narrow import fitting
 
     console = out()
     console.print(fitting(bus_table(result), console.width))

@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from dxlrun.cli.flags import Flag, JsonFlag, Motions
 from dxlrun.cli.inputs import compiled
-from dxlrun.cli.terminal import out, problems_json, say_error, say_warning
+from dxlrun.cli.output.flags import Flag, JsonFlag, Motions
+from dxlrun.cli.output.terminal import out, problems_json, say_error, say_warning
 from dxlrun.errors import InputError
 
 if TYPE_CHECKING:
     from dxlrun.compile import Compiled
-    from dxlrun.dynamixel.bus_plan import BusPlan
-    from dxlrun.identification import Found
+    from dxlrun.dynamixel.plan.bus_plan import BusPlan
+    from dxlrun.run.identification import Found
 
 
 def check(
@@ -75,7 +75,7 @@ def check(
 
 
 def _asked(buses: Sequence[BusPlan], joints: Sequence[str]) -> Mapping[str, str]:
-    from dxlrun.identification import ask_servos  # not above: most checks open no port
+    from dxlrun.run.identification import ask_servos  # not above: most checks open no port
 
     return ask_servos(buses, joints)
 
@@ -83,7 +83,7 @@ def _asked(buses: Sequence[BusPlan], joints: Sequence[str]) -> Mapping[str, str]
 def _look(result: Compiled) -> Found:
     """Look at the servos on real ports; raises InputError where there are none."""
     from dxlrun.compile.buses import SIMULATED
-    from dxlrun.identification import look
+    from dxlrun.run.identification import look
 
     buses = [bus for bus in result.plan.buses if bus.port != SIMULATED]
     if not buses:
@@ -99,7 +99,7 @@ def _print_json(value: dict[str, object]) -> None:
 
 
 def _print_tables(result: Compiled, found: Found | None) -> None:
-    from dxlrun.cli.check_tables import registers, tables, verdict
+    from dxlrun.cli.output.check_tables import registers, tables, verdict
 
     console = out()
     console.print(verdict(result), soft_wrap=True)

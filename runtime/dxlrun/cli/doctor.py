@@ -6,13 +6,13 @@ import json
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
-from dxlrun.cli.flags import Flag, JsonFlag
-from dxlrun.cli.terminal import out
+from dxlrun.cli.output.flags import Flag, JsonFlag
+from dxlrun.cli.output.terminal import out
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from dxlrun.doctor import Finding
+    from dxlrun.run.doctor import Finding
 
 
 def doctor(*, as_json: JsonFlag = False, debug: Flag = False) -> int:
@@ -28,7 +28,7 @@ def doctor(*, as_json: JsonFlag = False, debug: Flag = False) -> int:
     debug
         Print the traceback of an error.
     """
-    from dxlrun.doctor import Machine, diagnose
+    from dxlrun.run.doctor import Machine, diagnose
 
     findings = diagnose(Machine.this())
     missing = sum(finding.state == "missing" for finding in findings)

@@ -9,8 +9,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dxlrun.cli.flags import Flag, JsonFlag
-from dxlrun.cli.terminal import out
+from dxlrun.cli.output.flags import Flag, JsonFlag
+from dxlrun.cli.output.terminal import out
 from dxlrun.errors import DxlrunError, InputError
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def examples(
         return 0
     stem = Path(name).name.removesuffix(".yaml")
     if stem not in known:
-        from dxlrun.compile.problems import suggestion
+        from dxlrun.compile.checks.problems import suggestion
 
         raise InputError(f"there is no example {name}; {suggestion(stem, tuple(known))}")
     example = _example(known[stem])
@@ -93,7 +93,7 @@ def _list(found: Sequence[Example], *, as_json: bool) -> None:
         return
     from rich.table import Table
 
-    from dxlrun.cli.narrow import fitting
+    from dxlrun.cli.output.narrow import fitting
 
     table = Table("example", box=None, pad_edge=False)
     table.add_column("servos", justify="right")

@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from dxlrun.cli.flags import Flag, JsonFlag
 from dxlrun.cli.inputs import parse_assignments
-from dxlrun.cli.terminal import out, say_warning
+from dxlrun.cli.output.flags import Flag, JsonFlag
+from dxlrun.cli.output.terminal import out, say_warning
 from dxlrun.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from dxlrun.replay import Difference, ReplayReport
+    from dxlrun.log.replay import Difference, ReplayReport
 
 Settings = Annotated[
     tuple[str, ...], Parameter(name="--set", negative=(), show_default=False, allow_leading_hyphen=False)
@@ -48,8 +48,8 @@ def replay(
     if not log.is_file():
         raise InputError(f"there is no log {log}; a run says at its end where its log is")
     arguments = parse_assignments(assignments)
-    from dxlrun.replay import replay_log, to_json
-    from dxlrun.replay.changes import Setting
+    from dxlrun.log.replay import replay_log, to_json
+    from dxlrun.log.replay.changes import Setting
 
     report = replay_log(log, [Setting.parse(text) for text in settings], arguments)
     for remark in report.remarks:

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from dxlrun.cli.flags import Flag, Motions
 from dxlrun.cli.inputs import compiled
-from dxlrun.cli.terminal import out, say_error, say_warning
+from dxlrun.cli.output.flags import Flag, Motions
+from dxlrun.cli.output.terminal import out, say_error, say_warning
 from dxlrun.errors import InputError, LogError
 from dxlrun.plurals import counted
 
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from dxlrun.analysis.tally import Figures
     from dxlrun.analysis.verdict import Verdict
     from dxlrun.compile.plan import Plan
-    from dxlrun.dynamixel.bus_plan import BusPlan
-    from dxlrun.run_summary import RunSummary
+    from dxlrun.dynamixel.plan.bus_plan import BusPlan
+    from dxlrun.run.run_summary import RunSummary
 
 
 def run(
@@ -76,18 +76,18 @@ def run(
         say_warning(str(warning))
     if ledger is not None:
         _check_ledger(ledger, result.plan)
-    from dxlrun.run_summary import RunOptions
+    from dxlrun.run.run_summary import RunOptions
 
     options = RunOptions(
         record=not no_record, take_over=take_over, debug=debug, ledger=ledger, gateway=not no_gateway
     )
     console = out()
     if virtual:
-        from dxlrun.virtual_run import run_virtual
+        from dxlrun.run.virtual_run import run_virtual
 
         summary = run_virtual(result.plan, options, console)
     else:
-        from dxlrun.supervisor import run_robot
+        from dxlrun.run.supervisor import run_robot
 
         summary = run_robot(result.plan, options, console)
     return show(summary, result.plan, console)
@@ -95,7 +95,7 @@ def run(
 
 def _check_ledger(ledger: Path, plan: Plan) -> None:
     """Raise InputError where no ledger can be written, before anything starts."""
-    from dxlrun.simulation.ledger import for_group
+    from dxlrun.simulation.bus.ledger import for_group
 
     if not plan.simulated:
         raise InputError(
@@ -112,7 +112,7 @@ def _check_ledger(ledger: Path, plan: Plan) -> None:
 
 def _ask_servos(buses: Sequence[BusPlan], joints: Sequence[str]) -> Mapping[str, str]:
     """Ask for the models of joints that say `model: auto`; most robots have none, so it is imported late."""
-    from dxlrun.identification import ask_servos
+    from dxlrun.run.identification import ask_servos
 
     return ask_servos(buses, joints)
 

@@ -6,8 +6,8 @@ import json
 from pathlib import Path
 from typing import Literal
 
-from dxlrun.cli.flags import Flag
-from dxlrun.cli.terminal import out
+from dxlrun.cli.output.flags import Flag
+from dxlrun.cli.output.terminal import out
 from dxlrun.errors import InputError
 
 
@@ -50,7 +50,7 @@ def schema_text(kind: Literal["robot", "motion", "fragment"], *, only: str = "")
     if kind == "motion":
         made = motion_schema()
     else:
-        from dxlrun.control.plugins import load_plugins
+        from dxlrun.control.controllers.plugins import load_plugins
 
         offers = load_plugins().controllers.items()
         parameters = {

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+from dxlrun.compile.checks.problems import Problems
 from dxlrun.compile.health import with_health
-from dxlrun.compile.joints import CompiledJoint
-from dxlrun.compile.problems import Problems
-from dxlrun.compile.registers import check_position_limits
+from dxlrun.compile.joint.joints import CompiledJoint
+from dxlrun.compile.joint.registers import check_position_limits
 from dxlrun.description import Description
-from dxlrun.dynamixel.bus_plan import Budget, BusPlan
-from dxlrun.dynamixel.plan import Wiring, bus_plan
+from dxlrun.dynamixel.plan.bus_plan import Budget, BusPlan
+from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
 from dxlrun.mode import Mode
 
 SIMULATED = "sim"

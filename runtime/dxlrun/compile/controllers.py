@@ -7,15 +7,15 @@ from dataclasses import dataclass
 
 from pydantic import ValidationError
 
-from dxlrun.compile.places import joint_mark
-from dxlrun.compile.problems import Problems, suggestion
-from dxlrun.control.claims import conflicts
-from dxlrun.control.contract import interfaces_breach
-from dxlrun.control.controller import Interfaces, ParametersModel
+from dxlrun.compile.checks.places import joint_mark
+from dxlrun.compile.checks.problems import Problems, suggestion
+from dxlrun.control.controllers.claims import conflicts
+from dxlrun.control.controllers.contract import interfaces_breach
+from dxlrun.control.controllers.controller import Interfaces, ParametersModel
+from dxlrun.control.controllers.plugins import Offer, PlugIns
 from dxlrun.control.loop_plan import ControllerPlan
-from dxlrun.control.plugins import Offer, PlugIns
-from dxlrun.cycle import MOST_CONTROLLERS
 from dxlrun.description import Description, problems_of
+from dxlrun.run.channels.cycle import MOST_CONTROLLERS
 
 _RATE_TOLERANCE = 1e-6
 """Relative; a loop rate of 33.3 Hz is three times 11.1 Hz."""

@@ -6,13 +6,13 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from dxlrun.compile.problems import Problems, suggestion
+from dxlrun.compile.checks.problems import Problems, suggestion
 from dxlrun.control.policy_plan import GroupPolicy
-from dxlrun.control_table import control_table
 from dxlrun.description import Description
-from dxlrun.dynamixel.bus_plan import BusPlan
-from dxlrun.dynamixel.bus_watchdog import LEAST_PERIODS, MOST_TICKS, UNIT_NS, has_one
-from dxlrun.dynamixel.slow_registers import slow_items
+from dxlrun.dynamixel.control_table import control_table
+from dxlrun.dynamixel.plan.bus_plan import BusPlan
+from dxlrun.dynamixel.registers.bus_watchdog import LEAST_PERIODS, MOST_TICKS, UNIT_NS, has_one
+from dxlrun.dynamixel.servo.slow_registers import slow_items
 
 WATCHDOG_NS = 200_000_000
 """How long a servo of Protocol 2.0 goes on without instructions where the file is silent (failures.md)."""

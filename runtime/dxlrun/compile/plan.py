@@ -8,7 +8,7 @@ from typing import Literal
 import msgspec
 
 from dxlrun.control.loop_plan import LoopPlan
-from dxlrun.dynamixel.bus_plan import BusPlan
+from dxlrun.dynamixel.plan.bus_plan import BusPlan
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from dxlrun.compile.checks.problems import Problems, suggestion
 from dxlrun.compile.health import group_policies
-from dxlrun.compile.joints import CompiledJoint
-from dxlrun.compile.problems import Problems, suggestion
-from dxlrun.compile.reach import Interval, degrees
+from dxlrun.compile.joint.joints import CompiledJoint
+from dxlrun.compile.joint.reach import Interval, degrees
 from dxlrun.control.policy_plan import HOLD, LIMP, POLICIES, Last, Policy, PolicyName, PolicyPlan, Step
 from dxlrun.control.safe_motion import longest_ns
 from dxlrun.description import Description
 from dxlrun.description.policies import PoseStep, TorqueStep
-from dxlrun.dynamixel.bus_plan import BusPlan
+from dxlrun.dynamixel.plan.bus_plan import BusPlan
 
 MARGIN_NS = 100_000_000
 """For the processor, and for servos that answer only the second time, while torque is switched off."""

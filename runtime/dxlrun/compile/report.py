@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 from dxlrun.compile.controllers import CompiledController
-from dxlrun.compile.joints import CompiledJoint
-from dxlrun.compile.motions import CompiledPart
+from dxlrun.compile.joint.joints import CompiledJoint
+from dxlrun.compile.motion.motions import CompiledPart
 from dxlrun.control.policy_plan import POLICIES, PolicyPlan
 from dxlrun.description import Description
-from dxlrun.dynamixel.bus_plan import BusPlan, ReadWay
+from dxlrun.dynamixel.plan.bus_plan import BusPlan, ReadWay
 from dxlrun.mode import Mode
 
 

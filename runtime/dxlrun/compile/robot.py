@@ -9,24 +9,24 @@ from pathlib import Path
 from typing import TypeAlias
 
 from dxlrun.compile.buses import SIMULATED, compile_buses
+from dxlrun.compile.checks.left_out import left_out_names, still_true
+from dxlrun.compile.checks.problems import Problems
 from dxlrun.compile.controllers import compile_controllers
 from dxlrun.compile.health import slowest_period_ns
-from dxlrun.compile.joints import AUTO, compile_joints
-from dxlrun.compile.left_out import left_out_names, still_true
-from dxlrun.compile.modes import compile_modes
-from dxlrun.compile.motions import compile_motion
+from dxlrun.compile.joint.joints import AUTO, compile_joints
+from dxlrun.compile.joint.modes import compile_modes
+from dxlrun.compile.joint.twins import check_twins
+from dxlrun.compile.joint.urdf import compile_urdf
+from dxlrun.compile.motion.motions import compile_motion
 from dxlrun.compile.plan import Plan, SimulationPlan
 from dxlrun.compile.policies import compile_policies
-from dxlrun.compile.problems import Problems
 from dxlrun.compile.report import Checked, CheckReport, check_report
 from dxlrun.compile.scheduler import check_scheduler, least_period_ns, scheduler_plan
 from dxlrun.compile.simulation import compile_simulation
-from dxlrun.compile.twins import check_twins
-from dxlrun.compile.urdf import compile_urdf
+from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.control.loop_plan import LoopPlan
-from dxlrun.control.plugins import load_plugins
 from dxlrun.description import Description, MotionDescription, Survey, read_motion, survey_robot
-from dxlrun.dynamixel.bus_plan import BusPlan
+from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.errors import InputError, Problem
 
 Ask: TypeAlias = Callable[[Sequence[BusPlan], Sequence[str]], Mapping[str, str]]

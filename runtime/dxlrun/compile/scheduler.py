@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from dxlrun.compile.problems import Problems
+from dxlrun.compile.checks.problems import Problems
 from dxlrun.control.loop_plan import SchedulerPlan
-from dxlrun.control.margin import MOST_SHARE
+from dxlrun.control.realtime.margin import MOST_SHARE
 from dxlrun.description import Description
 from dxlrun.description.robot import Loop
-from dxlrun.dynamixel.bus_plan import BusPlan
+from dxlrun.dynamixel.plan.bus_plan import BusPlan
 
 _HIGHEST = 98
 """The guardian needs one priority above the loop, and 99 is the highest there is (sched(7))."""

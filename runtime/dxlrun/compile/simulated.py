@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dxlrun.compile.plan import AdapterPlan, LoadPlan, Plan
 from dxlrun.compile.simulation import NAME_URDF, NEEDS_URDF
-from dxlrun.control_table import added_control_tables
-from dxlrun.dynamixel.bus_plan import BusPlan
+from dxlrun.dynamixel.control_table import added_control_tables
+from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.errors import InputError
 from dxlrun.simulation import AdapterConfig, BusConfig, Load, ServoConfig
-from dxlrun.simulation.mujoco_plant import UrdfBodies, UrdfJoint, mujoco_plant
+from dxlrun.simulation.motion.mujoco_plant import UrdfBodies, UrdfJoint, mujoco_plant
 
 
 def simulated_buses(plan: Plan) -> tuple[BusConfig, ...]:

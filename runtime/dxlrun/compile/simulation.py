@@ -9,12 +9,12 @@ import importlib.util
 from collections.abc import Mapping
 
 from dxlrun.compile.buses import SIMULATED
-from dxlrun.compile.joints import CompiledJoint
+from dxlrun.compile.checks.problems import Problems
+from dxlrun.compile.joint.joints import CompiledJoint
 from dxlrun.compile.plan import AdapterPlan, LoadPlan, SimulationPlan
-from dxlrun.compile.problems import Problems
 from dxlrun.description import Description
 from dxlrun.description.bus import Bus
-from dxlrun.simulation.mujoco_plant import INSTALL_MUJOCO, NEEDS_MUJOCO
+from dxlrun.simulation.motion.mujoco_plant import INSTALL_MUJOCO, NEEDS_MUJOCO
 
 NEEDS_URDF = "physics: mujoco moves the bodies of a URDF, and the file names none"
 NAME_URDF = "write `model: {urdf: ...}`, or take physics: independent"

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.control.loop_plan import JointPlan
-from dxlrun.cycle import Clamp
 from dxlrun.interfaces import Commands, Floats, States
 from dxlrun.mode import Mode
+from dxlrun.run.channels.cycle import Clamp
 
 BRAKING_S = 0.1
 """A joint in velocity mode may come nearer to a position limit by as much of the way that is left in this

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from dxlrun.control.drive_gate import DriveGate
 from dxlrun.control.loop_plan import LoopPlan
-from dxlrun.cycle import Clamp, CycleRecord
-from dxlrun.events import EventCode, EventSink, Severity
 from dxlrun.interfaces import Commands, Floats
 from dxlrun.mode import Mode
+from dxlrun.run.channels.cycle import Clamp, CycleRecord
+from dxlrun.run.channels.events import EventCode, EventSink, Severity
 
 SLOW_SPEED = 1.5
 """rad/s; a goal moves no faster in the first second after torque was switched on. A quarter of an AX-12's

@@ -10,23 +10,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.clock import Clock
-from dxlrun.commands import CommandSink, NoCommands, TakenCommand
+from dxlrun.control.controllers.managed import PERIOD_CAP
+from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.gate import Gate
+from dxlrun.control.hardware import Hardware
 from dxlrun.control.loop_plan import ControllerPlan, LoopPlan
 from dxlrun.control.lost_servos import LostServos
-from dxlrun.control.managed import PERIOD_CAP
-from dxlrun.control.manager import Manager
 from dxlrun.control.overrun import OverrunHook, Overruns
 from dxlrun.control.policy_plan import Last, PolicyName
 from dxlrun.control.safe_motion import SafeMotion
 from dxlrun.control.schedule import Schedule
 from dxlrun.control.steering import Steering
-from dxlrun.cycle import CycleRecord
 from dxlrun.errors import PortError
-from dxlrun.events import EventCode, EventSink, Severity
-from dxlrun.hardware import LOST_CYCLES, Hardware
-from dxlrun.inbox import LOOP, Inbox, NoInbox
+from dxlrun.interfaces import LOST_CYCLES
 from dxlrun.plurals import counted
+from dxlrun.run.channels.commands import CommandSink, NoCommands, TakenCommand
+from dxlrun.run.channels.cycle import CycleRecord
+from dxlrun.run.channels.events import EventCode, EventSink, Severity
+from dxlrun.run.channels.inbox import LOOP, Inbox, NoInbox
 
 MOST_RATE = 100_000.0
 """Hz; as in the robot file."""

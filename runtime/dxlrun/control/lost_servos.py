@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dxlrun.control.policy_plan import GroupPolicy, PolicyName, PolicyPlan
-from dxlrun.hardware import LOST_AGE_NS, LOST_CYCLES
-from dxlrun.interfaces import States
+from dxlrun.interfaces import LOST_AGE_NS, LOST_CYCLES, States
 
 
 class LostServos:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TypeAlias, cast, get_args
 
 from dxlrun.control.loop_plan import OverrunPolicy
-from dxlrun.events import EventCode, EventSink, Severity
+from dxlrun.run.channels.events import EventCode, EventSink, Severity
 
 Decide: TypeAlias = Callable[[int, int, int], object]
 """What the hook `dxlrun_overrun` of one plug-in says: cycle, scheduled_ns, actual_ns -> policy or None."""

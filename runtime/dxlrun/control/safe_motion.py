@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from dxlrun.control.gate import SLOW_SPEED, SLOW_START_NS
 from dxlrun.control.loop_plan import JointPlan
 from dxlrun.control.policy_plan import Policy, Step
-from dxlrun.cycle import CycleRecord
 from dxlrun.interfaces import Floats
 from dxlrun.mode import Mode
+from dxlrun.run.channels.cycle import CycleRecord
 
 ARRIVED = 0.05
 """rad; so near to its pose a joint counts as there. Ten ticks of an AX-12: friction holds it off by some."""

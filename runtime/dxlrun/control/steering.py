@@ -10,12 +10,12 @@ from typing import Protocol
 import msgspec
 import numpy as np
 
-from dxlrun.commands import CommandSink, TakenCommand
+from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.loop_plan import ControllerPlan
-from dxlrun.control.manager import Manager
-from dxlrun.cycle import CycleRecord
-from dxlrun.events import EventCode, EventSink, Severity
-from dxlrun.inbox import LOOP, Command, Inbox
+from dxlrun.run.channels.commands import CommandSink, TakenCommand
+from dxlrun.run.channels.cycle import CycleRecord
+from dxlrun.run.channels.events import EventCode, EventSink, Severity
+from dxlrun.run.channels.inbox import LOOP, Command, Inbox
 
 
 class Steered(Protocol):

@@ -7,9 +7,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from dxlrun.description import units
-    from dxlrun.description.marks import KeyPath, Marks
     from dxlrun.description.motion import Motion
-    from dxlrun.description.problems import problems_of
     from dxlrun.description.reading import (
         Description,
         MotionDescription,
@@ -19,6 +17,8 @@ if TYPE_CHECKING:
         survey_robot,
     )
     from dxlrun.description.robot import Robot
+    from dxlrun.description.source.marks import KeyPath, Marks
+    from dxlrun.description.source.problems import problems_of
 
 __all__ = [
     "Description",
@@ -37,13 +37,13 @@ __all__ = [
 
 _HOMES = {
     "Description": "reading",
-    "KeyPath": "marks",
-    "Marks": "marks",
+    "KeyPath": "source.marks",
+    "Marks": "source.marks",
     "Motion": "motion",
     "MotionDescription": "reading",
     "Robot": "robot",
     "Survey": "reading",
-    "problems_of": "problems",
+    "problems_of": "source.problems",
     "read_motion": "reading",
     "read_robot": "reading",
     "survey_robot": "reading",

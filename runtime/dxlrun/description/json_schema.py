@@ -14,12 +14,12 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from dxlrun.description.arguments import Argument
-from dxlrun.description.including import KEY as INCLUDE
-from dxlrun.description.including import MOST_FILES
 from dxlrun.description.motion import Motion
 from dxlrun.description.robot import Robot
-from dxlrun.description.scalars import plain_value
+from dxlrun.description.source.arguments import Argument
+from dxlrun.description.source.including import KEY as INCLUDE
+from dxlrun.description.source.including import MOST_FILES
+from dxlrun.description.source.scalars import plain_value
 
 Schema = dict[str, Any]
 """A JSON Schema: values are whatever JSON has, so nothing narrower than Any is true."""

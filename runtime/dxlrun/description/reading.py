@@ -9,15 +9,15 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from dxlrun.description.arguments import COMMAND_LINE, Arguments, refuse_arguments
-from dxlrun.description.including import merged, read_sources
-from dxlrun.description.marks import KeyPath, Marks
 from dxlrun.description.motion import Motion
-from dxlrun.description.problems import places_of, problems_of
-from dxlrun.description.pruning import Guess, prune
 from dxlrun.description.robot import Robot
-from dxlrun.description.syntax import parse, read_text
-from dxlrun.description.tree import grow
+from dxlrun.description.source.arguments import COMMAND_LINE, Arguments, refuse_arguments
+from dxlrun.description.source.including import merged, read_sources
+from dxlrun.description.source.marks import KeyPath, Marks
+from dxlrun.description.source.problems import places_of, problems_of
+from dxlrun.description.source.pruning import Guess, prune
+from dxlrun.description.source.syntax import parse, read_text
+from dxlrun.description.source.tree import grow
 from dxlrun.errors import InputError, Problem
 
 

@@ -9,24 +9,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.clock import Clock
-from dxlrun.dynamixel import bus_watchdog
-from dxlrun.dynamixel.bus import NEVER, Bus
-from dxlrun.dynamixel.bus_plan import BusPlan
-from dxlrun.dynamixel.exchange import MOST_BROKEN
-from dxlrun.dynamixel.gaps import Gaps
-from dxlrun.dynamixel.health import Servos
-from dxlrun.dynamixel.kernel import Answer, Kernel, Library
-from dxlrun.dynamixel.limp import LimpOutcome, limp_buses
-from dxlrun.dynamixel.port import Ports
-from dxlrun.dynamixel.pump import clear, pump, run
-from dxlrun.dynamixel.samples import Samples
-from dxlrun.dynamixel.setting_up import SetUp, tell_failures
-from dxlrun.dynamixel.torque_limit import reduced
-from dxlrun.dynamixel.wanted import Wanted
+from dxlrun.dynamixel.exchange.bus import NEVER, Bus
+from dxlrun.dynamixel.exchange.cyclic_reads import MOST_BROKEN
+from dxlrun.dynamixel.exchange.gaps import Gaps
+from dxlrun.dynamixel.exchange.kernel import Answer, Kernel, Library
+from dxlrun.dynamixel.exchange.pump import clear, pump, run
+from dxlrun.dynamixel.exchange.samples import Samples
+from dxlrun.dynamixel.plan.bus_plan import BusPlan
+from dxlrun.dynamixel.port.ports import Ports
+from dxlrun.dynamixel.registers import bus_watchdog
+from dxlrun.dynamixel.registers.torque_limit import reduced
+from dxlrun.dynamixel.servo.health import Servos
+from dxlrun.dynamixel.servo.limp import LimpOutcome, limp_buses
+from dxlrun.dynamixel.servo.setting_up import SetUp, tell_failures
+from dxlrun.dynamixel.servo.wanted import Wanted
 from dxlrun.errors import PortError, StartUpError
-from dxlrun.events import EventCode, EventSink, Severity
 from dxlrun.interfaces import Commands, States
-from dxlrun.packets import PacketLog
+from dxlrun.run.channels.events import EventCode, EventSink, Severity
+from dxlrun.run.channels.packets import PacketLog
 
 STOP_LIMIT_NS = 1_000_000_000
 """Retries of torque off end here; half of the default exit timeout."""
@@ -43,7 +43,7 @@ IDLE_MARGIN_NS = 150_000
 
 
 class DynamixelHardware:
-    """Reads all servos, writes all goals, once a cycle; see `dxlrun.hardware.Hardware` for the contract.
+    """Reads all servos, writes all goals, once a cycle; `control.hardware` has the contract.
 
     States and goals are the robot's arrays, one row a joint. A row whose reply was lost is invalid and keeps
     its values while its age grows. A servo that missed a read, or whose torque enable was not read as 1, gets

@@ -30,14 +30,14 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 from starlette.routing import Route
 
-from dxlrun.compile.problems import suggestion
+from dxlrun.compile.checks.problems import suggestion
 from dxlrun.control.steering import Rate, Switch
-from dxlrun.cycle import CycleRecord
 from dxlrun.mode import Mode
 from dxlrun.remote.asking import Allowance, body, number, origin, peer, typed
 from dxlrun.remote.link import Link, Loaded
 from dxlrun.remote.preparation import Preparation, Refusal
 from dxlrun.remote.registers import Value, register_wish
+from dxlrun.run.channels.cycle import CycleRecord
 
 MOST_OPERATIONS = 200.0
 MOST_SET_POINTS = 4000.0

@@ -14,14 +14,14 @@ import msgspec
 
 from dxlrun.compile.plan import Plan
 from dxlrun.control.loop_plan import ControllerPlan
-from dxlrun.cycle import CycleLayout, CycleRecord
-from dxlrun.events import Event, EventCode, decode_event
-from dxlrun.heartbeat import Heartbeat, Phase
-from dxlrun.inbox import LOOP, Command
-from dxlrun.mailbox import LARGEST, Answers, MailboxWriter
 from dxlrun.remote.job import Descriptors
 from dxlrun.remote.preparation import Refusal
-from dxlrun.ring import RingReader
+from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
+from dxlrun.run.channels.events import Event, EventCode, decode_event
+from dxlrun.run.channels.heartbeat import Heartbeat, Phase
+from dxlrun.run.channels.inbox import LOOP, Command
+from dxlrun.run.channels.mailbox import LARGEST, Answers, MailboxWriter
+from dxlrun.run.channels.ring import RingReader
 
 ANSWER_S = 2.0
 """A loop that does not answer in this time, and two of its periods, is not waited for any longer."""

@@ -14,9 +14,8 @@ from contextlib import contextmanager, suppress
 import msgspec
 import uvicorn
 
-from dxlrun import process
 from dxlrun.compile.plan import Plan, from_json
-from dxlrun.control.plugins import load_plugins
+from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.errors import DxlrunError
 from dxlrun.remote.connection import MOST_CONNECTIONS, SILENCE_S, Connection
 from dxlrun.remote.gateway import Gateway
@@ -24,6 +23,7 @@ from dxlrun.remote.job import GatewayJob
 from dxlrun.remote.link import Link
 from dxlrun.remote.preparation import Preparation
 from dxlrun.remote.sockets import listen
+from dxlrun.run.channels import process
 
 _PR_SET_PDEATHSIG = 1
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dxlrun.simulation.adapter import AdapterConfig
-from dxlrun.simulation.bus import SimulatedBus
-from dxlrun.simulation.bus_config import BusConfig, ServoCounts
-from dxlrun.simulation.ledger import Ledger, LedgerEntry, read_ledger
-from dxlrun.simulation.mechanics import Load, Mechanics
-from dxlrun.simulation.servo import ServoConfig, SimulatedServo
-from dxlrun.simulation.virtual import VirtualPort, VirtualPorts
+from dxlrun.simulation.bus.adapter import AdapterConfig
+from dxlrun.simulation.bus.bus_config import BusConfig, ServoCounts
+from dxlrun.simulation.bus.ledger import Ledger, LedgerEntry, read_ledger
+from dxlrun.simulation.bus.simulated_bus import SimulatedBus
+from dxlrun.simulation.motion.mechanics import Load, Mechanics
+from dxlrun.simulation.port.virtual import VirtualPort, VirtualPorts
+from dxlrun.simulation.servo.simulated_servo import ServoConfig, SimulatedServo
 
 __all__ = [
     "AdapterConfig",

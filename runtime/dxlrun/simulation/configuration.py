@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 import msgspec
 
-from dxlrun.simulation.bus_config import BusConfig
-from dxlrun.simulation.mujoco_plant import UrdfBodies
+from dxlrun.simulation.bus.bus_config import BusConfig
+from dxlrun.simulation.motion.mujoco_plant import UrdfBodies
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from dxlrun.simulation.bus import SimulatedBus
-from dxlrun.simulation.memory import Memory
-from dxlrun.simulation.servo import SimulatedServo
+from dxlrun.simulation.bus.simulated_bus import SimulatedBus
+from dxlrun.simulation.memory.cells import Memory
+from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 
 _GOAL_MODES = (3, 4, 5)
 """Operating Mode (11): position, extended position, current-based position (e-Manual, X series)."""

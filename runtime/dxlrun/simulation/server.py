@@ -12,17 +12,17 @@ from pathlib import Path
 import msgspec
 
 from dxlrun.errors import InputError
-from dxlrun.simulation.bus import SimulatedBus
+from dxlrun.simulation.bus.ledger import SOME_ENTRIES, Ledger
+from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.configuration import SimulationConfig
 from dxlrun.simulation.control_line import ControlLine
-from dxlrun.simulation.faults import FaultScript, parse_fault
-from dxlrun.simulation.ledger import SOME_ENTRIES, Ledger
-from dxlrun.simulation.link import Link
+from dxlrun.simulation.faults.planned import FaultScript, parse_fault
 from dxlrun.simulation.look import lateness_us, servo_looks
-from dxlrun.simulation.mechanics import Mechanics
-from dxlrun.simulation.mujoco_plant import mujoco_plant
-from dxlrun.simulation.pseudo_terminal import PseudoTerminal
-from dxlrun.simulation.realtime import Patience
+from dxlrun.simulation.motion.mechanics import Mechanics
+from dxlrun.simulation.motion.mujoco_plant import mujoco_plant
+from dxlrun.simulation.port.link import Link
+from dxlrun.simulation.port.pseudo_terminal import PseudoTerminal
+from dxlrun.simulation.port.realtime import Patience
 
 _HAPPENED = "fault: "
 MOST_BACKLOG_NS = 20_000_000

@@ -7,7 +7,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from dxlrun.analysis.envelope import Columns
 from dxlrun.analysis.figures.drawing import (
     BLUE,
     DASHED,
@@ -23,11 +22,12 @@ from dxlrun.analysis.figures.drawing import (
     draw,
     time_axis,
 )
+from dxlrun.analysis.figures.envelope import Columns
 from dxlrun.analysis.figures.run_time import run_time_s
 from dxlrun.analysis.figures.steered import SteeringMarks
 from dxlrun.analysis.latency import cycle_periods_ns
 from dxlrun.analysis.verdict import microseconds
-from dxlrun.recording.reader import Log
+from dxlrun.log.reader import Log
 
 _STEPS = (
     ("wake-up", "scheduled_ns", "woken_ns", PURPLE),

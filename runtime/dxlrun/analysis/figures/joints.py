@@ -9,7 +9,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from dxlrun.analysis.envelope import Columns
 from dxlrun.analysis.figures.drawing import (
     BLUE,
     ERROR,
@@ -24,11 +23,12 @@ from dxlrun.analysis.figures.drawing import (
     draw,
     time_axis,
 )
+from dxlrun.analysis.figures.envelope import Columns
 from dxlrun.analysis.figures.run_time import Marks, run_time_s
 from dxlrun.analysis.figures.steered import SteeringMarks
 from dxlrun.analysis.tracking import Joint, reachable
 from dxlrun.interfaces import Floats
-from dxlrun.recording.reader import Log
+from dxlrun.log.reader import Log
 
 _LEAST_RAD, _LEAST_RAD_S = 0.1, 0.5
 _APART_RAD = 1e-6

@@ -10,13 +10,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
 
-from dxlrun.analysis.envelope import Columns
 from dxlrun.analysis.figures import drawing
 from dxlrun.analysis.figures.drawing import BLUE, MUTED, WARNING, Drawing, Words, draw, reference
+from dxlrun.analysis.figures.envelope import Columns
 from dxlrun.analysis.latency import ROUGH_NS, Latency, cycle_periods_ns
 from dxlrun.analysis.verdict import microseconds
 from dxlrun.interfaces import Floats
-from dxlrun.recording.reader import Log
+from dxlrun.log.reader import Log
 
 _ROUGH_US = ROUGH_NS / 1000
 _LEAST_US = 1.0

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dxlrun.analysis.latency import ROUGH_NS, first_deadline_ns
 from dxlrun.interfaces import Floats
-from dxlrun.recording.reader import Log
+from dxlrun.log.reader import Log
 
 
 def run_time_s(log: Log) -> Floats:

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 
 from dxlrun.analysis.figures.drawing import MUTED, PURPLE
 from dxlrun.analysis.steering import Pause, Steering
-from dxlrun.recording.reader import Log
+from dxlrun.log.reader import Log
 
 _FEW = 60
 """More lines would bury the curves."""

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from dxlrun.analysis.envelope import COLUMNS
 from dxlrun.analysis.figures.drawing import BLUE, ERROR, WARNING, Drawing, Words, draw, time_axis
+from dxlrun.analysis.figures.envelope import COLUMNS
 from dxlrun.analysis.figures.steered import SteeringMarks
 from dxlrun.analysis.latency import first_deadline_ns
-from dxlrun.events import Severity
 from dxlrun.interfaces import Floats
+from dxlrun.log.reader import Log
 from dxlrun.plurals import counted
-from dxlrun.recording.reader import Log
+from dxlrun.run.channels.events import Severity
 
 _SHAPES = (
     ("information", Severity.INFO, "o", BLUE, 3.5),

@@ -1,0 +1,1 @@
+"""Ledger: a log beside what the simulated servos saw."""

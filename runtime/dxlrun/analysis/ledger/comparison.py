@@ -1,0 +1,299 @@
+"""A log beside the ledger of the simulated buses it ran on: is what one says what the other saw?
+
+The ledger is the judge: the runtime cannot edit it. Compared is the time of the run; what other programs did
+on the buses before and after is only counted.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+
+from dxlrun.analysis.bus import joints_of
+from dxlrun.analysis.ledger.alignment import Span, differing
+from dxlrun.analysis.ledger.faults import FaultAnswers, UncausedEvent, answered, uncaused
+from dxlrun.analysis.ledger.lateness import Lateness, lateness
+from dxlrun.analysis.ledger.overruns import OverrunCauses, overrun_causes
+from dxlrun.analysis.ledger.streams import WAYS, Stream, Way, logged, seen
+from dxlrun.errors import InputError
+from dxlrun.log.reader import Log
+from dxlrun.plurals import counted
+from dxlrun.run.channels.events import EventCode
+from dxlrun.run.channels.packets import LoggedPacket, PacketKind
+from dxlrun.simulation import LedgerEntry
+
+GRACE_NS = 250_000_000
+"""What the bus sees so long after the log's last record still belongs to the run; the next run takes longer
+to start."""
+RING_NS = 20_000_000_000
+"""A recorder that lost records lost them at most so long before it says so: twice what a ring holds."""
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """Bytes that are in one record of a bus and not in the other."""
+
+    seconds: float
+    """Since the log's first packet."""
+    bus: str
+    way: Way
+    only_log: bytes
+    only_ledger: bytes
+    declared: str = ""
+    """How the log itself explains what it lacks; empty: nothing explains it."""
+
+
+@dataclass(frozen=True, slots=True)
+class ComparedBus:
+    """One bus over the time of the run."""
+
+    name: str
+    sent_packets: int
+    sent_bytes: int
+    """By the log, as all that follow but the last."""
+    replies: int
+    received_bytes: int
+    noise_bytes: int
+    differences: int
+    """Without those that the log declares."""
+    declared: int
+    outside_bytes: int
+    """Bytes in the ledger before and after the run."""
+
+
+@dataclass(frozen=True, slots=True)
+class LedgerReport:
+    """Everything that `dxlrun analyze LOG --ledger LEDGER` says."""
+
+    log: str
+    ledger: str
+    same: bool
+    """No difference but declared ones."""
+    good: bool
+    """The same, and each fault was noticed that no run bears in silence, and each event has a cause."""
+    sentences: tuple[str, ...]
+    buses: tuple[ComparedBus, ...]
+    differences: tuple[Difference, ...]
+    """In order of time."""
+    faults: tuple[FaultAnswers, ...]
+    """What was injected during the run."""
+    uncaused: tuple[UncausedEvent, ...]
+    """Events that tell of a fault where the ledger has none."""
+    lateness: Lateness | None
+    """None where no servo said anything."""
+    causes: OverrunCauses | None
+    """Why the loop overran; None where it had no cycle."""
+
+
+def compare(log: Log, entries: Sequence[LedgerEntry], ledger: Path) -> LedgerReport:
+    """Compare a log with a ledger, bus by bus; `ledger` is only named.
+
+    Raises InputError when the two cannot be of one run, LogError when a packet cannot be read.
+    """
+    if not log.packets:
+        raise InputError(f"{log.path} holds no packet, so there is nothing to compare with a ledger")
+    begin_ns = min(packet.first_ns for packet in log.packets)
+    end_ns = max(last_of(log), *(packet.last_ns for packet in log.packets)) + GRACE_NS
+    by_bus = _by_bus(log, entries, ledger)
+    of_run = [entry for one in by_bus.values() for entry in one if begin_ns <= entry.t_ns <= end_ns]
+    if not any(entry.data for entry in of_run):
+        raise InputError(
+            f"{ledger} holds not a byte from the time of {log.path}: the two are of different runs; "
+            "a ledger is only good for the runs that used its simulated buses"
+        )
+    buses: list[ComparedBus] = []
+    differences: list[Difference] = []
+    for index, name in enumerate(log.buses):
+        packets = sorted((p for p in log.packets if p.bus == index), key=lambda packet: packet.first_ns)
+        found = _differences(log, packets, by_bus[name], (begin_ns, end_ns))
+        outside = sum(len(e.data) for e in by_bus[name] if not begin_ns <= e.t_ns <= end_ns)
+        buses.append(_bus(name, packets, found, outside))
+        differences += found
+    joints = joints_of(log)
+    faults = answered(of_run, log.events, joints, begin_ns, log.period_ns)
+    causeless = uncaused(of_run, log.events, joints, begin_ns)
+    late = lateness(log, of_run)
+    causes = overrun_causes(log, by_bus)
+    same = not any(bus.differences for bus in buses)
+    return LedgerReport(
+        log=str(log.path),
+        ledger=str(ledger),
+        same=same,
+        good=same and not causeless and not any(fault.unanswered for fault in faults),
+        sentences=(*_sentences(buses), *_said_of_faults(faults, causeless), *_said_of(late, causes)),
+        buses=tuple(buses),
+        differences=tuple(sorted(differences, key=lambda difference: difference.seconds)),
+        faults=faults,
+        uncaused=causeless,
+        lateness=late,
+        causes=causes,
+    )
+
+
+def to_json(report: LedgerReport) -> bytes:
+    """Return a report as JSON, indented; bytes are hexadecimal digits."""
+    plain = msgspec.to_builtins(report, builtin_types=(bytes,))
+    return msgspec.json.format(msgspec.json.encode(_hex(plain)), indent=2)
+
+
+def _hex(value: object) -> object:
+    if isinstance(value, bytes):
+        return value.hex()
+    if isinstance(value, Mapping):
+        return {key: _hex(item) for key, item in value.items()}
+    return [_hex(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def last_of(log: Log) -> int:
+    """Return the time of the last cycle and event in a log, ns; 0 where it has neither."""
+    times = [event.t_ns for event in log.events]
+    if len(log.cycles):
+        times.append(int(log.cycles["written_ns"][-1]))
+    return max(times, default=0)
+
+
+def _by_bus(log: Log, entries: Sequence[LedgerEntry], ledger: Path) -> dict[str, list[LedgerEntry]]:
+    """Return the entries by the log's names of the buses; one bus alone may have another name."""
+    found: dict[str, list[LedgerEntry]] = {}
+    for entry in entries:
+        found.setdefault(entry.bus, []).append(entry)
+    if len(found) == 1 and len(log.buses) == 1:
+        name = log.buses[0]
+        return {name: [entry._replace(bus=name) for entry in next(iter(found.values()))]}
+    missing = [name for name in log.buses if name not in found]
+    if missing:
+        known = ", ".join(sorted(found))
+        raise InputError(
+            f"{ledger} knows no bus {', '.join(missing)}{f', only {known}' if known else ''}; "
+            f"give the ledger of the simulated buses on which {log.path} was made"
+        )
+    return found
+
+
+def _differences(
+    log: Log, packets: Sequence[LoggedPacket], entries: Sequence[LedgerEntry], run: tuple[int, int]
+) -> list[Difference]:
+    """Return how the log and the ledger of one bus differ during the run."""
+    found: list[Difference] = []
+    begin_ns = min((packet.first_ns for packet in log.packets), default=0)
+    looked_ns = max((packet.last_ns for packet in packets), default=run[0])
+    name = log.buses[packets[0].bus] if packets else (entries[0].bus if entries else "")
+    for way in WAYS:
+        mine, theirs = logged(packets, way), seen(entries, way).between(*run)
+        for span in differing(mine, theirs):
+            t_ns = _when(span, mine, theirs)
+            trailing = span.log_start == span.log_stop == len(mine.data)
+            unread = way == "received" and trailing and t_ns >= looked_ns
+            late = "came after the host had read for the last time" if unread else ""
+            found.append(
+                Difference(
+                    seconds=(t_ns - begin_ns) / 1e9,
+                    bus=name,
+                    way=way,
+                    only_log=mine.data[span.log_start : span.log_stop],
+                    only_ledger=theirs.data[span.ledger_start : span.ledger_stop],
+                    declared=_declared(log, span, t_ns) or late,
+                )
+            )
+    return found
+
+
+def _when(span: Span, mine: Stream, theirs: Stream) -> int:
+    in_ledger = span.ledger_stop > span.ledger_start
+    return theirs.time_at(span.ledger_start) if in_ledger else mine.time_at(span.log_start)
+
+
+def _declared(log: Log, span: Span, t_ns: int) -> str:
+    """Return how the log says itself that it lacks these bytes; empty when it does not."""
+    if span.log_stop > span.log_start:
+        return ""
+    if log.damage:
+        return f"the log says: {log.damage[0]}"
+    for event in log.events:
+        of_packets = event.code == EventCode.RECORDER_GAP and re.search(r"/packets\b", event.text)
+        if of_packets and -GRACE_NS <= event.t_ns - t_ns + GRACE_NS <= RING_NS:
+            return f"the log says: {event.text}"
+    return ""
+
+
+def _bus(
+    name: str, packets: Sequence[LoggedPacket], found: Sequence[Difference], outside: int
+) -> ComparedBus:
+    size = dict.fromkeys(PacketKind, 0)
+    number = dict.fromkeys(PacketKind, 0)
+    for packet in packets:
+        size[packet.kind] += len(packet.data)
+        number[packet.kind] += 1
+    declared = sum(1 for difference in found if difference.declared)
+    return ComparedBus(
+        name=name,
+        sent_packets=number[PacketKind.INSTRUCTION],
+        sent_bytes=size[PacketKind.INSTRUCTION],
+        replies=number[PacketKind.STATUS],
+        received_bytes=size[PacketKind.STATUS] + size[PacketKind.NOISE],
+        noise_bytes=size[PacketKind.NOISE],
+        differences=len(found) - declared,
+        declared=declared,
+        outside_bytes=outside,
+    )
+
+
+def _sentences(buses: Sequence[ComparedBus]) -> list[str]:
+    bad = [bus for bus in buses if bus.differences]
+    said: list[str] = []
+    if bad:
+        where = ", ".join(f"{counted(bus.differences, 'place', 'places')} on {bus.name}" for bus in bad)
+        said.append(f"The log is not what the simulated buses saw: it differs in {where}.")
+    else:
+        sent = counted(sum(bus.sent_packets for bus in buses), "packet", "packets")
+        got = counted(sum(bus.replies for bus in buses), "reply", "replies")
+        lines = "the bus" if len(buses) == 1 else f"all {len(buses)} buses"
+        said.append(f"The log is what {lines} saw, to the byte: {sent} out, {got} in.")
+    declared = sum(bus.declared for bus in buses)
+    if declared:
+        said.append(f"The log itself explains {counted(declared, 'difference', 'differences')}.")
+    return said
+
+
+def _said_of_faults(faults: Sequence[FaultAnswers], causeless: Sequence[UncausedEvent]) -> list[str]:
+    said: list[str] = []
+    if faults:
+        silent = sum(1 for fault in faults if not fault.answers)
+        borne = f"; the log has no answer to {silent} of them" if silent else "; the log answers each"
+        were = "fault was" if len(faults) == 1 else "faults were"
+        said.append(f"{len(faults)} {were} injected{borne}.")
+    unnoticed = [fault for fault in faults if fault.unanswered]
+    if unnoticed:
+        first = unnoticed[0]
+        what = (
+            "1 fault that had to be noticed was not"
+            if len(unnoticed) == 1
+            else (f"{len(unnoticed)} faults that had to be noticed were not")
+        )
+        said.append(f"{what}: {first.text}, by no event of {', '.join(first.unanswered)} within 2 s.")
+    if causeless:
+        first_event = causeless[0]
+        what = "1 event has" if len(causeless) == 1 else f"{len(causeless)} events have"
+        said.append(f"{what} no cause in the ledger; the first: {first_event.name} of {first_event.source}.")
+    return said
+
+
+def _said_of(late: Lateness | None, causes: OverrunCauses | None) -> list[str]:
+    """Return what a person must know of the simulation before they blame the loop."""
+    if late is None or not late.overruns:
+        return []
+    overran = f"The loop overran {counted(late.overruns, 'time', 'times')}"
+    beside = "never" if not late.overruns_beside else counted(late.overruns_beside, "time", "times")
+    said = [f"{overran}, {beside} with a simulated reply that was more than 1 ms late."]
+    if causes is not None and causes.overruns:
+        said.append(
+            f"The cause was the simulated servos {counted(causes.simulation, 'time', 'times')}, the kernel "
+            f"{counted(causes.kernel, 'time', 'times')}, which hands replies over, a late wake-up "
+            f"{counted(causes.wake_up, 'time', 'times')}, and our own work "
+            f"{counted(causes.own_work, 'time', 'times')}: {causes.own_share:.3%} of {causes.cycles} cycles."
+        )
+    return said

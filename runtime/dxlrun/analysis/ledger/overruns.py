@@ -1,0 +1,190 @@
+"""Why a loop on simulated buses overran: late servos, the kernel, a late wake-up, or our own work.
+
+A cycle that ended behind the next deadline is split into what its servos were late (by the ledger), how long
+the kernel kept replies, what it woke late, and what its own work took beyond the median of all cycles. The
+largest of them is the cause; but a cycle that would have overrun with all of them punctual, too, is our own.
+
+- A servo's lateness counts as far as the loop waited for it: within the read, or in the gap behind the
+  deadline. Several buses are waited for at once, so the latest one counts.
+- The kernel keeps a reply from when the servos' process has written it until the loop has it, beyond the
+  median of this bus: a worker of the kernel carries the bytes through a pseudo-terminal, and it, or the loop,
+  had no processor. Only where the log is what the ledger has, to the byte; else it counts as our own.
+- What is left of the time between waking and the last write is our own: the controllers and the log, but
+  also a time slice that another process took from us outside of such a wait.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.analysis.ledger.streams import logged, seen
+from dxlrun.analysis.ledger.waits import Transaction, transactions
+from dxlrun.log.reader import UNREADABLE, Log
+from dxlrun.run.channels.packets import PacketKind
+from dxlrun.simulation import LedgerEntry
+
+Cause = Literal["simulation", "kernel", "wake-up", "own work"]
+_BITS_A_BYTE = 10
+Longs = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Overrun:
+    """A cycle that ended behind the next deadline; microseconds."""
+
+    seconds: float
+    """Since the log's first cycle."""
+    skipped: int
+    cause: Cause
+    simulation_us: float
+    kernel_us: float
+    """Beyond the usual."""
+    wake_up_us: float
+    own_us: float
+    """Beyond the usual."""
+
+
+@dataclass(frozen=True, slots=True)
+class OverrunCauses:
+    """All overruns of a run on simulated buses."""
+
+    cycles: int
+    usual_us: float
+    """Median of what a cycle takes from waking to its last write, without the servos' lateness."""
+    simulation: int
+    """Overruns whose cause is the simulation."""
+    kernel: int
+    wake_up: int
+    own_work: int
+    overruns: tuple[Overrun, ...]
+
+    @property
+    def own_share(self) -> float:
+        """Overruns by our own work as a share of all cycles."""
+        return self.own_work / self.cycles if self.cycles else 0.0
+
+
+def overrun_causes(log: Log, by_bus: Mapping[str, Sequence[LedgerEntry]]) -> OverrunCauses | None:
+    """Split every overrun of a log by the ledger of its buses; None where the log has no cycle."""
+    cycles = log.cycles
+    if not len(cycles):
+        return None
+    woken = cycles["woken_ns"].astype(np.int64)
+    scheduled = cycles["scheduled_ns"].astype(np.int64)
+    waits = _Waits(scheduled, woken, cycles["read_ns"].astype(np.int64))
+    servos, gap, kept = (np.zeros(len(cycles), np.int64) for _ in range(3))
+    for index, name in enumerate(log.buses):
+        found, kept_ns = _found(log, index, by_bus[name])
+        in_read, in_gap = waits.late(found)
+        servos, gap = np.maximum(servos, in_read), np.maximum(gap, in_gap)
+        kept = np.maximum(kept, waits.kept(found, kept_ns))
+    work = cycles["written_ns"].astype(np.int64) - woken - servos
+    usual = int(np.median(work))
+    kernel = np.clip(work - usual, 0, kept)
+    work = work - kernel
+    late = np.flatnonzero(cycles["skipped"] > 0) - 1  # the cycle before the periods that were left out
+    late = late[late >= 0]
+    overruns = tuple(
+        _overrun(
+            (int(woken[index]) - int(woken[0])) / 1e9,
+            int(cycles["skipped"][index + 1]),
+            (
+                int(servos[index] + gap[index]),
+                int(kernel[index]),
+                int(woken[index] - scheduled[index] - gap[index]),
+                int(work[index]) - usual,
+            ),
+            too_long=bool(work[index] > log.period_ns),
+        )
+        for index in late
+    )
+    count = [one.cause for one in overruns].count
+    return OverrunCauses(
+        cycles=len(cycles),
+        usual_us=usual / 1e3,
+        simulation=count("simulation"),
+        kernel=count("kernel"),
+        wake_up=count("wake-up"),
+        own_work=count("own work"),
+        overruns=overruns,
+    )
+
+
+class _Bus(msgspec.Struct):
+    name: str
+    baud_rate: int = 0
+
+
+class _Plan(msgspec.Struct):
+    buses: list[_Bus] = []
+
+
+def _baud_rates(log: Log) -> dict[str, int]:
+    """Return the rate of each bus by the log's plan; a log without one leaves waiting for the line unseen."""
+    try:
+        plan = msgspec.json.decode(log.attachments.get("plan.json", b"{}"), type=_Plan)
+    except UNREADABLE:
+        return {}
+    return {bus.name: bus.baud_rate for bus in plan.buses}
+
+
+def _overrun(seconds: float, skipped: int, parts: tuple[int, int, int, int], *, too_long: bool) -> Overrun:
+    simulation, kernel, wake_up, own = parts
+    causes: tuple[Cause, ...] = ("own work", "wake-up", "kernel", "simulation")  # in doubt it is our own
+    cause = "own work" if too_long else causes[int(np.argmax((own, wake_up, kernel, simulation)))]
+    return Overrun(seconds, skipped, cause, *(part / 1e3 for part in parts))
+
+
+def _found(log: Log, bus: int, entries: Sequence[LedgerEntry]) -> tuple[list[Transaction], Longs]:
+    """Return what was answered on a bus, and how long the kernel kept the end of each answer, ns."""
+    packets = sorted((p for p in log.packets if p.bus == bus), key=lambda packet: packet.first_ns)
+    sent = [(p.first_ns, len(p.data)) for p in packets if p.kind is PacketKind.INSTRUCTION]
+    rate = _baud_rates(log).get(log.buses[bus])
+    found = list(transactions(entries, sent, _BITS_A_BYTE * 1e9 / rate if rate else 0.0))
+    got, given = logged(packets, "received"), seen(entries, "received")
+    most = min(len(got.data), len(given.data))
+    if not most or got.data[:most] != given.data[:most]:
+        return found, np.zeros(len(found), np.int64)
+    kept = [got.time_at(one.given - 1) - one.handed_ns if one.given <= most else 0 for one in found]
+    return found, np.array(kept, np.int64)
+
+
+@dataclass(frozen=True, slots=True)
+class _Waits:
+    """Cycles: in which of them, and in which part of it, something was waited for."""
+
+    scheduled: Longs
+    woken: Longs
+    read: Longs
+
+    def late(self, found: Iterable[Transaction]) -> tuple[Longs, Longs]:
+        """Return how long each cycle waited for late servos of a bus: in its read, behind its deadline."""
+        scheduled, woken = self.scheduled, self.woken
+        in_read, in_gap = np.zeros(len(woken), np.int64), np.zeros(len(woken), np.int64)
+        for one in found:
+            index = int(np.searchsorted(woken, one.handed_ns, side="right")) - 1
+            if index >= 0 and one.handed_ns <= self.read[index]:
+                # a reply that was asked for in the cycle before was on its way already when this one woke
+                in_read[index] += min(one.late_ns, one.handed_ns - int(woken[index]))
+            elif index + 1 < len(woken) and one.handed_ns > scheduled[index + 1]:
+                waited = min(one.late_ns, one.handed_ns - int(scheduled[index + 1]))
+                in_gap[index + 1] = max(in_gap[index + 1], waited)
+        return in_read, in_gap
+
+    def kept(self, found: Sequence[Transaction], kept_ns: Longs) -> Longs:
+        """Return how long the kernel kept answers of a bus from the read of each cycle, beyond the median."""
+        in_read = np.zeros(len(self.woken), np.int64)
+        if not found:
+            return in_read
+        beyond = np.maximum(kept_ns - int(np.median(kept_ns)), 0)
+        handed = np.array([one.handed_ns for one in found], np.int64)
+        index = np.searchsorted(self.woken, handed, side="right") - 1
+        waited = (index >= 0) & (handed <= self.read[index])
+        np.add.at(in_read, index[waited], beyond[waited])
+        return in_read

@@ -1,0 +1,213 @@
+"""The report as one page: HTML with figures, style and numbers inside; it loads nothing from anywhere."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+from dxlrun.analysis.figures.budget import budget_drawings
+from dxlrun.analysis.figures.joints import joint_drawings
+from dxlrun.analysis.figures.latency import latency_drawings
+from dxlrun.analysis.figures.timeline import events_drawing
+from dxlrun.analysis.figures.wires import reply_drawing
+from dxlrun.analysis.latency import first_deadline_ns, on_virtual_time
+from dxlrun.analysis.output.elements import Element, clean, drawing_of, paragraph, section, table_of
+from dxlrun.analysis.output.facts import began, facts
+from dxlrun.analysis.output.tables import (
+    Cell,
+    Column,
+    Table,
+    buses_table,
+    controllers_table,
+    events_table,
+    joints_table,
+    loop_table,
+    servos_table,
+    steering_table,
+    steps_table,
+    tone_of,
+)
+from dxlrun.analysis.report import Report, to_json
+from dxlrun.analysis.verdict import microseconds
+from dxlrun.log.reader import Log
+from dxlrun.run.channels.events import Severity
+
+_STYLE_SHEET = Path(__file__).with_name("page.css")
+_MOST_EVENTS = 100
+
+
+def page(log: Log, report: Report) -> str:
+    """Return the page of a log and its report: well-formed, self-contained, the same bytes each time.
+
+    Takes matplotlib. Raises LogError when a packet of the log cannot be read.
+    """
+    html = Element("html", {"lang": "en"})
+    head = ET.SubElement(html, "head")
+    ET.SubElement(head, "meta", {"charset": "utf-8"})
+    ET.SubElement(head, "meta", {"name": "viewport", "content": "width=device-width, initial-scale=1"})
+    ET.SubElement(head, "meta", {"name": "color-scheme", "content": "light dark"})
+    ET.SubElement(head, "title").text = clean(
+        f"{report.robot}, {began(log) or log.path.name}: report of a run"
+    )
+    ET.SubElement(head, "style").text = _STYLE_SHEET.read_text(encoding="utf-8")
+    numbers = ET.SubElement(head, "script", {"type": "application/json", "id": "report"})
+    numbers.text = to_json(report).decode().replace("<", "\\u003c")  # no text in it ends the element
+    body = ET.SubElement(html, "body")
+    body.append(_header(log, report))
+    main = ET.SubElement(body, "main")
+    sections = _sections(log, report)
+    body.insert(1, _contents(sections))
+    main.extend(sections)
+    body.append(_footer(log))
+    return "<!DOCTYPE html>\n" + ET.tostring(html, encoding="unicode", method="html") + "\n"
+
+
+def _header(log: Log, report: Report) -> Element:
+    header = Element("header")
+    ET.SubElement(header, "h1").text = clean(report.robot)
+    when = began(log)
+    header.append(paragraph(f"Report of the run of {when}" if when else "Report of a run", "when"))
+    good = report.verdict.good
+    box = ET.SubElement(
+        header, "section", {"class": f"verdict {'good' if good else 'look'}", "id": "verdict"}
+    )
+    ET.SubElement(box, "h2").text = f"Verdict: {report.verdict.word}"
+    for sentence in report.verdict.sentences:
+        box.append(paragraph(sentence))
+    header.append(_key_numbers(report))
+    return header
+
+
+def _key_numbers(report: Report) -> Element:
+    """Return the numbers that a reader compares between runs."""
+    account, late = report.periods, report.latency
+    numbers = [
+        ("rate", account.rates),
+        ("lasted", f"{account.seconds:.1f} s"),
+        ("periods skipped", f"{account.skipped} of {account.elapsed}"),
+    ]
+    if late is not None:
+        numbers.append(("worst wake-up", microseconds(late.max_us)))
+    if report.steps:
+        numbers.append(("99 % of cycles take", microseconds(report.steps[-1].p99_us)))
+    if report.servos:
+        lost, asked = sum(s.lost for s in report.servos), sum(s.asked for s in report.servos)
+        numbers.append(("replies lost", f"{lost} of {asked}"))
+    strip = Element("dl", {"class": "key"})
+    for name, value in numbers:
+        group = ET.SubElement(strip, "div")
+        ET.SubElement(group, "dt").text = name
+        ET.SubElement(group, "dd").text = value
+    return strip
+
+
+def _contents(sections: list[Element]) -> Element:
+    nav = Element("nav", {"aria-label": "contents"})
+    for part in sections:
+        link = ET.SubElement(nav, "a", {"href": f"#{part.get('id')}"})
+        link.text = part.findtext("h2")
+    return nav
+
+
+def _sections(log: Log, report: Report) -> list[Element]:
+    found = [
+        section("run", "The run", [table_of(table) for table in facts(log, report)]),
+        _latency(log, report),
+        _budget(log, report),
+        _joints(log, report),
+        _wires(report),
+        _steering(report),
+        _events(log, report),
+    ]
+    return [part for part in found if len(part) > 1]
+
+
+def _latency(log: Log, report: Report) -> Element:
+    parts = [table_of(loop_table(report))]
+    if on_virtual_time(log):
+        parts.append(
+            paragraph("The run was on virtual time: every wake-up is exact, so there is no latency to show.")
+        )
+    elif report.latency is not None:
+        parts += [drawing_of(drawing) for drawing in latency_drawings(log, report.latency)]
+    return section("latency", "Wake-up latency", parts)
+
+
+def _budget(log: Log, report: Report) -> Element:
+    tables = [table for table in (steps_table(report), controllers_table(report)) if table.rows]
+    parts = [table_of(table) for table in tables]
+    if len(log.cycles):
+        first, second = budget_drawings(log)
+        parts = [drawing_of(first), *parts, drawing_of(second)]
+    return section("budget", "Where the time of a cycle goes", parts)
+
+
+def _joints(log: Log, report: Report) -> Element:
+    parts = [table_of(joints_table(report))] if report.joints else []
+    if len(log.cycles) and report.joints:
+        parts.append(
+            paragraph(
+                "Desired is what the controllers wanted, sent is the goal after the last gate, read is what "
+                "the servo said. Marked are cycles that woke later than 150 us (late), that follow skipped "
+                "periods, that got no intact reply, or whose command the last gate changed (clamped)."
+            )
+        )
+        parts += [drawing_of(drawing) for drawing in joint_drawings(log, report.joints)]
+    return section("joints", "Joints", parts)
+
+
+def _wires(report: Report) -> Element:
+    parts = [table_of(table) for table in (buses_table(report), servos_table(report)) if table.rows]
+    drawing = reply_drawing(report.servos)
+    if drawing is not None:
+        parts.append(drawing_of(drawing))
+    return section("buses", "Buses and servos", parts)
+
+
+def _steering(report: Report) -> Element:
+    table = steering_table(report.steering)
+    return section("steering", "Steered from outside", [table_of(table)] if table.rows else [])
+
+
+def _events(log: Log, report: Report) -> Element:
+    parts = [table_of(events_table(report.events))] if report.events else []
+    drawing = events_drawing(log)
+    if drawing is not None:
+        parts = [drawing_of(drawing), *parts, *_each_event(log)]
+    return section("events", "Events", parts)
+
+
+def _each_event(log: Log) -> list[Element]:
+    """Return the events one by one; of very many, the first ones that are warnings or errors, and say so."""
+    ordered = sorted(log.events, key=lambda event: event.t_ns)
+    chosen, title = ordered, "Each event"
+    if len(ordered) > _MOST_EVENTS:
+        grave = [event for event in ordered if event.severity >= Severity.WARNING]
+        chosen = grave[:_MOST_EVENTS]
+        title = (
+            f"Warnings and errors: {len(chosen)} of {len(grave)} (the log holds all {len(ordered)} events)"
+        )
+    start = first_deadline_ns(log)
+    rows = tuple(
+        (
+            Cell(f"{(event.t_ns - start) / 1e9:.3f}"),
+            Cell(event.name, tone_of(event.severity)),
+            Cell(event.source),
+            Cell(event.text),
+        )
+        for event in chosen
+    )
+    columns = (Column("s"), Column("event", "name"), Column("source", "name"), Column("text", "text"))
+    return [table_of(Table(title, columns, rows))] if rows else []
+
+
+def _footer(log: Log) -> Element:
+    footer = Element("footer")
+    version = log.metadata.get("versions", {}).get("dxlrun", "of an unknown version")
+    footer.append(
+        paragraph(
+            f"Made by dxlrun analyze from {log.path.name}, which dxlrun {version} recorded. The numbers "
+            "of this page are in it as JSON, in the element with the identifier report."
+        )
+    )
+    return footer

@@ -1,0 +1,1 @@
+"""Commands about servos on a port, and about models."""

@@ -1,0 +1,165 @@
+"""Robot draft: a robot file for the servos that a scan found, which a person then completes.
+
+What nobody can read out of a servo (what a joint is called, where its zero is, which way it turns) is
+assumed, and said in a comment beside it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from dxlrun.compile import compile_files
+from dxlrun.dynamixel.control_table import ControlTable, control_table
+from dxlrun.dynamixel.tools.scanning import FoundServo
+from dxlrun.errors import InputError, ServoFault
+
+_SLOW = 30
+"""deg/s, the velocity limit of each drafted joint: slow enough to step back from."""
+_LONGEST_STEP = 3
+"""deg; at low rates a goal moves no further in one cycle, as a servo takes each step at its full speed."""
+_RATES = (100, 50, 25, 20, 10, 5, 2, 1)
+_SHARE = 0.5
+"""Of the period, at most, that a cycle takes on the bus."""
+_LONGEST_DELAY_NS = 500_000
+"""Where no servo said its own: as they are shipped (protocol.md, Line)."""
+
+
+def draft_file(path: Path, port: str, servos: Sequence[FoundServo], latency_ns: int) -> str:
+    """Write a robot file that is not there yet; return its text, which `dxlrun check` accepts.
+
+    Raises InputError where it is there or cannot be written, ServoFault where these servos cannot be one bus:
+    one port is one bus, of one protocol and one rate.
+    """
+    may_be_written(path)
+    text = draft(path.stem, port, servos, latency_ns)
+    try:
+        path.write_text(text)
+    except OSError as error:
+        raise InputError(f"{path} cannot be written ({error.strerror}); choose another file") from None
+    return text
+
+
+def may_be_written(path: Path) -> None:
+    """Raise InputError where `draft_file` would write nothing, whatever the servos are."""
+    if path.exists():
+        raise InputError(f"{path} is there already and is not overwritten; choose another file")
+    if path.suffix not in (".yaml", ".yml"):
+        raise InputError(f"{path} is no name for a robot file; end it in .yaml")
+    if not path.parent.is_dir():
+        raise InputError(f"{path} cannot be written: there is no directory {path.parent}; make it first")
+
+
+def draft(stem: str, port: str, servos: Sequence[FoundServo], latency_ns: int) -> str:
+    """Return the text of a robot file; see `draft_file`."""
+    known = [servo for servo in servos if servo.model]
+    if not known:
+        raise ServoFault("no servo of a known model was found, so there is no robot file to write")
+    lines = sorted({(servo.protocol, servo.baud_rate) for servo in known})
+    if len(lines) > 1:
+        told = [
+            f"Protocol {protocol} at {rate} bit/s: ID {_ids(known, protocol, rate)}"
+            for protocol, rate in lines
+        ]
+        raise ServoFault(
+            f"these servos cannot share a bus ({'; '.join(told)}); `dxlrun servo {port} ID baud RATE` brings "
+            "one to another rate, two protocols need two ports; or scan one of them alone by --protocol and "
+            "--baud"
+        )
+    text = _text(stem, port, known, latency_ns, rate=1)
+    with tempfile.TemporaryDirectory() as folder:
+        trial = Path(folder) / "draft.yaml"
+        trial.write_text(text)
+        budget = compile_files(trial, {}, []).plan.buses[0].budget
+        rate = next((each for each in _RATES if budget.total_ns * 1e-9 * each <= _SHARE), 1)
+        text = _text(stem, port, known, latency_ns, rate)
+        trial.write_text(text)
+        compile_files(trial, {}, [])
+    return text
+
+
+def _text(stem: str, port: str, servos: Sequence[FoundServo], latency_ns: int, rate: int) -> str:
+    first = servos[0]
+    delays = [each.return_delay for each in servos if each.return_delay is not None]
+    delay_ns = max(delays, default=_LONGEST_DELAY_NS)
+    velocity = min(_SLOW, _LONGEST_STEP * rate)
+    joints = [line for servo in servos for line in _joint(servo, velocity)]
+    names = ", ".join(_name(servo) for servo in servos)
+    return "\n".join(
+        [
+            f"# Drafted by `dxlrun scan {port}`. What a servo cannot tell is assumed:",
+            "# check every line that has a comment.",
+            "# Then: dxlrun check THIS_FILE --online",
+            f"name: {_robot_name(stem)}",
+            "",
+            "arguments:",
+            f"  port: {{default: {json.dumps(port)}, help: serial port of the adapter or sim}}",
+            "",
+            "buses:",
+            "  main:",
+            "    port: ${port}",
+            f"    protocol: {first.protocol}",
+            f"    baud_rate: {first.baud_rate}",
+            f"    adapter: {{latency: {latency_ns * 1e-6:g} ms}}  # 0 ms where it keeps nothing back",
+            f"    return_delay_time: {delay_ns / 1000:g} us  # as found",
+            "",
+            "loop:",
+            f"  rate: {rate}  # `dxlrun check` tells the highest that is possible",
+            "",
+            f"# Every joint is held to {velocity} deg/s, so that the first commands move it slowly. Once its",
+            "# limits and direction are right, raise its limits.velocity; without a limit it moves as fast",
+            "# as its servo can.",
+            "joints:  # names and directions are yours to choose; a reference is where a joint's 0 is",
+            *joints,
+            "",
+            "controllers:",
+            "  joint_state_broadcaster: {type: joint_state_broadcaster}",
+            f"  all_joints: {{type: joint_group_position_controller, joints: [{names}]}}",
+            "",
+        ]
+    )
+
+
+def _robot_name(stem: str) -> str:
+    name = re.sub(r"[^a-z0-9_]", "_", stem.lower())
+    return name if name[:1].isalpha() else f"robot_{name}"
+
+
+def _joint(servo: FoundServo, velocity: int) -> list[str]:
+    table = control_table(servo.model, servo.protocol)
+    reference = _middle(table)
+    entries = [
+        f"bus: main, id: {servo.servo_id}, model: {servo.model}, reference: {reference} deg, direction: 1"
+    ]
+    limits = [f"velocity: {velocity} deg/s"]
+    comment = "reference: middle of the travel"
+    if servo.lowest is not None and servo.highest is not None:
+        if servo.lowest >= servo.highest:
+            comment += "; it has no position limits now, a wheel is `continuous: true`"
+        elif servo.lowest > table.min_tick or servo.highest < table.max_tick:
+            degrees = math.degrees(table.rad_per_tick)
+            low = math.ceil((servo.lowest * degrees - reference) * 10) / 10
+            high = math.floor((servo.highest * degrees - reference) * 10) / 10
+            limits.insert(0, f"position: [{low:g} deg, {high:g} deg]")
+            comment += "; position limits: the servo's own"
+    entries.append(f"limits: {{{', '.join(limits)}}}")
+    remarks = [f"  # {_name(servo)}: {remark}" for remark in servo.remarks]
+    return [*remarks, f"  {_name(servo)}: {{{', '.join(entries)}}}  # {comment}"]
+
+
+def _ids(servos: Sequence[FoundServo], protocol: float, rate: int) -> str:
+    here = [each for each in servos if (each.protocol, each.baud_rate) == (protocol, rate)]
+    return ", ".join(str(each.servo_id) for each in here)
+
+
+def _name(servo: FoundServo) -> str:
+    return f"joint_{servo.servo_id}"
+
+
+def _middle(table: ControlTable) -> int:
+    """Return the middle of a model's travel, whole degrees."""
+    return round(math.degrees((table.min_tick + table.max_tick) / 2 * table.rad_per_tick))

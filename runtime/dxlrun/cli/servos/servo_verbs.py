@@ -1,0 +1,269 @@
+"""What `dxlrun servo` can do: each verb reads its words, asks where it must, and tells what was done."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Literal
+
+from dxlrun.cli.output.terminal import say_warning
+from dxlrun.errors import InputError, ServoFault
+
+if TYPE_CHECKING:
+    from dxlrun.dynamixel.plan.bus_plan import RegisterValue
+    from dxlrun.dynamixel.tools.one_servo import OneServo
+
+Keep = Literal["nothing", "id", "id-and-baud"]
+_TORQUE_OFF = "its torque goes off, and what it holds falls"
+_ELSEWHERE: Mapping[str, str] = MappingProxyType(
+    {
+        "id": "`dxlrun servo PORT ID id NEW` changes it",
+        "baud_rate": "`dxlrun servo PORT ID baud RATE` changes it",
+        "baud_rate_bus": "`dxlrun servo PORT ID baud RATE` changes it",
+        "torque_enable": "`dxlrun servo PORT ID torque on` or `off` switches it",
+        "protocol_type": "dxlrun would not find the servo again; use the maker's tool",
+    }
+)
+"""What `set` does not do, as more than a write belongs to it."""
+
+
+@dataclass(slots=True)
+class Asked:
+    """A verb with its words, and what came of it."""
+
+    words: tuple[str, ...]
+    keep: Keep | None
+    yes: bool
+    done: list[str] = field(default_factory=list)
+    """What was done, one sentence each."""
+    registers: dict[str, int] = field(default_factory=dict)
+    """What was read, by item."""
+    declined: bool = False
+
+    def confirmed(self, question: str) -> bool:
+        """Ask the person at the terminal; raises InputError where nobody is there and --yes is not given."""
+        if self.yes:
+            return True
+        if not sys.stdin.isatty():
+            raise InputError(f"{question}: nobody can be asked here, so nothing was changed; give --yes")
+        sys.stderr.write(f"{question}. Go on? [y/N] ")
+        sys.stderr.flush()
+        self.declined = sys.stdin.readline().strip().lower() not in ("y", "yes")
+        return not self.declined
+
+
+@dataclass(frozen=True, slots=True)
+class Verb:
+    """One thing that can be done."""
+
+    usage: str
+    """Its words."""
+    fewest: int
+    most: int
+    do: Callable[[OneServo, Asked], None]
+    check: Callable[[Asked], None] = lambda _: None
+    """Looks at the words before the port is opened; raises InputError."""
+
+
+def _get(one: OneServo, asked: Asked) -> None:
+    from dxlrun.compile.checks.problems import suggestion
+
+    names = asked.words or tuple(name for name in one.table.items if not name.startswith("indirect_"))
+    wrong = [name for name in names if name not in one.table.items]
+    if wrong:
+        known = tuple(one.table.items)
+        raise InputError(
+            "\n".join(f"an {one.table.model} has no {name}; {suggestion(name, known)}" for name in wrong)
+        )
+    asked.registers |= one.read(names, refused=not asked.words)
+
+
+def _set(one: OneServo, asked: Asked) -> None:
+    from dxlrun.compile.joint.registers import any_value
+    from dxlrun.dynamixel.registers.inspection import called, shown
+
+    name, text = asked.words
+    if name in _ELSEWHERE:
+        raise InputError(f"{name} is not set like others; {_ELSEWHERE[name]}")
+    if name in one.table.items and one.table.items[name].access == "R":
+        raise InputError(f"{called(one.table.items[name])} can only be read; `get` shows it")
+    try:
+        wanted = any_value(one.table, name, _value(text))
+    except ValueError as error:  # also an UnfitRegister
+        raise InputError(str(error)) from None
+    item = called(one.table.items[name])
+    (found,) = one.differences([wanted])
+    if not found.differs:
+        asked.done.append(f"{item} is {wanted.value} already")
+        if not wanted.eeprom:  # a goal that is there already is not pursued while its Bus Watchdog is tripped
+            asked.done += one.write([wanted])
+        return
+    assert found.found is not None  # noqa: S101  `differs` says so
+    change = f"{item} is {shown(one.table.items[name], found.found)} and becomes {wanted.value}"
+    if wanted.eeprom:
+        one.writable([wanted])
+        if not asked.confirmed(f"{one.called}: {change} (EEPROM)"):
+            return
+    asked.done += one.write([wanted])
+
+
+def _value(text: str) -> int | str:
+    try:
+        return int(text, 0)
+    except ValueError:
+        return text
+
+
+def _id(one: OneServo, asked: Asked) -> None:
+    from dxlrun.dynamixel.tools.changing import change_id
+    from dxlrun.dynamixel.wire.dialect import dialect_of
+
+    new, highest = int(asked.words[0]), dialect_of(one.table.protocol).HIGHEST_ID
+    if new > highest:
+        raise InputError(f"{new} is no ID of Protocol {one.table.protocol}; they are 0..{highest}")
+    if new == one.servo_id:
+        asked.done.append(f"has ID {new} already")
+    elif asked.confirmed(f"{one.called}: its ID becomes {new} (EEPROM)"):
+        asked.done.append(change_id(one, new))
+
+
+def _baud(one: OneServo, asked: Asked) -> None:
+    from dxlrun.dynamixel.tools.changing import change_rate
+
+    new, rates = int(asked.words[0]), sorted(one.table.baud_rates.values())
+    if new not in rates:
+        known = ", ".join(map(str, rates))
+        raise InputError(f"an {one.table.model} has no rate of {new} bit/s; it has {known}")
+    if new == one.baud_rate:
+        asked.done.append(f"talks at {new} bit/s already")
+    elif asked.confirmed(f"{one.called}: its baud rate becomes {new} bit/s (EEPROM)"):
+        asked.done.append(change_rate(one, new))
+
+
+def _reboot(one: OneServo, asked: Asked) -> None:
+    from dxlrun.dynamixel.tools.changing import reboot
+
+    if not one.holds_torque() or asked.confirmed(f"{one.called} holds torque: {_TORQUE_OFF}"):
+        asked.done.append(reboot(one))
+
+
+def _factory_reset(one: OneServo, asked: Asked) -> None:
+    from dxlrun.dynamixel.tools.changing import factory_reset
+    from dxlrun.dynamixel.wire.protocol2 import Reset
+
+    old = one.table.protocol == 1.0
+    if old and asked.keep not in (None, "nothing"):
+        raise InputError("a reset of Protocol 1.0 keeps neither ID nor baud rate; give --keep nothing")
+    keep = asked.keep or ("nothing" if old else "id-and-baud")
+    kept = {
+        "nothing": "ID and baud rate too",
+        "id": "its baud rate too; its ID stays",
+        "id-and-baud": "its ID and its baud rate stay",
+    }
+    if asked.confirmed(f"{one.called}: its EEPROM gets the factory's values ({kept[keep]})"):
+        how = {"nothing": Reset.ALL, "id": Reset.KEEP_ID, "id-and-baud": Reset.KEEP_ID_AND_BAUD_RATE}
+        asked.done.append(factory_reset(one, how[keep]))
+
+
+def _backup(one: OneServo, asked: Asked) -> None:
+    from dxlrun.dynamixel.tools import servo_backup
+    from dxlrun.dynamixel.tools.changing import back_up
+
+    if not asked.words:
+        if asked.confirmed(f"{one.called}: the backup that it keeps itself is overwritten"):
+            asked.done.append(back_up(one))
+        return
+    asked.registers |= one.read(servo_backup.kept_items(one.table), refused=True)
+    address = one.servo_id, one.baud_rate
+    path = Path(asked.words[0])
+    backup = servo_backup.stamped(one.table, one.found.firmware, address, asked.registers)
+    servo_backup.write_backup(path, backup)
+    asked.done.append(f"{len(asked.registers)} registers are in {path}")
+
+
+def _new_file(asked: Asked) -> None:
+    if asked.words and Path(asked.words[0]).exists():
+        raise InputError(f"{asked.words[0]} is there already and is not overwritten; choose another file")
+
+
+def _restore(one: OneServo, asked: Asked) -> None:
+    from dxlrun.dynamixel.tools import servo_backup
+    from dxlrun.dynamixel.tools.changing import take_back
+
+    if not asked.words:
+        if asked.confirmed(f"{one.called}: its EEPROM becomes that of the backup that it keeps itself"):
+            asked.done.append(take_back(one))
+        return
+    path = Path(asked.words[0])
+    backup = servo_backup.read_backup(path)
+    wanted = servo_backup.registers_to_restore(path, backup, one.table)
+    if backup.firmware != one.found.firmware:
+        say_warning(f"{path} was made with firmware {backup.firmware}; this servo has {one.found.firmware}")
+    differing = [each.register for each in one.differences(wanted) if each.differs]
+    if not differing:
+        asked.done.append(f"has everything that {path} restores already")
+        return
+    one.writable(differing)
+    names = ", ".join(each.name for each in differing)
+    if not asked.confirmed(f"{one.called}: {names} become as in {path}; its ID and its rate stay"):
+        return
+    asked.done += _written_back(one, wanted)
+
+
+def _written_back(one: OneServo, wanted: Sequence[RegisterValue]) -> tuple[str, ...]:
+    """Write, and look at all of it again: a mode that comes back resets registers beside it."""
+    written = one.write(wanted)
+    left = [each.register.name for each in one.differences(wanted) if each.differs]
+    if left:
+        raise ServoFault(
+            f"{one.called}: {', '.join(left)} changed again while others were written; try again"
+        )
+    return written
+
+
+def _old_file(asked: Asked) -> None:
+    from dxlrun.dynamixel.tools.servo_backup import read_backup
+
+    if asked.words:
+        read_backup(Path(asked.words[0]))
+
+
+def _blink(one: OneServo, asked: Asked) -> None:
+    asked.done.append(one.blink(int(asked.words[0]) if asked.words else 5))
+
+
+def _torque(one: OneServo, asked: Asked) -> None:
+    asked.done += one.torque(asked.words[0] == "on")
+
+
+def _whole(what: str, lowest: int, highest: int) -> Callable[[Asked], None]:
+    def check(asked: Asked) -> None:
+        for word in asked.words:
+            if not word.isdecimal() or not lowest <= int(word) <= highest:
+                raise InputError(f"{word!r} is no {what}; give a whole number from {lowest} to {highest}")
+
+    return check
+
+
+def _on_or_off(asked: Asked) -> None:
+    if asked.words[0] not in ("on", "off"):
+        raise InputError(f"torque is switched on or off, not {asked.words[0]!r}")
+
+
+VERBS: Mapping[str, Verb] = MappingProxyType(
+    {
+        "get": Verb("[ITEM...]", 0, 1000, _get),
+        "set": Verb("ITEM VALUE", 2, 2, _set),
+        "id": Verb("NEW", 1, 1, _id, _whole("ID", 0, 253)),
+        "baud": Verb("RATE", 1, 1, _baud, _whole("baud rate", 9_600, 10_500_000)),
+        "reboot": Verb("", 0, 0, _reboot),
+        "factory-reset": Verb("[--keep nothing|id|id-and-baud]", 0, 0, _factory_reset),
+        "backup": Verb("[FILE]", 0, 1, _backup, _new_file),
+        "restore": Verb("[FILE]", 0, 1, _restore, _old_file),
+        "blink": Verb("[TIMES]", 0, 1, _blink, _whole("number of times", 1, 1000)),
+        "torque": Verb("on|off", 1, 1, _torque, _on_or_off),
+    }
+)

@@ -1,0 +1,269 @@
+"""`dxlrun sim`: simulated servos that other programs open as they would open an adapter."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from dxlrun.cli.inputs import compiled
+from dxlrun.cli.output.flags import Flag, JsonFlag
+from dxlrun.cli.output.terminal import out, say_error, say_warning
+from dxlrun.cli.simulated.sim_inputs import (
+    Absent,
+    AdapterWishes,
+    Mistakes,
+    Split,
+    read_faults,
+    read_latency,
+    servo_bus,
+    with_adapter,
+)
+from dxlrun.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from dxlrun.cli.output.sim_views import Shown
+    from dxlrun.run.simulation_front import FrontOptions, Served
+    from dxlrun.simulation import BusConfig
+    from dxlrun.simulation.faults.planned import Fault
+    from dxlrun.simulation.motion.mujoco_plant import UrdfBodies
+    from dxlrun.simulation.process import SimulationConfig
+
+Words = Annotated[tuple[str, ...], Parameter(negative=(), show_default=False, allow_leading_hyphen=False)]
+_ABOVE_LOOP = 2
+"""The guardian is one above the loop."""
+_PRIORITY = 31 + _ABOVE_LOOP
+"""Where no robot file says the loop's: above that of a loop that says nothing else."""
+Seed = Annotated[int, Parameter(show_default=False)]
+
+
+def sim(
+    robot: Path | None = None,
+    /,
+    *assignments: Annotated[str, Parameter(name="arg:=value")],
+    servo: Words = (),
+    baud: int | None = None,
+    protocol: float | None = None,
+    link: Path | None = None,
+    fault: Words = (),
+    faults: Path | None = None,
+    seed: Seed = 0,
+    ledger: Path | None = None,
+    latency_timer: str | None = None,
+    split: Split | None = None,
+    echo: Flag = False,
+    absent: Absent | None = None,
+    as_json: JsonFlag = False,
+    debug: Flag = False,
+) -> int:
+    """Serve simulated servos on pseudo-terminals until Ctrl-C, for any program that speaks Dynamixel.
+
+    Give a robot file, or servos by `--servo`. Faults can be typed while it runs; `help` lists them.
+
+    Parameters
+    ----------
+    robot
+        A robot file: each of its buses is simulated, whatever its port says.
+    assignments
+        Arguments of the robot file, for example rate:=25.
+    servo
+        Servos on one bus without a robot file, MODEL:IDS, for example XL430-W250:1-3 or AX-12A:1,4; may be
+        given several times.
+    baud
+        Baud rate of that bus, bit/s; without it the one that the servos are shipped with.
+    protocol
+        Protocol of that bus, 1.0 or 2.0; needed only by models that exist with both.
+    link
+        A symbolic link to the pseudo-terminal, which gets another name at each start; with several buses
+        LINK.NAME for each bus.
+    fault
+        A fault, for example "lose servo=3 at=2s"; may be given several times.
+    faults
+        A text file of faults, one a line.
+    seed
+        What is random in faults and adapter is drawn from this number (0 without it).
+    ledger
+        Write every byte on the buses with its time, and every fault, into this file.
+    latency_timer
+        The adapter keeps replies back for so long, for example "4 ms", as FTDI adapters do.
+    split
+        How the adapter hands replies over: whole, byte by byte, or in pieces of random length.
+    echo
+        The adapter gives back what is sent, as some half-duplex adapters do.
+    absent
+        What those after an absent servo do in a sync or bulk read: answer never (silent), or later (slot).
+    as_json
+        Print the ports as JSON, then a line of JSON for each fault.
+    debug
+        Print the traceback of an error, and what the process of the servos said.
+    """
+    mistakes = Mistakes()
+    with mistakes.collected():
+        planned = read_faults(fault, faults)
+    with mistakes.collected():
+        _writable(ledger)
+    with mistakes.collected():
+        latency_ns = read_latency(latency_timer)
+    with mistakes.collected():
+        told = _told(robot, assignments, servo, baud, protocol)
+        links = link_of_each(told.buses, link)
+    mistakes.refuse()
+    wishes = AdapterWishes(latency_ns, split, echo, absent)
+    buses = tuple(with_adapter(bus, wishes, seed) for bus in told.buses)
+    refuse_what_cannot_be(buses, planned, seed)
+    from dxlrun.cli.output.sim_views import Shown, ending
+    from dxlrun.run.channels.process import spare_core
+    from dxlrun.run.simulation_front import FrontOptions
+    from dxlrun.simulation.process import SimulationConfig
+
+    title = told.title
+    config = SimulationConfig(
+        buses=buses,
+        faults=tuple(str(each) for each in planned),
+        seed=seed,
+        links={bus: str(path) for bus, path in links.items()},
+        bodies=told.bodies,
+    )
+    shown = Shown(title, buses, links, told.hint)
+    options = FrontOptions(ledger, told.priority, spare_core(told.loop_cores))
+    served = _serve(config, options, shown, as_json=as_json)
+    if not as_json:
+        out().print(ending(title, served.elapsed_s, served.look), markup=False, soft_wrap=True)
+        if ledger is not None:
+            out().print(f"ledger: {ledger}", markup=False, soft_wrap=True)
+    if debug:
+        sys.stderr.write(served.printed)
+    for sentence in served.sentences:
+        say_error(f"{title}: {sentence}")
+    return 1 if served.sentences else 0
+
+
+@dataclass(frozen=True, slots=True)
+class _Told:
+    """What is to be simulated."""
+
+    title: str
+    buses: tuple[BusConfig, ...]
+    bodies: UrdfBodies | None = None
+    """What their servos move together; None: each joint by itself."""
+    priority: int = _PRIORITY
+    """Real-time priority above the loop's."""
+    loop_cores: tuple[int, ...] = ()
+    """Where the loop may run; empty: anywhere."""
+    hint: str | None = None
+    """A command line that uses it when the port is added."""
+
+
+def _told(
+    robot: Path | None,
+    assignments: Sequence[str],
+    servo: Sequence[str],
+    baud: int | None,
+    protocol: float | None,
+) -> _Told:
+    """Return what the robot file says, or `--servo`."""
+    if robot is None:
+        if not servo:
+            raise InputError(
+                "there is nothing to simulate; give a robot file, or servos such as --servo XL430-W250:1-3"
+            )
+        return _Told("simulation", (servo_bus(servo, baud, protocol),))
+    options = {"--servo": servo or None, "--baud": baud, "--protocol": protocol}
+    given = [name for name, value in options.items() if value is not None]
+    if servo and not robot.is_file():
+        raise InputError(f"{robot} is no robot file; if it is a servo, give it a --servo of its own")
+    if given:
+        raise InputError(f"{' and '.join(given)} and a robot file exclude each other; leave one of them out")
+    result = compiled(robot, assignments, (), None)
+    for warning in result.warnings:
+        say_warning(str(warning))
+    from dxlrun.compile.simulated import simulated_bodies, simulated_buses
+
+    plan = result.plan
+    everywhere = replace(plan, buses=tuple(replace(bus, port="sim") for bus in plan.buses))
+    others = [word for word in assignments if not word.startswith("port:=")]
+    hint = shlex.join(["dxlrun", str(robot), *others])
+    takes_port = len(plan.buses) == 1 and "port" in plan.arguments
+    return _Told(
+        title=plan.robot,
+        buses=simulated_buses(everywhere),
+        bodies=simulated_bodies(everywhere),
+        priority=min(plan.loop.scheduler.priority + _ABOVE_LOOP, 99),
+        loop_cores=plan.loop.scheduler.cores,
+        hint=hint if takes_port else None,
+    )
+
+
+def refuse_what_cannot_be(buses: Sequence[BusConfig], faults: Sequence[Fault], seed: int) -> None:
+    """Put the buses together as their process will, so that what is wrong is said before anything starts.
+
+    Raises InputError for a servo that cannot be as it is told, and for each fault that could never happen.
+    """
+    from dxlrun.simulation import Ledger, SimulatedBus
+    from dxlrun.simulation.faults.planned import FaultScript
+
+    ledger = Ledger(keep=False)
+    try:
+        tried = [SimulatedBus(bus, ledger, 0) for bus in buses]
+    except ValueError as error:
+        raise InputError(f"a servo cannot be simulated: {error}") from error
+    FaultScript(faults, seed).attach(tried)
+
+
+def link_of_each(buses: Sequence[BusConfig], link: Path | None) -> dict[str, Path]:
+    """Return the link of each bus: LINK itself for one bus, LINK.NAME for several.
+
+    Raises InputError when something that is no link stands there, or no link can be made there.
+    """
+    if link is None:
+        return {}
+    names = [bus.name for bus in buses]
+    links = {name: link if len(names) == 1 else link.with_name(f"{link.name}.{name}") for name in names}
+    wrong = []
+    if not link.parent.is_dir():
+        wrong.append(f"--link {link}: there is no directory {link.parent}; make it first")
+    wrong += [
+        f"--link {path} stands there already and is no link; it is not replaced, choose another --link"
+        for path in links.values()
+        if path.exists() and not path.is_symlink()
+    ]
+    if wrong:
+        raise InputError("\n".join(wrong))
+    return {name: path.absolute() for name, path in links.items()}
+
+
+def _writable(ledger: Path | None) -> None:
+    """Refuse a ledger that cannot be written with one sentence, before anything starts."""
+    if ledger is None:
+        return
+    from dxlrun.simulation.bus.ledger import for_group
+
+    try:
+        open(ledger, "a", opener=for_group).close()
+    except OSError as error:
+        raise InputError(
+            f"--ledger {ledger} cannot be written ({error.strerror}); choose another file"
+        ) from None
+
+
+def _serve(config: SimulationConfig, options: FrontOptions, shown: Shown, *, as_json: bool) -> Served:
+    """Serve it to whom stdout leads: a program, a pipe, or a person at a terminal."""
+    from dxlrun.cli.output.sim_views import JsonView, PlainView
+    from dxlrun.run.simulation_front import TypedLines, serve
+
+    typed = TypedLines(sys.stdin.fileno())
+    if as_json:
+        return serve(config, options, JsonView(shown), typed)
+    if not sys.stdout.isatty() or not typed.in_foreground:
+        return serve(config, options, PlainView(shown), typed)
+    from dxlrun.cli.output.sim_table import TableView
+
+    view = TableView(shown, out())
+    with view.showing():
+        return serve(config, options, view, typed)

@@ -1,0 +1,1 @@
+"""How checks collect problems and name their places."""

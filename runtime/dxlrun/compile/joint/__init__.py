@@ -1,0 +1,1 @@
+"""Joints of a robot file against models, limits, registers and URDF."""

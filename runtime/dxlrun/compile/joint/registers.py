@@ -1,0 +1,240 @@
+"""Declared registers: what a robot file or a client may want in a servo's memory, and what is not theirs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from types import MappingProxyType
+
+from dxlrun.compile.checks.problems import Problems, suggestion
+from dxlrun.description import Description
+from dxlrun.description.robot import Joint
+from dxlrun.description.units import quantity
+from dxlrun.dynamixel.control_table import ControlItem, ControlTable
+from dxlrun.dynamixel.plan.bus_plan import BusPlan, RegisterValue, ServoPlan
+from dxlrun.dynamixel.registers.inspection import called
+
+_COMMANDED = ("controllers command it", "take it out; a controller sends it")
+_MODE = ("the interfaces of the active controllers choose the mode", "take it out; claim other interfaces")
+_ADDRESS = ("dxlrun finds the servo by it", "take it out; `dxlrun servo` changes it")
+_SECOND_ID = ("a servo that hears a second ID obeys the goals of another", "take it out")
+_TICK = ("it changes what a tick is", "take it out")
+_OWN: Mapping[str, tuple[str, str]] = MappingProxyType(
+    {
+        "id": _ADDRESS,
+        "baud_rate": _ADDRESS,
+        "baud_rate_bus": _ADDRESS,
+        "protocol_type": _ADDRESS,
+        "secondary_id": _SECOND_ID,
+        "secondary_shadow_id": _SECOND_ID,
+        "torque_enable": ("dxlrun switches the torque, after its checks", "take it out"),
+        "operating_mode": _MODE,
+        "control_mode": _MODE,
+        "torque_ctrl_mode_enable": _MODE,
+        "goal_position": _COMMANDED,
+        "goal_velocity": _COMMANDED,
+        "goal_current": _COMMANDED,
+        "goal_pwm": _COMMANDED,
+        "goal_torque": _COMMANDED,
+        "moving_speed": _COMMANDED,
+        "profile_velocity": _COMMANDED,
+        "current": ("it is measured", "take it out"),
+        "torque_limit": (
+            "policies reduce it, and a start restores it",
+            "declare max_torque, which it begins as",
+        ),
+        "bus_watchdog": ("dxlrun arms it", "take it out; the bus' key `bus_watchdog` is its time"),
+        "lock": ("nothing in the EEPROM could be written until power-off", "take it out"),
+        "hybrid_save": ("it stores values at a moment of its own", "take it out"),
+        "electronic_gearratio_numerator": _TICK,
+        "electronic_gearratio_denominator": _TICK,
+    }
+)
+"""What dxlrun writes itself, or must be able to rely on: why, and how to mend it."""
+_FIXED: Mapping[str, tuple[int, str]] = MappingProxyType(
+    {
+        "drive_mode": (0, "dxlrun has `direction` for that, and sends speeds, not times"),
+        "homing_offset": (0, "every position would be shifted; `reference` is there for that"),
+        "multi_turn_offset": (0, "every position would be shifted; `reference` is there for that"),
+        "resolution_divider": (1, "a tick would be something else"),
+        "status_return_level": (2, "no write would be acknowledged"),
+    }
+)
+"""What the start-up demands anyway: a servo may be mended to it, and to nothing else."""
+_TORQUE_AT_BOOT = 0x01
+"""Startup Configuration, bit 0 (e-Manual XM430-W350, Startup Configuration (60))."""
+_LEVEL = "status_return_level"
+_LOWER = ("min_position_limit", "cw_angle_limit")
+_UPPER = ("max_position_limit", "ccw_angle_limit")
+_ANGLE_LIMITS = ("cw_angle_limit", "ccw_angle_limit")
+
+
+class UnfitRegister(ValueError):
+    """A register that may not be written so: `what` is wrong, and how to `mend` it."""
+
+    def __init__(self, what: str, mend: str) -> None:
+        super().__init__(f"{what}; {mend}")
+        self.what = what
+        self.mend = mend
+
+
+def register_value(table: ControlTable, name: str, value: int | str) -> RegisterValue:
+    """Return what is written for a declared register; raises UnfitRegister.
+
+    `value` is the integer on the wire, signed where the item is, or text with a unit of the item's kind; that
+    becomes the nearest tick.
+    """
+    item = table.items.get(name)
+    if item is None:
+        raise UnfitRegister(f"an {table.model} has no register {name}", suggestion(name, declarable(table)))
+    if reason := own_reason(table, item):
+        raise UnfitRegister(f"{called(item)} is not to be declared: {reason[0]}", reason[1])
+    wanted = any_value(table, name, value)
+    _check_meaning(item, wanted.value)
+    return wanted
+
+
+def any_value(table: ControlTable, name: str, value: int | str) -> RegisterValue:
+    """Return what a tool writes into any item that can be written; raises UnfitRegister.
+
+    `value` is what `register_value` takes.
+    """
+    item = table.items.get(name)
+    if item is None:
+        names = tuple(each.name for each in table.items.values() if each.access == "RW")
+        raise UnfitRegister(f"an {table.model} has no register {name}", suggestion(name, names))
+    if item.access == "R":
+        raise UnfitRegister(f"{called(item)} can only be read", "take it out")
+    raw = _raw(item, value)
+    if not item.minimum <= raw <= item.maximum:
+        raise UnfitRegister(
+            f"{called(item)} of an {table.model} is {_range(item)}, not {_shown(value, raw)}",
+            "write a value in this range",
+        )
+    return RegisterValue(item.address, item.size, raw, name, item.area == "EEPROM")
+
+
+def steered_value(table: ControlTable, name: str, value: int | str) -> RegisterValue:
+    """Return what is written for a register that a client changes in the run; raises UnfitRegister."""
+    item = table.items.get(name)
+    if item is not None and item.access == "R":
+        raise UnfitRegister(f"{called(item)} can only be read", "write another item")
+    if item is not None and (reason := own_reason(table, item)):
+        raise UnfitRegister(f"{called(item)} is not to be changed: {reason[0]}", "write another item")
+    wanted = register_value(table, name, value)
+    item = table.items[name]
+    if wanted.eeprom:
+        raise UnfitRegister(
+            f"{called(item)} stands in the EEPROM, which no servo writes while it holds torque",
+            "declare it under `registers` in the robot file, which the next start writes",
+        )
+    if name in _FIXED:
+        raise UnfitRegister(f"{called(item)} is not to be changed: {_FIXED[name][1]}", "leave it as it is")
+    return wanted
+
+
+def declarable(table: ControlTable) -> tuple[str, ...]:
+    """Return the items of a model that may be declared, in the order of their addresses."""
+    items = table.items.values()
+    return tuple(item.name for item in items if item.access == "RW" and not own_reason(table, item))
+
+
+def own_reason(table: ControlTable, item: ControlItem) -> tuple[str, str] | None:
+    """Return why an item is dxlrun's own and what to do instead; None where it is not."""
+    if item.name.startswith("indirect_"):
+        return "dxlrun may lay the cycle's reads there", "take it out"
+    if item.name in _ANGLE_LIMITS and table.protocol == 1.0:
+        return (
+            "both angle limits choose the mode, which dxlrun sets",
+            "write `limits: {position: ...}` instead",
+        )
+    return _OWN.get(item.name)
+
+
+def compile_registers(
+    description: Description, name: str, joint: Joint, table: ControlTable, problems: Problems
+) -> tuple[RegisterValue, ...]:
+    """Return what a joint declares, in the order in which it is written: EEPROM first, by address.
+
+    Before all of it Status Return Level, so that the other writes are acknowledged.
+    """
+    found: list[RegisterValue] = []
+    for register, value in joint.registers.items():
+        mark = description.marks.value("joints", name, "registers", register)
+        try:
+            found.append(register_value(table, register, value))
+        except UnfitRegister as error:
+            problems.error(mark, f"{name}: {error.what}", error.mend)
+        except ValueError as error:  # a quantity that is none
+            what, _, mend = str(error).partition("; ")
+            problems.error(mark, f"{register} of {name}: {what}", mend)
+    bus = description.robot.buses.get(joint.bus)
+    delay = next((one.value for one in found if one.name == "return_delay_time"), None)
+    if delay is not None and bus is not None and abs(delay * 2_000 - bus.return_delay_time) >= 2_000:
+        problems.warning(
+            description.marks.value("joints", name, "registers", "return_delay_time"),
+            f"{name} declares a return delay of {delay * 2} us, but bus {joint.bus} is reckoned with "
+            f"{bus.return_delay_time / 1000:g} us",
+            f"write `return_delay_time: {delay * 2} us` at the bus if all its servos have it",
+        )
+    return tuple(sorted(found, key=lambda one: (one.name != _LEVEL, not one.eeprom, one.address)))
+
+
+def check_position_limits(description: Description, plan: BusPlan, problems: Problems) -> None:
+    """Refuse position limits that are declared narrower than those of the joint: goals would be refused.
+
+    Multi-turn modes know no limits (e-Manual XM430-W350, Min/Max Position Limit (52, 48)).
+    """
+    for servo in plan.servos:
+        if servo.continuous:
+            continue
+        for register, needed in _narrow(servo):
+            problems.error(
+                description.marks.value("joints", servo.joint, "registers", register.name),
+                f"{servo.joint} declares {register.name} = {register.value}, but its limits reach to tick "
+                f"{needed}, and the servo would refuse goals there",
+                f"declare {needed}, or make `limits: {{position: ...}}` narrower",
+            )
+
+
+def _narrow(servo: ServoPlan) -> Iterator[tuple[RegisterValue, int]]:
+    for register in servo.registers:
+        if register.name in _LOWER and register.value > servo.lower_tick:
+            yield register, servo.lower_tick
+        if register.name in _UPPER and register.value < servo.upper_tick:
+            yield register, servo.upper_tick
+
+
+def _raw(item: ControlItem, value: int | str) -> int:
+    if isinstance(value, int):
+        return value
+    if not item.unit:
+        raise UnfitRegister(f"{called(item)} has no unit, but is {value!r}", "write a whole number")
+    ticks = quantity(value, item.unit) / item.scale
+    if not math.isfinite(ticks):
+        raise UnfitRegister(f"{value} is too much for {called(item)}", f"it takes {_range(item)}")
+    return round(ticks)
+
+
+def _range(item: ControlItem) -> str:
+    ends = f"{item.minimum}..{item.maximum}"
+    if not item.unit:
+        return ends
+    unit = "of the maximum" if item.unit == "1" else item.unit
+    return f"{ends} ({item.minimum * item.scale:.6g}..{item.maximum * item.scale:.6g} {unit})"
+
+
+def _shown(value: int | str, raw: int) -> str:
+    return str(value) if isinstance(value, int) else f"{value} ({raw})"
+
+
+def _check_meaning(item: ControlItem, raw: int) -> None:
+    """Refuse values that a servo takes, but with which no robot may run."""
+    wanted, why = _FIXED.get(item.name, (raw, ""))
+    if raw != wanted:
+        raise UnfitRegister(f"{called(item)} cannot be {raw}: {why}", f"write {wanted}, or take it out")
+    if item.name == "startup_configuration" and raw & _TORQUE_AT_BOOT:
+        raise UnfitRegister(
+            f"{called(item)} = {raw} switches torque on by itself at power-up",
+            f"write {raw & ~_TORQUE_AT_BOOT}",
+        )

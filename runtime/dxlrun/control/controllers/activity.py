@@ -1,0 +1,150 @@
+"""Activity: the controller whose code runs now, shown to other processes; what that code must not start.
+
+A thread beside the loop would be handed the interpreter in the middle of a cycle, and a forked child has the
+loop's memory and stops the loop while it is made. Both are refused to controllers while the robot runs: where
+Python starts them the start itself fails; threads that foreign machine code starts are counted after the
+call, its processes are not seen. A process that a controller needs is started in on_configure.
+"""
+
+from __future__ import annotations
+
+import _posixsubprocess
+import os
+import sys
+import threading
+from collections.abc import Callable
+from functools import cache
+from typing import ClassVar, Protocol
+
+from dxlrun.plurals import counted
+from dxlrun.run.channels.heartbeat import Step
+
+_LOADING = int(Step.ON_CONFIGURE)
+"""The last step before the robot runs."""
+# found at once, twice a call
+_ident, _process = threading.get_ident, os.getpid
+
+
+class ActivityPage(Protocol):
+    """Where other processes read what runs; each call is a few stores."""
+
+    def name_controller(self, place: int, name: str) -> None:
+        """Keep the name of the controller in this place, before anything of it is called."""
+        ...
+
+    def call(self, place: int, step: int) -> None:
+        """Show what is called now, and of the controller in which place; a step of 0: nothing."""
+        ...
+
+
+class NoPage:
+    """No other process looks on."""
+
+    def name_controller(self, place: int, name: str) -> None:
+        """Forget it."""
+
+    def call(self, place: int, step: int) -> None:
+        """Forget it."""
+
+
+class Activity:
+    """What is called now of which controller.
+
+    `count_threads` returns the number of threads, in a process that must have no other than the loop's;
+    without it other threads come and go.
+    """
+
+    __slots__ = ("_count_threads", "_page", "_process", "_threads", "refused", "thread")
+    guarded: ClassVar[Activity | None] = None
+    """The one whose controller must start nothing now; a process runs one loop at a time."""
+
+    def __init__(
+        self, page: ActivityPage | None = None, count_threads: Callable[[], int] | None = None
+    ) -> None:
+        self._page = page or NoPage()
+        self._count_threads = count_threads
+        self._threads = count_threads() if count_threads else 0
+        self._process = _process()
+        self.thread = 0
+        """Which thread calls the controller."""
+        self.refused = ""
+        """What was refused to the controller in this call."""
+        _guard()
+
+    def name_controller(self, place: int, name: str) -> None:
+        """Name the controller in this place, before anything of it is called."""
+        self._page.name_controller(place, name)
+
+    def begin(self, place: int, step: Step) -> None:
+        """Show what is called next; while the robot runs, refuse what it must not start."""
+        self._page.call(place, step)
+        if step > _LOADING:
+            self.thread = _ident()
+            Activity.guarded = self
+
+    def end(self) -> str:
+        """Show that it returned, or raised; return what it did against the rules, empty when that is nothing.
+
+        A child that a controller forked and that came back from the call ends here: there is one loop only.
+        """
+        if _process() != self._process:
+            os._exit(0)
+        watched, Activity.guarded = Activity.guarded is self, None
+        self._page.call(0, 0)
+        refused, self.refused = self.refused, ""
+        if self._count_threads is not None:
+            more = self._count_threads() - self._threads
+            if more > 0:
+                self._threads += more
+                if watched and not refused:
+                    return f"started {counted(more, 'thread', 'threads')}"
+        return f"tried to start {refused}" if refused else ""
+
+
+_STARTS = {
+    "os.fork": "a child process",
+    "os.forkpty": "a child process",
+    "os.posix_spawn": "a child process",
+    "os.system": "a child process",
+    "subprocess.Popen": "a child process",
+    "os.exec": "another program in place of the loop",
+    "_thread.start_new_thread": "a thread",
+    "_thread.start_joinable_thread": "a thread",
+}
+"""Audit events (docs.python.org, Audit events table) that come before something is started."""
+
+
+def _refuse(what: str) -> None:
+    """Raise RuntimeError in a controller that starts something while the robot runs."""
+    activity = Activity.guarded
+    if activity is not None and activity.thread == _ident():
+        activity.refused = what
+        raise RuntimeError(f"a controller cannot start {what} while the robot runs")
+
+
+def _audit(event: str, _: tuple[object, ...]) -> None:
+    if event in _STARTS:
+        _refuse(_STARTS[event])
+
+
+@cache
+def _guard() -> None:
+    """Look at every start of a thread or a process from now on.
+
+    Before Python 3.12 no audit event tells of a thread, and none tells of the processes of multiprocessing
+    that are not forked.
+    """
+    sys.addaudithook(_audit)
+    start: Callable[[threading.Thread], None] = threading.Thread.start
+    fork_exec: Callable[..., int] = _posixsubprocess.fork_exec
+
+    def start_thread(thread: threading.Thread) -> None:
+        _refuse("a thread")
+        start(thread)
+
+    def start_process(*arguments: object) -> int:
+        _refuse("a child process")
+        return fork_exec(*arguments)
+
+    setattr(threading.Thread, "start", start_thread)  # noqa: B010  a method, which mypy would not let replace
+    setattr(_posixsubprocess, "fork_exec", start_process)  # noqa: B010  see above

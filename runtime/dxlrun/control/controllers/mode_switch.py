@@ -1,0 +1,177 @@
+"""Mode switch: controllers that enter when all their joints are in the modes that they need."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.control.controllers.claims import claimed_modes, conflicts, told
+from dxlrun.control.controllers.managed import Managed
+from dxlrun.control.loop_plan import JointPlan
+from dxlrun.mode import Mode
+
+PATIENCE_NS = 5_000_000_000
+"""How long controllers wait for modes: twenty servos that take their turns in short gaps need less than one
+second, a servo that came back from a reset some more. [i]"""
+_STILL = (Mode.POSITION, Mode.VELOCITY)
+"""Modes in which a joint holds still by itself: it stays in them when nobody claims it."""
+
+SetModes = Callable[[NDArray[np.uint8]], None]
+"""Hardware.set_modes"""
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """Controllers that become active together."""
+
+    entering: tuple[Managed, ...]
+    until_ns: int
+    """The controllers' time at which they are given up."""
+    why: str
+    """The fault of the one that they stand in for; empty: they were asked for."""
+
+
+class ModeSwitch:
+    """Who waits for which modes, and what is asked of the hardware for it; times are the controllers'.
+
+    A joint that is claimed, or about to be, is asked into the mode of its claim. One that nobody claims stays
+    in position or velocity mode, where it holds still, and is asked out of others into its rest mode.
+    """
+
+    __slots__ = ("_asked", "_groups", "_joints", "_modes", "_rows", "_set_modes")
+
+    def __init__(
+        self, joints: Sequence[JointPlan], modes: NDArray[np.uint8], set_modes: SetModes | None
+    ) -> None:
+        """`modes` is the record's array of the modes in which the joints are, shape (joints,)."""
+        self._joints = tuple(joints)
+        self._rows = {joint.name: row for row, joint in enumerate(joints)}
+        self._modes = modes
+        self._set_modes = set_modes
+        self._groups: list[Group] = []
+        self._asked = True
+
+    @property
+    def awaited(self) -> bool:
+        """True while anybody waits."""
+        return bool(self._groups)
+
+    @property
+    def entering(self) -> tuple[Managed, ...]:
+        """Who waits."""
+        return tuple(managed for group in self._groups for managed in group.entering)
+
+    def changed(self) -> None:
+        """Claims are other ones than before: modes are asked for anew."""
+        self._asked = False
+
+    def await_modes(self, entering: Iterable[Managed], time_ns: int, why: str) -> None:
+        """Let controllers wait, together, until all their joints are in their modes."""
+        self._groups.append(Group(tuple(entering), time_ns + PATIENCE_NS, why))
+        self._asked = False
+
+    def ready(self, entering: Iterable[Managed]) -> bool:
+        """Say whether all joints of these controllers are in the modes that they need."""
+        return not self._missing(entering)
+
+    def due(self, time_ns: int) -> tuple[list[Group], list[Group]]:
+        """Return the groups that may enter now, and those whose modes will not come; both wait no more.
+
+        They will not when the time is over, and when a joint is in another mode although it was asked: on the
+        way it would be in none.
+        """
+        ready, late = [], []
+        for group in self._groups:
+            missing = self._missing(group.entering)
+            refused = self._asked and any(now != Mode.UNKNOWN for _, now in missing.values())
+            if not missing:
+                ready.append(group)
+            elif refused or time_ns >= group.until_ns:
+                late.append(group)
+        self._groups = [group for group in self._groups if group not in ready and group not in late]
+        if late:
+            self._asked = False
+        return ready, late
+
+    def excuse(self, group: Group) -> str:
+        """Say which joints did not come into their modes."""
+        missing = self._missing(group.entering)
+        stays = [
+            f"{joint} stays in {_said(now)} mode instead of {_said(mode)} mode"
+            for joint, (mode, now) in missing.items()
+            if now != Mode.UNKNOWN
+        ]
+        late = [
+            f"{joint} did not come into {_said(mode)} mode within {PATIENCE_NS * 1e-9:g} s"
+            for joint, (mode, now) in missing.items()
+            if now == Mode.UNKNOWN
+        ]
+        return (stays or late)[0] + (f", nor did {len(missing) - 1} more" if len(missing) > 1 else "")
+
+    def drop(self, managed: Managed, _time_ns: int) -> None:
+        """Let one controller wait no more."""
+        kept = [
+            Group(tuple(one for one in group.entering if one is not managed), group.until_ns, group.why)
+            for group in self._groups
+        ]
+        self._groups = [group for group in kept if group.entering]
+        self._asked = False
+
+    def end(self) -> None:
+        """Let nobody wait, and ask for nothing any more."""
+        self._groups = []
+        self._asked = True
+
+    def ask(self, managed: Iterable[Managed]) -> None:
+        """Ask the hardware for modes, once for each change of claims of those of them who are active."""
+        if self._asked:
+            return
+        self._asked = True
+        active = (one for one in managed if one.active)
+        claimed = claimed_modes(one.plan for one in (*active, *self.entering))
+        wanted = np.zeros(len(self._joints), dtype=np.uint8)
+        for row, joint in enumerate(self._joints):
+            now = self._modes[row]
+            mode = claimed.get(joint.name)
+            if mode is None:
+                mode = Mode(now) if now in _STILL else joint.rest
+            if mode != now:
+                wanted[row] = mode
+        if self._set_modes is not None and wanted.any():
+            self._set_modes(wanted)
+
+    def refuse(
+        self,
+        activate: Sequence[str],
+        deactivate: Sequence[str],
+        named: Mapping[str, Managed],
+        active: Iterable[Managed],
+    ) -> str:
+        """Say why controllers cannot be switched so; empty when they can."""
+        for names in (activate, deactivate):
+            for name in names:
+                if name not in named:
+                    return f"there is no controller {name}"
+            if len(set(names)) != len(names):
+                return "a controller is named twice"
+        engaged = {managed.plan.name: managed.plan for managed in (*active, *self.entering)}
+        if idle := [name for name in deactivate if name not in engaged]:
+            return f"{', '.join(idle)} is not active"
+        if busy := [name for name in activate if name in engaged and name not in deactivate]:
+            return f"{', '.join(busy)} is active already"
+        staying = [plan for name, plan in engaged.items() if name not in deactivate]
+        clash = told(conflicts([*staying, *(named[name].plan for name in activate)]))
+        return f"{clash}; deactivate whoever is in the way in the same switch" if clash else ""
+
+    def _missing(self, entering: Iterable[Managed]) -> dict[str, tuple[Mode, Mode]]:
+        """Return the joints that are not in their modes, with the mode that they need and theirs."""
+        claimed = claimed_modes(managed.plan for managed in entering)
+        now = {joint: Mode(int(self._modes[self._rows[joint]])) for joint in claimed}
+        return {joint: (mode, now[joint]) for joint, mode in claimed.items() if mode != now[joint]}
+
+
+def _said(mode: Mode) -> str:
+    return mode.name.lower().replace("_", " with ")

@@ -1,0 +1,234 @@
+"""Plug-ins: finds the packages that offer controllers, one by one; a broken one never takes others along."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Any, cast
+
+import pluggy
+from pydantic import ValidationError
+
+from dxlrun.control.controllers.contract import ControllerClass, controller_breach, hook_breach
+from dxlrun.control.controllers.controller import CONTRACT_VERSION, Controller
+from dxlrun.control.controllers.hookspecs import GROUP, HookSpecs
+from dxlrun.control.loop_plan import ControllerPlan
+from dxlrun.control.overrun import Decide, OverrunHook
+from dxlrun.dynamixel.control_table import add_control_table
+from dxlrun.errors import ControllerFault, PlugInError
+
+_MOST_MISTAKES = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Offer:
+    """A controller that a plug-in offers."""
+
+    type: str
+    """The robot file's name for it."""
+    controller: ControllerClass
+    distribution: str
+    """Who published it: `name version`."""
+
+
+def _look_away(name: str) -> None:
+    """Do nothing: processes without a loop may have threads."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlugIns:
+    """All controllers that are installed, and why others are not to be had."""
+
+    controllers: Mapping[str, Offer]
+    """By type."""
+    broken: Mapping[str, str]
+    """One sentence a plug-in that could not be used, by its entry point's name, and one a type that two
+    plug-ins offer, by the type's name."""
+    overrun_hooks: tuple[OverrunHook, ...] = ()
+    """Who is asked what becomes of a late cycle, in this order."""
+    after_each: Callable[[str], None] = _look_away
+    """Called with a name after foreign code prepared something; it may raise PlugInError."""
+
+    def built(self, plan: ControllerPlan) -> Controller[Any]:
+        """Return a new controller of the plan's type.
+
+        Raises PlugInError (the type is not to be had, parameters do not fit it), and ControllerFault for
+        whatever else its class raises.
+        """
+        offer = self.controllers.get(plan.type)
+        if offer is None:
+            why = "; ".join(self.broken.values())
+            raise PlugInError(
+                f"no plug-in offers the type {plan.type} of controller {plan.name}"
+                + (f" ({why})" if why else "")
+            )
+        try:
+            parameters = offer.controller.Parameters.model_validate_json(plan.parameters)
+            return offer.controller(parameters)
+        except ValidationError as error:
+            from dxlrun.description.source.problems import sentences_of
+
+            wrong = "; ".join(sentences_of(error, plan.name, offer.controller.Parameters, _MOST_MISTAKES))
+            raise PlugInError(f"the parameters of a controller: {wrong}") from error
+        except (Exception, SystemExit) as error:  # foreign code: one sentence instead of its traceback
+            raise ControllerFault(
+                f"controller {plan.name} cannot be built: {type(error).__name__}: {error}"
+            ) from error
+
+
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """What one plug-in brings."""
+
+    offers: tuple[Offer, ...] = ()
+    overrun: Decide | None = None
+
+
+def load_plugins(after_each: Callable[[str], None] = _look_away) -> PlugIns:
+    """Import every entry point of the group `dxlrun` and ask it for its controllers and servo models.
+
+    `after_each` is called with the plug-in's name and distribution after its import, broken or not; what it
+    raises passes through: the loop's process counts its threads there, and again when a controller was
+    configured. Itself raises nothing.
+    """
+    offers: dict[str, Offer] = {}
+    broken: dict[str, str] = {}
+    hooks: list[OverrunHook] = []
+    ambiguous: dict[str, str] = {}
+    for entry_point in sorted(entry_points(group=GROUP), key=_order):
+        publisher = _publisher(entry_point)
+        try:
+            found = _load(entry_point, publisher)
+        except PlugInError as error:
+            broken[_free_key(entry_point.name, publisher, broken)] = str(error)
+            found = _Found()
+        if found.overrun is not None:
+            hooks.append(OverrunHook(f"{entry_point.name} ({publisher})", found.overrun))
+        after_each(f"{entry_point.name} ({publisher})")
+        for offer in found.offers:
+            first = offers.setdefault(offer.type, offer)
+            if first is not offer:
+                ambiguous[offer.type] = (
+                    f"{first.distribution} and {offer.distribution} both offer a controller of type "
+                    f"{offer.type}; neither is used: uninstall one of them, or ask an author for another name"
+                )
+    usable = {name: offer for name, offer in offers.items() if name not in ambiguous}
+    return PlugIns(usable, broken | ambiguous, tuple(hooks), after_each)
+
+
+def _order(entry_point: EntryPoint) -> tuple[str, str]:
+    """The order must not depend on the file system, because two runs are to say the same."""
+    return _publisher(entry_point), entry_point.name
+
+
+def _publisher(entry_point: EntryPoint) -> str:
+    distribution = entry_point.dist
+    return f"{distribution.name} {distribution.version}" if distribution else "an unknown distribution"
+
+
+def _told(error: BaseException) -> str:
+    """Return an error in one line."""
+    return " ".join(f"{type(error).__name__}: {error}".split())
+
+
+def _free_key(name: str, publisher: str, taken: Mapping[str, str]) -> str:
+    return name if name not in taken else f"{name} ({publisher})"
+
+
+def _load(entry_point: EntryPoint, publisher: str) -> _Found:
+    """Return what one plug-in offers. Raises PlugInError with one sentence that names its distribution."""
+
+    def refuse(what: str, mend: str) -> PlugInError:
+        return PlugInError(f"plug-in {entry_point.name} of {publisher} {what}; {mend}")
+
+    try:
+        module = entry_point.load()
+    except (Exception, SystemExit) as error:  # foreign code: whatever it does on import is its fault alone
+        raise refuse(f"cannot be imported ({_told(error)})", "reinstall it, or tell its author") from error
+    manager = pluggy.PluginManager(GROUP)
+    manager.add_hookspecs(HookSpecs)
+    try:
+        breach = hook_breach(module, manager)
+        if breach is None:
+            manager.register(module, entry_point.name)
+            manager.check_pending()
+    except Exception as error:  # foreign code, see above: looking at an object may run its code
+        raise refuse(f"has a wrong hook ({_told(error)})", "tell its author") from error
+    if breach is not None:
+        raise refuse(*breach)
+    try:
+        contracts = manager.hook.dxlrun_contract()
+        mappings = manager.hook.dxlrun_controllers()
+        servo_models = manager.hook.dxlrun_servo_models()
+    except (Exception, SystemExit) as error:  # foreign code, see above
+        raise refuse(f"raised in a hook ({_told(error)})", "tell its author") from error
+    if not contracts:
+        raise refuse(
+            "does not say for which contract it was written", "it must implement the hook dxlrun_contract"
+        )
+    if contracts != [CONTRACT_VERSION]:
+        raise refuse(
+            f"was written for contract {contracts[0]!r}, this dxlrun has contract {CONTRACT_VERSION}",
+            "install a version of it that fits",
+        )
+    offers = tuple(
+        _offer(name, controller, publisher, refuse)
+        for mapping in mappings
+        for name, controller in _items(mapping, refuse)
+    )
+    for models in servo_models:
+        _add_servo_models(models, refuse)
+    return _Found(offers, _overrun(manager))
+
+
+def _overrun(manager: pluggy.PluginManager) -> Decide | None:
+    """Return what the loop calls for the hook `dxlrun_overrun`, with the arguments that the plug-in wants."""
+    found = manager.hook.dxlrun_overrun.get_hookimpls()
+    return partial(_call, found[0].function, found[0].argnames) if found else None
+
+
+def _call(
+    function: Callable[..., object], wanted: Sequence[str], cycle: int, scheduled_ns: int, actual_ns: int
+) -> object:
+    given = {"cycle": cycle, "scheduled_ns": scheduled_ns, "actual_ns": actual_ns}
+    return function(**{name: given[name] for name in wanted})
+
+
+def _add_servo_models(models: object, refuse: Callable[[str, str], PlugInError]) -> None:
+    """Make the control tables of a plug-in known to this process."""
+    if not isinstance(models, Sequence) or isinstance(models, str | bytes):
+        raise refuse(
+            "does not return a list from dxlrun_servo_models", "return TOML texts, or paths of TOML files"
+        )
+    for model in models:
+        if not isinstance(model, str | Path):
+            raise refuse(f"offers the servo model {model!r}", "it must be a TOML text or the path of a file")
+        where = f"({model}) " if isinstance(model, Path) else ""
+        try:
+            add_control_table(model if isinstance(model, str) else model.read_text("utf-8"))
+        except (OSError, ValueError) as error:
+            raise refuse(
+                f"offers a servo model {where}that cannot be used ({_told(error)})", "tell its author"
+            ) from error
+
+
+def _items(mapping: object, refuse: Callable[[str, str], PlugInError]) -> list[tuple[object, object]]:
+    if not isinstance(mapping, Mapping):
+        raise refuse("does not return a mapping from dxlrun_controllers", "return {type: class}")
+    return list(mapping.items())
+
+
+def _offer(
+    name: object, controller: object, publisher: str, refuse: Callable[[str, str], PlugInError]
+) -> Offer:
+    if not isinstance(name, str):
+        raise refuse(f"offers a controller under {name!r}", "the type must be a string")
+    breach = controller_breach(controller)
+    if breach is not None:
+        what, mend = breach
+        shown = controller.__qualname__ if isinstance(controller, type) else repr(controller)
+        raise refuse(f"offers {shown} as {name}, {what}", mend)
+    return Offer(name, cast("ControllerClass", controller), publisher)

@@ -1,0 +1,1 @@
+"""Source: YAML text with marks, includes and arguments to one tree."""

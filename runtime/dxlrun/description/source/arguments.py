@@ -1,0 +1,148 @@
+"""Arguments: `arguments:` of a robot file, `name:=value` of the command line, and `${name}` in use.
+
+A value that is nothing but `${name}` takes the argument's value with its type: text when the default is text,
+else what YAML reads in it. Inside longer text the argument is put in as text. `$${` writes a plain `${`.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Mapping, Sequence
+from typing import Annotated
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import PydanticCustomError
+
+from dxlrun.description.source.marks import KeyPath, Marks
+from dxlrun.description.source.problems import problems_of
+from dxlrun.description.source.scalars import plain_value, text_of
+from dxlrun.description.source.tree import Filled, literal
+from dxlrun.errors import Mark, Problem
+
+COMMAND_LINE = "command line"
+"""Stands for a file in the mark of what is wrong with `name:=value`."""
+
+_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*", re.ASCII)
+_USE = re.compile(r"\$\$\{|\$\{([^{}]*)(\}?)")
+
+
+def _scalar(value: object) -> object:
+    if isinstance(value, dict | list):
+        raise PydanticCustomError(
+            "dxlrun",
+            "{what}; {mend}",
+            {
+                "what": "the default of an argument is one value",
+                "mend": "write text, a number, true or false",
+            },
+        )
+    return value
+
+
+class Argument(BaseModel):
+    """One argument of a robot file."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    default: Annotated[object, AfterValidator(_scalar)] = Field(
+        default=None, description="Value when none is given; without one it must be given.", examples=["sim"]
+    )
+    help: str = Field(default="", description="What it is for.", examples=['"serial port of the adapter"'])
+
+
+class Arguments:
+    """The arguments of one run: declared in the file, given on the command line."""
+
+    def __init__(self, block: object, given: Mapping[str, str], marks: Marks) -> None:
+        """Take the `arguments:` block as it was read (None: there is none) and what was given."""
+        self.problems: list[Problem] = []
+        self.texts: dict[str, str] = {}
+        """Value of each argument as text."""
+        self._values: dict[str, object] = {}
+        self._names: tuple[str, ...] = ()
+        self._given = given
+        self._marks = marks
+        if isinstance(block, dict):
+            self._names = tuple(block)
+            for name, entry in block.items():
+                self._declare(name, entry)
+        elif block is not None or marks.has(("arguments",)):
+            self._problem(
+                ("arguments",), "arguments is not a mapping", "write port: {default: sim, help: ...} in it"
+            )
+        for name in given:
+            if name not in self._names:
+                what = f"{name}:={given[name]} was given, but the robot file has no argument {name!r}"
+                self.problems.append(Problem(Mark(COMMAND_LINE), what, _suggestion(name, self._names)))
+
+    def _declare(self, name: str, entry: object) -> None:
+        path = ("arguments", name)
+        if not _NAME.fullmatch(name):
+            self._problem(path, f"{name!r} is no name of an argument", "use letters, digits and _")
+        try:
+            default = Argument.model_validate(entry).default
+        except ValidationError as error:
+            self.problems.extend(problems_of(error, self._marks, path, model=Argument))
+            return
+        if name in self._given:
+            text = self._given[name]
+            self._values[name] = text if isinstance(default, str) else plain_value(text)
+            self.texts[name] = text
+        elif default is not None:
+            self._values[name] = default
+            self.texts[name] = text_of(default)
+        else:
+            self._problem(
+                path,
+                f"the argument {name} has no value",
+                f"write {name}:=... behind the robot file, or give it a default",
+            )
+
+    def _problem(self, path: KeyPath, what: str, mend: str) -> None:
+        self.problems.append(Problem(self._marks.key(*path), what, mend))
+
+    def fill(self, path: KeyPath, text: str, quoted: bool) -> Filled:
+        """Return the value of a scalar with the arguments put in."""
+        if "${" not in text:
+            return literal(path, text, quoted)
+        if path[:1] == ("arguments",):
+            if path[-1] == "help":
+                return literal(path, text, quoted)
+            return _unusable("an argument's default cannot use ${...}", "write the value itself")
+        uses = [match for match in _USE.finditer(text) if match[0] != "$${"]
+        wrong = tuple(problem for use in uses for problem in self._wrong(use))
+        names = [use[1].strip() for use in uses]
+        if wrong or not all(name in self._values for name in names):
+            return Filled(None, problems=wrong, unknown=True)
+        origin = ", ".join(f"{name}:={self.texts[name]}" for name in dict.fromkeys(names)) or None
+        if len(uses) == 1 and uses[0][0] == text.strip():
+            return Filled(self._values[names[0]], origin)
+        filled = _USE.sub(lambda use: "${" if use[0] == "$${" else self.texts[use[1].strip()], text)
+        return Filled(filled if quoted else plain_value(filled), origin)
+
+    def _wrong(self, use: re.Match[str]) -> list[tuple[str, str]]:
+        name = use[1].strip()
+        if not use[2]:
+            return [("a ${ is not closed", "write ${name}, or $${ for a plain ${")]
+        if name in self._names:
+            return []
+        return [(f"there is no argument {name!r}", _suggestion(name, self._names))]
+
+
+def refuse_arguments(path: KeyPath, text: str, quoted: bool) -> Filled:
+    """Return the value of a scalar in a file that takes no arguments."""
+    if "${" in text:
+        return _unusable("a motion file takes no arguments", "write the value itself")
+    return literal(path, text, quoted)
+
+
+def _unusable(what: str, mend: str) -> Filled:
+    return Filled(None, problems=((what, mend),), unknown=True)
+
+
+def _suggestion(name: str, known: Sequence[str]) -> str:
+    if not known:
+        return "take it out, or declare it: arguments: {NAME: {default: ..., help: ...}}"
+    close = difflib.get_close_matches(name, known, n=1)
+    return f"did you mean {close[0]}?" if close else f"the arguments are {', '.join(known)}"

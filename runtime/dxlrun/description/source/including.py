@@ -1,0 +1,175 @@
+"""Including: a robot file and the fragments that it names become one document.
+
+`include: [fragments/head.yaml]` is relative to the file that says it. Mappings are merged, key by key, at
+every depth; of two values the including file's counts, of two fragments the later one's. Marks stay with the
+file in which a value stands. A fragment that is reached twice counts once, where it is reached first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from dxlrun.description.source.marks import KeyPath, Marks
+from dxlrun.description.source.problems import shown
+from dxlrun.description.source.syntax import LARGEST_FILE, Tree, parse, read_text
+from dxlrun.description.source.tree import Fill, Grown, grow, literal
+from dxlrun.errors import InputError, Mark, Problem
+
+KEY = "include"
+MOST_LEVELS = 8
+"""Files that include each other in a row."""
+MOST_FILES = 64
+"""Of one robot."""
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """One file of a robot, as it was read."""
+
+    path: Path
+    text: str
+    tree: Tree
+    declared: Grown
+    """Its values before arguments are put in."""
+
+    def grown(self, fill: Fill) -> Grown:
+        """Return its values with arguments put in."""
+        return grow(self.tree, str(self.path), fill)
+
+
+def read_sources(path: Path) -> tuple[Source, ...]:
+    """Return the file and all that it includes, the weakest first, itself last.
+
+    Raises InputError when one of them is no YAML, or an `include` cannot be followed, with all such problems.
+    """
+    text = read_text(path)
+    collector = _Collector()
+    collector.take(path, text, parse(text, str(path)), ())
+    if collector.problems:
+        raise InputError(collector.problems)
+    return tuple(collector.sources)
+
+
+class _Collector:
+    """Follows the includes of each file, deepest first."""
+
+    def __init__(self) -> None:
+        self.sources: list[Source] = []
+        self.problems: list[Problem] = []
+        self._done: set[Path] = set()
+        self._characters = 0
+
+    def take(self, path: Path, text: str, tree: Tree, above: tuple[Path, ...]) -> None:
+        """Take what a file includes, then the file; `above` are the files that led to it."""
+        declared = grow(tree, str(path), literal)
+        self._done.add(path.resolve())
+        self._characters += len(text)
+        for entry, mark in self._entries(declared):
+            self._follow(path, entry, mark, (*above, path.resolve()))
+        self.sources.append(Source(path, text, tree, declared))
+
+    def _entries(self, declared: Grown) -> list[tuple[str, Mark]]:
+        """Return the fragments that a file names; anything else in its `include` is a problem."""
+        if KEY not in declared.data:
+            return []
+        entries, marks = declared.data[KEY], declared.marks
+        if not isinstance(entries, list):
+            self._refuse(
+                marks.value(KEY), f"include is {shown(entries)}, but must be a list", "write [fragment.yaml]"
+            )
+            return []
+        found: list[tuple[str, Mark]] = []
+        for index, entry in enumerate(entries):
+            mark = marks.value(KEY, index)
+            if not isinstance(entry, str) or not entry:
+                self._refuse(
+                    mark, f"include[{index}] is {shown(entry)}, but must be a file's name", "name it"
+                )
+            elif "${" in entry:
+                self._refuse(mark, "arguments are not put into include", "write the file's name itself")
+            else:
+                found.append((entry, mark))
+        return found
+
+    def _follow(self, path: Path, entry: str, mark: Mark, above: tuple[Path, ...]) -> None:
+        fragment = path.parent / entry
+        place = fragment.resolve()
+        if place in above:
+            chain = " -> ".join(each.name for each in (*above[above.index(place) :], place))
+            self._refuse(mark, f"{entry} includes itself ({chain})", "take one of these includes out")
+        elif place in self._done:
+            return
+        elif len(above) >= MOST_LEVELS:
+            self._refuse(mark, f"includes go deeper than {MOST_LEVELS} files", "include it further up")
+        elif len(self._done) >= MOST_FILES:
+            self._refuse(mark, f"more than {MOST_FILES} files are included", "put some of them together")
+        elif not fragment.exists():
+            mend = "check the name, which counts from the folder of this file"
+            self._refuse(mark, f"there is no file {entry}", mend)
+        else:
+            self._read(fragment, entry, mark, above)
+
+    def _read(self, fragment: Path, entry: str, mark: Mark, above: tuple[Path, ...]) -> None:
+        try:
+            text = read_text(fragment)
+        except InputError as error:
+            for problem in error.problems:
+                at_file = problem.mark == Mark(str(fragment))  # the file itself, not a place in it
+                what = f"{entry}: {problem.what}" if at_file else problem.what
+                self._refuse(mark if at_file else problem.mark, what, problem.mend)
+            return
+        if self._characters + len(text) > LARGEST_FILE:
+            what = f"with {entry} the robot has more than {LARGEST_FILE // 1024} KiB"
+            self._refuse(mark, what, "thin it out")
+            return
+        try:
+            self.take(fragment, text, parse(text, str(fragment)), above)
+        except InputError as error:
+            self.problems.extend(error.problems)
+
+    def _refuse(self, mark: Mark, what: str, mend: str) -> None:
+        self.problems.append(Problem(mark, what, mend))
+
+
+def merged(documents: Iterable[Grown]) -> Grown:
+    """Return the documents as one, the weakest given first; problems of all of them are kept."""
+    first, *others = documents
+    for document in others:
+        first = _over(first, document)
+    return first
+
+
+def _over(low: Grown, high: Grown) -> Grown:
+    """Return `high` laid over `low`: where both have mappings these are merged, else `high` counts."""
+    replaced: set[KeyPath] = set()
+    data = _laid(low.data, high.data, (), replaced)
+
+    def stays(path: KeyPath) -> bool:
+        return not any(path[:end] in replaced for end in range(1, len(path) + 1))
+
+    marks = Marks(
+        high.marks.file,
+        {**{path: mark for path, mark in low.marks.values.items() if stays(path)}, **high.marks.values},
+        {**{path: mark for path, mark in low.marks.keys.items() if stays(path)}, **high.marks.keys},
+        {**{path: text for path, text in low.marks.origins.items() if stays(path)}, **high.marks.origins},
+    )
+    unknown = high.unknown | {path for path in low.unknown if stays(path)}
+    return Grown(data, marks, (*low.problems, *high.problems), unknown)
+
+
+def _laid(
+    low: dict[str, object], high: dict[str, object], path: KeyPath, replaced: set[KeyPath]
+) -> dict[str, object]:
+    result = dict(low)
+    for key, value in high.items():
+        here = (*path, key)
+        below = low.get(key)
+        if isinstance(below, dict) and isinstance(value, dict):
+            result[key] = _laid(below, value, here, replaced)
+        else:
+            if key in low:
+                replaced.add(here)
+            result[key] = value
+    return result

@@ -1,0 +1,39 @@
+"""Control tables: what stands where in a servo's memory, in which unit.
+
+`control_table("AX-12A")` is the table of a model, `control_table("MX-28", 2.0)` that of one of its firmwares.
+Protocol 1.0 tables are data files of ours, Protocol 2.0 tables the maker's, corrected in one visible file.
+"""
+
+from dxlrun.dynamixel.control_table.item import SIGN_BIT, Access, Area, ControlItem, Encoding
+from dxlrun.dynamixel.control_table.models import (
+    add_control_table,
+    added_control_tables,
+    all_tables,
+    control_table,
+    model_names,
+    models_by_number,
+    perhaps_meant,
+    protocols_of,
+)
+from dxlrun.dynamixel.control_table.sources import read_control_table
+from dxlrun.dynamixel.control_table.table import CAPABILITIES, ControlTable, EffortUnit
+
+__all__ = [
+    "CAPABILITIES",
+    "SIGN_BIT",
+    "Access",
+    "Area",
+    "ControlItem",
+    "ControlTable",
+    "EffortUnit",
+    "Encoding",
+    "add_control_table",
+    "added_control_tables",
+    "all_tables",
+    "control_table",
+    "model_names",
+    "models_by_number",
+    "perhaps_meant",
+    "protocols_of",
+    "read_control_table",
+]

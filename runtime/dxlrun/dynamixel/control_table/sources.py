@@ -1,0 +1,243 @@
+"""Data files -> control tables: the rules that hold for tables of ours and for those of the SDK."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import TypeAlias, get_args
+
+from dxlrun.dynamixel.control_table.item import SIGN_BIT, Access, Area, ControlItem, Encoding
+from dxlrun.dynamixel.control_table.table import (
+    CAPABILITIES,
+    DERIVED,
+    ControlTable,
+    EffortUnit,
+    derived_capabilities,
+)
+
+Entry: TypeAlias = Mapping[str, object]
+"""One table of a data file: an item, or a whole model."""
+
+Items: TypeAlias = dict[str, dict[str, object]]
+"""Items by name while they are put together."""
+
+
+@dataclass(frozen=True, slots=True)
+class Listing:
+    """A model whose table is built when somebody asks for it."""
+
+    names: tuple[str, ...]
+    """The model's own name first."""
+    model_number: int
+    firmware: int
+    build: Callable[[], ControlTable]
+    """Return the same table at each call; raises ValueError or KeyError when its data file is broken."""
+
+
+_SI = {
+    "deg": ("rad", math.pi / 180),
+    "rpm": ("rad/s", 2 * math.pi / 60),
+    "rpm2": ("rad/s^2", 2 * math.pi / 3600),
+    "deg/s": ("rad/s", math.pi / 180),
+    "deg/s2": ("rad/s^2", math.pi / 180),
+    "us": ("s", 1e-6),
+    "ms": ("s", 1e-3),
+    "V": ("V", 1.0),
+    "A": ("A", 1.0),
+    "mA": ("A", 1e-3),
+    "Nm": ("Nm", 1.0),
+    "degC": ("degC", 1.0),
+    "fraction": ("1", 1.0),
+}
+"""Unit of a data file -> SI unit and factor; `rpm2` is revolutions per minute per minute."""
+
+
+def read_control_table(text: str) -> ControlTable:
+    """Return the control table that the TOML text of a data file describes.
+
+    Raises ValueError (also tomllib.TOMLDecodeError) when it is not one, KeyError when an entry is missing.
+    """
+    return build_table(tomllib.loads(text))
+
+
+def build_table(data: Entry) -> ControlTable:
+    """Return the control table of a model's entry, `extends` resolved.
+
+    Raises ValueError when something in it is wrong, KeyError when an entry is missing.
+    """
+    items = tuple(_item(name, section(entry)) for name, entry in section(data["items"]).items())
+    _check(items)
+    by_name = {item.name: item for item in items}
+    goal_speed = _first(by_name, "moving_speed", "profile_velocity", "goal_velocity")
+    present_speed = _first(by_name, "present_speed", "present_velocity")
+    effort = _first(by_name, "present_load", "present_current")
+    position, speed = by_name["goal_position"], by_name[goal_speed]
+    firmware = data.get("fast_sync_read_firmware")
+    return ControlTable(
+        model=str(data["model"]),
+        aliases=tuple(words(data["aliases"])),
+        model_number=whole(data, "model_number"),
+        protocol=_protocol(data["protocol"]),
+        items=MappingProxyType(by_name),
+        baud_rates=MappingProxyType(
+            {int(value): whole({"rate": rate}, "rate") for value, rate in section(data["baud_rates"]).items()}
+        ),
+        capabilities=_capabilities(data) | derived_capabilities(by_name, goal_speed, present_speed, effort),
+        goal_speed_item=goal_speed,
+        present_speed_item=present_speed,
+        effort_item=effort,
+        rad_per_tick=position.scale,
+        min_tick=position.minimum,
+        max_tick=position.maximum,
+        rad_s_per_tick=by_name[present_speed].scale,
+        max_speed_tick=(1 << SIGN_BIT) - 1 if speed.encoding == "sign_magnitude" else speed.maximum,
+        effort_per_tick=by_name[effort].scale,
+        effort_unit=_effort_unit(by_name[effort]),
+        max_speed=_figure(data, "no_load_speed", "rad/s"),
+        stall_torque=_figure(data, "stall_torque", "Nm"),
+        fast_sync_read_firmware=firmware if isinstance(firmware, int) else None,
+        firmware=whole(data, "firmware") if "firmware" in data else 0,
+        gear_ratio=_ratio(data.get("gear_ratio", 0)),
+        stall_current=_figure({"stall_current": "0 A", **data}, "stall_current", "A"),
+        nominal_voltage=_figure({"nominal_voltage": "0 V", **data}, "nominal_voltage", "V"),
+    )
+
+
+def _figure(data: Entry, key: str, unit: str) -> float:
+    """Return a quantity of the motor; raises ValueError when it is negative or of another unit."""
+    found, value = quantity(str(data[key]))
+    if found != unit or not value >= 0:
+        raise ValueError(f"{key}: {data[key]!r} is no quantity in {unit} from 0 on")
+    return value
+
+
+def _ratio(value: object) -> float:
+    if not isinstance(value, int | float) or isinstance(value, bool) or not value >= 0:
+        raise ValueError(f"gear_ratio is a number from 0 on, not {value!r}")
+    return float(value)
+
+
+def section(value: object) -> Entry:
+    """Return a table of a data file; raises ValueError when the value is none."""
+    if not isinstance(value, Mapping):
+        raise ValueError(f"{value!r} is no table")
+    return value
+
+
+def whole(entry: Entry, key: str) -> int:
+    """Return a whole number of a table; raises ValueError when it is none, KeyError when it is missing."""
+    value = entry[key]
+    if type(value) is not int:
+        raise ValueError(f"{key} is not a whole number")
+    return value
+
+
+def words(value: object) -> list[str]:
+    """Return a list of words; raises ValueError when the value is none."""
+    if not isinstance(value, list) or not all(isinstance(word, str) for word in value):
+        raise ValueError(f"{value!r} is no list of words")
+    return value
+
+
+def in_order(items: Items) -> Entry:
+    """Return items in the order of their addresses."""
+    return dict(sorted(items.items(), key=lambda pair: whole(pair[1], "address")))
+
+
+def quantity(text: str) -> tuple[str, float]:
+    """Return SI unit and value of `59 rpm` or `300/1023 deg`: the manual's ratio, rounded only once.
+
+    Raises ValueError when it is no quantity.
+    """
+    number, _, unit = text.partition(" ")
+    if unit not in _SI:
+        raise ValueError(f"{text!r}: the unit is none of {', '.join(_SI)}")
+    numerator, _, denominator = number.partition("/")
+    si, factor = _SI[unit]
+    return si, float(numerator) * factor / float(denominator or "1")
+
+
+def _item(name: str, entry: Entry) -> ControlItem:
+    def number(key: str) -> int:
+        try:
+            return whole(entry, key)
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from None
+
+    def word(key: str, words: tuple[str, ...]) -> str:
+        value = entry[key]
+        if value not in words or not isinstance(value, str):
+            raise ValueError(f"{name}: {key} is none of {', '.join(words)}")
+        return value
+
+    tick = entry.get("tick")
+    unit, scale = ("", 1.0) if tick is None else quantity(str(tick))
+    return ControlItem(
+        name=name,
+        address=number("address"),
+        size=number("size"),
+        access="R" if word("access", get_args(Access)) == "R" else "RW",
+        area="RAM" if word("area", get_args(Area)) == "RAM" else "EEPROM",
+        minimum=number("minimum"),
+        maximum=number("maximum"),
+        initial=number("initial") if "initial" in entry else None,
+        encoding=_encoding(word("encoding", get_args(Encoding))),
+        unit=unit,
+        scale=scale,
+        page=str(entry["page"]),
+        firmware=number("firmware") if "firmware" in entry else 0,
+    )
+
+
+def _encoding(word: str) -> Encoding:
+    if word == "sign_magnitude":
+        return "sign_magnitude"
+    return "unsigned" if word == "unsigned" else "twos_complement"
+
+
+def _first(items: Mapping[str, ControlItem], *names: str) -> str:
+    for name in names:
+        if name in items:
+            return name
+    raise ValueError(f"none of {', '.join(names)} is among the items")
+
+
+def _effort_unit(item: ControlItem) -> EffortUnit:
+    if item.unit == "A":
+        return "A"
+    if item.unit == "Nm":
+        return "Nm"
+    if item.unit == "1":
+        return "1"
+    raise ValueError(f"{item.name}: its unit is neither a fraction nor A nor Nm")
+
+
+def _protocol(value: object) -> float:
+    if value not in (1.0, 2.0) or not isinstance(value, float):
+        raise ValueError(f"protocol is 1.0 or 2.0, not {value!r}")
+    return value
+
+
+def _capabilities(data: Entry) -> frozenset[str]:
+    named = frozenset(words(data.get("capabilities", [])))
+    if wrong := named - (CAPABILITIES.keys() - DERIVED):
+        raise ValueError(f"capabilities that a data file cannot name: {', '.join(sorted(wrong))}")
+    return named
+
+
+def _check(items: tuple[ControlItem, ...]) -> None:
+    end = 0
+    for item in items:
+        if item.address < end:
+            raise ValueError(f"{item.name}: address {item.address} lies in the item before it")
+        if item.size not in (1, 2, 4):
+            raise ValueError(f"{item.name}: an item has 1, 2 or 4 bytes, not {item.size}")
+        bits = 8 * item.size - item.signed
+        if not -item.signed << bits <= item.minimum <= item.maximum < 1 << bits:
+            raise ValueError(f"{item.name}: {item.minimum}..{item.maximum} does not fit into its bytes")
+        if item.initial is not None and not item.minimum <= item.initial <= item.maximum:
+            raise ValueError(f"{item.name}: the initial value {item.initial} lies outside its range")
+        end = item.address + item.size

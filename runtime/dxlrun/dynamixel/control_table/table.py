@@ -1,0 +1,127 @@
+"""A control table: the items of one model, and what the room above the wire needs to know of it."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Literal
+
+from dxlrun.dynamixel.control_table.item import ControlItem
+
+EffortUnit = Literal["1", "A", "Nm"]
+
+_HIGHEST_VOLTAGE = 4 / 3
+"""Times the nominal voltage: 16 V of 12 V (e-Manual XM430-W350, Max Voltage Limit (32)), taken for all models
+[i]. Speed grows as the voltage [i]: that manual gives 46 rpm at 12 V and 57 rpm at 14.8 V."""
+
+
+@dataclass(frozen=True, slots=True)
+class ControlTable:
+    """The control items of one model, and its exact units.
+
+    The angle of a servo is counted from the raw position 0: theta = raw * `rad_per_tick`.
+    """
+
+    model: str
+    """The model's own name, also when it was asked for by another one."""
+    aliases: tuple[str, ...]
+    """Names of models with the same table."""
+    model_number: int
+    protocol: float
+    items: Mapping[str, ControlItem]
+    """By the e-Manual's name in snake_case, in the order of addresses."""
+    baud_rates: Mapping[int, int]
+    """Value of the baud rate item -> bit/s."""
+    capabilities: frozenset[str]
+    """What the model can do; `CAPABILITIES` explains each word."""
+    goal_speed_item: str
+    """Speed of the way to the goal: `moving_speed`, `profile_velocity`, or on PRO `goal_velocity`."""
+    present_speed_item: str
+    effort_item: str
+    """`present_load`, or `present_current` where the model measures its current."""
+    rad_per_tick: float
+    min_tick: int
+    """Lowest value of goal and present position; below 0 where the middle of the travel is 0."""
+    max_tick: int
+    """Highest value of goal and present position."""
+    rad_s_per_tick: float
+    max_speed_tick: int
+    """Highest value of a goal speed without its direction."""
+    effort_per_tick: float
+    """`effort_unit` per tick of `effort_item`."""
+    effort_unit: EffortUnit
+    """`1`: fraction of the maximum, as the model measures no torque; `A`: motor current."""
+    max_speed: float
+    """No-load speed, rad/s, at `nominal_voltage`."""
+    stall_torque: float
+    """Nm, at `nominal_voltage`; 0 where the manual gives none."""
+    fast_sync_read_firmware: int | None = None
+    """First firmware version with the fast forms; None where the model has none."""
+    firmware: int = 0
+    """First firmware version that has this table; 0: every one."""
+    gear_ratio: float = 0.0
+    """Turns of the motor for one of the horn; 0 where the manual gives none."""
+    stall_current: float = 0.0
+    """A drawn at `stall_torque`; 0 where the manual gives none."""
+    nominal_voltage: float = 0.0
+    """V at which `max_speed`, `stall_torque` and `stall_current` hold; 0 where the manual gives none."""
+
+    @property
+    def top_speed(self) -> float:
+        """The highest speed of the servo, rad/s: without load, at the highest voltage that it accepts."""
+        return self.max_speed * _HIGHEST_VOLTAGE
+
+    @property
+    def zero_tick(self) -> int:
+        """Tick at which theta is 0: always the raw position 0, on every model."""
+        return 0
+
+    @property
+    def size(self) -> int:
+        """Number of bytes from address 0 to the end of the last item."""
+        return max(item.address + item.size for item in self.items.values())
+
+    def with_firmware(self, firmware: int) -> ControlTable:
+        """Return the table that a servo of a firmware version has: without the items that came later."""
+        items = {name: item for name, item in self.items.items() if item.firmware <= firmware}
+        return self if len(items) == len(self.items) else replace(self, items=MappingProxyType(items))
+
+
+CAPABILITIES: Mapping[str, str] = {
+    "bulk_read": "bulk read",
+    "bulk_write": "bulk write",
+    "fast_sync_read": "fast sync read and fast bulk read, from `fast_sync_read_firmware` on",
+    "indirect": "indirect addresses",
+    "hardware_error": "hardware error status, and the alert bit in its replies",
+    "operating_mode": "operating modes chosen by an item instead of by the angle limits",
+    "posvel": "goal speed and goal position stand side by side: one write sets both",
+    "reboot": "the reboot instruction",
+    "state_block": "effort, speed and position stand side by side: one read gets all three",
+    "sync_read": "sync read",
+    "sync_write": "sync write",
+}
+"""What a model can do, in the words of `ControlTable.capabilities`."""
+
+DERIVED = frozenset({"hardware_error", "indirect", "operating_mode", "posvel", "state_block"})
+"""Capabilities that follow from the items; data files do not name them."""
+
+
+def derived_capabilities(
+    items: Mapping[str, ControlItem], goal_speed: str, present_speed: str, effort: str
+) -> frozenset[str]:
+    """Return the capabilities that follow from which items there are and where they stand."""
+
+    def side_by_side(*names: str) -> bool:
+        found = sorted((items[name].address, items[name].size) for name in names)
+        return all(address + size == after for (address, size), (after, _) in itertools.pairwise(found))
+
+    has = {
+        "operating_mode": "operating_mode" in items or "control_mode" in items,
+        "hardware_error": "hardware_error_status" in items,
+        "indirect": "indirect_address_1" in items,
+        "posvel": side_by_side(goal_speed, "goal_position"),
+        "state_block": side_by_side(effort, present_speed, "present_position"),
+    }
+    return frozenset(name for name, yes in has.items() if yes)

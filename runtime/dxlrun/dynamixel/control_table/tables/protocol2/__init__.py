@@ -1,0 +1,1 @@
+"""dynamixel/control_table/tables/protocol2"""

@@ -1,0 +1,256 @@
+"""Gaps: what is done on one bus between two cycles, by programs of transactions, the most urgent first.
+
+Nothing of it makes a cycle late, as long as it is not urgent and starved: a transaction begins only when its
+reply can be there in time, and a program that did not end goes on in the next gap.
+"""
+
+from __future__ import annotations
+
+from bisect import insort
+from collections.abc import Callable
+from dataclasses import replace
+from enum import IntEnum, unique
+
+from dxlrun.dynamixel.plan.bus_plan import BusPlan
+from dxlrun.dynamixel.plan.line import SHORT_PATIENCE_NS
+from dxlrun.dynamixel.wire.transaction import Outcome, Program, Reply, Result, Transaction
+from dxlrun.run.channels.events import EventCode, EventSink, Severity
+
+LEAST_PATIENCE_NS = 100_000
+"""A reply is awaited at least so long beyond the moment at which it is due; a servo is late by less."""
+_FORGOTTEN = 6
+"""By 2 ** -6 of itself the lateness of a line is forgotten with each reply that is less late."""
+_LATEST_NS = 1_000_000
+"""More than this is an accident of one reply, as after this process stood still, and not the line's way."""
+STARVED = 50
+"""Cycles after which an urgent program goes on though the gap is too short: a skipped period is better than a
+joint that gets no goals for the rest of the run."""
+STARVED_AGAIN = 5
+"""Cycles between its transactions from then on."""
+WHOLE_BUS = -1
+"""Instead of a servo: the program is about no single one."""
+
+
+@unique
+class Urgency(IntEnum):
+    """Whose turn it is: a lower number goes first, between two transactions of others if need be."""
+
+    MODE = 0
+    """A joint has no goal until its mode is there."""
+    REPAIR = 1
+    """What a servo is owed: its torque, its alert, its return."""
+    STEERED = 2
+    """A client waits for it."""
+    SLOW = 3
+    """Registers of which nobody misses one reading; never done without the time for it."""
+
+
+class _Task:
+    """A program on its way: the transaction that is next, and since when it waits."""
+
+    __slots__ = (
+        "_program",
+        "begun",
+        "name",
+        "next",
+        "paused",
+        "pressed",
+        "said",
+        "servo",
+        "starved",
+        "turn",
+        "wake_ns",
+    )
+
+    def __init__(self, program: Program[None], turn: tuple[Urgency, int], name: str, servo: int) -> None:
+        self._program = program
+        self.turn = turn
+        self.name = name
+        self.servo = servo
+        self.pressed = turn[0]
+        """The urgency of who waits for it."""
+        self.next: Transaction | None = None
+        self.begun = False
+        """True once anything of it was on the line."""
+        self.paused = False
+        self.wake_ns = 0
+        self.starved = 0
+        """Cycles in a row without time for its next transaction."""
+        self.said = False
+
+    def resume(self, reply: Reply | None) -> bool:
+        """Hand over what came of the transaction before, None at the start; return whether one follows."""
+        self.begun = reply is not None
+        try:
+            self.next = next(self._program) if reply is None else self._program.send(reply)
+        except StopIteration:
+            return False
+        return True
+
+
+class Gaps:
+    """Programs of one bus that wait for time between cycles; a bus executes it as one job a gap.
+
+    Programs of one servo never mix: one that has begun ends before another one begins. A transaction that
+    sends nothing (`line.listen`) is a pause; others use the line meanwhile. Every program comes to its end,
+    and `done` is called with what it returned: a line that is gone answers with time-outs (`abandon`).
+    """
+
+    __slots__ = (
+        "_count",
+        "_current",
+        "_events",
+        "_latency_ns",
+        "_plan",
+        "_tasks",
+        "_until_ns",
+        "late_ns",
+        "now_ns",
+    )
+
+    def __init__(self, plan: BusPlan, events: EventSink, now_ns: Callable[[], int]) -> None:
+        self._plan = plan
+        self._events = events
+        self.now_ns = now_ns
+        self._latency_ns = plan.latency_ns
+        self.late_ns = 0
+        """How late replies on this line came at worst in the last moment, beside the adapter's latency."""
+        self._tasks: list[_Task] = []  # in the order of their turns
+        self._current: _Task | None = None
+        self._until_ns = 0
+        self._count = 0
+
+    def add(
+        self,
+        program: Program[Result],
+        done: Callable[[Result], None],
+        urgency: Urgency,
+        name: str,
+        servo: int = WHOLE_BUS,
+    ) -> None:
+        """Let a program be executed in the next gaps; `done` takes what it returns, in some gap's time.
+
+        `name`: what a person reads when it has to wait: `torque enable of elbow (ID 4 on bus main)`.
+        `servo`: index into the plan's servos. May be called from `done` and from a program.
+        """
+        self._count += 1
+        insort(self._tasks, _Task(_ended(program, done), (urgency, self._count), name, servo), key=_turn)
+
+    def came(self, at_ns: int, due_ns: int) -> None:
+        """Take note of when a reply came and when it was due: a gap begins nothing that would end as late.
+
+        Who answers behind its gap talks into the next cyclic read, which costs far more than it brings.
+        """
+        late_ns = at_ns - due_ns - self._latency_ns
+        forgotten_ns = self.late_ns - (self.late_ns >> _FORGOTTEN) - 1
+        if late_ns > forgotten_ns:
+            forgotten_ns = min(late_ns, _LATEST_NS)
+        self.late_ns = forgotten_ns if forgotten_ns > 0 else 0  # a third of the time of max()
+
+    @property
+    def waiting(self) -> int:
+        """How many programs have not come to their end."""
+        return len(self._tasks)
+
+    def begin(self, until_ns: int) -> bool:
+        """Prepare for the gap that ends at `until_ns`; return whether there is anything to do in it."""
+        if not self._tasks:
+            return False
+        self._until_ns = until_ns
+        self._current = None
+        return True
+
+    def advance(self, reply: Reply | None) -> Transaction | None:
+        """Give a reply to the program that waits for it, return the next transaction that fits the gap."""
+        if reply is not None and self._current is not None:
+            if reply.answered and (asked := self._current.next) is not None:
+                self.came(reply.last_ns, reply.sent_ns + asked.due_ns)
+            self._resume(self._current, replace(reply, parameters=bytes(reply.parameters)))
+        first = reply is None
+        while (task := self._ready()) is not None:
+            if task.next is None:
+                self._resume(task, None)
+            elif not task.next.packet:
+                self._pause(task, task.next)
+            else:
+                self._current = task
+                return self._timed(task, task.next, first)
+        self._current = None
+        return None
+
+    def status(self, index: int, reply: Reply) -> None:
+        """Wait for the end of the transaction: a program awaits one status at a time."""
+
+    def abandon(self) -> None:
+        """Bring every program to its end without a line: whatever it asks, nobody answers.
+
+        What `done` adds meanwhile waits for the next gap.
+        """
+        tasks, self._tasks, self._current = self._tasks, [], None
+        for task in tasks:
+            more = task.next is not None or task.resume(None)
+            while more:
+                more = task.resume(_nothing())
+
+    def _ready(self) -> _Task | None:
+        """Return whose turn it is; of one servo that is who has begun."""
+        now = self.now_ns()
+        for task in self._tasks:
+            chosen = task
+            if task.servo != WHOLE_BUS and not task.begun:
+                chosen = next((one for one in self._tasks if one.begun and one.servo == task.servo), task)
+                chosen.pressed = min(chosen.pressed, task.pressed)
+            if not chosen.paused or chosen.wake_ns <= now:
+                return chosen
+        return None
+
+    def _resume(self, task: _Task, reply: Reply | None) -> None:
+        if not task.resume(reply):
+            self._tasks.remove(task)
+
+    def _pause(self, task: _Task, pause: Transaction) -> None:
+        if not task.paused:
+            task.paused, task.wake_ns = True, self.now_ns() + pause.due_ns
+        else:
+            task.paused = False
+            self._resume(task, _nothing(Outcome.SENT))
+
+    def _timed(self, task: _Task, wanted: Transaction, first: bool) -> Transaction | None:
+        """Return the transaction with no more patience than the gap allows; None: it has to wait."""
+        left_ns = self._until_ns - self.now_ns()
+        latest_ns = wanted.due_ns
+        if wanted.awaited:
+            latest_ns += self._latency_ns + max(self.late_ns, LEAST_PATIENCE_NS)
+        if latest_ns > left_ns:
+            if not first or not self._forced(task, latest_ns, left_ns):
+                return None
+            left_ns = latest_ns + SHORT_PATIENCE_NS
+        task.starved = 0
+        return replace(wanted, timeout_ns=min(wanted.timeout_ns, left_ns))
+
+    def _forced(self, task: _Task, need_ns: int, left_ns: int) -> bool:
+        """Count the cycles that a program waits; say whether it is done at the cost of the next cycle."""
+        task.starved += 1
+        if task.pressed is Urgency.SLOW or task.starved <= (STARVED_AGAIN if task.said else STARVED):
+            return False
+        if not task.said:
+            task.said = True
+            servos = self._plan.servos
+            source = self._plan.name if task.servo == WHOLE_BUS else servos[task.servo].joint
+            need, left = need_ns * 1e-6, max(left_ns, 0) * 1e-6
+            text = f"{task.name} waits for time beside the cycle: it may take {need:.1f} ms, the gap has"
+            text = f"{text} {left:.1f} ms; periods may be skipped"
+            self._events.emit(EventCode.OVERRUN, Severity.WARNING, source, text)
+        return True
+
+
+def _ended(program: Program[Result], done: Callable[[Result], None]) -> Program[None]:
+    done((yield from program))
+
+
+def _turn(task: _Task) -> tuple[Urgency, int]:
+    return task.turn
+
+
+def _nothing(outcome: Outcome = Outcome.TIMEOUT) -> Reply:
+    return Reply(outcome, 0, b"", 0, 0, False)

@@ -1,0 +1,636 @@
+"""Kernel: lays out the plan of a cycle for `kernel.c`, which executes it, and says how that went.
+
+The kernel is one shared object without Python in it, called through ctypes; it is built with the package
+where a C compiler is found. Without it every cycle goes through the packet-by-packet parser (`bus`), which
+also takes over where the kernel meets anything unexpected.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Sequence
+from ctypes import POINTER, c_double, c_int32, c_int64, c_uint8, c_uint32, c_uint64, c_void_p
+from dataclasses import dataclass
+from enum import IntEnum, unique
+from itertools import pairwise
+from pathlib import Path
+from zlib import crc32
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.clock import Clock
+from dxlrun.dynamixel.exchange.goal_arrays import SyncWrite
+from dxlrun.dynamixel.exchange.samples import Samples
+from dxlrun.dynamixel.plan.bus_plan import BusPlan, Field
+from dxlrun.dynamixel.plan.line import BITS_PER_BYTE
+from dxlrun.dynamixel.port.ports import Ports, ReplyPolling
+from dxlrun.dynamixel.wire.dialect import dialect_of
+from dxlrun.dynamixel.wire.transaction import BROADCAST_ID, Transaction
+from dxlrun.errors import PortError
+from dxlrun.interfaces import Commands, Floats, States
+from dxlrun.run.channels.packets import RECORD_HEADER, PacketLog
+
+LIBRARY = Path(__file__).with_name("libkernel.so")
+"""Where the build puts the compiled kernel."""
+SOURCE = Path(__file__).with_name("kernel.c")
+NEVER = 1 << 62
+BEAT_NS = 1_000_000
+"""After so long a wait the kernel returns, so that the loop can show that it lives."""
+MOST_LINES = 32
+_MOST_PIECES = 32
+_ROOM = 8192
+"""Bytes of a line's buffer; the replies to one read may take a quarter of it."""
+_MOST_RECORD = 63
+"""Bytes of a servo's goals in one sync write."""
+_ENCODINGS = {"unsigned": 0, "twos_complement": 1, "sign_magnitude": 2}
+
+
+@unique
+class Answer(IntEnum):
+    """How a call of the kernel ended."""
+
+    OK = 0
+    WAITING = 1
+    """Replies are still awaited."""
+    FULL = 2
+    """The log's batch must be committed first."""
+    UNEXPECTED = 3
+    """Something did not come as planned; the parser goes on."""
+    LOOK = 4
+    """All replies came, and a position is further from the last one than is plausible."""
+
+
+_ANSWERS = tuple(Answer)  # to make one of a number takes longer than the call
+
+
+@unique
+class LineState(IntEnum):
+    """What a line of the kernel does."""
+
+    IDLE = 0
+    AWAITING = 1
+    """A read was sent."""
+    THROUGH = 2
+    """All its reads of this cycle are done."""
+
+
+class _Field(ctypes.Structure):
+    _fields_ = (("offset", c_int32), ("size", c_int32), ("encoding", c_int32), ("unused", c_int32))
+
+
+class _Servo(ctypes.Structure):
+    _fields_ = (("fields", _Field * 3), ("row", c_int64), ("quick", c_double))
+
+
+class _Part(ctypes.Structure):
+    _fields_ = (("servo", c_int32), ("data_at", c_int32), ("end", c_int32), ("unused", c_int32))
+
+
+class _Packet(ctypes.Structure):
+    _fields_ = (("start", c_int32), ("end", c_int32), ("id", c_int32), ("unused", c_int32))
+
+
+class _Read(ctypes.Structure):
+    _fields_ = (
+        ("instruction", c_void_p),
+        ("expected", c_void_p),
+        ("known", c_void_p),
+        ("packets", POINTER(_Packet)),
+        ("parts", POINTER(_Part)),
+        *(
+            (name, c_int32)
+            for name in ("instruction_size", "size", "packet_count", "part_count", "id", "fast")
+        ),
+        *((name, c_int64) for name in ("due_ns", "timeout_ns", "least_ns", "record_bytes")),
+    )
+
+
+class _Cell(ctypes.Structure):
+    _fields_ = (
+        *(
+            (name, c_int32)
+            for name in ("at", "size", "interface", "magnitude", "mirrored", "low", "high", "free")
+        ),
+        *((name, c_double) for name in ("sign", "offset", "unit")),
+    )
+
+
+class _SyncWrite(ctypes.Structure):
+    _fields_ = (
+        *(
+            (name, c_void_p)
+            for name in ("members", "rows", "ids", "cells", "ticks", "again", "served", "sent_at")
+        ),
+        ("cycle", c_int64),
+        *((name, c_int32) for name in ("count", "items", "address", "length", "lead", "unused")),
+    )
+
+
+class _Piece(ctypes.Structure):
+    _fields_ = (("at_ns", c_int64), ("end", c_int32), ("unused", c_int32))
+
+
+class _Line(ctypes.Structure):
+    _fields_ = (
+        ("reads", POINTER(_Read)),
+        ("writes", POINTER(_SyncWrite)),
+        *((name, c_void_p) for name in ("included", "ceiling", "buffer")),
+        *((name, c_int64) for name in ("byte_ns", "free_ns", "sent_ns", "due_ns", "deadline_ns", "at_ns")),
+        *((name, c_int32) for name in ("descriptor", "bus", "protocol", "active", "split")),
+        *((name, c_int32) for name in ("first_servo", "servo_count", "room", "read_count", "write_count")),
+        *((name, c_int32) for name in ("state", "done", "have", "pieces", "gone", "unused")),
+        ("piece", _Piece * _MOST_PIECES),
+    )
+
+
+class Polling(ctypes.Structure):
+    """How replies are polled for; see `dxl_polling_begin` in kernel.c."""
+
+    _fields_ = (
+        *((name, c_double) for name in ("share", "credit_ns")),
+        *(
+            (name, c_int64)
+            for name in ("longest_ns", "updated_ns", "late_ns", "step_ns", "margin_ns", "saved_ns")
+        ),
+        *((name, c_int32) for name in ("enabled", "slept")),
+    )
+
+    @classmethod
+    def of(cls, polling: ReplyPolling | None) -> Polling:
+        """Return the state before the first reply; without `polling` replies are awaited by the operating
+        system alone.
+        """
+        if polling is None:
+            return cls()
+        return cls(
+            share=polling.share,
+            longest_ns=polling.longest_ns,
+            updated_ns=-1,
+            step_ns=polling.margin_ns,
+            margin_ns=polling.margin_ns,
+            saved_ns=50_000_000,  # what was saved in a pause is not spent at once
+            enabled=1,
+        )
+
+
+_NOW = ctypes.CFUNCTYPE(c_int64)
+_TRANSFER = ctypes.CFUNCTYPE(c_int32, c_int32, POINTER(c_uint8), c_int32)
+_WAIT = ctypes.CFUNCTYPE(c_int32, c_int64, POINTER(c_uint8))
+
+
+class _Kernel(ctypes.Structure):
+    _fields_ = (
+        ("lines", POINTER(_Line)),
+        ("servos", POINTER(_Servo)),
+        *((name, c_void_p) for name in ("values", "scale", "reference", "fresh", "at_ns", "shown_ns")),
+        *((name, c_void_p) for name in ("position", "velocity", "effort", "valid", "age_ns")),
+        ("goals", c_void_p * 4),
+        ("desk", c_void_p),
+        ("used", POINTER(c_uint64)),
+        *((name, c_int64) for name in ("desk_room", "reserved", "beat_ns")),
+        ("now", _NOW),
+        ("send", _TRANSFER),
+        ("receive", _TRANSFER),
+        ("wait", _WAIT),
+        *((name, c_int32) for name in ("line_count", "servo_count", "write_line", "write_number")),
+        ("polling", Polling),
+    )
+
+
+_STRUCTS = (_Servo, _Part, _Packet, _Read, _Cell, _SyncWrite, _Line, Polling, _Kernel)
+
+
+@dataclass(frozen=True, slots=True)
+class Library:
+    """The functions of the compiled kernel."""
+
+    read: Callable[[c_void_p, int, int], int]
+    write: Callable[[c_void_p], int]
+    abandon: Callable[[c_void_p], None]
+    handle: ctypes.CDLL
+
+
+def load(path: Path = LIBRARY) -> Library | None:
+    """Return the compiled kernel; None where it was not built, or was built of another source."""
+    try:
+        handle, source = ctypes.CDLL(str(path)), SOURCE.read_bytes()
+    except OSError:
+        return None
+    handle.dxl_layout.restype = c_uint32
+    found = [handle.dxl_layout(number) for number in range(1 + len(_STRUCTS))]
+    if found != [crc32(source), *map(ctypes.sizeof, _STRUCTS)]:
+        return None
+    handle.dxl_read.argtypes = (c_void_p, c_int64, c_int32)
+    handle.dxl_write.argtypes = handle.dxl_abandon.argtypes = (c_void_p,)
+    handle.dxl_abandon.restype = None
+    return Library(handle.dxl_read, handle.dxl_write, handle.dxl_abandon, handle)
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedRead:
+    """One read of a cycle: its transaction, the servos that answer, and the error bytes that they report."""
+
+    transaction: Transaction
+    indices: tuple[int, ...]
+    """Indices of servos on the bus, in the order of their replies."""
+    errors: tuple[int, ...]
+
+
+class Program:
+    """The reads of one bus, laid out for the kernel."""
+
+    __slots__ = ("_kept", "bytes", "count", "reads")
+
+    def __init__(self, plan: BusPlan, reads: Sequence[PlannedRead]) -> None:
+        self._kept: list[object] = []  # the kernel has only the addresses
+        self.count = len(reads)
+        self.reads = (_Read * max(len(reads), 1))(*(self._read(plan, read) for read in reads))
+        self.bytes = max((read.record_bytes for read in self.reads[: self.count]), default=0)
+        """The most that one read and its replies take in the log."""
+
+    def _keep(self, data: bytes) -> int:
+        kept = ctypes.create_string_buffer(data, len(data))
+        self._kept.append(kept)
+        return ctypes.addressof(kept)
+
+    def _read(self, plan: BusPlan, read: PlannedRead) -> _Read:
+        transaction = read.transaction
+        expected, known, packets, parts = (_fast_replies if transaction.fast else _replies)(plan, read)
+        byte_ns = BITS_PER_BYTE * 1_000_000_000 // plan.baud_rate
+        packet_array, part_array = (_Packet * len(packets))(*packets), (_Part * len(parts))(*parts)
+        self._kept += [packet_array, part_array]
+        instruction = transaction.packet
+        recorded = sum(RECORD_HEADER + packet.end - packet.start for packet in packets)
+        return _Read(
+            instruction=self._keep(instruction),
+            expected=self._keep(expected),
+            known=self._keep(known),
+            packets=packet_array,
+            parts=part_array,
+            instruction_size=len(instruction),
+            size=len(expected),
+            packet_count=len(packets),
+            part_count=len(parts),
+            id=transaction.servo_id,
+            fast=transaction.fast,
+            due_ns=transaction.due_ns,
+            timeout_ns=transaction.timeout_ns,
+            least_ns=(len(instruction) + packets[0].end) * byte_ns,
+            record_bytes=RECORD_HEADER + len(instruction) + recorded,
+        )
+
+
+_Replies = tuple[bytes, bytes, list[_Packet], list[_Part]]
+
+
+def _replies(plan: BusPlan, read: PlannedRead) -> _Replies:
+    """Return replies that come one behind the other: header, ID, length and error byte are known."""
+    dialect = dialect_of(plan.protocol)
+    data_at = dialect.OVERHEAD - dialect.CHECKSUM
+    expected, known = b"", b""
+    packets: list[_Packet] = []
+    parts: list[_Part] = []
+    for awaited, servo, error in zip(read.transaction.awaited, read.indices, read.errors, strict=True):
+        start = len(expected)
+        packet = dialect.status_packet(awaited.servo_id, error, bytes(awaited.length))
+        expected += packet
+        known += b"\xff" * data_at + bytes(len(packet) - data_at)
+        packets.append(_Packet(start, len(expected), awaited.servo_id))
+        parts.append(_Part(servo, start + data_at, len(expected)))
+    return expected, known, packets, parts
+
+
+def _fast_replies(plan: BusPlan, read: PlannedRead) -> _Replies:
+    """Return the one status of a fast form (e-Manual, Protocol 2.0, "Fast Sync Read (0x8A)")."""
+    dialect = dialect_of(plan.protocol)
+    awaited = read.transaction.awaited
+    size = dialect.fast_size(sum(one.length for one in awaited), len(awaited))
+    expected = dialect.HEADER + bytes((BROADCAST_ID,)) + (size - 7).to_bytes(2, "little") + b"\x55"
+    known = b"\xff" * len(expected)
+    parts: list[_Part] = []
+    for one, servo, error in zip(awaited, read.indices, read.errors, strict=True):
+        data_at = len(expected) + 2
+        expected += bytes((error, one.servo_id)) + bytes(one.length + dialect.CHECKSUM)
+        known += b"\xff\xff" + bytes(one.length + dialect.CHECKSUM)
+        parts.append(_Part(servo, data_at, len(expected)))
+    return expected, known, [_Packet(0, size, BROADCAST_ID)], parts
+
+
+@dataclass(frozen=True, slots=True)
+class Interrupted:
+    """Where a line stood when the kernel ended: the parser goes on from there."""
+
+    done: int
+    """How many of its reads are done."""
+    awaiting: bool
+    """True when the next one was sent."""
+    sent_ns: int
+    heard_ns: int
+    """When the replies to the read before it came."""
+    pieces: tuple[tuple[bytes, int], ...]
+    """What has come of its replies, and when, ns."""
+    failure: PortError | None
+    """Why the next one could not be sent."""
+
+
+class Kernel:
+    """The lines of a robot as the kernel knows them."""
+
+    def __init__(  # noqa: PLR0917  the arrays and lines that the hardware has
+        self,
+        library: Library,
+        plans: Sequence[BusPlan],
+        samples: Samples,
+        states: States,
+        goals: Commands,
+        included: Sequence[NDArray[np.bool_]],
+        ceilings: Sequence[Floats],
+        packets: PacketLog,
+        ports: Ports,
+        clock: Clock,
+        beat: Callable[[], None],
+    ) -> None:
+        """`included`, `ceilings`: of each bus, which of its servos may get goals, and how fast they may go to
+        positions, rad/s, NaN: no limit.
+
+        Raises ValueError for more lines than the kernel knows.
+        """
+        if len(plans) > MOST_LINES:
+            raise ValueError(f"{len(plans)} buses, the kernel knows {MOST_LINES}")
+        self._library = library
+        self._plans = plans
+        self._packets = packets
+        self._ports = ports
+        self._beat = beat
+        self._now_ns = clock.now_ns
+        self._raised: BaseException | None = None
+        self._kept: list[object] = [samples, states, goals, *included, *ceilings]
+        self._buffers = [ctypes.create_string_buffer(_ROOM) for _ in plans]
+        self._programs: list[Program | None] = [None] * len(plans)
+        self._writes: list[tuple[SyncWrite, ...] | None] = [None] * len(plans)
+        self._written: list[object] = [None] * len(plans)
+        self._kernel = _Kernel(beat_ns=BEAT_NS)
+        self._lines = self._laid_lines(plans, included, ceilings)
+        self._lay_states(plans, samples, states, goals)
+        self._lay_ports()
+        desk = packets.desk
+        self._room = NEVER
+        if desk is not None:
+            self._room = len(desk.records)
+            self._kernel.desk = _address(desk.records)
+            self._kernel.used = ctypes.cast(_address(desk.used), POINTER(c_uint64))
+            self._kernel.desk_room = self._room
+        self._pointer = ctypes.cast(ctypes.pointer(self._kernel), c_void_p)
+
+    def _laid_lines(
+        self, plans: Sequence[BusPlan], included: Sequence[NDArray[np.bool_]], ceilings: Sequence[Floats]
+    ) -> ctypes.Array[_Line]:
+        lines = (_Line * max(len(plans), 1))()
+        first = 0
+        for index, (line, plan) in enumerate(zip(lines, plans, strict=False)):
+            line.included = included[index].ctypes.data
+            line.ceiling = ceilings[index].ctypes.data
+            line.buffer = ctypes.addressof(self._buffers[index])
+            line.room = _ROOM
+            line.byte_ns = BITS_PER_BYTE * 1_000_000_000 // plan.baud_rate
+            line.bus = index
+            line.protocol = int(plan.protocol)
+            line.split = plan.split
+            line.first_servo, line.servo_count = first, len(plan.servos)
+            first += len(plan.servos)
+        self._kernel.lines = lines
+        self._kernel.line_count = len(plans)
+        return lines
+
+    def _lay_states(
+        self, plans: Sequence[BusPlan], samples: Samples, states: States, goals: Commands
+    ) -> None:
+        servos = [servo for plan in plans for servo in plan.servos]
+        kernel = self._kernel
+        kernel.servo_count = len(servos)
+        laid = (_Servo * max(len(servos), 1))()
+        for one, servo, quick in zip(laid, servos, samples.jumps.always_possible.tolist(), strict=False):
+            layout = servo.state
+            one.fields = (_Field * 3)(*map(_field, (layout.position, layout.velocity, layout.effort)))
+            one.row, one.quick = servo.row, quick
+        kernel.servos = laid
+        for name in ("values", "scale", "reference", "fresh", "at_ns", "shown_ns"):
+            setattr(kernel, name, _data(getattr(samples, name)))
+        for name in ("position", "velocity", "effort", "valid", "age_ns"):
+            setattr(kernel, name, _data(getattr(states, name)))
+        kernel.goals = (c_void_p * 4)(*(_data(row) for row in goals.values))
+
+    def _lay_ports(self) -> None:
+        """Let the kernel use descriptors, or functions of the ports and the clock where there are none."""
+        if (descriptors := self._ports.descriptors) is not None:
+            for line, descriptor in zip(self._lines, descriptors, strict=False):
+                line.descriptor = descriptor
+            return
+        self._kernel.beat_ns = NEVER
+        self._kernel.now = _NOW(self._now)
+        self._kernel.send = _TRANSFER(self._send)
+        self._kernel.receive = _TRANSFER(self._receive)
+        self._kernel.wait = _WAIT(self._wait)
+
+    # What the kernel calls on virtual time. It knows no exceptions: one, such as an interrupt of the user, is
+    # kept, every later call fails, and `_raise` raises it when the kernel has returned.
+
+    def _now(self) -> int:
+        try:
+            return self._now_ns()
+        except BaseException as error:
+            self._raised = error
+            return NEVER
+
+    def _send(self, line: int, data: ctypes._Pointer[c_uint8], size: int) -> int:
+        try:
+            self._ports.ports[line].write(bytes(data[:size]))
+        except PortError:
+            return -1
+        except BaseException as error:
+            self._raised = error
+            return -1
+        return -1 if self._raised else size
+
+    def _receive(self, line: int, data: ctypes._Pointer[c_uint8], room: int) -> int:
+        array = ctypes.cast(data, POINTER(c_uint8 * room)).contents
+        try:
+            count = self._ports.ports[line].read_into(memoryview(array).cast("B"))
+        except PortError:
+            return -1  # the parser meets it again and has the reason
+        except BaseException as error:
+            self._raised = error
+            return -1
+        return -1 if self._raised else count
+
+    def _wait(self, deadline_ns: int, ready: ctypes._Pointer[c_uint8]) -> int:
+        indices: Sequence[int] = range(len(self._plans))  # after an exception: all lines, whose calls fail
+        try:
+            if self._raised is None:
+                indices = [index for index in self._ports.wait(deadline_ns) if self._lines[index].active]
+        except BaseException as error:
+            self._raised = error
+        for index in indices:
+            ready[index] = 1
+        return len(indices)
+
+    def _raise(self) -> None:
+        """Raise what came up while the kernel was at work."""
+        error, self._raised = self._raised, None
+        if error is not None:
+            self._library.abandon(self._pointer)
+            raise error
+
+    def poll_for_replies(self) -> None:
+        """Begin to poll for replies as the ports say; before real time."""
+        self._kernel.polling = Polling.of(self._ports.polling)
+
+    def fits(self, program: Program) -> bool:
+        """Say whether the log's batch has room for what the lines have at once, and a line's buffer too."""
+        sizes = [read.size for read in program.reads[: program.count]]
+        return program.bytes * len(self._plans) <= self._room and max(sizes, default=0) <= _ROOM // 4
+
+    def set_program(self, index: int, program: Program | None) -> None:
+        """Read a bus by a program from now on; None: not at all."""
+        if program is not self._programs[index]:
+            line = self._lines[index]
+            self._programs[index] = program
+            line.active = int(program is not None and program.count > 0)
+            line.gone = 0
+            if program is not None:
+                line.reads, line.read_count = program.reads, program.count
+
+    def set_writes(self, index: int, writes: tuple[SyncWrite, ...]) -> None:
+        """Send the goals of a bus by these sync writes from now on."""
+        if writes is not self._writes[index]:
+            self._writes[index] = writes
+            laid = [_laid_write(one) for one in writes]
+            array = (_SyncWrite * max(len(laid), 1))(*(one for one, _ in laid))
+            self._written[index] = (array, [kept for _, kept in laid])
+            self._lines[index].writes, self._lines[index].write_count = array, len(laid)
+
+    def read(self, until_ns: int = NEVER, *, everything: bool = True) -> Answer:
+        """Read every servo once; without `everything`, go on with the lines that were asked before."""
+        while True:
+            answer = _ANSWERS[self._library.read(self._pointer, until_ns, everything)]
+            if self._raised is not None:
+                self._raise()
+            if answer is Answer.WAITING:
+                self._beat()
+                if self._now_ns() >= until_ns:
+                    return answer
+            elif answer is Answer.FULL:
+                self._packets.commit()
+            else:
+                return answer
+
+    def write(self) -> Answer:
+        """Send the goals that are due, and ask split buses for their next states.
+
+        LOOK: those have bytes that nothing asked for, and were not asked. UNEXPECTED: see `failures`.
+        """
+        while (answer := _ANSWERS[self._library.write(self._pointer)]) is Answer.FULL:
+            self._packets.commit()
+        if self._raised is not None:
+            self._raise()
+        return answer
+
+    def failures(self) -> dict[int, PortError]:
+        """Return why lines took no more bytes, by index, once."""
+        found = {index: self._failure(index) for index in range(len(self._plans))}
+        return {index: failure for index, failure in found.items() if failure is not None}
+
+    def _failure(self, index: int) -> PortError | None:
+        """Return why a line took no more bytes, once; None: it takes them."""
+        line = self._lines[index]
+        code, line.gone = line.gone, 0
+        return self._ports.ports[index].failure(code) if code else None
+
+    def arrival(self, index: int) -> tuple[int, int]:
+        """Return when the newest read of a bus was due, and when its replies were there, ns."""
+        return self._lines[index].due_ns, self._lines[index].at_ns
+
+    def free_at(self, index: int) -> int:
+        """Return when everything that was sent on a line is off the wire, ns."""
+        return int(self._lines[index].free_ns)
+
+    def awaits(self, index: int) -> bool:
+        """Say whether replies on a line are awaited now."""
+        return bool(self._lines[index].state == LineState.AWAITING)
+
+    def interrupt(self) -> list[Interrupted | None]:
+        """End the cycle; return where each line stands, None for one that has nothing more to read."""
+        found: list[Interrupted | None] = []
+        for index, line in enumerate(self._lines[: len(self._plans)]):
+            if not line.active or line.state == LineState.THROUGH:
+                found.append(None)
+                continue
+            ends = [0, *(line.piece[number].end for number in range(line.pieces))]
+            data = self._buffers[index].raw
+            pieces = tuple(
+                (data[start:end], line.piece[number].at_ns)
+                for number, (start, end) in enumerate(pairwise(ends))
+            )
+            awaiting, failure = line.state == LineState.AWAITING, self._failure(index)
+            found.append(Interrupted(line.done, awaiting, line.sent_ns, line.at_ns, pieces, failure))
+        self._library.abandon(self._pointer)
+        return found
+
+
+def _laid_write(write: SyncWrite) -> tuple[_SyncWrite, list[object]]:
+    """Return a sync write for the kernel, and what must be kept as long as it is used."""
+    count, items = len(write.members), max(map(len, write.cells), default=0)
+    arrays: dict[str, NDArray[np.generic]] = {
+        "members": np.array(write.members, dtype=np.int32),
+        "rows": np.array(write.rows, dtype=np.int32),
+        "ids": np.array(write.ids, dtype=np.uint8),
+        "ticks": np.zeros(count * items, dtype=np.int32),
+        "again": np.zeros(count, dtype=np.uint8),
+        "served": np.zeros(count, dtype=np.uint8),
+        "sent_at": np.zeros(count, dtype=np.int64),
+    }
+    cells = (_Cell * max(count * items, 1))(
+        *(
+            _Cell(
+                at=cell.place.offset,
+                size=cell.place.size,
+                interface=cell.interface,
+                magnitude=cell.magnitude,
+                mirrored=cell.place.encoding == "sign_magnitude" and not cell.magnitude,
+                low=cell.low,
+                high=cell.high,
+                free=cell.free,
+                sign=cell.sign,
+                offset=cell.offset,
+                unit=cell.unit,
+            )
+            for servo in write.cells
+            for cell in servo
+        )
+    )
+    laid = _SyncWrite(
+        count=count,
+        items=items,
+        address=write.layout.address,
+        length=write.layout.length,
+        lead=write.lead,
+        cells=ctypes.addressof(cells),
+        **{name: array.ctypes.data for name, array in arrays.items()},
+    )
+    return laid, [arrays, cells]
+
+
+def _field(field: Field) -> _Field:
+    return _Field(field.offset, field.size, _ENCODINGS[field.encoding])
+
+
+def _data(array: NDArray[np.generic]) -> int:
+    """Return the address of an array whose elements lie one behind the other; raises ValueError if not."""
+    if not array.flags.c_contiguous:
+        raise ValueError("the kernel takes arrays whose elements lie one behind the other")
+    return array.ctypes.data
+
+
+def _address(memory: memoryview) -> int:
+    return ctypes.addressof(ctypes.c_char.from_buffer(memory))

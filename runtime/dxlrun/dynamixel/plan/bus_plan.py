@@ -1,0 +1,250 @@
+"""What the bus executes: prepared transactions, reply layouts, units; made before a port opens."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from dxlrun.dynamixel.wire.transaction import Transaction
+from dxlrun.mode import Mode
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """One item inside a block of bytes, little-endian."""
+
+    offset: int
+    size: int
+    """1, 2 or 4"""
+    encoding: Literal["unsigned", "sign_magnitude", "twos_complement"]
+
+
+@dataclass(frozen=True, slots=True)
+class StateLayout:
+    """The block that is read of a servo each cycle."""
+
+    address: int
+    length: int
+    position: Field
+    velocity: Field
+    effort: Field
+    spare: int
+    """Bytes behind the block that can be read with it, see `exchange`."""
+
+
+@dataclass(frozen=True, slots=True)
+class GoalLayout:
+    """A block that is written to a servo each cycle, with the goals of a mode that stand in it."""
+
+    address: int
+    length: int
+    position: Field | None = None
+    speed: Field | None = None
+    """Beside a position: of the way to it, None where it does not stand there; alone: the goal itself."""
+    effort: Field | None = None
+    """Beside a position's block: the most that the way to it may take; alone: the goal itself."""
+    pwm: Field | None = None
+
+    @property
+    def position_place(self) -> Field:
+        """Where the position stands; raises LookupError for a block without."""
+        if self.position is None:
+            raise LookupError("no goal position stands in this block")
+        return self.position
+
+
+@dataclass(frozen=True, slots=True)
+class TorqueLimit:
+    """Where a servo's torque is limited in RAM, and where its own limit stands, which it begins with."""
+
+    name: str
+    """As the e-Manual writes it: `Torque Limit (34)`."""
+    address: int
+    full_address: int
+    size: int
+    """Of both, bytes."""
+
+
+@dataclass(frozen=True, slots=True)
+class RegisterValue:
+    """One item of a servo's memory and what it shall hold."""
+
+    address: int
+    size: int
+    """1, 2 or 4"""
+    value: int
+    """The integer on the wire; one below 0 in two's complement."""
+    name: str
+    """As the control table has it: `position_p_gain`."""
+    eeprom: bool = False
+    """True where it survives power-off, and is written only while torque is off."""
+
+    @property
+    def data(self) -> bytes:
+        """What is written, little-endian."""
+        return self.value.to_bytes(self.size, "little", signed=self.value < 0)
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """Unit and reach of a goal."""
+
+    per_tick: float
+    """rad/s, the unit of the state's effort, or fraction of the full voltage"""
+    most: int
+    """Highest tick without its sign, by the manual; the servo's own limit may be lower."""
+
+
+@dataclass(frozen=True, slots=True)
+class OwnLimit:
+    """Where a servo keeps the limit beyond which it refuses a goal as a whole."""
+
+    of: Literal["speed", "effort", "pwm"]
+    name: str
+    address: int
+    size: int
+
+
+@dataclass(frozen=True, slots=True)
+class ModePlan:
+    """One mode of one servo: what selects it, which goals it follows; see `mode_plan` for the sources."""
+
+    mode: Mode
+    operating: tuple[RegisterValue, ...]
+    """What selects the mode, in the order in which it is written, with torque off."""
+    goals: tuple[GoalLayout, ...]
+    """The blocks of its goals, in the order in which they are sent."""
+    lower_tick: int
+    """Lowest goal position."""
+    upper_tick: int
+    """Highest goal position."""
+    present_rad_s_per_tick: float
+    """Unit of the present speed in this mode."""
+    speed: Scale | None = None
+    effort: Scale | None = None
+    pwm: Scale | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ServoPlan:
+    """One servo and the joint that it moves: q = direction * (theta - reference)."""
+
+    joint: str
+    row: int
+    """Row of the joint in the state and goal arrays of the whole robot."""
+    servo_id: int
+    model: str
+    model_number: int
+    reference: float
+    """rad, counted from the servo's raw 0"""
+    direction: int
+    rad_per_tick: float
+    max_tick: int
+    rad_s_per_tick: float
+    max_speed_tick: int
+    effort_per_tick: float
+    """Nm, A, or the fraction of the maximum per tick of present load or current."""
+    lower_tick: int
+    """Lowest goal that the joint's limits allow, as the servo counts."""
+    upper_tick: int
+    """Highest goal that the joint's limits allow, as the servo counts."""
+    state: StateLayout
+    goal: GoalLayout
+    torque_address: int
+    """Where torque enable stands, one byte."""
+    hardware_error_address: int | None
+    """Where hardware error status stands, one byte; None where the model has none."""
+    torque_limit: TorqueLimit | None = None
+    """None where the model has none that limits position control."""
+    registers: tuple[RegisterValue, ...] = ()
+    """What the robot file declares, in the order in which it is written: EEPROM first."""
+    modes: tuple[ModePlan, ...] = ()
+    """The modes in which the servo can be."""
+    start_mode: Mode = Mode.POSITION
+    """In which it is brought at the start; one of `modes`."""
+    own_limits: tuple[OwnLimit, ...] = ()
+    slow: tuple[str, ...] = ()
+    """Items that are read slowly, by name."""
+    torque_on_return: bool = False
+    """Torque is given back after a reboot (policy `on_returned_servo: hold`)."""
+    continuous: bool = False
+    """The joint is a wheel, or one of many turns."""
+
+    def mode_plan(self, mode: int) -> ModePlan:
+        """Return one of its modes; raises LookupError when the servo does not have it."""
+        for plan in self.modes:
+            if plan.mode == mode:
+                return plan
+        raise LookupError(f"{self.model} of {self.joint} has no mode {Mode(mode).name.lower()}")
+
+
+@dataclass(frozen=True, slots=True)
+class Budget:
+    """What one cycle costs on one bus, ns (protocol.md, Time budget)."""
+
+    request_bytes: int
+    reply_bytes: int
+    wire_ns: int
+    return_delay_ns: int
+    latency_ns: int
+    goal_bytes: int = 0
+    """Those of `request_bytes` that are goals, which nobody answers."""
+
+    @property
+    def goals_ns(self) -> int:
+        """Time of the goals on the wire, ns."""
+        return self.wire_ns * self.goal_bytes // max(self.request_bytes + self.reply_bytes, 1)
+
+    @property
+    def total_ns(self) -> int:
+        """Time of one read-and-write exchange, ns."""
+        return self.wire_ns + self.return_delay_ns + self.latency_ns
+
+    @property
+    def highest_rate_hz(self) -> float:
+        """The rate at which the bus would do nothing else, Hz."""
+        return 1e9 / self.total_ns
+
+
+@dataclass(frozen=True, slots=True)
+class ReadWay:
+    """One way to read every servo of a bus once a cycle, and what a cycle then costs."""
+
+    name: str
+    """As the e-Manual calls it: `fast sync read`."""
+    budget: Budget
+    chosen: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class BusPlan:
+    """One serial line: its servos, its prepared packets, its budget."""
+
+    name: str
+    port: str
+    """Device path, or `sim`."""
+    protocol: float
+    baud_rate: int
+    latency_ns: int
+    return_delay_ns: int
+    servos: tuple[ServoPlan, ...]
+    groups: tuple[tuple[int, ...], ...]
+    """Who is read by one instruction: indices into `servos`; a group of one is read by itself."""
+    reads: tuple[Transaction, ...]
+    """The state read of each group, when all its servos answer, in the form that every firmware knows."""
+    limp: tuple[Transaction, ...]
+    """Torque off, to be sent at any moment: to everybody first, then servo by servo, acknowledged."""
+    torque_reads: tuple[Transaction, ...]
+    """Read torque enable, in the order of `servos`."""
+    budget: Budget
+    """Of a cycle with the reads that were chosen: the fast forms where `fast` says so."""
+    fast: tuple[bool, ...] = ()
+    """Of each group: it is to be read by a fast form, if that is answered at the start."""
+    ways: tuple[ReadWay, ...] = ()
+    """How the bus could be read, the chosen one among them."""
+    split: bool = False
+    """The next read request leaves right behind the goals, so that the replies wait when a cycle begins."""
+    watchdog_ticks: int = 0
+    """Bus Watchdog of each servo that has one, steps of 20 ms; 0: not armed."""
+    slow_period_ns: int = 0
+    """In which time each slow register is read once; 0: none is."""

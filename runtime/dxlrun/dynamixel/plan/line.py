@@ -1,0 +1,101 @@
+"""Line: the times of one serial line, and the transactions that are made of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from dxlrun.dynamixel.wire import protocol1
+from dxlrun.dynamixel.wire.dialect import Dialect
+from dxlrun.dynamixel.wire.transaction import BROADCAST_ID, Awaited, Transaction
+
+BITS_PER_BYTE = 10
+"""8N1: start bit, eight bits, stop bit (protocol.md, Line)."""
+LONGEST_RETURN_DELAY_NS = 508_000
+"""254 steps of 2 us (e-Manual, Return Delay Time (5)); what a servo may be set to before it was asked."""
+PATIENCE_NS = 10_000_000
+"""How long a servo that answered last time is awaited beyond the latest moment of its reply by the wire.
+
+A real servo is never late by more than microseconds, but a simulated one is a process of the same machine: it
+may have to wait for its processor for a slice or two of the scheduler (3 ms each on a stock kernel). Ten
+milliseconds keep that from being taken for a broken cable; only the first silence of a cycle costs them
+(`hardware` is short with everybody after it), and they stay below the 15.6 ms after which a loop of 320 Hz
+would count as hanging.
+"""
+SHORT_PATIENCE_NS = 1_000_000
+"""The same for a servo that is silent already: it must not take the time of the others."""
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """One serial line as the robot file assumes it; makes transactions with due times and timeouts, ns."""
+
+    baud_rate: int
+    latency_ns: int
+    """Of the adapter, once per request."""
+    return_delay_ns: int
+    dialect: Dialect = protocol1
+    return_delays: Mapping[int, int] = field(default_factory=dict)
+    """Of servos of which it is known, by ID, ns; `return_delay_ns` is that of all others."""
+
+    def wire_ns(self, count: int) -> int:
+        """Return the time that `count` bytes take on the wire, ns."""
+        return count * BITS_PER_BYTE * 1_000_000_000 // self.baud_rate
+
+    def delay_ns(self, servo_id: int) -> int:
+        """Return what a servo waits before it answers, ns."""
+        return self.return_delays.get(servo_id, self.return_delay_ns)
+
+    def ping(self, servo_id: int) -> Transaction:
+        """Return a ping."""
+        length = self.dialect.PING_LENGTH
+        return self._answered(self.dialect.ping(servo_id), servo_id, Awaited(servo_id, length))
+
+    def read(self, servo_id: int, address: int, length: int) -> Transaction:
+        """Return a read of `length` bytes from `address` on."""
+        packet = self.dialect.read(servo_id, address, length)
+        return self._answered(packet, servo_id, Awaited(servo_id, length))
+
+    def read_many(self, requests: Sequence[tuple[int, int, int]], *, fast: bool = False) -> Transaction:
+        """Return the read of several servos, each by (ID, address, length); of one alone a plain read.
+
+        `fast`: by a fast form, which all answer by one status. Raises ValueError where a protocol has none.
+        """
+        if len(requests) == 1:
+            return self.read(*requests[0])
+        awaited = tuple(Awaited(servo_id, length) for servo_id, _, length in requests)
+        packet = self.dialect.read_many(requests, fast=fast)
+        if not fast:
+            return self._answered(packet, BROADCAST_ID, *awaited)
+        size = self.dialect.fast_size(sum(one.length for one in awaited), len(awaited))
+        # only the first one waits before it speaks: the others add their parts at once (protocol.md, Time)
+        due_ns = self.wire_ns(len(packet) + size) + self.delay_ns(awaited[0].servo_id)
+        timeout_ns = due_ns + self.latency_ns + PATIENCE_NS
+        return Transaction(packet, BROADCAST_ID, awaited, due_ns, timeout_ns, size, fast=True)
+
+    def write(self, servo_id: int, address: int, data: bytes) -> Transaction:
+        """Return a write that the servo acknowledges; to everybody: without reply."""
+        packet = self.dialect.write(servo_id, address, data)
+        if servo_id == BROADCAST_ID:
+            return self.unanswered(packet)
+        return self._answered(packet, servo_id, Awaited(servo_id, 0))
+
+    def instruct(self, servo_id: int, packet: bytes) -> Transaction:
+        """Return the transaction of an instruction that one servo acknowledges without data."""
+        return self._answered(packet, servo_id, Awaited(servo_id, 0))
+
+    def unanswered(self, packet: bytes) -> Transaction:
+        """Return a transaction without reply."""
+        return Transaction(packet, BROADCAST_ID, (), self.wire_ns(len(packet)), 0)
+
+    def _answered(self, packet: bytes, servo_id: int, *awaited: Awaited) -> Transaction:
+        """Return a transaction whose replies come one after the other, each after a return delay."""
+        replies = sum(self.dialect.OVERHEAD + one.length for one in awaited)
+        due_ns = self.wire_ns(len(packet) + replies) + sum(self.delay_ns(one.servo_id) for one in awaited)
+        widest = self.dialect.widest(max(one.length for one in awaited))
+        return Transaction(packet, servo_id, awaited, due_ns, due_ns + self.latency_ns + PATIENCE_NS, widest)
+
+
+def listen(duration_ns: int) -> Transaction:
+    """Return a transaction that sends nothing and hears what arrives unasked for `duration_ns`."""
+    return Transaction(b"", BROADCAST_ID, (), duration_ns, 0)

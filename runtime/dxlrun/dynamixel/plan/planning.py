@@ -1,0 +1,224 @@
+"""From joints and control tables to the plan of one bus: every packet of the cycle, its times, its cost."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from dxlrun.dynamixel.control_table import ControlItem, ControlTable
+from dxlrun.dynamixel.plan.bus_plan import (
+    BusPlan,
+    Field,
+    GoalLayout,
+    ModePlan,
+    RegisterValue,
+    ServoPlan,
+    StateLayout,
+    TorqueLimit,
+)
+from dxlrun.dynamixel.plan.line import Line
+from dxlrun.dynamixel.plan.mode_plan import LACKS, mode_plans, own_limits, position_layout, position_reach
+from dxlrun.dynamixel.plan.reads import choose_reads
+from dxlrun.dynamixel.wire.dialect import dialect_of
+from dxlrun.dynamixel.wire.transaction import BROADCAST_ID, Transaction
+from dxlrun.mode import Mode
+
+MOST_SPARE = 2
+"""Two longer forms of a read tell its late replies from the newest (`exchange`)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Wiring:
+    """One joint and the servo that moves it, as `bus_plan` needs them."""
+
+    joint: str
+    row: int
+    """Row of the joint in the state and goal arrays of the whole robot."""
+    servo_id: int
+    table: ControlTable
+    reference: float
+    """rad, counted from the servo's raw 0"""
+    direction: int
+    lower: float
+    """rad, joint angle"""
+    upper: float
+    """rad, joint angle"""
+    registers: tuple[RegisterValue, ...] = ()
+    """What its memory shall hold, in the order in which it is written."""
+    continuous: bool = False
+    """A wheel, or a joint of many turns, which positions count; without limits `lower`, `upper` are inf."""
+    start_mode: Mode | None = None
+    """In which the servo is brought at the start; None: VELOCITY for a wheel, else POSITION."""
+
+
+def bus_plan(
+    *,
+    name: str,
+    port: str,
+    baud_rate: int,
+    latency_ns: int,
+    return_delay_ns: int,
+    joints: Sequence[Wiring],
+    protocol: float = 1.0,
+    split: bool = False,
+) -> BusPlan:
+    """Prepare everything that goes over one serial line.
+
+    `latency_ns` is what the adapter adds to each request, `return_delay_ns` what each servo waits before it
+    answers. Raises ValueError when the servos cannot share one cycle.
+    """
+    line = Line(baud_rate, latency_ns, return_delay_ns, dialect_of(protocol))
+    servos = tuple(_servo(joint) for joint in joints)
+    goals = [_empty_goals(name, line, layout, servos) for layout in goal_layouts(servos)]
+    reads = choose_reads(line, servos, [joint.table for joint in joints], goals)
+    return BusPlan(
+        name=name,
+        port=port,
+        protocol=protocol,
+        baud_rate=baud_rate,
+        latency_ns=latency_ns,
+        return_delay_ns=return_delay_ns,
+        servos=servos,
+        groups=reads.groups,
+        reads=reads.plain,
+        limp=(
+            *_torque_off(line, servos),
+            *(line.write(servo.servo_id, servo.torque_address, b"\0") for servo in servos),
+        ),
+        torque_reads=tuple(line.read(servo.servo_id, servo.torque_address, 1) for servo in servos),
+        budget=reads.budget,
+        fast=reads.fast,
+        ways=reads.ways,
+        split=split,
+    )
+
+
+def plan_line(plan: BusPlan) -> Line:
+    """Return the line of a plan, as the robot file assumes it."""
+    return Line(plan.baud_rate, plan.latency_ns, plan.return_delay_ns, dialect_of(plan.protocol))
+
+
+def readable(table: ControlTable, start: int, end: int) -> bool:
+    """Say whether the addresses from `start` up to before `end` all belong to items."""
+    items = table.items.values()
+    known = {address for item in items for address in range(item.address, item.address + item.size)}
+    return known.issuperset(range(start, end))
+
+
+def goal_layouts(servos: Sequence[ServoPlan]) -> tuple[GoalLayout, ...]:
+    """Return the different goal blocks of servos in their first modes; each needs a sync write of its own."""
+    return tuple(dict.fromkeys(goal for servo in servos for goal in servo.mode_plan(servo.start_mode).goals))
+
+
+def _empty_goals(name: str, line: Line, layout: GoalLayout, servos: Sequence[ServoPlan]) -> bytes:
+    """Return a sync write of zeros to everybody of one layout, to know its size; it is never sent."""
+    count = sum(layout in servo.mode_plan(servo.start_mode).goals for servo in servos)
+    most = line.dialect.MOST_GOAL_BYTES // (layout.length + 1)
+    if count > most:
+        raise ValueError(
+            f"bus {name} has {count} servos; the goals of {most} fit one sync write: "
+            "put the others on a second bus"
+        )
+    return line.dialect.sync_write_records(layout.address, layout.length, bytes((layout.length + 1) * count))
+
+
+def _torque_off(line: Line, servos: Sequence[ServoPlan]) -> list[Transaction]:
+    """Return torque off for everybody at once; nobody answers.
+
+    Where torque enable stands at several addresses nobody may be told to write at another's.
+    """
+    addresses = dict.fromkeys(servo.torque_address for servo in servos)
+    if len(addresses) == 1:
+        return [line.write(BROADCAST_ID, address, b"\0") for address in addresses]
+    return [
+        line.unanswered(
+            line.dialect.sync_write_records(
+                address, 1, b"".join(bytes((s.servo_id, 0)) for s in servos if s.torque_address == address)
+            )
+        )
+        for address in addresses
+    ]
+
+
+def _servo(joint: Wiring) -> ServoPlan:
+    table = joint.table
+    ends = sorted(
+        (joint.direction * angle + joint.reference) / table.rad_per_tick
+        for angle in (joint.lower, joint.upper)
+    )
+    reach = position_reach(table, joint.continuous)
+    # inwards, so that no goal is outside; 1e-6 ticks forgive the rounding of degrees
+    lower = math.ceil(max(ends[0], reach[0]) - 1e-6)
+    upper = math.floor(min(ends[1], reach[1]) + 1e-6)
+    hardware_error = table.items.get("hardware_error_status")
+    modes = mode_plans(table, lower, upper, joint.continuous)
+    return ServoPlan(
+        joint=joint.joint,
+        row=joint.row,
+        servo_id=joint.servo_id,
+        model=table.model,
+        model_number=table.model_number,
+        reference=joint.reference,
+        direction=joint.direction,
+        rad_per_tick=table.rad_per_tick,
+        max_tick=table.max_tick,
+        rad_s_per_tick=table.rad_s_per_tick,
+        max_speed_tick=table.max_speed_tick,
+        effort_per_tick=table.effort_per_tick,
+        lower_tick=lower,
+        upper_tick=upper,
+        state=_state_layout(table, counts_turns=joint.continuous),
+        goal=position_layout(table),
+        torque_address=table.items["torque_enable"].address,
+        hardware_error_address=None if hardware_error is None else hardware_error.address,
+        torque_limit=_torque_limit(table),
+        modes=modes,
+        start_mode=_start_mode(joint, modes),
+        own_limits=own_limits(table),
+        continuous=joint.continuous,
+        registers=joint.registers,
+    )
+
+
+def _start_mode(joint: Wiring, modes: Sequence[ModePlan]) -> Mode:
+    """Return the first mode; raises ValueError when the model does not have it."""
+    wanted = joint.start_mode or (Mode.VELOCITY if joint.continuous else Mode.POSITION)
+    if any(plan.mode == wanted for plan in modes):
+        return wanted
+    raise ValueError(f"{joint.table.model} of {joint.joint} {LACKS[wanted]}")
+
+
+def _torque_limit(table: ControlTable) -> TorqueLimit | None:
+    """Return where a model's torque is limited; see `dynamixel.torque_limit` for the manual's pages."""
+    for name, full in (("torque_limit", "max_torque"), ("goal_pwm", "pwm_limit")):
+        item, own = table.items.get(name), table.items.get(full)
+        if item is not None and own is not None and item.size == own.size:
+            words = name.replace("_", " ").title().replace("Pwm", "PWM")
+            return TorqueLimit(f"{words} ({item.address})", item.address, own.address, item.size)
+    return None
+
+
+def _state_layout(table: ControlTable, *, counts_turns: bool) -> StateLayout:
+    """Return the one block that holds position, speed and load or current.
+
+    Raises ValueError when they do not stand together: an address without an item cannot be read.
+    """
+    names = ("present_position", table.present_speed_item, table.effort_item)
+    items = [table.items[name] for name in names]
+    start = min(item.address for item in items)
+    end = max(item.address + item.size for item in items)
+    if not readable(table, start, end):
+        raise ValueError(f"{table.model}: {', '.join(names)} do not stand in one block, so no read gets all")
+    position, velocity, effort = (_field(item, start) for item in items)
+    if counts_turns:
+        # turns below 0 are in two's complement, also in the 16 bits of multi-turn mode
+        position = replace(position, encoding="twos_complement")
+    spare = 0
+    while spare < MOST_SPARE and readable(table, start, end + spare + 1):
+        spare += 1
+    return StateLayout(start, end - start, position, velocity, effort, spare)
+
+
+def _field(item: ControlItem, start: int) -> Field:
+    return Field(item.address - start, item.size, item.encoding)

@@ -1,0 +1,1 @@
+"""Port: serial lines, opened, locked and opened again."""

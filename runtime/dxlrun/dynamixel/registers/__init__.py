@@ -1,0 +1,1 @@
+"""Registers and modes of a servo: declared, checked, and changed while it runs."""

@@ -1,0 +1,194 @@
+"""Slow registers: what changes slowly in the servos of one bus, read in turn in the gaps between cycles."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+from dxlrun.dynamixel.control_table import ControlItem, control_table
+from dxlrun.dynamixel.exchange.gaps import Gaps, Urgency
+from dxlrun.dynamixel.plan.bus_plan import BusPlan
+from dxlrun.dynamixel.plan.planning import plan_line
+from dxlrun.dynamixel.registers.inspection import called
+from dxlrun.dynamixel.servo.absent import NEVER, Absent, Voice
+from dxlrun.dynamixel.wire.transaction import Program, Reply, Transaction
+from dxlrun.interfaces import Floats, States
+from dxlrun.run.channels.events import EventCode, Severity
+
+TEMPERATURES = ("present_temperature", "present_motor_temperature")
+VOLTAGES = ("present_voltage", "present_input_voltage")
+"""What the control tables call it."""
+_LIMITS = ("temperature_limit", "motor_temperature_limit")
+WARN_BELOW = 10.0
+"""degrees C below the servo's own limit (failures.md)."""
+COOLED = 5.0
+"""degrees C below the warning until it is told that the servo has cooled down."""
+
+_Block = tuple[ControlItem, ...]
+"""Items side by side, read by one instruction."""
+
+
+class SlowRegisters:
+    """Reads one block of one servo at a time, so that each servo's registers come once in the plan's period.
+
+    Temperature and voltage go into the states; whatever else is read is told when it changes. Realtime Tick
+    is read along with them: it tells a reboot that nobody noticed.
+    """
+
+    __slots__ = (
+        "_absent",
+        "_asking",
+        "_away",
+        "_due_ns",
+        "_gaps",
+        "_hot",
+        "_interval_ns",
+        "_known",
+        "_limits",
+        "_next",
+        "_plan",
+        "_rebooted",
+        "_round",
+        "_say",
+        "_states",
+    )
+
+    def __init__(  # noqa: PLR0917  whom it asks, whom it tells
+        self,
+        plan: BusPlan,
+        gaps: Gaps,
+        absent: Absent,
+        away: list[bool],
+        say: Voice,
+        states: States,
+        rebooted: Callable[[int], None],
+    ) -> None:
+        self._plan = plan
+        self._gaps = gaps
+        self._absent = absent
+        self._away = away
+        self._say = say
+        self._rebooted = rebooted
+        self._states = states
+        self._round: list[tuple[int, _Block | None]] = _round(plan)  # None: the tick
+        self._next = 0
+        self._asking = False
+        count = len(plan.servos)
+        self._interval_ns = plan.slow_period_ns // len(self._round) if self._round else 0
+        self._due_ns = 0 if self._round else NEVER
+        self._known: dict[tuple[int, str], int] = {}
+        self._limits = [_limit_item(plan, index) for index in range(count)]
+        self._hot = [False] * count
+
+    def look(self) -> None:
+        """Let the coming gaps read the next block when its time has come; called once a cycle."""
+        if self._asking or self._due_ns == NEVER or self._gaps.now_ns() < self._due_ns:
+            return
+        for _ in self._round:
+            index, block = self._round[self._next]
+            self._next = (self._next + 1) % len(self._round)
+            if not self._away[index]:
+                self._ask(index, block)
+                break
+        self._due_ns = self._gaps.now_ns() + self._interval_ns
+
+    def _ask(self, index: int, block: _Block | None) -> None:
+        self._asking = True
+        name = f"slow registers of {self._plan.servos[index].joint}"
+        if block is None:
+            self._gaps.add(self._absent.tick(index), partial(self._ticked, index), Urgency.SLOW, name, index)
+            return
+        read = self._read(index, block)
+        self._gaps.add(once(read), partial(self._take, index, block), Urgency.SLOW, name, index)
+
+    def _read(self, index: int, block: _Block) -> Transaction:
+        start, end = block[0].address, block[-1].address + block[-1].size
+        return plan_line(self._plan).read(self._plan.servos[index].servo_id, start, end - start)
+
+    def _ticked(self, index: int, rebooted: bool) -> None:
+        self._asking = False
+        if rebooted and not self._away[index]:
+            self._rebooted(index)
+
+    def _take(self, index: int, block: _Block, reply: Reply) -> None:
+        self._asking = False
+        if not reply.answered:
+            return
+        for item in block:
+            at = item.address - block[0].address
+            self._note(index, item, item.decode(reply.parameters[at : at + item.size]))
+
+    def _note(self, index: int, item: ControlItem, raw: int) -> None:
+        states, row = self._states, self._plan.servos[index].row
+        before = self._known.get((index, item.name))
+        self._known[index, item.name] = raw
+        if item.name in TEMPERATURES:
+            self._warm(index, raw * item.scale, states.temperature, row)
+        elif item.name in VOLTAGES:
+            states.voltage[row] = raw * item.scale
+        elif before not in (None, raw) and item.name not in _LIMITS:
+            self._say(
+                EventCode.REGISTER_DIFFERS, Severity.INFO, index, f"{called(item)} was {before}, is {raw}"
+            )
+
+    def _warm(self, index: int, celsius: float, temperature: Floats, row: int) -> None:
+        temperature[row] = celsius
+        item = self._limits[index]
+        if item is None:
+            return
+        raw = self._known.get((index, item.name))
+        if raw is None:  # read once, after the first temperature
+            if not self._asking:
+                self._ask(index, (item,))
+            return
+        limit = raw * item.scale
+        text = f"is at {celsius:.0f} deg C; its {called(item)} is {limit:.0f} deg C"
+        if celsius >= limit - WARN_BELOW and not self._hot[index]:
+            self._hot[index] = True
+            text = f"{text}, beyond which it cuts its torque: let it rest"
+            self._say(EventCode.SERVO_HOT, Severity.WARNING, index, text)
+        elif celsius <= limit - WARN_BELOW - COOLED and self._hot[index]:
+            self._hot[index] = False
+            self._say(EventCode.SERVO_HOT, Severity.INFO, index, text)
+
+
+def slow_items(model: str, protocol: float) -> tuple[str, ...]:
+    """Return what is read slowly of a model when the robot file does not say it."""
+    items = control_table(model, protocol).items
+    return tuple(name for name in items if name in TEMPERATURES or name in VOLTAGES)
+
+
+def _round(plan: BusPlan) -> list[tuple[int, _Block | None]]:
+    """Return what is read in turn: the first block of every servo, then the second, then the ticks."""
+    if not plan.slow_period_ns:
+        return []
+    found: list[tuple[int, int, _Block | None]] = []
+    for index, servo in enumerate(plan.servos):
+        items = control_table(servo.model, plan.protocol).items
+        blocks: list[_Block | None] = [*_blocks([items[name] for name in servo.slow if name in items])]
+        if "realtime_tick" in items:
+            blocks.append(None)
+        found += [(number, index, block) for number, block in enumerate(blocks)]
+    return [(index, block) for _, index, block in sorted(found, key=lambda one: one[:2])]
+
+
+def _blocks(items: list[ControlItem]) -> list[_Block]:
+    """Return items in blocks that stand side by side."""
+    blocks: list[_Block] = []
+    for item in sorted(items, key=lambda one: one.address):
+        if blocks and blocks[-1][-1].address + blocks[-1][-1].size == item.address:
+            blocks[-1] = (*blocks[-1], item)
+        else:
+            blocks.append((item,))
+    return blocks
+
+
+def _limit_item(plan: BusPlan, index: int) -> ControlItem | None:
+    items = control_table(plan.servos[index].model, plan.protocol).items
+    return next((items[name] for name in _LIMITS if name in items), None)
+
+
+def once(transaction: Transaction) -> Program[Reply]:
+    """Return the program of one transaction."""
+    reply = yield transaction
+    return reply

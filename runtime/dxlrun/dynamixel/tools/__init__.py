@@ -1,0 +1,1 @@
+"""Tools: scan a port, change one servo, back it up."""

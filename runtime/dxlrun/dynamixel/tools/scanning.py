@@ -1,0 +1,274 @@
+"""Scanning: who answers on a line, in which protocol and at which rate; nothing is written to a servo.
+
+Protocol 2.0 is asked by one broadcast ping a rate, which each servo answers in a slot of its own;
+Protocol 1.0 ID by ID, because all its servos would answer at once (e-Manual, Protocol 1.0 and 2.0, Ping).
+Where anything is heard that is no whole answer every ID is asked again, patiently.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+from dxlrun.dynamixel.control_table import ControlTable, all_tables, models_by_number
+from dxlrun.dynamixel.plan.line import Line, listen
+from dxlrun.dynamixel.registers.inspection import called, persist
+from dxlrun.dynamixel.registers.patience import patient
+from dxlrun.dynamixel.tools.tool_line import ToolLine, refuse_echo
+from dxlrun.dynamixel.wire.dialect import dialect_of
+from dxlrun.dynamixel.wire.transaction import BROADCAST_ID, Outcome, Program, Reply, Transaction
+
+SHORT_PATIENCE_NS = 2_000_000
+"""How long a servo that is probably not there is awaited beyond the latest moment by the wire."""
+SLOT_NS = 3_000_000
+"""After a broadcast ping: of each ID, beside the bytes of its answer (dynamixel-sdk, broadcastPing)."""
+LATE_NS = 20_000_000
+"""Behind the last question of a rate: what comes still, came late through the adapter."""
+LATE_OF_FEW_NS = 100_000_000
+"""The same where few are asked: there it may be the machine that is late."""
+FEW = 20
+"""So many IDs are quicker asked one by one."""
+_USUAL = (1_000_000, 57_600, 115_200)
+_WHO_LENGTH = 3
+_LIMITS = (("min_position_limit", "max_position_limit"), ("cw_angle_limit", "ccw_angle_limit"))
+_TRIES = 2
+"""Of a ping at a rate that is one of many."""
+_TRIES_ALONE = 4
+"""Where somebody said where the servo is: there it is awaited patiently."""
+
+
+@dataclass(frozen=True, slots=True)
+class FoundServo:
+    """A servo that answered."""
+
+    protocol: float
+    baud_rate: int
+    """bit/s"""
+    servo_id: int
+    model: str = ""
+    """Name of its control table; empty where there is none, or it did not say."""
+    model_number: int = -1
+    """-1: it did not say."""
+    firmware: int = 0
+    position: int | None = None
+    """Present position, ticks."""
+    return_delay: int | None = None
+    """ns"""
+    lowest: int | None = None
+    """Its own limits of the position, ticks; both 0 in wheel mode."""
+    highest: int | None = None
+    garbled: bool = False
+    """True when it answers garbled, as two servos of one ID do."""
+    remarks: tuple[str, ...] = ()
+    """What a person should know."""
+
+
+@dataclass(frozen=True, slots=True)
+class Wish:
+    """Where to look."""
+
+    protocols: tuple[float, ...] = (2.0, 1.0)
+    baud_rates: tuple[int, ...] = ()
+    """bit/s; empty: all that a control table of the protocol knows."""
+    ids: tuple[int, ...] = ()
+    """Empty: all that the protocol has."""
+
+    def lines(self) -> tuple[tuple[float, int], ...]:
+        """Return each protocol with each rate."""
+        return tuple(
+            (protocol, rate)
+            for protocol in self.protocols
+            for rate in self.baud_rates or known_rates(protocol)
+        )
+
+
+EVERYWHERE = Wish()
+Progress = Callable[[str, float], None]
+
+
+def known_rates(protocol: float) -> tuple[int, ...]:
+    """Return the rates that servos of a protocol can have, bit/s, the usual ones first."""
+    rates = {
+        rate for table in all_tables() if table.protocol == protocol for rate in table.baud_rates.values()
+    }
+    return tuple(sorted(rates, key=lambda rate: (rate not in _USUAL, -rate)))
+
+
+@dataclass(frozen=True, slots=True)
+class Scanned:
+    """What a scan found."""
+
+    servos: tuple[FoundServo, ...]
+    left_out: tuple[int, ...]
+    """Rates at which the adapter cannot run, bit/s."""
+
+
+def scan(tool: ToolLine, wish: Wish = EVERYWHERE, progress: Progress = lambda *_: None) -> Scanned:
+    """Look for servos; raises PortError when the line is gone, or its adapter echoes."""
+    found: list[FoundServo] = []
+    left_out: list[int] = []
+    lines = wish.lines()
+    for index, (protocol, baud_rate) in enumerate(lines):
+        if not tool.speak(protocol, baud_rate):
+            left_out.append(baud_rate)
+            continue
+        words = f"Protocol {protocol} at {baud_rate} bit/s, {len(found)} found"
+
+        def beat(share: float, index: int = index, words: str = words) -> None:
+            progress(words, (index + share) / len(lines))
+
+        ids = wish.ids or tuple(range(dialect_of(protocol).HIGHEST_ID + 1))
+        beat(0.0)
+        found += tool.run(_search(tool, ids, beat))
+    return Scanned(tuple(found), tuple(dict.fromkeys(left_out)))
+
+
+def find(tool: ToolLine, servo_id: int, wish: Wish = EVERYWHERE) -> tuple[FoundServo, ...]:
+    """Look for one ID in every protocol and at every rate; raises PortError as `scan` does."""
+    found: list[FoundServo] = []
+    lines = wish.lines()
+    tries = _TRIES_ALONE if len(lines) == 1 else _TRIES
+    for protocol, baud_rate in lines:
+        if servo_id <= dialect_of(protocol).HIGHEST_ID and tool.speak(protocol, baud_rate):
+            found += tool.run(_find(tool, servo_id, tries))
+    return tuple(found)
+
+
+def _find(tool: ToolLine, servo_id: int, tries: int) -> Program[list[FoundServo]]:
+    knocked = _knock(tool, servo_id, tries)
+    if (yield from (patient(knocked) if tries == _TRIES_ALONE else knocked)):
+        return [(yield from patient(look(tool.line, servo_id)))]
+    return []
+
+
+def _knock(tool: ToolLine, servo_id: int, tries: int) -> Program[bool]:
+    for _ in range(tries):
+        reply = yield tool.line.ping(servo_id)
+        refuse_echo(tool.port.name, reply)
+        if reply.outcome is not Outcome.TIMEOUT:
+            return True
+    return False
+
+
+def _search(tool: ToolLine, ids: Sequence[int], beat: Callable[[float], None]) -> Program[list[FoundServo]]:
+    """Look for servos at one rate."""
+    line, heard = tool.line, tool.heard
+    yield listen(LATE_NS)  # what still comes of the rate before
+    heard.clear()
+    if line.dialect.PING_LENGTH >= _WHO_LENGTH and len(ids) > FEW:
+        slot_ns = line.wire_ns(line.dialect.OVERHEAD + line.dialect.PING_LENGTH) + SLOT_NS
+        asked = line.unanswered(line.dialect.ping(BROADCAST_ID))
+        slots_ns = slot_ns * (len(ids) + 1) + line.latency_ns
+        refuse_echo(tool.port.name, (yield replace(asked, due_ns=asked.due_ns + slots_ns)))
+        there = heard.ids & set(ids)
+    else:
+        there = yield from _one_by_one(tool, ids, SHORT_PATIENCE_NS, beat)
+    if heard.noise:
+        there |= yield from _one_by_one(tool, ids, None, beat)
+    found: list[FoundServo] = []
+    for servo_id in sorted(there):
+        found.append((yield from patient(look(line, servo_id))))
+    return found
+
+
+def _one_by_one(
+    tool: ToolLine, ids: Sequence[int], patience_ns: int | None, beat: Callable[[float], None]
+) -> Program[set[int]]:
+    """Ping every ID; return who is there, or seems to be."""
+    line, heard = tool.line, tool.heard
+    there: set[int] = set()
+    suspected: list[int] = []
+    for index, servo_id in enumerate(ids):
+        ping = line.ping(servo_id)
+        reply = yield ping if patience_ns is None else _hurried(tool, ping, patience_ns)
+        refuse_echo(tool.port.name, reply)
+        if reply.answered:
+            there.add(servo_id)
+        elif reply.outcome is not Outcome.TIMEOUT:
+            suspected.append(servo_id)
+        beat((index + 1) / len(ids))
+    yield listen(LATE_NS if len(ids) > FEW else LATE_OF_FEW_NS)
+    there |= yield from patient(_answering(line, suspected))
+    return there | (heard.ids & set(ids))
+
+
+def _answering(line: Line, suspected: Sequence[int]) -> Program[set[int]]:
+    """Ping each again: what came may have been the late answer of the one before."""
+    there: set[int] = set()
+    for servo_id in suspected:
+        reply = yield from persist(line.ping(servo_id))
+        if reply.outcome is not Outcome.TIMEOUT:
+            there.add(servo_id)
+    return there
+
+
+def _hurried(tool: ToolLine, transaction: Transaction, patience_ns: int) -> Transaction:
+    return replace(transaction, timeout_ns=transaction.due_ns + tool.port.latency_ns + patience_ns)
+
+
+def look(line: Line, servo_id: int) -> Program[FoundServo]:
+    """Ask a servo that is there what it is and how it is set; writes nothing."""
+    dialect = line.dialect
+    servo = FoundServo(dialect.PROTOCOL, line.baud_rate, servo_id)
+    ping = yield from persist(line.ping(servo_id))
+    said = ping
+    if ping.answered and dialect.PING_LENGTH < _WHO_LENGTH:
+        said = yield from persist(line.read(servo_id, 0, _WHO_LENGTH))
+    if not said.answered:
+        garbled = Outcome.GARBLED in (ping.outcome, said.outcome)
+        return replace(servo, garbled=garbled, remarks=(_mute(ping, said, line),))
+    number, firmware = said.word(), said.parameters[2]
+    remarks = [dialect.describe_error(said.error)] if said.error else []
+    table = _table(number, firmware, dialect.PROTOCOL)
+    if table is None:
+        remarks.append(f"no control table has its model number {number}: a plug-in can add one")
+        return replace(servo, model_number=number, firmware=firmware, remarks=tuple(remarks))
+    servo = replace(servo, model=table.model, model_number=number, firmware=firmware, remarks=tuple(remarks))
+    return (yield from _look_closer(line, table, servo))
+
+
+def _look_closer(line: Line, table: ControlTable, servo: FoundServo) -> Program[FoundServo]:
+    """Read what a robot file wants to know, and find two servos of one ID: they stand somewhere else."""
+    values: dict[str, int] = {}
+    names = ["present_position", "return_delay_time", *(name for pair in _LIMITS for name in pair)]
+    items = [table.items[name] for name in names if name in table.items]
+    silent: list[str] = []
+    garbled = False
+    for item in items:
+        reply = yield from persist(line.read(servo.servo_id, item.address, item.size))
+        if reply.answered:
+            values[item.name] = item.decode(reply.parameters)
+        else:
+            silent.append(called(item))
+        garbled = garbled or reply.outcome is Outcome.GARBLED or bool(reply.strays)
+    remarks = list(servo.remarks)
+    if garbled:
+        remarks.append("answers garbled now and then: do two servos have this ID? If not, check its cable")
+    elif silent:
+        level = called(table.items["status_return_level"])
+        remarks.append(f"did not answer when {', '.join(silent)} was read: is its {level} 0?")
+    lowest, highest = next((pair for pair in _LIMITS if pair[0] in values and pair[1] in values), ("", ""))
+    delay = values.get("return_delay_time")
+    return replace(
+        servo,
+        position=values.get("present_position"),
+        return_delay=None if delay is None else delay * 2_000,
+        lowest=values.get(lowest),
+        highest=values.get(highest),
+        garbled=garbled,
+        remarks=tuple(remarks),
+    )
+
+
+def _mute(ping: Reply, said: Reply, line: Line) -> str:
+    if Outcome.GARBLED in (ping.outcome, said.outcome):
+        return "answers garbled: do two servos have this ID? If not, check cable and ground"
+    if not ping.answered:
+        return "answered once, and then no more: check its cable and power"
+    if said.outcome is Outcome.REFUSED:
+        return f"refuses to be read: {line.dialect.describe_error(said.error)}"
+    return "answers pings but no read: its Status Return Level (16) is 0"
+
+
+def _table(number: int, firmware: int, protocol: float) -> ControlTable | None:
+    return next((each for each in models_by_number(number, protocol) if each.firmware <= firmware), None)

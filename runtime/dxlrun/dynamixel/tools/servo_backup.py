@@ -1,0 +1,115 @@
+"""A servo's registers in a file: all that can be written, stamped with who it was; and what goes back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+
+from dxlrun.dynamixel.control_table import ControlTable
+from dxlrun.dynamixel.plan.bus_plan import RegisterValue
+from dxlrun.errors import InputError
+
+FORMAT: Literal["dxlrun servo backup 1"] = "dxlrun servo backup 1"
+_ADDRESSED = ("id", "secondary_id", "secondary_shadow_id", "baud_rate", "baud_rate_bus", "protocol_type")
+_MOMENTARY = frozenset(
+    ("torque_enable", "bus_watchdog", "lock", "hybrid_save", "moving_speed", "registered_instruction")
+)
+_MODES = ("operating_mode", "control_mode")
+"""The mode resets gains and profile, so it goes back before them."""
+_LAST = "status_return_level"
+"""Afterwards a servo may answer no read any more."""
+
+
+class ServoBackup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What stands in the file."""
+
+    format: Literal["dxlrun servo backup 1"]
+    model: str
+    model_number: int
+    firmware: int
+    protocol: float
+    id: int
+    baud_rate: int
+    """bit/s"""
+    registers: dict[str, int]
+    """By name, in the order of addresses; integers of the wire."""
+
+
+def kept_items(table: ControlTable) -> tuple[str, ...]:
+    """Return what a backup keeps of a model: every item that can be written, but for indirect data."""
+    return tuple(
+        item.name
+        for item in table.items.values()
+        if item.access == "RW" and not item.name.startswith("indirect_data_")
+    )
+
+
+def write_backup(path: Path, backup: ServoBackup) -> None:
+    """Write a file that is not there yet; raises InputError where it is, or cannot be written."""
+    text = msgspec.json.format(msgspec.json.encode(backup), indent=2) + b"\n"
+    try:
+        with path.open("xb") as file:
+            file.write(text)
+    except FileExistsError:
+        raise InputError(f"{path} is there already and is not overwritten; choose another file") from None
+    except OSError as error:
+        raise InputError(f"{path} cannot be written ({error.strerror}); choose another file") from None
+
+
+def read_backup(path: Path) -> ServoBackup:
+    """Read a file; raises InputError where it cannot be read, or is no backup."""
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=ServoBackup)
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}); check the path") from None
+    except (msgspec.DecodeError, ValueError, RecursionError) as error:  # also bytes that are no text
+        raise InputError(
+            f"{path} is no backup of a servo: {error}; `dxlrun servo backup` writes one"
+        ) from None
+
+
+def registers_to_restore(path: Path, backup: ServoBackup, table: ControlTable) -> tuple[RegisterValue, ...]:
+    """Return what goes back into a servo, in order: EEPROM first; ID, rate and goals stay.
+
+    Raises InputError with everything that does not fit the model.
+    """
+    wrong: list[str] = []
+    if (backup.model_number, backup.protocol) != (table.model_number, table.protocol):
+        raise InputError(
+            f"{path} is of a {backup.model} of Protocol {backup.protocol}, not of a {table.model} of "
+            f"Protocol {table.protocol}; give the backup of such a servo"
+        )
+    found: list[RegisterValue] = []
+    for name, value in backup.registers.items():
+        item = table.items.get(name)
+        if item is None or item.access != "RW":
+            wrong.append(f"{path}: a {table.model} has no register {name} to be written; take it out")
+        elif _stays(name):
+            continue
+        elif not item.minimum <= value <= item.maximum and value != item.initial:
+            wrong.append(f"{path}: {name} is {value}, not in {item.minimum}..{item.maximum}; correct it")
+        else:
+            found.append(RegisterValue(item.address, item.size, value, name, item.area == "EEPROM"))
+    if wrong:
+        raise InputError("\n".join(wrong))
+    return tuple(sorted(found, key=_turn))
+
+
+def stamped(
+    table: ControlTable, firmware: int, address: tuple[int, int], values: Mapping[str, int]
+) -> ServoBackup:
+    """Return the backup of a servo at an address: its ID and its rate, bit/s."""
+    servo_id, rate = address
+    number, protocol = table.model_number, table.protocol
+    return ServoBackup(FORMAT, table.model, number, firmware, protocol, servo_id, rate, dict(values))
+
+
+def _turn(one: RegisterValue) -> tuple[bool, bool, bool, int]:
+    return one.name == _LAST, one.name not in _MODES, not one.eeprom, one.address
+
+
+def _stays(name: str) -> bool:
+    return name in _ADDRESSED or name in _MOMENTARY or name.startswith(("goal_", "indirect_data_"))

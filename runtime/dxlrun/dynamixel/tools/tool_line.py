@@ -1,0 +1,186 @@
+"""Tool line: one serial line for tools, at one rate and in one protocol after the other; never in a run."""
+
+from __future__ import annotations
+
+import errno
+import termios
+from collections.abc import Callable
+from typing import Protocol
+
+from dxlrun.clock import Clock, MonotonicClock
+from dxlrun.dynamixel.exchange.bus import Bus
+from dxlrun.dynamixel.exchange.pump import run
+from dxlrun.dynamixel.plan.bus_plan import Budget, BusPlan
+from dxlrun.dynamixel.plan.line import LONGEST_RETURN_DELAY_NS, Line, listen
+from dxlrun.dynamixel.port.latency_timer import latency_timer, shorten
+from dxlrun.dynamixel.port.ports import Ports, SerialPort, SerialPorts
+from dxlrun.dynamixel.port.serial_open import open_serial
+from dxlrun.dynamixel.wire.dialect import dialect_of
+from dxlrun.dynamixel.wire.transaction import Program, Reply, Result
+from dxlrun.errors import PortError
+from dxlrun.run.channels.packets import NoPackets, PacketKind
+from dxlrun.run.channels.ring import Payload
+
+FIRST_RATE = 57_600
+"""At which a port is opened, bit/s; every adapter has it."""
+LATENCY_NS = 1_000_000
+"""What an adapter adds whose latency timer is not known: a frame of USB at full speed."""
+MOST_LATENCY_NS = 16_000_000
+"""What it may add then: the latency timer of an FTDI chip as shipped (FTDI AN232B-04)."""
+_NOTHING = Budget(0, 0, 0, 0, 0)
+
+
+class Tunable(Protocol):
+    """One open line whose rate can be changed."""
+
+    @property
+    def name(self) -> str:
+        """Its path, for messages."""
+        ...
+
+    @property
+    def ports(self) -> Ports:
+        """The line alone."""
+        ...
+
+    @property
+    def clock(self) -> Clock:
+        """Its time."""
+        ...
+
+    @property
+    def latency_ns(self) -> int:
+        """What the adapter adds to each request, as far as that is known."""
+        ...
+
+    @property
+    def most_latency_ns(self) -> int:
+        """What it may add; a servo that is known to be there is awaited for so long."""
+        ...
+
+    def tune(self, baud_rate: int) -> bool:
+        """Go on at another rate, bit/s; say whether the adapter can. Raises PortError when it is gone."""
+        ...
+
+
+class TunablePort:
+    """A serial port, opened for this process alone; a context manager, which lets go of it.
+
+    Raises PortError when it cannot be opened: it is not there, or somebody else has it, and who that is.
+    """
+
+    def __init__(self, path: str) -> None:
+        self._serial = open_serial(path, FIRST_RATE)
+        self.name = path
+        self.clock: Clock = MonotonicClock()
+        self.ports: Ports = SerialPorts([SerialPort(self._serial.fileno(), path)])
+        shorten(self._serial, path, LATENCY_NS)
+        timer = latency_timer(path)
+        found_ns = 0 if timer is None else timer.found_ms * 1_000_000
+        self.latency_ns = max(LATENCY_NS, found_ns)
+        self.most_latency_ns = found_ns or MOST_LATENCY_NS
+
+    def __enter__(self) -> TunablePort:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._serial.close()
+
+    def tune(self, baud_rate: int) -> bool:
+        """Go on at another rate; what came at the old one and was not read is thrown away."""
+        try:
+            if self._serial.baudrate != baud_rate:
+                self._serial.baudrate = baud_rate
+            termios.tcflush(self._serial.fileno(), termios.TCIFLUSH)
+        except ValueError:  # pyserial, of a rate that the driver refuses
+            return False
+        except (OSError, termios.error) as error:
+            if error.args and error.args[0] == errno.EINVAL:
+                return False
+            raise PortError(f"{self.name} is gone ({error}): was the adapter unplugged?") from error
+        return True
+
+
+class Heard(NoPackets):
+    """Keeps who was heard on a line, whether awaited or not."""
+
+    def __init__(self) -> None:
+        self.ids: set[int] = set()
+        """Whose intact status packets came."""
+        self.noise = 0
+        """Bytes that belonged to no intact packet."""
+
+    def clear(self) -> None:
+        """Forget all that."""
+        self.ids.clear()
+        self.noise = 0
+
+    def packet(  # noqa: PLR0917  the contract of PacketSink
+        self, bus: int, kind: int, servo_id: int, first_ns: int, last_ns: int, data: Payload
+    ) -> None:
+        """Take what was sent or received."""
+        if kind == PacketKind.STATUS:
+            self.ids.add(servo_id)
+        elif kind == PacketKind.NOISE:
+            self.noise += len(data)
+
+
+class ToolLine:
+    """Runs programs on one line; `speak` comes first, and again for every other protocol or rate."""
+
+    def __init__(self, port: Tunable) -> None:
+        self.port = port
+        self.heard = Heard()
+        self.protocol = 0.0
+        self.baud_rate = 0
+        self.line: Line = Line(FIRST_RATE, port.most_latency_ns, LONGEST_RETURN_DELAY_NS)
+        """Makes transactions for the protocol and the rate that are spoken."""
+        self._bus: Bus | None = None
+
+    def speak(self, protocol: float, baud_rate: int) -> bool:
+        """Go on in a protocol, at a rate; say whether the adapter can, and stay as it was where not."""
+        if not self.port.tune(baud_rate):
+            return False
+        port, latency_ns = self.port, self.port.most_latency_ns
+        delay_ns = LONGEST_RETURN_DELAY_NS
+        plan = BusPlan(
+            port.name, port.name, protocol, baud_rate, latency_ns, delay_ns, (), (), (), (), (), _NOTHING
+        )
+        self.protocol, self.baud_rate = protocol, baud_rate
+        self.line = Line(baud_rate, latency_ns, delay_ns, dialect_of(protocol))
+        self._bus = Bus(0, plan, port.ports.ports[0], port.clock, self.heard)
+        return True
+
+    def can_run_at(self, baud_rate: int) -> bool:
+        """Try a rate, and go back to the one that is spoken."""
+        can = self.port.tune(baud_rate)
+        self.port.tune(self.baud_rate)
+        return can
+
+    def run(self, program: Program[Result], beat: Callable[[], None] = lambda: None) -> Result:
+        """Run a program to its end; raises PortError when the line is gone, or is none for servos."""
+        bus = self._bus
+        if bus is None:
+            raise LookupError("speak a protocol first")
+        (result,) = run([program], [bus], self.port.ports, self.port.clock, beat)
+        if bus.failure is not None or result is None:
+            raise bus.failure or PortError(f"{self.port.name}: nothing came of it")
+        return result
+
+    def wait(self, duration_ns: int) -> None:
+        """Let time pass, and hear what comes."""
+        self.run(_wait(duration_ns))
+
+
+def refuse_echo(name: str, reply: Reply) -> None:
+    """Raise PortError where the adapter gives back what it was sent: an echo looks like a servo's answer."""
+    if reply.echoed:
+        raise PortError(
+            f"the adapter at {name} echoes what it sends; use one that switches its receiver off while it "
+            "sends"
+        )
+
+
+def _wait(duration_ns: int) -> Program[bool]:
+    yield listen(duration_ns)
+    return True

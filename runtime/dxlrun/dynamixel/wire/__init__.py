@@ -1,0 +1,1 @@
+"""Wire: packets of both protocols and bytes, without I/O."""

@@ -1,0 +1,98 @@
+"""Dialect: what the two protocols have in common, so that bus, plan and start-up know neither of them.
+
+The modules `protocol1` and `protocol2` are the two dialects.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Protocol
+
+from dxlrun.dynamixel.wire import protocol1, protocol2
+from dxlrun.dynamixel.wire.transaction import Status
+
+Bytes = bytes | bytearray | memoryview
+
+
+class Dialect(Protocol):
+    """Packets of one protocol <-> bytes; pure functions, see the modules for what they raise."""
+
+    PROTOCOL: float
+    HEADER: bytes
+    OVERHEAD: int
+    CHECKSUM: int
+    ID_AT: int
+    LONGEST: int
+    HIGHEST_ID: int
+    PING_LENGTH: int
+    MOST_GOAL_BYTES: int
+    ALERT: int
+
+    def size_at(self, buffer: Bytes, start: int, end: int) -> int:
+        """Return the size of the packet whose header is at `start`: 0 is not known yet, -1 false header."""
+        ...
+
+    def intact(self, packet: memoryview) -> bool:
+        """Say whether the checksum of a whole packet is right."""
+        ...
+
+    def opened(self, packet: memoryview) -> Status | None:
+        """Take an intact packet apart; None when it cannot be a status."""
+        ...
+
+    def refused(self, error: int, length: int, awaited: int) -> bool:
+        """Say whether a status says that the instruction was not carried out."""
+        ...
+
+    def describe_error(self, error: int) -> str:
+        """Return the e-Manual's words for an error byte."""
+        ...
+
+    def widest(self, length: int) -> int:
+        """Return the most bytes that a status of `length` parameters has on the line."""
+        ...
+
+    def status_packet(self, servo_id: int, error: int = 0, parameters: bytes = b"") -> bytes:
+        """Return the status packet that a servo would send."""
+        ...
+
+    def ping(self, servo_id: int) -> bytes:
+        """Return the packet that asks whether a servo is there."""
+        ...
+
+    def read(self, servo_id: int, address: int, length: int) -> bytes:
+        """Return the packet that asks for a part of the control table."""
+        ...
+
+    def write(self, servo_id: int, address: int, data: bytes) -> bytes:
+        """Return the packet that writes a part of the control table."""
+        ...
+
+    def read_many(self, requests: Sequence[tuple[int, int, int]], *, fast: bool = False) -> bytes:
+        """Return the one packet that asks several servos, each by (ID, address, length)."""
+        ...
+
+    def fast_size(self, length: int, count: int) -> int:
+        """Return the bytes of the one status by which `count` servos answer a fast form."""
+        ...
+
+    def fast_answers(self, packet: Bytes, lengths: Sequence[int]) -> list[Status]:
+        """Return the servos' parts of such a status, those before the first broken one."""
+        ...
+
+    def sealed(self, body: bytes) -> bytes:
+        """Return a packet of everything that stands before its checksum."""
+        ...
+
+    def sync_write_records(self, address: int, length: int, records: Bytes) -> bytes:
+        """Return the packet that writes to several servos: ID and `length` bytes of each."""
+        ...
+
+
+_DIALECTS: Mapping[float, Dialect] = MappingProxyType({1.0: protocol1, 2.0: protocol2})
+
+
+def dialect_of(protocol: float) -> Dialect:
+    """Return the dialect of Protocol 1.0 or 2.0; raises LookupError for another one."""
+    return _DIALECTS[protocol]

@@ -1,0 +1,302 @@
+"""The log: records of the rings become MCAP messages; two runs on virtual time give the same bytes."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import IO, cast
+
+import msgspec
+import numpy as np
+from mcap.writer import CompressionType, Writer
+from numpy.typing import NDArray
+
+from dxlrun.log import schemas
+from dxlrun.log.cdr import ENCAPSULATION, Codec
+from dxlrun.log.diagnostics import Diagnostics
+from dxlrun.log.header import LogHeader, LogSummary, to_metadata
+from dxlrun.log.log_file import LogFile
+from dxlrun.log.schemas import MessageType
+from dxlrun.plurals import counted
+from dxlrun.run.channels.commands import CommandPieces
+from dxlrun.run.channels.cycle import CycleLayout
+from dxlrun.run.channels.events import Event, EventCode, Severity, decode_event
+from dxlrun.run.channels.packets import split_packets
+from dxlrun.run.channels.ring import Payload
+
+CHUNK_BYTES = 256 * 1024
+_PACKET = struct.Struct("<4sqqBBxxI")
+"""What precedes the bytes of a BUS_PACKET, as Codec packs it: nine of ten messages are packets."""
+_LIBRARY = "dxlrun"
+_MEDIA_TYPES = {".json": "application/json", ".yaml": "application/yaml", ".txt": "text/plain"}
+
+
+class LogWriter:
+    """Writes one log; takes the records of the rings as they come.
+
+    A disk that takes no more (OSError while writing) stops the writing, not the caller: the file is cut back
+    to its last whole chunk, `error` says why, later records are counted. Only a file that cannot be created
+    or begun raises OSError.
+    """
+
+    def __init__(self, path: Path, header: LogHeader) -> None:
+        self.header = header
+        self.error: str | None = None
+        self.late_metadata: dict[str, dict[str, str]] = {}
+        """Written at the end, beside the header's: what became known in the run."""
+        self._layout = CycleLayout(header.joints, [c.name for c in header.controllers])
+        self._file = LogFile(path)
+        self._messages = self._lost = self._unwritten = self._last_ns = 0
+        self._whole_bytes = self._whole_messages = 0
+        self._summary: LogSummary | None = None
+        self._first: tuple[int, bytes] | None = None
+        self._writer = Writer(
+            cast("IO[bytes]", self._file), chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD
+        )
+        self._sequences: dict[int, int] = {}
+        self._pieces = CommandPieces()
+        self._diagnostics = Diagnostics(header.joints)
+        self._event, self._ros_log, self._joint_state, self._command = (
+            Codec(message)
+            for message in (
+                schemas.EVENT,
+                schemas.ROS_LOG,
+                schemas.JOINT_STATE,
+                schemas.COMMAND,
+            )
+        )
+        try:
+            self._begin()
+        except BaseException:
+            self._file.close()
+            raise
+
+    def _begin(self) -> None:
+        header = self.header
+        self._writer.start(profile=schemas.PROFILE, library=_LIBRARY)
+        self._writer.add_metadata(schemas.METADATA_NAME, to_metadata(header))
+        for name, record in sorted(header.metadata.items()):
+            self._writer.add_metadata(name, dict(sorted(record.items())))
+        own = {schemas.HEADER_ATTACHMENT: msgspec.json.format(msgspec.json.encode(to_metadata(header)))}
+        for name, data in sorted({**header.attachments, **own}.items()):
+            media = _MEDIA_TYPES.get(Path(name).suffix, "application/octet-stream")
+            at_ns = max(0, header.epoch_offset_ns)
+            self._writer.add_attachment(at_ns, at_ns, name, media, data)
+        known: dict[str, int] = {}
+        self._cycle_channel = self._channel(known, schemas.CYCLE_TOPIC, schemas.CYCLE)
+        self._activation_channel = self._channel(known, schemas.ACTIVATION_TOPIC, schemas.CYCLE)
+        self._taken_channel = self._channel(known, schemas.COMMANDS_TOPIC, schemas.COMMAND)
+        self._states_channel = self._channel(known, schemas.JOINT_STATES_TOPIC, schemas.JOINT_STATE)
+        self._commands_channel = self._channel(known, schemas.JOINT_COMMANDS_TOPIC, schemas.JOINT_STATE)
+        self._diagnostics_channel = self._channel(known, schemas.DIAGNOSTICS_TOPIC, schemas.DIAGNOSTICS)
+        self._event_channel = self._channel(known, schemas.EVENT_TOPIC, schemas.EVENT)
+        self._rosout_channel = self._channel(known, schemas.ROSOUT_TOPIC, schemas.ROS_LOG)
+        self._bus_channels = [
+            self._channel(known, schemas.bus_topic(bus), schemas.BUS_PACKET) for bus in header.buses
+        ]
+        self._publishers = [
+            (
+                1 << index,
+                controller.joints,
+                np.array([header.joints.index(j) for j in controller.joints], int),
+            )
+            for index, controller in enumerate(header.controllers)
+            if schemas.JOINT_STATES_TOPIC in controller.publishes
+        ]
+        if header.robot_description is not None:
+            latched = {"offered_qos_profiles": schemas.LATCHED}
+            channel = self._channel(known, schemas.ROBOT_DESCRIPTION_TOPIC, schemas.STRING, latched)
+            self._first = (channel, Codec(schemas.STRING).pack(header.robot_description))
+        self._mark_whole()
+
+    def _channel(
+        self, known: dict[str, int], topic: str, message: MessageType, more: Mapping[str, str] | None = None
+    ) -> int:
+        if message.name not in known:
+            known[message.name] = self._writer.register_schema(
+                message.name, schemas.SCHEMA_ENCODING, message.text.encode()
+            )
+        channel = self._writer.register_channel(
+            topic,
+            schemas.ENCODING,
+            known[message.name],
+            {"topic_type_hash": message.type_hash, **(more or {})},
+        )
+        self._sequences[channel] = 0
+        return channel
+
+    def _add(self, channel: int, t_ns: int, data: bytes) -> None:
+        if self._first is not None:  # the run begins with its first record, not when the log is opened
+            first, self._first = self._first, None
+            self._add(first[0], t_ns, first[1])
+        wall_ns = max(0, t_ns + self.header.epoch_offset_ns)
+        sequence = self._sequences[channel]
+        self._sequences[channel] = sequence + 1
+        self._writer.add_message(channel, wall_ns, data, wall_ns, sequence & 0xFFFFFFFF)
+        self._messages += 1
+        self._last_ns = max(self._last_ns, t_ns)
+        if self._file.tell() != self._whole_bytes:
+            self._mark_whole()
+
+    def _mark_whole(self) -> None:
+        self._whole_bytes, self._whole_messages = self._file.tell(), self._messages
+
+    def _guarded(self, write: Callable[[], None]) -> None:
+        if self.error is not None:
+            self._unwritten += 1
+            return
+        try:
+            write()
+        except OSError as error:
+            self._give_up(error)
+
+    def _give_up(self, error: OSError) -> None:
+        self.error = f"writing the log stopped: {error.strerror or error}"
+        self._unwritten += self._messages - self._whole_messages + 1
+        self._messages = self._whole_messages
+        try:
+            self._file.truncate(self._whole_bytes)
+        except OSError:
+            return  # what lies behind the last whole chunk stays; a reader stops there
+
+    def cycle(self, payload: Payload) -> None:
+        """Write one cycle record: /cycle, the goals, and the states that controllers marked.
+
+        The record before the first cycle goes to /activation.
+        """
+        self._guarded(lambda: self._cycle(payload))
+
+    def _cycle(self, payload: Payload) -> None:
+        data = bytes(payload)
+        record = np.frombuffer(data, dtype=self._layout.dtype)[0]
+        written_ns, read_ns = int(record["written_ns"]), int(record["read_ns"])
+        if int(record["cycle"]) < 0:
+            self._add(self._activation_channel, written_ns, ENCAPSULATION + data)
+            return
+        self._add(self._cycle_channel, written_ns, ENCAPSULATION + data)
+        published = int(record["published"])
+        for bit, joints, rows in self._publishers:
+            if published & bit:
+                self._joint_states(read_ns, joints, record, rows)
+        goals = self._joint_state.pack(
+            (self._stamp(written_ns), ""),
+            self.header.joints,
+            record["goal_position"],
+            record["goal_velocity"],
+            record["goal_effort"],
+        )
+        self._add(self._commands_channel, written_ns, goals)
+        diagnostics = self._diagnostics.of(record, written_ns, self._stamp(written_ns))
+        if diagnostics is not None:
+            self._add(self._diagnostics_channel, written_ns, diagnostics)
+
+    def _joint_states(
+        self, t_ns: int, joints: tuple[str, ...], record: np.void, rows: NDArray[np.int_]
+    ) -> None:
+        stale = ~record["valid"][rows]
+        values = []
+        for name in ("position", "velocity", "effort"):
+            row = record[name][rows]
+            row[stale] = np.nan
+            values.append(row)
+        data = self._joint_state.pack((self._stamp(t_ns), ""), joints, *values)
+        self._add(self._states_channel, t_ns, data)
+
+    def _stamp(self, t_ns: int) -> tuple[int, int]:
+        return divmod(max(0, t_ns + self.header.epoch_offset_ns), 1_000_000_000)
+
+    def packets(self, payload: Payload) -> None:
+        """Write one batch of packets, each to its bus' topic."""
+        self._guarded(lambda: self._packets(payload))
+
+    def _packets(self, payload: Payload) -> None:
+        for bus, kind, servo_id, first_ns, last_ns, data in split_packets(payload):
+            head = _PACKET.pack(ENCAPSULATION, first_ns, last_ns, kind, servo_id, len(data))
+            self._add(self._bus_channels[bus], last_ns, head + data)
+
+    def command(self, payload: Payload) -> None:
+        """Write one command that a cycle took, when its last piece is there.
+
+        Raises ValueError for a piece whose predecessors were lost.
+        """
+        command = self._pieces.add(payload)
+        if command is None:
+            return
+        data = self._command.pack(
+            command.t_ns,
+            command.cycle,
+            command.planned,
+            command.lease_ns,
+            command.controller,
+            command.kind,
+            command.origin,
+            command.text,
+            command.numbers,
+        )
+        self._guarded(lambda: self._add(self._taken_channel, command.t_ns, data))
+
+    def event(self, payload: Payload) -> None:
+        """Write one event, to /events and /rosout."""
+        self._guarded(lambda: self._write_event(decode_event(payload)))
+
+    def _write_event(self, event: Event) -> None:
+        data = self._event.pack(
+            event.t_ns, event.code, event.severity, event.part, event.name, event.source, event.text
+        )
+        self._add(self._event_channel, event.t_ns, data)
+        log = self._ros_log.pack(
+            self._stamp(event.t_ns), event.severity, event.source, event.text, "", event.name, 0
+        )
+        self._add(self._rosout_channel, event.t_ns, log)
+
+    def gap(self, source: str, lost: int) -> None:
+        """Declare that `lost` records of `source` did not reach the log; it becomes an event."""
+        self._lost += lost
+        what = counted(lost, f"record of {source} was", f"records of {source} were")
+        them = "it" if lost == 1 else "them"
+        text = f"{what} overwritten or damaged before the recorder read {them}"
+        event = Event(self._last_ns, EventCode.RECORDER_GAP, Severity.ERROR, "recorder", text)
+        self._guarded(lambda: self._write_event(event))
+
+    def flush(self, *, sync: bool = False) -> None:
+        """Finish the chunk in progress, so that a reader finds it; with `sync`, wait for the disk."""
+        if self.error is not None:
+            return
+        try:
+            self._writer.flush()  # type: ignore[no-untyped-call]  # mcap does not annotate it
+            self._mark_whole()
+            if sync:
+                self._file.sync()
+        except OSError as error:
+            self._give_up(error)
+
+    def close(self) -> LogSummary:
+        """Finish the file and return what is in it; a second call returns the same.
+
+        Its error tells too when the file is not there any more.
+        """
+        if self._summary is not None:
+            return self._summary
+        if self.error is None:
+            try:
+                self._finish()
+            except OSError as error:
+                self._give_up(error)
+        if self._file.gone:
+            self.error = "its file was deleted or moved by another program during the run"
+        size = self._file.tell()
+        self._file.close()
+        self._summary = LogSummary(self._messages, size, self._lost, self.error, self._unwritten)
+        return self._summary
+
+    def _finish(self) -> None:
+        self._writer.flush()  # type: ignore[no-untyped-call]  # mcap does not annotate it
+        self._mark_whole()
+        for name, record in sorted(self.late_metadata.items()):
+            self._writer.add_metadata(name, dict(sorted(record.items())))
+        self._writer.add_metadata(
+            schemas.SUMMARY_NAME, {"messages": str(self._messages), "gaps": str(self._lost)}
+        )
+        self._writer.finish()  # type: ignore[no-untyped-call]  # mcap does not annotate it
+        self._file.sync()

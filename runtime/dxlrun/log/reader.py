@@ -1,0 +1,354 @@
+"""Reading a log: whole, unfinished after a kill, or damaged; what can be read is read, the rest is said."""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import IO, cast
+
+import lz4.frame
+import msgspec
+import numpy as np
+import zstandard
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Chunk, McapRecord, Metadata
+from mcap.stream_reader import StreamReader
+from numpy.typing import NDArray
+
+from dxlrun.errors import LogError
+from dxlrun.log import schemas
+from dxlrun.log.cdr import ENCAPSULATION, Codec
+from dxlrun.log.header import LoggedController, LogHeader, from_metadata
+from dxlrun.mode import Mode
+from dxlrun.run.channels.commands import TakenCommand, data_of
+from dxlrun.run.channels.cycle import CycleLayout
+from dxlrun.run.channels.events import Event
+from dxlrun.run.channels.packets import LoggedPacket, PacketKind
+
+_MAGIC = b"\x89MCAP0\r\n"
+_RECORD = struct.Struct("<BQ")
+_MESSAGE = struct.Struct("<HIQQ")
+_PACKET = struct.Struct("<qqBBxxI")
+_FOR_OTHERS = frozenset(
+    (
+        schemas.ROSOUT_TOPIC,
+        schemas.JOINT_STATES_TOPIC,
+        schemas.JOINT_COMMANDS_TOPIC,
+        schemas.DIAGNOSTICS_TOPIC,
+        schemas.ROBOT_DESCRIPTION_TOPIC,
+    )
+)
+"""What other tools read; the same stands in the other topics."""
+_DAMAGE = (McapError, zstandard.ZstdError, struct.error, UnicodeDecodeError, EOFError)
+UNREADABLE = (msgspec.MsgspecError, ValueError, RecursionError)
+"""What msgspec raises for JSON in a log (the plan, data of a command) that is damaged or too deep."""
+_LARGEST_CHUNK = 64 << 20
+"""Bytes of a chunk when decompressed; ours have 256 KiB and one message, those of other writers some MiB."""
+_MOST_EXPANDED = 256
+"""Bytes that a file may become for each of its own: logs of ours become 8 to 50 times as long."""
+
+
+@dataclass(slots=True)
+class _Found:
+    """What a walk through a file collects."""
+
+    channels: dict[int, str] = field(default_factory=dict)
+    needless: set[int] = field(default_factory=set)
+    """Channels whose messages are left where they are."""
+    messages: dict[int, list[bytes]] = field(default_factory=dict)
+    attachments: dict[str, bytes] = field(default_factory=dict)
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+    damage: list[str] = field(default_factory=list)
+    finished: bool = False
+    room: int = 0
+    """Bytes that the chunks which follow may have when they are decompressed."""
+    after: Callable[[_Found], None] = lambda found: None
+    """Called behind each chunk."""
+
+
+@dataclass(frozen=True)
+class Log:
+    """One run, as its log tells it. Times: ns of the run's clock; wall time = that + `epoch_offset_ns`."""
+
+    path: Path
+    header: LogHeader
+    cycles: NDArray[np.void]
+    """Shape (cycles,), read-only; fields of CycleLayout: scalars, and rows of joints or controllers."""
+    events: tuple[Event, ...]
+    attachments: dict[str, bytes]
+    metadata: dict[str, dict[str, str]]
+    complete: bool
+    """True when the recorder finished the file and nothing in it is damaged."""
+    damage: tuple[str, ...]
+    """A sentence for each thing that is missing or could not be read."""
+    packet_messages: tuple[tuple[int, tuple[bytes, ...]], ...]
+    """Undecoded packets by index of the bus; see `packets`."""
+    activation: NDArray[np.void] | None = None
+    """Shape (1,), as `cycles`: states and goals when the controllers were activated; None: not in the log."""
+    commands: tuple[TakenCommand, ...] = ()
+    """What cycles took for controllers and for the loop, in order."""
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Names of the joints, in the order of rows."""
+        return self.header.joints
+
+    @property
+    def buses(self) -> tuple[str, ...]:
+        """Names of the buses; a packet's `bus` is an index here."""
+        return self.header.buses
+
+    @property
+    def controllers(self) -> tuple[LoggedController, ...]:
+        """The controllers, in the order of the masks' bits."""
+        return self.header.controllers
+
+    @property
+    def period_ns(self) -> int:
+        """The nominal period of the loop, ns."""
+        return self.header.period_ns
+
+    @cached_property
+    def packets(self) -> tuple[LoggedPacket, ...]:
+        """Every packet of every bus, bus by bus as recorded; decoded at the first use. Raises LogError."""
+        try:
+            return tuple(_packet(bus, data) for bus, messages in self.packet_messages for data in messages)
+        except (ValueError, struct.error) as error:
+            raise LogError(f"{self.path}: a packet cannot be read: {error}") from error
+
+
+def read_log(path: str | Path) -> Log:
+    """Read a log of dxlrun. Raises LogError with one sentence when the file is none, is missing or empty."""
+    path = Path(path)
+    found = _opened(path, _Found())
+    return _log_of(path, found)
+
+
+def scan_log(path: str | Path, take: Callable[[Log], None]) -> Log:
+    """Read a log slice by slice, in memory that does not grow with it: `take` gets each as a log of its own.
+
+    A slice has the cycles, packets, events and commands of a chunk of the file; an event that goes on in the
+    next one is continued there by one of `part` > 0. Return what is left: a log without them, with all that
+    the file says of itself. Raises LogError as read_log, and where a packet of a slice cannot be read.
+    """
+    path = Path(path)
+
+    def slice_of(found: _Found) -> None:
+        if schemas.METADATA_NAME in found.metadata:
+            part = _log_of(path, replace(found, damage=[], finished=True))
+            found.messages.clear()
+            take(part)
+
+    found = _opened(path, _Found(after=slice_of))
+    return _log_of(path, replace(found, messages={}))
+
+
+def _opened(path: Path, found: _Found) -> _Found:
+    """Go through a file; raises LogError with one sentence when it is none, is missing or empty."""
+    try:
+        with path.open("rb") as stream:
+            size = os.fstat(stream.fileno()).st_size
+            if size == 0:
+                raise LogError(f"{path}: the file is empty; its recorder never began to write")
+            if stream.read(len(_MAGIC)) != _MAGIC:
+                raise LogError(f"{path}: this is no MCAP file, so it is no log of dxlrun")
+            _walk(stream, size, found)
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read: {error.strerror or error}") from error
+    return found
+
+
+def _log_of(path: Path, found: _Found) -> Log:
+    if schemas.METADATA_NAME not in found.metadata:
+        raise LogError(f"{path}: an MCAP file, but not written by dxlrun: it has no metadata 'dxlrun'")
+    try:
+        header = from_metadata(found.metadata[schemas.METADATA_NAME])
+        return _log(path, header, found)
+    except ValueError as error:
+        raise LogError(f"{path}: a log that this version of dxlrun cannot read: {error}") from error
+
+
+def _log(path: Path, header: LogHeader, found: _Found) -> Log:
+    by_topic: dict[str, list[bytes]] = {topic: [] for topic in found.channels.values()}
+    for channel, topic in found.channels.items():
+        by_topic[topic] += found.messages.get(channel, [])
+    layout = CycleLayout(header.joints, [controller.name for controller in header.controllers])
+    packets = tuple(
+        (index, tuple(by_topic.get(schemas.bus_topic(bus), ()))) for index, bus in enumerate(header.buses)
+    )
+    activation = by_topic.get(schemas.ACTIVATION_TOPIC, [])[:1]
+    if not found.finished:
+        found.damage.append("the file has no end: its recorder was killed, or could write no more")
+    return Log(
+        path=path,
+        header=header,
+        cycles=_cycles(layout, by_topic.get(schemas.CYCLE_TOPIC, [])),
+        events=_events(by_topic.get(schemas.EVENT_TOPIC, [])),
+        attachments=found.attachments,
+        metadata=found.metadata,
+        complete=not found.damage,
+        damage=tuple(found.damage),
+        packet_messages=packets,
+        activation=_cycles(layout, activation) if activation else None,
+        commands=_commands(by_topic.get(schemas.COMMANDS_TOPIC, [])),
+    )
+
+
+def _cycles(layout: CycleLayout, messages: list[bytes]) -> NDArray[np.void]:
+    size = len(ENCAPSULATION) + layout.size
+    if any(len(message) != size for message in messages):
+        raise ValueError("the messages of /cycle are not as long as joints and controllers ask")
+    bodies = b"".join(message[len(ENCAPSULATION) :] for message in messages)
+    array: NDArray[np.void] = np.frombuffer(bodies, dtype=layout.dtype)
+    unknown = np.flatnonzero((array["mode"] > max(Mode)).any(axis=1))
+    if len(unknown):
+        raise ValueError(f"cycle {array['cycle'][unknown[0]]} has a mode of a servo that is not known")
+    return array
+
+
+def _packet(bus: int, data: bytes) -> LoggedPacket:
+    head = len(ENCAPSULATION)
+    first_ns, last_ns, kind, servo_id, length = _PACKET.unpack_from(data, head)
+    start = head + _PACKET.size
+    return LoggedPacket(bus, PacketKind(kind), servo_id, first_ns, last_ns, data[start : start + length])
+
+
+def _commands(messages: list[bytes]) -> tuple[TakenCommand, ...]:
+    codec = Codec(schemas.COMMAND)
+    return tuple(
+        TakenCommand(
+            t_ns=cast("int", values["t_ns"]),
+            cycle=cast("int", values["cycle"]),
+            planned=cast("int", values["planned"]),
+            controller=str(values["controller"]),
+            kind=str(values["kind"]),
+            origin=str(values["origin"]),
+            data=data_of(
+                str(values["controller"]),
+                str(values["text"]),
+                cast("NDArray[np.float64]", values["data"]),
+            ),
+            lease_ns=cast("int", values["lease_ns"]),
+        )
+        for values in map(codec.unpack, messages)
+    )
+
+
+def _events(messages: list[bytes]) -> tuple[Event, ...]:
+    codec = Codec(schemas.EVENT)
+    events: list[Event] = []
+    for data in messages:
+        values = codec.unpack(data)
+        event = Event(
+            t_ns=cast("int", values["t_ns"]),
+            code=cast("int", values["code"]),
+            severity=cast("int", values["severity"]),
+            source=str(values["source"]),
+            text=str(values["text"]),
+            part=cast("int", values["part"]),
+        )
+        if event.part and events and (events[-1].t_ns, events[-1].code) == (event.t_ns, event.code):
+            last = events.pop()
+            event = Event(last.t_ns, last.code, last.severity, last.source, last.text + event.text)
+        events.append(event)
+    return tuple(events)
+
+
+def _walk(stream: IO[bytes], size: int, found: _Found) -> None:
+    """Go through the file from its start, record by record, until its end or to what cannot be read."""
+    found.room = _LARGEST_CHUNK + _MOST_EXPANDED * size
+    stream.seek(0)
+    reader = StreamReader(stream, emit_chunks=True, record_size_limit=size)
+    records: Iterator[McapRecord] = reader.records
+    while True:
+        try:
+            record = next(records, None)
+        except _DAMAGE as error:
+            at = stream.tell()
+            if at < size or not isinstance(error, struct.error | EOFError | McapError):
+                found.damage.append(f"what lies behind byte {at} cannot be read: {_said(error)}")
+            return
+        if record is None:
+            found.finished = True  # the footer and the magic bytes behind it were read
+            return
+        _take(record, found)
+
+
+def _take(record: McapRecord, found: _Found) -> None:
+    if isinstance(record, Chunk):
+        try:
+            _split(_decompressed(record, found), found)
+        except _DAMAGE as error:
+            damage = f"a chunk of messages is damaged and left out: {_said(error)}"
+            if damage not in found.damage:
+                found.damage.append(damage)
+        found.after(found)
+    elif isinstance(record, Attachment):
+        found.attachments[record.name] = record.data
+    elif isinstance(record, Metadata):
+        found.metadata[record.name] = record.metadata
+    elif isinstance(record, Channel):
+        _open_channel(record.id, record.topic, found)
+
+
+def _open_channel(identifier: int, topic: str, found: _Found) -> None:
+    found.channels[identifier] = topic
+    if topic in _FOR_OTHERS:
+        found.needless.add(identifier)
+
+
+def _decompressed(chunk: Chunk, found: _Found) -> bytes:
+    """Return the records of a chunk; EOFError when it is not what it says, or more than a log can have."""
+    size = chunk.uncompressed_size
+    if size > _LARGEST_CHUNK:
+        raise EOFError(f"it is {size} bytes long when decompressed, and a chunk has {_LARGEST_CHUNK} at most")
+    if size > found.room:
+        raise EOFError(f"the file becomes more than {_MOST_EXPANDED} times as long when decompressed")
+    found.room -= size
+    if chunk.compression == "zstd":
+        # not decompress(): it believes the length in the frame, whatever the chunk says
+        data = zstandard.ZstdDecompressor().stream_reader(chunk.data).read(size + 1)
+    elif chunk.compression == "lz4":
+        try:
+            data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
+        except RuntimeError as error:
+            raise EOFError(str(error)) from error
+    elif chunk.compression == "":
+        data = chunk.data
+    else:
+        raise EOFError(f"its compression {chunk.compression!r} is not known")
+    if len(data) != size:
+        raise EOFError("it is not as long as it says")
+    if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
+        raise EOFError("its bytes do not agree with their CRC")
+    return data
+
+
+def _split(data: bytes, found: _Found) -> None:
+    """Cut a chunk into its messages; several times faster than the library's objects."""
+    start, end = 0, len(data)
+    messages, needless, head = found.messages, found.needless, _RECORD.size + _MESSAGE.size
+    while start < end:
+        opcode, length = _RECORD.unpack_from(data, start)
+        body = start + _RECORD.size
+        start = body + length
+        if start > end:
+            raise EOFError("a record is longer than its chunk")
+        if opcode == Opcode.MESSAGE:
+            (channel,) = struct.unpack_from("<H", data, body)
+            if channel not in needless:
+                messages.setdefault(channel, []).append(data[body - _RECORD.size + head : start])
+        elif opcode == Opcode.CHANNEL:
+            identifier, _ = struct.unpack_from("<HH", data, body)
+            (text_length,) = struct.unpack_from("<I", data, body + 4)
+            _open_channel(identifier, data[body + 8 : body + 8 + text_length].decode(), found)
+
+
+def _said(error: Exception) -> str:
+    return str(error) or type(error).__name__

@@ -1,0 +1,297 @@
+"""Recorded: what a log gives a replay, judged: the plan, each cycle's inputs, and where they end."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, field, replace
+from importlib import metadata
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.control.controllers.controller import CONTRACT_VERSION
+from dxlrun.control.controllers.plugins import PlugIns
+from dxlrun.control.loop_plan import LoopPlan
+from dxlrun.control.policy_plan import PolicyName, PolicyPlan
+from dxlrun.errors import LogError
+from dxlrun.log.reader import UNREADABLE, Log
+from dxlrun.log.steered import Steered, policy_begun, steered, untold
+from dxlrun.run.channels.commands import TakenCommand
+from dxlrun.run.channels.events import EventCode
+
+PLAN = "plan.json"
+_LIBRARIES = ("dxlrun", "numpy")
+"""Whose version may change a command."""
+
+
+class _Begun(msgspec.Struct):
+    """Data of the command that tells of a policy."""
+
+    policy: PolicyName
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedPlan:
+    """The part of the plan in a log that a replay needs; how the buses were driven is none of it."""
+
+    robot: str
+    loop: LoopPlan
+    source_file: str
+    source_text: str
+    arguments: dict[str, str]
+    included: dict[str, str] = field(default_factory=dict)
+    urdf: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """The inputs of one run."""
+
+    log: Path
+    plan: RecordedPlan
+    loop: LoopPlan
+    """The plan's loop with those of its commands that cycles really took. It ends, skips periods and begins a
+    policy where the run did, not by itself."""
+    activation: np.void
+    """States and goals when the controllers were activated."""
+    start_ns: int
+    """Deadline of cycle 0."""
+    steered: tuple[Steered, ...]
+    """What clients asked of the loop."""
+    commands: tuple[TakenCommand, ...]
+    """All that cycles took."""
+    ends: int
+    """How many of `cycles` are before the steps of a policy; the controllers are not active in those."""
+    cycles: NDArray[np.void]
+    """Those that can be compared: from cycle 0 to the first that is missing."""
+    in_log: int
+    """All cycles that the log has."""
+    stopped: str
+    """Why those behind the last of `cycles` cannot be compared; empty when there are none."""
+    remarks: tuple[str, ...]
+
+
+def recorded(log: Log) -> Recorded:
+    """Return the inputs that a log holds. Raises LogError when it does not hold them from the start."""
+    plan = _plan(log)
+    cycles, path = log.cycles, log.path
+    if not len(cycles):
+        raise LogError(
+            f"{path}: there is nothing to replay: the loop finished no cycle, or the log lost them"
+        )
+    if log.activation is None:
+        raise LogError(
+            f"{path}: the log does not say with which states and goals the controllers began: "
+            "that message is lost, or its run was made by an older dxlrun"
+        )
+    activation = log.activation[0]
+    start_ns = int(activation["scheduled_ns"])
+    if int(cycles["cycle"][0]) != int(cycles["skipped"][0]):
+        raise LogError(
+            f"{path}: the log begins with cycle {int(cycles['cycle'][0])}: what the controllers did before "
+            "is lost, so nothing can be compared"
+        )
+    _check_times(log, start_ns, plan.loop.period_ns)
+    usable, stopped = _until_gap(log)
+    usable, ends, stopped = _until_policy(log, usable, stopped)
+    remarks = () if log.complete else log.damage
+    return Recorded(
+        log=path,
+        plan=plan,
+        loop=_loop(log, plan.loop),
+        activation=activation,
+        start_ns=start_ns,
+        steered=steered(log),
+        commands=log.commands,
+        ends=ends,
+        cycles=cycles[:usable],
+        in_log=len(cycles),
+        stopped=stopped,
+        remarks=remarks,
+    )
+
+
+def version_remarks(log: Log, loop: LoopPlan, plugins: PlugIns) -> tuple[str, ...]:
+    """Return a sentence for each part that has another version than in the recorded run."""
+    then = log.metadata.get("versions", {})
+    sentences = []
+    for name in _LIBRARIES:
+        now = metadata.version(name)
+        if then.get(name, now) != now:
+            sentences.append(f"{name} was {then[name]} in the run and is {now} in the replay")
+    for was in sorted({(plan.type, plan.distribution) for plan in loop.controllers}):
+        offer = plugins.controllers.get(was[0])
+        if offer is not None and offer.distribution != was[1]:
+            sentences.append(
+                f"the controller type {was[0]} came from {was[1]} in the run and comes from "
+                f"{offer.distribution} in the replay"
+            )
+    return tuple(sentences)
+
+
+def _plan(log: Log) -> RecordedPlan:
+    contract = log.metadata.get("versions", {}).get("contract", str(CONTRACT_VERSION))
+    if contract != str(CONTRACT_VERSION):
+        raise LogError(
+            f"{log.path}: the run's controllers were made for contract {contract}, this dxlrun has contract "
+            f"{CONTRACT_VERSION}: replay it with the dxlrun that made it, {_version(log)}"
+        )
+    data = log.attachments.get(PLAN)
+    if data is None:
+        raise LogError(f"{log.path}: the log has no attachment {PLAN}, so nobody knows its controllers")
+    try:
+        plan = msgspec.json.decode(data, type=RecordedPlan)
+    except UNREADABLE as error:
+        raise LogError(
+            f"{log.path}: the plan in the log is not one of this dxlrun ({error}): replay it with the dxlrun "
+            f"that made it, {_version(log)}"
+        ) from error
+    if tuple(joint.name for joint in plan.loop.joints) != log.joints:
+        raise LogError(f"{log.path}: the plan in the log has other joints than its cycles")
+    if tuple(controller.name for controller in plan.loop.controllers) != tuple(
+        controller.name for controller in log.controllers
+    ):
+        raise LogError(f"{log.path}: the plan in the log has other controllers than its cycles")
+    _check_controllers(log, plan.loop)
+    return plan
+
+
+def _check_controllers(log: Log, loop: LoopPlan) -> None:
+    """Refuse controllers that no compiler has made: with an unknown joint, or a rate divider below 1."""
+    for controller in loop.controllers:
+        unknown = set(controller.joints) - set(log.joints)
+        if unknown or controller.every < 1:
+            what = f"no joint {min(unknown)}" if unknown else f"no rate divider {controller.every}"
+            raise LogError(
+                f"{log.path}: there is {what}, as controller {controller.name} has it in the plan: "
+                "the log is damaged"
+            )
+
+
+def _version(log: Log) -> str:
+    return f"version {log.metadata.get('versions', {}).get('dxlrun', 'unknown')}"
+
+
+def _check_times(log: Log, start_ns: int, period_ns: int) -> None:
+    """Refuse times that no loop can have had; a replay would follow them without an end.
+
+    The time between two deadlines is as many periods as their numbers say; another period begins only in a
+    cycle that took a change of the rate, and none is known where cycles are lost.
+    """
+    cycles = log.cycles
+    number, due, woken = cycles["cycle"], cycles["scheduled_ns"], cycles["woken_ns"]
+    passed = np.diff(number, prepend=0)
+    elapsed_ns = np.diff(due, prepend=start_ns)
+    changes = [command.cycle for command in log.commands if command.for_loop and command.kind == "rate"]
+    begins = np.unique(np.searchsorted(number, changes, side="right"))
+    begins = begins[begins < len(number)]
+    unknown = begins[passed[begins] != 1 + cycles["skipped"][begins]]
+    period = np.full(len(number), period_ns)
+    for first, end in itertools.pairwise([*np.union1d(begins, unknown + 1).tolist(), len(number)]):
+        period[first:end] = elapsed_ns[first] // max(int(passed[first]), 1) if first < end else 0
+    uneven = elapsed_ns != passed * period
+    uneven[unknown] = False
+    wrong = (woken < due) | (cycles["read_ns"] < woken) | uneven
+    wrong[1:] |= passed[1:] <= 0
+    _check_commands(log)
+    if wrong.any():
+        raise LogError(
+            f"{log.path}: the times of cycle {int(number[int(np.argmax(wrong))])} contradict its number: "
+            "the log is damaged"
+        )
+
+
+def _check_commands(log: Log) -> None:
+    """Refuse a command whose time is not that of the cycle that took it."""
+    woken = dict(zip(log.cycles["cycle"].tolist(), log.cycles["woken_ns"].tolist(), strict=True))
+    policy = policy_begun(log)
+    for command in log.commands:
+        if command is not policy and woken.get(command.cycle, command.t_ns) != command.t_ns:
+            raise LogError(
+                f"{log.path}: a command ({command.kind}) that cycle {command.cycle} took has not its time: "
+                "the log is damaged"
+            )
+
+
+def _until_gap(log: Log) -> tuple[int, str]:
+    """Return how many cycles can be compared, and a sentence on why not more."""
+    cycles = log.cycles
+    number = cycles["cycle"]
+    usable, stopped = len(cycles), ""
+    lost = np.flatnonzero(number[1:] != number[:-1] + 1 + cycles["skipped"][1:])
+    if len(lost):
+        usable = int(lost[0]) + 1
+        first, last = int(number[usable - 1]) + 1, int(number[usable]) - 1
+        stopped = f"the log misses cycles between {first} and {last}"
+    held = np.zeros(len(cycles), dtype=np.int64)
+    at = {int(cycle): index for index, cycle in enumerate(number)}
+    for command in log.commands:
+        if command.cycle in at and not command.for_loop:
+            held[at[command.cycle]] += 1
+    missing = held < cycles["command_count"]
+    missing[[at[cycle] for cycle in untold(log)]] = True
+    short = np.flatnonzero(missing)
+    if len(short) and int(short[0]) < usable:
+        usable = int(short[0])
+        stopped = f"the log misses a command that cycle {int(number[usable])} took"
+    if stopped:
+        gaps = [event.text for event in log.events if event.code == EventCode.RECORDER_GAP]
+        because = f" ({gaps[0]})" if gaps else ""
+        stopped += (
+            f"{because}; what the controllers knew after that is lost, so from cycle "
+            f"{int(number[usable])} on nothing is compared"
+        )
+    if not usable:
+        raise LogError(f"{log.path}: {stopped}")
+    return usable, stopped
+
+
+def _until_policy(log: Log, usable: int, stopped: str) -> tuple[int, int, str]:
+    """Return how many cycles can be compared, how many of them are the controllers', and why not more.
+
+    A cycle in which a bus failed is not in the log, but the time of the one after it counts from it.
+    """
+    cycles, policy = log.cycles, policy_begun(log)
+    if policy is None:
+        told = [
+            event.t_ns for event in log.events if (event.code, event.source) == (EventCode.POLICY, "loop")
+        ]
+        ends = int(np.searchsorted(cycles["woken_ns"], told[0], side="right")) if told else usable
+        if ends >= usable:
+            return usable, usable, stopped
+        return ends, ends, f"the log misses in which cycle a policy began after cycle {ends - 1}"
+    ends = min(usable, int(np.searchsorted(cycles["cycle"], policy.cycle)))
+    if 0 < ends < usable:
+        passed_ns = int(cycles["woken_ns"][ends]) - int(cycles["woken_ns"][ends - 1])
+        if policy.t_ns != int(cycles["woken_ns"][ends - 1]) and int(cycles["period_ns"][ends]) < passed_ns:
+            return ends, ends, f"a bus failed in cycle {policy.cycle}; what came after it is not compared"
+    return usable, ends, stopped
+
+
+def _loop(log: Log, plan: LoopPlan) -> LoopPlan:
+    """Return the loop as the replay runs it: what time and signals decided in the run is in the log."""
+    taken = {command.planned for command in log.commands if command.planned >= 0}
+    if beyond := sorted(number for number in taken if number >= len(plan.commands)):
+        cycle = next(command.cycle for command in log.commands if command.planned == beyond[0])
+        raise LogError(f"{log.path}: cycle {cycle} took a command that the plan in the log has not")
+    return replace(
+        plan,
+        commands=tuple(command for number, command in enumerate(plan.commands) if number in taken),
+        end_ns=None,
+        overrun="skip",
+        policies=_policies(log, plan.policies),
+    )
+
+
+def _policies(log: Log, policies: PolicyPlan) -> PolicyPlan:
+    """Let the run's own policy begin where it is stopped."""
+    begun = policy_begun(log)
+    if begun is None:
+        return policies
+    try:
+        name = msgspec.json.decode(begun.data, type=_Begun).policy
+    except UNREADABLE as error:
+        raise LogError(f"{log.path}: the log does not say which policy began: {error}") from error
+    return replace(policies, on_exit=policies.named(name))

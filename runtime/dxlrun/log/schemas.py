@@ -1,0 +1,209 @@
+"""Topics and messages of the log: the one place that knows them.
+
+Messages are ROS 2 definitions (`ros2msg`), encoded as CDR little-endian, so that rosbag2, Foxglove,
+PlotJuggler and Rerun open a log without conversion. Every channel carries the RIHS01 hash of its type (REP
+2016); the hashes of our own messages are constants here, and a test computes them anew.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from dxlrun.run.channels.cycle import SCALARS, SEQUENCES
+
+PROFILE = "ros2"
+ENCODING = "cdr"
+SCHEMA_ENCODING = "ros2msg"
+
+CYCLE_TOPIC = "/cycle"
+ACTIVATION_TOPIC = "/activation"
+"""One message of the type of /cycle: the states and goals with which the controllers were activated."""
+COMMANDS_TOPIC = "/commands"
+EVENT_TOPIC = "/events"
+ROSOUT_TOPIC = "/rosout"
+JOINT_STATES_TOPIC = "/joint_states"
+JOINT_COMMANDS_TOPIC = "/joint_commands"
+DIAGNOSTICS_TOPIC = "/diagnostics"
+ROBOT_DESCRIPTION_TOPIC = "/robot_description"
+BUS_PREFIX = "/bus/"
+
+METADATA_NAME = "dxlrun"
+"""The metadata record that makes an MCAP file a log of dxlrun."""
+SUMMARY_NAME = "dxlrun_summary"
+"""The metadata record that a finished log ends with."""
+FAILURES_NAME = "failures"
+"""The metadata record with what failed in the run outside of the loop, one sentence each."""
+HEADER_ATTACHMENT = "header.json"
+FORMAT = "3"
+"""Grows when a reader of the version before would misread a log."""
+
+_RULE = "=" * 80
+
+
+@dataclass(frozen=True, slots=True)
+class MessageType:
+    """A message: its full name, its definition with all it depends on, its RIHS01 hash."""
+
+    name: str
+    text: str
+    type_hash: str
+
+
+def bus_topic(bus: str) -> str:
+    """Return the topic of a bus' packets."""
+    return f"{BUS_PREFIX}{bus}"
+
+
+_TIME = f"""
+{_RULE}
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+"""
+
+JOINT_STATE = MessageType(
+    "sensor_msgs/msg/JointState",
+    f"""std_msgs/Header header
+string[] name
+float64[] position
+float64[] velocity
+float64[] effort
+{_RULE}
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+{_TIME.strip()}
+""",
+    "RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e",
+)
+
+ROS_LOG = MessageType(
+    "rcl_interfaces/msg/Log",
+    f"""builtin_interfaces/Time stamp
+uint8 level
+string name
+string msg
+string file
+string function
+uint32 line
+{_TIME.strip()}
+""",
+    "RIHS01_e28ce254ca8abc06abf92773b74602cdbf116ed34fbaf294fb9f81da9f318eac",
+)
+
+
+DIAGNOSTICS = MessageType(
+    "diagnostic_msgs/msg/DiagnosticArray",
+    f"""std_msgs/Header header
+diagnostic_msgs/DiagnosticStatus[] status
+{_RULE}
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+{_TIME.strip()}
+{_RULE}
+MSG: diagnostic_msgs/DiagnosticStatus
+# 0 OK, 1 warning, 2 error, 3 stale
+byte level
+string name
+string message
+string hardware_id
+diagnostic_msgs/KeyValue[] values
+{_RULE}
+MSG: diagnostic_msgs/KeyValue
+string key
+string value
+""",
+    "RIHS01_5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e",
+)
+
+STRING = MessageType(
+    "std_msgs/msg/String",
+    "string data\n",
+    "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
+)
+
+_FOREVER = "sec: 9223372036\n    nsec: 854775807"
+LATCHED = f"""- history: 1
+  depth: 1
+  reliability: 1
+  durability: 1
+  deadline:
+    {_FOREVER}
+  lifespan:
+    {_FOREVER}
+  liveliness: 1
+  liveliness_lease_duration:
+    {_FOREVER}
+  avoid_ros_namespace_conventions: false"""
+"""Quality of service as rosbag2 writes it: keep last, reliable, transient local, so that who comes later gets
+the message too. The integers are those of rmw/types.h; older rosbag2 reads no words here."""
+
+
+def _cycle_text() -> str:
+    lines = [
+        "# One cycle of the loop. Times: ns of the run's clock; wall time = that + epoch_offset_ns",
+        "# of the metadata. Rows: in the order of the metadata's joints and controllers; rad, rad/s;",
+        "# effort: Nm, A or the fraction of maximum; pwm: fraction of the full voltage; deg C, V.",
+        "# NaN = not known or not commanded. active, published: bit i is controller i. clamped:",
+        "# 1 lower, 2 upper, 4 step, 8 velocity, 16 not finite, 32 effort, 64 pwm, 128 outward.",
+        "# hardware_error: bits of Hardware Error Status, or states of Protocol 1.0's ERR. mode: 0 not",
+        "# known, 1 position, 2 velocity, 3 effort, 4 pwm, 5 position with an effort limit.",
+        "# Records + skipped = elapsed periods.",
+    ]
+    lines += [f"{kind} {name}" for name, kind in SCALARS]
+    lines += [f"{kind}[] {name}" for name, kind, _ in SEQUENCES]
+    return "\n".join(lines) + "\n"
+
+
+CYCLE = MessageType(
+    "dxlrun_msgs/msg/Cycle",
+    _cycle_text(),
+    "RIHS01_10c0e4036b7ed80a34c95410e76aefc8bbdff6fb7693d76c4c1107fc25373d6c",
+)
+
+BUS_PACKET = MessageType(
+    "dxlrun_msgs/msg/BusPacket",
+    """# Bytes on a bus. kind: 1 instruction, 2 status, 3 noise. Times, ns of the run's clock: of an
+# instruction before and after its write(); else after the read() that brought the first and the last byte.
+int64 first_ns
+int64 last_ns
+uint8 kind
+uint8 servo_id
+uint8[] data
+""",
+    "RIHS01_a1803896530c41f5f48b1dbd1edaf11340e05121807c1416d4514e70af7f50f8",
+)
+
+EVENT = MessageType(
+    "dxlrun_msgs/msg/Event",
+    """# Something that happened beside the regular cycle. part: 0; 1, 2 ... for what follows of a long text.
+int64 t_ns
+uint16 code
+uint8 severity
+uint8 part
+string name
+string source
+string text
+""",
+    "RIHS01_52b75cd08e34ca10ea5c06c64fbfeb30f3e85c73af0478f1ca6c1b3aafb5d98e",
+)
+
+COMMAND = MessageType(
+    "dxlrun_msgs/msg/Command",
+    """# A command that a cycle took, for a controller or (no name) for the loop itself; an event says when it
+# was refused. t_ns: of the cycle's wake-up. planned: its number in the commands of plan.json, whose
+# array it is; -1: the array is data. lease_ns: for how long a set-point of a stream counts; 0: for ever.
+# text: JSON for the loop; for a controller empty, or in hexadecimal what is no array of numbers.
+int64 t_ns
+int64 cycle
+int64 planned
+int64 lease_ns
+string controller
+string kind
+string origin
+string text
+float64[] data
+""",
+    "RIHS01_7dd2e55f1fcd868f64d4cb24f352e0436dd8e8a6037b4115b0e01c0a29f89f1a",
+)

@@ -1,0 +1,93 @@
+"""What was steered, as a log tells it: each command from outside, and what became of it."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from dxlrun.log.reader import Log
+from dxlrun.run.channels.commands import TakenCommand
+from dxlrun.run.channels.events import Event, EventCode
+
+POLICY = "policy"
+"""Kind of the command that the loop leaves in the log when it begins a policy's steps."""
+_LOOP = "loop"
+_REFUSED = " refused: "
+
+
+@dataclass(frozen=True, slots=True)
+class Steered:
+    """One command that no plan foresaw."""
+
+    command: TakenCommand
+    refusal: str
+    """Why nothing was done; empty where it was done, or where the event that tells it is lost."""
+
+
+def steered(log: Log) -> tuple[Steered, ...]:
+    """Return every command that came from outside, with what became of it, in the order of the cycles."""
+    told = _told(log)
+    last = policy_begun(log)
+    found = []
+    for command in log.commands:
+        if command.planned < 0 and command is not last:
+            found.append(Steered(command, _refusal(command, told.get(command.cycle, deque()))))
+    return tuple(found)
+
+
+def policy_begun(log: Log) -> TakenCommand | None:
+    """Return what tells in which cycle the steps of a policy begin; None where no policy had any.
+
+    The loop says it before that cycle wakes up; a client's command of this kind has the cycle's own time.
+    """
+    last = log.commands[-1] if log.commands else None
+    if last is None or not last.for_loop or (last.kind, last.origin) != (POLICY, _LOOP):
+        return None
+    woken = log.cycles["woken_ns"][log.cycles["cycle"] == last.cycle]
+    return None if len(woken) and int(woken[0]) <= last.t_ns else last
+
+
+def untold(log: Log) -> tuple[int, ...]:
+    """Return the cycles of which events tell more commands for the loop than the log has."""
+    named_loop = any(controller.name == _LOOP for controller in log.controllers)
+    held: dict[int, int] = {}
+    for command in log.commands:
+        if command.for_loop or (named_loop and command.controller == _LOOP):
+            held[command.cycle] = held.get(command.cycle, 0) + 1
+    missing = (
+        cycle
+        for cycle, events in _told(log).items()
+        if sum(event.source == _LOOP for event in events) > held.get(cycle, 0)
+    )
+    return tuple(sorted(missing))
+
+
+def _told(log: Log) -> dict[int, deque[Event]]:
+    """Return the events that answer commands, by the cycle in which they happened."""
+    woken, updated, numbers = (log.cycles[name] for name in ("woken_ns", "updated_ns", "cycle"))
+    told: dict[int, deque[Event]] = {}
+    for event in log.events:
+        if event.code not in (EventCode.STEERED, EventCode.COMMAND_REFUSED):
+            continue
+        index = int(np.searchsorted(woken, event.t_ns, side="right")) - 1
+        if index >= 0 and event.t_ns <= updated[index]:
+            told.setdefault(int(numbers[index]), deque()).append(event)
+    return told
+
+
+def _refusal(command: TakenCommand, told: deque[Event]) -> str:
+    """Take the answer to a command out of those of its cycle; a controller's is there only if it refused."""
+    source = command.controller or _LOOP
+    for event in told:
+        if event.source != source or not event.text.startswith(command.kind):
+            continue
+        refused = f"{command.origin}{_REFUSED}"
+        if event.code == EventCode.STEERED and command.for_loop:
+            told.remove(event)
+            return ""
+        if event.code == EventCode.COMMAND_REFUSED and refused in event.text:
+            told.remove(event)
+            return event.text.split(refused, 1)[1]
+    return ""

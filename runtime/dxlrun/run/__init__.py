@@ -1,0 +1,1 @@
+"""Run: the processes of a robot, from the terminal to the loop."""

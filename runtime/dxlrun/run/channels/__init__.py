@@ -1,0 +1,1 @@
+"""Channels: what crosses between processes, and the shared memory in which it does."""

@@ -1,0 +1,260 @@
+"""One cycle of the loop: the layout of its record; the record's memory is the arrays that the loop works on.
+
+The bytes of a record are, as they are, the CDR body (little-endian, after the encapsulation header) of the
+message dxlrun_msgs/msg/Cycle of the log: scalars of 64 bits, then sequences, each with its length of 32 bits
+in front and aligned as its elements ask. So the loop fills arrays, the ring copies once, and the recorder
+writes what it finds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import IntFlag, unique
+from typing import Any
+
+import numpy as np
+from numpy.lib.stride_tricks import as_strided
+from numpy.typing import NDArray
+
+from dxlrun.interfaces import COMMAND_INTERFACES, Commands, Floats, States
+from dxlrun.run.channels.ring import RING_SECONDS
+
+MOST_CONTROLLERS = 63
+
+SCALARS: tuple[tuple[str, str], ...] = (
+    ("cycle", "int64"),
+    ("scheduled_ns", "int64"),
+    ("woken_ns", "int64"),
+    ("read_ns", "int64"),
+    ("updated_ns", "int64"),
+    ("written_ns", "int64"),
+    ("period_ns", "int64"),
+    ("skipped", "int64"),
+    ("active", "uint64"),
+    ("published", "uint64"),
+    ("command_count", "int64"),
+)
+"""Name and type of the fields that a cycle has once."""
+
+SEQUENCES: tuple[tuple[str, str, str], ...] = (
+    ("position", "float64", "joints"),
+    ("velocity", "float64", "joints"),
+    ("effort", "float64", "joints"),
+    ("age_ns", "int64", "joints"),
+    ("command_position", "float64", "joints"),
+    ("command_velocity", "float64", "joints"),
+    ("command_effort", "float64", "joints"),
+    ("command_pwm", "float64", "joints"),
+    ("goal_position", "float64", "joints"),
+    ("goal_velocity", "float64", "joints"),
+    ("goal_effort", "float64", "joints"),
+    ("goal_pwm", "float64", "joints"),
+    ("temperature", "float64", "joints"),
+    ("voltage", "float64", "joints"),
+    ("controller_ns", "int64", "controllers"),
+    ("valid", "bool", "joints"),
+    ("clamped", "uint8", "joints"),
+    ("hardware_error", "uint8", "joints"),
+    ("mode", "uint8", "joints"),
+)
+"""Name, element type and what it has one element of."""
+
+
+@unique
+class Clamp(IntFlag):
+    """What the last gate did to a joint's command in a cycle; the bits are in the log."""
+
+    LOWER = 1
+    """Raised to the lower position limit."""
+    UPPER = 2
+    """Lowered to the upper position limit."""
+    STEP = 4
+    """The change since the last goal was cut to the step limit."""
+    VELOCITY = 8
+    """The velocity was cut to the velocity limit."""
+    NOT_FINITE = 16
+    """NaN after a finite value, or infinite: the last goal was kept, the controller is at fault."""
+    EFFORT = 32
+    """The effort was cut to the effort limit."""
+    PWM = 64
+    """The PWM was cut to the full voltage."""
+    OUTWARD = 128
+    """A velocity, an effort or a PWM that leads out of the position limits was cut, at the end to 0."""
+
+
+class CycleLayout:
+    """The numpy dtype of a robot's cycle record; rows are in the order of the plan's joints and controllers.
+
+    Raises ValueError for more than 63 controllers (they are bits of a mask).
+    """
+
+    __slots__ = ("controllers", "dtype", "joints", "lengths", "places")
+
+    def __init__(self, joints: Sequence[str], controllers: Sequence[str]) -> None:
+        if len(controllers) > MOST_CONTROLLERS:
+            raise ValueError(f"at most {MOST_CONTROLLERS} controllers, not {len(controllers)}")
+        self.joints = tuple(joints)
+        self.controllers = tuple(controllers)
+        counts = {"joints": len(self.joints), "controllers": len(self.controllers)}
+        names = [name for name, _ in SCALARS]
+        formats: list[Any] = [np.dtype(kind).newbyteorder("<") for _, kind in SCALARS]
+        offsets = [8 * index for index in range(len(SCALARS))]
+        end = 8 * len(SCALARS)
+        self.lengths: dict[str, int] = {}
+        self.places: dict[str, slice] = {}
+        """The bytes of each sequence's elements in a record."""
+        for name, kind, per in SEQUENCES:
+            element = np.dtype(kind).newbyteorder("<")
+            count = counts[per]
+            self.lengths[f"{name}_length"] = count
+            at = -(-end // 4) * 4
+            # An empty CDR sequence is its length alone: nothing follows that would have to be aligned.
+            body = -(-(at + 4) // element.itemsize) * element.itemsize if count else at + 4
+            names += [f"{name}_length", name]
+            formats += [np.dtype("<u4"), (element, (count,))]
+            offsets += [at, body]
+            end = body + count * element.itemsize
+            self.places[name] = slice(body, end)
+        self.dtype: np.dtype[np.void] = np.dtype(
+            {"names": names, "formats": formats, "offsets": offsets, "itemsize": end}
+        )
+
+    @property
+    def size(self) -> int:
+        """Bytes of one record: the slot size of the cycles' ring."""
+        return self.dtype.itemsize
+
+
+class _Word:
+    """A scalar field of 64 bits, by its index in the record."""
+
+    __slots__ = ("_index",)
+
+    def __init__(self, index: int) -> None:
+        self._index = index
+
+    def __get__(self, record: CycleRecord, owner: type[CycleRecord]) -> int:
+        return record.words[self._index]
+
+    def __set__(self, record: CycleRecord, value: int) -> None:
+        record.words[self._index] = value
+
+
+class CycleRecord:
+    """One cycle's memory, filled again and again: the arrays that hardware, controllers and gate share.
+
+    Times are int64 ns of the run's clock, shape of arrays is (joints,) or (controllers,).
+    """
+
+    __slots__ = (
+        "_renewed",
+        "clamped",
+        "commands",
+        "controller_ns",
+        "goals",
+        "layout",
+        "raw",
+        "states",
+        "words",
+    )
+
+    cycle = _Word(0)
+    """Number of the period since the loop's first deadline, skipped ones counted."""
+    scheduled_ns = _Word(1)
+    """The deadline of this cycle: start + cycle * period."""
+    woken_ns = _Word(2)
+    """After the wake-up."""
+    read_ns = _Word(3)
+    """After the states were read."""
+    updated_ns = _Word(4)
+    """After the controllers and the gate."""
+    written_ns = _Word(5)
+    """After the goals were sent."""
+    period_ns = _Word(6)
+    """The true time since the cycle before, as controllers saw it, capped."""
+    skipped = _Word(7)
+    """Whole periods that were declared skipped before this cycle."""
+    active = _Word(8)
+    """Bit i: controller i is active."""
+    published = _Word(9)
+    """Bit i: controller i marked this cycle for the topics it publishes."""
+    command_count = _Word(10)
+    """Commands handed to controllers in this cycle."""
+
+    def __init__(self, layout: CycleLayout) -> None:
+        self.layout = layout
+        array: NDArray[np.void] = np.zeros(1, dtype=layout.dtype)
+        for name, count in layout.lengths.items():
+            array[name] = count
+        self.raw: memoryview = array.view(np.uint8).data
+        """The bytes of the record; a view, not a copy."""
+        self.words: memoryview = self.raw[: 8 * len(SCALARS)].cast("q")
+        self.states = States(
+            motion=_rows(array, "position", 3),
+            valid=array["valid"][0],
+            age_ns=array["age_ns"][0],
+            temperature=_row(array, "temperature"),
+            voltage=_row(array, "voltage"),
+            hardware_error=array["hardware_error"][0],
+            mode=array["mode"][0],
+        )
+        """What the servos said."""
+        self.commands = Commands(_rows(array, "command_position", len(COMMAND_INTERFACES)))
+        """What the controllers want, merged; NaN = not commanded."""
+        self.goals = Commands(_rows(array, "goal_position", len(COMMAND_INTERFACES)))
+        """What goes to the servos, after the last gate."""
+        self.controller_ns: NDArray[np.int64] = array["controller_ns"][0]
+        """How long each controller's update took; 0 where it was not updated in this cycle."""
+        self.clamped: NDArray[np.uint8] = array["clamped"][0]
+        """Bits of Clamp, one element a joint."""
+        for name, kind, per in SEQUENCES:
+            if kind == "float64" and per == "joints":
+                array[name] = np.nan
+        self.states.age_ns[:] = -1
+        self._renewed = tuple(
+            (self.raw[place], bytes(place.stop - place.start))
+            for place in (layout.places["clamped"], layout.places["controller_ns"])
+        )
+
+    def renew(self) -> None:
+        """Begin a cycle: nothing was published, taken, clamped or updated in it yet."""
+        words = self.words
+        words[9] = words[10] = 0
+        for part, nothing in self._renewed:
+            part[:] = nothing
+
+    def wake(self, cycle: int, scheduled_ns: int, woken_ns: int, period_ns: int) -> None:
+        """Take what is known of a cycle when it begins."""
+        words = self.words
+        words[0], words[1], words[2], words[6] = cycle, scheduled_ns, woken_ns, period_ns
+
+    def tell(self, read_ns: int, updated_ns: int, written_ns: int) -> None:
+        """Take when the parts of a cycle ended."""
+        words = self.words
+        words[3], words[4], words[5] = read_ns, updated_ns, written_ns
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """True where this cycle's reply arrived intact."""
+        return self.states.valid
+
+    @property
+    def age_ns(self) -> NDArray[np.int64]:
+        """Time since the reply that the row shows arrived; -1 while none ever did."""
+        return self.states.age_ns
+
+
+def _row(array: NDArray[np.void], name: str) -> Floats:
+    row: Floats = array[name][0]
+    return row
+
+
+def _rows(array: NDArray[np.void], first: str, count: int) -> Floats:
+    """Return float64 sequences from `first` on, which stand in equal distances: one length lies between."""
+    row = _row(array, first)
+    return as_strided(row, (count, row.size), (row.nbytes + row.itemsize, row.itemsize))
+
+
+def cycle_slots(period_ns: int) -> int:
+    """Return how many slots hold 10 s of cycles, with a margin of a second."""
+    return max(64, (RING_SECONDS + 1) * 1_000_000_000 // period_ns)

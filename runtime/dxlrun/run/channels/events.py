@@ -1,0 +1,244 @@
+"""Events: what happened beside the regular cycle, as the log tells it."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from enum import IntEnum, unique
+from typing import Protocol
+
+from dxlrun.run.channels.ring import RING_SECONDS, Appender, Payload
+
+
+@unique
+class Severity(IntEnum):
+    """Levels of rcl_interfaces/msg/Log, so that /rosout needs no translation."""
+
+    INFO = 20
+    WARNING = 30
+    ERROR = 40
+    FATAL = 50
+
+
+@unique
+class EventCode(IntEnum):
+    """What kind of thing happened; the number is in the log and is never used for something else."""
+
+    LOOP_STARTED = 1
+    LOOP_STOPPED = 2
+    OVERRUN = 3
+    SCHEDULER = 4
+    """A wish about scheduler, memory or collector, and whether it was granted."""
+    SETUP = 10
+    TORQUE_ON = 11
+    TORQUE_OFF = 12
+    SHUTDOWN_FAILED = 13
+    REGISTER_DIFFERS = 14
+    REGISTER_WRITTEN = 15
+    """A register was written because the robot file declares it or a client wants it; read back, too."""
+    READ_LOST = 20
+    """The first of a row of missed replies of one servo."""
+    READ_BACK = 21
+    """The servo answers again; the text counts what was missed."""
+    SERVO_ERROR = 22
+    """The error byte of a status packet changed."""
+    SERVO_LIMP = 23
+    """Torque enable reads 0 where 1 was expected: the servo was reset or its torque was cut."""
+    BUS_NOISE = 24
+    PORT_LOST = 25
+    PORT_BACK = 26
+    SERVO_LOST = 27
+    """A servo missed several replies in a row: it leaves the exchange and is asked once a second."""
+    SERVO_BACK = 28
+    """A servo that was lost was looked at as at the start, and takes part again."""
+    SERVO_REBOOTED = 29
+    COMMAND = 30
+    """A command was handed to a controller."""
+    COMMAND_REFUSED = 31
+    CONTROLLER_ACTIVATED = 32
+    CONTROLLER_DEACTIVATED = 33
+    CONTROLLER_FAULT = 34
+    CONTROLLER_SAYS = 35
+    """Free text of a controller: goal reached, goal preempted, tolerance violated."""
+    STEERED = 36
+    """The loop did what a client asked of it: switch, rate, pause, resume, load, unload, stop."""
+    STALE_COMMAND = 37
+    """A stream of commands ended without a word; the policy for it begins."""
+    CONTROLLER_LOADED = 38
+    """A controller came or went while the loop was paused; the text has the time that it took."""
+    POLICY = 39
+    """A policy of the robot file begins or ends: what for, and what it does."""
+    GATE = 40
+    """A command was clamped at the last gate; the text names joint, controller and limit."""
+    MODE = 45
+    """A joint goes into another mode, or controllers wait until theirs have."""
+    IMPLAUSIBLE = 41
+    """A servo's position jumped further than it can turn: the sample is not valid."""
+    SERVO_HOT = 42
+    """A servo is near its Temperature Limit, or has cooled down again."""
+    WATCHDOG = 43
+    """The Bus Watchdog of servos was armed, disarmed, or has stopped them."""
+    UNREQUESTED = 46
+    """Packets came that answer no request of this run: another host writes on the line."""
+    GUARDIAN = 50
+    RECORDER = 60
+    RECORDER_GAP = 61
+
+
+class EventSink(Protocol):
+    """Takes events; never blocks, never raises."""
+
+    def emit(self, code: EventCode, severity: Severity, source: str, text: str) -> None:
+        """Record that `source` (a joint, a controller, a process) has something to tell."""
+        ...
+
+
+EVENT_SLOT = 240
+"""Bytes of one slot of an events' ring; a longer text takes several slots."""
+
+_MOST_PARTS = 32
+_HEADER = struct.Struct("<qHBBBxH")
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """One thing that happened."""
+
+    t_ns: int
+    """ns of the run's clock"""
+    code: int
+    """An EventCode; a plain number where a log was written by a newer version."""
+    severity: int
+    source: str
+    """A joint, a controller, a process."""
+    text: str
+    part: int = 0
+    """0 for an event; 1, 2 ... for the pieces of a text that did not fit one slot."""
+
+    @property
+    def name(self) -> str:
+        """The name of the code, in lower case."""
+        known = _known(self.code)
+        return known.name.lower() if isinstance(known, EventCode) else f"code_{self.code}"
+
+
+@dataclass(frozen=True, slots=True)
+class EventGroup:
+    """Events of one kind and one source."""
+
+    code: int
+    severity: int
+    source: str
+    count: int
+    t_ns: int
+    """Of the first one; ns of the run's clock."""
+    text: str
+    """Of the first one."""
+
+    @property
+    def name(self) -> str:
+        """The name of the code, in lower case."""
+        return Event(self.t_ns, self.code, self.severity, self.source, self.text).name
+
+
+class EventCounts:
+    """Counts events by kind and source: no more is kept than there are joints, controllers and processes."""
+
+    __slots__ = ("_groups",)
+
+    def __init__(self) -> None:
+        self._groups: dict[tuple[int, int, str], EventGroup] = {}
+
+    def add(self, event: Event) -> None:
+        """Count an event; one of `part` > 0 goes on with the text of the one before."""
+        key = (event.code, event.severity, event.source)
+        group = self._groups.get(key)
+        if group is None:
+            self._groups[key] = EventGroup(*key, 1, event.t_ns, event.text)
+        elif not event.part:
+            self._groups[key] = replace(group, count=group.count + 1)
+        elif group.t_ns == event.t_ns:
+            self._groups[key] = replace(group, text=group.text + event.text)
+
+    @property
+    def groups(self) -> tuple[EventGroup, ...]:
+        """All of them, in the order of the first of each."""
+        return tuple(self._groups.values())
+
+
+class _Now(Protocol):
+    """The part of a Clock that an event needs."""
+
+    def now_ns(self) -> int:
+        """Return the time of the run's clock, ns."""
+        ...
+
+
+class EventRing:
+    """Takes events of one process and appends them to its ring; never blocks, never raises.
+
+    A text longer than a slot becomes several records (`part`); beyond 32 slots it is cut.
+    """
+
+    __slots__ = ("_clock", "_writer", "errors")
+
+    def __init__(self, writer: Appender, clock: _Now) -> None:
+        self._writer = writer
+        self._clock = clock
+        self.errors = EventCounts()
+        """What was emitted as an error, for a run without a log."""
+
+    def emit(self, code: EventCode, severity: Severity, source: str, text: str) -> None:
+        """Record that `source` (a joint, a controller, a process) has something to tell, now."""
+        t_ns = self._clock.now_ns()
+        if severity >= Severity.ERROR:
+            self.errors.add(Event(t_ns, code, severity, source, text))
+        name = source.encode(errors="replace")[:64]
+        room = min(self._writer.slot_size, EVENT_SLOT) - _HEADER.size - len(name)
+        for part, piece in enumerate(_pieces(text.encode(errors="replace"), room)):
+            if part == _MOST_PARTS:
+                break
+            header = _HEADER.pack(t_ns, code, severity, part, len(name), len(piece))
+            self._writer.append(header + name + piece)
+
+
+def _pieces(text: bytes, room: int) -> Iterator[bytes]:
+    """Cut UTF-8 into pieces of at most `room` bytes, never inside a character; at least one piece."""
+    start = 0
+    while True:
+        end = min(start + room, len(text))
+        while end < len(text) and text[end] & 0xC0 == 0x80:
+            end -= 1
+        yield text[start:end]
+        start = end
+        if start == len(text):
+            return
+
+
+def _known(code: int) -> int:
+    try:
+        return EventCode(code)
+    except ValueError:
+        return code
+
+
+def decode_event(payload: Payload) -> Event:
+    """Return the event, or the piece of one, of one record. Raises ValueError when it is not one."""
+    try:
+        t_ns, code, severity, part, name_length, text_length = _HEADER.unpack_from(payload)
+    except struct.error as error:
+        raise ValueError(f"an event ends inside its header: {error}") from error
+    data = bytes(payload[_HEADER.size :])
+    if len(data) != name_length + text_length:
+        raise ValueError("an event is not as long as it says")
+    name = data[:name_length].decode(errors="replace")
+    return Event(t_ns, _known(code), severity, name, data[name_length:].decode(errors="replace"), part)
+
+
+def event_slots(period_ns: int, servos: int) -> int:
+    """Return how many slots hold 10 s of the worst storm: in each cycle one event a servo, and four more.
+
+    That is what a robot says whose servos all fail and recover in turn; a row of misses is one event.
+    """
+    return max(1024, RING_SECONDS * 1_000_000_000 // period_ns * (servos + 4))

@@ -1,0 +1,341 @@
+"""Guardian: the last hand on the ports.
+
+A small process, one priority above the loop. It opens, locks and keeps the ports' descriptors, executes the
+loop's process on them as its child, and watches that child: by its pidfd, which tells at once that it ended,
+and by its heartbeat, which tells that it hangs. A loop that is gone before it reported DONE, or that stands
+still, is killed and reaped, and then every servo is made limp with the packets that the plan prepared. A line
+that the loop has lost is opened again and handed over.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import msgspec
+
+from dxlrun.clock import MonotonicClock
+from dxlrun.control.policy_plan import TORQUE_STAYS, Last
+from dxlrun.control.realtime import grants as realtime
+from dxlrun.dynamixel.plan.bus_plan import BusPlan
+from dxlrun.dynamixel.port.ports import SerialPort, SerialPorts
+from dxlrun.dynamixel.port.reopening import KeptLines, Wanted
+from dxlrun.dynamixel.servo.limp import limp
+from dxlrun.dynamixel.servo.standing import stand
+from dxlrun.errors import PortError
+from dxlrun.run.channels import process
+from dxlrun.run.channels.events import EventCode, EventRing, Severity
+from dxlrun.run.channels.heartbeat import Heartbeat, Phase, Standstill
+from dxlrun.run.channels.packets import PacketBatch, salvage
+from dxlrun.run.channels.ring import RingReader, RingWriter
+
+_NEVER = 1 << 62
+SILENT_PERIODS = 5
+"""A running loop whose counter stands still this long hangs."""
+LEAST_PATIENCE_NS = 80_000_000
+"""At high rates a few periods are less than a stock kernel's worst wake-up (thesis: 17 ms), and than a host
+of virtual machines takes a processor away [i]: a robot that falls for that was made safe for nothing."""
+SETUP_PATIENCE_NS = 1_000_000_000
+"""Set-up and shutdown beat while they await replies; each wait ends within milliseconds."""
+LOADING_PATIENCE_NS = 60_000_000_000
+"""For each plug-in's import and each on_configure: a neural network on a slow card takes half of it [i]."""
+ENDING_PATIENCE_NS = 5_000_000_000
+"""For what plug-ins left to be done when the process of a loop that is done ends."""
+
+LEAST_NAP_NS, LONGEST_NAP_NS = 5_000_000, 10_000_000
+"""It looks at the loop once a period within these bounds: a look takes some 60 us from a loop on its core."""
+LONGEST_LOOK_NS = 20_000_000
+"""One look of the guardian counts for at most this: when it was not running, the loop may not have been."""
+
+Ending = Literal["done", "unused", "died", "hung", "late", "cut"]
+"""done: by itself, torque off; unused: before a byte was sent; the others leave torque off to us."""
+
+
+@dataclass(frozen=True, slots=True)
+class GuardianJob:
+    """What the guardian is given: buses, patience, and the descriptors that it and the loop inherit."""
+
+    buses: tuple[BusPlan, ...]
+    ports: tuple[str, ...]
+    """Device paths, in the order of `buses`; a simulated bus has its pseudo-terminal here."""
+    period_ns: int
+    exit_timeout_ns: int
+    """How long the loop may take to stop when it is asked to."""
+    priority: int
+    """Real-time priority of the guardian; 0: none."""
+    lock_memory: bool
+    heartbeat: int
+    packets: int
+    events: int
+    loop_packets: int
+    """The loop's ring of packets: says whether the batch on the desk is in it."""
+    desk: int
+    """The loop's unfinished batch of packets."""
+    stderr: int
+    last: Last
+    """How the robot is left when the loop is gone in the middle of a run."""
+    loop: dict[str, object]
+    """The loop's job, but for its port descriptors and its guardian."""
+    loop_descriptors: tuple[int, ...]
+
+
+class LastHand:
+    """Switches torque off in the place of a loop that is gone, and tells log and terminal what came of it."""
+
+    def __init__(self, job: GuardianJob) -> None:
+        self._job = job
+        self._clock = MonotonicClock()
+        self._heartbeat = Heartbeat(job.heartbeat)
+        self._ring = RingWriter(job.packets)
+        self._events = EventRing(RingWriter(job.events), self._clock)
+
+    def end(self, descriptors: Sequence[int], how: str, severity: Severity) -> list[str]:
+        """Leave the robot as the policy for a fault does, without its steps; return that as sentences.
+
+        A robot holds only when it ran: in a set-up some servos have torque and others have not.
+        """
+        if self._job.last == "limp" or self._heartbeat.phase is not Phase.RUNNING:
+            return self.limp(descriptors, how, severity)
+        standing = self.stand(descriptors)
+        self.tell("; ".join([how, TORQUE_STAYS, *standing]), severity)
+        return [how, TORQUE_STAYS, *standing]
+
+    def stand(self, descriptors: Sequence[int]) -> tuple[str, ...]:
+        """Stop the joints that would go on moving with their torque on; return a sentence for each."""
+        ports, packets = self._take_over(descriptors)
+        sentences = stand(self._job.buses, ports, self._clock, packets, self._heartbeat.look)
+        packets.commit()
+        return sentences
+
+    def limp(self, descriptors: Sequence[int], how: str, severity: Severity) -> list[str]:
+        """Send torque off to every servo; return `how` it came to that, and the result, as sentences."""
+        ports, packets = self._take_over(descriptors)
+        outcome = limp(self._job.buses, ports, self._clock, packets, beat=self._heartbeat.look)
+        packets.commit()
+        silent = [str(one) for one in outcome if not one.confirmed]
+        everybody = "the servo" if len(outcome) == 1 else f"all {len(outcome)} servos"
+        result = (
+            f"torque off was confirmed by {everybody}"
+            if not silent
+            else f"torque off was sent, but not confirmed by {', '.join(silent)}"
+        )
+        self.tell(f"{how}; {result}", Severity.ERROR if silent else severity)
+        return [how, result]
+
+    def _take_over(self, descriptors: Sequence[int]) -> tuple[SerialPorts, PacketBatch]:
+        """Bring what the loop had on its desk into the log; return its lines, and where packets go now."""
+        job = self._job
+        salvage(process.shared_memory(job.desk), RingReader(job.loop_packets).head, self._ring)
+        ports = SerialPorts(
+            [SerialPort(descriptor, path) for descriptor, path in zip(descriptors, job.ports, strict=True)]
+        )
+        return ports, PacketBatch(self._ring)
+
+    def tell_grants(self, grants: Sequence[realtime.Grant]) -> None:
+        """Put into the log what the operating system granted to this process."""
+        realtime.tell(grants, "guardian", self._events)
+
+    def tell(self, text: str, severity: Severity) -> None:
+        """Put a sentence into the log."""
+        self._events.emit(EventCode.GUARDIAN, severity, "guardian", text)
+
+
+class Handing:
+    """Opens the lines again that the loop has lost, and hands them to the loop and to the terminal."""
+
+    def __init__(self, lines: KeptLines, loop: process.Line, terminal: process.Line, hand: LastHand) -> None:
+        self._lines = lines
+        self._loop = loop
+        self._terminal = terminal
+        self._hand = hand
+
+    @property
+    def watched(self) -> list[int]:
+        """What can wake the guardian for it; a loop that is gone asks for nothing."""
+        return [self._lines.fileno()] + ([] if self._loop.closed else [self._loop.fileno()])
+
+    def look(self, ready: Collection[int]) -> None:
+        """Take what the loop asks for, and hand over what is back."""
+        if self._loop.fileno() in ready:
+            for message in self._loop.receive():
+                self._terminal.send(message)
+                if not self._lines.lost(int(str(message["gone"]))):
+                    self._hand.tell("a line is gone and is not opened again", Severity.ERROR)
+        if self._lines.fileno() in ready:
+            for opened in self._lines.returned():
+                if opened.done:
+                    self._hand.tell(opened.done, Severity.INFO)
+                if opened.wrong:
+                    self._hand.tell(opened.wrong, Severity.ERROR)
+                for line in (self._loop, self._terminal):
+                    line.send({"back": opened.index}, [self._lines.descriptors[opened.index]])
+
+
+class Guardian:
+    """Watches one loop process from its start to its end."""
+
+    def __init__(self, job: GuardianJob, control: process.Line) -> None:
+        self._job = job
+        self._control = control
+        self._clock = MonotonicClock()
+        self._heartbeat = Heartbeat(job.heartbeat)
+        self._hand = LastHand(job)
+        self._still = Standstill(LONGEST_LOOK_NS, self._clock.now_ns())
+        self._stop_by_ns = _NEVER
+        self._killed: Literal["hung", "late", "cut"] | None = None
+        """Why the loop was killed."""
+
+    def run(self) -> None:
+        """Open the ports, execute the loop, watch it, and see that the robot is limp when it is gone."""
+        lines = KeptLines(
+            [
+                Wanted(path, bus.baud_rate, bus.latency_ns)
+                for path, bus in zip(self._job.ports, self._job.buses, strict=True)
+            ]
+        )
+        # before the loop is executed, which inherits none of it: whoever starts us is told at once
+        grants = realtime.apply_to_guardian(self._job.priority, self._job.lock_memory)
+        self._hand.tell_grants(grants)
+        for sentence in lines.done:
+            self._hand.tell(sentence, Severity.INFO)
+        loop_line, theirs = process.line_pair()
+        loop = self._execute(lines.descriptors, theirs.fileno())
+        theirs.close()
+        # whoever asked gets the ports too: should this process die, they are still held, and still open
+        self._control.send({"loop": loop.pid, "grants": msgspec.to_builtins(grants)}, lines.descriptors)
+        ending = self._watch(loop, Handing(lines, loop_line, self._control, self._hand))
+        outcome: list[str] = []
+        how = self._how(ending, loop)
+        if ending == "unused":
+            outcome = [f"{how}; nothing had been sent to the robot"]
+            self._hand.tell(outcome[0], Severity.ERROR)
+        elif ending != "done":
+            lines.returned()  # one that came back in this moment is to hear it, too
+            if ending == "cut":
+                outcome = self._hand.limp(lines.descriptors, how, Severity.WARNING)
+            else:
+                outcome = self._hand.end(lines.descriptors, how, Severity.ERROR)
+        lines.close()
+        self._control.send({"ended": ending, "outcome": outcome})
+
+    def _execute(self, descriptors: list[int], line: int) -> subprocess.Popen[bytes]:
+        job = self._job.loop | {"ports": descriptors, "line": line, "guardian": os.getpid()}
+        return process.start(
+            "dxlrun.run.loop_process",
+            ["--job", msgspec.json.encode(job).decode()],
+            [*self._job.loop_descriptors, *descriptors, line],
+            self._job.stderr,
+        )
+
+    def _watch(self, loop: subprocess.Popen[bytes], handing: Handing) -> Ending:
+        """Return how the loop ended; it is dead and reaped then."""
+        watched = os.pidfd_open(loop.pid)
+        nap = min(max(self._job.period_ns, LEAST_NAP_NS), LONGEST_NAP_NS) * 1e-9
+        while True:
+            ready, _, _ = select.select([*self._watched(watched), *handing.watched], [], [], nap)
+            self._heartbeat.look()
+            if watched in ready:
+                return self._ending(loop.wait())
+            handing.look(ready)
+            wish = self._wish() if self._control.fileno() in ready else None
+            if wish == "stop":
+                self._stop_by_ns = min(self._stop_by_ns, self._clock.now_ns() + self._job.exit_timeout_ns)
+                loop.send_signal(signal.SIGTERM)
+            reason: Literal["hung", "late", "cut"] | None = "cut" if wish == "cut" else self._impatience()
+            if reason and not self._killed:
+                self._killed = reason
+                loop.kill()
+
+    def _ending(self, code: int) -> Ending:
+        """Say how a loop ended that was killed for a reason, or ended by itself."""
+        phase, killed = self._heartbeat.phase, self._killed
+        if phase is Phase.DONE and (code in (0, 1) or killed == "hung"):
+            return "done"
+        if phase is Phase.LOADING and killed in ("hung", "late"):
+            return "unused"
+        if killed:
+            return killed
+        if phase is Phase.LOADING:
+            return "done" if code == -signal.SIGTERM and self._stop_by_ns < _NEVER else "unused"
+        return "died"
+
+    def _watched(self, pidfd: int) -> list[int]:
+        """Return what can wake the guardian; a terminal that is gone would wake it for ever."""
+        return [pidfd] if self._control.closed else [pidfd, self._control.fileno()]
+
+    def _impatience(self) -> Literal["hung", "late"] | None:
+        """Return why the loop is not waited for any longer, if it is not."""
+        now_ns, phase = self._clock.now_ns(), self._heartbeat.phase
+        patience_ns = self._patience_ns(phase)  # first: the loop beats before it asks for less of it
+        if self._still.ns((phase, self._heartbeat.beats), now_ns) > patience_ns:
+            return "hung"
+        return "late" if now_ns > self._stop_by_ns else None
+
+    def _patience_ns(self, phase: Phase) -> float:
+        return patience_ns(phase, self._heartbeat.cycle_ns or self._job.period_ns)
+
+    def _wish(self) -> Literal["stop", "cut"] | None:
+        """Return what the terminal asks; one that is gone cannot ask any more: stop in order."""
+        messages = self._control.receive()
+        if any("cut" in message for message in messages):
+            return "cut"
+        return "stop" if messages or self._control.closed else None
+
+    def _how(self, ending: Ending, loop: subprocess.Popen[bytes]) -> str:
+        """Say how the loop came to its end, and in which controller's code."""
+        if ending == "cut":
+            return "torque was cut on request"
+        called = self._heartbeat.activity
+        where = f" in {called}" if called else ""
+        if self._killed == "hung":
+            still = _duration(self._patience_ns(self._heartbeat.phase))
+            return f"the loop stood still for more than {still}{where} and was killed"
+        if self._killed == "late":
+            limit = _duration(self._job.exit_timeout_ns)
+            return f"the loop did not stop within {limit}{where} and was killed"
+        return f"the loop's process ended by itself ({_manner(loop.returncode)}){where}"
+
+
+def patience_ns(phase: Phase, period_ns: int) -> float:
+    """Return how long the loop's counter may stand still, ns."""
+    if phase is Phase.RUNNING:
+        return max(SILENT_PERIODS * period_ns, LEAST_PATIENCE_NS)
+    if phase is Phase.LOADING:
+        return LOADING_PATIENCE_NS
+    return ENDING_PATIENCE_NS if phase is Phase.DONE else SETUP_PATIENCE_NS
+
+
+def _duration(time_ns: float) -> str:
+    """Write a time in the unit that a person would take."""
+    return f"{time_ns / 1e9:g} s" if time_ns >= 1e9 else f"{time_ns / 1e6:.0f} ms"
+
+
+def _manner(code: int | None) -> str:
+    """Say how a process ended."""
+    if code is not None and code < 0:
+        return f"signal {signal.Signals(-code).name}"
+    return f"exit code {code}"
+
+
+def main() -> None:
+    """Run the guardian's process: `--job-fd N --control-fd M`."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    job_descriptor, control_descriptor = int(sys.argv[2]), int(sys.argv[4])
+    job = msgspec.json.decode(process.whole(job_descriptor), type=GuardianJob)
+    control = process.Line(socket.socket(fileno=control_descriptor))
+    try:
+        Guardian(job, control).run()
+    except PortError as error:
+        control.send({"error": str(error)})
+        sys.exit(error.exit_code)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,304 @@
+"""The loop's process: plug-ins, set-up on the bus, real time, the loop, torque off.
+
+One thread, executed afresh (no fork), on descriptors that the guardian opened. It learns of a wish to stop
+by SIGTERM, which the guardian sends, or the kernel when the guardian is gone.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import socket
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, replace
+
+import msgspec
+
+from dxlrun.clock import MonotonicClock
+from dxlrun.compile.plan import Plan, from_json
+from dxlrun.control.controllers.activity import Activity
+from dxlrun.control.controllers.plugins import load_plugins
+from dxlrun.control.loop import StopFlag
+from dxlrun.control.loop_plan import SchedulerPlan
+from dxlrun.control.policy_plan import TORQUE_STAYS, Last
+from dxlrun.control.realtime import grants as realtime
+from dxlrun.control.realtime.margin import Pacing
+from dxlrun.dynamixel.hardware import TAKEN_BACK
+from dxlrun.dynamixel.port.ports import MOST_SHARE, ReplyPolling, SerialPort, SerialPorts
+from dxlrun.dynamixel.port.reopening import LinesAgain
+from dxlrun.errors import DxlrunError, PlugInError
+from dxlrun.plurals import counted
+from dxlrun.run.assembly import assemble
+from dxlrun.run.channels import process
+from dxlrun.run.channels.commands import CommandRing
+from dxlrun.run.channels.cycle import CycleRecord
+from dxlrun.run.channels.events import EventCode, EventGroup, EventRing, Severity
+from dxlrun.run.channels.heartbeat import Heartbeat, Phase
+from dxlrun.run.channels.mailbox import Mailbox
+from dxlrun.run.channels.packets import PacketBatch
+from dxlrun.run.channels.ring import RingWriter
+
+_PR_SET_PDEATHSIG = 1
+
+
+@dataclass(frozen=True, slots=True)
+class LoopJob:
+    """The descriptors that the loop's process inherits."""
+
+    plan: int
+    heartbeat: int
+    cycles: int
+    packets: int
+    desk: int
+    """Where the packets of the unfinished cycle lie."""
+    events: int
+    commands: int
+    result: int
+    mailbox: int
+    answers: int
+    grants: int
+    """Where it leaves what the operating system granted."""
+    take_over: bool
+    ports: tuple[int, ...] = ()
+    line: int = 0
+    """To the guardian, which opens lines that are gone again."""
+    guardian: int = 0
+    """Process ID. Filled in by the guardian, like ports and line."""
+
+    @property
+    def descriptors(self) -> tuple[int, ...]:
+        """All that was inherited."""
+        fields = (value for name, value in asdict(self).items() if name not in ("take_over", "guardian"))
+        return tuple(one for value in fields for one in (value if isinstance(value, tuple) else (value,)))
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What the loop's process leaves behind for the terminal."""
+
+    reason: str
+    """ended, stopped, fault, start-up"""
+    cycles: int = 0
+    skipped: int = 0
+    sentences: tuple[str, ...] = ()
+    """What a person must know, one sentence each."""
+    remarks: tuple[str, ...] = ()
+    """What a person should know beside that."""
+    traceback: str = ""
+    invalid: tuple[int, ...] = ()
+    """Cycles in which the state of each joint was not valid."""
+    errors: tuple[EventGroup, ...] = ()
+    """Events that were errors."""
+
+
+@dataclass(slots=True)
+class RingSinks:
+    """The rings of the loop's process; a cycle takes the packets of its exchange with it."""
+
+    cycles: RingWriter
+    packets: PacketBatch
+    events: EventRing
+    commands: CommandRing
+    heartbeat: Heartbeat
+    _count: int = field(default=0, init=False)
+    _skipped: int = field(default=0, init=False)
+
+    def begin(self, record: CycleRecord) -> None:
+        """Put the packets of the start-up and what the controllers are activated with into the rings."""
+        self.packets.commit()
+        self.cycles.append(record.raw)
+
+    def append(self, record: CycleRecord) -> None:
+        """Put one finished cycle, and the packets since the one before, into the rings."""
+        self.packets.commit()
+        self.cycles.append(record.raw)
+        self._count += 1
+        self._skipped += record.skipped
+        self.heartbeat.cycle(self._count, self._skipped)
+
+
+def _keep_to_this_process(descriptors: Sequence[int]) -> None:
+    """See to it that no child process has the ports and the line to the guardian, executed or forked.
+
+    A child that kept them could write to the servos, and would hold the lock of a port after the run. A
+    forked one ends by SIGTERM again, not by a flag that only the loop looks at; it keeps what is mapped.
+    """
+    for descriptor in descriptors:
+        os.set_inheritable(descriptor, False)
+
+    def let_go() -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        for descriptor in descriptors:
+            with suppress(OSError):
+                os.close(descriptor)
+
+    os.register_at_fork(after_in_child=let_go)
+
+
+def _looked_at(heartbeat: Heartbeat) -> Callable[[str], None]:
+    """Return the check after foreign code prepared something: it took its time, and left no second thread,
+    which is the fault of the newest, and no second loop."""
+    before, own = 1, os.getpid()
+
+    def check(name: str) -> None:
+        nonlocal before
+        if os.getpid() != own:
+            os._exit(0)  # a child that was forked while a plug-in was imported, and came back
+        heartbeat.beat()
+        more, before = realtime.thread_count() - before, max(before, realtime.thread_count())
+        if more > 0:
+            raise PlugInError(
+                f"plug-in {name} started {counted(more, 'more thread', 'more threads')} in the loop's "
+                "process; "
+                "CPython would hand the interpreter over to them in the middle of a cycle: "
+                "let it work in on_configure without threads, or in a process of its own"
+            )
+
+    return check
+
+
+class AskedToStop(Exception):
+    """Somebody asked to stop before the robot ran: no torque may be switched on any more."""
+
+
+@dataclass(slots=True)
+class Pulse:
+    """Called while replies are awaited, and once a cycle: beats, and gives a set-up up that is to stop."""
+
+    heartbeat: Heartbeat
+    stop: StopFlag
+
+    def __call__(self) -> None:
+        """Beat. Raises AskedToStop, once, and only in the set-up: the loop looks at the flag itself."""
+        self.heartbeat.beat()
+        if self.stop.requested and self.heartbeat.phase is Phase.SETUP:
+            self.heartbeat.enter(Phase.STOPPING)
+            raise AskedToStop
+
+
+def _reply_polling(wish_ns: int | None) -> ReplyPolling | None:
+    if wish_ns is None:
+        return ReplyPolling()
+    return ReplyPolling(wish_ns, MOST_SHARE) if wish_ns else None
+
+
+def beside_simulation(plan: Plan) -> SchedulerPlan:
+    """Return the scheduler's wishes: off the core of simulated servos, whose process goes before the loop."""
+    scheduler = plan.loop.scheduler
+    others = os.sched_getaffinity(0) - {process.spare_core(())}
+    if scheduler.policy == "other" or scheduler.cores or not others:
+        return scheduler
+    simulated = any(bus.port == "sim" for bus in plan.buses)
+    return replace(scheduler, cores=tuple(sorted(others))) if simulated else scheduler
+
+
+def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: RingSinks) -> Outcome:
+    """Execute the plan from plug-ins to torque off."""
+    stop = StopFlag()
+    signal.signal(signal.SIGTERM, lambda *_: stop.request())
+    ports = SerialPorts(
+        [SerialPort(descriptor, bus.port) for descriptor, bus in zip(job.ports, plan.buses, strict=True)],
+        LinesAgain(process.Line(socket.socket(fileno=job.line))),
+        _reply_polling(plan.loop.scheduler.reply_polling_ns),
+    )
+    clock = MonotonicClock()
+    pacing = Pacing(clock, plan.loop.scheduler.polling_ns)
+    robot = assemble(
+        plan,
+        load_plugins(_looked_at(heartbeat)),
+        ports=ports,
+        clock=clock,
+        sinks=sinks,
+        beat=Pulse(heartbeat, stop),
+        stop=stop,
+        take_over=job.take_over,
+        inbox=Mailbox(job.mailbox, RingWriter(job.answers)),
+        patience=heartbeat.may_take,
+        pace=pacing,
+        activity=Activity(heartbeat, realtime.thread_count),
+    )
+    heartbeat.enter(Phase.SETUP)
+    # before anybody has torque: it takes a while, and a Bus Watchdog waits for the first cycle
+    _prepare(plan, job, heartbeat, sinks, ports, pacing)
+    try:
+        robot.hardware.start()
+    except AskedToStop as asked:
+        sinks.events.emit(EventCode.SETUP, Severity.INFO, "loop", "the set-up was given up on request")
+        notes: list[str] = getattr(asked, "__notes__", [])
+        return Outcome("stopped", sentences=tuple(note for note in notes if note != TAKEN_BACK))
+    failures: tuple[str, ...] = ()
+    last: Last = "limp"
+    try:
+        heartbeat.enter(Phase.RUNNING)
+        result = robot.loop.run()
+        last = result.last
+    finally:
+        if last == "limp":
+            heartbeat.enter(Phase.STOPPING)
+            failures = robot.hardware.stop()
+        else:
+            robot.hardware.release()
+    detail = (result.detail,) if result.detail else ()
+    remarks = (TORQUE_STAYS,) if last == "hold" else ()
+    return Outcome(
+        result.reason,
+        result.cycles,
+        result.skipped,
+        (*detail, *failures),
+        remarks,
+        invalid=result.invalid,
+        errors=sinks.events.errors.groups,
+    )
+
+
+def _prepare(  # noqa: PLR0917  what a loop's process has
+    plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: RingSinks, ports: SerialPorts, pacing: Pacing
+) -> None:
+    """Ask the operating system for real time, measure how late sleeps wake, and tell both."""
+    grants = realtime.apply(beside_simulation(plan))
+    heartbeat.beat()
+    grants = (*grants, pacing.measure(plan.loop.period_ns, heartbeat.beat))
+    if ports.polling:
+        ports.polling.margin_ns = pacing.wanted_ns
+    realtime.tell(grants, "loop", sinks.events)
+    os.pwrite(job.grants, msgspec.json.encode(grants), 0)
+    heartbeat.beat()
+
+
+def main() -> None:
+    """Run the loop's process: `--job JSON`."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    sys.stdout = sys.stderr = process.Printed(sys.stderr.fileno())
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    job = msgspec.json.decode(sys.argv[2], type=LoopJob)
+    _keep_to_this_process(job.descriptors)
+    clock = MonotonicClock()
+    heartbeat = Heartbeat(job.heartbeat)
+    events = EventRing(RingWriter(job.events), clock)
+    batch = PacketBatch(RingWriter(job.packets), process.shared_memory(job.desk))
+    sinks = RingSinks(RingWriter(job.cycles), batch, events, CommandRing(RingWriter(job.commands)), heartbeat)
+    try:
+        if os.getppid() != job.guardian:
+            sys.exit(1)  # the guardian was gone before its death could be signalled
+        outcome = _run(from_json(process.whole(job.plan)), job, heartbeat, sinks)
+    except DxlrunError as error:
+        outcome = Outcome("start-up", sentences=error.sentences)
+        events.emit(EventCode.SETUP, Severity.ERROR, "loop", "\n".join(error.sentences))
+    except Exception as error:  # the last resort: the run ends with a sentence and the log has the traceback
+        sentence = f"dxlrun itself failed: {type(error).__name__}: {error}; --debug shows where"
+        outcome = Outcome("fault", sentences=(sentence,), traceback=traceback.format_exc())
+        sys.stderr.write(outcome.traceback)
+        events.emit(EventCode.LOOP_STOPPED, Severity.FATAL, "loop", outcome.traceback)
+    sinks.packets.commit()
+    os.pwrite(job.result, msgspec.json.encode(outcome), 0)
+    if not outcome.traceback:
+        heartbeat.enter(Phase.DONE)
+    sys.exit(0 if outcome.reason in ("ended", "stopped") and not outcome.sentences else 1)
+
+
+if __name__ == "__main__":
+    main()

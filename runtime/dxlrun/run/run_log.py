@@ -1,0 +1,123 @@
+"""What a log says about its run before the first cycle: files, versions, kernel, wishes."""
+
+from __future__ import annotations
+
+import platform
+import sys
+import time
+from importlib.metadata import version
+from pathlib import Path
+
+from dxlrun.compile.plan import Plan, to_json
+from dxlrun.control.controllers.controller import CONTRACT_VERSION
+from dxlrun.dynamixel.exchange import kernel
+from dxlrun.errors import InputError
+from dxlrun.log.header import LoggedController, LogHeader
+from dxlrun.log.log_file import LOG_MODE
+
+_LIBRARIES = ("dxlrun", "mcap", "msgspec", "numpy", "pluggy", "pydantic", "pyserial")
+
+
+def log_header(plan: Plan, epoch_offset_ns: int, *, virtual: bool) -> LogHeader:
+    """Return everything that makes the log explain itself.
+
+    `epoch_offset_ns` is added to the run's clock to get wall time.
+    """
+    scheduler = plan.loop.scheduler
+    machine = platform.uname()
+    return LogHeader(
+        robot=plan.robot,
+        joints=tuple(joint.name for joint in plan.loop.joints),
+        buses=tuple(bus.name for bus in plan.buses),
+        controllers=tuple(
+            LoggedController(controller.name, controller.joints, controller.publishes)
+            for controller in plan.loop.controllers
+        ),
+        period_ns=plan.loop.period_ns,
+        epoch_offset_ns=epoch_offset_ns,
+        attachments={
+            "robot.yaml": plan.source_text.encode(),
+            "plan.json": to_json(plan),
+            **{f"included/{name}": text.encode() for name, text in plan.included.items()},
+        },
+        robot_description=plan.urdf,
+        metadata={
+            "run": {
+                "robot_file": plan.source_file,
+                "clock": "virtual" if virtual else "monotonic",
+                "exchange": "parser" if kernel.load() is None else "compiled kernel",
+                "epoch_offset_ns": str(epoch_offset_ns),
+                **{f"argument {name}": value for name, value in plan.arguments.items()},
+            },
+            "versions": {"python": sys.version.split()[0], "contract": str(CONTRACT_VERSION)}
+            | {name: version(name) for name in _LIBRARIES},
+            "plugins": {controller.type: controller.distribution for controller in plan.loop.controllers},
+            "kernel": {"system": machine.system, "release": machine.release, "version": machine.version}
+            | {"machine": machine.machine},
+            "scheduler": {
+                "policy": scheduler.policy,
+                "priority": str(scheduler.priority),
+                "lock_memory": str(scheduler.lock_memory).lower(),
+                "cores": ", ".join(map(str, scheduler.cores)),
+                "polling": "auto" if scheduler.polling_ns is None else f"{scheduler.polling_ns} ns",
+                "reply_polling": "auto"
+                if scheduler.reply_polling_ns is None
+                else f"{scheduler.reply_polling_ns} ns",
+                "idle_latency": str(scheduler.idle_latency).lower(),
+                "overrun": plan.loop.overrun,
+            },
+        },
+    )
+
+
+def epoch_offset_ns() -> int:
+    """Return wall time minus monotonic time, ns: read once, so that a clock step cannot bend the log."""
+    return time.time_ns() - time.monotonic_ns()
+
+
+def new_log(directory: Path, robot: str) -> Path:
+    """Create an empty file for a log and return its path: `<robot>_<date>_<time>.mcap`.
+
+    It is created here, so that two runs which start in the same second cannot take the same name.
+    A directory of `~/logs` is in the user's home. Raises InputError when nothing can be created there.
+    """
+    try:
+        directory = directory.expanduser()
+        directory.mkdir(parents=True, exist_ok=True)
+    except RuntimeError as error:
+        raise InputError(f"the log's directory {directory}: {error}; write its whole path") from error
+    except OSError as error:
+        raise InputError(
+            f"the log's directory {directory} cannot be made: {error.strerror or error}; write another under "
+            "`recording: {directory: ...}` or give --no-record"
+        ) from error
+    stem, number = f"{robot}_{time.strftime('%Y%m%d_%H%M%S')}", 1
+    while True:
+        path = directory / f"{stem}{f'_{number}' * (number > 1)}.mcap"
+        try:
+            path.touch(LOG_MODE, exist_ok=False)
+        except FileExistsError:
+            number += 1
+        except OSError as error:
+            raise InputError(
+                f"no log can be written in {directory}: {error.strerror or error}; write another directory "
+                "under `recording: {directory: ...}` or give --no-record"
+            ) from error
+        else:
+            return path
+
+
+def ledger_of(log: Path) -> Path:
+    """Return where the simulated buses leave what they saw and said."""
+    return log.with_suffix(".ledger.jsonl")
+
+
+def discard_log(log: Path) -> None:
+    """Remove the log of a run that never came to the robot."""
+    log.unlink(missing_ok=True)
+    ledger_of(log).unlink(missing_ok=True)
+
+
+def incomplete_log(error: str) -> str:
+    """Return the sentence for a log that is not whole."""
+    return f"the log is incomplete: {error}"

@@ -1,0 +1,94 @@
+"""Options, progress and summary of a run, the same on both clocks."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dxlrun.plurals import counted
+
+if TYPE_CHECKING:
+    from rich.status import Status
+
+    from dxlrun.compile.plan import Plan
+    from dxlrun.run.channels.events import EventGroup
+
+_REFRESH_S = 0.1
+_LINE_S = 5.0
+"""Between two lines in a pipe or a file."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunOptions:
+    """What the command line decides about one run."""
+
+    record: bool = True
+    take_over: bool = False
+    """Accept servos that are already torqued."""
+    debug: bool = False
+    ledger: Path | None = None
+    """Where simulated buses write what they saw; None: beside the log, on virtual time nowhere."""
+    gateway: bool = True
+    """Let others steer the run, over a Unix socket."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunSummary:
+    """How a run went, for the terminal and for `--json`."""
+
+    exit_code: int
+    reason: str
+    cycles: int
+    skipped: int
+    elapsed_s: float
+    sentences: tuple[str, ...]
+    """What went wrong, one sentence each; empty after a good run."""
+    remarks: tuple[str, ...] = ()
+    """What the operating system did not grant, and what went wrong beside the robot."""
+    log: str | None = None
+    messages: int = 0
+    """Messages in the log."""
+    invalid: tuple[int, ...] = ()
+    """Cycles in which the state of each joint was not valid."""
+    errors: tuple[EventGroup, ...] = ()
+    """Events of the loop that were errors."""
+
+
+class Progress:
+    """The status line of a run: how far it has come, and on virtual time how fast.
+
+    A console that is no terminal shows no status; it gets a line every few seconds.
+    """
+
+    def __init__(self, plan: Plan, status: Status, *, virtual: bool = False) -> None:
+        self._plan = plan
+        self._status = status
+        self._virtual = virtual
+        self._every_s = _REFRESH_S if status.console.is_terminal else _LINE_S
+        self._began = self._shown = time.monotonic()
+
+    def setting_up(self) -> None:
+        """Show that the servos are set up."""
+        self._status.update(f"{self._plan.robot}: checking servos, torque on")
+
+    def ran(self, cycles: int, skipped: int) -> None:
+        """Show how many cycles ran and how many periods were skipped; cheap when called for every cycle."""
+        now = time.monotonic()
+        if now - self._shown < self._every_s:
+            return
+        self._shown, elapsed_s = now, now - self._began
+        ran_ns, end_ns = (cycles + skipped) * self._plan.loop.period_ns, self._plan.loop.end_ns
+        # the steps of a policy come after the end: none is shown beside them
+        end = f" of {end_ns / 1e9:.1f}" if end_ns and ran_ns <= end_ns else ""
+        speed = f", {ran_ns / 1e9 / elapsed_s:.3g} times real time" if self._virtual else ""
+        line = (
+            f"{self._plan.robot}: {ran_ns / 1e9:.1f}{end} s{speed}, {counted(cycles, 'cycle', 'cycles')}, "
+            f"{counted(skipped, 'period', 'periods')} skipped"
+        )
+        if self._status.console.is_terminal:
+            self._status.update(f"{line} ({elapsed_s:.0f} s; Ctrl-C stops)")
+        else:
+            self._status.console.print(line, markup=False, soft_wrap=True)
+            self._status.console.file.flush()

@@ -1,0 +1,325 @@
+"""Front: the process in this terminal while simulated servos serve other programs.
+
+It starts the process of the simulated buses, hands it the faults that a person types, tells an audience what
+comes back, and ends it in order when SIGINT or SIGTERM comes.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import select
+import signal
+import socket
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+import msgspec
+
+from dxlrun.run.channels import process
+from dxlrun.run.channels.child import Child
+from dxlrun.run.channels.process import Line
+from dxlrun.simulation.process import SimulationConfig, encode_config
+
+_LAST_LOOK_S = 1.0
+"""How long the last look may take: a process that does not answer in it ends without."""
+_STOPS = frozenset((signal.SIGINT, signal.SIGTERM))
+_LONGEST_LINE = 1024
+_BACKGROUND_S = 0.5
+_ESCAPE = re.compile(r"\x1b(?:\[[0-9;?]*[ -/]*[@-~]|O.|.)?")
+"""What arrow and function keys send; they mean nothing here."""
+
+
+@dataclass(frozen=True, slots=True)
+class ServoLook:
+    """One servo as it is now."""
+
+    bus: str
+    id: int
+    model: str
+    torque: bool
+    goal: float | None
+    """rad, from the servo's raw 0; None: its operating mode has no goal position"""
+    present: float
+    """rad"""
+    temperature: float
+    """degrees C"""
+    voltage: float
+    """V"""
+    error: int
+    """The error bits that stand: the error byte (Protocol 1.0), hardware error status (Protocol 2.0)."""
+    heard: int
+    """Instruction packets to it since the start."""
+    answered: int
+    """Status packets from it since the start."""
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """All servos as they are now, and how late the simulator handed its replies over."""
+
+    servos: tuple[ServoLook, ...] = ()
+    lateness_us: dict[str, float] = field(default_factory=dict)
+    """Microseconds by what they are of, such as median and p99; empty before the first reply."""
+
+
+class Audience(Protocol):
+    """Whom the front tells what happens."""
+
+    look_every_s: float | None
+    """How often it wants a look; None: never."""
+
+    def opened(self, ports: Mapping[str, str], real_time: str) -> None:
+        """Take the device of each bus, and what the system granted of real time; told once."""
+
+    def moved(self, ports: Mapping[str, str]) -> None:
+        """Take the new devices: empty for an adapter that was pulled, another name when it is back."""
+
+    def fault(self, text: str) -> None:
+        """Take a fault that was injected now, by hand or by the script."""
+
+    def accepted(self, text: str) -> None:
+        """Take a fault line that was typed and understood, in its canonical writing."""
+
+    def refused(self, sentence: str) -> None:
+        """Take what is wrong with a line that was typed."""
+
+    def help(self) -> None:
+        """Tell which faults there are."""
+
+    def look(self, look: Look, typed: str) -> None:
+        """Take the newest look, and what was typed so far of the next line."""
+
+
+@dataclass(frozen=True, slots=True)
+class Served:
+    """How a simulation went."""
+
+    elapsed_s: float
+    look: Look
+    sentences: tuple[str, ...]
+    """What went wrong; nothing in a simulation that ran until it was stopped."""
+    printed: str = ""
+    """What the process of the simulated buses printed."""
+
+
+class TypedLines:
+    """Lines of a descriptor without waiting for them; a terminal is read only in the foreground.
+
+    A job in the background that reads its terminal would be stopped by the kernel.
+    """
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+        self.ended = False
+        """True after the end of what can be typed."""
+        self.pending = ""
+        """What was typed so far of the next line."""
+
+    def fileno(self) -> int:
+        """Return the descriptor, for select."""
+        return self._descriptor
+
+    @property
+    def in_foreground(self) -> bool:
+        """Whether a read cannot stop this process."""
+        try:
+            return os.tcgetpgrp(self._descriptor) == os.getpgrp()
+        except OSError:  # no terminal, or not ours
+            return True
+
+    def receive(self) -> list[str]:
+        """Return the lines that were completed by what arrived; one read, which may wait."""
+        try:
+            data = os.read(self._descriptor, 4096)
+        except OSError:
+            data = b""
+        if not data:
+            self.ended = True
+            lines, self.pending = [self.pending], ""
+        else:
+            lines = self._take(data.decode(errors="replace"))
+        return [stripped for line in lines if (stripped := line.strip())]
+
+    def _take(self, text: str) -> list[str]:
+        lines = []
+        for character in _ESCAPE.sub("", text):
+            if character in "\r\n":
+                lines.append(self.pending)
+                self.pending = ""
+            elif character in "\b\x7f":  # a terminal without its own line editing sends them on
+                self.pending = self.pending[:-1]
+            elif character == "\x15":  # Ctrl-U
+                self.pending = ""
+            elif character.isprintable() or character == "\t":
+                self.pending = (self.pending + character)[:_LONGEST_LINE]
+        return lines
+
+
+@dataclass(frozen=True, slots=True)
+class FrontOptions:
+    """How the process of the simulated buses is started."""
+
+    ledger: Path | None = None
+    priority: int = 0
+    """Real-time priority that it asks for; 0: none."""
+    core: int = -1
+    """Core that it stays on; -1: any."""
+
+
+def serve(
+    config: SimulationConfig, options: FrontOptions, audience: Audience, typed: TypedLines | None
+) -> Served:
+    """Serve simulated buses until SIGINT or SIGTERM comes; nothing is left of them when it returns.
+
+    Raises PortError when the process refuses its configuration, ProcessFault when it does not start.
+    """
+    errors = process.memory_file("dxlrun-stderr")
+    with _stop_signals() as stop:
+        began = time.monotonic()
+        child = _start(config, options, errors)
+        front = _Front(child, audience, typed, stop)
+        try:
+            front.run()
+        finally:
+            child.end()
+    printed = process.whole(errors).decode(errors="replace")
+    os.close(errors)
+    sentences = _sentences(front.sentences, child.process.returncode, printed)
+    return Served(time.monotonic() - began, front.newest, sentences, printed)
+
+
+def _sentences(before: Sequence[str], code: int, printed: str) -> tuple[str, ...]:
+    """Return what went wrong: a process that ends with a code other than 0 prints why."""
+    last = printed.strip().splitlines()[-1:]
+    if before:
+        return (*before, *(f"it printed last: {line} (--debug shows all)" for line in last))
+    if not code:
+        return ()
+    return tuple(last) or (f"the simulated bus ended with exit code {code}",)
+
+
+def _start(config: SimulationConfig, options: FrontOptions, errors: int) -> Child:
+    descriptor = process.memory_file("dxlrun-simulation", encode_config(config))
+    arguments = ["--config-fd", str(descriptor)]
+    arguments += ["--priority", str(options.priority)] if options.priority else []
+    arguments += ["--core", str(options.core)] if options.core >= 0 else []
+    arguments += ["--ledger", str(options.ledger)] if options.ledger else []
+    try:
+        return Child("simulated bus", "dxlrun.simulation", arguments, [descriptor], errors)
+    finally:
+        os.close(descriptor)
+
+
+class _Front:
+    """One select over the simulation, the signals and what is typed."""
+
+    def __init__(
+        self, child: Child, audience: Audience, typed: TypedLines | None, stop: socket.socket
+    ) -> None:
+        self._child = child
+        self._audience = audience
+        self._typed = typed
+        self._stop = stop
+        self._ports: dict[str, str] = {}
+        self.newest = Look()
+        self.sentences: list[str] = []
+
+    def run(self) -> None:
+        """Tell the ports, then pass on what comes from either side until it is stopped."""
+        first = self._child.ready()
+        self._ports = _ports(first)
+        self._audience.opened(self._ports, str(first.get("real_time", "")))
+        look_s = time.monotonic()
+        while not self._child.line.closed:
+            if self._audience.look_every_s is not None and time.monotonic() >= look_s:
+                self._child.line.send({"look": True})
+                look_s = time.monotonic() + self._audience.look_every_s
+            ready = select.select(self._sources(), [], [], self._patience(look_s))[0]
+            if self._stop in ready and _STOPS.intersection(self._stop.recv(64)):
+                self._last_look()
+                return
+            if self._typed in ready and self._typed is not None:
+                self._type(self._typed)
+            self._listen()
+        self.sentences.append("the simulated bus ended in the middle")
+
+    def _sources(self) -> list[Line | socket.socket | TypedLines]:
+        sources: list[Line | socket.socket | TypedLines] = [self._child.line, self._stop]
+        if self._typed is not None and not self._typed.ended and self._typed.in_foreground:
+            sources.append(self._typed)
+        return sources
+
+    def _patience(self, look_s: float) -> float | None:
+        """Return for how long nothing must be done, s; a job that waits in the background looks up."""
+        if self._audience.look_every_s is not None:
+            return max(0.0, look_s - time.monotonic())
+        waiting = self._typed is not None and not self._typed.ended and not self._typed.in_foreground
+        return _BACKGROUND_S if waiting else None
+
+    def _type(self, typed: TypedLines) -> None:
+        for line in typed.receive():
+            if line in ("help", "?"):
+                self._audience.help()
+            else:
+                self._child.line.send({"fault": line})
+        if self._audience.look_every_s is not None:
+            self._audience.look(self.newest, typed.pending)  # a person sees each letter at once
+
+    def _listen(self) -> None:
+        while (message := self._child.poll(0)) is not None:
+            if "servos" in message:
+                self.newest = msgspec.convert(message, type=Look)
+                if self._audience.look_every_s is not None:
+                    self._audience.look(self.newest, self._typed.pending if self._typed else "")
+            elif "ports" in message:
+                self._move(_ports(message))
+            elif "happened" in message:
+                self._audience.fault(str(message["happened"]))
+            elif "fault" in message:
+                self._audience.accepted(str(message["fault"]))
+            elif "error" in message:
+                self._audience.refused(str(message["error"]))
+
+    def _move(self, ports: dict[str, str]) -> None:
+        """Tell what is another port now."""
+        moved = {bus: port for bus, port in ports.items() if port != self._ports.get(bus)}
+        self._ports = ports
+        if moved:
+            self._audience.moved(moved)
+
+    def _last_look(self) -> None:
+        """Take what is still to be told, and the servos' last counts."""
+        before = self.newest
+        self._child.line.send({"look": True})
+        deadline = time.monotonic() + _LAST_LOOK_S
+        while self.newest is before and not self._child.line.closed:
+            left = deadline - time.monotonic()
+            if left <= 0 or not select.select([self._child.line], [], [], left)[0]:
+                return
+            self._listen()
+
+
+def _ports(message: Mapping[str, object]) -> dict[str, str]:
+    return msgspec.convert(message["ports"], type=dict[str, str])
+
+
+@contextmanager
+def _stop_signals() -> Iterator[socket.socket]:
+    """Give a socket that says the numbers of signals; SIGINT and SIGTERM do nothing else meanwhile."""
+    wake, signalled = socket.socketpair()
+    signalled.setblocking(False)
+    before = {number: signal.signal(number, lambda *_: None) for number in _STOPS}
+    descriptor = signal.set_wakeup_fd(signalled.fileno(), warn_on_full_buffer=False)
+    try:
+        yield wake
+    finally:
+        signal.set_wakeup_fd(descriptor)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        wake.close()
+        signalled.close()

@@ -1,0 +1,359 @@
+"""Supervisor: the process in this terminal; plan -> processes -> orderly end, and a summary for a person."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+from rich.console import Console
+
+from dxlrun.compile.plan import Plan
+from dxlrun.control.realtime.grants import Grant
+from dxlrun.dynamixel.port.ports import put_in_place, set_aside
+from dxlrun.dynamixel.port.serial_open import let_go
+from dxlrun.errors import ProcessFault
+from dxlrun.log.schemas import FAILURES_NAME
+from dxlrun.plurals import counted
+from dxlrun.run.channels import process
+from dxlrun.run.channels.child import END_TIMEOUT_S, Child
+from dxlrun.run.channels.events import Severity
+from dxlrun.run.channels.heartbeat import Heartbeat, Phase, Standstill
+from dxlrun.run.grant_table import ProcessGrant, granted_text, refusals, show_grants
+from dxlrun.run.guardian import GuardianJob, LastHand
+from dxlrun.run.loop_process import Outcome
+from dxlrun.run.run_log import discard_log, epoch_offset_ns, incomplete_log, ledger_of, log_header, new_log
+from dxlrun.run.run_processes import (
+    Memory,
+    guardian_job,
+    start_gateway,
+    start_guardian,
+    start_recorder,
+    start_simulation,
+)
+from dxlrun.run.run_summary import Progress, RunOptions, RunSummary
+
+_POLL_S = 0.1
+_LOOK_NS = 500_000_000
+_GUARDIAN_PATIENCE_NS = 5_000_000_000
+"""The guardian looks at the loop at least every 10 ms, and counts each transaction of its own."""
+
+
+@dataclass(slots=True)
+class _Signals:
+    """SIGINT and SIGTERM, counted; the first asks the robot to stop in order, the second cuts torque."""
+
+    count: int = 0
+
+    @contextmanager
+    def caught(self) -> Iterator[None]:
+        """Count them while the run lasts; afterwards they do again what they did before."""
+
+        def count(*_: object) -> None:
+            self.count += 1
+
+        before = {number: signal.signal(number, count) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
+@dataclass(slots=True)
+class _Run:
+    """The processes of one run, as far as they were started, and what became of them."""
+
+    plan: Plan
+    options: RunOptions
+    memory: Memory
+    signals: _Signals
+    out: Console
+    simulation: Child | None = None
+    recorder: Child | None = None
+    guardian: Child | None = None
+    gateway: Child | None = None
+    socket: Path | None = None
+    """Where the gateway listens; None before it does."""
+    remarks: list[str] = field(default_factory=list)
+    job: GuardianJob | None = None
+    loop: int | None = None
+    """A pidfd of the loop's process; None before there is one, and after it was seen to be gone."""
+    log: Path | None = None
+    sentences: list[str] = field(default_factory=list)
+    ended: Mapping[str, object] | None = None
+    """What the guardian said at the end."""
+    messages: int = 0
+    guardian_grants: tuple[Grant, ...] = ()
+    grants: tuple[ProcessGrant, ...] = ()
+    """What the operating system granted, once the loop runs."""
+    steerable: bool = field(init=False)
+    """False when nobody wants a gateway, and after it ended."""
+
+    def __post_init__(self) -> None:
+        self.steerable = self.options.gateway and self.plan.gateway
+
+    def start(self) -> Child:
+        """Start everything in order, return the guardian; raises PortError or ProcessFault."""
+        ledger = self.options.ledger
+        if self.options.record:
+            self.log = new_log(Path(self.plan.recording_directory), self.plan.robot)
+            ledger = ledger or ledger_of(self.log)
+        ports: dict[str, str] = {}
+        if self.plan.simulated:
+            self.simulation, ports = start_simulation(self.plan, ledger, self.memory)
+        if self.log:
+            header = log_header(self.plan, epoch_offset_ns(), virtual=False)
+            self.recorder = start_recorder(self.log, header, self.memory)
+        others = [child for child in (self.simulation, self.recorder) if child]
+        self.job = guardian_job(self.plan, ports, self.memory, take_over=self.options.take_over)
+        self.guardian = start_guardian(self.job, others)
+        ready = self.guardian.ready()
+        loop = ready["loop"]
+        self.guardian_grants = msgspec.convert(ready["grants"], type=tuple[Grant, ...])
+        with suppress(ProcessLookupError):  # the guardian has reaped it already, and knows what to do
+            self.loop = os.pidfd_open(int(str(loop)))
+        return self.guardian
+
+    def discard(self) -> None:
+        """Remove the log of a run that never came to the robot."""
+        if self.log:
+            discard_log(self.log)
+            self.log = None
+
+    def watch(self, guardian: Child, show: Callable[[Heartbeat], None]) -> None:
+        """Wait for the guardian's last word; pass on what the signals ask."""
+        heartbeat = Heartbeat(self.memory.heartbeat)
+        still = Standstill(_LOOK_NS, time.monotonic_ns())
+        asked = 0
+        while self.ended is None and not guardian.line.closed:
+            if self.signals.count > asked:
+                asked = self.signals.count
+                guardian.line.send({"stop": True} if asked == 1 else {"cut": True})
+            show(heartbeat)
+            self._look_at_grants()
+            self._look_after_gateway(heartbeat)
+            self._look_after_simulation(guardian)
+            message = guardian.poll(_POLL_S)
+            if message:
+                self._heed(message, guardian.line.descriptors)
+            elif still.ns(heartbeat.looks, time.monotonic_ns()) > _GUARDIAN_PATIENCE_NS:
+                self.sentences.append("the guardian did not look after the loop any more and was killed")
+                guardian.kill()
+                break
+
+    def _look_after_simulation(self, guardian: Child) -> None:
+        """End the run when the simulated servos are gone: unlike an adapter they do not come back."""
+        if self.simulation and self.simulation.process.poll() is not None:
+            self.sentences.append("the simulated bus ended before the run did")
+            self.simulation.end()
+            self.simulation = None
+            guardian.line.send({"stop": True})
+
+    def _heed(self, message: Mapping[str, object], descriptors: list[int]) -> None:
+        """Take the guardian's last word, let go of a line that is gone, hold the one that is back."""
+        if "ended" in message:
+            self.ended = message
+        elif "gone" in message:
+            set_aside(descriptors[int(str(message["gone"]))])
+        elif "back" in message:
+            put_in_place(descriptors.pop(len(self.plan.buses)), descriptors[int(str(message["back"]))])
+
+    def _heed_last_words(self, guardian: Child) -> None:
+        """Heed what a guardian that is gone said before; one that was killed here says no more."""
+        while guardian.line.fileno() >= 0 and (message := guardian.poll(0)):
+            self._heed(message, guardian.line.descriptors)
+
+    def _look_at_grants(self) -> None:
+        """Show what the operating system granted, and let the log keep it, once the loop has said it."""
+        loop = () if self.grants else self.memory.loop_grants()
+        if loop:
+            self.grants = (
+                *(ProcessGrant("loop", grant) for grant in loop),
+                *(ProcessGrant("guardian", grant) for grant in self.guardian_grants),
+            )
+            show_grants(self.grants, self.out)
+            if self.recorder:
+                self.recorder.line.send({"metadata": {"granted": granted_text(self.grants)}})
+
+    def _look_after_gateway(self, heartbeat: Heartbeat) -> None:
+        """Start it when the loop runs, so that nothing waits for it; without it the robot goes on."""
+        if self.gateway is None:
+            if self.steerable and heartbeat.phase is Phase.RUNNING:
+                try:
+                    self.gateway = start_gateway(self.log, self.memory)
+                except OSError as error:
+                    self._without_gateway(f"did not start ({error.strerror or error})")
+        elif message := self.gateway.poll(0):
+            if "socket" in message:
+                self.socket = Path(str(message["socket"]))
+            else:
+                self._without_gateway(f"did not start ({message.get('error')})")
+        elif self.gateway.line.closed:
+            self._without_gateway("ended")
+
+    def _without_gateway(self, what: str) -> None:
+        """Say that nobody can steer the run any more, and start no other gateway."""
+        self.steerable = False
+        self.remarks.append(f"the gateway {what}: the run goes on, and nobody can steer it")
+        self._end_gateway()
+
+    def _end_gateway(self) -> None:
+        """End the gateway, which keeps nothing, and remove its socket."""
+        if self.gateway:
+            message = self.gateway.poll(0) or {}
+            self.gateway.kill()
+            self.gateway = None
+            place = self.socket or message.get("socket")
+            if place is not None:
+                Path(str(place)).unlink(missing_ok=True)
+
+    def _without_guardian(self, loop: int, guardian: Child, job: GuardianJob) -> None:
+        """The guardian is gone: the kernel told the loop to stop; see that it does, or cut torque here."""
+        give_up = time.monotonic() + self.plan.exit_timeout_ns * 1e-9
+        while not (gone := bool(select.select([loop], [], [], _POLL_S)[0])):
+            # the second wish may have been told to a guardian that did not hear it any more
+            if time.monotonic() > give_up or self.signals.count > 1:
+                signal.pidfd_send_signal(loop, signal.SIGKILL)
+                select.select([loop], [], [])
+                break
+        phase = Heartbeat(self.memory.heartbeat).phase
+        self.sentences.append("the guardian ended in the middle of the run")
+        cut = self.signals.count > 1
+        if phase is Phase.DONE and not cut:
+            self.sentences.append("the loop stopped and left the robot as its policy says")
+        elif phase is not Phase.LOADING:
+            called = Heartbeat(self.memory.heartbeat).activity
+            where = f" in {called}" if called else ""
+            how = f"the loop ended too{where}" if gone else f"the loop did not stop{where} and was killed"
+            hand = LastHand(job)
+            leave = hand.limp if cut else hand.end
+            self.sentences += leave(guardian.line.descriptors, how, Severity.ERROR)
+
+    def end(self) -> None:
+        """End what is left, in order: guardian, recorder, simulated bus, gateway."""
+        self._look_at_grants()
+        if self.guardian:
+            self._heed_last_words(self.guardian)
+            self.guardian.end()
+            if self.loop is not None and self.ended is None and self.job is not None:
+                self._without_guardian(self.loop, self.guardian, self.job)
+            self.loop = None
+            let_go(self.guardian.line.descriptors)
+            self.guardian.line.descriptors.clear()
+        if self.recorder:
+            self._end_recorder(self.recorder)
+        if self.simulation:
+            self.simulation.end()
+        self._end_gateway()  # the last one: when its socket is gone, the log is closed
+
+    def _end_recorder(self, recorder: Child) -> None:
+        """Let the recorder drain the rings and close the log; say so when it could not."""
+        if self.sentences:  # no ring has them, and the log's verdict is to be that of the run
+            recorder.line.send({"metadata": {FAILURES_NAME: dict(enumerate(self.sentences))}})
+        recorder.line.send({"finish": True})
+        closed = False
+        try:
+            while (message := recorder.message(END_TIMEOUT_S)) is not None:
+                if "error" in message:
+                    self.sentences.append(incomplete_log(str(message["error"])))
+                summary = message.get("summary")
+                if isinstance(summary, dict):
+                    closed = True
+                    self.messages = summary["messages"]
+                    if summary["gaps"]:
+                        self.sentences.append(
+                            f"the log lacks {counted(summary['gaps'], 'record', 'records')}, and says so: "
+                            "the recorder was too slow"
+                        )
+            recorder.end()
+        except ProcessFault as fault:
+            self.sentences.append(f"{fault} and was killed")
+            recorder.kill()
+        if not closed:
+            self.sentences.append(
+                f"the recorder ended before the run did; {self.log} is readable up to its last second"
+            )
+
+
+def run_robot(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
+    """Run a robot until its end, a signal, or a fault; every process is gone when it returns.
+
+    Raises PortError (a port is missing, busy, forbidden) and ProcessFault (a child did not start).
+    """
+    signals = _Signals()
+    run = _Run(plan, options, Memory.create(plan), signals, out)
+    began = time.monotonic()
+    with signals.caught():
+        try:
+            with out.status(f"{plan.robot}: starting") as status:
+                guardian = run.start()
+                began = time.monotonic()
+                run.watch(guardian, _watching(Progress(plan, status)))
+        finally:
+            run.end()
+            if run.guardian is None or Heartbeat(run.memory.heartbeat).phase is Phase.LOADING:
+                run.discard()
+            if options.debug:
+                sys.stderr.write(process.whole(run.memory.stderr).decode(errors="replace"))
+    return _summary(run, time.monotonic() - began)
+
+
+def _watching(progress: Progress) -> Callable[[Heartbeat], None]:
+    """Return what keeps the terminal's status line up to date."""
+
+    def show(heartbeat: Heartbeat) -> None:
+        if heartbeat.phase is Phase.SETUP:
+            progress.setting_up()
+        elif heartbeat.phase is Phase.RUNNING:
+            progress.ran(heartbeat.cycles, heartbeat.skipped)
+
+    return show
+
+
+def _summary(run: _Run, elapsed_s: float) -> RunSummary:
+    """Judge the run: 0 good, 1 failed, 130 interrupted."""
+    outcome = run.memory.outcome()
+    heartbeat = Heartbeat(run.memory.heartbeat)
+    sentences: list[str] = []
+    if outcome is None and run.ended is not None and run.ended["ended"] == "done":
+        outcome = Outcome("stopped")  # while it was still loading: no byte had been sent
+    elif outcome is None:
+        outcome = Outcome("fault", heartbeat.cycles, heartbeat.skipped, _last_words(run.memory))
+    sentences += outcome.sentences
+    if run.ended is not None and run.ended["ended"] != "done":
+        sentences += [str(sentence) for sentence in _list(run.ended["outcome"])]
+    sentences += run.sentences
+    interrupted = run.signals.count > 0
+    bad: Literal[0, 1] = 1 if outcome.reason not in ("ended", "stopped") or sentences else 0
+    return RunSummary(
+        exit_code=130 if interrupted and not outcome.sentences and not run.sentences else bad,
+        reason="interrupted" if interrupted else outcome.reason,
+        cycles=outcome.cycles,
+        skipped=outcome.skipped,
+        elapsed_s=elapsed_s,
+        sentences=tuple(sentences),
+        remarks=(*refusals(run.grants, run.out), *outcome.remarks, *run.remarks),
+        log=str(run.log) if run.log and run.log.exists() else None,
+        messages=run.messages,
+        invalid=outcome.invalid,
+        errors=outcome.errors,
+    )
+
+
+def _last_words(memory: Memory) -> tuple[str, ...]:
+    """Return what was printed last, by whichever process, if anything was: one of them ended early."""
+    lines = process.whole(memory.stderr).decode(errors="replace").strip().splitlines()
+    return (f"the run's processes printed last: {lines[-1]} (--debug shows all)",) if lines else ()
+
+
+def _list(value: object) -> list[object]:
+    return value if isinstance(value, list) else [value]

@@ -1,0 +1,243 @@
+"""A run on virtual time: the same loop, hardware and log, with simulated servos, in one process."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+
+from dxlrun.clock import VirtualClock
+from dxlrun.compile.plan import Plan
+from dxlrun.compile.simulated import simulated_bodies, simulated_buses
+from dxlrun.control.controllers.plugins import load_plugins
+from dxlrun.control.loop import LoopResult, StopFlag
+from dxlrun.control.policy_plan import TORQUE_STAYS, Last
+from dxlrun.errors import DxlrunError, InputError
+from dxlrun.log.log_writer import LogWriter
+from dxlrun.run.assembly import assemble
+from dxlrun.run.channels.commands import CommandRing, NoCommands
+from dxlrun.run.channels.cycle import CycleRecord
+from dxlrun.run.channels.events import EventCode, EventGroup, EventRing, Severity
+from dxlrun.run.channels.inbox import QueueInbox
+from dxlrun.run.channels.packets import NoPackets, PacketBatch
+from dxlrun.run.channels.ring import Handover
+from dxlrun.run.run_log import discard_log, incomplete_log, log_header, new_log
+from dxlrun.run.run_summary import Progress, RunOptions, RunSummary
+from dxlrun.simulation import Ledger, Mechanics, SimulatedBus, VirtualPorts
+from dxlrun.simulation.motion.mujoco_plant import mujoco_plant
+
+
+@dataclass(slots=True)
+class _LogSinks:
+    """Hand each cycle, its packets and all events straight to the log."""
+
+    writer: LogWriter
+    packets: PacketBatch
+    events: EventRing
+    commands: CommandRing
+    watch: Callable[[CycleRecord], None]
+
+    def begin(self, record: CycleRecord) -> None:
+        """Write the packets of the start-up and what the controllers are activated with."""
+        self.packets.commit()
+        self.writer.cycle(record.raw)
+
+    def append(self, record: CycleRecord) -> None:
+        """Write one finished cycle and the packets since the one before."""
+        self.packets.commit()
+        self.writer.cycle(record.raw)
+        self.watch(record)
+
+
+@dataclass(slots=True)
+class _NoSinks:
+    """A run without a log."""
+
+    packets: NoPackets
+    events: EventRing
+    commands: NoCommands
+    watch: Callable[[CycleRecord], None]
+
+    def begin(self, record: CycleRecord) -> None:
+        """Forget it."""
+
+    def append(self, record: CycleRecord) -> None:
+        """Count it."""
+        self.watch(record)
+
+
+class VirtualRobot:
+    """A robot and its simulated servos on virtual time; two of them from one plan do exactly the same.
+
+    `log`: where the log goes, None for no log. `ledger`: where the simulated buses enter what they see, None
+    for one in memory; it is closed with the log. Every bus of the plan is simulated, whatever its port says.
+    Raises InputError when the plan has a bus that is not `sim`.
+    """
+
+    def __init__(
+        self, plan: Plan, *, log: Path | None = None, take_over: bool = False, ledger: Ledger | None = None
+    ) -> None:
+        real = [bus.name for bus in plan.buses if bus.port != "sim"]
+        if real:
+            raise InputError(
+                f"virtual time needs simulated servos, but bus {', '.join(real)} has a real port: "
+                "give the argument port:=sim"
+            )
+        self.plan = plan
+        self.clock = VirtualClock()
+        self.ledger = Ledger() if ledger is None else ledger
+        """Every byte that the simulated servos received and sent."""
+        bodies = simulated_bodies(plan)
+        mechanics = Mechanics(0, mujoco_plant(bodies) if bodies else None)
+        self.buses = tuple(
+            SimulatedBus(config, self.ledger, 0, mechanics) for config in simulated_buses(plan)
+        )
+        """The simulated lines, in the order of the plan's buses; faults are injected here."""
+        self.stop = StopFlag()
+        self.inbox = QueueInbox()
+        """Commands put here are taken at the start of a cycle."""
+        self.result: LoopResult | None = None
+        self.failures: tuple[str, ...] = ()
+        """What could not be switched off at the end, one sentence each."""
+        self.cycles = self.skipped = 0
+        """How many cycles ran, and how many periods were skipped."""
+        self.progress: Callable[[int, int], None] = lambda cycles, skipped: None
+        """Called with both after each cycle."""
+        self.messages = 0
+        self.log_error: str | None = None
+        """Why the log is not whole."""
+        self._writer = LogWriter(log, log_header(plan, 0, virtual=True)) if log else None
+        self._sinks = self._sinks_for(self._writer)
+        self.robot = assemble(
+            plan,
+            load_plugins(),
+            ports=VirtualPorts(self.clock, self.buses),
+            clock=self.clock,
+            sinks=self._sinks,
+            beat=lambda: None,
+            stop=self.stop,
+            take_over=take_over,
+            inbox=self.inbox,
+        )
+
+    def _sinks_for(self, writer: LogWriter | None) -> _LogSinks | _NoSinks:
+        if writer is None:
+            return _NoSinks(
+                NoPackets(), EventRing(Handover(lambda _: None), self.clock), NoCommands(), self._count
+            )
+        return _LogSinks(
+            writer,
+            PacketBatch(Handover(writer.packets)),
+            EventRing(Handover(writer.event), self.clock),
+            CommandRing(Handover(writer.command)),
+            self._count,
+        )
+
+    def _count(self, record: CycleRecord) -> None:
+        self.cycles += 1
+        self.skipped += record.skipped
+        self.progress(self.cycles, self.skipped)
+
+    @property
+    def record(self) -> CycleRecord:
+        """The memory of the cycle that ran last."""
+        return self.robot.record
+
+    @property
+    def errors(self) -> tuple[EventGroup, ...]:
+        """The events that were errors, by kind and source."""
+        return self._sinks.events.errors.groups
+
+    def run(self) -> LoopResult:
+        """Set up, run to the plan's end or a fault, switch torque off unless a policy holds, close the log.
+
+        Raises StartUpError; a controller's fault is in the result.
+        """
+        try:
+            self.robot.hardware.start()
+            last: Last = "limp"
+            try:
+                self.result = self.robot.loop.run()
+                last = self.result.last
+            finally:
+                if last == "limp":
+                    self.failures = self.robot.hardware.stop()
+                else:
+                    self.robot.hardware.release()
+        except DxlrunError as error:
+            self._sinks.events.emit(EventCode.SETUP, Severity.ERROR, "loop", "\n".join(error.sentences))
+            raise
+        finally:
+            self._sinks.packets.commit()
+            if self._writer:
+                summary = self._writer.close()
+                self.messages, self.log_error = summary.messages, summary.error
+            self.ledger.close()
+        return self.result
+
+
+@contextmanager
+def _stopped_by_signals(stop: StopFlag) -> Iterator[None]:
+    """Let SIGINT and SIGTERM stop the run in order, a second one at once, by KeyboardInterrupt."""
+
+    def ask(*_: object) -> None:
+        if stop.requested:
+            raise KeyboardInterrupt
+        stop.request()
+
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def run_virtual(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
+    """Run a plan on virtual time for the command line; the log has the times of the virtual clock."""
+    log = new_log(Path(plan.recording_directory), plan.robot) if options.record else None
+    try:
+        # nobody asks a command line for the entries afterwards: memory stays bounded
+        ledger = Ledger(options.ledger, keep=False)
+        robot = VirtualRobot(plan, log=log, take_over=options.take_over, ledger=ledger)
+    except BaseException:
+        if log:
+            discard_log(log)
+        raise
+    began = time.monotonic()
+    refused: tuple[str, ...] = ()
+    with _stopped_by_signals(robot.stop), out.status(f"{plan.robot}: starting") as status:
+        robot.progress = Progress(plan, status, virtual=True).ran
+        try:
+            result = robot.run()
+        except DxlrunError as error:
+            if options.debug:
+                sys.stderr.write(traceback.format_exc())
+            result, refused = LoopResult(0, 0, "fault"), error.sentences
+        except KeyboardInterrupt:
+            result = LoopResult(robot.cycles, robot.skipped, "stopped")
+    incomplete = [ledger.error] if ledger.error else []
+    if robot.log_error:
+        incomplete.append(incomplete_log(robot.log_error))
+    sentences = (*refused, *((result.detail,) if result.detail else ()), *robot.failures, *incomplete)
+    interrupted = robot.stop.requested and not sentences
+    return RunSummary(
+        exit_code=130 if interrupted else 1 if sentences or result.reason == "fault" else 0,
+        reason="interrupted" if interrupted else result.reason,
+        cycles=result.cycles,
+        skipped=result.skipped,
+        elapsed_s=time.monotonic() - began,
+        sentences=sentences,
+        remarks=(TORQUE_STAYS,) if result.last == "hold" else (),
+        log=str(log) if log and log.exists() else None,
+        messages=robot.messages,
+        invalid=result.invalid,
+        errors=robot.errors,
+    )

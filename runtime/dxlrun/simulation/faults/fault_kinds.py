@@ -1,0 +1,256 @@
+"""What each kind of fault does to a bus when its moment has come.
+
+Simpler than the world: noise and a babbling servo reach the host and spoil what it says meanwhile, but no
+servo takes their bytes for an instruction; a supply changes from one moment to the next; a servo without
+power is limp at once; a second servo with an ID stands where the first one stands, and carries no load [i].
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from random import Random
+
+from dxlrun.simulation.bus.simulated_bus import SimulatedBus
+from dxlrun.simulation.bus.wire import flipped
+from dxlrun.simulation.faults.fault_text import Fault
+from dxlrun.simulation.servo.simulated_servo import ServoConfig, SimulatedServo
+
+NOISE_BYTES = 8
+FLIPPED_BITS = 0x01
+HOT_CELSIUS = 90.0
+"""Above Temperature Limit (31) as every model has it from the factory: 85 degrees C at most."""
+BOOT_NS = 100_000_000
+"""How long a servo that starts again hears nothing; no manual names it [i]."""
+BROWNOUT_NS = 200_000_000
+BABBLE_NS = 200_000_000
+BABBLE_PAUSE_NS = 2_000_000
+TURN_NS = 1_000_000_000
+
+
+@dataclass(slots=True)
+class Hold:
+    """What lasts as long as any fault of its kind does, on one servo or one adapter."""
+
+    restore: Callable[[], None]
+    """Brings back what was before the first of them."""
+    faults: int = 0
+
+
+Holds = dict[tuple[str, int], Hold]
+"""By kind and whom it holds; one for all faults of a script, since they may overlap."""
+
+
+@dataclass(slots=True)
+class Injection:
+    """One fault on its way to one bus; it enters the ledger once, when it happens."""
+
+    fault: Fault
+    bus: SimulatedBus
+    random: Random
+    """For what the fault leaves open."""
+    holds: Holds
+    happened: bool = field(default=False, init=False)
+
+    def begin(self) -> None:
+        """Let the fault happen now; one of a packet happens with the next packet."""
+        _BEGIN[self.fault.kind](self)
+
+    def enter(self) -> None:
+        """Enter the fault into the ledger, when this is called first."""
+        if not self.happened:
+            self.happened = True
+            self.bus.note(f"fault: {self.fault}")
+
+    def servos(self) -> Sequence[SimulatedServo]:
+        """Return the servo that the fault names, or all of the bus, at the bus' time; it happens to them.
+
+        None is left when the host has given the servo another ID meanwhile: the fault does not happen.
+        """
+        servo_id = self.fault.servo
+        named = [servo for servo in self.bus.servos if servo_id in (None, servo.servo_id)]
+        if servo_id is not None:
+            named = named[:1]  # of two with one ID the first is meant
+        for servo in named:
+            servo.advance(self.bus.now_ns)
+        if named:
+            self.enter()
+        return named
+
+    def hold(self, whom: object, restore: Callable[[], None]) -> None:
+        """Call `restore` when the fault's `for=` is over, and that of the last one that overlaps with it."""
+        hold = self.holds.setdefault((self.fault.kind, id(whom)), Hold(restore))
+        hold.faults += 1
+
+        def release() -> None:
+            hold.faults -= 1
+            if not hold.faults:
+                del self.holds[self.fault.kind, id(whom)]
+                hold.restore()
+
+        if self.fault.for_ns is not None:
+            self.bus.at(self.bus.now_ns + self.fault.for_ns, release)
+
+
+# Packets
+
+
+def _alter(injection: Injection, text: str, change: Callable[[bytes], bytes], copies: int = 1) -> None:
+    """Alter the next packets of a servo or of the host."""
+    fault, bus = injection.fault, injection.bus
+
+    def altered(packet: bytes) -> bytes:
+        injection.enter()
+        return change(packet)
+
+    for _ in range(fault.count):
+        if fault.servo is None:
+            bus.alter_next_instruction(f"its instruction {text}", altered)
+        else:
+            delay_ns = fault.by_ns or 0
+            bus.alter_next(fault.servo, f"its reply {text}", altered, delay_ns=delay_ns, copies=copies)
+
+
+def _lose(injection: Injection) -> None:
+    _alter(injection, "lost", lambda packet: b"")
+
+
+def _corrupt(injection: Injection) -> None:
+    """Flip bits of one byte; an index beyond the packet means its nearest byte."""
+    index = -1 if injection.fault.byte is None else injection.fault.byte
+    flip = injection.fault.flip or FLIPPED_BITS
+
+    def corrupted(packet: bytes) -> bytes:
+        return flipped(packet, max(-len(packet), min(index, len(packet) - 1)), flip)
+
+    _alter(injection, "corrupted", corrupted)
+
+
+def _truncate(injection: Injection) -> None:
+    keep = injection.fault.keep or 0
+    _alter(injection, f"cut to {keep} bytes", lambda packet: packet[:keep])
+
+
+def _delay(injection: Injection) -> None:
+    _alter(injection, "delayed", lambda packet: packet)
+
+
+def _duplicate(injection: Injection) -> None:
+    copies = injection.fault.copies or 2
+    _alter(injection, f"sent {copies} times", lambda packet: packet, copies)
+
+
+# The line
+
+
+def _noise(injection: Injection) -> None:
+    fault, bus = injection.fault, injection.bus
+    injection.enter()
+    bus.inject_noise(fault.data or injection.random.randbytes(fault.size or NOISE_BYTES), bus.now_ns)
+
+
+def _babble(injection: Injection) -> None:
+    fault, bus = injection.fault, injection.bus
+    if not injection.servos():
+        return
+    end_ns = bus.now_ns + (fault.for_ns or BABBLE_NS)
+
+    def burst() -> None:
+        if bus.now_ns < end_ns:
+            bus.inject_noise(injection.random.randbytes(fault.size or NOISE_BYTES), bus.now_ns)
+            bus.at(bus.now_ns + (fault.every_ns or BABBLE_PAUSE_NS), burst)
+
+    burst()
+
+
+def _unplug(injection: Injection) -> None:
+    injection.enter()
+    injection.bus.unplug()
+    injection.hold(injection.bus, injection.bus.plug_in)
+
+
+def _wedge(injection: Injection) -> None:
+    bus = injection.bus
+    injection.enter()
+    bus.wedge(True)
+    injection.hold(bus, lambda: bus.wedge(False))
+
+
+# Servos
+
+
+def _silence(injection: Injection) -> None:
+    for servo in injection.servos():
+        servo.silence(True)
+        injection.hold(servo, partial(servo.silence, False))
+
+
+def _reboot(injection: Injection) -> None:
+    for servo in injection.servos():
+        servo.cut_power(injection.bus.now_ns + (injection.fault.for_ns or BOOT_NS))
+
+
+def _brownout(injection: Injection) -> None:
+    """Cut the power; when it is back, the servos start: some of them switch their torque on by themselves."""
+    for servo in injection.servos():
+        end_ns = injection.bus.now_ns + (injection.fault.for_ns or BROWNOUT_NS)
+        servo.cut_power(end_ns)
+        injection.bus.at(end_ns, partial(_start_again, servo, end_ns))
+
+
+def _start_again(servo: SimulatedServo, now_ns: int) -> None:
+    servo.advance(now_ns)
+    servo.reset()
+
+
+def _voltage(injection: Injection) -> None:
+    for servo in injection.servos():
+        injection.hold(servo, partial(servo.set_voltage, servo.voltage))
+        servo.set_voltage(injection.fault.volts or 0.0)
+
+
+def _overload(injection: Injection) -> None:
+    for servo in injection.servos():
+        servo.trigger_overload()
+
+
+def _overheat(injection: Injection) -> None:
+    for servo in injection.servos():
+        injection.hold(servo, partial(servo.set_temperature, servo.temperature))
+        servo.set_temperature(HOT_CELSIUS if injection.fault.celsius is None else injection.fault.celsius)
+
+
+def _turn(injection: Injection) -> None:
+    for servo in injection.servos():
+        by = math.radians(injection.fault.by_deg or 0.0)
+        servo.turn(by, injection.fault.for_ns or TURN_NS)
+
+
+def _duplicate_id(injection: Injection) -> None:
+    for servo in injection.servos():
+        table, delay = servo.registers.table, servo.registers["return_delay_time"]
+        twin = ServoConfig(servo.servo_id, table.model, servo.position, delay * 2000)
+        injection.bus.add_servo(twin)
+
+
+_BEGIN: Mapping[str, Callable[[Injection], None]] = {
+    "lose": _lose,
+    "corrupt": _corrupt,
+    "truncate": _truncate,
+    "delay": _delay,
+    "duplicate": _duplicate,
+    "noise": _noise,
+    "silence": _silence,
+    "babble": _babble,
+    "reboot": _reboot,
+    "brownout": _brownout,
+    "voltage": _voltage,
+    "overload": _overload,
+    "overheat": _overheat,
+    "turn": _turn,
+    "duplicate_id": _duplicate_id,
+    "unplug": _unplug,
+    "wedge": _wedge,
+}

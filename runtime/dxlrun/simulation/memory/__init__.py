@@ -1,0 +1,1 @@
+"""Memory: control tables of simulated servos, and what may be written to them."""

@@ -1,0 +1,310 @@
+"""The memory of a simulated servo: the control items of its table as bytes and as integers of the wire."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+from dxlrun.dynamixel.control_table import ControlItem, ControlTable
+
+_INDIRECT = re.compile(r"indirect_address_(\d+)")
+
+_CELLS_KEPT = 1024
+"""So many places of a table are looked up only once: a host writes few of them, rubbish goes everywhere."""
+
+IDENTITY = ("id", "secondary_id", "secondary_shadow_id", "baud_rate", "baud_rate_bus", "protocol_type")
+"""Items that say what the servo hears."""
+
+
+class Cells(NamedTuple):
+    """What stands in a row of cells."""
+
+    items: tuple[ControlItem, ...]
+    """Their items; none when a cell belongs to no item."""
+    names: frozenset[str]
+    whole: bool
+    """True when they are those items from the first byte to the last."""
+    touched: bool
+    """True when one of them belongs to an item."""
+    direct: bool
+    """True when none of them stands for another one."""
+    read_only: bool
+    """True when one of the items is."""
+    eeprom: bool
+    """True when one of the items is in the EEPROM area."""
+    single: str
+    """Name of the item that they are, whole, where none of them stands for another cell; else empty."""
+
+
+class LiveItem(NamedTuple):
+    """An item that shows something else whenever it is looked at."""
+
+    name: str
+    show: Callable[[], int]
+    """Returns what it shows now, in ticks."""
+    lowest: int
+    highest: int
+    """What its bytes hold; beyond that it stays there."""
+    start: int
+    end: int
+    mask: int
+
+
+class Run(NamedTuple):
+    """Bytes for a row of cells."""
+
+    address: int
+    data: bytes
+    cells: Cells
+    after: dict[str, int]
+    """The integers of the items that a write touches, as they would be after it."""
+
+
+class Memory:
+    """Bytes of a control table; `memory[name]` is the integer of the wire, never negative.
+
+    Cells of Indirect Data stand for the cells whose addresses the Indirect Addresses hold.
+    """
+
+    def __init__(self, table: ControlTable, firmware: int) -> None:
+        self.table = table = table.with_firmware(firmware)
+        self.firmware = firmware
+        self.size = table.size
+        """Bytes from address 0 to the end of the last item."""
+        self._memory = bytearray(self.size)
+        self._values: dict[str, int] = {}  # the same as in the bytes: looked up far more often than written
+        self._cells_at: dict[tuple[int, int], Cells] = {}  # hosts ask for the same again and again
+        self._item_at: dict[int, ControlItem] = {
+            address: item
+            for item in table.items.values()
+            for address in range(item.address, item.address + item.size)
+        }
+        self._indirect = _indirect_cells(table)
+        self._bounds = {item.name: _bounds(item) for item in table.items.values()}
+        self._places = {
+            item.name: (item.address, item.address + item.size, item.size, (1 << 8 * item.size) - 1)
+            for item in table.items.values()
+        }
+        self._watchers: dict[str, list[Callable[[], None]]] = {}
+        self.changes = 0
+        """How often something was changed of the servo, but for what it shows by itself (`show_all`)."""
+        self.restore_factory_values()
+
+    def restore_factory_values(self, keep: tuple[str, ...] = ()) -> None:
+        """Set every item but those of `keep` to its initial value, and those without one to 0."""
+        for item in self.table.items.values():
+            if item.name not in keep:
+                self[item.name] = self._initial(item)
+        self["model_number"] = self.table.model_number
+        self["firmware_version"] = self.firmware
+
+    def restore_ram(self) -> None:
+        """Set the items of the RAM area to what they are at power-up; the EEPROM area stays."""
+        for item in self.table.items.values():
+            if item.area == "RAM":
+                self[item.name] = self._initial(item)
+
+    def reset(self, names: Iterable[str]) -> None:
+        """Set some items to their initial values, those of them that the model has."""
+        for name in names:
+            if (item := self.table.items.get(name)) is not None:
+                self[name] = self._initial(item)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._values
+
+    def __getitem__(self, name: str) -> int:
+        return self._values[name]
+
+    def __setitem__(self, name: str, wire: int) -> None:
+        start, end, size, mask = self._places[name]
+        wire &= mask
+        if self._values.get(name) == wire:
+            return
+        self._memory[start:end] = wire.to_bytes(size, "little")
+        self._values[name] = wire
+        self.changes += 1
+        if name in self._watchers:
+            self._tell((name,))
+
+    def watch(self, names: Iterable[str], act: Callable[[], None]) -> None:
+        """Let something be done now, and whenever one of some items changes; others may stay the same."""
+        for name in names:
+            self._watchers.setdefault(name, []).append(act)
+        act()
+
+    def _tell(self, names: Iterable[str]) -> None:
+        for act in dict.fromkeys(act for name in names for act in self._watchers.get(name, ())):
+            act()
+
+    def get(self, name: str, otherwise: int = 0) -> int:
+        """Return the integer of an item, or another one when the model has no such item."""
+        return self._values.get(name, otherwise)
+
+    def show(self, name: str, wire: int) -> None:
+        """Set an item if the model has it; what does not fit ends at its highest or lowest value."""
+        bounds = self._bounds.get(name)
+        if bounds is not None:
+            lowest, highest = bounds
+            self[name] = lowest if wire < lowest else min(wire, highest)
+
+    def live(self, name: str, show: Callable[[], int]) -> LiveItem:
+        """Return an item that shows what a function says; raises KeyError when the model has none."""
+        start, end, _, mask = self._places[name]
+        return LiveItem(name, show, *self._bounds[name], start, end, mask)
+
+    def show_all(self, items: Iterable[LiveItem]) -> None:
+        """Set items of the model to what they show now, as `show` does, for what is read all the time."""
+        values = self._values
+        for name, show, lowest, highest, start, end, mask in items:
+            wire = show()
+            if not lowest <= wire <= highest:
+                wire = lowest if wire < lowest else highest
+            wire &= mask
+            if values[name] != wire:
+                self._memory[start:end] = wire.to_bytes(end - start, "little")
+                values[name] = wire
+                if name in self._watchers:
+                    self._tell((name,))
+
+    def ticks(self, name: str) -> int:
+        """Return the signed number of ticks of an item."""
+        wire, item = self._values[name], self.table.items[name]
+        if item.encoding == "twos_complement":
+            bits = 8 * item.size
+            return wire - (wire >> bits - 1 << bits)
+        return wire if item.encoding == "unsigned" else item.decode(self.data(name))
+
+    def data(self, name: str) -> bytes:
+        """Return the bytes of an item."""
+        item = self.table.items[name]
+        return bytes(self._memory[item.address : item.address + item.size])
+
+    def read(self, address: int, length: int) -> bytes | None:
+        """Return bytes of the table, None where it has none; cells between items are 0 [i]."""
+        if length < 1 or address + length > self.size:
+            return None
+        if self.cells(address, length).direct:
+            return self.raw(address, length)
+        data = self._memory[address : address + length]
+        for cell in self._indirect.keys() & range(address, address + length):
+            target = self[self._indirect[cell]]
+            data[cell - address] = self._memory[target] if target < len(self._memory) else 0
+        return bytes(data)
+
+    def raw(self, address: int, length: int) -> bytes:
+        """Return the bytes of cells of the table, as they stand there."""
+        return bytes(self._memory[address : address + length])
+
+    def runs(self, address: int, data: bytes) -> tuple[Run, ...]:
+        """Return where bytes really go: as they are, or to the cells behind Indirect Data."""
+        cells = self._cells_at.get((address, len(data))) or self.cells(address, len(data))
+        if cells.single:
+            return (Run(address, data, cells, {cells.single: int.from_bytes(data, "little")}),)
+        if cells.direct:
+            return (self._run(address, data, cells),)
+        return tuple(
+            self._run(target, data[first:last], self.cells(target, last - first))
+            for target, first, last in self.places(address, len(data))
+        )
+
+    def places(self, address: int, length: int) -> list[tuple[int, int, int]]:
+        """Return where some cells really are: address, and the first and last of them that begin there."""
+        places: list[tuple[int, int, int]] = []
+        for index in range(length):
+            name = self._indirect.get(address + index)
+            target = address + index if name is None else self[name]
+            if places and places[-1][0] + index - places[-1][1] == target:
+                places[-1] = places[-1][0], places[-1][1], index + 1
+            else:
+                places.append((target, index, index + 1))
+        return places
+
+    def cells(self, address: int, length: int) -> Cells:
+        """Return what some cells are; looked up once."""
+        cells = self._cells_at.get((address, length))
+        if cells is None:
+            spanned = range(address, address + length)
+            owned = [item.name for cell in spanned if (item := self._item_at.get(cell)) is not None]
+            names = tuple(dict.fromkeys(owned)) if len(owned) == length else ()
+            items = tuple(self.table.items[name] for name in names)
+            whole = bool(items) and sum(item.size for item in items) == length
+            direct = self._indirect.keys().isdisjoint(spanned)
+            cells = Cells(
+                items,
+                frozenset(names),
+                whole=whole,
+                touched=bool(owned),
+                direct=direct,
+                single=names[0] if whole and direct and len(names) == 1 else "",
+                read_only=any(item.access == "R" for item in items),
+                eeprom=any(item.area == "EEPROM" for item in items),
+            )
+            if len(self._cells_at) >= _CELLS_KEPT:
+                self._cells_at.clear()
+            self._cells_at[address, length] = cells
+        return cells
+
+    def reaches_eeprom(self, address: int, data: bytes) -> bool:
+        """Return whether a write would change the EEPROM area, also through Indirect Data."""
+        return any(run.cells.eeprom for run in self.runs(address, data))
+
+    def touches(self, address: int, length: int) -> bool:
+        """Return whether any of some cells belongs to an item."""
+        return self.cells(address, length).touched
+
+    def _run(self, address: int, data: bytes, cells: Cells) -> Run:
+        """Return bytes for some cells, with what would be after it."""
+        items = cells.items
+        start, all_of_them = address, data
+        if items and not cells.whole:  # parts of items stay as they are
+            start, end = items[0].address, items[-1].address + items[-1].size
+            before, behind = self._memory[start:address], self._memory[address + len(data) : end]
+            all_of_them = bytes(before) + data + bytes(behind)
+        after = {
+            item.name: int.from_bytes(
+                all_of_them[item.address - start : item.address - start + item.size], "little"
+            )
+            for item in items
+        }
+        return Run(address, data, cells, after)
+
+    def write(self, run: Run) -> None:
+        """Write bytes that were not refused."""
+        start, end = run.address, run.address + len(run.data)
+        if self._memory[start:end] != run.data:
+            self._memory[start:end] = run.data
+            self._values.update(run.after)
+            self.changes += 1
+        if not self._watchers.keys().isdisjoint(run.after):
+            self._tell(run.after)
+
+    @staticmethod
+    def _initial(item: ControlItem) -> int:
+        if item.initial is not None:
+            return item.initial
+        return max(0, item.minimum) if item.access == "RW" else 0
+
+
+def _bounds(item: ControlItem) -> tuple[int, int]:
+    """Return the lowest and the highest number of ticks that an item's bytes hold."""
+    bits = 8 * item.size - item.signed
+    return (-1 << bits if item.signed else 0), (1 << bits) - 1
+
+
+def in_range(item: ControlItem, wire: int) -> bool:
+    """Return whether an integer of the wire lies in an item's range."""
+    if item.minimum < 0 and wire >> (8 * item.size - 1):
+        wire -= 1 << 8 * item.size
+    return item.minimum <= wire <= item.maximum
+
+
+def _indirect_cells(table: ControlTable) -> dict[int, str]:
+    """Return for each cell of Indirect Data the item that holds the address behind it."""
+    cells = {}
+    for name in table.items:
+        match = _INDIRECT.fullmatch(name)
+        if match and (data := table.items.get(f"indirect_data_{match[1]}")) is not None:
+            cells[data.address] = name
+    return cells

@@ -1,0 +1,1 @@
+"""Motion: motors, gains, loads and bodies of simulated servos."""

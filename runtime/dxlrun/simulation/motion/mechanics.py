@@ -1,0 +1,282 @@
+"""All servos of one simulation as mechanics: stepped together on one grid of time.
+
+In each step the profiles say where the servos' controllers want to be, the control law which torque their
+motors give, and the plant what it moves. Commands act at the next point of the grid; between its points
+angles go on with their velocity. While nothing moves, nothing is computed.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from dxlrun.simulation.motion.command import LIMP, ROWS, Command
+from dxlrun.simulation.motion.control_law import ControlLaw
+from dxlrun.simulation.motion.motor import Motor
+from dxlrun.simulation.motion.plant import NO_LOAD, Floats, IndependentJoints, Joint, Load, Plant, PlantMaker
+from dxlrun.simulation.motion.profile import Profiles
+from dxlrun.simulation.motion.strain import OVERLOAD_TICKS, Strain
+
+__all__ = ["NO_LOAD", "STEP_NS", "Load", "Mechanics", "Motor", "Plant", "PlantMaker"]
+
+STEP_NS = 2_000_000
+"""Step of the grid. The fastest thing in a servo here is its motor's time constant: 13.6 ms and more."""
+
+EAGER_NS, EASY_NS = 4_000_000, 1_000_000_000
+"""In real time it is let go on so often while servos move and while they only cool: to catch up with a long
+pause of the host would delay the next reply."""
+
+STRAIN_NS = 100_000_000
+"""So often servos feel heat and load; a whole number of steps."""
+
+_STEPS_A_LOOK = 16
+"""So often it is looked whether all rest."""
+
+_STILL, _UNDRIVEN = 1e-6, 1e-8
+"""rad/s, and its change in a step: below both a servo rests."""
+
+
+@dataclass(slots=True)
+class _Hand:
+    """A hand that turns a shaft, as long as nothing drives it."""
+
+    speed: float
+    """rad/s"""
+    steps: int
+    """of the grid that are left"""
+    gives_way: Callable[[float], None]
+    turned: float = 0.0
+    """rad so far"""
+
+
+class Mechanics:
+    """Servos that are stepped together; time comes from the callers, and going back is ignored."""
+
+    def __init__(self, start_ns: int, plant: PlantMaker | None = None) -> None:
+        self._make_plant: PlantMaker = plant or IndependentJoints
+        self.grid_ns = start_ns
+        """Time of the last step"""
+        self._start_ns = start_ns
+        self._next_strain_ns = start_ns + STRAIN_NS
+        self._motors: list[Motor] = []
+        self._loads: list[Load] = []
+        self._watchers: dict[int, Callable[[], None]] = {}
+        self._agenda: list[tuple[int, int, Callable[[], None]]] = []
+        self._order = itertools.count()
+        self._hands: dict[int, _Hand] = {}
+        self._busy = False
+        self._commanded = False
+        self._pauses = 0
+        self.still = 0
+        """Number of the pause in which all servos rest, uncommanded; 0 while one of them moves."""
+        self._build(np.zeros(0), np.zeros(0))
+
+    # Servos
+
+    def add(self, motor: Motor, load: Load, angle: float) -> int:
+        """Add a servo with its shaft at an angle, rad from its raw 0, at rest and limp; return its index."""
+        plant, profiles, law, strain = self.plant, self.profiles, self.law, self.strain
+        commands, count = self._commands, len(self._motors)
+        self._motors.append(motor)
+        self._loads.append(load)
+        self._build(np.append(plant.angle, angle), np.append(plant.velocity, 0.0))
+        self._commands[:, :count] = commands
+        self._commands[ROWS["goal"], count] = angle
+        self.profiles.position[:count], self.profiles.velocity[:count] = profiles.position, profiles.velocity
+        self.law.stall[:count], self.law.integral[:count] = law.stall, law.integral
+        self.strain.temperature[:count] = strain.temperature
+        self.strain.overloaded[:count] = strain.overloaded
+        self._wake()
+        return count
+
+    def motor(self, index: int) -> Motor:
+        """Return a servo's motor."""
+        return self._motors[index]
+
+    def watch(self, index: int, act: Callable[[], None]) -> None:
+        """Let a servo be told when its temperature changes by a degree, or when it is overloaded."""
+        self._watchers[index] = act
+
+    def supply(self, index: int, volts: float) -> None:
+        """Give a servo another voltage: its stall torque and no-load speed go with it."""
+        motor = self._motors[index]
+        self.law.stall[index] = motor.stall_torque * (volts / motor.voltage if motor.voltage else 1.0)
+        self._wake()
+
+    def command(self, index: int, command: Command) -> None:
+        """Command a servo; its trajectory goes on from where it is, that of a limp one from the shaft."""
+        was_limp = self._commands[ROWS["limit"], index] == 0.0
+        was_turning = self._commands[ROWS["turning"], index] != 0.0
+        self._commands[:, index] = command
+        if command.limit == 0.0:
+            self._commands[ROWS["goal"], index] = self.plant.angle[index]
+        if was_limp or command.limit == 0.0 or was_turning != (command.turning != 0.0):
+            self.profiles.position[index] = self.plant.angle[index]
+            self.profiles.velocity[index] = self.plant.velocity[index] if command.turning else 0.0
+            self.law.integral[index] = 0.0
+        self._wake()
+
+    def aim(self, index: int, goal: float, speed: float, acceleration: float) -> None:
+        """Change the goal of a servo and its profile, and nothing else; as in `Command`."""
+        self.strain.calm = False
+        self.profiles.aim(index, goal, speed, acceleration)
+        self.still = 0
+
+    def place(self, index: int, angle: float) -> None:
+        """Put a shaft somewhere, rad, at rest; its trajectory begins there."""
+        self.plant.place(index, angle)
+        self.profiles.position[index], self.profiles.velocity[index] = angle, 0.0
+        if self._commands[ROWS["limit"], index] == 0.0:
+            self._commands[ROWS["goal"], index] = angle
+        self.profiles.arrived = False
+        self.still = 0
+
+    def turn(self, index: int, by: float, duration_ns: int, gives_way: Callable[[float], None]) -> None:
+        """Let a hand turn a shaft evenly by an angle, rad, from now on.
+
+        It gives way to a servo that drives or holds its shaft; `gives_way` is then told how far it came, rad.
+        """
+        steps = max(1, round(duration_ns / STEP_NS))
+        self._hands[index] = _Hand(by / (steps * STEP_NS * 1e-9), steps, gives_way)
+        self.still = 0
+
+    def heat(self, index: int, celsius: float) -> None:
+        """Bring a servo to a temperature, degrees C; it goes back to that of its load."""
+        self.strain.temperature[index] = celsius
+        self.strain.calm = False
+
+    def overloaded(self, index: int) -> bool:
+        """Return whether a servo has been overloaded for too long."""
+        return bool(self.strain.overloaded[index] >= OVERLOAD_TICKS)
+
+    # Time
+
+    def call_at(self, t_ns: int, action: Callable[[], None]) -> None:
+        """Let something happen at the first point of the grid that is not before a time."""
+        heapq.heappush(self._agenda, (t_ns, next(self._order), action))
+
+    def due_ns(self) -> int | None:
+        """Return when it should be let go on in real time, though nobody asks; None: it has nothing to do."""
+        if not self._motors:
+            return None
+        if not self.still:
+            return self.grid_ns + EAGER_NS
+        agenda_ns = self._agenda[0][0] + STEP_NS if self._agenda else None
+        if self.strain.calm:
+            return agenda_ns
+        easy_ns = self.grid_ns + EASY_NS
+        return easy_ns if agenda_ns is None else min(easy_ns, agenda_ns)
+
+    def advance(self, now_ns: int) -> None:
+        """Step up to the last point of the grid before a time."""
+        if self._busy or self.grid_ns + STEP_NS > now_ns:
+            return
+        self._busy = True  # what is called on the way may look at the time, not change it
+        try:
+            while self.grid_ns + STEP_NS <= now_ns:
+                self._go_on(now_ns)
+        finally:
+            self._busy = False
+
+    def _go_on(self, now_ns: int) -> None:
+        """Take one step, or as many as nothing happens in."""
+        while self._agenda and self._agenda[0][0] <= self.grid_ns:
+            heapq.heappop(self._agenda)[2]()
+        if self.still or not self._motors:
+            self._skip(now_ns)
+        else:
+            if self._hands:
+                self._step_with_hands()
+            else:
+                self._step()
+            self.grid_ns += STEP_NS
+        if self.grid_ns >= self._next_strain_ns:
+            self._next_strain_ns = self._strain_after(self.grid_ns)
+            self._feel()
+
+    def _skip(self, now_ns: int) -> None:
+        """Let the time pass in which nothing moves, and nothing gets warmer or colder."""
+        until_ns = now_ns if self.strain.calm else min(now_ns, self._next_strain_ns)
+        if self._agenda:
+            until_ns = min(until_ns, self._agenda[0][0])
+        self.grid_ns += max(1, (until_ns - self.grid_ns) // STEP_NS) * STEP_NS
+
+    def _strain_after(self, t_ns: int) -> int:
+        return t_ns - (t_ns - self._start_ns) % STRAIN_NS + STRAIN_NS
+
+    def _step(self) -> None:
+        plant, profiles, law = self.plant, self.profiles, self.law
+        if self._commanded:
+            self._commanded = False
+            profiles.commanded()
+            law.commanded()
+        profiles.step()
+        law.step(profiles, plant.angle, plant.velocity)
+        if (self.grid_ns - self._start_ns) // STEP_NS % _STEPS_A_LOOK:
+            plant.step(law.drive, law.damping, STEP_NS * 1e-9)
+            return
+        before = plant.velocity.copy()
+        plant.step(law.drive, law.damping, STEP_NS * 1e-9)
+        profiles.look()
+        still = profiles.arrived and np.abs(plant.velocity).max() < _STILL and not law.winding
+        if still and np.abs(before - plant.velocity).max() < _UNDRIVEN:
+            plant.velocity.fill(0.0)
+            self._pauses += 1
+            self.still = self._pauses
+
+    def _step_with_hands(self) -> None:
+        """Take one step; what a hand turns is where the hand is."""
+        angles = {index: self.plant.angle.item(index) for index in self._hands}
+        self._step()
+        for index, angle in angles.items():
+            hand, way = self._hands[index], self._hands[index].speed * STEP_NS * 1e-9
+            if self._drives(index):
+                del self._hands[index]
+                hand.gives_way(hand.turned)
+                continue
+            hand.steps, hand.turned = hand.steps - 1, hand.turned + way
+            self.place(index, angle + way)
+            if hand.steps:
+                self.plant.velocity[index] = hand.speed
+            else:
+                del self._hands[index]
+
+    def _drives(self, index: int) -> bool:
+        """Return whether a servo is commanded to a position, a speed, or a torque that is not 0."""
+        command = Command(*self._commands[:, index].tolist())
+        able = command.limit > 0.0 and command.torque_limit > 0.0
+        return able and any((command.bias, command.turning, command.p_ccw, command.p_cw))
+
+    def _feel(self) -> None:
+        if not self._motors:
+            return
+        most = self.law.stall * self._commands[ROWS["limit"]]
+        for index in self.strain.tick(self.law.torque, most):
+            if (act := self._watchers.get(index)) is not None:
+                act()
+
+    def _wake(self) -> None:
+        self._commanded = True
+        self.still = 0
+        self.strain.calm = False
+
+    def _build(self, angle: Floats, velocity: Floats) -> None:
+        count, dt_s = len(self._motors), STEP_NS * 1e-9
+        self.plant: Plant = self._make_plant(
+            [
+                Joint(motor, load, float(each))
+                for motor, load, each in zip(self._motors, self._loads, angle, strict=True)
+            ]
+        )
+        self.plant.velocity[:] = velocity
+        self._commands = np.tile(np.array([LIMP]).T, (1, count))
+        nominal = np.array([motor.stall_torque for motor in self._motors])
+        self.profiles = Profiles(self._commands, self.plant.angle, dt_s)
+        self.law = ControlLaw(self._commands, np.array([motor.damping for motor in self._motors]), dt_s)
+        self.law.stall[:] = nominal
+        self.strain = Strain(nominal, STRAIN_NS * 1e-9)
+        self._next_strain_ns = self._strain_after(self.grid_ns)

@@ -1,0 +1,253 @@
+"""The shaft of servos with an operating mode: Protocol 2.0 but the XL-320."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import ClassVar
+
+from dxlrun.simulation.memory.access import watchdog_expired
+from dxlrun.simulation.memory.cells import Memory
+from dxlrun.simulation.motion.command import FREE, LIMP, Command
+from dxlrun.simulation.motion.gains import position_gains, velocity_gains
+from dxlrun.simulation.motion.mechanics import Load, Mechanics
+from dxlrun.simulation.motion.shaft import Shaft, Trajectory
+
+REVERSE, TIME_BASED = 0x01, 0x04
+"""Bits of Drive Mode (10): clockwise is positive; Profile Velocity and Acceleration are durations in ms."""
+
+CURRENT, VELOCITY, POSITION, EXTENDED, CURRENT_BASED, PWM = 0, 1, 3, 4, 5, 16
+"""Operating Mode (11)"""
+
+_RECTANGULAR, _TRIANGULAR, _TRAPEZOIDAL = 0x10, 0x20, 0x30
+_ARRIVED, _ON_THE_WAY = 0x01, 0x02
+"""Bits of Moving Status (123): the profile's kind, in position, a profile is under way."""
+
+_IN_POSITION_TICKS = 10
+"""So near is "in position"; the manual of the X series names no number [i]."""
+
+
+class ModeShaft(Shaft):
+    """Moves by the goal of its mode, with the profile that stands beside it.
+
+    Where Profile Velocity is 0 there is no profile (a step), where Profile Acceleration is 0 it is
+    rectangular (e-Manual, X series, Profile Velocity (112)); velocity control uses the acceleration only.
+    """
+
+    items: ClassVar[frozenset[str]] = frozenset(
+        (
+            "torque_enable",
+            "operating_mode",
+            "drive_mode",
+            "homing_offset",
+            "goal_position",
+            "goal_velocity",
+            "goal_current",
+            "goal_torque",
+            "goal_pwm",
+            "goal_acceleration",
+            "profile_velocity",
+            "profile_acceleration",
+            "velocity_limit",
+            "current_limit",
+            "torque_limit",
+            "pwm_limit",
+            "bus_watchdog",
+            "position_p_gain",
+            "position_i_gain",
+            "position_d_gain",
+            "velocity_p_gain",
+            "velocity_i_gain",
+            "feedforward_1st_gain",
+            "feedforward_2nd_gain",
+        )
+    )
+    aims: ClassVar[frozenset[str]] = frozenset(
+        ("goal_position", "profile_velocity", "profile_acceleration", "goal_velocity", "goal_acceleration")
+    )
+
+    def __init__(self, memory: Memory, mechanics: Mechanics, load: Load, angle: float) -> None:
+        super().__init__(memory, mechanics, load, angle)
+        self._aimed: tuple[int, int, int] = (0, 0, 0)
+        self._profile_kind = 0
+        items = memory.table.items
+        self._speed_item = memory.table.goal_speed_item
+        """What the profile's speed is: on PRO Goal Velocity (600), with Goal Acceleration (606)."""
+        of_pro = self._speed_item == "goal_velocity"
+        self._ramp_item = "goal_acceleration" if of_pro else "profile_acceleration"
+        item = items.get(self._ramp_item)
+        self._acceleration_unit = item.scale if item is not None else 1.0
+        self._pwm_unit = items["goal_pwm"].scale if "goal_pwm" in items else 1 / 885
+        self._current_unit = items["present_current"].scale if "present_current" in items else 0.001
+        self._torque_item = items.get("goal_torque" if of_pro else "goal_current")
+        self._scale = {name: item.scale for name, item in items.items()}
+        self._rad_per_tick = memory.table.rad_per_tick
+        self._sign, self._offset = 1, 0
+        memory.watch(("drive_mode", "homing_offset"), self._orient)
+        self._velocity_wanted, self._ramp_wanted = 0, 0
+        memory.watch((self._speed_item, self._ramp_item), self._note_profile)
+
+    def within_a_turn(self, angle: float) -> float:
+        """Return the angle within the turn that the encoder knows: 0 to 4095 ticks, or around 0."""
+        shown = self._sign * angle
+        if self.memory.table.items["min_position_limit"].minimum < 0:
+            return self._sign * (shown - math.tau * round(shown / math.tau))
+        # less than half a tick below 0 is still 0
+        half = self.memory.table.rad_per_tick / 2
+        return self._sign * (shown - math.tau * math.floor((shown + half) / math.tau))
+
+    def position_tick(self, angle: float) -> int:
+        """Return what Present Position shows."""
+        tick = round(self._sign * angle / self._rad_per_tick)
+        return tick + self._offset
+
+    def live(self) -> Mapping[str, Callable[[], int]]:
+        """Return the items that show the motion, each with what it shows now, in ticks."""
+        return {
+            "present_position": lambda: self.position_tick(self.angle),
+            "present_velocity": lambda: self._velocity_tick("present_velocity", self.velocity),
+            "position_trajectory": lambda: self.position_tick(self._trajectory_angle),
+            "velocity_trajectory": lambda: self._velocity_tick("velocity_trajectory", self._trajectory_speed),
+            "present_load": lambda: round(self._sign * self.duty * 1000),  # unit 0.1 %, as the output is
+            "present_current": lambda: round(self._sign * self.current / self._current_unit),
+            "present_pwm": lambda: round(self._sign * self.duty / self._pwm_unit),
+            "moving": lambda: int(self.moving),
+            "moving_status": self._moving_status,
+        }
+
+    def _velocity_tick(self, name: str, velocity: float) -> int:
+        return round(self._sign * velocity / self._scale[name])
+
+    @property
+    def _trajectory_angle(self) -> float:
+        if not self._goes_to_goal:
+            return self.angle
+        ahead_s = max(0, self.now_ns - self.mechanics.grid_ns) * 1e-9
+        return float(self.mechanics.profiles.position[self.index]) + self._trajectory_speed * ahead_s
+
+    @property
+    def _trajectory_speed(self) -> float:
+        speed = float(self.mechanics.profiles.velocity[self.index])
+        return speed if self._goes_to_goal or (self._last and self._last.turning) else 0.0
+
+    def _moving_status(self) -> int:
+        if not self._goes_to_goal:
+            return _ARRIVED if not self.moving else 0
+        if self._under_way:
+            return self._profile_kind | _ON_THE_WAY
+        goal = float(self.mechanics.profiles.position[self.index])
+        near = abs(goal - self.angle) <= _IN_POSITION_TICKS * self.memory.table.rad_per_tick
+        return self._profile_kind | (_ARRIVED if near else 0)
+
+    def _orient(self) -> None:
+        """Take note of how the servo counts angles."""
+        self._sign = -1 if self.memory.get("drive_mode") & REVERSE else 1
+        self._offset = self.memory.ticks("homing_offset") if "homing_offset" in self.memory else 0
+
+    @property
+    def _controls_position(self) -> bool:
+        return self.memory["operating_mode"] in {POSITION, EXTENDED, CURRENT_BASED}
+
+    @property
+    def _noticed_speed(self) -> float:
+        threshold = self.memory.get("moving_threshold", 1)
+        return max(threshold, 0.5) * self.memory.table.rad_s_per_tick
+
+    def _command(self) -> Command:
+        memory, mode = self.memory, self.memory["operating_mode"]
+        if watchdog_expired(memory):
+            return LIMP
+        duty = self._part("goal_pwm", "pwm_limit")
+        limit = memory.get("pwm_limit", round(1 / self._pwm_unit)) * self._pwm_unit
+        if mode == PWM:
+            return Command(bias=duty, limit=limit)
+        limit = min(limit, abs(duty)) if "goal_pwm" in memory else limit
+        torque = self._goal_torque()
+        if mode == CURRENT:
+            return Command(bias=math.copysign(limit, torque), limit=limit, torque_limit=abs(torque))
+        if mode == VELOCITY:
+            return self._turn(limit)._replace(torque_limit=self._most_torque(torque))
+        if not self._controls_position:
+            return LIMP  # a value that the model's manual does not name
+        most = (
+            abs(torque) if mode == CURRENT_BASED and "goal_current" in memory else self._most_torque(torque)
+        )
+        return position_gains(memory, self.motor)._replace(limit=limit, torque_limit=most)
+
+    def _most_torque(self, torque: float) -> float:
+        """Return what limits the torque beside a position or a speed, Nm.
+
+        Of PRO it is Goal Torque (604), where that is 0 Torque Limit (30) (e-Manual, Goal Torque (604)); of
+        the RH-P12-RN the latter is inferred [i].
+        """
+        if self._torque_item is None or self._torque_item.name != "goal_torque":
+            return FREE
+        return abs(torque) or self.memory["torque_limit"] * self._torque_unit
+
+    def _turn(self, limit: float) -> Command:
+        memory = self.memory
+        speed = self._sign * memory.ticks("goal_velocity") * memory.table.rad_s_per_tick
+        ramp = self._ramp_wanted * self._acceleration_unit or FREE
+        return velocity_gains(memory)._replace(turning=1.0, speed=speed, acceleration=ramp, limit=limit)
+
+    def _part(self, name: str, otherwise: str) -> float:
+        memory = self.memory
+        ticks = memory.ticks(name) if name in memory else memory.get(otherwise)
+        return self._sign * ticks * self._pwm_unit
+
+    def _goal_torque(self) -> float:
+        memory = self.memory
+        if self._torque_item is None:
+            return FREE
+        return self._sign * memory.ticks(self._torque_item.name) * self._torque_unit
+
+    @property
+    def _torque_unit(self) -> float:
+        """Nm per tick of the goal: it counts current, or parts of the stall torque (L42-10-S300-R)."""
+        if self._torque_item is None:
+            return 0.0
+        parts = self._torque_item.unit == "1"
+        whole = self.motor.stall_torque if parts else self.motor.torque_per_ampere
+        return self._torque_item.scale * whole
+
+    def _new_trajectory(self, *, afresh: bool = False) -> Trajectory | None:
+        memory, table = self.memory, self.memory.table
+        velocity, ramp = self._velocity_wanted, self._ramp_wanted
+        aimed = (memory["goal_position"], velocity, ramp)
+        if aimed == self._aimed and not afresh:
+            return None
+        self._aimed = aimed
+        goal = self._sign * (memory.ticks("goal_position") - self._offset) * table.rad_per_tick
+        if not velocity:
+            self._profile_kind = 0
+            return goal, FREE, FREE
+        distance = abs(goal - float(self.mechanics.profiles.position[self.index]))
+        if memory.get("drive_mode") & TIME_BASED:
+            return self._timed(goal, distance, velocity * 1e-3, ramp * 1e-3)
+        speed = velocity * table.rad_s_per_tick
+        acceleration = ramp * self._acceleration_unit or FREE
+        self._profile_kind = _kind(ramp, distance, speed, acceleration)
+        return goal, speed, acceleration
+
+    def _timed(self, goal: float, distance: float, duration: float, ramp: float) -> Trajectory:
+        """Return the move that takes a duration, s, and a time to come to speed, s, at most half of it."""
+        if distance == 0.0:
+            return goal, FREE, FREE
+        ramp = min(ramp, duration / 2)
+        speed = distance / (duration - ramp)
+        acceleration = speed / ramp if ramp else FREE
+        self._profile_kind = _kind(ramp, distance, speed, acceleration)
+        return goal, speed, acceleration
+
+    def _note_profile(self) -> None:
+        self._velocity_wanted = self._profile(self._speed_item)
+        self._ramp_wanted = self._profile(self._ramp_item)
+
+    def _profile(self, name: str) -> int:
+        return abs(self.memory.ticks(name)) if name in self.memory else 0
+
+
+def _kind(ramp: float, distance: float, speed: float, acceleration: float) -> int:
+    if not ramp:
+        return _RECTANGULAR
+    return _TRAPEZOIDAL if distance * acceleration > speed * speed else _TRIANGULAR

@@ -1,0 +1,171 @@
+"""The motor of a simulated servo with its gear, from the manual's figures and published identifications."""
+
+from __future__ import annotations
+
+import dataclasses
+import fnmatch
+import functools
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+
+from dxlrun.dynamixel.control_table import ControlTable
+
+STALL_POWER_W = 20.0
+"""Stall torque times no-load speed where the manual gives no stall torque: as an XM430-W350 [i]."""
+
+STALL_CURRENT_A = 1.5
+"""Where the manual gives none and the model measures none: as an AX-12A [i]."""
+
+_FILE = Path(__file__).parent / "motors.toml"
+
+
+@dataclass(frozen=True, slots=True)
+class Motor:
+    """A direct-current motor with its gear, as felt at the horn: torque falls with speed in a line.
+
+    Friction is at most `friction + load_friction * |motor's torque - load's torque|`, and in motion
+    `viscous_friction` times the speed beside it: model M3 of M. Duclusaud et al., "Extended Friction Models
+    for the Physics Simulation of Servo Actuators" (arXiv 2410.08650).
+    """
+
+    stall_torque: float
+    """Nm of the motor at `voltage` and standstill; friction is not taken off"""
+    damping: float
+    """Nm s/rad that the motor loses to its own voltage: torque constant squared over resistance"""
+    torque_per_ampere: float
+    """Nm/A"""
+    voltage: float
+    """V at which `stall_torque` holds; 0: whatever it is supplied with"""
+    inertia: float
+    """kg m^2 of rotor and gear"""
+    friction: float = 0.0
+    """Nm (Coulomb)"""
+    load_friction: float = 0.0
+    """Nm of friction for each Nm between the motor's torque and the load's"""
+    viscous_friction: float = 0.0
+    """Nm s/rad"""
+    p_gain_duty: float = 0.0
+    """Duty for each rad of error and each unit of the P gain; 0: not identified, the manual's holds"""
+    source: str = ""
+    """Where the figures are from that no manual gives"""
+    gain_source: str = ""
+    """Where `p_gain_duty` is from"""
+
+    @property
+    def time_constant(self) -> float:
+        """How fast the motor takes up speed without load and friction, s: J R / kt^2."""
+        return self.inertia / self.damping
+
+    @property
+    def no_load_speed(self) -> float:
+        """rad/s at `voltage` and full duty: where motor and friction are in balance."""
+        driving = 1.0 - self.load_friction
+        return (driving * self.stall_torque - self.friction) / (
+            driving * self.damping + self.viscous_friction
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Identified:
+    """A motor as it was identified; its fields are explained in motors.toml."""
+
+    model: str
+    source: str
+    voltage: float
+    torque_constant: float
+    resistance: float
+    inertia: float
+    friction: float
+    load_friction: float
+    viscous_friction: float
+
+    def motor(self) -> Motor:
+        return Motor(
+            stall_torque=self.torque_constant * self.voltage / self.resistance,
+            damping=self.torque_constant**2 / self.resistance,
+            torque_per_ampere=self.torque_constant,
+            voltage=self.voltage,
+            inertia=self.inertia,
+            friction=self.friction,
+            load_friction=self.load_friction,
+            viscous_friction=self.viscous_friction,
+            source=self.source,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Gain:
+    item: str
+    duty_per_rad: float
+    models: tuple[str, ...]
+    identified: tuple[str, ...]
+    source: str
+
+
+@dataclass(frozen=True, slots=True)
+class _Motors:
+    identified: Mapping[str, _Identified]
+    scaled: tuple[tuple[str, str], ...]
+    """Pattern of models, and the identified model that they are like"""
+    gains: tuple[_Gain, ...]
+
+
+def motor_of(table: ControlTable) -> Motor:
+    """Return a model's motor: an identified one, or the manual's with inertia and friction of one like it."""
+    motors, model = _motors(), table.model.partition("-FW")[0]
+    if (identified := motors.identified.get(model)) is not None:
+        motor = identified.motor()
+    else:
+        like = next(like for pattern, like in motors.scaled if fnmatch.fnmatchcase(model, pattern))
+        motor = _scaled(table, motors.identified[like])
+    for gain in motors.gains:
+        if gain.item in table.items and any(fnmatch.fnmatchcase(model, each) for each in gain.models):
+            known = "" if model in gain.identified else f"[i] as {gain.identified[0]}; "
+            return dataclasses.replace(motor, p_gain_duty=gain.duty_per_rad, gain_source=known + gain.source)
+    return motor
+
+
+def _scaled(table: ControlTable, like: _Identified) -> Motor:
+    """Return a motor of the manual's stall torque and no-load speed, the rest in proportion to another one's.
+
+    Damping is what leaves just that speed with friction f, load friction l and viscous friction v:
+    (1 - l) * (stall torque - damping * speed) = f + v * speed.
+    """
+    model = like.motor()
+    torque = table.stall_torque or STALL_POWER_W / table.max_speed
+    friction = model.friction / model.stall_torque
+    viscous = model.viscous_friction / model.damping
+    driving = 1.0 - model.load_friction
+    damping = torque * (driving - friction) / (table.max_speed * (driving + viscous))
+    limit = table.items.get("current_limit") or table.items.get("torque_limit")  # PRO has the latter, in A
+    measured = STALL_CURRENT_A
+    if limit is not None and limit.unit == "A":
+        measured = limit.maximum * limit.scale
+    return Motor(
+        stall_torque=torque,
+        damping=damping,
+        torque_per_ampere=torque / (table.stall_current or measured),
+        voltage=table.nominal_voltage,
+        inertia=model.time_constant * damping,
+        friction=friction * torque,
+        load_friction=model.load_friction,
+        viscous_friction=viscous * damping,
+        source=f"[i] scaled from the {like.model}: {like.source}",
+    )
+
+
+@functools.cache
+def _motors() -> _Motors:
+    data = tomllib.loads(_FILE.read_text("utf-8"))
+    identified = [_Identified(**entry) for entry in data["identified"]]
+    return _Motors(
+        MappingProxyType({each.model: each for each in identified}),
+        tuple((pattern, entry["like"]) for entry in data["scaled"] for pattern in entry["models"]),
+        tuple(
+            _Gain(**{**entry, "models": tuple(entry["models"]), "identified": tuple(entry["identified"])})
+            for entry in data["gain"]
+        ),
+    )

@@ -1,0 +1,139 @@
+"""What simulated servos move: joints with inertia, friction and gravity, all of them in one step.
+
+The servos say with which torque they drive at standstill and how much of it each rad/s takes away; a plant
+turns that into motion. `IndependentJoints` is the plant of joints that do not feel one another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.simulation.motion.motor import Motor
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Load:
+    """What hangs on the shaft of a servo; nothing by default."""
+
+    inertia: float = 0.0
+    """kg m^2, beside that of the servo's own rotor and gear"""
+    friction: float = 0.0
+    """Nm, Coulomb, beside the servo's own: the same at every speed, and the most that holds at rest"""
+    gravity: float = 0.0
+    """Nm with which gravity turns the link where it is horizontal"""
+    gravity_angle: float = 0.0
+    """rad from the servo's raw 0, where the link hangs straight down"""
+
+
+NO_LOAD = Load()
+
+
+@dataclass(frozen=True, slots=True)
+class Joint:
+    """One servo's shaft as a plant takes it over."""
+
+    motor: Motor
+    """Its inertia and friction are the plant's to apply"""
+    load: Load
+    angle: float
+    """rad from the servo's raw 0, at the start"""
+
+
+class Plant(Protocol):
+    """All joints of a simulation, in the order in which the servos were added."""
+
+    @property
+    def angle(self) -> Floats:
+        """Angles, rad; the same array for ever."""
+
+    @property
+    def velocity(self) -> Floats:
+        """Speeds, rad/s, counter-clockwise positive; the same array for ever."""
+
+    def step(self, drive: Floats, damping: Floats, dt_s: float) -> None:
+        """Let a time pass in which each servo drives with `drive - damping * velocity`; Nm and Nm s/rad."""
+
+    def place(self, index: int, angle: float) -> None:
+        """Put a joint somewhere, rad, at rest."""
+
+
+PlantMaker = Callable[[Sequence[Joint]], Plant]
+"""Makes the plant of some joints; called again when a servo is added later, with the joints as they are."""
+
+
+class IndependentJoints:
+    """Joints that do not feel one another.
+
+    Velocity first, damping taken at the end of the step: stable at any damping and any step. Friction is that
+    of `Motor` and of `Load`.
+    """
+
+    def __init__(self, joints: Sequence[Joint]) -> None:
+        self.angle: Floats = np.array([joint.angle for joint in joints], dtype=np.float64)
+        self.velocity: Floats = np.zeros(len(joints))
+        self._inverse_inertia = np.array([1.0 / (each.motor.inertia + each.load.inertia) for each in joints])
+        self._friction = np.array([each.motor.friction + each.load.friction for each in joints])
+        self._load_friction = np.array([each.motor.load_friction for each in joints])
+        self._viscous_friction = np.array([each.motor.viscous_friction for each in joints])
+        self._gravity = np.array([each.load.gravity for each in joints])
+        self._down = np.array([each.load.gravity_angle for each in joints])
+        self._has_friction = bool((self._friction + self._load_friction).any())
+        self._has_gravity = bool(self._gravity.any())
+        self._torque, self._work, self._less = (np.zeros(len(joints)) for _ in range(3))
+        self._dt, self._per_torque = np.zeros(len(joints)), np.zeros(len(joints))
+        self._least_most, self._most_per_torque = np.zeros(len(joints)), np.zeros(len(joints))
+        self._most, self._undamped = np.zeros(len(joints)), np.ones(len(joints))
+        self._dt_s = 0.0
+
+    def step(self, drive: Floats, damping: Floats, dt_s: float) -> None:
+        """Let a time pass in which each servo drives with `drive - damping * velocity`; Nm and Nm s/rad."""
+        torque, work, most, velocity = self._torque, self._work, self._most, self.velocity
+        if dt_s != self._dt_s:
+            self._set_step(dt_s)
+        if self._has_friction:
+            np.multiply(damping, velocity, out=most)
+            np.subtract(drive, most, out=most)  # the motor's torque, which gravity's is added to
+        if self._has_gravity:
+            np.subtract(self.angle, self._down, out=work)
+            np.sin(work, out=work)
+            np.multiply(work, self._gravity, out=work)
+            np.subtract(drive, work, out=torque)
+            np.multiply(torque, self._per_torque, out=torque)
+            np.add(most, work, out=most)
+        else:
+            np.multiply(drive, self._per_torque, out=torque)
+        np.add(velocity, torque, out=velocity)  # as it would be without friction and damping
+        if self._has_friction:
+            np.abs(most, out=most)
+            np.multiply(most, self._most_per_torque, out=most)
+            np.add(most, self._least_most, out=most)
+            np.negative(most, out=self._less)
+            # what friction takes in a step, and no more: a joint that it stops stays at rest
+            np.minimum(velocity, most, out=work)
+            np.maximum(work, self._less, out=work)
+            np.subtract(velocity, work, out=velocity)
+        np.multiply(self._per_torque, damping, out=work)
+        np.add(work, self._undamped, out=work)
+        np.divide(velocity, work, out=velocity)
+        np.multiply(velocity, self._dt, out=work)
+        np.add(self.angle, work, out=self.angle)
+
+    def place(self, index: int, angle: float) -> None:
+        """Put a joint somewhere, rad, at rest."""
+        self.angle[index] = angle
+        self.velocity[index] = 0.0
+
+    def _set_step(self, dt_s: float) -> None:
+        self._dt_s = dt_s
+        self._dt.fill(dt_s)
+        np.multiply(self._inverse_inertia, dt_s, out=self._per_torque)
+        np.multiply(self._friction, self._per_torque, out=self._least_most)
+        np.multiply(self._load_friction, self._per_torque, out=self._most_per_torque)
+        np.copyto(self._undamped, 1.0 + self._viscous_friction * self._per_torque)

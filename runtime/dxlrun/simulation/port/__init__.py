@@ -1,0 +1,1 @@
+"""Port: how programs reach a simulated bus."""

@@ -1,0 +1,148 @@
+"""A pseudo-terminal before a simulated bus, so that a host opens it as it would open an adapter."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import struct
+import time
+import tty
+from contextlib import suppress
+
+from dxlrun.simulation.bus.simulated_bus import SimulatedBus
+from dxlrun.simulation.port.link import Link
+
+_TCGETS2, _TCSETS2 = 0x802C542A, 0x402C542B
+"""Terminal settings with the rate as a number (Linux, asm-generic/ioctls.h): they know every rate."""
+_SETTINGS = struct.Struct("4I20s2I")
+"""struct termios2 (asm-generic/termbits.h): flags of input, output, control, local; line; both rates."""
+_ROOM = bytes(_SETTINGS.size)
+_CBAUD, _BOTHER = 0o010017, 0o010000
+
+
+class PseudoTerminal:
+    """The master's end; a slave's descriptor stays open here, so that hosts may come and go.
+
+    A terminal that was never told a rate has that of the bus; a host that sets another one talks at that
+    rate, and servos at the old one hear nothing.
+
+    What a USB adapter would not do [i]: a host that throws its output away (`tcflush(TCOFLUSH)`, pyserial's
+    `reset_output_buffer`) right after writing loses what the kernel has not handed over yet; pypot 5.0 does
+    so before each packet.
+    """
+
+    def __init__(self, bus: SimulatedBus, link: Link | None = None) -> None:
+        self.bus = bus
+        self._link = link
+        self._master, self._slave = self._new_pair()
+        self._told = b""
+        """Settings of the terminal when the host last wrote."""
+        self._taken = b""
+        """What the host wrote and the bus was not handed yet."""
+        self._times_unplugged = bus.times_unplugged
+        self.plugged = True
+        """False: the host saw it go, and no device is there."""
+        self._publish()
+
+    @property
+    def path(self) -> str:
+        """Path of the device that a host opens, empty while the adapter is unplugged."""
+        return os.ttyname(self._slave) if self.plugged else ""
+
+    def fileno(self) -> int:
+        """Return the descriptor that becomes readable when the host has written."""
+        return self._master
+
+    def follow_adapter(self) -> bool:
+        """Go and come back with the adapter of the bus; return whether the device is another one now.
+
+        It comes back under another name, because a host may still hold the old one, as udev would have it;
+        the link follows. What the host wrote meanwhile is lost.
+        """
+        if self._times_unplugged == self.bus.times_unplugged and self.plugged == self.bus.plugged:
+            return False
+        self._taken = b""
+        if self._times_unplugged != self.bus.times_unplugged:
+            self._times_unplugged = self.bus.times_unplugged
+            old = self._master, self._slave
+            self._master, self._slave = self._new_pair()  # while the old name is still taken
+            _close(old)
+            self._unpublish()
+        self.plugged = self.bus.plugged
+        if self.plugged:
+            try:
+                self._publish()
+            except OSError as error:
+                self.bus.note(f"the link does not follow the adapter: {error}")
+        return True
+
+    def listen(self) -> None:
+        """Take what the host has written."""
+        with suppress(BlockingIOError):
+            self._taken += os.read(self._master, 4096)
+
+    def receive(self, now_ns: int) -> None:
+        """Hand what was taken to the bus, as if it had been written at `now_ns`, which is no earlier."""
+        data, self._taken = self._taken, b""
+        if not data:
+            return
+        settings = _settings(self._slave)
+        if settings != self._told:  # the host's rate can only be another one then
+            self._told = settings
+            rate = _rate(settings)
+            if rate not in (0, self.bus.baud_rate):
+                self.bus.change_rate(rate)
+        self.bus.receive(data, now_ns)
+
+    def deliver(self, now_ns: int) -> None:
+        """Give the host what has reached it by `now_ns`; what does not fit into the terminal is lost."""
+        data = self.bus.take(now_ns, handed_ns=time.monotonic_ns())
+        if not data:
+            return
+        try:
+            written = os.write(self._master, data)
+        except BlockingIOError:
+            written = 0
+        if written < len(data):
+            self.bus.note(f"{len(data) - written} bytes to the host are lost: it does not read")
+
+    def close(self) -> None:
+        """Take the terminal and its link away."""
+        _close((self._master, self._slave))
+        self._unpublish()
+
+    def _new_pair(self) -> tuple[int, int]:
+        master, slave = os.openpty()
+        tty.setraw(slave)
+        _set_rate(slave, self.bus.baud_rate)
+        os.set_blocking(master, False)
+        return master, slave
+
+    def _publish(self) -> None:
+        if self._link is not None:
+            self._link.point(self.path)
+
+    def _unpublish(self) -> None:
+        if self._link is not None:
+            self._link.remove()
+
+
+def _close(pair: tuple[int, int]) -> None:
+    for descriptor in pair:
+        os.close(descriptor)
+
+
+def _settings(terminal: int) -> bytes:
+    return fcntl.ioctl(terminal, _TCGETS2, _ROOM)
+
+
+def _rate(settings: bytes) -> int:
+    """Return the rate at which a terminal of such settings would send, bit/s."""
+    return int(_SETTINGS.unpack(settings)[-1])
+
+
+def _set_rate(terminal: int, baud_rate: int) -> None:
+    settings = list(_SETTINGS.unpack(_settings(terminal)))
+    settings[2] = settings[2] & ~_CBAUD | _BOTHER
+    settings[-2:] = [baud_rate, baud_rate]
+    fcntl.ioctl(terminal, _TCSETS2, _SETTINGS.pack(*settings))

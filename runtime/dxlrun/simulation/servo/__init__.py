@@ -1,0 +1,1 @@
+"""Servo: memory, instructions and protection of a simulated servo."""

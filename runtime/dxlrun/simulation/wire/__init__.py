@@ -1,0 +1,1 @@
+"""Wire: packets of both protocols as servos read and write them."""
