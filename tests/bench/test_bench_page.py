@@ -9,22 +9,27 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.bench.hosts import HOSTS
-from dxlrun.bench.rate import ALLOWED, HIGHEST_HZ
-from dxlrun.bench.rounds import WARM, measure
 from dxlrun.cli import main
-from dxlrun.cli.bench import bench_bus
+from dxlrun.run.highest_rate import ALLOWED, HIGHEST_HZ
+from exchange import command
+from exchange.hosts import HOSTS
+from exchange.rounds import WARM, measure
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "bench.md").read_text()
 FLAT = " ".join(PAGE.split())
-COMMANDS = [line.strip() for line in PAGE.splitlines() if re.match(r"(    )?dxlrun ", line)]
+PROGRAM = "python tests/bench/exchange"
+EXCHANGES = [
+    line
+    for path in sorted(ROOT.glob("docs/*.md"))
+    for line in re.findall(rf"(?:^ *|`){PROGRAM}[^`\n]*", path.read_text(), re.MULTILINE)
+]
 
 
-def test_every_host_is_on_the_page_and_measured_unless_somebody_says_otherwise() -> None:
+def test_every_host_is_on_the_page_and_measured_by_default() -> None:
     names = [kind.name for kind in HOSTS]
     assert re.findall(r"^\| `([\w-]+)` \|", PAGE, re.MULTILINE) == names
-    assert inspect.signature(bench_bus).parameters["peers"].default.split(",") == names
+    assert command.parser().get_default("peers").split(",") == names
 
 
 def test_the_numbers_of_the_page_are_those_of_the_program() -> None:
@@ -34,10 +39,21 @@ def test_the_numbers_of_the_page_are_those_of_the_program() -> None:
     assert ALLOWED == 1 / 1000
 
 
-@pytest.mark.parametrize("line", [line for line in COMMANDS if " bench " in line])
-def test_the_commands_of_the_page_are_understood(line: str, capsys: pytest.CaptureFixture[str]) -> None:
-    words = [word for word in shlex.split(line)[1:] if not word.startswith(("robots/", "--json"))]
+def test_the_search_for_a_rate_is_understood_as_the_page_has_it(capsys: pytest.CaptureFixture[str]) -> None:
+    (line,) = re.findall(r"^    dxlrun (bench .+)$", PAGE, re.MULTILINE)
+    words = [str(ROOT / word) if word.startswith("robots/") else word for word in shlex.split(line)]
     # refused for this alone, so everything before it was understood
-    robot = [str(ROOT / "robots" / "single_joint.yaml")] if "rate" in words else []
-    assert main([*words, *robot, "--seconds", "-1"]) == 2
+    assert main([*words, "--seconds", "-1"]) == 2
     assert capsys.readouterr().err.startswith("dxlrun: --seconds -1: give from")
+
+
+@pytest.mark.parametrize("line", EXCHANGES)
+def test_the_exchange_is_measured_with_the_options_of_the_pages(
+    line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command.main([*shlex.split(line.partition(PROGRAM)[2]), "--seconds", "-1"]) == 2
+    assert "--seconds -1: give from" in capsys.readouterr().err
+
+
+def test_the_pages_have_commands_of_the_exchange() -> None:
+    assert len(EXCHANGES) >= 3

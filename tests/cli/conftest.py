@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import pytest
 
-from dxlrun.bench.simulated import SimulatedServos
 from dxlrun.cli import main
 from dxlrun.simulation import BusConfig, LedgerEntry, read_ledger
+from exchange.simulated import SimulatedServos
 
 
 class Said(NamedTuple):

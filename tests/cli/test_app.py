@@ -194,7 +194,7 @@ def test_a_reader_that_goes_away_is_no_traceback(torso):
         (["sim", "--servo", "toaster"], 2, "this is not MODEL:IDS"),
         (["sim", "missing.yaml"], 2, "there is no robot file missing.yaml"),
         (["bench", "rate", "missing.yaml"], 2, "there is no robot file missing.yaml"),
-        (["bench", "bus", "--seconds", "soon"], 2, "Invalid value"),
+        (["bench", "rate", "missing.yaml", "--seconds", "soon"], 2, "Invalid value"),
         (["doctor", "--loud"], 2, "Unknown option"),
         (["list", "--robot", "nobody"], 2, "no robot nobody runs"),
         *(

@@ -57,7 +57,7 @@ def scan(
     debug
         Print the traceback of an error.
     """
-    from dxlrun.cli.output.bench_table import progress_bar
+    from dxlrun.cli.output.progress import progress_bar
     from dxlrun.dynamixel.tools import scanning
     from dxlrun.dynamixel.tools.tool_line import ToolLine, TunablePort
 

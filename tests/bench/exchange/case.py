@@ -91,7 +91,7 @@ class Registers:
         servo = plan.buses[0].servos[0]
         state, goal = servo.state, servo.goal
         position = goal.position
-        assert position is not None  # noqa: S101  nobody commands the joints of a case: they hold positions
+        assert position is not None  # no controller commands the joints of a case: they hold positions
         middle = (servo.lower_tick + servo.upper_tick) // 2
         return cls(
             read_address=state.address,

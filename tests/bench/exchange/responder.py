@@ -4,18 +4,18 @@ It has one pseudo-terminal a host. While a host rehearses, simulated servos answ
 not at the speed of a wire. What they answered during one exchange is kept: after so many bytes these bytes.
 From then on nothing is parsed, computed or waited for: bytes are counted, and what was kept is written.
 
-Its starter talks to it in lines of JSON: `{"do": "rehearse" | "learn" | "play", "port": number}`; each is
-answered, `play` by the kept steps, `{"steps": [[bytes that come, bytes that are answered], ...]}`.
+Its starter writes lines of JSON to its standard input. The first has the buses, one a host; the answer is
+`{"ports": [device, ...]}`. Each further one is `{"do": "rehearse" | "learn" | "play", "port": number}`; the
+answer is `{"steps": [[bytes that come, bytes that are answered], ...]}`, for `play` those that were kept.
 """
 
 from __future__ import annotations
 
 import argparse
 import gc
+import json
 import os
 import select
-import signal
-import socket
 import sys
 import time
 import tty
@@ -24,7 +24,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Literal
 
-from dxlrun.run.channels import process
 from dxlrun.simulation import BusConfig, Ledger, SimulatedBus
 from dxlrun.simulation.configuration import decode_config
 
@@ -106,51 +105,42 @@ class Terminal:
                 self._waiting = 0
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Answer until the control socket ends; the ports are told on it first."""
-    parser = argparse.ArgumentParser(prog="dxlrun.bench.responder", description=__doc__)
-    parser.add_argument("--config-fd", type=int, required=True, help="the buses, one a host")
-    parser.add_argument("--control-fd", type=int, required=True, help="socket: its end ends the process")
+def main() -> None:
+    """Answer until the standard input ends."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--core", type=int, default=-1, help="core to stay on; -1: any")
-    options = parser.parse_args(arguments)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # only the front process takes it
+    options = parser.parse_args()
     if options.core >= 0:
         with suppress(OSError):
             os.sched_setaffinity(0, {options.core})
-    with os.fdopen(options.config_fd, "rb") as file:
-        buses = decode_config(file.read()).buses
-    control = process.Line(socket.socket(fileno=options.control_fd))
-    terminals = [Terminal(config) for config in buses]
-    control.send({"ports": [terminal.path for terminal in terminals]})
+    terminals = [Terminal(config) for config in decode_config(sys.stdin.buffer.readline()).buses]
+    _say(ports=[terminal.path for terminal in terminals])
     gc.collect()
     gc.freeze()
-    _serve(control, terminals)
-    return 0
+    _serve(terminals)
 
 
-def _serve(control: process.Line, terminals: Sequence[Terminal]) -> None:
+def _serve(terminals: Sequence[Terminal]) -> None:
+    asked = sys.stdin.fileno()
     by_descriptor = {terminal.fileno(): terminal for terminal in terminals}
     with select.epoll() as waiting:
-        for descriptor in (control.fileno(), *by_descriptor):
+        for descriptor in (asked, *by_descriptor):
             waiting.register(descriptor, select.EPOLLIN)
-        while not control.closed:
+        while True:
             for descriptor, _ in waiting.poll():
-                terminal = by_descriptor.get(descriptor)
-                if terminal is not None:
-                    terminal.receive()
-                    continue
-                for message in control.receive():
-                    _obey(control, terminals, message)
+                if descriptor != asked:
+                    by_descriptor[descriptor].receive()
+                elif line := sys.stdin.buffer.readline():  # one at a time: the starter awaits each answer
+                    request = json.loads(line)
+                    steps = terminals[request["port"]].do(request["do"])
+                    _say(steps=[[step.count, len(step.reply)] for step in steps])
+                else:
+                    return
 
 
-def _obey(control: process.Line, terminals: Sequence[Terminal], message: dict[str, object]) -> None:
-    port, what = message["port"], message["do"]
-    assert isinstance(port, int)  # noqa: S101  our own starter says so
-    for known in ("rehearse", "learn", "play"):
-        if what == known:
-            steps = terminals[port].do(known)
-            control.send({"steps": [[step.count, len(step.reply)] for step in steps]})
+def _say(**answer: object) -> None:
+    print(json.dumps(answer), flush=True)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -1,4 +1,4 @@
-"""`bench rate`: the highest rate that a robot keeps, found by running it at one rate after another.
+"""The highest rate that a robot keeps, found by running it at one rate after another: `dxlrun bench rate`.
 
 The first run has nearly the rate that the buses allow by computation. A run that overran is followed by one
 at the rate that nearly all its cycles would have kept. Everything is as in a run: all processes, the
@@ -8,12 +8,15 @@ controllers, each in its share of the cycles, and the recording; the robot holds
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import msgspec
 import numpy as np
+from rich.console import Console
 
 from dxlrun.analysis.ledger.comparison import compare
 from dxlrun.compile import compile_robot
@@ -21,6 +24,8 @@ from dxlrun.compile.plan import Plan
 from dxlrun.description import Description
 from dxlrun.errors import ProcessFault
 from dxlrun.log.reader import Log, read_log
+from dxlrun.run.run_summary import RunOptions
+from dxlrun.run.supervisor import run_robot
 from dxlrun.simulation import read_ledger
 
 HIGHEST_HZ = 2000.0
@@ -29,6 +34,7 @@ ALLOWED = 0.001
 """Share of cycles that may overrun: one in a thousand."""
 _STEP = 0.95
 _COMFORT = 0.98
+_INTERRUPTED = 130
 
 Run = Callable[[Plan], Path]
 """Runs a plan and returns its log; the ledger of simulated buses lies beside it."""
@@ -51,8 +57,8 @@ class Tried:
 
 
 @dataclass(frozen=True, slots=True)
-class RateBench:
-    """What `bench rate` found."""
+class HighestRate:
+    """The rate that a robot keeps on this machine, and the runs that led to it."""
 
     robot: str
     computed_hz: float
@@ -62,14 +68,15 @@ class RateBench:
     tries: tuple[Tried, ...]
 
 
-def bench_rate(
+def highest_rate(
     description: Description,
     seconds: float,
     run: Run,
     progress: Callable[[float], None] = lambda _: None,
-) -> RateBench:
-    """Run a robot at falling rates, each for some seconds, until one is kept; `progress` is told each rate.
+) -> HighestRate:
+    """Run a robot at falling rates, each for some seconds, until one is kept.
 
+    `progress` is called with each rate before its run.
     Raises InputError when the robot file cannot be compiled, ProcessFault when a run left no cycle.
     """
     plan = compile_robot(description, [], round(seconds * 1e9)).plan
@@ -82,12 +89,30 @@ def bench_rate(
             break
         rate = _round(min(_STEP * rate, 1e6 / tries[-1].p999_us))
     kept = tries[-1].rate_hz if tries and tries[-1].kept else None
-    return RateBench(description.robot.name, round(computed, 1), kept, tuple(tries))
+    return HighestRate(description.robot.name, round(computed, 1), kept, tuple(tries))
 
 
-def to_json(result: RateBench) -> bytes:
+def to_json(result: HighestRate) -> bytes:
     """Encode what was found."""
     return msgspec.json.format(msgspec.json.encode(result))
+
+
+@contextmanager
+def runs_to_discard() -> Iterator[Run]:
+    """Give runs of a robot with all its processes, in real time; their logs last until the context ends."""
+    with tempfile.TemporaryDirectory(prefix="dxlrun-bench-") as folder:
+
+        def run(plan: Plan) -> Path:
+            summary = run_robot(
+                replace(plan, recording_directory=folder), RunOptions(gateway=False), Console(quiet=True)
+            )
+            if summary.exit_code == _INTERRUPTED:
+                raise KeyboardInterrupt
+            if summary.exit_code or summary.log is None:
+                raise ProcessFault("\n".join(summary.sentences) or f"the run failed: {summary.reason}")
+            return Path(summary.log)
+
+        yield run
 
 
 def _round(rate: float) -> float:

@@ -8,18 +8,30 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.bench.case import BUS, Case
-from dxlrun.bench.rate import Run, bench_rate, to_json
 from dxlrun.compile.plan import AdapterPlan, Plan
 from dxlrun.description import Description, read_robot
 from dxlrun.errors import ProcessFault
+from dxlrun.run.highest_rate import Run, highest_rate, to_json
 from dxlrun.run.virtual_run import VirtualRobot
+
+ROBOT = """
+name: two
+buses:
+  main: {port: sim, protocol: 1.0, baud_rate: 1000000, adapter: {latency: 0 ms}, return_delay_time: 0 us}
+loop: {rate: 10}
+joints:
+  joint_1:
+    {bus: main, id: 1, model: AX-12A, reference: 150 deg, direction: 1, limits: {position: [-90 deg, 90 deg]}}
+  joint_2:
+    {bus: main, id: 2, model: AX-12A, reference: 150 deg, direction: 1, limits: {position: [-90 deg, 90 deg]}}
+controllers: {joint_state_broadcaster: {type: joint_state_broadcaster, rate: 10}}
+"""
 
 
 @pytest.fixture
 def robot(tmp_path: Path) -> Description:
     path = tmp_path / "two.yaml"
-    path.write_text(Case(1.0, 2).robot_file())
+    path.write_text(ROBOT)
     return read_robot(path, {})
 
 
@@ -31,7 +43,7 @@ def run_with(tmp_path: Path) -> Callable[..., Run]:
     def run_with(latency_ms: float = 0.0) -> Run:
         def run(plan: Plan) -> Path:
             adapter = AdapterPlan(latency_timer_ns=round(latency_ms * 1e6))
-            told = replace(plan, simulation=replace(plan.simulation, adapters={BUS: adapter}))
+            told = replace(plan, simulation=replace(plan.simulation, adapters={"main": adapter}))
             path = tmp_path / f"{next(logs)}.mcap"
             VirtualRobot(told, log=path).run()
             return path
@@ -44,7 +56,7 @@ def run_with(tmp_path: Path) -> Callable[..., Run]:
 def test_a_robot_whose_buses_are_all_that_takes_time_keeps_what_they_allow(
     robot: Description, run_with: Callable[..., Run]
 ) -> None:
-    found = bench_rate(robot, 0.2, run_with())
+    found = highest_rate(robot, 0.2, run_with())
     assert found.kept_hz is not None
     assert found.kept_hz == int(0.98 * found.computed_hz)
     (one,) = found.tries
@@ -56,7 +68,7 @@ def test_a_slower_adapter_brings_the_rate_down_to_what_nearly_all_cycles_keep(
     robot: Description, run_with: Callable[..., Run]
 ) -> None:
     tried: list[float] = []
-    found = bench_rate(robot, 0.5, run_with(latency_ms=4), tried.append)
+    found = highest_rate(robot, 0.5, run_with(latency_ms=4), tried.append)
     assert tried == [one.rate_hz for one in found.tries]
     first, *_, last = found.tries
     assert first.overruns > 0
@@ -77,4 +89,4 @@ def test_a_run_without_a_cycle_is_an_error_with_a_hint(
         return run(replace(plan, loop=replace(plan.loop, end_ns=0)))
 
     with pytest.raises(ProcessFault, match="ran no cycle"):
-        bench_rate(robot, 0.2, none)
+        highest_rate(robot, 0.2, none)

@@ -1,6 +1,6 @@
-"""The benchmark of the exchange: who is measured exchanges what, judged by byte counts and by the ledger.
+"""The benchmark of the exchange: what each host exchanges, judged by byte counts and by the ledger.
 
-How fast anybody is decides nothing here.
+How fast a host is decides nothing here.
 """
 
 from __future__ import annotations
@@ -16,14 +16,16 @@ import numpy as np
 import pytest
 
 from dxlrun.analysis.ledger.waits import Transaction
-from dxlrun.bench.bus import Wish, bench_bus, chosen_hosts, to_json
-from dxlrun.bench.case import Case, Registers
-from dxlrun.bench.figures import host_figures, wire_figures
-from dxlrun.bench.hosts import HOSTS, HostKind
-from dxlrun.bench.responder import Terminal
-from dxlrun.bench.rounds import Measured, measure
-from dxlrun.bench.wire import judge
 from dxlrun.dynamixel.wire import protocol1
+from dxlrun.errors import ProcessFault
+from exchange.bus import Wish, bench_bus, chosen_hosts, to_json
+from exchange.canned import CannedResponder
+from exchange.case import Case, Registers
+from exchange.figures import host_figures, wire_figures
+from exchange.hosts import HOSTS, HostKind
+from exchange.responder import Terminal
+from exchange.rounds import Measured, measure
+from exchange.wire import judge
 
 SECONDS = 0.2
 PATIENCE_S = 60.0
@@ -137,6 +139,14 @@ def test_the_responder_is_a_servo_again_when_it_is_rehearsed(learned: Any) -> No
     terminal.do("rehearse")
     assert say(protocol1.ping(7)) == b""
     assert say(protocol1.ping(1), 6)[2] == 1
+
+
+def test_a_responder_that_ended_is_an_error_and_is_not_waited_for() -> None:
+    responder = CannedResponder([Case(1.0, 1).simulated("main")], -1)
+    responder._process.kill()
+    with pytest.raises(ProcessFault, match="the canned responder ended"):
+        responder.rehearse(0, Made(set()), first=True)
+    responder.close()
 
 
 # The rounds, and the figures made of them

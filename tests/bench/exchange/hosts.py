@@ -14,8 +14,6 @@ from typing import Protocol
 import numpy as np
 
 from dxlrun.analysis.ledger.waits import Sent
-from dxlrun.bench.case import Case, Registers
-from dxlrun.bench.peers import Rustypot, Sdk
 from dxlrun.clock import MonotonicClock
 from dxlrun.compile.plan import Plan
 from dxlrun.control.controllers.plugins import load_plugins
@@ -34,6 +32,8 @@ from dxlrun.run.channels.packets import (
     packet_slots,
 )
 from dxlrun.run.channels.ring import Gap, RingReader, RingWriter, create
+from exchange.case import Case, Registers
+from exchange.peers import Rustypot, Sdk
 
 _IDLE_NS = 50_000_000
 _TICKS = 2
@@ -197,4 +197,4 @@ HOSTS: Sequence[HostKind] = (
     HostKind("rustypot", "rustypot", _rustypot),
     HostKind("rustypot-fast", "rustypot", partial(_rustypot, fast=True), (2.0,)),
 )
-"""Who can be measured."""
+"""The hosts that can be measured."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.bench.rounds import Measured
+from exchange.rounds import Measured
 
 Floats = NDArray[np.float64]
 

@@ -1,4 +1,4 @@
-"""`bench bus`: what one exchange with the servos costs, ours and others', side by side in one run."""
+"""What one exchange with the servos costs, ours and others', side by side in one run."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ import msgspec
 import numpy as np
 
 from dxlrun.analysis.ledger.waits import Sent, transactions
-from dxlrun.bench.canned import CannedResponder
-from dxlrun.bench.case import Case
-from dxlrun.bench.figures import CaseFigures, WireFigures, host_figures, wire_figures
-from dxlrun.bench.hosts import HOSTS, Host, HostKind
-from dxlrun.bench.rounds import Measured, cores, measure, on_core
-from dxlrun.bench.simulated import SimulatedServos
-from dxlrun.bench.wire import judge
 from dxlrun.simulation import LedgerEntry, read_ledger
+from exchange.canned import CannedResponder
+from exchange.case import Case
+from exchange.figures import CaseFigures, WireFigures, host_figures, wire_figures
+from exchange.hosts import HOSTS, Host, HostKind
+from exchange.rounds import Measured, cores, measure, on_core
+from exchange.simulated import SimulatedServos
+from exchange.wire import judge
 
 Against = Literal["canned", "simulated"]
 Progress = Callable[[str, float], None]
@@ -42,10 +42,10 @@ class Wish:
 
 @dataclass(frozen=True, slots=True)
 class BusBench:
-    """What `bench bus` found."""
+    """What was found."""
 
     cores: tuple[int, int]
-    """Of the host, and of who answers."""
+    """Of the host, and of what answers."""
     cases: tuple[CaseFigures, ...]
     missing: tuple[str, ...]
     """Hosts that are not installed here."""

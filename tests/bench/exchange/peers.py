@@ -10,8 +10,8 @@ of goals; ours has SI units at both ends. With `values=False` they leave the byt
 from __future__ import annotations
 
 from dxlrun.analysis.ledger.waits import Sent
-from dxlrun.bench.case import Case, Registers
 from dxlrun.errors import InputError
+from exchange.case import Case, Registers
 
 PATIENCE_S = 1.0
 """rustypot waits so long for a reply; the SDK has a time of its own."""

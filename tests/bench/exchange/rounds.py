@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from dxlrun.bench.hosts import Host
+from exchange.hosts import Host
 
 _PR_SET_TIMERSLACK, _PR_GET_TIMERSLACK = 29, 30
 """linux/prctl.h"""

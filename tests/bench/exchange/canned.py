@@ -2,44 +2,47 @@
 
 from __future__ import annotations
 
-import os
+import json
+import subprocess
+import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 import msgspec
 
-from dxlrun.bench.hosts import Host
 from dxlrun.errors import ProcessFault
-from dxlrun.run.channels import process
-from dxlrun.run.channels.child import Child
 from dxlrun.simulation import BusConfig
 from dxlrun.simulation.configuration import encode_config
+from exchange.hosts import Host
 
+_RESPONDER = Path(__file__).with_name("responder.py")
 _MOST_REHEARSALS = 500
 _ALIKE = 3
 """Two goals in turn are written, so of two alike there would be only one of each."""
-_TIMEOUT_S = 5.0
+_END_TIMEOUT_S = 10.0
 
 Steps = tuple[tuple[int, int], ...]
 """Of one exchange: bytes that go to the servos, bytes that come back."""
+
+
+class _Answer(msgspec.Struct):
+    """A line of the responder."""
+
+    ports: tuple[str, ...] = ()
+    steps: Steps = ()
 
 
 class CannedResponder:
     """The process that answers; one line a host."""
 
     def __init__(self, buses: Sequence[BusConfig], core: int) -> None:
-        self._errors = process.memory_file("dxlrun-bench-stderr")
-        config = process.memory_file("dxlrun-bench", encode_config(buses))
-        try:
-            self._child = Child(
-                "canned responder",
-                "dxlrun.bench.responder",
-                ["--config-fd", str(config), "--core", str(core)],
-                [config],
-                self._errors,
-            )
-        finally:
-            os.close(config)
-        self.ports = msgspec.convert(self._child.ready()["ports"], type=tuple[str, ...])
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", str(_RESPONDER), "--core", str(core)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            start_new_session=True,  # a terminal's Ctrl-C is for its starter, which ends it
+        )
+        self.ports = self._ask(encode_config(buses)).ports
         """The devices, one a bus."""
 
     def rehearse(self, port: int, host: Host, *, first: bool) -> Steps:
@@ -67,14 +70,25 @@ class CannedResponder:
         )
 
     def close(self) -> None:
-        """End the process."""
-        self._child.end()
-        os.close(self._errors)
+        """End the process: it ends with its input."""
+        try:
+            self._process.communicate(timeout=_END_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.communicate()
 
     def _do(self, port: int, what: str) -> Steps:
-        self._child.line.send({"do": what, "port": port})
-        answer = self._child.message(_TIMEOUT_S)
-        if answer is None:
-            told = process.whole(self._errors).decode(errors="replace").strip()
-            raise ProcessFault(f"the canned responder ended: {told.splitlines()[-1] if told else 'no word'}")
-        return msgspec.convert(answer["steps"], type=Steps)
+        return self._ask(json.dumps({"do": what, "port": port}).encode()).steps
+
+    def _ask(self, line: bytes) -> _Answer:
+        assert self._process.stdin is not None  # both are pipes
+        assert self._process.stdout is not None
+        try:
+            self._process.stdin.write(line + b"\n")
+            self._process.stdin.flush()
+            answer = self._process.stdout.readline()
+        except BrokenPipeError:
+            answer = b""
+        if not answer:
+            raise ProcessFault("the canned responder ended; what it printed says why")
+        return msgspec.json.decode(answer, type=_Answer)

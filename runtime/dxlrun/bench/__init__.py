@@ -1,1 +1,0 @@
-"""Measuring the exchange with the servos, ours and others', and the rates that a robot keeps."""
