@@ -117,19 +117,22 @@ def test_a_file_is_no_serial_line(tmp_path):
         open_serial(str(path), 1_000_000)
 
 
-def test_the_process_that_has_the_line_is_named(opened):
-    _, _, path = opened
+def test_the_process_that_has_the_line_is_named(terminal):
+    _, path, _ = terminal
     code = (
         "import sys\n"
         "from dxlrun.dynamixel.port.serial_open import open_serial\n"
-        "from dxlrun.errors import PortError\n"
-        "try:\n    open_serial(sys.argv[1], 1_000_000)\n"
-        "except PortError as error:\n    print(error)\n"
+        "port = open_serial(sys.argv[1], 1_000_000)\n"
+        "print('opened', flush=True)\n"
+        "sys.stdin.read()\n"
     )
     command = [sys.executable, "-c", code, path]
-    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    assert f"{path} is in use by" in said
-    assert f"(process {os.getpid()})" in said
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as holder:
+        assert holder.stdout.readline() == "opened\n"
+        with pytest.raises(PortError, match="is in use by") as error:
+            open_serial(path, 1_000_000)
+        holder.stdin.close()
+    assert f"(process {holder.pid})" in str(error.value)
 
 
 def test_the_run_that_has_the_line_is_named_and_how_to_end_it(terminal):

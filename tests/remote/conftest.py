@@ -214,5 +214,5 @@ class Desk:
 
 
 @pytest.fixture
-def desk():
+def desk(no_memory_left):
     return Desk()

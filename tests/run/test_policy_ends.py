@@ -23,6 +23,8 @@ from dxlrun.testing import VirtualRobot, plan_of, simulated_robot
 
 Start = Callable[..., Any]
 Limp = Callable[[Any], bool]
+pytestmark = pytest.mark.usefixtures("no_memory_left")
+
 POLICIES = """\
 poses:
   home: {{pan: 60 deg, tilt: 60 deg}}

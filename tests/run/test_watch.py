@@ -33,6 +33,8 @@ from dxlrun.run.run_processes import Memory, guardian_job
 from dxlrun.simulation import Ledger, SimulatedBus, VirtualPorts
 from dxlrun.testing import plan_of
 
+pytestmark = pytest.mark.usefixtures("no_memory_left")
+
 MS = 1_000_000
 
 

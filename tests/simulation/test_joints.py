@@ -231,8 +231,8 @@ def test_every_model_settles_where_it_should_without_much_overshoot() -> None:
         table, margin = servo.registers.table, servo.registers.get("cw_compliance_margin")
         motor = motor_of(table)
         assert abs(torque) <= 1.001 * motor.friction / (1 - motor.load_friction)
-        # so much friction leaves where gains are weakest
-        rest = math.radians(1.1) + margin * table.rad_per_tick
+        # so much friction leaves where gains are weakest, those of YM070
+        rest = math.radians(1.3) + margin * table.rad_per_tick
         assert servo.position == pytest.approx(goal * table.rad_per_tick, abs=rest)
         assert top < goal * table.rad_per_tick + 0.25 * 0.5, table.model  # most: the quick XL330-M077
         assert servo.registers.get("moving") == 0

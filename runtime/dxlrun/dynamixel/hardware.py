@@ -186,8 +186,9 @@ class DynamixelHardware:
         for index, line in enumerate(kernel.interrupt()):
             bus, servos = self._lines[index]
             bus.free_ns = kernel.free_at(index)
-            if line is None:  # it has all its replies
-                bus.due_ns, _ = kernel.arrival(index)
+            if line is None:  # it has all its replies, or none to await
+                if (arrival := kernel.arrival(index)) is not None:
+                    bus.due_ns, _ = arrival
             elif line.failure is not None:
                 bus.fail(line.failure)
             elif line.awaiting:
@@ -318,8 +319,9 @@ class DynamixelHardware:
         kernel = self._kernel
         if kernel is not None and self._planned:
             for index, (bus, servos) in enumerate(self._lines):
-                if bus.failure is None and index not in self._split:
-                    due_ns, at_ns = kernel.arrival(index)
+                arrival = kernel.arrival(index)
+                if bus.failure is None and index not in self._split and arrival is not None:
+                    due_ns, at_ns = arrival
                     servos.arrived(at_ns, due_ns)
             if self._split and kernel.read(latest_ns, everything=False) is Answer.UNEXPECTED:
                 self._interrupt(kernel)

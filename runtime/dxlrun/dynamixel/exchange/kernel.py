@@ -547,9 +547,10 @@ class Kernel:
         code, line.gone = line.gone, 0
         return self._ports.ports[index].failure(code) if code else None
 
-    def arrival(self, index: int) -> tuple[int, int]:
-        """Return when the newest read of a bus was due, and when its replies were there, ns."""
-        return self._lines[index].due_ns, self._lines[index].at_ns
+    def arrival(self, index: int) -> tuple[int, int] | None:
+        """Return when the newest read of a bus was due, and when its replies came, ns; None: it has none."""
+        line = self._lines[index]
+        return (line.due_ns, line.at_ns) if line.active else None
 
     def free_at(self, index: int) -> int:
         """Return when everything that was sent on a line is off the wire, ns."""
