@@ -8,6 +8,7 @@ its source, so that an old one is never used.
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -25,25 +26,19 @@ FLAGS = ("-std=c11", "-O2", "-fPIC", "-shared", "-ffp-contract=off", "-Wall", "-
 
 def compile_kernel(root: Path) -> Path | None:
     """Compile the kernel; return where it is, None where that was not possible."""
-    compiler = os.environ.get("CC") or shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+    found = os.environ.get("CC") or shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+    compiler = shlex.split(found or "")  # CC may have options, or a compiler cache in front
     source, target = root / FOLDER / "kernel.c", root / FOLDER / "libkernel.so"
     target.unlink(missing_ok=True)
     if not compiler or not sys.platform.startswith("linux"):
         return None
-    built = subprocess.run(
-        [
-            compiler,
-            *FLAGS,
-            f"-DSOURCE_CRC={zlib.crc32(source.read_bytes())}u",
-            "-o",
-            str(target),
-            str(source),
-            "-lm",
-        ],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    crc = f"-DSOURCE_CRC={zlib.crc32(source.read_bytes())}u"
+    command = [*compiler, *FLAGS, crc, "-o", str(target), str(source), "-lm"]
+    try:
+        built = subprocess.run(command, capture_output=True, text=True, check=False)
+    except OSError as error:
+        sys.stderr.write(f"the kernel was not built, dxlrun runs without it: {error}\n")
+        return None
     if built.returncode:
         sys.stderr.write(f"the kernel was not built, dxlrun runs without it:\n{built.stderr}\n")
         return None

@@ -8,6 +8,7 @@ import time
 import tty
 from pathlib import Path
 from threading import Thread
+from types import ModuleType
 
 import pytest
 
@@ -165,3 +166,24 @@ def answer(terminal, size, replies):
         got += os.read(terminal, size - len(got))
     time.sleep(0.002)
     os.write(terminal, replies)
+
+
+@pytest.mark.parametrize(
+    ("compiler", "built"), [("{cc} -g", True), ("/nowhere/cc", False), ("false", False)], ids=str
+)
+def test_the_build_takes_a_compiler_with_options_and_goes_on_without_one(
+    tmp_path, monkeypatch, compiler, built
+):
+    name = "hatchling.builders.hooks.plugin.interface"
+    stub = ModuleType(name)  # the build has hatchling, tests need none of it
+    stub.BuildHookInterface = dict
+    monkeypatch.setitem(sys.modules, name, stub)
+    spec = importlib.util.spec_from_file_location("hatch_build", Path(__file__).parents[2] / "hatch_build.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    (tmp_path / module.FOLDER).mkdir(parents=True)
+    shutil.copy(kernel.SOURCE, tmp_path / module.FOLDER)
+    monkeypatch.setenv("CC", compiler.format(cc=shutil.which("cc") or shutil.which("gcc")))
+    target = module.compile_kernel(tmp_path)
+    assert (target is not None) == built
+    assert not built or kernel.load(target) is not None
