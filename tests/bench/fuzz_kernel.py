@@ -30,6 +30,7 @@ from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
 from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.errors import PortError
 from dxlrun.interfaces import Commands, States
+from dxlrun.mode import Mode
 from dxlrun.run.channels.packets import PacketBatch, PacketKind, decode_packets
 from dxlrun.run.channels.ring import Handover
 
@@ -67,10 +68,14 @@ class Line:
         self.clock, self.kind_at = clock, 4 if protocol == 1.0 else 7
         self.told, self.said, self.sent = [], [], []
         self.stall_ns = 0
+        self.lost = False
+        """True where the line takes no goals: its adapter is gone."""
         """How long the host stands still behind each read."""
 
     def write(self, data):
         self.sent.append(bytes(data))
+        if self.lost:
+            raise PortError("it is gone")
         if data[self.kind_at] == SYNC_WRITE:
             return
         pieces = self.told.pop(0) if self.told else []
@@ -125,10 +130,12 @@ class Events:
 class Side:
     """A robot with the kernel, or without, and what became of each cycle."""
 
-    def __init__(self, plans, library):
+    def __init__(self, plans, library, slot_size=1 << 20):
         self.lines = Lines(plans)
         self.log, self.events = [], Events()
-        self.packets = PacketBatch(Handover(lambda payload: self.log.extend(decode_packets(payload))))
+        self.packets = PacketBatch(
+            Handover(lambda payload: self.log.extend(decode_packets(payload)), slot_size)
+        )
         count = sum(len(plan.servos) for plan in plans)
         self.states, self.goals = States.empty(count), Commands.empty(count)
         self.hardware = DynamixelHardware(
@@ -155,6 +162,25 @@ class Side:
             shapes = [reads._shape[one.group] % len(one.patient) for one in reads._queue]
             found.append([one.patient[shape] for one, shape in zip(reads._queue, shapes, strict=True)])
         return found
+
+    def change(self, number, row, servo, rng):
+        """Change between two cycles what stays for many: modes, torque, limits; or lose a line."""
+        _, servos = self.hardware._lines[number]
+        match rng.randrange(6):
+            case 0 | 1:
+                plan = self.hardware._plans[number].servos[servo]
+                mode = rng.choice([one.mode for one in plan.modes] + [Mode.UNKNOWN])
+                servos.goals.set_mode(servo, mode)
+                self.states.mode[row] = mode
+            case 2:
+                servos.torqued[servo] = not servos.torqued[servo]
+            case 3:
+                servos.ceiling[servo] = rng.choice((math.nan, 0.0, 0.5, 3.0))
+            case 4:
+                servos.goals.weaken(rng.choice((0.0, 0.3, 1.0)))
+            case _:
+                if rng.random() < 0.2:
+                    self.lines.ports[number].lost = True
 
     def cycle(self, told, goals, gap_ns):
         """Write goals, read once; return all that can be told apart."""
@@ -196,15 +222,17 @@ class Side:
         )
 
 
-def replies(transaction, dialect, rng, drift):
-    """Return the replies to a read, as servos send them; their data drift, or are anything."""
+def replies(transaction, dialect, rng, drift, standing):
+    """Return the replies to a read, as servos send them; their data drift, or are anything. `standing`: error
+    bytes that stay, by ID.
+    """
     error = rng.choice((0x80, 0x20)) if rng.random() < 0.02 else 0
     found = []
     for one in transaction.awaited:
         data = bytes((drift >> 8 * at % 16 & 0xFF) for at in range(one.length))
         if rng.random() < 0.1:
-            data = bytes(rng.choices((0xFF, 0xFF, 0xFD, 0x00, 0x12), k=one.length))
-        found.append((one.servo_id, error, data))
+            data = bytes(rng.choices((0xFF, 0xFF, 0xFD, 0x00, 0x00, 0x04, 0x12), k=one.length))
+        found.append((one.servo_id, error | standing.get(one.servo_id, 0), data))
     if not transaction.fast:
         return [dialect.status_packet(*one) for one in found]
     size = sum(one.length + 4 for one in transaction.awaited) + 1
@@ -237,13 +265,13 @@ def spoilt(packets, rng):
     return bytes(stream)
 
 
-def said(transactions, dialect, rng, accident):
+def said(transactions, dialect, rng, accident, standing):
     """Return what a line says to each read of a cycle; with an accident in one of them."""
     told = []
     victim = rng.randrange(len(transactions)) if accident and transactions else -1
     drift = rng.randrange(500, 520)
     for number, transaction in enumerate(transactions):
-        packets = replies(transaction, dialect, rng, drift)
+        packets = replies(transaction, dialect, rng, drift, standing)
         stream, at, most = b"".join(packets), 1_500_000, rng.choice((9, 1_000, 1_000))
         if number == victim:
             if rng.random() < 0.03:
@@ -327,12 +355,18 @@ def campaign(streams: int, seed: int, names: Sequence[str] = tuple(ROBOTS)) -> T
         plans, dialect = robot(name, count, split)
         ours, theirs = Side(plans, library), Side(plans, None)
         goals = np.full_like(ours.goals.values, math.nan)
+        standing: dict[int, int] = {}
         for number in range(CYCLES):
+            if number % 12 == 9:
+                where, servo, seed_of_change = rng.randrange(count), rng.randrange(len(IDS)), rng.random()
+                for side in (ours, theirs):
+                    side.change(where, where * len(IDS) + servo, servo, random.Random(seed_of_change))
+                standing = {rng.choice(IDS): rng.choice((0x80, 0x04, 0x20))} if rng.random() < 0.2 else {}
             reads = theirs.prepare()
             planned = ours.prepare()
             assert planned == reads, (seed, tally)
             victim = rng.randrange(count) if number % 6 == 5 else -1
-            told = [said(mine, dialect, rng, index == victim) for index, mine in enumerate(reads)]
+            told = [said(mine, dialect, rng, index == victim, standing) for index, mine in enumerate(reads)]
             goals, gap_ns = moved(goals, rng), rng.choice((0, 1_000_000, 5_000_000))
             began = ours.hardware._planned
             found, expected = ours.cycle(told, goals, gap_ns), theirs.cycle(told, goals, gap_ns)

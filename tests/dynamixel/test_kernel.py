@@ -18,7 +18,7 @@ from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.port.ports import SerialPort, SerialPorts
 from dxlrun.dynamixel.wire import protocol2
 from dxlrun.interfaces import Commands, States
-from dxlrun.run.channels.packets import PacketKind
+from dxlrun.run.channels.packets import PACKET_SLOT, PacketKind
 from dxlrun.testing import simulated_robot
 
 ROBOTS = Path(__file__).parents[2] / "robots"
@@ -92,6 +92,79 @@ def test_an_interrupt_on_virtual_time_comes_out_of_the_kernel(make_rig, make_pla
     for _ in range(5):
         rig.cycle()
     assert rig.states.valid.all()
+
+
+@pytest.fixture
+def two_lines(make_rig, make_plan):
+    rig = make_rig(make_plan((1, 2)), make_plan((3,), name="other", first_row=2))
+    rig.hardware.start()
+    for _ in range(5):
+        rig.cycle()
+    assert rig.hardware._planned
+    return rig
+
+
+@pytest.mark.parametrize("accident", [False, True])
+def test_no_row_is_valid_of_a_line_that_took_no_goals(two_lines, accident):
+    rig = two_lines
+    rig.hardware.read()
+    rig.ports.ports[0].unplug()
+    rig.goals.position[:] += 0.1
+    rig.hardware.write()
+    assert rig.hardware._buses[0].failure is not None
+    assert rig.hardware._planned
+    if accident:  # on the other line: the parser ends the cycle
+        rig.ports.ports[1]._arrived += b"\x55"
+    rig.hardware.read()  # no gap came between, in which the lost line is set aside
+    assert rig.states.valid.tolist() == [False, False, True]
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_what_is_sent_behind_goals_is_awaited_from_when_they_are_off_the_wire(make_rig, make_plan, compiled):
+    rig = make_rig(make_plan((1, 2)), compiled=compiled)
+    rig.hardware.start()
+    for _ in range(5):
+        rig.cycle()
+    (bus,) = rig.hardware._buses
+    assert rig.hardware._planned == compiled
+    rig.hardware.read()
+    rig.goals.position[:] += 0.1
+    before_ns = rig.clock.now_ns()
+    rig.hardware.write()
+    assert bus.free_ns == before_ns + len(rig.into_bus()[-1]) * bus.byte_ns
+
+
+def test_goals_go_out_behind_what_the_parser_sent(make_rig, make_plan):
+    rig = make_rig(make_plan((1, 2)))
+    rig.hardware.start()
+    for _ in range(5):
+        rig.cycle()
+    (bus,) = rig.hardware._buses
+    rig.hardware.read()
+    rig.goals.position[:] += 0.1
+    bus.send(bytes(100))  # such as reduced limits of torque
+    before_ns = bus.free_ns
+    rig.hardware.write()
+    assert rig.hardware._kernel.free_at(0) == before_ns + len(rig.into_bus()[-1]) * bus.byte_ns
+
+
+@pytest.mark.parametrize(
+    ("buses", "servos", "compiled"), [(32, 1, True), (33, 1, False), (1, 150, True), (1, 250, False)]
+)
+def test_a_robot_that_the_kernel_has_no_room_for_is_left_to_the_parser(
+    fuzz, make_plan, buses, servos, compiled
+):
+    plans = [
+        make_plan(
+            range(servos), name=f"bus{index}", first_row=index * servos, model="XM430-W350", protocol=2.0
+        )
+        for index in range(buses)
+    ]
+    side = fuzz.Side(plans, kernel.load(), PACKET_SLOT)
+    assert (side.hardware._kernel is not None) == compiled
+    side.goals.values[:] = 0.0
+    side.hardware.write()
+    assert all(line.sent for line in side.lines.ports)
 
 
 class TestOnDescriptors:

@@ -12,7 +12,7 @@ from dxlrun.clock import Clock
 from dxlrun.dynamixel.exchange.bus import NEVER, Bus
 from dxlrun.dynamixel.exchange.cyclic_reads import MOST_BROKEN
 from dxlrun.dynamixel.exchange.gaps import Gaps
-from dxlrun.dynamixel.exchange.kernel import Answer, Kernel, Library
+from dxlrun.dynamixel.exchange.kernel import Answer, Kernel, Library, holds
 from dxlrun.dynamixel.exchange.pump import clear, pump, run
 from dxlrun.dynamixel.exchange.samples import Samples
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
@@ -100,7 +100,7 @@ class DynamixelHardware:
         )
         self._lines = tuple(zip(self._buses, self._servos, strict=True))
         self._kernel: Kernel | None = None
-        if library is not None:
+        if library is not None and holds(self._plans, packets):
             self._kernel = Kernel(
                 library,
                 self._plans,
@@ -242,10 +242,12 @@ class DynamixelHardware:
     def _write_by_kernel(self, kernel: Kernel) -> None:
         for index, (bus, servos) in enumerate(self._lines):
             kernel.set_writes(index, servos.goals.sync_writes if bus.failure is None else ())
+            kernel.occupy(index, bus.free_ns)
         answer = kernel.write()
-        if not self._planned or answer is not Answer.OK:  # the parser reads behind these goals
-            for index, bus in enumerate(self._buses):
-                bus.free_ns = kernel.free_at(index)
+        for index, bus in enumerate(
+            self._buses
+        ):  # what the gaps and the parser send goes out behind these goals
+            bus.free_ns = kernel.free_at(index)
         if answer is Answer.LOOK:
             self._planned = False
         elif answer is Answer.UNEXPECTED:

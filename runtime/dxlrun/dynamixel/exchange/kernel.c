@@ -391,7 +391,7 @@ static double tick(const Field *f, const uint8_t *data)
     for (int32_t i = 0; i < f->size; i++)
         raw |= (uint32_t)data[f->offset + i] << 8 * i;
     if (f->encoding == SIGN_MAGNITUDE) /* bit 10 is the sign: e-Manual AX-12A, Present Speed (38) */
-        return raw & 0x400 ? -(double)(raw & 0x3ff) : (double)(raw & 0x3ff);
+        return raw & 0x400 ? -(int32_t)(raw & 0x3ff) : (int32_t)(raw & 0x3ff); /* an integer: has no -0.0 */
     if (f->encoding == TWOS_COMPLEMENT)
         return f->size == 1 ? (int8_t)raw : f->size == 2 ? (int16_t)raw : (int32_t)raw;
     return raw;
@@ -487,8 +487,6 @@ static int settle(Kernel *k, int64_t now)
         Line *l = &k->lines[i];
         l->state = IDLE;
         l->done = 0;
-        if (!l->active)
-            memset(k->fresh + l->first_servo, 0, (size_t)l->servo_count);
     }
     for (int32_t i = 0; i < n; i++)
         if (k->fresh[i] && fabs(k->values[i] - k->position[k->servos[i].row]) > k->servos[i].quick)
@@ -513,8 +511,13 @@ int32_t dxl_read(Kernel *k, int64_t until_ns, int32_t all)
 {
     uint8_t ready[MOST_LINES];
     int64_t now = now_ns(k);
-    int64_t stop = until_ns < now + k->beat_ns ? until_ns : now + k->beat_ns;
+    int64_t stop = until_ns - now < k->beat_ns ? until_ns : now + k->beat_ns; /* both may be NEVER */
     int32_t idle = 0;
+    for (int32_t i = 0; i < k->line_count; i++) { /* now, as the parser may settle this cycle */
+        const Line *l = &k->lines[i];
+        if (!l->active)
+            memset(k->fresh + l->first_servo, 0, (size_t)l->servo_count);
+    }
     for (int32_t i = 0; all && i < k->line_count; i++)
         idle += k->lines[i].active && k->lines[i].state == IDLE && !k->lines[i].done;
     if (idle && wait_for(k, IDLE, 0, ready)) /* what came before a request must not be taken for its reply */

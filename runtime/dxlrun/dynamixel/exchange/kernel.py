@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from dxlrun.clock import Clock
 from dxlrun.dynamixel.exchange.goal_arrays import SyncWrite
+from dxlrun.dynamixel.exchange.pump import LOST_LINE_STEP_NS
 from dxlrun.dynamixel.exchange.samples import Samples
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, Field
 from dxlrun.dynamixel.plan.line import BITS_PER_BYTE
@@ -38,6 +39,7 @@ NEVER = 1 << 62
 BEAT_NS = 1_000_000
 """After so long a wait the kernel returns, so that the loop can show that it lives."""
 MOST_LINES = 32
+_LONGEST_SYNC_WRITE = 6200
 _MOST_PIECES = 32
 _ROOM = 8192
 """Bytes of a line's buffer; the replies to one read may take a quarter of it."""
@@ -334,6 +336,26 @@ class Interrupted:
     """Why the next one could not be sent."""
 
 
+def holds(plans: Sequence[BusPlan], packets: PacketLog) -> bool:
+    """Say whether the kernel has room for every line and every goal packet of a robot; a goal packet must fit
+    into the log's batch, too. Else the parser does all.
+    """
+    room = (
+        _LONGEST_SYNC_WRITE if packets.desk is None else min(_LONGEST_SYNC_WRITE, len(packets.desk.records))
+    )
+    layouts = [
+        (layout.length, len(plan.servos))
+        for plan in plans
+        for servo in plan.servos
+        for mode in servo.modes
+        for layout in mode.goals
+    ]
+    return len(plans) <= MOST_LINES and all(
+        length <= _MOST_RECORD and RECORD_HEADER + 16 + (length + 1) * count * 4 // 3 <= room
+        for length, count in layouts
+    )
+
+
 class Kernel:
     """The lines of a robot as the kernel knows them."""
 
@@ -352,17 +374,14 @@ class Kernel:
         beat: Callable[[], None],
     ) -> None:
         """`included`, `ceilings`: of each bus, which of its servos may get goals, and how fast they may go to
-        positions, rad/s, NaN: no limit.
-
-        Raises ValueError for more lines than the kernel knows.
+        positions, rad/s, NaN: no limit. Only for a robot that the kernel `holds`.
         """
-        if len(plans) > MOST_LINES:
-            raise ValueError(f"{len(plans)} buses, the kernel knows {MOST_LINES}")
         self._library = library
         self._plans = plans
         self._packets = packets
         self._ports = ports
         self._beat = beat
+        self._clock = clock
         self._now_ns = clock.now_ns
         self._raised: BaseException | None = None
         self._kept: list[object] = [samples, states, goals, *included, *ceilings]
@@ -468,7 +487,10 @@ class Kernel:
         indices: Sequence[int] = range(len(self._plans))  # after an exception: all lines, whose calls fail
         try:
             if self._raised is None:
-                indices = [index for index in self._ports.wait(deadline_ns) if self._lines[index].active]
+                heard = self._ports.wait(deadline_ns)
+                indices = [index for index in heard if self._lines[index].active]
+                if heard and not indices:  # a line that is gone is ready for ever: let time pass
+                    self._clock.wait_until(min(deadline_ns, self._now_ns() + LOST_LINE_STEP_NS))
         except BaseException as error:
             self._raised = error
         for index in indices:
@@ -555,6 +577,11 @@ class Kernel:
     def free_at(self, index: int) -> int:
         """Return when everything that was sent on a line is off the wire, ns."""
         return int(self._lines[index].free_ns)
+
+    def occupy(self, index: int, until_ns: int) -> None:
+        """Take note that something else was sent on a line, which is off the wire at `until_ns`."""
+        line = self._lines[index]
+        line.free_ns = max(line.free_ns, until_ns)
 
     def awaits(self, index: int) -> bool:
         """Say whether replies on a line are awaited now."""
