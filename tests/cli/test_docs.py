@@ -1,31 +1,50 @@
-"""The commands of README.md and docs: each page has a test that runs its own, and those of four are run here.
+"""The pages of the repository: what they tell a reader to type works, and what they name is there.
 
-Where a page names hardware, the command gets a simulated line instead; a run gets virtual time.
+Each page with commands has a test that runs them; those of five are run here. Where a page names hardware,
+the command gets a simulated line instead; a run gets virtual time.
 """
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from dxlrun.cli.simulated import sim
+from dxlrun.cli.steering.written import Written
 from dxlrun.compile import compile_files
+from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.dynamixel.control_table import control_table
+from dxlrun.remote.preparation import Preparation
+from dxlrun.run.channels.events import EventCode
+from dxlrun.run.channels.inbox import Command
 from dxlrun.run.run_summary import RunOptions, RunSummary
 from dxlrun.run.simulation_front import Look, Served
 from dxlrun.simulation import BusConfig, ServoConfig
 from dxlrun.simulation.faults.fault_text import parse_fault
 from dxlrun.simulation.process import SimulationConfig
+from dxlrun.testing import plan_of, read_log, simulated_robot
 
 ROOT = Path(__file__).parents[2]
-PAGES = {path.name: path.read_text() for path in [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md"))]}
+PATHS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/*.md"))]
+PAGES = {path.name: path.read_text() for path in PATHS}
+PROJECT = (ROOT / "pyproject.toml").read_text()
+SOURCES = [
+    path
+    for folder in ("runtime", "plugins", "tests")
+    for path in sorted((ROOT / folder).rglob("*"))
+    if path.suffix in {".py", ".c", ".toml", ".md"} and "site-packages" not in path.parts
+]
 TESTS = {
     "README.md": ("tests/test_readme.py", "tests/cli/test_steer.py"),
+    "architecture.md": ("tests/cli/test_docs.py",),
     "bench.md": ("tests/bench/test_bench_page.py", "tests/cli/test_docs.py"),
     "bus.md": ("tests/cli/test_docs.py",),
     "controllers.md": ("tests/plugins/test_docs.py",),
@@ -188,3 +207,133 @@ def test_every_robot_of_the_clone_is_checked_and_runs(
     assert ran.code == 0, ran.err
     cycles = round(0.1e9 / compile_files(robot, {}, []).plan.loop.period_ns)
     assert f"{cycles} cycles, 0 periods skipped" in ran.out
+
+
+def anchors(text: str) -> set[str]:
+    """Return the names by which the headings of a page are linked to, as GitHub makes them."""
+    headings = re.findall(
+        r"^#+ (.+)$", re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE), re.MULTILINE
+    )
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("path", [*PATHS, ROOT / "CHANGELOG.md"], ids=lambda path: path.name)
+def test_the_links_of_a_page_lead_somewhere(path: Path) -> None:
+    for link in re.findall(r"\]\(([^)\s]+)\)", path.read_text()):
+        if link.startswith("https://"):
+            continue
+        target, _, anchor = link.partition("#")
+        linked = path.parent / target if target else path
+        assert linked.exists(), link
+        if anchor:
+            assert anchor in anchors(linked.read_text()), link
+
+
+@pytest.mark.parametrize("path", [*PATHS, ROOT / "CHANGELOG.md"], ids=lambda path: path.name)
+def test_the_files_that_a_page_names_exist(path: Path) -> None:
+    roots = (ROOT, ROOT / "runtime/dxlrun")
+    folders = {one.name for root in roots for one in root.iterdir() if one.is_dir()} - {"logs"}
+    text = path.read_text()
+    typed = [word for line in re.findall(r"^    (.+)$", text, re.MULTILINE) for word in line.split()]
+    for token in [*re.findall(r"`([\w.+-]+(?:/[\w.+-]+)*/?)`", text), *typed]:
+        if token.split("/")[0] in folders and "/" in token:
+            assert any((root / token).exists() for root in roots), token
+
+
+def test_every_page_is_in_the_index() -> None:
+    pages = {path.name for path in ROOT.glob("docs/*.md")} - {"index.md"}
+    assert pages <= set(re.findall(r"\]\(([\w-]+\.md)\)", PAGES["index.md"]))
+
+
+def test_what_the_code_cites_is_in_the_repository() -> None:
+    pages = {*PAGES, "CHANGELOG.md"}
+    cited = {
+        (name, path.name)
+        for path in SOURCES
+        for name in re.findall(r"(?<![\w/*.{}-])((?:docs/)?[a-zA-Z-]+\.md)\b", path.read_text())
+    }
+    assert ("protocol.md", "line.py") in cited
+    assert {(name, where) for name, where in cited if name.removeprefix("docs/") not in pages} == set()
+    headings = anchors(PAGES["protocol.md"])
+    sections = [
+        one for path in SOURCES for one in re.findall(r"\(protocol\.md, ([A-Z]\w+)", path.read_text())
+    ]
+    assert sections
+    for section in sections:
+        assert any(heading.startswith(section.lower()) for heading in headings), section
+
+
+def test_architecture_md_names_what_the_code_has() -> None:
+    code = "\n".join(path.read_text() for path in SOURCES if path.relative_to(ROOT).parts[0] != "tests")
+    names = re.findall(r"`([A-Za-z_]\w+(?:\.[a-z_]\w+)?)(?:\(\))?`", PAGES["architecture.md"])
+    names = [name for name in names if not name.endswith((".py", ".so", ".toml"))]
+    assert {"CyclicReads.status", "keep_replies"} <= set(names)
+    for name in names:
+        for word in name.split("."):
+            assert re.search(rf"\b{word}\b", code), name
+
+
+def test_architecture_md_its_command_and_its_reply_are_these_bytes(tmp_path: Path) -> None:
+    """The command goes the page's way, without the sockets: tests/cli/test_steer.py has those."""
+    page = PAGES["architecture.md"]
+    (line,) = commands("architecture.md")
+    _, _, controller, kind, *words = shlex.split(line)
+    wanted, request, reply = map(bytes.fromhex, re.findall(r"^(FF FF [\dA-F ]+)$", page, re.MULTILINE))
+    plan = plan_of(ROOT / "robots/bioloid_torso.yaml")
+    preparation = Preparation({joint.name: joint for joint in plan.loop.joints}, load_plugins())
+    (head,) = (one for one in plan.loop.controllers if one.name == controller)
+    body = Written.read(words, None).in_si()
+    prepared = preparation.command(head, kind, json.dumps(body).encode())
+    assert (len(prepared.data), prepared.beyond) == (32, ())
+    log = tmp_path / "torso.mcap"
+    robot = simulated_robot(ROOT / "robots/bioloid_torso.yaml", duration_s=2.5, log=log)
+    sent = Command(1, controller, kind, prepared.data, "a reader")
+    robot.buses[0].at(2_000_000_000, lambda: robot.inbox.waiting.append(sent))
+    robot.run()
+    assert robot.inbox.answers == {1: ""}
+    entries = robot.ledger.entries
+    assert [one.data for one in entries if one.direction == "in"].count(wanted) == 2  # once more, as it says
+    (at,) = (index for index, one in enumerate(entries) if one.data == reply)
+    assert entries[at - 1].data == request
+    recorded = read_log(log)
+    assert [packet.data for packet in recorded.packets].count(reply) == 1
+    cycle = recorded.cycles[np.searchsorted(recorded.cycles["read_ns"], entries[at].t_ns)]
+    row = recorded.joints.index("head_yaw_joint")
+    assert f"{np.degrees(cycle['position'][row]):.1f} deg of the joint" in page
+    assert f"{cycle['velocity'][row]:.2f} rad/s" in page
+    assert cycle["effort"][row] == -195 / 1023
+    assert cycle["valid"][row]
+
+
+def test_failures_md_names_events_and_keys_that_exist() -> None:
+    events = {code.name.lower() for code in EventCode}
+    names = set(re.findall(r"`([a-z]+_[a-z_]+)`", PAGES["failures.md"]))
+    assert {"servo_lost", "on_exit"} <= names
+    for name in names - events:
+        assert f"`{name}`" in PAGES["robot-file.md"] or name.startswith("on_") or name == "clamped", name
+
+
+def test_contributing_md_has_every_variable_and_what_ci_runs() -> None:
+    page = PAGES["CONTRIBUTING.md"]
+    variables = {
+        name
+        for path in SOURCES
+        if path.name.startswith("test_")
+        for name in re.findall(r"environ\.get\(\s*\"(DXLRUN_\w+)\"", path.read_text())
+    }
+    assert "DXLRUN_STORMS" in variables
+    assert set(re.findall(r"`(DXLRUN_\w+)`", page)) == variables
+    linters = {"ruff format", "ruff check", "mypy", "lint-imports"}
+    assert set(re.findall(r"^    .*\.venv/bin/(ruff \w+|mypy|lint-imports)", page, re.MULTILINE)) == linters
+    ci = (ROOT / ".ci/run").read_text().replace('"', "")
+    assert set(re.findall(r"\.lint/bin/(ruff \w+|mypy|lint-imports)", ci)) == linters
+    (extras,) = re.findall(r"^    .*install -e '\.\[(.+)\]'$", page, re.MULTILINE)
+    assert set(extras.split(",")) == set(tomllib.loads(PROJECT)["project"]["optional-dependencies"])
+    rows = re.findall(
+        r"^\| `(DXLRUN_\w+)` \|(?: `(DXLRUN_\w+)`)? \| `([\w/.]+)`.*\| (\d+) \| .*\|$", page, re.MULTILINE
+    )
+    assert {row[0] for row in rows} | {row[1] for row in rows if row[1]} == variables
+    for name, seed, file, count in rows:
+        text = (ROOT / file).read_text()
+        assert f'"{name}", "{count}"' in text, name
+        assert seed in text
