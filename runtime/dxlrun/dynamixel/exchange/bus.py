@@ -128,6 +128,7 @@ class Bus(Listener):
             self._receiver.flush()
         self._last_byte_ns = max(self._last_byte_ns, line.heard_ns)
         self._await(transaction, line.sent_ns)
+        self._deadline_ns = line.deadline_ns
         for data, at_ns in line.pieces:
             self._last_byte_ns = at_ns
             self._receiver.feed(data, at_ns)
@@ -186,6 +187,8 @@ class Bus(Listener):
         packet = transaction.packet
         now_ns = self._write(packet, transaction.servo_id) if packet else self._now_ns()
         self._await(transaction, self._sent_ns if packet else now_ns)
+        # this process may have stood still before the bytes left
+        self._deadline_ns = max(self._deadline_ns, now_ns + transaction.timeout_ns)
         return now_ns
 
     def _write(self, packet: bytes | bytearray | memoryview, servo_id: int) -> int:

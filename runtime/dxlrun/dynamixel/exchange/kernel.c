@@ -428,13 +428,15 @@ static int ask(Kernel *k, Line *l)
     int64_t before = now_ns(k);
     if (!send_all(k, l, r->instruction, r->instruction_size))
         return UNEXPECTED;
-    put_record(k, l, INSTRUCTION, r->id, before, now_ns(k), r->instruction, r->instruction_size);
+    int64_t after = now_ns(k);
+    put_record(k, l, INSTRUCTION, r->id, before, after, r->instruction, r->instruction_size);
     k->reserved += r->record_bytes - RECORD_HEADER - r->instruction_size;
     /* it waits in the adapter behind what was sent before */
     l->sent_ns = l->free_ns > before ? l->free_ns : before;
     l->free_ns = l->sent_ns + r->instruction_size * l->byte_ns;
     l->due_ns = l->sent_ns + r->due_ns;
-    l->deadline_ns = l->sent_ns + r->timeout_ns;
+    /* this process may have stood still before the bytes left */
+    l->deadline_ns = (l->sent_ns > after ? l->sent_ns : after) + r->timeout_ns;
     l->state = AWAITING;
     return OK;
 }

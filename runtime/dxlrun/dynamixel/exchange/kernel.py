@@ -328,6 +328,7 @@ class Interrupted:
     awaiting: bool
     """True when the next one was sent."""
     sent_ns: int
+    deadline_ns: int
     heard_ns: int
     """When the replies to the read before it came."""
     pieces: tuple[tuple[bytes, int], ...]
@@ -601,7 +602,8 @@ class Kernel:
                 for number, (start, end) in enumerate(pairwise(ends))
             )
             awaiting, failure = line.state == LineState.AWAITING, self._failure(index)
-            found.append(Interrupted(line.done, awaiting, line.sent_ns, line.at_ns, pieces, failure))
+            times = line.sent_ns, line.deadline_ns, line.at_ns
+            found.append(Interrupted(line.done, awaiting, *times, pieces, failure))
         self._library.abandon(self._pointer)
         return found
 
