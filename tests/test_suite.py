@@ -115,3 +115,24 @@ def test_the_wheel_has_every_robot_and_motion(tmp_path: Path) -> None:
         shipped = {Path(name).relative_to("dxlrun/examples"): archive.read(name) for name in names}
     tracked = [path for path in (ROOT / "robots").rglob("*") if path.suffix in {".yaml", ".urdf", ".json"}]
     assert shipped == {path.relative_to(ROOT / "robots"): path.read_bytes() for path in tracked}
+
+
+CROWDED = {
+    "runtime/dxlrun": 16,  # the rooms, and the modules that every room uses
+    "runtime/dxlrun/dynamixel/control_table/tables/protocol1": 16,  # a data file a model
+}
+
+
+def test_no_folder_of_the_package_is_crowded() -> None:
+    """A reader takes in a dozen entries or so at a glance; more of them want a room of their own."""
+    made = {"__init__.py", "py.typed", "__pycache__"}
+    crowded, folders = {}, 0
+    for room in (ROOT / "runtime", ROOT / "plugins"):
+        for folder in (path for path in room.rglob("*") if path.is_dir() and path.name not in made):
+            entries = {path for path in folder.iterdir() if path.name not in made and path.suffix != ".so"}
+            name = str(folder.relative_to(ROOT))
+            folders += 1
+            if len(entries) > CROWDED.get(name, 14):
+                crowded[name] = len(entries)
+    assert crowded == {}
+    assert folders > 20
