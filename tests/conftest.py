@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from pathlib import Path
+from contextlib import suppress
 
 import pytest
 from hypothesis import settings
@@ -19,22 +19,23 @@ settings.register_profile("search", derandomize=False, print_blob=True, max_exam
 settings.load_profile("fixed")
 
 
-def _memories() -> set[int]:
-    """The descriptors of memory without a name that this process has open."""
-    found = set()
-    for link in Path("/proc/self/fd").iterdir():
-        try:
-            if os.readlink(link).startswith("/memfd:"):
-                found.add(int(link.name))
-        except OSError:
-            pass  # it was that of the folder itself
-    return found
-
-
 @pytest.fixture
-def no_memory_left() -> Iterator[None]:
-    """Close the descriptors of shared memory that a test leaves open: a process has some hundred of them."""
-    before = _memories()
+def no_memory_left(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Close the descriptors of shared memory that a test leaves open: a process has some hundred of them.
+
+    Only those that were made here: a mapping has a descriptor of its own, which it closes itself.
+    """
+    made: list[tuple[int, int]] = []
+    create = os.memfd_create
+
+    def recorded(name: str, flags: int = os.MFD_CLOEXEC) -> int:
+        descriptor = create(name, flags)
+        made.append((descriptor, os.fstat(descriptor).st_ino))
+        return descriptor
+
+    monkeypatch.setattr(os, "memfd_create", recorded)
     yield
-    for descriptor in _memories() - before:
-        os.close(descriptor)
+    for descriptor, inode in made:
+        with suppress(OSError):  # the test has closed it
+            if os.fstat(descriptor).st_ino == inode:
+                os.close(descriptor)

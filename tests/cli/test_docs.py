@@ -232,7 +232,7 @@ def test_the_links_of_a_page_lead_somewhere(path: Path) -> None:
 @pytest.mark.parametrize("path", [*PATHS, ROOT / "CHANGELOG.md"], ids=lambda path: path.name)
 def test_the_files_that_a_page_names_exist(path: Path) -> None:
     roots = (ROOT, ROOT / "runtime/dxlrun")
-    folders = {one.name for root in roots for one in root.iterdir() if one.is_dir()} - {"logs"}
+    folders = {one.name for root in roots for one in root.iterdir() if one.is_dir()} - {"logs", ".venv"}
     text = path.read_text()
     typed = [word for line in re.findall(r"^    (.+)$", text, re.MULTILINE) for word in line.split()]
     for token in [*re.findall(r"`([\w.+-]+(?:/[\w.+-]+)*/?)`", text), *typed]:
