@@ -10,6 +10,7 @@ from pathlib import Path
 from threading import Thread
 from types import ModuleType
 
+import numpy as np
 import pytest
 
 from dxlrun.clock import MonotonicClock
@@ -165,6 +166,38 @@ def test_a_robot_that_the_kernel_has_no_room_for_is_left_to_the_parser(
     side.goals.values[:] = 0.0
     side.hardware.write()
     assert all(line.sent for line in side.lines.ports)
+
+
+@pytest.mark.parametrize("gone", [False, True], ids=["alone", "beside a lost line"])
+def test_a_reply_from_before_its_request_is_stray_however_late_the_host_looks(fuzz, gone):
+    plans, dialect = fuzz.robot("single reads", 2, False)
+    side = fuzz.Side(plans, kernel.load())
+    goals = np.full_like(side.goals.values, np.nan)
+    _, line = side.lines.ports
+    before = b""
+    for number in range(16):
+        reads = side.prepare()
+        told = [
+            [
+                [(3_000_000, dialect.status_packet(one.servo_id, 0, bytes((240 + number, 1, 0, 0, 0, 0))))]
+                for one in mine
+            ]
+            for mine in reads
+        ]
+        if gone and number == 6:
+            told[0] = [None]
+        if number == 15:
+            assert side.hardware._planned
+            line.said.append((side.lines.clock.now_ns(), before))
+            line.stall_ns = 2_000_000  # longer than the wire takes for both
+        side.cycle(told, goals, 0)
+        before = told[1][0][0][1]
+    assert str(side.hardware._buses[0].failure) == ("it is gone" if gone else "None")
+    logged = [packet for packet in side.log if packet.bus == 1]
+    assert logged[0].kind is not PacketKind.INSTRUCTION
+    answers = [packet.data for packet in logged[1:] if packet.kind is PacketKind.STATUS]
+    assert answers == [pieces[0][1] for pieces in told[1]]
+    assert side.states.valid[len(plans[0].servos) :].all()
 
 
 class TestOnDescriptors:

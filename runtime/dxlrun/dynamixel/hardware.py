@@ -203,8 +203,7 @@ class DynamixelHardware:
 
     def _parse(self) -> None:
         """Read packet by packet what was not read in this cycle."""
-        if not any(self._asked):
-            clear(self._buses, self._ports)
+        clear(self._buses, self._ports, self._asked)
         for asked, (bus, servos) in zip(self._asked, self._lines, strict=True):
             if not asked:
                 servos.reads.begin()

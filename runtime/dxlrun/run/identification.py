@@ -35,7 +35,7 @@ class RegisterRow:
     declared: int
     """The integer on the wire, as `found`."""
     found: int | None
-    """None: nobody answered."""
+    """None: it did not answer."""
     action: str
     """What a run would do: `nothing`, `write`, or empty where it would not start."""
 

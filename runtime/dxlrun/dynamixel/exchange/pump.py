@@ -15,14 +15,14 @@ BEAT_NS = 1_000_000
 """So long, and one wait more, nobody sees a sign of life."""
 
 
-def clear(buses: Sequence[Bus], ports: Ports) -> None:
-    """Take what lines have; on one that nobody was asked on it belongs to nobody.
+def clear(buses: Sequence[Bus], ports: Ports, asked: Sequence[bool] = ()) -> None:
+    """Take what lines have that were not asked yet in this cycle; without `asked`: what all have.
 
     What came before a request must not be taken for its reply, and replies come in the order of requests: one
     that is too many would shift all that follow.
     """
     for index in ports.wait(0):
-        if buses[index].failure is None:
+        if buses[index].failure is None and not (asked and asked[index]):
             buses[index].hear()
 
 
