@@ -6,8 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dxlrun.control.drive_gate import BRAKING_S
-from dxlrun.control.gate import SLOW_SPEED, SLOW_START_NS, Gate
+from dxlrun.control.gate import Gate
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan, LoopPlan, SchedulerPlan
+from dxlrun.control.policy_plan import SLOW_SPEED, SLOW_START_NS
 from dxlrun.interfaces import COMMAND_INTERFACES
 from dxlrun.mode import Mode
 from dxlrun.run.channels.cycle import Clamp, CycleLayout, CycleRecord

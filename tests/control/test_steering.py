@@ -7,8 +7,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from dxlrun.control.gate import SLOW_SPEED
 from dxlrun.control.loop_plan import ControllerPlan
+from dxlrun.control.policy_plan import SLOW_SPEED
 from dxlrun.run.channels.events import EventCode
 
 PERIOD_NS = 20_000_000

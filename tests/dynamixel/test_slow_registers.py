@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dxlrun.dynamixel.servo.slow_registers import slow_items
+from dxlrun.dynamixel.control_table import control_table
+from dxlrun.dynamixel.plan.reads import slow_items
 from dxlrun.run.channels.events import EventCode
 
 SECOND_NS = 1_000_000_000
@@ -17,7 +18,7 @@ def start(make_rig, make_plan):
     def build(model="XM430-W350", ids=(11, 12), *, protocol=2.0, period_ns=SECOND_NS, items=(), **change):
         x = {"reference": math.pi, "lower": -2.5, "upper": 2.5, "return_delay_ns": 0}
         plan = make_plan(ids, protocol=protocol, model=model, **(x if protocol == 2.0 else {}) | change)
-        slow = items or slow_items(model, protocol)
+        slow = items or slow_items(control_table(model, protocol))
         servos = tuple(replace(servo, slow=slow) for servo in plan.servos)
         rig = make_rig(replace(plan, servos=servos, slow_period_ns=period_ns))
         rig.hardware.start()

@@ -11,8 +11,8 @@ from dxlrun.control.policy_plan import GroupPolicy
 from dxlrun.description import Description
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
+from dxlrun.dynamixel.plan.reads import slow_items
 from dxlrun.dynamixel.registers.bus_watchdog import LEAST_PERIODS, MOST_TICKS, UNIT_NS, has_one
-from dxlrun.dynamixel.servo.slow_registers import slow_items
 
 WATCHDOG_NS = 200_000_000
 """How long a servo of Protocol 2.0 goes on without instructions where the file is silent (failures.md)."""
@@ -27,7 +27,9 @@ def with_health(description: Description, plan: BusPlan, problems: Problems) -> 
         servos=tuple(
             replace(
                 servo,
-                slow=slow_items(servo.model, plan.protocol) if slow.items is None else slow.items,
+                slow=slow_items(control_table(servo.model, plan.protocol))
+                if slow.items is None
+                else slow.items,
                 torque_on_return=_returns(description, servo.joint) == "hold",
             )
             for servo in plan.servos

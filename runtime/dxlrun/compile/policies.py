@@ -8,8 +8,17 @@ from dxlrun.compile.checks.problems import Problems, suggestion
 from dxlrun.compile.health import group_policies
 from dxlrun.compile.joint.joints import CompiledJoint
 from dxlrun.compile.joint.reach import Interval, degrees
-from dxlrun.control.policy_plan import HOLD, LIMP, POLICIES, Last, Policy, PolicyName, PolicyPlan, Step
-from dxlrun.control.safe_motion import longest_ns
+from dxlrun.control.policy_plan import (
+    HOLD,
+    LIMP,
+    POLICIES,
+    Last,
+    Policy,
+    PolicyName,
+    PolicyPlan,
+    Step,
+    longest_pose_ns,
+)
 from dxlrun.description import Description
 from dxlrun.description.policies import PoseStep, TorqueStep
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
@@ -97,7 +106,7 @@ def _pose(step: PoseStep, angles: Mapping[str, float], joints: Mapping[str, Comp
         if name in joints:
             plan = joints[name].plan
             speed = step.speed if plan.velocity is None else min(step.speed, plan.velocity)
-            longest = max(longest, longest_ns(max(plan.upper - angle, angle - plan.lower), speed))
+            longest = max(longest, longest_pose_ns(max(plan.upper - angle, angle - plan.lower), speed))
     return Step(
         text=f"pose {step.pose} at {degrees(step.speed)} deg/s",
         longest_ns=longest,

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from dxlrun.compile.checks.problems import Problems
-from dxlrun.control.loop_plan import SchedulerPlan
-from dxlrun.control.realtime.margin import MOST_SHARE
+from dxlrun.control.loop_plan import MOST_SHARE, SchedulerPlan
 from dxlrun.description import Description
 from dxlrun.description.robot import Loop
 from dxlrun.dynamixel.plan.bus_plan import BusPlan

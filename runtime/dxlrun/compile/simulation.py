@@ -14,7 +14,6 @@ from dxlrun.compile.joint.joints import CompiledJoint
 from dxlrun.compile.plan import AdapterPlan, LoadPlan, SimulationPlan
 from dxlrun.description import Description
 from dxlrun.description.bus import Bus
-from dxlrun.simulation.motion.mujoco_plant import INSTALL_MUJOCO, NEEDS_MUJOCO
 
 NEEDS_URDF = "physics: mujoco moves the bodies of a URDF, and the file names none"
 NAME_URDF = "write `model: {urdf: ...}`, or take physics: independent"
@@ -111,4 +110,7 @@ def _check_physics(description: Description, problems: Problems) -> None:
     if robot.model is None:
         tell(mark, NEEDS_URDF, NAME_URDF)
     if importlib.util.find_spec("mujoco") is None:
+        # not above: `check` reads no part of the simulation but for these two sentences
+        from dxlrun.simulation.motion.mujoco_plant import INSTALL_MUJOCO, NEEDS_MUJOCO
+
         tell(mark, NEEDS_MUJOCO, INSTALL_MUJOCO)

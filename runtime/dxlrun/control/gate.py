@@ -9,16 +9,11 @@ from numpy.typing import NDArray
 
 from dxlrun.control.drive_gate import DriveGate
 from dxlrun.control.loop_plan import LoopPlan
+from dxlrun.control.policy_plan import SLOW_SPEED, SLOW_START_NS
 from dxlrun.interfaces import Commands, Floats
 from dxlrun.mode import Mode
 from dxlrun.run.channels.cycle import Clamp, CycleRecord
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
-
-SLOW_SPEED = 1.5
-"""rad/s; a goal moves no faster in the first second after torque was switched on. A quarter of an AX-12's
-full speed: a person beside the robot can step back, and the thesis' motions still begin on time."""
-SLOW_START_NS = 1_000_000_000
-"""How long after `ease_in` the slow speed holds (failures: limit violation)."""
 
 _WHAT = {
     Clamp.LOWER: "raised to the lower position limit",

@@ -17,6 +17,9 @@ Policy = Literal["other", "fifo", "round_robin"]
 OverrunPolicy = Literal["skip", "catch_up", "stop"]
 """What becomes of deadlines that passed while a cycle was late."""
 
+MOST_SHARE = 2
+"""One part in so many of the period is the most that the clock is polled: the rest is left to others."""
+
 
 @dataclass(frozen=True, slots=True)
 class SchedulerPlan:

@@ -15,6 +15,25 @@ TORQUE_STAYS = (
 )
 """What a person is told of a run that ends with `hold`."""
 
+SLOW_SPEED = 1.5
+"""rad/s; a goal moves no faster in the first second after torque was switched on. A quarter of an AX-12's
+full speed: a person beside the robot can step back, and the thesis' motions still begin on time."""
+SLOW_START_NS = 1_000_000_000
+"""How long after `ease_in` the slow speed holds (failures: limit violation)."""
+SETTLE_NS = 300_000_000
+"""A joint that has had its pose as goal for so long and is not there is blocked, too weak, or lost."""
+
+
+def longest_pose_ns(distance: float, speed: float) -> int:
+    """Return how long a pose takes at the most from `distance` rad away at `speed` rad/s, ns.
+
+    The gate lets nothing go faster than SLOW_SPEED in the first second, and a run may be stopped in it.
+    """
+    slow_s = SLOW_START_NS * 1e-9
+    slow = min(speed, SLOW_SPEED)
+    left = max(0.0, distance - slow * slow_s)
+    return round((min(distance, slow * slow_s) / slow + left / speed) * 1e9) + SETTLE_NS
+
 
 @dataclass(frozen=True, slots=True)
 class Step:

@@ -11,19 +11,14 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.control.gate import SLOW_SPEED, SLOW_START_NS
 from dxlrun.control.loop_plan import JointPlan
-from dxlrun.control.policy_plan import Policy, Step
+from dxlrun.control.policy_plan import SETTLE_NS, Policy, Step
 from dxlrun.interfaces import Floats
 from dxlrun.mode import Mode
 from dxlrun.run.channels.cycle import CycleRecord
 
 ARRIVED = 0.05
 """rad; so near to its pose a joint counts as there. Ten ticks of an AX-12: friction holds it off by some."""
-SETTLE_NS = 300_000_000
-"""A joint that has its pose as goal for so long and is not there will not come: it is blocked or too weak, or
-its servo is lost."""
-
 MODES_NS = 500_000_000
 """How long a policy waits for modes: its own time runs on. Some twenty transactions a servo. [i]"""
 STAND_NS = 100_000_000
@@ -41,17 +36,6 @@ class MotionHardware(Protocol):
     def set_modes(self, modes: NDArray[np.uint8]) -> None:
         """Bring joints into other modes."""
         ...
-
-
-def longest_ns(distance: float, speed: float) -> int:
-    """Return how long a pose takes at the most from `distance` rad away at `speed` rad/s, ns.
-
-    The gate lets nothing go faster than SLOW_SPEED in the first second, and a run may be stopped in it.
-    """
-    slow_s = SLOW_START_NS * 1e-9
-    slow = min(speed, SLOW_SPEED)
-    left = max(0.0, distance - slow * slow_s)
-    return round((min(distance, slow * slow_s) / slow + left / speed) * 1e9) + SETTLE_NS
 
 
 @dataclass(slots=True)

@@ -6,12 +6,11 @@ import time
 from collections.abc import Callable
 
 from dxlrun.clock import MonotonicClock
+from dxlrun.control.loop_plan import MOST_SHARE
 from dxlrun.control.realtime.grants import Grant
 
 AUTO_SHARE = 10
 """Without a word in the file, at most one part in so many of the period is polled."""
-MOST_SHARE = 2
-"""Whatever the file says, at least half of the period is left to others."""
 _TRIES = 32
 _NAP_NS = 2_000_000
 """All tries together take 64 ms; longer sleeps overshoot more, which _RESERVE is for."""

@@ -19,6 +19,9 @@ from dxlrun.dynamixel.wire.transaction import Transaction
 
 CHAIN = MappingProxyType({1.0: "bulk_read", 2.0: "sync_read"})
 """Protocol -> the capability by which several servos of one layout answer one instruction in turn."""
+TEMPERATURES = ("present_temperature", "present_motor_temperature")
+VOLTAGES = ("present_voltage", "present_input_voltage")
+"""Names of the item in the control tables."""
 TOGETHER = "bulk_read"
 """The capability by which servos of different layouts do."""
 FAST = "fast_sync_read"
@@ -52,6 +55,11 @@ def state_read(line: Line, servos: Sequence[ServoPlan], more: int = 0, *, fast: 
     return line.read_many(
         [(servo.servo_id, servo.state.address, servo.state.length + more) for servo in servos], fast=fast
     )
+
+
+def slow_items(table: ControlTable) -> tuple[str, ...]:
+    """Return the items that are read between the cycles where the robot file names none."""
+    return tuple(name for name in table.items if name in TEMPERATURES or name in VOLTAGES)
 
 
 def choose_reads(

@@ -9,15 +9,13 @@ from dxlrun.dynamixel.control_table import ControlItem, control_table
 from dxlrun.dynamixel.exchange.gaps import Gaps, Urgency
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.dynamixel.plan.planning import plan_line
+from dxlrun.dynamixel.plan.reads import TEMPERATURES, VOLTAGES
 from dxlrun.dynamixel.registers.inspection import called
 from dxlrun.dynamixel.servo.absent import NEVER, Absent, Voice
 from dxlrun.dynamixel.wire.transaction import Program, Reply, Transaction
 from dxlrun.interfaces import Floats, States
 from dxlrun.run.channels.events import EventCode, Severity
 
-TEMPERATURES = ("present_temperature", "present_motor_temperature")
-VOLTAGES = ("present_voltage", "present_input_voltage")
-"""What the control tables call it."""
 _LIMITS = ("temperature_limit", "motor_temperature_limit")
 WARN_BELOW = 10.0
 """degrees C below the servo's own limit (failures.md)."""
@@ -150,12 +148,6 @@ class SlowRegisters:
         elif celsius <= limit - WARN_BELOW - COOLED and self._hot[index]:
             self._hot[index] = False
             self._say(EventCode.SERVO_HOT, Severity.INFO, index, text)
-
-
-def slow_items(model: str, protocol: float) -> tuple[str, ...]:
-    """Return what is read slowly of a model when the robot file does not say it."""
-    items = control_table(model, protocol).items
-    return tuple(name for name in items if name in TEMPERATURES or name in VOLTAGES)
 
 
 def _round(plan: BusPlan) -> list[tuple[int, _Block | None]]:
