@@ -22,7 +22,8 @@ from dxlrun.log.reader import Log, read_log, scan_log
 from dxlrun.run.channels.events import EventCode, Severity
 from dxlrun.run.channels.inbox import Command
 from dxlrun.run.channels.packets import PacketKind
-from dxlrun.simulation.faults.planned import FaultScript, parse_fault
+from dxlrun.simulation.faults.fault import parse_fault
+from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.testing import simulated_robot
 
 Make = Callable[..., Any]

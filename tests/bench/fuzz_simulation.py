@@ -23,7 +23,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dxlrun.dynamixel.control_table import ControlTable, all_tables
-from dxlrun.simulation import BusConfig, Ledger, ServoConfig, SimulatedBus
+from dxlrun.simulation import BusConfig, Ledger, ServoConfig
+from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 
 PER_SERVO = 250
 """Strings that one servo hears before another takes its place."""

@@ -10,8 +10,9 @@ from __future__ import annotations
 import time
 
 from dxlrun.dynamixel.control_table import control_table
-from dxlrun.simulation import Load, Mechanics, ServoConfig, SimulatedServo
-from dxlrun.simulation.motion.mechanics import STEP_NS
+from dxlrun.simulation import Load, ServoConfig
+from dxlrun.simulation.motion.mechanics import STEP_NS, Mechanics
+from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 
 STEPS = 2000
 

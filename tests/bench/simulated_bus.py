@@ -23,8 +23,7 @@ import tty
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from dxlrun.simulation import BusConfig, ServoConfig
-from dxlrun.simulation.process import encode_config
+from dxlrun.simulation import BusConfig, ServoConfig, encode_config
 from dxlrun.simulation.wire.protocol2 import crc16
 
 RATES = (57_600, 1_000_000, 2_000_000, 4_000_000)

@@ -27,9 +27,8 @@ from dxlrun.run.channels.events import EventCode
 from dxlrun.run.channels.inbox import Command
 from dxlrun.run.run_summary import RunOptions, RunSummary
 from dxlrun.run.simulation_front import Look, Served
-from dxlrun.simulation import BusConfig, ServoConfig
-from dxlrun.simulation.faults.fault_text import parse_fault
-from dxlrun.simulation.process import SimulationConfig
+from dxlrun.simulation import BusConfig, ServoConfig, SimulationConfig
+from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.testing import plan_of, read_log, simulated_robot
 
 ROOT = Path(__file__).parents[2]

@@ -10,8 +10,8 @@ import pytest
 
 from dxlrun.cli.simulated import sim
 from dxlrun.run.simulation_front import Look, Served
-from dxlrun.simulation.faults.fault_text import KINDS
-from dxlrun.simulation.process import SimulationConfig
+from dxlrun.simulation import SimulationConfig
+from dxlrun.simulation.faults.fault import KINDS
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "simulation.md").read_text()

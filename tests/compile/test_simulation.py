@@ -13,8 +13,7 @@ from dxlrun.compile import Compiled
 from dxlrun.compile.plan import AdapterPlan, LoadPlan, SimulationPlan, from_json, to_json
 from dxlrun.compile.simulated import simulated_bodies, simulated_buses
 from dxlrun.errors import InputError, Problem
-from dxlrun.simulation import AdapterConfig, Load
-from dxlrun.simulation.motion.mujoco_plant import UrdfBodies, UrdfJoint
+from dxlrun.simulation import AdapterConfig, Load, UrdfBodies, UrdfJoint
 
 Compile = Callable[..., Compiled]
 ProblemsIn = Callable[..., tuple[Problem, ...]]

@@ -23,8 +23,9 @@ from dxlrun.interfaces import Commands, States
 from dxlrun.run.channels.events import EventCode, Severity
 from dxlrun.run.channels.packets import LoggedPacket, PacketBatch, PacketKind, decode_packets
 from dxlrun.run.channels.ring import Handover
-from dxlrun.simulation import BusConfig, Ledger, ServoConfig, SimulatedBus, VirtualPorts, read_ledger
-from dxlrun.simulation.process import encode_config
+from dxlrun.simulation import BusConfig, Ledger, ServoConfig, encode_config, read_ledger
+from dxlrun.simulation.bus.simulated_bus import SimulatedBus
+from dxlrun.simulation.virtual_ports import VirtualPorts
 
 MIDDLE = math.radians(150)
 

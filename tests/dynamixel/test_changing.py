@@ -11,7 +11,9 @@ from dxlrun.dynamixel.tools.scanning import Wish, find
 from dxlrun.dynamixel.tools.tool_line import ToolLine
 from dxlrun.dynamixel.wire.protocol2 import Reset
 from dxlrun.errors import ServoFault
-from dxlrun.simulation import BusConfig, Ledger, ServoConfig, SimulatedBus, VirtualPorts
+from dxlrun.simulation import BusConfig, Ledger, ServoConfig
+from dxlrun.simulation.bus.simulated_bus import SimulatedBus
+from dxlrun.simulation.virtual_ports import VirtualPorts
 
 RATE = 57_600
 

@@ -7,7 +7,9 @@ from dxlrun.compile import compile_files
 from dxlrun.dynamixel.servo.identify import identify
 from dxlrun.errors import PortError, StartUpError
 from dxlrun.run.identification import ask_servos
-from dxlrun.simulation import BusConfig, Ledger, ServoConfig, SimulatedBus, VirtualPorts
+from dxlrun.simulation import BusConfig, Ledger, ServoConfig
+from dxlrun.simulation.bus.simulated_bus import SimulatedBus
+from dxlrun.simulation.virtual_ports import VirtualPorts
 
 ROBOT = """
 name: arm

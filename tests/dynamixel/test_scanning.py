@@ -8,7 +8,9 @@ from dxlrun.dynamixel.tools import scanning
 from dxlrun.dynamixel.tools.scanning import Wish, find, known_rates, scan
 from dxlrun.dynamixel.tools.tool_line import ToolLine
 from dxlrun.errors import PortError
-from dxlrun.simulation import AdapterConfig, BusConfig, Ledger, ServoConfig, SimulatedBus, VirtualPorts
+from dxlrun.simulation import AdapterConfig, BusConfig, Ledger, ServoConfig
+from dxlrun.simulation.bus.simulated_bus import SimulatedBus
+from dxlrun.simulation.virtual_ports import VirtualPorts
 
 
 class VirtualLine:

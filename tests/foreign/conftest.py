@@ -19,8 +19,7 @@ from typing import Any
 import pytest
 from dynamixel_sdk import PortHandler
 
-from dxlrun.simulation import BusConfig, LedgerEntry, read_ledger
-from dxlrun.simulation.process import encode_config
+from dxlrun.simulation import BusConfig, LedgerEntry, encode_config, read_ledger
 
 PATIENCE_S = 60.0
 """How long a test waits for what must come; it decides nothing but when to give up."""

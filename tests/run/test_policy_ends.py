@@ -18,7 +18,7 @@ from dxlrun.run.channels.packets import PacketBatch, PacketKind, decode_packets
 from dxlrun.run.channels.ring import Handover, RingReader, RingWriter
 from dxlrun.run.guardian import LastHand
 from dxlrun.run.run_processes import Memory, guardian_job
-from dxlrun.simulation import VirtualPorts
+from dxlrun.simulation.virtual_ports import VirtualPorts
 from dxlrun.testing import VirtualRobot, plan_of, simulated_robot
 
 Start = Callable[..., Any]

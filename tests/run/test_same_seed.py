@@ -12,7 +12,8 @@ from dxlrun.compile.plan import AdapterPlan, Plan
 from dxlrun.log.reader import read_log
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.simulation import Ledger, read_ledger
-from dxlrun.simulation.faults.planned import FaultScript, parse_fault
+from dxlrun.simulation.faults.fault import parse_fault
+from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.testing import plan_of
 
 ROBOTS = Path(__file__).parents[2] / "robots"

@@ -30,7 +30,9 @@ from dxlrun.run.channels.ring import Handover
 from dxlrun.run.guardian import LEAST_PATIENCE_NS, LONGEST_LOOK_NS, Guardian, Handing, LastHand, patience_ns
 from dxlrun.run.loop_process import AskedToStop, Pulse
 from dxlrun.run.run_processes import Memory, guardian_job
-from dxlrun.simulation import Ledger, SimulatedBus, VirtualPorts
+from dxlrun.simulation import Ledger
+from dxlrun.simulation.bus.simulated_bus import SimulatedBus
+from dxlrun.simulation.virtual_ports import VirtualPorts
 from dxlrun.testing import plan_of
 
 pytestmark = pytest.mark.usefixtures("no_memory_left")

@@ -17,18 +17,10 @@ from typing import IO, Any, NamedTuple
 import pytest
 
 from dxlrun.clock import VirtualClock
-from dxlrun.simulation import (
-    BusConfig,
-    Ledger,
-    LedgerEntry,
-    Load,
-    ServoConfig,
-    SimulatedBus,
-    SimulatedServo,
-    VirtualPorts,
-    read_ledger,
-)
-from dxlrun.simulation.process import encode_config
+from dxlrun.simulation import BusConfig, Ledger, LedgerEntry, Load, ServoConfig, encode_config, read_ledger
+from dxlrun.simulation.bus.simulated_bus import SimulatedBus
+from dxlrun.simulation.servo.simulated_servo import SimulatedServo
+from dxlrun.simulation.virtual_ports import VirtualPorts
 
 PATIENCE_S = 60.0
 """How long a test waits for what must come; it decides nothing but when to give up."""

@@ -24,8 +24,11 @@ from dxlrun.errors import DxlrunError
 from dxlrun.log.reader import Log
 from dxlrun.run.channels.events import EventCode
 from dxlrun.run.channels.packets import PacketKind
-from dxlrun.simulation import LedgerEntry, SimulatedBus, SimulatedServo
-from dxlrun.simulation.faults.planned import FaultScript, parse_fault
+from dxlrun.simulation import LedgerEntry
+from dxlrun.simulation.bus.simulated_bus import SimulatedBus
+from dxlrun.simulation.faults.fault import parse_fault
+from dxlrun.simulation.faults.script import FaultScript
+from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 from dxlrun.testing import VirtualRobot
 
 MS = 1_000_000

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from dxlrun.simulation.control_line import ControlLine
-from dxlrun.simulation.port.link import Link
+from dxlrun.simulation.pseudo_terminal import Link
 
 
 def test_what_nobody_reads_from_the_control_socket_is_dropped() -> None:

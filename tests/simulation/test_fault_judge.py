@@ -14,7 +14,7 @@ from dxlrun.dynamixel.wire import protocol2
 from dxlrun.log.reader import Log, read_log
 from dxlrun.run.channels.events import Event, EventCode, Severity
 from dxlrun.simulation import LedgerEntry
-from dxlrun.simulation.bus.simulated_bus import OTHER_HOST
+from dxlrun.simulation.bus.ledger import OTHER_HOST
 from dxlrun.testing import simulated_robot
 
 ROBOT = """\

@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 
 from dxlrun.errors import InputError, PortError
-from dxlrun.simulation.faults.planned import FaultScript, parse_fault
+from dxlrun.simulation.faults.fault import parse_fault
+from dxlrun.simulation.faults.script import FaultScript
 
 PING, READ, WRITE = 0x01, 0x02, 0x03
 TORQUE_ENABLE, LED = 24, 25

@@ -23,7 +23,7 @@ import pytest
 
 from dxlrun.log.reader import read_log
 from dxlrun.run.channels.inbox import Command
-from dxlrun.simulation.faults.fault_text import KINDS
+from dxlrun.simulation.faults.fault import KINDS
 from dxlrun.testing import VirtualRobot, simulated_robot
 
 ROBOTS = Path(__file__).parents[2] / "robots"

@@ -7,8 +7,8 @@ import random
 import pytest
 
 from dxlrun.errors import InputError
-from dxlrun.simulation.faults.fault_text import KEYS, KINDS, OF_KIND, parse_fault
-from dxlrun.simulation.faults.planned import FaultScript
+from dxlrun.simulation.faults.fault import KEYS, KINDS, OF_KIND, parse_fault
+from dxlrun.simulation.faults.script import FaultScript
 
 MS = 1_000_000
 VALUES: dict[str, tuple[str, ...]] = {

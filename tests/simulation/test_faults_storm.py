@@ -10,9 +10,11 @@ import pytest
 
 from dxlrun.clock import VirtualClock
 from dxlrun.errors import InputError
-from dxlrun.simulation import BusConfig, Ledger, ServoConfig, SimulatedBus, VirtualPorts
-from dxlrun.simulation.faults.planned import FaultScript, parse_fault
-from dxlrun.simulation.faults.storm import PASSING
+from dxlrun.simulation import BusConfig, Ledger, ServoConfig
+from dxlrun.simulation.bus.simulated_bus import SimulatedBus
+from dxlrun.simulation.faults.fault import parse_fault
+from dxlrun.simulation.faults.script import PASSING, FaultScript
+from dxlrun.simulation.virtual_ports import VirtualPorts
 
 READ = 0x02
 MS = 1_000_000

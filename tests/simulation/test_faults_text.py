@@ -7,7 +7,7 @@ from dataclasses import fields
 import pytest
 
 from dxlrun.errors import InputError
-from dxlrun.simulation.faults.fault_text import KEYS, KINDS, OF_KIND, Fault, fault_help, parse_fault
+from dxlrun.simulation.faults.fault import KEYS, KINDS, OF_KIND, Fault, fault_help, parse_fault
 
 LINES = (
     "lose servo=3 at=2s",

@@ -8,7 +8,8 @@ from collections.abc import Callable
 import pytest
 from fastcrc import crc16
 
-from dxlrun.simulation import BusConfig, Ledger, LedgerEntry, ServoConfig, SimulatedBus
+from dxlrun.simulation import BusConfig, Ledger, LedgerEntry, ServoConfig
+from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 
 MICROFRAME_NS = 125_000
 SYNC_READ, FAST_SYNC_READ, BULK_READ = 0x82, 0x8A, 0x92

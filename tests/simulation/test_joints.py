@@ -8,8 +8,10 @@ from typing import Any
 import pytest
 
 from dxlrun.dynamixel.control_table import all_tables, control_table
-from dxlrun.simulation import Load, Mechanics, ServoConfig, SimulatedServo
+from dxlrun.simulation import Load, ServoConfig
+from dxlrun.simulation.motion.mechanics import Mechanics
 from dxlrun.simulation.motion.motor import motor_of
+from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 
 S = 1_000_000_000
 

@@ -10,10 +10,12 @@ import pytest
 import serial
 
 from dxlrun.dynamixel.control_table import control_table
-from dxlrun.simulation import BusConfig, Load, Mechanics, ServoConfig, SimulatedBus, VirtualPorts
-from dxlrun.simulation.configuration import SimulationConfig
+from dxlrun.simulation import BusConfig, Load, ServoConfig, SimulationConfig, UrdfBodies, UrdfJoint
+from dxlrun.simulation.bus.simulated_bus import SimulatedBus
+from dxlrun.simulation.motion.mechanics import Mechanics
 from dxlrun.simulation.motion.motor import motor_of
-from dxlrun.simulation.motion.mujoco_plant import UrdfBodies, UrdfJoint, mujoco_plant
+from dxlrun.simulation.motion.mujoco_plant import mujoco_plant
+from dxlrun.simulation.virtual_ports import VirtualPorts
 
 TICK = math.tau / 4096
 MASS, ARM = 0.5, 0.2

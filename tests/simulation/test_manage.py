@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 
-from dxlrun.simulation import ServoConfig, SimulatedServo
+from dxlrun.simulation import ServoConfig
+from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 from dxlrun.simulation.wire.protocol2 import ErrorNumber
 
 PING, READ, WRITE, REG_WRITE, ACTION, RESET, REBOOT, CLEAR, BACKUP = 1, 2, 3, 4, 5, 6, 8, 0x10, 0x20

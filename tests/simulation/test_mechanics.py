@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from dxlrun.dynamixel.control_table import ControlTable, all_tables, control_table
+from dxlrun.simulation import Load
 from dxlrun.simulation.motion.command import LIMP, Command
-from dxlrun.simulation.motion.mechanics import EAGER_NS, EASY_NS, STEP_NS, Load, Mechanics
+from dxlrun.simulation.motion.mechanics import EAGER_NS, EASY_NS, STEP_NS, Mechanics
 from dxlrun.simulation.motion.motor import Motor, motor_of
 from dxlrun.simulation.motion.strain import AMBIENT_C, COOLING_S, STALLED_RISE_C
 

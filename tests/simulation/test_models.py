@@ -11,7 +11,8 @@ from collections.abc import Iterator
 import pytest
 
 from dxlrun.dynamixel.control_table import ControlItem, ControlTable, all_tables
-from dxlrun.simulation import ServoConfig, SimulatedServo
+from dxlrun.simulation import ServoConfig
+from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 from dxlrun.simulation.wire.packets import InstructionPacket
 
 OLD = [table for table in all_tables() if table.protocol == 1.0]

@@ -14,9 +14,11 @@ import numpy.typing as npt
 import pytest
 
 from dxlrun.dynamixel.control_table import all_tables, control_table
-from dxlrun.simulation import Mechanics, ServoConfig, SimulatedServo
+from dxlrun.simulation import ServoConfig
+from dxlrun.simulation.motion.mechanics import Mechanics
 from dxlrun.simulation.motion.motor import motor_of
 from dxlrun.simulation.motion.shaft import critical_d
+from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 
 S, STEP_NS = 1_000_000_000, 2_000_000
 START = 1.0

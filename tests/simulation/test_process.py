@@ -18,10 +18,18 @@ import pytest
 import rustypot
 
 from dxlrun.dynamixel.control_table import control_table
-from dxlrun.simulation import BusConfig, Ledger, ServoConfig, SimulatedBus, read_ledger
-from dxlrun.simulation.port.pseudo_terminal import PseudoTerminal
-from dxlrun.simulation.port.realtime import Patience
-from dxlrun.simulation.process import SimulationConfig, decode_config, encode_config
+from dxlrun.simulation import (
+    BusConfig,
+    Ledger,
+    ServoConfig,
+    SimulationConfig,
+    decode_config,
+    encode_config,
+    read_ledger,
+)
+from dxlrun.simulation.bus.simulated_bus import SimulatedBus
+from dxlrun.simulation.pseudo_terminal import PseudoTerminal
+from dxlrun.simulation.realtime import Patience
 
 PING_1 = bytes.fromhex("ff ff 01 02 01 fb")
 PONG_1 = bytes.fromhex("ff ff 01 02 00 fc")

@@ -6,8 +6,9 @@ from typing import Any
 import pytest
 
 from dxlrun.dynamixel.control_table import control_table
-from dxlrun.simulation import ServoConfig, SimulatedServo
+from dxlrun.simulation import ServoConfig
 from dxlrun.simulation.memory.cells import Memory
+from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 from dxlrun.simulation.wire.protocol1 import ErrorBit
 
 PING, READ, WRITE, REG_WRITE, ACTION, FACTORY_RESET, SYNC_WRITE, BULK_READ = 1, 2, 3, 4, 5, 6, 0x83, 0x92

@@ -8,7 +8,8 @@ from unittest.mock import ANY
 
 import pytest
 
-from dxlrun.simulation import ServoConfig, SimulatedServo
+from dxlrun.simulation import ServoConfig
+from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 from dxlrun.simulation.servo.torque_body import HardwareError
 from dxlrun.simulation.wire.protocol2 import ErrorNumber
 

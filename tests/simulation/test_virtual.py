@@ -8,7 +8,9 @@ import pytest
 from dxlrun.clock import VirtualClock
 from dxlrun.dynamixel.port.ports import Ports
 from dxlrun.errors import PortError
-from dxlrun.simulation import BusConfig, Ledger, ServoConfig, SimulatedBus, VirtualPorts
+from dxlrun.simulation import BusConfig, Ledger, ServoConfig
+from dxlrun.simulation.bus.simulated_bus import SimulatedBus
+from dxlrun.simulation.virtual_ports import VirtualPorts
 
 PING_1 = bytes.fromhex("ff ff 01 02 01 fb")
 PONG_1 = bytes.fromhex("ff ff 01 02 00 fc")

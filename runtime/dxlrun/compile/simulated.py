@@ -7,8 +7,7 @@ from dxlrun.compile.simulation import NAME_URDF, NEEDS_URDF
 from dxlrun.dynamixel.control_table import added_control_tables
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.errors import InputError
-from dxlrun.simulation import AdapterConfig, BusConfig, Load, ServoConfig
-from dxlrun.simulation.motion.mujoco_plant import UrdfBodies, UrdfJoint, mujoco_plant
+from dxlrun.simulation import AdapterConfig, BusConfig, Load, ServoConfig, UrdfBodies, UrdfJoint
 
 
 def simulated_buses(plan: Plan) -> tuple[BusConfig, ...]:
@@ -33,6 +32,8 @@ def simulated_bodies(plan: Plan) -> UrdfBodies | None:
         for servo in bus.servos
     )
     bodies = UrdfBodies(plan.urdf, tuple(joints))
+    from dxlrun.simulation.motion.mujoco_plant import mujoco_plant  # MuJoCo is optional, and slow to import
+
     mujoco_plant(bodies)
     return bodies
 

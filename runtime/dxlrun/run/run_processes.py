@@ -23,7 +23,7 @@ from dxlrun.run.channels.events import EVENT_SLOT, event_slots
 from dxlrun.run.channels.packets import PACKET_SLOT, packet_slots
 from dxlrun.run.guardian import GuardianJob
 from dxlrun.run.loop_process import LoopJob, Outcome
-from dxlrun.simulation.process import SimulationConfig, encode_config
+from dxlrun.simulation import SimulationConfig, encode_config
 
 _GUARDIAN_SLOTS = 1024
 

@@ -23,7 +23,7 @@ import msgspec
 from dxlrun.run.channels import process
 from dxlrun.run.channels.child import Child
 from dxlrun.run.channels.process import Line
-from dxlrun.simulation.process import SimulationConfig, encode_config
+from dxlrun.simulation import SimulationConfig, encode_config
 
 _LAST_LOOK_S = 1.0
 """How long the last look may take: a process that does not answer in it ends without."""

@@ -30,8 +30,10 @@ from dxlrun.run.channels.packets import NoPackets, PacketBatch
 from dxlrun.run.channels.ring import Handover
 from dxlrun.run.run_log import discard_log, incomplete_log, log_header, new_log
 from dxlrun.run.run_summary import Progress, RunOptions, RunSummary
-from dxlrun.simulation import Ledger, Mechanics, SimulatedBus, VirtualPorts
-from dxlrun.simulation.motion.mujoco_plant import mujoco_plant
+from dxlrun.simulation import Ledger
+from dxlrun.simulation.bus.simulated_bus import SimulatedBus
+from dxlrun.simulation.motion.mechanics import Mechanics, plant_of
+from dxlrun.simulation.virtual_ports import VirtualPorts
 
 
 @dataclass(slots=True)
@@ -95,7 +97,7 @@ class VirtualRobot:
         self.ledger = Ledger() if ledger is None else ledger
         """Every byte that the simulated servos received and sent."""
         bodies = simulated_bodies(plan)
-        mechanics = Mechanics(0, mujoco_plant(bodies) if bodies else None)
+        mechanics = Mechanics(0, plant_of(bodies))
         self.buses = tuple(
             SimulatedBus(config, self.ledger, 0, mechanics) for config in simulated_buses(plan)
         )

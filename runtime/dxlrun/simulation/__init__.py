@@ -1,14 +1,23 @@
-"""Simulated servos on simulated buses, with packet code of their own; they share only the control tables."""
+"""Simulated servos on simulated buses, with packet code of their own; they share only the control tables.
+
+The names of this module describe a simulation and read its ledger, and are cheap to import. What simulates is
+imported from its own module: `bus.simulated_bus`, `servo`, `motion.mechanics`, `virtual_ports`.
+"""
 
 from __future__ import annotations
 
-from dxlrun.simulation.bus.adapter import AdapterConfig
-from dxlrun.simulation.bus.bus_config import BusConfig, ServoCounts
 from dxlrun.simulation.bus.ledger import Ledger, LedgerEntry, read_ledger
-from dxlrun.simulation.bus.simulated_bus import SimulatedBus
-from dxlrun.simulation.motion.mechanics import Load, Mechanics
-from dxlrun.simulation.port.virtual import VirtualPort, VirtualPorts
-from dxlrun.simulation.servo.simulated_servo import ServoConfig, SimulatedServo
+from dxlrun.simulation.configuration import (
+    AdapterConfig,
+    BusConfig,
+    Load,
+    ServoConfig,
+    SimulationConfig,
+    UrdfBodies,
+    UrdfJoint,
+    decode_config,
+    encode_config,
+)
 
 __all__ = [
     "AdapterConfig",
@@ -16,12 +25,11 @@ __all__ = [
     "Ledger",
     "LedgerEntry",
     "Load",
-    "Mechanics",
     "ServoConfig",
-    "ServoCounts",
-    "SimulatedBus",
-    "SimulatedServo",
-    "VirtualPort",
-    "VirtualPorts",
+    "SimulationConfig",
+    "UrdfBodies",
+    "UrdfJoint",
+    "decode_config",
+    "encode_config",
     "read_ledger",
 ]

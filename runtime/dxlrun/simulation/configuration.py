@@ -1,19 +1,110 @@
-"""What the process of the simulated buses is started with."""
+"""What is simulated: servos with their loads on buses with their adapters; plain data, as JSON too.
+
+Nothing of the simulation itself is imported here, so that the rest of the runtime can describe one cheaply.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 import msgspec
 
-from dxlrun.simulation.bus.bus_config import BusConfig
-from dxlrun.simulation.motion.mujoco_plant import UrdfBodies
+
+@dataclass(frozen=True, slots=True)
+class Load:
+    """What hangs on the shaft of a servo; nothing by default."""
+
+    inertia: float = 0.0
+    """kg m^2, beside that of the servo's own rotor and gear"""
+    friction: float = 0.0
+    """Nm, Coulomb, beside the servo's own: the same at every speed, and the most that holds at rest"""
+    gravity: float = 0.0
+    """Nm with which gravity turns the link where it is horizontal"""
+    gravity_angle: float = 0.0
+    """rad from the servo's raw 0, where the link hangs straight down"""
+
+
+NO_LOAD = Load()
+
+
+@dataclass(frozen=True, slots=True)
+class ServoConfig:
+    """A servo as it is connected to a bus when the simulation starts."""
+
+    servo_id: int
+    model: str
+    position: float
+    """rad, from the servo's raw 0"""
+    return_delay_ns: int = 500_000
+    """Initial value of Return Delay Time, rounded to its unit of 2 us."""
+    load: Load = NO_LOAD
+    """What its shaft moves."""
+    firmware: int | None = None
+    """Firmware Version: it decides the control table where a model has two, and the fast reads.
+
+    None: one that has all that the model's table names.
+    """
+
+
+@dataclass(frozen=True, slots=True)
+class AdapterConfig:
+    """How the adapter of a line behaves; the default hands each reply over whole, at its last byte."""
+
+    latency_timer_ns: int = 0
+    """FTDI: bytes are handed over when this timer runs out or 62 are there; 0: at once."""
+    split: Literal["whole", "byte", "random"] = "whole"
+    """Pieces in which bytes are handed over; `random`: 1 to 8 bytes."""
+    seed: int = 0
+    """Of `random`."""
+    echo: bool = False
+    """True: the host receives its own bytes back."""
+
+
+WHOLE_REPLIES = AdapterConfig()
+
+
+@dataclass(frozen=True, slots=True)
+class BusConfig:
+    """One serial line and its servos."""
+
+    name: str
+    baud_rate: int
+    """bit/s, of the host and, at the start, of every servo"""
+    servos: tuple[ServoConfig, ...]
+    protocol: float = 1.0
+    """1.0 or 2.0: one bus speaks one protocol"""
+    control_tables: tuple[str, ...] = ()
+    """Texts of the control tables of plug-ins: the process of the simulated buses loads no plug-ins."""
+    adapter: AdapterConfig = WHOLE_REPLIES
+    """What is between the line and the host."""
+    absent: Literal["silent", "slot"] = "silent"
+    """Protocol 2.0, a listed servo does not reply: those after it never reply, or after its time [?]."""
+
+
+@dataclass(frozen=True, slots=True)
+class UrdfJoint:
+    """Which joint of a URDF a servo turns: q = direction * (theta - reference)."""
+
+    name: str
+    reference: float
+    """rad, of the servo from its raw 0"""
+    direction: int
+
+
+@dataclass(frozen=True, slots=True)
+class UrdfBodies:
+    """A URDF, and how servos turn its joints."""
+
+    urdf: str
+    joints: tuple[UrdfJoint, ...]
+    """In the order in which the servos are added; servos after them move by themselves."""
 
 
 @dataclass(frozen=True, slots=True)
 class SimulationConfig:
-    """What the process of the simulated buses is to serve."""
+    """What the process of the simulated buses serves."""
 
     buses: tuple[BusConfig, ...]
     faults: tuple[str, ...] = ()

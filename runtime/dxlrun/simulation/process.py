@@ -18,13 +18,11 @@ from pathlib import Path
 
 from dxlrun.dynamixel.control_table import add_control_table
 from dxlrun.errors import DxlrunError
+from dxlrun.simulation import realtime
 from dxlrun.simulation.bus.ledger import Ledger
-from dxlrun.simulation.configuration import SimulationConfig, decode_config, encode_config
+from dxlrun.simulation.configuration import decode_config
 from dxlrun.simulation.control_line import ControlLine
-from dxlrun.simulation.port import realtime
 from dxlrun.simulation.server import Server
-
-__all__ = ["SimulationConfig", "decode_config", "encode_config", "main"]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -7,6 +7,7 @@ import select
 import signal
 import socket
 import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import msgspec
@@ -16,13 +17,13 @@ from dxlrun.simulation.bus.ledger import SOME_ENTRIES, Ledger
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.configuration import SimulationConfig
 from dxlrun.simulation.control_line import ControlLine
-from dxlrun.simulation.faults.planned import FaultScript, parse_fault
-from dxlrun.simulation.look import lateness_us, servo_looks
-from dxlrun.simulation.motion.mechanics import Mechanics
-from dxlrun.simulation.motion.mujoco_plant import mujoco_plant
-from dxlrun.simulation.port.link import Link
-from dxlrun.simulation.port.pseudo_terminal import PseudoTerminal
-from dxlrun.simulation.port.realtime import Patience
+from dxlrun.simulation.faults.fault import parse_fault
+from dxlrun.simulation.faults.script import FaultScript
+from dxlrun.simulation.memory.cells import Memory
+from dxlrun.simulation.motion.mechanics import Mechanics, plant_of
+from dxlrun.simulation.pseudo_terminal import Link, PseudoTerminal
+from dxlrun.simulation.realtime import Patience
+from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 
 _HAPPENED = "fault: "
 MOST_BACKLOG_NS = 20_000_000
@@ -36,6 +37,10 @@ microframes of USB: each hand-over costs the processor, and the host's, more tha
 
 IDLE_NS = 300_000
 """So long the mechanics of a few steps and the lines of the ledger may take."""
+
+
+_GOAL_MODES = (3, 4, 5)
+"""Operating Mode (11): position, extended position, current-based position (e-Manual, X series)."""
 
 
 class _Question(msgspec.Struct):
@@ -56,8 +61,7 @@ class Server:
         self.start_ns = time.monotonic_ns()
         self._ledger = ledger
         self._line = line
-        plant = mujoco_plant(config.bodies) if config.bodies else None
-        self._mechanics = Mechanics(self.start_ns, plant)
+        self._mechanics = Mechanics(self.start_ns, plant_of(config.bodies))
         self._buses = tuple(SimulatedBus(bus, ledger, self.start_ns, self._mechanics) for bus in config.buses)
         self._faults = FaultScript([parse_fault(text) for text in config.faults], config.seed)
         self._faults.attach(self._buses, start_ns=self.start_ns)
@@ -230,3 +234,49 @@ def _wake_on_sigterm() -> socket.socket:
     signal.signal(signal.SIGTERM, lambda number, frame: None)
     signal.set_wakeup_fd(signalled.detach())
     return wake
+
+
+def servo_looks(bus: SimulatedBus, now_ns: int) -> list[Mapping[str, object]]:
+    """Return each servo of a bus as it is now: angles in rad from raw 0, degrees C, V."""
+    bus.advance(now_ns)
+    return [_look(bus, servo) for servo in bus.servos]
+
+
+def _look(bus: SimulatedBus, servo: SimulatedServo) -> Mapping[str, object]:
+    counts = bus.counts(servo)
+    registers = servo.registers
+    return {
+        "bus": bus.name,
+        "id": servo.servo_id,
+        "model": registers.table.model,
+        "torque": servo.torque_on,
+        "goal": _goal(registers),
+        "present": servo.position,
+        "temperature": servo.temperature,
+        "voltage": servo.voltage,
+        "error": registers.get("hardware_error_status", counts.last_error),
+        "heard": counts.heard,
+        "answered": counts.answered,
+    }
+
+
+def _goal(registers: Memory) -> float | None:
+    """Return the goal, rad from raw 0; None in a mode that has none."""
+    if "goal_position" not in registers or registers.get("operating_mode", 3) not in _GOAL_MODES:
+        return None
+    if registers.get("cw_angle_limit", 1) == registers.get("ccw_angle_limit", 1) == 0:
+        return None  # wheel mode (e-Manual, AX-12A, CW/CCW Angle Limit)
+    return registers.ticks("goal_position") * registers.table.rad_per_tick
+
+
+def lateness_us(buses: Sequence[SimulatedBus]) -> Mapping[str, float]:
+    """Return how late hosts got their last bytes, us: median, p99, maximum; nothing before the first."""
+    ordered = sorted(late_ns for bus in buses for late_ns in bus.lateness_ns)
+    if not ordered:
+        return {}
+    picked = {
+        "median": ordered[len(ordered) // 2],
+        "p99": ordered[len(ordered) * 99 // 100],
+        "maximum": ordered[-1],
+    }
+    return {name: late_ns / 1000 for name, late_ns in picked.items()}

@@ -11,8 +11,7 @@ from pathlib import Path
 import msgspec
 
 from dxlrun.errors import ProcessFault
-from dxlrun.simulation import BusConfig
-from dxlrun.simulation.configuration import encode_config
+from dxlrun.simulation import BusConfig, encode_config
 from exchange.hosts import Host
 
 _RESPONDER = Path(__file__).with_name("responder.py")

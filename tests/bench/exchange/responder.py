@@ -24,8 +24,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Literal
 
-from dxlrun.simulation import BusConfig, Ledger, SimulatedBus
-from dxlrun.simulation.configuration import decode_config
+from dxlrun.simulation import BusConfig, Ledger, decode_config
+from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 
 Does = Literal["rehearse", "learn", "play"]
 _MOST = 1 << 16

@@ -12,8 +12,7 @@ import msgspec
 from dxlrun.errors import ProcessFault
 from dxlrun.run.channels import process
 from dxlrun.run.channels.child import Child
-from dxlrun.simulation import BusConfig
-from dxlrun.simulation.configuration import encode_config
+from dxlrun.simulation import BusConfig, encode_config
 
 _PRIORITY = 33
 """As in a run: a servo's electronics do not wait for the host's processor."""

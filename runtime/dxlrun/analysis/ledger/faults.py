@@ -13,9 +13,8 @@ from dataclasses import dataclass, replace
 from dxlrun.errors import InputError
 from dxlrun.run.channels.events import Event, EventCode, Severity
 from dxlrun.simulation import LedgerEntry
-from dxlrun.simulation.bus.simulated_bus import OTHER_HOST
-from dxlrun.simulation.faults.fault_kinds import BABBLE_NS, BOOT_NS, BROWNOUT_NS, TURN_NS
-from dxlrun.simulation.faults.planned import Fault, parse_fault
+from dxlrun.simulation.bus.ledger import OTHER_HOST
+from dxlrun.simulation.faults.fault import BABBLE_NS, BOOT_NS, BROWNOUT_NS, TURN_NS, Fault, parse_fault
 
 MARK = "fault: "
 """How the note of an injected fault begins in the ledger."""

@@ -155,7 +155,7 @@ class JsonView:
 
 def fault_lines() -> Sequence[str]:
     """Return what can be typed: a line for each kind of fault."""
-    from dxlrun.simulation.faults.planned import fault_help
+    from dxlrun.simulation.faults.fault import fault_help
 
     return fault_help()
 

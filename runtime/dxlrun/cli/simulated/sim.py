@@ -30,10 +30,8 @@ if TYPE_CHECKING:
 
     from dxlrun.cli.output.sim_views import Shown
     from dxlrun.run.simulation_front import FrontOptions, Served
-    from dxlrun.simulation import BusConfig
-    from dxlrun.simulation.faults.planned import Fault
-    from dxlrun.simulation.motion.mujoco_plant import UrdfBodies
-    from dxlrun.simulation.process import SimulationConfig
+    from dxlrun.simulation import BusConfig, SimulationConfig, UrdfBodies
+    from dxlrun.simulation.faults.fault import Fault
 
 Words = Annotated[tuple[str, ...], Parameter(negative=(), show_default=False, allow_leading_hyphen=False)]
 _ABOVE_LOOP = 2
@@ -120,7 +118,7 @@ def sim(
     from dxlrun.cli.output.sim_views import Shown, ending
     from dxlrun.run.channels.process import spare_core
     from dxlrun.run.simulation_front import FrontOptions
-    from dxlrun.simulation.process import SimulationConfig
+    from dxlrun.simulation import SimulationConfig
 
     title = told.title
     config = SimulationConfig(
@@ -205,8 +203,9 @@ def refuse_what_cannot_be(buses: Sequence[BusConfig], faults: Sequence[Fault], s
 
     Raises InputError for a servo that cannot be as it is told, and for each fault that could never happen.
     """
-    from dxlrun.simulation import Ledger, SimulatedBus
-    from dxlrun.simulation.faults.planned import FaultScript
+    from dxlrun.simulation import Ledger
+    from dxlrun.simulation.bus.simulated_bus import SimulatedBus
+    from dxlrun.simulation.faults.script import FaultScript
 
     ledger = Ledger(keep=False)
     try:

@@ -14,7 +14,7 @@ from dxlrun.errors import InputError, Mark, Problem
 if TYPE_CHECKING:
     from dxlrun.dynamixel.control_table import ControlTable
     from dxlrun.simulation import BusConfig
-    from dxlrun.simulation.faults.planned import Fault
+    from dxlrun.simulation.faults.fault import Fault
 
 Split = Literal["whole", "byte", "random"]
 Absent = Literal["silent", "slot"]
@@ -117,7 +117,7 @@ def read_faults(lines: Sequence[str], file: Path | None) -> tuple[Fault, ...]:
 
     In a file, empty lines and what follows a # are left out.
     """
-    from dxlrun.simulation.faults.planned import parse_fault
+    from dxlrun.simulation.faults.fault import parse_fault
 
     faults: list[Fault] = []
     wrong: list[str] = []
@@ -135,7 +135,7 @@ def read_faults(lines: Sequence[str], file: Path | None) -> tuple[Fault, ...]:
 
 
 def _faults_of(file: Path) -> tuple[list[Fault], list[Problem]]:
-    from dxlrun.simulation.faults.planned import parse_fault
+    from dxlrun.simulation.faults.fault import parse_fault
 
     try:
         text = file.read_text(encoding="utf-8")

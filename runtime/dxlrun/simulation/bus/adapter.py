@@ -10,9 +10,9 @@ import random
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 from dxlrun.simulation.bus.wire import Chunk
+from dxlrun.simulation.configuration import AdapterConfig
 
 BURST = 62
 """Bytes that an FTDI chip hands over without waiting for its timer: a USB packet of 64 bytes less two of
@@ -23,20 +23,6 @@ UNREAD_LIMIT = 4096
 
 _LONGEST_PIECE = 8
 """Bytes of the longest piece of `random`."""
-
-
-@dataclass(frozen=True, slots=True)
-class AdapterConfig:
-    """How the adapter of a line behaves; the default hands each reply over whole, at its last byte."""
-
-    latency_timer_ns: int = 0
-    """FTDI: bytes are handed over when this timer runs out or 62 are there; 0: at once."""
-    split: Literal["whole", "byte", "random"] = "whole"
-    """Pieces in which bytes are handed over; `random`: 1 to 8 bytes."""
-    seed: int = 0
-    """Of `random`."""
-    echo: bool = False
-    """True: the host gets its own bytes back."""
 
 
 @dataclass(frozen=True, slots=True)

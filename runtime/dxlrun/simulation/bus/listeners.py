@@ -2,8 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from dxlrun.simulation.memory.cells import IDENTITY
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
+
+
+@dataclass(slots=True)
+class ServoCounts:
+    """What a servo did on the line since the start."""
+
+    heard: int = 0
+    """Intact instructions to it, those to all servos among them."""
+    answered: int = 0
+    errors: int = 0
+    """Answers that tell of an error."""
+    last_error: int = 0
+    """Of its last answer, as it stood in the packet."""
+
+    def answer(self, error: int, times: int = 1) -> None:
+        """Count an answer, or several alike."""
+        self.answered += times
+        self.errors += times * (error != 0)
+        self.last_error = error
 
 
 class Listeners:

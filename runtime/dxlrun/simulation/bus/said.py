@@ -7,9 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 
-from dxlrun.simulation.bus.bus_config import ServoCounts
 from dxlrun.simulation.bus.flow import Answers, Flow
-from dxlrun.simulation.bus.listeners import Listeners
+from dxlrun.simulation.bus.listeners import Listeners, ServoCounts
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 from dxlrun.simulation.wire.packets import Codec, ReadEntry, ReadInTurn, Reply
 

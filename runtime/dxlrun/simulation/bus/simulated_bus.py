@@ -21,20 +21,17 @@ from collections.abc import Callable
 
 from dxlrun.simulation.bus.adapter import Adapter
 from dxlrun.simulation.bus.agenda import Agenda
-from dxlrun.simulation.bus.bus_config import BusConfig, ServoCounts
 from dxlrun.simulation.bus.delivery import Delivery
 from dxlrun.simulation.bus.flow import Flow
-from dxlrun.simulation.bus.ledger import Ledger
-from dxlrun.simulation.bus.listeners import Listeners
+from dxlrun.simulation.bus.ledger import OTHER_HOST, Ledger
+from dxlrun.simulation.bus.listeners import Listeners, ServoCounts
 from dxlrun.simulation.bus.said import Readings
 from dxlrun.simulation.bus.wire import STATUS_BYTES, Alteration, Chain, Change, Chunk, Wire, flipped
+from dxlrun.simulation.configuration import BusConfig, ServoConfig
 from dxlrun.simulation.motion.mechanics import Mechanics
-from dxlrun.simulation.servo.simulated_servo import ServoConfig, SimulatedServo
+from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 from dxlrun.simulation.wire import protocol1, protocol2
 from dxlrun.simulation.wire.packets import Codec, InstructionPacket, ReadInTurn, Reply
-
-OTHER_HOST = "another host sends"
-"""How the note of an instruction of another host begins in the ledger."""
 
 
 class SimulatedBus:

@@ -6,10 +6,11 @@ import math
 from collections.abc import Callable, Mapping
 from typing import ClassVar
 
+from dxlrun.simulation.configuration import Load
 from dxlrun.simulation.memory.access import multi_turn_mode, wheel_mode
 from dxlrun.simulation.memory.cells import Memory
 from dxlrun.simulation.motion.command import FREE, Command
-from dxlrun.simulation.motion.mechanics import Load, Mechanics
+from dxlrun.simulation.motion.mechanics import Mechanics
 from dxlrun.simulation.motion.shaft import Shaft, Trajectory, in_turn
 
 SLOPE_TICK = math.radians(300) / 1023

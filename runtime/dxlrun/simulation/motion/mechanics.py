@@ -14,14 +14,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dxlrun.simulation.configuration import Load, UrdfBodies
 from dxlrun.simulation.motion.command import LIMP, ROWS, Command
 from dxlrun.simulation.motion.control_law import ControlLaw
 from dxlrun.simulation.motion.motor import Motor
-from dxlrun.simulation.motion.plant import NO_LOAD, Floats, IndependentJoints, Joint, Load, Plant, PlantMaker
+from dxlrun.simulation.motion.plant import Floats, IndependentJoints, Joint, Plant, PlantMaker
 from dxlrun.simulation.motion.profile import Profiles
 from dxlrun.simulation.motion.strain import OVERLOAD_TICKS, Strain
-
-__all__ = ["NO_LOAD", "STEP_NS", "Load", "Mechanics", "Motor", "Plant", "PlantMaker"]
 
 STEP_NS = 2_000_000
 """Step of the grid. The fastest thing in a servo here is its motor's time constant: 13.6 ms and more."""
@@ -280,3 +279,15 @@ class Mechanics:
         self.law.stall[:] = nominal
         self.strain = Strain(nominal, STRAIN_NS * 1e-9)
         self._next_strain_ns = self._strain_after(self.grid_ns)
+
+
+def plant_of(bodies: UrdfBodies | None) -> PlantMaker:
+    """Return what makes the plant of some bodies, or of joints that move by themselves.
+
+    Raises InputError when MuJoCo is not installed, cannot take the URDF, or would turn nothing.
+    """
+    if bodies is None:
+        return IndependentJoints
+    from dxlrun.simulation.motion.mujoco_plant import mujoco_plant  # MuJoCo is optional, and slow to import
+
+    return mujoco_plant(bodies)

@@ -6,11 +6,12 @@ import math
 from collections.abc import Callable, Mapping
 from typing import ClassVar
 
+from dxlrun.simulation.configuration import Load
 from dxlrun.simulation.memory.access import watchdog_expired
 from dxlrun.simulation.memory.cells import Memory
 from dxlrun.simulation.motion.command import FREE, LIMP, Command
 from dxlrun.simulation.motion.gains import position_gains, velocity_gains
-from dxlrun.simulation.motion.mechanics import Load, Mechanics
+from dxlrun.simulation.motion.mechanics import Mechanics
 from dxlrun.simulation.motion.shaft import Shaft, Trajectory
 
 REVERSE, TIME_BASED = 0x01, 0x04

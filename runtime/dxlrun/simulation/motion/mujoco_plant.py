@@ -9,12 +9,12 @@ are turned: how far the turn of a servo would move a slide is said nowhere.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence, Set
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dxlrun.errors import InputError
+from dxlrun.simulation.configuration import UrdfBodies, UrdfJoint
 from dxlrun.simulation.motion.plant import Floats, IndependentJoints, Joint, PlantMaker
 
 if TYPE_CHECKING:
@@ -33,25 +33,6 @@ _LEAST_INERTIA = 1e-9
 _FRICTION_SOLREF = (0.004, 1.0)
 _FRICTION_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 """Friction that holds: with MuJoCo's own values a joint creeps although its friction could hold it."""
-
-
-@dataclass(frozen=True, slots=True)
-class UrdfJoint:
-    """Which joint of a URDF a servo turns: q = direction * (theta - reference)."""
-
-    name: str
-    reference: float
-    """rad, of the servo from its raw 0"""
-    direction: int
-
-
-@dataclass(frozen=True, slots=True)
-class UrdfBodies:
-    """A URDF, and how servos turn its joints."""
-
-    urdf: str
-    joints: tuple[UrdfJoint, ...]
-    """In the order in which the servos are added; servos after them move by themselves."""
 
 
 def mujoco_plant(bodies: UrdfBodies) -> PlantMaker:

@@ -13,26 +13,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.simulation.configuration import Load
 from dxlrun.simulation.motion.motor import Motor
 
 Floats = NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True)
-class Load:
-    """What hangs on the shaft of a servo; nothing by default."""
-
-    inertia: float = 0.0
-    """kg m^2, beside that of the servo's own rotor and gear"""
-    friction: float = 0.0
-    """Nm, Coulomb, beside the servo's own: the same at every speed, and the most that holds at rest"""
-    gravity: float = 0.0
-    """Nm with which gravity turns the link where it is horizontal"""
-    gravity_angle: float = 0.0
-    """rad from the servo's raw 0, where the link hangs straight down"""
-
-
-NO_LOAD = Load()
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,9 +7,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from typing import ClassVar
 
+from dxlrun.simulation.configuration import Load
 from dxlrun.simulation.memory.cells import Memory
 from dxlrun.simulation.motion.command import LIMP, Command
-from dxlrun.simulation.motion.mechanics import STEP_NS, Load, Mechanics
+from dxlrun.simulation.motion.mechanics import STEP_NS, Mechanics
 from dxlrun.simulation.motion.motor import Motor, motor_of
 
 Trajectory = tuple[float, float, float]

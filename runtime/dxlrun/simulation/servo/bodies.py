@@ -6,9 +6,10 @@ from collections.abc import Callable
 from typing import Protocol
 
 from dxlrun.dynamixel.control_table import ControlTable
+from dxlrun.simulation.configuration import Load
 from dxlrun.simulation.memory.cells import Memory
 from dxlrun.simulation.motion.joint_shaft import JointShaft
-from dxlrun.simulation.motion.mechanics import Load, Mechanics
+from dxlrun.simulation.motion.mechanics import Mechanics
 from dxlrun.simulation.motion.mode_shaft import ModeShaft
 from dxlrun.simulation.motion.shaft import Shaft
 from dxlrun.simulation.servo import instructions1, instructions2

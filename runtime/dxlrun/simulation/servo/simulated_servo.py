@@ -11,33 +11,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 from dxlrun.dynamixel.control_table import ControlTable, control_table, models_by_number
+from dxlrun.simulation.configuration import ServoConfig
 from dxlrun.simulation.memory.cells import Memory
-from dxlrun.simulation.motion.mechanics import NO_LOAD, Load, Mechanics
+from dxlrun.simulation.motion.mechanics import Mechanics
 from dxlrun.simulation.servo.bodies import make_body
 from dxlrun.simulation.servo.body import Body
 from dxlrun.simulation.wire.packets import BROADCAST, InstructionPacket, ReadEntry, ReadInTurn, Reply
-
-
-@dataclass(frozen=True, slots=True)
-class ServoConfig:
-    """A servo as it hangs on a bus when the simulation starts."""
-
-    servo_id: int
-    model: str
-    position: float
-    """rad, from the servo's raw 0"""
-    return_delay_ns: int = 500_000
-    """Initial value of Return Delay Time, rounded to its unit of 2 us."""
-    load: Load = NO_LOAD
-    """What its shaft moves."""
-    firmware: int | None = None
-    """Firmware Version: it decides the control table where a model has two, and the fast reads.
-
-    None: one that has all that the model's table names.
-    """
 
 
 class SimulatedServo:

@@ -82,6 +82,16 @@ class Kind:
         return (*self.needs, *self.takes)
 
 
+NOISE_BYTES = 8
+FLIPPED_BITS = 0x01
+HOT_CELSIUS = 90.0
+"""Above Temperature Limit (31) as every model has it from the factory: 85 degrees C at most."""
+BOOT_NS = 100_000_000
+"""How long a servo that starts again hears nothing; no manual names it [i]."""
+BROWNOUT_NS = 200_000_000
+BABBLE_NS = 200_000_000
+BABBLE_PAUSE_NS = 2_000_000
+TURN_NS = 1_000_000_000
 SHORTEST_PAUSE_NS = 100_000
 """A babbling servo without pauses would leave the simulation no time."""
 WHEN = ("bus", "at", "packet")

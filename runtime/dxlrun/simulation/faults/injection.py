@@ -15,19 +15,19 @@ from random import Random
 
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.bus.wire import flipped
-from dxlrun.simulation.faults.fault_text import Fault
-from dxlrun.simulation.servo.simulated_servo import ServoConfig, SimulatedServo
-
-NOISE_BYTES = 8
-FLIPPED_BITS = 0x01
-HOT_CELSIUS = 90.0
-"""Above Temperature Limit (31) as every model has it from the factory: 85 degrees C at most."""
-BOOT_NS = 100_000_000
-"""How long a servo that starts again hears nothing; no manual names it [i]."""
-BROWNOUT_NS = 200_000_000
-BABBLE_NS = 200_000_000
-BABBLE_PAUSE_NS = 2_000_000
-TURN_NS = 1_000_000_000
+from dxlrun.simulation.configuration import ServoConfig
+from dxlrun.simulation.faults.fault import (
+    BABBLE_NS,
+    BABBLE_PAUSE_NS,
+    BOOT_NS,
+    BROWNOUT_NS,
+    FLIPPED_BITS,
+    HOT_CELSIUS,
+    NOISE_BYTES,
+    TURN_NS,
+    Fault,
+)
+from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 
 
 @dataclass(slots=True)

@@ -1,1 +1,0 @@
-"""Port: how programs reach a simulated bus."""
