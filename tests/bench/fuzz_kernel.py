@@ -1,23 +1,27 @@
-"""Campaign: the compiled kernel and the packet-by-packet parser on the same lines.
+"""Campaign: the exchange kernel and the packet-by-packet parser on the same lines.
 
 Two robots of equal plans, one with the kernel, one without, get the same bytes at the same times: replies
-that are good, cut, stuffed, late, shifted, doubled, foreign or noisy, in one piece or many. After each cycle
-everything that can be told apart is compared: bytes sent, the log, states, ages, what is known of each servo,
-events. A stream is what one line says to one read.
+that are good, cut, stuffed, late, shifted, doubled, foreign or noisy, in one piece or many. Lines are lost,
+servos leave the exchange and join it. After each cycle
+everything that a run shows is compared: bytes sent, the log, states, ages, what is known of each servo,
+events. A stream is the bytes of one line after one read.
 
-    python tests/bench/fuzz_kernel.py 2000000
+    python tests/bench/fuzz_kernel.py 2000000 --seed 1 --processes 2
 
 CI runs a seeded sample of it (tests/dynamixel/test_kernel.py).
 """
 
 from __future__ import annotations
 
+import argparse
 import math
 import random
+import subprocess
 import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import zip_longest
 
 import numpy as np
 
@@ -31,7 +35,7 @@ from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.errors import PortError
 from dxlrun.interfaces import Commands, States
 from dxlrun.mode import Mode
-from dxlrun.run.channels.packets import PacketBatch, PacketKind, decode_packets
+from dxlrun.run.channels.packets import PacketBatch, decode_packets
 from dxlrun.run.channels.ring import Handover
 
 IDS = (1, 7, 3, 20)
@@ -44,14 +48,13 @@ ROBOTS = {
     "two layouts": (("XM430-W350", "XL-320"), 2.0),
 }
 PERIOD_NS = 20_000_000
-SYNC_WRITE = 0x83
 CYCLES = 60
 """Cycles of one robot; the sixth of each six has an accident."""
 
 
 @dataclass(slots=True)
 class Tally:
-    """What came of a campaign."""
+    """Figures of a campaign."""
 
     streams: int = 0
     cycles: int = 0
@@ -62,33 +65,36 @@ class Tally:
 
 
 class Line:
-    """Says to the n-th read of a cycle what it was told: pieces of (ns after it, bytes)."""
+    """Answers the reads of a cycle in their order with prepared pieces of (ns after it, bytes), and nothing
+    else. `replies`: pairs of a read's packet and its pieces, None where the line is lost at that read.
+    """
 
-    def __init__(self, clock, protocol):
-        self.clock, self.kind_at = clock, 4 if protocol == 1.0 else 7
-        self.told, self.said, self.sent = [], [], []
+    def __init__(self, clock):
+        self.clock = clock
+        self.replies, self.arriving, self.sent = [], [], []
         self.stall_ns = 0
-        self.lost = False
-        """True where the line takes no goals: its adapter is gone."""
         """How long the host stands still behind each read."""
+        self.lost = False
+        """True where the line takes no bytes: its adapter is gone."""
 
     def write(self, data):
         self.sent.append(bytes(data))
         if self.lost:
             raise PortError("it is gone")
-        if data[self.kind_at] == SYNC_WRITE:
+        if not self.replies or self.replies[0][0] != data:
             return
-        pieces = self.told.pop(0) if self.told else []
+        _, pieces = self.replies.pop(0)
         if pieces is None:
+            self.lost = True
             raise PortError("it is gone")
-        self.said += [(self.clock.now_ns() + at, piece) for at, piece in pieces]
-        self.said.sort(key=lambda one: one[0])
+        self.arriving += [(self.clock.now_ns() + at, piece) for at, piece in pieces]
+        self.arriving.sort(key=lambda one: one[0])
         self.clock.wait_until(self.clock.now_ns() + self.stall_ns)
 
     def read_into(self, buffer):
-        if not self.heard:
+        if not self.ready:
             return 0
-        _, data = self.said.pop(0)
+        _, data = self.arriving.pop(0)
         buffer[: len(data)] = data
         return len(data)
 
@@ -96,8 +102,8 @@ class Line:
         return PortError("it is gone")
 
     @property
-    def heard(self):
-        return bool(self.said) and self.said[0][0] <= self.clock.now_ns()
+    def ready(self):
+        return bool(self.arriving) and self.arriving[0][0] <= self.clock.now_ns()
 
 
 class Lines:
@@ -107,11 +113,11 @@ class Lines:
 
     def __init__(self, plans):
         self.clock = VirtualClock(1_000_000)
-        self.ports = [Line(self.clock, plan.protocol) for plan in plans]
+        self.ports = [Line(self.clock) for _ in plans]
 
     def wait(self, deadline_ns):
-        self.clock.wait_until(min([deadline_ns, *(at for line in self.ports for at, _ in line.said)]))
-        return [index for index, line in enumerate(self.ports) if line.heard]
+        self.clock.wait_until(min([deadline_ns, *(at for line in self.ports for at, _ in line.arriving)]))
+        return [index for index, line in enumerate(self.ports) if line.ready]
 
     def reopen(self, index):
         return False
@@ -128,7 +134,7 @@ class Events:
 
 
 class Side:
-    """A robot with the kernel, or without, and what became of each cycle."""
+    """A robot with the kernel, or without."""
 
     def __init__(self, plans, library, slot_size=1 << 20):
         self.lines = Lines(plans)
@@ -152,24 +158,26 @@ class Side:
         for servos in self.hardware._servos:
             servos.torqued[:] = True
         self.by_kernel = 0
-        self.noise = [b""] * len(plans)
-        """What belonged to no packet, from the beginning: bytes behind the last reply of a cycle may stay in
-        the line until the next one."""
 
     def prepare(self):
-        """Plan the next cycle; return the reads of each bus."""
+        """Plan the next cycle; return the reads of each bus, none where it is lost."""
         self.hardware._prepare()
         found = []
-        for servos in self.hardware._servos:
+        for bus, servos in self.hardware._lines:
+            if bus.failure is not None:
+                found.append([])
+                continue
             reads = servos.reads
             shapes = [reads._shape[one.group] % len(one.patient) for one in reads._queue]
             found.append([one.patient[shape] for one, shape in zip(reads._queue, shapes, strict=True)])
         return found
 
     def change(self, number, row, servo, rng):
-        """Change between two cycles what stays for many: modes, torque, limits; or lose a line."""
+        """Change between two cycles what stays for many: modes, torque, limits, servos in the exchange; or
+        lose a line.
+        """
         _, servos = self.hardware._lines[number]
-        match rng.randrange(6):
+        match rng.randrange(7):
             case 0 | 1:
                 plan = self.hardware._plans[number].servos[servo]
                 mode = rng.choice([one.mode for one in plan.modes] + [Mode.UNKNOWN])
@@ -181,21 +189,23 @@ class Side:
                 servos.ceiling[servo] = rng.choice((math.nan, 0.0, 0.5, 3.0))
             case 4:
                 servos.goals.weaken(rng.choice((0.0, 0.3, 1.0)))
+            case 5:
+                (servos.reads.join if servos.reads.away[servo] else servos.reads.leave)(servo)
             case _:
                 if rng.random() < 0.2:
                     self.lines.ports[number].lost = True
 
-    def cycle(self, told, goals, gap_ns):
-        """Write goals, read once; return all that can be told apart."""
+    def cycle(self, replies, goals, idle_ns):
+        """Write goals, use the idle time, read once; return everything that a run shows."""
         self.log.clear()
         self.events.list.clear()
         hardware, clock = self.hardware, self.lines.clock
-        for line, mine in zip(self.lines.ports, told, strict=True):
-            line.told, line.sent = list(mine), []
+        for line, mine in zip(self.lines.ports, replies, strict=True):
+            line.replies, line.sent = list(mine), []
         self.goals.values[:] = goals
         hardware.write()
         if hardware._split:
-            hardware._await_states(clock.now_ns() + gap_ns)
+            hardware._await_states(clock.now_ns() + idle_ns)
         hardware.read()
         self.by_kernel += hardware._planned
         self.packets.commit()
@@ -204,23 +214,25 @@ class Side:
         return found
 
     def found(self):
-        """Return what can be told apart."""
+        """Return everything that a run shows of a cycle, by name."""
         hardware = self.hardware
-        quiet = [packet for packet in self.log if packet.kind is not PacketKind.NOISE]
-        for packet in self.log:
-            if packet.kind is PacketKind.NOISE:
-                self.noise[packet.bus] += packet.data
-        return (
-            [[packet for packet in quiet if packet.bus == index] for index in range(len(hardware._lines))],
-            [line.sent for line in self.lines.ports],
-            self.states.motion.tobytes(),
-            self.states.valid.tolist(),
-            self.states.age_ns.tolist(),
-            [(one.reads.missed, one.reads.errors, one.reads.garbled) for one in hardware._servos],
-            [one.torqued.tolist() for one in hardware._servos],
-            [str(bus.failure) for bus in hardware._buses],
-            list(self.events.list),
-        )
+        return {
+            "packets": [
+                [packet for packet in self.log if packet.bus == index]
+                for index in range(len(hardware._lines))
+            ],
+            "sent": [line.sent for line in self.lines.ports],
+            "motion": self.states.motion.tobytes(),
+            "valid": self.states.valid.tolist(),
+            "age": self.states.age_ns.tolist(),
+            "known": [
+                (one.reads.missed, one.reads.errors, one.reads.garbled, one.reads.away)
+                for one in hardware._servos
+            ],
+            "torqued": [one.torqued.tolist() for one in hardware._servos],
+            "failures": [str(bus.failure) for bus in hardware._buses],
+            "events": list(self.events.list),
+        }
 
 
 def replies(transaction, dialect, rng, drift, standing):
@@ -266,9 +278,9 @@ def spoilt(packets, rng):
     return bytes(stream)
 
 
-def said(transactions, dialect, rng, accident, standing):
-    """Return what a line says to each read of a cycle; with an accident in one of them."""
-    told = []
+def answered(transactions, dialect, rng, accident, standing):
+    """Return the replies of a line to each read of a cycle, with an accident in one of them; see `Line`."""
+    found = []
     victim = rng.randrange(len(transactions)) if accident and transactions else -1
     drift = rng.randrange(500, 520)
     for number, transaction in enumerate(transactions):
@@ -276,7 +288,7 @@ def said(transactions, dialect, rng, accident, standing):
         stream, at, most = b"".join(packets), 1_500_000, rng.choice((9, 1_000, 1_000))
         if number == victim:
             if rng.random() < 0.03:
-                told.append(None)
+                found.append((transaction.packet, None))
                 continue
             stream = spoilt(packets, rng)
             at = rng.choice((1_000, 1_500_000, 1_500_000, 9_000_000, 30_000_000))
@@ -285,8 +297,8 @@ def said(transactions, dialect, rng, accident, standing):
         while stream:
             pieces.append((at, stream[:most]))
             stream, at = stream[most:], at + rng.choice((0, 1_000, 100_000))
-        told.append(pieces)
-    return told
+        found.append((transaction.packet, pieces))
+    return found
 
 
 def robot(name: str, count: int, split: bool) -> tuple[list[BusPlan], object]:
@@ -337,13 +349,16 @@ def moved(goals, rng):
 
 def difference(found, expected, where):
     """Return what differs of what two robots did in a cycle."""
-    names = ["packets", "sent", "motion", "valid", "age", "known", "torqued", "failures", "events"]
-    told = [
-        f"{name}: {one} instead of {two}"
-        for name, one, two in zip(names, found[0], expected[0], strict=True)
-        if one != two
-    ]
-    return "\n".join([where, *told, f"{found[1]} {expected[1]}"])
+    lines = [where, f"at {found[1]} and {expected[1]} ns"]
+    for name, one in found[0].items():
+        other = expected[0][name]
+        if name in {"packets", "sent"}:
+            for index, (ours, theirs) in enumerate(zip(one, other, strict=True)):
+                pairs = zip_longest(ours, theirs)
+                lines += [f"{name} of line {index}: {a} instead of {b}" for a, b in pairs if a != b]
+        elif one != other:
+            lines.append(f"{name}: {one} instead of {other}")
+    return "\n".join(lines)
 
 
 def campaign(streams: int, seed: int, names: Sequence[str] = tuple(ROBOTS)) -> Tally:
@@ -365,20 +380,20 @@ def campaign(streams: int, seed: int, names: Sequence[str] = tuple(ROBOTS)) -> T
                 standing = {rng.choice(IDS): rng.choice((0x80, 0x04, 0x20))} if rng.random() < 0.2 else {}
             reads = theirs.prepare()
             planned = ours.prepare()
-            assert planned == reads, (seed, tally)
+            assert planned == reads, f"{seed} {name} {count} {split} {number}: {planned} instead of {reads}"
             victim = rng.randrange(count) if number % 6 == 5 else -1
-            told = [said(mine, dialect, rng, index == victim, standing) for index, mine in enumerate(reads)]
-            goals, gap_ns = moved(goals, rng), rng.choice((0, 1_000_000, 5_000_000))
+            replies = [
+                answered(mine, dialect, rng, index == victim, standing) for index, mine in enumerate(reads)
+            ]
+            goals, idle_ns = moved(goals, rng), rng.choice((0, 0, 1_000_000, 5_000_000))
             began = ours.hardware._planned
-            found, expected = ours.cycle(told, goals, gap_ns), theirs.cycle(told, goals, gap_ns)
-            where = f"{seed} {name} {count} {split} {number}"
-            assert found == expected, difference(found, expected, where)
-            for one, two in zip(ours.noise, theirs.noise, strict=True):
-                assert one.startswith(two) or two.startswith(one), f"{where}: noise {one} instead of {two}"
+            found, expected = ours.cycle(replies, goals, idle_ns), theirs.cycle(replies, goals, idle_ns)
+            assert found == expected, difference(found, expected, f"{seed} {name} {count} {split} {number}")
             tally.interrupted += began and not ours.hardware._planned
-            tally.streams += sum(map(len, told))
+            lost = [bus.failure is not None for bus in ours.hardware._buses]
+            tally.streams += sum(len(mine) for mine, gone in zip(replies, lost, strict=True) if not gone)
             tally.cycles += 1
-            if any(bus.failure for bus in ours.hardware._buses):
+            if any(lost):
                 break
         assert not theirs.by_kernel
         tally.by_kernel += ours.by_kernel
@@ -386,11 +401,22 @@ def campaign(streams: int, seed: int, names: Sequence[str] = tuple(ROBOTS)) -> T
 
 
 def main() -> None:
-    """Run the campaign: count of streams, seed."""
-    count = int(sys.argv[1]) if len(sys.argv) > 1 else 2_000_000
-    seed = int(sys.argv[2]) if len(sys.argv) > 2 else 1
-    began = time.monotonic()
-    print(f"{campaign(count, seed)}, {time.monotonic() - began:.0f} s")
+    """Run the campaign, in several processes by seeds that follow each other."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("streams", type=int, nargs="?", default=2_000_000)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--processes", type=int, default=1)
+    chosen = parser.parse_args()
+    if chosen.processes == 1:
+        began = time.monotonic()
+        tally = campaign(chosen.streams, chosen.seed)
+        sys.stdout.write(f"seed {chosen.seed}: {tally}, {time.monotonic() - began:.0f} s\n")
+        return
+    share = -(-chosen.streams // chosen.processes)
+    seeds = range(chosen.seed, chosen.seed + chosen.processes)
+    command = [sys.executable, __file__, str(share), "--seed"]
+    children = [subprocess.Popen([*command, str(seed)]) for seed in seeds]
+    sys.exit(max(child.wait() for child in children))
 
 
 if __name__ == "__main__":

@@ -177,27 +177,49 @@ def test_a_reply_from_before_its_request_is_stray_however_late_the_host_looks(fu
     before = b""
     for number in range(16):
         reads = side.prepare()
-        told = [
-            [
-                [(3_000_000, dialect.status_packet(one.servo_id, 0, bytes((240 + number, 1, 0, 0, 0, 0))))]
-                for one in mine
-            ]
+        data = bytes((240 + number, 1, 0, 0, 0, 0))
+        replies = [
+            [(one.packet, [(3_000_000, dialect.status_packet(one.servo_id, 0, data))]) for one in mine]
             for mine in reads
         ]
         if gone and number == 6:
-            told[0] = [None]
+            replies[0] = [(reads[0][0].packet, None)]
         if number == 15:
             assert side.hardware._planned
-            line.said.append((side.lines.clock.now_ns(), before))
+            line.arriving.append((side.lines.clock.now_ns(), before))
             line.stall_ns = 2_000_000  # longer than the wire takes for both
-        side.cycle(told, goals, 0)
-        before = told[1][0][0][1]
+        side.cycle(replies, goals, 0)
+        before = replies[1][0][1][0][1]
     assert str(side.hardware._buses[0].failure) == ("it is gone" if gone else "None")
     logged = [packet for packet in side.log if packet.bus == 1]
     assert logged[0].kind is not PacketKind.INSTRUCTION
     answers = [packet.data for packet in logged[1:] if packet.kind is PacketKind.STATUS]
-    assert answers == [pieces[0][1] for pieces in told[1]]
+    assert answers == [pieces[0][1] for _, pieces in replies[1]]
     assert side.states.valid[len(plans[0].servos) :].all()
+
+
+@pytest.mark.parametrize("compiled", [True, False], ids=["kernel", "parser"])
+def test_a_doubled_reply_is_logged_in_the_same_cycle_by_kernel_and_parser(fuzz, compiled):
+    plans, dialect = fuzz.robot("sync read", 3, False)
+    side = fuzz.Side(plans, kernel.load() if compiled else None)
+    goals = np.full_like(side.goals.values, np.nan)
+    counts = []
+    for number in range(8):
+        replies = []
+        for index, ((read,),) in enumerate(zip(side.prepare(), strict=True)):
+            answers = [dialect.status_packet(one.servo_id, 0, bytes(one.length)) for one in read.awaited]
+            pieces = [(2_000_000, b"".join(answers))]
+            if number == 6 and index != 1:  # at the instant of the other lines' last replies
+                pieces = [(2_000_000, b"".join([*answers, answers[0]])), (2_000_000, answers[0])]
+            replies.append([(read.packet, pieces)])
+        assert number != 6 or side.hardware._planned == compiled
+        side.cycle(replies, goals, 0)
+        counts.append(
+            [sum(p.bus == bus and p.kind is PacketKind.STATUS for p in side.log) for bus in range(3)]
+        )
+        assert side.states.valid.all()
+    # the parser hears every line that a wait has shown before it waits again; so does the kernel
+    assert counts[5:] == [[4, 4, 4], [5, 4, 5], [5, 4, 5]]
 
 
 class TestOnDescriptors:

@@ -12,7 +12,7 @@ from dxlrun.clock import Clock
 from dxlrun.dynamixel.exchange.bus import NEVER, Bus
 from dxlrun.dynamixel.exchange.cyclic_reads import MOST_BROKEN
 from dxlrun.dynamixel.exchange.gaps import Gaps
-from dxlrun.dynamixel.exchange.kernel import Answer, Kernel, Library, holds
+from dxlrun.dynamixel.exchange.kernel import Answer, Kernel, Library, LineState, holds
 from dxlrun.dynamixel.exchange.pump import clear, pump, run
 from dxlrun.dynamixel.exchange.samples import Samples
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
@@ -186,20 +186,21 @@ class DynamixelHardware:
         for index, line in enumerate(kernel.interrupt()):
             bus, servos = self._lines[index]
             bus.free_ns = kernel.free_at(index)
-            if line is None:  # it has all its replies, or none to await
-                if (arrival := kernel.arrival(index)) is not None:
-                    bus.due_ns, _ = arrival
-            elif line.failure is not None:
-                bus.fail(line.failure)
-            elif line.awaiting:
-                transaction = servos.reads.resume(line.done)
-                bus.take_over(servos.reads, transaction, line)
-            elif line.done:
-                servos.reads.begin_at(line.done)
-                bus.load(servos.reads)
-            else:
-                continue
             self._asked[index] = True
+            if line is None:
+                continue
+            if line.failure is not None:
+                bus.fail(line.failure)
+            elif line.state is LineState.AWAITING:
+                bus.take_over(servos.reads, servos.reads.resume(line.done), line)
+            else:
+                bus.due_ns = line.due_ns
+                bus.take_pieces(line)
+                if line.state is LineState.IDLE and line.done:
+                    servos.reads.begin_at(line.done)
+                    bus.load(servos.reads)
+                elif line.state is LineState.IDLE:
+                    self._asked[index] = False
 
     def _parse(self) -> None:
         """Read packet by packet what was not read in this cycle."""
@@ -292,7 +293,7 @@ class DynamixelHardware:
 
         On a split bus the states come first.
         """
-        self._ask_for_lines()
+        self._reopen_lines()
         latest = until_ns - IDLE_MARGIN_NS
         self._await_states(latest)
         end = latest if any(map(self._busy, range(len(self._buses)))) else NEVER  # late states may be awaited
@@ -373,7 +374,7 @@ class DynamixelHardware:
                 with suppress(PortError):  # a servo that stops without a host stays as it is
                     bus.send(packet)
 
-    def _ask_for_lines(self) -> None:
+    def _reopen_lines(self) -> None:
         """Go on with every line that was gone and is back."""
         for index, (bus, servos) in enumerate(zip(self._buses, self._servos, strict=True)):
             if bus.failure is not None and self._ports.reopen(index):
@@ -385,7 +386,7 @@ class DynamixelHardware:
         now_ns = self._clock.now_ns()
         deadline_ns, patience_ns = now_ns + STOP_LIMIT_NS, now_ns + LINE_PATIENCE_NS
         while True:
-            self._ask_for_lines()
+            self._reopen_lines()
             for bus, servos in zip(self._buses, self._servos, strict=True):
                 servos.torqued[:] = False
                 bus.failure = None  # a line that is back, or was only stuck, gets its chance

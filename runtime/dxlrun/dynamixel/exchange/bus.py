@@ -129,6 +129,10 @@ class Bus(Listener):
         self._last_byte_ns = max(self._last_byte_ns, line.heard_ns)
         self._await(transaction, line.sent_ns)
         self._deadline_ns = line.deadline_ns
+        self.take_pieces(line)
+
+    def take_pieces(self, line: Interrupted) -> None:
+        """Take what the kernel received beyond the replies that it has kept."""
         for data, at_ns in line.pieces:
             self._last_byte_ns = at_ns
             self._receiver.feed(data, at_ns)

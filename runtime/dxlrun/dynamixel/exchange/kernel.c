@@ -141,9 +141,8 @@ static int64_t clock_ns(void)
 
 static int64_t now_ns(const Kernel *k) { return k->now ? k->now() : clock_ns(); }
 
-/* Waits for bytes on lines in one state; `ready` has a flag a line. Returns the number of lines with bytes.
- * Functions of the Python side look at all lines: then another line may be the one that has bytes. */
-static int32_t wait_for(Kernel *k, int32_t state, int64_t deadline_ns, uint8_t *ready)
+/* Waits for bytes on any line; `ready` has a flag a line. Returns the number of lines with bytes. */
+static int32_t wait_for(Kernel *k, int64_t deadline_ns, uint8_t *ready)
 {
     struct pollfd set[MOST_LINES];
     int32_t line[MOST_LINES], count = 0, found = 0;
@@ -151,7 +150,7 @@ static int32_t wait_for(Kernel *k, int32_t state, int64_t deadline_ns, uint8_t *
     if (k->wait)
         return k->wait(deadline_ns, ready);
     for (int32_t i = 0; i < k->line_count; i++)
-        if (k->lines[i].active && k->lines[i].state == state) {
+        if (k->lines[i].active) {
             set[count] = (struct pollfd){k->lines[i].descriptor, POLLIN, 0};
             line[count++] = i;
         }
@@ -376,7 +375,7 @@ static int32_t poll_for_replies(Kernel *k, int64_t deadline_ns, uint8_t *ready)
     int64_t since = clock_ns();
     int32_t found = 0, looks = 0;
     for (now = since; !found && now < until; now = clock_ns()) {
-        found = wait_for(k, AWAITING, 0, ready);
+        found = wait_for(k, 0, ready);
         looks++;
     }
     dxl_polling_spent(&k->polling, clock_ns() - since, looks);
@@ -423,7 +422,6 @@ static int ask(Kernel *k, Line *l)
         return FULL;
     if (!l->done)
         memset(k->fresh + l->first_servo, 0, (size_t)l->servo_count);
-    l->have = l->pieces = 0;
     l->state = IDLE;
     int64_t before = now_ns(k);
     if (!send_all(k, l, r->instruction, r->instruction_size))
@@ -455,6 +453,7 @@ static int keep_replies(Kernel *k, Line *l, const Read *r, int64_t at)
         dxl_polling_came(&k->polling, l->due_ns, at);
     l->at_ns = at;
     l->state = IDLE;
+    l->have = l->pieces = 0;
     if (++l->done < l->read_count)
         return ask(k, l);
     l->state = THROUGH;
@@ -479,6 +478,21 @@ static int take(Kernel *k, Line *l, int32_t count, int64_t at)
     if (piece_of(l, r->packets[0].end - 1)->at_ns < l->sent_ns + r->least_ns || !sums_are_right(l, r))
         return UNEXPECTED;
     return keep_replies(k, l, r, at);
+}
+
+/* Takes what a line has; what comes where nothing is awaited is left in the buffer for the parser. */
+static int hear(Kernel *k, Line *l)
+{
+    int32_t count = receive(k, l);
+    if (count < 0)
+        return UNEXPECTED;
+    if (!count)
+        return OK;
+    if (l->state == AWAITING)
+        return take(k, l, count, now_ns(k));
+    l->have = count;
+    l->piece[l->pieces++] = (Piece){now_ns(k), count, 0};
+    return UNEXPECTED;
 }
 
 /* Fills the states of the robot; LOOK, with nothing changed, where a position is further than is plausible. */
@@ -521,8 +535,8 @@ int32_t dxl_read(Kernel *k, int64_t until_ns, int32_t all)
             memset(k->fresh + l->first_servo, 0, (size_t)l->servo_count);
     }
     for (int32_t i = 0; all && i < k->line_count; i++)
-        idle += k->lines[i].active && k->lines[i].state == IDLE && !k->lines[i].done;
-    if (idle && wait_for(k, IDLE, 0, ready)) /* what came before a request must not be taken for its reply */
+        idle += k->lines[i].active && k->lines[i].state == IDLE;
+    if (idle && wait_for(k, 0, ready)) /* what came before a request must not be taken for its reply */
         for (int32_t i = 0; i < k->line_count; i++)
             if (ready[i] && k->lines[i].active && k->lines[i].state == IDLE)
                 return UNEXPECTED;
@@ -548,23 +562,19 @@ int32_t dxl_read(Kernel *k, int64_t until_ns, int32_t all)
         int64_t end = deadline < stop ? deadline : stop;
         int32_t found = k->polling.enabled && !k->wait ? poll_for_replies(k, end, ready) : 0;
         if (!found)
-            found = wait_for(k, AWAITING, end, ready);
+            found = wait_for(k, end, ready);
         now = now_ns(k);
-        if (!found && now >= deadline && !(found = wait_for(k, AWAITING, 0, ready)))
+        if (!found && now >= deadline && !(found = wait_for(k, 0, ready)))
             return UNEXPECTED; /* looked once more: this process may have stood still meanwhile */
+        /* every line that has bytes is heard, whatever came on another: the parser does so, too */
+        int answer = OK;
         for (int32_t i = 0; i < k->line_count; i++) {
-            Line *l = &k->lines[i];
-            if (!ready[i])
-                continue;
-            if (!l->active || l->state != AWAITING)
-                return UNEXPECTED;
-            int32_t count = receive(k, l);
-            if (count < 0)
-                return UNEXPECTED;
-            int answer = count ? take(k, l, count, now_ns(k)) : OK;
-            if (answer != OK)
-                return answer;
+            int one = ready[i] && k->lines[i].active ? hear(k, &k->lines[i]) : OK;
+            if (one > answer)
+                answer = one;
         }
+        if (answer != OK)
+            return answer;
     }
     return all ? settle(k, now_ns(k)) : OK;
 }
@@ -692,7 +702,7 @@ int32_t dxl_write(Kernel *k)
     for (int32_t i = 0; i < n; i++)
         split += k->lines[i].split && k->lines[i].active;
     if (split && k->write_line == n)
-        wait_for(k, IDLE, 0, ready);
+        wait_for(k, 0, ready);
     for (int32_t i = 0; split && k->write_line == n && i < n; i++)
         early += ready[i] && k->lines[i].active;
     for (; split && !early && k->write_line < 2 * n; k->write_line++) {

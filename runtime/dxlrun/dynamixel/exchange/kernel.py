@@ -323,16 +323,17 @@ def _fast_replies(plan: BusPlan, read: PlannedRead) -> _Replies:
 class Interrupted:
     """Where a line stood when the kernel ended: the parser goes on from there."""
 
+    state: LineState
     done: int
-    """How many of its reads are done."""
-    awaiting: bool
-    """True when the next one was sent."""
+    """How many of its reads are done; the next one was sent where the line is AWAITING."""
     sent_ns: int
     deadline_ns: int
     heard_ns: int
     """When the replies to the read before it came."""
+    due_ns: int
+    """When the replies to its newest read were due."""
     pieces: tuple[tuple[bytes, int], ...]
-    """What has come of its replies, and when, ns."""
+    """What was received beyond them, and when, ns: of the awaited replies, or stray."""
     failure: PortError | None
     """Why the next one could not be sent."""
 
@@ -589,10 +590,10 @@ class Kernel:
         return bool(self._lines[index].state == LineState.AWAITING)
 
     def interrupt(self) -> list[Interrupted | None]:
-        """End the cycle; return where each line stands, None for one that has nothing more to read."""
+        """End the cycle; return where each line stands, None for one that is not read."""
         found: list[Interrupted | None] = []
         for index, line in enumerate(self._lines[: len(self._plans)]):
-            if not line.active or line.state == LineState.THROUGH:
+            if not line.active:
                 found.append(None)
                 continue
             ends = [0, *(line.piece[number].end for number in range(line.pieces))]
@@ -601,9 +602,8 @@ class Kernel:
                 (data[start:end], line.piece[number].at_ns)
                 for number, (start, end) in enumerate(pairwise(ends))
             )
-            awaiting, failure = line.state == LineState.AWAITING, self._failure(index)
-            times = line.sent_ns, line.deadline_ns, line.at_ns
-            found.append(Interrupted(line.done, awaiting, *times, pieces, failure))
+            times = line.sent_ns, line.deadline_ns, line.at_ns, line.due_ns
+            found.append(Interrupted(LineState(line.state), line.done, *times, pieces, self._failure(index)))
         self._library.abandon(self._pointer)
         return found
 
