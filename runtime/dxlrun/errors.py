@@ -1,16 +1,16 @@
-"""The exceptions that dxlrun raises, and the problems that it reports.
+"""The exceptions that dxlrun raises, the problems that it reports, and words that their messages share.
 
 ```
 Exception
-└── DxlrunError                    anything dxlrun says on purpose; exit code 1
+└── DxlrunError                    every error that dxlrun raises on purpose; exit code 1
     ├── InputError (ValueError)    a file, an argument or a plug-in is wrong; exit code 2
     │   └── PlugInError (ImportError)   a plug-in is missing, broken on import, or of another contract
     ├── PortError (OSError)        a serial line cannot be opened, or is gone
-    ├── StartUpError               a servo is not what the robot file says; no torque was given
-    ├── ServoFault                 a servo does not do what a tool asks, or is not there
+    ├── StartUpError               a servo differs from the robot file; torque stayed off
+    ├── ServoFault                 a servo refused a tool's request, or did not answer
     ├── ControllerFault            a controller raised, or broke its contract
     ├── ProcessFault               a process of the run ended or hung
-    ├── Refused                    a running robot does not do what it was asked; 2: a wrong wish
+    ├── Refused                    a running robot refused a request; exit code 2: the request was wrong
     └── LogError (ValueError)      a log or a ledger cannot be read; exit code 2
 ```
 """
@@ -36,26 +36,26 @@ class Mark:
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """One thing that is wrong with an input: where, what, and how to mend it."""
+    """One thing that is wrong with an input: where, what, and how to fix it."""
 
     mark: Mark
     what: str
-    mend: str
+    fix: str
     severity: Literal["error", "warning"] = "error"
 
     def __str__(self) -> str:
         kind = "" if self.severity == "error" else "warning: "
-        return f"{self.mark}: {kind}{self.what}; {self.mend}"
+        return f"{self.mark}: {kind}{self.what}; {self.fix}"
 
 
 class DxlrunError(Exception):
-    """Anything dxlrun says on purpose; `exit_code` is what the command line returns."""
+    """Every error that dxlrun raises on purpose; the command line returns its `exit_code`."""
 
     exit_code = 1
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What a person is told: the message, line by line, and the notes that were added on the way."""
+        """The message, line by line, and the notes that were added to it."""
         return (*str(self).splitlines(), *getattr(self, "__notes__", ()))
 
 
@@ -75,11 +75,11 @@ class PlugInError(InputError, ImportError):
 
 
 class PortError(DxlrunError, OSError):
-    """A serial line cannot be opened, is held by somebody else, or is gone."""
+    """A serial line cannot be opened, is in use by another program, or is gone."""
 
 
 class Refused(DxlrunError):
-    """A running robot does not do what it was asked; the message says why, and how to ask better."""
+    """A running robot refused a request; the message gives the reason and a request that would work."""
 
     def __init__(self, sentence: str, *, wrong_input: bool = False) -> None:
         super().__init__(sentence)
@@ -87,11 +87,11 @@ class Refused(DxlrunError):
 
 
 class StartUpError(DxlrunError, RuntimeError):
-    """A servo is not what the robot file says; no torque was given, or what was given was taken back."""
+    """A servo differs from the robot file; torque stayed off, or was switched off again."""
 
 
 class ServoFault(DxlrunError, RuntimeError):
-    """A servo does not do what a tool asks of it, or is not there; the message names it."""
+    """A servo refused the request of a tool, or did not answer; the message names it."""
 
 
 class ControllerFault(DxlrunError, RuntimeError):
@@ -106,3 +106,18 @@ class LogError(DxlrunError, ValueError):
     """A log or a ledger cannot be read, or is not one of dxlrun."""
 
     exit_code = 2
+
+
+def suggestion(name: str, known: Sequence[str]) -> str:
+    """Return how to fix an unknown name: the closest known one, or all of them."""
+    import difflib  # not above: only a wrong name needs it
+
+    if not known:
+        return "there is none"
+    close = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
+    return f"did you mean {close[0]}?" if close else f"known: {', '.join(sorted(known))}"
+
+
+def counted(number: int, one: str, many: str) -> str:
+    """Return `1 period`, `2 periods`: one form for exactly one, the other for all else, zero included."""
+    return f"{number} {one if number == 1 else many}"

@@ -143,7 +143,7 @@ def test_the_torso_as_tables(dxlrun, torso, three_parts):
     assert "70%" in bus
     (warning,) = said.errors
     assert warning.startswith(f"{torso}:")
-    assert "right_shoulder_lateral_joint is no mirror image of left_shoulder_lateral_joint" in warning
+    assert "right_shoulder_lateral_joint is not a mirror image of left_shoulder_lateral_joint" in warning
 
 
 def test_the_torso_as_json(dxlrun, torso, three_parts):

@@ -4,8 +4,8 @@ from pathlib import Path
 import pytest
 
 from dxlrun.compile import Compiled, compile_robot
-from dxlrun.compile.checks.problems import Problems
-from dxlrun.compile.joint.joints import compile_joints
+from dxlrun.compile.joints import compile_joints
+from dxlrun.compile.problems import Problems
 from dxlrun.description import read_robot
 from dxlrun.errors import InputError
 
@@ -18,8 +18,7 @@ def test_a_servo_that_is_not_asked_yet_is_taken_for_its_neighbour(
     assert {servo.model for servo in compiled.plan.buses[0].servos} == {"AX-12A"}
     (warning,) = [each for each in compiled.warnings if "model" in each.what]
     assert warning.what == (
-        "the servo of left_arm_joint is asked for its model at the start; "
-        "until then it is taken for an AX-12A"
+        "the servo of left_arm_joint reports its model at the start; until then it is taken for an AX-12A"
     )
     assert (warning.mark.line, warning.mark.column) == (9, 12)
 
@@ -57,5 +56,5 @@ def test_an_id_of_protocol_1_only_is_refused_on_a_bus_of_protocol_2(robot_text: 
     problems = Problems()
     compile_joints(read_robot(path, {}), problems, {})
 
-    with pytest.raises(InputError, match="servo ID 253 of right_arm_joint is none of Protocol"):
+    with pytest.raises(InputError, match="servo ID 253 of right_arm_joint is not valid in Protocol"):
         problems.refuse()

@@ -34,7 +34,7 @@ def test_a_right_file_has_no_problem(problems_in: Find, robot_text: str):
         (
             ("    bus: main\n    id: 2", "    bus: mian\n    id: 2"),
             "mian",
-            ("error", "bus mian, which the file does not have", "did you mean main?"),
+            ("error", "bus mian, which is not defined", "did you mean main?"),
         ),
         (
             ("    id: 2\n    model: AX-12A", "    id: 2\n    model: AX-12AX"),
@@ -56,7 +56,7 @@ def test_a_right_file_has_no_problem(problems_in: Find, robot_text: str):
                 "posvel_controller\n    joints: [left_arm_joint, right_arm_jiont]",
             ),
             "right_arm_jiont",
-            ("error", "arms wants joint right_arm_jiont", "did you mean right_arm_joint?"),
+            ("error", "arms claims joint right_arm_jiont", "did you mean right_arm_joint?"),
         ),
         (
             (
@@ -104,7 +104,7 @@ def test_a_right_file_has_no_problem(problems_in: Find, robot_text: str):
             "150 deg",
             (
                 "warning",
-                "right_arm_joint is no mirror image of left_arm_joint: its reference is 150 deg, "
+                "right_arm_joint is not a mirror image of left_arm_joint: its reference is 150 deg, "
                 "mirrored it would be 240 deg",
                 "not symmetric",
             ),
@@ -117,7 +117,7 @@ def test_a_right_file_has_no_problem(problems_in: Find, robot_text: str):
         (
             ("  main: {", "  other: {port: sim, protocol: 1.0, baud_rate: 57600}\n  main: {"),
             "other",
-            ("warning", "no joint stands on bus other", "take it out"),
+            ("warning", "bus other has no joint", "take it out"),
         ),
     ],
 )
@@ -133,7 +133,7 @@ def test_one_mistake_is_one_problem_with_its_place(
     offset = {"1\n": 4, "[ right_arm_joint]": 2}.get(at, 0)
     assert (problem.mark.line, problem.mark.column) == (line, column + offset)
     assert what in problem.what
-    assert mend in problem.mend
+    assert mend in problem.fix
 
 
 def test_parameters_are_judged_by_the_controllers_own_model(problems_in: Find, robot_text: str):
@@ -144,7 +144,7 @@ def test_parameters_are_judged_by_the_controllers_own_model(problems_in: Find, r
     assert "controllers.arms has no joints" in missing.what
     assert (missing.mark.line, missing.mark.column) == place(text, "arms:")
     assert "unknown key 'jonits'" in unknown.what
-    assert "did you mean joints?" in unknown.mend
+    assert "did you mean joints?" in unknown.fix
     assert (unknown.mark.line, unknown.mark.column) == place(text, "jonits")
 
 
@@ -184,8 +184,8 @@ def test_a_bus_that_is_too_slow_is_told_what_would_help(problems_in: Find, robot
 
     # by hand: wire 580 us (2 x 8 + 18 bytes out, 2 x 12 in), delays 2 x 500 us, latency 2 x 16 ms
     assert "the highest possible rate is 29 Hz" in problem.what
-    assert "an adapter latency of 1 ms instead of 16 ms would allow 279 Hz" in problem.mend
-    assert "a return delay time of 0 us instead of 500 us would allow 30 Hz" in problem.mend
+    assert "an adapter latency of 1 ms instead of 16 ms would allow 279 Hz" in problem.fix
+    assert "a return delay time of 0 us instead of 500 us would allow 30 Hz" in problem.fix
 
 
 def test_a_bus_that_is_nearly_too_slow_is_a_warning(problems_in: Find, robot_text: str):
@@ -218,7 +218,7 @@ def test_servos_of_the_other_protocol_are_errors_and_hide_no_others(problems_in:
     assert what == [
         "AX-12A of left_arm_joint speaks Protocol 1.0, bus main Protocol 2.0",
         "AX-12A of right_arm_joint speaks Protocol 1.0, bus main Protocol 2.0",
-        "arms wants joint left_jiont, which the file does not have",
+        "arms claims joint left_jiont, which is not defined",
     ]
 
 

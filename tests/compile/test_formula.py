@@ -5,14 +5,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dxlrun.compile.motion.formula import LONGEST_FORMULA, Formula
+from dxlrun.compile.samples import LONGEST_FORMULA, Expression
 
 
 @settings(max_examples=50, deadline=None)
 @given(t=st.floats(0, 100))
 def test_the_formulas_of_the_thesis_have_the_values_of_python(t: float):
-    left = Formula("0.2 * (sin(2 * t) - sin(4 * t)) - 0.4")
-    right = Formula("0.2 * (sin(2*t) - cos(1.5*t)) - 0.4")
+    left = Expression("0.2 * (sin(2 * t) - sin(4 * t)) - 0.4")
+    right = Expression("0.2 * (sin(2*t) - cos(1.5*t)) - 0.4")
 
     assert left.at(t) == pytest.approx(0.2 * (math.sin(2 * t) - math.sin(4 * t)) - 0.4, abs=1e-12)
     assert right.at(t) == pytest.approx(0.2 * (math.sin(2 * t) - math.cos(1.5 * t)) - 0.4, abs=1e-12)
@@ -30,7 +30,7 @@ def test_the_formulas_of_the_thesis_have_the_values_of_python(t: float):
     ],
 )
 def test_operations(text: str, value: float):
-    assert Formula(text).at(3.0) == pytest.approx(value)
+    assert Expression(text).at(3.0) == pytest.approx(value)
 
 
 @pytest.mark.parametrize(
@@ -57,7 +57,7 @@ def test_operations(text: str, value: float):
 )
 def test_what_is_no_formula_is_refused_with_a_sentence(text: str, says: str):
     with pytest.raises(ValueError, match=re.escape(says)):
-        Formula(text)
+        Expression(text)
 
 
 @pytest.mark.parametrize(
@@ -76,12 +76,12 @@ def test_what_is_no_formula_is_refused_with_a_sentence(text: str, says: str):
 )
 def test_where_a_formula_has_no_value_it_says_why(text: str, says: str):
     with pytest.raises(ValueError, match=says):
-        Formula(text).at(0.0)
+        Expression(text).at(0.0)
 
 
 def test_a_long_sum_is_evaluated_and_a_longer_one_refused():
-    assert Formula("t" + "+t" * 90).at(1.0) == 91
+    assert Expression("t" + "+t" * 90).at(1.0) == 91
     with pytest.raises(ValueError, match="group long sums"):
-        Formula("t" + "+t" * 300)
+        Expression("t" + "+t" * 300)
     with pytest.raises(ValueError, match="at most"):
-        Formula("t" + "+t" * LONGEST_FORMULA)
+        Expression("t" + "+t" * LONGEST_FORMULA)

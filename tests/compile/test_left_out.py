@@ -101,7 +101,7 @@ def test_a_wrong_key_of_a_bus_hides_no_other_mistake(
     assert [line for line, _ in found] == [3, 9, 10, 13, 20]
     assert "no control table for model XX-7" in found[1][1]
     assert "has no unit" in found[2][1]
-    assert "right_arm_joint stands on bus mian" in found[3][1]
+    assert "right_arm_joint is on bus mian" in found[3][1]
     assert "no plug-in offers the controller type joint_state_brodcaster" in found[4][1]
 
 

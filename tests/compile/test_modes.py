@@ -48,7 +48,7 @@ def test_a_controller_whose_mode_the_model_does_not_have_is_refused(problems_in:
         "drive commands an effort alone, but XL430-W250 of left_wheel has no mode that follows a torque or a "
         "current"
     )
-    assert problems[0].mend == "use a controller that commands a position, a velocity alone or a PWM"
+    assert problems[0].fix == "use a controller that commands a position, a velocity alone or a PWM"
 
 
 def test_a_model_that_cannot_turn_on_and_on_is_no_wheel(problems_in: Find) -> None:
@@ -63,7 +63,7 @@ def test_a_model_that_cannot_turn_on_and_on_is_no_wheel(problems_in: Find) -> No
 def test_a_wheel_has_no_effort_limit_of_a_position_though_its_model_has_one(problems_in: Find) -> None:
     problems = [one for one in problems_in(wheels("XM430-W350", "poseffort")) if one.severity == "error"]
     assert problems[0].what.endswith("but left_wheel is continuous, for which it is not offered")
-    assert problems[0].mend.startswith("take `continuous` out, or use a controller that commands a position,")
+    assert problems[0].fix.startswith("take `continuous` out, or use a controller that commands a position,")
 
 
 def test_positions_of_a_wheel_need_a_model_that_counts_turns(problems_in: Find) -> None:

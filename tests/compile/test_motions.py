@@ -175,7 +175,7 @@ def test_one_mistake_in_points_is_one_error(
     assert problem.mark.file.endswith("motion0.yaml")
     assert (problem.mark.line, problem.mark.column) == at
     assert says[0] in problem.what
-    assert says[1] in problem.mend
+    assert says[1] in problem.fix
 
 
 @pytest.mark.parametrize(
@@ -256,13 +256,13 @@ def many(samples: int, formula: str = "sin(t)") -> str:
 def test_what_would_take_minutes_is_refused_at_once(
     problems_in: Find, robot_text: str, monkeypatch: pytest.MonkeyPatch, motion: str, says: str
 ):
-    monkeypatch.setattr("dxlrun.compile.motion.samples.Expression.at", lambda *_: pytest.fail("evaluated"))
+    monkeypatch.setattr("dxlrun.compile.samples.Expression.at", lambda *_: pytest.fail("evaluated"))
 
     (problem,) = problems_in(robot_text, motion)
 
     assert says in problem.what
     assert problem.mark.line == 14  # the part with the most
-    assert "lower samples" in problem.mend
+    assert "lower samples" in problem.fix
 
 
 TOO_FAST = """\

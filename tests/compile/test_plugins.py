@@ -96,7 +96,9 @@ def test_what_its_model_refuses_is_said_in_our_words(problems_in: Find, text: st
 def test_what_its_interfaces_raise_is_an_error_of_the_file(problems_in: Find, text: str):
     (problem,) = problems_in(text.replace("foreign", "raising"))
 
-    assert "controller mine (elsewhere 2.1) cannot say what it needs: RuntimeError: not today" in problem.what
+    assert (
+        "controller mine (elsewhere 2.1) cannot name its interfaces: RuntimeError: not today" in problem.what
+    )
     assert (problem.mark.line, problem.mark.column) == (20, 3)
 
 
@@ -104,7 +106,7 @@ def test_what_its_interfaces_raise_is_an_error_of_the_file(problems_in: Find, te
 def test_an_unknown_type_names_the_broken_plug_ins(problems_in: Find, text: str):
     (problem,) = problems_in(text.replace("foreign", "sad_controller"))
 
-    assert problem.mend == "plug-in sad of sad-robots 0.3 cannot be imported; reinstall it"
+    assert problem.fix == "plug-in sad of sad-robots 0.3 cannot be imported; reinstall it"
 
 
 @pytest.mark.usefixtures("foreign_plugins")

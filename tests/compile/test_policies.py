@@ -27,15 +27,15 @@ policies:
   exit_timeout: 6 s
 """
 MISTAKES = [
-    ("pose: home", "pose: §hom", "on_exit has pose hom, which the file does not have; did you mean home?"),
-    ("home: {left_arm_joint", "home: {§left_arm", "pose home has joint left_arm, which the file does not have; did"),
+    ("pose: home", "pose: §hom", "on_exit has pose hom, which is not defined; did you mean home?"),
+    ("home: {left_arm_joint", "home: {§left_arm", "pose home has joint left_arm, which is not defined; did"),
     ("joint: -20 deg", "joint: §-91 deg", "pose home puts right_arm_joint at -91 deg; it can go to -90..+60 deg"),
-    ("[hold]", "[§hold, limp]", "on_fault goes on after hold; write hold as the last step"),
+    ("[hold]", "[§hold, limp]", "on_fault has steps after hold; write hold as the last step"),
     ("exit_timeout: 6 s\n", "exit_timeout: 3 s\n", "on_exit may take"),
     ("active: false\n", "active: false\n    fallback: §spar\n", "the fallback spar of spare is no controller of the file"),
     ("active: false\n", "active: false\n    fallback: §spare\n", "spare is its own fallback"),
     ("rate: 25}", "rate: 25, fallback: §arms}", "the fallback arms of states is active from the start"),
-    ("rate: 25}", "rate: 25, fallback: §spare}", "the fallback spare of states claims joints of arms, which goes on"),
+    ("rate: 25}", "rate: 25, fallback: §spare}", "fallback spare of states claims joints of arms, which stays active"),
 ]  # fmt: skip
 
 
@@ -59,7 +59,7 @@ def test_each_mistake_is_named_where_it_stands(
 def test_steps_that_take_too_long_say_what_would_do(problems_in: Find, robot_text: str) -> None:
     (problem,) = problems_in((robot_text + POLICIES).replace("exit_timeout: 6 s", "exit_timeout: 3 s"))
     assert "pose home at 90 deg/s: up to" in problem.what
-    seconds = problem.mend.removeprefix("raise exit_timeout to ").split(" s,")[0]
+    seconds = problem.fix.removeprefix("raise exit_timeout to ").split(" s,")[0]
     mended = (robot_text + POLICIES).replace("exit_timeout: 6 s", f"exit_timeout: {seconds} s")
     assert problems_in(mended) == ()
 
@@ -115,7 +115,7 @@ def test_a_pose_that_is_not_there_is_said_beside_a_wrong_joint(problems_in: Find
     said = [problem.what for problem in problems_in(text)]
     assert said[0] == "joints.right_arm_joint.id is 999, but must be at most 253"
     assert len(said) > 1
-    assert all(what.endswith("has pose hme, which the file does not have") for what in said[1:])
+    assert all(what.endswith("has pose hme, which is not defined") for what in said[1:])
 
 
 def test_the_check_tells_each_policy_and_what_is_left_without_the_loop(

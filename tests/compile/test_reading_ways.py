@@ -26,7 +26,7 @@ def test_a_latency_timer_ends_1_khz_and_the_highest_rate_is_named_for_both_phase
     for one in problems:
         assert "1000 Hz (argument rate:=1000) leave 1 ms" in one.what
         assert "the highest possible rate is 719 Hz, with read: split and without" in one.what
-        assert "an adapter without a latency timer would allow 2564 Hz" in one.mend
+        assert "an adapter without a latency timer would allow 2564 Hz" in one.fix
 
 
 @pytest.mark.parametrize("read", ["together", "split"])

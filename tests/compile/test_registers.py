@@ -7,7 +7,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from dxlrun.compile.joint.registers import declarable, register_value, steered_value
+from dxlrun.compile.registers import declarable, register_value, steered_value
 from dxlrun.dynamixel.control_table import all_tables, control_table
 
 ROBOT = """\
@@ -85,7 +85,7 @@ def test_a_quantity_becomes_the_nearest_tick(compile_text, text, value):
 )  # fmt: skip
 def test_a_register_that_cannot_be_declared_is_refused_with_the_reason(problems_in, text, said):
     (problem,) = problems_in(ROBOT.format(registers=f"{{{text}}}", model="XM430-W350"))
-    assert said in f"{problem.what}; {problem.mend}"
+    assert said in f"{problem.what}; {problem.fix}"
     assert problem.mark.line == 13
 
 
@@ -150,7 +150,7 @@ def test_a_return_delay_beside_the_bus_is_told(compile_text):
     _, warnings = declared(compile_text, "{return_delay_time: 500 us}")
     (warning,) = [one for one in warnings if "return delay" in one.what]
     assert "declares a return delay of 500 us, but bus main is reckoned with 0 us" in warning.what
-    assert warning.mend.startswith("write `return_delay_time: 500 us` at the bus")
+    assert warning.fix.startswith("write `return_delay_time: 500 us` at the bus")
 
 
 def test_nothing_that_dxlrun_owns_is_declarable_on_any_model():
@@ -173,7 +173,7 @@ def test_what_is_declarable_is_declared_on_every_model():
 
 @pytest.mark.parametrize(
     ("name", "said"),
-    [("temperature_limit", "stands in the EEPROM"), ("status_return_level", "is not to be changed"), ("goal_pwm", "controllers command it")],
+    [("temperature_limit", "is in the EEPROM"), ("status_return_level", "is not to be changed"), ("goal_pwm", "controllers command it")],
 )  # fmt: skip
 def test_a_client_may_change_only_ram_of_its_own(name, said):
     table = control_table("XM430-W350", 2.0)
@@ -185,4 +185,4 @@ def test_a_client_may_change_only_ram_of_its_own(name, said):
 def test_of_a_model_that_is_still_to_be_asked_what_fits_the_usual_one_is_taken(compile_text):
     found, warnings = declared(compile_text, "{position_p_gain: 900, p_gain: 3}", model="auto")
     assert [one.name for one in found] == ["position_p_gain"]
-    assert "is asked for its model at the start" in " ".join(one.what for one in warnings)
+    assert "reports its model at the start" in " ".join(one.what for one in warnings)

@@ -52,7 +52,7 @@ def test_the_rate_of_the_file_is_always_possible(compile_text, robot_text):
     [
         (
             "{rate: 50, scheduler: {polling: 12 ms}}",
-            "4:39: polling 12 ms is more than half of the period, 20 ms; write less, or auto",
+            "4:39: polling 12 ms is over half of the period, 20 ms; write less, or auto",
         ),
         (
             "{rate: 50, scheduler: {policy: fifo, priority: 99}}",
@@ -88,7 +88,7 @@ def test_a_wish_that_cannot_be_is_told_with_its_place(problems_in, robot_text, l
 def test_a_rate_at_which_nobody_can_stop_the_loop_in_time_is_a_warning(problems_in, robot_text):
     (warning,) = problems_in(with_loop(robot_text, "{rate: 0.25}").replace(", rate: 25", ""))
     assert str(warning).split("robot.yaml:")[1] == (
-        "4:14: warning: at 0.25 Hz a wish to stop is seen up to 4 s late, when the guardian has "
+        "4:14: warning: at 0.25 Hz a request to stop is seen up to 4 s late, when the guardian has "
         "ended the loop, as exit_timeout is 2 s; raise policies.exit_timeout, or the rate"
     )
 

@@ -11,7 +11,7 @@ import pytest
 
 from dxlrun.compile import Compiled
 from dxlrun.compile.plan import AdapterPlan, LoadPlan, SimulationPlan, from_json, to_json
-from dxlrun.compile.simulated import simulated_bodies, simulated_buses
+from dxlrun.compile.simulation import simulated_bodies, simulated_buses
 from dxlrun.errors import InputError, Problem
 from dxlrun.simulation import AdapterConfig, Load, UrdfBodies, UrdfJoint
 
@@ -74,7 +74,7 @@ def test_a_real_port_does_not_use_it_and_refuses_nothing(
     assert bus.latency_ns == 1_000_000
     assert simulated_buses(compiled.plan) == ()
     assert [each.what for each in compiled.warnings if "physics: mujoco" in each.what] == [
-        "with physics: mujoco the URDF says the gravity of left_arm_joint",
+        "with physics: mujoco the URDF defines the gravity of left_arm_joint",
         "physics: mujoco moves the bodies of a URDF, and the file names none",
         "physics: mujoco needs MuJoCo, which is not installed",
     ]
@@ -97,8 +97,8 @@ def test_the_plan_keeps_it_and_old_plans_have_none(compile_text: Compile, simula
     [
         (
             "{gravity_angle: 0 deg}",
-            "gravity_angle says where the weight of left_arm_joint hangs down, but it has none",
-            "say how heavy it is by `gravity: ... Nm`, or take gravity_angle out",
+            "gravity_angle is where the weight of left_arm_joint hangs down, but it has none",
+            "give its weight as `gravity: ... Nm`, or take gravity_angle out",
         ),
         (
             "{friction: 1.5 Nm}",
@@ -116,7 +116,7 @@ def test_what_makes_no_sense_is_a_warning_at_its_place(
     problems_in: ProblemsIn, simulated: str, simulation: str, what: str, mend: str
 ) -> None:
     (problem,) = [each for each in problems_in(_joint(simulated, simulation)) if "left_arm" in each.what]
-    assert (problem.severity, problem.what, problem.mend) == ("warning", what, mend)
+    assert (problem.severity, problem.what, problem.fix) == ("warning", what, mend)
     assert (
         problem.mark.line
         == _joint(simulated, simulation).splitlines().index(f"    simulation: {simulation}") + 1
@@ -141,7 +141,7 @@ def test_mujoco_needs_a_urdf(problems_in: ProblemsIn, simulated: str) -> None:
         each for each in problems_in(simulated + "simulation: {physics: mujoco}\n") if "URDF" in each.what
     ]
     assert problem.severity == "error"
-    assert problem.mend == "write `model: {urdf: ...}`, or take physics: independent"
+    assert problem.fix == "write `model: {urdf: ...}`, or take physics: independent"
 
 
 def test_mujoco_that_is_not_installed_is_named_with_its_extra(
@@ -152,7 +152,7 @@ def test_mujoco_that_is_not_installed_is_named_with_its_extra(
     text = simulated + "model: {urdf: pair.urdf}\nsimulation: {physics: mujoco}\n"
     (problem,) = [each for each in problems_in(text) if each.severity == "error"]
     assert problem.what == "physics: mujoco needs MuJoCo, which is not installed"
-    assert "pip install 'dxlrun[physics]'" in problem.mend
+    assert "pip install 'dxlrun[physics]'" in problem.fix
 
 
 URDF = """<robot name="pair"><link name="body"/><link name="left"/><link name="right"/>
@@ -209,4 +209,4 @@ def test_with_mujoco_the_urdf_says_what_a_joint_moves(
 ) -> None:
     text = _with_bodies(_joint(simulated, "{inertia: 1 kg cm^2, friction: 0.1 Nm}"), tmp_path)
     told = [each.what for each in problems_in(text) if "physics" in each.what]
-    assert told == ["with physics: mujoco the URDF says the inertia of left_arm_joint"]
+    assert told == ["with physics: mujoco the URDF defines the inertia of left_arm_joint"]

@@ -89,7 +89,7 @@ def test_what_is_no_urdf_is_an_error_at_its_place(
 
     assert Path(error.mark.file).name == "pair.urdf"
     assert (error.mark.line, error.mark.column) == place
-    assert f"{error.what}; {error.mend}" == expected
+    assert f"{error.what}; {error.fix}" == expected
 
 
 def test_a_missing_urdf_is_an_error_in_the_file_that_names_it(

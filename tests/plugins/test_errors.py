@@ -117,23 +117,23 @@ def test_a_plugin_that_is_wrong(told: Told, old: str) -> None:
 ASKED = {
     'Interfaces(parameters.joints, ("position",))': (
         "None",
-        "returns None from interfaces; tell its author: return dxlrun.Interfaces(joints, command)",
+        "returns None from interfaces; report it to its author: return dxlrun.Interfaces(joints, command)",
     ),
     'parameters.joints, ("position",)': (
         'list(parameters.joints), ("position",)',
         "asks for joints ['pan_joint', 'tilt_joint']; "
-        "tell its author: joints of dxlrun.Interfaces is a tuple of names",
+        "report it to its author: joints of dxlrun.Interfaces is a tuple of names",
     ),
     ', ("position",))': (
         ', ("position", "pwm"))',
         "asks for command interfaces that do not go together: no servo follows position and pwm together; "
-        "tell its author: ask for position (with velocity or effort beside it), or for velocity, effort or "
-        "pwm alone",
+        "report it to its author: ask for position (with velocity or effort beside it), or for "
+        "velocity, effort or pwm alone",
     ),
     '("position",))': (
         '("torque",))',
-        "asks for the command interface torque; tell its author: command interfaces are position, velocity, "
-        "effort, pwm",
+        "asks for the command interface torque; report it to its author: command interfaces are position, "
+        "velocity, effort, pwm",
     ),
 }
 

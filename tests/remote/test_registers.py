@@ -61,7 +61,7 @@ def test_what_the_servo_says_is_the_answer(arm):
         ("/joints/pan/registers/present_position", {"value": 1}, 422, "can only be read; write another item"),
         ("/joints/pan/registers/torque_enable", {"value": 0}, 422, "dxlrun switches the torque"),
         ("/joints/pan/registers/bus_watchdog", {"value": 0}, 422, "dxlrun arms it"),
-        ("/joints/pan/registers/return_delay_time", {"value": 0}, 422, "stands in the EEPROM"),
+        ("/joints/pan/registers/return_delay_time", {"value": 0}, 422, "is in the EEPROM"),
         (GAIN, {"value": True}, 422, "Expected `int | str`, got `bool`"),
         (GAIN, {"value": 1.0}, 422, "Expected `int | str`, got `float`"),
         (GAIN, {"gain": 1}, 422, 'write for example {"value": 800}'),

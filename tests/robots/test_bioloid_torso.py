@@ -80,7 +80,7 @@ def test_the_only_warning_is_the_odd_twin(torso: Compiled):
     (warning,) = torso.warnings
 
     assert warning.what.startswith(
-        "right_shoulder_lateral_joint is no mirror image of left_shoulder_lateral_joint"
+        "right_shoulder_lateral_joint is not a mirror image of left_shoulder_lateral_joint"
     )
 
 

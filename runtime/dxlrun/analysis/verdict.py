@@ -26,7 +26,7 @@ from dxlrun.analysis.bus import BusTraffic, Servo
 from dxlrun.analysis.steering import Act, Pause
 from dxlrun.analysis.tally import Figures
 from dxlrun.dynamixel.port.latency_timer import late_replies
-from dxlrun.plurals import counted
+from dxlrun.errors import counted
 from dxlrun.run.channels.events import EventCode, EventGroup, Severity
 
 INVALID_SHARE = 0.01

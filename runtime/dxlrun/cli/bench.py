@@ -9,8 +9,7 @@ from cyclopts import App, Parameter
 
 from dxlrun.cli.output.flags import Flag, JsonFlag
 from dxlrun.cli.output.terminal import out
-from dxlrun.errors import InputError
-from dxlrun.plurals import counted
+from dxlrun.errors import InputError, counted
 
 if TYPE_CHECKING:
     from rich.table import Table

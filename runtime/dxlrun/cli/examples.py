@@ -60,7 +60,7 @@ def examples(
         return 0
     stem = Path(name).name.removesuffix(".yaml")
     if stem not in known:
-        from dxlrun.compile.checks.problems import suggestion
+        from dxlrun.errors import suggestion
 
         raise InputError(f"there is no example {name}; {suggestion(stem, tuple(known))}")
     example = _example(known[stem])

@@ -11,8 +11,7 @@ from cyclopts import Parameter
 from dxlrun.cli.inputs import compiled
 from dxlrun.cli.output.flags import Flag, Motions
 from dxlrun.cli.output.terminal import out, say_error, say_warning
-from dxlrun.errors import InputError, LogError
-from dxlrun.plurals import counted
+from dxlrun.errors import InputError, LogError, counted
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

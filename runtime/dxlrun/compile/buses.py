@@ -1,17 +1,21 @@
-"""Buses of the robot file: ports, prepared packets, and their time budget against the loop's rate."""
+"""Buses of the robot file: ports, prepared packets, the time budget of a cycle, and servo monitoring."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
-from dxlrun.compile.checks.problems import Problems
-from dxlrun.compile.health import with_health
-from dxlrun.compile.joint.joints import CompiledJoint
-from dxlrun.compile.joint.registers import check_position_limits
+from dxlrun.compile.joints import CompiledJoint
+from dxlrun.compile.problems import Problems
+from dxlrun.compile.registers import check_position_limits
 from dxlrun.description import Description
+from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.plan.bus_plan import Budget, BusPlan
 from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
+from dxlrun.dynamixel.plan.reads import slow_items
+from dxlrun.dynamixel.registers.bus_watchdog import LEAST_PERIODS, MOST_TICKS, UNIT_NS, has_one
+from dxlrun.errors import suggestion
 from dxlrun.mode import Mode
 
 SIMULATED = "sim"
@@ -19,6 +23,8 @@ FAST_LATENCY_NS = 1_000_000
 """The shortest latency timer of an FTDI adapter (protocol.md, Time budget)."""
 _COMFORTABLE = 0.9
 """Share of the period above which controllers and the operating system have too little left."""
+WATCHDOG_NS = 200_000_000
+"""Bus Watchdog of a servo of Protocol 2.0 where the file gives none (failures.md)."""
 
 
 def compile_buses(
@@ -37,7 +43,7 @@ def compile_buses(
     for name, bus in description.robot.buses.items():
         mark = description.marks.key("buses", name)
         if not any(joint.bus == name for joint in description.robot.joints.values()):
-            problems.warning(mark, f"no joint stands on bus {name}", "it will not be opened; take it out")
+            problems.warning(mark, f"bus {name} has no joint", "it will not be opened; take it out")
         wirings = [
             _wiring(joint, rows, modes)
             for joint in joints.values()
@@ -62,7 +68,7 @@ def compile_buses(
         _check_ticks(description, plan, problems)
         check_position_limits(description, plan, problems)
         _check_budget(description, plan, problems)
-        plans.append(with_health(description, plan, problems))
+        plans.append(_with_monitoring(description, plan, problems))
     return plans
 
 
@@ -117,18 +123,18 @@ def _check_budget(description: Description, plan: BusPlan, problems: Problems) -
             mark,
             f"{cycle}, but {rate:g} Hz{given} leave {1e3 / rate:.3g} ms; the highest possible rate is "
             f"{_floor(budget.highest_rate_hz)} Hz, with read: split and without",
-            "; ".join(["lower the rate", *_what_would_help(plan)]),
+            "; ".join(["lower the rate", *_improvements(plan)]),
         )
     elif share > _COMFORTABLE:
         problems.warning(
             mark,
             f"{cycle}, {share:.0%} of the period; what is left is short for controllers and the system",
-            "; ".join(["expect skipped periods, or lower the rate", *_what_would_help(plan)]),
+            "; ".join(["expect skipped periods, or lower the rate", *_improvements(plan)]),
         )
 
 
-def _what_would_help(plan: BusPlan) -> list[str]:
-    """Say what each change alone would allow."""
+def _improvements(plan: BusPlan) -> list[str]:
+    """Return the rate that each change alone would allow."""
     budget = plan.budget
     now = _floor(budget.highest_rate_hz)
     found: list[str] = []
@@ -158,3 +164,72 @@ def _rate(budget: Budget, *, latency_ns: int | None = None, return_delay_ns: int
 def _floor(rate: float) -> str:
     """Write a rate that is certainly possible, Hz, with two digits at least."""
     return str(math.floor(rate)) if rate >= 10 else f"{math.floor(rate * 10) / 10:g}"
+
+
+def _with_monitoring(description: Description, plan: BusPlan, problems: Problems) -> BusPlan:
+    """Return a bus' plan with Bus Watchdog, slow registers, and which servos get torque after a reboot."""
+    items = description.robot.buses[plan.name].slow_registers.items
+    return replace(
+        plan,
+        servos=tuple(
+            replace(
+                servo,
+                slow=slow_items(control_table(servo.model, plan.protocol)) if items is None else items,
+                torque_on_return=_on_returned_servo(description, servo.joint) == "hold",
+            )
+            for servo in plan.servos
+        ),
+        watchdog_ticks=_watchdog_ticks(description, plan, problems),
+        slow_period_ns=_slow_period_ns(description, plan, problems),
+    )
+
+
+def slowest_period_ns(buses: Sequence[BusPlan]) -> int:
+    """Return the longest period in which no Bus Watchdog stops its servos, ns; 0: any."""
+    armed = [bus.watchdog_ticks for bus in buses if any(has_one(bus, servo) for servo in bus.servos)]
+    return min(armed) * UNIT_NS // LEAST_PERIODS if armed else 0
+
+
+def _on_returned_servo(description: Description, joint: str) -> str:
+    policies = description.robot.policies
+    for group in policies.groups.values():
+        if joint in group.joints and group.on_returned_servo is not None:
+            return group.on_returned_servo
+    return policies.on_returned_servo
+
+
+def _watchdog_ticks(description: Description, plan: BusPlan, problems: Problems) -> int:
+    written = description.robot.buses[plan.name].bus_watchdog
+    least_ns = math.ceil(LEAST_PERIODS * 1e9 / description.robot.loop.rate)
+    if written == "auto":
+        default_ns = max(WATCHDOG_NS, least_ns)
+        return -(-default_ns // UNIT_NS) if plan.protocol == 2.0 and default_ns <= MOST_TICKS * UNIT_NS else 0
+    if not written:
+        return 0
+    mark = description.marks.value("buses", plan.name, "bus_watchdog")
+    if plan.protocol != 2.0:
+        fix = "take it out; the guardian switches the torque off when the loop dies"
+        problems.error(mark, f"bus {plan.name} has Protocol 1.0, which has no Bus Watchdog", fix)
+        return 0
+    if written < least_ns:
+        what = f"a Bus Watchdog of {written * 1e-6:g} ms stops the servos of bus {plan.name} after one failed"
+        fix = (
+            f"write {-(-least_ns // UNIT_NS) * UNIT_NS * 1e-6:g} ms at least, three periods, or 0 ms for none"
+        )
+        problems.error(mark, f"{what} cycle", fix)
+    if written > MOST_TICKS * UNIT_NS:
+        what = f"a Bus Watchdog has {MOST_TICKS} steps of {UNIT_NS * 1e-6:g} ms"
+        problems.error(mark, what, f"write {MOST_TICKS * UNIT_NS * 1e-9:g} s at most, or 0 ms for none")
+        return 0
+    return -(-written // UNIT_NS)
+
+
+def _slow_period_ns(description: Description, plan: BusPlan, problems: Problems) -> int:
+    slow = description.robot.buses[plan.name].slow_registers
+    tables = [control_table(servo.model, plan.protocol).items for servo in plan.servos]
+    known = tuple(dict.fromkeys(name for items in tables for name in items))
+    for index, name in enumerate(slow.items or ()):
+        if name not in known:
+            mark = description.marks.value("buses", plan.name, "slow_registers", "items", index)
+            problems.error(mark, f"no servo of bus {plan.name} has the item {name}", suggestion(name, known))
+    return round(1e9 / slow.rate)

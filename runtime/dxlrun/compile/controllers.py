@@ -1,24 +1,35 @@
-"""Controllers of the robot file against plug-ins, joints, claims and the loop's rate."""
+"""Controllers of the robot file against plug-ins, joints, claims, modes and the loop's rate."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from pydantic import ValidationError
 
-from dxlrun.compile.checks.places import joint_mark
-from dxlrun.compile.checks.problems import Problems, suggestion
-from dxlrun.control.controllers.claims import conflicts
+from dxlrun.compile.joints import CompiledJoint
+from dxlrun.compile.problems import Problems, joint_mark
+from dxlrun.control.controllers.claims import conflicts, start_modes
 from dxlrun.control.controllers.contract import interfaces_breach
 from dxlrun.control.controllers.controller import Interfaces, ParametersModel
 from dxlrun.control.controllers.plugins import Offer, PlugIns
 from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.description import Description, problems_of
+from dxlrun.dynamixel.plan.mode_plan import LACKS, controls_speed, model_modes
+from dxlrun.errors import suggestion
+from dxlrun.mode import Mode, mode_of
 from dxlrun.run.channels.cycle import MOST_CONTROLLERS
 
 _RATE_TOLERANCE = 1e-6
 """Relative; a loop rate of 33.3 Hz is three times 11.1 Hz."""
+_INTERFACE: Mapping[Mode, str] = {
+    Mode.POSITION: "a position",
+    Mode.VELOCITY: "a velocity alone",
+    Mode.EFFORT: "an effort alone",
+    Mode.PWM: "a PWM",
+    Mode.EFFORT_POSITION: "a position with an effort",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +118,7 @@ def _offer(
 
 
 def _where_to_get(type_name: str, plugins: PlugIns) -> str:
-    """Return how to come by a type: another spelling, another package, or mending a broken one."""
+    """Return how to get a type: another spelling, another package, or the repair of a broken one."""
     if type_name in plugins.broken:  # two plug-ins offer it
         return plugins.broken[type_name]
     known = tuple(plugins.controllers)
@@ -129,7 +140,7 @@ def _parameters(
         return model.model_validate(entry.parameters)
     except ValidationError as error:
         problems.extend(problems_of(error, description.marks, ("controllers", name), model=model))
-    except Exception as error:  # a validator of the model is anybody's code
+    except Exception as error:  # a validator of the model is foreign code
         _at_fault(description, name, offer, _raised("check its parameters", error), problems)
     return None
 
@@ -137,31 +148,31 @@ def _parameters(
 def _at_fault(
     description: Description, name: str, offer: Offer, breach: tuple[str, str], problems: Problems
 ) -> None:
-    """Add what the plug-in of a controller did wrong, and how to mend it."""
-    what, mend = breach
+    """Add what the plug-in of a controller did wrong, and how to fix it."""
+    what, fix = breach
     text = f"controller {name} ({offer.distribution}) {what}"
-    problems.error(description.marks.key("controllers", name), text, mend)
+    problems.error(description.marks.key("controllers", name), text, fix)
 
 
 def _raised(what: str, error: Exception) -> tuple[str, str]:
-    told = " ".join(f"{type(error).__name__}: {error}".split())
-    return f"cannot {what}: {told}", "correct its parameters, or its plug-in"
+    raised = " ".join(f"{type(error).__name__}: {error}".split())
+    return f"cannot {what}: {raised}", "correct its parameters, or its plug-in"
 
 
 def _interfaces(
     description: Description, name: str, offer: Offer, parameters: ParametersModel, problems: Problems
 ) -> Interfaces | None:
-    """Ask the controller what it wants; it is anybody's code, so what it raises is a problem of the file."""
+    """Return the interfaces that a controller claims; what its code raises is a problem of the file."""
     joints = tuple(description.robot.joints)
     try:
         interfaces = offer.controller.interfaces(parameters, joints)
     except Exception as error:
-        _at_fault(description, name, offer, _raised("say what it needs", error), problems)
+        _at_fault(description, name, offer, _raised("name its interfaces", error), problems)
         return None
     breach = interfaces_breach(interfaces)
     if breach is not None:
-        what, mend = breach
-        _at_fault(description, name, offer, (what, f"tell its author: {mend}"), problems)
+        what, fix = breach
+        _at_fault(description, name, offer, (what, f"report it to its author: {fix}"), problems)
         return None
     seen: set[str] = set()
     good = True
@@ -169,7 +180,7 @@ def _interfaces(
         mark = joint_mark(description, name, joint)
         if joint not in joints:
             problems.error(
-                mark, f"{name} wants joint {joint}, which the file does not have", suggestion(joint, joints)
+                mark, f"{name} claims joint {joint}, which is not defined", suggestion(joint, joints)
             )
             good = False
         elif joint in seen:
@@ -180,7 +191,7 @@ def _interfaces(
 
 
 def _fallbacks(description: Description, compiled: dict[str, CompiledController], problems: Problems) -> None:
-    """Make sure that each fallback can take over when the moment comes."""
+    """Check that each fallback can take over when it is needed."""
     robot = description.robot
     for name, entry in robot.controllers.items():
         if entry.fallback is None:
@@ -193,7 +204,7 @@ def _fallbacks(description: Description, compiled: dict[str, CompiledController]
         elif entry.fallback == name:
             problems.error(mark, f"{name} is its own fallback", "name another controller, or take it out")
         elif not entry.active:
-            continue  # who is active when it fails depends on what is switched
+            continue  # which are active when it fails depends on what is switched
         elif other.active:
             what = f"the fallback {entry.fallback} of {name} is active from the start"
             problems.error(mark, what, f"write active: false in {entry.fallback}: it takes over later")
@@ -201,7 +212,7 @@ def _fallbacks(description: Description, compiled: dict[str, CompiledController]
             staying = [one.plan for one in compiled.values() if one.plan.active and one.plan.name != name]
             after = [*staying, compiled[entry.fallback].plan]
             for holder in sorted({c.holder for c in conflicts(after) if entry.fallback == c.other}):
-                what = f"the fallback {entry.fallback} of {name} claims joints of {holder}, which goes on"
+                what = f"fallback {entry.fallback} of {name} claims joints of {holder}, which stays active"
                 problems.error(mark, what, "take these joints out of it, or name another controller")
 
 
@@ -217,3 +228,66 @@ def _exclusive_claims(
             f"{other} and {holder} are both active and both claim {', '.join(joints)}",
             f"write active: false in one of the two, or take the joint{'s' * (len(joints) > 1)} out",
         )
+
+
+def compile_modes(
+    description: Description,
+    joints: Mapping[str, CompiledJoint],
+    controllers: Mapping[str, CompiledController],
+    problems: Problems,
+) -> dict[str, Mode]:
+    """Return the mode in which each joint begins a run, by its name; it is one that its model has.
+
+    Every controller's joints must have the mode that the controller needs, and every joint one in which it
+    rests.
+    """
+    able = {name: model_modes(joint.table, joint.plan.continuous) for name, joint in joints.items()}
+    for name, joint in joints.items():
+        if joint.plan.rest not in able[name]:
+            problems.error(
+                description.marks.value("joints", name, "continuous"),
+                f"{joint.table.model} of {name} {LACKS[joint.plan.rest]}, so {name} cannot be continuous",
+                "take `continuous` out, or use another model",
+            )
+    for name, controller in controllers.items():
+        _check(description, name, controller, joints, able, problems)
+    plans = [joint.plan for joint in joints.values()], [one.plan for one in controllers.values()]
+    modes = start_modes(*plans)
+    return {
+        name: mode if mode in able[name] else next(iter(able[name]))
+        for name, mode in modes.items()
+        if name in able
+    }
+
+
+def _check(  # noqa: PLR0917  one controller against everything that was compiled before
+    description: Description,
+    name: str,
+    controller: CompiledController,
+    joints: Mapping[str, CompiledJoint],
+    able: Mapping[str, Collection[Mode]],
+    problems: Problems,
+) -> None:
+    if not controller.plan.command:
+        return
+    mode = mode_of(controller.plan.command)
+    for joint in controller.plan.joints:
+        if joint not in joints:
+            continue
+        model, mark = joints[joint].table.model, joint_mark(description, name, joint)
+        if mode not in able[joint]:
+            *others, last = (_INTERFACE[each] for each in able[joint])
+            known = f"use a controller that commands {', '.join(others)}{' or ' * bool(others)}{last}"
+            lacks = f"{model} of {joint} {LACKS[mode]}"
+            within_a_turn = model_modes(joints[joint].table, continuous=False)
+            if mode is Mode.EFFORT_POSITION and mode in within_a_turn:
+                lacks = f"{joint} is continuous, for which it is not offered"
+                known = f"take `continuous` out, or {known}"
+            problems.error(mark, f"{name} commands {_INTERFACE[mode]}, but {lacks}", known)
+        elif mode is Mode.VELOCITY and not controls_speed(joints[joint].table):
+            problems.warning(
+                mark,
+                f"{model} of {joint} controls no speed in wheel mode: a velocity of {name} is taken for the "
+                "same fraction of full output, and a loaded servo turns slower",
+                "command its PWM, or use a model that controls its speed",
+            )

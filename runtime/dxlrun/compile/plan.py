@@ -15,7 +15,7 @@ from dxlrun.dynamixel.plan.bus_plan import BusPlan
 class LoadPlan:
     """What a simulated servo moves, as the servo feels it.
 
-    `dxlrun.simulation` has such words, too, but the loop reads the plan and must not load the simulation.
+    `dxlrun.simulation` has the same, but the loop reads the plan and must not load the simulation.
     """
 
     inertia: float = 0.0
@@ -40,7 +40,7 @@ class AdapterPlan:
 
 @dataclass(frozen=True, slots=True)
 class SimulationPlan:
-    """What simulated servos and buses are told beside the rest of the plan."""
+    """What only simulated servos and buses need."""
 
     loads: dict[str, LoadPlan] = field(default_factory=dict)
     """By joint; one that is missing moves nothing but itself."""

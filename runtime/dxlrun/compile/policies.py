@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from dxlrun.compile.checks.problems import Problems, suggestion
-from dxlrun.compile.health import group_policies
-from dxlrun.compile.joint.joints import CompiledJoint
-from dxlrun.compile.joint.reach import Interval, degrees
+from dxlrun.compile.joints import CompiledJoint
+from dxlrun.compile.limits import Interval, degrees
+from dxlrun.compile.problems import Problems
 from dxlrun.control.policy_plan import (
     HOLD,
     LIMP,
     POLICIES,
+    GroupPolicy,
     Last,
     Policy,
     PolicyName,
@@ -22,6 +22,7 @@ from dxlrun.control.policy_plan import (
 from dxlrun.description import Description
 from dxlrun.description.policies import PoseStep, TorqueStep
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
+from dxlrun.errors import suggestion
 
 MARGIN_NS = 100_000_000
 """For the processor, and for servos that answer only the second time, while torque is switched off."""
@@ -33,7 +34,7 @@ def compile_policies(
     buses: Sequence[BusPlan],
     problems: Problems,
 ) -> PolicyPlan:
-    """Return the policies of a file; says what of them does not fit the robot or its `exit_timeout`."""
+    """Return the policies of a file; add problems where they do not fit the robot or `exit_timeout`."""
     _check_poses(description, joints, problems)
     robot = description.robot
     limit_ns = robot.policies.exit_timeout - _reserve_ns(buses, robot.loop.rate)
@@ -49,7 +50,7 @@ def compile_policies(
         on_fault=found["on_fault"],
         on_lost_servo=found["on_lost_servo"],
         on_stale_command=found["on_stale_command"],
-        groups=group_policies(description, {name: row for row, name in enumerate(joints)}, problems),
+        groups=_group_policies(description, {name: row for row, name in enumerate(joints)}, problems),
         limit_ns=max(0, limit_ns),
     )
 
@@ -60,7 +61,7 @@ def _check_poses(description: Description, joints: Mapping[str, CompiledJoint], 
         for joint, angle in angles.items():
             if joint not in known:
                 mark = description.marks.key("poses", pose, joint)
-                what = f"pose {pose} has joint {joint}, which the file does not have"
+                what = f"pose {pose} has joint {joint}, which is not defined"
                 problems.error(mark, what, suggestion(joint, known))
             elif joint in joints:
                 plan = joints[joint].plan
@@ -84,14 +85,14 @@ def _policy(
             last = "hold" if step == "hold" else "limp"
             if index + 1 < len(written):
                 mark = description.marks.value("policies", name, index)
-                problems.error(mark, f"{name} goes on after {step}", f"write {step} as the last step")
+                problems.error(mark, f"{name} has steps after {step}", f"write {step} as the last step")
         elif isinstance(step, PoseStep):
             mark_path = ("policies", name, index, "pose")
             angles = description.robot.poses.get(step.pose)
             if angles is None:
                 mark = description.marks.value(*mark_path)
                 known = tuple(description.robot.poses)
-                what = f"{name} has pose {step.pose}, which the file does not have"
+                what = f"{name} has pose {step.pose}, which is not defined"
                 problems.error(mark, what, suggestion(step.pose, known) if known else "write it in poses")
             else:
                 steps.append(_pose(step, angles, joints))
@@ -132,8 +133,29 @@ def _check_torque(
             )
 
 
+def _group_policies(
+    description: Description, rows: Mapping[str, int], problems: Problems
+) -> tuple[GroupPolicy, ...]:
+    """Return the groups of joints with a policy of their own for lost servos."""
+    known = tuple(description.robot.joints)
+    owner: dict[str, str] = {}
+    found = []
+    for name, group in description.robot.policies.groups.items():
+        for index, joint in enumerate(group.joints):
+            mark = description.marks.value("policies", "groups", name, "joints", index)
+            if joint not in known:
+                what = f"group {name} has joint {joint}, which is not defined"
+                problems.error(mark, what, suggestion(joint, known))
+            elif owner.setdefault(joint, name) != name or group.joints.index(joint) < index:
+                problems.error(mark, f"{joint} is in group {owner[joint]} already", "name each joint once")
+        members = frozenset(rows[joint] for joint in group.joints if joint in rows)
+        if group.on_lost_servo is not None:
+            found.append(GroupPolicy(name, members, group.on_lost_servo))
+    return tuple(found)
+
+
 def _reserve_ns(buses: Sequence[BusPlan], rate: float) -> int:
-    """Return what of the exit timeout the steps may not have: two periods, and torque off on every line."""
+    """Return the part of the exit timeout that is no step's: two periods, and torque off on every line."""
     limp = [
         sum(each.due_ns + bus.latency_ns * bool(each.awaited) for each in (*bus.limp, *bus.torque_reads))
         for bus in buses

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from dxlrun.compile.controllers import CompiledController
-from dxlrun.compile.joint.joints import CompiledJoint
-from dxlrun.compile.motion.motions import CompiledPart
+from dxlrun.compile.joints import CompiledJoint
+from dxlrun.compile.motions import CompiledPart
 from dxlrun.control.policy_plan import POLICIES, PolicyPlan
 from dxlrun.description import Description
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, ReadWay
@@ -116,7 +116,7 @@ class PolicyRow:
 
     name: str
     does: str
-    """Its steps, and how the robot is left; or who is held while the run goes on."""
+    """Its steps and how the robot is left; or which joints are held while the run continues."""
     longest: float
     """s, that the steps take at the most"""
     without_loop: str
@@ -149,7 +149,7 @@ class CheckReport:
     policies: tuple[PolicyRow, ...]
     motions: tuple[MotionRow, ...]
     duration: float | None
-    """s; None: the run goes on until it is told to stop."""
+    """s; None: the run continues until it is stopped."""
 
 
 def check_report(checked: Checked) -> CheckReport:
@@ -246,13 +246,13 @@ def _way_row(bus: BusPlan, way: ReadWay, split: bool, period: float) -> WayRow:
     )
 
 
-_WHO_IS_HELD = {
+_HELD = {
     "on_lost_servo": "hold its controllers until it answers, the others go on",
     "on_stale_command": "hold its joints until the next command",
 }
 
 
-_WHO_IS_LOST = {
+_GROUP_ACTIONS = {
     "hold": "hold their controllers until it answers, the others go on",
     "limp": "no torque for the group any more, the others go on",
     "stop": "end the run by on_fault",
@@ -263,18 +263,18 @@ def _policy_rows(policies: PolicyPlan, buses: Sequence[BusPlan]) -> tuple[Policy
     rows = []
     for name in POLICIES:
         policy = policies.named(name)
-        going_on = _WHO_IS_HELD.get(name, policy.text) if policy.goes_on else policy.text
+        going_on = _HELD.get(name, policy.text) if policy.goes_on else policy.text
         alone = policies.on_fault.last
         rows.append(PolicyRow(name, going_on, policy.longest_ns * 1e-9, alone))
     for group in policies.groups:
-        does = _WHO_IS_LOST[group.on_lost_servo]
+        does = _GROUP_ACTIONS[group.on_lost_servo]
         rows.append(PolicyRow(f"on_lost_servo of {group.name}", does, 0.0, policies.on_fault.last))
-    rows.append(PolicyRow("on_returned_servo", _who_returns(buses), 0.0, policies.on_fault.last))
+    rows.append(PolicyRow("on_returned_servo", _on_returned_servo(buses), 0.0, policies.on_fault.last))
     return tuple(rows)
 
 
-def _who_returns(buses: Sequence[BusPlan]) -> str:
-    """Say which servos get their torque back when they had rebooted."""
+def _on_returned_servo(buses: Sequence[BusPlan]) -> str:
+    """Return which servos get torque after a reboot."""
     servos = [servo for bus in buses for servo in bus.servos]
     held = [servo.joint for servo in servos if servo.torque_on_return]
     if len(held) in {0, len(servos)}:

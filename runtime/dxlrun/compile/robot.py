@@ -8,29 +8,27 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
 
-from dxlrun.compile.buses import SIMULATED, compile_buses
-from dxlrun.compile.checks.left_out import left_out_names, still_true
-from dxlrun.compile.checks.problems import Problems
-from dxlrun.compile.controllers import compile_controllers
-from dxlrun.compile.health import slowest_period_ns
-from dxlrun.compile.joint.joints import AUTO, compile_joints
-from dxlrun.compile.joint.modes import compile_modes
-from dxlrun.compile.joint.twins import check_twins
-from dxlrun.compile.joint.urdf import compile_urdf
-from dxlrun.compile.motion.motions import compile_motion
+from dxlrun.compile.buses import SIMULATED, compile_buses, slowest_period_ns
+from dxlrun.compile.controllers import compile_controllers, compile_modes
+from dxlrun.compile.joints import AUTO, check_twins, compile_joints
+from dxlrun.compile.motions import compile_motion
 from dxlrun.compile.plan import Plan, SimulationPlan
 from dxlrun.compile.policies import compile_policies
+from dxlrun.compile.problems import Problems, independent_errors, left_out_names
 from dxlrun.compile.report import Checked, CheckReport, check_report
-from dxlrun.compile.scheduler import check_scheduler, least_period_ns, scheduler_plan
 from dxlrun.compile.simulation import compile_simulation
+from dxlrun.compile.urdf import compile_urdf
 from dxlrun.control.controllers.plugins import load_plugins
-from dxlrun.control.loop_plan import LoopPlan
+from dxlrun.control.loop_plan import MOST_SHARE, LoopPlan, SchedulerPlan
 from dxlrun.description import Description, MotionDescription, Survey, read_motion, survey_robot
+from dxlrun.description.robot import Loop
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.errors import InputError, Problem
 
 Ask: TypeAlias = Callable[[Sequence[BusPlan], Sequence[str]], Mapping[str, str]]
-"""Asks the servos of joints for their models: takes the buses and the joints, returns models by joint."""
+"""Read the models of the servos of joints: takes the buses and the joints, returns models by joint."""
+_HIGHEST = 98
+"""The guardian needs one priority above the loop, and 99 is the highest there is (sched(7))."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,8 +49,8 @@ def compile_files(
 ) -> Compiled:
     """Read robot file and motion files and compile them; raises InputError with the problems of all files.
 
-    Only when nothing is wrong, servos on real ports whose joints say `model: auto` are asked, if `ask` is
-    given; what it raises goes on.
+    Only when nothing is wrong, the models of servos on real ports with `model: auto` are read by `ask`, if
+    it is given.
     """
     read: list[MotionDescription] = []
     survey = Survey(None, ())
@@ -86,16 +84,16 @@ def compile_files(
 def _problems_of(
     description: Description, motions: Sequence[MotionDescription], duration_ns: int | None
 ) -> list[Problem]:
-    """Return the errors of a survey's description that have nothing to do with what was left out of it."""
+    """Return the errors of a survey's description that do not follow from what was left out of it."""
     try:
         compile_robot(description, motions, duration_ns)
     except InputError as error:
-        return [*still_true(description, _placed(error))]
+        return [*independent_errors(description, _placed(error))]
     return []
 
 
 def _unknown(description: Description) -> list[str]:
-    """Return the joints whose servos must be asked for their models, and can be."""
+    """Return the joints whose models can be read from their servos, and must be."""
     robot = description.robot
     return [
         name
@@ -119,14 +117,14 @@ def compile_robot(
 ) -> Compiled:
     """Turn a description and motions into a plan.
 
-    The run ends by itself after `duration_ns`, else when the last motion has ended, else when it is told to.
-    `models` are those that the servos of joints with `model: auto` gave when they were asked, by joint.
+    The run ends by itself after `duration_ns`, else when the last motion has ended, else when it is stopped.
+    `models` are those that were read from the servos of joints with `model: auto`, by joint.
     Raises InputError with every problem of the robot file and the motions.
     """
     problems = Problems()
     plugins = load_plugins()  # first, as they may bring the servo models of joints along
     joints = compile_joints(description, problems, models or {})
-    check_scheduler(description, problems)
+    _check_scheduler(description, problems)
     check_twins(description, {name: joint.table for name, joint in joints.items()}, problems)
     urdf = compile_urdf(description, joints, problems)
     simulation = compile_simulation(description, joints, problems)
@@ -151,7 +149,7 @@ def _plan(checked: Checked, urdf: str | None, simulation: SimulationPlan) -> Pla
     commands = [command for part in checked.parts for command in part.commands]
     loop = LoopPlan(
         period_ns=round(1e9 / robot.loop.rate),
-        scheduler=scheduler_plan(robot.loop),
+        scheduler=_scheduler_plan(robot.loop),
         joints=tuple(joint.plan for joint in checked.joints.values()),
         controllers=tuple(controller.plan for controller in checked.controllers.values()),
         commands=tuple(sorted(commands, key=lambda command: command.at_ns)),
@@ -159,7 +157,7 @@ def _plan(checked: Checked, urdf: str | None, simulation: SimulationPlan) -> Pla
         policies=checked.policies,
         overrun=robot.loop.overrun,
         tolerated_skips=robot.loop.tolerated_skips,
-        least_period_ns=least_period_ns(robot.loop, checked.buses),
+        least_period_ns=_least_period_ns(robot.loop, checked.buses),
         slowest_period_ns=slowest_period_ns(checked.buses),
     )
     return Plan(
@@ -179,3 +177,51 @@ def _plan(checked: Checked, urdf: str | None, simulation: SimulationPlan) -> Pla
         simulation=simulation,
         gateway=robot.processes.gateway.enabled,
     )
+
+
+def _check_scheduler(description: Description, problems: Problems) -> None:
+    """Check the scheduler's settings; whether this machine grants them is checked at the start."""
+    loop, marks = description.robot.loop, description.marks
+    scheduler, timeout_ns = loop.scheduler, description.robot.policies.exit_timeout
+    if 1e9 / loop.rate >= timeout_ns:
+        problems.warning(
+            marks.value("loop", "rate"),
+            f"at {loop.rate:g} Hz a request to stop is seen up to {1 / loop.rate:.3g} s late, when the "
+            f"guardian has ended the loop, as exit_timeout is {timeout_ns * 1e-9:g} s",
+            "raise policies.exit_timeout, or the rate",
+        )
+    if scheduler.policy != "other" and scheduler.priority > _HIGHEST:
+        problems.warning(
+            marks.value("loop", "scheduler", "priority"),
+            f"priority {scheduler.priority} leaves none above it for the guardian",
+            f"write {_HIGHEST} at most",
+        )
+    if scheduler.polling != "auto" and scheduler.polling * MOST_SHARE > round(1e9 / loop.rate):
+        problems.error(
+            marks.value("loop", "scheduler", "polling"),
+            f"polling {scheduler.polling / 1e6:g} ms is over half of the period, {1e3 / loop.rate:.3g} ms",
+            "write less, or auto",
+        )
+
+
+def _scheduler_plan(loop: Loop) -> SchedulerPlan:
+    """Return the scheduler's settings as the loop's process reads them."""
+    scheduler = loop.scheduler
+    return SchedulerPlan(
+        policy=scheduler.policy,
+        priority=scheduler.priority,
+        lock_memory=scheduler.lock_memory,
+        cores=scheduler.cores or (),
+        polling_ns=None if scheduler.polling == "auto" else scheduler.polling,
+        reply_polling_ns=None if scheduler.reply_polling == "auto" else scheduler.reply_polling,
+        idle_latency=scheduler.idle_latency,
+    )
+
+
+def _least_period_ns(loop: Loop, buses: Sequence[BusPlan]) -> int:
+    """Return the shortest period that the slowest bus allows, ns: the buses work at the same time.
+
+    Never more than the file's own period, which was checked by the same budget.
+    """
+    slowest = max((bus.budget.total_ns for bus in buses), default=0)
+    return min(slowest, round(1e9 / loop.rate))

@@ -1,6 +1,6 @@
-"""The `simulation` keys of the robot file: what simulated servos move, and how their adapters behave.
+"""Simulation: the `simulation` keys of the robot file, checked, and the simulated buses of a plan.
 
-On a real port nothing of it is used, so what could not be simulated is then a warning at most.
+On a real port none of these keys is used, so one that could not be simulated is then a warning at most.
 """
 
 from __future__ import annotations
@@ -9,20 +9,24 @@ import importlib.util
 from collections.abc import Mapping
 
 from dxlrun.compile.buses import SIMULATED
-from dxlrun.compile.checks.problems import Problems
-from dxlrun.compile.joint.joints import CompiledJoint
-from dxlrun.compile.plan import AdapterPlan, LoadPlan, SimulationPlan
+from dxlrun.compile.joints import CompiledJoint
+from dxlrun.compile.plan import AdapterPlan, LoadPlan, Plan, SimulationPlan
+from dxlrun.compile.problems import Problems
 from dxlrun.description import Description
 from dxlrun.description.bus import Bus
+from dxlrun.dynamixel.control_table import added_control_tables
+from dxlrun.dynamixel.plan.bus_plan import BusPlan
+from dxlrun.errors import InputError
+from dxlrun.simulation import AdapterConfig, BusConfig, Load, ServoConfig, UrdfBodies, UrdfJoint
 
-NEEDS_URDF = "physics: mujoco moves the bodies of a URDF, and the file names none"
-NAME_URDF = "write `model: {urdf: ...}`, or take physics: independent"
+_NEEDS_URDF = "physics: mujoco moves the bodies of a URDF, and the file names none"
+_NAME_URDF = "write `model: {urdf: ...}`, or take physics: independent"
 
 
 def compile_simulation(
     description: Description, joints: Mapping[str, CompiledJoint], problems: Problems
 ) -> SimulationPlan:
-    """Return what simulated servos and buses are told, and warn of what makes no sense."""
+    """Return the plan of the simulated servos and buses; add problems for contradictory keys."""
     for name, joint in joints.items():
         _check_load(description, name, joint, problems)
     _check_buses(description, problems)
@@ -30,42 +34,96 @@ def compile_simulation(
     return SimulationPlan(
         loads={name: load for name, joint in joints.items() if (load := _load(joint)) != LoadPlan()},
         adapters={
-            name: told
+            name: adapter
             for name, bus in description.robot.buses.items()
-            if (told := _adapter(bus)) != AdapterPlan()
+            if (adapter := _adapter(bus)) != AdapterPlan()
         },
         physics=description.robot.simulation.physics,
     )
 
 
+def simulated_buses(plan: Plan) -> tuple[BusConfig, ...]:
+    """Return the simulated lines of a plan: the servos that it expects, each at its reference (q = 0)."""
+    return tuple(_simulated_bus(plan, bus) for bus in plan.buses if bus.port == SIMULATED)
+
+
+def simulated_bodies(plan: Plan) -> UrdfBodies | None:
+    """Return the bodies that the servos of `simulated_buses` move together; None: each joint by itself.
+
+    Raises InputError when the robot file asks for bodies that cannot be moved: here, where the
+    user sees it, and not in the process of the simulated buses.
+    """
+    if plan.simulation.physics == "independent":
+        return None
+    if plan.urdf is None:
+        raise InputError(f"{_NEEDS_URDF}; {_NAME_URDF}")
+    joints = (
+        UrdfJoint(servo.joint, servo.reference, servo.direction)
+        for bus in plan.buses
+        if bus.port == SIMULATED
+        for servo in bus.servos
+    )
+    bodies = UrdfBodies(plan.urdf, tuple(joints))
+    from dxlrun.simulation.motion.mujoco_plant import mujoco_plant  # MuJoCo is optional, and slow to import
+
+    mujoco_plant(bodies)
+    return bodies
+
+
+def _simulated_bus(plan: Plan, bus: BusPlan) -> BusConfig:
+    adapter = plan.simulation.adapters.get(bus.name, AdapterPlan())
+    loads = plan.simulation.loads
+    return BusConfig(
+        name=bus.name,
+        baud_rate=bus.baud_rate,
+        servos=tuple(
+            ServoConfig(
+                servo.servo_id,
+                servo.model,
+                servo.reference,
+                bus.return_delay_ns,
+                load=Load(load.inertia, load.friction, load.gravity, load.gravity_angle),
+            )
+            for servo in bus.servos
+            for load in (loads.get(servo.joint, LoadPlan()),)
+        ),
+        protocol=bus.protocol,
+        control_tables=added_control_tables(servo.model for servo in bus.servos),
+        adapter=AdapterConfig(
+            latency_timer_ns=adapter.latency_timer_ns, split=adapter.split, echo=adapter.echo
+        ),
+        absent=adapter.absent,
+    )
+
+
 def _adapter(bus: Bus) -> AdapterPlan:
-    told = bus.simulation
-    return AdapterPlan(bus.latency_timer, told.split, told.echo, told.absent)
+    keys = bus.simulation
+    return AdapterPlan(bus.latency_timer, keys.split, keys.echo, keys.absent)
 
 
 def _load(joint: CompiledJoint) -> LoadPlan:
-    told = joint.described.simulation
-    if not told.gravity:
-        return LoadPlan(told.inertia or 0.0, told.friction or 0.0)
+    keys = joint.described.simulation
+    if not keys.gravity:
+        return LoadPlan(keys.inertia or 0.0, keys.friction or 0.0)
     return LoadPlan(
-        inertia=told.inertia or 0.0,
-        friction=told.friction or 0.0,
-        gravity=told.gravity,
-        gravity_angle=joint.described.reference + joint.described.direction * (told.gravity_angle or 0.0),
+        inertia=keys.inertia or 0.0,
+        friction=keys.friction or 0.0,
+        gravity=keys.gravity,
+        gravity_angle=joint.described.reference + joint.described.direction * (keys.gravity_angle or 0.0),
     )
 
 
 def _check_load(description: Description, name: str, joint: CompiledJoint, problems: Problems) -> None:
-    told, table = joint.described.simulation, joint.table
-    if told.gravity_angle is not None and not told.gravity:
+    keys, table = joint.described.simulation, joint.table
+    if keys.gravity_angle is not None and not keys.gravity:
         problems.warning(
             description.marks.value("joints", name, "simulation", "gravity_angle"),
-            f"gravity_angle says where the weight of {name} hangs down, but it has none",
-            "say how heavy it is by `gravity: ... Nm`, or take gravity_angle out",
+            f"gravity_angle is where the weight of {name} hangs down, but it has none",
+            "give its weight as `gravity: ... Nm`, or take gravity_angle out",
         )
     for key, torque, what in (
-        ("friction", told.friction, "cannot turn against a friction"),
-        ("gravity", told.gravity, "cannot hold a weight"),
+        ("friction", keys.friction, "cannot turn against a friction"),
+        ("gravity", keys.gravity, "cannot hold a weight"),
     ):
         if torque is not None and 0 < table.stall_torque <= torque:
             problems.warning(
@@ -75,11 +133,11 @@ def _check_load(description: Description, name: str, joint: CompiledJoint, probl
                 "check the value and its unit",
             )
     if description.robot.simulation.physics == "mujoco":
-        for key, value in (("inertia", told.inertia), ("gravity", told.gravity)):
+        for key, value in (("inertia", keys.inertia), ("gravity", keys.gravity)):
             if value is not None:
                 problems.warning(
                     description.marks.value("joints", name, "simulation", key),
-                    f"with physics: mujoco the URDF says the {key} of {name}",
+                    f"with physics: mujoco the URDF defines the {key} of {name}",
                     f"take {key} out; it counts only for joints that the URDF does not turn",
                 )
 
@@ -106,11 +164,11 @@ def _check_physics(description: Description, problems: Problems) -> None:
         return
     mark = description.marks.value("simulation", "physics")
     simulated = any(bus.port == SIMULATED for bus in robot.buses.values())
-    tell = problems.error if simulated else problems.warning
+    add = problems.error if simulated else problems.warning
     if robot.model is None:
-        tell(mark, NEEDS_URDF, NAME_URDF)
+        add(mark, _NEEDS_URDF, _NAME_URDF)
     if importlib.util.find_spec("mujoco") is None:
         # not above: `check` reads no part of the simulation but for these two sentences
         from dxlrun.simulation.motion.mujoco_plant import INSTALL_MUJOCO, NEEDS_MUJOCO
 
-        tell(mark, NEEDS_MUJOCO, INSTALL_MUJOCO)
+        add(mark, NEEDS_MUJOCO, INSTALL_MUJOCO)

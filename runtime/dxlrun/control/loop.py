@@ -21,9 +21,8 @@ from dxlrun.control.policy_plan import Last, PolicyName
 from dxlrun.control.safe_motion import SafeMotion
 from dxlrun.control.schedule import Schedule
 from dxlrun.control.steering import Steering
-from dxlrun.errors import PortError
+from dxlrun.errors import PortError, counted
 from dxlrun.interfaces import LOST_CYCLES
-from dxlrun.plurals import counted
 from dxlrun.run.channels.commands import CommandSink, NoCommands, TakenCommand
 from dxlrun.run.channels.cycle import CycleRecord
 from dxlrun.run.channels.events import EventCode, EventSink, Severity

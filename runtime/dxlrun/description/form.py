@@ -11,9 +11,9 @@ from pydantic_core import PydanticCustomError
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*", re.ASCII)
 
 
-def refuse(what: str, mend: str) -> PydanticCustomError:
-    """Return the error of a validator that says what is wrong, and apart from it how to mend it."""
-    return PydanticCustomError("dxlrun", "{what}; {mend}", {"what": what, "mend": mend})
+def refuse(what: str, fix: str) -> PydanticCustomError:
+    """Return the error of a validator that says what is wrong, and apart from it how to fix it."""
+    return PydanticCustomError("dxlrun", "{what}; {fix}", {"what": what, "fix": fix})
 
 
 def _name(value: str) -> str:

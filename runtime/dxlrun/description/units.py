@@ -155,9 +155,9 @@ def _split(text: object, what: str, units: Mapping[str, object], written: str) -
     return number, match[2]
 
 
-def _refusal(what: str, mend: str) -> PydanticCustomError:
-    # a ValueError too; what and how to mend it travel apart, so that reports can place them
-    return PydanticCustomError("dxlrun", "{what}; {mend}", {"what": what, "mend": mend})
+def _refusal(what: str, fix: str) -> PydanticCustomError:
+    # a ValueError too; what and how to fix it travel apart, so that reports can place them
+    return PydanticCustomError("dxlrun", "{what}; {fix}", {"what": what, "fix": fix})
 
 
 def _auto_duration(value: str) -> int | str:
@@ -167,7 +167,7 @@ def _auto_duration(value: str) -> int | str:
         return duration(value)
     except PydanticCustomError as error:
         context = error.context or {}
-        raise _refusal(str(context["what"]), f"{context['mend']}, or auto") from error
+        raise _refusal(str(context["what"]), f"{context['fix']}, or auto") from error
 
 
 def _polling(value: str) -> int | str:
@@ -177,7 +177,7 @@ def _polling(value: str) -> int | str:
         return duration(value)
     except PydanticCustomError as error:
         context = error.context or {}
-        raise _refusal(str(context["what"]), f"{context['mend']}, auto or off") from error
+        raise _refusal(str(context["what"]), f"{context['fix']}, auto or off") from error
 
 
 def _text_schema(example: str, units: Mapping[str, object], *others: dict[str, object]) -> WithJsonSchema:

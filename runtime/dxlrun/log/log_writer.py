@@ -12,13 +12,13 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
+from dxlrun.errors import counted
 from dxlrun.log import schemas
 from dxlrun.log.cdr import ENCAPSULATION, Codec
 from dxlrun.log.diagnostics import Diagnostics
 from dxlrun.log.header import LogHeader, LogSummary, to_metadata
 from dxlrun.log.log_file import LogFile
 from dxlrun.log.schemas import MessageType
-from dxlrun.plurals import counted
 from dxlrun.run.channels.commands import CommandPieces
 from dxlrun.run.channels.cycle import CycleLayout
 from dxlrun.run.channels.events import Event, EventCode, Severity, decode_event

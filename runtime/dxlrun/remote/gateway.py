@@ -30,8 +30,8 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 from starlette.routing import Route
 
-from dxlrun.compile.checks.problems import suggestion
 from dxlrun.control.steering import Rate, Switch
+from dxlrun.errors import suggestion
 from dxlrun.mode import Mode
 from dxlrun.remote.asking import Allowance, body, number, origin, peer, typed
 from dxlrun.remote.link import Link, Loaded

@@ -14,8 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
-from dxlrun.compile.checks.problems import suggestion
-from dxlrun.compile.motion.commands import beyond_limits
+from dxlrun.compile.limits import beyond_limits
 from dxlrun.control.controllers.contract import interfaces_breach
 from dxlrun.control.controllers.controller import Interfaces
 from dxlrun.control.controllers.plugins import Offer, PlugIns
@@ -23,6 +22,7 @@ from dxlrun.control.loop_plan import ControllerPlan, JointPlan
 from dxlrun.description.form import Name
 from dxlrun.description.robot import ControllerEntry
 from dxlrun.description.source.problems import sentences_of
+from dxlrun.errors import suggestion
 
 LONGEST_NAME = 64
 """Of a controller that is loaded; the log cuts names there."""

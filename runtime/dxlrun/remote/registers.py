@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import msgspec
 
-from dxlrun.compile.checks.problems import suggestion
-from dxlrun.compile.joint.registers import UnfitRegister, steered_value
 from dxlrun.compile.plan import Plan
+from dxlrun.compile.registers import UnfitRegister, steered_value
 from dxlrun.control.steering import Register
 from dxlrun.dynamixel.control_table import ControlTable, control_table
+from dxlrun.errors import suggestion
 from dxlrun.remote.preparation import Refusal
 
 

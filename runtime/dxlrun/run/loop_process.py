@@ -30,8 +30,7 @@ from dxlrun.control.realtime.margin import Pacing
 from dxlrun.dynamixel.hardware import TAKEN_BACK
 from dxlrun.dynamixel.port.ports import MOST_SHARE, ReplyPolling, SerialPort, SerialPorts
 from dxlrun.dynamixel.port.reopening import LinesAgain
-from dxlrun.errors import DxlrunError, PlugInError
-from dxlrun.plurals import counted
+from dxlrun.errors import DxlrunError, PlugInError, counted
 from dxlrun.run.assembly import assemble
 from dxlrun.run.channels import process
 from dxlrun.run.channels.commands import CommandRing

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dxlrun.plurals import counted
+from dxlrun.errors import counted
 
 if TYPE_CHECKING:
     from rich.status import Status

@@ -20,9 +20,8 @@ from dxlrun.compile.plan import Plan
 from dxlrun.control.realtime.grants import Grant
 from dxlrun.dynamixel.port.ports import put_in_place, set_aside
 from dxlrun.dynamixel.port.serial_open import let_go
-from dxlrun.errors import ProcessFault
+from dxlrun.errors import ProcessFault, counted
 from dxlrun.log.schemas import FAILURES_NAME
-from dxlrun.plurals import counted
 from dxlrun.run.channels import process
 from dxlrun.run.channels.child import END_TIMEOUT_S, Child
 from dxlrun.run.channels.events import Severity

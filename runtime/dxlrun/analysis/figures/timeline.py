@@ -9,9 +9,9 @@ from dxlrun.analysis.figures.drawing import BLUE, ERROR, WARNING, Drawing, Words
 from dxlrun.analysis.figures.envelope import COLUMNS
 from dxlrun.analysis.figures.steered import SteeringMarks
 from dxlrun.analysis.latency import first_deadline_ns
+from dxlrun.errors import counted
 from dxlrun.interfaces import Floats
 from dxlrun.log.reader import Log
-from dxlrun.plurals import counted
 from dxlrun.run.channels.events import Severity
 
 _SHAPES = (

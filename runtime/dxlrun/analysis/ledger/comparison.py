@@ -19,9 +19,8 @@ from dxlrun.analysis.ledger.faults import FaultAnswers, UncausedEvent, answered,
 from dxlrun.analysis.ledger.lateness import Lateness, lateness
 from dxlrun.analysis.ledger.overruns import OverrunCauses, overrun_causes
 from dxlrun.analysis.ledger.streams import WAYS, Stream, Way, logged, seen
-from dxlrun.errors import InputError
+from dxlrun.errors import InputError, counted
 from dxlrun.log.reader import Log
-from dxlrun.plurals import counted
 from dxlrun.run.channels.events import EventCode
 from dxlrun.run.channels.packets import LoggedPacket, PacketKind
 from dxlrun.simulation import LedgerEntry

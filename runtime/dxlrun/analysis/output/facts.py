@@ -10,8 +10,8 @@ import msgspec
 from dxlrun.analysis.latency import on_virtual_time
 from dxlrun.analysis.output.tables import Cell, Column, Table, tone_of
 from dxlrun.analysis.report import Report
+from dxlrun.errors import counted
 from dxlrun.log.reader import UNREADABLE, Log
-from dxlrun.plurals import counted
 from dxlrun.run.channels.events import EventCode
 
 

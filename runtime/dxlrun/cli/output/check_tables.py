@@ -13,7 +13,7 @@ from rich.text import Text
 
 from dxlrun.cli.output.narrow import fitting
 from dxlrun.compile import Compiled
-from dxlrun.compile.joint.reach import degrees
+from dxlrun.compile.limits import degrees
 from dxlrun.compile.report import (
     BusRow,
     CheckReport,
@@ -23,7 +23,7 @@ from dxlrun.compile.report import (
     PolicyRow,
     WayRow,
 )
-from dxlrun.plurals import counted
+from dxlrun.errors import counted
 
 if TYPE_CHECKING:
     from dxlrun.run.identification import RegisterRow

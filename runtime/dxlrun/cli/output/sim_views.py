@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from dxlrun.cli.output.terminal import out, say_error
-from dxlrun.plurals import counted
+from dxlrun.errors import counted
 
 if TYPE_CHECKING:
     from pathlib import Path

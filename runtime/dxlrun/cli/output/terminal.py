@@ -56,7 +56,7 @@ def problems_json(problems: Sequence[Problem]) -> list[dict[str, object]]:
             "line": problem.mark.line,
             "column": problem.mark.column,
             "what": problem.what,
-            "mend": problem.mend,
+            "mend": problem.fix,
         }
         for problem in problems
     ]

@@ -90,7 +90,7 @@ def _check(servo_id: int, verb: str, asked: Asked) -> None:
         raise InputError(f"{servo_id} is no ID of a servo; they are 0..{_HIGHEST_ID}")
     found = VERBS.get(verb)
     if found is None:
-        from dxlrun.compile.checks.problems import suggestion
+        from dxlrun.errors import suggestion
 
         raise InputError(f"a servo cannot {verb}; {suggestion(verb, tuple(VERBS))}")
     if not found.fewest <= len(asked.words) <= found.most:

@@ -69,7 +69,7 @@ class Verb:
 
 
 def _get(one: OneServo, asked: Asked) -> None:
-    from dxlrun.compile.checks.problems import suggestion
+    from dxlrun.errors import suggestion
 
     names = asked.words or tuple(name for name in one.table.items if not name.startswith("indirect_"))
     wrong = [name for name in names if name not in one.table.items]
@@ -82,7 +82,7 @@ def _get(one: OneServo, asked: Asked) -> None:
 
 
 def _set(one: OneServo, asked: Asked) -> None:
-    from dxlrun.compile.joint.registers import any_value
+    from dxlrun.compile.registers import any_value
     from dxlrun.dynamixel.registers.inspection import called, shown
 
     name, text = asked.words

@@ -8,8 +8,7 @@ from collections.abc import Iterator, Mapping
 
 from dxlrun.cli.output.flags import Flag, JsonFlag
 from dxlrun.cli.output.terminal import out, say_error
-from dxlrun.compile.checks.problems import suggestion
-from dxlrun.errors import DxlrunError, InputError
+from dxlrun.errors import DxlrunError, InputError, suggestion
 
 
 def list_robots(*, robot: str | None = None, as_json: JsonFlag = False, debug: Flag = False) -> int:

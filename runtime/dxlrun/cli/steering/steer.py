@@ -15,8 +15,7 @@ from cyclopts import Parameter
 
 from dxlrun.cli.output.flags import Flag, JsonFlag
 from dxlrun.cli.output.terminal import out
-from dxlrun.compile.checks.problems import suggestion
-from dxlrun.errors import DxlrunError, InputError
+from dxlrun.errors import DxlrunError, InputError, suggestion
 
 if TYPE_CHECKING:
     from dxlrun.remote.client import RemoteRobot

@@ -125,4 +125,4 @@ def _told(problems: Sequence[Problem], in_words: bool) -> InputError:
     """Return the error: places for a file, plain sentences for words, where lines and columns say nothing."""
     if not in_words:
         return InputError(problems)
-    return InputError("\n".join(f"{problem.what}; {problem.mend}" for problem in problems))
+    return InputError("\n".join(f"{problem.what}; {problem.fix}" for problem in problems))

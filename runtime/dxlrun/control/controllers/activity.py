@@ -16,7 +16,7 @@ from collections.abc import Callable
 from functools import cache
 from typing import ClassVar, Protocol
 
-from dxlrun.plurals import counted
+from dxlrun.errors import counted
 from dxlrun.run.channels.heartbeat import Step
 
 _LOADING = int(Step.ON_CONFIGURE)

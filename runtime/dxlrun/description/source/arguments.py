@@ -31,10 +31,10 @@ def _scalar(value: object) -> object:
     if isinstance(value, dict | list):
         raise PydanticCustomError(
             "dxlrun",
-            "{what}; {mend}",
+            "{what}; {fix}",
             {
                 "what": "the default of an argument is one value",
-                "mend": "write text, a number, true or false",
+                "fix": "write text, a number, true or false",
             },
         )
     return value
@@ -99,8 +99,8 @@ class Arguments:
                 f"write {name}:=... behind the robot file, or give it a default",
             )
 
-    def _problem(self, path: KeyPath, what: str, mend: str) -> None:
-        self.problems.append(Problem(self._marks.key(*path), what, mend))
+    def _problem(self, path: KeyPath, what: str, fix: str) -> None:
+        self.problems.append(Problem(self._marks.key(*path), what, fix))
 
     def fill(self, path: KeyPath, text: str, quoted: bool) -> Filled:
         """Return the value of a scalar with the arguments put in."""
@@ -137,8 +137,8 @@ def refuse_arguments(path: KeyPath, text: str, quoted: bool) -> Filled:
     return literal(path, text, quoted)
 
 
-def _unusable(what: str, mend: str) -> Filled:
-    return Filled(None, problems=((what, mend),), unknown=True)
+def _unusable(what: str, fix: str) -> Filled:
+    return Filled(None, problems=((what, fix),), unknown=True)
 
 
 def _suggestion(name: str, known: Sequence[str]) -> str:

@@ -106,8 +106,8 @@ class _Collector:
         elif len(self._done) >= MOST_FILES:
             self._refuse(mark, f"more than {MOST_FILES} files are included", "put some of them together")
         elif not fragment.exists():
-            mend = "check the name, which counts from the folder of this file"
-            self._refuse(mark, f"there is no file {entry}", mend)
+            fix = "check the name, which counts from the folder of this file"
+            self._refuse(mark, f"there is no file {entry}", fix)
         else:
             self._read(fragment, entry, mark, above)
 
@@ -118,7 +118,7 @@ class _Collector:
             for problem in error.problems:
                 at_file = problem.mark == Mark(str(fragment))  # the file itself, not a place in it
                 what = f"{entry}: {problem.what}" if at_file else problem.what
-                self._refuse(mark if at_file else problem.mark, what, problem.mend)
+                self._refuse(mark if at_file else problem.mark, what, problem.fix)
             return
         if self._characters + len(text) > LARGEST_FILE:
             what = f"with {entry} the robot has more than {LARGEST_FILE // 1024} KiB"
@@ -129,8 +129,8 @@ class _Collector:
         except InputError as error:
             self.problems.extend(error.problems)
 
-    def _refuse(self, mark: Mark, what: str, mend: str) -> None:
-        self.problems.append(Problem(mark, what, mend))
+    def _refuse(self, mark: Mark, what: str, fix: str) -> None:
+        self.problems.append(Problem(mark, what, fix))
 
 
 def merged(documents: Iterable[Grown]) -> Grown:

@@ -59,7 +59,7 @@ def sentences_of(error: ValidationError, what: str, model: type[BaseModel], most
         location = details["loc"]
         places |= {(what, *location[:end]): Mark(what) for end in range(len(location) + 1)}
     problems = _problems(errors, Marks(what, places, places), (what,), model)
-    return [f"{problem.what}; {problem.mend}" for problem in problems]
+    return [f"{problem.what}; {problem.fix}" for problem in problems]
 
 
 def places_of(error: ValidationError, marks: Marks) -> list[KeyPath]:
@@ -130,10 +130,10 @@ def _merged(complaints: list[_Complaint], marks: Marks) -> Problem:
         origin = marks.origins.get(first.path)
         given = shown(first.input) + (f" (argument {origin})" if origin else "")
         return Problem(mark, f"{first.name} is {given}, but must be {' or '.join(wanted)}", _remedy(first))
-    what, mend = _sentence(first)
+    what, fix = _sentence(first)
     if (origin := marks.origins.get(first.path)) is not None:
         what = f"{what} (argument {origin})"
-    return Problem(mark, what, mend)
+    return Problem(mark, what, fix)
 
 
 def shown(value: object) -> str:
@@ -208,7 +208,7 @@ def _bound(value: object) -> str:
 
 
 def _remedy(complaint: _Complaint) -> str:
-    """Return how to mend a value of a wrong type or outside its range."""
+    """Return how to fix a value of a wrong type or outside its range."""
     wanted = _WANTED.get(complaint.kind, "")
     if complaint.kind in ("literal_error", "enum"):
         return "write it so"
@@ -229,7 +229,7 @@ def _example(complaint: _Complaint) -> str:
 
 
 def _sentence(complaint: _Complaint) -> tuple[str, str]:
-    """Return what is wrong and how to mend it, for the kinds that need more than a value."""
+    """Return what is wrong and how to fix it, for the kinds that need more than a value."""
     teller = _TELLERS.get(complaint.kind)
     return teller(complaint) if teller is not None else (f"{complaint.name}: {complaint.kind}", "correct it")
 
@@ -270,12 +270,12 @@ def _tell_length(complaint: _Complaint) -> tuple[str, str]:
 
 
 def _tell_own(complaint: _Complaint) -> tuple[str, str]:
-    """Return what a validator of ours or of a plug-in said: `what; how to mend it`."""
-    if "what" in complaint.context and "mend" in complaint.context:
-        what, mend = str(complaint.context["what"]), str(complaint.context["mend"])
+    """Return what a validator of ours or of a plug-in said: `what; how to fix it`."""
+    if "what" in complaint.context and "fix" in complaint.context:
+        what, fix = str(complaint.context["what"]), str(complaint.context["fix"])
     else:
-        what, _, mend = str(complaint.context.get("error", "it is refused")).partition("; ")
-    return f"{complaint.name}: {what}", mend or "correct it"
+        what, _, fix = str(complaint.context.get("error", "it is refused")).partition("; ")
+    return f"{complaint.name}: {what}", fix or "correct it"
 
 
 def _tell_json(complaint: _Complaint) -> tuple[str, str]:

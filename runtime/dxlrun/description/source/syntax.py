@@ -140,9 +140,9 @@ def _mark(place: _Place | None, file: str) -> Mark:
     return Mark(file) if place is None else Mark(file, place.line + 1, place.column + 1)
 
 
-def refusal(mark: Mark, what: str, mend: str) -> InputError:
+def refusal(mark: Mark, what: str, fix: str) -> InputError:
     """Return an InputError with one problem."""
-    return InputError([Problem(mark, what, mend)])
+    return InputError([Problem(mark, what, fix)])
 
 
 def _mark_at(text: str, index: int, file: str) -> Mark:
@@ -151,7 +151,7 @@ def _mark_at(text: str, index: int, file: str) -> Mark:
 
 
 def _in_our_words(error: yaml.MarkedYAMLError, text: str, file: str) -> Problem:
-    """Say what the scanner or parser stumbled over, and how to mend it."""
+    """Say what the scanner or parser stumbled over, and how to fix it."""
     place = error.problem_mark or error.context_mark
     opened = error.context_mark
     said = error.problem or ""
@@ -165,9 +165,9 @@ def _in_our_words(error: yaml.MarkedYAMLError, text: str, file: str) -> Problem:
         return Problem(mark, "${...} stands inside { } or [ ] without quotes", 'put it in quotes: "${name}"')
     if "cannot start any token" in said and character == "\t":
         return Problem(mark, "there is a tab in the indentation", "indent with spaces")
-    for part, what, mend in _WORDS:
+    for part, what, fix in _WORDS:
         if part in said:
-            return Problem(mark, what.format(since=since, character=character), mend)
+            return Problem(mark, what.format(since=since, character=character), fix)
     return Problem(mark, f"this is not YAML ({said})", "correct it")
 
 

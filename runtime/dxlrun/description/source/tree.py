@@ -21,7 +21,7 @@ class Filled:
     origin: str | None = None
     """`rate:=100` when an argument is in it."""
     problems: tuple[tuple[str, str], ...] = ()
-    """What is wrong, and how to mend it."""
+    """What is wrong, and how to fix it."""
     unknown: bool = False
     """The value could not be made; whoever checks it shall not complain again."""
 
@@ -133,7 +133,7 @@ class _Grower:
     def _scalar(self, node: yaml.ScalarNode, path: KeyPath) -> object:
         filled = self._fill(path, node.value, _quoted(node))
         mark = self.values[path]
-        self.problems.extend(Problem(mark, what, mend) for what, mend in filled.problems)
+        self.problems.extend(Problem(mark, what, fix) for what, fix in filled.problems)
         if filled.unknown:
             self.unknown.add(path)
         if filled.origin is not None:

@@ -12,12 +12,11 @@ import yaml
 from pydantic import ValidationError
 
 from dxlrun.compile import compile_robot
-from dxlrun.compile.checks.problems import suggestion
 from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.loop_plan import ControllerPlan, LoopPlan
 from dxlrun.description import read_robot
 from dxlrun.description.source.problems import sentences_of
-from dxlrun.errors import InputError
+from dxlrun.errors import InputError, suggestion
 from dxlrun.log.replay.recorded import RecordedPlan
 
 _MOST_SENTENCES = 20

@@ -13,13 +13,13 @@ from dxlrun.control.controllers.plugins import PlugIns, load_plugins
 from dxlrun.control.gate import Gate
 from dxlrun.control.loop import Loop, LoopResult, StopFlag
 from dxlrun.control.loop_plan import LoopPlan
+from dxlrun.errors import counted
 from dxlrun.log.reader import read_log
 from dxlrun.log.replay.changes import Setting, with_arguments, with_settings
 from dxlrun.log.replay.comparison import Comparison, Difference, JointDifferences
 from dxlrun.log.replay.hardware import RecordedClock, RecordedHardware
 from dxlrun.log.replay.inputs import PlannedCommands, RecordedInbox
 from dxlrun.log.replay.recorded import Recorded, recorded, version_remarks
-from dxlrun.plurals import counted
 from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
 from dxlrun.run.channels.events import EventCode, Severity
 

@@ -1,6 +1,6 @@
-"""URDF of the robot file: that it can be read, and that it and the joints speak of the same robot.
+"""URDF of the robot file: that it can be read, and that it has the same joints and limits.
 
-It is only shown and recorded; what a joint may do is said by the robot file.
+It is only shown and recorded; the robot file alone limits a joint.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dxlrun.compile.checks.problems import Problems
-from dxlrun.compile.joint.joints import CompiledJoint
-from dxlrun.compile.joint.reach import Interval
+from dxlrun.compile.joints import CompiledJoint
+from dxlrun.compile.limits import Interval
+from dxlrun.compile.problems import Problems
 from dxlrun.description import Description
 from dxlrun.description.source.syntax import read_text
 from dxlrun.errors import InputError, Mark
@@ -118,11 +118,11 @@ def _check_joint(
                 f"{name} may move {allowed}, beyond its limits in the URDF, {shown}",
                 "make both alike",
             )
-    wanted = joint.described.limits.velocity
-    if speed and wanted is not None and wanted > speed:
+    limit_speed = joint.described.limits.velocity
+    if speed and limit_speed is not None and limit_speed > speed:
         problems.warning(
             marks.value("joints", name, "limits", "velocity"),
-            f"{name} may move at {wanted:g} rad/s, faster than in the URDF, {speed:g} rad/s",
+            f"{name} may move at {limit_speed:g} rad/s, faster than in the URDF, {speed:g} rad/s",
             "make both alike",
         )
 

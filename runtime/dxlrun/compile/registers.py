@@ -1,4 +1,4 @@
-"""Declared registers: what a robot file or a client may want in a servo's memory, and what is not theirs."""
+"""Declared registers: the items that a robot file or a client may write, and those of dxlrun alone."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ import math
 from collections.abc import Iterator, Mapping
 from types import MappingProxyType
 
-from dxlrun.compile.checks.problems import Problems, suggestion
+from dxlrun.compile.problems import Problems
 from dxlrun.description import Description
 from dxlrun.description.robot import Joint
 from dxlrun.description.units import quantity
 from dxlrun.dynamixel.control_table import ControlItem, ControlTable
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, RegisterValue, ServoPlan
 from dxlrun.dynamixel.registers.inspection import called
+from dxlrun.errors import suggestion
 
 _COMMANDED = ("controllers command it", "take it out; a controller sends it")
 _MODE = ("the interfaces of the active controllers choose the mode", "take it out; claim other interfaces")
@@ -50,7 +51,7 @@ _OWN: Mapping[str, tuple[str, str]] = MappingProxyType(
         "electronic_gearratio_denominator": _TICK,
     }
 )
-"""What dxlrun writes itself, or must be able to rely on: why, and how to mend it."""
+"""Items that dxlrun writes itself or relies on: why, and what to do instead."""
 _FIXED: Mapping[str, tuple[int, str]] = MappingProxyType(
     {
         "drive_mode": (0, "dxlrun has `direction` for that, and sends speeds, not times"),
@@ -60,7 +61,7 @@ _FIXED: Mapping[str, tuple[int, str]] = MappingProxyType(
         "status_return_level": (2, "no write would be acknowledged"),
     }
 )
-"""What the start-up demands anyway: a servo may be mended to it, and to nothing else."""
+"""Values that the start-up requires: an item may be declared as its own, and no other."""
 _TORQUE_AT_BOOT = 0x01
 """Startup Configuration, bit 0 (e-Manual XM430-W350, Startup Configuration (60))."""
 _LEVEL = "status_return_level"
@@ -70,12 +71,12 @@ _ANGLE_LIMITS = ("cw_angle_limit", "ccw_angle_limit")
 
 
 class UnfitRegister(ValueError):
-    """A register that may not be written so: `what` is wrong, and how to `mend` it."""
+    """A register that may not be written so: `what` is wrong, and how to `fix` it."""
 
-    def __init__(self, what: str, mend: str) -> None:
-        super().__init__(f"{what}; {mend}")
+    def __init__(self, what: str, fix: str) -> None:
+        super().__init__(f"{what}; {fix}")
         self.what = what
-        self.mend = mend
+        self.fix = fix
 
 
 def register_value(table: ControlTable, name: str, value: int | str) -> RegisterValue:
@@ -89,9 +90,9 @@ def register_value(table: ControlTable, name: str, value: int | str) -> Register
         raise UnfitRegister(f"an {table.model} has no register {name}", suggestion(name, declarable(table)))
     if reason := own_reason(table, item):
         raise UnfitRegister(f"{called(item)} is not to be declared: {reason[0]}", reason[1])
-    wanted = any_value(table, name, value)
-    _check_meaning(item, wanted.value)
-    return wanted
+    found = any_value(table, name, value)
+    _check_meaning(item, found.value)
+    return found
 
 
 def any_value(table: ControlTable, name: str, value: int | str) -> RegisterValue:
@@ -121,16 +122,16 @@ def steered_value(table: ControlTable, name: str, value: int | str) -> RegisterV
         raise UnfitRegister(f"{called(item)} can only be read", "write another item")
     if item is not None and (reason := own_reason(table, item)):
         raise UnfitRegister(f"{called(item)} is not to be changed: {reason[0]}", "write another item")
-    wanted = register_value(table, name, value)
+    found = register_value(table, name, value)
     item = table.items[name]
-    if wanted.eeprom:
+    if found.eeprom:
         raise UnfitRegister(
-            f"{called(item)} stands in the EEPROM, which no servo writes while it holds torque",
+            f"{called(item)} is in the EEPROM, which no servo writes while it holds torque",
             "declare it under `registers` in the robot file, which the next start writes",
         )
     if name in _FIXED:
         raise UnfitRegister(f"{called(item)} is not to be changed: {_FIXED[name][1]}", "leave it as it is")
-    return wanted
+    return found
 
 
 def declarable(table: ControlTable) -> tuple[str, ...]:
@@ -140,7 +141,7 @@ def declarable(table: ControlTable) -> tuple[str, ...]:
 
 
 def own_reason(table: ControlTable, item: ControlItem) -> tuple[str, str] | None:
-    """Return why an item is dxlrun's own and what to do instead; None where it is not."""
+    """Return why an item belongs to dxlrun and what to do instead; None where it does not."""
     if item.name.startswith("indirect_"):
         return "dxlrun may lay the cycle's reads there", "take it out"
     if item.name in _ANGLE_LIMITS and table.protocol == 1.0:
@@ -164,10 +165,10 @@ def compile_registers(
         try:
             found.append(register_value(table, register, value))
         except UnfitRegister as error:
-            problems.error(mark, f"{name}: {error.what}", error.mend)
+            problems.error(mark, f"{name}: {error.what}", error.fix)
         except ValueError as error:  # a quantity that is none
-            what, _, mend = str(error).partition("; ")
-            problems.error(mark, f"{register} of {name}: {what}", mend)
+            what, _, fix = str(error).partition("; ")
+            problems.error(mark, f"{register} of {name}: {what}", fix)
     bus = description.robot.buses.get(joint.bus)
     delay = next((one.value for one in found if one.name == "return_delay_time"), None)
     if delay is not None and bus is not None and abs(delay * 2_000 - bus.return_delay_time) >= 2_000:
@@ -229,10 +230,10 @@ def _shown(value: int | str, raw: int) -> str:
 
 
 def _check_meaning(item: ControlItem, raw: int) -> None:
-    """Refuse values that a servo takes, but with which no robot may run."""
-    wanted, why = _FIXED.get(item.name, (raw, ""))
-    if raw != wanted:
-        raise UnfitRegister(f"{called(item)} cannot be {raw}: {why}", f"write {wanted}, or take it out")
+    """Refuse values that a servo accepts but no robot may run with."""
+    fixed, why = _FIXED.get(item.name, (raw, ""))
+    if raw != fixed:
+        raise UnfitRegister(f"{called(item)} cannot be {raw}: {why}", f"write {fixed}, or take it out")
     if item.name == "startup_configuration" and raw & _TORQUE_AT_BOOT:
         raise UnfitRegister(
             f"{called(item)} = {raw} switches torque on by itself at power-up",

@@ -1,17 +1,29 @@
-"""Formulas: expressions of time in a motion file, evaluated by simpleeval inside narrow bounds."""
+"""Samples: the points of one part of a motion, listed or computed by formulas of time.
+
+Formulas are evaluated by simpleeval within narrow bounds.
+"""
 
 from __future__ import annotations
 
 import ast
 import math
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 from simpleeval import (  # type: ignore[import-untyped]  # no type information is published
     InvalidExpression,
     SimpleEval,
 )
 
+from dxlrun.compile.problems import Problems
+from dxlrun.description import MotionDescription
+from dxlrun.description.motion import Formula, FormulaPart, PointsPart
+from dxlrun.errors import Mark
+
+Quantity = Literal["position", "velocity", "acceleration"]
+QUANTITIES: tuple[Quantity, ...] = ("position", "velocity", "acceleration")
 LONGEST_FORMULA = 1000
 """Characters; bounds parsing and evaluation together with the list of operations."""
 DEEPEST_FORMULA = 100
@@ -56,7 +68,124 @@ _OPERATORS: Mapping[type[ast.AST], Callable[..., float]] = {
 }
 
 
-class Formula:
+@dataclass(frozen=True, slots=True)
+class Target:
+    """Position, rad, velocity, rad/s, and acceleration, rad/s^2, of a joint; None = not given."""
+
+    position: float | None
+    velocity: float | None
+    acceleration: float | None
+    mark: Mark
+
+    def get(self, quantity: Quantity) -> float | None:
+        """Return the value of a quantity."""
+        value: float | None = getattr(self, quantity)
+        return value
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """The targets of one moment."""
+
+    t_ns: int
+    """Since the part's start."""
+    targets: dict[str, Target]
+    mark: Mark
+
+
+def listed_samples(
+    motion: MotionDescription, index: int, part: PointsPart, problems: Problems
+) -> tuple[Sample, ...]:
+    """Return the listed points of a part; their times must increase."""
+    samples: list[Sample] = []
+    for number, point in enumerate(part.points):
+        path = ("motions", index, "points", number)
+        if samples and point.time <= samples[-1].t_ns:
+            problems.error(
+                motion.marks.value(*path, "time"),
+                f"time {point.time / 1e9:g} s is not after that of the point before, "
+                f"{samples[-1].t_ns / 1e9:g} s",
+                "sort the points by time",
+            )
+        targets = {
+            joint: Target(
+                target.position,
+                target.velocity,
+                target.acceleration,
+                motion.marks.key(*path, "joints", joint),
+            )
+            for joint, target in point.joints.items()
+        }
+        samples.append(Sample(point.time, targets, motion.marks.value(*path)))
+    return tuple(samples)
+
+
+def formula_texts(part: FormulaPart) -> tuple[str, ...]:
+    """Return every formula of a part."""
+    texts = (_text(formula, quantity) for formula in part.joints.values() for quantity in QUANTITIES)
+    return tuple(text for text in texts if text is not None)
+
+
+def formula_samples(
+    motion: MotionDescription, index: int, part: FormulaPart, problems: Problems
+) -> tuple[Sample, ...]:
+    """Return the formulas' values at `samples` moments over `duration`, both ends included."""
+    count = part.samples
+    times = [round(part.duration * i / max(1, count - 1)) for i in range(count)]
+    columns: dict[str, dict[Quantity, list[float]]] = {}
+    good = True
+    for joint, formula in part.joints.items():
+        columns[joint] = {}
+        for quantity in QUANTITIES:
+            text = _text(formula, quantity)
+            if text is None:
+                continue
+            mark = motion.marks.value("motions", index, "joints", joint, quantity)
+            values = _values(mark, text, times, problems)
+            good = good and values is not None
+            columns[joint][quantity] = values or []
+    if not good:
+        return ()
+    marks = {joint: motion.marks.value("motions", index, "joints", joint, "position") for joint in columns}
+    part_mark = motion.marks.value("motions", index)
+    return tuple(
+        Sample(t_ns, {joint: _target(columns[joint], row, marks[joint]) for joint in columns}, part_mark)
+        for row, t_ns in enumerate(times)
+    )
+
+
+def _target(column: Mapping[Quantity, Sequence[float]], row: int, mark: Mark) -> Target:
+    values = {quantity: column[quantity][row] for quantity in column}
+    return Target(values.get("position"), values.get("velocity"), values.get("acceleration"), mark)
+
+
+def _text(formula: Formula, quantity: Quantity) -> str | None:
+    text: str | None = getattr(formula, quantity)
+    return text
+
+
+def _values(mark: Mark, text: str, times: Sequence[int], problems: Problems) -> list[float] | None:
+    """Return a formula's values at the times; None when it is wrong."""
+    try:
+        formula = Expression(text)
+    except ValueError as error:
+        problems.error(mark, f"formula {text!r} cannot be read: {error}", "correct the formula")
+        return None
+    values: list[float] = []
+    for t_ns in times:
+        try:
+            values.append(formula.at(t_ns * 1e-9))
+        except ValueError as error:
+            problems.error(
+                mark,
+                f"formula {text!r} has no value at t = {t_ns * 1e-9:.6g} s: {error}",
+                "correct the formula",
+            )
+            return None
+    return values
+
+
+class Expression:
     """An expression of `t`, s; knows pi, sin, cos, tan, sqrt, exp, abs and a few more, and nothing else.
 
     Raises ValueError with one sentence when the text is not such an expression.

@@ -1,6 +1,10 @@
 """Motions: the parts of a motion file become prepared commands for controllers, by time.
 
 A part's `start` is the time since the loop's first deadline at which its controller gets the first command.
+A controller can be played when it takes a command `trajectory` (points: time s, positions, velocities,
+accelerations; start_in s) or one whose fields are `positions`, `velocities` or both: values in rad and rad/s
+in the order of its joints. The standard controllers do; those of any plug-in may.
+
 A controller that takes trajectories gets one; a group controller gets one command for each point, in which a
 joint that the point does not name keeps the target of the point before. A trajectory whose first point lies
 at t = 0 would be a jump, so it begins 1 s after it was handed over, as in the thesis: meanwhile the
@@ -9,37 +13,31 @@ controller leads the joints to the first point.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
 
-from dxlrun.compile.checks.problems import Problems, suggestion
 from dxlrun.compile.controllers import CompiledController
-from dxlrun.compile.joint.joints import CompiledJoint
-from dxlrun.compile.joint.reach import Interval
-from dxlrun.compile.motion.commands import (
-    TRAJECTORY,
-    UnfitError,
-    command_kind,
-    group_command,
-    trajectory_command,
-)
-from dxlrun.compile.motion.samples import (
-    Sample,
-    check_limits,
-    check_speeds,
-    formula_samples,
-    formula_texts,
-    listed_samples,
-)
+from dxlrun.compile.joints import CompiledJoint
+from dxlrun.compile.limits import Interval, check_limits, check_speeds
+from dxlrun.compile.problems import Problems
+from dxlrun.compile.samples import Quantity, Sample, formula_samples, formula_texts, listed_samples
+from dxlrun.control.controllers.controller import Controller
 from dxlrun.control.loop_plan import ScheduledCommand
 from dxlrun.description import MotionDescription
 from dxlrun.description.motion import FormulaPart, PointsPart
 from dxlrun.description.source.problems import sentences_of
-from dxlrun.errors import Mark
+from dxlrun.errors import Mark, suggestion
 
+TRAJECTORY = "trajectory"
+_FIELDS: dict[Quantity, str] = {
+    "position": "positions",
+    "velocity": "velocities",
+    "acceleration": "accelerations",
+}
 LEAD_NS = 1_000_000_000
 """From handing over a trajectory that begins at t = 0 to its first point, as in the thesis."""
 MOST_TARGETS = 200_000
@@ -47,7 +45,17 @@ MOST_TARGETS = 200_000
 MOST_CHARACTERS = 20_000_000
 """Of formulas, as often as they are evaluated: up to 0.5 us each, so 10 s."""
 SETTLE_NS = 1_000_000_000
-"""From the last target to the end of the part, where the controller's `goal_time` says nothing."""
+"""From the last target to the end of the part, where the controller has no `goal_time`."""
+
+
+class UnfitError(ValueError):
+    """A sample does not fit into the controller's command."""
+
+    def __init__(self, mark: Mark, what: str, fix: str) -> None:
+        super().__init__(what)
+        self.mark = mark
+        self.what = what
+        self.fix = fix
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +102,7 @@ def compile_motion(
         try:
             commands = _commands(controller, kind, samples, part.start, lead_ns)
         except UnfitError as error:
-            problems.error(error.mark, error.what, error.mend)
+            problems.error(error.mark, error.what, error.fix)
             continue
         end_ns = part.start + lead_ns + samples[-1].t_ns + _settle_ns(controller)
         parts.append(
@@ -104,7 +112,7 @@ def compile_motion(
 
 
 def _affordable(motion: MotionDescription, problems: Problems) -> bool:
-    """Say whether the formulas of a motion file can be sampled in a few seconds and some 100 MB."""
+    """Return whether the formulas of a motion file can be sampled in a few seconds and some 100 MB."""
     values: dict[int, int] = {}
     characters: dict[int, int] = {}
     for index, part in enumerate(motion.motion.motions):
@@ -144,7 +152,7 @@ def _controller(
     names: tuple[str, ...],
     problems: Problems,
 ) -> CompiledController | None:
-    """Return the active controller of a part; None when there is none, or the robot file got it wrong."""
+    """Return the active controller of a part; None when there is none, or the robot file has it wrong."""
     name = motion.motion.motions[index].controller
     mark = motion.marks.value("motions", index, "controller")
     if name not in names:
@@ -164,7 +172,7 @@ def _controller(
 def _own_joints(
     motion: MotionDescription, index: int, controller: CompiledController, problems: Problems
 ) -> bool:
-    """Say whether every joint that the part names belongs to its controller."""
+    """Return whether every joint that the part names belongs to its controller."""
     part = motion.motion.motions[index]
     paths: list[tuple[str | int, ...]]
     if isinstance(part, PointsPart):
@@ -188,7 +196,7 @@ def _own_joints(
 
 
 def _settle_ns(controller: CompiledController) -> int:
-    """Return how long a part goes on after its last target: to when the goal must be reached, if said."""
+    """Return how long a part lasts after its last target: until the goal must be reached, if given."""
     tolerances = getattr(controller.parameters, "tolerances", controller.parameters)
     goal_time = getattr(tolerances, "goal_time", None)
     return goal_time if isinstance(goal_time, int) and goal_time > 0 else SETTLE_NS
@@ -214,7 +222,7 @@ def _commands(
 def _prepared(
     controller: CompiledController, kind: str, payload: dict[str, object], at_ns: int, mark: Mark
 ) -> ScheduledCommand:
-    """Let the controller's own model and `prepare` judge a command; they are anybody's code."""
+    """Validate and prepare a command by the controller's own code, which may raise anything."""
     cls = controller.offer.controller
     try:
         data = cls.prepare(kind, cls.Commands[kind].model_validate(payload), controller.parameters)
@@ -228,3 +236,66 @@ def _prepared(
             at_ns=at_ns, controller=controller.plan.name, kind=kind, data=flat, origin=str(mark)
         )
     raise UnfitError(mark, f"{controller.plan.name} refuses this: {reason}", "change the motion")
+
+
+def command_kind(controller: type[Controller[Any]]) -> str | None:
+    """Return the name of the command by which motions are played; None when the controller takes none."""
+    if TRAJECTORY in controller.Commands:
+        return TRAJECTORY
+    for kind, model in controller.Commands.items():
+        if model.model_fields and set(model.model_fields) <= {"positions", "velocities"}:
+            return kind
+    return None
+
+
+def group_command(
+    controller: type[Controller[Any]], kind: str, joints: Sequence[str], sample: Sample
+) -> dict[str, object]:
+    """Return one command with a value for each joint; raises UnfitError."""
+    fields = controller.Commands[kind].model_fields
+    quantities = [quantity for quantity, name in _FIELDS.items() if name in fields]
+    for joint, target in sample.targets.items():
+        for quantity in _FIELDS:
+            if quantity not in quantities and target.get(quantity) is not None:
+                raise UnfitError(
+                    target.mark,
+                    f"{joint} has a target {quantity}, which this controller does not take",
+                    f"take the {quantity} out, or choose another controller",
+                )
+    return {
+        _FIELDS[quantity]: [_value(sample, joint, quantity) for joint in joints] for quantity in quantities
+    }
+
+
+def trajectory_command(joints: Sequence[str], samples: Sequence[Sample], lead_ns: int) -> dict[str, object]:
+    """Return a trajectory through all samples, starting `lead_ns` after it was taken; raises UnfitError."""
+    quantities: list[Quantity] = ["position"]
+    derivatives: tuple[Quantity, ...] = ("velocity", "acceleration")
+    for quantity in derivatives:
+        if any(target.get(quantity) is not None for sample in samples for target in sample.targets.values()):
+            quantities.append(quantity)
+    points: list[dict[str, object]] = [
+        {
+            "time": sample.t_ns * 1e-9,
+            **{
+                _FIELDS[quantity]: [_value(sample, joint, quantity) for joint in joints]
+                for quantity in quantities
+            },
+        }
+        for sample in samples
+    ]
+    return {"points": points, "start_in": lead_ns * 1e-9}
+
+
+def _value(sample: Sample, joint: str, quantity: Quantity) -> float:
+    """Return one value; raises UnfitError where the point does not give it."""
+    target = sample.targets.get(joint)
+    value = None if target is None else target.get(quantity)
+    if value is None:
+        raise UnfitError(
+            sample.mark if target is None else target.mark,
+            f"{joint} has no target {quantity} at {sample.t_ns * 1e-9:g} s",
+            f"give it one; every joint of the controller needs its {quantity}, here or, "
+            "for a group controller, in a point before",
+        )
+    return value

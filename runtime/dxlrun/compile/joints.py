@@ -1,13 +1,14 @@
-"""Joints of the robot file against buses, models and reach."""
+"""Joints of the robot file against buses, models, limits and reach."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from dxlrun.compile.checks.problems import Problems, suggestion
-from dxlrun.compile.joint.reach import Interval, degrees, joint_reach, many_turns, servo_travel
-from dxlrun.compile.joint.registers import compile_registers
+from dxlrun.compile.limits import Interval, degrees
+from dxlrun.compile.problems import Problems
+from dxlrun.compile.registers import compile_registers
 from dxlrun.control.loop_plan import JointPlan
 from dxlrun.description import Description
 from dxlrun.description.robot import Joint
@@ -15,20 +16,27 @@ from dxlrun.description.units import EffortUnit
 from dxlrun.dynamixel.control_table import ControlTable, control_table, perhaps_meant, protocols_of
 from dxlrun.dynamixel.plan.bus_plan import RegisterValue
 from dxlrun.dynamixel.plan.mode_plan import mode_plans
+from dxlrun.errors import suggestion
 
 _UNITS: Mapping[EffortUnit, str] = {"Nm": "Nm", "A": "A", "1": "% of its highest load"}
 _EXAMPLES: Mapping[EffortUnit, str] = {"Nm": "0.3 Nm", "A": "800 mA", "1": "40 %"}
 AUTO = "auto"
-"""Instead of a model: the servo is asked."""
+"""In place of a model: it is read from the servo."""
 _HIGHEST_ID_OF_PROTOCOL_2 = 252
-"""0xFD stands in the header of each packet (e-Manual, Protocol 2.0, Packet ID)."""
+"""0xFD is in the header of each packet (e-Manual, Protocol 2.0, Packet ID)."""
 _USUAL = {1.0: "AX-12A", 2.0: "XM430-W350"}
-"""What stands in for a model that is not known, by protocol."""
+"""The model that is assumed where none is known, by protocol."""
+MANY_TURNS = {1.0: 7, 2.0: 256}
+"""Turns that a goal position can be away from raw 0, by protocol: Multi-turn Mode of MX (e-Manual MX-64, Goal
+Position (30): -28,672..28,672), Extended Position Control Mode (e-Manual XM430-W350, Goal Position (116):
+-1,048,575..1,048,575)."""
+_SAME = math.radians(1.0)
+"""References nearer than this are taken as equal: a horn has teeth, a trim has not."""
 
 
 @dataclass(frozen=True, slots=True)
 class CompiledJoint:
-    """A joint that stands on a known bus and a known model."""
+    """A joint whose bus and model are known."""
 
     plan: JointPlan
     described: Joint
@@ -36,7 +44,7 @@ class CompiledJoint:
     reach: Interval
     """rad, in the joint's coordinate"""
     registers: tuple[RegisterValue, ...] = ()
-    """What is declared of its servo's memory, in the order in which it is written."""
+    """Its declared registers, in the order in which they are written."""
 
 
 def compile_joints(
@@ -44,7 +52,7 @@ def compile_joints(
 ) -> dict[str, CompiledJoint]:
     """Return the joints that could be compiled, by name, in the order of the file.
 
-    `models`: what the servos of joints with `model: auto` said that they are.
+    `models`: those that were read from the servos of joints with `model: auto`, by joint.
     """
     _unique_ids(description, problems)
     compiled: dict[str, CompiledJoint] = {}
@@ -60,12 +68,12 @@ def compile_joints(
         if not joint.continuous:
             _check_reference(description, name, joint, table, problems)
         allowed = _allowed(description, name, reach, table.model, problems)
-        # of a servo that is still to be asked for its model nobody knows which registers it has: what fits
-        # the assumed one is taken, for a simulated servo is that one; without its bus' protocol neither
+        # the registers of a servo whose model is still to be read are unknown: those that fit the assumed
+        # model are kept, as a simulated servo has exactly these; what does not fit is no error yet
         certain = (joint.model != AUTO or name in models) and (known_bus or _one_table(model))
-        told = problems if certain else Problems()
-        effort = _effort(description, name, joint, table, told)
-        registers = compile_registers(description, name, joint, table, told)
+        found = problems if certain else Problems()
+        effort = _effort(description, name, joint, table, found)
+        registers = compile_registers(description, name, joint, table, found)
         if known_bus and allowed is not None:
             plan = JointPlan(
                 name,
@@ -100,20 +108,20 @@ def _known_bus(description: Description, name: str, joint: Joint, problems: Prob
         if buses[joint.bus].protocol == 2.0 and joint.id > _HIGHEST_ID_OF_PROTOCOL_2:
             problems.error(
                 description.marks.value("joints", name, "id"),
-                f"servo ID {joint.id} of {name} is none of Protocol 2.0",
+                f"servo ID {joint.id} of {name} is not valid in Protocol 2.0",
                 f"give it one from 0 to {_HIGHEST_ID_OF_PROTOCOL_2}",
             )
         return True
     problems.error(
         description.marks.value("joints", name, "bus"),
-        f"{name} stands on bus {joint.bus}, which the file does not have",
+        f"{name} is on bus {joint.bus}, which is not defined",
         suggestion(joint.bus, tuple(buses)),
     )
     return False
 
 
 def _assumed_model(description: Description, name: str, joint: Joint, problems: Problems) -> str:
-    """Return what a servo that cannot be asked now may be: like its neighbours, else the usual one."""
+    """Return the model to assume until it is read: that of the neighbours, else the usual one."""
     robot = description.robot
     neighbours = [each.model for each in robot.joints.values() if each.bus == joint.bus]
     known = [model for model in neighbours if model != AUTO]
@@ -121,7 +129,7 @@ def _assumed_model(description: Description, name: str, joint: Joint, problems: 
     model = known[0] if known else _USUAL[1.0 if bus is None else bus.protocol]
     problems.warning(
         description.marks.value("joints", name, "model"),
-        f"the servo of {name} is asked for its model at the start; until then it is taken for an {model}",
+        f"the servo of {name} reports its model at the start; until then it is taken for an {model}",
         "write its model to have reach and time checked for certain",
     )
     return model
@@ -132,25 +140,25 @@ def _table(
 ) -> ControlTable | None:
     mark = description.marks.value("joints", name, "model")
     bus = description.robot.buses.get(joint.bus)
-    wanted = None if bus is None else bus.protocol
+    protocol = None if bus is None else bus.protocol
     try:
-        return control_table(model, wanted)
+        return control_table(model, protocol)
     except LookupError:
-        spoken = protocols_of(model)
-    if not spoken:
-        problems.error(mark, f"no control table for model {model} of {name}", perhaps_meant(model, wanted))
+        protocols = protocols_of(model)
+    if not protocols:
+        problems.error(mark, f"no control table for model {model} of {name}", perhaps_meant(model, protocol))
         return None
     if bus is not None:
         problems.error(
             mark,
-            f"{model} of {name} speaks Protocol {spoken[0]}, bus {joint.bus} Protocol {bus.protocol}",
+            f"{model} of {name} speaks Protocol {protocols[0]}, bus {joint.bus} Protocol {bus.protocol}",
             "put it on a bus of its own protocol; a bus cannot be mixed",
         )
-    return control_table(model, spoken[0])
+    return control_table(model, protocols[0])
 
 
 def _one_table(model: str) -> bool:
-    """Say whether a model speaks one protocol alone; MX servos carry one name with two firmwares."""
+    """Return whether a model has one protocol alone; MX servos have one name for two firmwares."""
     return len(protocols_of(model)) == 1
 
 
@@ -204,18 +212,71 @@ def _allowed(
     if limits is None:
         return reach
     mark = description.marks.value("joints", name, "limits", "position")
-    wanted = Interval(*limits)
-    allowed = wanted.meet(reach)
+    written = Interval(*limits)
+    allowed = written.meet(reach)
     if allowed is None:
         problems.error(
             mark,
-            f"limits {wanted} of {name} have nothing in common with the reach of its {model}, {reach}",
+            f"limits {written} of {name} have nothing in common with the reach of its {model}, {reach}",
             "check limits, reference and direction",
         )
-    elif not reach.contains(wanted):
+    elif not reach.contains(written):
         problems.warning(
             mark,
-            f"limits {wanted} of {name} go beyond the reach of its {model}, {reach}",
+            f"limits {written} of {name} go beyond the reach of its {model}, {reach}",
             f"the joint will keep {allowed}; write that, or check reference and direction",
         )
     return allowed
+
+
+def many_turns(protocol: float, reference: float, direction: int) -> Interval:
+    """Return the reach of a continuous joint, rad: how far its goal positions go."""
+    turns = 2 * math.pi * MANY_TURNS[protocol]
+    middle = -direction * reference
+    return Interval(middle - turns, middle + turns)
+
+
+def servo_travel(table: ControlTable) -> Interval:
+    """Return the angles that a servo's goal positions reach, rad from raw 0.
+
+    From 0 on in Protocol 1.0 and on X and MX, to both sides of 0 on P, PRO and Y (e-Manual, Goal Position).
+    """
+    return Interval(table.min_tick * table.rad_per_tick, table.max_tick * table.rad_per_tick)
+
+
+def joint_reach(travel: Interval, reference: float, direction: int) -> Interval:
+    """Return the reach of a joint, rad, of a servo that turns within `travel`, rad from raw 0.
+
+    q = direction * (theta - reference), theta in `travel` (thesis of M. Amarante Araujo, 2017, JointID).
+    """
+    ends = (direction * (travel.lower - reference), direction * (travel.upper - reference))
+    return Interval(min(ends), max(ends))
+
+
+def check_twins(description: Description, tables: dict[str, ControlTable], problems: Problems) -> None:
+    """Warn of each pair of joints that are not mirror images of each other.
+
+    Mirrored, the right servo counts from the other end and turns the other way:
+    reference_right = lowest + highest angle of the servo - reference_left, direction_right = -direction_left.
+    """
+    joints = description.robot.joints
+    for name, left in joints.items():
+        twin = name.replace("left", "right", 1)
+        right = joints.get(twin)
+        if twin == name or right is None or left.model != right.model or name not in tables:
+            continue
+        travel = servo_travel(tables[name])
+        expected = travel.lower + travel.upper - left.reference
+        if abs(expected - right.reference) > _SAME:
+            problems.warning(
+                description.marks.value("joints", twin, "reference"),
+                f"{twin} is not a mirror image of {name}: its reference is {degrees(right.reference)} deg, "
+                f"mirrored it would be {degrees(expected)} deg",
+                "correct one of the two references, or ignore this if the body is not symmetric there",
+            )
+        if right.direction == left.direction:
+            problems.warning(
+                description.marks.value("joints", twin, "direction"),
+                f"{twin} is not a mirror image of {name}: both have direction {left.direction:+d}",
+                f"write direction: {-left.direction:+d}, or ignore this if the body is not symmetric there",
+            )

@@ -1,1 +1,0 @@
-"""How checks collect problems and name their places."""

@@ -1,1 +1,0 @@
-"""Joints of a robot file against models, limits, registers and URDF."""

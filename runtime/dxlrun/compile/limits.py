@@ -1,0 +1,182 @@
+"""Limits of joints: intervals of angles, and what motions and commands ask of a joint beyond them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+from dxlrun.compile.problems import Problems
+from dxlrun.compile.samples import Sample
+from dxlrun.control.controllers.controller import CommandModel
+from dxlrun.control.loop_plan import JointPlan
+from dxlrun.errors import Mark
+
+_TOLERANCE = 1e-6
+"""rad; far below a tick (5e-3 rad on an AX-12), far above the rounding of degrees."""
+
+
+_ROUNDING = 1e-9
+"""Part of a speed that differences of positions and times may be off."""
+
+
+@dataclass(frozen=True, slots=True)
+class Interval:
+    """Closed interval of joint angles, rad."""
+
+    lower: float
+    upper: float
+
+    def contains(self, other: Interval) -> bool:
+        """Return whether `other` lies inside, but for rounding."""
+        return other.lower >= self.lower - _TOLERANCE and other.upper <= self.upper + _TOLERANCE
+
+    def meet(self, other: Interval) -> Interval | None:
+        """Return what both have in common; None when that is not more than a point."""
+        lower, upper = max(self.lower, other.lower), min(self.upper, other.upper)
+        return Interval(lower, upper) if lower < upper else None
+
+    def __str__(self) -> str:
+        return f"{degrees(self.lower, signed=True)}..{degrees(self.upper, signed=True)} deg"
+
+
+def degrees(angle: float, *, signed: bool = False) -> str:
+    """Write an angle of `angle` rad in degrees, with as many digits as it needs, at most two."""
+    value = round(math.degrees(angle), 2) + 0.0  # + 0.0: no minus sign before zero
+    text = f"{value:.2f}".rstrip("0").rstrip(".")
+    return f"+{text}" if signed and value > 0 else text
+
+
+def check_limits(
+    samples: Sequence[Sample], start_ns: int, limits: dict[str, Interval], problems: Problems
+) -> None:
+    """Warn once for each joint whose targets leave its limits, with the worst of them."""
+    worst: dict[str, tuple[float, Sample, float]] = {}
+    for sample in samples:
+        for joint, target in sample.targets.items():
+            allowed = limits.get(joint)
+            if allowed is None or target.position is None:
+                continue
+            excess = max(allowed.lower - target.position, target.position - allowed.upper)
+            if excess > worst.get(joint, (1e-6, sample, 0.0))[0]:
+                worst[joint] = (excess, sample, target.position)
+    for joint, (_, sample, position) in worst.items():
+        problems.warning(
+            sample.targets[joint].mark,
+            f"{joint} is sent to {degrees(position)} deg at {(start_ns + sample.t_ns) * 1e-9:.3f} s, "
+            f"outside its limits {limits[joint]}",
+            "the gate will hold it at the limit; change the motion or the limits",
+        )
+
+
+def check_speeds(
+    samples: Sequence[Sample],
+    start_ns: int,
+    joints: Mapping[str, JointPlan],
+    problems: Problems,
+    *,
+    interpolated: bool,
+) -> None:
+    """Refuse once for each joint a speed above the top speed of its servo; warn above the file's limit.
+
+    The speeds are the targets', and with `interpolated`, where a controller moves from sample to sample, the
+    mean speed between two samples, which every path through both reaches.
+    """
+    fastest: dict[str, tuple[float, int, Mark]] = {}
+
+    def note(joint: str, speed: float, t_ns: int, mark: Mark) -> None:
+        if abs(speed) > fastest.get(joint, (0.0, 0, mark))[0]:
+            fastest[joint] = abs(speed), t_ns, mark
+
+    before: dict[str, tuple[int, float]] = {}
+    for sample in samples:
+        for joint, target in sample.targets.items():
+            if target.velocity is not None:
+                note(joint, target.velocity, sample.t_ns, target.mark)
+            if target.position is None:
+                continue
+            t_ns, position = before.get(joint, (sample.t_ns, 0.0))
+            if interpolated and sample.t_ns > t_ns:
+                speed = (target.position - position) / ((sample.t_ns - t_ns) * 1e-9)
+                note(joint, speed, sample.t_ns, target.mark)
+            before[joint] = sample.t_ns, target.position
+    for joint, (speed, t_ns, mark) in fastest.items():
+        plan = joints.get(joint)
+        if plan is None or speed <= plan.highest_speed * (1 + 1e-9):
+            continue
+        asked = f"{joint} is asked for {speed:.4g} rad/s at {(start_ns + t_ns) * 1e-9:.3f} s"
+        if plan.top_speed is not None and speed > plan.top_speed * (1 + 1e-9):
+            problems.error(
+                mark,
+                f"{asked}, more than {plan.top_speed:.4g} rad/s, the top speed of its servo",
+                "give it more time, or a shorter way",
+            )
+        else:
+            problems.warning(
+                mark,
+                f"{asked}, more than {plan.highest_speed:.4g} rad/s, its velocity limit",
+                "the gate will hold it at the limit, so it comes late; give it more time, or raise the limit",
+            )
+
+
+def beyond_limits(joints: Sequence[JointPlan], command: CommandModel) -> list[str]:
+    """Return a sentence for each value of a command that its joint cannot follow.
+
+    `joints`: those of the controller, in its order. Positions (rad) are compared with the position limits,
+    velocities (rad/s) and efforts with the lower one of the file's limit and the servo's own; between two
+    points of a trajectory the mean speed, which every path through both reaches. A field that has not one
+    number a joint is for the controller's `prepare` to judge.
+    """
+    values = command.model_dump()
+    points = values.get("points")
+    if isinstance(points, Sequence) and all(isinstance(point, Mapping) for point in points):
+        return list(_beyond_in_points(joints, points))
+    return list(_beyond(joints, values, ""))
+
+
+def _beyond(joints: Sequence[JointPlan], values: Mapping[str, object], where: str) -> Iterator[str]:
+    for joint, position in zip(joints, _row(joints, values, "positions"), strict=False):
+        if not joint.lower - _TOLERANCE <= position <= joint.upper + _TOLERANCE:
+            limits = Interval(joint.lower, joint.upper)
+            angle = f"{math.degrees(position):.6g}"
+            yield f"{joint.name} is sent to {angle} deg{where}, outside its limits {limits}"
+    for joint, speed in zip(joints, _row(joints, values, "velocities"), strict=False):
+        yield from _too_fast(joint, speed, where)
+    for joint, effort in zip(joints, _row(joints, values, "efforts"), strict=False):
+        if abs(effort) > joint.highest_effort:
+            most, own = joint.highest_effort, joint.highest_effort != joint.effort
+            limit = "the highest goal of its servo" if own else "its effort limit"
+            yield f"{joint.name} is asked for {effort:.6g}{where}, more than {most:.6g}, {limit}"
+
+
+def _beyond_in_points(joints: Sequence[JointPlan], points: Sequence[Mapping[str, object]]) -> Iterator[str]:
+    before: tuple[float, Sequence[float]] | None = None
+    for number, point in enumerate(points, 1):
+        yield from _beyond(joints, point, f" in point {number}")
+        time, positions = point.get("time"), _row(joints, point, "positions")
+        if not isinstance(time, int | float) or not positions:
+            before = None
+            continue
+        if before is not None and time > before[0]:
+            where = f" from point {number - 1} to {number}"
+            for joint, start, end in zip(joints, before[1], positions, strict=True):
+                yield from _too_fast(joint, (end - start) / (time - before[0]), where)
+        before = time, positions
+
+
+def _too_fast(joint: JointPlan, speed: float, where: str) -> Iterator[str]:
+    if abs(speed) > joint.highest_speed * (1 + _ROUNDING):
+        own = joint.highest_speed != joint.velocity
+        limit = "the top speed of its servo" if own else "its velocity limit"
+        yield (
+            f"{joint.name} is asked for {speed:.6g} rad/s{where}, more than {joint.highest_speed:.6g} rad/s, "
+            f"{limit}"
+        )
+
+
+def _row(joints: Sequence[JointPlan], values: Mapping[str, object], name: str) -> Sequence[float]:
+    """Return a field with one number a joint, else nothing."""
+    row = values.get(name)
+    if not isinstance(row, list | tuple) or len(row) != len(joints):
+        return ()
+    return row if all(isinstance(value, int | float) for value in row) else ()

@@ -1,1 +1,0 @@
-"""Motion files: points and formulas to commands."""

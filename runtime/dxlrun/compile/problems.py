@@ -1,0 +1,108 @@
+"""Problems of a robot file: collected by all checks, each at its place in the file.
+
+Parts of a wrong form were reported when the file was read and are left out of its description, or guessed
+where a robot needs them, so that mistakes of form and of meaning are listed together. Problems that only
+follow from what was left out are dropped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+from dxlrun.description import Description, KeyPath
+from dxlrun.errors import InputError, Mark, Problem
+
+
+class Problems:
+    """All problems of one compilation: a check adds to it and continues."""
+
+    __slots__ = ("_found",)
+
+    def __init__(self) -> None:
+        self._found: list[Problem] = []
+
+    def error(self, mark: Mark, what: str, fix: str) -> None:
+        """Add a problem that prevents the run."""
+        self._found.append(Problem(mark, what, fix))
+
+    def warning(self, mark: Mark, what: str, fix: str) -> None:
+        """Add a problem that a person should look at; the robot can run."""
+        self._found.append(Problem(mark, what, fix, severity="warning"))
+
+    def extend(self, problems: Iterable[Problem]) -> None:
+        """Add the problems of another check."""
+        self._found.extend(problems)
+
+    @property
+    def errors(self) -> tuple[Problem, ...]:
+        """The errors in file order."""
+        return tuple(sorted((p for p in self._found if p.severity == "error"), key=lambda p: p.mark))
+
+    @property
+    def warnings(self) -> tuple[Problem, ...]:
+        """The warnings in file order."""
+        return tuple(sorted((p for p in self._found if p.severity == "warning"), key=lambda p: p.mark))
+
+    def refuse(self) -> None:
+        """Raise InputError with the errors, and after them the warnings, if there is any error."""
+        if self.errors:
+            raise InputError(self.errors + self.warnings)
+
+
+def joint_mark(description: Description, controller: str, joint: str) -> Mark:
+    """Return where a controller of the file names a joint last; the controller's own place if nowhere."""
+    start = ("controllers", controller)
+    parameters = description.robot.controllers[controller].parameters
+    named = [path for path, text in _texts(parameters, start) if text == joint]
+    return description.marks.value(*named[-1]) if named else description.marks.key(*start)
+
+
+def _texts(value: object, path: KeyPath) -> Iterator[tuple[KeyPath, str]]:
+    """Yield every text of a tree with its path."""
+    if isinstance(value, str):
+        yield path, value
+    elif isinstance(value, dict):
+        for key, item in value.items():
+            yield from _texts(item, (*path, str(key)))
+    elif isinstance(value, list):
+        for index, item in enumerate(value):
+            yield from _texts(item, (*path, index))
+
+
+def left_out_names(description: Description, section: str) -> tuple[str, ...]:
+    """Return the names of the entries of a section (buses, joints, controllers) that were left out."""
+    return tuple(str(path[1]) for path in description.left_out if len(path) == 2 and path[0] == section)
+
+
+def independent_errors(description: Description, problems: Iterable[Problem]) -> tuple[Problem, ...]:
+    """Return the errors that do not follow from what was left out of a description."""
+    following = set(_following(description))
+    return tuple(p for p in problems if p.severity == "error" and p.mark not in following)
+
+
+def _following(description: Description) -> Iterator[Mark]:
+    """Yield the places whose problems may follow from what was left out."""
+    robot, marks = description.robot, description.marks
+    buses, joints = left_out_names(description, "buses"), left_out_names(description, "joints")
+    for name, joint in robot.joints.items():
+        if joint.bus in buses or ("buses",) in description.left_out:
+            yield marks.value("joints", name, "bus")
+    for name, pose in robot.poses.items():
+        yield from (marks.key("poses", name, joint) for joint in pose if joint in joints)
+    poses = ("poses",) in description.left_out or left_out_names(description, "poses")
+    if poses or joints:  # steps that use them may be too few, or too short
+        for name, policy in robot.policies:
+            yield marks.value("policies", name)
+            for index in range(len(policy) if isinstance(policy, tuple) else 0):
+                yield marks.value("policies", name, index)
+                if poses:
+                    yield marks.value("policies", name, index, "pose")
+    yield from (
+        marks.value("controllers", name, "fallback")
+        for name, controller in robot.controllers.items()
+        if controller.fallback in left_out_names(description, "controllers")
+    )
+    for name, controller in robot.controllers.items():
+        for path, text in _texts(controller.parameters, ("controllers", name)):
+            if text in joints:
+                yield marks.value(*path)
