@@ -42,7 +42,8 @@ SOURCES = [
     if path.suffix in {".py", ".c", ".toml", ".md"} and "site-packages" not in path.parts
 ]
 TESTS = {
-    "README.md": ("tests/test_readme.py", "tests/cli/test_steer.py"),
+    "README.md": ("tests/test_readme.py",),
+    "analyze.md": ("tests/cli/test_docs.py",),
     "architecture.md": ("tests/cli/test_docs.py",),
     "bench.md": ("tests/bench/test_bench_page.py", "tests/cli/test_docs.py"),
     "bus.md": ("tests/cli/test_docs.py",),
@@ -179,7 +180,7 @@ def test_simulations_inside_sentences_are_understood(
     assert lines or page != "tools.md"
 
 
-@pytest.mark.parametrize("page", ["real-time.md", "bench.md", "simulation.md"])
+@pytest.mark.parametrize("page", ["real-time.md", "bench.md", "simulation.md", "analyze.md"])
 def test_a_log_is_compared_with_its_ledger_as_the_page_says(dxlrun: Dxlrun, clone: Path, page: str) -> None:
     analyze = next(line for line in commands(page) if " analyze " in line and "--ledger" in line)
     runs = [line for line in commands(page) if line.startswith("dxlrun robots/")]

@@ -310,18 +310,6 @@ def test_stop_waits_for_the_end_unless_told(
 # The pages
 
 
-def test_what_the_readme_steers_works_on_its_torso(dxlrun, torso: RemoteRobot) -> None:
-    readme = (ROOT / "README.md").read_text()
-    (script,) = (code for code in re.findall(r"```python\n(.*?)```", readme, re.DOTALL) if "connect(" in code)
-    exec(script, {})  # noqa: S102  ours
-    until(torso, "head_pitch_joint", 0.3)
-    lines = [line.split("dxlrun ")[1] for line in readme.splitlines() if line.startswith("    dxlrun ")]
-    lines = [line for line in lines if line.split()[0] in COMMANDS_WHILE_IT_RUNS]
-    assert len(lines) == 2
-    for line in lines:
-        assert dxlrun(*shlex.split(line)).code == 0, line
-
-
 def test_the_script_of_the_page_steers_a_torso(torso: RemoteRobot, tmp_path: Path) -> None:
     (script,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
     assert len(script.splitlines()) <= 30
