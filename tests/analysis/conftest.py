@@ -16,7 +16,7 @@ from dxlrun.log.log_writer import LogWriter
 from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
 from dxlrun.run.channels.events import EventCode, EventRing, Severity
 from dxlrun.run.channels.packets import PacketBatch, PacketKind
-from dxlrun.run.channels.ring import Handover
+from dxlrun.run.channels.ring import Handover, RecordKind
 
 PERIOD_NS = 20_000_000
 JOINTS = ("left_elbow_joint", "head_yaw_joint")
@@ -101,13 +101,13 @@ def make_log(
     record = CycleRecord(CycleLayout(JOINTS, ["head", "idle"]))
     for cycle in cycles:
         fill(record, cycle)
-        log.cycle(record.raw)
-    batch = PacketBatch(Handover(log.packets))
+        log.take(RecordKind.CYCLE, record.raw)
+    batch = PacketBatch(Handover(log.take))
     for wire in wires:
         last = wire.at if wire.last is None else wire.last
         batch.packet(0, wire.kind, wire.servo_id, wire.at * 1000, last * 1000, wire.data)
     batch.commit()
-    ring = EventRing(Handover(log.event), VirtualClock(9))
+    ring = EventRing(Handover(log.take), VirtualClock(9))
     for said in events:
         ring.emit(said.code, said.severity, said.source, said.text)
     if gaps:

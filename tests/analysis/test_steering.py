@@ -18,7 +18,7 @@ from dxlrun.analysis.output.tables import steering_table
 from dxlrun.analysis.output.terminal import render
 from dxlrun.analysis.report import Report, analyze
 from dxlrun.log.reader import Log, read_log
-from dxlrun.run.channels.inbox import Command, QueueInbox
+from dxlrun.run.channels.commands import Command, QueueInbox
 from dxlrun.testing import VirtualRobot, simulated_robot
 
 MS = 1_000_000

@@ -21,6 +21,7 @@ from dxlrun.log.header import LogHeader
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import Log, read_log
 from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
+from dxlrun.run.channels.ring import RecordKind
 
 DT = 0.02
 TICK = math.radians(300) / 1023
@@ -55,7 +56,7 @@ def make(tmp_path: Path) -> Make:
             record.states.position[0], record.goals.position[0] = position, goal
             record.goals.velocity[0] = speed
             record.valid[0] = not math.isnan(position)
-            log.cycle(record.raw)
+            log.take(RecordKind.CYCLE, record.raw)
         log.close()
         return read_log(path)
 

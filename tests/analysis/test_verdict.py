@@ -19,8 +19,8 @@ from dxlrun.analysis.tally import Figures, RealTime, Tally, figures_of
 from dxlrun.analysis.verdict import Verdict, judge
 from dxlrun.log import log_writer
 from dxlrun.log.reader import Log, read_log, scan_log
+from dxlrun.run.channels.commands import Command
 from dxlrun.run.channels.events import EventCode, Severity
-from dxlrun.run.channels.inbox import Command
 from dxlrun.run.channels.packets import PacketKind
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.faults.script import FaultScript

@@ -136,11 +136,12 @@ class Events:
 class Side:
     """A robot with the kernel, or without."""
 
-    def __init__(self, plans, library, slot_size=1 << 20):
+    def __init__(self, plans, library, batch=1 << 20):
         self.lines = Lines(plans)
         self.log, self.events = [], Events()
         self.packets = PacketBatch(
-            Handover(lambda payload: self.log.extend(decode_packets(payload)), slot_size)
+            Handover(lambda _, payload: self.log.extend(decode_packets(payload))),
+            memoryview(bytearray(batch + 16)),
         )
         count = sum(len(plan.servos) for plan in plans)
         self.states, self.goals = States.empty(count), Commands.empty(count)

@@ -23,8 +23,8 @@ from dxlrun.compile import compile_files
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.remote.preparation import Preparation
+from dxlrun.run.channels.commands import Command
 from dxlrun.run.channels.events import EventCode
-from dxlrun.run.channels.inbox import Command
 from dxlrun.run.run_summary import RunOptions, RunSummary
 from dxlrun.run.simulation_front import Look, Served
 from dxlrun.simulation import BusConfig, ServoConfig, SimulationConfig

@@ -25,9 +25,9 @@ from dxlrun.control.loop_plan import (
     SchedulerPlan,
 )
 from dxlrun.mode import Mode
+from dxlrun.run.channels.commands import LOOP, Command, QueueInbox
 from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
 from dxlrun.run.channels.events import EventCode, Severity
-from dxlrun.run.channels.inbox import LOOP, Command, QueueInbox
 
 PERIOD_NS = 20_000_000
 

@@ -10,8 +10,8 @@ from dxlrun.control.loop import PAUSED_CYCLE_NS
 from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.control.policy_plan import LIMP, PolicyPlan
 from dxlrun.errors import PlugInError
+from dxlrun.run.channels.commands import LOOP
 from dxlrun.run.channels.events import EventCode
-from dxlrun.run.channels.inbox import LOOP
 
 PERIOD_NS = 20_000_000
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dxlrun.run.channels.cycle import SCALARS, SEQUENCES, CycleLayout, CycleRecord, cycle_slots
+from dxlrun.run.channels.cycle import SCALARS, SEQUENCES, CycleLayout, CycleRecord, cycle_capacity
+from dxlrun.run.channels.ring import record_size
 
 SHAPES = [(0, 0), (1, 0), (3, 1), (8, 2), (18, 5)]
 
@@ -92,4 +93,4 @@ def test_the_mask_of_controllers_has_an_end() -> None:
 
 @pytest.mark.parametrize("rate", [50, 320, 1000])
 def test_the_ring_holds_ten_seconds(rate: int) -> None:
-    assert cycle_slots(1_000_000_000 // rate) >= 10 * rate
+    assert cycle_capacity(1_000_000_000 // rate, 1000) >= 10 * rate * record_size(1000)

@@ -35,7 +35,7 @@ class Packets(PacketBatch):
 
     def __init__(self):
         self._decoded: list[LoggedPacket] = []
-        super().__init__(Handover(lambda payload: self._decoded.extend(decode_packets(payload))))
+        super().__init__(Handover(lambda _, payload: self._decoded.extend(decode_packets(payload))))
 
     @property
     def list(self) -> list[LoggedPacket]:

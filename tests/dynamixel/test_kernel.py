@@ -19,7 +19,7 @@ from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.port.ports import SerialPort, SerialPorts
 from dxlrun.dynamixel.wire import protocol2
 from dxlrun.interfaces import Commands, States
-from dxlrun.run.channels.packets import PACKET_SLOT, PacketKind
+from dxlrun.run.channels.packets import PacketKind
 from dxlrun.testing import simulated_robot
 
 ROBOTS = Path(__file__).parents[2] / "robots"
@@ -161,7 +161,7 @@ def test_a_robot_that_the_kernel_has_no_room_for_is_left_to_the_parser(
         )
         for index in range(buses)
     ]
-    side = fuzz.Side(plans, kernel.load(), PACKET_SLOT)
+    side = fuzz.Side(plans, kernel.load(), 2048)
     assert (side.hardware._kernel is not None) == compiled
     side.goals.values[:] = 0.0
     side.hardware.write()

@@ -7,17 +7,16 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from dxlrun.run.channels.packets import (
-    PACKET_SLOT,
+    LONGEST_BATCH,
     LoggedPacket,
     NoPackets,
     PacketBatch,
     PacketKind,
     decode_packets,
-    desk_size,
-    packet_slots,
+    packet_capacity,
     salvage,
 )
-from dxlrun.run.channels.ring import Handover, Payload
+from dxlrun.run.channels.ring import Handover, Payload, RecordKind, record_size
 
 TIMES = st.integers(-(2**63), 2**63 - 1)
 PACKETS = st.builds(
@@ -31,11 +30,27 @@ PACKETS = st.builds(
 )
 
 
+def collected() -> tuple[list[bytes], Handover]:
+    """The batches that a writer gets, and the writer."""
+    batches: list[bytes] = []
+
+    def take(kind: RecordKind, payload: Payload) -> None:
+        assert kind is RecordKind.PACKETS
+        batches.append(bytes(payload))
+
+    return batches, Handover(take)
+
+
+def desk_of(room: int) -> memoryview:
+    """Memory of an unfinished batch of at most so many bytes."""
+    return memoryview(bytearray(16 + room))
+
+
 @settings(max_examples=100, deadline=None)
 @given(st.lists(st.one_of(PACKETS, st.just(None)), max_size=30))
 def test_packets_come_out_as_they_went_in(steps: list[LoggedPacket | None]) -> None:
-    slots: list[bytes] = []
-    batch = PacketBatch(Handover(lambda payload: slots.append(bytes(payload)), slot_size=128))
+    slots, writer = collected()
+    batch = PacketBatch(writer, desk_of(128))
     for step in [*steps, None]:
         if step is None:
             batch.commit()
@@ -50,9 +65,9 @@ def test_packets_come_out_as_they_went_in(steps: list[LoggedPacket | None]) -> N
 @settings(max_examples=30, deadline=None)
 @example(bytes(range(256)))
 @given(st.binary(min_size=1, max_size=400))
-def test_noise_longer_than_a_slot_is_cut_and_nothing_of_it_lost(noise: bytes) -> None:
-    slots: list[bytes] = []
-    batch = PacketBatch(Handover(lambda payload: slots.append(bytes(payload)), slot_size=64))
+def test_noise_longer_than_the_desk_is_cut_and_nothing_of_it_lost(noise: bytes) -> None:
+    slots, writer = collected()
+    batch = PacketBatch(writer, desk_of(64))
     batch.packet(0, PacketKind.NOISE, 254, 5, 9, memoryview(noise))
     batch.commit()
     pieces = [packet for slot in slots for packet in decode_packets(slot)]
@@ -61,37 +76,39 @@ def test_noise_longer_than_a_slot_is_cut_and_nothing_of_it_lost(noise: bytes) ->
 
 
 def test_a_commit_without_packets_takes_no_slot() -> None:
-    slots: list[bytes] = []
-    batch = PacketBatch(Handover(lambda payload: slots.append(bytes(payload))))
+    slots, writer = collected()
+    batch = PacketBatch(writer)
     batch.commit()
     assert slots == []
 
 
 @pytest.mark.parametrize("cut", [1, 10, 23, 25])
 def test_a_cut_batch_is_refused(cut: int) -> None:
-    slots: list[bytes] = []
-    batch = PacketBatch(Handover(lambda payload: slots.append(bytes(payload))))
+    slots, writer = collected()
+    batch = PacketBatch(writer)
     batch.packet(0, PacketKind.STATUS, 1, 2, 3, b"abc")
     batch.commit()
     with pytest.raises(ValueError, match="ends inside"):
         decode_packets(slots[0][:cut])
 
 
-def test_a_slot_without_room_for_a_packet_is_refused() -> None:
+def test_a_desk_without_room_for_a_packet_is_refused() -> None:
     with pytest.raises(ValueError, match="holds no packet"):
-        PacketBatch(Handover(lambda payload: None, slot_size=24))
+        PacketBatch(collected()[1], desk_of(24))
 
 
 @pytest.mark.parametrize(("rate", "servos"), [(50, 8), (1000, 20), (320, 1)])
 def test_the_ring_holds_ten_seconds_of_a_robot(rate: int, servos: int) -> None:
-    slots: list[bytes] = []
-    batch = PacketBatch(Handover(lambda payload: slots.append(bytes(payload)), slot_size=PACKET_SLOT))
+    slots, writer = collected()
+    batch = PacketBatch(writer)
     for _ in range(servos):
         batch.packet(0, PacketKind.INSTRUCTION, 1, 0, 0, bytes(8))
         batch.packet(0, PacketKind.STATUS, 1, 0, 0, bytes(14))
     batch.packet(0, PacketKind.INSTRUCTION, 254, 0, 0, bytes(8 + 5 * servos))
     batch.commit()
-    assert len(slots) * rate * 10 <= packet_slots(1_000_000_000 // rate, servos)
+    (cycle,) = slots  # nothing is committed in the middle
+    assert len(cycle) <= LONGEST_BATCH
+    assert record_size(len(cycle)) * rate * 10 <= packet_capacity(1_000_000_000 // rate, servos)
 
 
 def test_without_a_log_packets_are_taken_and_forgotten() -> None:
@@ -100,14 +117,9 @@ def test_without_a_log_packets_are_taken_and_forgotten() -> None:
     sink.commit()
 
 
-def collected() -> tuple[list[bytes], Handover]:
-    slots: list[bytes] = []
-    return slots, Handover(lambda payload: slots.append(bytes(payload)), slot_size=128)
-
-
 def test_what_a_dead_process_left_on_its_desk_is_taken_up_once() -> None:
     slots, writer = collected()
-    desk = memoryview(bytearray(desk_size(writer)))
+    desk = desk_of(128)
     batch = PacketBatch(writer, desk)
     batch.packet(0, PacketKind.INSTRUCTION, 1, 2, 3, b"committed")
     batch.commit()
@@ -126,15 +138,15 @@ class Killed(BaseException):
 class DyingWriter(Handover):
     """Dies after the record is in the ring, before its writer hears of it."""
 
-    def append(self, payload: Payload) -> int:
-        super().append(payload)
+    def append(self, kind: RecordKind, payload: Payload) -> int:
+        super().append(kind, payload)
         raise Killed
 
 
 def test_a_process_that_dies_between_append_and_clearing_leaves_nothing_twice() -> None:
     slots: list[bytes] = []
-    writer = DyingWriter(lambda payload: slots.append(bytes(payload)), slot_size=128)
-    desk = memoryview(bytearray(desk_size(writer)))
+    writer = DyingWriter(lambda _, payload: slots.append(bytes(payload)))
+    desk = desk_of(128)
     batch = PacketBatch(writer, desk)
     batch.packet(0, PacketKind.INSTRUCTION, 1, 2, 3, b"once")
     with pytest.raises(Killed):
@@ -146,19 +158,9 @@ def test_a_process_that_dies_between_append_and_clearing_leaves_nothing_twice() 
 
 def test_an_empty_or_a_scribbled_desk_gives_nothing() -> None:
     taken, guardian = collected()
-    desk = memoryview(bytearray(desk_size(guardian)))
+    desk = desk_of(128)
     PacketBatch(guardian, desk).commit()
     salvage(desk, guardian.head, guardian)
     desk[:8] = b"\xff" * 8
     salvage(desk, guardian.head, guardian)
     assert taken == []
-
-
-def test_a_desk_larger_than_a_slot_does_not_make_batches_larger() -> None:
-    slots, writer = collected()
-    batch = PacketBatch(writer, memoryview(bytearray(4096)))
-    for _ in range(20):
-        batch.packet(0, PacketKind.STATUS, 1, 2, 3, bytes(10))
-    batch.commit()
-    assert sum(len(decode_packets(slot)) for slot in slots) == 20
-    assert max(len(slot) for slot in slots) <= 128

@@ -16,7 +16,7 @@ from mcap_ros2.decoder import DecoderFactory
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import read_log
 from dxlrun.run.channels.commands import CommandRing, TakenCommand
-from dxlrun.run.channels.ring import Handover
+from dxlrun.run.channels.ring import Handover, RecordKind
 
 PLANNED = TakenCommand(5_000, 3, 7, "left_arm", "trajectory", "wave.yaml:7:5", b"")
 GIVEN = TakenCommand(6_000, 4, -1, "head", "positions", "somebody", np.array([0.5, -0.0, np.nan]).tobytes())
@@ -31,13 +31,13 @@ TAKEN = (PLANNED, GIVEN, STREAMED, STEERING, LONG, NO_NUMBERS)
 
 @pytest.fixture
 def written(log: LogWriter, tmp_path: Path, cycle: Callable[[int], bytes]) -> Path:
-    log.cycle(cycle(-1))
-    ring = CommandRing(Handover(log.command))
+    log.take(RecordKind.CYCLE, cycle(-1))
+    ring = CommandRing(Handover(log.take))
     for number in range(5):
         for command in TAKEN:
             if command.cycle == number:
                 ring.take(command)
-        log.cycle(cycle(number))
+        log.take(RecordKind.CYCLE, cycle(number))
     log.close()
     return tmp_path / "run.mcap"
 
@@ -69,7 +69,7 @@ def test_another_reader_decodes_them(written: Path) -> None:
 
 def test_what_was_no_json_is_none_in_the_log(log: LogWriter, tmp_path: Path) -> None:
     for data in (b'{"a": "\xff"}', b"\xfe", b""):
-        CommandRing(Handover(log.command)).take(replace(STEERING, data=data))
+        CommandRing(Handover(log.take)).take(replace(STEERING, data=data))
     log.close()
     read = read_log(tmp_path / "run.mcap")
     first, second, third = (command.data for command in read.commands)
@@ -80,7 +80,7 @@ def test_what_was_no_json_is_none_in_the_log(log: LogWriter, tmp_path: Path) -> 
 
 
 def test_a_log_without_them_says_so(log: LogWriter, tmp_path: Path, cycle: Callable[[int], bytes]) -> None:
-    log.cycle(cycle(0))
+    log.take(RecordKind.CYCLE, cycle(0))
     log.close()
     read = read_log(tmp_path / "run.mcap")
     assert (read.activation, read.commands) == (None, ())

@@ -28,9 +28,9 @@ from dxlrun.log.header import LogHeader, LogSummary, to_metadata
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import read_log
 from dxlrun.run.channels.cycle import CycleLayout
-from dxlrun.run.channels.events import Event, EventCode, EventRing, Severity
+from dxlrun.run.channels.events import Event, EventCode, EventCounts, EventRing, Severity
 from dxlrun.run.channels.packets import LoggedPacket, PacketBatch, PacketKind
-from dxlrun.run.channels.ring import Handover
+from dxlrun.run.channels.ring import Handover, RecordKind
 
 Cycle = Callable[[int], bytes]
 PACKETS = [
@@ -46,12 +46,12 @@ SAID = [
 
 def fill(log: LogWriter, cycle: Cycle, cycles: int = 10) -> LogSummary:
     for number in range(cycles):
-        log.cycle(cycle(number))
-    batch = PacketBatch(Handover(log.packets))
+        log.take(RecordKind.CYCLE, cycle(number))
+    batch = PacketBatch(Handover(log.take))
     for packet in PACKETS:
         batch.packet(packet.bus, packet.kind, packet.servo_id, packet.first_ns, packet.last_ns, packet.data)
     batch.commit()
-    events = EventRing(Handover(log.event), VirtualClock(7_000))
+    events = EventRing(Handover(log.take), VirtualClock(7_000))
     for code, severity, source, text in SAID:
         events.emit(code, severity, source, text)
     return log.close()
@@ -74,6 +74,22 @@ def test_everything_comes_back_as_it_was(
     assert (read.complete, read.damage) == (True, ())
     assert summary == LogSummary(summary.messages, (tmp_path / "run.mcap").stat().st_size, 0)
     assert log.close() is summary
+
+
+def test_a_long_text_in_pieces_as_the_first_release_wrote_it_is_read_as_one(
+    log: LogWriter, tmp_path: Path, cycle: Cycle
+) -> None:
+    pieces = [Event(7, EventCode.SETUP, Severity.INFO, "loop", "x" * 200, part) for part in range(3)]
+    other = Event(8, EventCode.GATE, Severity.WARNING, "head", "clamped")
+    for event in (*pieces, other):
+        log._write_event(event)
+    log.close()
+    whole = Event(7, EventCode.SETUP, Severity.INFO, "loop", "x" * 600)
+    assert read_log(tmp_path / "run.mcap").events == (whole, other)
+    counts = EventCounts()
+    for event in (*pieces, other):  # a slice of a log may begin inside such a text
+        counts.add(event)
+    assert [(group.count, group.text) for group in counts.groups] == [(1, "x" * 600), (1, "clamped")]
 
 
 def test_mcap_ros2_support_decodes_every_topic(
@@ -148,7 +164,7 @@ def test_two_writers_of_the_same_records_write_the_same_bytes(
 
 
 def test_a_gap_is_an_event_and_counted(log: LogWriter, tmp_path: Path, cycle: Cycle) -> None:
-    log.cycle(cycle(0))
+    log.take(RecordKind.CYCLE, cycle(0))
     log.gap("loop/packets", 17)
     assert log.close().gaps == 17
     (event,) = read_log(tmp_path / "run.mcap").events
@@ -158,9 +174,9 @@ def test_a_gap_is_an_event_and_counted(log: LogWriter, tmp_path: Path, cycle: Cy
 
 
 def test_a_log_is_readable_up_to_the_last_flush(log: LogWriter, tmp_path: Path, cycle: Cycle) -> None:
-    log.cycle(cycle(0))
+    log.take(RecordKind.CYCLE, cycle(0))
     log.flush(sync=True)
-    log.cycle(cycle(1))
+    log.take(RecordKind.CYCLE, cycle(1))
     read = read_log(tmp_path / "run.mcap")
     assert len(read.cycles) == 1
     assert not read.complete
@@ -173,9 +189,9 @@ def test_a_log_is_readable_up_to_the_last_flush(log: LogWriter, tmp_path: Path, 
 def test_a_cut_log_is_readable_and_says_so(
     log: LogWriter, tmp_path: Path, cycle: Cycle, missing: int
 ) -> None:
-    log.cycle(cycle(0))
+    log.take(RecordKind.CYCLE, cycle(0))
     log.flush()
-    log.cycle(cycle(1))
+    log.take(RecordKind.CYCLE, cycle(1))
     fill(log, cycle)
     path = tmp_path / "run.mcap"
     os.truncate(path, path.stat().st_size - missing)
@@ -186,13 +202,13 @@ def test_a_cut_log_is_readable_and_says_so(
 
 def test_a_damaged_chunk_is_left_out_and_said(log: LogWriter, tmp_path: Path, cycle: Cycle) -> None:
     path = tmp_path / "run.mcap"
-    log.cycle(cycle(0))
+    log.take(RecordKind.CYCLE, cycle(0))
     log.flush()
     begin = path.stat().st_size
     for number in range(1, 5):
-        log.cycle(cycle(number))
+        log.take(RecordKind.CYCLE, cycle(number))
     log.flush()
-    log.cycle(cycle(5))
+    log.take(RecordKind.CYCLE, cycle(5))
     log.close()
     data = bytearray(path.read_bytes())
     data[begin + 120] ^= 0x55
@@ -254,7 +270,7 @@ def rewritten(log: LogWriter, tmp_path: Path, cycle: Cycle) -> Callable[[Callabl
     def rewritten(change: Callable[[Chunk], None]) -> Path:
         path, chunks = tmp_path / "run.mcap", []
         for number in range(4):
-            log.cycle(cycle(number))
+            log.take(RecordKind.CYCLE, cycle(number))
             log.flush()
         log.close()
         with path.open("rb") as stream:
@@ -352,7 +368,7 @@ def test_a_mode_that_is_none_is_said(
 ) -> None:
     record = np.frombuffer(bytearray(cycle(7)), dtype=layout.dtype)
     record["mode"][0, 1] = 77
-    log.cycle(record.tobytes())
+    log.take(RecordKind.CYCLE, record.tobytes())
     log.close()
     with pytest.raises(LogError, match="cycle 7 has a mode of a servo that is not known"):
         read_log(tmp_path / "run.mcap")
@@ -380,14 +396,14 @@ def test_a_full_disk_stops_the_writing_and_leaves_a_readable_log(
     log: LogWriter, tmp_path: Path, cycle: Cycle
 ) -> None:
     path = tmp_path / "run.mcap"
-    log.cycle(cycle(0))
+    log.take(RecordKind.CYCLE, cycle(0))
     log.flush()
     whole = path.stat().st_size
     with files_of_at_most(whole + 100):
-        log.cycle(cycle(1))
+        log.take(RecordKind.CYCLE, cycle(1))
         log.flush()
         assert log.error is not None
-        log.cycle(cycle(2))
+        log.take(RecordKind.CYCLE, cycle(2))
         log.flush()
         summary = log.close()
     assert path.stat().st_size == whole == summary.bytes
@@ -400,7 +416,7 @@ def test_a_full_disk_stops_the_writing_and_leaves_a_readable_log(
 
 
 def test_a_disk_that_is_full_at_the_end_is_said(log: LogWriter, tmp_path: Path, cycle: Cycle) -> None:
-    log.cycle(cycle(0))
+    log.take(RecordKind.CYCLE, cycle(0))
     with files_of_at_most((tmp_path / "run.mcap").stat().st_size):
         summary = log.close()
     assert summary.error is not None
@@ -410,7 +426,7 @@ def test_a_disk_that_is_full_at_the_end_is_said(log: LogWriter, tmp_path: Path, 
 @pytest.mark.parametrize("what", ["deleted", "moved", "replaced"])
 def test_a_file_that_is_gone_is_said(log: LogWriter, tmp_path: Path, cycle: Cycle, what: str) -> None:
     path, elsewhere = tmp_path / "run.mcap", tmp_path / "elsewhere.mcap"
-    log.cycle(cycle(0))
+    log.take(RecordKind.CYCLE, cycle(0))
     log.flush()
     path.rename(elsewhere)
     if what == "deleted":
@@ -422,9 +438,9 @@ def test_a_file_that_is_gone_is_said(log: LogWriter, tmp_path: Path, cycle: Cycl
 
 def test_a_file_that_was_cut_is_said_and_gets_no_hole(log: LogWriter, tmp_path: Path, cycle: Cycle) -> None:
     path = tmp_path / "run.mcap"
-    log.cycle(cycle(0))
+    log.take(RecordKind.CYCLE, cycle(0))
     log.flush()
     os.truncate(path, 100)
-    log.cycle(cycle(1))
+    log.take(RecordKind.CYCLE, cycle(1))
     assert log.close().error == "writing the log stopped: the file was cut by another program"
     assert path.stat().st_size == 100

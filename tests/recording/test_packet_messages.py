@@ -23,7 +23,7 @@ PACKETS = [
 
 def test_a_packet_in_a_log_is_the_message_of_its_definition(tmp_path: Path) -> None:
     log = LogWriter(tmp_path / "run.mcap", LogHeader("r", (), ("main", "arm"), (), 10**6, 0))
-    batch = PacketBatch(Handover(log.packets))
+    batch = PacketBatch(Handover(log.take))
     for packet in PACKETS:
         batch.packet(*packet)
     batch.commit()
@@ -39,7 +39,7 @@ def test_a_packet_in_a_log_is_the_message_of_its_definition(tmp_path: Path) -> N
 
 def test_a_kind_that_is_none_is_refused(tmp_path: Path) -> None:
     slots: list[bytes] = []
-    batch = PacketBatch(Handover(lambda payload: slots.append(bytes(payload))))
+    batch = PacketBatch(Handover(lambda _, payload: slots.append(bytes(payload))))
     batch.packet(*PACKETS[0])
     batch.commit()
     with pytest.raises(ValueError, match="kind 9"):

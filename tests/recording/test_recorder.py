@@ -18,14 +18,14 @@ import msgspec
 import pytest
 
 from dxlrun.clock import VirtualClock
-from dxlrun.log.header import LogHeader
+from dxlrun.log.header import LogHeader, RecorderJob
 from dxlrun.log.reader import read_log
-from dxlrun.log.recorder import _MOST_PER_TURN, Control, RecordedRing, Recorder, RecorderJob
+from dxlrun.log.recorder import _MOST_PER_TURN, Control, Recorder
 from dxlrun.run.channels import ring
 from dxlrun.run.channels.cycle import CycleLayout
-from dxlrun.run.channels.events import EVENT_SLOT, EventCode, EventRing, Severity
-from dxlrun.run.channels.packets import PACKET_SLOT, PacketBatch, PacketKind
-from dxlrun.run.channels.ring import RingWriter
+from dxlrun.run.channels.events import LONGEST_EVENT, EventCode, EventRing, Severity
+from dxlrun.run.channels.packets import LONGEST_BATCH, PacketBatch, PacketKind
+from dxlrun.run.channels.ring import RecordKind, RingWriter, record_size
 
 Cycle = Callable[[int], bytes]
 
@@ -63,13 +63,13 @@ def start(tmp_path: Path, header: LogHeader, layout: CycleLayout) -> Iterator[St
     started: list[Recording] = []
 
     def make(
-        path: Path | None = None, cycle_slots: int = 64, before: Callable[[RingWriter], None] | None = None
+        path: Path | None = None, cycles_kept: int = 64, before: Callable[[RingWriter], None] | None = None
     ) -> Recording:
         path = path or tmp_path / "run.mcap"
         rings = {
-            "cycles": ring.create("cycles", layout.size, cycle_slots),
-            "packets": ring.create("packets", PACKET_SLOT, 64),
-            "events": ring.create("events", EVENT_SLOT, 64),
+            "loop/cycles": ring.create("cycles", cycles_kept * record_size(layout.size), layout.size),
+            "loop/packets": ring.create("packets", 4 * LONGEST_BATCH, LONGEST_BATCH),
+            "loop/events": ring.create("events", 2 * LONGEST_EVENT, LONGEST_EVENT),
         }
         job_fd = os.memfd_create("job")
         ours, theirs = socket.socketpair()
@@ -77,12 +77,12 @@ def start(tmp_path: Path, header: LogHeader, layout: CycleLayout) -> Iterator[St
         job = RecorderJob(
             str(path),
             header,
-            tuple(RecordedRing(kind, fd, "loop") for kind, fd in rings.items()),  # type: ignore[arg-type]  # the three literals
+            rings,
         )
         os.write(job_fd, msgspec.json.encode(job))
         os.lseek(job_fd, 0, os.SEEK_SET)
         descriptors.extend([*rings.values(), job_fd])
-        cycles = RingWriter(rings["cycles"])
+        cycles = RingWriter(rings["loop/cycles"])
         if before is not None:
             before(cycles)
         process = subprocess.Popen(
@@ -103,8 +103,8 @@ def start(tmp_path: Path, header: LogHeader, layout: CycleLayout) -> Iterator[St
             process,
             ours,
             cycles,
-            PacketBatch(RingWriter(rings["packets"])),
-            EventRing(RingWriter(rings["events"]), VirtualClock(5)),
+            PacketBatch(RingWriter(rings["loop/packets"])),
+            EventRing(RingWriter(rings["loop/events"]), VirtualClock(5)),
         )
         started.append(recording)
         return recording
@@ -123,7 +123,7 @@ def test_what_the_rings_carry_is_in_the_log_byte_for_byte(start: Start, cycle: C
     assert next(recording.lines) == {"ready": True}
     sent = [bytes([255, 255, number]) for number in range(30)]
     for number in range(30):
-        recording.cycles.append(cycle(number))
+        recording.cycles.append(RecordKind.CYCLE, cycle(number))
         recording.packets.packet(0, PacketKind.STATUS, 1, number, number + 1, sent[number])
         recording.packets.commit()
     recording.events.emit(EventCode.TORQUE_OFF, Severity.INFO, "loop", "every servo is limp")
@@ -139,7 +139,7 @@ def test_what_the_rings_carry_is_in_the_log_byte_for_byte(start: Start, cycle: C
 
 
 def test_records_from_before_it_was_ready_are_recorded(start: Start, cycle: Cycle) -> None:
-    recording = start(before=lambda cycles: cycles.append(cycle(0)))
+    recording = start(before=lambda cycles: cycles.append(RecordKind.CYCLE, cycle(0)))
     recording.finish()
     assert len(read_log(recording.path).cycles) == 1
 
@@ -147,16 +147,16 @@ def test_records_from_before_it_was_ready_are_recorded(start: Start, cycle: Cycl
 def test_what_was_overwritten_is_declared_and_counted(start: Start, cycle: Cycle) -> None:
     def storm(cycles: RingWriter) -> None:
         for number in range(100):
-            cycles.append(cycle(number))
+            cycles.append(RecordKind.CYCLE, cycle(number))
 
-    recording = start(cycle_slots=10, before=storm)
+    recording = start(cycles_kept=10, before=storm)
     summary = recording.finish()
     log = read_log(recording.path)
     assert summary["gaps"] + len(log.cycles) == 100
-    assert summary["gaps"] == 91
+    assert summary["gaps"] == 90
     (event,) = log.events
     assert event.code == EventCode.RECORDER_GAP
-    assert "91 records of loop/cycles" in event.text
+    assert "90 records of loop/cycles" in event.text
     assert recording.process.wait(60) == 1
 
 
@@ -166,15 +166,15 @@ def test_what_waits_at_the_end_is_drained_however_much_it_is(
 ) -> None:
     """A recorder that was stopped while it was behind: two turns and a half are in the ring."""
     count = 2 * _MOST_PER_TURN + 1000
-    memory = ring.create("cycles", layout.size, count)
+    memory = ring.create("cycles", count * record_size(layout.size), layout.size)
     writer, record = RingWriter(memory), cycle(0)
     for _ in range(count + overwritten):
-        writer.append(record)
+        writer.append(RecordKind.CYCLE, record)
     ours, theirs = socket.socketpair()
     with ours, theirs:
         control = Control(theirs.fileno())
         control.metadata["grants"] = {"loop": "none"}  # what the supervisor said while it ran
-        job = RecorderJob(str(tmp_path / "run.mcap"), header, (RecordedRing("cycles", memory, "loop"),))
+        job = RecorderJob(str(tmp_path / "run.mcap"), header, {"loop/cycles": memory})
         summary = Recorder(job, control).run(lambda: True)
     os.close(memory)
     log = read_log(tmp_path / "run.mcap")
@@ -186,8 +186,8 @@ def test_what_waits_at_the_end_is_drained_however_much_it_is(
 
 def test_a_record_of_another_robot_is_declared_not_written(start: Start, cycle: Cycle) -> None:
     recording = start()
-    recording.cycles.append(b"short")
-    recording.cycles.append(cycle(1))
+    recording.cycles.append(RecordKind.CYCLE, b"short")
+    recording.cycles.append(RecordKind.CYCLE, cycle(1))
     assert recording.finish()["gaps"] == 1
     assert read_log(recording.path).cycles["cycle"] == [1]
 
@@ -196,7 +196,7 @@ def test_after_a_kill_the_log_is_readable_up_to_the_last_flush(start: Start, cyc
     recording = start()
     assert next(recording.lines) == {"ready": True}
     for number in range(20):
-        recording.cycles.append(cycle(number))
+        recording.cycles.append(RecordKind.CYCLE, cycle(number))
     while len(read_log(recording.path).cycles) < 20:  # until a flush, which needs no help from here
         assert recording.process.poll() is None
     recording.process.send_signal(signal.SIGKILL)
@@ -210,7 +210,7 @@ def test_it_ignores_ctrl_c_and_ends_well_on_sigterm(start: Start, cycle: Cycle) 
     recording = start()
     assert next(recording.lines) == {"ready": True}
     recording.process.send_signal(signal.SIGINT)
-    recording.cycles.append(cycle(0))
+    recording.cycles.append(RecordKind.CYCLE, cycle(0))
     recording.process.send_signal(signal.SIGTERM)
     assert recording.summary()["gaps"] == 0
     assert recording.process.wait(60) == 0
@@ -220,7 +220,7 @@ def test_it_ignores_ctrl_c_and_ends_well_on_sigterm(start: Start, cycle: Cycle) 
 def test_it_finishes_when_the_supervisor_is_gone(start: Start, cycle: Cycle) -> None:
     recording = start()
     assert next(recording.lines) == {"ready": True}
-    recording.cycles.append(cycle(0))
+    recording.cycles.append(RecordKind.CYCLE, cycle(0))
     recording.control.shutdown(socket.SHUT_RDWR)
     assert recording.process.wait(60) == 0
     log = read_log(recording.path)
@@ -233,11 +233,11 @@ def test_a_full_disk_is_reported_once_and_the_rings_are_drained_on(start: Start,
     resource.prlimit(
         recording.process.pid, resource.RLIMIT_FSIZE, (recording.path.stat().st_size, resource.RLIM_INFINITY)
     )
-    recording.cycles.append(cycle(0))
+    recording.cycles.append(RecordKind.CYCLE, cycle(0))
     error = next(recording.lines)
     assert "writing the log stopped" in error["error"]
     for number in range(500):  # many times the ring
-        recording.cycles.append(cycle(number))
+        recording.cycles.append(RecordKind.CYCLE, cycle(number))
     summary = recording.finish()
     assert summary["error"] == error["error"]
     assert summary["messages"] == 0

@@ -14,6 +14,7 @@ from mcap_ros2.decoder import DecoderFactory
 from dxlrun.log import schemas
 from dxlrun.log.header import LogHeader
 from dxlrun.log.log_writer import LogWriter
+from dxlrun.run.channels.ring import RecordKind
 
 TOPIC = "/robot_description"
 
@@ -24,7 +25,7 @@ def test_the_urdf_comes_first_and_once(
     path = tmp_path / "described.mcap"
     writer = LogWriter(path, replace(header, robot_description="<robot name='körper'/>"))
     for number in range(3):
-        writer.cycle(cycle(number))
+        writer.take(RecordKind.CYCLE, cycle(number))
     summary = writer.close()
     with path.open("rb") as stream:
         reader: Any = make_reader(stream, decoder_factories=[DecoderFactory()])
@@ -44,7 +45,7 @@ def test_a_robot_without_a_urdf_has_no_such_topic(
     header: LogHeader, cycle: Callable[[int], bytes], tmp_path: Path
 ) -> None:
     writer = LogWriter(tmp_path / "plain.mcap", header)
-    writer.cycle(cycle(0))
+    writer.take(RecordKind.CYCLE, cycle(0))
     writer.close()
     with (tmp_path / "plain.mcap").open("rb") as stream:
         summary = make_reader(stream).get_summary()

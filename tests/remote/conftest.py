@@ -20,7 +20,7 @@ from dxlrun.remote.link import Link
 from dxlrun.remote.preparation import Preparation
 from dxlrun.run.channels import heartbeat, mailbox, ring
 from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
-from dxlrun.run.channels.events import EVENT_SLOT, EventRing
+from dxlrun.run.channels.events import LONGEST_EVENT, EventRing
 from dxlrun.run.channels.heartbeat import Heartbeat, Phase
 from dxlrun.run.channels.mailbox import Mailbox
 
@@ -113,11 +113,11 @@ class Desk:
     def __init__(self):
         memory = Descriptors(
             heartbeat=heartbeat.create(),
-            cycles=ring.create("cycles", 1024, 8),
-            events=ring.create("events", EVENT_SLOT, 4096),
-            guardian_events=ring.create("events", EVENT_SLOT, 64),
+            cycles=ring.create("cycles", 8192, 1000),
+            events=ring.create("events", 1 << 20, LONGEST_EVENT),
+            guardian=ring.create("guardian", 1 << 16, LONGEST_EVENT),
             mailbox=mailbox.create(8),
-            answers=ring.create("answers", mailbox.ANSWER_SLOT, mailbox.ANSWER_SLOTS),
+            answers=ring.create("answers", mailbox.ANSWERS_CAPACITY, mailbox.LONGEST_ANSWER),
         )
         self.heartbeat = Heartbeat(memory.heartbeat)
         self.heartbeat.enter(Phase.RUNNING)
@@ -128,7 +128,7 @@ class Desk:
         self.cycles = ring.RingWriter(memory.cycles)
         self.clock = SimpleNamespace(now_ns=lambda: 7_000_000_000)
         self.events = EventRing(ring.RingWriter(memory.events), self.clock)
-        self.guardian_events = EventRing(ring.RingWriter(memory.guardian_events), self.clock)
+        self.guardian_events = EventRing(ring.RingWriter(memory.guardian), self.clock)
         self.link = Link(PLAN, memory)
         plugins = PlugIns({"arm": Offer("arm", Arm, "tests 1")}, {})
         self.gateway = Gateway(
@@ -155,7 +155,7 @@ class Desk:
 
     def finish_cycle(self):
         self.record.cycle, self.record.woken_ns = self.ended, 1_000_000_000 + self.ended * PERIOD_NS
-        self.cycles.append(self.record.raw)
+        self.cycles.append(ring.RecordKind.CYCLE, self.record.raw)
         self.ended += 1
         self.heartbeat.cycle(self.ended, 0)
 

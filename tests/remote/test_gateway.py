@@ -14,9 +14,9 @@ from dxlrun.remote import asking, connection, gateway, link
 from dxlrun.remote.gateway import MOST_OPERATIONS, MOST_SET_POINTS
 from dxlrun.remote.preparation import Prepared, Refusal
 from dxlrun.remote.sockets import MOST_BYTES
+from dxlrun.run.channels.commands import MOST_PER_CYCLE
 from dxlrun.run.channels.events import EventCode, Severity
 from dxlrun.run.channels.heartbeat import Phase
-from dxlrun.run.channels.inbox import MOST_PER_CYCLE
 
 DONE = {"done": True}
 IN_LIMITS = {"done": True, "clamped": 0}

@@ -14,7 +14,7 @@ from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import Log, read_log
 from dxlrun.run.channels.commands import CommandRing, TakenCommand
 from dxlrun.run.channels.events import Event, EventCode, EventRing, Severity
-from dxlrun.run.channels.ring import Handover
+from dxlrun.run.channels.ring import Handover, RecordKind
 from dxlrun.testing import VirtualRobot, simulated_robot
 
 ROBOT = """\
@@ -185,14 +185,14 @@ def changed(tmp_path: Path) -> Callable[[Path, Callable[[Changed], None]], Path]
         header = replace(log.header, attachments=content.attachments, metadata=content.metadata)
         writer = LogWriter(new, header)
         if content.activation is not None:
-            writer.cycle(content.activation.tobytes())
-        ring = CommandRing(Handover(writer.command))
+            writer.take(RecordKind.CYCLE, content.activation.tobytes())
+        ring = CommandRing(Handover(writer.take))
         for command in content.commands:
             ring.take(command)
         for row in range(len(content.cycles)):
-            writer.cycle(content.cycles[row : row + 1].tobytes())
+            writer.take(RecordKind.CYCLE, content.cycles[row : row + 1].tobytes())
         then = Then()
-        events = EventRing(Handover(writer.event), then)
+        events = EventRing(Handover(writer.take), then)
         for event in content.events:
             then.t_ns = event.t_ns
             events.emit(EventCode(event.code), Severity(event.severity), event.source, event.text)

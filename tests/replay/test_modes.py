@@ -11,8 +11,8 @@ import pytest
 from dxlrun.log.reader import Log, read_log
 from dxlrun.log.replay import replay_log
 from dxlrun.mode import Mode
+from dxlrun.run.channels.commands import Command, QueueInbox
 from dxlrun.run.channels.events import EventCode
-from dxlrun.run.channels.inbox import Command, QueueInbox
 from dxlrun.testing import VirtualRobot, simulated_robot
 
 ROBOT = """\

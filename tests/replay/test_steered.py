@@ -22,8 +22,8 @@ from dxlrun.errors import LogError
 from dxlrun.log.reader import Log, read_log
 from dxlrun.log.replay import replay_log
 from dxlrun.log.steered import policy_begun, steered
+from dxlrun.run.channels.commands import Command, QueueInbox
 from dxlrun.run.channels.events import EventCode
-from dxlrun.run.channels.inbox import Command, QueueInbox
 from dxlrun.testing import VirtualRobot, simulated_robot
 
 Change = Callable[..., Path]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import random
 import struct
 import subprocess
 import sys
@@ -13,9 +14,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dxlrun.run.channels import ring
-from dxlrun.run.channels.ring import SLOT_HEADER, Gap, Handover, RingReader, RingWriter
+from dxlrun.run.channels.ring import (
+    RECORD_HEADER,
+    Gap,
+    Handover,
+    Record,
+    RecordKind,
+    RingReader,
+    RingWriter,
+    record_size,
+)
 
 HEADER = 64
+HEAD, INTENT, LATEST, TAKEN = 24, 32, 40, 48
+KINDS = list(RecordKind)
 Make = Callable[[int, int], int]
 
 
@@ -23,8 +35,8 @@ Make = Callable[[int, int], int]
 def make() -> Iterator[Make]:
     descriptors: list[int] = []
 
-    def create(slot_size: int, slots: int) -> int:
-        descriptors.append(ring.create("test", slot_size, slots))
+    def create(capacity: int, longest: int) -> int:
+        descriptors.append(ring.create("test", capacity, longest))
         return descriptors[-1]
 
     yield create
@@ -32,26 +44,44 @@ def make() -> Iterator[Make]:
         os.close(descriptor)
 
 
-@settings(max_examples=80, deadline=None)
+def event(payload: bytes) -> Record:
+    return Record(RecordKind.EVENT, payload)
+
+
+def append(writer: RingWriter, *payloads: bytes) -> None:
+    for payload in payloads:
+        writer.append(RecordKind.EVENT, payload)
+
+
+def all_of(reader: RingReader) -> list[Record | Gap]:
+    return list(iter(reader.read, None))
+
+
+@settings(max_examples=150, deadline=None)
 @given(
-    slots=st.integers(2, 6),
-    steps=st.lists(st.one_of(st.binary(max_size=24), st.just(None)), max_size=60),
+    capacity=st.integers(8, 40).map(lambda words: 8 * words),
+    steps=st.lists(
+        st.one_of(st.tuples(st.sampled_from(KINDS), st.binary(max_size=40)), st.just(None)), max_size=80
+    ),
 )
-def test_every_record_is_delivered_as_it_was_or_declared_lost(slots: int, steps: list[bytes | None]) -> None:
-    descriptor = ring.create("property", 24, slots)
+def test_every_record_is_delivered_as_it_was_or_declared_lost(
+    capacity: int, steps: list[tuple[RecordKind, bytes] | None]
+) -> None:
+    descriptor = ring.create("property", capacity, 40)
     try:
         writer, reader = RingWriter(descriptor), RingReader(descriptor)
-        appended: list[bytes] = []
+        appended: list[tuple[RecordKind, bytes]] = []
+        ends = [0]
         seen = 0
-        for step in [*steps, *([None] * (slots + 2))]:
+        for step in [*steps, *([None] * (capacity // RECORD_HEADER + 3))]:
             if step is not None:
-                assert writer.append(step) == len(appended)
+                ends.append(writer.append(*step))
                 appended.append(step)
                 continue
             got = reader.read()
             if isinstance(got, Gap):
-                # Nothing is given up that could still be read, but for the slot that is overwritten next.
-                assert len(appended) - seen > slots
+                # nothing is given up that was not overwritten, in whole or in part
+                assert all(start < ends[-1] - capacity for start in ends[seen : seen + got.lost])
                 seen += got.lost
             elif got is not None:
                 assert got == appended[seen]
@@ -62,90 +92,173 @@ def test_every_record_is_delivered_as_it_was_or_declared_lost(slots: int, steps:
         os.close(descriptor)
 
 
-def test_a_damaged_record_is_one_gap_and_its_neighbours_stay(make: Make) -> None:
-    descriptor = make(16, 4)
+@pytest.mark.parametrize("length", range(41))
+def test_a_record_goes_round_at_every_offset(make: Make, length: int) -> None:
+    """With a record of one word less than the capacity, starts move by a word at each round."""
+    descriptor = make(104, 48)
     writer, reader = RingWriter(descriptor), RingReader(descriptor)
-    for text in (b"one", b"two", b"three"):
-        writer.append(text)
-    second = HEADER + (SLOT_HEADER + 16) + SLOT_HEADER
-    os.pwrite(descriptor, b"X", second)
-    assert [reader.read() for _ in range(4)] == [b"one", Gap(1), b"three", None]
+    starts = set()
+    for number in range(60):
+        payload = bytes([number]) * length
+        starts.add(writer.head % 104)
+        append(writer, payload, b"next")
+        assert all_of(reader) == [event(payload), event(b"next")]
+    assert len(starts) > 1 or 104 % (record_size(length) + 32) == 0
+    if length == 16:
+        assert starts == set(range(0, 104, 8))
+
+
+def test_the_longest_record_of_a_ring_that_holds_one_is_read_again_and_again(make: Make) -> None:
+    descriptor = make(record_size(100), 100)
+    writer, reader = RingWriter(descriptor), RingReader(descriptor)
+    for number in range(20):
+        append(writer, bytes([number]) * 100)
+        assert all_of(reader) == [event(bytes([number]) * 100)]
+    append(writer, b"a" * 100, b"b" * 100)
+    assert all_of(reader) == [Gap(1), event(b"b" * 100)]
+
+
+@pytest.mark.parametrize("at", range(record_size(3)))
+def test_a_damaged_byte_is_one_gap_and_the_neighbours_stay(make: Make, at: int) -> None:
+    descriptor = make(512, 64)
+    writer, reader = RingWriter(descriptor), RingReader(descriptor)
+    append(writer, b"one", b"two", b"three")
+    place = HEADER + record_size(3) + at
+    (byte,) = os.pread(descriptor, 1, place)
+    os.pwrite(descriptor, bytes([byte ^ 0x41]), place)
+    padding = at >= RECORD_HEADER + 3
+    middle = event(b"two") if padding else Gap(1)
+    assert all_of(reader) == [event(b"one"), middle, event(b"three")]
+
+
+def test_damage_at_the_end_is_declared_at_once_and_counted_when_the_next_record_tells_how_much(
+    make: Make,
+) -> None:
+    descriptor = make(512, 64)
+    writer, reader = RingWriter(descriptor), RingReader(descriptor)
+    append(writer, b"one", b"two")
+    os.pwrite(descriptor, bytes(2 * record_size(3)), HEADER)
+    assert all_of(reader) == [Gap(1)]
+    append(writer, b"three")
+    assert all_of(reader) == [Gap(1), event(b"three")]
 
 
 def test_a_length_out_of_bounds_is_a_gap(make: Make) -> None:
-    descriptor = make(16, 4)
+    descriptor = make(64, 16)
     writer, reader = RingWriter(descriptor), RingReader(descriptor)
-    writer.append(b"one")
-    os.pwrite(descriptor, struct.pack("<I", 1 << 30), HEADER + 8)
+    append(writer, b"one")
+    os.pwrite(descriptor, struct.pack("<I", 1 << 30), HEADER + 12)
     assert reader.read() == Gap(1)
 
 
 def test_an_old_payload_under_a_new_number_does_not_pass(make: Make) -> None:
-    descriptor = make(8, 2)
+    descriptor = make(2 * record_size(8), 8)
     writer, reader = RingWriter(descriptor), RingReader(descriptor)
-    writer.append(b"old")
-    slot = os.pread(descriptor, SLOT_HEADER + 8, HEADER)
-    writer.append(b"b")
-    writer.append(b"new")
-    os.pwrite(descriptor, slot[8:], HEADER + 8)  # all but the sequence number
-    assert reader.read() == Gap(2)
-    assert reader.read() == Gap(1)
+    append(writer, b"old.....")
+    body = os.pread(descriptor, 12, HEADER + RECORD_HEADER - 4)
+    append(writer, b"b.......", b"new.....")
+    os.pwrite(descriptor, body, HEADER + RECORD_HEADER - 4)  # CRC and payload, under the new mark and number
+    assert all_of(reader) == [Gap(1), event(b"b......."), Gap(1)]
 
 
-def test_a_writer_that_laps_the_reader_in_the_middle_of_a_copy_is_noticed(
-    make: Make, monkeypatch: pytest.MonkeyPatch
+def test_a_mark_inside_a_payload_is_not_taken_for_a_record(make: Make) -> None:
+    descriptor = make(256, 128)
+    writer, reader = RingWriter(descriptor), RingReader(descriptor)
+    lure = b"".join(struct.pack("<Q", RECORD_HEADER + 8 * word + 1) for word in range(12))
+    append(writer, lure, b"next")
+    os.pwrite(descriptor, b"X", HEADER)
+    assert all_of(reader) == [Gap(1), event(b"next")]
+
+
+@pytest.mark.parametrize("overwritten", range(1, 5))
+def test_a_writer_that_overtakes_the_reader_in_the_middle_of_a_copy_is_noticed(
+    make: Make, monkeypatch: pytest.MonkeyPatch, overwritten: int
 ) -> None:
-    descriptor = make(16, 4)
+    descriptor = make(4 * record_size(8), 8)
     writer, reader = RingWriter(descriptor), RingReader(descriptor)
-    writer.append(b"first")
-    form = struct.Struct("=II")
+    texts = [b"record %d" % number for number in range(4 + overwritten)]
+    append(writer, *texts[:4])
+    form = struct.Struct("=I")
 
     class Interrupted:
+        """The CRC of a record is read after its header and before its payload."""
+
+        size = form.size
+
         @staticmethod
-        def unpack_from(buffer: memoryview, offset: int) -> tuple[int, int]:
-            found: tuple[int, int] = form.unpack_from(buffer, offset)
-            monkeypatch.setattr(ring, "_LENGTH_CRC", form)
-            for text in (b"b", b"c", b"d", b"fifth"):
-                writer.append(text)
-            return found
+        def unpack_from(buffer: memoryview, offset: int) -> tuple[int]:
+            monkeypatch.setattr(ring, "_CRC", form)
+            append(writer, *texts[4:])
+            return form.unpack_from(buffer, offset)
 
-    monkeypatch.setattr(ring, "_LENGTH_CRC", Interrupted)
-    assert reader.read() == Gap(1)
-    assert [reader.read() for _ in range(5)] == [b"b", b"c", b"d", b"fifth", None]
+    monkeypatch.setattr(ring, "_CRC", Interrupted)
+    assert all_of(reader) == [Gap(overwritten), *map(event, texts[overwritten:])]
 
 
-def test_a_record_that_is_being_written_is_not_delivered(make: Make) -> None:
-    descriptor = make(16, 4)
+def test_a_record_that_is_being_written_is_not_delivered_and_what_it_overwrites_neither(make: Make) -> None:
+    """A writer that died in the middle of a record: it had raised `intent`, and nothing more is known."""
+    descriptor = make(3 * record_size(8), 8)
     writer, reader = RingWriter(descriptor), RingReader(descriptor)
-    os.pwrite(descriptor, b"half a rec", HEADER + SLOT_HEADER)
-    assert reader.read() is None
-    writer.append(b"whole")
-    assert reader.read() == b"whole"
+    append(writer, b"first...", b"second..", b"third...")
+    os.pwrite(descriptor, struct.pack("<Q", writer.head + record_size(8)), INTENT)
+    os.pwrite(descriptor, b"half", HEADER + 4)
+    assert all_of(reader) == [Gap(1), event(b"second.."), event(b"third...")]
+    append(RingWriter(descriptor), b"fourth..")
+    assert all_of(reader) == [event(b"fourth..")]
 
 
 def test_a_second_writer_goes_on_where_the_first_ended(make: Make) -> None:
-    descriptor = make(16, 4)
+    descriptor = make(256, 16)
     reader = RingReader(descriptor)
-    first = RingWriter(descriptor)
-    first.append(b"a")
-    first.close()
-    assert RingWriter(descriptor).append(b"b") == 1
-    assert [reader.read(), reader.read(), reader.read()] == [b"a", b"b", None]
-    reader.close()
+    append(RingWriter(descriptor), b"a", b"b")
+    append(RingWriter(descriptor), b"c")
+    assert all_of(reader) == [event(b"a"), event(b"b"), event(b"c")]
 
 
-def test_a_record_longer_than_a_slot_is_refused_and_leaves_the_ring_whole(make: Make) -> None:
-    descriptor = make(10, 4)
+def test_numbers_go_round_without_a_gap(make: Make) -> None:
+    descriptor = make(256, 16)
     writer, reader = RingWriter(descriptor), RingReader(descriptor)
-    assert writer.slot_size == 16  # whole words
+    writer._number = reader._number = 2**32 - 2
+    for text in (b"a", b"b", b"c"):
+        append(writer, text)
+        assert all_of(reader) == [event(text)]
+    append(writer, *[b"lapped"] * 20)
+    gap, *rest = all_of(reader)
+    assert isinstance(gap, Gap)
+    assert gap.lost + len(rest) == 20
+
+
+def test_the_newest_record_alone(make: Make) -> None:
+    descriptor = make(128, 16)
+    writer, reader = RingWriter(descriptor), RingReader(descriptor)
+    assert reader.newest() is None
+    for number in range(50):
+        append(writer, b"%d" % number)
+        if number % 7 == 0:
+            assert reader.newest() == event(b"%d" % number)
+            assert reader.newest() is None
+    append(writer, b"damaged")
+    os.pwrite(descriptor, b"X", HEADER + (writer.head - record_size(7)) % 128 + RECORD_HEADER)
+    assert reader.newest() is None
+    append(writer, b"whole")
+    assert reader.newest() == event(b"whole")
+    append(writer, b"next")
+    assert all_of(reader) == [event(b"next")]
+
+
+def test_a_record_longer_than_the_longest_is_refused_and_leaves_the_ring_whole(make: Make) -> None:
+    descriptor = make(128, 10)
+    writer, reader = RingWriter(descriptor), RingReader(descriptor)
     with pytest.raises(ValueError, match="does not fit"):
-        writer.append(bytes(17))
+        append(writer, bytes(11))
     assert reader.read() is None
+    append(writer, bytes(10))
+    assert reader.read() == event(bytes(10))
 
 
-def test_nobody_can_shrink_a_ring_under_the_others(make: Make) -> None:
+def test_a_ring_cannot_be_shrunk_under_its_readers(make: Make) -> None:
     with pytest.raises(PermissionError):
-        os.ftruncate(make(16, 4), 64)
+        os.ftruncate(make(128, 16), 64)
 
 
 def test_what_is_no_ring_is_refused() -> None:
@@ -154,34 +267,58 @@ def test_what_is_no_ring_is_refused() -> None:
         os.ftruncate(descriptor, 4096)
         with pytest.raises(ValueError, match="not a ring"):
             RingReader(descriptor)
+        os.pwrite(descriptor, b"dxlring2" + struct.pack("<QQ", 1 << 20, 16), 0)  # longer than its memory
+        with pytest.raises(ValueError, match="not a ring"):
+            RingReader(descriptor)
     finally:
         os.close(descriptor)
-    with pytest.raises(ValueError, match="at least"):
-        ring.create("none", 0, 4)
+    for capacity, longest in ((64, 0), (32, 16)):
+        with pytest.raises(ValueError, match="cannot hold"):
+            ring.create("none", capacity, longest)
+
+
+def test_any_bytes_in_any_place_raise_nothing_and_end(make: Make) -> None:
+    descriptor = make(1024, 200)
+    writer, reader = RingWriter(descriptor), RingReader(descriptor)
+    chance = random.Random(8)
+    delivered = 0
+    for _ in range(2000):
+        append(writer, chance.randbytes(chance.randrange(200)))
+        place = chance.choice((HEAD, INTENT, LATEST, TAKEN, HEADER + chance.randrange(1024)))
+        if chance.random() < 0.5:
+            os.pwrite(descriptor, chance.randbytes(chance.randrange(1, 9)), place)
+        for _ in range(20):
+            if isinstance(reader.newest() if chance.random() < 0.1 else reader.read(), Record):
+                delivered += 1
+        if chance.random() < 0.1:  # the words that a writer owns, whole again
+            os.pwrite(descriptor, struct.pack("<QQQ", 0, 0, 0), HEAD)
+            writer, reader = RingWriter(descriptor), RingReader(descriptor)
+    assert delivered > 100
 
 
 WRITER = """
-import sys
-from dxlrun.run.channels.ring import RingWriter
-writer = RingWriter(int(sys.argv[1]))
+import random, sys
+from dxlrun.run.channels.ring import RecordKind, RingWriter
+writer, chance = RingWriter(int(sys.argv[1])), random.Random(4)
 for number in range(int(sys.argv[2])):
-    writer.append(b"%d " % number * 20)
+    writer.append(RecordKind.PACKETS, b"%d " % number * chance.randrange(40))
 """
 
 
 def test_a_reader_beside_a_writing_process_gets_or_misses_each_record_once(make: Make) -> None:
-    descriptor, count = make(256, 16), 20_000
-    reader = RingReader(descriptor)
+    descriptor, count = make(2048, 400), 20_000
+    reader, chance = RingReader(descriptor), random.Random(4)
+    sent = [b"%d " % number * chance.randrange(40) for number in range(count)]
     command = [sys.executable, "-c", WRITER, str(descriptor), str(count)]
     with subprocess.Popen(command, pass_fds=[descriptor]) as process:
-        seen = 0
+        seen = gaps = 0
         while seen < count:
             ended = process.poll() is not None
             got = reader.read()
             if isinstance(got, Gap):
-                seen += got.lost
+                seen, gaps = seen + got.lost, gaps + 1
             elif got is not None:
-                assert got == b"%d " % seen * 20
+                assert got == (RecordKind.PACKETS, sent[seen])
                 seen += 1
             elif ended:
                 break
@@ -189,9 +326,45 @@ def test_a_reader_beside_a_writing_process_gets_or_misses_each_record_once(make:
     assert seen == count
 
 
+def test_a_writer_that_is_killed_at_any_moment_leaves_whole_records(make: Make) -> None:
+    """Eight writers, one after the other, each killed in the middle of a storm; a record cut off is a gap."""
+    descriptor = make(1 << 16, 400)
+    reader = RingReader(descriptor)
+    chance, seen = random.Random(2), 0
+    endless = WRITER.replace("range(int(sys.argv[2]))", "iter(int, 1)").replace('b"%d " % number', 'b"7 "')
+    for _ in range(8):
+        with subprocess.Popen(
+            [sys.executable, "-c", endless, str(descriptor)], pass_fds=[descriptor]
+        ) as process:
+            until = reader.head + chance.randrange(200_000)
+            while reader.head <= until:
+                assert process.poll() is None
+            process.kill()
+        for got in all_of(reader):
+            assert isinstance(got, Gap) or set(got.payload) <= set(b"7 ")
+            seen += isinstance(got, Record)
+        append(RingWriter(descriptor), b"7 after a kill")
+        assert event(b"7 after a kill") in all_of(reader)
+    assert seen > 100
+
+
+def test_a_queue_knows_how_far_its_reader_is(make: Make) -> None:
+    descriptor = make(128, 16)
+    writer, reader = RingWriter(descriptor), RingReader(descriptor)
+    append(writer, b"one", b"two")
+    assert writer.taken == 0
+    assert reader.take() == event(b"one")
+    reader.report_taken()
+    assert writer.taken == record_size(3)
+    reader.skip()
+    reader.report_taken()
+    assert writer.taken == writer.head
+
+
 def test_a_handover_gives_each_record_at_once() -> None:
-    taken: list[bytes] = []
-    handover = Handover(lambda payload: taken.append(bytes(payload)), slot_size=8)
-    assert [handover.append(b"a"), handover.append(bytearray(b"b"))] == [0, 1]
-    assert taken == [b"a", b"b"]
-    assert handover.slot_size == 8
+    taken: list[tuple[RecordKind, bytes]] = []
+    handover = Handover(lambda kind, payload: taken.append((kind, bytes(payload))))
+    assert handover.head == 0
+    assert handover.append(RecordKind.EVENT, b"a") == 1
+    assert handover.append(RecordKind.CYCLE, bytearray(b"b")) == handover.head == 2
+    assert taken == [(RecordKind.EVENT, b"a"), (RecordKind.CYCLE, b"b")]

@@ -13,8 +13,8 @@ import pytest
 from dxlrun.control.lost_servos import LostServos
 from dxlrun.control.policy_plan import GroupPolicy, PolicyPlan
 from dxlrun.interfaces import States
+from dxlrun.run.channels.commands import LOOP, Command
 from dxlrun.run.channels.events import EventCode
-from dxlrun.run.channels.inbox import LOOP, Command
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import read_log, simulated_robot
 from dxlrun_controllers.group import JointGroupPositionController

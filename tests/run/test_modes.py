@@ -10,7 +10,7 @@ import pytest
 
 from dxlrun.log.reader import Log
 from dxlrun.mode import Mode
-from dxlrun.run.channels.inbox import Command, QueueInbox
+from dxlrun.run.channels.commands import Command, QueueInbox
 from dxlrun.testing import VirtualRobot, read_log, simulated_robot
 
 ROBOT = """\

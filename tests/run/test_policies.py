@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from dxlrun.errors import StartUpError
-from dxlrun.run.channels.inbox import LOOP, Command
+from dxlrun.run.channels.commands import LOOP, Command
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import simulated_robot
 from dxlrun_controllers.group import JointGroupPositionController

@@ -15,7 +15,7 @@ from dxlrun.run.channels import process
 from dxlrun.run.channels.events import Severity, decode_event
 from dxlrun.run.channels.heartbeat import Heartbeat, Phase
 from dxlrun.run.channels.packets import PacketBatch, PacketKind, decode_packets
-from dxlrun.run.channels.ring import Handover, RingReader, RingWriter
+from dxlrun.run.channels.ring import Handover, Record, RecordKind, RingReader, RingWriter
 from dxlrun.run.guardian import LastHand
 from dxlrun.run.run_processes import Memory, guardian_job
 from dxlrun.simulation.virtual_ports import VirtualPorts
@@ -156,8 +156,16 @@ def last_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[VirtualR
     hand = LastHand(guardian_job(robot.plan, {}, memory, take_over=False))
     hand._clock = robot.clock  # type: ignore[assignment]  # the time of the simulated servos
     lines = VirtualPorts(robot.clock, robot.buses)
-    monkeypatch.setattr(hand, "_take_over", lambda _: (lines, PacketBatch(Handover(lambda _: None))))
+    monkeypatch.setattr(
+        hand, "_take_over", lambda _: (lines, PacketBatch(Handover(lambda kind, payload: None)))
+    )
     return robot, hand, memory
+
+
+def records(ring: int, kind: RecordKind) -> list[bytes]:
+    """The payloads of a kind in a ring."""
+    found = iter(RingReader(ring).read, None)
+    return [one.payload for one in found if isinstance(one, Record) and one.kind == kind]
 
 
 def test_a_guardian_that_leaves_torque_on_stops_what_is_led_by_a_velocity(
@@ -179,7 +187,7 @@ def test_the_last_hand_names_who_did_not_confirm_torque_off(
     robot, hand, memory = last_hand
     robot.buses[0].servo(2).silence(silent)
     _, result = hand.limp((), "torque was cut on request", Severity.WARNING)
-    event = decode_event(RingReader(memory.guardian_events).read())
+    event = decode_event(records(memory.guardian, RecordKind.EVENT)[-1])
     assert event.text == f"torque was cut on request; {result}"
     if silent:
         assert "not confirmed by lift (ID 2 on bus main): " in result
@@ -197,6 +205,7 @@ def test_what_the_loop_had_on_its_desk_when_it_died_comes_into_the_log(start: St
     desk.packet(0, PacketKind.INSTRUCTION, 3, 1, 2, b"half a cycle")
     master, slave = os.openpty()
     LastHand(guardian_job(plan, {}, memory, take_over=False))._take_over([slave])
-    (packet,) = decode_packets(memoryview(RingReader(memory.guardian_packets).read()))
+    (batch,) = records(memory.guardian, RecordKind.PACKETS)
+    (packet,) = decode_packets(batch)
     assert packet.data == b"half a cycle"
     os.close(master)

@@ -7,7 +7,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from dxlrun.run.channels.inbox import LOOP, Command
+from dxlrun.run.channels.commands import LOOP, Command
 from dxlrun.testing import simulated_robot
 
 ROBOT = """\

@@ -13,8 +13,8 @@ import pytest
 from dxlrun.analysis.tracking import tracking
 from dxlrun.errors import InputError
 from dxlrun.log.reader import read_log
+from dxlrun.run.channels.commands import Command
 from dxlrun.run.channels.events import EventCode
-from dxlrun.run.channels.inbox import Command
 from dxlrun.run.channels.packets import PacketKind
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import plan_of, simulated_robot
@@ -179,7 +179,7 @@ def test_the_progress_of_a_run_on_virtual_time_has_the_skipped_periods() -> None
         if cycles == 5:
             robot.clock.wait_until(robot.clock.now_ns() + 70_000_000)
 
-    robot.progress = fall_behind
+    robot.sinks.progress = fall_behind
     result = robot.run()
     assert result.skipped == 3
     assert seen[4:6] == [(5, 0), (6, 3)]

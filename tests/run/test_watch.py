@@ -172,7 +172,7 @@ def set_up(tmp_path: Path, transactions: int) -> bool | None:
 
     clock, ledger = VirtualClock(), Ledger()
     buses = [SimulatedBus(config, ledger, 0) for config in simulated_buses(plan)]
-    events = EventRing(Handover(lambda _: None), clock)
+    events = EventRing(Handover(lambda kind, payload: None), clock)
     hardware = DynamixelHardware(
         plan.buses,
         VirtualPorts(clock, buses),

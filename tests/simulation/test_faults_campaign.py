@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 
 from dxlrun.log.reader import read_log
-from dxlrun.run.channels.inbox import Command
+from dxlrun.run.channels.commands import Command
 from dxlrun.simulation.faults.fault import KINDS
 from dxlrun.testing import VirtualRobot, simulated_robot
 

@@ -11,7 +11,7 @@ from dxlrun.compile import compile_files
 from dxlrun.dynamixel.control_table import all_tables
 from dxlrun.dynamixel.tools.scanning import FoundServo
 from dxlrun.errors import InputError, ServoFault
-from dxlrun.run.channels.inbox import Command
+from dxlrun.run.channels.commands import Command
 from dxlrun.testing import simulated_robot
 
 PORT = "/dev/ttyUSB0"

@@ -23,10 +23,9 @@ from dxlrun.control.schedule import Schedule
 from dxlrun.control.steering import Steering
 from dxlrun.errors import PortError, counted
 from dxlrun.interfaces import LOST_CYCLES
-from dxlrun.run.channels.commands import CommandSink, NoCommands, TakenCommand
+from dxlrun.run.channels.commands import LOOP, CommandSink, Inbox, NoCommands, NoInbox, TakenCommand
 from dxlrun.run.channels.cycle import CycleRecord
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
-from dxlrun.run.channels.inbox import LOOP, Inbox, NoInbox
 
 MOST_RATE = 100_000.0
 """Hz; as in the robot file."""

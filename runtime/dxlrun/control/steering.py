@@ -12,10 +12,9 @@ import numpy as np
 
 from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.loop_plan import ControllerPlan
-from dxlrun.run.channels.commands import CommandSink, TakenCommand
+from dxlrun.run.channels.commands import LOOP, Command, CommandSink, Inbox, TakenCommand
 from dxlrun.run.channels.cycle import CycleRecord
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
-from dxlrun.run.channels.inbox import LOOP, Command, Inbox
 
 
 class Steered(Protocol):

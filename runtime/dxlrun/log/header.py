@@ -39,6 +39,16 @@ class LogHeader:
 
 
 @dataclass(frozen=True, slots=True)
+class RecorderJob:
+    """What a recorder works on, as JSON through a descriptor."""
+
+    path: str
+    header: LogHeader
+    rings: dict[str, int]
+    """Descriptors of the rings that it reads, by their names."""
+
+
+@dataclass(frozen=True, slots=True)
 class LogSummary:
     """What was written, and what was not."""
 

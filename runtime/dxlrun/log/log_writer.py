@@ -19,11 +19,11 @@ from dxlrun.log.diagnostics import Diagnostics
 from dxlrun.log.header import LogHeader, LogSummary, to_metadata
 from dxlrun.log.log_file import LogFile
 from dxlrun.log.schemas import MessageType
-from dxlrun.run.channels.commands import CommandPieces
+from dxlrun.run.channels.commands import decode_taken_command
 from dxlrun.run.channels.cycle import CycleLayout
 from dxlrun.run.channels.events import Event, EventCode, Severity, decode_event
 from dxlrun.run.channels.packets import split_packets
-from dxlrun.run.channels.ring import Payload
+from dxlrun.run.channels.ring import Payload, RecordKind
 
 CHUNK_BYTES = 256 * 1024
 _PACKET = struct.Struct("<4sqqBBxxI")
@@ -55,7 +55,12 @@ class LogWriter:
             cast("IO[bytes]", self._file), chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD
         )
         self._sequences: dict[int, int] = {}
-        self._pieces = CommandPieces()
+        self._takers: dict[int, Callable[[Payload], None]] = {
+            RecordKind.CYCLE: self._cycle,
+            RecordKind.PACKETS: self._packets,
+            RecordKind.EVENT: self._event_record,
+            RecordKind.TAKEN_COMMAND: self._taken_command,
+        }
         self._diagnostics = Diagnostics(header.joints)
         self._event, self._ros_log, self._joint_state, self._command = (
             Codec(message)
@@ -160,14 +165,15 @@ class LogWriter:
         except OSError:
             return  # what lies behind the last whole chunk stays; a reader stops there
 
-    def cycle(self, payload: Payload) -> None:
-        """Write one cycle record: /cycle, the goals, and the states that controllers marked.
-
-        The record before the first cycle goes to /activation.
-        """
-        self._guarded(lambda: self._cycle(payload))
+    def take(self, kind: int, payload: Payload) -> None:
+        """Write one record of a ring. Raises ValueError when it is none that the log can hold."""
+        if kind not in self._takers:
+            raise ValueError(f"a record of kind {kind} does not belong into a log")
+        self._guarded(lambda: self._takers[kind](payload))
 
     def _cycle(self, payload: Payload) -> None:
+        """Write a cycle: /cycle, the goals, and the states that controllers marked; before the first one
+        /activation."""
         data = bytes(payload)
         record = np.frombuffer(data, dtype=self._layout.dtype)[0]
         written_ns, read_ns = int(record["written_ns"]), int(record["read_ns"])
@@ -206,23 +212,14 @@ class LogWriter:
     def _stamp(self, t_ns: int) -> tuple[int, int]:
         return divmod(max(0, t_ns + self.header.epoch_offset_ns), 1_000_000_000)
 
-    def packets(self, payload: Payload) -> None:
-        """Write one batch of packets, each to its bus' topic."""
-        self._guarded(lambda: self._packets(payload))
-
     def _packets(self, payload: Payload) -> None:
+        """Write one batch of packets, each to its bus' topic."""
         for bus, kind, servo_id, first_ns, last_ns, data in split_packets(payload):
             head = _PACKET.pack(ENCAPSULATION, first_ns, last_ns, kind, servo_id, len(data))
             self._add(self._bus_channels[bus], last_ns, head + data)
 
-    def command(self, payload: Payload) -> None:
-        """Write one command that a cycle took, when its last piece is there.
-
-        Raises ValueError for a piece whose predecessors were lost.
-        """
-        command = self._pieces.add(payload)
-        if command is None:
-            return
+    def _taken_command(self, payload: Payload) -> None:
+        command = decode_taken_command(payload)
         data = self._command.pack(
             command.t_ns,
             command.cycle,
@@ -234,13 +231,13 @@ class LogWriter:
             command.text,
             command.numbers,
         )
-        self._guarded(lambda: self._add(self._taken_channel, command.t_ns, data))
+        self._add(self._taken_channel, command.t_ns, data)
 
-    def event(self, payload: Payload) -> None:
-        """Write one event, to /events and /rosout."""
-        self._guarded(lambda: self._write_event(decode_event(payload)))
+    def _event_record(self, payload: Payload) -> None:
+        self._write_event(decode_event(payload))
 
     def _write_event(self, event: Event) -> None:
+        """Write one event, to /events and /rosout."""
         data = self._event.pack(
             event.t_ns, event.code, event.severity, event.part, event.name, event.source, event.text
         )

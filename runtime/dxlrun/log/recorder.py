@@ -9,57 +9,17 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, TypeAlias
 
 import msgspec
 
-from dxlrun.log.header import LogHeader, LogSummary
+from dxlrun.log.header import LogSummary, RecorderJob
 from dxlrun.log.log_writer import LogWriter
-from dxlrun.run.channels.ring import Gap, Payload, RingReader
+from dxlrun.run.channels.ring import Gap, RingReader
 
 POLL_S = 0.005
 FLUSH_S = 0.5
 SYNC_S = 2.0
 _MOST_PER_TURN = 2000
-
-RingKind: TypeAlias = Literal["cycles", "packets", "events", "commands"]
-
-
-@dataclass(frozen=True, slots=True)
-class RecordedRing:
-    """One ring that the recorder reads."""
-
-    kind: RingKind
-    fd: int
-    """Descriptor of the ring's memory, inherited."""
-    source: str
-    """Who writes it: loop, guardian, supervisor."""
-
-
-@dataclass(frozen=True, slots=True)
-class RecorderJob:
-    """What the recorder is told to do, as JSON through a descriptor."""
-
-    path: str
-    header: LogHeader
-    rings: tuple[RecordedRing, ...]
-
-
-class _Tap:
-    """One ring, and where its records go."""
-
-    __slots__ = ("name", "reader", "take")
-
-    def __init__(self, ring: RecordedRing, log: LogWriter) -> None:
-        self.name = f"{ring.source}/{ring.kind}"
-        self.reader = RingReader(ring.fd)
-        takers: dict[RingKind, Callable[[Payload], None]] = {
-            "cycles": log.cycle,
-            "packets": log.packets,
-            "events": log.event,
-            "commands": log.command,
-        }
-        self.take = takers[ring.kind]
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +75,7 @@ class Recorder:
     def __init__(self, job: RecorderJob, control: Control) -> None:
         self._control = control
         self._log = LogWriter(Path(job.path), job.header)
-        self._taps = [_Tap(ring, self._log) for ring in job.rings]
+        self._rings = [(name, RingReader(descriptor)) for name, descriptor in job.rings.items()]
         self._reported = False
         self._next_flush = self._next_sync = time.monotonic() + FLUSH_S
 
@@ -136,7 +96,7 @@ class Recorder:
 
     def _turn(self) -> bool:
         """Take what is there, bounded, and keep the file's rhythm; True when there may be more."""
-        full = [self._drain(tap) for tap in self._taps]
+        full = [self._drain(name, ring) for name, ring in self._rings]
         now = time.monotonic()
         if now >= self._next_flush:
             sync = now >= self._next_sync
@@ -146,28 +106,23 @@ class Recorder:
         self._report()
         return any(full)
 
-    def _drain(self, tap: _Tap) -> bool:
-        lost = 0
+    def _drain(self, name: str, ring: RingReader) -> bool:
+        """Write what is in a ring, at most _MOST_PER_TURN records; return whether there may be more."""
+        lost, record = 0, None
         for _ in range(_MOST_PER_TURN):
-            record = tap.reader.read()
+            record = ring.read()
             if record is None:
                 break
             if isinstance(record, Gap):
                 lost += record.lost
                 continue
             try:
-                tap.take(record)
+                self._log.take(record.kind, record.payload)
             except (ValueError, IndexError, OverflowError):
-                lost += 1  # whole, but not what this ring should carry: declared like any other loss
-        else:
-            self._declare(tap, lost)
-            return True
-        self._declare(tap, lost)
-        return False
-
-    def _declare(self, tap: _Tap, lost: int) -> None:
+                lost += 1  # whole, but not what the log can hold: declared like any other loss
         if lost:
-            self._log.gap(tap.name, lost)
+            self._log.gap(name, lost)
+        return record is not None
 
     def _report(self) -> None:
         if self._log.error is not None and not self._reported:

@@ -12,7 +12,7 @@ class Descriptors:
     heartbeat: int
     cycles: int
     events: int
-    guardian_events: int
+    guardian: int
     mailbox: int
     answers: int
 

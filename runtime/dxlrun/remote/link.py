@@ -8,7 +8,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import msgspec
 
@@ -16,22 +16,22 @@ from dxlrun.compile.plan import Plan
 from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.remote.job import Descriptors
 from dxlrun.remote.preparation import Refusal
+from dxlrun.run.channels.commands import LONGEST_COMMAND, LOOP, Command
 from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
 from dxlrun.run.channels.events import Event, EventCode, decode_event
 from dxlrun.run.channels.heartbeat import Heartbeat, Phase
-from dxlrun.run.channels.inbox import LOOP, Command
-from dxlrun.run.channels.mailbox import LARGEST, Answers, MailboxWriter
-from dxlrun.run.channels.ring import RingReader
+from dxlrun.run.channels.mailbox import Answers, MailboxWriter
+from dxlrun.run.channels.ring import Record, RecordKind, RingReader
 
 ANSWER_S = 2.0
 """A loop that does not answer in this time, and two of its periods, is not waited for any longer."""
 MOST_WAITING = 64
-MOST_WAITING_BYTES = 2 * LARGEST
+MOST_WAITING_BYTES = 2 * LONGEST_COMMAND
 """What may wait for the loop's answer; the rest of the mailbox is kept for `stop`."""
 KEPT_EVENTS = 1000
 KEPT_TEXT = 1 << 20
 """So many of the newest events are kept for clients, and so many characters of their texts."""
-LONGEST_DATA = LARGEST - 1024
+LONGEST_DATA = LONGEST_COMMAND - 1024
 """Bytes; what an operation of the mailbox has beside names."""
 ENTER_S = 6.0
 """The loop gives joints five seconds to come into their modes."""
@@ -72,15 +72,6 @@ class _Asked:
     """What the gateway knows anew when the loop has done it; also when nobody waits for the answer."""
 
 
-@dataclass(slots=True)
-class _Teller:
-    """A process that tells events."""
-
-    ring: RingReader
-    last: int = 0
-    """Number of its newest event: pieces that follow belong to it."""
-
-
 class Link:
     """What the gateway knows of the loop, and how it asks it; one asyncio loop, no threads."""
 
@@ -95,7 +86,7 @@ class Link:
         joints = tuple(joint.name for joint in plan.loop.joints)
         layout = CycleLayout(joints, tuple(one.name for one in plan.loop.controllers))
         self._record = CycleRecord(layout)
-        self._tellers = [_Teller(RingReader(memory.events)), _Teller(RingReader(memory.guardian_events))]
+        self._event_rings = (RingReader(memory.events), RingReader(memory.guardian))
         self._mailbox = MailboxWriter(memory.mailbox)
         self._answers = Answers(memory.answers)
         self._numbers = itertools.count(1)
@@ -109,8 +100,8 @@ class Link:
     def newest(self) -> CycleRecord | None:
         """Return the newest cycle, None before the first; the memory is used again."""
         found = self._cycles.newest()
-        if found is not None and len(found) == len(self._record.raw):
-            self._record.raw[:] = found
+        if found is not None and len(found.payload) == len(self._record.raw):
+            self._record.raw[:] = found.payload
         return self._record if self._record.woken_ns else None
 
     def active(self, loaded: Loaded) -> bool:
@@ -220,26 +211,19 @@ class Link:
                 asked.done()
             if not asked.answer.done():
                 asked.answer.set_result(refusal)
-        for teller in self._tellers:
-            while (record := teller.ring.read()) is not None:
-                if isinstance(record, bytes):  # the log tells of gaps
+        for ring in self._event_rings:
+            while (record := ring.read()) is not None:
+                # the log reports gaps; packets and commands are for it alone
+                if isinstance(record, Record) and record.kind == RecordKind.EVENT:
                     with suppress(ValueError):
-                        self._hear(teller, decode_event(record))
+                        self._hear(decode_event(record.payload))
 
-    def _hear(self, teller: _Teller, event: Event) -> None:
-        """Keep an event; a long text comes in pieces, one after the other."""
+    def _hear(self, event: Event) -> None:
+        """Keep an event, and note what it says of its controller."""
         self._text += len(event.text)
         while self.events and (self._text > KEPT_TEXT or len(self.events) >= KEPT_EVENTS):
             self._text -= len(self.events.popleft()[1].text)
-        if event.part:
-            for index in reversed(range(len(self.events))):
-                number, before = self.events[index]
-                if number == teller.last:
-                    self.events[index] = (number, replace(before, text=before.text + event.text))
-                    break
-            return
-        teller.last = next(self._event_numbers)
-        self.events.append((teller.last, event))
+        self.events.append((next(self._event_numbers), event))
         loaded = self.controllers.get(event.source)
         if loaded is not None:
             self._follow(loaded, event)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, field
 
 from dxlrun.clock import Clock
 from dxlrun.compile.plan import Plan
@@ -12,34 +11,42 @@ from dxlrun.control.controllers.activity import Activity
 from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.gate import Gate
-from dxlrun.control.loop import CycleSink, Loop, StopFlag
+from dxlrun.control.loop import Loop, StopFlag
 from dxlrun.dynamixel.exchange import kernel
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.port.ports import Ports
-from dxlrun.run.channels.commands import CommandSink
+from dxlrun.run.channels.commands import CommandSink, Inbox, NoInbox
 from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
 from dxlrun.run.channels.events import EventSink
-from dxlrun.run.channels.inbox import Inbox, NoInbox
 from dxlrun.run.channels.packets import PacketLog
+from dxlrun.run.channels.ring import Appender, RecordKind
 
 
-class Sinks(CycleSink, Protocol):
-    """Where cycles, packets and events go."""
+@dataclass(slots=True)
+class Sinks:
+    """Where the records of a run go: into rings, straight into a log, or nowhere."""
 
-    @property
-    def packets(self) -> PacketLog:
-        """Takes every packet that goes over a line."""
-        ...
+    cycles: Appender
+    packets: PacketLog
+    """Takes every packet that goes over a line."""
+    events: EventSink
+    commands: CommandSink
+    progress: Callable[[int, int], None] = lambda cycles, skipped: None
+    """Called after each cycle with how many ran and how many periods were skipped."""
+    ran: int = field(default=0, init=False)
+    skipped: int = field(default=0, init=False)
 
-    @property
-    def events(self) -> EventSink:
-        """Takes what happens beside the cycle."""
-        ...
+    def begin(self, record: CycleRecord) -> None:
+        """Record the packets of the start-up, and what the controllers are activated with."""
+        self.packets.commit()
+        self.cycles.append(RecordKind.CYCLE, record.raw)
 
-    @property
-    def commands(self) -> CommandSink:
-        """Takes what controllers were handed."""
-        ...
+    def append(self, record: CycleRecord) -> None:
+        """Record one finished cycle, and the packets since the one before."""
+        self.begin(record)
+        self.ran += 1
+        self.skipped += record.skipped
+        self.progress(self.ran, self.skipped)
 
 
 @dataclass(frozen=True, slots=True)

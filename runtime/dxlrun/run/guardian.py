@@ -72,8 +72,8 @@ class GuardianJob:
     """Real-time priority of the guardian; 0: none."""
     lock_memory: bool
     heartbeat: int
-    packets: int
-    events: int
+    records: int
+    """The guardian's ring: its packets and its events."""
     loop_packets: int
     """The loop's ring of packets: says whether the batch on the desk is in it."""
     desk: int
@@ -93,8 +93,8 @@ class LastHand:
         self._job = job
         self._clock = MonotonicClock()
         self._heartbeat = Heartbeat(job.heartbeat)
-        self._ring = RingWriter(job.packets)
-        self._events = EventRing(RingWriter(job.events), self._clock)
+        self._ring = RingWriter(job.records)
+        self._events = EventRing(self._ring, self._clock)
 
     def end(self, descriptors: Sequence[int], how: str, severity: Severity) -> list[str]:
         """Leave the robot as the policy for a fault does, without its steps; return that as sentences.

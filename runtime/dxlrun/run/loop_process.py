@@ -14,7 +14,7 @@ import sys
 import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 
 import msgspec
 
@@ -31,10 +31,9 @@ from dxlrun.dynamixel.hardware import TAKEN_BACK
 from dxlrun.dynamixel.port.ports import MOST_SHARE, ReplyPolling, SerialPort, SerialPorts
 from dxlrun.dynamixel.port.reopening import LinesAgain
 from dxlrun.errors import DxlrunError, PlugInError, counted
-from dxlrun.run.assembly import assemble
+from dxlrun.run.assembly import Sinks, assemble
 from dxlrun.run.channels import process
 from dxlrun.run.channels.commands import CommandRing
-from dxlrun.run.channels.cycle import CycleRecord
 from dxlrun.run.channels.events import EventCode, EventGroup, EventRing, Severity
 from dxlrun.run.channels.heartbeat import Heartbeat, Phase
 from dxlrun.run.channels.mailbox import Mailbox
@@ -55,7 +54,7 @@ class LoopJob:
     desk: int
     """Where the packets of the unfinished cycle lie."""
     events: int
-    commands: int
+    """Also the commands that cycles took."""
     result: int
     mailbox: int
     answers: int
@@ -92,32 +91,6 @@ class Outcome:
     """Cycles in which the state of each joint was not valid."""
     errors: tuple[EventGroup, ...] = ()
     """Events that were errors."""
-
-
-@dataclass(slots=True)
-class RingSinks:
-    """The rings of the loop's process; a cycle takes the packets of its exchange with it."""
-
-    cycles: RingWriter
-    packets: PacketBatch
-    events: EventRing
-    commands: CommandRing
-    heartbeat: Heartbeat
-    _count: int = field(default=0, init=False)
-    _skipped: int = field(default=0, init=False)
-
-    def begin(self, record: CycleRecord) -> None:
-        """Put the packets of the start-up and what the controllers are activated with into the rings."""
-        self.packets.commit()
-        self.cycles.append(record.raw)
-
-    def append(self, record: CycleRecord) -> None:
-        """Put one finished cycle, and the packets since the one before, into the rings."""
-        self.packets.commit()
-        self.cycles.append(record.raw)
-        self._count += 1
-        self._skipped += record.skipped
-        self.heartbeat.cycle(self._count, self._skipped)
 
 
 def _keep_to_this_process(descriptors: Sequence[int]) -> None:
@@ -195,7 +168,7 @@ def beside_simulation(plan: Plan) -> SchedulerPlan:
     return replace(scheduler, cores=tuple(sorted(others))) if simulated else scheduler
 
 
-def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: RingSinks) -> Outcome:
+def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks) -> Outcome:
     """Execute the plan from plug-ins to torque off."""
     stop = StopFlag()
     signal.signal(signal.SIGTERM, lambda *_: stop.request())
@@ -250,12 +223,11 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: RingSinks) -> Ou
         (*detail, *failures),
         remarks,
         invalid=result.invalid,
-        errors=sinks.events.errors.groups,
     )
 
 
 def _prepare(  # noqa: PLR0917  what a loop's process has
-    plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: RingSinks, ports: SerialPorts, pacing: Pacing
+    plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks, ports: SerialPorts, pacing: Pacing
 ) -> None:
     """Ask the operating system for real time, measure how late sleeps wake, and tell both."""
     grants = realtime.apply(beside_simulation(plan))
@@ -277,13 +249,15 @@ def main() -> None:
     _keep_to_this_process(job.descriptors)
     clock = MonotonicClock()
     heartbeat = Heartbeat(job.heartbeat)
-    events = EventRing(RingWriter(job.events), clock)
-    batch = PacketBatch(RingWriter(job.packets), process.shared_memory(job.desk))
-    sinks = RingSinks(RingWriter(job.cycles), batch, events, CommandRing(RingWriter(job.commands)), heartbeat)
+    happened = RingWriter(job.events)
+    events = EventRing(happened, clock)
+    packets = PacketBatch(RingWriter(job.packets), process.shared_memory(job.desk))
+    sinks = Sinks(RingWriter(job.cycles), packets, events, CommandRing(happened), heartbeat.cycle)
     try:
         if os.getppid() != job.guardian:
             sys.exit(1)  # the guardian was gone before its death could be signalled
         outcome = _run(from_json(process.whole(job.plan)), job, heartbeat, sinks)
+        outcome = replace(outcome, errors=events.errors.groups)
     except DxlrunError as error:
         outcome = Outcome("start-up", sentences=error.sentences)
         events.emit(EventCode.SETUP, Severity.ERROR, "loop", "\n".join(error.sentences))

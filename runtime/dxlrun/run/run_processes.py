@@ -12,20 +12,23 @@ import msgspec
 from dxlrun.compile.plan import Plan, to_json
 from dxlrun.compile.simulation import simulated_bodies, simulated_buses
 from dxlrun.control.realtime.grants import Grant, guardian_priority
-from dxlrun.log.header import LogHeader
+from dxlrun.log.header import LogHeader, RecorderJob
 from dxlrun.remote.job import Descriptors, GatewayJob
 from dxlrun.run.assembly import cycle_layout
 from dxlrun.run.channels import heartbeat, mailbox, process, ring
 from dxlrun.run.channels.child import Child
-from dxlrun.run.channels.commands import COMMAND_SLOT, command_slots
-from dxlrun.run.channels.cycle import MOST_CONTROLLERS, cycle_slots
-from dxlrun.run.channels.events import EVENT_SLOT, event_slots
-from dxlrun.run.channels.packets import PACKET_SLOT, packet_slots
+from dxlrun.run.channels.commands import LONGEST_COMMAND, command_capacity
+from dxlrun.run.channels.cycle import MOST_CONTROLLERS, cycle_capacity
+from dxlrun.run.channels.events import LONGEST_EVENT, event_capacity
+from dxlrun.run.channels.packets import DESK_SIZE, LONGEST_BATCH, packet_capacity
 from dxlrun.run.guardian import GuardianJob
 from dxlrun.run.loop_process import LoopJob, Outcome
 from dxlrun.simulation import SimulationConfig, encode_config
 
-_GUARDIAN_SLOTS = 1024
+_GUARDIAN_CAPACITY = 2 << 20
+"""Bytes: it sends and receives little, and reports little."""
+_LONGEST_TAKEN = LONGEST_COMMAND + 64
+"""Bytes of a command's record when a cycle has taken it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,9 +41,9 @@ class Memory:
     packets: int
     desk: int
     events: int
-    commands: int
-    guardian_packets: int
-    guardian_events: int
+    """Of the loop, and the commands that its cycles took."""
+    guardian: int
+    """Packets and events of the guardian."""
     result: int
     mailbox: int
     answers: int
@@ -51,20 +54,21 @@ class Memory:
     def create(cls, plan: Plan) -> Memory:
         """Create it all, rings sized for ten seconds of this robot."""
         servos = sum(len(bus.servos) for bus in plan.buses)
-        period = plan.loop.period_ns
+        period, cycle = plan.loop.period_ns, cycle_layout(plan).size
+        events = event_capacity(period, servos) + command_capacity(
+            period, len(plan.loop.controllers), mailbox.capacity(MOST_CONTROLLERS)
+        )
         return cls(
             plan=process.memory_file("dxlrun-plan", to_json(plan)),
             heartbeat=heartbeat.create(),
-            cycles=ring.create("cycles", cycle_layout(plan).size, cycle_slots(period)),
-            packets=ring.create("packets", PACKET_SLOT, packet_slots(period, servos)),
-            desk=process.memory_file("dxlrun-desk", bytes(PACKET_SLOT + 64)),
-            events=ring.create("events", EVENT_SLOT, event_slots(period, servos)),
-            commands=ring.create("commands", COMMAND_SLOT, command_slots(period, len(plan.loop.controllers))),
-            guardian_packets=ring.create("guardian-packets", PACKET_SLOT, _GUARDIAN_SLOTS),
-            guardian_events=ring.create("guardian-events", EVENT_SLOT, _GUARDIAN_SLOTS),
+            cycles=ring.create("cycles", cycle_capacity(period, cycle), cycle),
+            packets=ring.create("packets", packet_capacity(period, servos), LONGEST_BATCH),
+            desk=process.memory_file("dxlrun-desk", bytes(DESK_SIZE)),
+            events=ring.create("events", events, max(_LONGEST_TAKEN, LONGEST_EVENT)),
+            guardian=ring.create("guardian", _GUARDIAN_CAPACITY, max(LONGEST_BATCH, LONGEST_EVENT)),
             result=process.memory_file("dxlrun-result"),
             mailbox=mailbox.create(MOST_CONTROLLERS),
-            answers=ring.create("answers", mailbox.ANSWER_SLOT, mailbox.ANSWER_SLOTS),
+            answers=ring.create("answers", mailbox.ANSWERS_CAPACITY, mailbox.LONGEST_ANSWER),
             grants=process.memory_file("dxlrun-grants"),
             stderr=process.memory_file("dxlrun-stderr"),
         )
@@ -83,16 +87,14 @@ class Memory:
         except msgspec.MsgspecError:
             return ()
 
-    def rings(self) -> list[dict[str, object]]:
-        """Return what the recorder reads, and from whom."""
-        return [
-            {"kind": "cycles", "fd": self.cycles, "source": "loop"},
-            {"kind": "packets", "fd": self.packets, "source": "loop"},
-            {"kind": "events", "fd": self.events, "source": "loop"},
-            {"kind": "commands", "fd": self.commands, "source": "loop"},
-            {"kind": "packets", "fd": self.guardian_packets, "source": "guardian"},
-            {"kind": "events", "fd": self.guardian_events, "source": "guardian"},
-        ]
+    def rings(self) -> dict[str, int]:
+        """Return the rings that the recorder reads, by the name under which it reports missing records."""
+        return {
+            "loop/cycles": self.cycles,
+            "loop/packets": self.packets,
+            "loop/events": self.events,
+            "guardian": self.guardian,
+        }
 
 
 def _ready(child: Child) -> Mapping[str, object]:
@@ -124,9 +126,9 @@ def start_simulation(plan: Plan, ledger: Path | None, memory: Memory) -> tuple[C
 
 def start_recorder(log: Path, header: LogHeader, memory: Memory) -> Child:
     """Start the recorder and wait until the log is open."""
-    job = {"path": str(log), "header": header, "rings": memory.rings()}
+    job = RecorderJob(str(log), header, memory.rings())
     descriptor = process.memory_file("dxlrun-recorder", msgspec.json.encode(job))
-    descriptors = [descriptor, *(int(str(one["fd"])) for one in memory.rings())]
+    descriptors = [descriptor, *job.rings.values()]
     child = Child("recorder", "dxlrun.log", ["--job-fd", str(descriptor)], descriptors, memory.stderr)
     os.close(descriptor)
     _ready(child)
@@ -142,7 +144,7 @@ def start_gateway(log: Path | None, memory: Memory) -> Child:
         memory.heartbeat,
         memory.cycles,
         memory.events,
-        memory.guardian_events,
+        memory.guardian,
         memory.mailbox,
         memory.answers,
     )
@@ -164,7 +166,6 @@ def guardian_job(plan: Plan, ports: Mapping[str, str], memory: Memory, *, take_o
         memory.packets,
         memory.desk,
         memory.events,
-        memory.commands,
         memory.result,
         memory.mailbox,
         memory.answers,
@@ -180,8 +181,7 @@ def guardian_job(plan: Plan, ports: Mapping[str, str], memory: Memory, *, take_o
         priority=guardian_priority(scheduler),
         lock_memory=scheduler.lock_memory,
         heartbeat=memory.heartbeat,
-        packets=memory.guardian_packets,
-        events=memory.guardian_events,
+        records=memory.guardian,
         loop_packets=memory.packets,
         desk=memory.desk,
         stderr=memory.stderr,
@@ -194,7 +194,6 @@ def guardian_job(plan: Plan, ports: Mapping[str, str], memory: Memory, *, take_o
             memory.packets,
             memory.desk,
             memory.events,
-            memory.commands,
             memory.result,
             memory.mailbox,
             memory.answers,
@@ -211,7 +210,7 @@ def start_guardian(job: GuardianJob, others: Sequence[Child]) -> Child:
     see the end of their lines only after the guardian has made the robot limp.
     """
     descriptor = process.memory_file("dxlrun-guardian", msgspec.json.encode(job))
-    inherited = [descriptor, job.packets, job.events, *job.loop_descriptors]
+    inherited = [descriptor, job.records, *job.loop_descriptors]
     inherited += [other.line.fileno() for other in others]
     child = Child("guardian", "dxlrun.run.guardian", ["--job-fd", str(descriptor)], inherited, job.stderr)
     os.close(descriptor)

@@ -6,9 +6,8 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 from rich.console import Console
@@ -21,11 +20,10 @@ from dxlrun.control.loop import LoopResult, StopFlag
 from dxlrun.control.policy_plan import TORQUE_STAYS, Last
 from dxlrun.errors import DxlrunError, InputError
 from dxlrun.log.log_writer import LogWriter
-from dxlrun.run.assembly import assemble
-from dxlrun.run.channels.commands import CommandRing, NoCommands
+from dxlrun.run.assembly import Sinks, assemble
+from dxlrun.run.channels.commands import CommandRing, NoCommands, QueueInbox
 from dxlrun.run.channels.cycle import CycleRecord
 from dxlrun.run.channels.events import EventCode, EventGroup, EventRing, Severity
-from dxlrun.run.channels.inbox import QueueInbox
 from dxlrun.run.channels.packets import NoPackets, PacketBatch
 from dxlrun.run.channels.ring import Handover
 from dxlrun.run.run_log import discard_log, incomplete_log, log_header, new_log
@@ -34,45 +32,6 @@ from dxlrun.simulation import Ledger
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.motion.mechanics import Mechanics, plant_of
 from dxlrun.simulation.virtual_ports import VirtualPorts
-
-
-@dataclass(slots=True)
-class _LogSinks:
-    """Hand each cycle, its packets and all events straight to the log."""
-
-    writer: LogWriter
-    packets: PacketBatch
-    events: EventRing
-    commands: CommandRing
-    watch: Callable[[CycleRecord], None]
-
-    def begin(self, record: CycleRecord) -> None:
-        """Write the packets of the start-up and what the controllers are activated with."""
-        self.packets.commit()
-        self.writer.cycle(record.raw)
-
-    def append(self, record: CycleRecord) -> None:
-        """Write one finished cycle and the packets since the one before."""
-        self.packets.commit()
-        self.writer.cycle(record.raw)
-        self.watch(record)
-
-
-@dataclass(slots=True)
-class _NoSinks:
-    """A run without a log."""
-
-    packets: NoPackets
-    events: EventRing
-    commands: NoCommands
-    watch: Callable[[CycleRecord], None]
-
-    def begin(self, record: CycleRecord) -> None:
-        """Forget it."""
-
-    def append(self, record: CycleRecord) -> None:
-        """Count it."""
-        self.watch(record)
 
 
 class VirtualRobot:
@@ -108,44 +67,29 @@ class VirtualRobot:
         self.result: LoopResult | None = None
         self.failures: tuple[str, ...] = ()
         """What could not be switched off at the end, one sentence each."""
-        self.cycles = self.skipped = 0
-        """How many cycles ran, and how many periods were skipped."""
-        self.progress: Callable[[int, int], None] = lambda cycles, skipped: None
-        """Called with both after each cycle."""
         self.messages = 0
         self.log_error: str | None = None
         """Why the log is not whole."""
         self._writer = LogWriter(log, log_header(plan, 0, virtual=True)) if log else None
-        self._sinks = self._sinks_for(self._writer)
+        to_log = Handover(self._writer.take if self._writer else lambda kind, payload: None)
+        self._events = EventRing(to_log, self.clock)
+        self.sinks = Sinks(
+            to_log,
+            PacketBatch(to_log) if log else NoPackets(),
+            self._events,
+            CommandRing(to_log) if log else NoCommands(),
+        )
         self.robot = assemble(
             plan,
             load_plugins(),
             ports=VirtualPorts(self.clock, self.buses),
             clock=self.clock,
-            sinks=self._sinks,
+            sinks=self.sinks,
             beat=lambda: None,
             stop=self.stop,
             take_over=take_over,
             inbox=self.inbox,
         )
-
-    def _sinks_for(self, writer: LogWriter | None) -> _LogSinks | _NoSinks:
-        if writer is None:
-            return _NoSinks(
-                NoPackets(), EventRing(Handover(lambda _: None), self.clock), NoCommands(), self._count
-            )
-        return _LogSinks(
-            writer,
-            PacketBatch(Handover(writer.packets)),
-            EventRing(Handover(writer.event), self.clock),
-            CommandRing(Handover(writer.command)),
-            self._count,
-        )
-
-    def _count(self, record: CycleRecord) -> None:
-        self.cycles += 1
-        self.skipped += record.skipped
-        self.progress(self.cycles, self.skipped)
 
     @property
     def record(self) -> CycleRecord:
@@ -155,7 +99,7 @@ class VirtualRobot:
     @property
     def errors(self) -> tuple[EventGroup, ...]:
         """The events that were errors, by kind and source."""
-        return self._sinks.events.errors.groups
+        return self._events.errors.groups
 
     def run(self) -> LoopResult:
         """Set up, run to the plan's end or a fault, switch torque off unless a policy holds, close the log.
@@ -174,10 +118,10 @@ class VirtualRobot:
                 else:
                     self.robot.hardware.release()
         except DxlrunError as error:
-            self._sinks.events.emit(EventCode.SETUP, Severity.ERROR, "loop", "\n".join(error.sentences))
+            self.sinks.events.emit(EventCode.SETUP, Severity.ERROR, "loop", "\n".join(error.sentences))
             raise
         finally:
-            self._sinks.packets.commit()
+            self.sinks.packets.commit()
             if self._writer:
                 summary = self._writer.close()
                 self.messages, self.log_error = summary.messages, summary.error
@@ -216,7 +160,7 @@ def run_virtual(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
     began = time.monotonic()
     refused: tuple[str, ...] = ()
     with _stopped_by_signals(robot.stop), out.status(f"{plan.robot}: starting") as status:
-        robot.progress = Progress(plan, status, virtual=True).ran
+        robot.sinks.progress = Progress(plan, status, virtual=True).ran
         try:
             result = robot.run()
         except DxlrunError as error:
@@ -224,7 +168,7 @@ def run_virtual(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
                 sys.stderr.write(traceback.format_exc())
             result, refused = LoopResult(0, 0, "fault"), error.sentences
         except KeyboardInterrupt:
-            result = LoopResult(robot.cycles, robot.skipped, "stopped")
+            result = LoopResult(robot.sinks.ran, robot.sinks.skipped, "stopped")
     incomplete = [ledger.error] if ledger.error else []
     if robot.log_error:
         incomplete.append(incomplete_log(robot.log_error))

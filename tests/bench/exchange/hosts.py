@@ -19,19 +19,18 @@ from dxlrun.compile.plan import Plan
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.control.loop import StopFlag
 from dxlrun.dynamixel.port.ports import ReplyPolling, SerialPort, SerialPorts
-from dxlrun.run.assembly import assemble
+from dxlrun.run.assembly import Sinks, assemble
 from dxlrun.run.channels.commands import NoCommands
-from dxlrun.run.channels.cycle import CycleRecord
 from dxlrun.run.channels.events import EventCode, Severity
 from dxlrun.run.channels.packets import (
-    PACKET_SLOT,
+    LONGEST_BATCH,
     NoPackets,
     PacketBatch,
     PacketKind,
     decode_packets,
-    packet_slots,
+    packet_capacity,
 )
-from dxlrun.run.channels.ring import Gap, RingReader, RingWriter, create
+from dxlrun.run.channels.ring import Gap, Handover, RingReader, RingWriter, create
 from exchange.case import Case, Registers
 from exchange.peers import Rustypot, Sdk
 
@@ -89,21 +88,6 @@ class _Events:
         """Forget it."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Sinks:
-    """Where our loop's parts would put what they have."""
-
-    packets: PacketBatch | NoPackets
-    events: _Events
-    commands: NoCommands
-
-    def begin(self, record: CycleRecord) -> None:
-        """Forget it."""
-
-    def append(self, record: CycleRecord) -> None:
-        """Forget it."""
-
-
 class Ours:
     """The exchange of our loop: `DynamixelHardware` as a run assembles it, on a real descriptor."""
 
@@ -115,7 +99,7 @@ class Ours:
         packets: PacketBatch | NoPackets = NoPackets()
         if recorded:
             servos = sum(len(bus.servos) for bus in plan.buses)
-            self._ring = create("bench", PACKET_SLOT, packet_slots(1_000_000, servos))
+            self._ring = create("bench", packet_capacity(1_000_000, servos), LONGEST_BATCH)
             packets = PacketBatch(RingWriter(self._ring))
             self._recorded = RingReader(self._ring)
         self._commit = packets.commit
@@ -127,7 +111,7 @@ class Ours:
                 [SerialPort(self._descriptor, path)], polling=ReplyPolling(share=1.0) if polled else None
             ),
             clock=MonotonicClock(),
-            sinks=_Sinks(packets, _Events(), NoCommands()),
+            sinks=Sinks(Handover(lambda kind, payload: None), packets, _Events(), NoCommands()),
             beat=lambda: None,
             stop=StopFlag(),
             take_over=True,
@@ -168,7 +152,7 @@ class Ours:
                 return ()  # bytes are counted: without some of them nothing can be said
             found += [
                 (packet.first_ns, len(packet.data))
-                for packet in decode_packets(record)
+                for packet in decode_packets(record.payload)
                 if packet.kind is PacketKind.INSTRUCTION
             ]
         return found

@@ -6,9 +6,8 @@ from collections.abc import Collection, Iterable, Sequence
 
 from dxlrun.errors import LogError
 from dxlrun.log.steered import Steered
-from dxlrun.run.channels.commands import TakenCommand
+from dxlrun.run.channels.commands import Command, TakenCommand
 from dxlrun.run.channels.cycle import CycleRecord
-from dxlrun.run.channels.inbox import Command
 
 
 class RecordedInbox:

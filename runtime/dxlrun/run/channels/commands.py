@@ -1,25 +1,56 @@
-"""Commands on their way to the log: what cycles took for controllers and the loop; an input of the run."""
+"""Commands: on their way into the loop, and, once a cycle has taken them, to the log as inputs of the run.
+
+A command is for one controller, or for the loop itself (its name is then LOOP): switch, rate, pause, resume,
+load, unload, register, stop. Both are prepared and checked before they come here, and both are in the log.
+"""
 
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass, replace
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.run.channels.ring import RING_SECONDS, Appender, Payload
+from dxlrun.run.channels.ring import RING_SECONDS, Appender, Payload, RecordKind, record_size
 
-COMMAND_SLOT = 512
-"""Bytes of one slot of a commands' ring; a longer array takes several slots."""
+LOOP = ""
+"""Name of the addressee of a command that is for the loop itself; no controller can be called so."""
 
-_HEADER = struct.Struct("<qqqqIIHHH2x")
-_LONGEST_NAME = 64
-_FULL_MAILBOX = 5 * 1024
-"""Slots: 1 MiB of commands with the longest names (272 bytes a slot), and a long set-point of 63 streams."""
+MOST_PER_CYCLE = 8
+"""Commands that one cycle takes; the others wait for the next."""
+LONGEST_COMMAND = 256 * 1024
+"""Bytes of a command's record: a trajectory of some thousand points for twenty joints."""
+
+_COMMAND = struct.Struct("<qq")
+"""Number, lease; names and data follow."""
+_TAKEN = struct.Struct("<qqqq")
+"""Time, cycle, planned, lease; names and data follow."""
+_NAMES = struct.Struct("<HHH2x")
+"""Lengths of controller, kind and origin, which follow, and then the data."""
+_LONGEST_NAME = 0xFFFF
+_USUAL_COMMAND = 256
 _NUMBER = 8
 """Bytes of a float64."""
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """A request to a controller, or to the loop."""
+
+    number: int
+    """The sender's; the answer names it."""
+    controller: str
+    kind: str
+    data: bytes
+    """For a controller what its `prepare` made, little-endian float64; for the loop JSON (UTF-8)."""
+    origin: str
+    """The client, for the log."""
+    lease_ns: int = 0
+    """For how long it counts unless another one follows, ns; 0: for ever."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +66,7 @@ class TakenCommand:
     """Empty: the loop itself."""
     kind: str
     origin: str
-    """Who asked."""
+    """The client, or the place in a motion file."""
     data: bytes
     """Little-endian float64, for the loop JSON; empty for a planned command."""
     lease_ns: int = 0
@@ -68,8 +99,49 @@ def data_of(controller: str, text: str, numbers: NDArray[np.float64]) -> bytes:
     return numbers.tobytes() if controller else text.encode()
 
 
+class Inbox(Protocol):
+    """Where the loop finds commands; never blocks, never raises."""
+
+    def take(self) -> Sequence[Command]:
+        """Return what has come, in order, at most MOST_PER_CYCLE and the newest set-point of each stream."""
+        ...
+
+    def answer(self, number: int, refusal: str) -> None:
+        """Report to the sender what became of a command: done when `refusal` is empty, else why not."""
+        ...
+
+
+class NoInbox:
+    """The inbox of a loop that takes no commands from outside."""
+
+    def take(self) -> Sequence[Command]:
+        """Return nothing."""
+        return ()
+
+    def answer(self, number: int, refusal: str) -> None:
+        """Forget it: no command came from here."""
+
+
+class QueueInbox:
+    """Commands from the same process, on virtual time; `answers` holds the refusal of each number."""
+
+    def __init__(self) -> None:
+        self.waiting: deque[Command] = deque()
+        self.answers: dict[int, str] = {}
+
+    def take(self) -> Sequence[Command]:
+        """Return what has been put into `waiting`."""
+        if not self.waiting:
+            return ()
+        return [self.waiting.popleft() for _ in range(min(len(self.waiting), MOST_PER_CYCLE))]
+
+    def answer(self, number: int, refusal: str) -> None:
+        """Keep the answer."""
+        self.answers[number] = refusal
+
+
 class CommandSink(Protocol):
-    """Takes what cycles took; never blocks, never raises."""
+    """Takes the commands that cycles took; never blocks, never raises."""
 
     def take(self, command: TakenCommand) -> None:
         """Record one command."""
@@ -84,7 +156,7 @@ class NoCommands:
 
 
 class CommandRing:
-    """Appends commands to a ring, cut into slots; the number of slots grows only with the array."""
+    """Appends the commands that cycles took to a ring."""
 
     __slots__ = ("_writer",)
 
@@ -92,77 +164,59 @@ class CommandRing:
         self._writer = writer
 
     def take(self, command: TakenCommand) -> None:
-        """Append one command; names are cut at 64 bytes (the origin keeps its end, where the line is)."""
-        controller = command.controller.encode(errors="replace")[:_LONGEST_NAME]
-        kind = command.kind.encode(errors="replace")[:_LONGEST_NAME]
-        origin = command.origin.encode(errors="replace")[-_LONGEST_NAME:]
-        names = controller + kind + origin
-        room = self._writer.slot_size - _HEADER.size - len(names)
-        pieces = max(1, -(-len(command.data) // room))
-        lengths = len(controller), len(kind), len(origin)
-        for part in range(pieces):
-            head = _HEADER.pack(
-                command.t_ns,
-                command.cycle,
-                command.planned,
-                command.lease_ns,
-                part,
-                pieces - part - 1,
-                *lengths,
-            )
-            self._writer.append(head + names + command.data[part * room : (part + 1) * room])
+        """Append one command."""
+        head = _TAKEN.pack(command.t_ns, command.cycle, command.planned, command.lease_ns)
+        self._writer.append(RecordKind.TAKEN_COMMAND, head + _named_data(command))
 
 
-class CommandPieces:
-    """Puts the records of a commands' ring together again."""
-
-    __slots__ = ("_parts", "_pieces")
-
-    def __init__(self) -> None:
-        self._pieces: list[bytes] = []
-        self._parts = 0
-
-    def add(self, payload: Payload) -> TakenCommand | None:
-        """Take one record; return the command that it completes.
-
-        Raises ValueError when a record is none, or does not follow the one before: some were lost.
-        """
-        command, part, remaining = _decode(payload)
-        expected, self._parts = self._parts, part + 1 if remaining else 0
-        if part == 0:
-            self._pieces.clear()
-        elif part != expected or not self._pieces:
-            self._pieces.clear()
-            self._parts = 0
-            raise ValueError("a piece of a command came without those before it")
-        self._pieces.append(command.data)
-        if remaining:
-            return None
-        data = b"".join(self._pieces)
-        self._pieces.clear()
-        return replace(command, data=data)
+def encode_command(command: Command) -> bytes:
+    """Return the record of a command on its way to the loop."""
+    return _COMMAND.pack(command.number, command.lease_ns) + _named_data(command)
 
 
-def _decode(payload: Payload) -> tuple[TakenCommand, int, int]:
+def decode_command(payload: Payload) -> Command:
+    """Return the command of a record; raises ValueError when it is none."""
+    (number, lease_ns), (controller, kind, origin), data = _decoded(_COMMAND, payload)
+    if lease_ns < 0:
+        raise ValueError("a command has a lease below 0")
+    return Command(number, controller, kind, data, origin, lease_ns)
+
+
+def decode_taken_command(payload: Payload) -> TakenCommand:
+    """Return the command of a record that a cycle left; raises ValueError when it is none."""
+    (t_ns, cycle, planned, lease_ns), names, data = _decoded(_TAKEN, payload)
+    return TakenCommand(t_ns, cycle, planned, *names, data, lease_ns)
+
+
+def _named_data(command: Command | TakenCommand) -> bytes:
+    names = [
+        name.encode(errors="replace")[:_LONGEST_NAME]
+        for name in (command.controller, command.kind, command.origin)
+    ]
+    return b"".join((_NAMES.pack(*map(len, names)), *names, command.data))
+
+
+def _decoded(numbers: struct.Struct, payload: Payload) -> tuple[tuple[int, ...], tuple[str, str, str], bytes]:
+    """Return the numbers, the names and the data of a record."""
     try:
-        t_ns, cycle, planned, lease_ns, part, remaining, *lengths = _HEADER.unpack_from(payload)
+        values = numbers.unpack_from(payload)
+        lengths = _NAMES.unpack_from(payload, numbers.size)
     except struct.error as error:
         raise ValueError(f"a command ends inside its header: {error}") from error
-    data = bytes(payload[_HEADER.size :])
-    if len(data) < sum(lengths):
-        raise ValueError("a command is shorter than its names")
-    names = []
+    at, names = numbers.size + _NAMES.size, []
     for length in lengths:
-        names.append(data[:length].decode(errors="replace"))
-        data = data[length:]
+        names.append(bytes(payload[at : at + length]).decode(errors="replace"))
+        at += length
+    if at > len(payload):
+        raise ValueError("a command is shorter than its names")
     controller, kind, origin = names
-    return TakenCommand(t_ns, cycle, planned, controller, kind, origin, data, lease_ns), part, remaining
+    return values, (controller, kind, origin), bytes(payload[at:])
 
 
-def command_slots(period_ns: int, controllers: int) -> int:
-    """Return how many slots hold 10 s in which every controller takes a short command in each cycle.
+def command_capacity(period_ns: int, controllers: int, mailbox: int) -> int:
+    """Return how many bytes of a ring hold 10 s in which every controller takes a command in each cycle.
 
-    Beside them there is room for everything that a full mailbox gives one cycle: a command that overwrote its
-    own beginning would never come whole into the log.
+    Beside them there is room for everything that a full mailbox of so many bytes gives at once.
     """
-    return _FULL_MAILBOX + RING_SECONDS * 1_000_000_000 // period_ns * controllers
+    commands = RING_SECONDS * 1_000_000_000 // period_ns * controllers
+    return commands * record_size(_USUAL_COMMAND) + mailbox

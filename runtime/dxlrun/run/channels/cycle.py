@@ -17,7 +17,7 @@ from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
 from dxlrun.interfaces import COMMAND_INTERFACES, Commands, Floats, States
-from dxlrun.run.channels.ring import RING_SECONDS
+from dxlrun.run.channels.ring import RING_SECONDS, record_size
 
 MOST_CONTROLLERS = 63
 
@@ -121,7 +121,7 @@ class CycleLayout:
 
     @property
     def size(self) -> int:
-        """Bytes of one record: the slot size of the cycles' ring."""
+        """Bytes of one record."""
         return self.dtype.itemsize
 
 
@@ -255,6 +255,6 @@ def _rows(array: NDArray[np.void], first: str, count: int) -> Floats:
     return as_strided(row, (count, row.size), (row.nbytes + row.itemsize, row.itemsize))
 
 
-def cycle_slots(period_ns: int) -> int:
-    """Return how many slots hold 10 s of cycles, with a margin of a second."""
-    return max(64, (RING_SECONDS + 1) * 1_000_000_000 // period_ns)
+def cycle_capacity(period_ns: int, size: int) -> int:
+    """Return how many bytes of a ring hold 10 s of cycles of this size, with a margin of a second."""
+    return record_size(size) * max(64, (RING_SECONDS + 1) * 1_000_000_000 // period_ns)

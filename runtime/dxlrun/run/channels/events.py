@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from enum import IntEnum, unique
 from typing import Protocol
 
-from dxlrun.run.channels.ring import RING_SECONDS, Appender, Payload
+from dxlrun.run.channels.ring import RING_SECONDS, Appender, Payload, RecordKind, record_size
 
 
 @unique
@@ -94,11 +93,14 @@ class EventSink(Protocol):
         ...
 
 
-EVENT_SLOT = 240
-"""Bytes of one slot of an events' ring; a longer text takes several slots."""
-
-_MOST_PARTS = 32
-_HEADER = struct.Struct("<qHBBBxH")
+LONGEST_SOURCE = 64
+LONGEST_TEXT = 8192
+"""Characters; a longer text, such as a plug-in's traceback, is cut."""
+LONGEST_EVENT = 4 * LONGEST_TEXT + 4 * LONGEST_SOURCE + 64
+"""Bytes of an event's record."""
+_USUAL_EVENT = 192
+_HEADER = struct.Struct("<qHBxI")
+"""Time, code, severity, length of the source; source and text follow."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +116,7 @@ class Event:
     """A joint, a controller, a process."""
     text: str
     part: int = 0
-    """0 for an event; 1, 2 ... for the pieces of a text that did not fit one slot."""
+    """Always 0 but in older logs, where 1, 2 ... are the following pieces of a long text."""
 
     @property
     def name(self) -> str:
@@ -176,10 +178,7 @@ class _Now(Protocol):
 
 
 class EventRing:
-    """Takes events of one process and appends them to its ring; never blocks, never raises.
-
-    A text longer than a slot becomes several records (`part`); beyond 32 slots it is cut.
-    """
+    """Takes events of one process and appends them to its ring; never blocks, never raises."""
 
     __slots__ = ("_clock", "_writer", "errors")
 
@@ -190,30 +189,13 @@ class EventRing:
         """What was emitted as an error, for a run without a log."""
 
     def emit(self, code: EventCode, severity: Severity, source: str, text: str) -> None:
-        """Record that `source` (a joint, a controller, a process) has something to tell, now."""
+        """Record an event of `source` (a joint, a controller, a process), now."""
         t_ns = self._clock.now_ns()
         if severity >= Severity.ERROR:
             self.errors.add(Event(t_ns, code, severity, source, text))
-        name = source.encode(errors="replace")[:64]
-        room = min(self._writer.slot_size, EVENT_SLOT) - _HEADER.size - len(name)
-        for part, piece in enumerate(_pieces(text.encode(errors="replace"), room)):
-            if part == _MOST_PARTS:
-                break
-            header = _HEADER.pack(t_ns, code, severity, part, len(name), len(piece))
-            self._writer.append(header + name + piece)
-
-
-def _pieces(text: bytes, room: int) -> Iterator[bytes]:
-    """Cut UTF-8 into pieces of at most `room` bytes, never inside a character; at least one piece."""
-    start = 0
-    while True:
-        end = min(start + room, len(text))
-        while end < len(text) and text[end] & 0xC0 == 0x80:
-            end -= 1
-        yield text[start:end]
-        start = end
-        if start == len(text):
-            return
+        name = source[:LONGEST_SOURCE].encode(errors="replace")
+        header = _HEADER.pack(t_ns, code, severity, len(name))
+        self._writer.append(RecordKind.EVENT, header + name + text[:LONGEST_TEXT].encode(errors="replace"))
 
 
 def _known(code: int) -> int:
@@ -224,21 +206,22 @@ def _known(code: int) -> int:
 
 
 def decode_event(payload: Payload) -> Event:
-    """Return the event, or the piece of one, of one record. Raises ValueError when it is not one."""
+    """Return the event of one record. Raises ValueError when it is not one."""
     try:
-        t_ns, code, severity, part, name_length, text_length = _HEADER.unpack_from(payload)
+        t_ns, code, severity, name_length = _HEADER.unpack_from(payload)
     except struct.error as error:
         raise ValueError(f"an event ends inside its header: {error}") from error
     data = bytes(payload[_HEADER.size :])
-    if len(data) != name_length + text_length:
-        raise ValueError("an event is not as long as it says")
-    name = data[:name_length].decode(errors="replace")
-    return Event(t_ns, _known(code), severity, name, data[name_length:].decode(errors="replace"), part)
+    if len(data) < name_length:
+        raise ValueError("an event ends inside its source")
+    source, text = data[:name_length], data[name_length:]
+    return Event(t_ns, _known(code), severity, source.decode(errors="replace"), text.decode(errors="replace"))
 
 
-def event_slots(period_ns: int, servos: int) -> int:
-    """Return how many slots hold 10 s of the worst storm: in each cycle one event a servo, and four more.
+def event_capacity(period_ns: int, servos: int) -> int:
+    """Return how many bytes of a ring hold 10 s of the worst storm: one event a servo and four more a cycle.
 
-    That is what a robot says whose servos all fail and recover in turn; a row of misses is one event.
+    That is what a robot reports whose servos all fail and recover in turn; a row of misses is one event.
     """
-    return max(1024, RING_SECONDS * 1_000_000_000 // period_ns * (servos + 4))
+    events = max(1024, RING_SECONDS * 1_000_000_000 // period_ns * (servos + 4))
+    return LONGEST_EVENT + events * record_size(_USUAL_EVENT)

@@ -7,17 +7,19 @@ from dataclasses import dataclass
 from enum import IntEnum, unique
 from typing import Protocol
 
-from dxlrun.run.channels.ring import RING_SECONDS, Appender, Payload
+from dxlrun.run.channels.ring import RING_SECONDS, Appender, Payload, RecordKind, record_size
 
-PACKET_SLOT = 2048
-"""Bytes of one slot of the packets' ring: a batch, usually the packets of one cycle."""
+LONGEST_BATCH = 16 * 1024
+"""Bytes: a batch has the packets of one cycle, of a large robot and of noisy lines in pieces of this size."""
 
 _HEADER = struct.Struct("<BBBxI qq")
 RECORD_HEADER = _HEADER.size
 """Bytes in front of the packet in its record; its two times, 64-bit each, are the last of them."""
-_USED, _NUMBER = 0, 1
+_USED, _POSITION = 0, 1
 _WORDS = 2
 _DESK_HEADER = 8 * _WORDS
+DESK_SIZE = _DESK_HEADER + LONGEST_BATCH
+"""Bytes of memory for a batch that is not finished."""
 
 
 @unique
@@ -45,7 +47,7 @@ class LoggedPacket:
     """Index in the plan's buses."""
     kind: PacketKind
     servo_id: int
-    """Who is addressed or who answers; 254 is everybody, and noise of nobody known."""
+    """Of the servo that is addressed or that answers; 254: all of them, and noise of unknown origin."""
     first_ns: int
     last_ns: int
     data: bytes
@@ -87,12 +89,12 @@ class PacketLog(PacketSink, Protocol):
 class PacketBatch:
     """Collects packets in a buffer made before real time; one `commit` a cycle hands them on together.
 
-    A full buffer commits by itself. Bytes that are longer than a slot (noise only) become several records.
+    A full buffer commits by itself. Bytes longer than the buffer (noise only) become several packets.
 
-    `desk` is memory of `desk_size(writer)` bytes where the unfinished batch lies; shared memory lets whoever
-    outlives this process take it up with `salvage`, so that a loop that dies in the middle of a cycle does
-    not take that cycle's packets with it. Two 64-bit words lead it: bytes used, and the number that the batch
-    gets in its ring. Each is one store, because a process may be killed between any two.
+    `desk` is the memory where the unfinished batch lies, usually of DESK_SIZE; shared memory lets whichever
+    process outlives this one take it up with `salvage`, so that a loop that dies in the middle of a cycle
+    does not take that cycle's packets with it. Two 64-bit words lead it: bytes used, and the position of its
+    ring at which the batch will lie. Each is one store, because a process may be killed between any two.
     """
 
     __slots__ = ("_buffer", "_room", "_words", "_writer")
@@ -100,14 +102,14 @@ class PacketBatch:
     def __init__(self, writer: Appender, desk: memoryview | None = None) -> None:
         self._writer = writer
         if desk is None:
-            desk = memoryview(bytearray(desk_size(writer)))
+            desk = memoryview(bytearray(DESK_SIZE))
         self._words = desk[:_DESK_HEADER].cast("Q")
-        self._buffer = desk[_DESK_HEADER : desk_size(writer)]  # shared memory may be larger
+        self._buffer = desk[_DESK_HEADER:]
         self._room = len(self._buffer)
         self._words[_USED] = 0
-        self._words[_NUMBER] = writer.head
+        self._words[_POSITION] = writer.head
         if self._room <= _HEADER.size:
-            raise ValueError(f"a slot of {self._room} bytes holds no packet")
+            raise ValueError(f"a desk of {self._room} bytes holds no packet")
 
     def packet(  # noqa: PLR0917  called for every packet in the loop: positional is quickest
         self, bus: int, kind: int, servo_id: int, first_ns: int, last_ns: int, data: Payload
@@ -138,26 +140,21 @@ class PacketBatch:
     def commit(self) -> None:
         """Hand on what was collected; without packets nothing happens."""
         if used := self._words[_USED]:
-            number = self._writer.append(self._buffer[:used])
+            position = self._writer.append(RecordKind.PACKETS, self._buffer[:used])
             self._words[_USED] = 0
-            self._words[_NUMBER] = number + 1
+            self._words[_POSITION] = position
 
 
-def desk_size(writer: Appender) -> int:
-    """Return how many bytes of memory the unfinished batch of a writer needs."""
-    return _DESK_HEADER + min(writer.slot_size, 1 << 16)
-
-
-def salvage(desk: memoryview, committed: int, writer: Appender) -> None:
+def salvage(desk: memoryview, head: int, writer: Appender) -> None:
     """Append the batch that a process left unfinished when it died; call it when that process is gone.
 
-    `committed`: how many batches its ring has (`head`). A process that died after it had appended the batch,
-    and before it had cleared the desk, left nothing unfinished.
+    `head`: that of its ring. A process that died after it had appended the batch, and before it had cleared
+    the desk, left nothing unfinished.
     """
     words = desk[:_DESK_HEADER].cast("Q")
     used = words[_USED]
-    if words[_NUMBER] == committed and 0 < used <= min(len(desk) - _DESK_HEADER, writer.slot_size):
-        writer.append(desk[_DESK_HEADER : _DESK_HEADER + used])
+    if words[_POSITION] == head and 0 < used <= len(desk) - _DESK_HEADER:
+        writer.append(RecordKind.PACKETS, desk[_DESK_HEADER : _DESK_HEADER + used])
         words[_USED] = 0
 
 
@@ -210,11 +207,11 @@ def split_packets(payload: Payload) -> list[tuple[int, int, int, int, int, bytes
     return packets
 
 
-def packet_slots(period_ns: int, servos: int) -> int:
-    """Return how many slots of PACKET_SLOT hold 10 s of a robot with `servos` servos in all.
+def packet_capacity(period_ns: int, servos: int) -> int:
+    """Return how many bytes of a ring hold 10 s of a robot with `servos` servos in all.
 
     Per cycle: one instruction and one status a servo (Protocol 1.0 reads), goals, one probe, at most 40
-    bytes each beside the header; plus the unfinished slot of each commit.
+    bytes each beside the header.
     """
-    per_cycle = (2 * servos + 4) * (_HEADER.size + 40)
-    return max(256, RING_SECONDS * 1_000_000_000 // period_ns * (1 + -(-per_cycle // PACKET_SLOT)))
+    cycle = record_size((2 * servos + 4) * (_HEADER.size + 40))
+    return max(32 * LONGEST_BATCH, RING_SECONDS * 1_000_000_000 // period_ns * cycle)
