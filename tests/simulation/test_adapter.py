@@ -142,7 +142,7 @@ def test_a_collision_in_a_reply_that_is_half_handed_over_takes_only_the_rest() -
     assert len(whole) == 3
     bus.receive(bytes(1), 612_000)  # into its fourth byte
     assert b"".join(data for _, data in handed_over(bus)) == b""
-    assert any("talks into" in note for note in notes(bus))
+    assert any("sends into" in note for note in notes(bus))
 
 
 def test_a_wedged_adapter_takes_bytes_and_gives_none_until_it_is_mended() -> None:
@@ -153,7 +153,7 @@ def test_a_wedged_adapter_takes_bytes_and_gives_none_until_it_is_mended() -> Non
     bus.wedge(False)
     bus.receive(PING_1, 10 * MS)
     assert [data for _, data in handed_over(bus)] == [PONG_1]
-    assert bus.counts(bus.servo(1)).heard == 1
+    assert bus.servo(1).counts.received == 1
     assert notes(bus)[0] == "adapter wedged"
 
 
@@ -198,8 +198,8 @@ def test_what_the_servos_hear_of_an_instruction_can_be_changed_or_lost() -> None
         heard.append(b"".join(data for _, data in handed_over(bus, (turn + 1) * 10 * MS - 1)))
     assert heard == [b"", b"", PONG_1]
     assert notes(bus)[:2] == [
-        "the servos hear another instruction: lost",
-        "the servos hear another instruction: byte 5 flipped",
+        "the servos receive another instruction: lost",
+        "the servos receive another instruction: byte 5 flipped",
     ]
 
 
@@ -248,16 +248,16 @@ def test_a_servo_that_joins_the_line_answers_and_a_second_one_of_its_kind_collid
     assert sum(reply[2:]) & 0xFF != 0xFF
 
 
-def test_the_counts_tell_what_each_servo_heard_and_said(make_packet: Callable[..., bytes]) -> None:
+def test_each_servo_counts_instructions_and_replies(make_packet: Callable[..., bytes]) -> None:
     bus = new_bus(AdapterConfig())
     asked = (PING_1, make_packet(0xFE, 3, 25, 1), make_packet(1, 3, 25, 1), make_packet(2, 3, 25, 9))
     spoiled = make_packet(2, 2, 36, 2)[:-1] + b"\x00"
     for turn, data in enumerate((*asked, spoiled)):
         bus.receive(data, turn * 10 * MS)
         bus.take((turn + 1) * 10 * MS)
-    one, two = (bus.counts(bus.servo(servo_id)) for servo_id in (1, 2))
-    assert (one.heard, one.answered, one.errors) == (3, 2, 0)
-    assert (two.heard, two.answered, two.errors) == (2, 1, 1)
+    one, two = (bus.servo(servo_id).counts for servo_id in (1, 2))
+    assert (one.received, one.replied, one.errors) == (3, 2, 0)
+    assert (two.received, two.replied, two.errors) == (2, 1, 1)
     assert two.last_error == 0x08  # range (e-Manual, Protocol 1.0, Error)
 
 

@@ -88,7 +88,7 @@ def test_who_talks_into_a_reply_loses_both() -> None:
     bus.receive(READ_1, 0)  # the reply passes from 580 to 700 us
     bus.receive(READ_1, 600_000)
     assert bus.take(10**12) == bytes.fromhex("ff ff")  # 20 us of it
-    assert any("talks into" in entry.note for entry in bus.ledger.entries)
+    assert any("sends into" in entry.note for entry in bus.ledger.entries)
 
 
 def test_a_host_that_sends_within_the_return_delay_is_heard() -> None:

@@ -1,4 +1,4 @@
-"""Answers of a read in turn that are handed over together: the same bytes as those one by one."""
+"""Replies to a group read that are sent ahead, cached or handed over together: as those one by one."""
 
 from __future__ import annotations
 
@@ -67,20 +67,22 @@ def entries_of(
     next_ns: Callable[[SimulatedBus], int | None],
     *,
     midway: bool = False,
-    watched: bool = False,
+    one_by_one: bool = False,
 ) -> tuple[list[LedgerEntry], int]:
-    """Return what the ledger of random traffic says, and how often the host was given something.
+    """Return the ledger of random traffic, and how often bytes were handed over.
 
-    `midway`: some of what disturbs it comes between the answers.
-    `watched`: something that changes nothing is planned within each answer, so that it passes byte by byte.
+    `midway`: some of what disturbs it comes between the replies.
+    `one_by_one`: no reply is cached, and whatever was sent ahead is withdrawn every 5 us.
     """
     chance, ledger, now_ns, hands = random.Random(seed), Ledger(), 0, 0
     bus = bus_of(ledger, absent=absent)
     bus.receive(packet2(0xFE, 0x83, bytes((64, 0, 1, 0)) + b"".join(bytes((each, 1)) for each in IDS)), 0)
     for _ in range(60):
         disturb(bus, chance, now_ns)
-        if watched:
-            bus.at(now_ns + 1, lambda: None)
+        if one_by_one:
+            bus.servos[0].registers.version += 1
+            for t_ns in range(now_ns, now_ns + 300_000, 5_000):
+                bus.at(t_ns, lambda: bus.alter_next(99, "of a servo that is never read", bytes))
         bus.receive(question(chance), now_ns)
         if midway and chance.randint(0, 1):
             within_ns = now_ns + chance.randrange(200_000)
@@ -96,7 +98,7 @@ def entries_of(
 
 @pytest.mark.parametrize("absent", ["silent", "slot"])
 @pytest.mark.parametrize("seed", range(4))
-def test_gathered_answers_stand_in_the_ledger_as_single_ones_do(seed: int, absent: str) -> None:
+def test_gathered_replies_are_in_the_ledger_as_single_ones(seed: int, absent: str) -> None:
     def of_bus(entries: list[LedgerEntry]) -> list[LedgerEntry]:
         """Return entries in the order of time: what is handed over later is entered later."""
         return sorted(entries, key=lambda each: (each.t_ns, each.direction, each.data, each.note))
@@ -109,14 +111,14 @@ def test_gathered_answers_stand_in_the_ledger_as_single_ones_do(seed: int, absen
 
 @pytest.mark.parametrize("absent", ["silent", "slot"])
 @pytest.mark.parametrize("seed", range(4))
-def test_answers_that_nobody_disturbs_are_those_that_are_decided_one_by_one(seed: int, absent: str) -> None:
-    def entries(watched: bool) -> list[LedgerEntry]:
-        return entries_of(seed, absent, SimulatedBus.next_due_ns, midway=True, watched=watched)[0]
+def test_replies_sent_ahead_or_cached_are_those_that_are_decided_one_by_one(seed: int, absent: str) -> None:
+    def entries(one_by_one: bool) -> list[LedgerEntry]:
+        return entries_of(seed, absent, SimulatedBus.next_due_ns, midway=True, one_by_one=one_by_one)[0]
 
-    assert entries(watched=False) == entries(watched=True)
+    assert entries(one_by_one=False) == entries(one_by_one=True)
 
 
-def test_no_answer_waits_longer_than_a_microframe_and_the_last_one_not_at_all() -> None:
+def test_no_reply_waits_longer_than_a_microframe_and_the_last_one_not_at_all() -> None:
     ledger = Ledger()
     bus = bus_of(ledger)
     bus.receive(packet2(0xFE, SYNC_READ, PRESENT_POSITION + bytes(IDS)), 0)

@@ -41,7 +41,7 @@ def test_after_an_absent_servo_nobody_answers(make_line2: Any) -> None:
     line = make_line2((1, 3))
     line.tell(BROADCAST, SYNC_READ, POSITION + b"\x01\x02\x03")
     assert [each.servo_id for each in line.statuses()] == [1]
-    assert any("servo 2 does not answer" in note for note in line.notes())
+    assert any("servo 2 does not reply" in note for note in line.notes())
 
 
 def test_or_they_wait_for_its_time(make_line2: Any) -> None:
@@ -159,7 +159,7 @@ def bulk(*entries: tuple[int, int, int]) -> list[int]:
     return [0, *(number for servo_id, address, size in entries for number in (size, servo_id, address))]
 
 
-def test_mx_answer_a_bulk_read_in_turn(make_line: Any) -> None:
+def test_mx_answer_a_bulk_group_read(make_line: Any) -> None:
     line = make_line((1, 2, 3), "MX-28")
     line.send(BROADCAST, BULK_READ, *bulk((3, 36, 2), (1, 30, 4), (2, 43, 1)))
     heard = line.hear()

@@ -6,7 +6,7 @@ import pytest
 
 from dxlrun.errors import LogError
 from dxlrun.simulation import Ledger, LedgerEntry, read_ledger
-from dxlrun.simulation.bus.ledger import FLUSH_NS, Passed
+from dxlrun.simulation.bus.ledger import FLUSH_NS
 
 ENTRIES = (
     LedgerEntry(5, "main", "in", b"\xff\xff\x01", ""),
@@ -112,21 +112,3 @@ def test_what_does_not_fit_at_the_end_is_told() -> None:
     fill(ledger)
     ledger.close()
     assert "No space left" in str(ledger.error)
-
-
-@pytest.mark.parametrize("handed_ns", [None, 1_035, 1_090], ids=["virtual", "punctual", "late"])
-def test_answers_that_passed_together_stand_there_as_one_by_one(
-    tmp_path: Path, handed_ns: int | None
-) -> None:
-    passed = Passed("100 %d", 1_000, (0, 35), (b"\xff\xff", b"\x01"), handed_ns)
-    together, single = tmp_path / "together", tmp_path / "single"
-    with Ledger(together, keep=False) as ledger:
-        ledger.add_passed(passed)
-    with Ledger(single) as ledger:
-        for t_ns, data in ((1_000, b"\xff\xff"), (1_035, b"\x01")):
-            late_ns = 0 if handed_ns is None else handed_ns - t_ns
-            ledger.add(t_ns, "100 %d", "out", data, late_ns=late_ns)
-        kept = Ledger()
-        kept.add_passed(passed)
-        assert kept.entries == ledger.entries
-    assert together.read_bytes() == single.read_bytes()

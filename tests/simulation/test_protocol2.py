@@ -6,13 +6,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dxlrun.simulation.wire.packets import InstructionPacket, ReadEntry, ReadInTurn, Reply
+from dxlrun.simulation.wire.packets import GroupRead, InstructionPacket, ReadEntry, Reply
 from dxlrun.simulation.wire.protocol2 import (
     FastStatusPacket,
     Instruction,
     InstructionReceiver,
     crc16,
-    read_in_turn,
+    group_read,
     status_packet,
     stuffed,
     unstuffed,
@@ -192,7 +192,7 @@ def test_fast_status_is_not_stuffed() -> None:
 )
 def test_reads_in_turn(instruction: int, parameters: str, fast: bool, entries: tuple[ReadEntry, ...]) -> None:
     packet = InstructionPacket(0xFE, instruction, bytes.fromhex(parameters), intact=True, end=0)
-    assert read_in_turn(packet) == ReadInTurn(instruction, entries, fast=fast, has_slots=not fast)
+    assert group_read(packet) == GroupRead(instruction, entries, fast=fast, has_slots=not fast)
 
 
 @pytest.mark.parametrize(
@@ -205,6 +205,6 @@ def test_reads_in_turn(instruction: int, parameters: str, fast: bool, entries: t
         (0xFE, 0x82, "840004000102", False),
     ],
 )
-def test_what_is_no_read_in_turn(servo_id: int, instruction: int, parameters: str, intact: bool) -> None:
+def test_what_is_no_group_read(servo_id: int, instruction: int, parameters: str, intact: bool) -> None:
     packet = InstructionPacket(servo_id, instruction, bytes.fromhex(parameters), intact=intact, end=0)
-    assert read_in_turn(packet) is None
+    assert group_read(packet) is None

@@ -243,7 +243,7 @@ def servo_looks(bus: SimulatedBus, now_ns: int) -> list[Mapping[str, object]]:
 
 
 def _look(bus: SimulatedBus, servo: SimulatedServo) -> Mapping[str, object]:
-    counts = bus.counts(servo)
+    counts = servo.counts
     registers = servo.registers
     return {
         "bus": bus.name,
@@ -255,8 +255,8 @@ def _look(bus: SimulatedBus, servo: SimulatedServo) -> Mapping[str, object]:
         "temperature": servo.temperature,
         "voltage": servo.voltage,
         "error": registers.get("hardware_error_status", counts.last_error),
-        "heard": counts.heard,
-        "answered": counts.answered,
+        "heard": counts.received,
+        "answered": counts.replied,
     }
 
 

@@ -47,27 +47,6 @@ class LedgerEntry(NamedTuple):
     """`out`, in real time: how long after it should have been the host got the last of them."""
 
 
-class Passed(NamedTuple):
-    """Answers that passed the wire one after the other: as many entries, each of direction `out`."""
-
-    bus: str
-    begin_ns: int
-    dues_ns: tuple[int, ...]
-    """When each of them had passed, from `begin_ns` on."""
-    parts: tuple[bytes, ...]
-    handed_ns: int | None
-    """In real time: when the host got them."""
-
-    def entries(self) -> list[LedgerEntry]:
-        """Return them one by one."""
-        found = []
-        for due_ns, part in zip(self.dues_ns, self.parts, strict=True):
-            t_ns = self.begin_ns + due_ns
-            late_ns = 0 if self.handed_ns is None else self.handed_ns - t_ns
-            found.append(LedgerEntry(t_ns, self.bus, "out", part, "", late_ns))
-        return found
-
-
 def for_group(path: str, flags: int) -> int:
     """Open a file for `open`; a new one can be read by its user and group only."""
     return os.open(path, flags, _MODE)
@@ -89,7 +68,7 @@ class Ledger:
         self._file: IO[bytes] | None = None
         if path is not None:
             self._file = open(path, "wb", _BUFFER, opener=for_group)  # noqa: SIM115  `close` closes it
-        self._new: list[LedgerEntry | Passed] = []
+        self._new: list[LedgerEntry] = []
         """Entries that are not encoded yet."""
         self._unflushed_ns: int | None = None
 
@@ -108,40 +87,19 @@ class Ledger:
         if self._keep:
             self.entries.append(entry)
         if self._file is not None:
-            self._enter(entry, t_ns)
+            self._new.append(entry)
+            if self._unflushed_ns is None:
+                self._unflushed_ns = t_ns
+            if len(self._new) >= _MOST_ENTRIES:
+                self.encode()
         if direction == "note" and self.on_note is not None:
             self.on_note(note)
-
-    def add_passed(self, passed: Passed) -> None:
-        """Enter answers that passed one after the other, as `add` does each of them."""
-        if self._keep:
-            self.entries += passed.entries()
-        if self._file is not None:
-            self._enter(passed, passed.begin_ns + passed.dues_ns[0])
-
-    def _enter(self, new: LedgerEntry | Passed, t_ns: int) -> None:
-        self._new.append(new)
-        if self._unflushed_ns is None:
-            self._unflushed_ns = t_ns
-        if len(self._new) >= _MOST_ENTRIES:
-            self.encode()
 
     def encode(self, least: int = 1) -> None:
         """Make lines of so many new entries or more: for a moment in which nothing else is to be done."""
         if len(self._new) < least:
             return
-        lines = []
-        for each in self._new:
-            if isinstance(each, LedgerEntry):
-                lines.append(_line(each))
-                continue
-            bus, begin_ns, dues_ns, parts, handed_ns = each
-            if handed_ns is None or handed_ns <= begin_ns + dues_ns[-1]:
-                lines += map(_line, each.entries())  # nothing is told of a lateness of 0
-            else:
-                late_ns = handed_ns - begin_ns
-                numbers = [number for due_ns in dues_ns for number in (begin_ns + due_ns, late_ns - due_ns)]
-                lines.append(_form(bus, parts) % tuple(numbers))
+        lines = [_line(entry) for entry in self._new]
         self._new.clear()
         if self._file is not None:
             try:
@@ -203,16 +161,9 @@ def _begin(bus: str, direction: Direction) -> str:
 
 def _line(entry: LedgerEntry) -> str:
     t_ns, bus, direction, data, note, late_ns = entry
-    told = json.dumps(note) if note else '""'
+    text = json.dumps(note) if note else '""'
     late = f', "late_ns": {late_ns}' if late_ns else ""
-    return f'{{"t_ns": {t_ns}{_begin(bus, direction)}{data.hex()}", "note": {told}{late}}}\n'
-
-
-@lru_cache(maxsize=64)  # servos that rest say the same again and again
-def _form(bus: str, parts: tuple[bytes, ...]) -> str:
-    """Return the lines of some answers, with a place for the time and the lateness of each."""
-    begin = _begin(bus, "out").replace("%", "%%")
-    return "".join([f'{{"t_ns": %d{begin}{part.hex()}", "note": "", "late_ns": %d}}\n' for part in parts])
+    return f'{{"t_ns": {t_ns}{_begin(bus, direction)}{data.hex()}", "note": {text}{late}}}\n'
 
 
 def read_ledger(path: Path) -> tuple[LedgerEntry, ...]:

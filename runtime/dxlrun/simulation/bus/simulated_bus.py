@@ -3,35 +3,69 @@
 The rules of the line:
 
 - A byte takes 10 bits. An instruction acts when its last byte has passed; a reply starts after the servo's
-  return delay, and the host gets it when its last byte has passed and the adapter hands it over.
-- Who talks does not listen. Where the host talks into a reply, its bytes arrive as 0, and the reply is lost
-  from there on.
-- Servos that talk at once (a broadcast ping, two servos with one ID) give one reply of their bytes ANDed, as
+  return delay, and the host receives it when its last byte has passed and the adapter hands it over.
+- A servo does not receive while it sends. Where the host sends into a reply, its bytes arrive as 0, and the
+  reply is lost from there on.
+- Servos that send at once (a broadcast ping, two servos with one ID) give one reply of their bytes ANDed, as
   drivers that both pull a line low would [i].
 - A pause inside an instruction ends it: more than 100 ms (Protocol 1.0), more than 1.5 ms (Protocol 2.0).
-- Servos that are read in turn answer one after the other, each its return delay after it heard the one before
-  it; what they answer is their state when the instruction ended [i].
-- A servo at another baud rate hears nothing.
+- Servos of a group read reply one after the other, each its return delay after the end of the reply before
+  it; what they reply is their state when the instruction ended [i].
+- A servo at another baud rate receives nothing.
 """
 
 from __future__ import annotations
 
+import heapq
+import itertools
+from bisect import bisect_right
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from operator import attrgetter
+from typing import NamedTuple
 
 from dxlrun.simulation.bus.adapter import Adapter
-from dxlrun.simulation.bus.agenda import Agenda
-from dxlrun.simulation.bus.delivery import Delivery
-from dxlrun.simulation.bus.flow import Flow
 from dxlrun.simulation.bus.ledger import OTHER_HOST, Ledger
-from dxlrun.simulation.bus.listeners import Listeners, ServoCounts
-from dxlrun.simulation.bus.said import Readings
-from dxlrun.simulation.bus.wire import STATUS_BYTES, Alteration, Chain, Change, Chunk, Wire, flipped
+from dxlrun.simulation.bus.line import ECHO, GroupReply, Line, Transmission, Turn, flipped
 from dxlrun.simulation.configuration import BusConfig, ServoConfig
+from dxlrun.simulation.memory.cells import IDENTITY
 from dxlrun.simulation.motion.mechanics import Mechanics
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 from dxlrun.simulation.wire import protocol1, protocol2
-from dxlrun.simulation.wire.packets import Codec, InstructionPacket, ReadInTurn, Reply
+from dxlrun.simulation.wire.packets import Codec, GroupRead, InstructionPacket, Reply
+
+_STATUS_BYTES = 11
+"""Bytes of a status packet of Protocol 2.0 without data: the slot of an absent servo is as long [i]."""
+
+_RATE_TOLERANCE = 0.03
+"""Rates of host and servo may differ by less (e-Manual, Baud Rate (4))."""
+
+Alteration = Callable[[bytes], bytes]
+"""What becomes of a packet's bytes."""
+
+Action = Callable[[], None]
+
+
+class PacketFault(NamedTuple):
+    """What happens to the next packet of a servo, or of the host."""
+
+    text: str
+    alter: Alteration
+    delay_ns: int = 0
+    copies: int = 1
+
+
+class GroupReplies(NamedTuple):
+    """What the servos reply to a group read, as long as none of them changes."""
+
+    read: GroupRead
+    version: int
+    """Of the bus, when they replied; -1: they would reply something else at another time."""
+    turns: tuple[Turn, ...]
+
+
+_NONE_YET = GroupReplies(GroupRead(0, ()), -1, ())
 
 
 class SimulatedBus:
@@ -51,25 +85,30 @@ class SimulatedBus:
         self.servos: tuple[SimulatedServo, ...] = ()
         self.mechanics = mechanics or Mechanics(start_ns)
         """What the servos move; several buses of one robot share it."""
-        self._now_ns = start_ns
-        self._host_free_ns = start_ns
+        self.now_ns = start_ns
+        """The time that the bus has reached."""
+        self.host_free_ns = start_ns
+        """When the last byte that the host handed over has passed the wire."""
+        self.lateness_ns: deque[int] = deque(maxlen=1000)
+        """How long after its time the host received what it received last, in real time."""
         self._codec: Codec = protocol2 if config.protocol == 2.0 else protocol1
         self._receiver = self._codec.receiver()
-        self._wire = Wire(config.baud_rate, self.note)
+        self._line = Line(config.baud_rate, self.note)
         self._adapter = Adapter(config.adapter, start_ns)
-        self._delivery = Delivery(self._adapter, ledger, config.name)
-        self.lateness_ns = self._delivery.lateness_ns
-        """How long after its time the host got what it got last, in real time."""
         self._wedged = False
-        self._chain: Chain | None = None
-        self._flow: Flow | None = None
-        """Answers that nobody disturbs: nothing else is on the line, or planned before they end."""
-        self._changes: dict[int, deque[Change]] = {}
-        self._instruction_changes: deque[Change] = deque()
-        self._agenda = Agenda()
-        self._counts: dict[SimulatedServo, ServoCounts] = {}
-        self._listeners = Listeners(config.baud_rate)
-        self._readings = Readings(self._codec, self._wire.duration_ns, self._listeners, self._counts)
+        self._group: GroupReply | None = None
+        """The group read whose replies are under way."""
+        self._replies = _NONE_YET
+        """Of the last group read: a robot at rest is read a thousand times a second."""
+        self._servos_by_id: dict[int, tuple[SimulatedServo, ...]] = {}
+        self._reply_faults: dict[int, deque[PacketFault]] = {}
+        self._instruction_faults: deque[PacketFault] = deque()
+        self._planned: list[tuple[int, int, Action]] = []
+        """Actions by their time, those of one moment in the order in which they were planned."""
+        self._planned_after: list[tuple[int, int, Action]] = []
+        """Actions by the number of packets that pass before them."""
+        self._packets = 0
+        self._order = itertools.count()
         for servo in config.servos:
             self.add_servo(servo)
 
@@ -77,79 +116,77 @@ class SimulatedBus:
 
     def receive(self, data: bytes | bytearray | memoryview, at_ns: int) -> None:
         """Take bytes that the host hands to its adapter at `at_ns`; they follow those still on the wire."""
-        heard = bytes(data)
+        sent = bytes(data)
         self._pass_time(at_ns)
-        self.ledger.add(at_ns, self.name, "in", heard)
+        self.ledger.add(at_ns, self.name, "in", sent)
         if self._wedged or not self.plugged:
-            self.note(f"{len(heard)} bytes of the host do not reach the line")
+            self.note(f"{len(sent)} bytes of the host do not reach the line")
             return
-        start_ns = max(at_ns, self._host_free_ns)
-        if self._receiver.pending and start_ns - self._host_free_ns > self._codec.LONGEST_PAUSE_NS:
+        start_ns = max(at_ns, self.host_free_ns)
+        if self._receiver.pending and start_ns - self.host_free_ns > self._codec.LONGEST_PAUSE_NS:
             self.note(f"an instruction of {self._receiver.pending} bytes was broken off")
             self._receiver.forget()
-        self._host_free_ns = start_ns + self._wire.duration_ns(len(heard))
-        self._hear(heard, start_ns)
+        self.host_free_ns = start_ns + self._line.duration_ns(len(sent))
+        self._transmit(sent, start_ns)
         if self.echo:
-            self._wire.echo(Chunk(start_ns, self._host_free_ns, heard, "echo"))
+            self._line.echo(Transmission(start_ns, self.host_free_ns, sent, ECHO))
 
     @property
     def baud_rate(self) -> int:
         """The host's rate, bit/s."""
-        return self._wire.baud_rate
+        return self._line.baud_rate
 
     @baud_rate.setter
     def baud_rate(self, baud_rate: int) -> None:
-        self._break_up()
-        self._wire.baud_rate = baud_rate
-        self._listeners.change_rate(baud_rate)
+        self._withdraw_waiting()
+        self._line.baud_rate = baud_rate
+        self._servos_by_id.clear()
 
     def change_rate(self, baud_rate: int) -> None:
-        """Let the host talk and listen at another rate from now on, bit/s."""
+        """Let the host send and receive at another rate from now on, bit/s."""
         self.note(f"the host's rate is {baud_rate} bit/s")
         self.baud_rate = baud_rate
 
     def next_due_ns(self) -> int | None:
         """Return when something happens by itself: bytes can be taken, a fault comes; None: nothing will."""
-        if self._flow is not None:
-            return self._flow.next_ns()  # what is planned comes later
-        passing = self._wire.passing
+        passing = self._line.passing
         due_ns = None if self._wedged else self._adapter.next_ns(passing)
         if passing and (due_ns is None or passing[0].due_ns < due_ns):
-            due_ns = passing[0].due_ns  # perhaps somebody waits for it, to answer next
-        planned_ns = self._agenda.next_ns
-        return planned_ns if planned_ns is not None and (due_ns is None or planned_ns < due_ns) else due_ns
+            due_ns = passing[0].due_ns  # a group read may go on at its end
+        if self._planned and (due_ns is None or self._planned[0][0] < due_ns):
+            return self._planned[0][0]
+        return due_ns
 
     def next_delivery_ns(self, gather_ns: int) -> int | None:
-        """Return `next_due_ns`, or when the last answer has passed that follows it within a time."""
-        return self.next_due_ns() if self._flow is None else self._flow.gathered_ns(gather_ns)
+        """Return `next_due_ns`, or when the last reply has passed that follows it within a time."""
+        due_ns = self.next_due_ns()
+        passing = self._line.passing
+        if due_ns is None or not passing or due_ns != passing[0].due_ns or not self._adapter.immediate:
+            return due_ns
+        last_ns = due_ns + gather_ns
+        if self._planned:
+            last_ns = max(due_ns, min(last_ns, self._planned[0][0] - 1))
+        return passing[bisect_right(passing, last_ns, key=_due) - 1].due_ns
 
     def take(self, now_ns: int, *, handed_ns: int | None = None) -> bytes:
         """Return the bytes that have reached the host by `now_ns`, each once.
 
-        `handed_ns`: when the host really gets them; how late that is belongs into the ledger.
+        `handed_ns`: when the host really receives them; how late that is belongs into the ledger.
         """
         self._pass_time(now_ns)
-        if (flow := self._flow) is not None:
-            data = self._delivery.take_flow(flow, handed_ns)
-            if flow.over:
-                self._flow = None
-            return data
-        passing = self._wire.passing
-        if self._wedged or not (passing or self._adapter.holds):
+        if self._wedged:
             return b""
-        return self._delivery.take(now_ns, passing, handed_ns)
+        taken = b""
+        for planned_ns, data, ended in self._adapter.hand_over(now_ns, self._line.passing):
+            late_ns = 0 if handed_ns is None else handed_ns - planned_ns
+            if handed_ns is not None:
+                self.lateness_ns.append(late_ns)
+            for each in ended:
+                self.ledger.add(each.due_ns, self.name, "out", each.data, each.note, late_ns=late_ns)
+            taken += data
+        return taken
 
     # What tests see and do
-
-    @property
-    def host_free_ns(self) -> int:
-        """When the last byte that the host handed over has passed the wire."""
-        return self._host_free_ns
-
-    @property
-    def now_ns(self) -> int:
-        """The time that the bus has reached."""
-        return self._now_ns
 
     def servo(self, servo_id: int) -> SimulatedServo:
         """Return the first servo that has this ID now; raises LookupError when none has."""
@@ -159,19 +196,13 @@ class SimulatedBus:
         raise LookupError(f"bus {self.name} has no servo with ID {servo_id}")
 
     def add_servo(self, config: ServoConfig) -> SimulatedServo:
-        """Hang one more servo on the line, now."""
+        """Connect one more servo to the line, now."""
         servo = SimulatedServo(
-            config, self.baud_rate, self._now_ns, self.note, self.protocol, mechanics=self.mechanics
+            config, self.baud_rate, self.now_ns, self.note, self.protocol, mechanics=self.mechanics
         )
         self.servos += (servo,)
-        self._counts[servo] = ServoCounts()
-        self._listeners.add(servo)
+        servo.registers.watch(IDENTITY, self._servos_by_id.clear)
         return servo
-
-    def counts(self, servo: SimulatedServo) -> ServoCounts:
-        """Return what a servo of this bus did so far; raises KeyError for one of another bus."""
-        self._readings.count()
-        return self._counts[servo]
 
     def advance(self, now_ns: int) -> None:
         """Bring every servo to a time, so that a test can look at it."""
@@ -179,29 +210,29 @@ class SimulatedBus:
         for servo in self.servos:
             servo.advance(now_ns)
 
-    def at(self, t_ns: int, action: Callable[[], None]) -> None:
+    def at(self, t_ns: int, action: Action) -> None:
         """Plan a fault: `action` is called when the bus' time reaches `t_ns`."""
-        self._break_up()
-        self._agenda.at(t_ns, action)
+        heapq.heappush(self._planned, (t_ns, next(self._order), action))
 
-    def after(self, packets: int, action: Callable[[], None]) -> None:
-        """Plan a fault: `action` is called when the servos have obeyed so many more instruction packets."""
-        self._agenda.after(packets, action)
+    def after(self, packets: int, action: Action) -> None:
+        """Plan a fault: `action` is called when so many more instruction packets have passed; 0: now."""
+        heapq.heappush(self._planned_after, (self._packets + packets, next(self._order), action))
+        self._act_after_packets()
 
     def note(self, text: str) -> None:
         """Enter a note into the ledger, at the bus' time."""
-        self.ledger.add(self._now_ns, self.name, "note", note=text)
+        self.ledger.add(self.now_ns, self.name, "note", note=text)
 
     def alter_next(
-        self, servo_id: int, text: str, change: Alteration, *, delay_ns: int = 0, copies: int = 1
+        self, servo_id: int, text: str, alter: Alteration, *, delay_ns: int = 0, copies: int = 1
     ) -> None:
-        """Change a servo's next reply, let it start later or come several times; the ledger gets `text`."""
-        self._break_up()
-        self._changes.setdefault(servo_id, deque()).append(Change(text, change, delay_ns, copies))
+        """Alter a servo's next reply, let it start later or come several times; the ledger gets `text`."""
+        self._withdraw_waiting()
+        self._reply_faults.setdefault(servo_id, deque()).append(PacketFault(text, alter, delay_ns, copies))
 
-    def alter_next_instruction(self, text: str, change: Alteration) -> None:
-        """Change what the servos hear of the next whole instruction; b"" loses it."""
-        self._instruction_changes.append(Change(text, change))
+    def alter_next_instruction(self, text: str, alter: Alteration) -> None:
+        """Alter what the servos receive of the next whole instruction; b"" loses it."""
+        self._instruction_faults.append(PacketFault(text, alter))
 
     def corrupt_next(self, servo_id: int, index: int = -1, flip: int = 0x01) -> None:
         """Flip bits of one byte of a servo's next reply."""
@@ -218,16 +249,17 @@ class SimulatedBus:
 
     def other_host(self, packet: bytes, at_ns: int, *, heard: bool = True) -> None:
         """Let another host on the line send an instruction packet at a time: the servos execute it, and this
-        host gets the instruction and their replies.
+        host receives the instruction and their replies.
 
         `heard=False`: it sends by the adapter of this host, which gives back the replies only.
         """
 
         def send() -> None:
+            self._withdraw_waiting()
             self.note(f"{OTHER_HOST} {packet.hex(' ')}")
-            start_ns, end_ns = self._now_ns, self._now_ns + self._wire.duration_ns(len(packet))
+            start_ns, end_ns = self.now_ns, self.now_ns + self._line.duration_ns(len(packet))
             if heard:
-                self._wire.send(Chunk(start_ns, end_ns, packet, "another host"))
+                self._line.send(Transmission(start_ns, end_ns, packet, "another host"))
             instruction = self._codec.receiver().feed(packet, 0)
             if instruction is not None:
                 self._execute(instruction, end_ns)
@@ -236,14 +268,13 @@ class SimulatedBus:
 
     def inject_noise(self, data: bytes, at_ns: int) -> None:
         """Put bytes on the line that no servo sent, toward the host, beginning at `at_ns`."""
-        self._break_up()
+        self._withdraw_waiting()
         self.note(f"noise of {len(data)} bytes at {at_ns} ns")
-        self._wire.send(Chunk(at_ns, at_ns + self._wire.duration_ns(len(data)), data, "noise"))
+        self._line.send(Transmission(at_ns, at_ns + self._line.duration_ns(len(data)), data, "noise"))
 
     def unplug(self) -> None:
         """Pull the adapter: what it holds is lost, and the host sees its port go."""
         if self.plugged:
-            self._break_up()
             self.note("adapter unplugged")
             self.plugged = False
             self.times_unplugged += 1
@@ -257,9 +288,8 @@ class SimulatedBus:
             self.plugged = True
 
     def wedge(self, on: bool = True) -> None:
-        """Let the adapter take the host's bytes and pass none on, in either direction; or mend it."""
-        self._break_up()
-        self.note("adapter wedged" if on else "adapter mended")
+        """Let the adapter take the host's bytes and pass none on, in either direction; False: no longer."""
+        self.note("adapter wedged" if on else "adapter works again")
         self._wedged = on
         self._adapter.forget()
 
@@ -267,152 +297,209 @@ class SimulatedBus:
 
     def _pass_time(self, now_ns: int) -> None:
         """Let everything happen that happens by itself until `now_ns`, in order."""
-        passing, agenda = self._wire.passing, self._agenda
-        if self._flow is not None:
-            self._flow.pass_until(now_ns)
-        while passing or agenda.next_ns is not None:
-            t_ns = agenda.next_ns
-            if passing and passing[0].due_ns <= now_ns and (t_ns is None or t_ns >= passing[0].due_ns):
+        passing, planned = self._line.passing, self._planned
+        while True:
+            due_ns = passing[0].due_ns if passing else now_ns + 1
+            if planned and planned[0][0] < due_ns and planned[0][0] <= now_ns:
+                self.now_ns = max(self.now_ns, planned[0][0])
+                heapq.heappop(planned)[2]()
+            elif due_ns <= now_ns:
                 self._arrive(passing.pop(0))
-            elif t_ns is not None and t_ns <= now_ns:
-                self._break_up()
-                self._now_ns = max(self._now_ns, t_ns)
-                agenda.pop()()
             else:
                 break
-        self._now_ns = max(self._now_ns, now_ns)
+        self.now_ns = max(self.now_ns, now_ns)
 
-    def _break_up(self) -> None:
-        """Let answers that nobody disturbed so far pass chunk by chunk."""
-        if self._flow is None:
-            return
-        arrived, passing = self._flow.break_up()
-        self._flow = None
-        self._adapter.arrived.extend(arrived)
-        self._wire.passing.extend(passing)
-        self._chain = passing[0].chain if passing else None
-
-    def _hand(self, chunk: Chunk) -> None:
-        """Let the adapter have what has passed the wire."""
+    def _arrive(self, each: Transmission) -> None:
+        """Let the adapter have what has passed the wire, and the group read go on that waited for its end."""
+        self.now_ns = max(self.now_ns, each.due_ns)
         if not self.plugged or self._wedged:
-            self.note(f"{len(chunk.data)} bytes to the host are lost: {chunk.data.hex(' ')}")
-        elif not self._adapter.accept(chunk):
-            self.note(f"{len(chunk.data)} bytes to the host are lost: it does not read")
-
-    def _arrive(self, chunk: Chunk) -> None:
-        """Let the adapter have what has passed the wire, and who waits for its end answer."""
-        self._now_ns = max(self._now_ns, chunk.due_ns)
-        self._hand(chunk)
-        chain = chunk.chain
-        if chain is None or chain is not self._chain:
+            self.note(f"{len(each.data)} bytes to the host are lost: {each.data.hex(' ')}")
+        elif not self._adapter.accept(each):
+            self.note(f"{len(each.data)} bytes to the host are lost: it does not read")
+        group = each.group
+        if group is None or group is not self._group or group.sent > each.turn + 1:
             return
-        if not chunk.broken:
-            self._continue(chain, chunk.due_ns)
-        elif chain.has_slots:
-            self._continue(chain, max(chunk.due_ns, chain.slot_end_ns))
+        if not each.broken:
+            self._send_turns(group, each.due_ns)
+        elif group.has_slots:
+            self._send_turns(group, max(each.due_ns, each.turn_end_ns))
         else:
-            self.note("a broken answer: those after it wait for it in vain")
-            self._chain = None
+            self.note("a broken reply: the servos after it wait for it in vain")
+            self._group = None
+
+    def _withdraw_waiting(self) -> None:
+        """Take back the replies of a group read that have not begun: something may happen before them."""
+        if self._group is not None:
+            self._line.withdraw(self._group)
 
     # Inside: instructions
-    def _hear(self, heard: bytes | bytearray, start_ns: int) -> None:
+
+    def _transmit(self, sent: bytes | bytearray, start_ns: int) -> None:
+        """Bring the host's bytes to the servos, which execute each whole instruction in them."""
         position = 0
-        while position < len(heard):
-            self._break_up()
-            if self._wire.passing:
-                heard = bytearray(heard)
-                self._wire.talk_over(heard, position, start_ns)
-            packet = self._receiver.feed(heard, position)
+        while position < len(sent):
+            self._withdraw_waiting()
+            if self._line.passing:
+                sent = bytearray(sent)
+                self._line.talk_over(sent, position, start_ns)
+            packet = self._receiver.feed(sent, position)
             if packet is None:
                 return
             position = packet.end
-            end_ns = start_ns + self._wire.duration_ns(position)
-            obey = self._mishear if self._instruction_changes else self._execute
-            obey(packet, end_ns)
+            end_ns = start_ns + self._line.duration_ns(position)
+            if self._instruction_faults:
+                self._execute_altered(packet, end_ns)
+            else:
+                self._execute(packet, end_ns)
 
-    def _mishear(self, packet: InstructionPacket, end_ns: int) -> None:
-        """Let the servos hear something else than the host said."""
-        fault = self._instruction_changes.popleft()
-        self.note(f"the servos hear another instruction: {fault.text}")
-        heard = fault.change(packet.raw)
+    def _execute_altered(self, packet: InstructionPacket, end_ns: int) -> None:
+        """Let the servos receive something else than the host sent."""
+        fault = self._instruction_faults.popleft()
+        self.note(f"the servos receive another instruction: {fault.text}")
+        received = fault.alter(packet.raw)
         position = 0
-        while (other := self._receiver.feed(heard, position)) is not None:
+        while (other := self._receiver.feed(received, position)) is not None:
             position = other.end
             self._execute(other, end_ns)
         if not position:  # it was one all the same
-            self._agenda.packet_passed()
+            self._count_packet()
 
     def _execute(self, packet: InstructionPacket, end_ns: int) -> None:
-        self._chain = None  # who waited for its turn hears another instruction
-        reading = self._codec.read_in_turn(packet)
-        if reading is not None:
-            self._read_in_turn(reading, end_ns)
+        self._group = None  # servos that wait for their turn receive another instruction
+        read = self._codec.group_read(packet)
+        if read is not None:
+            slots = read.has_slots and self.absent == "slot"
+            self._group = GroupReply(self._turns(read, slots, end_ns), slots)
+            self._send_turns(self._group, end_ns)
         else:
-            self._readings.count()
-            for servo in self._listeners.of(packet.servo_id):
-                counts = self._counts[servo]
-                counts.heard += packet.intact
+            for servo in self._servos_of(packet.servo_id):
+                servo.counts.received += packet.intact
                 reply = servo.execute(packet, end_ns)
                 if reply is not None:
-                    counts.answer(reply.error)
-                    self._answer(reply, self._status(reply), end_ns)
-        self._agenda.packet_passed()
+                    servo.counts.reply(reply.error)
+                    first_ns = end_ns + reply.delay_ns
+                    data = self._status(reply)
+                    due_ns = first_ns + self._line.duration_ns(len(data))
+                    self._send_reply(reply.servo_id, Transmission(first_ns, due_ns, data))
+        self._count_packet()
 
-    def _read_in_turn(self, reading: ReadInTurn, end_ns: int) -> None:
-        """Let the listed servos answer, each when it has heard the one before it."""
-        slots = reading.has_slots and self.absent == "slot"
-        told = self._readings.said(reading, slots, end_ns)
-        if told.flow is not None and self._undisturbed(reading, end_ns + told.flow.lasts_ns):
-            self._flow = told.flow.begin(end_ns)
-        else:
-            shared = self._codec.fast_status(reading.lengths) if reading.fast else None
-            self._chain = Chain(reading, deque(told.answers), shared, slots)
-            self._continue(self._chain, end_ns)
+    def _servos_of(self, servo_id: int) -> tuple[SimulatedServo, ...]:
+        """Return the servos that receive an ID, at the host's rate; kept until one changes ID or rate."""
+        found = self._servos_by_id.get(servo_id)
+        if found is None:
+            rate, tolerance = self.baud_rate, _RATE_TOLERANCE * self.baud_rate
+            addressed = [each for each in self.servos if each.listens_to(servo_id)]
+            found = tuple(each for each in addressed if abs(each.baud_rate - rate) < tolerance)
+            self._servos_by_id[servo_id] = found
+        return found
 
-    def _undisturbed(self, reading: ReadInTurn, end_ns: int) -> bool:
-        """Return whether nothing but the answers passes the line, and nothing is to happen, until a time."""
-        planned_ns, changes = self._agenda.next_ns, self._changes
-        if self._wire.passing or self._adapter.holds or (planned_ns is not None and planned_ns <= end_ns):
-            return False
-        changed = changes and any(changes.get(entry.servo_id) for entry in reading.entries)
-        return self._adapter.immediate and not self.echo and not changed
+    @property
+    def _version(self) -> int:
+        """Grows with whatever may change what a servo replies, but for the time."""
+        return self.mechanics.version + sum([servo.registers.version for servo in self.servos])
 
-    def _continue(self, chain: Chain, free_ns: int) -> None:
-        """Let the next one answer; nobody does any more when there is none."""
-        while chain.waiting:
-            entry, replies = chain.waiting.popleft()
-            slot_ns = self._wire.duration_ns(STATUS_BYTES + entry.length)
-            chain.slot_end_ns = free_ns + slot_ns
+    def _turns(self, read: GroupRead, slots: bool, end_ns: int) -> Sequence[Turn]:
+        """Return what each servo of a group read replies to it, in its state at a time."""
+        self.mechanics.advance(end_ns)
+        if self._replies.read is not read or self._replies.version != self._version:
+            return self._new_turns(read, slots, end_ns)
+        for turn in self._replies.turns:
+            servo = self._servos_of(turn.servo_id)[0]
+            servo.receives(end_ns)
+            servo.counts.received += 1
+            servo.counts.reply(turn.replies[0][0].error)
+        return self._replies.turns
+
+    def _new_turns(self, read: GroupRead, slots: bool, end_ns: int) -> Sequence[Turn]:
+        turns: list[Turn] = []
+        lasting = self.mechanics.still
+        shared = self._codec.fast_status(read.lengths) if read.fast else None
+        for entry in read.entries:
+            replies = []
+            servos = self._servos_of(entry.servo_id)
+            for servo in servos:
+                if servo.servo_id != entry.servo_id:
+                    continue  # only by its secondary ID, to which it never replies
+                servo.counts.received += 1
+                reply = servo.reply_to_group_read(read, entry, end_ns)
+                if reply is not None:
+                    servo.counts.reply(reply.error)
+                    replies.append((reply, shared.part(reply) if shared else self._status(reply)))
+            turns.append(Turn(entry.servo_id, tuple(replies), _STATUS_BYTES + entry.length))
+            lasting = lasting and len(replies) == len(servos) == 1 and servos[0].lasts(entry)
+            if not replies and not slots:
+                break  # those after it wait for it in vain
+        self._replies = GroupReplies(read, self._version if lasting else -1, tuple(turns))
+        return turns
+
+    def _send_turns(self, group: GroupReply, free_ns: int) -> None:
+        """Send the next replies of a group read, from when the line is free.
+
+        A reply is sent ahead of the end of the one before it when nothing else is on the line: whatever may
+        yet come between them withdraws it again.
+        """
+        alone, sent_any = not self._line.passing, False
+        while group.sent < len(group.turns):
+            turn = group.turns[group.sent]
+            plain = alone and len(turn.replies) == 1 and not self._reply_faults.get(turn.servo_id)
+            if sent_any and not plain:
+                return  # it is decided when the reply before it has passed
+            slot_ns = self._line.duration_ns(turn.slot_bytes)
+            end_ns = due_ns = free_ns + slot_ns
             sent = False
-            for reply in replies:  # two servos with one ID talk at once
-                data = self._status(reply) if chain.fast is None else chain.fast.part(reply)
-                chain.slot_end_ns = free_ns + reply.delay_ns + slot_ns
-                sent = self._answer(reply, data, free_ns, chain) or sent
-            if sent:
-                return  # its end is heard
-            free_ns = chain.slot_end_ns
-            if not chain.has_slots:
-                self.note(f"servo {entry.servo_id} does not answer: those after it wait for it in vain")
+            for reply, data in turn.replies:  # two servos with one ID send at once
+                first_ns = free_ns + reply.delay_ns
+                end_ns, due_ns = first_ns + slot_ns, first_ns + self._line.duration_ns(len(data))
+                each = Transmission(first_ns, due_ns, data, "", group, group.sent, end_ns)
+                sent = self._send_reply(reply.servo_id, each) or sent
+            group.sent += 1
+            if sent and not plain:
+                return
+            if not sent and not group.has_slots:
+                self.note(f"servo {turn.servo_id} does not reply: those after it wait for it in vain")
                 break
-        self._chain = None
+            sent_any = sent_any or sent
+            free_ns = due_ns if sent else end_ns
+        if not sent_any:
+            self._group = None
+
+    def _send_reply(self, servo_id: int, reply: Transmission) -> bool:
+        """Send a servo's reply, faults and all; return whether anything was sent."""
+        faults = self._reply_faults.get(servo_id)
+        if not faults:
+            self._line.send(reply)
+            return True
+        fault = faults.popleft()
+        self.note(f"servo {servo_id}: {fault.text}")
+        data = fault.alter(reply.data)
+        duration_ns = self._line.duration_ns(len(data))
+        first_ns = reply.first_ns + fault.delay_ns
+        copies = fault.copies if data else 0
+        for copy in range(copies):
+            group = reply.group if copy == copies - 1 else None
+            altered = replace(
+                reply,
+                first_ns=first_ns,
+                due_ns=first_ns + duration_ns,
+                data=data,
+                group=group,
+                broken=data != reply.data,
+            )
+            self._line.send(altered)
+            first_ns += duration_ns
+        return copies > 0
 
     def _status(self, reply: Reply) -> bytes:
         return self._codec.status_packet(reply.servo_id, reply.error, reply.parameters)
 
-    def _answer(self, reply: Reply, data: bytes, free_ns: int, chain: Chain | None = None) -> bool:
-        """Send a servo's bytes, faults and all, some time after the line is free; False: nothing was sent."""
-        first_ns = free_ns + reply.delay_ns
-        changes = self._changes.get(reply.servo_id)
-        if not changes:
-            self._wire.send(Chunk(first_ns, first_ns + self._wire.duration_ns(len(data)), data, "", chain))
-            return True
-        fault = changes.popleft()
-        self.note(f"servo {reply.servo_id}: {fault.text}")
-        said = fault.change(data)
-        first_ns += fault.delay_ns
-        for copy in range(fault.copies if said else 0):
-            end_ns = first_ns + self._wire.duration_ns(len(said))
-            heard_by = chain if copy == fault.copies - 1 else None
-            self._wire.send(Chunk(first_ns, end_ns, said, "", heard_by, broken=said != data))
-            first_ns = end_ns
-        return bool(said) and fault.copies > 0
+    def _count_packet(self) -> None:
+        """Count an instruction packet, and do what was planned for it."""
+        self._packets += 1
+        self._act_after_packets()
+
+    def _act_after_packets(self) -> None:
+        while self._planned_after and self._planned_after[0][0] <= self._packets:
+            heapq.heappop(self._planned_after)[2]()
+
+
+_due = attrgetter("due_ns")

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 from functools import partial
 from random import Random
 
+from dxlrun.simulation.bus.line import flipped
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
-from dxlrun.simulation.bus.wire import flipped
 from dxlrun.simulation.configuration import ServoConfig
 from dxlrun.simulation.faults.fault import (
     BABBLE_NS,

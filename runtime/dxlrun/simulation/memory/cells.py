@@ -87,8 +87,8 @@ class Memory:
             for item in table.items.values()
         }
         self._watchers: dict[str, list[Callable[[], None]]] = {}
-        self.changes = 0
-        """How often something was changed of the servo, but for what it shows by itself (`show_all`)."""
+        self.version = 0
+        """Grows with every change, but for what the servo shows by itself (`show_all`)."""
         self.restore_factory_values()
 
     def restore_factory_values(self, keep: tuple[str, ...] = ()) -> None:
@@ -124,7 +124,7 @@ class Memory:
             return
         self._memory[start:end] = wire.to_bytes(size, "little")
         self._values[name] = wire
-        self.changes += 1
+        self.version += 1
         if name in self._watchers:
             self._tell((name,))
 
@@ -276,7 +276,7 @@ class Memory:
         if self._memory[start:end] != run.data:
             self._memory[start:end] = run.data
             self._values.update(run.after)
-            self.changes += 1
+            self.version += 1
         if not self._watchers.keys().isdisjoint(run.after):
             self._tell(run.after)
 

@@ -69,9 +69,10 @@ class Mechanics:
         self._hands: dict[int, _Hand] = {}
         self._busy = False
         self._commanded = False
-        self._pauses = 0
-        self.still = 0
-        """Number of the pause in which all servos rest, uncommanded; 0 while one of them moves."""
+        self.still = False
+        """True while all servos rest, uncommanded."""
+        self.version = 0
+        """Grows with whatever may change what a servo shows, but for the time while one of them moves."""
         self._build(np.zeros(0), np.zeros(0))
 
     # Servos
@@ -121,9 +122,9 @@ class Mechanics:
 
     def aim(self, index: int, goal: float, speed: float, acceleration: float) -> None:
         """Change the goal of a servo and its profile, and nothing else; as in `Command`."""
-        self.strain.calm = False
         self.profiles.aim(index, goal, speed, acceleration)
-        self.still = 0
+        self.strain.calm = False
+        self._disturb()
 
     def place(self, index: int, angle: float) -> None:
         """Put a shaft somewhere, rad, at rest; its trajectory begins there."""
@@ -132,7 +133,7 @@ class Mechanics:
         if self._commands[ROWS["limit"], index] == 0.0:
             self._commands[ROWS["goal"], index] = angle
         self.profiles.arrived = False
-        self.still = 0
+        self._disturb()
 
     def turn(self, index: int, by: float, duration_ns: int, gives_way: Callable[[float], None]) -> None:
         """Let a hand turn a shaft evenly by an angle, rad, from now on.
@@ -141,12 +142,13 @@ class Mechanics:
         """
         steps = max(1, round(duration_ns / STEP_NS))
         self._hands[index] = _Hand(by / (steps * STEP_NS * 1e-9), steps, gives_way)
-        self.still = 0
+        self._disturb()
 
     def heat(self, index: int, celsius: float) -> None:
         """Bring a servo to a temperature, degrees C; it goes back to that of its load."""
         self.strain.temperature[index] = celsius
         self.strain.calm = False
+        self.version += 1
 
     def overloaded(self, index: int) -> bool:
         """Return whether a servo has been overloaded for too long."""
@@ -224,8 +226,7 @@ class Mechanics:
         still = profiles.arrived and np.abs(plant.velocity).max() < _STILL and not law.winding
         if still and np.abs(before - plant.velocity).max() < _UNDRIVEN:
             plant.velocity.fill(0.0)
-            self._pauses += 1
-            self.still = self._pauses
+            self.still = True
 
     def _step_with_hands(self) -> None:
         """Take one step; what a hand turns is where the hand is."""
@@ -255,13 +256,18 @@ class Mechanics:
             return
         most = self.law.stall * self._commands[ROWS["limit"]]
         for index in self.strain.tick(self.law.torque, most):
+            self.version += 1
             if (act := self._watchers.get(index)) is not None:
                 act()
 
     def _wake(self) -> None:
         self._commanded = True
-        self.still = 0
         self.strain.calm = False
+        self._disturb()
+
+    def _disturb(self) -> None:
+        self.still = False
+        self.version += 1
 
     def _build(self, angle: Floats, velocity: Floats) -> None:
         count, dt_s = len(self._motors), STEP_NS * 1e-9

@@ -16,7 +16,7 @@ from dxlrun.simulation.servo import instructions1, instructions2
 from dxlrun.simulation.servo.body import Body
 from dxlrun.simulation.servo.lock_body import LockBody
 from dxlrun.simulation.servo.torque_body import TorqueBody
-from dxlrun.simulation.wire.packets import InstructionPacket, ReadEntry, ReadInTurn
+from dxlrun.simulation.wire.packets import GroupRead, InstructionPacket, ReadEntry
 
 FIRMWARE = {1.0: 24, 2.0: 45}
 """Firmware version of a simulated servo where its table asks for nothing newer; the manual gives none."""
@@ -37,7 +37,7 @@ class Instructions(Protocol):
     def obey(self, packet: InstructionPacket) -> tuple[int, bytes]:
         """Return error and parameters of the reply."""
 
-    def answer_in_turn(self, reading: ReadInTurn, entry: ReadEntry) -> tuple[int, bytes] | None:
+    def reply_to_group_read(self, reading: GroupRead, entry: ReadEntry) -> tuple[int, bytes] | None:
         """Return the servo's part of the answer; None: it says nothing."""
 
 

@@ -20,17 +20,8 @@ BOOT_NS = 100_000_000
 _READS_KEPT = 1024
 """So many reads are looked up only once: a host reads few places, rubbish goes everywhere."""
 
-_STILL = frozenset(
-    (
-        "present_position",
-        "present_velocity",
-        "present_speed",
-        "present_load",
-        "present_current",
-        "present_pwm",
-    )
-)
-"""What shows the same again while no servo moves and nothing is written."""
+_BY_TIME = frozenset(("realtime_tick",))
+"""What shows something else at another time, though no servo moves and nothing is written."""
 
 _SECONDARY_IDS = ("secondary_shadow_id", "secondary_id")
 
@@ -40,7 +31,7 @@ class _Window(NamedTuple):
 
     live: tuple[LiveItem, ...]
     """What changes by itself in it."""
-    rests: bool
+    lasts: bool
     """True: nothing of it does while no servo moves."""
 
 
@@ -65,8 +56,6 @@ class Body(ABC):
         shaft.mechanics.watch(shaft.index, self._strained)
         self._live = {name: show for name, show in self._live_items().items() if name in memory}
         self._windows: dict[tuple[int, int], _Window] = {}
-        self._kept: tuple[int, int, int, int] = (0, 0, 0, 0)  # of what: pause, changes, address, length
-        self._kept_data = b""
         self.answers_damaged = False
         """True: a packet with a wrong checksum is answered by the manual's error; False: never [?]."""
         self._registered: tuple[int, bytes] | None = None
@@ -119,10 +108,6 @@ class Body(ABC):
         """Take note of an instruction on the line at a time."""
         self.advance(now_ns)
 
-    def hear_again(self, now_ns: int) -> None:
-        """Take note of an instruction to which nothing changed since it heard the one before."""
-        self.shaft.now_ns = now_ns
-
     def power_up(self) -> None:
         """Start: RAM is as it is at power-up, the shaft stays where it is."""
         self._registered = None
@@ -142,26 +127,20 @@ class Body(ABC):
 
     def read(self, address: int, length: int) -> bytes | None:
         """Return bytes of the table, None where it has none."""
-        memory, still = self.memory, self.shaft.mechanics.still
-        if still and self._kept == (still, memory.changes, address, length):
-            return self._kept_data
+        memory = self.memory
         if length < 1 or address + length > memory.size:
             return None
-        if not memory.cells(address, length).direct:
-            for target, first, last in memory.places(address, length):
-                memory.show_all(self._look_up(target, last - first).live)
-            return memory.read(address, length)
-        window = self._windows.get((address, length)) or self._look_up(address, length)
-        memory.show_all(window.live)
-        data = memory.raw(address, length)
-        if still and window.rests:
-            self._kept, self._kept_data = (still, memory.changes, address, length), data
-        return data
+        if memory.cells(address, length).direct:
+            memory.show_all(self._look_up(address, length).live)
+            return memory.raw(address, length)
+        for target, first, last in memory.places(address, length):
+            memory.show_all(self._look_up(target, last - first).live)
+        return memory.read(address, length)
 
-    def keeps(self, address: int, length: int) -> bool:
-        """Return whether bytes were read since all servos rest, of which nothing changes by itself."""
-        still = self.shaft.mechanics.still
-        return still > 0 and self._kept == (still, self.memory.changes, address, length)
+    def lasts(self, address: int, length: int) -> bool:
+        """Return whether some cells show the same until a servo moves or something is written."""
+        places = self.memory.places(address, length)
+        return all(self._look_up(target, last - first).lasts for target, first, last in places)
 
     def _look_up(self, address: int, length: int) -> _Window:
         """Return what changes by itself in some cells; looked up once."""
@@ -174,7 +153,7 @@ class Body(ABC):
                 for each in self._live.items()
                 if _overlaps(self.memory, each[0], address, length)
             )
-            window = _Window(live, all(each.name in _STILL for each in live))
+            window = _Window(live, _BY_TIME.isdisjoint([each.name for each in live]))
             self._windows[address, length] = window
         return window
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dxlrun.simulation.servo.body import Body
-from dxlrun.simulation.wire.packets import BROADCAST, InstructionPacket, ReadEntry, ReadInTurn
+from dxlrun.simulation.wire.packets import BROADCAST, GroupRead, InstructionPacket, ReadEntry
 from dxlrun.simulation.wire.protocol1 import ErrorBit, Instruction
 
 Answer = tuple[int, bytes]
@@ -62,7 +62,7 @@ class Instructions1:
                 answer = ErrorBit.INSTRUCTION, b""
         return answer
 
-    def answer_in_turn(self, reading: ReadInTurn, entry: ReadEntry) -> Answer | None:
+    def reply_to_group_read(self, reading: GroupRead, entry: ReadEntry) -> Answer | None:
         """Return a servo's part of a bulk read; None: it says nothing.
 
         Only the MX know it, and only for two servos or more.

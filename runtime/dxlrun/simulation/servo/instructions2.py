@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dxlrun.simulation.servo.body import Body
 from dxlrun.simulation.servo.torque_body import TorqueBody
-from dxlrun.simulation.wire.packets import BROADCAST, InstructionPacket, ReadEntry, ReadInTurn
+from dxlrun.simulation.wire.packets import BROADCAST, GroupRead, InstructionPacket, ReadEntry
 from dxlrun.simulation.wire.protocol2 import ErrorNumber, Instruction, ListedWrites, bulk_writes, sync_writes
 
 Answer = tuple[int, bytes]
@@ -90,7 +90,7 @@ class Instructions2:
                 answer = _manage(self._body, packet), b""
         return answer
 
-    def answer_in_turn(self, reading: ReadInTurn, entry: ReadEntry) -> Answer | None:
+    def reply_to_group_read(self, reading: GroupRead, entry: ReadEntry) -> Answer | None:
         """Return a servo's part of a sync or bulk read; None: it says nothing.
 
         The form of a fast read has no room for an error without data [i].

@@ -29,7 +29,7 @@ class LockBody(Body):
         error = int(ErrorBit.OVERLOAD) if self.overload else 0
         if not memory["min_voltage_limit"] <= round(self.voltage * 10) <= memory["max_voltage_limit"]:
             error |= ErrorBit.VOLTAGE
-        if self.temperature > memory["temperature_limit"]:
+        if round(self.temperature) > memory["temperature_limit"]:
             error |= ErrorBit.OVERHEATING
         return error
 

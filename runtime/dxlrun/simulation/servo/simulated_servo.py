@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 from dxlrun.dynamixel.control_table import ControlTable, control_table, models_by_number
 from dxlrun.simulation.configuration import ServoConfig
@@ -18,11 +19,30 @@ from dxlrun.simulation.memory.cells import Memory
 from dxlrun.simulation.motion.mechanics import Mechanics
 from dxlrun.simulation.servo.bodies import make_body
 from dxlrun.simulation.servo.body import Body
-from dxlrun.simulation.wire.packets import BROADCAST, InstructionPacket, ReadEntry, ReadInTurn, Reply
+from dxlrun.simulation.wire.packets import BROADCAST, GroupRead, InstructionPacket, ReadEntry, Reply
+
+
+@dataclass(slots=True)
+class ServoCounts:
+    """What a servo did on the line since the start."""
+
+    received: int = 0
+    """Intact instructions to it, those to all servos among them."""
+    replied: int = 0
+    errors: int = 0
+    """Replies with an error."""
+    last_error: int = 0
+    """Of its last reply, as in the packet."""
+
+    def reply(self, error: int) -> None:
+        """Count a reply."""
+        self.replied += 1
+        self.errors += error != 0
+        self.last_error = error
 
 
 class SimulatedServo:
-    """One servo: the bus calls `execute` and `answer_in_turn`; tests look at registers and cause faults.
+    """One servo: the bus calls `execute` and `reply_to_group_read`; tests look at registers and cause faults.
 
     `note` is told of every refusal and every fault.
     """
@@ -47,6 +67,7 @@ class SimulatedServo:
             self._note,
             firmware=config.firmware,
         )
+        self.counts = ServoCounts()
         self._silent = False
         self.registers["id"] = config.servo_id
         self._baud_item = (
@@ -97,7 +118,7 @@ class SimulatedServo:
         body, instructions = self._body, self._instructions
         servo_id = body.servo_id  # a write of ID is still answered under the old one [i]
         own = packet.servo_id == servo_id
-        if not (own or self.listens_to(packet.servo_id)) or not self.hears(now_ns):
+        if not (own or self.listens_to(packet.servo_id)) or not self.receives(now_ns):
             return None
         answering = instructions.answers(packet, own)
         delay_ns = instructions.delay_ns(packet, 10_000_000_000 // self.baud_rate) if answering else 0
@@ -110,11 +131,11 @@ class SimulatedServo:
             return None
         return Reply(servo_id, error | body.state(), parameters, delay_ns)
 
-    def answer_in_turn(self, reading: ReadInTurn, entry: ReadEntry, now_ns: int) -> Reply | None:
+    def reply_to_group_read(self, reading: GroupRead, entry: ReadEntry, now_ns: int) -> Reply | None:
         """Return its part of the answer to an instruction that ended at `now_ns`; None for silence."""
-        if not self.hears(now_ns):
+        if not self.receives(now_ns):
             return None
-        answer = self._instructions.answer_in_turn(reading, entry)
+        answer = self._instructions.reply_to_group_read(reading, entry)
         if answer is None:
             return None
         body = self._body
@@ -122,22 +143,17 @@ class SimulatedServo:
         delay_ns = 0 if reading.fast and entry is not reading.entries[0] else body.delay_ns
         return Reply(body.servo_id, answer[0] | body.state(), answer[1], delay_ns)
 
-    def hears(self, now_ns: int) -> bool:
-        """Take note of an instruction at a time; say whether the servo takes it in."""
+    def receives(self, now_ns: int) -> bool:
+        """Take note of an instruction at a time; return whether it reaches the servo."""
         body = self._body
         if self._silent or now_ns < body.deaf_until_ns or not body.hears_protocol:
             return False
         body.hear(now_ns)
         return True
 
-    def shows_the_same(self, entry: ReadEntry) -> bool:
-        """Return whether what it was read last is the same until a servo moves or something is written."""
-        return self._body.keeps(entry.address, entry.length)
-
-    @property
-    def mechanics(self) -> Mechanics:
-        """What it moves, with others."""
-        return self._body.shaft.mechanics
+    def lasts(self, entry: ReadEntry) -> bool:
+        """Return whether it replies the same until a servo moves or something is written."""
+        return self._body.lasts(entry.address, entry.length)
 
     # What tests see and do
 
@@ -196,7 +212,7 @@ class SimulatedServo:
     def silence(self, on: bool = True) -> None:
         """Cut or mend its data line: it hears and answers nothing, and goes on with what it does."""
         self._silent = on
-        self.registers.changes += 1
+        self.registers.version += 1
         self._note(f"servo {self.servo_id}: data line {'cut' if on else 'mended'}")
 
     def reset(self) -> None:
@@ -208,7 +224,7 @@ class SimulatedServo:
         """Cut its power until a time: RAM is lost, and it neither moves nor hears anything before."""
         self.reset()
         self._body.deaf_until_ns = max(self._body.deaf_until_ns, until_ns)
-        self.registers.changes += 1
+        self.registers.version += 1
 
     def poke(self, name: str, wire: int) -> None:
         """Set a control item as if it had been so before; the integer of the wire, no refusal."""
@@ -221,6 +237,7 @@ class SimulatedServo:
         It ends with a power cycle, a reboot (Protocol 2.0), a write of Torque Limit (34, Protocol 1.0).
         """
         self._body.overload = True
+        self.registers.version += 1
         self._note(f"servo {self.servo_id}: overload")
         self._body.protect()
 

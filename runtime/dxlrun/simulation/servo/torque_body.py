@@ -95,10 +95,6 @@ class TorqueBody(Body):
         if self._guarded and (self._looked_after_ns is None or self._retimed):
             self._watch()
 
-    def hear_again(self, now_ns: int) -> None:
-        """Take note of an instruction to which nothing changed since it heard the one before."""
-        self._heard_ns = self.shaft.now_ns = now_ns
-
     def _guard(self) -> None:
         self._guarded = self.memory.get("bus_watchdog") != 0
         self._retimed = True
@@ -175,7 +171,7 @@ class TorqueBody(Body):
         self.note(f"servo {self.servo_id}: reboot")
         self.power_up()
         self.deaf_until_ns = self.shaft.now_ns + self.boot_ns
-        self.memory.changes += 1
+        self.memory.version += 1
 
     def power_up(self) -> None:
         """Start: RAM is as it is at power-up, and so is the angle, but for the turns of the Y series."""
@@ -252,7 +248,7 @@ class TorqueBody(Body):
             if not memory["min_voltage_limit"] <= volts <= memory["max_voltage_limit"]:
                 wrong.append(HardwareError.VOLTAGE)
         limit = "motor_temperature_limit" if self.has_error_code else "temperature_limit"
-        if self.temperature > memory.get(limit, 255):
+        if round(self.temperature) > memory.get(limit, 255):
             wrong.append(HardwareError.OVERHEATING)
         return tuple(wrong)
 

@@ -40,7 +40,7 @@ class ReadEntry(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class ReadInTurn:
+class GroupRead:
     """An instruction that several servos answer one after the other, in the order of its list."""
 
     instruction: int
@@ -88,7 +88,7 @@ class Codec(Protocol):
     def status_packet(self, servo_id: int, error: int, parameters: bytes = b"") -> bytes:
         """Return the bytes of a status packet."""
 
-    def read_in_turn(self, packet: InstructionPacket) -> ReadInTurn | None:
+    def group_read(self, packet: InstructionPacket) -> GroupRead | None:
         """Return what a packet asks several servos for; None: it is no such instruction, or a wrong one."""
 
     def fast_status(self, lengths: tuple[int, ...]) -> FastStatus:

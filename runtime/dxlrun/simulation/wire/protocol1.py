@@ -9,7 +9,7 @@ from __future__ import annotations
 from enum import IntEnum, IntFlag, unique
 from typing import NoReturn
 
-from dxlrun.simulation.wire.packets import BROADCAST, InstructionPacket, ReadEntry, ReadInTurn
+from dxlrun.simulation.wire.packets import BROADCAST, GroupRead, InstructionPacket, ReadEntry
 
 LONGEST_PAUSE_NS = 100_000_000
 """Longest gap inside an instruction (e-Manual, Protocol 1.0)."""
@@ -56,7 +56,7 @@ def status_packet(servo_id: int, error: int, parameters: bytes = b"") -> bytes:
     return HEADER + body + bytes((checksum(body),))
 
 
-def read_in_turn(packet: InstructionPacket) -> ReadInTurn | None:
+def group_read(packet: InstructionPacket) -> GroupRead | None:
     """Return what a bulk read asks for; None: it is none, or its parameters are wrong."""
     if not packet.intact or packet.servo_id != BROADCAST or packet.instruction != Instruction.BULK_READ:
         return None
@@ -66,7 +66,7 @@ def read_in_turn(packet: InstructionPacket) -> ReadInTurn | None:
     entries: dict[int, ReadEntry] = {}
     for length, servo_id, address in zip(listed[::3], listed[1::3], listed[2::3], strict=True):
         entries.setdefault(servo_id, ReadEntry(servo_id, address, length))  # of an ID listed twice the first
-    return ReadInTurn(packet.instruction, tuple(entries.values()))
+    return GroupRead(packet.instruction, tuple(entries.values()))
 
 
 def fast_status(lengths: tuple[int, ...]) -> NoReturn:

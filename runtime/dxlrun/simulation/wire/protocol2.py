@@ -13,7 +13,7 @@ from functools import lru_cache
 
 from fastcrc.crc16 import umts
 
-from dxlrun.simulation.wire.packets import BROADCAST, InstructionPacket, ReadEntry, ReadInTurn, Reply
+from dxlrun.simulation.wire.packets import BROADCAST, GroupRead, InstructionPacket, ReadEntry, Reply
 
 LONGEST_PAUSE_NS = 1_500_000
 """Longest gap inside an instruction."""
@@ -127,7 +127,7 @@ def fast_status(lengths: tuple[int, ...]) -> FastStatusPacket:
     return FastStatusPacket(lengths)
 
 
-def read_in_turn(packet: InstructionPacket) -> ReadInTurn | None:
+def group_read(packet: InstructionPacket) -> GroupRead | None:
     """Return what a sync or bulk read asks for; None: it is none, or its parameters are wrong."""
     if packet.instruction not in _READS_IN_TURN or not packet.intact or packet.servo_id != BROADCAST:
         return None
@@ -136,14 +136,14 @@ def read_in_turn(packet: InstructionPacket) -> ReadInTurn | None:
 
 
 @lru_cache(maxsize=16)  # hosts ask again and again for the same
-def _reading(instruction: int, parameters: bytes) -> ReadInTurn | None:
+def _reading(instruction: int, parameters: bytes) -> GroupRead | None:
     fast = instruction in _FAST_READS
     if instruction in (Instruction.SYNC_READ, Instruction.FAST_SYNC_READ):
         entries = _sync_entries(parameters)
     else:
         entries = _bulk_entries(parameters)
     # A fast status is one packet [i]: with an absent servo in it, it stays short.
-    reading = ReadInTurn(instruction, entries, fast=fast, has_slots=not fast)
+    reading = GroupRead(instruction, entries, fast=fast, has_slots=not fast)
     if not entries or (fast and _fast_length(reading.lengths) > LONGEST):
         return None
     return reading
