@@ -10,14 +10,13 @@ from typing import TypeAlias
 
 from dxlrun.compile.buses import SIMULATED, compile_buses, slowest_period_ns
 from dxlrun.compile.controllers import compile_controllers, compile_modes
-from dxlrun.compile.joints import AUTO, check_twins, compile_joints
+from dxlrun.compile.joints import AUTO, check_twins, compile_joints, compile_urdf
 from dxlrun.compile.motions import compile_motion
 from dxlrun.compile.plan import Plan, SimulationPlan
 from dxlrun.compile.policies import compile_policies
 from dxlrun.compile.problems import Problems, independent_errors, left_out_names
 from dxlrun.compile.report import Checked, CheckReport, check_report
 from dxlrun.compile.simulation import compile_simulation
-from dxlrun.compile.urdf import compile_urdf
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.control.loop_plan import MOST_SHARE, LoopPlan, SchedulerPlan
 from dxlrun.description import Description, MotionDescription, Survey, read_motion, survey_robot

@@ -1,4 +1,4 @@
-"""Simulation: the `simulation` keys of the robot file, checked, and the simulated buses of a plan.
+"""Simulation: the `simulation` keys of the robot file, checked and put into the plan.
 
 On a real port none of these keys is used, so one that could not be simulated is then a warning at most.
 """
@@ -10,17 +10,13 @@ from collections.abc import Mapping
 
 from dxlrun.compile.buses import SIMULATED
 from dxlrun.compile.joints import CompiledJoint
-from dxlrun.compile.plan import AdapterPlan, LoadPlan, Plan, SimulationPlan
+from dxlrun.compile.plan import AdapterPlan, LoadPlan, SimulationPlan
 from dxlrun.compile.problems import Problems
 from dxlrun.description import Description
 from dxlrun.description.bus import Bus
-from dxlrun.dynamixel.control_table import added_control_tables
-from dxlrun.dynamixel.plan.bus_plan import BusPlan
-from dxlrun.errors import InputError
-from dxlrun.simulation import AdapterConfig, BusConfig, Load, ServoConfig, UrdfBodies, UrdfJoint
 
-_NEEDS_URDF = "physics: mujoco moves the bodies of a URDF, and the file names none"
-_NAME_URDF = "write `model: {urdf: ...}`, or take physics: independent"
+NEEDS_URDF = "physics: mujoco moves the bodies of a URDF, and the file names none"
+NAME_URDF = "write `model: {urdf: ...}`, or take physics: independent"
 
 
 def compile_simulation(
@@ -39,60 +35,6 @@ def compile_simulation(
             if (adapter := _adapter(bus)) != AdapterPlan()
         },
         physics=description.robot.simulation.physics,
-    )
-
-
-def simulated_buses(plan: Plan) -> tuple[BusConfig, ...]:
-    """Return the simulated lines of a plan: the servos that it expects, each at its reference (q = 0)."""
-    return tuple(_simulated_bus(plan, bus) for bus in plan.buses if bus.port == SIMULATED)
-
-
-def simulated_bodies(plan: Plan) -> UrdfBodies | None:
-    """Return the bodies that the servos of `simulated_buses` move together; None: each joint by itself.
-
-    Raises InputError when the robot file asks for bodies that cannot be moved: here, where the
-    user sees it, and not in the process of the simulated buses.
-    """
-    if plan.simulation.physics == "independent":
-        return None
-    if plan.urdf is None:
-        raise InputError(f"{_NEEDS_URDF}; {_NAME_URDF}")
-    joints = (
-        UrdfJoint(servo.joint, servo.reference, servo.direction)
-        for bus in plan.buses
-        if bus.port == SIMULATED
-        for servo in bus.servos
-    )
-    bodies = UrdfBodies(plan.urdf, tuple(joints))
-    from dxlrun.simulation.motion.mujoco_plant import mujoco_plant  # MuJoCo is optional, and slow to import
-
-    mujoco_plant(bodies)
-    return bodies
-
-
-def _simulated_bus(plan: Plan, bus: BusPlan) -> BusConfig:
-    adapter = plan.simulation.adapters.get(bus.name, AdapterPlan())
-    loads = plan.simulation.loads
-    return BusConfig(
-        name=bus.name,
-        baud_rate=bus.baud_rate,
-        servos=tuple(
-            ServoConfig(
-                servo.servo_id,
-                servo.model,
-                servo.reference,
-                bus.return_delay_ns,
-                load=Load(load.inertia, load.friction, load.gravity, load.gravity_angle),
-            )
-            for servo in bus.servos
-            for load in (loads.get(servo.joint, LoadPlan()),)
-        ),
-        protocol=bus.protocol,
-        control_tables=added_control_tables(servo.model for servo in bus.servos),
-        adapter=AdapterConfig(
-            latency_timer_ns=adapter.latency_timer_ns, split=adapter.split, echo=adapter.echo
-        ),
-        absent=adapter.absent,
     )
 
 
@@ -166,7 +108,7 @@ def _check_physics(description: Description, problems: Problems) -> None:
     simulated = any(bus.port == SIMULATED for bus in robot.buses.values())
     add = problems.error if simulated else problems.warning
     if robot.model is None:
-        add(mark, _NEEDS_URDF, _NAME_URDF)
+        add(mark, NEEDS_URDF, NAME_URDF)
     if importlib.util.find_spec("mujoco") is None:
         # not above: `check` reads no part of the simulation but for these two sentences
         from dxlrun.simulation.motion.mujoco_plant import INSTALL_MUJOCO, NEEDS_MUJOCO

@@ -34,4 +34,4 @@ Name = Annotated[
 class Form(BaseModel):
     """Base of all parts: frozen, unknown keys refused, finite numbers only, no number made from text."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, defer_build=True)

@@ -10,7 +10,7 @@ from pathlib import Path
 import msgspec
 
 from dxlrun.compile.plan import Plan, to_json
-from dxlrun.compile.simulation import simulated_bodies, simulated_buses
+from dxlrun.compile.simulated import simulated_bodies, simulated_buses
 from dxlrun.control.realtime.grants import Grant, guardian_priority
 from dxlrun.log.header import LogHeader, RecorderJob
 from dxlrun.remote.job import Descriptors, GatewayJob

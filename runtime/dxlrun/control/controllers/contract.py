@@ -115,7 +115,9 @@ def _is_model(found: object, base: type) -> bool:
 
 
 def _takes(found: Callable[..., object], wanted: Callable[..., object]) -> bool:
-    """Say whether a method can be called as the contract's: by position, with as many arguments."""
+    """Return whether a method can be called as the contract's: by position, with as many arguments."""
+    if found is wanted:  # inherited
+        return True
     count = len(inspect.signature(wanted).parameters)
     try:
         inspect.signature(found).bind(*range(count))

@@ -20,13 +20,13 @@ CONTRACT_VERSION = 1
 class ParametersModel(BaseModel):
     """Base of a controller's parameters: frozen, unknown keys refused, finite numbers only."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, defer_build=True)
 
 
 class CommandModel(BaseModel):
     """Base of a typed command: frozen, unknown keys refused, finite numbers only."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, defer_build=True)
 
 
 P = TypeVar("P", bound=ParametersModel)

@@ -98,8 +98,9 @@ def load_plugins(after_each: Callable[[str], None] = _look_away) -> PlugIns:
     broken: dict[str, str] = {}
     hooks: list[OverrunHook] = []
     ambiguous: dict[str, str] = {}
-    for entry_point in sorted(entry_points(group=GROUP), key=_order):
-        publisher = _publisher(entry_point)
+    # the order must not depend on the file system: two runs load the same plug-ins in the same order
+    found_points = [(_publisher(each), each.name, each) for each in entry_points(group=GROUP)]
+    for publisher, _, entry_point in sorted(found_points, key=lambda each: each[:2]):
         try:
             found = _load(entry_point, publisher)
         except PlugInError as error:
@@ -117,11 +118,6 @@ def load_plugins(after_each: Callable[[str], None] = _look_away) -> PlugIns:
                 )
     usable = {name: offer for name, offer in offers.items() if name not in ambiguous}
     return PlugIns(usable, broken | ambiguous, tuple(hooks), after_each)
-
-
-def _order(entry_point: EntryPoint) -> tuple[str, str]:
-    """The order must not depend on the file system, because two runs are to say the same."""
-    return _publisher(entry_point), entry_point.name
 
 
 def _publisher(entry_point: EntryPoint) -> str:
