@@ -6,9 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dxlrun.dynamixel.registers import modes
-from dxlrun.dynamixel.servo.limp import limp
-from dxlrun.dynamixel.servo.standing import stand
+from dxlrun.dynamixel.servo import modes
+from dxlrun.dynamixel.servo.torque_off import limp, stand
 from dxlrun.mode import Mode
 from dxlrun.run.channels.events import EventCode
 
@@ -49,7 +48,7 @@ def test_a_joint_that_forgot_its_turns_over_a_reboot_does_not_wind_them_up_again
     assert rig.states.valid[0]
     assert servo.position == pytest.approx(standing, abs=0.1), "it wound up the turns that it had forgotten"
     assert rig.torque() == [False, True]
-    assert "in which turn it stood" in rig.events.of(EventCode.SERVO_LIMP)[0][1]
+    assert "lost count of its turns" in rig.events.of(EventCode.SERVO_LIMP)[0][1]
 
 
 def test_a_wheel_that_is_led_by_its_velocity_gets_torque_again_after_a_reboot(make_wheel):
@@ -196,7 +195,7 @@ def test_a_wheel_that_keeps_its_torque_whatever_is_written_is_named(make_wheel):
     servo.poke("bus_watchdog", -1)
     servo.registers.watch(("torque_enable",), lambda: servo.poke("torque_enable", 1))
     (said, _) = stand(rig.plans, rig.ports, rig.clock, rig.packets)[::-1]
-    assert said.startswith("main_1_joint (ID 1 on bus main) may go on moving: ")
+    assert said.startswith("main_1_joint (ID 1 on bus main) may keep moving: ")
     assert said.endswith("torque off was not confirmed")
 
 
@@ -257,7 +256,7 @@ def test_a_wheel_stands_before_silent_ones_are_awaited_for_long(make_rig, make_p
     said = stand(rig.plans, rig.ports, rig.clock, rig.packets)
     assert stood_ns[-1] - begin_ns < 500_000_000
     assert [text.split()[0] for text in said] == [f"main_{one}_joint" for one in (4, 1, 2, 3)]
-    assert [" may go on moving: " in text for text in said] == [False, True, True, True]
+    assert [" may keep moving: " in text for text in said] == [False, True, True, True]
 
 
 @pytest.mark.parametrize("last_hand", [limp, stand])

@@ -34,6 +34,12 @@ class Rounds:
         self.rig.clock.wait_until(until + 1_000_000)
         return self.rig.into_bus()[count:]
 
+    def add(self, program, done, *others, **more):
+        def ended():
+            done((yield from program))
+
+        self.gaps.add(ended(), *others, **more)
+
     def read(self, servo_id, address, size=1):
         return plan_line(self.rig.plans[0]).read(servo_id, address, size)
 
@@ -64,7 +70,7 @@ def reading(rounds, servo_id, *addresses):
 
 def test_a_program_goes_on_from_gap_to_gap(rounds):
     found = []
-    rounds.gaps.add(reading(rounds, 11, 7, 11, 64), found.append, Urgency.SLOW, "three reads")
+    rounds.add(reading(rounds, 11, 7, 11, 64), found.append, Urgency.SLOW, "three reads")
     sent = [rounds.gap(READ_NS + 150_000) for _ in range(4)]
     assert sent == [[protocol2.read(11, address, 1)] for address in (7, 11, 64)] + [[]]
     assert found == [[11, 3, 0]]
@@ -73,7 +79,7 @@ def test_a_program_goes_on_from_gap_to_gap(rounds):
 
 def test_a_gap_takes_as_many_transactions_as_fit_and_ends_in_time(rounds):
     found = []
-    rounds.gaps.add(reading(rounds, 11, *[7] * 9), found.append, Urgency.SLOW, "nine reads")
+    rounds.add(reading(rounds, 11, *[7] * 9), found.append, Urgency.SLOW, "nine reads")
     assert len(rounds.gap(1_000_000)) == 3
     assert rounds.over_ns <= 0
     rounds.rig.buses[0].servo(11).silence()
@@ -84,9 +90,9 @@ def test_a_gap_takes_as_many_transactions_as_fit_and_ends_in_time(rounds):
 def test_the_more_urgent_goes_first_even_between_two_transactions(rounds):
     ended = []
     for urgency in (Urgency.SLOW, Urgency.STEERED, Urgency.REPAIR):
-        rounds.gaps.add(reading(rounds, 11, 7, 11), lambda _, u=urgency: ended.append(u), urgency, "two")
+        rounds.add(reading(rounds, 11, 7, 11), lambda _, u=urgency: ended.append(u), urgency, "two")
     rounds.gap(READ_NS + 150_000)
-    rounds.gaps.add(reading(rounds, 12, 7), lambda _: ended.append(Urgency.MODE), Urgency.MODE, "one")
+    rounds.add(reading(rounds, 12, 7), lambda _: ended.append(Urgency.MODE), Urgency.MODE, "one")
     for _ in range(8):
         rounds.gap(READ_NS + 150_000)
     assert ended == [Urgency.MODE, Urgency.REPAIR, Urgency.STEERED, Urgency.SLOW]
@@ -97,7 +103,7 @@ def test_of_one_servo_the_program_that_began_ends_first(rounds):
     for name, urgency, servo in (("a", Urgency.REPAIR, 0), ("b", Urgency.MODE, 0), ("c", Urgency.MODE, 1)):
         servo_id = rounds.rig.plans[0].servos[servo].servo_id
         program = reading(rounds, servo_id, 7, 11, 64)
-        rounds.gaps.add(program, lambda _, name=name: ended.append(name), urgency, name, servo)
+        rounds.add(program, lambda _, name=name: ended.append(name), urgency, name, servo)
         rounds.gap(READ_NS + 150_000)
     for _ in range(9):
         rounds.gap(READ_NS + 150_000)
@@ -114,8 +120,8 @@ def test_a_pause_of_one_program_leaves_the_line_to_the_others(rounds):
         assert reply.outcome is Outcome.SENT
         return rounds.rig.clock.now_ns() - before
 
-    rounds.gaps.add(pausing(), ended.append, Urgency.MODE, "pausing")
-    rounds.gaps.add(reading(rounds, 12, 7), ended.append, Urgency.SLOW, "reading")
+    rounds.add(pausing(), ended.append, Urgency.MODE, "pausing")
+    rounds.add(reading(rounds, 12, 7), ended.append, Urgency.SLOW, "reading")
     for _ in range(8):
         rounds.gap(1_000_000)
     assert ended[0] == [12]
@@ -126,7 +132,7 @@ def test_a_pause_of_one_program_leaves_the_line_to_the_others(rounds):
 def test_what_is_urgent_is_done_at_last_in_a_gap_too_short_and_what_is_slow_never(rounds, urgency, done):
     found = []
     name = "torque enable of arm_11_joint"
-    rounds.gaps.add(reading(rounds, 11, 7, 7, 7), found.append, urgency, name, servo=0)
+    rounds.add(reading(rounds, 11, 7, 7, 7), found.append, urgency, name, servo=0)
     sent = [len(rounds.gap(READ_NS)) for _ in range(STARVED + 3 * STARVED_AGAIN)]
     assert sum(sent[:STARVED]) == 0
     assert found == ([[11, 11, 11]] if done else [])
@@ -142,14 +148,14 @@ def test_what_is_urgent_is_done_at_last_in_a_gap_too_short_and_what_is_slow_neve
 
 def test_every_program_of_a_line_that_is_gone_ends_with_time_outs(rounds):
     found = []
-    rounds.gaps.add(reading(rounds, 11, 7, 11), found.append, Urgency.MODE, "begun")
+    rounds.add(reading(rounds, 11, 7, 11), found.append, Urgency.MODE, "begun")
     rounds.gap(READ_NS + 150_000)
 
     def adding(result):
         found.append(result)
-        rounds.gaps.add(reading(rounds, 12, 7), found.append, Urgency.SLOW, "added")
+        rounds.add(reading(rounds, 12, 7), found.append, Urgency.SLOW, "added")
 
-    rounds.gaps.add(reading(rounds, 12, 7), adding, Urgency.SLOW, "not begun")
+    rounds.add(reading(rounds, 12, 7), adding, Urgency.SLOW, "not begun")
     rounds.gaps.abandon()
     assert found == [[11, Outcome.TIMEOUT], [Outcome.TIMEOUT]]
     assert rounds.gaps.waiting == 1
@@ -157,7 +163,7 @@ def test_every_program_of_a_line_that_is_gone_ends_with_time_outs(rounds):
 
 def test_a_transaction_that_a_cycle_cut_off_is_asked_again(rounds):
     found = []
-    rounds.gaps.add(reading(rounds, 11, 7), found.append, Urgency.MODE, "one")
+    rounds.add(reading(rounds, 11, 7), found.append, Urgency.MODE, "one")
     assert rounds.gaps.begin(rounds.rig.clock.now_ns() + 5_000_000)
     rounds.bus.load(rounds.gaps)
     rounds.bus.step(rounds.rig.clock.now_ns())  # sent, and nobody waits for the reply
@@ -170,7 +176,7 @@ def test_a_gap_begins_nothing_on_a_line_that_was_late_until_that_is_forgotten(ro
     found = []
     now = rounds.rig.clock.now_ns()
     rounds.gaps.came(now, now - 400_000)  # its cyclic reply came so late
-    rounds.gaps.add(reading(rounds, 11, 7), found.append, Urgency.SLOW, "a read")
+    rounds.add(reading(rounds, 11, 7), found.append, Urgency.SLOW, "a read")
     assert rounds.gap(READ_NS + 150_000) == []
     assert rounds.gaps.late_ns == 400_000
     for _ in range(200):
@@ -184,7 +190,7 @@ def test_one_reply_that_came_a_second_late_does_not_close_the_gaps_of_the_next_s
     found = []
     now = rounds.rig.clock.now_ns()
     rounds.gaps.came(now, now - 1_000_000_000)  # the process was not running
-    rounds.gaps.add(reading(rounds, 11, 7), found.append, Urgency.MODE, "the mode of a servo")
+    rounds.add(reading(rounds, 11, 7), found.append, Urgency.MODE, "the mode of a servo")
     assert len(rounds.gap(5_000_000)) == 1
     assert found == [[11]]
 

@@ -8,7 +8,7 @@ import pytest
 from dxlrun.dynamixel.control_table import all_tables
 from dxlrun.dynamixel.plan.bus_plan import RegisterValue
 from dxlrun.dynamixel.plan.units import joint_position
-from dxlrun.dynamixel.servo.limp import limp
+from dxlrun.dynamixel.servo.torque_off import limp
 from dxlrun.dynamixel.wire import protocol2
 from dxlrun.dynamixel.wire.receiver import Receiver
 from dxlrun.errors import StartUpError

@@ -5,18 +5,15 @@ import re
 from dataclasses import replace
 from functools import partial
 
-import numpy as np
 import pytest
 
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.plan.bus_plan import RegisterValue
-from dxlrun.dynamixel.registers.bus_watchdog import RETURN_SPEED
-from dxlrun.dynamixel.servo.reboots import RealtimeTicks, RebootCount
-from dxlrun.dynamixel.servo.returning import Returning
+from dxlrun.dynamixel.servo.offline import RealtimeTicks, RebootCount
+from dxlrun.dynamixel.servo.watchdog import RETURN_SPEED
 from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.dynamixel.wire.transaction import Outcome, Reply
 from dxlrun.errors import StartUpError
-from dxlrun.interfaces import Commands, States
 from dxlrun.run.channels.events import EventCode
 
 X_IDS = (11, 12, 13, 14)
@@ -219,7 +216,7 @@ def test_a_servo_that_reboots_twice_in_a_minute_gets_no_torque_again(start, make
 def test_two_reboots_latch_a_servo_only_within_a_minute(times_s, latched):
     count = RebootCount(2)
     assert tuple(count.add(1, round(at_s * 1e9)) for at_s in times_s) == latched
-    assert count.latched == [False, any(latched)]
+    assert count.exhausted == [False, any(latched)]
 
 
 def _reads_model(packet, protocol):
@@ -319,7 +316,7 @@ def _answer_no_third_question_for_torque(rig, servo):
     ("trick", "said"),
     [
         (_refuse_torque, "and torque enable 0"),
-        (_answer_no_third_question_for_torque, "did not answer when its torque was asked for"),
+        (_answer_no_third_question_for_torque, "did not answer when its torque was read"),
         (_refuse_watchdog, "was given Bus Watchdog (98) = 10, but has 0"),
     ],
 )
@@ -365,19 +362,6 @@ def test_a_watchdog_that_is_not_certain_to_be_armed_ends_the_start(make_rig, mak
     with pytest.raises(StartUpError, match=re.escape(f"ID 12 on bus arm) {said}")):
         rig.hardware.start()
     assert rig.torque() == [False] * 4
-
-
-def test_a_servo_without_torque_is_not_taken_for_one_that_has_caught_up():
-    """Its position from before it was lost may be where its goal is now."""
-    returning, goals, states = Returning([0]), Commands.empty(1), States.empty(1)
-    goals.position[0], states.position[0] = 0.3, 0.3
-    returning.slow_down(0)
-    returning.follow(goals, states, np.array([False]))
-    assert returning.ceiling[0] == RETURN_SPEED
-    assert returning.anybody == [0]
-    returning.follow(goals, states, np.array([True]))
-    assert np.isnan(returning.ceiling[0])
-    assert returning.anybody == []
 
 
 def test_registers_that_a_reboot_took_are_written_again(start, make_x):

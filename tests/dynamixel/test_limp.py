@@ -3,7 +3,7 @@ import sys
 
 import pytest
 
-from dxlrun.dynamixel.servo.limp import LATE_NS, LONGER_NS, limp
+from dxlrun.dynamixel.servo.torque_off import LATE_NS, LONGER_NS, limp
 
 
 def test_a_robot_whose_loop_died_becomes_limp(make_rig):

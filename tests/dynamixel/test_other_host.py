@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from dxlrun.dynamixel.servo.health import UNREQUESTED_EVENT_NS
+from dxlrun.dynamixel.servo.servos import UNREQUESTED_EVENT_NS
 from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.run.channels.events import EventCode
 

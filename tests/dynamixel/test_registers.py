@@ -9,9 +9,9 @@ from dxlrun.dynamixel.control_table import all_tables, control_table
 from dxlrun.dynamixel.exchange.bus import Bus
 from dxlrun.dynamixel.exchange.pump import run
 from dxlrun.dynamixel.plan.bus_plan import RegisterValue
-from dxlrun.dynamixel.registers.declared import compare, settle_registers
-from dxlrun.dynamixel.registers.inspection import setup_line
-from dxlrun.dynamixel.servo.startup import rejoin
+from dxlrun.dynamixel.servo.offline import rejoin
+from dxlrun.dynamixel.servo.registers import compare, settle
+from dxlrun.dynamixel.servo.retry import setup_line
 from dxlrun.errors import StartUpError
 from dxlrun.run.channels.events import EventCode
 from dxlrun.run.channels.packets import NoPackets
@@ -76,7 +76,7 @@ def test_only_what_differs_is_written_and_it_is_read_back(bench, make_x):
     plan = declared(make_x(), return_delay_time=250, position_p_gain=900, position_d_gain=0)
     rig, execute = bench(plan)
     rig.buses[0].servo(11).poke("return_delay_time", 0)
-    settled = execute(settle_registers(plan, plan.servos[0]))
+    settled = execute(settle(plan, plan.servos[0], plan.servos[0].registers, setup_line(plan)))
     assert settled.problems == []
     assert [text for _, text in settled.written] == [
         "Return Delay Time (9) was 0 and is 250",
@@ -84,7 +84,7 @@ def test_only_what_differs_is_written_and_it_is_read_back(bench, make_x):
     ]
     assert len(writes(rig)) == 2
     assert (held(rig, "return_delay_time"), held(rig, "position_p_gain")) == (250, 900)
-    assert execute(settle_registers(plan, plan.servos[0])).written == []
+    assert execute(settle(plan, plan.servos[0], plan.servos[0].registers, setup_line(plan))).written == []
     assert len(writes(rig)) == 2
 
 
@@ -104,7 +104,7 @@ def test_no_eeprom_is_written_while_a_servo_holds_torque(bench, make_x):
     rig, execute = bench(plan)
     rig.buses[0].servo(11).poke("return_delay_time", 0)
     rig.buses[0].servo(11).poke("torque_enable", 1)
-    (problem,) = execute(settle_registers(plan, plan.servos[0])).problems
+    (problem,) = execute(settle(plan, plan.servos[0], plan.servos[0].registers, setup_line(plan))).problems
     assert "holds torque, so Return Delay Time (9) in its EEPROM was not written" in problem
     assert writes(rig) == []
 
@@ -112,7 +112,7 @@ def test_no_eeprom_is_written_while_a_servo_holds_torque(bench, make_x):
 def test_a_servo_that_was_reset_gets_its_registers_and_its_torque_again(bench, make_x):
     plan = declared(make_x(), position_p_gain=900)
     rig, execute = bench(plan)
-    execute(settle_registers(plan, plan.servos[0]))
+    execute(settle(plan, plan.servos[0], plan.servos[0].registers, setup_line(plan)))
     rig.buses[0].servo(11).reset()
     rig.clock.wait_until(rig.clock.now_ns() + 2_000_000_000)
     assert held(rig, "position_p_gain") == 800
@@ -204,9 +204,9 @@ def test_whatever_may_be_declared_of_any_model_is_written_once_and_then_there(be
         wanted = sorted(others(table), key=lambda one: not one.eeprom)
         plan = replace(plan, servos=(replace(plan.servos[0], registers=tuple(wanted)),))
         rig, execute = bench(plan, position=1.5)
-        settled = execute(settle_registers(plan, plan.servos[0]))
+        settled = execute(settle(plan, plan.servos[0], plan.servos[0].registers, setup_line(plan)))
         assert settled.problems == []
         assert len(settled.written) == len(writes(rig)) > 5, table.model
-        assert execute(settle_registers(plan, plan.servos[0])).written == []
+        assert execute(settle(plan, plan.servos[0], plan.servos[0].registers, setup_line(plan))).written == []
         memory = rig.buses[0].servos[0].registers
         assert all(memory.read(one.address, one.size) == one.data for one in wanted)

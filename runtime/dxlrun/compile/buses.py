@@ -14,7 +14,7 @@ from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.plan.bus_plan import Budget, BusPlan
 from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
 from dxlrun.dynamixel.plan.reads import slow_items
-from dxlrun.dynamixel.registers.bus_watchdog import LEAST_PERIODS, MOST_TICKS, UNIT_NS, has_one
+from dxlrun.dynamixel.servo.watchdog import LEAST_PERIODS, MOST_TICKS, UNIT_NS, has_one
 from dxlrun.errors import suggestion
 from dxlrun.mode import Mode
 

@@ -12,7 +12,6 @@ from dxlrun.description.robot import Joint
 from dxlrun.description.units import quantity
 from dxlrun.dynamixel.control_table import ControlItem, ControlTable
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, RegisterValue, ServoPlan
-from dxlrun.dynamixel.registers.inspection import called
 from dxlrun.errors import suggestion
 
 _COMMANDED = ("controllers command it", "take it out; a controller sends it")
@@ -89,7 +88,7 @@ def register_value(table: ControlTable, name: str, value: int | str) -> Register
     if item is None:
         raise UnfitRegister(f"an {table.model} has no register {name}", suggestion(name, declarable(table)))
     if reason := own_reason(table, item):
-        raise UnfitRegister(f"{called(item)} is not to be declared: {reason[0]}", reason[1])
+        raise UnfitRegister(f"{item.title} is not to be declared: {reason[0]}", reason[1])
     found = any_value(table, name, value)
     _check_meaning(item, found.value)
     return found
@@ -105,11 +104,11 @@ def any_value(table: ControlTable, name: str, value: int | str) -> RegisterValue
         names = tuple(each.name for each in table.items.values() if each.access == "RW")
         raise UnfitRegister(f"an {table.model} has no register {name}", suggestion(name, names))
     if item.access == "R":
-        raise UnfitRegister(f"{called(item)} can only be read", "take it out")
+        raise UnfitRegister(f"{item.title} can only be read", "take it out")
     raw = _raw(item, value)
     if not item.minimum <= raw <= item.maximum:
         raise UnfitRegister(
-            f"{called(item)} of an {table.model} is {_range(item)}, not {_shown(value, raw)}",
+            f"{item.title} of an {table.model} is {_range(item)}, not {_shown(value, raw)}",
             "write a value in this range",
         )
     return RegisterValue(item.address, item.size, raw, name, item.area == "EEPROM")
@@ -119,18 +118,18 @@ def steered_value(table: ControlTable, name: str, value: int | str) -> RegisterV
     """Return what is written for a register that a client changes in the run; raises UnfitRegister."""
     item = table.items.get(name)
     if item is not None and item.access == "R":
-        raise UnfitRegister(f"{called(item)} can only be read", "write another item")
+        raise UnfitRegister(f"{item.title} can only be read", "write another item")
     if item is not None and (reason := own_reason(table, item)):
-        raise UnfitRegister(f"{called(item)} is not to be changed: {reason[0]}", "write another item")
+        raise UnfitRegister(f"{item.title} is not to be changed: {reason[0]}", "write another item")
     found = register_value(table, name, value)
     item = table.items[name]
     if found.eeprom:
         raise UnfitRegister(
-            f"{called(item)} is in the EEPROM, which no servo writes while it holds torque",
+            f"{item.title} is in the EEPROM, which no servo writes while it holds torque",
             "declare it under `registers` in the robot file, which the next start writes",
         )
     if name in _FIXED:
-        raise UnfitRegister(f"{called(item)} is not to be changed: {_FIXED[name][1]}", "leave it as it is")
+        raise UnfitRegister(f"{item.title} is not to be changed: {_FIXED[name][1]}", "leave it as it is")
     return found
 
 
@@ -210,10 +209,10 @@ def _raw(item: ControlItem, value: int | str) -> int:
     if isinstance(value, int):
         return value
     if not item.unit:
-        raise UnfitRegister(f"{called(item)} has no unit, but is {value!r}", "write a whole number")
+        raise UnfitRegister(f"{item.title} has no unit, but is {value!r}", "write a whole number")
     ticks = quantity(value, item.unit) / item.scale
     if not math.isfinite(ticks):
-        raise UnfitRegister(f"{value} is too much for {called(item)}", f"it takes {_range(item)}")
+        raise UnfitRegister(f"{value} is too much for {item.title}", f"it takes {_range(item)}")
     return round(ticks)
 
 
@@ -233,9 +232,9 @@ def _check_meaning(item: ControlItem, raw: int) -> None:
     """Refuse values that a servo accepts but no robot may run with."""
     fixed, why = _FIXED.get(item.name, (raw, ""))
     if raw != fixed:
-        raise UnfitRegister(f"{called(item)} cannot be {raw}: {why}", f"write {fixed}, or take it out")
+        raise UnfitRegister(f"{item.title} cannot be {raw}: {why}", f"write {fixed}, or take it out")
     if item.name == "startup_configuration" and raw & _TORQUE_AT_BOOT:
         raise UnfitRegister(
-            f"{called(item)} = {raw} switches torque on by itself at power-up",
+            f"{item.title} = {raw} switches torque on by itself at power-up",
             f"write {raw & ~_TORQUE_AT_BOOT}",
         )

@@ -17,12 +17,11 @@ from dxlrun.dynamixel.exchange.pump import clear, pump, run
 from dxlrun.dynamixel.exchange.samples import Samples
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.dynamixel.port.ports import Ports
-from dxlrun.dynamixel.registers import bus_watchdog
-from dxlrun.dynamixel.registers.torque_limit import reduced
-from dxlrun.dynamixel.servo.health import Servos
-from dxlrun.dynamixel.servo.limp import LimpOutcome, limp_buses
-from dxlrun.dynamixel.servo.setting_up import SetUp, tell_failures
-from dxlrun.dynamixel.servo.wanted import Wanted
+from dxlrun.dynamixel.servo import watchdog
+from dxlrun.dynamixel.servo.registers import reduced_torque_limits
+from dxlrun.dynamixel.servo.servos import Servos
+from dxlrun.dynamixel.servo.startup import StartUp, report_failures
+from dxlrun.dynamixel.servo.torque_off import LimpOutcome, limp_buses
 from dxlrun.errors import PortError, StartUpError
 from dxlrun.interfaces import Commands, States
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
@@ -85,17 +84,11 @@ class DynamixelHardware:
             for index, (plan, port) in enumerate(zip(self._plans, ports.ports, strict=True))
         )
         self._gaps = tuple(Gaps(plan, events, clock.now_ns) for plan in self._plans)
-        wanted = [
-            Wanted.of(plan, gaps, states.mode, events)
-            for plan, gaps in zip(self._plans, self._gaps, strict=True)
-        ]
-        self._registers = tuple(one.registers for one in wanted)
-        self._modes = tuple(one.modes for one in wanted)
         self._samples = Samples(self._plans, states, events)
         self._servos = tuple(
-            Servos(plan, bus, gaps, one, events, states, arrays)
-            for plan, bus, gaps, one, arrays in zip(
-                self._plans, self._buses, self._gaps, wanted, self._samples.buses, strict=True
+            Servos(plan, bus, gaps, events, states, arrays)
+            for plan, bus, gaps, arrays in zip(
+                self._plans, self._buses, self._gaps, self._samples.buses, strict=True
             )
         )
         self._lines = tuple(zip(self._buses, self._servos, strict=True))
@@ -114,7 +107,7 @@ class DynamixelHardware:
                 clock,
                 beat,
             )
-        self._set_up = SetUp(self._plans, self._buses, self._servos, ports, clock, events, beat)
+        self._start_up = StartUp(self._plans, self._buses, self._servos, ports, clock, events, beat)
 
     def start(self) -> None:
         """Look at every servo, hold each where it stands, fill the first states and goals.
@@ -122,15 +115,15 @@ class DynamixelHardware:
         Raises StartUpError with every problem of every servo, PortError when a line is gone; torque that was
         given is taken back, and a note of the exception says whether every servo confirmed that.
         """
-        self._set_up.look(self._take_over)
+        self._start_up.look(self._take_over)
         if self._kernel is not None:
             self._kernel.poll_for_replies()
         try:
-            self._set_up.engage(self._goals)
+            self._start_up.engage(self._goals)
             if self._restore_torque:
-                self._full_torque = self._set_up.restore_limits()
+                self._full_torque = self._start_up.restore_limits()
             self._first_states()
-            self._set_up.watch()
+            self._start_up.watch()
         except BaseException as error:  # also an interrupt: nothing may leave here with torque on
             for sentence in self.stop() or (TAKEN_BACK,):
                 error.add_note(sentence)
@@ -147,7 +140,7 @@ class DynamixelHardware:
         self._prepared = False
         now_ns = self._clock.now_ns()
         for servos in self._servos:
-            servos.feeding.feed(now_ns)
+            servos.watchdogs.sent(now_ns)
         self._samples.follow_modes()
         if self._kernel is not None and self._planned:
             answer = self._kernel.read()
@@ -217,7 +210,7 @@ class DynamixelHardware:
             if servos.reads.given_up:
                 self._tell_plain_reads()
         self._samples.settle(now_ns)
-        self._tell_failures()
+        self._report_failures()
 
     def write(self) -> None:
         """Send the goals, one sync write a line and layout, on every line that is there.
@@ -237,7 +230,7 @@ class DynamixelHardware:
                         bus.send(packet)
         if self._split and not self._planned:
             self._ask_behind()
-        self._tell_failures()
+        self._report_failures()
 
     def _write_by_kernel(self, kernel: Kernel) -> None:
         for index, (bus, servos) in enumerate(self._lines):
@@ -267,15 +260,15 @@ class DynamixelHardware:
 
     def set_modes(self, modes: NDArray[np.uint8]) -> None:
         """Bring joints into modes in the gaps between cycles; UNKNOWN leaves one as it is."""
-        for changes in self._modes:
-            changes.want(modes)
+        for servos in self._servos:
+            servos.desired.change_modes(modes)
 
     def set_register(self, row: int, item: str, value: int, done: Callable[[str], None]) -> None:
-        """Write a RAM item of a joint's servo in the gaps, and read it back; see `steered_registers`."""
-        for plan, registers in zip(self._plans, self._registers, strict=True):
+        """Write a RAM item of a joint's servo in the gaps, and read it back; see `DesiredState`."""
+        for plan, servos in zip(self._plans, self._servos, strict=True):
             for index, servo in enumerate(plan.servos):
                 if servo.row == row:
-                    registers.write(index, item, value, done)
+                    servos.desired.write_register(index, item, value, done)
 
     def limit_torque(self, fraction: float) -> None:
         """Let no servo exert more than a fraction of its own limit; `restore_torque` takes that back."""
@@ -284,7 +277,7 @@ class DynamixelHardware:
         for plan, bus, servos, full in zip(
             self._plans, self._buses, self._servos, self._full_torque, strict=False
         ):
-            for packet in reduced(plan, full, fraction, servos.goals.modes):
+            for packet in reduced_torque_limits(plan, full, fraction, servos.goals.modes):
                 with suppress(PortError):  # as with goals: the next read names the bus
                     bus.send(packet)
 
@@ -303,7 +296,7 @@ class DynamixelHardware:
             if bus.failure is not None:
                 gaps.abandon()
                 continue
-            servos.ask()
+            servos.look()
             if not self._busy(index) and gaps.begin(latest):
                 bus.load(gaps)
                 working.append(bus)
@@ -361,7 +354,7 @@ class DynamixelHardware:
 
         A servo that its Bus Watchdog has stopped already stays stopped.
         """
-        programs = [bus_watchdog.release_all(plan) for plan in self._plans]
+        programs = [watchdog.release_all(plan) for plan in self._plans]
         for problems in run(programs, self._buses, self._ports, self._clock, self._beat):
             for problem in problems or ():
                 self._events.emit(EventCode.WATCHDOG, Severity.WARNING, "hardware", problem)
@@ -370,7 +363,7 @@ class DynamixelHardware:
         """Disarm the Bus Watchdogs of servos without torque, by (bus, ID); the others stop by themselves."""
         for plan, bus in zip(self._plans, self._buses, strict=True):
             servos = [servo for servo in plan.servos if (plan.name, servo.servo_id) in limp]
-            for packet in bus_watchdog.disarming(plan, servos):
+            for packet in watchdog.disarming(plan, servos):
                 with suppress(PortError):  # a servo that stops without a host stays as it is
                     bus.send(packet)
 
@@ -388,7 +381,7 @@ class DynamixelHardware:
         while True:
             self._reopen_lines()
             for bus, servos in zip(self._buses, self._servos, strict=True):
-                servos.torqued[:] = False
+                servos.withhold_goals()
                 bus.failure = None  # a line that is back, or was only stuck, gets its chance
             outcomes = limp_buses(
                 self._plans, self._buses, self._ports, self._clock, deadline_ns=deadline_ns, beat=self._beat
@@ -408,10 +401,10 @@ class DynamixelHardware:
                     return True
         return False
 
-    def _tell_failures(self) -> None:
+    def _report_failures(self) -> None:
         for bus in self._buses:
             if bus.failure is not None:
-                tell_failures(self._plans, self._buses, self._servos)
+                report_failures(self._plans, self._buses, self._servos)
                 return
 
     def _tell_plain_reads(self) -> None:
@@ -428,9 +421,9 @@ class DynamixelHardware:
     def _first_states(self) -> None:
         for pause_ns in FIRST_READS_NS:
             if pause_ns:
-                self._set_up.pause(pause_ns)
+                self._start_up.pause(pause_ns)
             self.read()
-            self._set_up.raise_failures()
+            self._start_up.raise_failures()
             if not any(servos.silent for servos in self._servos):
                 break
         silent = [name for servos in self._servos for name in servos.silent]
@@ -438,12 +431,7 @@ class DynamixelHardware:
             raise StartUpError(
                 f"{', '.join(silent)} did not answer after torque was switched on: check cable and power"
             )
-        self._set_up.torque_lasts()
-        for servos in self._servos:
-            servos.torqued[:] = True
-        for plan, changes in zip(self._plans, self._modes, strict=True):
-            for index, servo in enumerate(plan.servos):
-                changes.entered(index, servo.start_mode)
+        self._start_up.confirm()
 
 
 def _is_steady(line: tuple[Bus, Servos]) -> bool:

@@ -27,8 +27,7 @@ from dxlrun.control.realtime import grants as realtime
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.dynamixel.port.ports import SerialPort, SerialPorts
 from dxlrun.dynamixel.port.reopening import KeptLines, Wanted
-from dxlrun.dynamixel.servo.limp import limp
-from dxlrun.dynamixel.servo.standing import stand
+from dxlrun.dynamixel.servo.torque_off import limp, stand
 from dxlrun.errors import PortError
 from dxlrun.run.channels import process
 from dxlrun.run.channels.events import EventCode, EventRing, Severity

@@ -13,11 +13,10 @@ from dxlrun.dynamixel.exchange.pump import run
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.port.ports import SerialPort, SerialPorts
 from dxlrun.dynamixel.port.serial_open import open_serial
-from dxlrun.dynamixel.registers.declared import Difference, compare
-from dxlrun.dynamixel.registers.inspection import setup_line
-from dxlrun.dynamixel.registers.patience import patient
+from dxlrun.dynamixel.servo.checks import survey
 from dxlrun.dynamixel.servo.identify import identify
-from dxlrun.dynamixel.servo.startup import survey
+from dxlrun.dynamixel.servo.registers import Difference, compare
+from dxlrun.dynamixel.servo.retry import extend_timeouts, setup_line
 from dxlrun.dynamixel.wire.transaction import Program
 from dxlrun.errors import StartUpError
 from dxlrun.run.channels.packets import NoPackets
@@ -82,7 +81,7 @@ def look(buses: Sequence[BusPlan]) -> Found:
             Bus(index, plan, port, clock, NoPackets())
             for index, (plan, port) in enumerate(zip(buses, ports.ports, strict=True))
         ]
-        found = run([patient(_look(plan)) for plan in buses], lines, ports, clock)
+        found = run([extend_timeouts(_look(plan)) for plan in buses], lines, ports, clock)
     for line in lines:
         if line.failure is not None:
             raise line.failure

@@ -157,7 +157,7 @@ def _registers(values: Mapping[str, int], items: Mapping[str, ControlItem]) -> T
 
 def _meaning(item: ControlItem, value: int) -> str:
     """Return a value with its unit; empty for what has none."""
-    from dxlrun.dynamixel.registers.inspection import tripped
+    from dxlrun.dynamixel.servo.watchdog import tripped
 
     if tripped(item, value):
         return "tripped"

@@ -83,18 +83,18 @@ def _get(one: OneServo, asked: Asked) -> None:
 
 def _set(one: OneServo, asked: Asked) -> None:
     from dxlrun.compile.registers import any_value
-    from dxlrun.dynamixel.registers.inspection import called, shown
+    from dxlrun.dynamixel.servo.watchdog import shown
 
     name, text = asked.words
     if name in _ELSEWHERE:
         raise InputError(f"{name} is not set like others; {_ELSEWHERE[name]}")
     if name in one.table.items and one.table.items[name].access == "R":
-        raise InputError(f"{called(one.table.items[name])} can only be read; `get` shows it")
+        raise InputError(f"{one.table.items[name].title} can only be read; `get` shows it")
     try:
         wanted = any_value(one.table, name, _value(text))
     except ValueError as error:  # also an UnfitRegister
         raise InputError(str(error)) from None
-    item = called(one.table.items[name])
+    item = one.table.items[name].title
     (found,) = one.differences([wanted])
     if not found.differs:
         asked.done.append(f"{item} is {wanted.value} already")

@@ -61,6 +61,13 @@ class ControlItem:
         return wire
 
     @property
+    def title(self) -> str:
+        """The item as the e-Manual writes it: `Torque Enable (24)`."""
+        small = {"id": "ID", "cw": "CW", "ccw": "CCW"}
+        words = (small.get(word, word.capitalize()) for word in self.name.split("_"))
+        return f"{' '.join(words)} ({self.address})"
+
+    @property
     def signed(self) -> bool:
         """True when the integer on the wire is in two's complement, so that `minimum` may be below 0."""
         return self.encoding == "twos_complement"

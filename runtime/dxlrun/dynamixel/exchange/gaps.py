@@ -13,7 +13,7 @@ from enum import IntEnum, unique
 
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.dynamixel.plan.line import SHORT_PATIENCE_NS
-from dxlrun.dynamixel.wire.transaction import Outcome, Program, Reply, Result, Transaction
+from dxlrun.dynamixel.wire.transaction import Outcome, Program, Reply, Transaction
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
 
 LEAST_PATIENCE_NS = 100_000
@@ -92,8 +92,8 @@ class Gaps:
     """Programs of one bus that wait for time between cycles; a bus executes it as one job a gap.
 
     Programs of one servo never mix: one that has begun ends before another one begins. A transaction that
-    sends nothing (`line.listen`) is a pause; others use the line meanwhile. Every program comes to its end,
-    and `done` is called with what it returned: a line that is gone answers with time-outs (`abandon`).
+    sends nothing (`line.listen`) is a pause; others use the line meanwhile. Every program comes to its end: a
+    line that is gone answers with time-outs (`abandon`).
     """
 
     __slots__ = (
@@ -122,19 +122,18 @@ class Gaps:
 
     def add(
         self,
-        program: Program[Result],
-        done: Callable[[Result], None],
+        program: Program[None],
         urgency: Urgency,
         name: str,
         servo: int = WHOLE_BUS,
     ) -> None:
-        """Let a program be executed in the next gaps; `done` takes what it returns, in some gap's time.
+        """Let a program be executed in the next gaps; at its end it does itself what follows from it.
 
         `name`: what a person reads when it has to wait: `torque enable of elbow (ID 4 on bus main)`.
-        `servo`: index into the plan's servos. May be called from `done` and from a program.
+        `servo`: index into the plan's servos. May be called from a program.
         """
         self._count += 1
-        insort(self._tasks, _Task(_ended(program, done), (urgency, self._count), name, servo), key=_turn)
+        insort(self._tasks, _Task(program, (urgency, self._count), name, servo), key=_turn)
 
     def came(self, at_ns: int, due_ns: int) -> None:
         """Take note of when a reply came and when it was due: a gap begins nothing that would end as late.
@@ -184,7 +183,7 @@ class Gaps:
     def abandon(self) -> None:
         """Bring every program to its end without a line: whatever it asks, nobody answers.
 
-        What `done` adds meanwhile waits for the next gap.
+        What they add meanwhile waits for the next gap.
         """
         tasks, self._tasks, self._current = self._tasks, [], None
         for task in tasks:
@@ -242,10 +241,6 @@ class Gaps:
             text = f"{text} {left:.1f} ms; periods may be skipped"
             self._events.emit(EventCode.OVERRUN, Severity.WARNING, source, text)
         return True
-
-
-def _ended(program: Program[Result], done: Callable[[Result], None]) -> Program[None]:
-    done((yield from program))
 
 
 def _turn(task: _Task) -> tuple[Urgency, int]:

@@ -248,3 +248,7 @@ class BusPlan:
     """Bus Watchdog of each servo that has one, steps of 20 ms; 0: not armed."""
     slow_period_ns: int = 0
     """In which time each slow register is read once; 0: none is."""
+
+    def label(self, servo: ServoPlan) -> str:
+        """Return a servo as messages name it: `elbow (ID 4 on bus main)`."""
+        return f"{servo.joint} (ID {servo.servo_id} on bus {self.name})"

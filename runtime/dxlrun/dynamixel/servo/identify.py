@@ -12,9 +12,8 @@ from dxlrun.dynamixel.exchange.pump import run
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.plan.line import listen
 from dxlrun.dynamixel.port.ports import Ports
-from dxlrun.dynamixel.registers.inspection import persist, setup_line, who
-from dxlrun.dynamixel.registers.patience import patient
-from dxlrun.dynamixel.servo.startup import LISTEN_NS
+from dxlrun.dynamixel.servo.checks import LISTEN_NS
+from dxlrun.dynamixel.servo.retry import extend_timeouts, retry, setup_line
 from dxlrun.dynamixel.wire.transaction import Outcome, Program, Reply
 from dxlrun.run.channels.packets import NoPackets, PacketSink
 
@@ -55,7 +54,7 @@ def identify(
         Bus(index, plan, port, clock, sink)
         for index, (plan, port) in enumerate(zip(plans, ports.ports, strict=True))
     ]
-    found = run([patient(_ask(plan, joints)) for plan in plans], buses, ports, clock, beat)
+    found = run([extend_timeouts(_ask(plan, joints)) for plan in plans], buses, ports, clock, beat)
     for bus in buses:
         if bus.failure is not None:
             raise bus.failure
@@ -69,15 +68,15 @@ def _ask(plan: BusPlan, joints: Collection[str]) -> Program[tuple[Identity, ...]
     for servo in plan.servos:
         if servo.joint not in joints:
             continue
-        reply = yield from persist(line.ping(servo.servo_id))
+        reply = yield from retry(line.ping(servo.servo_id))
         if reply.answered and line.dialect.PING_LENGTH < _WHO_LENGTH:
-            reply = yield from persist(line.read(servo.servo_id, 0, _WHO_LENGTH))
+            reply = yield from retry(line.read(servo.servo_id, 0, _WHO_LENGTH))
         identities.append(_identity(plan, servo, reply))
     return tuple(identities)
 
 
 def _identity(plan: BusPlan, servo: ServoPlan, reply: Reply) -> Identity:
-    name = who(plan, servo)
+    name = plan.label(servo)
     if not reply.answered:
         how = (
             f"does not answer at {plan.baud_rate} bit/s: check power, cable, and ID"

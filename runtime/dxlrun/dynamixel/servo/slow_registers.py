@@ -1,18 +1,15 @@
-"""Slow registers: what changes slowly in the servos of one bus, read in turn in the gaps between cycles."""
+"""Slow registers: what changes slowly in the servos of one bus, read in turn in idle time."""
 
 from __future__ import annotations
-
-from collections.abc import Callable
-from functools import partial
 
 from dxlrun.dynamixel.control_table import ControlItem, control_table
 from dxlrun.dynamixel.exchange.gaps import Gaps, Urgency
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.plan.reads import TEMPERATURES, VOLTAGES
-from dxlrun.dynamixel.registers.inspection import called
-from dxlrun.dynamixel.servo.absent import NEVER, Absent, Voice
-from dxlrun.dynamixel.wire.transaction import Program, Reply, Transaction
+from dxlrun.dynamixel.servo.life import Life
+from dxlrun.dynamixel.servo.offline import Offline
+from dxlrun.dynamixel.wire.transaction import Program
 from dxlrun.interfaces import Floats, States
 from dxlrun.run.channels.events import EventCode, Severity
 
@@ -20,7 +17,7 @@ _LIMITS = ("temperature_limit", "motor_temperature_limit")
 WARN_BELOW = 10.0
 """degrees C below the servo's own limit (failures.md)."""
 COOLED = 5.0
-"""degrees C below the warning until it is told that the servo has cooled down."""
+"""degrees C below the warning: the servo counts as cooled down."""
 
 _Block = tuple[ControlItem, ...]
 """Items side by side, read by one instruction."""
@@ -29,92 +26,74 @@ _Block = tuple[ControlItem, ...]
 class SlowRegisters:
     """Reads one block of one servo at a time, so that each servo's registers come once in the plan's period.
 
-    Temperature and voltage go into the states; whatever else is read is told when it changes. Realtime Tick
-    is read along with them: it tells a reboot that nobody noticed.
+    Temperature and voltage go into the states; other items are logged when they change. Realtime Tick is read
+    along with them: it shows a reboot between two cycles.
     """
 
     __slots__ = (
-        "_absent",
-        "_asking",
-        "_away",
         "_due_ns",
-        "_gaps",
         "_hot",
+        "_idle",
         "_interval_ns",
         "_known",
+        "_life",
         "_limits",
         "_next",
+        "_offline",
         "_plan",
-        "_rebooted",
+        "_reading",
         "_round",
-        "_say",
         "_states",
     )
 
-    def __init__(  # noqa: PLR0917  whom it asks, whom it tells
-        self,
-        plan: BusPlan,
-        gaps: Gaps,
-        absent: Absent,
-        away: list[bool],
-        say: Voice,
-        states: States,
-        rebooted: Callable[[int], None],
-    ) -> None:
+    def __init__(self, plan: BusPlan, idle: Gaps, life: Life, offline: Offline, states: States) -> None:
         self._plan = plan
-        self._gaps = gaps
-        self._absent = absent
-        self._away = away
-        self._say = say
-        self._rebooted = rebooted
+        self._idle = idle
+        self._life = life
+        self._offline = offline
         self._states = states
         self._round: list[tuple[int, _Block | None]] = _round(plan)  # None: the tick
         self._next = 0
-        self._asking = False
+        self._reading = False
         count = len(plan.servos)
         self._interval_ns = plan.slow_period_ns // len(self._round) if self._round else 0
-        self._due_ns = 0 if self._round else NEVER
+        self._due_ns = 0
         self._known: dict[tuple[int, str], int] = {}
         self._limits = [_limit_item(plan, index) for index in range(count)]
         self._hot = [False] * count
 
     def look(self) -> None:
-        """Let the coming gaps read the next block when its time has come; called once a cycle."""
-        if self._asking or self._due_ns == NEVER or self._gaps.now_ns() < self._due_ns:
+        """Let the coming idle time read the next block when its time has come; called once a cycle."""
+        if self._reading or not self._round or self._idle.now_ns() < self._due_ns:
             return
         for _ in self._round:
             index, block = self._round[self._next]
             self._next = (self._next + 1) % len(self._round)
-            if not self._away[index]:
-                self._ask(index, block)
+            if not self._life.offline(index):
+                self._begin(index, block)
                 break
-        self._due_ns = self._gaps.now_ns() + self._interval_ns
+        self._due_ns = self._idle.now_ns() + self._interval_ns
 
-    def _ask(self, index: int, block: _Block | None) -> None:
-        self._asking = True
+    def _begin(self, index: int, block: _Block | None) -> None:
+        self._reading = True
+        program = self._read_tick(index) if block is None else self._read(index, block)
         name = f"slow registers of {self._plan.servos[index].joint}"
-        if block is None:
-            self._gaps.add(self._absent.tick(index), partial(self._ticked, index), Urgency.SLOW, name, index)
-            return
-        read = self._read(index, block)
-        self._gaps.add(once(read), partial(self._take, index, block), Urgency.SLOW, name, index)
+        self._idle.add(program, Urgency.SLOW, name, index)
 
-    def _read(self, index: int, block: _Block) -> Transaction:
+    def _read_tick(self, index: int) -> Program[None]:
+        rebooted = yield from self._offline.tick(index)
+        self._reading = False
+        if rebooted and not self._life.offline(index):
+            self._life.lose(index, rebooted=True)
+
+    def _read(self, index: int, block: _Block) -> Program[None]:
         start, end = block[0].address, block[-1].address + block[-1].size
-        return plan_line(self._plan).read(self._plan.servos[index].servo_id, start, end - start)
-
-    def _ticked(self, index: int, rebooted: bool) -> None:
-        self._asking = False
-        if rebooted and not self._away[index]:
-            self._rebooted(index)
-
-    def _take(self, index: int, block: _Block, reply: Reply) -> None:
-        self._asking = False
-        if not reply.answered:
-            return
-        for item in block:
-            at = item.address - block[0].address
-            self._note(index, item, item.decode(reply.parameters[at : at + item.size]))
+        reply = yield plan_line(self._plan).read(self._plan.servos[index].servo_id, start, end - start)
+        self._reading = False
+        if reply.answered:
+            for item in block:
+                at = item.address - start
+                self._note(index, item, item.decode(reply.parameters[at : at + item.size]))
 
     def _note(self, index: int, item: ControlItem, raw: int) -> None:
         states, row = self._states, self._plan.servos[index].row
@@ -125,8 +104,8 @@ class SlowRegisters:
         elif item.name in VOLTAGES:
             states.voltage[row] = raw * item.scale
         elif before not in (None, raw) and item.name not in _LIMITS:
-            self._say(
-                EventCode.REGISTER_DIFFERS, Severity.INFO, index, f"{called(item)} was {before}, is {raw}"
+            self._life.report(
+                EventCode.REGISTER_DIFFERS, Severity.INFO, index, f"{item.title} was {before}, is {raw}"
             )
 
     def _warm(self, index: int, celsius: float, temperature: Floats, row: int) -> None:
@@ -136,18 +115,18 @@ class SlowRegisters:
             return
         raw = self._known.get((index, item.name))
         if raw is None:  # read once, after the first temperature
-            if not self._asking:
-                self._ask(index, (item,))
+            if not self._reading:
+                self._begin(index, (item,))
             return
         limit = raw * item.scale
-        text = f"is at {celsius:.0f} deg C; its {called(item)} is {limit:.0f} deg C"
+        text = f"is at {celsius:.0f} deg C; its {item.title} is {limit:.0f} deg C"
         if celsius >= limit - WARN_BELOW and not self._hot[index]:
             self._hot[index] = True
             text = f"{text}, beyond which it cuts its torque: let it rest"
-            self._say(EventCode.SERVO_HOT, Severity.WARNING, index, text)
+            self._life.report(EventCode.SERVO_HOT, Severity.WARNING, index, text)
         elif celsius <= limit - WARN_BELOW - COOLED and self._hot[index]:
             self._hot[index] = False
-            self._say(EventCode.SERVO_HOT, Severity.INFO, index, text)
+            self._life.report(EventCode.SERVO_HOT, Severity.INFO, index, text)
 
 
 def _round(plan: BusPlan) -> list[tuple[int, _Block | None]]:
@@ -178,9 +157,3 @@ def _blocks(items: list[ControlItem]) -> list[_Block]:
 def _limit_item(plan: BusPlan, index: int) -> ControlItem | None:
     items = control_table(plan.servos[index].model, plan.protocol).items
     return next((items[name] for name in _LIMITS if name in items), None)
-
-
-def once(transaction: Transaction) -> Program[Reply]:
-    """Return the program of one transaction."""
-    reply = yield transaction
-    return reply

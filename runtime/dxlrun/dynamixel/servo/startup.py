@@ -1,36 +1,58 @@
-"""Start-up on one bus, as failures.md has it: look at everything first, then torque on in groups.
+"""Start-up: the stages from silence to torque, on all lines of a robot side by side.
 
-Programs of transactions; nothing here waits. What the robot file declares is written by `registers`.
+Check everything first (`checks.py`), set registers and modes, learn how each servo answers; then torque on in
+groups, first states, torque confirmed, Bus Watchdogs armed. No stage begins before the one before succeeded
+on every line. The order and its reasons are in failures.md.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from types import MappingProxyType
+from statistics import median
+from typing import Protocol, TypeVar
 
-from dxlrun.dynamixel.plan.bus_plan import BusPlan, RegisterValue, ServoPlan
-from dxlrun.dynamixel.plan.line import listen
+from dxlrun.clock import Clock
+from dxlrun.dynamixel.control_table import control_table
+from dxlrun.dynamixel.exchange.bus import Bus
+from dxlrun.dynamixel.exchange.pump import run
+from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
+from dxlrun.dynamixel.plan.line import PATIENCE_NS, listen
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.plan.reads import state_read
-from dxlrun.dynamixel.plan.units import joint_position, ticks_in
-from dxlrun.dynamixel.registers import modes
-from dxlrun.dynamixel.registers.declared import settle
-from dxlrun.dynamixel.registers.inspection import Inspector, Survey, persist, who
-from dxlrun.dynamixel.registers.inspection1 import Inspector1
-from dxlrun.dynamixel.registers.inspection2 import Inspector2
-from dxlrun.dynamixel.wire.transaction import Outcome, Program, Reply
+from dxlrun.dynamixel.plan.units import joint_position
+from dxlrun.dynamixel.port.latency_timer import late_replies
+from dxlrun.dynamixel.port.ports import Ports
+from dxlrun.dynamixel.servo import modes, watchdog
+from dxlrun.dynamixel.servo.checks import survey
+from dxlrun.dynamixel.servo.registers import restore_torque_limits, settle_bus
+from dxlrun.dynamixel.servo.retry import LONGER_NS, extend_timeouts, retry, setup_line
+from dxlrun.dynamixel.servo.servos import Servos
+from dxlrun.dynamixel.wire.transaction import Program, Result
+from dxlrun.errors import PortError, StartUpError
+from dxlrun.interfaces import Commands
 from dxlrun.mode import Mode
+from dxlrun.run.channels.events import EventCode, EventSink, Severity
 
-PINGS = 3
-"""Two servos of one ID collide in most of three answers."""
-LISTEN_NS = 2_000_000
-"""After a ping: a second servo of the same ID may answer with another return delay, at most 0.508 ms."""
 GROUP = 3
 """Servos that get torque before the next ones do: eight at once could pull the supply down."""
 GROUP_PAUSE_NS = 20_000_000
-_INSPECTORS: Mapping[float, type[Inspector]] = MappingProxyType({1.0: Inspector1, 2.0: Inspector2})
+RETURN_DELAY_STEP_NS = 2_000
+"""Unit of Return Delay Time (e-Manual AX-12A (5), XM430-W350 (9))."""
+_SOME = 8
+"""Replies, from which on it is known how late they usually come: three pings a servo, and its model."""
+
+
+class _Stage(Protocol):
+    """What a stage found on one bus."""
+
+    @property
+    def problems(self) -> list[str]:
+        """Why the robot must not start, one sentence each."""
+        ...
+
+
+_Found = TypeVar("_Found", bound=_Stage)
 
 
 @dataclass(slots=True)
@@ -42,109 +64,185 @@ class Engagement:
     """Goal position in ticks as it was written, in the order of the plan's servos; None: there is none."""
 
 
-def survey(plan: BusPlan, take_over: bool) -> Program[Survey]:
-    """Look at every servo of the bus; writes nothing, and collects all problems of all servos."""
-    inspector = _INSPECTORS[plan.protocol](plan, take_over)
-    surveyor = _Surveyor(plan, inspector)
-    yield listen(LISTEN_NS)
-    if plan.servos and (yield from surveyor.echoes()):
-        return inspector.found
-    present: list[ServoPlan] = []
-    for servo in plan.servos:
-        if (yield from surveyor.answers(servo)):
-            present.append(servo)
-    readable: list[ServoPlan] = []
-    for servo in present:
-        if (yield from inspector.registers(servo)):
-            readable.append(servo)
-    yield from surveyor.states(readable)
-    return inspector.found
+@dataclass(slots=True)
+class Probed:
+    """What was found out about the cyclic reads of one bus."""
+
+    return_delays: dict[int, int] = field(default_factory=dict)
+    """What each servo waits before it answers, by ID, ns."""
+    refused: dict[int, str] = field(default_factory=dict)
+    """Groups that do not answer the fast form, and why, in a sentence without its subject."""
 
 
-class _Surveyor:
-    """Asks who is there and where it stands."""
+class StartUp:
+    """Runs each stage on all lines.
 
-    def __init__(self, plan: BusPlan, inspector: Inspector) -> None:
-        self.found = inspector.found
-        self._plan = plan
-        self._line = inspector.line
-        self._problem = inspector.problem
+    Each raises StartUpError with all problems of its stage, PortError when a line is gone.
+    """
 
-    def echoes(self) -> Program[bool]:
-        """Find out whether the adapter echoes: a read cannot be mistaken for its own answer."""
-        reply = yield self._line.read(self._plan.servos[0].servo_id, 0, 3)
-        if reply.echoed:
-            self.found.problems.append(
-                f"bus {self._plan.name}: the adapter at {self._plan.port} echoes what it sends; use one that "
-                "switches its receiver off while it sends"
-            )
-        return reply.echoed
+    def __init__(  # noqa: PLR0917  what a robot's lines consist of
+        self,
+        plans: Sequence[BusPlan],
+        buses: Sequence[Bus],
+        servos: Sequence[Servos],
+        ports: Ports,
+        clock: Clock,
+        events: EventSink,
+        beat: Callable[[], None],
+    ) -> None:
+        self._plans = plans
+        self._buses = buses
+        self._servos = servos
+        self._ports = ports
+        self._clock = clock
+        self._events = events
+        self._beat = beat
+        self._late_ns: list[list[int]] = [[] for _ in plans]
+        """How much later than by the wire the replies on each bus came."""
 
-    def answers(self, servo: ServoPlan) -> Program[bool]:
-        """Ping three times; name silence and collisions."""
-        answered = disturbed = 0
-        for _ in range(PINGS):
-            reply = yield self._line.ping(servo.servo_id)
-            after = yield listen(LISTEN_NS)
-            answered += reply.answered
-            disturbed += bool(reply.strays or after.strays)
-        if disturbed > 1:
-            self._problem(
-                servo,
-                f"answers {disturbed} of {PINGS} pings garbled or twice: do two servos have its ID? "
-                "Connect them one by one and give each its own",
-            )
-        elif answered == 0:
-            self._problem(
-                servo,
-                f"does not answer: check power, cable, ID, and that it runs at {self._plan.baud_rate} bit/s",
-            )
-        elif answered < PINGS - 1:
-            self._problem(servo, f"answers only {answered} of {PINGS} pings: check its cable and power")
-        return disturbed <= 1 and answered >= PINGS - 1
+    def look(self, take_over: bool) -> None:
+        """Check every servo; bring registers and modes to what the plan says; learn how each answers."""
+        surveys = self._run([survey(plan, take_over) for plan in self._plans])
+        for one in surveys:
+            self._log(EventCode.SETUP, Severity.INFO, one.servos)
+            self._log(EventCode.REGISTER_DIFFERS, Severity.WARNING, one.differences)
+        _judge(surveys)
+        _refuse(self._late_replies())
+        self._settle_registers()
+        self._settle_modes()
+        self._probe_reads()
+        self.carry_out([watchdog.disarm_all(plan) for plan in self._plans])
 
-    def states(self, servos: list[ServoPlan]) -> Program[None]:
-        """Read every state twice: inside the limits, and no jump in between."""
-        before: dict[int, tuple[int, int]] = {}
-        for again in (False, True):
-            for servo in servos:
-                reply = yield from persist(state_read(self._line, [servo]))
-                if not reply.answered:
-                    self._problem(servo, _lost(reply))
-                    continue
-                raw = ticks_in(servo.state.position, reply.parameters)
-                if again and servo.servo_id in before:
-                    self._jump(servo, before[servo.servo_id], (raw, reply.last_ns))
-                elif not again:
-                    before[servo.servo_id] = raw, reply.sent_ns
-                    self._place(servo, raw)
+    def engage(self, goals: Commands) -> None:
+        """Hold every servo where it stands, and let the goals be that."""
+        engaged = self._run([_engage(plan) for plan in self._plans])
+        _judge(engaged)
+        for plan, servos, one in zip(self._plans, self._servos, engaged, strict=True):
+            servos.engaged()
+            for servo, raw in zip(plan.servos, one.goals, strict=True):
+                _first_goals(goals, servo, raw)
+            names = ", ".join(servo.joint for servo in plan.servos)
+            self._events.emit(EventCode.TORQUE_ON, Severity.INFO, plan.name, f"torque is on: {names}")
 
-    def _place(self, servo: ServoPlan, raw: int) -> None:
-        if self.found.modes.get(servo.servo_id) != servo.start_mode:
-            return  # what it says counts in another mode; it is looked at again before it gets torque
-        if raw > servo.max_tick and not servo.continuous:
-            self._problem(servo, f"says that it stands at {raw}, beyond its {servo.max_tick} ticks")
-        elif not servo.lower_tick - 1 <= raw <= servo.upper_tick + 1:
-            limits = servo.lower_tick, servo.upper_tick
-            ends = sorted(math.degrees(joint_position(servo, end)) for end in limits)
-            self._problem(
-                servo,
-                f"stands at {math.degrees(joint_position(servo, raw)):.1f} deg, outside its limits "
-                f"{ends[0]:.1f}..{ends[1]:.1f} deg: move the joint inside by hand",
-            )
+    def restore_limits(self) -> list[list[int]]:
+        """Give the servos the torque again that a policy of an earlier run may have left them without.
 
-    def _jump(self, servo: ServoPlan, before: tuple[int, int], after: tuple[int, int]) -> None:
-        moved = abs(after[0] - before[0]) * servo.rad_per_tick
-        fastest = servo.max_speed_tick * servo.rad_s_per_tick * (after[1] - before[1]) * 1e-9
-        if moved > fastest + 2 * servo.rad_per_tick:
-            self._problem(
-                servo,
-                f"jumped by {math.degrees(moved):.1f} deg between two readings: two servos of one ID, or a "
-                "broken potentiometer?",
-            )
+        Returns each servo's own limit in ticks, by bus.
+        """
+        limits = self._run([restore_torque_limits(plan) for plan in self._plans])
+        _judge(limits)
+        for one in limits:
+            self._log(EventCode.SETUP, Severity.INFO, one.restored)
+        return [one.full for one in limits]
+
+    def confirm(self) -> None:
+        """Read torque enable of every servo again, and let them get goals.
+
+        Torque on draws current: a servo that browned out meanwhile answers again, limp, and may get no goal.
+        """
+        self.carry_out([_confirm(plan) for plan in self._plans])
+        for servos in self._servos:
+            servos.confirmed()
+
+    def carry_out(self, programs: Sequence[Program[list[str]]]) -> None:
+        """Run one program a bus that returns what went wrong."""
+        _refuse_any(self._run_all(programs))
+
+    def watch(self) -> None:
+        """Arm the Bus Watchdogs, which stop the servos where a reply is awaited for too long."""
+        programs = [servos.watch() for servos in self._servos]
+        longer_ns = [watchdog.longer_ns(plan) or LONGER_NS for plan in self._plans]
+        _refuse_any(self._run_all(programs, longer_ns))
+
+    def pause(self, duration_ns: int) -> None:
+        """Let a moment pass, and take what still comes."""
+        self.carry_out([_pause(duration_ns) for _ in self._plans])
+
+    def raise_failures(self) -> None:
+        """Raise PortError when a line is gone: there is no start without it."""
+        if error := report_failures(self._plans, self._buses, self._servos):
+            raise error
+
+    def _settle_registers(self) -> None:
+        """Write what the robot file declares and a servo has otherwise, before torque is switched on."""
+        settled = self._run([settle_bus(plan) for plan in self._plans])
+        for one in settled:
+            self._log(EventCode.REGISTER_WRITTEN, Severity.INFO, one.written)
+        _judge(settled)
+
+    def _settle_modes(self) -> None:
+        """Bring every servo into its first mode, before torque is switched on, and learn its own limits."""
+        settled = self._run([modes.settle_modes(plan) for plan in self._plans])
+        for one in settled:
+            self._log(EventCode.MODE, Severity.WARNING, one.switched)
+        _judge(settled)
+        for servos, one in zip(self._servos, settled, strict=True):
+            for index, limits in enumerate(one.limits):
+                servos.goals.set_limits(index, limits)
+
+    def _probe_reads(self) -> None:
+        """Find out when replies are due, and read each group plainly that does not answer the fast form."""
+        probes = self._run_all([_probe_reads(plan) for plan in self._plans])
+        for plan, servos, probed in zip(self._plans, self._servos, probes, strict=True):
+            if probed is None:
+                continue
+            servos.reads.learn(probed.return_delays)
+            for group in probed.refused:
+                servos.reads.plain(group)
+            if probed.refused:
+                total_ns = plan.budget.total_ns + _extra_ns(plan, probed.refused)
+                why = "; ".join(probed.refused.values())
+                text = (
+                    f"bus {plan.name} is not read by a fast form, {why}: a cycle "
+                    f"takes {total_ns / 1e6:.2f} ms instead of {plan.budget.total_ns / 1e6:.2f} ms, at most "
+                    f"{1e9 / total_ns:.0f} Hz"
+                )
+                self._events.emit(EventCode.SETUP, Severity.WARNING, plan.name, text)
+
+    def _run(self, programs: Sequence[Program[_Found]]) -> list[_Found]:
+        """Run one program a bus; `_judge` comes when everything that they found was logged."""
+        return [one for one in self._run_all(programs) if one is not None]
+
+    def _run_all(
+        self, programs: Sequence[Program[Result]], most_ns: Sequence[int] = ()
+    ) -> list[Result | None]:
+        """Run one program a bus with longer timeouts, as nothing else waits; `most_ns`: for a reply."""
+        most_ns = most_ns or [LONGER_NS] * len(programs)
+        slow = [
+            extend_timeouts(program, most, late_ns)
+            for program, most, late_ns in zip(programs, most_ns, self._late_ns, strict=True)
+        ]
+        found = run(slow, self._buses, self._ports, self._clock, self._beat)
+        self.raise_failures()
+        return found
+
+    def _late_replies(self) -> Iterable[str]:
+        """Name the buses whose replies usually come when the cyclic reads have given them up."""
+        for plan, late_ns in zip(self._plans, self._late_ns, strict=True):
+            usual_ns = median(late_ns) if len(late_ns) >= _SOME else 0.0
+            if usual_ns > plan.latency_ns + PATIENCE_NS:
+                how = late_replies(plan.name, plan.port, usual_ns, plan.latency_ns)
+                yield f"every servo answers too late: {how}"
+
+    def _log(self, code: EventCode, severity: Severity, texts: Iterable[tuple[str, str]]) -> None:
+        for joint, text in texts:
+            self._events.emit(code, severity, joint, text)
 
 
-def engage(plan: BusPlan) -> Program[Engagement]:
+def report_failures(
+    plans: Sequence[BusPlan], buses: Sequence[Bus], servos: Sequence[Servos]
+) -> PortError | None:
+    """Report each line that is gone, once; return the first of them."""
+    first: PortError | None = None
+    for plan, bus, mine in zip(plans, buses, servos, strict=True):
+        if bus.failure is not None:
+            text = f"bus {plan.name} on {plan.port}: {bus.failure}"
+            mine.lost(text)
+            first = first or PortError(text)
+    return first
+
+
+def _engage(plan: BusPlan) -> Program[Engagement]:
     """Hold every servo where it stands: goal := present, torque on, both read back, group by group.
 
     Ends at the first problem; the caller takes back the torque.
@@ -153,94 +251,101 @@ def engage(plan: BusPlan) -> Program[Engagement]:
     for index, servo in enumerate(plan.servos):
         if index and index % GROUP == 0:
             yield listen(GROUP_PAUSE_NS)
-        problem = yield from _engage_one(plan, servo, result)
-        if problem:
-            result.problems.append(f"{who(plan, servo)} {problem}")
+        held = yield from modes.hold(plan, servo, servo.mode_plan(servo.start_mode))
+        if held.problem:
+            result.problems.append(f"{plan.label(servo)} {held.problem}")
             break
+        result.goals.append(held.goal)
     return result
 
 
-def _engage_one(plan: BusPlan, servo: ServoPlan, result: Engagement) -> Program[str]:
-    """Hold one servo where it stands; return what went wrong, or nothing."""
-    held = yield from modes.hold(plan, servo, servo.mode_plan(servo.start_mode))
-    if not held.problem:
-        result.goals.append(held.goal)
-    return held.problem
-
-
-@dataclass(frozen=True, slots=True)
-class Rejoined:
-    """What came of a servo that answers again."""
-
-    problems: tuple[str, ...]
-    """Why it may take no part, one sentence each."""
-    torqued: bool
-    """True when torque enable was read as 1, and a goal that was written as `goal`."""
-    goal: int | None
-    """Goal position in ticks as it was written; None: it is limp, its mode has none, or none was."""
-    written: tuple[tuple[str, str], ...]
-    """Joint, and what was written into its registers."""
-    mode: Mode = Mode.UNKNOWN
-    """In which it is; UNKNOWN where there are problems."""
-
-
-def rejoin(
-    plan: BusPlan,
-    servo_index: int,
-    torque: bool,
-    mode: Mode | None = None,
-    registers: Sequence[RegisterValue] | None = None,
-) -> Program[Rejoined]:
-    """Take one servo back that was lost or was reset, as at the start: look, mend registers, then hold it.
-
-    `torque`: switch it on; without, who is limp stays limp and gets no goal, as a goal may switch torque on
-    (protocol.md), and who holds torque still goes on: were torque written to it, a reboot a moment ago would
-    be a way to torque that no policy gave. `mode`: in which it shall be, None: its
-    first one. `registers`: what it shall hold, None: what the robot file declares; see `SteeredRegisters`.
-    """
-    servo = plan.servos[servo_index]
-    line, mode = plan_line(plan), servo.start_mode if mode is None else mode
-    inspector = _INSPECTORS[plan.protocol](plan, True, line)
-    found = inspector.found
-    if (yield from inspector.registers(servo)):
-        yield from _Surveyor(plan, inspector).states([servo])
-    if found.problems:
-        return Rejoined(tuple(found.problems), False, None, ())
-    settled = yield from settle(plan, servo, servo.registers if registers is None else registers, line)
-    written = tuple(settled.written)
-    if not settled.problems and (problem := (yield from modes.enter(plan, servo, mode, again=False))):
-        settled.problems.append(f"{who(plan, servo)} {problem}")
-    enabled = yield from persist(plan.torque_reads[servo_index])
-    if not enabled.answered:
-        settled.problems.append(f"{who(plan, servo)} did not answer when its torque was asked for")
-    if settled.problems or not torque:
-        holds = not settled.problems and enabled.parameters[0] == 1
-        return Rejoined(tuple(settled.problems), holds, None, written, mode)
-    held = yield from modes.hold(plan, servo, servo.mode_plan(mode))
-    if held.problem:
-        return Rejoined((f"{who(plan, servo)} {held.problem}",), False, None, written)
-    return Rejoined((), True, held.goal, written, mode)
-
-
-def confirm(plan: BusPlan) -> Program[list[str]]:
-    """Read torque enable of everybody again, after the last one got torque; return what is wrong.
-
-    Torque on draws current: a servo that browned out meanwhile answers again, limp, before the first cycle.
-    """
+def _confirm(plan: BusPlan) -> Program[list[str]]:
+    """Read torque enable of every servo again, after the last one got torque; return what is wrong."""
     problems: list[str] = []
     for servo, read in zip(plan.servos, plan.torque_reads, strict=True):
-        reply = yield from persist(read)
+        reply = yield from retry(read)
         if not reply.answered:
-            problems.append(f"{who(plan, servo)} did not answer after torque was switched on")
+            problems.append(f"{plan.label(servo)} did not answer after torque was switched on")
         elif reply.parameters[0] != 1:
             problems.append(
-                f"{who(plan, servo)} lost its torque again while the others got theirs (Torque Enable "
+                f"{plan.label(servo)} lost its torque again while the others got theirs (Torque Enable "
                 f"({servo.torque_address}) is {reply.parameters[0]}): is its supply strong enough?"
             )
     return problems
 
 
-def _lost(reply: Reply) -> str:
-    if reply.outcome is Outcome.TIMEOUT:
-        return "does not answer any more: check cable and power"
-    return "answers the reading of its state garbled: do two servos have its ID?"
+def _probe_reads(plan: BusPlan) -> Program[Probed]:
+    """Read the return delay of every servo, and try the fast form on every group that is to be read by it."""
+    found = Probed()
+    for servo in plan.servos:
+        raw = yield from _read_item(plan, servo, "return_delay_time")
+        if raw is not None:
+            found.return_delays[servo.servo_id] = raw * RETURN_DELAY_STEP_NS
+    line = setup_line(plan)
+    for number, (group, fast) in enumerate(zip(plan.groups, plan.fast, strict=True)):
+        if fast:
+            servos = [plan.servos[index] for index in group]
+            reply = yield from retry(state_read(line, servos, fast=True))
+            if not reply.answered:
+                found.refused[number] = yield from _why_not_fast(plan, servos)
+    return found
+
+
+def _why_not_fast(plan: BusPlan, servos: list[ServoPlan]) -> Program[str]:
+    """Find the servos whose firmware does not have the fast form."""
+    old: list[str] = []
+    needed: set[int] = set()
+    for servo in servos:
+        first = control_table(servo.model, plan.protocol).fast_sync_read_firmware
+        found = yield from _read_item(plan, servo, "firmware_version")
+        if first is not None and found is not None and found < first:
+            old.append(f"{plan.label(servo)} has {found}")
+            needed.add(first)
+    if not old:
+        return "though their firmware should know it"
+    numbers = " or ".join(f"{number}" for number in sorted(needed))
+    return f"as it needs firmware {numbers} and {', '.join(old)}"
+
+
+def _extra_ns(plan: BusPlan, refused: Mapping[int, str]) -> int:
+    """Return how much longer a cycle takes when these groups are read by the form that every servo knows."""
+    line, extra_ns = plan_line(plan), 0
+    for number in refused:
+        servos = [plan.servos[index] for index in plan.groups[number]]
+        extra_ns += state_read(line, servos).due_ns - state_read(line, servos, fast=True).due_ns
+    return extra_ns
+
+
+def _read_item(plan: BusPlan, servo: ServoPlan, name: str) -> Program[int | None]:
+    item = control_table(servo.model, plan.protocol).items.get(name)
+    if item is None:
+        return None
+    reply = yield from retry(setup_line(plan).read(servo.servo_id, item.address, item.size))
+    return item.decode(reply.parameters) if reply.answered else None
+
+
+def _pause(duration_ns: int) -> Program[list[str]]:
+    yield listen(duration_ns)
+    return []
+
+
+def _judge(stage: Iterable[_Stage]) -> None:
+    _refuse(problem for one in stage for problem in one.problems)
+
+
+def _refuse_any(found: Iterable[list[str] | None]) -> None:
+    _refuse(problem for one in found if one is not None for problem in one)
+
+
+def _refuse(problems: Iterable[str]) -> None:
+    if found := "\n".join(problems):
+        raise StartUpError(found)
+
+
+def _first_goals(goals: Commands, servo: ServoPlan, raw: int | None) -> None:
+    """Let the goals be what the servo was given: where it stands, without a speed, or 0."""
+    row, mode = servo.row, servo.start_mode
+    goals.position[row] = float("nan") if raw is None else joint_position(servo, raw)
+    goals.velocity[row] = 0.0 if mode is Mode.VELOCITY else float("nan")
+    goals.effort[row] = 0.0 if mode is Mode.EFFORT else float("nan")
+    goals.pwm[row] = 0.0 if mode is Mode.PWM else float("nan")

@@ -6,7 +6,7 @@ Sources: e-Manual, Protocol 1.0 and 2.0: Factory Reset (0x06), Reboot (0x08), Co
 from __future__ import annotations
 
 from dxlrun.dynamixel.plan.line import listen
-from dxlrun.dynamixel.registers.inspection import called, persist
+from dxlrun.dynamixel.servo.retry import retry
 from dxlrun.dynamixel.tools.one_servo import OneServo
 from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.dynamixel.wire.protocol2 import Reset
@@ -28,9 +28,9 @@ def change_id(one: OneServo, new: int) -> str:
     old, line = one.servo_id, one.tool.line
     _free(one, new)
     item = one.table.items["id"]
-    _written(one, line.write(old, item.address, bytes((new,))), f"{called(item)} = {new}")
+    _written(one, line.write(old, item.address, bytes((new,))), f"{item.title} = {new}")
     if _there(one, old) is not Outcome.TIMEOUT and _there(one, new) is Outcome.TIMEOUT:
-        raise one.fail(f"was given {called(item)} = {new}, but still answers under its old one")
+        raise one.fail(f"was given {item.title} = {new}, but still answers under its old one")
     one.move_to(new, one.baud_rate)
     _same(one)
     if _there(one, old) is not Outcome.TIMEOUT:
@@ -57,7 +57,7 @@ def change_rate(one: OneServo, new: int) -> str:
     finally:
         one.tool.speak(one.table.protocol, old)
     packet = one.tool.line.write(one.servo_id, item.address, value.to_bytes(item.size, "little"))
-    _written(one, packet, f"{called(item)} = {value}")
+    _written(one, packet, f"{item.title} = {value}")
     one.move_to(one.servo_id, new)
     if _there(one, one.servo_id) is Outcome.TIMEOUT:
         one.move_to(one.servo_id, old)
@@ -66,7 +66,7 @@ def change_rate(one: OneServo, new: int) -> str:
             raise one.fail(
                 f"answers neither at {old} nor at {new} bit/s now; look for it: dxlrun scan {port}"
             )
-        raise one.fail(f"was given {called(item)} = {value}, but still answers at {old} bit/s")
+        raise one.fail(f"was given {item.title} = {value}, but still answers at {old} bit/s")
     _same(one)
     return f"talks at {new} bit/s; it did at {old}"
 
@@ -167,7 +167,7 @@ def _there(one: OneServo, servo_id: int) -> Outcome:
     """Ping an ID at the rate that is spoken now."""
 
     def program() -> Program[Outcome]:
-        reply = yield from persist(one.tool.line.ping(servo_id))
+        reply = yield from retry(one.tool.line.ping(servo_id))
         return reply.outcome
 
     return one.tool.run(program())

@@ -13,10 +13,10 @@ from dxlrun.dynamixel.control_table import ControlItem, ControlTable, control_ta
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, RegisterValue, ServoPlan
 from dxlrun.dynamixel.plan.line import LONGEST_RETURN_DELAY_NS, listen
 from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
-from dxlrun.dynamixel.registers import bus_watchdog, modes
-from dxlrun.dynamixel.registers.declared import Difference, Settled, compare, settle
-from dxlrun.dynamixel.registers.inspection import called, persist, shown, tripped
-from dxlrun.dynamixel.registers.patience import patient
+from dxlrun.dynamixel.servo import modes, watchdog
+from dxlrun.dynamixel.servo.registers import Difference, Settled, compare, settle
+from dxlrun.dynamixel.servo.retry import extend_timeouts, retry
+from dxlrun.dynamixel.servo.watchdog import shown, tripped
 from dxlrun.dynamixel.tools.scanning import FoundServo
 from dxlrun.dynamixel.tools.tool_line import ToolLine
 from dxlrun.dynamixel.wire.transaction import Outcome, Program, Result
@@ -75,14 +75,14 @@ class OneServo:
     def differences(self, wanted: Sequence[RegisterValue]) -> tuple[Difference, ...]:
         """Compare registers with what they shall hold; writes nothing."""
         found = self.run(compare(self.plan, self._servo, wanted, self.tool.line))
-        silent = [called(self.table.items[one.register.name]) for one in found if one.found is None]
+        silent = [self.table.items[one.register.name].title for one in found if one.found is None]
         if silent:
             raise self.fail(f"did not answer when {', '.join(silent)} was read")
         return found
 
     def writable(self, wanted: Sequence[RegisterValue]) -> None:
         """Make sure that nothing stands against writing registers: torque, or the lock of Protocol 1.0."""
-        stored = [called(self.table.items[one.name]) for one in wanted if one.eeprom]
+        stored = [self.table.items[one.name].title for one in wanted if one.eeprom]
         if not stored:
             return
         if self.holds_torque():
@@ -124,12 +124,12 @@ class OneServo:
         stopped = tripped(item, raw) and self.holds_torque()
         if stopped:
             self.torque(False)
-        if problem := self.run(bus_watchdog.disarm(self.plan, self._servo)):
+        if problem := self.run(watchdog.disarm(self.plan, self._servo)):
             raise ServoFault(problem)
         why = "it had stopped the servo, as no instruction came"
         if not tripped(item, raw):
             why = f"it would have stopped the servo after {raw * 20} ms without an instruction"
-        done = f"cleared {called(item)}, which was {shown(item, raw)}: {why}"
+        done = f"cleared {item.title}, which was {shown(item, raw)}: {why}"
         return (done, self._hold()) if stopped else (done,)
 
     # Torque and LED
@@ -181,7 +181,7 @@ class OneServo:
 
     def run(self, program: Program[Result]) -> Result:
         """Run a program patiently: somebody knows that the servo is there."""
-        return self.tool.run(patient(program))
+        return self.tool.run(extend_timeouts(program))
 
     @property
     def command(self) -> str:
@@ -232,19 +232,19 @@ class OneServo:
 
     def _read_block(self, block: Sequence[ControlItem], *, refused: bool) -> Program[dict[str, int]]:
         start, end = block[0].address, block[-1].address + block[-1].size
-        reply = yield from persist(self.tool.line.read(self.servo_id, start, end - start))
+        reply = yield from retry(self.tool.line.read(self.servo_id, start, end - start))
         if reply.answered:
             return {item.name: _integer(item, reply.parameters, start) for item in block}
         found: dict[str, int] = {}
         for item in block:
-            reply = yield from persist(self.tool.line.read(self.servo_id, item.address, item.size))
+            reply = yield from retry(self.tool.line.read(self.servo_id, item.address, item.size))
             if reply.answered:
                 found[item.name] = _integer(item, reply.parameters, item.address)
             elif reply.outcome is not Outcome.REFUSED:
-                raise self.fail(f"did not answer when {called(item)} was read")
+                raise self.fail(f"did not answer when {item.title} was read")
             elif not refused:
                 why = self.tool.line.dialect.describe_error(reply.error)
-                raise self.fail(f"refuses to read {called(item)}: {why}")
+                raise self.fail(f"refuses to read {item.title}: {why}")
         return found
 
 

@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 
 from dxlrun.dynamixel.control_table import ControlTable, all_tables, models_by_number
 from dxlrun.dynamixel.plan.line import Line, listen
-from dxlrun.dynamixel.registers.inspection import called, persist
-from dxlrun.dynamixel.registers.patience import patient
+from dxlrun.dynamixel.servo.retry import extend_timeouts, retry
 from dxlrun.dynamixel.tools.tool_line import ToolLine, refuse_echo
 from dxlrun.dynamixel.wire.dialect import dialect_of
 from dxlrun.dynamixel.wire.transaction import BROADCAST_ID, Outcome, Program, Reply, Transaction
@@ -136,8 +135,8 @@ def find(tool: ToolLine, servo_id: int, wish: Wish = EVERYWHERE) -> tuple[FoundS
 
 def _find(tool: ToolLine, servo_id: int, tries: int) -> Program[list[FoundServo]]:
     knocked = _knock(tool, servo_id, tries)
-    if (yield from (patient(knocked) if tries == _TRIES_ALONE else knocked)):
-        return [(yield from patient(look(tool.line, servo_id)))]
+    if (yield from (extend_timeouts(knocked) if tries == _TRIES_ALONE else knocked)):
+        return [(yield from extend_timeouts(look(tool.line, servo_id)))]
     return []
 
 
@@ -167,7 +166,7 @@ def _search(tool: ToolLine, ids: Sequence[int], beat: Callable[[float], None]) -
         there |= yield from _one_by_one(tool, ids, None, beat)
     found: list[FoundServo] = []
     for servo_id in sorted(there):
-        found.append((yield from patient(look(line, servo_id))))
+        found.append((yield from extend_timeouts(look(line, servo_id))))
     return found
 
 
@@ -188,7 +187,7 @@ def _one_by_one(
             suspected.append(servo_id)
         beat((index + 1) / len(ids))
     yield listen(LATE_NS if len(ids) > FEW else LATE_OF_FEW_NS)
-    there |= yield from patient(_answering(line, suspected))
+    there |= yield from extend_timeouts(_answering(line, suspected))
     return there | (heard.ids & set(ids))
 
 
@@ -196,7 +195,7 @@ def _answering(line: Line, suspected: Sequence[int]) -> Program[set[int]]:
     """Ping each again: what came may have been the late answer of the one before."""
     there: set[int] = set()
     for servo_id in suspected:
-        reply = yield from persist(line.ping(servo_id))
+        reply = yield from retry(line.ping(servo_id))
         if reply.outcome is not Outcome.TIMEOUT:
             there.add(servo_id)
     return there
@@ -210,10 +209,10 @@ def look(line: Line, servo_id: int) -> Program[FoundServo]:
     """Ask a servo that is there what it is and how it is set; writes nothing."""
     dialect = line.dialect
     servo = FoundServo(dialect.PROTOCOL, line.baud_rate, servo_id)
-    ping = yield from persist(line.ping(servo_id))
+    ping = yield from retry(line.ping(servo_id))
     said = ping
     if ping.answered and dialect.PING_LENGTH < _WHO_LENGTH:
-        said = yield from persist(line.read(servo_id, 0, _WHO_LENGTH))
+        said = yield from retry(line.read(servo_id, 0, _WHO_LENGTH))
     if not said.answered:
         garbled = Outcome.GARBLED in (ping.outcome, said.outcome)
         return replace(servo, garbled=garbled, remarks=(_mute(ping, said, line),))
@@ -235,17 +234,17 @@ def _look_closer(line: Line, table: ControlTable, servo: FoundServo) -> Program[
     silent: list[str] = []
     garbled = False
     for item in items:
-        reply = yield from persist(line.read(servo.servo_id, item.address, item.size))
+        reply = yield from retry(line.read(servo.servo_id, item.address, item.size))
         if reply.answered:
             values[item.name] = item.decode(reply.parameters)
         else:
-            silent.append(called(item))
+            silent.append(item.title)
         garbled = garbled or reply.outcome is Outcome.GARBLED or bool(reply.strays)
     remarks = list(servo.remarks)
     if garbled:
         remarks.append("answers garbled now and then: do two servos have this ID? If not, check its cable")
     elif silent:
-        level = called(table.items["status_return_level"])
+        level = table.items["status_return_level"].title
         remarks.append(f"did not answer when {', '.join(silent)} was read: is its {level} 0?")
     lowest, highest = next((pair for pair in _LIMITS if pair[0] in values and pair[1] in values), ("", ""))
     delay = values.get("return_delay_time")

@@ -1,18 +1,18 @@
-"""Bus Watchdog: a servo of Protocol 2.0 stops by itself when nobody sends instructions any more.
+"""Bus Watchdog: a servo of Protocol 2.0 stops by itself when no instruction comes any more.
 
-Armed last at the start, so that nothing but a cyclic exchange feeds it, and disarmed at the end. After it has
-stopped a servo it reads -1, and the servo refuses goals until 0 is written (e-Manual XM430-W350, Bus Watchdog
-(98)). Protocol 1.0 has none: there the guardian cuts the torque when the loop dies.
+Armed last at the start, so that nothing but a cyclic exchange keeps it from tripping, and disarmed at the
+end. After it has stopped a servo it reads -1, and the servo refuses goals until 0 is written (e-Manual
+XM430-W350, Bus Watchdog (98)). Protocol 1.0 has none: there the guardian cuts the torque when the loop dies.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from dxlrun.dynamixel.control_table import ControlItem, control_table
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.plan.planning import plan_line
-from dxlrun.dynamixel.registers.inspection import called, persist, tripped, who
+from dxlrun.dynamixel.servo.retry import retry
 from dxlrun.dynamixel.wire.dialect import dialect_of
 from dxlrun.dynamixel.wire.transaction import Program
 
@@ -24,15 +24,28 @@ RAMP = "profile_acceleration"
 """It is 0 after a servo was stopped, as is Profile Velocity (e-Manual XM430-W350, Bus Watchdog (98), step 4
 of the example)."""
 RETURN_SPEED = 1.5
-"""rad/s, no faster does a servo that was lost go to its goal, which may have gone on: a step that no gate saw
-is to be a slow one."""
+"""rad/s, no faster does a returning servo go to its goal, which may have moved on: a step that no gate saw
+has to be a slow one."""
 LEAST_PERIODS = 3
-"""It must bear two cycles that come to nothing (failures.md)."""
+"""It must outlast two lost cycles (failures.md)."""
+
+
+def tripped(item: ControlItem, raw: int) -> bool:
+    """Return whether a value is that of a Bus Watchdog that ran out and stopped its servo."""
+    return item.name == "bus_watchdog" and raw in (-1, (1 << 8 * item.size) - 1)
+
+
+def shown(item: ControlItem, raw: int) -> str:
+    """Return a value of an item as messages show it: that of a tripped Bus Watchdog is `255 (tripped)`.
+
+    e-Manual XM430-W350, Bus Watchdog (98): -1 is "Bus Watchdog Error Status".
+    """
+    return f"{raw} (tripped)" if tripped(item, raw) else str(raw)
 
 
 def arm(plan: BusPlan, servo: ServoPlan) -> Program[str]:
     """Arm a servo's watchdog, where the plan wants it and the model has one; return what went wrong."""
-    if not plan.watchdog_ticks or (item := _item(plan, servo)) is None:
+    if not plan.watchdog_ticks or (item := item_of(plan, servo)) is None:
         return ""
     return (yield from _write(plan, servo, item, plan.watchdog_ticks))
 
@@ -44,51 +57,31 @@ def disarm(plan: BusPlan, servo: ServoPlan) -> Program[str]:
     stopped with torque goes on to its old goal [i], at full speed as its profile was reset: it gets a slow
     one before.
     """
-    if (item := _item(plan, servo)) is None:
+    if (item := item_of(plan, servo)) is None:
         return ""
     line = plan_line(plan)
-    reply = yield from persist(line.read(servo.servo_id, item.address, item.size))
+    reply = yield from retry(line.read(servo.servo_id, item.address, item.size))
     if reply.answered and reply.word(item.size) == 0:
         return ""
     if reply.answered and tripped(item, reply.word(item.size)):
         speed = control_table(servo.model, plan.protocol).items["profile_velocity"]
         slow = max(1, round(RETURN_SPEED / speed.scale))
-        yield from persist(line.write(servo.servo_id, speed.address, slow.to_bytes(speed.size, "little")))
+        yield from retry(line.write(servo.servo_id, speed.address, slow.to_bytes(speed.size, "little")))
     return (yield from _write(plan, servo, item, 0))
 
 
 def revive(plan: BusPlan, servo: ServoPlan) -> Program[str]:
-    """Clear and arm a servo's watchdog again after nobody sent anything for too long."""
+    """Clear and arm a servo's watchdog again after no instruction came for too long."""
     return (yield from disarm(plan, servo)) or (yield from arm(plan, servo))
 
 
-def arm_all(plan: BusPlan, fed: Callable[[], None]) -> Program[list[str]]:
-    """Arm every servo of a bus, and read each back; return what went wrong.
-
-    All of them at once, and once more before each is read: nobody is stopped because the others take long.
-    `fed` is called whenever that goes out.
-    """
-    found = []
-    line, packets = plan_line(plan), _to_all(plan, plan.servos, plan.watchdog_ticks)
-    for servo in plan.servos:
-        if not plan.watchdog_ticks or (item := _item(plan, servo)) is None:
-            continue
-        fed()
-        for packet in packets:
-            yield line.unanswered(packet)
-        back = yield line.read(servo.servo_id, item.address, item.size)
-        if not (back.answered and back.word(item.size) == plan.watchdog_ticks):
-            found.append((yield from revive(plan, servo)))
-    return [problem for problem in found if problem]
-
-
-def patience_ns(plan: BusPlan) -> int:
+def longer_ns(plan: BusPlan) -> int:
     """Return how much longer than usual a reply may be awaited while servos are armed."""
     return plan.watchdog_ticks * UNIT_NS // 3
 
 
 def disarm_all(plan: BusPlan) -> Program[list[str]]:
-    """Clear every servo of a bus, before anybody gets torque or after; return what went wrong."""
+    """Clear every servo of a bus, before torque is switched on or after; return what went wrong."""
     found = []
     for servo in plan.servos:
         found.append((yield from disarm(plan, servo)))
@@ -96,27 +89,25 @@ def disarm_all(plan: BusPlan) -> Program[list[str]]:
 
 
 def release_all(plan: BusPlan) -> Program[list[str]]:
-    """Disarm the servos of a bus that go on holding; return which were not disarmed, and why.
+    """Disarm the servos of a bus that keep holding; return which were not disarmed, and why.
 
     One that its watchdog has stopped stays stopped: cleared, it would go on to its old goal [i], at full
     speed as its profile was reset, with no loop that could stop it. One that does not answer stops by itself.
     While all answer, a read of all that are left keeps them from tripping before their turn.
     """
     line, problems, all_answer = plan_line(plan), [], True
-    left = [(servo, item) for servo in plan.servos if plan.watchdog_ticks and (item := _item(plan, servo))]
+    left = [(servo, item) for servo in plan.servos if plan.watchdog_ticks and (item := item_of(plan, servo))]
     while left:
         if all_answer:
-            wanted = [(servo.servo_id, item.address, item.size) for servo, item in left]
-            all_answer = (yield line.read_many(wanted)).answered
+            reads = [(servo.servo_id, item.address, item.size) for servo, item in left]
+            all_answer = (yield line.read_many(reads)).answered
         servo, item = left.pop(0)
-        reply = yield from persist(line.read(servo.servo_id, item.address, item.size))
+        reply = yield from retry(line.read(servo.servo_id, item.address, item.size))
         if not reply.answered:
-            problem = f"did not answer when its {called(item)} was read: it may stop by itself"
-            problems.append(f"{who(plan, servo)} {problem}")
+            problem = f"did not answer when its {item.title} was read: it may stop by itself"
+            problems.append(f"{plan.label(servo)} {problem}")
         elif tripped(item, reply.word(item.size)):
-            problems.append(
-                f"{who(plan, servo)} was stopped by its {called(item)} and stays where it stopped"
-            )
+            problems.append(f"{plan.label(servo)} was stopped by its {item.title} and stays where it stopped")
         elif problem := (yield from _write(plan, servo, item, 0)):
             problems.append(problem)
     return problems
@@ -124,16 +115,16 @@ def release_all(plan: BusPlan) -> Program[list[str]]:
 
 def disarming(plan: BusPlan, servos: Sequence[ServoPlan]) -> list[bytes]:
     """Return the packets that clear some servos of a bus at once; no servo answers."""
-    return _to_all(plan, servos, 0)
+    return to_all(plan, servos, 0)
 
 
-def _to_all(plan: BusPlan, servos: Sequence[ServoPlan], ticks: int) -> list[bytes]:
+def to_all(plan: BusPlan, servos: Sequence[ServoPlan], ticks: int) -> list[bytes]:
     """Return the packets that write the same to these servos; none where the plan wants no watchdog."""
     if not plan.watchdog_ticks:
         return []
     places: dict[tuple[int, int], list[int]] = {}
     for servo in servos:
-        if item := _item(plan, servo):
+        if item := item_of(plan, servo):
             places.setdefault((item.address, item.size), []).append(servo.servo_id)
     records = dialect_of(plan.protocol).sync_write_records
     return [
@@ -143,20 +134,21 @@ def _to_all(plan: BusPlan, servos: Sequence[ServoPlan], ticks: int) -> list[byte
 
 
 def has_one(plan: BusPlan, servo: ServoPlan) -> bool:
-    """Say whether a servo's watchdog is armed by the plan."""
-    return bool(plan.watchdog_ticks) and _item(plan, servo) is not None
+    """Return whether a servo's watchdog is armed by the plan."""
+    return bool(plan.watchdog_ticks) and item_of(plan, servo) is not None
 
 
-def _item(plan: BusPlan, servo: ServoPlan) -> ControlItem | None:
+def item_of(plan: BusPlan, servo: ServoPlan) -> ControlItem | None:
+    """Return the item of a servo's watchdog, None where the model has none."""
     return control_table(servo.model, plan.protocol).items.get("bus_watchdog")
 
 
 def _write(plan: BusPlan, servo: ServoPlan, item: ControlItem, ticks: int) -> Program[str]:
     line = plan_line(plan)
-    yield from persist(line.write(servo.servo_id, item.address, ticks.to_bytes(item.size, "little")))
-    back = yield from persist(line.read(servo.servo_id, item.address, item.size))
+    yield from retry(line.write(servo.servo_id, item.address, ticks.to_bytes(item.size, "little")))
+    back = yield from retry(line.read(servo.servo_id, item.address, item.size))
     if not back.answered:
-        return f"{who(plan, servo)} did not answer when its {called(item)} was read back"
+        return f"{plan.label(servo)} did not answer when its {item.title} was read back"
     if (found := back.word(item.size)) != ticks:
-        return f"{who(plan, servo)} was given {called(item)} = {ticks}, but has {found}"
+        return f"{plan.label(servo)} was given {item.title} = {ticks}, but has {found}"
     return ""

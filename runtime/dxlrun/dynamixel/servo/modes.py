@@ -18,8 +18,8 @@ from dxlrun.dynamixel.plan.bus_plan import BusPlan, GoalLayout, ModePlan, OwnLim
 from dxlrun.dynamixel.plan.mode_plan import in_mode, mode_in
 from dxlrun.dynamixel.plan.planning import plan_line, readable
 from dxlrun.dynamixel.plan.units import ticks_in
-from dxlrun.dynamixel.registers import bus_watchdog
-from dxlrun.dynamixel.registers.inspection import called, persist, who
+from dxlrun.dynamixel.servo import watchdog
+from dxlrun.dynamixel.servo.retry import retry
 from dxlrun.dynamixel.wire.transaction import Outcome, Program, Reply
 from dxlrun.mode import Mode
 
@@ -62,7 +62,7 @@ def enter(
     `hold`. Raises LookupError when the model does not have the mode.
     """
     wanted, line = servo.mode_plan(mode), plan_line(plan)
-    torque = yield from persist(line.read(servo.servo_id, servo.torque_address, 1))
+    torque = yield from retry(line.read(servo.servo_id, servo.torque_address, 1))
     names = [register.name for register in wanted.operating]
     found = yield from _read_items(plan, servo, names)
     if not torque.answered or found is None:
@@ -106,16 +106,16 @@ def settle_modes(plan: BusPlan) -> Program[SettledModes]:
         if found is not None and in_mode(wanted, found):
             continue
         # one that has torque takes no goal while its watchdog has stopped it
-        problem = yield from bus_watchdog.disarm(plan, servo)
+        problem = yield from watchdog.disarm(plan, servo)
         problem = problem or (yield from enter(plan, servo, servo.start_mode))
         if problem or found is None:
             problem = problem or "did not answer when its mode was asked for"
-            settled.problems.append(f"{who(plan, servo)} {problem}")
+            settled.problems.append(f"{plan.label(servo)} {problem}")
             continue
         items = _items(plan, servo)
-        was = ", ".join(f"{called(items[name])} was {value}" for name, value in found.items())
+        was = ", ".join(f"{items[name].title} was {value}" for name, value in found.items())
         words = servo.start_mode.name.lower().replace("_", "-")
-        settled.switched.append((servo.joint, f"{was}: {who(plan, servo)} was brought into {words} mode"))
+        settled.switched.append((servo.joint, f"{was}: {plan.label(servo)} was brought into {words} mode"))
     return settled
 
 
@@ -130,7 +130,7 @@ def read_limits(plan: BusPlan, servo: ServoPlan) -> Program[dict[OwnLimit, int]]
     """Read the limits beyond which a servo refuses goals, ticks; what it does not answer is left out."""
     found: dict[OwnLimit, int] = {}
     for limit in servo.own_limits:
-        reply = yield from persist(plan_line(plan).read(servo.servo_id, limit.address, limit.size))
+        reply = yield from retry(plan_line(plan).read(servo.servo_id, limit.address, limit.size))
         if reply.answered:
             found[limit] = reply.word(limit.size)
     return found
@@ -145,7 +145,7 @@ def hold(plan: BusPlan, servo: ServoPlan, mode: ModePlan, *, inward: bool = Fals
     line, position = plan_line(plan), None
     if mode.goals[-1].position is not None:
         block = servo.state
-        state = yield from persist(line.read(servo.servo_id, block.address, block.length))
+        state = yield from retry(line.read(servo.servo_id, block.address, block.length))
         if not state.answered:
             return Held("did not answer when torque was to be switched on")
         present = ticks_in(servo.state.position, state.parameters)
@@ -161,10 +161,10 @@ def hold(plan: BusPlan, servo: ServoPlan, mode: ModePlan, *, inward: bool = Fals
     # the goal comes first: torque on a stale goal would move the joint
     writes = [(layout, _resting(mode, layout, position, most_effort)) for layout in mode.goals]
     for layout, data in writes:
-        reply = yield from persist(line.write(servo.servo_id, layout.address, data))
+        reply = yield from retry(line.write(servo.servo_id, layout.address, data))
         if not reply.answered:
             return Held("did not acknowledge its goal" + _reason(plan, reply))
-    reply = yield from persist(line.write(servo.servo_id, servo.torque_address, b"\x01"))
+    reply = yield from retry(line.write(servo.servo_id, servo.torque_address, b"\x01"))
     if not reply.answered:
         return Held("did not acknowledge torque enable" + _reason(plan, reply))
     problem = yield from _read_back(plan, servo, *writes[-1])
@@ -197,11 +197,11 @@ def _read_back(plan: BusPlan, servo: ServoPlan, layout: GoalLayout, data: bytes)
     start, end = layout.address + place.offset, layout.address + place.offset + place.size
     table = control_table(servo.model, plan.protocol)
     if torque < start and end - torque <= LONGEST_BACK and readable(table, torque, end):
-        replies = [(yield from persist(line.read(servo.servo_id, torque, end - torque)))]
+        replies = [(yield from retry(line.read(servo.servo_id, torque, end - torque)))]
     else:
         replies = [
-            (yield from persist(line.read(servo.servo_id, torque, 1))),
-            (yield from persist(line.read(servo.servo_id, start, place.size))),
+            (yield from retry(line.read(servo.servo_id, torque, 1))),
+            (yield from retry(line.read(servo.servo_id, start, place.size))),
         ]
     if not all(reply.answered for reply in replies):
         return "did not answer when its torque was read back"
@@ -223,7 +223,7 @@ def _change(
     if kept is None:
         return "did not answer when its gains were read before its mode was changed"
     if enabled:
-        reply = yield from persist(line.write(servo.servo_id, servo.torque_address, b"\0"))
+        reply = yield from retry(line.write(servo.servo_id, servo.torque_address, b"\0"))
         if not reply.answered:
             return "did not acknowledge torque off before its mode was changed" + _reason(plan, reply)
     for register in wanted.operating:
@@ -263,14 +263,14 @@ def _forgotten(
 def _write(plan: BusPlan, servo: ServoPlan, name: str, value: int) -> Program[str]:
     """Write one item and read it back; return what went wrong, or nothing."""
     line, item = plan_line(plan), _items(plan, servo)[name]
-    reply = yield from persist(line.write(servo.servo_id, item.address, item.encode(value)))
+    reply = yield from retry(line.write(servo.servo_id, item.address, item.encode(value)))
     if reply.outcome is Outcome.REFUSED:
-        return f"refuses {called(item)} = {value}" + _reason(plan, reply)
-    back = yield from persist(line.read(servo.servo_id, item.address, item.size))
+        return f"refuses {item.title} = {value}" + _reason(plan, reply)
+    back = yield from retry(line.read(servo.servo_id, item.address, item.size))
     if not back.answered:
-        return f"did not answer when {called(item)} was read back"
+        return f"did not answer when {item.title} was read back"
     has = item.decode(back.parameters)
-    return "" if has == value else f"was given {called(item)} = {value}, but has {has}"
+    return "" if has == value else f"was given {item.title} = {value}, but has {has}"
 
 
 def _read_items(plan: BusPlan, servo: ServoPlan, names: Sequence[str]) -> Program[dict[str, int] | None]:
@@ -288,7 +288,7 @@ def _read_items(plan: BusPlan, servo: ServoPlan, names: Sequence[str]) -> Progra
         start, end = block[0].address, block[-1].address + block[-1].size
         if end - start == 1 and readable(control_table(servo.model, plan.protocol), start, end + 1):
             end += 1  # torque enable is one byte, too: a late answer to that is none to this
-        reply = yield from persist(plan_line(plan).read(servo.servo_id, start, end - start))
+        reply = yield from retry(plan_line(plan).read(servo.servo_id, start, end - start))
         if not reply.answered:
             return None
         for item in block:

@@ -1,0 +1,437 @@
+"""Checks: what must hold for a servo before it may get torque, at the start and when it returns.
+
+`CHECKS` is the table: control item, predicate, sentence. `inspect` reads the items of one servo and walks the
+table; `survey` looks at a whole bus: presence, registers, states. All of it only reads.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import NamedTuple
+
+from dxlrun.dynamixel.control_table import ControlItem, control_table
+from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
+from dxlrun.dynamixel.plan.line import Line, listen
+from dxlrun.dynamixel.plan.mode_plan import mode_in
+from dxlrun.dynamixel.plan.reads import state_read
+from dxlrun.dynamixel.plan.units import joint_position, ticks_in
+from dxlrun.dynamixel.servo.retry import retry, setup_line
+from dxlrun.dynamixel.servo.watchdog import shown, tripped
+from dxlrun.dynamixel.wire.protocol1 import StatusError, describe_error
+from dxlrun.dynamixel.wire.protocol2 import describe_hardware_error
+from dxlrun.dynamixel.wire.transaction import Outcome, Program, Reply
+from dxlrun.mode import Mode
+
+RETURN_ALL = 2
+"""Status Return Level: every instruction is answered."""
+PINGS = 3
+"""Two servos of one ID collide in most of three answers."""
+LISTEN_NS = 2_000_000
+"""After a ping: a second servo of the same ID may answer with another return delay, at most 0.508 ms."""
+FORBIDDEN = StatusError.INPUT_VOLTAGE | StatusError.OVERHEATING | StatusError.OVERLOAD
+"""Error bits of Protocol 1.0 with which a servo gets no torque; the others concern one instruction."""
+STATUS_ERROR = "status_error"
+"""Stands in for a control item: the error byte of Protocol 1.0; in 2.0 Hardware Error Status has it."""
+
+_BLOCKS: Mapping[float, tuple[tuple[str, str], ...]] = MappingProxyType(
+    {
+        1.0: (
+            ("model_number", "firmware_version"),
+            ("return_delay_time", "ccw_angle_limit"),
+            ("status_return_level", "status_return_level"),
+            ("torque_enable", "torque_limit"),
+            ("multi_turn_offset", "multi_turn_offset"),
+            ("resolution_divider", "resolution_divider"),
+            ("drive_mode", "drive_mode"),
+        ),
+        2.0: tuple(
+            (name, name)
+            for name in (
+                "model_number",
+                "firmware_version",
+                "return_delay_time",
+                "drive_mode",
+                "operating_mode",
+                "control_mode",
+                "homing_offset",
+                "min_position_limit",
+                "max_position_limit",
+                "cw_angle_limit",
+                "ccw_angle_limit",
+                "startup_configuration",
+                "profile_acceleration",
+                "torque_enable",
+                "status_return_level",
+                "hardware_error_status",
+                "bus_watchdog",
+            )
+        ),
+    }
+)
+"""What is read of a servo, by protocol: from the first item to the last in one read, where the model has
+them. Models of Protocol 2.0 differ in what stands side by side, so there each item is read by itself."""
+_DRIVE_BITS: Mapping[int, str] = MappingProxyType(
+    {
+        0x01: "turns the other way round",
+        0x02: "follows another servo",
+        0x04: "takes profiles for times",
+        0x08: "switches torque on by every goal",
+    }
+)
+"""e-Manual XM430-W350, XM540, Drive Mode (10)"""
+
+
+@dataclass(slots=True)
+class Survey:
+    """What was found on one bus."""
+
+    problems: list[str] = field(default_factory=list)
+    """Why the robot must not start, one sentence each."""
+    differences: list[tuple[str, str]] = field(default_factory=list)
+    """Joint, and what its registers have that the robot file assumes otherwise."""
+    servos: list[tuple[str, str]] = field(default_factory=list)
+    """Joint, and what answered."""
+    modes: dict[int, Mode] = field(default_factory=dict)
+    """ID, and the mode in which the servo is; it is brought into its first one before it gets torque."""
+
+
+@dataclass(frozen=True, slots=True)
+class Inspected:
+    """What was read of one servo, and what it is compared with."""
+
+    plan: BusPlan
+    servo: ServoPlan
+    items: Mapping[str, ControlItem]
+    values: Mapping[str, int]
+    """By item; where the robot file declares a register, what the start will have written."""
+    take_over: bool
+
+    def title(self, name: str) -> str:
+        """Return an item as messages name it."""
+        return self.items[name].title
+
+
+class Check(NamedTuple):
+    """One row of the table."""
+
+    item: str
+    """The check applies where the servo has this item."""
+    fails: Callable[[Inspected, int], bool]
+    """Predicate on the item's value."""
+    sentence: Callable[[Inspected, int], str]
+    """What is wrong and how to fix it, behind the servo's name."""
+    refuses: bool = True
+    """The servo gets no torque; False: the difference is reported."""
+
+
+def _neutral(item: str, wanted: int, why: Callable[[Inspected, int], str]) -> Check:
+    """Return the check of a register that must have the one value that the plan counts on."""
+    return Check(
+        item,
+        lambda _, raw: raw != wanted,
+        lambda found, raw: f"has {found.title(item)} = {raw}, {why(found, raw)}: write {wanted} there",
+    )
+
+
+def _limits(low: str, high: str, names: str) -> Check:
+    """Return the check that a servo accepts every goal of its joint."""
+
+    def fails(found: Inspected, lowest: int) -> bool:
+        servo, highest = found.servo, found.values[high]
+        if servo.continuous or (found.plan.protocol == 1.0 and lowest >= highest):
+            return False  # not in joint mode: the start brings it there
+        return lowest > servo.lower_tick or highest < servo.upper_tick
+
+    def sentence(found: Inspected, lowest: int) -> str:
+        servo, highest = found.servo, found.values[high]
+        ends = sorted(math.degrees(joint_position(servo, raw)) for raw in (lowest, highest))
+        return (
+            f"has {names} {lowest}..{highest}, narrower than the joint's "
+            f"{servo.lower_tick}..{servo.upper_tick}, and would refuse goals: write "
+            f"`limits: {{position: [{ends[0]:.1f} deg, {ends[1]:.1f} deg]}}` or wider {names}"
+        )
+
+    return Check(low, fails, sentence)
+
+
+def _newer(found: Inspected, firmware: int) -> list[ControlItem]:
+    """Return the items that the robot file declares and that came with a newer firmware."""
+    declared = (found.items[one.name] for one in found.servo.registers)
+    return [item for item in declared if item.firmware > firmware]
+
+
+def _newer_sentence(found: Inspected, firmware: int) -> str:
+    newer = _newer(found, firmware)
+    return (
+        f"has firmware {firmware}, but {' and '.join(item.title for item in newer)}, which the robot file "
+        f"declares, came with firmware {max(item.firmware for item in newer)}: take it out of `registers`, "
+        "or update the servo"
+    )
+
+
+def _return_delay_sentence(found: Inspected, raw: int) -> str:
+    plan = found.plan
+    total_ns = plan.budget.total_ns + (raw * 2_000 - plan.return_delay_ns) * len(plan.servos)
+    return (
+        f"{found.title('return_delay_time')} is {raw}, {raw * 2} us, where the robot file assumes "
+        f"{plan.return_delay_ns / 1000:g} us; if all servos of bus {plan.name} have it, a cycle takes "
+        f"{total_ns / 1e6:.1f} ms instead of {plan.budget.total_ns / 1e6:.1f} ms, at most "
+        f"{1e9 / total_ns:.0f} Hz"
+    )
+
+
+def _drive_mode_reason(found: Inspected, raw: int) -> str:
+    if found.plan.protocol == 1.0:
+        return "so it turns the other way round or follows another servo"
+    return f"so it {' and '.join(words for bit, words in _DRIVE_BITS.items() if raw & bit) or 'is unknown'}"
+
+
+def _watchdog_sentence(found: Inspected, raw: int) -> str:
+    item = found.items["bus_watchdog"]
+    what = f"it would stop after {raw * 20} ms without an instruction"
+    if tripped(item, raw):
+        what = "it has stopped the servo"
+    return f"{item.title} is {shown(item, raw)}, {what}; it is cleared"
+
+
+CHECKS: tuple[Check, ...] = (
+    Check(
+        STATUS_ERROR,
+        lambda _, error: bool(error & FORBIDDEN),
+        lambda _, error: f"reports an error: {describe_error(error & FORBIDDEN)}",
+    ),
+    Check(
+        "model_number",
+        lambda found, number: number != found.servo.model_number,
+        lambda found, number: (
+            f"is model number {number}, not a {found.servo.model} ({found.servo.model_number}): correct "
+            "`model` or the ID in the robot file"
+        ),
+    ),
+    Check("firmware_version", lambda found, firmware: bool(_newer(found, firmware)), _newer_sentence),
+    Check(
+        "return_delay_time",
+        lambda found, raw: abs(raw * 2_000 - found.plan.return_delay_ns) >= 2_000,
+        _return_delay_sentence,
+        refuses=False,
+    ),
+    Check(
+        "status_return_level",
+        lambda _, level: level != RETURN_ALL,
+        lambda found, level: (
+            f"has {found.title('status_return_level')} = {level}, so it acknowledges no write: write "
+            f"{RETURN_ALL} there"
+        ),
+    ),
+    _neutral("drive_mode", 0, _drive_mode_reason),
+    _neutral("homing_offset", 0, lambda *_: "which shifts every position"),
+    _neutral("multi_turn_offset", 0, lambda *_: "which shifts every position"),
+    _neutral("resolution_divider", 1, lambda *_: "which changes what a tick is"),
+    _limits("min_position_limit", "max_position_limit", "position limits"),
+    _limits("cw_angle_limit", "ccw_angle_limit", "angle limits"),
+    Check(
+        "startup_configuration",
+        lambda _, raw: bool(raw & 0x01),
+        lambda found, raw: (
+            f"has {found.title('startup_configuration')} = {raw}, so it switches torque on by itself at "
+            "power-up: clear bit 0"
+        ),
+    ),
+    Check(
+        "startup_configuration",
+        lambda _, raw: bool(raw & 0x02),
+        lambda *_: "Startup Configuration bit 1 is set: RAM comes from the backup at power-up",
+        refuses=False,
+    ),
+    Check(
+        "hardware_error_status",
+        lambda _, raw: raw != 0,
+        lambda found, raw: (
+            f"reports in {found.title('hardware_error_status')}: {describe_hardware_error(raw)}; find the "
+            "cause, then reboot it"
+        ),
+    ),
+    Check(  # the start clears what an earlier run left; reported where this run arms none itself
+        "bus_watchdog",
+        lambda found, raw: raw != 0 and not found.plan.watchdog_ticks,
+        _watchdog_sentence,
+        refuses=False,
+    ),
+    Check(  # a ramp that another program left in RAM: a run does not write it
+        "profile_acceleration",
+        lambda found, raw: raw not in (0, found.items["profile_acceleration"].initial),
+        lambda found, raw: (
+            f"{found.title('profile_acceleration')} is {raw}: it reaches its goals late; write 0 there, or "
+            "switch it off and on"
+        ),
+        refuses=False,
+    ),
+    Check(
+        "torque_enable",
+        lambda found, enabled: enabled != 0 and not found.take_over,
+        lambda *_: (
+            "holds torque already, so another program may be moving it: stop that one and switch the torque "
+            "off, or take the robot over as it is with --take-over"
+        ),
+    ),
+    Check(
+        "torque_limit",
+        lambda _, raw: raw == 0,
+        lambda found, _: (
+            f"has {found.title('torque_limit')} = 0: it shut itself down after overload or overheating; find "
+            "the cause, then switch its power off and on"
+        ),
+    ),
+)
+"""In the order in which problems are reported; what each refuses is in failures.md."""
+
+
+def survey(plan: BusPlan, take_over: bool) -> Program[Survey]:
+    """Look at every servo of the bus, and collect all problems of all servos."""
+    found, line = Survey(), setup_line(plan)
+    yield listen(LISTEN_NS)
+    if plan.servos and (yield from _echoes(plan, line, found)):
+        return found
+    present: list[ServoPlan] = []
+    for servo in plan.servos:
+        if (yield from _answers(plan, servo, line, found)):
+            present.append(servo)
+    readable: list[ServoPlan] = []
+    for servo in present:
+        if (yield from inspect(plan, servo, line, found, take_over=take_over)):
+            readable.append(servo)
+    yield from inspect_states(plan, readable, line, found)
+    return found
+
+
+def inspect(plan: BusPlan, servo: ServoPlan, line: Line, found: Survey, *, take_over: bool) -> Program[bool]:
+    """Read what must fit the plan, and walk the table; return False when the servo cannot be read."""
+    items = control_table(servo.model, plan.protocol).items
+    declared = {one.name: one.value for one in servo.registers}
+    values: dict[str, int] = {}
+    for first, last in _BLOCKS[plan.protocol]:
+        if first not in items or items[first].firmware > values.get("firmware_version", 1 << 16):
+            continue
+        start, end = items[first].address, items[last].address + items[last].size
+        reply = yield from retry(line.read(servo.servo_id, start, end - start))
+        if not reply.answered:
+            found.problems.append(f"{plan.label(servo)} {_unreadable(items, line, reply)}")
+            return False
+        for item in items.values():
+            if start <= item.address and item.address + item.size <= end:
+                at = item.address - start
+                raw = item.decode(reply.parameters[at : at + item.size])
+                values[item.name] = declared.get(item.name, raw)
+        if plan.protocol == 1.0 and first == "torque_enable":
+            values[STATUS_ERROR] = reply.error
+    text = f"{servo.model}, ID {servo.servo_id} on bus {plan.name}, firmware {values['firmware_version']}"
+    found.servos.append((servo.joint, text))
+    # torque control mode of Protocol 1.0 is RAM, and only of some models: it is not read here
+    found.modes[servo.servo_id] = mode_in(servo, {"torque_ctrl_mode_enable": 0, **values})
+    inspected = Inspected(plan, servo, items, values, take_over)
+    for check in CHECKS:
+        if check.item in values and check.fails(inspected, values[check.item]):
+            sentence = check.sentence(inspected, values[check.item])
+            if check.refuses:
+                found.problems.append(f"{plan.label(servo)} {sentence}")
+            else:
+                found.differences.append((servo.joint, sentence))
+    return True
+
+
+def inspect_states(plan: BusPlan, servos: list[ServoPlan], line: Line, found: Survey) -> Program[None]:
+    """Read every state twice: inside the limits, and no jump in between."""
+    before: dict[int, tuple[int, int]] = {}
+    for again in (False, True):
+        for servo in servos:
+            reply = yield from retry(state_read(line, [servo]))
+            problem = ""
+            if not reply.answered:
+                problem = "answers the reading of its state garbled: do two servos have its ID?"
+                if reply.outcome is Outcome.TIMEOUT:
+                    problem = "does not answer any more: check cable and power"
+            else:
+                raw = ticks_in(servo.state.position, reply.parameters)
+                if again and servo.servo_id in before:
+                    problem = _jump(servo, before[servo.servo_id], (raw, reply.last_ns))
+                elif not again:
+                    before[servo.servo_id] = raw, reply.sent_ns
+                    problem = _misplaced(servo, raw, found)
+            if problem:
+                found.problems.append(f"{plan.label(servo)} {problem}")
+
+
+def _echoes(plan: BusPlan, line: Line, found: Survey) -> Program[bool]:
+    """Find out whether the adapter echoes: a read cannot be mistaken for its own answer."""
+    reply = yield line.read(plan.servos[0].servo_id, 0, 3)
+    if reply.echoed:
+        found.problems.append(
+            f"bus {plan.name}: the adapter at {plan.port} echoes what it sends; use one that switches its "
+            "receiver off while it sends"
+        )
+    return reply.echoed
+
+
+def _answers(plan: BusPlan, servo: ServoPlan, line: Line, found: Survey) -> Program[bool]:
+    """Ping a servo three times; report silence and collisions."""
+    answered = disturbed = 0
+    for _ in range(PINGS):
+        reply = yield line.ping(servo.servo_id)
+        after = yield listen(LISTEN_NS)
+        answered += reply.answered
+        disturbed += bool(reply.strays or after.strays)
+    problem = ""
+    if disturbed > 1:
+        problem = (
+            f"answers {disturbed} of {PINGS} pings garbled or twice: do two servos have its ID? "
+            "Connect them one by one and give each its own"
+        )
+    elif answered == 0:
+        problem = f"does not answer: check power, cable, ID, and that it runs at {plan.baud_rate} bit/s"
+    elif answered < PINGS - 1:
+        problem = f"answers only {answered} of {PINGS} pings: check its cable and power"
+    if problem:
+        found.problems.append(f"{plan.label(servo)} {problem}")
+    return not problem
+
+
+def _unreadable(items: Mapping[str, ControlItem], line: Line, reply: Reply) -> str:
+    """Return why a servo that answers pings cannot be read."""
+    if reply.outcome is Outcome.TIMEOUT:
+        return (
+            f"answers pings but no read: its {items['status_return_level'].title} is 0; write {RETURN_ALL} "
+            "there (writes are carried out, though not acknowledged)"
+        )
+    if reply.outcome is Outcome.REFUSED:
+        return f"refuses to be read: {line.dialect.describe_error(reply.error)}"
+    return "answers reads garbled: do two servos have its ID? If not, check cable and ground"
+
+
+def _misplaced(servo: ServoPlan, raw: int, found: Survey) -> str:
+    """Return what is wrong with a servo's position, or nothing."""
+    if found.modes.get(servo.servo_id) != servo.start_mode:
+        return ""  # its position counts in another mode; it is looked at again before it gets torque
+    if raw > servo.max_tick and not servo.continuous:
+        return f"reports position {raw}, beyond its {servo.max_tick} ticks"
+    if servo.lower_tick - 1 <= raw <= servo.upper_tick + 1:
+        return ""
+    ends = sorted(math.degrees(joint_position(servo, end)) for end in (servo.lower_tick, servo.upper_tick))
+    return (
+        f"stands at {math.degrees(joint_position(servo, raw)):.1f} deg, outside its limits "
+        f"{ends[0]:.1f}..{ends[1]:.1f} deg: move the joint inside by hand"
+    )
+
+
+def _jump(servo: ServoPlan, before: tuple[int, int], after: tuple[int, int]) -> str:
+    """Return what is wrong between two positions, each (ticks, time in ns), or nothing."""
+    moved = abs(after[0] - before[0]) * servo.rad_per_tick
+    fastest = servo.max_speed_tick * servo.rad_s_per_tick * (after[1] - before[1]) * 1e-9
+    if moved <= fastest + 2 * servo.rad_per_tick:
+        return ""
+    return (
+        f"jumped by {math.degrees(moved):.1f} deg between two readings: two servos of one ID, or a broken "
+        "potentiometer?"
+    )

@@ -1,0 +1,253 @@
+"""A servo's life as one state machine: its states, the events that lead from one to the next, the table.
+
+           engaged          torque on             doubt: back to HOLDING
+    LIMP ---------> HOLDING ---------> TORQUED
+                       | watchdog         | watchdog    ^
+                       v                  v             | caught up
+                    STOPPED <-------------'             |
+                     ^    '-- torque on --> RETURNING --'     doubt, watchdog: back to STOPPED
+                     | returned
+      lost --> OFFLINE -- returned limp --> LIMP
+      latch -> LATCHED
+
+What drives it are programs, generators that yield transactions to a bus and end in an event:
+
+| program | file | ends in |
+|---|---|---|
+| start-up: look, set up, hold, confirm | `startup.py`, `checks.py` | ENGAGED, TORQUE_ON |
+| read torque enable, hardware error, torque limit | `servos.py` | TORQUE_ON, TORQUE_OFF, DOUBT, LOST |
+| probe an offline servo, and take it back | `offline.py` | RETURNED, RETURNED_LIMP |
+| read Realtime Tick, which shows a reboot | `offline.py`, `slow_registers.py` | LOST |
+| switch off for the rest of the run | `offline.py` | LATCHED; LOST where it fails |
+| change a mode | `desired.py`, `modes.py` | DOUBT |
+| revive a servo that its Bus Watchdog stopped | `watchdog.py` | STOPPED; LOST where it fails |
+
+The cyclic exchange itself has three events: a lost reply is DOUBT, many in a row are LOST, and a position
+near the goal is CAUGHT_UP. Which servos get goals, how fast they may follow them, and which are read in a
+cycle follows from the state, and is changed nowhere else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import Enum, unique
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.dynamixel.exchange.cyclic_reads import CyclicReads
+from dxlrun.dynamixel.plan.bus_plan import BusPlan
+from dxlrun.dynamixel.servo.watchdog import RETURN_SPEED
+from dxlrun.interfaces import Floats
+from dxlrun.run.channels.events import EventCode, EventSink, Severity
+
+
+@unique
+class State(Enum):
+    """What a servo is doing."""
+
+    LIMP = "limp"
+    """Read in every cycle, without torque; it gets no goals, because a goal may switch torque on."""
+    HOLDING = "holding"
+    """Read in every cycle; holds its last goal, and gets no other before its torque enable was read as 1."""
+    TORQUED = "torqued"
+    """Has torque for certain, and gets goals."""
+    STOPPED = "stopped"
+    """As HOLDING, after its watchdog stopped it or it was offline: it will go to its goal slowly."""
+    RETURNING = "returning"
+    """Has torque for certain, and goes to its goal at RETURN_SPEED at most, until it has caught up."""
+    OFFLINE = "offline"
+    """Out of the cyclic reads; probed now and then, and taken back when it is in order."""
+    LATCHED = "latched"
+    """Read in every cycle; its torque is off for the rest of the run."""
+
+
+@unique
+class Event(Enum):
+    """What happens to a servo."""
+
+    ENGAGED = "engaged"
+    """Start-up: its goal is where it stands, torque is on, both were read back."""
+    TORQUE_ON = "torque on"
+    """Torque enable was read as 1."""
+    TORQUE_OFF = "torque off"
+    """Torque enable was read as 0 for a reason that is known, or a shutdown made it powerless."""
+    DOUBT = "doubt"
+    """Torque may be off: a reply was lost, an error raised, a mode changed without a confirmation."""
+    WATCHDOG = "watchdog"
+    """Its Bus Watchdog has stopped it."""
+    CAUGHT_UP = "caught up"
+    """It is near its goal again."""
+    LOST = "lost"
+    """It leaves the cyclic reads: silent, rebooted, its line was gone, or it cannot be trusted."""
+    RETURNED = "returned"
+    """It is in order again, and its torque is on."""
+    RETURNED_LIMP = "returned limp"
+    """It is in order again, without torque."""
+    LATCH = "latch"
+    """A policy switches its torque off for the rest of the run."""
+
+
+_ONLINE = {Event.LOST: State.OFFLINE, Event.LATCH: State.LATCHED}
+"""From every state in which a servo is read."""
+
+TRANSITIONS: Mapping[State, Mapping[Event, State]] = MappingProxyType(
+    {
+        State.LIMP: {
+            Event.ENGAGED: State.HOLDING,
+            Event.TORQUE_OFF: State.LIMP,
+            Event.DOUBT: State.LIMP,
+            Event.WATCHDOG: State.LIMP,
+            **_ONLINE,
+        },
+        State.HOLDING: {
+            Event.TORQUE_ON: State.TORQUED,
+            Event.TORQUE_OFF: State.LIMP,
+            Event.DOUBT: State.HOLDING,
+            Event.WATCHDOG: State.STOPPED,
+            **_ONLINE,
+        },
+        State.TORQUED: {
+            Event.TORQUE_OFF: State.LIMP,
+            Event.DOUBT: State.HOLDING,
+            Event.WATCHDOG: State.STOPPED,
+            **_ONLINE,
+        },
+        State.STOPPED: {
+            Event.TORQUE_ON: State.RETURNING,
+            Event.TORQUE_OFF: State.LIMP,
+            Event.DOUBT: State.STOPPED,
+            Event.WATCHDOG: State.STOPPED,
+            **_ONLINE,
+        },
+        State.RETURNING: {
+            Event.CAUGHT_UP: State.TORQUED,
+            Event.TORQUE_OFF: State.LIMP,
+            Event.DOUBT: State.STOPPED,
+            Event.WATCHDOG: State.STOPPED,
+            **_ONLINE,
+        },
+        State.OFFLINE: {
+            Event.RETURNED: State.STOPPED,
+            Event.RETURNED_LIMP: State.LIMP,
+            Event.DOUBT: State.OFFLINE,
+            Event.LOST: State.OFFLINE,
+            Event.LATCH: State.OFFLINE,  # `Loss.latched` keeps it until the servo is back
+        },
+        State.LATCHED: {
+            Event.TORQUE_OFF: State.LATCHED,
+            Event.DOUBT: State.LATCHED,
+            Event.WATCHDOG: State.LATCHED,
+            **_ONLINE,
+        },
+    }
+)
+"""Every legal transition; another event in a state is a mistake of this program."""
+
+GETS_GOALS = frozenset((State.TORQUED, State.RETURNING))
+IN_DOUBT = frozenset((State.HOLDING, State.STOPPED))
+"""Their torque enable is read as soon as there is time for it."""
+POWERLESS = frozenset((State.LIMP, State.LATCHED))
+_SLOW = frozenset((State.STOPPED, State.RETURNING, State.OFFLINE))
+
+
+class IllegalTransition(LookupError):
+    """An event in a state that does not have it."""
+
+
+@dataclass(slots=True)
+class Loss:
+    """What is known of a servo while it is OFFLINE."""
+
+    had_torque: bool
+    """It had torque when it was lost: torque that is off now shows a reboot, where no clock does."""
+    limp_reported: bool
+    """That it has no torque was reported already."""
+    latched: bool
+    """It is to be LATCHED when it is back."""
+    rebooted: bool
+    """A reboot was counted since it took part."""
+    probe_at_ns: int | None
+    """When it is probed next; None while it is."""
+    problem: str = ""
+    """Why it could not be taken back, as reported last."""
+
+
+class Life:
+    """The state of each servo of one bus, and what follows from it."""
+
+    __slots__ = ("_events", "_now_ns", "_plan", "ceiling", "losses", "reads", "states", "torqued")
+
+    def __init__(
+        self, plan: BusPlan, reads: CyclicReads, events: EventSink, now_ns: Callable[[], int]
+    ) -> None:
+        count = len(plan.servos)
+        self._plan = plan
+        self._events = events
+        self._now_ns = now_ns
+        self.reads = reads
+        """The cyclic reads, without the servos that are OFFLINE."""
+        self.states = [State.LIMP] * count
+        """The state of each servo."""
+        self.losses: list[Loss | None] = [None] * count
+        """Of each servo that is OFFLINE."""
+        self.torqued: NDArray[np.bool_] = np.zeros(count, dtype=np.bool_)
+        """Shape (servos,): the servos that get goals; the memory of the kernel, too."""
+        self.ceiling: Floats = np.full(count, np.nan)
+        """Shape (servos,): the highest speeds toward positions, rad/s; NaN: as the goal says."""
+
+    def on(self, index: int, event: Event) -> State:
+        """Change a servo's state by an event, and return it; raises IllegalTransition."""
+        before = self.states[index]
+        after = TRANSITIONS[before].get(event)
+        if after is None:
+            name = self._plan.label(self._plan.servos[index])
+            raise IllegalTransition(f"{name} is {before.value}, where {event.value} cannot happen")
+        self.states[index] = after
+        self.torqued[index] = after in GETS_GOALS
+        self.ceiling[index] = RETURN_SPEED if after in _SLOW else np.nan
+        if event is Event.LOST:
+            self.reads.leave(index)
+        elif before is State.OFFLINE and after is not State.OFFLINE:
+            self.losses[index] = None
+            self.reads.join(index)
+        return after
+
+    def lose(self, index: int, probe_after_ns: int = 0, *, rebooted: bool = False) -> Loss:
+        """Take a servo out of the exchange, to be probed after a while until it is in order."""
+        state, earlier = self.states[index], self.losses[index]
+        powerless = state in POWERLESS if earlier is None else earlier.limp_reported
+        loss = Loss(
+            had_torque=not powerless,
+            limp_reported=powerless,
+            latched=state is State.LATCHED if earlier is None else earlier.latched,
+            rebooted=rebooted or (earlier is not None and earlier.rebooted),
+            probe_at_ns=self._now_ns() + probe_after_ns,
+        )
+        self.on(index, Event.LOST)
+        self.losses[index] = loss
+        return loss
+
+    def latch(self, index: int) -> State:
+        """Give a servo no torque for the rest of the run; return its state."""
+        loss = self.losses[index]
+        if loss is not None:
+            loss.latched = True
+        return self.on(index, Event.LATCH)
+
+    def offline(self, index: int) -> bool:
+        """Return whether a servo is out of the exchange."""
+        return self.states[index] is State.OFFLINE
+
+    def report(self, code: EventCode, severity: Severity, index: int, text: str) -> None:
+        """Log an event of a servo; `text` stands behind its name."""
+        servo = self._plan.servos[index]
+        self._events.emit(code, severity, servo.joint, f"{self._plan.label(servo)} {text}")
+
+    def report_limp(self, index: int, enabled: int) -> None:
+        """Log that a servo was found without torque."""
+        item = f"Torque Enable ({self._plan.servos[index].torque_address})"
+        text = f"has {item} = {enabled}: it was reset or its torque was cut; it gets no goals"
+        self.report(EventCode.SERVO_LIMP, Severity.ERROR, index, text)

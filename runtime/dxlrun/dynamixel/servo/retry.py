@@ -1,0 +1,60 @@
+"""Retries and longer timeouts of programs that have time: start-up, return, tools.
+
+Giving a reply up too early is worse than waiting: it comes later, and looks like the reply to the next
+request (a status packet does not carry what it answers).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from dxlrun.dynamixel.plan.bus_plan import BusPlan
+from dxlrun.dynamixel.plan.line import LONGEST_RETURN_DELAY_NS, Line
+from dxlrun.dynamixel.wire.dialect import dialect_of
+from dxlrun.dynamixel.wire.transaction import Outcome, Program, Reply, Result, Transaction
+
+ATTEMPTS = 3
+LONGER_NS = 240_000_000
+"""Beyond the ordinary timeout [i]: hosts, virtual machines and USB adapters stall for tens of ms."""
+MOST_SILENCE_NS = 960_000_000
+"""Beyond the ordinary timeouts, for all lost replies together: after four a servo is not merely late."""
+
+
+def setup_line(plan: BusPlan) -> Line:
+    """Return the line before the servos' return delays are known: the longest is assumed."""
+    delay_ns = max(plan.return_delay_ns, LONGEST_RETURN_DELAY_NS)
+    return Line(plan.baud_rate, plan.latency_ns, delay_ns, dialect_of(plan.protocol))
+
+
+def retry(transaction: Transaction) -> Program[Reply]:
+    """Repeat a transaction until it is answered, at most ATTEMPTS times; return the last reply."""
+    reply = yield transaction
+    for _ in range(ATTEMPTS - 1):
+        if reply.answered:
+            break
+        reply = yield transaction
+    return reply
+
+
+def extend_timeouts(
+    program: Program[Result], most_ns: int = LONGER_NS, extra_ns: list[int] | None = None
+) -> Program[Result]:
+    """Run a program of one bus with longer timeouts, as long as few replies are lost.
+
+    A servo that answers late costs what it takes; a bus without any servo is reported within about two
+    seconds. `extra_ns` collects how much later than due by the wire each reply came.
+    """
+    left_ns = MOST_SILENCE_NS
+    try:
+        wanted = next(program)
+        while True:
+            longer_ns = min(most_ns, left_ns) if wanted.awaited else 0
+            reply = yield replace(wanted, timeout_ns=wanted.timeout_ns + longer_ns) if longer_ns else wanted
+            if extra_ns is not None and wanted.awaited and reply.answered:
+                extra_ns.append(reply.last_ns - reply.sent_ns - wanted.due_ns)
+            if reply.outcome in (Outcome.TIMEOUT, Outcome.GARBLED):
+                left_ns -= longer_ns
+            wanted = program.send(reply)
+    except StopIteration as end:
+        result: Result = end.value
+        return result

@@ -1,0 +1,364 @@
+"""Servos of one bus from cycle to cycle: lost replies, errors, alerts, and what is read in idle time.
+
+Each becomes an event of the state machine in `life.py`, and an event of the log where a person should know.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Generator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.dynamixel.exchange.bus import Bus
+from dxlrun.dynamixel.exchange.cyclic_reads import CyclicReads
+from dxlrun.dynamixel.exchange.gaps import Gaps, Urgency
+from dxlrun.dynamixel.exchange.goal_arrays import GoalArrays
+from dxlrun.dynamixel.exchange.samples import BusSamples
+from dxlrun.dynamixel.plan.bus_plan import BusPlan
+from dxlrun.dynamixel.plan.planning import plan_line
+from dxlrun.dynamixel.servo.checks import FORBIDDEN
+from dxlrun.dynamixel.servo.desired import DesiredState
+from dxlrun.dynamixel.servo.life import IN_DOUBT, Event, Life, State
+from dxlrun.dynamixel.servo.offline import FIRST_PROBE_NS, Offline
+from dxlrun.dynamixel.servo.slow_registers import SlowRegisters
+from dxlrun.dynamixel.servo.watchdog_monitor import WatchdogMonitor
+from dxlrun.dynamixel.wire.dialect import dialect_of
+from dxlrun.dynamixel.wire.protocol1 import StatusError
+from dxlrun.dynamixel.wire.protocol2 import describe_hardware_error
+from dxlrun.dynamixel.wire.transaction import Program, Reply, Transaction
+from dxlrun.errors import counted
+from dxlrun.interfaces import LOST_AGE_NS, LOST_CYCLES, Commands, Floats, States
+from dxlrun.run.channels.events import EventCode, EventSink, Severity
+
+NOISE_EVENT_NS = 1_000_000_000
+"""A noisy line has at most one event in this time."""
+UNREQUESTED_EVENT_NS = 10_000_000_000
+LEAST_UNREQUESTED = 2
+"""Packets that no request explains, for one event: an instruction of another host, and the reply to it. One
+alone can be noise that looks like a packet: the checksum of Protocol 1.0 is a byte [i]."""
+ALERT_AGAIN = 50
+"""Cycles after which a standing alert is read again: a second error does not change the alert bit."""
+CAUGHT_UP = 0.05
+"""rad from the goal: a returning servo has caught up."""
+_SHUTS_DOWN = StatusError.OVERHEATING | StatusError.OVERLOAD
+"""After them Torque Limit may be 0 (e-Manual AX-12A, Alarm Shutdown (18))."""
+
+
+class Servos:
+    """The servos of one bus: their life, cyclic reads, goals and desired state."""
+
+    __slots__ = (
+        "_alert_cycles",
+        "_alerts",
+        "_bus",
+        "_dialect",
+        "_events",
+        "_every_fresh",
+        "_hardware_errors",
+        "_idle",
+        "_life",
+        "_line_lost",
+        "_missing",
+        "_noise_at_ns",
+        "_noise_seen",
+        "_offline",
+        "_plan",
+        "_read_last",
+        "_reading",
+        "_reported_errors",
+        "_rows",
+        "_samples",
+        "_shown",
+        "_slow",
+        "_strained",
+        "_unrequested_at_ns",
+        "_unrequested_seen",
+        "desired",
+        "goals",
+        "reads",
+        "watchdogs",
+    )
+
+    def __init__(  # noqa: PLR0917  what a bus consists of
+        self, plan: BusPlan, bus: Bus, idle: Gaps, events: EventSink, states: States, samples: BusSamples
+    ) -> None:
+        count = len(plan.servos)
+        self._plan = plan
+        self._bus = bus
+        self._idle = idle
+        self._events = events
+        self._samples = samples
+        self._shown = states.hardware_error
+        self._rows = [servo.row for servo in plan.servos]
+        self._dialect = dialect_of(plan.protocol)
+        self._every_fresh = b"\1" * count
+        self.goals = GoalArrays(plan)
+        """Builds the sync write."""
+        self.reads = CyclicReads(plan, samples)
+        """The job that reads every servo once."""
+        self._life = Life(plan, self.reads, events, idle.now_ns)
+        self.desired = DesiredState(plan, idle, self.goals, self._life, states.mode, events)
+        """Modes and registers that the servos shall have."""
+        self.watchdogs = WatchdogMonitor(plan, idle, self._life, self.desired, events)
+        """Whether the Bus Watchdogs receive enough instructions."""
+        self._offline = Offline(plan, idle, self._life, self.desired)
+        self._slow = SlowRegisters(plan, idle, self._life, self._offline, states)
+        self._missing = False  # a newest reply is
+        self._reported_errors = [0] * count  # error byte of each servo
+        self._alerts: list[int] = []  # servos with an alert whose hardware error was not read yet
+        self._alert_cycles = 0
+        self._hardware_errors = [0] * count
+        self._strained: list[int] = []  # of Protocol 1.0, servos that may have shut down
+        self._reading = False  # one of these waits for idle time
+        self._read_last = 0
+        self._noise_seen = 0
+        self._noise_at_ns = -NOISE_EVENT_NS
+        self._unrequested_seen = 0
+        self._unrequested_at_ns = -UNREQUESTED_EVENT_NS
+        self._line_lost = False
+
+    @property
+    def torqued(self) -> NDArray[np.bool_]:
+        """Shape (servos,): the servos that get goals."""
+        return self._life.torqued
+
+    @property
+    def ceiling(self) -> Floats:
+        """The highest speed of each servo toward a position, rad/s; NaN: none."""
+        return self._life.ceiling
+
+    @property
+    def silent(self) -> list[str]:
+        """Names of the servos whose newest reply did not arrive."""
+        servos = zip(self._plan.servos, self.reads.missed, strict=True)
+        return [self._plan.label(servo) for servo, missed in servos if missed]
+
+    # Start and end
+
+    def engaged(self) -> None:
+        """Take every servo for one that holds where it stands, as the start-up has read back."""
+        for index in range(len(self._rows)):
+            self._life.on(index, Event.ENGAGED)
+
+    def confirmed(self) -> None:
+        """Let every servo get goals: its torque was read again behind the first states."""
+        for index, servo in enumerate(self._plan.servos):
+            self._life.on(index, Event.TORQUE_ON)
+            self.desired.entered(index, servo.start_mode)
+
+    def watch(self) -> Program[list[str]]:
+        """Read every servo's clock for the first time, and arm the Bus Watchdogs; return what went wrong.
+
+        The last step of the start: from now on the exchange must not stop.
+        """
+        for index in range(len(self._rows)):
+            yield from self._offline.tick(index)
+        return (yield from self.watchdogs.arm())
+
+    def withhold_goals(self) -> None:
+        """Send no goals any more: torque is being switched off."""
+        for index in range(len(self._rows)):
+            self._life.on(index, Event.DOUBT)
+
+    def let_go(self, rows: Collection[int]) -> None:
+        """Switch the torque of joints off for the rest of the run, of an offline servo when it is back."""
+        for index, row in enumerate(self._rows):
+            if row in rows and self._life.latch(index) is State.LATCHED:
+                self._offline.switch_off(index)
+
+    # The line
+
+    def lost(self, text: str) -> None:
+        """Report once that the line is gone."""
+        if not self._line_lost:
+            self._line_lost = True
+            self._events.emit(EventCode.PORT_LOST, Severity.ERROR, self._plan.name, text)
+
+    def found(self) -> None:
+        """Report that the line is back: its servos were without a host, and maybe without power."""
+        self._line_lost = False
+        for index in range(len(self._rows)):
+            self._life.lose(index)
+        text = f"bus {self._plan.name} is back; its servos count as rebooted"
+        self._events.emit(EventCode.PORT_BACK, Severity.WARNING, self._plan.name, text)
+
+    def _report_noise(self, now_ns: int) -> None:
+        name = self._plan.name
+        count = self._bus.noise_bytes - self._noise_seen
+        if count and now_ns - self._noise_at_ns >= NOISE_EVENT_NS:
+            self._noise_seen, self._noise_at_ns = self._bus.noise_bytes, now_ns
+            text = f"{counted(count, 'byte', 'bytes')} belonged to no packet"
+            self._events.emit(EventCode.BUS_NOISE, Severity.WARNING, name, text)
+        count = self._bus.unrequested - self._unrequested_seen
+        if count >= LEAST_UNREQUESTED and now_ns - self._unrequested_at_ns >= UNREQUESTED_EVENT_NS:
+            self._unrequested_seen, self._unrequested_at_ns = self._bus.unrequested, now_ns
+            text = (
+                f"{count} packets on bus {name} answer no request of this run: another program or another "
+                "computer writes on the line; stop it, or its commands move these servos too"
+            )
+            self._events.emit(EventCode.UNREQUESTED, Severity.WARNING, name, text)
+
+    # A cycle
+
+    def settle(self, now_ns: int) -> None:
+        """Report what changed with this cycle's replies."""
+        if self._missing or self._samples.fresh.tobytes() != self._every_fresh:
+            self._count_losses(now_ns)
+            self._missing = any(self.reads.missed)
+        elif self._rows:
+            self.arrived(int(self._samples.at_ns[-1]), self._bus.due_ns)
+        if self.reads.errors != self._reported_errors:
+            self._report_errors()
+
+    def arrived(self, at_ns: int, due_ns: int) -> None:
+        """Record when the last reply of a cycle came and when it was due; see `Gaps.came`."""
+        self._idle.came(at_ns, due_ns)
+
+    def prepare_goals(self, goals: Commands, states: States) -> None:
+        """Let the returning servos that have caught up follow their goals as fast as these say."""
+        if State.RETURNING not in self._life.states:
+            return
+        for index, row in enumerate(self._rows):
+            off = abs(goals.position[row] - states.position[row])
+            if self._life.states[index] is State.RETURNING and off < CAUGHT_UP:
+                self._life.on(index, Event.CAUGHT_UP)
+
+    def _count_losses(self, now_ns: int) -> None:
+        reads, life, missed = self.reads, self._life, self.reads.missed
+        for index, fresh in enumerate(self._samples.fresh.tolist()):
+            if life.offline(index):
+                continue
+            if fresh:
+                if missed[index]:
+                    lost = "1 reply was" if missed[index] == 1 else f"{missed[index]} replies in a row were"
+                    missed[index] = 0
+                    text = f"answers again; {lost} lost"
+                    life.report(EventCode.READ_BACK, Severity.INFO, index, text)
+                continue
+            if not reads.asks(index):
+                continue
+            missed[index] += 1
+            life.on(index, Event.DOUBT)
+            if missed[index] == 1:
+                how = "sent a garbled reply" if reads.garbled[index] else "did not answer"
+                life.report(EventCode.READ_LOST, Severity.WARNING, index, how)
+            elif missed[index] >= LOST_CYCLES and now_ns - self._samples.at_ns[index] >= LOST_AGE_NS:
+                text = f"missed {missed[index]} replies in a row; it is probed once a second until"
+                life.report(EventCode.SERVO_LOST, Severity.ERROR, index, f"{text} it is in order")
+                life.lose(index, FIRST_PROBE_NS)
+
+    def _report_errors(self) -> None:
+        for index, error in enumerate(self.reads.errors):
+            before = self._reported_errors[index]
+            if error == before:
+                continue
+            if self._dialect.ALERT:
+                if error & ~before & self._dialect.ALERT and index not in self._alerts:
+                    self._alerts.append(index)
+                elif not error & self._dialect.ALERT:
+                    self._hardware_errors[index] = self._shown[self._rows[index]] = 0
+            else:
+                self._shown[self._rows[index]] = error & FORBIDDEN
+                if error & ~before & _SHUTS_DOWN and index not in self._strained:
+                    self._strained.append(index)
+            self._reported_errors[index] = error
+            severity = Severity.ERROR if error else Severity.INFO
+            text = f"reports {self._dialect.describe_error(error)}"
+            self._life.report(EventCode.SERVO_ERROR, severity, index, text)
+
+    # Idle time
+
+    def look(self) -> None:
+        """Let the coming idle time read what is due beside the cyclic reads, one servo at a time.
+
+        That is the hardware error of a servo that raised an alert, the torque limit of one that may have shut
+        down, and torque enable of one that waits for its goals. Only a servo that answers is read.
+        """
+        self._report_noise(self._idle.now_ns())
+        self._offline.look()
+        self._slow.look()
+        if not self._reading and (due := self._due()) is not None:
+            index, what, program = due
+            self._reading, self._read_last = True, index
+            name = f"{what} of {self._plan.label(self._plan.servos[index])}"
+            self._idle.add(program, Urgency.REPAIR, name, index)
+
+    def _due(self) -> tuple[int, str, Program[None]] | None:
+        """Return the servo that is read next, what of it, and the program; None: nothing is due."""
+        if any(self._reported_errors) or self._alert_cycles:
+            self._repeat_alerts()
+        servos, fresh, line = self._plan.servos, self._samples.fresh, plan_line(self._plan)
+        for index in self._alerts:
+            address = servos[index].hardware_error_address
+            if address is not None and fresh[index]:
+                read = line.read(servos[index].servo_id, address, 1)
+                return index, "hardware error status", self._read_hardware_error(index, read)
+        for index in self._strained:
+            limit = servos[index].torque_limit
+            if limit is not None and fresh[index]:
+                read = line.read(servos[index].servo_id, limit.address, limit.size)
+                return index, limit.name, self._read_torque_limit(index, read, limit.name)
+        states = self._life.states
+        if State.HOLDING in states or State.STOPPED in states:
+            for offset in range(1, len(servos) + 1):
+                index = (self._read_last + offset) % len(servos)
+                if states[index] in IN_DOUBT and fresh[index]:
+                    return index, "torque enable", self._read_torque(index)
+        return None
+
+    def _repeat_alerts(self) -> None:
+        """Read the hardware error of each servo whose alert stands again now and then."""
+        bit = self._dialect.ALERT
+        standing = [index for index, error in enumerate(self._reported_errors) if error & bit]
+        self._alert_cycles = self._alert_cycles + 1 if standing else 0
+        if self._alert_cycles >= ALERT_AGAIN:
+            self._alert_cycles = 0
+            self._alerts += [index for index in standing if index not in self._alerts]
+
+    def _read(self, transaction: Transaction) -> Generator[Transaction, Reply, Reply]:
+        """Carry out a read that was due; the next one may follow."""
+        reply = yield transaction
+        self._reading = False
+        return reply
+
+    def _read_torque(self, index: int) -> Program[None]:
+        """Give goals again to a servo with torque, and none to one without."""
+        reply = yield from self._read(self._plan.torque_reads[index])
+        if not reply.answered or self._life.states[index] not in IN_DOUBT:
+            return  # lost or latched meanwhile: its return decides, or nothing gives it goals any more
+        enabled = reply.parameters[0]
+        if enabled == 1:
+            self._life.on(index, Event.TORQUE_ON)
+            return
+        if self._hardware_errors[index] or self._reported_errors[index] & self._dialect.ALERT:
+            self._life.on(index, Event.TORQUE_OFF)  # a shutdown, whose reason was reported
+        else:
+            self._life.lose(index).limp_reported = True  # it may have started anew
+        self._life.report_limp(index, enabled)
+
+    def _read_torque_limit(self, index: int, read: Transaction, name: str) -> Program[None]:
+        """Give no more goals to a servo of Protocol 1.0 that shut down: its torque enable stays 1."""
+        reply = yield from self._read(read)
+        if not reply.answered:
+            return
+        self._strained.remove(index)
+        if not any(reply.parameters) and not self._life.offline(index):
+            self._life.on(index, Event.TORQUE_OFF)
+            text = f"has {name} = 0: it shut down, and gets no goals until the next run"
+            self._life.report(EventCode.SERVO_LIMP, Severity.ERROR, index, text)
+
+    def _read_hardware_error(self, index: int, read: Transaction) -> Program[None]:
+        """Report a hardware error that is new; its shutdown may have cut the torque."""
+        reply = yield from self._read(read)
+        if not reply.answered:
+            return
+        self._alerts.remove(index)
+        error = reply.parameters[0]
+        if error == self._hardware_errors[index]:
+            return
+        self._hardware_errors[index] = self._shown[self._rows[index]] = error
+        self._life.on(index, Event.DOUBT)
+        address = self._plan.servos[index].hardware_error_address
+        text = f"has Hardware Error Status ({address}) = {error}: {describe_hardware_error(error)}"
+        self._life.report(EventCode.SERVO_ERROR, Severity.ERROR, index, text)

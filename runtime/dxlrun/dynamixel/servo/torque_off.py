@@ -1,0 +1,205 @@
+"""Torque off on every servo, acknowledged and read back: the last that is sent on every way out of a run.
+
+Where a robot is left with its torque on instead, `stand` stops the joints that follow no position. Needs
+neither numpy nor the loop: the guardian does both after the loop died.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+from dxlrun.clock import Clock
+from dxlrun.dynamixel.exchange.bus import Bus
+from dxlrun.dynamixel.exchange.pump import run
+from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
+from dxlrun.dynamixel.plan.line import listen
+from dxlrun.dynamixel.port.ports import Ports
+from dxlrun.dynamixel.servo import modes
+from dxlrun.dynamixel.servo.retry import retry
+from dxlrun.dynamixel.wire.transaction import Outcome, Program, Reply, Transaction
+from dxlrun.mode import Mode
+from dxlrun.run.channels.packets import PacketSink
+
+LONGER_NS = (0, 60_000_000, 180_000_000)
+"""A write and its read-back are tried so often, and the read-back is awaited so much longer each time.
+
+Noise rarely hits three times, and hosts and adapters rarely stall for so long; a cut cable always does.
+"""
+LATE_NS = 20_000_000
+"""After silence: what was requested twice is answered twice, and the log is to have all of it."""
+SETTLE_NS = 500_000
+"""Time that a half-sent reply may still take: it would collide with the broadcast."""
+_HOLD = (Mode.POSITION, Mode.EFFORT_POSITION)
+"""Modes in which a servo holds its last goal by itself; in the others it keeps moving."""
+
+
+@dataclass(frozen=True, slots=True)
+class LimpOutcome:
+    """What came of torque off for one servo."""
+
+    bus: str
+    joint: str
+    servo_id: int
+    confirmed: bool
+    """True when torque enable was read back as 0."""
+    detail: str
+    """Why it was not confirmed."""
+
+    def __str__(self) -> str:
+        return f"{self.joint} (ID {self.servo_id} on bus {self.bus}): {self.detail}"
+
+
+def limp(
+    plans: Sequence[BusPlan],
+    ports: Ports,
+    clock: Clock,
+    packets: PacketSink,
+    *,
+    limit_ns: int = 1_000_000_000,
+    beat: Callable[[], None] = lambda: None,
+) -> tuple[LimpOutcome, ...]:
+    """Drain the lines and switch torque off on every servo, on ports that were just taken over.
+
+    `limit_ns` bounds the retries, counted from now; `beat` is called while replies are awaited. Raises
+    nothing: a line that is gone is in the outcome.
+    """
+    buses = _buses(plans, ports, clock, packets)
+    return limp_buses(plans, buses, ports, clock, deadline_ns=clock.now_ns() + limit_ns, beat=beat)
+
+
+def limp_buses(
+    plans: Sequence[BusPlan],
+    buses: Sequence[Bus],
+    ports: Ports,
+    clock: Clock,
+    *,
+    deadline_ns: int,
+    beat: Callable[[], None] = lambda: None,
+) -> tuple[LimpOutcome, ...]:
+    """Switch torque off on all lines at once and return what came of it, per servo; raises nothing."""
+    results = run([_limp(plan, clock.now_ns, deadline_ns) for plan in plans], buses, ports, clock, beat)
+    outcomes: list[LimpOutcome] = []
+    for plan, bus, result in zip(plans, buses, results, strict=True):
+        gone = f"torque off could not be sent: {bus.failure}"
+        outcomes += result if result is not None else (_outcome(plan, servo, gone) for servo in plan.servos)
+    return tuple(outcomes)
+
+
+def stand(
+    plans: Sequence[BusPlan],
+    ports: Ports,
+    clock: Clock,
+    packets: PacketSink,
+    beat: Callable[[], None] = lambda: None,
+) -> tuple[str, ...]:
+    """Stop every joint that has torque and follows a velocity, an effort or a PWM; return a sentence each.
+
+    One that does not take a goal of 0 loses its torque, as one whose mode cannot be read. Raises nothing.
+    """
+    found = run([_stand(plan) for plan in plans], _buses(plans, ports, clock, packets), ports, clock, beat)
+    return tuple(sentence for one in found for sentence in one or ())
+
+
+def _limp(plan: BusPlan, now_ns: Callable[[], int], deadline_ns: int) -> Program[tuple[LimpOutcome, ...]]:
+    """Switch torque off everywhere on one bus: all at once first, then servo by servo with read-back.
+
+    Each servo that did not confirm is tried again when the others had their turn. After `deadline_ns` none is
+    tried again, but each at least once.
+    """
+    yield listen(SETTLE_NS)
+    for broadcast in plan.limp:
+        if not broadcast.awaited:
+            yield broadcast
+    writes = _torque_off_writes(plan)
+    details = dict.fromkeys(range(len(plan.servos)), "it was not tried")
+    late = False
+    for longer_ns in LONGER_NS:
+        for index in [index for index, detail in details.items() if detail]:
+            if longer_ns and now_ns() >= deadline_ns:
+                break
+            acknowledged = yield writes[index]
+            back = yield _torque_read(plan, index, longer_ns)
+            details[index] = _detail(acknowledged, back)
+            late = late or not (acknowledged.answered and back.answered)
+    if late:
+        yield listen(LATE_NS)
+    return tuple(_outcome(plan, servo, details[index]) for index, servo in enumerate(plan.servos))
+
+
+def _stand(plan: BusPlan) -> Program[list[str]]:
+    yield listen(SETTLE_NS)
+    sentences: list[str] = []
+    left: dict[int, str] = {}
+    for index, servo in enumerate(plan.servos):
+        problem = yield from _stop(plan, index)
+        if problem is None:
+            continue
+        if not problem:
+            sentences.append(f"{plan.label(servo)} stands: its goal is 0")
+        elif (yield from _off(plan, index, LONGER_NS[0])):
+            sentences.append(f"{plan.label(servo)} has no torque, as {problem}")
+        else:
+            left[index] = problem
+    for longer_ns in LONGER_NS[1:]:  # only now: a servo that still moves does not wait for a silent one
+        for index, problem in list(left.items()):
+            if (yield from _off(plan, index, longer_ns)):
+                del left[index]
+                sentences.append(f"{plan.label(plan.servos[index])} has no torque, as {problem}")
+    for index, problem in left.items():
+        name = plan.label(plan.servos[index])
+        sentences.append(f"{name} may keep moving: {problem}, and torque off was not confirmed")
+    return sentences
+
+
+def _stop(plan: BusPlan, index: int) -> Program[str | None]:
+    """Stop a servo; return why it does not stand, empty when it does, None where nothing was to be done."""
+    servo = plan.servos[index]
+    mode = yield from modes.mode_now(plan, servo)
+    if mode in _HOLD:
+        return None
+    torque = yield from retry(plan.torque_reads[index])
+    if torque.answered and torque.parameters[0] == 0:
+        return None
+    if mode is Mode.UNKNOWN:
+        return "its mode is not known"
+    return (yield from modes.hold(plan, servo, servo.mode_plan(mode))).problem
+
+
+def _off(plan: BusPlan, index: int, longer_ns: int) -> Program[bool]:
+    """Switch a servo's torque off; return whether that was read back."""
+    yield _torque_off_writes(plan)[index]
+    back = yield _torque_read(plan, index, longer_ns)
+    return back.answered and back.parameters[0] == 0
+
+
+def _torque_off_writes(plan: BusPlan) -> list[Transaction]:
+    """Return the acknowledged writes, in the order of the plan's servos."""
+    return [write for write in plan.limp if write.awaited]
+
+
+def _torque_read(plan: BusPlan, index: int, longer_ns: int) -> Transaction:
+    read = plan.torque_reads[index]
+    return replace(read, timeout_ns=read.timeout_ns + longer_ns)
+
+
+def _detail(acknowledged: Reply, back: Reply) -> str:
+    if back.answered:
+        enabled = back.parameters[0]
+        return "" if enabled == 0 else f"torque enable reads {enabled} after torque off was written"
+    if acknowledged.answered:
+        return "torque off was acknowledged, but the read-back got no answer"
+    if Outcome.GARBLED in (acknowledged.outcome, back.outcome):
+        return "torque off was sent, but only garbled bytes came back"
+    return "torque off was sent, but the servo does not answer"
+
+
+def _outcome(plan: BusPlan, servo: ServoPlan, detail: str) -> LimpOutcome:
+    return LimpOutcome(plan.name, servo.joint, servo.servo_id, not detail, detail)
+
+
+def _buses(plans: Sequence[BusPlan], ports: Ports, clock: Clock, packets: PacketSink) -> list[Bus]:
+    return [
+        Bus(index, plan, port, clock, packets)
+        for index, (plan, port) in enumerate(zip(plans, ports.ports, strict=True))
+    ]
