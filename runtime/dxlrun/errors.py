@@ -17,8 +17,9 @@ Exception
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Literal
 
 
@@ -79,10 +80,22 @@ class PortError(DxlrunError, OSError):
 
 
 class Refused(DxlrunError):
-    """A running robot refused a request; the message gives the reason and a request that would work."""
+    """A running robot refused a request; the message gives the reason and a request that would work.
 
-    def __init__(self, sentence: str, *, wrong_input: bool = False) -> None:
+    `code` names the reason and `fields` are its data, for programs: their names stay, the wording may change.
+    """
+
+    def __init__(
+        self,
+        sentence: str,
+        *,
+        code: str = "",
+        fields: Mapping[str, object] = MappingProxyType({}),
+        wrong_input: bool = False,
+    ) -> None:
         super().__init__(sentence)
+        self.code = code
+        self.fields = fields
         self.exit_code = InputError.exit_code if wrong_input else DxlrunError.exit_code
 
 

@@ -23,6 +23,7 @@ from dxlrun.compile import compile_files
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.remote.preparation import Preparation
+from dxlrun.run.channels.answers import Done
 from dxlrun.run.channels.commands import Command
 from dxlrun.run.channels.events import EventCode
 from dxlrun.run.run_summary import RunOptions, RunSummary
@@ -282,15 +283,15 @@ def test_architecture_md_its_command_and_its_reply_are_these_bytes(tmp_path: Pat
     plan = plan_of(ROOT / "robots/bioloid_torso.yaml")
     preparation = Preparation({joint.name: joint for joint in plan.loop.joints}, load_plugins())
     (head,) = (one for one in plan.loop.controllers if one.name == controller)
-    body = Written.read(words, None).in_si()
-    prepared = preparation.command(head, kind, json.dumps(body).encode())
+    body = json.dumps(Written.read(words, None).data).encode()
+    prepared = preparation.command(head, kind, body, units=True)
     assert (len(prepared.data), prepared.beyond) == (32, ())
     log = tmp_path / "torso.mcap"
     robot = simulated_robot(ROOT / "robots/bioloid_torso.yaml", duration_s=2.5, log=log)
     sent = Command(1, controller, kind, prepared.data, "a reader")
     robot.buses[0].at(2_000_000_000, lambda: robot.inbox.waiting.append(sent))
     robot.run()
-    assert robot.inbox.answers == {1: ""}
+    assert isinstance(robot.inbox.answers[1], Done)
     entries = robot.ledger.entries
     assert [one.data for one in entries if one.direction == "in"].count(wanted) == 2  # once more, as it says
     (at,) = (index for index, one in enumerate(entries) if one.data == reply)

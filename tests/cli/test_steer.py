@@ -147,7 +147,7 @@ def test_a_robot_that_went_away_is_said(dxlrun, torso: RemoteRobot, monkeypatch:
 
 def test_send_moves_the_joints_that_are_named_with_units(dxlrun, torso: RemoteRobot) -> None:
     said = dxlrun("send", "head", "posvel", "positions=[20 deg, -30 deg]", "velocities=[1 rad/s, 30 rpm]")
-    assert said == (0, "bioloid_torso: head has taken posvel\n", "")
+    assert said == (0, "bioloid_torso: head accepted posvel\n", "")
     until(torso, "head_yaw_joint", -0.5236)
     until(torso, "head_pitch_joint", 0.3491)
 
@@ -168,46 +168,73 @@ def test_send_takes_a_file(dxlrun, torso: RemoteRobot, tmp_path: Path) -> None:
     file = tmp_path / "wave.yaml"
     file.write_text("points:\n  - {time: 200 ms, positions: [0.1 rad, 0 deg, 10 deg]}\n")
     said = dxlrun("send", "left_arm", "trajectory", "--file", file, "--json")
-    assert said == (0, '{"robot": "bioloid_torso", "done": true}\n', "")
+    done = json.loads(said.out)
+    assert (said.code, said.err, done["robot"], done["done"]) == (0, "", "bioloid_torso", True)
+    assert 0 < done["cycle"] <= torso.info()["cycles"]
     until(torso, "left_elbow_joint", 0.1745)
 
 
-def test_what_no_motion_is_made_of_is_sent_as_it_was_written(
-    dxlrun, torso: RemoteRobot, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    grip = {"properties": {"positions": {}, "force": {}}}
-    hand = {"controllers": [{"name": "hand", "takes": {"grip": grip}}]}
-    sent: list[object] = []
-    monkeypatch.setattr(RemoteRobot, "info", lambda robot: hand)
-    monkeypatch.setattr(RemoteRobot, "send", lambda robot, *what: sent.append(what))
-    assert dxlrun("send", "hand", "grip", "positions=[30]", "force=5 N").code == 0
-    assert sent == [("hand", "grip", {"positions": [30], "force": "5 N"})]
+def test_a_command_is_one_request(dxlrun, torso: RemoteRobot, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+    ask = RemoteRobot._ask
+
+    def count(robot: RemoteRobot, method: str, path: str, *content: object) -> dict[str, object]:
+        asked.append(f"{method} {path}")
+        return ask(robot, method, path, *content)
+
+    monkeypatch.setattr(RemoteRobot, "_ask", count)
+    assert (
+        dxlrun("send", "head", "posvel", "positions=[0 deg, 0 deg]", "velocities=[1 rad/s, 1 rad/s]").code
+        == 0
+    )
+    assert dxlrun("switch", "--activate", "head", "--deactivate", "head").code == 0
+    assert asked == ["POST /controllers/head/commands/posvel?units=true", "POST /switch"]
 
 
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        ("send heat posvel", "bioloid_torso has no controller heat; did you mean head?"),
+        ("send heat posvel", "there is no controller heat; did you mean head?"),
         ("send head possvel", "head takes no command possvel; did you mean posvel?"),
         ("send joint_state_broadcaster go", "joint_state_broadcaster takes no command go; there is none"),
         ("send head posvel positions=[30,0]", "positions[0]: 30 has no unit; write an angle with its unit"),
         ("send head posvel positions=[30deg,0deg]", "posvel of head has no velocities; add"),
-        ("send joint_state_broadcaster go now=.nan", "takes no command go"),
         ("send head posvel positions=[1deg] force=.nan", "this cannot be sent"),
         ("send head posvel positions=[1deg] velocities=[1rpm]", "1 positions for 2 joints"),
         (
             "switch --activate hed --deactivate left_arn",
-            "bioloid_torso has no controller left_arn; did you mean",
+            "there is no controller hed, left_arn; hed: did you mean head?; left_arn: did you mean left_arm?",
         ),
-        ("unload spar", "bioloid_torso has no controller spar; known: "),
+        ("unload spar", "there is no controller spar; known: "),
         ("load spare type=joint_state_brodcaster", "did you mean joint_state_broadcaster?"),
         ("pause --robot torso", "no robot torso runs; known: bioloid_torso"),
     ],
 )
-def test_a_wrong_wish_is_wrong_input(dxlrun, torso: RemoteRobot, words: str, sentence: str) -> None:
+def test_a_wrong_request_is_wrong_input(dxlrun, torso: RemoteRobot, words: str, sentence: str) -> None:
     said = dxlrun(*words.split())
     assert (said.code, said.out) == (2, "")
     assert sentence in said.err
+
+
+def test_a_refusal_has_its_code_and_its_fields_for_programs(dxlrun, torso: RemoteRobot) -> None:
+    said = dxlrun("switch", "--activate", "head", "--json")
+    (error,) = json.loads(said.out)["errors"]
+    assert (said.code, error) == (
+        1,
+        {
+            "what": "head is active already",
+            "code": "active_already",
+            "fields": {"controller": ["head"]},
+        },
+    )
+    said = dxlrun("send", "heat", "posvel", "--json")
+    (error,) = json.loads(said.out)["errors"]
+    assert (said.code, error["code"], error["fields"]["controller"]) == (2, "unknown_controller", ["heat"])
+    said = dxlrun(
+        "send", "head", "posvel", "positions=[400 deg, 0 deg]", "velocities=[1 rpm, 1 rpm]", "--json"
+    )
+    (error,) = json.loads(said.out)["errors"]
+    assert (said.code, error["code"], error["fields"]["joints"]) == (2, "beyond_limits", ["head_pitch_joint"])
 
 
 @pytest.mark.parametrize(
@@ -235,17 +262,14 @@ def test_what_the_loop_refuses_is_a_failure_with_its_reason(
 def test_a_switch_hands_joints_over(dxlrun, torso: RemoteRobot) -> None:
     words = "--activate whole_body_position --deactivate head left_arm right_arm"
     said = dxlrun("switch", *words.split())
-    assert (
-        said.out
-        == "bioloid_torso: whole_body_position active; head, left_arm, right_arm not active any more\n"
-    )
+    assert said.out == "bioloid_torso: whole_body_position activated; head, left_arm, right_arm deactivated\n"
     active = [name for name, one in controllers(torso).items() if one["active"]]
     assert active == ["joint_state_broadcaster", "whole_body_position"]
 
 
 def test_a_controller_that_is_switched_off_and_on_has_begun_anew(dxlrun, torso: RemoteRobot) -> None:
     said = dxlrun("switch", "--activate", "head", "--deactivate", "head", "left_arm")
-    assert said.out == "bioloid_torso: left_arm not active any more; head begun anew\n"
+    assert said.out == "bioloid_torso: left_arm deactivated; head restarted\n"
 
 
 def test_a_rate_holds_at_once(dxlrun, torso: RemoteRobot) -> None:
@@ -255,7 +279,9 @@ def test_a_rate_holds_at_once(dxlrun, torso: RemoteRobot) -> None:
 
 
 def test_a_pause_is_when_controllers_are_loaded_and_unloaded(dxlrun, torso: RemoteRobot) -> None:
-    assert dxlrun("pause").out == ("bioloid_torso is paused, its joints are held; `dxlrun resume` goes on\n")
+    assert dxlrun("pause").out == (
+        "bioloid_torso is paused, its joints are held; `dxlrun resume` ends that\n"
+    )
     assert dxlrun("list").out.startswith("bioloid_torso: 50 Hz, paused, ")
     said = dxlrun("load", "spare", "type=joint_group_position_controller", "joints=[head_yaw_joint]")
     assert said == (
@@ -266,7 +292,7 @@ def test_a_pause_is_when_controllers_are_loaded_and_unloaded(dxlrun, torso: Remo
     assert dxlrun("unload", "spare").err == "dxlrun: spare is active; deactivate it first\n"
     assert dxlrun("switch", "--deactivate", "spare", "--activate", "head").code == 0
     assert dxlrun("unload", "spare").out == "bioloid_torso: spare is unloaded\n"
-    assert dxlrun("resume").out == "bioloid_torso goes on\n"
+    assert dxlrun("resume").out == "bioloid_torso runs again\n"
     assert torso.info()["paused"] is False
     assert "spare" not in controllers(torso)
 

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.cli.steering.robots import command, controllers, headline, state
-from dxlrun.cli.steering.written import Written, is_played
+from dxlrun.cli.steering.steer import command, controllers, headline, state
+from dxlrun.cli.steering.written import Written
+from dxlrun.errors import InputError, Refused
 
 NOBODY = "dxlrun: no robot runs that could be steered; `dxlrun ROBOT.yaml` starts one"
 
@@ -50,11 +51,11 @@ def test_a_list_of_no_robots_is_no_failure(dxlrun, nobody: None) -> None:
         (("rate", "0"), "0 is no rate; give a number of Hz above 0"),
         (("rate", "nan"), "nan is no rate; give a number of Hz above 0"),
         (("rate", "inf"), "inf is no rate; give a number of Hz above 0"),
-        (("send", "head", "posvel", "fast"), "'fast' says nothing; write key=value, such as"),
-        (("send", "head", "posvel", "p q=1"), "'p q=1' says nothing; write key=value"),
+        (("send", "head", "posvel", "fast"), "'fast' has no key; write key=value, such as"),
+        (("send", "head", "posvel", "p q=1"), "'p q=1' has no key; write key=value"),
         (("send", "head", "posvel", "a=[1"), "a comma is missing, or a bracket"),
         (("send", "head", "posvel", "a=1", "a=2"), "a was already given"),
-        (("send", "head", "posvel", "a=1", "--file", "f.yaml"), "'a=1' and --file say two things"),
+        (("send", "head", "posvel", "a=1", "--file", "f.yaml"), "'a=1' and --file exclude each other"),
         (("load", "spare", "joints=[a]"), "spare has no type; give it one, such as type="),
         (("list", "--robot", "torso"), "no robot torso runs; there is none"),
     ],
@@ -82,68 +83,33 @@ def test_a_wrong_file_is_said_with_its_places(dxlrun, nobody: None, tmp_path: Pa
 # What is written
 
 
-def test_quantities_become_si() -> None:
-    words = ["points=[{time: 500 ms, positions: [180 deg, -1 rad], velocities: [60 deg/s, 30 rpm]}]"]
-    assert Written.read([*words, "start_in=1 min"], None).in_si() == {
-        "points": [
-            {
-                "time": 0.5,
-                "positions": [pytest.approx(3.14159265), -1.0],
-                "velocities": [pytest.approx(1.04719755), pytest.approx(3.14159265)],
-            }
-        ],
-        "start_in": 60.0,
-    }
+WRONG = {
+    "paths": ["/positions/0", "/velocities/0"],
+    "problems": ["positions[0]: no unit; add it", "v: no; b"],
+}
 
 
-def test_what_is_no_quantity_stays_as_it_was_written() -> None:
-    words = ["label=30 deg", "count=3", "loud=true", "empty=", "positions=[null]"]
-    assert Written.read(words, None).in_si() == {
-        "label": "30 deg", "count": 3, "loud": True, "empty": None, "positions": [None],
-    }  # fmt: skip
-
-
-def test_efforts_and_pwm_are_numbers_and_text_there_is_explained() -> None:
-    assert Written.read(["positions=[0 deg]", "efforts=[0.1]"], None).in_si() == {
-        "positions": [0.0], "efforts": [0.1],
-    }  # fmt: skip
-    with pytest.raises(ValueError, match=r"efforts.*'100 mA' is text; write the number in what the model"):
-        Written.read(["efforts=[100 mA]"], None).in_si()
-    with pytest.raises(ValueError, match=r"pwm.*'20 %' is text; write the fraction of the full voltage"):
-        Written.read(["pwm=[20 %]"], None).in_si()
-
-
-def test_every_missing_unit_is_said_at_its_place(tmp_path: Path) -> None:
+def test_a_wrong_quantity_is_told_at_its_place_in_the_file(tmp_path: Path) -> None:
     file = tmp_path / "step.yaml"
-    file.write_text("positions:\n  - 30\n  - 1 rad/s\nvelocities: [true]\n")
-    with pytest.raises(ValueError, match="has no unit") as raised:
-        Written.read((), file).in_si()
-    assert str(raised.value).splitlines() == [
-        f"{file}:2:5: positions[0]: 30 has no unit; write an angle with its unit, such as 60 deg or 1.05 rad",
-        f"{file}:3:5: positions[1]: '1 rad/s' has the unit rad/s, which is not one of an angle; "
-        "write it as 60 deg or 1.05 rad",
-        f"{file}:4:14: velocities[0]: this is not an angular velocity; "
-        "write an angular velocity such as 2 rad/s, 30 deg/s or 5 rpm",
+    file.write_text("positions:\n  - 30\nvelocities: [true]\n")
+    refused = Refused("...", code="wrong_quantity", fields=WRONG, wrong_input=True)
+    located = Written.read((), file).located(refused)
+    assert isinstance(located, InputError)
+    assert str(located).splitlines() == [
+        f"{file}:2:5: positions[0]: no unit; add it",
+        f"{file}:3:14: v: no; b",
     ]
 
 
-@pytest.mark.parametrize(
-    ("kind", "keys", "played"),
-    [
-        ("positions", ("positions",), True),
-        ("posvel", ("positions", "velocities"), True),
-        ("trajectory", ("points", "start_in"), True),
-        ("grip", ("positions", "force"), False),
-        ("speeds", ("velocities",), True),
-        ("poseffort", ("positions", "efforts"), True),
-        ("pwm", ("pwm",), True),
-        ("reset", (), False),
-    ],
-)
-def test_only_what_standard_controllers_take_needs_units(
-    kind: str, keys: tuple[str, ...], played: bool
-) -> None:
-    assert is_played(kind, {"properties": {key: {} for key in keys}}) is played
+def test_wrong_quantities_of_the_command_line_are_a_line_each_and_keep_their_code() -> None:
+    refused = Refused("...", code="wrong_quantity", fields=WRONG, wrong_input=True)
+    located = Written.read(["positions=[30]", "velocities=[true]"], None).located(refused)
+    assert isinstance(located, Refused)
+    assert (str(located).splitlines(), located.code, located.exit_code) == (
+        WRONG["problems"], "wrong_quantity", 2,
+    )  # fmt: skip
+    other = Refused("no", code="not_active")
+    assert Written.read((), None).located(other) is other
 
 
 # What is listed

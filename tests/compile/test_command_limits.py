@@ -77,7 +77,9 @@ def trajectory(*points: tuple[float, tuple[float, float]], **more: object) -> Tr
 def test_each_value_beyond_a_limit_is_named_with_its_joint_and_the_limit(
     command: CommandModel, sentences: list[str]
 ) -> None:
-    assert beyond_limits(JOINTS, command) == sentences
+    found = beyond_limits(JOINTS, command)
+    assert [one.text for one in found] == sentences
+    assert [one.joint for one in found] == [sentence.split()[0] for sentence in sentences]
 
 
 def test_a_joint_of_which_no_limit_is_known_has_none() -> None:

@@ -125,5 +125,5 @@ def test_a_rate_at_which_the_watchdog_would_stop_the_servos_is_refused(tmp_path:
     path = tmp_path / "two.yaml"
     path.write_text(text())
     robot = simulated_robot(path, duration_s=0.1)
-    assert robot.robot.loop.change_rate(10) == "the Bus Watchdog needs at least 15 Hz"
-    assert robot.robot.loop.change_rate(50) == ""
+    assert robot.robot.loop.change_rate(10).text == "the Bus Watchdog needs at least 15 Hz"
+    assert robot.robot.loop.change_rate(50) is None

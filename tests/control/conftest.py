@@ -25,6 +25,7 @@ from dxlrun.control.loop_plan import (
     SchedulerPlan,
 )
 from dxlrun.mode import Mode
+from dxlrun.run.channels.answers import Refusal
 from dxlrun.run.channels.commands import LOOP, Command, QueueInbox
 from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
 from dxlrun.run.channels.events import EventCode, Severity
@@ -191,6 +192,19 @@ class Robot:
     def ask(self, kind: str, **data: Any) -> int:
         """Ask the loop itself for something; return the number."""
         return self.post(LOOP, kind, msgspec.json.encode(data) if data else b"")
+
+    @property
+    def refusals(self) -> dict[int, str]:
+        """Why commands were refused, by their numbers; empty: they were not."""
+        return {
+            number: answer.text if isinstance(answer, Refusal) else ""
+            for number, answer in self.inbox.answers.items()
+        }
+
+    def answer(self, number: int) -> Any:
+        """Return the answer to a command; of a refusal its code and its fields."""
+        answer = self.inbox.answers[number]
+        return (answer.code, answer.fields) if isinstance(answer, Refusal) else answer
 
     def take(self, command: Any) -> None:
         """Keep what the log gets."""

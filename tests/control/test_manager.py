@@ -242,14 +242,14 @@ def test_commands_come_at_the_first_cycle_that_is_not_too_early(robot):
     assert [cycle["command_count"] for cycle in robot.sink.cycles] == [0, 1, 1, 0]
 
 
-def test_commands_to_nobody_are_refused_in_words(robot):
+def test_commands_to_controllers_that_are_not_there_are_refused_in_words(robot):
     robot.script("asleep", idle, active=False)
     robot.send(0, "asleep", "go")
     robot.send(0, "unknown", "go")
     assert run(robot, 2).reason == "ended"
     assert robot.events.of(EventCode.COMMAND_REFUSED) == [
         ("asleep", "go from motion.yaml:7:5 refused: asleep is not active; switch to it first"),
-        ("unknown", "go from motion.yaml:7:5 refused: there is no such controller as unknown"),
+        ("unknown", "go from motion.yaml:7:5 refused: there is no controller unknown"),
     ]
 
 

@@ -11,6 +11,7 @@ from dxlrun.control.controllers.claims import claimed_modes, start_modes
 from dxlrun.control.controllers.mode_switch import PATIENCE_NS
 from dxlrun.control.loop_plan import JointPlan
 from dxlrun.mode import Mode, mode_of
+from dxlrun.run.channels.answers import Code, Done, Waiting
 from dxlrun.run.channels.events import EventCode
 
 PERIOD_NS = 20_000_000
@@ -32,6 +33,7 @@ class Story:
         self.slow = slow
         self.active: list[tuple[str, ...]] = []
         self.modes: list[list[int]] = []
+        self.answers: list[tuple[int, Any]] = []
         self._pending: dict[int, np.ndarray] = {}
 
     def run(self, cycles: int) -> Any:
@@ -53,6 +55,13 @@ class Story:
             story.active.append(robot.manager.active)
             story.at.get(cycle, lambda: None)()
 
+        answer = robot.inbox.answer
+
+        def keep(number: int, given: Any) -> None:
+            self.answers.append((robot.record.cycle, given))
+            answer(number, given)
+
+        robot.inbox.answer = keep
         robot.manager._modes._set_modes = set_modes
         hardware.idle = idle
         return robot.loop.run()
@@ -76,6 +85,7 @@ def test_the_leaving_one_is_out_at_once_and_the_entering_one_waits_for_its_modes
     story.at[2] = lambda: story.switch(["wheels"], ["arm"])
     story.run(10)
     assert story.active[2:9] == [("arm",), (), (), (), (), (), ("wheels",)]
+    assert story.answers == [(2, Waiting(("wheels",))), (7, Done(7))]
     assert story.robot.hardware.asked == [[VELOCITY, VELOCITY]]
     assert story.text(EventCode.MODE) == ["wheels: waits until its joints are in their modes"]
     last = story.robot.record
@@ -109,6 +119,9 @@ def test_joints_that_never_come_into_their_modes_keep_the_controller_out(story: 
     assert result.reason == "ended"
     (text,) = story.text(EventCode.COMMAND_REFUSED)
     assert text == "press: press is not activated: j1 did not come into effort mode within 5 s"
+    (_, waiting), (_, late) = story.answers
+    assert waiting == Waiting(("press",))
+    assert (late.code, late.fields["controller"]) == (Code.MODE_NOT_ENTERED, ("press",))
     assert story.active[-1] == ()
     assert story.robot.hardware.asked == [[0, EFFORT], [0, POSITION]]
 
@@ -123,6 +136,9 @@ def test_a_joint_that_refuses_its_mode_keeps_the_controller_out_at_once(story: S
     (text,) = story.text(EventCode.COMMAND_REFUSED)
     told = "j0 stays in position mode instead of velocity mode, nor did 1 more"
     assert text == f"wheels: wheels is not activated: {told}"
+    assert story.robot.answer(1) == (
+        Code.MODE_NOT_ENTERED, {"controller": ("wheels",), "problem": told},
+    )  # fmt: skip
     assert len(story.robot.hardware.asked) == 1
 
 
@@ -130,7 +146,8 @@ def test_what_waits_can_be_called_off_and_its_joints_go_to_rest(story: Story) ->
     story.at[2] = lambda: story.switch(["press"], ["arm"])
     story.at[4] = lambda: story.switch(["arm"], ["press"])
     story.run(12)
-    assert story.robot.inbox.answers == {1: "", 2: ""}
+    assert story.robot.answer(1) == (Code.SWITCHED_AGAIN, {"controller": "press"})
+    assert story.robot.answer(2) == Done(9)
     assert story.robot.hardware.asked == [[0, EFFORT], [0, POSITION]]
     assert story.active[-1] == ("arm",)
     assert not story.text(EventCode.COMMAND_REFUSED)
@@ -144,10 +161,27 @@ def test_who_waits_has_its_joints_and_gets_no_commands_yet(story: Story) -> None
         story.robot.post("wheels", "x"),
     )
     story.run(6)
-    answers = story.robot.inbox.answers
-    assert "wheels and press both command joint j1" in answers[2]
-    assert answers[3] == "wheels is active already"
-    assert answers[4] == "wheels is not active yet"
+    answers = [story.robot.answer(number) for number in (1, 2, 3, 4)]
+    assert answers[0] == (Code.RUN_ENDING, {})
+    code, fields = answers[1]
+    assert (code, fields["joints"], fields["holders"]) == (Code.JOINTS_CLAIMED, ("j1",), ("wheels",))
+    assert answers[2] == (Code.ACTIVE_ALREADY, {"controller": ("wheels",)})
+    assert answers[3] == (Code.NOT_ACTIVE_YET, {"controller": "wheels"})
+
+
+def test_a_controller_that_fails_when_its_modes_are_there_is_the_answer_to_its_switch(robot: Any) -> None:
+    def fails(self: Any, step: str, time_ns: int, _: object) -> None:
+        if step == "activate":
+            raise RuntimeError("no way")
+
+    robot.script("arm", holds, command=("position",))
+    robot.script("wheels", fails, command=("velocity",), active=False)
+    story = Story(robot, slow=3)
+    story.at[2] = lambda: story.switch(["wheels"], ["arm"])
+    story.run(10)
+    code, fields = robot.answer(1)
+    assert (code, fields["controller"]) == (Code.CONTROLLER_FAULT, "wheels")
+    assert "no way" in fields["problem"]
 
 
 def test_a_joint_that_nobody_claims_any_more_leaves_a_mode_in_which_it_would_not_hold(story: Story) -> None:
@@ -219,6 +253,6 @@ def test_a_controller_that_waits_for_its_modes_is_not_unloaded(story: Story) -> 
     story.at[2] = lambda: story.switch(["wheels"], ["arm"])
     story.at[3] = lambda: (ask("pause"), ask("unload", controller="wheels"), ask("resume"))
     story.run(10)
-    answers = story.robot.inbox.answers
+    answers = story.robot.refusals
     assert answers == {1: "", 2: "", 3: "wheels is active; deactivate it first", 4: ""}
     assert story.active[-1] == ("wheels",)

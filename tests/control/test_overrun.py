@@ -5,6 +5,7 @@ import pytest
 
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.control.overrun import OverrunHook
+from dxlrun.run.channels.answers import Code
 from dxlrun.run.channels.events import EventCode, Severity
 
 PERIOD_NS = 20_000_000
@@ -111,9 +112,9 @@ def test_another_rate_is_told_to_the_clock_which_polls_before_each_deadline(robo
     robot.build(end_ns=PERIOD_NS)
     told = []
     robot.loop.pace = told.append
-    assert robot.loop.change_rate(100) == ""
+    assert robot.loop.change_rate(100) is None
     assert told == [10_000_000]
-    assert robot.loop.change_rate(0) != ""
+    assert robot.loop.change_rate(0).code is Code.RATE_OUT_OF_RANGE
     assert told == [10_000_000]
 
 

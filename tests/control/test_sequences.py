@@ -170,7 +170,7 @@ def test_whatever_is_asked_claims_stay_single_and_only_active_controllers_comman
 ):
     run = Run(make_robot, overrun)
     result = run.run(sequence)
-    asked, answered = run.robot._asked, run.robot.inbox.answers
+    asked, answered = run.robot._asked, run.robot.refusals
     assert len(answered) + len(run.robot.inbox.waiting) == asked
     cycles = run.robot.sink.cycles
     assert result.cycles == len(cycles)

@@ -2,6 +2,7 @@
 
 import pytest
 
+from dxlrun.run.channels.answers import Code, Done
 from dxlrun.run.channels.events import EventCode
 
 
@@ -12,8 +13,8 @@ def steered(make_robot):
     def run(cycles, at):
         robot = make_robot()
         robot.build()
-        robot.wishes = []
-        robot.hardware.set_register = lambda *wanted: robot.wishes.append(wanted)
+        robot.written = []
+        robot.hardware.set_register = lambda *given: robot.written.append(given)
 
         def idle(deadline_ns):
             number = len(robot.sink.cycles)
@@ -28,25 +29,26 @@ def steered(make_robot):
     return run
 
 
-def wish(robot, **change):
-    robot.number = robot.ask("register", **({"joint": "j1", "item": "p_gain", "value": 40} | change))
+def change(robot, **other):
+    robot.number = robot.ask("register", **({"joint": "j1", "item": "p_gain", "value": 40} | other))
 
 
 def test_it_is_answered_when_it_is_there_and_not_before(steered):
     answers = []
 
     def look(robot):
-        answers.append(dict(robot.inbox.answers))
+        answers.append(dict(robot.refusals))
 
-    def written(robot):
-        ((row, item, value, done),) = robot.wishes
+    def settled(robot):
+        ((row, item, value, done),) = robot.written
         assert (row, item, value) == (1, "p_gain", 40)
         look(robot)
         done("")
         look(robot)
 
-    robot = steered(6, {1: wish, 2: look, 4: written})
+    robot = steered(6, {1: change, 2: look, 4: settled})
     assert answers == [{}, {}, {robot.number: ""}]
+    assert robot.answer(robot.number) == Done(3)  # it was there before cycle 4
     ((source, text),) = robot.events.of(EventCode.STEERED)
     assert (source, text) == ("loop", 'register {"joint":"j1","item":"p_gain","value":40} from anna')
     (taken,) = [one for one in robot.taken if one.kind == "register"]
@@ -54,19 +56,20 @@ def test_it_is_answered_when_it_is_there_and_not_before(steered):
 
 
 def test_what_went_wrong_is_the_answer(steered):
-    robot = steered(4, {1: wish, 2: lambda robot: robot.wishes[0][3]("j1 did not answer")})
-    assert robot.inbox.answers == {robot.number: "j1 did not answer"}
+    robot = steered(4, {1: change, 2: lambda robot: robot.written[0][3]("j1 did not answer")})
+    assert robot.answer(robot.number) == (Code.REGISTER_NOT_WRITTEN, {"problem": "j1 did not answer"})
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("other", "code", "said"),
     [
-        ({"joint": "j9"}, "there is no joint j9"),
-        ({"value": 1.5}, "its data does not fit: Expected `int`, got `float` - at `$.value`"),
-        ({"more": 1}, "its data does not fit: Object contains unknown field `more`"),
+        ({"joint": "j9"}, Code.UNKNOWN_JOINT, "there is no joint j9"),
+        ({"value": 1.5}, Code.INVALID, "Expected `int`, got `float` - at `$.value`"),
+        ({"more": 1}, Code.INVALID, "Object contains unknown field `more`"),
     ],
 )
-def test_what_cannot_be_is_refused_at_once(steered, change, said):
-    robot = steered(3, {1: lambda robot: wish(robot, **change)})
-    assert robot.inbox.answers == {robot.number: said}
-    assert robot.wishes == []
+def test_what_cannot_be_is_refused_at_once(steered, other, code, said):
+    robot = steered(3, {1: lambda robot: change(robot, **other)})
+    assert said in robot.refusals[robot.number]
+    assert robot.answer(robot.number)[0] is code
+    assert robot.written == []

@@ -9,6 +9,7 @@ import pytest
 
 from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.control.policy_plan import SLOW_SPEED
+from dxlrun.run.channels.answers import Code, Done
 from dxlrun.run.channels.events import EventCode
 
 PERIOD_NS = 20_000_000
@@ -70,29 +71,31 @@ def test_a_switch_happens_in_one_cycle_or_not_at_all(watched):
     assert watched.steps("left", "update") == [0, 1, 2]
     assert watched.steps("whole", "update") == [3, 4, 5]
     assert watched.steps("left", "deactivate") == watched.steps("whole", "activate") == [3]
-    assert robot.inbox.answers == {1: ""}
+    assert robot.answer(1) == Done(3)
     assert robot.events.of(EventCode.STEERED)[0][1].endswith("from anna")
 
 
 @pytest.mark.parametrize(
-    ("switch", "why"),
+    ("switch", "code", "why"),
     [
         (
             {"activate": ["whole"], "deactivate": ["left"]},
+            Code.JOINTS_CLAIMED,
             "right and whole both command joint j1; deactivate",
         ),
-        ({"activate": ["whole", "left"]}, "left is active already"),
-        ({"activate": ["nobody"]}, "no controller nobody"),
-        ({"deactivate": ["whole"]}, "whole is not active"),
-        ({"deactivate": ["left", "left"]}, "named twice"),
-        ({"activte": ["whole"]}, "activte"),
+        ({"activate": ["whole", "left"]}, Code.ACTIVE_ALREADY, "left is active already"),
+        ({"activate": ["nun"], "deactivate": ["no"]}, Code.UNKNOWN_CONTROLLER, "no controller nun, no"),
+        ({"deactivate": ["whole"]}, Code.INACTIVE_ALREADY, "whole is not active"),
+        ({"deactivate": ["left", "left"]}, Code.NAMED_TWICE, "left is named twice"),
+        ({"activte": ["whole"]}, Code.INVALID, "activte"),
     ],
 )
-def test_a_switch_that_cannot_be_is_refused_whole(watched, switch, why):
+def test_a_switch_that_cannot_be_is_refused_whole(watched, switch, code, why):
     robot = watched.robot
     watched.at[2] = [lambda: robot.ask("switch", **switch)]
     watched.run(5)
-    assert why in robot.inbox.answers[1]
+    assert why in robot.refusals[1]
+    assert robot.answer(1)[0] is code
     assert watched.active() == [0b011] * 5
     assert why in robot.events.of(EventCode.COMMAND_REFUSED)[0][1]
 
@@ -101,7 +104,7 @@ def test_bytes_that_are_no_text_are_refused(watched):
     robot = watched.robot
     watched.at[2] = [lambda: robot.post("", "switch", b'{"activate": ["\xff"]}')]
     watched.run(5)
-    assert "does not fit" in robot.inbox.answers[1]
+    assert robot.answer(1)[0] is Code.INVALID
     assert watched.active() == [0b011] * 5
 
 
@@ -158,7 +161,7 @@ def test_what_is_so_already_is_refused(watched, kind):
     watched.at[1] = [lambda: robot.ask("pause")] if kind == "pause" else []
     watched.at[2] = [lambda: robot.ask(kind)]
     watched.run(4)
-    assert max(robot.inbox.answers.items())[1].startswith("the loop is ")
+    assert max(robot.refusals.items())[1].startswith("the loop is ")
 
 
 def test_another_rate_begins_at_the_next_deadline_and_controllers_keep_theirs(make_robot):
@@ -175,20 +178,21 @@ def test_another_rate_begins_at_the_next_deadline_and_controllers_keep_theirs(ma
 
 
 @pytest.mark.parametrize(
-    ("rate", "why"),
+    ("rate", "code", "why"),
     [
-        (60.0, "of which 60 Hz is no multiple"),
-        (500.0, "at most 200 Hz"),
-        (0.001, "hears nobody between two cycles; write 1 to 100000"),
-        (0.0, "no rate"),
-        (-3.0, "no rate"),
+        (60.0, Code.RATE_NOT_DIVIDED, "60 Hz is no multiple of 25 Hz, the rate of controller right"),
+        (500.0, Code.RATE_OVER_BUSES, "at most 200 Hz"),
+        (0.001, Code.RATE_OUT_OF_RANGE, "no rate of a loop; write 1 to 100000"),
+        (0.0, Code.RATE_OUT_OF_RANGE, "no rate"),
+        (-3.0, Code.RATE_OUT_OF_RANGE, "no rate"),
     ],
 )
-def test_a_rate_that_cannot_be_is_refused(make_robot, rate, why):
+def test_a_rate_that_cannot_be_is_refused(make_robot, rate, code, why):
     watched = Watched(make_robot, right={"every": 2, "rate": 25.0})
     watched.at[1] = [lambda: watched.robot.ask("rate", rate=rate)]
     watched.run(4, least_period_ns=5_000_000)
-    assert why in watched.robot.inbox.answers[1]
+    assert why in watched.robot.refusals[1]
+    assert watched.robot.answer(1)[0] is code
     due = np.diff([cycle["scheduled_ns"] for cycle in watched.robot.sink.cycles])
     assert set(due.tolist()) == {PERIOD_NS}
 
@@ -207,15 +211,15 @@ def test_a_command_reaches_its_controller_and_the_log(watched):
 @pytest.mark.parametrize(
     ("name", "data", "why"),
     [
-        ("whole", b"", "not active"),
-        ("nobody", b"", "no such controller as nobody"),
-        ("left", b"abc", "no array of numbers"),
+        ("whole", b"", (Code.NOT_ACTIVE, {"controller": "whole"})),
+        ("nun", b"", (Code.UNKNOWN_CONTROLLER, {"controller": "nun"})),
+        ("left", b"abc", (Code.INVALID, {"problem": "3 bytes are no array of numbers"})),
     ],
 )
 def test_a_command_that_cannot_be_is_refused(watched, name, data, why):
     watched.at[1] = [lambda: watched.robot.post(name, "position", data)]
     watched.run(3)
-    assert why in watched.robot.inbox.answers[1]
+    assert watched.robot.answer(1) == why
     assert not watched.steps(name, "command")
 
 
@@ -248,7 +252,7 @@ def test_a_controller_is_loaded_and_unloaded_in_a_pause_only(watched):
     watched.at[6] = [lambda: ask("switch", activate=["left"], deactivate=["extra"])]
     watched.at[7] = [lambda: ask("unload", controller="extra"), lambda: ask("resume")]
     watched.run(10)
-    refusals = {number: text for number, text in robot.inbox.answers.items() if text}
+    refusals = {number: text for number, text in robot.refusals.items() if text}
     assert refusals == {
         1: "pause the loop first: it stands still meanwhile",
         7: "extra is active; deactivate it first",
@@ -263,7 +267,7 @@ def test_a_controller_that_is_loaded_while_its_servo_is_lost_waits_for_it(watche
     manager.wait_for({0})
     for name, joint in (("extra", "j0"), ("other", "j1")):
         plan = ControllerPlan(name, "left", "tests 1", "{}", (joint,), ("position",), (), False, 1)
-        assert manager.load(plan) == ""
+        assert isinstance(manager.load(plan), int)
     assert [manager._named[name].waiting for name in ("extra", "other")] == [True, False]
 
 
@@ -279,8 +283,8 @@ def test_a_controller_that_is_loaded_anew_after_its_failure_may_stand_in_again(m
     manager = robot.manager
     command = ("position", "velocity")
     extra = ControllerPlan("extra", "left", "tests 1", "{}", ("j0",), command, (), False, 1, fallback="left")
-    assert manager.load(extra) == ""
-    assert manager.switch(("extra",), (), 0) == ""
+    assert manager.load(extra) == 1
+    assert manager.switch(("extra",), (), 0) is None
     for failed, stands_in in (("extra", "left"), ("left", "extra")):
         failing.clear()
         failing.add(failed)
@@ -288,8 +292,8 @@ def test_a_controller_that_is_loaded_anew_after_its_failure_may_stand_in_again(m
         manager.update(0, 0)
         assert manager.active == (stands_in,)
         if stands_in == "left":
-            assert manager.unload("extra") == ""
-            assert manager.load(extra) == ""
+            assert manager.unload("extra") is None
+            assert manager.load(extra) == 1
     assert manager.fault is None
 
 
@@ -300,7 +304,7 @@ def test_places_of_unloaded_controllers_are_used_again(watched):
         watched.at[cycle] = [lambda: robot.ask("load", **loaded())]
         watched.at[cycle + 1] = [lambda: robot.ask("unload", controller="extra")]
     watched.run(210)
-    assert set(robot.inbox.answers.values()) == {""}
+    assert set(robot.refusals.values()) == {""}
 
 
 def test_a_controller_is_loaded_into_the_first_free_place_under_whatever_name(watched):
@@ -314,7 +318,7 @@ def test_a_controller_is_loaded_into_the_first_free_place_under_whatever_name(wa
     watched.at[1] = [lambda: robot.ask("pause"), *(ask(*step) for step in steps)]
     watched.at[2] = [lambda: robot.ask("switch", activate=["c"], deactivate=["left"])]
     watched.run(4)
-    assert set(robot.inbox.answers.values()) == {""}
+    assert set(robot.refusals.values()) == {""}
     assert watched.active()[2:] == [0b010010] * 2
 
 
@@ -326,7 +330,12 @@ def test_a_controller_is_loaded_with_the_period_that_the_loop_has_now(watched):
         lambda: robot.ask("load", **loaded() | {"rate": 25.0}),
     ]
     watched.run(4)
-    assert robot.inbox.answers == {1: "", 2: "", 3: "its rate 30 Hz does not divide the loop's 100 Hz", 4: ""}
+    assert robot.refusals == {
+        1: "",
+        2: "",
+        3: "100 Hz is no multiple of 30 Hz, the rate of controller extra",
+        4: "",
+    }
     assert robot.manager._named["extra"]._controller.context.period_ns == 40_000_000
 
 

@@ -125,7 +125,7 @@ def test_a_rate_that_is_none_is_refused_with_the_controller(steered, rate):
     steered.add("left", joints=("j0",))
     steered.at[1] = [lambda: robot.ask("pause"), lambda: robot.ask("load", **plan_of("x", "left", rate=rate))]
     assert steered.run(4).reason == "stopped"
-    assert "rate" in robot.inbox.answers[2]
+    assert "rate" in robot.refusals[2]
 
 
 def test_data_nested_deeper_than_python_goes_is_refused(steered):
@@ -134,7 +134,7 @@ def test_data_nested_deeper_than_python_goes_is_refused(steered):
     deep = b'{"unknown": ' + b"[" * 100_000 + b"]" * 100_000 + b"}"
     steered.at[1] = [lambda: robot.ask("pause"), lambda: robot.post(LOOP, "load", deep)]
     assert steered.run(4).reason == "stopped"
-    assert robot.inbox.answers[2]
+    assert robot.refusals[2]
 
 
 def test_a_controller_that_cannot_even_be_built_is_refused(steered):
@@ -150,7 +150,7 @@ def test_a_controller_that_cannot_even_be_built_is_refused(steered):
     controllers.remove(controllers[-1])  # its type is offered, and no plan asks for it
     steered.at[1] = [lambda: robot.ask("pause"), lambda: robot.ask("load", **plan_of("x", "unbuilt"))]
     assert steered.run(4).reason == "stopped"
-    assert "no such calibration" in robot.inbox.answers[2]
+    assert "no such calibration" in robot.refusals[2]
 
 
 def test_each_load_has_the_guardians_patience_for_itself(steered):
@@ -200,7 +200,7 @@ def test_a_rate_at_which_a_wish_to_stop_would_be_seen_too_late_is_refused(steere
     steered.add("left", joints=("j0",))
     steered.at[1] = [lambda: robot.ask("rate", rate=rate)]
     assert steered.run(4, policies=PolicyPlan()).reason == "stopped"
-    assert "Hz" in robot.inbox.answers[1]
+    assert "Hz" in robot.refusals[1]
 
 
 # Time
@@ -307,7 +307,7 @@ def test_a_controller_that_starts_a_thread_while_it_is_configured_is_refused(ste
 
     robot.build = watched_build
     assert steered.run(4).reason == "stopped"
-    assert "1 more thread" in robot.inbox.answers[2]
+    assert "1 more thread" in robot.refusals[2]
     assert asked == ["of controller x"]
 
 
@@ -322,4 +322,4 @@ def test_a_controller_that_failed_once_says_nothing_about_another_one_of_its_nam
         2: [lambda: steered.failing.add(("left", "update"))],
     }
     steered.run(4)
-    assert robot.inbox.answers == {1: "", 2: "", 3: ""}
+    assert robot.refusals == {1: "", 2: "", 3: ""}

@@ -7,6 +7,7 @@ import struct
 import pytest
 
 from dxlrun.run.channels import mailbox, ring
+from dxlrun.run.channels.answers import Code, Done, Refusal, Waiting
 from dxlrun.run.channels.commands import LONGEST_COMMAND, MOST_PER_CYCLE, Command, encode_command
 from dxlrun.run.channels.mailbox import LONGEST_SET_POINT, Answers, Mailbox, MailboxWriter
 from dxlrun.run.channels.ring import record_size
@@ -174,13 +175,25 @@ def test_counts_at_the_end_of_their_words_get_no_exception_out_of_the_loop(both,
 
 
 def test_answers_come_back_by_their_numbers_and_long_ones_are_cut(both):
-    both.reader.answer(3, "")
-    both.reader.answer(4, "the loop is paused already")
-    both.reader.answer(5, "x" * 10_000)
-    done, refused, cut = both.answers.new()
-    assert (done, refused) == ((3, ""), (4, "the loop is paused already"))
-    assert cut[0] == 5
-    assert len(cut[1]) < mailbox.LONGEST_ANSWER
+    fields = {"controller": ("arm", "head"), "rate": 0.5}
+    given = [
+        Done(7),
+        Done(7, 3),
+        Waiting(("arm",)),
+        Refusal(Code.PAUSED_ALREADY),
+        Refusal(Code.INVALID, fields),
+    ]
+    for number, answer in enumerate(given):
+        both.reader.answer(number, answer)
+    long = Refusal(
+        Code.CONTROLLER_FAULT, {"controller": "arm", "problem": '"ä\n' * 10_000, "seen": ("a",) * 999}
+    )
+    both.reader.answer(5, long)
+    *found, (number, cut) = both.answers.new()
+    assert found == list(enumerate(given))
+    assert (number, cut.code, cut.fields["controller"]) == (5, Code.CONTROLLER_FAULT, "arm")
+    assert long.fields["problem"].startswith(cut.fields["problem"])
+    assert len(cut.fields["problem"]) > 20
     assert both.answers.new() == []
 
 

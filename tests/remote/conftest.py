@@ -19,6 +19,7 @@ from dxlrun.remote.job import Descriptors
 from dxlrun.remote.link import Link
 from dxlrun.remote.preparation import Preparation
 from dxlrun.run.channels import heartbeat, mailbox, ring
+from dxlrun.run.channels.answers import Done
 from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
 from dxlrun.run.channels.events import LONGEST_EVENT, EventRing
 from dxlrun.run.channels.heartbeat import Heartbeat, Phase
@@ -33,6 +34,13 @@ class Go(dxlrun.CommandModel):
     positions: list[float]
 
 
+class Grip(dxlrun.CommandModel):
+    """How firmly."""
+
+    positions: list[float]
+    force: str
+
+
 class Number(dxlrun.CommandModel):
     """How many."""
 
@@ -45,7 +53,15 @@ class ArmParameters(dxlrun.ParametersModel):
 
 class Arm(dxlrun.Controller[ArmParameters]):
     Parameters = ArmParameters
-    Commands: ClassVar = {"go": Go, "many": Number, "break": Number, "leave": Number, "brood": Number}
+    Commands: ClassVar = {
+        "go": Go,
+        "positions": Go,
+        "grip": Grip,
+        "many": Number,
+        "break": Number,
+        "leave": Number,
+        "brood": Number,
+    }
 
     @classmethod
     def interfaces(cls, parameters, joints):
@@ -140,18 +156,33 @@ class Desk:
         self.app = self.gateway.app()
         self.now = 100.0  # of allowances, s
         self.taken = []
+        self.places = []  # names of the controllers that were loaded
         self.ended = 0
         self.finish_cycle()
 
     # The loop
 
-    def take(self, refusal=""):
+    def take(self, refusal=None):
         """Take what a cycle takes and answer it; return it."""
         commands = list(self.mailbox.take())
         for command in commands:
-            self.mailbox.answer(command.number, refusal)
+            place = self._place(command) if refusal is None else None
+            self.mailbox.answer(command.number, refusal or Done(self.ended - 1, place))
         self.taken += commands
         return commands
+
+    def _place(self, command):
+        """Return the place of a controller that is loaded, as the loop's manager chooses it."""
+        if command.kind == "unload" and (name := json.loads(command.data)["controller"]) in self.places:
+            self.places[self.places.index(name)] = None
+        if command.kind != "load":
+            return None
+        name = json.loads(command.data)["name"]
+        if None in self.places:
+            self.places[self.places.index(None)] = name
+        else:
+            self.places.append(name)
+        return 3 + self.places.index(name)
 
     def finish_cycle(self):
         self.record.cycle, self.record.woken_ns = self.ended, 1_000_000_000 + self.ended * PERIOD_NS
@@ -161,7 +192,7 @@ class Desk:
 
     # The client
 
-    def ask(self, *words, refusal="", **options):
+    def ask(self, *words, refusal=None, **options):
         """Ask the gateway, with a loop that answers; return status and content."""
         return asyncio.run(self._ask_and_answer(refusal, words, options))
 

@@ -1,27 +1,35 @@
+# ruff: noqa: E501 (a request and its answer are read best side by side)
+
 """The gateway by ASGI: what reaches the loop of what clients ask, and what they are told. No time decides."""
 
 import asyncio
 import json
 import struct
+from dataclasses import replace
 from pathlib import Path
+from string import Formatter
 
 import msgspec
 import numpy as np
 import pytest
+from pydantic import create_model
 
+from dxlrun.compile.limits import BeyondLimit
 from dxlrun.control.loop_plan import ControllerPlan
-from dxlrun.remote import asking, connection, gateway, link
+from dxlrun.remote import connection, gateway, link
 from dxlrun.remote.gateway import MOST_OPERATIONS, MOST_SET_POINTS
-from dxlrun.remote.preparation import Prepared, Refusal
+from dxlrun.remote.preparation import Prepared, RefusedRequest, _of_motions, in_si
 from dxlrun.remote.sockets import MOST_BYTES
+from dxlrun.run.channels.answers import Code, Done, Refusal, Waiting
 from dxlrun.run.channels.commands import MOST_PER_CYCLE
 from dxlrun.run.channels.events import EventCode, Severity
 from dxlrun.run.channels.heartbeat import Phase
 
-DONE = {"done": True}
-IN_LIMITS = {"done": True, "clamped": 0}
+DONE = {"done": True, "cycle": 0}
+IN_LIMITS = {"done": True, "clamped": 0, "clamped_joints": []}
 GO = "/controllers/left/commands/go"
 SET_POINT = "/controllers/left/set-points/go"
+NUMBERS = {"seconds", "rate", "controller_rate", "lowest", "highest"}
 
 
 def chunk(data, more=True):
@@ -56,78 +64,175 @@ def test_what_reaches_the_log_of_a_clients_name_is_short_and_printable(desk, giv
 
 
 def test_what_the_loop_refuses_is_told(desk):
-    assert desk.ask("POST", "/pause", refusal="it is paused already") == (
-        409,
-        {"refused": "it is paused already"},
-    )
+    assert desk.ask("POST", "/pause", refusal=Refusal(Code.PAUSED_ALREADY)) == (
+        409, {"refused": "the loop is paused already", "code": "paused_already", "fields": {}},
+    )  # fmt: skip
     assert desk.ask("GET", "/robot")[1]["paused"] is False
 
 
 LOAD = {"name": "more", "type": "arm", "joints": ["pan"]}
 WRONG = [
-    ("GET", "/nothing", None, 404, "GET /nothing is nothing"),
-    ("POST", "/robot", None, 405, "POST /robot is nothing"),
-    ("GET", "/robot/", None, 404, "nothing"),
-    ("POST", "/controllers/lefty/commands/go", {}, 404, "did you mean left?"),
-    ("POST", "/controllers/left/commands/goo", {}, 404, "did you mean go?"),
-    ("POST", "/controllers/%2e%2e/commands/go", {}, 404, "known: left, right, spare"),
-    ("POST", GO, b"", 422, "go of left is no JSON"),
-    ("POST", GO, b"[" * 100_000, 422, "go of left is no JSON (recursion limit"),
-    ("POST", GO, b'{"positions": [NaN]}', 422, "must be a finite number"),
-    ("POST", GO, b'{"positions": [1e999]}', 422, "must be a finite number"),
-    ("POST", GO, {"positions": [True]}, 422, "positions"),
-    ("POST", GO, {"positions": ["0.5"]}, 422, "positions"),
-    ("POST", GO, {"positions": [2]}, 422, "go of left: pan is sent to 114.592 deg, outside its limits -57.3"),
-    ("POST", GO, {"positions": [-1e300]}, 422, "pan is sent to -5.72958e+301 deg, outside its limits"),
-    ("POST", SET_POINT, {"positions": [True]}, 422, "positions"),
-    ("POST", GO, {"positions": [0], "speed": 1}, 422, "go of left has an unknown key 'speed'"),
-    ("POST", GO, {"positions": [1, 2]}, 422, "go of left: 1 positions, please"),
-    ("POST", GO, {"positions": ["x"] * 50_000}, 422, "; and 49995 more"),
-    ("POST", "/controllers/left/commands/break", {"count": 1}, 422, "KeyError: 'a mistake of its author'"),
-    ("POST", "/controllers/left/commands/leave", {"count": 1}, 422, "SystemExit: 3"),
-    ("POST", "/controllers/left/commands/many", {"count": 40_000}, 413, "320000 bytes are too many"),
-    ("POST", "/controllers/left/set-points/many", {"count": 300}, 413, "send it as a command"),
-    ("POST", "/controllers/spare/set-points/go", {"positions": [0]}, 409, "not active; switch to it first"),
-    ("POST", SET_POINT + "?lease=0", {"positions": [0]}, 422, "a lease is 0.01 to 60 s, not 0"),
-    ("POST", SET_POINT + "?lease=61", {"positions": [0]}, 422, "a lease is 0.01 to 60 s, not 61"),
-    ("POST", SET_POINT + "?lease=inf", {"positions": [0]}, 422, "lease=inf is no number"),
-    ("POST", SET_POINT + "?lease=long", {"positions": [0]}, 422, "lease=long is no number"),
-    ("GET", "/events?after=x", None, 422, "after=x is no number"),
-    ("POST", "/switch", b"{", 422, 'write for example {"activate": ["head"]'),
-    ("POST", "/switch", b"[" * 100_000, 422, "write for example"),
-    ("POST", "/switch", {"activate": ["nobody"]}, 404, "there is no controller nobody"),
-    ("POST", "/switch", {"activate": ["left"] * 2}, 422, "named twice"),
-    ("POST", "/switch", {"activate": "left"}, 422, "Expected `array`"),
-    ("POST", "/switch", {"start": ["left"]}, 422, "unknown field `start`"),
-    ("POST", "/rate", {"rate": "fast"}, 422, "Expected `float`"),
-    ("POST", "/rate", {"rate": True}, 422, "Expected `float`"),
-    ("POST", "/rate", b'{"rate": 1' + b"0" * 400 + b"}", 422, "write for example"),
-    ("POST", "/rate", {}, 422, "missing required field `rate`"),
-    ("DELETE", "/controllers/lefty", None, 404, "did you mean left?"),
-    ("POST", "/controllers", LOAD | {"name": "../x"}, 422, "is no name"),
-    ("POST", "/controllers", LOAD | {"name": 5}, 422, "must be text"),
-    ("POST", "/controllers", LOAD | {"name": "a" * 65}, 422, "at most 64"),
-    ("POST", "/controllers", LOAD | {"name": "left"}, 409, "there is a controller left already"),
-    ("POST", "/controllers", LOAD | {"type": "leg"}, 422, "no plug-in offers the controller type leg"),
-    ("POST", "/controllers", LOAD | {"joints": ["pam"]}, 422, "did you mean pan?"),
-    ("POST", "/controllers", LOAD | {"joints": ["pan", "pan"]}, 422, "names a joint twice"),
-    ("POST", "/controllers", LOAD | {"joints": 3}, 422, "more.joints is 3"),
-    ("POST", "/controllers", LOAD | {"rate": "x"}, 422, "must be a number"),
-    ("POST", "/controllers", LOAD | {"active": True}, 422, "load it, then switch to it"),
-    ("POST", "/controllers", LOAD | {"fallback": "nobody"}, 422, "there is no fallback nobody"),
-    ("POST", "/controllers", b"[]", 422, "Expected `object`"),
+    ("GET", "/nothing", None, 404, "unknown_page", "GET /nothing is no request"),
+    ("POST", "/robot", None, 405, "wrong_method", "/robot takes no POST"),
+    ("GET", "/robot/", None, 404, "unknown_page", "no request"),
+    ("POST", "/controllers/lefty/commands/go", {}, 404, "unknown_controller", "did you mean left?"),
+    ("POST", "/controllers/left/commands/goo", {}, 404, "unknown_command", "did you mean go?"),
+    ("POST", "/controllers/%2e%2e/commands/go", {}, 404, "unknown_controller", "known: left, right, spare"),
+    ("POST", GO, b"", 422, "invalid", "go of left is no JSON"),
+    ("POST", GO, b"[" * 100_000, 422, "invalid", "go of left is no JSON (recursion limit"),
+    ("POST", GO, b'{"positions": [NaN]}', 422, "invalid", "must be a finite number"),
+    ("POST", GO, b'{"positions": [1e999]}', 422, "invalid", "must be a finite number"),
+    ("POST", GO, {"positions": [True]}, 422, "invalid", "positions"),
+    ("POST", GO, {"positions": ["0.5"]}, 422, "invalid", "positions"),
+    ("POST", GO, {"positions": [2]}, 422, "beyond_limits", "go of left: pan is sent to 114.592 deg, outside its limits -57.3"),
+    ("POST", GO, {"positions": [-1e300]}, 422, "beyond_limits", "pan is sent to -5.72958e+301 deg, outside its limits"),
+    ("POST", SET_POINT, {"positions": [True]}, 422, "invalid", "positions"),
+    ("POST", GO, {"positions": [0], "speed": 1}, 422, "invalid", "go of left has an unknown key 'speed'"),
+    ("POST", GO, {"positions": [1, 2]}, 422, "invalid", "go of left: 1 positions, please"),
+    ("POST", GO, {"positions": ["x"] * 50_000}, 422, "invalid", "; and 49995 more"),
+    ("POST", "/controllers/left/commands/break", {"count": 1}, 422, "invalid", "KeyError: 'a mistake of its author'"),
+    ("POST", "/controllers/left/commands/leave", {"count": 1}, 422, "invalid", "SystemExit: 3"),
+    ("POST", "/controllers/left/commands/many", {"count": 40_000}, 413, "too_long", "320000 bytes are too many"),
+    ("POST", "/controllers/left/set-points/many", {"count": 300}, 413, "too_long", "send it as a command"),
+    ("POST", "/controllers/spare/set-points/go", {"positions": [0]}, 409, "not_active", "not active; switch to it first"),
+    ("POST", SET_POINT + "?lease=0", {"positions": [0]}, 422, "invalid", "a lease is 0.01 to 60 s, not 0"),
+    ("POST", SET_POINT + "?lease=61", {"positions": [0]}, 422, "invalid", "a lease is 0.01 to 60 s, not 61"),
+    ("POST", SET_POINT + "?lease=inf", {"positions": [0]}, 422, "invalid", "lease=inf is no number"),
+    ("POST", SET_POINT + "?lease=long", {"positions": [0]}, 422, "invalid", "lease=long is no number"),
+    ("GET", "/events?after=x", None, 422, "invalid", "after=x is no number"),
+    ("POST", "/switch", b"{", 422, "invalid", 'write for example {"activate": ["head"]'),
+    ("POST", "/switch", b"[" * 100_000, 422, "invalid", "write for example"),
+    ("POST", "/switch", {"activate": ["nun"]}, 404, "unknown_controller", "there is no controller nun"),
+    ("POST", "/switch", {"activate": "left"}, 422, "invalid", "Expected `array`"),
+    ("POST", "/switch", {"start": ["left"]}, 422, "invalid", "unknown field `start`"),
+    ("POST", "/rate", {"rate": "fast"}, 422, "invalid", "Expected `float`"),
+    ("POST", "/rate", {"rate": True}, 422, "invalid", "Expected `float`"),
+    ("POST", "/rate", b'{"rate": 1' + b"0" * 400 + b"}", 422, "invalid", "write for example"),
+    ("POST", "/rate", {}, 422, "invalid", "missing required field `rate`"),
+    ("DELETE", "/controllers/lefty", None, 404, "unknown_controller", "did you mean left?"),
+    ("POST", "/controllers", LOAD | {"name": "../x"}, 422, "invalid", "is no name"),
+    ("POST", "/controllers", LOAD | {"name": 5}, 422, "invalid", "must be text"),
+    ("POST", "/controllers", LOAD | {"name": "a" * 65}, 422, "invalid", "at most 64"),
+    ("POST", "/controllers", LOAD | {"name": "left"}, 409, "name_taken", "there is a controller left already"),
+    ("POST", "/controllers", LOAD | {"type": "leg"}, 422, "invalid", "no plug-in offers the controller type leg"),
+    ("POST", "/controllers", LOAD | {"joints": ["pam"]}, 422, "invalid", "did you mean pan?"),
+    ("POST", "/controllers", LOAD | {"joints": ["pan", "pan"]}, 422, "invalid", "names a joint twice"),
+    ("POST", "/controllers", LOAD | {"joints": 3}, 422, "invalid", "more.joints is 3"),
+    ("POST", "/controllers", LOAD | {"rate": "x"}, 422, "invalid", "must be a number"),
+    ("POST", "/controllers", LOAD | {"active": True}, 422, "invalid", "load it, then switch to it"),
+    ("POST", "/controllers", LOAD | {"fallback": "nun"}, 422, "invalid", "there is no fallback nun"),
+    ("POST", "/controllers", b"[]", 422, "invalid", "Expected `object`"),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize("wrong", WRONG, ids=[" ".join(wrong[:2]) for wrong in WRONG])
-def test_a_wrong_wish_is_refused_with_one_sentence_and_never_reaches_the_loop(desk, wrong):
-    method, path, body, status, sentence = wrong
+def test_a_wrong_request_is_refused_with_one_sentence_and_never_reaches_the_loop(desk, wrong):
+    method, path, body, status, code, sentence = wrong
     told, content = desk.ask(method, path, b"" if body is None else body)
     assert told == status
-    assert sentence in content["refused"]
+    assert (content["code"], sentence in content["refused"]) == (code, True), content
     assert "\n" not in content["refused"]
     assert len(content["refused"]) < 2001
     assert desk.taken == []
+
+
+# Quantities with units
+
+
+def test_quantities_of_a_command_of_motions_may_have_units(desk):
+    path = "/controllers/left/commands/positions?units=true"
+    assert desk.ask("POST", path, {"positions": ["30 deg"]}) == (200, DONE)
+    assert struct.unpack("<d", desk.taken[-1].data) == (pytest.approx(0.5235988),)
+
+
+def test_a_command_of_something_else_is_passed_on_as_it_was_written(desk):
+    path = "/controllers/left/commands/grip?units=true"
+    assert desk.ask("POST", path, {"positions": [0.5], "force": "5 N"}) == (200, DONE)
+    assert struct.unpack("<d", desk.taken[-1].data) == (0.5,)
+
+
+def test_every_wrong_quantity_is_refused_with_its_place(desk):
+    path = "/controllers/left/commands/positions?units=true"
+    status, content = desk.ask("POST", path, {"positions": [30, "1 rad/s"], "velocities": [True]})
+    assert (status, content["code"]) == (422, "wrong_quantity")
+    assert content["fields"]["paths"] == ["/positions/0", "/positions/1", "/velocities/0"]
+    assert content["fields"]["problems"] == [
+        "positions[0]: 30 has no unit; write an angle with its unit, such as 60 deg or 1.05 rad",
+        "positions[1]: '1 rad/s' has the unit rad/s, which is not one of an angle; "
+        "write it as 60 deg or 1.05 rad",
+        "velocities[0]: this is not an angular velocity; "
+        "write an angular velocity such as 2 rad/s, 30 deg/s or 5 rpm",
+    ]
+    assert desk.ask("POST", path, b"[")[1]["code"] == "invalid"
+    assert desk.taken == []
+
+
+def plain(**command):
+    return json.loads(in_si(json.dumps(command).encode(), "go of arm"))
+
+
+def test_quantities_become_si():
+    point = {"time": "500 ms", "positions": ["180 deg", "-1 rad"], "velocities": ["60 deg/s", "30 rpm"]}
+    assert plain(points=[point], start_in="1 min") == {
+        "points": [
+            {
+                "time": 0.5,
+                "positions": [pytest.approx(3.14159265), -1.0],
+                "velocities": [pytest.approx(1.04719755), pytest.approx(3.14159265)],
+            }
+        ],
+        "start_in": 60.0,
+    }
+
+
+def test_what_is_no_quantity_stays_as_it_was_written():
+    command = {"label": "30 deg", "count": 3, "loud": True, "empty": None, "positions": [None]}
+    assert plain(**command) == command
+
+
+def test_efforts_and_pwm_are_numbers_and_text_there_is_explained():
+    assert plain(positions=["0 deg"], efforts=[0.1]) == {"positions": [0.0], "efforts": [0.1]}
+    with pytest.raises(
+        RefusedRequest, match=r"efforts.*'100 mA' is text; write the number in what the model"
+    ):
+        plain(efforts=["100 mA"])
+    with pytest.raises(RefusedRequest, match=r"pwm.*'20 %' is text; write the fraction of the full voltage"):
+        plain(pwm=["20 %"])
+
+
+@pytest.mark.parametrize(
+    ("kind", "keys", "of_motions"),
+    [
+        ("positions", ("positions",), True),
+        ("posvel", ("positions", "velocities"), True),
+        ("trajectory", ("points", "start_in"), True),
+        ("grip", ("positions", "force"), False),
+        ("speeds", ("velocities",), True),
+        ("poseffort", ("positions", "efforts"), True),
+        ("pwm", ("pwm",), True),
+        ("reset", (), False),
+    ],
+)
+def test_only_the_commands_of_the_standard_controllers_have_units(kind, keys, of_motions):
+    model = create_model("Model", **dict.fromkeys(keys, (object, ...)))
+    assert _of_motions(kind, model) is of_motions
+
+
+def test_parameters_of_a_controller_are_parsed_once_and_anew_when_another_is_loaded(desk, monkeypatch):
+    parsed = []
+    model = desk.gateway._preparation.plugins.controllers["arm"].controller.Parameters
+    parse = model.model_validate_json
+    monkeypatch.setattr(model, "model_validate_json", lambda text: parsed.append(text) or parse(text))
+    for _ in range(3):
+        assert desk.ask("POST", GO, {"positions": [0.25]})[0] == 200
+    assert len(parsed) == 1
+    left = desk.link.controllers["left"]
+    left.plan = replace(left.plan, parameters='{"joints": ["pan", "tilt"]}', joints=("pan", "tilt"))
+    assert desk.ask("POST", GO, {"positions": [0.25, 0.5]})[0] == 200
+    assert len(parsed) == 2
+
+
+# Bodies
 
 
 def test_a_body_that_is_announced_too_long_is_refused_before_it_is_read(desk):
@@ -150,7 +255,7 @@ def test_of_a_body_without_end_a_mebibyte_is_read_and_no_more(desk):
 
 
 def test_a_body_that_never_ends_and_never_goes_on_is_given_up(desk, monkeypatch):
-    monkeypatch.setattr(asking, "BODY_S", 0.01)
+    monkeypatch.setattr(gateway, "BODY_S", 0.01)
     status, content = desk.ask("POST", GO, chunks=[chunk(b'{"posi')])
     assert (status, content["refused"]) == (408, "the request did not arrive within 0.01 s")
     assert desk.taken == []
@@ -165,15 +270,22 @@ def test_a_client_that_dies_in_the_middle_of_a_command_has_asked_nothing(desk):
 def test_a_set_point_beyond_the_limits_is_passed_to_the_gate_and_the_answer_counts_it(desk):
     for position, clamped in ((1.5, 1), (1.0, 0), (-1e9, 1)):
         status, content = desk.ask("POST", SET_POINT, {"positions": [position]})
-        assert (status, content) == (202, {"done": True, "clamped": clamped})
+        joints = ["pan"] * clamped
+        assert (status, content) == (202, {"done": True, "clamped": clamped, "clamped_joints": joints})
     desk.take()
     assert struct.unpack("<d", desk.taken[-1].data) == (-1e9,)
 
 
 def test_of_many_values_beyond_the_limits_some_are_named_and_all_counted():
-    prepared = Prepared(b"", tuple(f"j{row} is beyond" for row in range(7)))
-    with pytest.raises(Refusal, match=r"^go: j0 is beyond; .*; j4 is beyond; and 2 more$"):
-        prepared.require_within_limits("go")
+    beyond = tuple(BeyondLimit(f"j{row % 6}", f"j{row} is beyond") for row in range(7))
+    with pytest.raises(
+        RefusedRequest, match=r"^go of arm: j0 is beyond; .*; j4 is beyond; and 2 more$"
+    ) as raised:
+        Prepared("arm", "go", b"", beyond).require_within_limits()
+    refusal = raised.value.refusal
+    assert (refusal.code, refusal.fields["joints"]) == (
+        Code.BEYOND_LIMITS, ("j0", "j1", "j2", "j3", "j4", "j5"),
+    )  # fmt: skip
 
 
 def test_a_flood_of_set_points_gives_the_loop_one_a_cycle_and_takes_nothing_from_others(desk):
@@ -197,7 +309,7 @@ def test_a_flood_from_ever_new_processes_is_remembered_for_some_of_them_only(des
             await desk.request("POST", SET_POINT, {"positions": [0]}, client=(f"process {process}", 0))
 
     asyncio.run(flood())
-    assert len(desk.gateway._set_points._left) == asking.MOST_PEERS
+    assert len(desk.gateway._set_points._left) == gateway.MOST_PEERS
     assert len(desk.take()) == 1
 
 
@@ -271,7 +383,8 @@ def test_an_answer_that_comes_too_late_is_still_what_the_gateway_knows(desk, mon
 def test_a_run_at_its_end_takes_nothing_and_says_so_at_once(desk, phase):
     desk.heartbeat.enter(phase)
     for path, body in (("/pause", b""), (SET_POINT, {"positions": [0]})):
-        assert desk.ask("POST", path, body) == (503, {"refused": "the run is at its end"})
+        refused = {"refused": "the run is at its end", "code": "run_ending", "fields": {}}
+        assert desk.ask("POST", path, body) == (503, refused)
     assert desk.taken == []
 
 
@@ -286,41 +399,62 @@ def test_rate_pause_and_resume_are_known_when_they_were_done(desk):
     assert sent == [("", "rate", b'{"rate":100.0}'), ("", "pause", b""), ("", "resume", b"")]
 
 
-def test_a_controller_takes_set_points_as_soon_as_its_switch_was_answered(desk):
-    wish = {"activate": ["spare"], "deactivate": ["left"]}
-    assert desk.ask("POST", "/switch", wish) == (200, DONE)
-    path = "/controllers/spare/set-points/go?lease=0.5"
-    assert desk.ask("POST", path, {"positions": [0.5]}) == (202, IN_LIMITS)  # the cycle has not ended yet
-    assert desk.ask("POST", SET_POINT, {"positions": [0.5]})[0] == 409
-    streamed = [(one.controller, one.lease_ns) for one in desk.taken if one.lease_ns]
-    assert streamed == [("spare", 500_000_000)]
-    desk.record.active = 0b110
-    desk.finish_cycle()
-    assert [one["active"] for one in desk.ask("GET", "/robot")[1]["controllers"]] == [False, True, True]
-    desk.record.active = 0b010  # and later only the records count
-    desk.finish_cycle()
-    assert [one["active"] for one in desk.ask("GET", "/robot")[1]["controllers"]] == [False, True, False]
+def test_a_switch_is_answered_when_the_record_of_its_cycle_shows_it(desk):
+    """So that a set-point that follows finds the controller active."""
 
-
-@pytest.mark.parametrize("excuse", ["", "spare is not activated: pan stays in position mode"])
-def test_a_switch_that_waits_for_modes_is_answered_when_they_are_there_or_were_given_up(desk, excuse):
     async def switch():
-        asked = asyncio.ensure_future(desk.request("POST", "/switch", {"activate": ["spare"]}))
-        desk.events.emit(EventCode.MODE, Severity.INFO, "spare", "waits until its joints are in their modes")
-        while not desk.taken:
-            desk.take()
+        asked = asyncio.ensure_future(
+            desk.request("POST", "/switch", {"activate": ["spare"], "deactivate": ["left"]})
+        )
+        while not (commands := list(desk.mailbox.take())):
             await asyncio.sleep(0)
+        desk.mailbox.answer(commands[0].number, Done(desk.ended))
         for _ in range(20):
             desk.link.collect()
             await asyncio.sleep(0)
+        early = asked.done()
+        desk.record.active = 0b110
+        desk.finish_cycle()
+        return early, await asked
+
+    assert asyncio.run(switch()) == (False, (200, {"done": True, "cycle": 1}))
+    path = "/controllers/spare/set-points/go?lease=0.5"
+    assert desk.ask("POST", path, {"positions": [0.5]}) == (202, IN_LIMITS)
+    assert desk.ask("POST", SET_POINT, {"positions": [0.5]})[0] == 409
+    streamed = [(one.controller, one.lease_ns) for one in desk.taken if one.lease_ns]
+    assert streamed == [("spare", 500_000_000)]
+    assert [one["active"] for one in desk.ask("GET", "/robot")[1]["controllers"]] == [False, True, True]
+
+
+LATE = Refusal(Code.MODE_NOT_ENTERED, {"controller": ("spare",), "problem": "pan stays in position mode"})
+
+
+@pytest.mark.parametrize("last", [Done(0), LATE], ids=["done", "refused"])
+def test_a_switch_that_waits_for_modes_is_answered_when_they_are_there_or_were_given_up(
+    desk, monkeypatch, last
+):
+    monkeypatch.setattr(link, "ANSWER_S", 0.05)
+
+    async def switch():
+        asked = asyncio.ensure_future(desk.request("POST", "/switch", {"activate": ["spare"]}))
+        while not (commands := list(desk.mailbox.take())):
+            await asyncio.sleep(0)
+        desk.mailbox.answer(commands[0].number, Waiting(("spare",)))
+        desk.link.collect()
+        await asyncio.sleep(0.2)
         waited = not asked.done()
-        code = EventCode.COMMAND_REFUSED if excuse else EventCode.CONTROLLER_ACTIVATED
-        desk.events.emit(code, Severity.INFO, "spare", excuse or "active")
+        desk.mailbox.answer(commands[0].number, last)
         desk.link.collect()
         return waited, await asked
 
-    answer = (409, {"refused": excuse}) if excuse else (200, DONE)
-    assert asyncio.run(switch()) == (True, answer)
+    waited, (status, content) = asyncio.run(switch())
+    assert waited
+    if last is LATE:
+        assert (status, content["code"]) == (409, "mode_not_entered")
+        assert content["refused"] == "spare is not activated: pan stays in position mode"
+        assert content["fields"] == {"controller": ["spare"], "problem": "pan stays in position mode"}
+    else:
+        assert (status, content) == (200, DONE)
 
 
 def test_a_controller_that_is_unloaded_while_a_set_point_arrives_gets_none_of_it(desk):
@@ -332,16 +466,15 @@ def test_a_controller_that_is_unloaded_while_a_set_point_arrives_gets_none_of_it
         yield {"type": "http.request", "body": b"[0]}"}
 
     status, told = asyncio.run(desk.request("POST", SET_POINT, chunks=chunks()))
-    assert (status, told) == (404, {"refused": "left was unloaded meanwhile"})
+    refused = {"refused": "left was unloaded meanwhile", "code": "unloaded", "fields": {"controller": "left"}}
+    assert (status, told) == (404, refused)
     assert list(desk.mailbox.take()) == []
 
 
 def test_a_switch_whose_modes_never_come_is_given_up(desk, monkeypatch):
     monkeypatch.setattr(link, "ENTER_S", 0.01)
-    desk.link.controllers["spare"].entering = True
-    wish = {"activate": ["spare"], "deactivate": ["left"]}
-    desk.link.switched = lambda activate, deactivate: None  # the loop says no more of it
-    assert desk.ask("POST", "/switch", wish) == (409, {"refused": "spare is not active after 0.01 s"})
+    status, content = desk.ask("POST", "/switch", {"activate": ["spare"]}, refusal=Waiting(("spare",)))
+    assert (status, content["code"], content["fields"]) == (503, "no_answer", {"seconds": 0.01})
 
 
 def test_a_controller_is_loaded_into_the_place_that_the_loop_gives_it(desk):
@@ -415,11 +548,25 @@ def test_events_of_both_processes_are_whole_and_are_told_once_to_who_asks_after_
     assert desk.ask("GET", f"/events?after={told['last']}")[1] == {"events": [], "last": told["last"]}
 
 
+def test_the_page_has_every_code_of_a_refusal():
+    page = (Path(__file__).parents[2] / "docs" / "steering.md").read_text()
+    assert [code for code in Code if f"`{code}`" not in page] == []
+
+
+@pytest.mark.parametrize("code", Code)
+def test_every_refusal_has_a_sentence_of_its_fields(code):
+    names = [name for _, name, _, _ in Formatter().parse(code.text) if name]
+    values = {name: 0.5 if name in NUMBERS else ("arm", "head") for name in names}
+    text = Refusal(code, values | {"hint": "try it"}).text
+    assert text.endswith("; try it")
+    assert all(("0.5" if name in NUMBERS else "arm, head") in text for name in names if name != "highest")
+
+
 def test_the_page_gives_the_limits_that_are_kept():
     page = (Path(__file__).parents[2] / "docs" / "steering.md").read_text()
     rates = f"{gateway.MOST_LOOKS:.0f} GETs, {gateway.MOST_SET_POINTS:.0f} set-points or"
     assert f"{rates} {gateway.MOST_OPERATIONS:.0f} other requests a second" in page
-    assert f"{asking.CHARGED_BYTES >> 10} KiB of a body count as one more" in page
+    assert f"{gateway.CHARGED_BYTES >> 10} KiB of a body count as one more" in page
     assert f"within {link.ANSWER_S:g} s and two of its periods, {2 * link.ANSWER_S:g} s at most" in page
     assert f"of the last {link.KEPT_EVENTS} events (fewer when their texts have more than" in page
     assert f"more than {link.KEPT_TEXT >> 20} MiB together" in page

@@ -7,7 +7,7 @@ import pytest
 from dxlrun.remote import link, preparation
 from dxlrun.run.channels.events import EventCode, Severity
 
-DONE = {"done": True}
+DONE = {"done": True, "cycle": 0}
 GO = "/controllers/left/commands/go"
 SET_POINT = "/controllers/left/set-points/go"
 
@@ -46,7 +46,7 @@ def test_a_plug_in_that_thinks_for_ever_is_interrupted_and_the_next_client_is_se
     status, content = desk.ask("POST", "/controllers/left/commands/brood", {"count": 1})
     assert (status, content["refused"]) == (
         422,
-        "left thought about this for more than 0.05 s; send less at once",
+        "left computed for more than 0.05 s; send less at once",
     )
     assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
     assert desk.ask("POST", "/stop") == (200, DONE)

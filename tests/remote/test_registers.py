@@ -1,4 +1,4 @@
-# ruff: noqa: E501 (a wish and its answer are read best side by side)
+# ruff: noqa: E501 (a request and its answer are read best side by side)
 
 """What a client may change in a servo's memory, by ASGI: what reaches the loop, and what is refused before."""
 
@@ -9,6 +9,7 @@ import pytest
 
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
+from dxlrun.run.channels.answers import Code, Refusal
 
 GAIN = "/joints/pan/registers/position_p_gain"
 
@@ -38,7 +39,10 @@ def arm(desk):
     [("position_p_gain", 900, 900), ("profile_acceleration", "10 rad/s^2", 27), ("led", 1, 1)],
 )
 def test_the_loop_gets_the_integer_of_the_wire(arm, item, given, raw):
-    assert arm.ask("POST", f"/joints/pan/registers/{item}", {"value": given}) == (200, {"done": True})
+    assert arm.ask("POST", f"/joints/pan/registers/{item}", {"value": given}) == (
+        200,
+        {"done": True, "cycle": 0},
+    )
     (taken,) = arm.taken
     assert (taken.controller, taken.kind) == ("", "register")
     assert json.loads(taken.data) == {"joint": "pan", "item": item, "value": raw}
@@ -46,7 +50,9 @@ def test_the_loop_gets_the_integer_of_the_wire(arm, item, given, raw):
 
 def test_what_the_servo_says_is_the_answer(arm):
     said = "pan (ID 11 on bus main) did not answer"
-    assert arm.ask("POST", GAIN, {"value": 1}, refusal=said) == (409, {"refused": said})
+    refusal = Refusal(Code.REGISTER_NOT_WRITTEN, {"problem": said})
+    status, content = arm.ask("POST", GAIN, {"value": 1}, refusal=refusal)
+    assert (status, content["refused"], content["code"]) == (409, said, "register_not_written")
 
 
 @pytest.mark.parametrize(

@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import metadata
+from types import MappingProxyType
 
 from cyclopts import App, CycloptsError
 
@@ -23,9 +24,19 @@ from dxlrun.cli.servos.models import models
 from dxlrun.cli.servos.scan import scan
 from dxlrun.cli.servos.servo import servo
 from dxlrun.cli.simulated.sim import sim
-from dxlrun.cli.steering.robots import list_robots
-from dxlrun.cli.steering.steer import load, pause, rate, resume, send, set_register, stop, switch, unload
-from dxlrun.errors import DxlrunError, InputError, Problem
+from dxlrun.cli.steering.steer import (
+    list_robots,
+    load,
+    pause,
+    rate,
+    resume,
+    send,
+    set_register,
+    stop,
+    switch,
+    unload,
+)
+from dxlrun.errors import DxlrunError, InputError, Problem, Refused
 
 INTERRUPTED = 130
 """128 + SIGINT, as shells say it."""
@@ -105,15 +116,21 @@ def run_tokens(tokens: Sequence[str]) -> int:
             _refuse(tokens, (), error.problems)
             return error.exit_code
         sentences, code = _explained(error)
-        _refuse(tokens, sentences)
+        reason = {"code": error.code, "fields": error.fields} if isinstance(error, Refused) else {}
+        _refuse(tokens, sentences, reason=reason)
         return code
     return code if isinstance(code, int) else 0
 
 
-def _refuse(tokens: Sequence[str], sentences: Sequence[str], problems: Sequence[Problem] = ()) -> None:
+def _refuse(
+    tokens: Sequence[str],
+    sentences: Sequence[str],
+    problems: Sequence[Problem] = (),
+    reason: Mapping[str, object] = MappingProxyType({}),
+) -> None:
     """Say why a command is not done: in lines for a person, or in JSON for a program that asked for it."""
     if "--json" in tokens:
-        print_refusal(problems, sentences)
+        print_refusal(problems, sentences, reason)
         return
     for problem in problems:
         (say_error if problem.severity == "error" else say_warning)(str(problem))

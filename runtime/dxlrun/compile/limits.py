@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from dxlrun.compile.problems import Problems
 from dxlrun.compile.samples import Sample
@@ -119,8 +120,15 @@ def check_speeds(
             )
 
 
-def beyond_limits(joints: Sequence[JointPlan], command: CommandModel) -> list[str]:
-    """Return a sentence for each value of a command that its joint cannot follow.
+class BeyondLimit(NamedTuple):
+    """A value of a command that its joint cannot follow."""
+
+    joint: str
+    text: str
+
+
+def beyond_limits(joints: Sequence[JointPlan], command: CommandModel) -> list[BeyondLimit]:
+    """Return each value of a command that its joint cannot follow.
 
     `joints`: those of the controller, in its order. Positions (rad) are compared with the position limits,
     velocities (rad/s) and efforts with the lower one of the file's limit and the servo's own; between two
@@ -134,22 +142,26 @@ def beyond_limits(joints: Sequence[JointPlan], command: CommandModel) -> list[st
     return list(_beyond(joints, values, ""))
 
 
-def _beyond(joints: Sequence[JointPlan], values: Mapping[str, object], where: str) -> Iterator[str]:
+def _beyond(joints: Sequence[JointPlan], values: Mapping[str, object], where: str) -> Iterator[BeyondLimit]:
     for joint, position in zip(joints, _row(joints, values, "positions"), strict=False):
         if not joint.lower - _TOLERANCE <= position <= joint.upper + _TOLERANCE:
             limits = Interval(joint.lower, joint.upper)
             angle = f"{math.degrees(position):.6g}"
-            yield f"{joint.name} is sent to {angle} deg{where}, outside its limits {limits}"
+            text = f"{joint.name} is sent to {angle} deg{where}, outside its limits {limits}"
+            yield BeyondLimit(joint.name, text)
     for joint, speed in zip(joints, _row(joints, values, "velocities"), strict=False):
         yield from _too_fast(joint, speed, where)
     for joint, effort in zip(joints, _row(joints, values, "efforts"), strict=False):
         if abs(effort) > joint.highest_effort:
             most, own = joint.highest_effort, joint.highest_effort != joint.effort
             limit = "the highest goal of its servo" if own else "its effort limit"
-            yield f"{joint.name} is asked for {effort:.6g}{where}, more than {most:.6g}, {limit}"
+            text = f"{joint.name} is asked for {effort:.6g}{where}, more than {most:.6g}, {limit}"
+            yield BeyondLimit(joint.name, text)
 
 
-def _beyond_in_points(joints: Sequence[JointPlan], points: Sequence[Mapping[str, object]]) -> Iterator[str]:
+def _beyond_in_points(
+    joints: Sequence[JointPlan], points: Sequence[Mapping[str, object]]
+) -> Iterator[BeyondLimit]:
     before: tuple[float, Sequence[float]] | None = None
     for number, point in enumerate(points, 1):
         yield from _beyond(joints, point, f" in point {number}")
@@ -164,13 +176,14 @@ def _beyond_in_points(joints: Sequence[JointPlan], points: Sequence[Mapping[str,
         before = time, positions
 
 
-def _too_fast(joint: JointPlan, speed: float, where: str) -> Iterator[str]:
+def _too_fast(joint: JointPlan, speed: float, where: str) -> Iterator[BeyondLimit]:
     if abs(speed) > joint.highest_speed * (1 + _ROUNDING):
         own = joint.highest_speed != joint.velocity
         limit = "the top speed of its servo" if own else "its velocity limit"
-        yield (
+        yield BeyondLimit(
+            joint.name,
             f"{joint.name} is asked for {speed:.6g} rad/s{where}, more than {joint.highest_speed:.6g} rad/s, "
-            f"{limit}"
+            f"{limit}",
         )
 
 

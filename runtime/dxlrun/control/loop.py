@@ -23,6 +23,7 @@ from dxlrun.control.schedule import Schedule
 from dxlrun.control.steering import Steering
 from dxlrun.errors import PortError, counted
 from dxlrun.interfaces import LOST_CYCLES
+from dxlrun.run.channels.answers import Code, Refusal
 from dxlrun.run.channels.commands import LOOP, CommandSink, Inbox, NoCommands, NoInbox, TakenCommand
 from dxlrun.run.channels.cycle import CycleRecord
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
@@ -154,6 +155,7 @@ class Loop:
         finally:
             # behind the last cycle of a pause, the period until the next one is left out already
             self.manager.deactivate(max(self._time_ns, self.schedule.time_ns(self.clock.now_ns())))
+            self.steering.answer_late()
         if reason != "fault" and self.manager.fault is not None:
             reason, detail = "fault", self.manager.fault
         policy: PolicyName = "on_fault" if reason == "fault" else "on_exit"
@@ -167,60 +169,60 @@ class Loop:
 
     # What clients may ask for, through Steering
 
-    def change_rate(self, rate: float) -> str:
-        """Run in another period from the next cycle on, Hz; return why not."""
+    def change_rate(self, rate: float) -> Refusal | None:
+        """Run in another period from the next cycle on, Hz."""
         if not LEAST_RATE <= rate <= MOST_RATE:
-            why = ", since the loop hears nobody between two cycles" if 0 < rate < LEAST_RATE else ""
-            return f"{rate:g} Hz is no rate to change to{why}; write {LEAST_RATE:g} to {MOST_RATE:.0f}"
-        period_ns = round(1e9 / rate)
-        if period_ns < self.plan.least_period_ns:
-            return f"the buses allow at most {1e9 / self.plan.least_period_ns:.4g} Hz"
-        if 0 < self.plan.slowest_period_ns < period_ns:
-            return f"the Bus Watchdog needs at least {1e9 / self.plan.slowest_period_ns:.4g} Hz"
-        if refusal := self.plan.policies.refuse_period(period_ns, self.plan.period_ns):
-            return refusal
+            bounds = {"rate": rate, "lowest": LEAST_RATE, "highest": MOST_RATE}
+            return Refusal(Code.RATE_OUT_OF_RANGE, bounds)
+        plan, period_ns = self.plan, round(1e9 / rate)
+        if period_ns < plan.least_period_ns:
+            return Refusal(Code.RATE_OVER_BUSES, {"highest": 1e9 / plan.least_period_ns})
+        if 0 < plan.slowest_period_ns < period_ns:
+            return Refusal(Code.RATE_UNDER_WATCHDOG, {"lowest": 1e9 / plan.slowest_period_ns})
+        ending_ns = plan.policies.slowest_period_ns(plan.period_ns)
+        if ending_ns < period_ns:
+            return Refusal(Code.RATE_UNDER_EXIT, {"lowest": 1e9 / ending_ns})
         if refusal := self.manager.change_period(period_ns):
             return refusal
         self.schedule.change(self._cycle, period_ns)
         self._tell_patience()
         self.pace(period_ns)
-        return ""
+        return None
 
-    def pause(self) -> str:
-        """Stop the controllers' time after this cycle's read; return why not."""
+    def pause(self) -> Refusal | None:
+        """Stop the controllers' time after this cycle's read."""
         if self.paused:
-            return "the loop is paused already"
+            return Refusal(Code.PAUSED_ALREADY)
         self.paused = self._stood = True
         self._tell_patience()
-        return ""
+        return None
 
-    def resume(self) -> str:
-        """Let the controllers' time go on; goals that moved away meanwhile are approached slowly."""
+    def resume(self) -> Refusal | None:
+        """Let the controllers' time run again; goals that moved away meanwhile are approached slowly."""
         if not self.paused:
-            return "the loop is not paused"
+            return Refusal(Code.NOT_PAUSED)
         self.paused = False
         self.gate.ease_in()
         self._tell_patience()
-        return ""
+        return None
 
-    def load(self, plan: ControllerPlan) -> str:
-        """Configure one more controller, inactive; return why not. The guardian has patience for each."""
-        refusal = self.manager.load(plan)
+    def load(self, plan: ControllerPlan) -> int | Refusal:
+        """Configure one more controller, inactive; return its place. The guardian waits for each of them."""
+        found = self.manager.load(plan)
         self.beat()
-        return refusal
+        return found
 
-    def set_register(self, joint: str, item: str, value: int, done: Callable[[str], None]) -> str:
-        """Have a RAM item of a joint's servo written in the gaps between cycles; return why not."""
+    def set_register(self, joint: str, item: str, value: int, done: Callable[[str], None]) -> Refusal | None:
+        """Have a RAM item of a joint's servo written in idle time; `done` gets what went wrong, or ''."""
         for row, one in enumerate(self.plan.joints):
             if one.name == joint:
                 self.hardware.set_register(row, item, value, done)
-                return ""
-        return f"there is no joint {joint}"
+                return None
+        return Refusal(Code.UNKNOWN_JOINT, {"joint": joint})
 
-    def finish(self) -> str:
+    def finish(self) -> None:
         """End the run in order after this cycle."""
         self.stop.request()
-        return ""
 
     def expire(self, controller: str) -> str:
         """Hold a controller whose stream of commands ended, or end the run, as the policy says."""
@@ -271,7 +273,7 @@ class Loop:
         read_ns = now_ns()
         self.gate.enter_modes()
         if self._motion:
-            self.steering.refuse("the run is ending")
+            self.steering.refuse()
             self._motion.command()
         else:
             self._command(cycle, self._controllers_time())
@@ -294,6 +296,7 @@ class Loop:
             record.commands.clear()
         else:
             self.manager.update(cycle - self._paused_cycles, time_ns)
+        self.steering.answer_late()
 
     def _controllers_time(self) -> int:
         """Return the time of this cycle for controllers, which never goes back: who was late when a pause

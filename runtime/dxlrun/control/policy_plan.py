@@ -111,19 +111,15 @@ class PolicyPlan:
         """True when any of them leaves the servos with less torque, which a start-up must give back."""
         return any(step.levels for name in POLICIES for step in self.named(name).steps)
 
-    def refuse_period(self, period_ns: int, planned_ns: int) -> str:
-        """Say why a run would not end in time in another period than the planned one, ns.
+    def slowest_period_ns(self, planned_ns: int) -> int:
+        """Return the longest period in which a run ends within its exit timeout; `planned_ns` is the plan's.
 
-        A wish to stop is seen a period later, and the first step begins one after that; two planned periods
-        are kept free for it beside the limit.
+        A request to stop is seen a period later, and the first step begins one after that; two planned
+        periods are kept free for it beside the limit.
         """
         longest_ns = max(self.named(name).longest_ns for name in POLICIES)
         left_ns = max(0, self.limit_ns - longest_ns)
-        slowest_ns = planned_ns + (left_ns // 2 if longest_ns else planned_ns + left_ns)
-        if period_ns <= slowest_ns:
-            return ""
-        what = "its policies need" if longest_ns else "it takes"
-        return f"{what} at least {1e9 / slowest_ns:.2g} Hz to end the run within exit_timeout"
+        return planned_ns + (left_ns // 2 if longest_ns else planned_ns + left_ns)
 
     def of_lost(self, row: int) -> GroupPolicy | None:
         """Return the group whose policy counts when this joint is lost; None: `on_lost_servo` does."""

@@ -1,4 +1,4 @@
-"""Steering: what the loop does with commands from outside, at the start of a cycle, so many and no more."""
+"""Steering: take commands from outside at the start of a cycle, a bounded number, and answer each of them."""
 
 from __future__ import annotations
 
@@ -12,40 +12,41 @@ import numpy as np
 
 from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.loop_plan import ControllerPlan
+from dxlrun.run.channels.answers import Answer, Code, Done, Refusal, Waiting
 from dxlrun.run.channels.commands import LOOP, Command, CommandSink, Inbox, TakenCommand
 from dxlrun.run.channels.cycle import CycleRecord
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
 
 
 class Steered(Protocol):
-    """What can be done to a loop from outside; each returns why it was refused, empty when it was done."""
+    """What commands from outside do to a loop; None: it is done."""
 
-    def change_rate(self, rate: float) -> str:
+    def change_rate(self, rate: float) -> Refusal | None:
         """Run in another period from the next cycle on; Hz."""
         ...
 
-    def pause(self) -> str:
-        """Stop the controllers' time: servos are read and held, nobody is updated."""
+    def pause(self) -> Refusal | None:
+        """Stop the controllers' time: servos are read and held, no controller is updated."""
         ...
 
-    def resume(self) -> str:
-        """Let the controllers' time go on."""
+    def resume(self) -> Refusal | None:
+        """Let the controllers' time run again."""
         ...
 
-    def load(self, plan: ControllerPlan) -> str:
-        """Configure one more controller; the guardian has patience for each of them."""
+    def load(self, plan: ControllerPlan) -> int | Refusal:
+        """Configure one more controller; return its place."""
         ...
 
-    def set_register(self, joint: str, item: str, value: int, done: Callable[[str], None]) -> str:
-        """Have a RAM item of a joint's servo written; `done` is called when it is, or with why it is not."""
+    def set_register(self, joint: str, item: str, value: int, done: Callable[[str], None]) -> Refusal | None:
+        """Have a RAM item of a joint's servo written; `done` gets what went wrong, or an empty text."""
         ...
 
-    def finish(self) -> str:
+    def finish(self) -> None:
         """End the run in order after this cycle."""
         ...
 
     def expire(self, controller: str) -> str:
-        """Do what the policy for a stale command says; return that in words."""
+        """Do what the policy for a stale command says; return that in words, for the log."""
         ...
 
     @property
@@ -75,7 +76,7 @@ class Unload(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Register(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Data of `register`; what may be written was checked before it came here."""
+    """Data of `register`; whether the item may be written was checked before."""
 
     joint: str
     item: str
@@ -89,8 +90,11 @@ KINDS = ("switch", "rate", "pause", "resume", "load", "unload", "register", "sto
 
 @dataclass(slots=True)
 class Steering:
-    """Takes commands out of an inbox and answers each of them once: at once, but for registers, which take
-    some gaps between cycles."""
+    """Executes the commands of an inbox, logs them, and answers them.
+
+    Most are answered in the cycle that takes them. A switch that waits for modes is answered by `Waiting`
+    first, and again when its controllers are active or given up; a register when the servo has it.
+    """
 
     inbox: Inbox
     loop: Steered
@@ -100,30 +104,35 @@ class Steering:
     taken: CommandSink
 
     def take(self, time_ns: int) -> int:
-        """Do what waits, and end streams whose lease ran out; return how many commands controllers took."""
+        """Execute what has come, and end streams whose lease ran out; return the commands for controllers."""
         count = 0
         for command in self.inbox.take():
             self._log(command)
-            obey = self._obey if command.controller == LOOP else self._hand
-            refusal = obey(command, time_ns)
-            if refusal:
+            execute = self._for_loop if command.controller == LOOP else self._for_controller
+            answer = execute(command, time_ns)
+            if isinstance(answer, Refusal):
                 source = command.controller or "loop"
-                text = f"{command.kind} from {command.origin} refused: {refusal}"
+                text = f"{command.kind} from {command.origin} refused: {answer.text}"
                 self.events.emit(EventCode.COMMAND_REFUSED, Severity.WARNING, source, text)
             elif command.controller == LOOP:
                 text = f"{command.kind} {command.data.decode(errors='replace')}".strip()
                 self.events.emit(EventCode.STEERED, Severity.INFO, "loop", f"{text} from {command.origin}")
             else:
                 count += 1
-            if refusal is not None:
-                self.inbox.answer(command.number, refusal)
+            if answer is not None:
+                self.inbox.answer(command.number, answer)
         self._expire()
         return count
 
-    def refuse(self, why: str) -> None:
-        """Answer what waits without doing it; it is not in the log, as it changes nothing."""
+    def refuse(self) -> None:
+        """Refuse what has come, because the run is ending; it is not in the log, as it changes nothing."""
         for command in self.inbox.take():
-            self.inbox.answer(command.number, why)
+            self.inbox.answer(command.number, Refusal(Code.RUN_ENDING))
+
+    def answer_late(self) -> None:
+        """Answer the switches that waited for modes and have come to an end."""
+        for number, refusal in self.manager.ended_switches():
+            self.inbox.answer(number, refusal or Done(self.record.cycle))
 
     def _log(self, command: Command) -> None:
         record = self.record
@@ -140,51 +149,59 @@ class Steering:
             )
         )
 
-    def _hand(self, command: Command, time_ns: int) -> str | None:
+    def _for_controller(self, command: Command, time_ns: int) -> Answer:
         if len(command.data) % 8:
-            return f"{len(command.data)} bytes are no array of numbers"
+            problem = f"{len(command.data)} bytes are no array of numbers"
+            return Refusal(Code.INVALID, {"problem": problem})
         data = np.frombuffer(command.data, dtype="<f8")
         until_ns = self.record.woken_ns + command.lease_ns if command.lease_ns else 0
         name, kind, origin = command.controller, command.kind, command.origin
-        return self.manager.hand(name, kind, data, origin, time_ns, until_ns)
+        return self.manager.hand(name, kind, data, origin, time_ns, until_ns) or Done(self.record.cycle)
 
     def _expire(self) -> None:
         for name in self.manager.stale(self.record.woken_ns):
             text = f"the stream of commands ended; {self.loop.expire(name)}"
             self.events.emit(EventCode.STALE_COMMAND, Severity.WARNING, name, text)
 
-    def _obey(self, command: Command, time_ns: int) -> str | None:
-        """Return why a command for the loop is refused, empty when it is done, None while it is not yet."""
+    def _for_loop(self, command: Command, time_ns: int) -> Answer | None:
+        """Execute a command for the loop itself; None: it is answered later."""
         try:
-            return self._do(command, time_ns)
+            return self._execute(command, time_ns)
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-            return f"its data does not fit: {error}"
+            return Refusal(Code.INVALID, {"problem": f"the data of {command.kind} do not fit: {error}"})
 
-    def _do(self, command: Command, time_ns: int) -> str | None:
+    def _execute(self, command: Command, time_ns: int) -> Answer | None:
         loop, manager, data = self.loop, self.manager, command.data
-        refusal: str | None
+        answer: Refusal | Waiting | None = None
         match command.kind:
             case "switch":
                 switch = msgspec.json.decode(data, type=Switch)
-                refusal = manager.switch(switch.activate, switch.deactivate, time_ns)
+                answer = manager.switch(switch.activate, switch.deactivate, time_ns, command.number)
             case "rate":
-                refusal = loop.change_rate(msgspec.json.decode(data, type=Rate).rate)
+                answer = loop.change_rate(msgspec.json.decode(data, type=Rate).rate)
             case "pause":
-                refusal = loop.pause()
+                answer = loop.pause()
             case "resume":
-                refusal = loop.resume()
+                answer = loop.resume()
             case "stop":
-                refusal = loop.finish()
+                loop.finish()
             case "load" | "unload" if not loop.paused:
-                refusal = "pause the loop first: it stands still meanwhile"
+                answer = Refusal(Code.NOT_IN_PAUSE)
             case "load":
-                refusal = loop.load(msgspec.json.decode(data, type=ControllerPlan))
+                found = loop.load(msgspec.json.decode(data, type=ControllerPlan))
+                return found if isinstance(found, Refusal) else Done(self.record.cycle, found)
             case "unload":
-                refusal = manager.unload(msgspec.json.decode(data, type=Unload).controller)
+                answer = manager.unload(msgspec.json.decode(data, type=Unload).controller)
             case "register":
-                wish = msgspec.json.decode(data, type=Register)
-                done = partial(self.inbox.answer, command.number)
-                refusal = loop.set_register(wish.joint, wish.item, wish.value, done) or None
+                register = msgspec.json.decode(data, type=Register)
+                done = partial(self._written, command.number)
+                return loop.set_register(register.joint, register.item, register.value, done)
             case _:
-                refusal = f"the loop knows {', '.join(KINDS)}"
-        return refusal
+                problem = f"the loop has no command {command.kind}; known: {', '.join(KINDS)}"
+                answer = Refusal(Code.INVALID, {"problem": problem})
+        return answer or Done(self.record.cycle)
+
+    def _written(self, number: int, problem: str) -> None:
+        """Answer a register when the servo has it, or when that failed."""
+        refusal = Refusal(Code.REGISTER_NOT_WRITTEN, {"problem": problem}) if problem else None
+        self.inbox.answer(number, refusal or Done(self.record.cycle))

@@ -18,6 +18,7 @@ import socket
 import struct
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from urllib.parse import quote
@@ -25,7 +26,7 @@ from urllib.parse import quote
 from dxlrun.errors import DxlrunError, Refused
 from dxlrun.remote.sockets import MOST_BYTES, alive, running, sockets
 
-__all__ = ["RemoteRobot", "Stream", "connect", "running"]
+__all__ = ["Executed", "RemoteRobot", "Stream", "connect", "running"]
 
 TIMEOUT_S = 10.0
 """How long an answer may take: two seconds or so whatever the loop does, six more of a switch with modes."""
@@ -34,7 +35,15 @@ _IDLE_S = 20.0
 """The gateway closes silent connections after 30 s; one that was silent for so long is not used again."""
 _STOP_S = 30.0
 _WRONG_INPUT = (404, 413, 422)
-"""Statuses of wishes that would be refused at any time: no such thing, too long, not as they must be."""
+"""Statuses of requests that would be refused at any time: no such thing, too long, not as they must be."""
+
+
+@dataclass(frozen=True, slots=True)
+class Executed:
+    """The answer to a command that the robot executed."""
+
+    cycle: int
+    """The loop's cycle that did it; -1 where the robot does not say."""
 
 
 class _Connection(http.client.HTTPConnection):
@@ -132,49 +141,55 @@ class RemoteRobot:
 
     # Steering
 
-    def send(self, controller: str, kind: str, command: Mapping[str, object]) -> None:
-        """Give a controller a typed command; returns when the loop has taken it. Raises Refused for values
-        beyond their joints' limits too."""
-        self._post(f"/controllers/{_quoted(controller)}/commands/{_quoted(kind)}", command)
+    def send(
+        self, controller: str, kind: str, command: Mapping[str, object], *, units: bool = False
+    ) -> Executed:
+        """Send a controller a typed command; returns when the loop has taken it. Raises Refused for values
+        beyond their joints' limits too.
+
+        Numbers are in SI. With `units`, quantities are written as in a motion file, such as `"30 deg"`.
+        """
+        path = f"/controllers/{_quoted(controller)}/commands/{_quoted(kind)}"
+        return self._execute(f"{path}?units=true" if units else path, command)
 
     def stream(self, controller: str, kind: str, lease: float = LEASE_S) -> Stream:
         """Return a stream of set-points for a controller, of which the newest counts, for `lease` seconds."""
         return Stream(self, controller, kind, lease)
 
-    def switch(self, activate: Sequence[str] = (), deactivate: Sequence[str] = ()) -> None:
+    def switch(self, activate: Sequence[str] = (), deactivate: Sequence[str] = ()) -> Executed:
         """Activate and deactivate controllers in one cycle, or not at all; returns when they are.
 
         Where servos must change their mode first, that takes longer; raises Refused when one does not.
         """
-        self._post("/switch", {"activate": list(activate), "deactivate": list(deactivate)})
+        return self._execute("/switch", {"activate": list(activate), "deactivate": list(deactivate)})
 
-    def set_register(self, joint: str, item: str, value: int | str) -> None:
+    def set_register(self, joint: str, item: str, value: int | str) -> Executed:
         """Write a RAM item of a joint's servo, such as a gain; returns when it was read back.
 
         `value` is the integer of the e-Manual, or a quantity with its unit: `10 rad/s^2`. A servo that is
         reset in the run gets it again.
         """
-        self._post(f"/joints/{_quoted(joint)}/registers/{_quoted(item)}", {"value": value})
+        return self._execute(f"/joints/{_quoted(joint)}/registers/{_quoted(item)}", {"value": value})
 
-    def rate(self, rate: float) -> None:
+    def rate(self, rate: float) -> Executed:
         """Let the loop run at another rate, Hz."""
-        self._post("/rate", {"rate": rate})
+        return self._execute("/rate", {"rate": rate})
 
-    def pause(self) -> None:
+    def pause(self) -> Executed:
         """Hold the joints; the controllers' time stands still."""
-        self._post("/pause")
+        return self._execute("/pause")
 
-    def resume(self) -> None:
-        """Let the controllers go on where they were."""
-        self._post("/resume")
+    def resume(self) -> Executed:
+        """Let the controllers' time run again, from where it was."""
+        return self._execute("/resume")
 
-    def load(self, name: str, entry: Mapping[str, object]) -> None:
+    def load(self, name: str, entry: Mapping[str, object]) -> Executed:
         """Load a controller into the paused loop; `entry` is written as in the robot file."""
-        self._post("/controllers", {**entry, "name": name})
+        return self._execute("/controllers", {**entry, "name": name})
 
-    def unload(self, name: str) -> None:
+    def unload(self, name: str) -> Executed:
         """Take a controller that is not active out of the paused loop."""
-        self._ask("DELETE", f"/controllers/{_quoted(name)}")
+        return _executed(self._ask("DELETE", f"/controllers/{_quoted(name)}"))
 
     def stop(self, wait: bool = True) -> None:
         """End the run in order; with `wait`, return when it has ended and its log is closed.
@@ -198,7 +213,7 @@ class RemoteRobot:
     def _stopping(self) -> bool:
         """Ask once to stop; False when the connection was closed by a gateway that is alive."""
         try:
-            self._post("/stop")
+            self._ask("POST", "/stop")
         except Refused:
             raise
         except DxlrunError as error:
@@ -208,8 +223,8 @@ class RemoteRobot:
                 raise
         return True
 
-    def _post(self, path: str, content: Mapping[str, object] | None = None) -> dict[str, object]:
-        return self._ask("POST", path, content)
+    def _execute(self, path: str, content: Mapping[str, object] | None = None) -> Executed:
+        return _executed(self._ask("POST", path, content))
 
     def _ask(self, method: str, path: str, content: Mapping[str, object] | None = None) -> dict[str, object]:
         """Ask once and return the answer: nothing is ever asked twice, the first may have been heard."""
@@ -232,9 +247,19 @@ class RemoteRobot:
         if not isinstance(answer, dict):
             raise DxlrunError(f"{self.name} answers in a way that this version does not know")
         if "refused" in answer or response.status >= 400:
-            sentence = str(answer.get("refused", f"HTTP status {response.status}"))
-            raise Refused(sentence, wrong_input=response.status in _WRONG_INPUT)
+            fields = answer.get("fields")
+            raise Refused(
+                str(answer.get("refused", f"HTTP status {response.status}")),
+                code=str(answer.get("code", "")),
+                fields=fields if isinstance(fields, dict) else {},
+                wrong_input=response.status in _WRONG_INPUT,
+            )
         return answer
+
+
+def _executed(answer: Mapping[str, object]) -> Executed:
+    cycle = answer.get("cycle")
+    return Executed(cycle if isinstance(cycle, int) else -1)
 
 
 def _quoted(name: str) -> str:
@@ -247,11 +272,17 @@ def _json(content: Mapping[str, object]) -> bytes:
         body = json.dumps(content, default=_plain, allow_nan=False).encode()
     except (TypeError, ValueError, RecursionError) as error:
         raise Refused(
-            f"this cannot be sent: {error}; use numbers, texts, lists and mappings", wrong_input=True
+            f"this cannot be sent: {error}; use numbers, texts, lists and mappings",
+            code="invalid",
+            fields={"problem": str(error)},
+            wrong_input=True,
         ) from error
     if len(body) > MOST_BYTES:
         raise Refused(
-            f"{len(body)} bytes are too many, at most {MOST_BYTES} are taken at once", wrong_input=True
+            f"{len(body)} bytes are too many, at most {MOST_BYTES} are taken at once",
+            code="too_long",
+            fields={"size": len(body), "most": MOST_BYTES},
+            wrong_input=True,
         )
     return body
 
@@ -266,21 +297,25 @@ def _plain(value: object) -> object:
 class Stream:
     """Set-points for one controller; when they cease for longer than the lease, its joints are held.
 
-    `clamped` counts the values beyond their joints' limits, which the robot clamped.
+    `clamped` counts the values beyond their joints' limits, which the robot clamped; `clamped_joints` are the
+    joints of those in the newest set-point.
     """
 
     def __init__(self, robot: RemoteRobot, controller: str, kind: str, lease: float) -> None:
         self._robot = robot
         self._path = f"/controllers/{_quoted(controller)}/set-points/{_quoted(kind)}?lease={lease:g}"
         self.clamped = 0
+        self.clamped_joints: tuple[str, ...] = ()
 
     def send(self, command: Mapping[str, object]) -> int:
         """Leave the newest set-point, before the loop has taken it; return how many of its values are
         beyond their joints' limits."""
-        clamped = self._robot._post(self._path, command).get("clamped", 0)
-        count = clamped if isinstance(clamped, int) else 0
-        self.clamped += count
-        return count
+        answer = self._robot._ask("POST", self._path, command)
+        count, joints = answer.get("clamped"), answer.get("clamped_joints")
+        self.clamped_joints = tuple(joints) if isinstance(joints, list) else ()
+        clamped = count if isinstance(count, int) else 0
+        self.clamped += clamped
+        return clamped
 
     def __enter__(self) -> Stream:
         return self

@@ -1,27 +1,30 @@
-"""Gateway: who may ask a running robot what, over HTTP on a Unix socket; JSON in, JSON out.
+"""Gateway: what can be asked of a running robot, over HTTP on a Unix socket; JSON in, JSON out.
 
-    GET  /robot                                 who it is, its controllers and what they take
+    GET  /robot                                 the run, its controllers and the commands that they take
     GET  /states                                the newest cycle
     GET  /events?after=N                        what happened since event N
-    POST /controllers/NAME/commands/KIND        a typed command
+    POST /controllers/NAME/commands/KIND        a typed command; ?units=true: quantities with their units
     POST /controllers/NAME/set-points/KIND      one of a stream; the newest wins; ?lease=0.2 (seconds)
     POST /switch {activate, deactivate}         controllers, in one cycle or not at all
     POST /joints/NAME/registers/ITEM {value}    a RAM item of a joint's servo; answered when it is there
     POST /rate {rate}, /pause, /resume, /stop
     POST /controllers {name, type, ...}         load one, DELETE /controllers/NAME unload it; in a pause only
 
-`{"done": true}`, of a set-point with `"clamped"`, the number of values beyond their joints' limits; or
-`{"refused": "..."}` with a status of 4xx or 5xx.
+`{"done": true, "cycle": N}`, of a set-point instead `"clamped"`, the number of values beyond their joints'
+limits, and `"clamped_joints"`; or `{"refused": "...", "code": "...", "fields": {...}}` with a status of 4xx
+or 5xx: a sentence for a person, and for a program the code of the reason with its data.
 """
 
 from __future__ import annotations
 
+import asyncio
 import math
 import time
 import traceback
 from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
 from functools import partial
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar
 
 import msgspec
 from starlette.applications import Starlette
@@ -31,27 +34,72 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from dxlrun.control.steering import Rate, Switch
-from dxlrun.errors import suggestion
 from dxlrun.mode import Mode
-from dxlrun.remote.asking import Allowance, body, number, origin, peer, typed
 from dxlrun.remote.link import Link, Loaded
-from dxlrun.remote.preparation import Preparation, Refusal
-from dxlrun.remote.registers import Value, register_wish
+from dxlrun.remote.preparation import (
+    Preparation,
+    RefusedRequest,
+    invalid,
+    prepared_register,
+    refused,
+    unknown_controllers,
+)
+from dxlrun.remote.sockets import MOST_BYTES
+from dxlrun.run.channels.answers import Code, Done, Refusal
 from dxlrun.run.channels.cycle import CycleRecord
 
 MOST_OPERATIONS = 200.0
 MOST_SET_POINTS = 4000.0
 MOST_LOOKS = 2000.0
 """A second, of one process; a short burst may be as many at once as come in a tenth of it."""
+MOST_PEERS = 256
+"""Processes whose allowance is kept."""
+CHARGED_BYTES = 16_384
+"""So many bytes of a body count as one request more."""
+BODY_S = 10.0
+"""How long a body may take to arrive."""
 LEASE_S = (0.01, 0.2, 60.0)
 """Shortest, default and longest time that a set-point of a stream counts."""
+LONGEST_ORIGIN = 64
 LONGEST_SENTENCE = 2000
+_STATUS = {
+    Code.UNKNOWN_CONTROLLER: 404,
+    Code.UNKNOWN_COMMAND: 404,
+    Code.UNKNOWN_JOINT: 404,
+    Code.UNKNOWN_REGISTER: 404,
+    Code.UNKNOWN_PAGE: 404,
+    Code.UNLOADED: 404,
+    Code.WRONG_METHOD: 405,
+    Code.BODY_TIMEOUT: 408,
+    Code.TOO_LONG: 413,
+    Code.INVALID: 422,
+    Code.INVALID_REGISTER: 422,
+    Code.WRONG_QUANTITY: 422,
+    Code.BEYOND_LIMITS: 422,
+    Code.NAMED_TWICE: 422,
+    Code.TOO_SLOW: 422,
+    Code.TOO_OFTEN: 429,
+    Code.QUEUE_FULL: 429,
+    Code.GATEWAY_FAILED: 500,
+    Code.NO_CYCLE: 503,
+    Code.NO_ANSWER: 503,
+    Code.RUN_ENDING: 503,
+}
+_CONFLICT = 409
+"""Status of all other refusals: what the loop or a controller cannot do now."""
 
 Handler: TypeAlias = Callable[[Request], Awaitable[Response]]
+T = TypeVar("T")
+
+
+class Value(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Body of a register's request: the integer on the wire, or a quantity with its unit."""
+
+    value: int | str
 
 
 class Gateway:
-    """The routes; every wish is checked and prepared here, so that the loop only has to take it."""
+    """The routes; every request is checked and prepared here, so that the loop only has to execute it."""
 
     def __init__(
         self,
@@ -89,14 +137,14 @@ class Gateway:
             route("/resume", self.resume, "POST", operations),
             route("/stop", self.stop, "POST", None),  # always taken
         ]
-        app = Starlette(routes=routes, exception_handlers={HTTPException: _no_such_page})
+        app = Starlette(routes=routes, exception_handlers={HTTPException: _unknown_page})
         app.router.redirect_slashes = False
         return app
 
     # Looking
 
     async def robot(self, request: Request) -> Response:
-        """Who it is, its controllers and what they take."""
+        """Return the run, its controllers and the commands that they take."""
         link = self._link
         return _json(
             {
@@ -106,12 +154,12 @@ class Gateway:
                 "cycles": link.heartbeat.cycles,
                 "skipped": link.heartbeat.skipped,
                 "joints": [joint.name for joint in link.plan.loop.joints],
-                "controllers": [self._told(one) for one in link.controllers.values()],
+                "controllers": [self._shown(one) for one in link.controllers.values()],
                 "log": self._log,
             }
         )
 
-    def _told(self, loaded: Loaded) -> dict[str, object]:
+    def _shown(self, loaded: Loaded) -> dict[str, object]:
         plan = loaded.plan
         return {
             "name": plan.name,
@@ -128,7 +176,7 @@ class Gateway:
         """The newest cycle; numbers that are not there are null."""
         record = self._link.newest()
         if record is None:
-            raise Refusal(503, "the loop has run no cycle yet; ask again")
+            raise refused(Code.NO_CYCLE, {})
         joints = self._link.plan.loop.joints
         rows = {joint.name: _state(record, row) for row, joint in enumerate(joints)}
         return _json({"cycle": record.cycle, "time": record.woken_ns * 1e-9, "joints": rows})
@@ -156,10 +204,10 @@ class Gateway:
     async def command(self, request: Request) -> Response:
         """Check and prepare a typed command, within the limits, and let the loop hand it over."""
         loaded, kind = self._known(request), request.path_params["kind"]
-        prepared = self._preparation.command(loaded.plan, kind, await body(request))
-        prepared.require_within_limits(f"{kind} of {loaded.plan.name}")
-        await self._link.ask(loaded.plan.name, kind, prepared.data, origin(request))
-        return _done()
+        units = request.query_params.get("units") == "true"
+        prepared = self._preparation.command(loaded.plan, kind, await body(request), units=units)
+        prepared.require_within_limits()
+        return _done(await self._link.command(loaded.plan.name, kind, prepared.data, origin(request)))
 
     async def set_point(self, request: Request) -> Response:
         """Leave the newest of a stream for the loop; what the loop refuses is an event, not an answer.
@@ -169,79 +217,79 @@ class Gateway:
         shortest, usual, longest = LEASE_S
         lease = number(request, "lease", usual)
         if not shortest <= lease <= longest:
-            raise Refusal(422, f"a lease is {shortest:g} to {longest:g} s, not {lease:g}")
+            raise invalid(f"a lease is {shortest:g} to {longest:g} s, not {lease:g}")
         loaded, kind = self._known(request), request.path_params["kind"]
+        name = loaded.plan.name
         prepared = self._preparation.command(loaded.plan, kind, await body(request))
-        if self._link.controllers.get(loaded.plan.name) is not loaded:
-            raise Refusal(404, f"{loaded.plan.name} was unloaded meanwhile")
+        if self._link.controllers.get(name) is not loaded:
+            raise refused(Code.UNLOADED, {"controller": name})
         if not self._link.active(loaded):
-            raise Refusal(409, f"{loaded.plan.name} is not active; switch to it first")
+            raise refused(Code.NOT_ACTIVE, {"controller": name})
         self._link.set_point(loaded, kind, prepared.data, origin(request), round(lease * 1e9))
-        return _json({"done": True, "clamped": len(prepared.beyond)}, 202)
+        clamped = {"clamped": len(prepared.beyond), "clamped_joints": prepared.joints_beyond}
+        return _json({"done": True} | clamped, 202)
 
     async def switch(self, request: Request) -> Response:
         """Activate and deactivate controllers in one cycle; answer when those that wait for modes are in."""
-        wish = await typed(request, Switch, '{"activate": ["head"], "deactivate": []}')
-        for names in (wish.activate, wish.deactivate):
-            if len(set(names)) != len(names):
-                raise Refusal(422, "a controller is named twice; name it once")
-            for name in names:
-                self._named(name)
-        done = partial(self._link.switched, wish.activate, wish.deactivate)
-        answer = await self._ask(request, "switch", wish, done)
-        await self._link.entered(wish.activate)
-        return answer
+        switch = await typed(request, Switch, '{"activate": ["head"], "deactivate": []}')
+        known = tuple(self._link.controllers)
+        if unknown := [name for name in (*switch.activate, *switch.deactivate) if name not in known]:
+            raise unknown_controllers(unknown, known)
+        done = await self._link.for_loop("switch", switch, origin(request))
+        await self._link.recorded(done.cycle)  # so that a set-point that follows finds them active
+        return _done(done)
 
     async def register(self, request: Request) -> Response:
         """Have a RAM item of a joint's servo written, and answer when it was read back."""
-        wish = await typed(request, Value, '{"value": 800}')
+        given = await typed(request, Value, '{"value": 800}')
         joint, item = request.path_params["name"], request.path_params["item"]
-        prepared = register_wish(self._link.plan, joint, item, wish.value)
-        return await self._ask(request, "register", prepared, None)
+        register = prepared_register(self._link.plan, joint, item, given.value)
+        return _done(await self._link.for_loop("register", register, origin(request)))
 
     async def rate(self, request: Request) -> Response:
         """Run the loop at another rate."""
-        wish = await typed(request, Rate, '{"rate": 100}')
-        return await self._ask(request, "rate", wish, lambda: setattr(self._link, "rate", wish.rate))
+        rate = await typed(request, Rate, '{"rate": 100}')
+        noted = partial(self._note, "rate", rate.rate)
+        return _done(await self._link.for_loop("rate", rate, origin(request), noted))
 
     async def pause(self, request: Request) -> Response:
         """Hold the joints where they are sent; the controllers' time stands still."""
-        return await self._ask(request, "pause", None, lambda: setattr(self._link, "paused", True))
+        noted = partial(self._note, "paused", True)
+        return _done(await self._link.for_loop("pause", None, origin(request), noted))
 
     async def resume(self, request: Request) -> Response:
-        """Let the controllers' time go on."""
-        return await self._ask(request, "resume", None, lambda: setattr(self._link, "paused", False))
+        """Let the controllers' time run again."""
+        noted = partial(self._note, "paused", False)
+        return _done(await self._link.for_loop("resume", None, origin(request), noted))
 
     async def stop(self, request: Request) -> Response:
         """End the run in order."""
-        return await self._ask(request, "stop", None, None)
+        return _done(await self._link.for_loop("stop", None, origin(request)))
 
     async def load(self, request: Request) -> Response:
         """Load a controller into a paused loop."""
-        wish = await typed(request, dict[str, object], '{"name": "arm", "type": "..."}')
-        plan = self._preparation.controller(wish, self._link.controllers)
-        return await self._ask(request, "load", plan, partial(self._link.loaded, plan))
+        entry = await typed(request, dict[str, object], '{"name": "arm", "type": "..."}')
+        plan = self._preparation.controller(entry, self._link.controllers)
+        noted = partial(self._link.loaded, plan)
+        return _done(await self._link.for_loop("load", plan, origin(request), noted))
 
     async def unload(self, request: Request) -> Response:
         """Take a controller out of a paused loop."""
         name = self._known(request).plan.name
-        done = partial(self._link.controllers.pop, name, None)
-        return await self._ask(request, "unload", {"controller": name}, done)
 
-    async def _ask(
-        self, request: Request, kind: str, data: object, done: Callable[[], object] | None
-    ) -> Response:
-        await self._link.ask_loop(kind, data, origin(request), done)
-        return _done()
+        def noted(_: Done) -> None:
+            self._link.controllers.pop(name, None)
+
+        return _done(await self._link.for_loop("unload", {"controller": name}, origin(request), noted))
+
+    def _note(self, what: str, value: object, _: Done) -> None:
+        setattr(self._link, what, value)
 
     def _known(self, request: Request) -> Loaded:
-        return self._named(request.path_params["name"])
-
-    def _named(self, name: str) -> Loaded:
+        name = request.path_params["name"]
         loaded = self._link.controllers.get(name)
         if loaded is None:
-            known = suggestion(name[:80], tuple(self._link.controllers))
-            raise Refusal(404, f"there is no controller {name[:80]}; {known}")
+            raise unknown_controllers([name], tuple(self._link.controllers))
         return loaded
 
 
@@ -253,13 +301,13 @@ def _answered(handler: Handler, allowance: Allowance | None) -> Handler:
             if allowance is not None:
                 allowance.spend(peer(request))
             return await handler(request)
-        except Refusal as refusal:
-            return _refused(refusal.status, str(refusal))
+        except RefusedRequest as error:
+            return _refused(error.refusal)
         except ClientDisconnect:
-            return Response(status_code=400)  # nobody reads it
-        except Exception as error:  # the last resort: one request fails, the gateway goes on
+            return Response(status_code=400)  # no client reads it
+        except Exception as error:  # the last resort: one request fails, and the gateway serves the next
             traceback.print_exc()
-            return _refused(500, f"the gateway failed: {type(error).__name__}: {error}; --debug shows where")
+            return _refused(Refusal(Code.GATEWAY_FAILED, {"problem": f"{type(error).__name__}: {error}"}))
         finally:
             if allowance is not None:
                 allowance.charge(peer(request), getattr(request.state, "received", 0))
@@ -294,17 +342,108 @@ def _json(content: object, status: int = 200) -> Response:
     return Response(msgspec.json.encode(content), status, media_type="application/json")
 
 
-def _done() -> Response:
-    return _json({"done": True})
+def _done(done: Done) -> Response:
+    return _json({"done": True, "cycle": done.cycle})
 
 
-def _refused(status: int, sentence: str) -> Response:
-    response = _json({"refused": sentence[:LONGEST_SENTENCE]}, status)
+def _refused(refusal: Refusal) -> Response:
+    status = _STATUS.get(refusal.code, _CONFLICT)
+    sentence = " ".join(refusal.text.split())[:LONGEST_SENTENCE]
+    response = _json({"refused": sentence, "code": refusal.code, "fields": refusal.fields}, status)
     if status in (408, 413):
         response.headers["connection"] = "close"  # what still comes of the body is not read
     return response
 
 
-async def _no_such_page(request: Request, error: Exception) -> Response:
-    status = error.status_code if isinstance(error, HTTPException) else 500
-    return _refused(status, f"{request.method} {request.url.path} is nothing that can be asked")
+async def _unknown_page(request: Request, error: Exception) -> Response:
+    method = isinstance(error, HTTPException) and error.status_code == 405
+    code = Code.WRONG_METHOD if method else Code.UNKNOWN_PAGE
+    return _refused(Refusal(code, {"method": request.method, "path": request.url.path[:80]}))
+
+
+# Requests
+
+
+@dataclass(slots=True)
+class Allowance:
+    """So many requests a second of each process, and no more (token bucket of a tenth of a second).
+
+    Long bodies count as many short ones: what they cost to read and to check keeps other clients waiting.
+    """
+
+    rate: float
+    now: Callable[[], float]
+    """Returns the time, s."""
+    _left: dict[str, tuple[float, float]] = field(default_factory=dict, init=False)
+    """Peer -> what it has left, and since when."""
+
+    def spend(self, peer: str) -> None:
+        """Take one; raises RefusedRequest when there is none left."""
+        left = self._refilled(peer)
+        if left < 1:
+            raise refused(Code.TOO_OFTEN, {"rate": self.rate})
+        self._left[peer] = (left - 1, self.now())
+
+    def charge(self, peer: str, size: int) -> None:
+        """Take what a body of so many bytes costs, also when that is more than is left."""
+        self._left[peer] = (self._refilled(peer) - size // CHARGED_BYTES, self.now())
+
+    def _refilled(self, peer: str) -> float:
+        now, most = self.now(), self.rate / 10
+        left, since = self._left.pop(peer, (most, now))
+        left = min(most, left + (now - since) * self.rate)
+        self._left[peer] = (left, now)
+        if len(self._left) > MOST_PEERS:
+            del self._left[next(iter(self._left))]
+        return left
+
+
+async def body(request: Request) -> bytes:
+    """Return a body, as long as it may be; raises RefusedRequest before more than that is in memory."""
+    announced = request.headers.get("content-length", "0")
+    if not announced.isdecimal() or len(announced) > 18 or int(announced) > MOST_BYTES:
+        raise refused(Code.TOO_LONG, {"size": announced[:20], "most": MOST_BYTES})
+    content = bytearray()
+    try:
+        async with asyncio.timeout(BODY_S):
+            async for chunk in request.stream():
+                content += chunk
+                if len(content) > MOST_BYTES:
+                    raise refused(Code.TOO_LONG, {"size": len(content), "most": MOST_BYTES})
+    except TimeoutError:
+        raise refused(Code.BODY_TIMEOUT, {"seconds": BODY_S}) from None
+    finally:
+        request.state.received = len(content)
+    return bytes(content)
+
+
+async def typed(request: Request, kind: type[T], example: str) -> T:
+    """Return a body that is JSON of a type; raises RefusedRequest."""
+    try:
+        return msgspec.json.decode(await body(request), type=kind)
+    except (msgspec.MsgspecError, RecursionError) as error:
+        raise invalid(f"{error}; write for example {example}") from error
+
+
+def number(request: Request, name: str, default: float) -> float:
+    """Return a number of the query; raises RefusedRequest."""
+    text = request.query_params.get(name)
+    try:
+        value = default if text is None else float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise invalid(f"{name}={str(text)[:40]} is no number")
+    return value
+
+
+def peer(request: Request) -> str:
+    """Return the process that sent a request, as the operating system reports it."""
+    return request.client.host if request.client else "a process"
+
+
+def origin(request: Request) -> str:
+    """Return a client's name for the log: printable, at most 64 characters; the process if it has none."""
+    given = request.headers.get("x-dxlrun-client", "").encode("latin-1", "replace").decode(errors="replace")
+    name = "".join(letter for letter in given if letter.isprintable())[:LONGEST_ORIGIN]
+    return name.strip() or peer(request)

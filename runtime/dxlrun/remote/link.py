@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -15,12 +14,13 @@ import msgspec
 from dxlrun.compile.plan import Plan
 from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.remote.job import Descriptors
-from dxlrun.remote.preparation import Refusal
+from dxlrun.remote.preparation import RefusedRequest
+from dxlrun.run.channels.answers import Answer, Code, Done, Refusal, Waiting
 from dxlrun.run.channels.commands import LONGEST_COMMAND, LOOP, Command
 from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
 from dxlrun.run.channels.events import Event, EventCode, decode_event
 from dxlrun.run.channels.heartbeat import Heartbeat, Phase
-from dxlrun.run.channels.mailbox import Answers, MailboxWriter
+from dxlrun.run.channels.mailbox import LONGEST_SET_POINT, Answers, MailboxWriter
 from dxlrun.run.channels.ring import Record, RecordKind, RingReader
 
 ANSWER_S = 2.0
@@ -36,8 +36,6 @@ LONGEST_DATA = LONGEST_COMMAND - 1024
 ENTER_S = 6.0
 """The loop gives joints five seconds to come into their modes."""
 _LOOK_S = 0.002
-_WAITS, _NOT_ACTIVATED = "waits until", "is not activated"
-"""What the events of a controller say whose joints change their modes first, and of one that was given up."""
 _HELD = {
     EventCode.STALE_COMMAND: True,
     EventCode.COMMAND: False,
@@ -54,26 +52,20 @@ class Loaded:
     plan: ControllerPlan
     place: int
     held: bool = False
-    switched: tuple[bool, int] | None = None
-    """What a switch made of it, and how many cycles had ended then: their records do not show it yet."""
-    entering: bool = False
-    """A switch activates it when its joints are in their modes."""
-    excuse: str = ""
-    """Why the last switch that had to wait did not activate it."""
 
 
 @dataclass(slots=True)
-class _Asked:
+class _Pending:
     """A command whose answer is awaited."""
 
     size: int
-    answer: asyncio.Future[str]
-    done: Callable[[], object] | None
-    """What the gateway knows anew when the loop has done it; also when nobody waits for the answer."""
+    answer: asyncio.Future[Answer]
+    done: Callable[[Done], object] | None
+    """What the gateway notes when the loop has done it; also when the client waits no more."""
 
 
 class Link:
-    """What the gateway knows of the loop, and how it asks it; one asyncio loop, no threads."""
+    """What the gateway knows of the loop, and how it sends commands; one asyncio loop, no threads."""
 
     def __init__(self, plan: Plan, memory: Descriptors) -> None:
         self.plan = plan
@@ -92,8 +84,8 @@ class Link:
         self._numbers = itertools.count(1)
         self._event_numbers = itertools.count(1)
         self._text = 0
-        self._asked: dict[int, _Asked] = {}
-        self._asked_bytes = 0
+        self._pending: dict[int, _Pending] = {}
+        self._pending_bytes = 0
 
     # Looking
 
@@ -105,137 +97,123 @@ class Link:
         return self._record if self._record.woken_ns else None
 
     def active(self, loaded: Loaded) -> bool:
-        """Say whether a controller is active: by the newest cycle, or by a switch of the one that runs."""
-        if loaded.switched is not None:
-            active, ended = loaded.switched
-            if self.heartbeat.cycles <= ended:
-                return active
-            loaded.switched = None
+        """Return whether a controller is active in the newest cycle."""
         record = self.newest()
         return record is not None and bool(record.active >> loaded.place & 1)
 
-    # Asking
+    # Commands
 
-    async def ask(
+    async def command(
         self,
         controller: str,
         kind: str,
         data: bytes,
         origin: str,
-        done: Callable[[], object] | None = None,
-    ) -> None:
-        """Hand a command to the loop and wait for its answer; raises Refusal.
+        done: Callable[[Done], object] | None = None,
+    ) -> Done:
+        """Hand a command to the loop and wait until it is done; raises RefusedRequest.
 
         `done` is called when the loop has done it, also when that is after the wait was given up. `stop` is
         taken however much waits already.
         """
-        if self.heartbeat.phase is not Phase.RUNNING:
-            raise Refusal(503, "the run is at its end")
-        size = len(data) + 1024
+        self._require_running()
         if len(data) > LONGEST_DATA:
-            raise Refusal(413, f"{len(data)} bytes are too many for one command; send less at once")
+            raise RefusedRequest(Refusal(Code.TOO_LONG, {"size": len(data), "most": LONGEST_DATA}))
+        size = len(data) + 1024
         stop = controller == LOOP and kind == "stop"
-        full = len(self._asked) >= MOST_WAITING or self._asked_bytes + size > MOST_WAITING_BYTES
+        full = len(self._pending) >= MOST_WAITING or self._pending_bytes + size > MOST_WAITING_BYTES
         number = next(self._numbers)
         if (full and not stop) or not self._mailbox.post(Command(number, controller, kind, data, origin)):
-            raise Refusal(429, "so much waits for the loop already that there is no room; ask less often")
-        answer: asyncio.Future[str] = asyncio.get_running_loop().create_future()
-        self._asked[number] = _Asked(size, answer, done)
-        self._asked_bytes += size
-        patience = ANSWER_S + min(2 / self.rate, ANSWER_S)
-        try:
-            refusal = await asyncio.wait_for(answer, patience)
-        except TimeoutError:
-            what = f"the loop did not answer within {patience:.1f} s; it may still do it"
-            raise Refusal(503, what) from None
-        if refusal:
-            raise Refusal(409, refusal)
+            raise RefusedRequest(Refusal(Code.QUEUE_FULL))
+        pending = _Pending(size, asyncio.get_running_loop().create_future(), done)
+        self._pending[number] = pending
+        self._pending_bytes += size
+        answer = await self._answer(pending, ANSWER_S + min(2 / self.rate, ANSWER_S))
+        while isinstance(answer, Waiting):
+            answer = await self._answer(pending, ENTER_S)
+        if isinstance(answer, Refusal):
+            raise RefusedRequest(answer)
+        return answer
 
-    async def ask_loop(
-        self, kind: str, data: object, origin: str, done: Callable[[], object] | None = None
-    ) -> None:
-        """Ask the loop itself for something; raises Refusal."""
-        await self.ask(LOOP, kind, b"" if data is None else msgspec.json.encode(data), origin, done)
+    async def for_loop(
+        self, kind: str, data: object, origin: str, done: Callable[[Done], object] | None = None
+    ) -> Done:
+        """Hand a command to the loop itself and wait until it is done; raises RefusedRequest."""
+        return await self.command(
+            LOOP, kind, b"" if data is None else msgspec.json.encode(data), origin, done
+        )
 
     def set_point(self, loaded: Loaded, kind: str, data: bytes, origin: str, lease_ns: int) -> None:
-        """Leave the newest set-point of a stream for the loop; raises Refusal."""
-        if self.heartbeat.phase is not Phase.RUNNING:
-            raise Refusal(503, "the run is at its end")
+        """Leave the newest set-point of a stream for the loop; raises RefusedRequest."""
+        self._require_running()
         command = Command(next(self._numbers), loaded.plan.name, kind, data, origin, lease_ns)
         if not self._mailbox.set_point(loaded.place, command):
-            raise Refusal(413, "this command is too long for a stream; send it as a command")
+            hint = "send it as a command"
+            raise RefusedRequest(
+                Refusal(Code.TOO_LONG, {"size": len(data), "most": LONGEST_SET_POINT, "hint": hint})
+            )
+
+    async def recorded(self, cycle: int) -> None:
+        """Wait until the record of a cycle is there, which shows the controllers that are active in it."""
+        while self.heartbeat.phase is Phase.RUNNING:
+            record = self.newest()
+            if record is not None and record.cycle >= cycle:
+                return
+            await asyncio.sleep(_LOOK_S)
+
+    def _require_running(self) -> None:
+        if self.heartbeat.phase is not Phase.RUNNING:
+            raise RefusedRequest(Refusal(Code.RUN_ENDING))
+
+    async def _answer(self, pending: _Pending, timeout_s: float) -> Answer:
+        try:
+            return await asyncio.wait_for(asyncio.shield(pending.answer), timeout_s)
+        except TimeoutError:
+            raise RefusedRequest(Refusal(Code.NO_ANSWER, {"seconds": timeout_s})) from None
 
     # What the loop did
 
-    def switched(self, activate: Sequence[str], deactivate: Sequence[str]) -> None:
-        """Note a switch that the loop has done; the record of its cycle is still to come."""
-        for names, active in ((deactivate, False), (activate, True)):
-            for name in names:
-                if (loaded := self.controllers.get(name)) is not None:
-                    loaded.switched = (active, self.heartbeat.cycles)
-                    loaded.entering = loaded.entering and active
-
-    async def entered(self, names: Sequence[str]) -> None:
-        """Wait for controllers whose joints change their modes first; raises Refusal when they do not."""
-        until = time.monotonic() + ENTER_S
-        for loaded in [self.controllers[name] for name in names if name in self.controllers]:
-            while loaded.entering:
-                if self.heartbeat.phase is not Phase.RUNNING:
-                    raise Refusal(503, "the run is at its end")
-                if time.monotonic() > until:
-                    raise Refusal(409, f"{loaded.plan.name} is not active after {ENTER_S:g} s")
-                await asyncio.sleep(_LOOK_S)
-            if loaded.excuse:
-                raise Refusal(409, loaded.excuse)
-
-    def loaded(self, plan: ControllerPlan) -> None:
+    def loaded(self, plan: ControllerPlan, done: Done) -> None:
         """Note a controller that the loop has loaded, in the place that the loop gave it."""
-        taken = {one.place for one in self.controllers.values()}
-        own = len(self.plan.loop.controllers)
-        self.controllers[plan.name] = Loaded(plan, next(i for i in itertools.count(own) if i not in taken))
+        if done.place is not None:
+            self.controllers[plan.name] = Loaded(plan, done.place)
 
     async def watch(self) -> None:
         """Collect answers and events for ever."""
         while True:
             self.collect()
-            await asyncio.sleep(_LOOK_S if self._asked else 10 * _LOOK_S)
+            await asyncio.sleep(_LOOK_S if self._pending else 10 * _LOOK_S)
 
     def collect(self) -> None:
         """Collect the answers and events that have come."""
-        for number, refusal in self._answers.new():
-            asked = self._asked.pop(number, None)
-            if asked is None:
-                continue  # a set-point of a stream
-            self._asked_bytes -= asked.size
-            if not refusal and asked.done is not None:
-                asked.done()
-            if not asked.answer.done():
-                asked.answer.set_result(refusal)
+        for number, answer in self._answers.new():
+            if number in self._pending:  # else it answers a set-point of a stream
+                self._resolve(number, answer)
         for ring in self._event_rings:
             while (record := ring.read()) is not None:
                 # the log reports gaps; packets and commands are for it alone
                 if isinstance(record, Record) and record.kind == RecordKind.EVENT:
                     with suppress(ValueError):
-                        self._hear(decode_event(record.payload))
+                        self._keep(decode_event(record.payload))
 
-    def _hear(self, event: Event) -> None:
-        """Keep an event, and note what it says of its controller."""
+    def _resolve(self, number: int, answer: Answer) -> None:
+        pending = self._pending[number]
+        if not pending.answer.done():
+            pending.answer.set_result(answer)
+        if isinstance(answer, Waiting):
+            pending.answer = pending.answer.get_loop().create_future()
+            return
+        del self._pending[number]
+        self._pending_bytes -= pending.size
+        if isinstance(answer, Done) and pending.done is not None:
+            pending.done(answer)
+
+    def _keep(self, event: Event) -> None:
+        """Keep an event for clients, and note whether its controller's joints are held."""
         self._text += len(event.text)
         while self.events and (self._text > KEPT_TEXT or len(self.events) >= KEPT_EVENTS):
             self._text -= len(self.events.popleft()[1].text)
         self.events.append((next(self._event_numbers), event))
         loaded = self.controllers.get(event.source)
-        if loaded is not None:
-            self._follow(loaded, event)
-
-    def _follow(self, loaded: Loaded, event: Event) -> None:
-        """Note what an event says of its controller."""
-        if event.code in _HELD:
+        if loaded is not None and event.code in _HELD:
             loaded.held = _HELD[EventCode(event.code)]
-        if event.code == EventCode.MODE and event.text.startswith(_WAITS):
-            loaded.entering, loaded.excuse = True, ""
-        elif event.code == EventCode.CONTROLLER_ACTIVATED:
-            loaded.switched = (True, self.heartbeat.cycles)
-            loaded.entering = False
-        elif event.code == EventCode.COMMAND_REFUSED and _NOT_ACTIVATED in event.text:
-            loaded.entering, loaded.excuse = False, event.text

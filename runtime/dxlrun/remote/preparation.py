@@ -1,4 +1,4 @@
-"""Preparation: what a client asks, checked against plan and plug-ins, and made ready for the loop.
+"""Preparation: what a client sends, checked against plan and plug-ins, and made ready for the loop.
 
 All of a plug-in's code that a client can reach runs here, in the gateway's process, never in the loop's.
 """
@@ -7,47 +7,67 @@ from __future__ import annotations
 
 import json
 import signal
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
+import msgspec
 import numpy as np
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
-from dxlrun.compile.limits import beyond_limits
-from dxlrun.control.controllers.contract import interfaces_breach
-from dxlrun.control.controllers.controller import Interfaces
+from dxlrun.compile.limits import BeyondLimit, beyond_limits
+from dxlrun.compile.motions import TRAJECTORY
+from dxlrun.compile.plan import Plan
+from dxlrun.compile.registers import UnfitRegister, steered_value
+from dxlrun.control.controllers.contract import ControllerClass, interfaces_breach
+from dxlrun.control.controllers.controller import Interfaces, ParametersModel
 from dxlrun.control.controllers.plugins import Offer, PlugIns
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan
+from dxlrun.control.steering import Register
 from dxlrun.description.form import Name
 from dxlrun.description.robot import ControllerEntry
 from dxlrun.description.source.problems import sentences_of
+from dxlrun.description.units import angle, angular_acceleration, angular_velocity, duration
+from dxlrun.dynamixel.control_table import ControlTable, control_table
 from dxlrun.errors import suggestion
+from dxlrun.run.channels.answers import Code, Field, Refusal
 
 LONGEST_NAME = 64
 """Of a controller that is loaded; the log cuts names there."""
 BUDGET_S = 5.0
-"""How long a plug-in may think about one wish, while every other client waits, who wants to stop too."""
+"""How long a plug-in may compute for one request, while every other client waits, `stop` too."""
 _MOST_MISTAKES = 5
 _LONGEST_SENTENCE = 300
 _NAME: TypeAdapter[str] = TypeAdapter(Name)
+_GROUP_FIELDS = frozenset({"positions", "velocities", "efforts", "pwm"})
+"""What the commands of the group controllers have."""
 
 
-class Refusal(Exception):
-    """A client's wish that is not passed on; `status` is that of HTTP, the text a sentence for a person."""
+class RefusedRequest(Exception):
+    """A request that is not passed on, or that the loop refused."""
 
-    def __init__(self, status: int, sentence: str) -> None:
-        super().__init__(sentence)
-        self.status = status
+    def __init__(self, refusal: Refusal) -> None:
+        super().__init__(refusal.text)
+        self.refusal = refusal
+
+
+def refused(code: Code, fields: Mapping[str, Field]) -> RefusedRequest:
+    """Return the exception for a refusal."""
+    return RefusedRequest(Refusal(code, fields))
+
+
+def invalid(problem: str) -> RefusedRequest:
+    """Return the exception for an input that is wrong in itself."""
+    return refused(Code.INVALID, {"problem": problem})
 
 
 class _TooLong(BaseException):
-    """A plug-in thought for too long; no Exception, which it may catch."""
+    """A plug-in computes for too long; no Exception, which it may catch."""
 
 
 @contextmanager
-def _bounded(whose: str) -> Iterator[None]:
-    """Interrupt a plug-in's Python code after BUDGET_S, in the main thread; raises Refusal then.
+def _bounded(controller: str) -> Iterator[None]:
+    """Interrupt a plug-in's Python code after BUDGET_S, in the main thread; raises RefusedRequest then.
 
     A call into C that never returns is not interrupted: then Ctrl-C in the robot's terminal is what is left.
     """
@@ -60,9 +80,7 @@ def _bounded(whose: str) -> Iterator[None]:
     try:
         yield
     except _TooLong:
-        raise Refusal(
-            422, f"{whose} thought about this for more than {BUDGET_S:g} s; send less at once"
-        ) from None
+        raise refused(Code.TOO_SLOW, {"controller": controller, "seconds": BUDGET_S}) from None
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
@@ -72,141 +90,299 @@ def _bounded(whose: str) -> Iterator[None]:
 class Prepared:
     """A command, ready for the loop."""
 
+    controller: str
+    kind: str
     data: bytes
     """Little-endian float64"""
-    beyond: tuple[str, ...]
-    """A sentence for each value that is beyond its joint's limits."""
+    beyond: tuple[BeyondLimit, ...]
+    """The values that are beyond their joints' limits."""
 
-    def require_within_limits(self, what: str) -> None:
-        """Raise Refusal when a value is beyond its joint's limits."""
+    @property
+    def joints_beyond(self) -> tuple[str, ...]:
+        """The joints of these values, each once."""
+        return tuple(dict.fromkeys(one.joint for one in self.beyond))
+
+    def require_within_limits(self) -> None:
+        """Raise RefusedRequest when a value is beyond its joint's limits."""
         if self.beyond:
             left = len(self.beyond) - _MOST_MISTAKES
             more = f"; and {left} more" if left > 0 else ""
-            raise Refusal(422, f"{what}: {'; '.join(self.beyond[:_MOST_MISTAKES])}{more}")
+            problem = "; ".join(one.text for one in self.beyond[:_MOST_MISTAKES]) + more
+            fields: dict[str, Field] = {"controller": self.controller, "kind": self.kind}
+            raise refused(Code.BEYOND_LIMITS, fields | {"joints": self.joints_beyond, "problem": problem})
+
+
+@dataclass(frozen=True, slots=True)
+class _Known:
+    """What is looked up once for a controller, and used for each of its commands."""
+
+    plan: ControllerPlan
+    controller: ControllerClass
+    parameters: ParametersModel
+    joints: tuple[JointPlan, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Preparation:
-    """Knows the controllers' classes; everything here happens outside of the loop's process."""
+    """Prepares commands by the controllers' classes, outside of the loop's process."""
 
     joints: Mapping[str, JointPlan]
     """The robot's, by name, in its order."""
     plugins: PlugIns
-    _takes: dict[str, dict[str, object]] = field(default_factory=dict, init=False)
-    """Controller type -> schema of each command: nobody pays twice for it."""
-
-    def offer(self, plan: ControllerPlan) -> Offer:
-        """Return the class of a controller; raises Refusal."""
-        offer = self.plugins.controllers.get(plan.type)
-        if offer is None:
-            raise Refusal(409, f"no plug-in offers the type {plan.type} of {plan.name} any more")
-        return offer
+    _known: dict[str, _Known] = field(default_factory=dict, init=False)
+    """By the controller's name; one that is loaded later under the same name has another plan."""
+    _schemas: dict[str, dict[str, object]] = field(default_factory=dict, init=False)
+    """Controller type -> schema of each command."""
 
     def takes(self, plan: ControllerPlan) -> dict[str, object]:
         """Return the JSON Schema of each command that a controller takes; empty where it cannot be had."""
-        if plan.type not in self._takes:
+        if plan.type not in self._schemas:
             offer = self.plugins.controllers.get(plan.type)
             commands = offer.controller.Commands if offer else {}
             try:
                 found: dict[str, object] = {k: model.model_json_schema() for k, model in commands.items()}
             except (Exception, SystemExit):  # a plug-in's code; its commands can be taken all the same
                 found = {kind: {} for kind in commands}
-            self._takes[plan.type] = found
-        return self._takes[plan.type]
+            self._schemas[plan.type] = found
+        return self._schemas[plan.type]
 
-    def command(self, plan: ControllerPlan, kind: str, body: bytes) -> Prepared:
-        """Return a typed command that came as JSON (`true` and "1" are no numbers there); raises Refusal."""
-        controller = self.offer(plan).controller
+    def command(self, plan: ControllerPlan, kind: str, body: bytes, *, units: bool = False) -> Prepared:
+        """Return a typed command that came as JSON (`true` and "1" are no numbers there).
+
+        `units`: where the command is one of those that motions are made of, its quantities are texts with
+        their units. Raises RefusedRequest.
+        """
+        known = self._controller(plan)
+        controller = known.controller
         model = controller.Commands.get(kind)
         if model is None:
-            known = tuple(controller.Commands)
-            if not known:
-                raise Refusal(404, f"{plan.name} takes no commands")
-            raise Refusal(404, f"{plan.name} takes no command {kind}; {suggestion(kind, known)}")
+            kinds = tuple(controller.Commands)
+            fields: dict[str, Field] = {"controller": plan.name, "kind": kind, "known": kinds}
+            raise refused(Code.UNKNOWN_COMMAND, fields | {"hint": suggestion(kind, kinds)})
+        what = f"{kind} of {plan.name}"
+        if units and _of_motions(kind, model):
+            body = in_si(body, what)
         try:
             with _bounded(plan.name):
                 command = model.model_validate_json(body, strict=True)
-                parameters = controller.Parameters.model_validate_json(plan.parameters)
-                prepared = controller.prepare(kind, command, parameters)
+                prepared = controller.prepare(kind, command, known.parameters)
                 data = np.ascontiguousarray(prepared, dtype="<f8").tobytes()
-                beyond = beyond_limits([self.joints[joint] for joint in plan.joints], command)
-                return Prepared(data, tuple(beyond))
-        except Refusal:
+                beyond = tuple(beyond_limits(known.joints, command))
+        except RefusedRequest:
             raise
         except ValidationError as error:
-            raise Refusal(422, told(error, f"{kind} of {plan.name}", model)) from error
+            raise invalid(mistakes(error, what, model)) from error
         except ValueError as error:  # the way in which a plug-in refuses
-            raise Refusal(422, f"{kind} of {plan.name}: {_one_line(str(error))}") from error
+            raise invalid(f"{what}: {_one_line(str(error))}") from error
         except (Exception, SystemExit) as error:  # a plug-in's mistake
-            raise Refusal(422, f"{kind} of {plan.name}: {_raised(error)}") from error
+            raise invalid(f"{what}: {_raised(error)}") from error
+        return Prepared(plan.name, kind, data, beyond)
 
-    def controller(self, wish: Mapping[str, object], others: Collection[str]) -> ControllerPlan:
-        """Return the plan of a controller that is to be loaded beside `others`; raises Refusal.
+    def _controller(self, plan: ControllerPlan) -> _Known:
+        """Return a controller's class and parameters, parsed once; raises RefusedRequest."""
+        known = self._known.get(plan.name)
+        if known is not None and known.plan is plan:
+            return known
+        offer = self.plugins.controllers.get(plan.type)
+        if offer is None:
+            raise invalid(f"no plug-in offers the type {plan.type} of {plan.name} any more")
+        try:
+            with _bounded(plan.name):
+                parameters = offer.controller.Parameters.model_validate_json(plan.parameters)
+        except RefusedRequest:
+            raise
+        except (Exception, SystemExit) as error:  # a plug-in's code
+            raise invalid(f"the parameters of {plan.name}: {_raised(error)}") from error
+        joints = tuple(self.joints[joint] for joint in plan.joints)
+        known = self._known[plan.name] = _Known(plan, offer.controller, parameters, joints)
+        return known
 
-        `wish` is an entry of the robot file, with its name.
+    def controller(self, entry: Mapping[str, object], others: Collection[str]) -> ControllerPlan:
+        """Return the plan of a controller that is to be loaded beside `others`; raises RefusedRequest.
+
+        `entry` is one of the robot file, with its name.
         """
         try:
-            name = _NAME.validate_python(wish.get("name", ""))
-            entry = ControllerEntry.model_validate({k: v for k, v in wish.items() if k != "name"})
+            name = _NAME.validate_python(entry.get("name", ""))
+            written = ControllerEntry.model_validate({k: v for k, v in entry.items() if k != "name"})
         except ValidationError as error:
-            raise Refusal(422, told(error, "the controller's entry", ControllerEntry)) from error
+            raise invalid(mistakes(error, "the controller's entry", ControllerEntry)) from error
         if len(name) > LONGEST_NAME:
-            raise Refusal(422, f"a name has at most {LONGEST_NAME} characters; choose a shorter one")
+            raise invalid(f"a name has at most {LONGEST_NAME} characters; choose a shorter one")
         if name in others:
-            raise Refusal(409, f"there is a controller {name} already; choose another name, or unload it")
-        if wish.get("active"):
-            raise Refusal(422, f"{name} cannot be active at once; load it, then switch to it")
-        if entry.fallback is not None and entry.fallback not in others:
-            known = suggestion(entry.fallback, tuple(others))
-            raise Refusal(422, f"there is no fallback {entry.fallback}; {known}")
-        offer = self.plugins.controllers.get(entry.type)
+            hint = "choose another name, or unload it"
+            raise refused(Code.NAME_TAKEN, {"controller": name, "hint": hint})
+        if entry.get("active"):
+            raise invalid(f"{name} cannot be active at once; load it, then switch to it")
+        if written.fallback is not None and written.fallback not in others:
+            hint = suggestion(written.fallback, tuple(others))
+            raise invalid(f"there is no fallback {written.fallback}; {hint}")
+        offer = self.plugins.controllers.get(written.type)
         if offer is None:
-            known = suggestion(entry.type, tuple(self.plugins.controllers))
-            raise Refusal(422, f"no plug-in offers the controller type {entry.type}; {known}")
-        interfaces = self._interfaces(name, offer, entry.parameters)
+            hint = suggestion(written.type, tuple(self.plugins.controllers))
+            raise invalid(f"no plug-in offers the controller type {written.type}; {hint}")
+        interfaces = self._interfaces(name, offer, written.parameters)
         return ControllerPlan(
             name=name,
-            type=entry.type,
+            type=written.type,
             distribution=offer.distribution,
-            parameters=json.dumps(entry.parameters),
+            parameters=json.dumps(written.parameters),
             joints=interfaces.joints,
             command=interfaces.command,
             publishes=offer.controller.publishes,
             active=False,
             every=1,  # the loop knows its own rate
-            rate=entry.rate,
-            fallback=entry.fallback or "",
+            rate=written.rate,
+            fallback=written.fallback or "",
         )
 
     def _interfaces(self, name: str, offer: Offer, own: Mapping[str, object]) -> Interfaces:
-        """Ask a controller's class what it wants with these parameters."""
+        """Return the interfaces that a controller's class asks for with these parameters."""
         try:
             with _bounded(name):
                 parameters = offer.controller.Parameters.model_validate(own)
                 interfaces = offer.controller.interfaces(parameters, tuple(self.joints))
-        except Refusal:
+        except RefusedRequest:
             raise
         except ValidationError as error:
-            raise Refusal(422, told(error, name, offer.controller.Parameters)) from error
+            raise invalid(mistakes(error, name, offer.controller.Parameters)) from error
         except (Exception, SystemExit) as error:  # a plug-in's code
-            raise Refusal(422, f"{name} cannot say what it needs: {_raised(error)}") from error
+            raise invalid(f"the interfaces of {name} are not known: {_raised(error)}") from error
         if breach := interfaces_breach(interfaces):
-            raise Refusal(422, f"{name} ({offer.distribution}) {breach[0]}; tell its author: {breach[1]}")
+            raise invalid(f"{name} ({offer.distribution}) {breach[0]}; report it to its author: {breach[1]}")
         if unknown := [joint for joint in interfaces.joints if joint not in self.joints]:
-            raise Refusal(
-                422, f"{name} wants joint {unknown[0]}; {suggestion(unknown[0], tuple(self.joints))}"
-            )
+            hint = suggestion(unknown[0], tuple(self.joints))
+            raise invalid(f"{name} asks for joint {unknown[0]}, which there is not; {hint}")
         if len(set(interfaces.joints)) != len(interfaces.joints):
-            raise Refusal(422, f"{name} names a joint twice; name it once")
+            raise invalid(f"{name} names a joint twice; name it once")
         return interfaces
 
 
-def told(error: ValidationError, what: str, model: type[BaseModel]) -> str:
+# Registers
+
+
+def prepared_register(plan: Plan, joint: str, item: str, value: int | str) -> Register:
+    """Return the data of the loop's command for a RAM item; raises RefusedRequest where it cannot be written.
+
+    `value`: the integer on the wire, or a quantity with its unit.
+    """
+    tables = _tables(plan)
+    fields: dict[str, Field] = {"joint": joint[:80], "item": item[:80]}
+    table = tables.get(joint)
+    if table is None:
+        raise refused(Code.UNKNOWN_JOINT, fields | {"hint": suggestion(joint[:80], tuple(tables))})
+    try:
+        register = steered_value(table, item[:80], value)
+    except UnfitRegister as error:
+        code = Code.INVALID_REGISTER if item in table.items else Code.UNKNOWN_REGISTER
+        raise refused(code, fields | {"problem": str(error)}) from error
+    except ValueError as error:  # a quantity that is none
+        problem = f"{item} of {joint}: {error}"
+        raise refused(Code.WRONG_QUANTITY, fields | {"problem": problem}) from error
+    return Register(joint, item, register.value)
+
+
+def _tables(plan: Plan) -> dict[str, ControlTable]:
+    return {
+        servo.joint: control_table(servo.model, bus.protocol) for bus in plan.buses for servo in bus.servos
+    }
+
+
+# Quantities with units
+
+
+def _seconds(text: str) -> float:
+    return duration(text) / 1e9
+
+
+def _effort(value: object) -> object:
+    if isinstance(value, str):
+        raise ValueError(
+            f"{value!r} is text; write the number in what the model measures (Nm, A or the fraction of its "
+            "most), such as 0.1 for 100 mA"
+        )
+    return value
+
+
+def _fraction(value: object) -> object:
+    if isinstance(value, str):
+        raise ValueError(f"{value!r} is text; write the fraction of the full voltage, such as 0.2 for 20 %")
+    return value
+
+
+QUANTITIES: Mapping[str, Callable[[str], object]] = {
+    "positions": angle,
+    "velocities": angular_velocity,
+    "accelerations": angular_acceleration,
+    "efforts": _effort,
+    "pwm": _fraction,
+    "time": _seconds,
+    "start_in": _seconds,
+}
+"""Keys of commands -> what makes rad, rad/s, rad/s^2 or s of a quantity with its unit."""
+
+
+def _of_motions(kind: str, model: type[BaseModel]) -> bool:
+    """Return whether a command is like those of the standard controllers: its quantities have units."""
+    fields = set(model.model_fields)
+    return kind == TRAJECTORY or (bool(fields) and fields <= _GROUP_FIELDS)
+
+
+def in_si(body: bytes, what: str) -> bytes:
+    """Return a command, JSON whose quantities have units, with plain numbers in rad, rad/s, rad/s^2 and s.
+
+    Raises RefusedRequest with all mistakes: their sentences, and their places as JSON Pointers (RFC 6901).
+    """
+    try:
+        data = msgspec.json.decode(body)
+    except (msgspec.MsgspecError, RecursionError) as error:
+        raise invalid(f"{what} is no JSON: {error}") from error
+    mistaken: list[tuple[str, str]] = []
+    plain = _plain(data, (), mistaken)
+    if mistaken:
+        paths, problems = zip(*mistaken, strict=True)
+        raise refused(
+            Code.WRONG_QUANTITY, {"problem": "; ".join(problems), "paths": paths, "problems": problems}
+        )
+    return msgspec.json.encode(plain)
+
+
+def _plain(value: object, path: tuple[str | int, ...], mistaken: list[tuple[str, str]]) -> object:
+    if isinstance(value, dict):
+        return {key: _plain(inner, (*path, key), mistaken) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [_plain(inner, (*path, index), mistaken) for index, inner in enumerate(value)]
+    key = next((step for step in reversed(path) if isinstance(step, str)), "")
+    quantity = QUANTITIES.get(key)
+    if quantity is None or value is None:
+        return value
+    try:
+        return quantity(value)  # type: ignore[arg-type]  # of a number it says that the unit is missing
+    except ValueError as error:
+        shown = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in path)
+        mistaken.append(("".join(f"/{step}" for step in path), f"{shown.removeprefix('.')}: {error}"))
+        return None
+
+
+# Words
+
+
+def mistakes(error: ValidationError, what: str, model: type[BaseModel]) -> str:
     """Return the mistakes of an input called `what` in one sentence; of many, the first."""
-    mistakes = sentences_of(error, what, model, _MOST_MISTAKES)
-    sentences = [sentence[:_LONGEST_SENTENCE] for sentence in mistakes]
+    sentences = [
+        sentence[:_LONGEST_SENTENCE] for sentence in sentences_of(error, what, model, _MOST_MISTAKES)
+    ]
     left = max(0, error.error_count() - _MOST_MISTAKES)
     return "; ".join(sentences) + (f"; and {left} more" if left else "")
+
+
+def unknown_controllers(names: Sequence[str], known: Sequence[str]) -> RefusedRequest:
+    """Return the refusal of controllers that there are not, with the names that may be meant."""
+    shown = tuple(name[:80] for name in names)
+    hints = [suggestion(name, known) for name in shown]
+    if len(shown) > 1:
+        hints = [f"{name}: {hint}" for name, hint in zip(shown, hints, strict=True)]
+    return refused(Code.UNKNOWN_CONTROLLER, {"controller": shown, "hint": "; ".join(hints)})
 
 
 def _raised(error: BaseException) -> str:

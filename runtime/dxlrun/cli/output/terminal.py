@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import IO, cast
 
@@ -32,15 +32,18 @@ def say_warning(line: str) -> None:
     _say(line, "yellow")
 
 
-def print_refusal(problems: Sequence[Problem], sentences: Sequence[str]) -> None:
+def print_refusal(
+    problems: Sequence[Problem], sentences: Sequence[str], reason: Mapping[str, object]
+) -> None:
     """Print on stdout, as one line of JSON, why a command with --json was refused.
 
-    `problems` have places in files; `sentences` are errors without one.
+    `problems` have places in files; `sentences` are errors without one; `reason` is a running robot's: a code
+    with its fields.
     """
     errors = [problem for problem in problems if problem.severity == "error"]
     refusal = {
         "ok": False,
-        "errors": [*problems_json(errors), *({"what": sentence} for sentence in sentences)],
+        "errors": [*problems_json(errors), *({"what": sentence, **reason} for sentence in sentences)],
         "warnings": problems_json([problem for problem in problems if problem.severity == "warning"]),
     }
     with suppress(OSError):  # the reader is gone; the exit code says it too

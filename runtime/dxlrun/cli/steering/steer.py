@@ -1,12 +1,13 @@
-"""The verbs that steer a robot while it runs.
+"""Commands to a robot while it runs: `dxlrun list`, `send`, `switch`, `set`, `rate`, `pause`, `stop` ...
 
-Each is one request to the gateway of the run: obeyed at the start of a cycle, or refused with the reason.
+Each is one request to the gateway of the run: executed at the start of a cycle, or refused with the reason.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import textwrap
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,11 +15,11 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from dxlrun.cli.output.flags import Flag, JsonFlag
-from dxlrun.cli.output.terminal import out
-from dxlrun.errors import DxlrunError, InputError, suggestion
+from dxlrun.cli.output.terminal import out, say_error
+from dxlrun.errors import DxlrunError, InputError, Refused, suggestion
 
 if TYPE_CHECKING:
-    from dxlrun.remote.client import RemoteRobot
+    from dxlrun.remote.client import Executed, RemoteRobot
 
 Names = Annotated[tuple[str, ...], Parameter(negative=(), show_default=False, consume_multiple=True)]
 """Names of controllers, one or several behind the option."""
@@ -27,8 +28,8 @@ Words = Annotated[str, Parameter(name="key=value")]
 
 @Parameter(name="*")
 @dataclass(frozen=True, slots=True)
-class Whom:
-    """The robot that is meant, and how it is told.
+class Chosen:
+    """The robot, and the form of the output.
 
     Parameters
     ----------
@@ -45,38 +46,75 @@ class Whom:
     debug: Flag = False
 
 
-ONLY_ONE = Whom()
+ONLY_ONE = Chosen()
 """The one robot that runs."""
 
 
-def switch(*, activate: Names = (), deactivate: Names = (), whom: Whom = ONLY_ONE) -> int:
+def list_robots(*, robot: str | None = None, as_json: JsonFlag = False, debug: Flag = False) -> int:
+    """List the robots that run and can be steered, with their controllers and the commands these take.
+
+    Parameters
+    ----------
+    robot
+        Only the robot of this name.
+    as_json
+        Print the result as JSON.
+    debug
+        Print the traceback of an error.
+    """
+    from dxlrun.remote.client import connect, running
+
+    names = running()
+    if robot is not None and robot not in names:
+        raise InputError(f"no robot {robot} runs; {suggestion(robot, names)}")
+    found, code = [], 0
+    for name in names if robot is None else (robot,):
+        try:
+            with connect(name, "dxlrun list") as one:
+                found.append({**one.info(), "name": name})
+        except DxlrunError as error:  # it may have ended meanwhile; the others are listed
+            say_error(f"dxlrun: {error}")
+            code = 1
+    console = out()
+    if as_json:
+        console.file.write(json.dumps(found, indent=2, ensure_ascii=False) + "\n")
+        return code
+    for info in found:
+        console.print(headline(info), markup=False, soft_wrap=True)
+        for line in controllers(info, console.width):
+            console.print(line, markup=False, soft_wrap=True)
+    if not names:
+        console.print("no robot runs that could be steered; `dxlrun ROBOT.yaml` starts one", soft_wrap=True)
+    return code
+
+
+def switch(*, activate: Names = (), deactivate: Names = (), chosen: Chosen = ONLY_ONE) -> int:
     """Activate and deactivate controllers of a running robot in one cycle, or not at all.
 
     Parameters
     ----------
     activate
-        These controllers get their joints.
+        Controllers to activate.
     deactivate
-        These let go of theirs.
+        Controllers to deactivate.
     """
     if not activate and not deactivate:
         raise InputError("nothing to switch; write --activate NAME, --deactivate NAME, or both")
-    with _robot(whom, "switch") as robot:
-        _known(robot, *activate, *deactivate)
-        robot.switch(activate, deactivate)
+    with _robot(chosen, "switch") as robot:
+        done = robot.switch(activate, deactivate)
         groups = {
-            "active": [name for name in activate if name not in deactivate],
-            "not active any more": [name for name in deactivate if name not in activate],
-            "begun anew": [name for name in activate if name in deactivate],
+            "activated": [name for name in activate if name not in deactivate],
+            "deactivated": [name for name in deactivate if name not in activate],
+            "restarted": [name for name in activate if name in deactivate],
         }
         parts = [f"{', '.join(names)} {state}" for state, names in groups.items() if names]
-        return _done(robot, whom, f"{robot.name}: {'; '.join(parts)}")
+        return _done(robot, chosen, done, f"{robot.name}: {'; '.join(parts)}")
 
 
 def send(
-    controller: str, kind: str, /, *words: Words, file: Path | None = None, whom: Whom = ONLY_ONE
+    controller: str, kind: str, /, *words: Words, file: Path | None = None, chosen: Chosen = ONLY_ONE
 ) -> int:
-    """Give a controller of a running robot a command: `dxlrun send neck positions 'positions=[30 deg]'`.
+    """Send a controller of a running robot a command: `dxlrun send neck positions 'positions=[30 deg]'`.
 
     `dxlrun list` shows which commands a controller takes, and what is in them.
 
@@ -87,23 +125,22 @@ def send(
     kind
         The command.
     words
-        What is in it; values are YAML, quantities have their units.
+        Its keys; values are YAML, quantities have their units.
     file
-        A YAML file with what is in it, instead of the words.
+        A YAML file with its keys, instead of the words.
     """
-    from dxlrun.cli.steering.written import Written, is_played
+    from dxlrun.cli.steering.written import Written
 
     written = Written.read(words, file)
-    with _robot(whom, "send") as robot:
-        takes = _known(robot, controller)[controller]
-        if kind not in takes:
-            raise InputError(f"{controller} takes no command {kind}; {suggestion(kind, tuple(takes))}")
-        command = written.in_si() if is_played(kind, takes[kind]) else written.data
-        robot.send(controller, kind, command)
-        return _done(robot, whom, f"{robot.name}: {controller} has taken {kind}")
+    with _robot(chosen, "send") as robot:
+        try:
+            done = robot.send(controller, kind, written.data, units=True)
+        except Refused as refused:
+            raise written.located(refused) from None
+        return _done(robot, chosen, done, f"{robot.name}: {controller} accepted {kind}")
 
 
-def set_register(joint: str, item: str, value: str, /, *, whom: Whom = ONLY_ONE) -> int:
+def set_register(joint: str, item: str, value: str, /, *, chosen: Chosen = ONLY_ONE) -> int:
     """Change a register of a servo while the robot runs: `dxlrun set elbow_joint position_p_gain 900`.
 
     Items of the RAM that no controller commands; returns when the servo has it. `dxlrun models` lists them.
@@ -120,14 +157,14 @@ def set_register(joint: str, item: str, value: str, /, *, whom: Whom = ONLY_ONE)
     from dxlrun.description.source.scalars import plain_value
 
     number = plain_value(value)
-    wanted = number if isinstance(number, int) and not isinstance(number, bool) else value
-    with _robot(whom, "set") as robot:
-        robot.set_register(joint, item, wanted)
-        return _done(robot, whom, f"{robot.name}: {item} of {joint} is {wanted}")
+    given = number if isinstance(number, int) and not isinstance(number, bool) else value
+    with _robot(chosen, "set") as robot:
+        done = robot.set_register(joint, item, given)
+        return _done(robot, chosen, done, f"{robot.name}: {item} of {joint} is {given}")
 
 
-def rate(hz: float, /, *, whom: Whom = ONLY_ONE) -> int:
-    """Let the loop of a running robot run at another rate.
+def rate(hz: float, /, *, chosen: Chosen = ONLY_ONE) -> int:
+    """Change the rate of a running robot's loop.
 
     Parameters
     ----------
@@ -136,26 +173,27 @@ def rate(hz: float, /, *, whom: Whom = ONLY_ONE) -> int:
     """
     if not 0 < hz < float("inf"):  # false for nan too
         raise InputError(f"{hz:g} is no rate; give a number of Hz above 0")
-    with _robot(whom, "rate") as robot:
-        robot.rate(hz)
-        return _done(robot, whom, f"{robot.name} runs at {hz:g} Hz")
+    with _robot(chosen, "rate") as robot:
+        done = robot.rate(hz)
+        return _done(robot, chosen, done, f"{robot.name} runs at {hz:g} Hz")
 
 
-def pause(*, whom: Whom = ONLY_ONE) -> int:
+def pause(*, chosen: Chosen = ONLY_ONE) -> int:
     """Pause a running robot: its joints are held, its controllers' time stands still."""
-    with _robot(whom, "pause") as robot:
-        robot.pause()
-        return _done(robot, whom, f"{robot.name} is paused, its joints are held; `dxlrun resume` goes on")
+    with _robot(chosen, "pause") as robot:
+        done = robot.pause()
+        text = "is paused, its joints are held; `dxlrun resume` ends that"
+        return _done(robot, chosen, done, f"{robot.name} {text}")
 
 
-def resume(*, whom: Whom = ONLY_ONE) -> int:
-    """Let the controllers of a paused robot go on where they were."""
-    with _robot(whom, "resume") as robot:
-        robot.resume()
-        return _done(robot, whom, f"{robot.name} goes on")
+def resume(*, chosen: Chosen = ONLY_ONE) -> int:
+    """Resume the controllers of a paused robot where they were."""
+    with _robot(chosen, "resume") as robot:
+        done = robot.resume()
+        return _done(robot, chosen, done, f"{robot.name} runs again")
 
 
-def load(name: str, /, *words: Words, file: Path | None = None, whom: Whom = ONLY_ONE) -> int:
+def load(name: str, /, *words: Words, file: Path | None = None, chosen: Chosen = ONLY_ONE) -> int:
     """Load another controller into a paused robot; it is not active until it is switched on.
 
     Parameters
@@ -172,14 +210,13 @@ def load(name: str, /, *words: Words, file: Path | None = None, whom: Whom = ONL
     entry = Written.read(words, file).data
     if "type" not in entry:
         raise InputError(f"{name} has no type; give it one, such as type=joint_group_position_controller")
-    with _robot(whom, "load") as robot:
-        robot.load(name, entry)
-        return _done(
-            robot, whom, f"{robot.name}: {name} is loaded; `dxlrun switch --activate {name}` starts it"
-        )
+    with _robot(chosen, "load") as robot:
+        done = robot.load(name, entry)
+        text = f"{name} is loaded; `dxlrun switch --activate {name}` starts it"
+        return _done(robot, chosen, done, f"{robot.name}: {text}")
 
 
-def unload(name: str, /, *, whom: Whom = ONLY_ONE) -> int:
+def unload(name: str, /, *, chosen: Chosen = ONLY_ONE) -> int:
     """Take a controller that is not active out of a paused robot.
 
     Parameters
@@ -187,57 +224,87 @@ def unload(name: str, /, *, whom: Whom = ONLY_ONE) -> int:
     name
         Name of the controller.
     """
-    with _robot(whom, "unload") as robot:
-        _known(robot, name)
-        robot.unload(name)
-        return _done(robot, whom, f"{robot.name}: {name} is unloaded")
+    with _robot(chosen, "unload") as robot:
+        done = robot.unload(name)
+        return _done(robot, chosen, done, f"{robot.name}: {name} is unloaded")
 
 
-def stop(*, no_wait: Flag = False, whom: Whom = ONLY_ONE) -> int:
+def stop(*, no_wait: Flag = False, chosen: Chosen = ONLY_ONE) -> int:
     """End a running robot in order, as its policy on_exit says.
 
     Parameters
     ----------
     no_wait
-        Return as soon as the loop has taken it.
+        Return as soon as the loop has accepted it.
     """
-    with _robot(whom, "stop") as robot:
+    with _robot(chosen, "stop") as robot:
         robot.stop(wait=not no_wait)
-        return _done(robot, whom, f"{robot.name} {'is ending' if no_wait else 'has ended'}")
+        return _done(robot, chosen, None, f"{robot.name} {'is ending' if no_wait else 'has ended'}")
 
 
-def _robot(whom: Whom, verb: str) -> RemoteRobot:
-    """Return the robot that is meant; raises InputError when it is not clear, DxlrunError when none runs."""
+def _robot(chosen: Chosen, verb: str) -> RemoteRobot:
+    """Return the chosen robot; raises InputError when the choice is open, DxlrunError when none runs."""
     from dxlrun.remote.client import connect, running
 
     names = running()
     if not names:
         raise DxlrunError("no robot runs that could be steered; `dxlrun ROBOT.yaml` starts one")
-    if whom.robot is None and len(names) > 1:
+    if chosen.robot is None and len(names) > 1:
         raise InputError(f"several robots run; choose one: --robot {', --robot '.join(names)}")
-    if whom.robot is not None and whom.robot not in names:
-        raise InputError(f"no robot {whom.robot} runs; {suggestion(whom.robot, names)}")
-    return connect(whom.robot or names[0], f"dxlrun {verb}")
+    if chosen.robot is not None and chosen.robot not in names:
+        raise InputError(f"no robot {chosen.robot} runs; {suggestion(chosen.robot, names)}")
+    return connect(chosen.robot or names[0], f"dxlrun {verb}")
 
 
-def _known(robot: RemoteRobot, *names: str) -> dict[str, Mapping[str, Mapping[str, object]]]:
-    """Return which commands each controller takes, by name; raises InputError when one of `names` is none."""
-    told = robot.info()["controllers"]
-    takes = {one["name"]: one["takes"] for one in told} if isinstance(told, list) else {}
-    wrong = [
-        f"{robot.name} has no controller {name}; {suggestion(name, tuple(takes))}"
-        for name in names
-        if name not in takes
-    ]
-    if wrong:
-        raise InputError("\n".join(wrong))
-    return takes
-
-
-def _done(robot: RemoteRobot, whom: Whom, sentence: str) -> int:
+def _done(robot: RemoteRobot, chosen: Chosen, done: Executed | None, sentence: str) -> int:
     console = out()
-    if whom.as_json:
-        console.file.write(json.dumps({"robot": robot.name, "done": True}) + "\n")
+    if chosen.as_json:
+        cycle = {} if done is None else {"cycle": done.cycle}
+        console.file.write(json.dumps({"robot": robot.name, "done": True} | cycle) + "\n")
     else:
         console.print(sentence, markup=False, soft_wrap=True)
     return 0
+
+
+def headline(info: Mapping[str, object]) -> str:
+    """Return the state of a robot in one line."""
+    paused = ", paused" if info["paused"] else ""
+    periods = f"{info['skipped']} {'period' if info['skipped'] == 1 else 'periods'} skipped"
+    log = f"log {info['log']}" if info["log"] else "no log"
+    return f"{info['name']}: {info['rate']:g} Hz{paused}, {info['cycles']} cycles, {periods}, {log}"
+
+
+def controllers(info: Mapping[str, object], width: int) -> Iterator[str]:
+    """Yield a line for each controller, and below it its joints in their order, wrapped to the terminal."""
+    rows = info["controllers"]
+    listed = rows if isinstance(rows, list) else []
+    longest = max((len(one["name"]) for one in listed), default=0)
+    for one in listed:
+        takes = "; ".join(command(kind, schema) for kind, schema in one["takes"].items())
+        line = f"  {one['name']:{longest}}  {state(one):8}  {one['rate']:6g} Hz  {takes}"
+        yield line.rstrip()
+        if one["command"]:  # a broadcaster has no joints of its own
+            yield textwrap.fill(
+                "moves " + ", ".join(one["joints"]),
+                max(width - 1, 20),
+                initial_indent="      ",
+                subsequent_indent="      ",
+                break_long_words=False,
+                break_on_hyphens=False,
+            )
+
+
+def state(controller: Mapping[str, object]) -> str:
+    """Return what a controller does, in one word."""
+    if not controller["active"]:
+        return "inactive"
+    return "held" if controller["held"] else "active"
+
+
+def command(kind: str, schema: Mapping[str, object]) -> str:
+    """Return the keys of a command by its JSON Schema; those that may be left out are in brackets."""
+    properties, required = schema.get("properties"), schema.get("required")
+    needed = required if isinstance(required, list) else []
+    names = properties if isinstance(properties, dict) else {}
+    keys = (name if name in needed else f"[{name}]" for name in names)
+    return f"{kind}: {', '.join(keys)}" if names else kind

@@ -19,6 +19,7 @@ from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.controllers.turns import every, fits
 from dxlrun.control.loop_plan import ControllerPlan, LoopPlan, ScheduledCommand
 from dxlrun.errors import ControllerFault, PlugInError
+from dxlrun.run.channels.answers import Code, Field, Refusal, Waiting
 from dxlrun.run.channels.commands import CommandSink, NoCommands, TakenCommand
 from dxlrun.run.channels.cycle import MOST_CONTROLLERS, CycleRecord
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
@@ -65,6 +66,7 @@ class Manager:
         self._lost: Collection[int] = ()
         self._modes = ModeSwitch(plan.joints, record.states.mode, set_modes)
         self._failed: set[str] = set()
+        self._ended: list[tuple[int, Refusal | None]] = []
 
     def configure(self) -> None:
         """Build and configure every controller, decode every command; allocates, before real time.
@@ -85,7 +87,7 @@ class Manager:
 
     def activate(self, time_ns: int) -> None:
         """Activate what the plan wants active; states and goals must be fresh. A fault is in `fault`."""
-        self._enter([one for one in self._managed if one.plan.active and not one.active], time_ns, "")
+        self._enter([one for one in self._managed if one.plan.active and not one.active], time_ns, None, "")
 
     def begin(self) -> None:
         """Begin a cycle, before its states are read: ask for modes; nobody was updated in it yet."""
@@ -123,28 +125,29 @@ class Manager:
         origin: str,
         time_ns: int,
         until_ns: int = 0,
-    ) -> str:
-        """Hand a prepared command to a controller; return why it was refused, empty when it was taken.
+    ) -> Refusal | None:
+        """Hand a prepared command to a controller.
 
         `until_ns` is when it runs out, ns of the clock, unless another one follows (see `stale`); 0: never.
         The next one of a stream is told by no event.
         """
         managed = self._named.get(controller)
         if managed is None:
-            return f"there is no such controller as {controller}"
+            return Refusal(Code.UNKNOWN_CONTROLLER, {"controller": controller})
         if not managed.active:
-            waits = managed in self._modes.entering
-            return f"{controller} is not active{' yet' if waits else '; switch to it first'}"
+            entering = managed in self._modes.entering
+            code = Code.NOT_ACTIVE_YET if entering else Code.NOT_ACTIVE
+            return Refusal(code, {"controller": controller})
         streaming = until_ns and managed.until_ns
         self._streaming = self._streaming or until_ns > 0
         try:
             managed.command(kind, data, time_ns, until_ns)
         except ControllerFault as fault:
             self._end(managed, fault, time_ns)
-            return str(fault)
+            return _refused_by(managed, str(fault))
         if not streaming:
             self._tell(EventCode.COMMAND, managed, f"{kind} from {origin}")
-        return ""
+        return None
 
     def stale(self, now_ns: int) -> list[str]:
         """Return the controllers whose stream of commands has run out, each of them once."""
@@ -180,73 +183,96 @@ class Manager:
             self._events.emit(EventCode.POLICY, severity, managed.plan.name, text)
         return tuple(going)
 
-    def switch(self, activate: Sequence[str], deactivate: Sequence[str], time_ns: int) -> str:
-        """Deactivate and activate controllers in one step; return why nothing was done, empty when it was.
+    def switch(
+        self, activate: Sequence[str], deactivate: Sequence[str], time_ns: int, number: int | None = None
+    ) -> Refusal | Waiting | None:
+        """Deactivate and activate controllers in one step, or refuse all of it; None: it is done.
 
-        A controller in both lists begins anew. Claims are those of everybody who is active afterwards. Where
+        A controller in both lists begins anew. Claims are those of all that are active afterwards. Where
         joints must change their mode first, those that leave do so at once, and those that enter do together
-        in the first cycle in which all of theirs have (see ModeSwitch); an event tells when they never do.
+        in the first cycle in which all joints have (see ModeSwitch). How that ends is in `ended_switches`,
+        under `number`, the command's; None: no command asked for it.
         """
-        return self._switch(activate, deactivate, time_ns, "")
-
-    def _switch(self, activate: Sequence[str], deactivate: Sequence[str], time_ns: int, why: str) -> str:
-        active = [one for one in self._managed if one.active]
-        if refusal := self._modes.refuse(activate, deactivate, self._named, active):
+        if refusal := self._refuse(activate, deactivate):
             return refusal
         for managed in (self._named[name] for name in deactivate):
-            leave = self._deactivate if managed.active else self._modes.drop
-            leave(managed, time_ns)
-        self._enter([self._named[name] for name in activate], time_ns, why)
-        return ""
+            if managed.active:
+                self._deactivate(managed, time_ns)
+            else:
+                refusal = Refusal(Code.SWITCHED_AGAIN, {"controller": managed.plan.name})
+                self._end_switch(self._modes.drop(managed), refusal)
+        return self._enter([self._named[name] for name in activate], time_ns, number, "")
 
-    def _enter(self, wanted: Sequence[Managed], time_ns: int, why: str) -> None:
-        """Activate controllers whose claims were checked together, at once or when their modes are there."""
+    def ended_switches(self) -> Sequence[tuple[int, Refusal | None]]:
+        """Return the switches that waited and have ended since the last call: the number, and why not."""
+        if not self._ended:
+            return ()
+        ended, self._ended = self._ended, []
+        return ended
+
+    def _end_switch(self, number: int | None, refusal: Refusal | None) -> None:
+        if number is not None:
+            self._ended.append((number, refusal))
+
+    def _refuse(self, activate: Sequence[str], deactivate: Sequence[str]) -> Refusal | None:
+        active = [managed for managed in self._managed if managed.active]
+        return self._modes.refuse(activate, deactivate, self._named, active)
+
+    def _enter(
+        self, entering: Sequence[Managed], time_ns: int, number: int | None, why: str
+    ) -> Refusal | Waiting | None:
+        """Activate controllers whose claims were checked together, at once or when their modes are there.
+
+        `why`: the fault of the controller that these stand in for; empty: they were asked for.
+        """
         self._modes.changed()
-        if self._modes.ready(wanted):
-            self._activate_all(wanted, time_ns)
-            return
-        self._modes.await_modes(wanted, time_ns, why)
-        for managed in wanted:
+        if self._modes.ready(entering):
+            return self._activate_all(entering, time_ns)
+        self._modes.await_modes(entering, time_ns, number, why)
+        for managed in entering:
             self._tell(EventCode.MODE, managed, "waits until its joints are in their modes")
+        return Waiting(tuple(managed.plan.name for managed in entering))
 
     def _admit(self, time_ns: int) -> None:
-        """Activate who waited for modes that are there now; give up who waited too long."""
+        """Activate controllers whose modes are there now; give up those that waited too long."""
         ready, late = self._modes.due(time_ns)
         for group in ready:
-            self._activate_all(group.entering, time_ns)
+            self._end_switch(group.number, self._activate_all(group.entering, time_ns))
         for group in late:
-            excuse = self._modes.excuse(group)
+            problem = self._modes.problem(group)
+            refusal = Refusal(Code.MODE_NOT_ENTERED, {"controller": group.names, "problem": problem})
+            self._end_switch(group.number, refusal)
             for managed in group.entering:
                 name = managed.plan.name
                 self._events.emit(
-                    EventCode.COMMAND_REFUSED, Severity.WARNING, name, f"{name} is not activated: {excuse}"
+                    EventCode.COMMAND_REFUSED, Severity.WARNING, name, f"{name} is not activated: {problem}"
                 )
             self.fault = self.fault or group.why or None
 
-    def load(self, plan: ControllerPlan) -> str:
-        """Configure one more controller, inactive; return why not. Only while the loop is paused."""
+    def load(self, plan: ControllerPlan) -> int | Refusal:
+        """Configure one more controller, inactive; return its place. Only while the loop is paused."""
         if plan.name in self._named:
-            return f"there is a controller {plan.name} already"
-        if not fits(plan, self._period_ns):
-            return f"its rate {plan.rate:g} Hz does not divide the loop's {1e9 / self._period_ns:g} Hz"
+            return Refusal(Code.NAME_TAKEN, {"controller": plan.name})
+        if plan.rate is not None and not fits(plan, self._period_ns):
+            return _not_divided(plan.name, plan.rate, self._period_ns)
         index = self._free_index()
         if index >= MOST_CONTROLLERS:
-            return f"there are {MOST_CONTROLLERS} controllers, which is the most"
-        if unknown := [joint for joint in plan.joints if joint not in self._rows]:
-            return f"the robot has no joint {', '.join(unknown)}"
+            return Refusal(Code.TOO_MANY_CONTROLLERS, {"most": MOST_CONTROLLERS})
+        if unknown := tuple(joint for joint in plan.joints if joint not in self._rows):
+            return Refusal(Code.UNKNOWN_JOINT, {"joint": unknown})
         begin_ns = self._clock.now_ns()
         try:
             turns = every(plan, self._period_ns)
             managed = self._configured(index, replace(plan, active=False, every=turns))
         except (ControllerFault, PlugInError) as error:
-            return str(error)
+            return Refusal(Code.CONTROLLER_FAULT, {"controller": plan.name, "problem": str(error)})
         self._failed.discard(plan.name)  # that was another one
         managed.pace(self._period_ns, turns)
         managed.wait_for(self._lost)
         self._managed = (*self._managed[:index], managed, *self._managed[index + 1 :])
         self._named[plan.name] = managed
         self._tell_loaded(managed, "loaded", begin_ns)
-        return ""
+        return index
 
     def _free_index(self) -> int:
         """Return a place for a controller; those of the plan keep theirs, also when they were unloaded.
@@ -259,30 +285,28 @@ class Manager:
                 return index
         return len(self._managed)
 
-    def unload(self, name: str) -> str:
-        """Forget a controller that is not active; return why not. Only while the loop is paused."""
+    def unload(self, name: str) -> Refusal | None:
+        """Forget a controller that is not active. Only while the loop is paused."""
         managed = self._named.get(name)
         if managed is None:
-            return f"there is no controller {name}"
+            return Refusal(Code.UNKNOWN_CONTROLLER, {"controller": name})
         if managed.active or managed in self._modes.entering:
-            return f"{name} is active; deactivate it first"
+            return Refusal(Code.STILL_ACTIVE, {"controller": name})
         begin_ns = self._clock.now_ns()
         del self._named[name]
         self._tell_loaded(managed, "unloaded", begin_ns)
-        return ""
+        return None
 
-    def change_period(self, period_ns: int) -> str:
-        """Let every controller keep its own rate in another period of the loop; return why that cannot be."""
+    def change_period(self, period_ns: int) -> Refusal | None:
+        """Let every controller keep its own rate in another period of the loop."""
         for managed in self._named.values():
-            if not fits(managed.plan, period_ns):
-                return (
-                    f"controller {managed.plan.name} runs at {managed.plan.rate:g} Hz, of which "
-                    f"{1e9 / period_ns:g} Hz is no multiple"
-                )
+            plan = managed.plan
+            if plan.rate is not None and not fits(plan, period_ns):
+                return _not_divided(plan.name, plan.rate, period_ns)
         self._period_ns = period_ns
         for managed in self._named.values():
             managed.pace(period_ns, every(managed.plan, period_ns))
-        return ""
+        return None
 
     @property
     def active(self) -> tuple[str, ...]:
@@ -299,11 +323,15 @@ class Manager:
         for managed in reversed(self._managed):
             if managed.active:
                 self._deactivate(managed, time_ns)
-        self._modes.end()
+        for number in self._modes.end():
+            self._end_switch(number, Refusal(Code.RUN_ENDING))
 
-    def _activate_all(self, wanted: Sequence[Managed], time_ns: int) -> None:
+    def _activate_all(self, wanted: Sequence[Managed], time_ns: int) -> Refusal | None:
         """Activate controllers whose claims were checked together, then the fallbacks of those that failed:
-        a fallback that came first could have a joint that belongs to one of the others."""
+        a fallback that came first could have a joint that belongs to one of the others.
+
+        Returns the first fault; the other controllers are active all the same.
+        """
         failed: list[tuple[Managed, str]] = []  # no faults, which hold this frame: nobody collects circles
         for managed in wanted:
             try:
@@ -316,6 +344,7 @@ class Manager:
                 self._tell(EventCode.CONTROLLER_ACTIVATED, managed, "active")
         for managed, why in failed:
             self._fall_back(managed, why, time_ns)
+        return _refused_by(*failed[0]) if failed else None
 
     def _deactivate(self, managed: Managed, time_ns: int) -> None:
         self._record.active &= ~managed.bit
@@ -336,9 +365,9 @@ class Manager:
             self._tell_taken(self._next, command)
             self._next += 1
             refusal = self.hand(command.controller, command.kind, data, command.origin, time_ns)
-            taken += not refusal
-            if refusal:
-                text = f"{command.kind} from {command.origin} refused: {refusal}"
+            taken += refusal is None
+            if refusal is not None:
+                text = f"{command.kind} from {command.origin} refused: {refusal.text}"
                 self._events.emit(EventCode.COMMAND_REFUSED, Severity.WARNING, command.controller, text)
         return taken
 
@@ -367,8 +396,10 @@ class Manager:
         """Let a fallback take over, but for one that broke its own contract before: two that fall back on
         each other would do so for ever."""
         name = managed.plan.fallback
-        if not name or name in self._failed or self._switch((name,), (), time_ns, why):
+        if not name or name in self._failed or self._refuse((name,), ()):
             self.fault = self.fault or why
+        else:
+            self._enter([self._named[name]], time_ns, None, why)
 
     def _tell_loaded(self, managed: Managed, what: str, begin_ns: int) -> None:
         text = f"{what} in {(self._clock.now_ns() - begin_ns) / 1e6:.1f} ms, while the loop stood still"
@@ -421,3 +452,16 @@ class Manager:
             self._record.published |= bit
 
         return publish
+
+
+def _refused_by(managed: Managed, problem: str) -> Refusal:
+    return Refusal(Code.CONTROLLER_FAULT, {"controller": managed.plan.name, "problem": problem})
+
+
+def _not_divided(controller: str, controller_rate: float, period_ns: int) -> Refusal:
+    fields: dict[str, Field] = {
+        "controller": controller,
+        "controller_rate": controller_rate,
+        "rate": 1e9 / period_ns,
+    }
+    return Refusal(Code.RATE_NOT_DIVIDED, fields)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from dxlrun.control.controllers.claims import claimed_modes, conflicts, told
 from dxlrun.control.controllers.managed import Managed
 from dxlrun.control.loop_plan import JointPlan
 from dxlrun.mode import Mode
+from dxlrun.run.channels.answers import Code, Field, Refusal
 
 PATIENCE_NS = 5_000_000_000
 """How long controllers wait for modes: twenty servos that take their turns in short gaps need less than one
@@ -30,8 +31,15 @@ class Group:
     entering: tuple[Managed, ...]
     until_ns: int
     """The controllers' time at which they are given up."""
+    number: int | None
+    """Of the command that asked for it; None: none did."""
     why: str
     """The fault of the one that they stand in for; empty: they were asked for."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the controllers."""
+        return tuple(managed.plan.name for managed in self.entering)
 
 
 class ModeSwitch:
@@ -68,9 +76,9 @@ class ModeSwitch:
         """Claims are other ones than before: modes are asked for anew."""
         self._asked = False
 
-    def await_modes(self, entering: Iterable[Managed], time_ns: int, why: str) -> None:
+    def await_modes(self, entering: Iterable[Managed], time_ns: int, number: int | None, why: str) -> None:
         """Let controllers wait, together, until all their joints are in their modes."""
-        self._groups.append(Group(tuple(entering), time_ns + PATIENCE_NS, why))
+        self._groups.append(Group(tuple(entering), time_ns + PATIENCE_NS, number, why))
         self._asked = False
 
     def ready(self, entering: Iterable[Managed]) -> bool:
@@ -96,8 +104,8 @@ class ModeSwitch:
             self._asked = False
         return ready, late
 
-    def excuse(self, group: Group) -> str:
-        """Say which joints did not come into their modes."""
+    def problem(self, group: Group) -> str:
+        """Return which joints did not come into their modes, in words."""
         missing = self._missing(group.entering)
         stays = [
             f"{joint} stays in {_said(now)} mode instead of {_said(mode)} mode"
@@ -111,19 +119,24 @@ class ModeSwitch:
         ]
         return (stays or late)[0] + (f", nor did {len(missing) - 1} more" if len(missing) > 1 else "")
 
-    def drop(self, managed: Managed, _time_ns: int) -> None:
-        """Let one controller wait no more."""
-        kept = [
-            Group(tuple(one for one in group.entering if one is not managed), group.until_ns, group.why)
-            for group in self._groups
-        ]
-        self._groups = [group for group in kept if group.entering]
+    def drop(self, managed: Managed) -> int | None:
+        """Let a controller wait no more; return the number of the command whose last one it was."""
+        ended = None
+        for index, group in enumerate(self._groups):
+            if managed in group.entering:
+                left = tuple(one for one in group.entering if one is not managed)
+                self._groups[index] = replace(group, entering=left)
+                ended = None if left else group.number
+        self._groups = [group for group in self._groups if group.entering]
         self._asked = False
+        return ended
 
-    def end(self) -> None:
-        """Let nobody wait, and ask for nothing any more."""
+    def end(self) -> list[int | None]:
+        """End all waiting, and ask for no modes any more; return the numbers of the commands that waited."""
+        numbers = [group.number for group in self._groups]
         self._groups = []
         self._asked = True
+        return numbers
 
     def ask(self, managed: Iterable[Managed]) -> None:
         """Ask the hardware for modes, once for each change of claims of those of them who are active."""
@@ -149,22 +162,29 @@ class ModeSwitch:
         deactivate: Sequence[str],
         named: Mapping[str, Managed],
         active: Iterable[Managed],
-    ) -> str:
-        """Say why controllers cannot be switched so; empty when they can."""
+    ) -> Refusal | None:
+        """Return why controllers cannot be switched so, None when they can."""
+        if unknown := tuple(name for name in (*activate, *deactivate) if name not in named):
+            return Refusal(Code.UNKNOWN_CONTROLLER, {"controller": unknown})
         for names in (activate, deactivate):
-            for name in names:
-                if name not in named:
-                    return f"there is no controller {name}"
-            if len(set(names)) != len(names):
-                return "a controller is named twice"
+            if twice := tuple({name for name in names if names.count(name) > 1}):
+                return Refusal(Code.NAMED_TWICE, {"controller": twice})
         engaged = {managed.plan.name: managed.plan for managed in (*active, *self.entering)}
-        if idle := [name for name in deactivate if name not in engaged]:
-            return f"{', '.join(idle)} is not active"
-        if busy := [name for name in activate if name in engaged and name not in deactivate]:
-            return f"{', '.join(busy)} is active already"
+        if idle := tuple(name for name in deactivate if name not in engaged):
+            return Refusal(Code.INACTIVE_ALREADY, {"controller": idle})
+        if busy := tuple(name for name in activate if name in engaged and name not in deactivate):
+            return Refusal(Code.ACTIVE_ALREADY, {"controller": busy})
         staying = [plan for name, plan in engaged.items() if name not in deactivate]
-        clash = told(conflicts([*staying, *(named[name].plan for name in activate)]))
-        return f"{clash}; deactivate whoever is in the way in the same switch" if clash else ""
+        found = conflicts([*staying, *(named[name].plan for name in activate)])
+        if not found:
+            return None
+        fields: dict[str, Field] = {
+            "conflict": told(found),
+            "joints": tuple(conflict.joint for conflict in found),
+            "holders": tuple(conflict.holder for conflict in found),
+            "others": tuple(conflict.other for conflict in found),
+        }
+        return Refusal(Code.JOINTS_CLAIMED, fields)
 
     def _missing(self, entering: Iterable[Managed]) -> dict[str, tuple[Mode, Mode]]:
         """Return the joints that are not in their modes, with the mode that they need and theirs."""

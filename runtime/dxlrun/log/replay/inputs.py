@@ -6,6 +6,7 @@ from collections.abc import Collection, Iterable, Sequence
 
 from dxlrun.errors import LogError
 from dxlrun.log.steered import Steered
+from dxlrun.run.channels.answers import Answer, Refusal
 from dxlrun.run.channels.commands import Command, TakenCommand
 from dxlrun.run.channels.cycle import CycleRecord
 
@@ -19,6 +20,7 @@ class RecordedInbox:
     def __init__(self, steered: Iterable[Steered], record: CycleRecord) -> None:
         self.remarks: list[str] = []
         self._steered = tuple(steered)
+        self._answered: set[int] = set()
         self._record = record
         self._by_cycle: dict[int, list[Command]] = {}
         for number, one in enumerate(self._steered):
@@ -31,9 +33,13 @@ class RecordedInbox:
         """Return what this cycle took then."""
         return self._by_cycle.get(self._record.cycle, ())
 
-    def answer(self, number: int, refusal: str) -> None:
-        """Compare what became of a command with what became of it then."""
+    def answer(self, number: int, answer: Answer) -> None:
+        """Compare the first answer to a command with the one in the run."""
+        if number in self._answered:
+            return  # a switch that waited for modes: the states decide about it, and they are compared
+        self._answered.add(number)
         then = self._steered[number]
+        refusal = answer.text if isinstance(answer, Refusal) else ""
         if bool(refusal) == bool(then.refusal):
             return
         command = then.command

@@ -15,6 +15,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.run.channels.answers import Answer
 from dxlrun.run.channels.ring import RING_SECONDS, Appender, Payload, RecordKind, record_size
 
 LOOP = ""
@@ -106,8 +107,8 @@ class Inbox(Protocol):
         """Return what has come, in order, at most MOST_PER_CYCLE and the newest set-point of each stream."""
         ...
 
-    def answer(self, number: int, refusal: str) -> None:
-        """Report to the sender what became of a command: done when `refusal` is empty, else why not."""
+    def answer(self, number: int, answer: Answer) -> None:
+        """Answer a command by its number; after `Waiting` another answer follows."""
         ...
 
 
@@ -118,16 +119,16 @@ class NoInbox:
         """Return nothing."""
         return ()
 
-    def answer(self, number: int, refusal: str) -> None:
+    def answer(self, number: int, answer: Answer) -> None:
         """Forget it: no command came from here."""
 
 
 class QueueInbox:
-    """Commands from the same process, on virtual time; `answers` holds the refusal of each number."""
+    """Commands from the same process, on virtual time; `answers` has the newest answer to each number."""
 
     def __init__(self) -> None:
         self.waiting: deque[Command] = deque()
-        self.answers: dict[int, str] = {}
+        self.answers: dict[int, Answer] = {}
 
     def take(self) -> Sequence[Command]:
         """Return what has been put into `waiting`."""
@@ -135,9 +136,9 @@ class QueueInbox:
             return ()
         return [self.waiting.popleft() for _ in range(min(len(self.waiting), MOST_PER_CYCLE))]
 
-    def answer(self, number: int, refusal: str) -> None:
+    def answer(self, number: int, answer: Answer) -> None:
         """Keep the answer."""
-        self.answers[number] = refusal
+        self.answers[number] = answer
 
 
 class CommandSink(Protocol):

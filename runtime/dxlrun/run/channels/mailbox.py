@@ -19,8 +19,10 @@ import mmap
 import os
 import struct
 from collections.abc import Sequence
+from contextlib import suppress
 
 from dxlrun.run.channels import ring
+from dxlrun.run.channels.answers import Answer, decode_answer, encode_answer
 from dxlrun.run.channels.commands import (
     LONGEST_COMMAND,
     MOST_PER_CYCLE,
@@ -35,8 +37,8 @@ LONGEST_SET_POINT = 2048
 MOST_BYTES = 64 * 1024
 """After so many a cycle takes no more operations, so that of long ones it takes one: copying 256 KiB into the
 log takes some 2 ms [measured]."""
-LONGEST_ANSWER = 512
-"""Bytes of an answer's record; a longer refusal is cut."""
+LONGEST_ANSWER = 2048
+"""Bytes of an answer's record; long texts of a refusal are cut."""
 ANSWERS_CAPACITY = 256 * 1024
 
 _CAPACITY = 4 * LONGEST_COMMAND
@@ -153,10 +155,10 @@ class Mailbox:
                     self._decode(place.newest(), commands)
         return commands
 
-    def answer(self, number: int, refusal: str) -> None:
-        """Report to the gateway what became of a command; a long sentence is cut."""
-        text = refusal.encode(errors="replace")[: LONGEST_ANSWER - _ANSWER.size]
-        self._answers.append(RecordKind.ANSWER, _ANSWER.pack(number) + text)
+    def answer(self, number: int, answer: Answer) -> None:
+        """Answer a command of the gateway; long texts in a refusal's fields are cut."""
+        payload = _ANSWER.pack(number) + encode_answer(answer, LONGEST_ANSWER - _ANSWER.size)
+        self._answers.append(RecordKind.ANSWER, payload)
 
     def _decode(self, record: Record | None, commands: list[Command]) -> None:
         try:
@@ -169,16 +171,17 @@ class Mailbox:
 
 
 class Answers:
-    """The gateway's view of what became of its commands."""
+    """The gateway's end of the ring of answers."""
 
     def __init__(self, descriptor: int) -> None:
         self._ring = RingReader(descriptor)
 
-    def new(self) -> list[tuple[int, str]]:
-        """Return number and refusal of what was answered since the last call; empty: done."""
-        found: list[tuple[int, str]] = []
+    def new(self) -> list[tuple[int, Answer]]:
+        """Return the answers since the last call, each with its command's number."""
+        found: list[tuple[int, Answer]] = []
         while (record := self._ring.read()) is not None:
             if isinstance(record, Record) and len(record.payload) >= _ANSWER.size:
-                text = record.payload[_ANSWER.size :].decode(errors="replace")
-                found.append((_ANSWER.unpack_from(record.payload)[0], text))
+                with suppress(ValueError):
+                    answer = decode_answer(bytes(record.payload[_ANSWER.size :]))
+                    found.append((_ANSWER.unpack_from(record.payload)[0], answer))
         return found

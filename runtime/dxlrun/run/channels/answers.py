@@ -1,0 +1,151 @@
+"""Answers: what became of a command from outside, as data; sentences are made of it for a person, at the end.
+
+The loop's process answers each command by its number: `Done`, `Refusal`, or first `Waiting` and one of the
+two later. The gateway passes an answer on as JSON, the Python client makes objects of it. A program goes by
+`code` and `fields`; the text is for people, and its wording may change.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import StrEnum, unique
+from typing import TypeAlias
+
+import msgspec
+
+Field: TypeAlias = str | int | float | tuple[str, ...]
+
+
+@unique
+class Code(StrEnum):
+    """Why a command is refused, with the sentence that is made of the refusal's fields.
+
+    A field `hint` that the sentence does not name follows at its end.
+    """
+
+    text: str
+
+    def __new__(cls, code: str, text: str) -> Code:
+        """Keep the sentence beside the value."""
+        member = str.__new__(cls, code)
+        member._value_ = code
+        member.text = text
+        return member
+
+    # the run
+    RUN_ENDING = "run_ending", "the run is at its end"
+    NO_CYCLE = "no_cycle", "the loop has run no cycle yet; ask again"
+    NO_ANSWER = (
+        "no_answer",
+        "the loop did not answer within {seconds:.1f} s; it may still do it",
+    )
+    # controllers
+    UNKNOWN_CONTROLLER = "unknown_controller", "there is no controller {controller}"
+    NAMED_TWICE = "named_twice", "{controller} is named twice; name it once"
+    NOT_ACTIVE = "not_active", "{controller} is not active; switch to it first"
+    NOT_ACTIVE_YET = "not_active_yet", "{controller} is not active yet: its joints change their modes"
+    INACTIVE_ALREADY = "inactive_already", "{controller} is not active"
+    ACTIVE_ALREADY = "active_already", "{controller} is active already"
+    STILL_ACTIVE = "still_active", "{controller} is active; deactivate it first"
+    JOINTS_CLAIMED = "joints_claimed", "{conflict}; deactivate the other one in the same switch"
+    MODE_NOT_ENTERED = "mode_not_entered", "{controller} is not activated: {problem}"
+    SWITCHED_AGAIN = "switched_again", "another switch deactivated {controller} before it was active"
+    CONTROLLER_FAULT = "controller_fault", "{problem}"
+    NAME_TAKEN = "name_taken", "there is a controller {controller} already"
+    TOO_MANY_CONTROLLERS = "too_many_controllers", "there are {most} controllers, which is the most"
+    NOT_IN_PAUSE = "not_in_pause", "pause the loop first: it stands still meanwhile"
+    UNLOADED = "unloaded", "{controller} was unloaded meanwhile"
+    # the loop
+    PAUSED_ALREADY = "paused_already", "the loop is paused already"
+    NOT_PAUSED = "not_paused", "the loop is not paused"
+    RATE_OUT_OF_RANGE = (
+        "rate_out_of_range",
+        "{rate:g} Hz is no rate of a loop; write {lowest:g} to {highest:.0f}",
+    )
+    RATE_OVER_BUSES = "rate_over_buses", "the buses allow at most {highest:.4g} Hz"
+    RATE_UNDER_WATCHDOG = "rate_under_watchdog", "the Bus Watchdog needs at least {lowest:.4g} Hz"
+    RATE_UNDER_EXIT = (
+        "rate_under_exit",
+        "at less than {lowest:.2g} Hz the run would not end within exit_timeout",
+    )
+    RATE_NOT_DIVIDED = (
+        "rate_not_divided",
+        "{rate:g} Hz is no multiple of {controller_rate:g} Hz, the rate of controller {controller}",
+    )
+    # joints
+    UNKNOWN_JOINT = "unknown_joint", "there is no joint {joint}"
+    UNKNOWN_REGISTER = "unknown_register", "{joint}: {problem}"
+    INVALID_REGISTER = "invalid_register", "{joint}: {problem}"
+    REGISTER_NOT_WRITTEN = "register_not_written", "{problem}"
+    # commands
+    UNKNOWN_COMMAND = "unknown_command", "{controller} takes no command {kind}"
+    INVALID = "invalid", "{problem}"
+    WRONG_QUANTITY = "wrong_quantity", "{problem}"
+    BEYOND_LIMITS = "beyond_limits", "{kind} of {controller}: {problem}"
+    TOO_SLOW = (
+        "too_slow",
+        "{controller} computed for more than {seconds:g} s; send less at once",
+    )
+    # requests
+    UNKNOWN_PAGE = "unknown_page", "{method} {path} is no request of this version"
+    WRONG_METHOD = "wrong_method", "{path} takes no {method}"
+    TOO_LONG = "too_long", "{size} bytes are too many, at most {most}; send less at once"
+    BODY_TIMEOUT = "body_timeout", "the request did not arrive within {seconds:g} s"
+    TOO_OFTEN = "too_often", "more than {rate:g} a second, or too much in them; reduce the request rate"
+    QUEUE_FULL = "queue_full", "command queue full; reduce the request rate"
+    GATEWAY_FAILED = "gateway_failed", "the gateway failed: {problem}; --debug shows where"
+
+
+class Done(msgspec.Struct, frozen=True, tag="done"):
+    """The command was executed."""
+
+    cycle: int
+    """The loop's cycle that did it."""
+    place: int | None = None
+    """Of a controller that was loaded: its bit in the masks of the cycles."""
+
+
+class Waiting(msgspec.Struct, frozen=True, tag="waiting"):
+    """The command was accepted; controllers enter when their joints are in the modes that they need."""
+
+    controllers: tuple[str, ...]
+
+
+class Refusal(msgspec.Struct, frozen=True, tag="refused"):
+    """Nothing was done, for a reason that a program can read."""
+
+    code: Code
+    fields: Mapping[str, Field] = {}
+
+    @property
+    def text(self) -> str:
+        """The reason in one sentence."""
+        shown = {
+            name: ", ".join(value) if isinstance(value, tuple) else value
+            for name, value in self.fields.items()
+        }
+        sentence = self.code.text.format_map(shown)
+        hint = "" if "{hint}" in self.code.text else shown.get("hint", "")
+        return f"{sentence}; {hint}" if hint else sentence
+
+
+Answer: TypeAlias = Done | Waiting | Refusal
+
+
+def encode_answer(answer: Answer, most: int) -> bytes:
+    """Return an answer as JSON of at most so many bytes; of a refusal's long texts as much as fits."""
+    data = msgspec.json.encode(answer)
+    while len(data) > most and isinstance(answer, Refusal):
+        fields = dict(answer.fields)
+        longest = max(fields, key=lambda name: len(str(fields[name])))
+        value = fields[longest]
+        fields[longest] = value[: len(value) // 2] if isinstance(value, str | tuple) else 0
+        answer = Refusal(answer.code, fields)
+        data = msgspec.json.encode(answer)
+    return data
+
+
+def decode_answer(data: bytes) -> Answer:
+    """Return the answer of some bytes; raises ValueError when they are none."""
+    answer: Answer = msgspec.json.decode(data, type=Answer)
+    return answer
