@@ -111,6 +111,7 @@ def test_commands_inside_sentences_exist_with_their_options(dxlrun: Dxlrun, page
             assert verb in verbs, span
             family = [verb, rest[0]] if verb == "bench" else [verb]
             helped = dxlrun(*family, "--help").out
+            assert f"dxlrun {' '.join(family)}" in helped, span
         for option in re.findall(r"--[a-z][a-z-]*", span):
             assert option in helped, span
 
