@@ -11,8 +11,7 @@ from typing import Any
 import pytest
 
 from dxlrun.control.realtime.rights import UNLIMITED
-from dxlrun.run.doctor import Finding, Machine, diagnose
-from dxlrun.run.doctor.machine import may_schedule
+from dxlrun.run.doctor import Finding, Machine, diagnose, may_schedule
 
 GOOD = {
     "proc/sys/kernel/osrelease": "6.12.1-rt5",
@@ -89,7 +88,7 @@ CONTAINER = "--cap-add SYS_NICE --ulimit rtprio=98 --ulimit memlock=-1"
             "cat /sys/bus/usb-serial/devices/ttyUSB0/latency_timer",
         ),
         ({}, {"highest_priority": 0}, "real-time priority", "none is allowed", LIMITS),
-        ({}, {"highest_priority": 20}, "real-time priority", "up to 20, 32 are wanted", "rtprio 98"),
+        ({}, {"highest_priority": 20}, "real-time priority", "up to 20, a run needs 32", "rtprio 98"),
         ({".dockerenv": ""}, {"highest_priority": 0}, "real-time priority", "none is allowed", CONTAINER),
         ({}, {"may_schedule": lambda: False}, "real-time priority", "the kernel refuses it", "sysctl"),
         (

@@ -1,0 +1,381 @@
+"""The doctor: what on this machine keeps a robot from running, or from running smoothly."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from dxlrun.control.realtime.grants import IDLE_LATENCY, allow_idle_latency
+from dxlrun.control.realtime.rights import (
+    IPC_LOCK,
+    SYS_NICE,
+    UNLIMITED,
+    allow,
+    has_capability,
+    highest_priority,
+    lockable_bytes,
+    user,
+)
+from dxlrun.dynamixel.exchange import kernel as compiled_exchange
+from dxlrun.dynamixel.port.latency_timer import mend, timer_ms
+
+NEEDED = ("memfd_create", "pidfd_open", "sched_setscheduler")
+"""Calls of `os` without which no run starts; Linux has them all since 5.3."""
+NEEDED_PRIORITY = 32
+"""The robot file's default priority for the loop, and one more for the guardian."""
+FAST_MS = 1
+"""The shortest latency timer of an FTDI adapter (FTDI application note AN232B-04)."""
+
+_CAPABILITIES = {SYS_NICE: "CAP_SYS_NICE", IPC_LOCK: "CAP_IPC_LOCK"}
+_REAL_TIME_KERNELS = {
+    "debian": "sudo apt install linux-image-rt-$(dpkg --print-architecture)",
+    "ubuntu": "sudo pro enable realtime-kernel",
+    "arch": "sudo pacman -S linux-rt",
+}
+_CONTAINER = "start the container with --cap-add SYS_NICE --ulimit rtprio=98 --ulimit memlock=-1"
+_SHARE = "proc/sys/kernel/sched_rt_runtime_us"
+_DEFAULT_SHARE = "sudo sysctl kernel.sched_rt_runtime_us=950000"
+_CLOCK_SOURCE = "sys/devices/system/clocksource/clocksource0/current_clocksource"
+_SLOW_CLOCKS = ("hpet", "acpi_pm", "pit", "jiffies", "refined-jiffies")
+"""Sources that are read over a bus, in a microsecond or more, or that tick [i]."""
+_PORTS = ("dev/ttyUSB*", "dev/ttyACM*")
+_TIMERS = "sys/bus/usb-serial/devices/*/latency_timer"
+_GOVERNORS = "sys/devices/system/cpu/cpu[0-9]*/cpufreq/scaling_governor"
+
+State = Literal["good", "worse", "missing"]
+"""worse: robots run, but not as smoothly as they could; missing: no robot runs like this."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """The result of one check; its fields are those of `dxlrun doctor --json`."""
+
+    what: str
+    state: State
+    found: str
+    """How it is here."""
+    why: str
+    """What it matters for."""
+    mend: str = ""
+    """The command, or the step, that fixes it; empty where nothing is to be fixed."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Check:
+    """What is looked at, and what it matters for."""
+
+    what: str
+    why: str
+
+    def good(self, found: str) -> Finding:
+        return Finding(self.what, "good", found, self.why)
+
+    def worse(self, found: str, fix: str) -> Finding:
+        return Finding(self.what, "worse", found, self.why, fix)
+
+    def missing(self, found: str, fix: str) -> Finding:
+        return Finding(self.what, "missing", found, self.why, fix)
+
+
+def _open_to_us(path: Path) -> bool:
+    return os.access(path, os.R_OK | os.W_OK)
+
+
+def may_schedule() -> bool:
+    """Return whether the kernel really gives a real-time policy: a container's group may have no share of it.
+
+    Takes it for a moment, and gives it back.
+    """
+    try:
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    except (AttributeError, OSError):
+        return False
+    return True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Machine:
+    """One machine and its user, as far as checks depend on them; the tests make up others."""
+
+    platform: str = sys.platform
+    root: Path = Path("/")
+    missing_calls: tuple[str, ...] = ()
+    user: str = "nobody"
+    cores: int = 1
+    """On which this process may run."""
+    capabilities: tuple[str, ...] = ()
+    """Those that matter here: CAP_SYS_NICE, CAP_IPC_LOCK."""
+    highest_priority: int = 0
+    """99 with the capability; 0: none."""
+    lockable: int = 0
+    """Bytes; UNLIMITED with the capability."""
+    compiled: bool = True
+    """dxlrun was installed with the compiled part of its exchange with servos."""
+    may_schedule: Callable[[], bool] = field(default=may_schedule)
+    may_write: Callable[[Path], bool] = field(default=_open_to_us)
+
+    @classmethod
+    def this(cls) -> Machine:
+        """Return the machine on which we run; never raises."""
+        missing = tuple(name for name in NEEDED if not hasattr(os, name))
+        if missing or not sys.platform.startswith("linux"):
+            return cls(missing_calls=missing)
+        return cls(
+            user=user(),
+            cores=len(os.sched_getaffinity(0)),
+            capabilities=tuple(name for bit, name in _CAPABILITIES.items() if has_capability(bit)),
+            highest_priority=highest_priority(),
+            lockable=lockable_bytes(),
+            compiled=compiled_exchange.load() is not None,
+        )
+
+    @property
+    def container(self) -> bool:
+        """True in a container: rights come with its start, the kernel from outside."""
+        return any((self.root / name).exists() for name in (".dockerenv", "run/.containerenv"))
+
+    def read(self, path: str) -> str | None:
+        """Return the text of a file under the root, stripped; None when it cannot be read."""
+        try:
+            return (self.root / path).read_text(errors="replace").strip()
+        except OSError:
+            return None
+
+    def glob(self, pattern: str) -> list[Path]:
+        """Return the paths under the root that match a pattern, in order."""
+        return sorted(self.root.glob(pattern))
+
+    def shown(self, path: Path) -> str:
+        """Return a path as the machine's user would write it."""
+        return f"/{path.relative_to(self.root)}"
+
+
+def diagnose(machine: Machine) -> tuple[Finding, ...]:
+    """Return the findings in the order in which to fix them; only the first where no robot can run."""
+    first = _system(machine)
+    if first.state == "missing":
+        return (first,)
+    return (
+        first,
+        _exchange(machine),
+        *_ports(machine),
+        *(_timer(machine, path) for path in machine.glob(_TIMERS)),
+        _priority(machine),
+        _locked_memory(machine),
+        _kernel(machine),
+        _real_time_share(machine),
+        _clock_source(machine),
+        _cores(machine),
+        _governor(machine),
+        _idle_latency(machine),
+    )
+
+
+def _system(machine: Machine) -> Finding:
+    check = _Check("system", "a run is several processes that share nameless memory and watch each other")
+    if not machine.platform.startswith("linux"):
+        return check.missing(
+            f"this is {machine.platform}; robots run on Linux only, files can be checked everywhere",
+            "run the robot from a Linux machine, which may be a small one",
+        )
+    if machine.missing_calls:
+        return check.missing(
+            f"this Python has no {', '.join(machine.missing_calls)}", "install Linux 5.3 or newer"
+        )
+    return check.good(f"Linux {machine.read('proc/sys/kernel/osrelease') or 'of an unknown version'}")
+
+
+def _exchange(machine: Machine) -> Finding:
+    """Whether the exchange with the servos is compiled: it is where a C compiler was at installation."""
+    check = _Check(
+        "exchange",
+        "the compiled exchange takes a fraction of the processor time of the one in Python, and can poll",
+    )
+    if machine.compiled:
+        return check.good("compiled")
+    return check.worse(
+        "in Python: no C compiler was found at installation",
+        "install a C compiler (Debian, Ubuntu: sudo apt install gcc), then dxlrun again",
+    )
+
+
+def _ports(machine: Machine) -> tuple[Finding, ...]:
+    found = [path for pattern in _PORTS for path in machine.glob(pattern)]
+    if not found:
+        none = _Check("ports", "servos hang on a serial port")
+        return (none.good("no USB serial adapter is plugged in"),)
+    return tuple(_port(machine, path) for path in found)
+
+
+def _port(machine: Machine, path: Path) -> Finding:
+    name = machine.shown(path)
+    check = _Check(name, "the guardian opens the port to read and to write")
+    if machine.may_write(path):
+        return check.good(f"{machine.user} may open it")
+    group = _helpful_group(path)
+    if group is None:
+        return check.missing(
+            f"{machine.user} may not open it", f"sudo chmod a+rw {name}  # until it is unplugged"
+        )
+    return check.missing(
+        f"it belongs to the group {group}, and {machine.user} is not in it",
+        f"sudo usermod -aG {group} {machine.user}  # then log in again",
+    )
+
+
+def _helpful_group(path: Path) -> str | None:
+    """Return the group of a file whose members may read and write it."""
+    try:
+        mode = path.stat().st_mode
+        return path.group() if mode & 0o060 == 0o060 and path.group() != "root" else None
+    except (KeyError, OSError):
+        return None
+
+
+def _timer(machine: Machine, path: Path) -> Finding:
+    """The latency timer of an FTDI adapter; other adapters have none."""
+    check = _Check(
+        f"latency timer of {path.parent.name}",
+        "the adapter keeps the last bytes of each reply back for so long",
+    )
+    found, shown = timer_ms(path), machine.shown(path)
+    if found is None:
+        return check.worse("it cannot be read", f"cat {shown}")
+    if found <= FAST_MS:
+        return check.good(f"{found} ms")
+    return check.worse(f"{found} ms where 1 ms is possible", mend(shown))
+
+
+def _priority(machine: Machine) -> Finding:
+    """Whether a run may have real-time priority (RLIMIT_RTPRIO, CAP_SYS_NICE), and really gets it."""
+    check = _Check(
+        "real-time priority", "with ordinary priority any busy program delays the loop by milliseconds"
+    )
+    highest = machine.highest_priority
+    if highest < NEEDED_PRIORITY:
+        found = f"up to {highest}, a run needs {NEEDED_PRIORITY}" if highest else "none is allowed"
+        return check.worse(found, _raise_limit(machine, "rtprio", 98))
+    if not machine.may_schedule():
+        return check.worse(
+            "it is allowed, but the kernel refuses it: this group of processes has no share of it",
+            _CONTAINER if machine.container else _DEFAULT_SHARE,
+        )
+    return check.good(f"up to {highest}, {_by(machine, 'CAP_SYS_NICE', 'rtprio')}")
+
+
+def _locked_memory(machine: Machine) -> Finding:
+    """Whether a run may lock all of its memory (RLIMIT_MEMLOCK, CAP_IPC_LOCK)."""
+    check = _Check("locked memory", "a page that was swapped out delays the loop by milliseconds")
+    if machine.lockable == UNLIMITED:
+        return check.good(f"all of it, {_by(machine, 'CAP_IPC_LOCK', 'memlock')}")
+    return check.worse(
+        f"only {machine.lockable >> 10} KiB may be locked", _raise_limit(machine, "memlock", "unlimited")
+    )
+
+
+def _by(machine: Machine, capability: str, limit: str) -> str:
+    return f"by {capability}" if capability in machine.capabilities else f"by the limit {limit}"
+
+
+def _raise_limit(machine: Machine, limit: str, value: int | str) -> str:
+    return _CONTAINER if machine.container else f"{allow(limit, value, machine.user)}  # then log in again"
+
+
+def _kernel(machine: Machine) -> Finding:
+    """Whether the operating system's kernel is a real-time one.
+
+    Source of the figures: wake-ups of a 1 kHz timer under full load, 1,000,000 each, in the bachelor thesis
+    on real-time control of Dynamixel servos that dxlrun follows.
+    """
+    check = _Check(
+        "kernel",
+        "under full load a stock kernel woke a 1 kHz loop up to 17 ms late, a real-time kernel 86 us",
+    )
+    version = machine.read("proc/sys/kernel/version") or ""
+    if "PREEMPT_RT" in version or machine.read("sys/kernel/realtime") == "1":
+        return check.good("a real-time kernel (PREEMPT_RT)")
+    kind = next((word for word in version.split() if word.startswith("PREEMPT")), "no preemption")
+    return check.worse(f"a stock kernel ({kind})", _real_time_kernel(machine))
+
+
+def _real_time_kernel(machine: Machine) -> str:
+    """Return how to get one on this distribution."""
+    if machine.container:
+        return "install a PREEMPT_RT kernel on the machine that runs this container"
+    lines = (machine.read("etc/os-release") or "").splitlines()
+    ids = [line.partition("=")[2].strip('"') for line in lines if line.startswith(("ID=", "ID_LIKE="))]
+    known = [_REAL_TIME_KERNELS[one] for words in ids for one in words.split() if one in _REAL_TIME_KERNELS]
+    return known[0] if known else "install your distribution's PREEMPT_RT kernel"
+
+
+def _real_time_share(machine: Machine) -> Finding:
+    """Whether a loop gone wild leaves the machine a share of its cores (sched(7))."""
+    check = _Check(
+        "real-time share",
+        "a real-time loop that never sleeps would lock out everything else on its core, also you",
+    )
+    share = machine.read(_SHARE)
+    if share == "-1":
+        return check.worse("real-time processes may take all of a core", _DEFAULT_SHARE)
+    if share is None or not share.isdigit():
+        return check.good("the kernel does not show it")
+    return check.good(f"at most {int(share) / 1e4:g} % of a core")
+
+
+def _clock_source(machine: Machine) -> Finding:
+    check = _Check("clock", "the loop polls the clock shortly before each deadline")
+    source = machine.read(_CLOCK_SOURCE)
+    if source in _SLOW_CLOCKS:
+        return check.worse(
+            f"the clock source is {source}, which is slow to read",
+            "add clocksource=tsc to the kernel's command line and start again",
+        )
+    return check.good(f"the clock source is {source or 'not shown'}")
+
+
+def _cores(machine: Machine) -> Finding:
+    """Whether the loop can have a core for itself."""
+    check = _Check("cores", "guardian, recorder and gateway work beside the loop")
+    if machine.cores < 2:
+        return check.worse(
+            "there is one core for all processes", "use a machine, or allow this process, two cores or more"
+        )
+    isolated = machine.read("sys/devices/system/cpu/isolated")
+    also = f"; isolated: {isolated}, give them to the loop by loop.scheduler.cores" if isolated else ""
+    return check.good(f"{machine.cores} cores{also}")
+
+
+def _governor(machine: Machine) -> Finding:
+    """Whether the cores always run at their full clock rate."""
+    check = _Check(
+        "CPU governor", "a core that has to speed up first makes the first milliseconds of work slow"
+    )
+    found = sorted({path.read_text().strip() for path in machine.glob(_GOVERNORS)})
+    if not found:
+        return check.good("this machine has none, or hides it")
+    if found == ["performance"]:
+        return check.good("performance on all cores")
+    return check.worse(
+        f"{', '.join(found)} where performance is meant",
+        f"echo performance | sudo tee /{_GOVERNORS.replace('[0-9]', '')}",
+    )
+
+
+def _idle_latency(machine: Machine) -> Finding:
+    """Whether a run may keep the cores from deep idle states."""
+    check = _Check(
+        "idle latency",
+        "a core in a deep idle state wakes up to some 100 us late; "
+        "loop.scheduler.idle_latency keeps it awake",
+    )
+    device = machine.root / IDLE_LATENCY.relative_to("/")
+    if not device.exists():
+        return check.good("this machine has no such states, or hides them")
+    if machine.may_write(device):
+        return check.good("runs may keep cores awake")
+    return check.worse("runs may not keep cores awake", allow_idle_latency(machine.user))
