@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from dxlrun.clock import VirtualClock
-from dxlrun.log.header import LoggedController, LogHeader
 from dxlrun.log.log_writer import LogWriter
+from dxlrun.log.schemas import LoggedController, LogHeader
 from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
 from dxlrun.run.channels.events import EventCode, EventRing, Severity
 from dxlrun.run.channels.packets import PacketBatch, PacketKind

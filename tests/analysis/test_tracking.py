@@ -17,9 +17,9 @@ from dxlrun.analysis.figures.joints import joint_drawings
 from dxlrun.analysis.output.tables import joints_table
 from dxlrun.analysis.report import analyze, to_json
 from dxlrun.analysis.tracking import Joint, reachable, tracking
-from dxlrun.log.header import LogHeader
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import Log, read_log
+from dxlrun.log.schemas import LogHeader
 from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
 from dxlrun.run.channels.ring import RecordKind
 

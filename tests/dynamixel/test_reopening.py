@@ -5,11 +5,12 @@ import select
 import socket
 
 import pytest
+from msgspec.json import Decoder
 
 from dxlrun.dynamixel.port.ports import SerialPort, SerialPorts
 from dxlrun.dynamixel.port.reopening import KeptLines, LinesAgain, Wanted, lasting_name
 from dxlrun.errors import PortError
-from dxlrun.run.channels.process import Line
+from dxlrun.run.channels.process import LineLost, LineReturned, MessageChannel
 
 PATIENCE_S = 60.0
 
@@ -109,24 +110,25 @@ def test_of_two_lines_of_which_one_is_missing_neither_is_kept(adapters):
 
 def test_whoever_asks_gets_the_line_in_the_place_of_the_old_one(adapters, kept):
     ours, theirs = socket.socketpair()
-    keeper = Line(theirs)
+    keeper = MessageChannel(theirs, Decoder(LineLost))
     ports = SerialPorts(
-        [SerialPort(os.dup(one), "a line") for one in kept.descriptors], LinesAgain(Line(ours))
+        [SerialPort(os.dup(one), "a line") for one in kept.descriptors],
+        LinesAgain(MessageChannel(ours, Decoder(LineReturned))),
     )
     adapters[0].unplug()
     assert not ports.reopen(0)
     assert not ports.reopen(0)
-    assert keeper.receive() == [{"gone": 0}]  # asked once
+    assert keeper.receive() == [LineLost(0)]  # asked once
     kept.lost(0)
     adapters[0].plug_in()
     assert returned(kept) == [0]
-    keeper.send({"back": 0}, [kept.descriptors[0]])
+    keeper.send(LineReturned(0), [kept.descriptors[0]])
     assert ports.reopen(0)
     ports.ports[0].write(b"again")
     assert adapters[0].heard() == b"again"
     adapters[0].unplug()
     assert not ports.reopen(0)
-    assert keeper.receive() == [{"gone": 0}]  # it was lost anew
+    assert keeper.receive() == [LineLost(0)]  # it was lost anew
     adapters[0].plug_in()
     keeper.close()
     assert not ports.reopen(0)  # nobody is there to ask

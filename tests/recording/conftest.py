@@ -11,8 +11,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from dxlrun.log import schemas
-from dxlrun.log.header import LoggedController, LogHeader
 from dxlrun.log.log_writer import LogWriter
+from dxlrun.log.schemas import LoggedController, LogHeader
 from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
 
 PERIOD_NS = 20_000_000

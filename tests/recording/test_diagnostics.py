@@ -8,7 +8,7 @@ import numpy as np
 
 from dxlrun.log import schemas
 from dxlrun.log.cdr import Codec
-from dxlrun.log.diagnostics import PERIOD_NS, Diagnostics
+from dxlrun.log.log_writer import DIAGNOSTICS_NS, Diagnostics
 from dxlrun.mode import Mode
 from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
 
@@ -54,5 +54,9 @@ def test_it_is_said_once_a_second() -> None:
     record = record_of()
     row = np.frombuffer(bytes(record.raw), dtype=record.layout.dtype)[0]
     diagnostics = Diagnostics(JOINTS)
-    times = [time for time in range(0, 5 * PERIOD_NS, PERIOD_NS // 50) if diagnostics.of(row, time, (0, 0))]
-    assert times == [second * PERIOD_NS for second in range(5)]
+    times = [
+        time
+        for time in range(0, 5 * DIAGNOSTICS_NS, DIAGNOSTICS_NS // 50)
+        if diagnostics.of(row, time, (0, 0))
+    ]
+    assert times == [second * DIAGNOSTICS_NS for second in range(5)]

@@ -24,9 +24,9 @@ from rosbags.typesys.store import Typestore
 from dxlrun.clock import VirtualClock
 from dxlrun.errors import LogError
 from dxlrun.log import reader
-from dxlrun.log.header import LogHeader, LogSummary, to_metadata
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import read_log
+from dxlrun.log.schemas import LogHeader, LogSummary, to_metadata
 from dxlrun.run.channels.cycle import CycleLayout
 from dxlrun.run.channels.events import Event, EventCode, EventCounts, EventRing, Severity
 from dxlrun.run.channels.packets import LoggedPacket, PacketBatch, PacketKind

@@ -8,9 +8,9 @@ import pytest
 
 from dxlrun.log import schemas
 from dxlrun.log.cdr import Codec
-from dxlrun.log.header import LogHeader
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import read_log
+from dxlrun.log.schemas import LogHeader
 from dxlrun.run.channels.packets import PacketBatch, PacketKind, decode_packets
 from dxlrun.run.channels.ring import Handover
 

@@ -18,13 +18,14 @@ import msgspec
 import pytest
 
 from dxlrun.clock import VirtualClock
-from dxlrun.log.header import LogHeader, RecorderJob
 from dxlrun.log.reader import read_log
-from dxlrun.log.recorder import _MOST_PER_TURN, Control, Recorder
+from dxlrun.log.recorder import _MOST_PER_TURN, REQUESTS, Recorder
+from dxlrun.log.schemas import LogHeader, RecorderJob
 from dxlrun.run.channels import ring
 from dxlrun.run.channels.cycle import CycleLayout
 from dxlrun.run.channels.events import LONGEST_EVENT, EventCode, EventRing, Severity
 from dxlrun.run.channels.packets import LONGEST_BATCH, PacketBatch, PacketKind
+from dxlrun.run.channels.process import LateMetadata, MessageChannel
 from dxlrun.run.channels.ring import RecordKind, RingWriter, record_size
 
 Cycle = Callable[[int], bytes]
@@ -46,7 +47,7 @@ class Recording:
         self.lines = (json.loads(line) for line in self.control.makefile("rb"))
 
     def finish(self) -> dict[str, Any]:
-        self.control.sendall(b'{"finish": true}\n')
+        self.control.sendall(b'{"type": "Finish"}\n')
         return self.summary()
 
     def summary(self) -> dict[str, Any]:
@@ -89,7 +90,7 @@ def start(tmp_path: Path, header: LogHeader, layout: CycleLayout) -> Iterator[St
             [
                 sys.executable,
                 "-m",
-                "dxlrun.log",
+                "dxlrun.log.recorder",
                 "--job-fd",
                 str(job_fd),
                 "--control-fd",
@@ -120,7 +121,7 @@ def start(tmp_path: Path, header: LogHeader, layout: CycleLayout) -> Iterator[St
 
 def test_what_the_rings_carry_is_in_the_log_byte_for_byte(start: Start, cycle: Cycle) -> None:
     recording = start()
-    assert next(recording.lines) == {"ready": True}
+    assert next(recording.lines) == {"type": "Ready"}
     sent = [bytes([255, 255, number]) for number in range(30)]
     for number in range(30):
         recording.cycles.append(RecordKind.CYCLE, cycle(number))
@@ -172,8 +173,8 @@ def test_what_waits_at_the_end_is_drained_however_much_it_is(
         writer.append(RecordKind.CYCLE, record)
     ours, theirs = socket.socketpair()
     with ours, theirs:
-        control = Control(theirs.fileno())
-        control.metadata["grants"] = {"loop": "none"}  # what the supervisor said while it ran
+        control = MessageChannel(theirs, REQUESTS)
+        MessageChannel(ours, REQUESTS).send(LateMetadata({"grants": {"loop": "none"}}))
         job = RecorderJob(str(tmp_path / "run.mcap"), header, {"loop/cycles": memory})
         summary = Recorder(job, control).run(lambda: True)
     os.close(memory)
@@ -194,7 +195,7 @@ def test_a_record_of_another_robot_is_declared_not_written(start: Start, cycle: 
 
 def test_after_a_kill_the_log_is_readable_up_to_the_last_flush(start: Start, cycle: Cycle) -> None:
     recording = start()
-    assert next(recording.lines) == {"ready": True}
+    assert next(recording.lines) == {"type": "Ready"}
     for number in range(20):
         recording.cycles.append(RecordKind.CYCLE, cycle(number))
     while len(read_log(recording.path).cycles) < 20:  # until a flush, which needs no help from here
@@ -208,7 +209,7 @@ def test_after_a_kill_the_log_is_readable_up_to_the_last_flush(start: Start, cyc
 
 def test_it_ignores_ctrl_c_and_ends_well_on_sigterm(start: Start, cycle: Cycle) -> None:
     recording = start()
-    assert next(recording.lines) == {"ready": True}
+    assert next(recording.lines) == {"type": "Ready"}
     recording.process.send_signal(signal.SIGINT)
     recording.cycles.append(RecordKind.CYCLE, cycle(0))
     recording.process.send_signal(signal.SIGTERM)
@@ -219,7 +220,7 @@ def test_it_ignores_ctrl_c_and_ends_well_on_sigterm(start: Start, cycle: Cycle) 
 
 def test_it_finishes_when_the_supervisor_is_gone(start: Start, cycle: Cycle) -> None:
     recording = start()
-    assert next(recording.lines) == {"ready": True}
+    assert next(recording.lines) == {"type": "Ready"}
     recording.cycles.append(RecordKind.CYCLE, cycle(0))
     recording.control.shutdown(socket.SHUT_RDWR)
     assert recording.process.wait(60) == 0
@@ -229,17 +230,17 @@ def test_it_finishes_when_the_supervisor_is_gone(start: Start, cycle: Cycle) -> 
 
 def test_a_full_disk_is_reported_once_and_the_rings_are_drained_on(start: Start, cycle: Cycle) -> None:
     recording = start()
-    assert next(recording.lines) == {"ready": True}
+    assert next(recording.lines) == {"type": "Ready"}
     resource.prlimit(
         recording.process.pid, resource.RLIMIT_FSIZE, (recording.path.stat().st_size, resource.RLIM_INFINITY)
     )
     recording.cycles.append(RecordKind.CYCLE, cycle(0))
     error = next(recording.lines)
-    assert "writing the log stopped" in error["error"]
+    assert "writing the log stopped" in error["sentence"]
     for number in range(500):  # many times the ring
         recording.cycles.append(RecordKind.CYCLE, cycle(number))
     summary = recording.finish()
-    assert summary["error"] == error["error"]
+    assert summary["error"] == error["sentence"]
     assert summary["messages"] == 0
     assert summary["unwritten"] > 0
     assert next(recording.lines, None) is None
@@ -251,6 +252,6 @@ def test_a_log_that_cannot_be_created_is_reported(start: Start, tmp_path: Path) 
     path = tmp_path / "there"
     path.write_bytes(b"precious")
     recording = start(path=path)
-    assert "cannot be written" in next(recording.lines)["error"]
+    assert "cannot be written" in next(recording.lines)["sentence"]
     assert recording.process.wait(60) == 1
     assert path.read_bytes() == b"precious"

@@ -12,8 +12,8 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from dxlrun.log import schemas
-from dxlrun.log.header import LogHeader
 from dxlrun.log.log_writer import LogWriter
+from dxlrun.log.schemas import LogHeader
 from dxlrun.run.channels.ring import RecordKind
 
 TOPIC = "/robot_description"

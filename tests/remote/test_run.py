@@ -204,7 +204,7 @@ def test_without_its_gateway_the_robot_goes_on_and_says_so(tmp_path_factory, pla
     run.process.send_signal(signal.SIGINT)
     run.finish()
     assert run.process.returncode == 130
-    assert "the gateway ended: the run goes on, and nobody can steer it" in " ".join(run.err.split())
+    assert "the gateway ended: the run continues, but cannot be steered" in " ".join(run.err.split())
     assert run.log.complete
 
 

@@ -1,4 +1,4 @@
-"""Whether a run has a gateway is what robot file and command line say; nobody waits until it has started."""
+"""Whether a run has a gateway is what robot file and command line say; no run waits until it has started."""
 
 import io
 from functools import cache
@@ -11,17 +11,18 @@ from dxlrun.compile import compile_files
 from dxlrun.compile.plan import from_json, to_json
 from dxlrun.run import supervisor
 from dxlrun.run.channels.heartbeat import Heartbeat, Phase, create
+from dxlrun.run.channels.process import Failed, Listening
 from dxlrun.run.run_summary import RunOptions
 
 ROBOT = Path(__file__).parents[2] / "robots" / "single_joint.yaml"
 
 
 class Gateway:
-    """What the supervisor sees of a gateway: what it says, and that its line is closed afterwards."""
+    """What the supervisor sees of a gateway: its messages, and that its channel is closed afterwards."""
 
     def __init__(self, *messages):
         self.messages = list(messages)
-        self.line = self
+        self.channel = self
         self.closed = not messages
         self.killed = False
 
@@ -67,7 +68,7 @@ def heartbeat():
 def started(monkeypatch):
     """The gateways that were started; the next one to start may be put into it."""
     found = []
-    ready = [Gateway({"socket": "/nowhere/robot.sock"})]
+    ready = [Gateway(Listening("/nowhere/robot.sock"))]
 
     def start(log, memory):
         if isinstance(ready[0], OSError):
@@ -110,7 +111,7 @@ def test_it_is_started_when_the_loop_runs_and_not_before_or_after(make_run, star
     ("ready", "remark"),
     [
         (OSError(11, "Resource temporarily unavailable"), "did not start (Resource temporarily unavailable)"),
-        (Gateway({"error": "/tmp/x must be a directory"}), "did not start (/tmp/x must be a directory)"),  # noqa: S108
+        (Gateway(Failed("/tmp/x must be a directory")), "did not start (/tmp/x must be a directory)"),  # noqa: S108
         (Gateway(), "ended"),
     ],
     ids=["no process", "no place", "ends"],
@@ -120,7 +121,7 @@ def test_without_it_the_run_goes_on_with_one_remark(make_run, started, heartbeat
     started.ready[0] = ready
     for _ in range(5):
         run._look_after_gateway(heartbeat)
-    assert run.remarks == [f"the gateway {remark}: the run goes on, and nobody can steer it"]
+    assert run.remarks == [f"the gateway {remark}: the run continues, but cannot be steered"]
     assert run.sentences == []
     assert all(one.killed for one in started.found)
 
@@ -128,7 +129,7 @@ def test_without_it_the_run_goes_on_with_one_remark(make_run, started, heartbeat
 def test_the_socket_of_a_gateway_that_was_killed_is_removed(make_run, started, heartbeat, tmp_path):
     place = tmp_path / "robot.sock"
     place.touch()
-    started.ready[0] = Gateway({"socket": str(place)})
+    started.ready[0] = Gateway(Listening(str(place)))
     run = make_run()
     for _ in range(3):
         run._look_after_gateway(heartbeat)

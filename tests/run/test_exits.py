@@ -192,10 +192,10 @@ def test_a_recorder_that_stands_still_does_not_stop_the_robot_and_is_said(
 ) -> None:
     run = start("--duration", "1")
     run.wait_until_moving()
-    os.kill(run.child("dxlrun.log"), signal.SIGSTOP)
+    os.kill(run.child("dxlrun.log.recorder"), signal.SIGSTOP)
     code, _, err = run.finish()
     assert code == 1
-    assert "the recorder said nothing for 10 s and was killed" in err
+    assert "the recorder did not answer for 10 s and was killed" in err
     assert "Traceback" not in err
     assert all_limp(run)
     assert run.log().cycles is not None

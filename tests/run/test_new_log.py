@@ -14,7 +14,7 @@ import pytest
 from dxlrun.cli import main
 from dxlrun.cli.simulated.sim import _writable
 from dxlrun.errors import InputError
-from dxlrun.log.log_file import LogFile
+from dxlrun.log.log_writer import LogFile
 from dxlrun.run.run_log import discard_log, ledger_of, new_log
 from dxlrun.simulation import Ledger
 

@@ -103,7 +103,7 @@ def test_killing_the_recorder_does_not_stop_the_robot(
     run = start("--duration", "3")
     run.wait_until_moving()
     wait_for(lambda: len(run.log().cycles), "cycles in the log")
-    os.kill(run.child("dxlrun.log"), signal.SIGKILL)
+    os.kill(run.child("dxlrun.log.recorder"), signal.SIGKILL)
     before = len(goals(run))
     code, out, err = run.finish()
     assert code == 1

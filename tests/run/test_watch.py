@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec.json import Decoder
 
 from dxlrun.clock import VirtualClock
 from dxlrun.compile import compile_robot
@@ -26,8 +27,18 @@ from dxlrun.run.channels import heartbeat, process
 from dxlrun.run.channels.events import EventRing
 from dxlrun.run.channels.heartbeat import Heartbeat, Phase, Standstill, Step
 from dxlrun.run.channels.packets import NoPackets
+from dxlrun.run.channels.process import Cut, LineLost, Stop
 from dxlrun.run.channels.ring import Handover
-from dxlrun.run.guardian import LEAST_PATIENCE_NS, LONGEST_LOOK_NS, Guardian, Handing, LastHand, patience_ns
+from dxlrun.run.guardian import (
+    GUARDIAN_MESSAGES,
+    LEAST_TIMEOUT_NS,
+    LONGEST_LOOK_NS,
+    Ended,
+    Guardian,
+    Handing,
+    LastHand,
+    standstill_timeout_ns,
+)
 from dxlrun.run.loop_process import AskedToStop, Pulse
 from dxlrun.run.run_processes import Memory, guardian_job
 from dxlrun.simulation import Ledger
@@ -64,7 +75,7 @@ def test_a_machine_that_slept_is_no_hung_loop() -> None:
 def test_a_hung_loop_is_found_by_a_watcher_that_is_always_late() -> None:
     still = Standstill(LONGEST_LOOK_NS, 0)
     looks = [still.ns("same", at * 200 * MS) for at in range(10)]
-    assert looks[-1] > LEAST_PATIENCE_NS
+    assert looks[-1] > LEAST_TIMEOUT_NS
 
 
 @pytest.mark.parametrize(
@@ -78,8 +89,8 @@ def test_a_hung_loop_is_found_by_a_watcher_that_is_always_late() -> None:
         (Phase.DONE, 50, 5000 * MS),
     ],
 )
-def test_patience(phase: Phase, rate: int, patience: int) -> None:
-    assert patience_ns(phase, 1_000_000_000 // rate) == patience
+def test_standstill_timeout(phase: Phase, rate: int, patience: int) -> None:
+    assert standstill_timeout_ns(phase, 1_000_000_000 // rate) == patience
 
 
 @pytest.mark.parametrize(
@@ -87,13 +98,13 @@ def test_patience(phase: Phase, rate: int, patience: int) -> None:
     [
         (
             Phase.LOADING,
-            "LOADING_PATIENCE_NS",
+            "LOADING_TIMEOUT_NS",
             Step.ON_CONFIGURE,
             "unused",
             " in on_configure of controller arm",
         ),
-        (Phase.LOADING, "LOADING_PATIENCE_NS", Step.NONE, "unused", ""),
-        (Phase.DONE, "ENDING_PATIENCE_NS", Step.NONE, "done", ""),
+        (Phase.LOADING, "LOADING_TIMEOUT_NS", Step.NONE, "unused", ""),
+        (Phase.DONE, "ENDING_TIMEOUT_NS", Step.NONE, "done", ""),
     ],
 )
 def test_a_loop_that_never_gets_on_is_ended(  # noqa: PLR0917  fixtures
@@ -114,8 +125,8 @@ def test_a_loop_that_never_gets_on_is_ended(  # noqa: PLR0917  fixtures
     page.name_controller(1, "arm")
     page.enter(phase)
     page.call(1, called)
-    control, terminal = process.line_pair()
-    line, loops_end = process.line_pair()
+    control, terminal = process.message_channel(Decoder(Stop | Cut))
+    line, loops_end = process.message_channel(Decoder(LineLost))
     watcher = Guardian(guardian_job(plan, {}, memory, take_over=False), control)
     lines = KeptLines(())
     with terminal, loops_end, subprocess.Popen(["/bin/sleep", "60"]) as loop:
@@ -193,12 +204,12 @@ def set_up(tmp_path: Path, transactions: int) -> bool | None:
 
 
 def test_a_line_whose_other_end_is_gone_still_gives_what_it_said_last() -> None:
-    ours, theirs = process.line_pair()
-    theirs.sendall(b'{"ended": "done"}\n')
+    ours, theirs = process.message_channel(GUARDIAN_MESSAGES)
+    theirs.sendall(b'{"type": "Ended", "ending": "done"}\n')
     theirs.close()
-    ours.send({"stop": True})
+    ours.send(Stop())
     assert not ours.closed
-    assert ours.receive() == [{"ended": "done"}]
+    assert ours.receive() == [Ended("done")]
     assert ours.receive() == []
     assert ours.closed
     ours.close()
@@ -212,7 +223,7 @@ def watcher(start: object, tmp_path: Path) -> Iterator[tuple[Guardian, socket.so
     """A guardian of the robot `pair` on virtual time, the terminal's end of its line, and the loop's page."""
     plan = compile_robot(read_robot(tmp_path / "pair.yaml", {}), [], None).plan
     memory = Memory.create(plan)
-    control, terminal = process.line_pair()
+    control, terminal = process.message_channel(Decoder(Stop | Cut))
     made = Guardian(guardian_job(plan, {}, memory, take_over=False), control)
     made._clock = VirtualClock(0)  # type: ignore[assignment]  # so that the test says how time passes
     made._still = Standstill(LONGEST_LOOK_NS, 0)
@@ -259,9 +270,9 @@ def test_a_loop_that_was_asked_to_stop_while_it_loads_is_done(
 @pytest.mark.parametrize(
     ("said", "wish"),
     [
-        (b'{"stop": true}\n', "stop"),
-        (b'{"cut": true}\n', "cut"),
-        (b'{"stop": true}\n{"cut": true}\n', "cut"),  # two interrupts that arrive together
+        (b'{"type": "Stop"}\n', "stop"),
+        (b'{"type": "Cut"}\n', "cut"),
+        (b'{"type": "Stop"}\n{"type": "Cut"}\n', "cut"),  # two interrupts that arrive together
         (None, "stop"),  # the terminal is gone
     ],
 )
@@ -273,7 +284,7 @@ def test_what_the_terminal_asks_for(
         terminal.shutdown(socket.SHUT_RDWR)
     else:
         terminal.sendall(said)
-    assert made._wish() == wish
+    assert made._request() == wish
 
 
 def test_a_loop_that_stands_still_hangs_and_one_that_does_not_stop_is_late(
@@ -284,11 +295,11 @@ def test_a_loop_that_stands_still_hangs_and_one_that_does_not_stop_is_late(
     told = []
     for at_ms in range(0, 130, 10):
         made._clock.wait_until(at_ms * MS)
-        told.append(made._impatience())
+        told.append(made._timed_out())
     assert told == [None] * 11 + ["hung"] * 2  # five periods of 20 ms
     page.beat()
-    assert made._impatience() is None
+    assert made._timed_out() is None
     made._stop_by_ns = 125 * MS
     page.beat()
     made._clock.wait_until(126 * MS)
-    assert made._impatience() == "late"
+    assert made._timed_out() == "late"

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from dxlrun.errors import LogError
 from dxlrun.log import schemas
 from dxlrun.log.cdr import ENCAPSULATION, Codec
-from dxlrun.log.header import LoggedController, LogHeader, from_metadata
+from dxlrun.log.schemas import LoggedController, LogHeader, from_metadata
 from dxlrun.mode import Mode
 from dxlrun.run.channels.commands import TakenCommand, data_of
 from dxlrun.run.channels.cycle import CycleLayout

@@ -13,6 +13,7 @@ from contextlib import contextmanager, suppress
 
 import msgspec
 import uvicorn
+from msgspec.json import Decoder
 
 from dxlrun.compile.plan import Plan, from_json
 from dxlrun.control.controllers.plugins import load_plugins
@@ -24,6 +25,7 @@ from dxlrun.remote.link import Link
 from dxlrun.remote.preparation import Preparation
 from dxlrun.remote.sockets import listen
 from dxlrun.run.channels import process
+from dxlrun.run.channels.process import Failed, Finish, Listening, MessageChannel
 
 _PR_SET_PDEATHSIG = 1
 
@@ -82,7 +84,9 @@ def main() -> None:
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     job = msgspec.json.decode(process.whole(int(sys.argv[2])), type=GatewayJob)
     control = socket.socket(fileno=int(sys.argv[4]))
-    line = process.Line(control)
+    channel = MessageChannel(
+        control, Decoder(Finish)
+    )  # nothing is sent to a gateway: it ends with the channel
     plan: Plan = from_json(process.whole(job.plan))
     try:
         link = Link(plan, job.memory)
@@ -90,9 +94,9 @@ def main() -> None:
         gateway = Gateway(link, Preparation(joints, load_plugins()), job.log)
         listener, path = listen(plan.robot)
     except (DxlrunError, OSError) as error:
-        line.send({"error": str(error)})
+        channel.send(Failed(str(error)))
         sys.exit(1)
-    line.send({"socket": str(path)})
+    channel.send(Listening(str(path)))
     try:
         asyncio.run(serve(link, gateway, listener, control))
     finally:

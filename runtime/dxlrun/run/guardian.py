@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import msgspec
+from msgspec.json import Decoder
 
 from dxlrun.clock import MonotonicClock
 from dxlrun.control.policy_plan import TORQUE_STAYS, Last
@@ -33,19 +34,20 @@ from dxlrun.run.channels import process
 from dxlrun.run.channels.events import EventCode, EventRing, Severity
 from dxlrun.run.channels.heartbeat import Heartbeat, Phase, Standstill
 from dxlrun.run.channels.packets import PacketBatch, salvage
+from dxlrun.run.channels.process import Cut, Failed, LineLost, LineReturned, MessageChannel, Stop
 from dxlrun.run.channels.ring import RingReader, RingWriter
 
 _NEVER = 1 << 62
 SILENT_PERIODS = 5
 """A running loop whose counter stands still this long hangs."""
-LEAST_PATIENCE_NS = 80_000_000
+LEAST_TIMEOUT_NS = 80_000_000
 """At high rates a few periods are less than a stock kernel's worst wake-up (thesis: 17 ms), and than a host
 of virtual machines takes a processor away [i]: a robot that falls for that was made safe for nothing."""
-SETUP_PATIENCE_NS = 1_000_000_000
+SETUP_TIMEOUT_NS = 1_000_000_000
 """Set-up and shutdown beat while they await replies; each wait ends within milliseconds."""
-LOADING_PATIENCE_NS = 60_000_000_000
+LOADING_TIMEOUT_NS = 60_000_000_000
 """For each plug-in's import and each on_configure: a neural network on a slow card takes half of it [i]."""
-ENDING_PATIENCE_NS = 5_000_000_000
+ENDING_TIMEOUT_NS = 5_000_000_000
 """For what plug-ins left to be done when the process of a loop that is done ends."""
 
 LEAST_NAP_NS, LONGEST_NAP_NS = 5_000_000, 10_000_000
@@ -59,7 +61,7 @@ Ending = Literal["done", "unused", "died", "hung", "late", "cut"]
 
 @dataclass(frozen=True, slots=True)
 class GuardianJob:
-    """What the guardian is given: buses, patience, and the descriptors that it and the loop inherit."""
+    """What the guardian works on: buses, timeouts, and the descriptors that it and the loop inherit."""
 
     buses: tuple[BusPlan, ...]
     ports: tuple[str, ...]
@@ -83,6 +85,29 @@ class GuardianJob:
     loop: dict[str, object]
     """The loop's job, but for its port descriptors and its guardian."""
     loop_descriptors: tuple[int, ...]
+
+
+class Started(msgspec.Struct, frozen=True, tag=True):
+    """Guardian to terminal: the loop is executed; the ports come along."""
+
+    loop: int
+    """Process ID."""
+    grants: tuple[realtime.Grant, ...]
+    """What the operating system granted to the guardian."""
+
+
+class Ended(msgspec.Struct, frozen=True, tag=True):
+    """Guardian to terminal: the loop is gone, and the robot is left as its policy says."""
+
+    ending: Ending
+    outcome: tuple[str, ...] = ()
+    """What the guardian did in the place of the loop, one sentence each."""
+
+
+GuardianMessage = Started | LineLost | LineReturned | Ended | Failed
+GUARDIAN_MESSAGES: Decoder[GuardianMessage] = Decoder(GuardianMessage)
+_REQUESTS: Decoder[Stop | Cut] = Decoder(Stop | Cut)
+_LINES_LOST = Decoder(LineLost)
 
 
 class LastHand:
@@ -149,7 +174,13 @@ class LastHand:
 class Handing:
     """Opens the lines again that the loop has lost, and hands them to the loop and to the terminal."""
 
-    def __init__(self, lines: KeptLines, loop: process.Line, terminal: process.Line, hand: LastHand) -> None:
+    def __init__(
+        self,
+        lines: KeptLines,
+        loop: MessageChannel[LineLost],
+        terminal: MessageChannel[Stop | Cut],
+        hand: LastHand,
+    ) -> None:
         self._lines = lines
         self._loop = loop
         self._terminal = terminal
@@ -165,7 +196,7 @@ class Handing:
         if self._loop.fileno() in ready:
             for message in self._loop.receive():
                 self._terminal.send(message)
-                if not self._lines.lost(int(str(message["gone"]))):
+                if not self._lines.lost(message.bus):
                     self._hand.tell("a line is gone and is not opened again", Severity.ERROR)
         if self._lines.fileno() in ready:
             for opened in self._lines.returned():
@@ -173,14 +204,14 @@ class Handing:
                     self._hand.tell(opened.done, Severity.INFO)
                 if opened.wrong:
                     self._hand.tell(opened.wrong, Severity.ERROR)
-                for line in (self._loop, self._terminal):
-                    line.send({"back": opened.index}, [self._lines.descriptors[opened.index]])
+                for channel in (self._loop, self._terminal):
+                    channel.send(LineReturned(opened.index), [self._lines.descriptors[opened.index]])
 
 
 class Guardian:
     """Watches one loop process from its start to its end."""
 
-    def __init__(self, job: GuardianJob, control: process.Line) -> None:
+    def __init__(self, job: GuardianJob, control: MessageChannel[Stop | Cut]) -> None:
         self._job = job
         self._control = control
         self._clock = MonotonicClock()
@@ -199,17 +230,17 @@ class Guardian:
                 for path, bus in zip(self._job.ports, self._job.buses, strict=True)
             ]
         )
-        # before the loop is executed, which inherits none of it: whoever starts us is told at once
+        # before the loop is executed, which inherits none of it
         grants = realtime.apply_to_guardian(self._job.priority, self._job.lock_memory)
         self._hand.tell_grants(grants)
         for sentence in lines.done:
             self._hand.tell(sentence, Severity.INFO)
-        loop_line, theirs = process.line_pair()
+        loop_channel, theirs = process.message_channel(_LINES_LOST)
         loop = self._execute(lines.descriptors, theirs.fileno())
         theirs.close()
-        # whoever asked gets the ports too: should this process die, they are still held, and still open
-        self._control.send({"loop": loop.pid, "grants": msgspec.to_builtins(grants)}, lines.descriptors)
-        ending = self._watch(loop, Handing(lines, loop_line, self._control, self._hand))
+        # the terminal gets the ports too: should this process die, they are still held, and still open
+        self._control.send(Started(loop.pid, grants), lines.descriptors)
+        ending = self._watch(loop, Handing(lines, loop_channel, self._control, self._hand))
         outcome: list[str] = []
         how = self._how(ending, loop)
         if ending == "unused":
@@ -222,14 +253,14 @@ class Guardian:
             else:
                 outcome = self._hand.end(lines.descriptors, how, Severity.ERROR)
         lines.close()
-        self._control.send({"ended": ending, "outcome": outcome})
+        self._control.send(Ended(ending, tuple(outcome)))
 
-    def _execute(self, descriptors: list[int], line: int) -> subprocess.Popen[bytes]:
-        job = self._job.loop | {"ports": descriptors, "line": line, "guardian": os.getpid()}
+    def _execute(self, descriptors: list[int], channel: int) -> subprocess.Popen[bytes]:
+        job = self._job.loop | {"ports": descriptors, "channel": channel, "guardian": os.getpid()}
         return process.start(
             "dxlrun.run.loop_process",
             ["--job", msgspec.json.encode(job).decode()],
-            [*self._job.loop_descriptors, *descriptors, line],
+            [*self._job.loop_descriptors, *descriptors, channel],
             self._job.stderr,
         )
 
@@ -243,11 +274,11 @@ class Guardian:
             if watched in ready:
                 return self._ending(loop.wait())
             handing.look(ready)
-            wish = self._wish() if self._control.fileno() in ready else None
-            if wish == "stop":
+            request = self._request() if self._control.fileno() in ready else None
+            if request == "stop":
                 self._stop_by_ns = min(self._stop_by_ns, self._clock.now_ns() + self._job.exit_timeout_ns)
                 loop.send_signal(signal.SIGTERM)
-            reason: Literal["hung", "late", "cut"] | None = "cut" if wish == "cut" else self._impatience()
+            reason: Literal["hung", "late", "cut"] | None = "cut" if request == "cut" else self._timed_out()
             if reason and not self._killed:
                 self._killed = reason
                 loop.kill()
@@ -269,21 +300,21 @@ class Guardian:
         """Return what can wake the guardian; a terminal that is gone would wake it for ever."""
         return [pidfd] if self._control.closed else [pidfd, self._control.fileno()]
 
-    def _impatience(self) -> Literal["hung", "late"] | None:
+    def _timed_out(self) -> Literal["hung", "late"] | None:
         """Return why the loop is not waited for any longer, if it is not."""
         now_ns, phase = self._clock.now_ns(), self._heartbeat.phase
-        patience_ns = self._patience_ns(phase)  # first: the loop beats before it asks for less of it
-        if self._still.ns((phase, self._heartbeat.beats), now_ns) > patience_ns:
+        timeout_ns = self._timeout_ns(phase)  # first: the loop beats before it asks for less of it
+        if self._still.ns((phase, self._heartbeat.beats), now_ns) > timeout_ns:
             return "hung"
         return "late" if now_ns > self._stop_by_ns else None
 
-    def _patience_ns(self, phase: Phase) -> float:
-        return patience_ns(phase, self._heartbeat.cycle_ns or self._job.period_ns)
+    def _timeout_ns(self, phase: Phase) -> float:
+        return standstill_timeout_ns(phase, self._heartbeat.cycle_ns or self._job.period_ns)
 
-    def _wish(self) -> Literal["stop", "cut"] | None:
-        """Return what the terminal asks; one that is gone cannot ask any more: stop in order."""
+    def _request(self) -> Literal["stop", "cut"] | None:
+        """Return what the terminal asks for; one that is gone cannot ask any more: stop in order."""
         messages = self._control.receive()
-        if any("cut" in message for message in messages):
+        if any(isinstance(message, Cut) for message in messages):
             return "cut"
         return "stop" if messages or self._control.closed else None
 
@@ -294,7 +325,7 @@ class Guardian:
         called = self._heartbeat.activity
         where = f" in {called}" if called else ""
         if self._killed == "hung":
-            still = _duration(self._patience_ns(self._heartbeat.phase))
+            still = _duration(self._timeout_ns(self._heartbeat.phase))
             return f"the loop stood still for more than {still}{where} and was killed"
         if self._killed == "late":
             limit = _duration(self._job.exit_timeout_ns)
@@ -302,13 +333,13 @@ class Guardian:
         return f"the loop's process ended by itself ({_manner(loop.returncode)}){where}"
 
 
-def patience_ns(phase: Phase, period_ns: int) -> float:
+def standstill_timeout_ns(phase: Phase, period_ns: int) -> float:
     """Return how long the loop's counter may stand still, ns."""
     if phase is Phase.RUNNING:
-        return max(SILENT_PERIODS * period_ns, LEAST_PATIENCE_NS)
+        return max(SILENT_PERIODS * period_ns, LEAST_TIMEOUT_NS)
     if phase is Phase.LOADING:
-        return LOADING_PATIENCE_NS
-    return ENDING_PATIENCE_NS if phase is Phase.DONE else SETUP_PATIENCE_NS
+        return LOADING_TIMEOUT_NS
+    return ENDING_TIMEOUT_NS if phase is Phase.DONE else SETUP_TIMEOUT_NS
 
 
 def _duration(time_ns: float) -> str:
@@ -328,11 +359,11 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     job_descriptor, control_descriptor = int(sys.argv[2]), int(sys.argv[4])
     job = msgspec.json.decode(process.whole(job_descriptor), type=GuardianJob)
-    control = process.Line(socket.socket(fileno=control_descriptor))
+    control = MessageChannel(socket.socket(fileno=control_descriptor), _REQUESTS)
     try:
         Guardian(job, control).run()
     except PortError as error:
-        control.send({"error": str(error)})
+        control.send(Failed(str(error)))
         sys.exit(error.exit_code)
 
 

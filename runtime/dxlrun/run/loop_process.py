@@ -17,6 +17,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 
 import msgspec
+from msgspec.json import Decoder
 
 from dxlrun.clock import MonotonicClock
 from dxlrun.compile.plan import Plan, from_json
@@ -38,6 +39,7 @@ from dxlrun.run.channels.events import EventCode, EventGroup, EventRing, Severit
 from dxlrun.run.channels.heartbeat import Heartbeat, Phase
 from dxlrun.run.channels.mailbox import Mailbox
 from dxlrun.run.channels.packets import PacketBatch
+from dxlrun.run.channels.process import LineReturned, MessageChannel
 from dxlrun.run.channels.ring import RingWriter
 
 _PR_SET_PDEATHSIG = 1
@@ -62,10 +64,10 @@ class LoopJob:
     """Where it leaves what the operating system granted."""
     take_over: bool
     ports: tuple[int, ...] = ()
-    line: int = 0
+    channel: int = 0
     """To the guardian, which opens lines that are gone again."""
     guardian: int = 0
-    """Process ID. Filled in by the guardian, like ports and line."""
+    """Process ID. Filled in by the guardian, like ports and channel."""
 
     @property
     def descriptors(self) -> tuple[int, ...]:
@@ -174,7 +176,7 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks) -> Outcom
     signal.signal(signal.SIGTERM, lambda *_: stop.request())
     ports = SerialPorts(
         [SerialPort(descriptor, bus.port) for descriptor, bus in zip(job.ports, plan.buses, strict=True)],
-        LinesAgain(process.Line(socket.socket(fileno=job.line))),
+        LinesAgain(MessageChannel(socket.socket(fileno=job.channel), Decoder(LineReturned))),
         _reply_polling(plan.loop.scheduler.reply_polling_ns),
     )
     clock = MonotonicClock()

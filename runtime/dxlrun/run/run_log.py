@@ -12,8 +12,7 @@ from dxlrun.compile.plan import Plan, to_json
 from dxlrun.control.controllers.controller import CONTRACT_VERSION
 from dxlrun.dynamixel.exchange import kernel
 from dxlrun.errors import InputError
-from dxlrun.log.header import LoggedController, LogHeader
-from dxlrun.log.log_file import LOG_MODE
+from dxlrun.log.schemas import LOG_MODE, LoggedController, LogHeader
 
 _LIBRARIES = ("dxlrun", "mcap", "msgspec", "numpy", "pluggy", "pydantic", "pyserial")
 

@@ -3,27 +3,34 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import astuple, dataclass
 from pathlib import Path
 
 import msgspec
+from msgspec.json import Decoder
 
 from dxlrun.compile.plan import Plan, to_json
 from dxlrun.compile.simulated import simulated_bodies, simulated_buses
 from dxlrun.control.realtime.grants import Grant, guardian_priority
-from dxlrun.log.header import LogHeader, RecorderJob
+from dxlrun.log.schemas import LogHeader, Recorded, RecorderJob
 from dxlrun.remote.job import Descriptors, GatewayJob
 from dxlrun.run.assembly import cycle_layout
 from dxlrun.run.channels import heartbeat, mailbox, process, ring
-from dxlrun.run.channels.child import Child
 from dxlrun.run.channels.commands import LONGEST_COMMAND, command_capacity
 from dxlrun.run.channels.cycle import MOST_CONTROLLERS, cycle_capacity
 from dxlrun.run.channels.events import LONGEST_EVENT, event_capacity
 from dxlrun.run.channels.packets import DESK_SIZE, LONGEST_BATCH, packet_capacity
-from dxlrun.run.guardian import GuardianJob
+from dxlrun.run.channels.process import Child, Draining, Failed, Listening, Ready
+from dxlrun.run.guardian import GUARDIAN_MESSAGES, GuardianJob, GuardianMessage
 from dxlrun.run.loop_process import LoopJob, Outcome
-from dxlrun.simulation import SimulationConfig, encode_config
+from dxlrun.run.simulation_front import FrontOptions, SimulationMessage, first_message, start_simulation
+from dxlrun.simulation import SimulationConfig
+
+RecorderMessage = Ready | Draining | Failed | Recorded
+RECORDER_MESSAGES: Decoder[RecorderMessage] = Decoder(RecorderMessage)
+GatewayMessage = Listening | Failed
+GATEWAY_MESSAGES: Decoder[GatewayMessage] = Decoder(GatewayMessage)
 
 _GUARDIAN_CAPACITY = 2 << 20
 """Bytes: it sends and receives little, and reports little."""
@@ -97,46 +104,53 @@ class Memory:
         }
 
 
-def _ready(child: Child) -> Mapping[str, object]:
-    """Return what a child says when it is ready; one that says something else does not outlive that."""
-    try:
-        return child.ready()
-    except BaseException:
-        child.kill()
-        raise
-
-
-def start_simulation(plan: Plan, ledger: Path | None, memory: Memory) -> tuple[Child, dict[str, str]]:
+def start_simulated_buses(
+    plan: Plan, ledger: Path | None, memory: Memory
+) -> tuple[Child[SimulationMessage], dict[str, str]]:
     """Start the simulated servos; return the process and the pseudo-terminal of each simulated bus.
 
     With a loop in real time they get a priority above loop and guardian, and the last core that the loop was
     not given: a servo's electronics do not wait for the host's processor.
     """
-    told = SimulationConfig(simulated_buses(plan), bodies=simulated_bodies(plan))
-    config = process.memory_file("dxlrun-simulation", encode_config(told))
-    arguments = ["--config-fd", str(config)] + (["--ledger", str(ledger)] if ledger else [])
     scheduler = plan.loop.scheduler
-    if scheduler.policy != "other":
-        core = process.spare_core(scheduler.cores)
-        arguments += ["--priority", str(min(scheduler.priority + 2, 99)), "--core", str(core)]
-    child = Child("simulated bus", "dxlrun.simulation", arguments, [config], memory.stderr)
-    os.close(config)
-    return child, msgspec.convert(_ready(child)["ports"], type=dict[str, str])
+    real_time = (
+        (min(scheduler.priority + 2, 99), process.spare_core(scheduler.cores))
+        if scheduler.policy != "other"
+        else (0, -1)
+    )
+    config = SimulationConfig(simulated_buses(plan), bodies=simulated_bodies(plan))
+    child = start_simulation(config, FrontOptions(ledger, *real_time), memory.stderr)
+    try:
+        return child, first_message(child).ports or {}
+    except BaseException:
+        child.kill()
+        raise
 
 
-def start_recorder(log: Path, header: LogHeader, memory: Memory) -> Child:
+def start_recorder(log: Path, header: LogHeader, memory: Memory) -> Child[RecorderMessage]:
     """Start the recorder and wait until the log is open."""
     job = RecorderJob(str(log), header, memory.rings())
     descriptor = process.memory_file("dxlrun-recorder", msgspec.json.encode(job))
     descriptors = [descriptor, *job.rings.values()]
-    child = Child("recorder", "dxlrun.log", ["--job-fd", str(descriptor)], descriptors, memory.stderr)
+    child = Child(
+        "recorder",
+        "dxlrun.log.recorder",
+        ["--job-fd", str(descriptor)],
+        descriptors,
+        memory.stderr,
+        RECORDER_MESSAGES,
+    )
     os.close(descriptor)
-    _ready(child)
+    try:
+        child.ready()
+    except BaseException:
+        child.kill()
+        raise
     return child
 
 
-def start_gateway(log: Path | None, memory: Memory) -> Child:
-    """Start the gateway; it says where its socket is when it is ready, nobody waits for it.
+def start_gateway(log: Path | None, memory: Memory) -> Child[GatewayMessage]:
+    """Start the gateway; it reports its socket when it is ready, and the run does not wait for that.
 
     Raises OSError when the system has no process left.
     """
@@ -152,7 +166,14 @@ def start_gateway(log: Path | None, memory: Memory) -> Child:
     descriptor = process.memory_file("dxlrun-gateway", msgspec.json.encode(job))
     inherited = [descriptor, memory.plan, *astuple(shared)]
     try:
-        return Child("gateway", "dxlrun.remote", ["--job-fd", str(descriptor)], inherited, memory.stderr)
+        return Child(
+            "gateway",
+            "dxlrun.remote",
+            ["--job-fd", str(descriptor)],
+            inherited,
+            memory.stderr,
+            GATEWAY_MESSAGES,
+        )
     finally:
         os.close(descriptor)
 
@@ -203,15 +224,21 @@ def guardian_job(plan: Plan, ports: Mapping[str, str], memory: Memory, *, take_o
     )
 
 
-def start_guardian(job: GuardianJob, others: Sequence[Child]) -> Child:
+def start_guardian(job: GuardianJob, others: Iterable[int]) -> Child[GuardianMessage]:
     """Start the guardian; `ready` then waits until it holds the ports and has executed the loop.
 
-    It inherits our ends of the lines to `others`: should this process die, the simulated bus and the recorder
-    see the end of their lines only after the guardian has made the robot limp.
+    It inherits `others`, our ends of the channels to simulated bus and recorder: should this process die,
+    they see the end of their channels only after the guardian has made the robot limp.
     """
     descriptor = process.memory_file("dxlrun-guardian", msgspec.json.encode(job))
     inherited = [descriptor, job.records, *job.loop_descriptors]
-    inherited += [other.line.fileno() for other in others]
-    child = Child("guardian", "dxlrun.run.guardian", ["--job-fd", str(descriptor)], inherited, job.stderr)
+    child = Child(
+        "guardian",
+        "dxlrun.run.guardian",
+        ["--job-fd", str(descriptor)],
+        [*inherited, *others],
+        job.stderr,
+        GUARDIAN_MESSAGES,
+    )
     os.close(descriptor)
     return child

@@ -20,10 +20,10 @@ from typing import Protocol
 
 import msgspec
 
+from dxlrun.errors import PortError
 from dxlrun.run.channels import process
-from dxlrun.run.channels.child import Child
-from dxlrun.run.channels.process import Line
-from dxlrun.simulation import SimulationConfig, encode_config
+from dxlrun.run.channels.process import Child, MessageChannel
+from dxlrun.simulation import BusConfig, SimulationConfig, encode_config
 
 _LAST_LOOK_S = 1.0
 """How long the last look may take: a process that does not answer in it ends without."""
@@ -65,6 +65,62 @@ class Look:
     servos: tuple[ServoLook, ...] = ()
     lateness_us: dict[str, float] = field(default_factory=dict)
     """Microseconds by what they are of, such as median and p99; empty before the first reply."""
+
+
+class SimulationMessage(msgspec.Struct, frozen=True):
+    """What the process of the simulated buses sends: one of these, and real_time with the first ports."""
+
+    ports: dict[str, str] | None = None
+    """The device of each bus."""
+    real_time: str = ""
+    """What the system granted of it."""
+    servos: tuple[ServoLook, ...] | None = None
+    lateness_us: dict[str, float] = {}
+    """With `servos`: see Look."""
+    happened: str | None = None
+    """A fault that was injected now."""
+    fault: str | None = None
+    """A fault line that was understood, in its canonical writing."""
+    error: str | None = None
+    """Why the configuration cannot be served, or what is wrong with a fault line."""
+
+
+Messages = MessageChannel[SimulationMessage]
+
+
+@dataclass(frozen=True, slots=True)
+class FrontOptions:
+    """How the process of the simulated buses is started."""
+
+    ledger: Path | None = None
+    priority: int = 0
+    """Real-time priority that it asks for; 0: none."""
+    core: int = -1
+    """Core that it stays on; -1: any."""
+
+
+def start_simulation(
+    config: SimulationConfig | Sequence[BusConfig], options: FrontOptions, errors: int
+) -> Child[SimulationMessage]:
+    """Start the process of simulated buses; `errors` takes what it prints."""
+    descriptor = process.memory_file("dxlrun-simulation", encode_config(config))
+    arguments = ["--config-fd", str(descriptor)]
+    arguments += ["--priority", str(options.priority)] if options.priority else []
+    arguments += ["--core", str(options.core)] if options.core >= 0 else []
+    arguments += ["--ledger", str(options.ledger)] if options.ledger else []
+    messages = msgspec.json.Decoder(SimulationMessage)
+    try:
+        return Child("simulated bus", "dxlrun.simulation", arguments, [descriptor], errors, messages)
+    finally:
+        os.close(descriptor)
+
+
+def first_message(child: Child[SimulationMessage]) -> SimulationMessage:
+    """Return its first message, which has the ports; raises PortError when it cannot serve them."""
+    message = child.ready()
+    if message.error is not None:
+        raise PortError(message.error)
+    return message
 
 
 class Audience(Protocol):
@@ -160,17 +216,6 @@ class TypedLines:
         return lines
 
 
-@dataclass(frozen=True, slots=True)
-class FrontOptions:
-    """How the process of the simulated buses is started."""
-
-    ledger: Path | None = None
-    priority: int = 0
-    """Real-time priority that it asks for; 0: none."""
-    core: int = -1
-    """Core that it stays on; -1: any."""
-
-
 def serve(
     config: SimulationConfig, options: FrontOptions, audience: Audience, typed: TypedLines | None
 ) -> Served:
@@ -181,7 +226,7 @@ def serve(
     errors = process.memory_file("dxlrun-stderr")
     with _stop_signals() as stop:
         began = time.monotonic()
-        child = _start(config, options, errors)
+        child = start_simulation(config, options, errors)
         front = _Front(child, audience, typed, stop)
         try:
             front.run()
@@ -203,23 +248,15 @@ def _sentences(before: Sequence[str], code: int, printed: str) -> tuple[str, ...
     return tuple(last) or (f"the simulated bus ended with exit code {code}",)
 
 
-def _start(config: SimulationConfig, options: FrontOptions, errors: int) -> Child:
-    descriptor = process.memory_file("dxlrun-simulation", encode_config(config))
-    arguments = ["--config-fd", str(descriptor)]
-    arguments += ["--priority", str(options.priority)] if options.priority else []
-    arguments += ["--core", str(options.core)] if options.core >= 0 else []
-    arguments += ["--ledger", str(options.ledger)] if options.ledger else []
-    try:
-        return Child("simulated bus", "dxlrun.simulation", arguments, [descriptor], errors)
-    finally:
-        os.close(descriptor)
-
-
 class _Front:
     """One select over the simulation, the signals and what is typed."""
 
     def __init__(
-        self, child: Child, audience: Audience, typed: TypedLines | None, stop: socket.socket
+        self,
+        child: Child[SimulationMessage],
+        audience: Audience,
+        typed: TypedLines | None,
+        stop: socket.socket,
     ) -> None:
         self._child = child
         self._audience = audience
@@ -231,13 +268,13 @@ class _Front:
 
     def run(self) -> None:
         """Tell the ports, then pass on what comes from either side until it is stopped."""
-        first = self._child.ready()
-        self._ports = _ports(first)
-        self._audience.opened(self._ports, str(first.get("real_time", "")))
+        first = first_message(self._child)
+        self._ports = first.ports or {}
+        self._audience.opened(self._ports, first.real_time)
         look_s = time.monotonic()
-        while not self._child.line.closed:
+        while not self._child.channel.closed:
             if self._audience.look_every_s is not None and time.monotonic() >= look_s:
-                self._child.line.send({"look": True})
+                self._child.channel.send({"look": True})
                 look_s = time.monotonic() + self._audience.look_every_s
             ready = select.select(self._sources(), [], [], self._patience(look_s))[0]
             if self._stop in ready and _STOPS.intersection(self._stop.recv(64)):
@@ -248,8 +285,8 @@ class _Front:
             self._listen()
         self.sentences.append("the simulated bus ended in the middle")
 
-    def _sources(self) -> list[Line | socket.socket | TypedLines]:
-        sources: list[Line | socket.socket | TypedLines] = [self._child.line, self._stop]
+    def _sources(self) -> list[Messages | socket.socket | TypedLines]:
+        sources: list[Messages | socket.socket | TypedLines] = [self._child.channel, self._stop]
         if self._typed is not None and not self._typed.ended and self._typed.in_foreground:
             sources.append(self._typed)
         return sources
@@ -266,24 +303,24 @@ class _Front:
             if line in ("help", "?"):
                 self._audience.help()
             else:
-                self._child.line.send({"fault": line})
+                self._child.channel.send({"fault": line})
         if self._audience.look_every_s is not None:
             self._audience.look(self.newest, typed.pending)  # a person sees each letter at once
 
     def _listen(self) -> None:
         while (message := self._child.poll(0)) is not None:
-            if "servos" in message:
-                self.newest = msgspec.convert(message, type=Look)
+            if message.servos is not None:
+                self.newest = Look(message.servos, message.lateness_us)
                 if self._audience.look_every_s is not None:
                     self._audience.look(self.newest, self._typed.pending if self._typed else "")
-            elif "ports" in message:
-                self._move(_ports(message))
-            elif "happened" in message:
-                self._audience.fault(str(message["happened"]))
-            elif "fault" in message:
-                self._audience.accepted(str(message["fault"]))
-            elif "error" in message:
-                self._audience.refused(str(message["error"]))
+            elif message.ports is not None:
+                self._move(message.ports)
+            elif message.happened is not None:
+                self._audience.fault(message.happened)
+            elif message.fault is not None:
+                self._audience.accepted(message.fault)
+            elif message.error is not None:
+                self._audience.refused(message.error)
 
     def _move(self, ports: dict[str, str]) -> None:
         """Tell what is another port now."""
@@ -295,17 +332,13 @@ class _Front:
     def _last_look(self) -> None:
         """Take what is still to be told, and the servos' last counts."""
         before = self.newest
-        self._child.line.send({"look": True})
+        self._child.channel.send({"look": True})
         deadline = time.monotonic() + _LAST_LOOK_S
-        while self.newest is before and not self._child.line.closed:
+        while self.newest is before and not self._child.channel.closed:
             left = deadline - time.monotonic()
-            if left <= 0 or not select.select([self._child.line], [], [], left)[0]:
+            if left <= 0 or not select.select([self._child.channel], [], [], left)[0]:
                 return
             self._listen()
-
-
-def _ports(message: Mapping[str, object]) -> dict[str, str]:
-    return msgspec.convert(message["ports"], type=dict[str, str])
 
 
 @contextmanager

@@ -7,13 +7,12 @@ import select
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-import msgspec
 from rich.console import Console
 
 from dxlrun.compile.plan import Plan
@@ -21,28 +20,42 @@ from dxlrun.control.realtime.grants import Grant
 from dxlrun.dynamixel.port.ports import put_in_place, set_aside
 from dxlrun.dynamixel.port.serial_open import let_go
 from dxlrun.errors import ProcessFault, counted
-from dxlrun.log.schemas import FAILURES_NAME
+from dxlrun.log.schemas import FAILURES_NAME, Recorded
 from dxlrun.run.channels import process
-from dxlrun.run.channels.child import END_TIMEOUT_S, Child
 from dxlrun.run.channels.events import Severity
 from dxlrun.run.channels.heartbeat import Heartbeat, Phase, Standstill
+from dxlrun.run.channels.process import (
+    END_TIMEOUT_S,
+    Child,
+    Cut,
+    Failed,
+    Finish,
+    LateMetadata,
+    LineLost,
+    LineReturned,
+    Listening,
+    Stop,
+)
 from dxlrun.run.grant_table import ProcessGrant, granted_text, refusals, show_grants
-from dxlrun.run.guardian import GuardianJob, LastHand
+from dxlrun.run.guardian import Ended, GuardianJob, GuardianMessage, LastHand, Started
 from dxlrun.run.loop_process import Outcome
 from dxlrun.run.run_log import discard_log, epoch_offset_ns, incomplete_log, ledger_of, log_header, new_log
 from dxlrun.run.run_processes import (
+    GatewayMessage,
     Memory,
+    RecorderMessage,
     guardian_job,
     start_gateway,
     start_guardian,
     start_recorder,
-    start_simulation,
+    start_simulated_buses,
 )
 from dxlrun.run.run_summary import Progress, RunOptions, RunSummary
+from dxlrun.run.simulation_front import SimulationMessage
 
 _POLL_S = 0.1
 _LOOK_NS = 500_000_000
-_GUARDIAN_PATIENCE_NS = 5_000_000_000
+_GUARDIAN_TIMEOUT_NS = 5_000_000_000
 """The guardian looks at the loop at least every 10 ms, and counts each transaction of its own."""
 
 
@@ -76,10 +89,10 @@ class _Run:
     memory: Memory
     signals: _Signals
     out: Console
-    simulation: Child | None = None
-    recorder: Child | None = None
-    guardian: Child | None = None
-    gateway: Child | None = None
+    simulation: Child[SimulationMessage] | None = None
+    recorder: Child[RecorderMessage] | None = None
+    guardian: Child[GuardianMessage] | None = None
+    gateway: Child[GatewayMessage] | None = None
     socket: Path | None = None
     """Where the gateway listens; None before it does."""
     remarks: list[str] = field(default_factory=list)
@@ -88,19 +101,19 @@ class _Run:
     """A pidfd of the loop's process; None before there is one, and after it was seen to be gone."""
     log: Path | None = None
     sentences: list[str] = field(default_factory=list)
-    ended: Mapping[str, object] | None = None
-    """What the guardian said at the end."""
+    ended: Ended | None = None
+    """The guardian's last message."""
     messages: int = 0
     guardian_grants: tuple[Grant, ...] = ()
     grants: tuple[ProcessGrant, ...] = ()
     """What the operating system granted, once the loop runs."""
     steerable: bool = field(init=False)
-    """False when nobody wants a gateway, and after it ended."""
+    """False without a gateway, and after it ended."""
 
     def __post_init__(self) -> None:
         self.steerable = self.options.gateway and self.plan.gateway
 
-    def start(self) -> Child:
+    def start(self) -> Child[GuardianMessage]:
         """Start everything in order, return the guardian; raises PortError or ProcessFault."""
         ledger = self.options.ledger
         if self.options.record:
@@ -108,18 +121,18 @@ class _Run:
             ledger = ledger or ledger_of(self.log)
         ports: dict[str, str] = {}
         if self.plan.simulated:
-            self.simulation, ports = start_simulation(self.plan, ledger, self.memory)
+            self.simulation, ports = start_simulated_buses(self.plan, ledger, self.memory)
         if self.log:
             header = log_header(self.plan, epoch_offset_ns(), virtual=False)
             self.recorder = start_recorder(self.log, header, self.memory)
-        others = [child for child in (self.simulation, self.recorder) if child]
+        others = [child.channel.fileno() for child in (self.simulation, self.recorder) if child]
         self.job = guardian_job(self.plan, ports, self.memory, take_over=self.options.take_over)
         self.guardian = start_guardian(self.job, others)
-        ready = self.guardian.ready()
-        loop = ready["loop"]
-        self.guardian_grants = msgspec.convert(ready["grants"], type=tuple[Grant, ...])
-        with suppress(ProcessLookupError):  # the guardian has reaped it already, and knows what to do
-            self.loop = os.pidfd_open(int(str(loop)))
+        started = self.guardian.ready()
+        if isinstance(started, Started):
+            self.guardian_grants = started.grants
+            with suppress(ProcessLookupError):  # the guardian has reaped it already, and knows what to do
+                self.loop = os.pidfd_open(started.loop)
         return self.guardian
 
     def discard(self) -> None:
@@ -128,51 +141,52 @@ class _Run:
             discard_log(self.log)
             self.log = None
 
-    def watch(self, guardian: Child, show: Callable[[Heartbeat], None]) -> None:
-        """Wait for the guardian's last word; pass on what the signals ask."""
+    def watch(self, guardian: Child[GuardianMessage], show: Callable[[Heartbeat], None]) -> None:
+        """Wait for the guardian's last message; pass on what the signals ask for."""
         heartbeat = Heartbeat(self.memory.heartbeat)
         still = Standstill(_LOOK_NS, time.monotonic_ns())
         asked = 0
-        while self.ended is None and not guardian.line.closed:
+        while self.ended is None and not guardian.channel.closed:
             if self.signals.count > asked:
                 asked = self.signals.count
-                guardian.line.send({"stop": True} if asked == 1 else {"cut": True})
+                guardian.channel.send(Stop() if asked == 1 else Cut())
             show(heartbeat)
             self._look_at_grants()
             self._look_after_gateway(heartbeat)
             self._look_after_simulation(guardian)
             message = guardian.poll(_POLL_S)
             if message:
-                self._heed(message, guardian.line.descriptors)
-            elif still.ns(heartbeat.looks, time.monotonic_ns()) > _GUARDIAN_PATIENCE_NS:
+                self._take(message, guardian.channel.descriptors)
+            elif still.ns(heartbeat.looks, time.monotonic_ns()) > _GUARDIAN_TIMEOUT_NS:
                 self.sentences.append("the guardian did not look after the loop any more and was killed")
                 guardian.kill()
                 break
 
-    def _look_after_simulation(self, guardian: Child) -> None:
+    def _look_after_simulation(self, guardian: Child[GuardianMessage]) -> None:
         """End the run when the simulated servos are gone: unlike an adapter they do not come back."""
         if self.simulation and self.simulation.process.poll() is not None:
             self.sentences.append("the simulated bus ended before the run did")
             self.simulation.end()
             self.simulation = None
-            guardian.line.send({"stop": True})
+            guardian.channel.send(Stop())
 
-    def _heed(self, message: Mapping[str, object], descriptors: list[int]) -> None:
-        """Take the guardian's last word, let go of a line that is gone, hold the one that is back."""
-        if "ended" in message:
-            self.ended = message
-        elif "gone" in message:
-            set_aside(descriptors[int(str(message["gone"]))])
-        elif "back" in message:
-            put_in_place(descriptors.pop(len(self.plan.buses)), descriptors[int(str(message["back"]))])
+    def _take(self, message: GuardianMessage, descriptors: list[int]) -> None:
+        """Note how the loop ended; let go of a line that is lost, and hold the one that returned."""
+        match message:
+            case Ended():
+                self.ended = message
+            case LineLost(bus):
+                set_aside(descriptors[bus])
+            case LineReturned(bus):
+                put_in_place(descriptors.pop(len(self.plan.buses)), descriptors[bus])
 
-    def _heed_last_words(self, guardian: Child) -> None:
-        """Heed what a guardian that is gone said before; one that was killed here says no more."""
-        while guardian.line.fileno() >= 0 and (message := guardian.poll(0)):
-            self._heed(message, guardian.line.descriptors)
+    def _take_last_messages(self, guardian: Child[GuardianMessage]) -> None:
+        """Take what a guardian that is gone has sent before; of one that was killed here nothing is left."""
+        while guardian.channel.fileno() >= 0 and (message := guardian.poll(0)):
+            self._take(message, guardian.channel.descriptors)
 
     def _look_at_grants(self) -> None:
-        """Show what the operating system granted, and let the log keep it, once the loop has said it."""
+        """Show what the operating system granted, and record it, once the loop has reported it."""
         loop = () if self.grants else self.memory.loop_grants()
         if loop:
             self.grants = (
@@ -181,7 +195,7 @@ class _Run:
             )
             show_grants(self.grants, self.out)
             if self.recorder:
-                self.recorder.line.send({"metadata": {"granted": granted_text(self.grants)}})
+                self.recorder.channel.send(LateMetadata({"granted": granted_text(self.grants)}))
 
     def _look_after_gateway(self, heartbeat: Heartbeat) -> None:
         """Start it when the loop runs, so that nothing waits for it; without it the robot goes on."""
@@ -192,30 +206,31 @@ class _Run:
                 except OSError as error:
                     self._without_gateway(f"did not start ({error.strerror or error})")
         elif message := self.gateway.poll(0):
-            if "socket" in message:
-                self.socket = Path(str(message["socket"]))
+            if isinstance(message, Listening):
+                self.socket = Path(message.socket)
             else:
-                self._without_gateway(f"did not start ({message.get('error')})")
-        elif self.gateway.line.closed:
+                self._without_gateway(f"did not start ({message.sentence})")
+        elif self.gateway.channel.closed:
             self._without_gateway("ended")
 
     def _without_gateway(self, what: str) -> None:
-        """Say that nobody can steer the run any more, and start no other gateway."""
+        """Report that the run cannot be steered any more, and start no other gateway."""
         self.steerable = False
-        self.remarks.append(f"the gateway {what}: the run goes on, and nobody can steer it")
+        self.remarks.append(f"the gateway {what}: the run continues, but cannot be steered")
         self._end_gateway()
 
     def _end_gateway(self) -> None:
         """End the gateway, which keeps nothing, and remove its socket."""
         if self.gateway:
-            message = self.gateway.poll(0) or {}
+            message = self.gateway.poll(0)
             self.gateway.kill()
             self.gateway = None
-            place = self.socket or message.get("socket")
-            if place is not None:
-                Path(str(place)).unlink(missing_ok=True)
+            if isinstance(message, Listening):
+                self.socket = Path(message.socket)
+            if self.socket is not None:
+                self.socket.unlink(missing_ok=True)
 
-    def _without_guardian(self, loop: int, guardian: Child, job: GuardianJob) -> None:
+    def _without_guardian(self, loop: int, guardian: Child[GuardianMessage], job: GuardianJob) -> None:
         """The guardian is gone: the kernel told the loop to stop; see that it does, or cut torque here."""
         give_up = time.monotonic() + self.plan.exit_timeout_ns * 1e-9
         while not (gone := bool(select.select([loop], [], [], _POLL_S)[0])):
@@ -235,42 +250,42 @@ class _Run:
             how = f"the loop ended too{where}" if gone else f"the loop did not stop{where} and was killed"
             hand = LastHand(job)
             leave = hand.limp if cut else hand.end
-            self.sentences += leave(guardian.line.descriptors, how, Severity.ERROR)
+            self.sentences += leave(guardian.channel.descriptors, how, Severity.ERROR)
 
     def end(self) -> None:
         """End what is left, in order: guardian, recorder, simulated bus, gateway."""
         self._look_at_grants()
         if self.guardian:
-            self._heed_last_words(self.guardian)
+            self._take_last_messages(self.guardian)
             self.guardian.end()
             if self.loop is not None and self.ended is None and self.job is not None:
                 self._without_guardian(self.loop, self.guardian, self.job)
             self.loop = None
-            let_go(self.guardian.line.descriptors)
-            self.guardian.line.descriptors.clear()
+            let_go(self.guardian.channel.descriptors)
+            self.guardian.channel.descriptors.clear()
         if self.recorder:
             self._end_recorder(self.recorder)
         if self.simulation:
             self.simulation.end()
         self._end_gateway()  # the last one: when its socket is gone, the log is closed
 
-    def _end_recorder(self, recorder: Child) -> None:
-        """Let the recorder drain the rings and close the log; say so when it could not."""
+    def _end_recorder(self, recorder: Child[RecorderMessage]) -> None:
+        """Let the recorder drain the rings and close the log; report it when it could not."""
         if self.sentences:  # no ring has them, and the log's verdict is to be that of the run
-            recorder.line.send({"metadata": {FAILURES_NAME: dict(enumerate(self.sentences))}})
-        recorder.line.send({"finish": True})
+            failures = {str(number): sentence for number, sentence in enumerate(self.sentences)}
+            recorder.channel.send(LateMetadata({FAILURES_NAME: failures}))
+        recorder.channel.send(Finish())
         closed = False
         try:
             while (message := recorder.message(END_TIMEOUT_S)) is not None:
-                if "error" in message:
-                    self.sentences.append(incomplete_log(str(message["error"])))
-                summary = message.get("summary")
-                if isinstance(summary, dict):
+                if isinstance(message, Failed):
+                    self.sentences.append(incomplete_log(message.sentence))
+                elif isinstance(message, Recorded):
                     closed = True
-                    self.messages = summary["messages"]
-                    if summary["gaps"]:
+                    self.messages = message.summary.messages
+                    if gaps := message.summary.gaps:
                         self.sentences.append(
-                            f"the log lacks {counted(summary['gaps'], 'record', 'records')}, and says so: "
+                            f"the log lacks {counted(gaps, 'record', 'records')}, and says so: "
                             "the recorder was too slow"
                         )
             recorder.end()
@@ -323,13 +338,13 @@ def _summary(run: _Run, elapsed_s: float) -> RunSummary:
     outcome = run.memory.outcome()
     heartbeat = Heartbeat(run.memory.heartbeat)
     sentences: list[str] = []
-    if outcome is None and run.ended is not None and run.ended["ended"] == "done":
+    if outcome is None and run.ended is not None and run.ended.ending == "done":
         outcome = Outcome("stopped")  # while it was still loading: no byte had been sent
     elif outcome is None:
         outcome = Outcome("fault", heartbeat.cycles, heartbeat.skipped, _last_words(run.memory))
     sentences += outcome.sentences
-    if run.ended is not None and run.ended["ended"] != "done":
-        sentences += [str(sentence) for sentence in _list(run.ended["outcome"])]
+    if run.ended is not None and run.ended.ending != "done":
+        sentences += run.ended.outcome
     sentences += run.sentences
     interrupted = run.signals.count > 0
     bad: Literal[0, 1] = 1 if outcome.reason not in ("ended", "stopped") or sentences else 0
@@ -352,7 +367,3 @@ def _last_words(memory: Memory) -> tuple[str, ...]:
     """Return what was printed last, by whichever process, if anything was: one of them ended early."""
     lines = process.whole(memory.stderr).decode(errors="replace").strip().splitlines()
     return (f"the run's processes printed last: {lines[-1]} (--debug shows all)",) if lines else ()
-
-
-def _list(value: object) -> list[object]:
-    return value if isinstance(value, list) else [value]

@@ -7,12 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 
-import msgspec
-
 from dxlrun.errors import ProcessFault
 from dxlrun.run.channels import process
-from dxlrun.run.channels.child import Child
-from dxlrun.simulation import BusConfig, encode_config
+from dxlrun.run.simulation_front import FrontOptions, first_message, start_simulation
+from dxlrun.simulation import BusConfig
 
 _PRIORITY = 33
 """As in a run: a servo's electronics do not wait for the host's processor."""
@@ -23,19 +21,8 @@ class SimulatedServos:
 
     def __init__(self, buses: Sequence[BusConfig], core: int, ledger: Path) -> None:
         self._errors = process.memory_file("dxlrun-bench-stderr")
-        config = process.memory_file("dxlrun-bench", encode_config(buses))
-        words = ["--config-fd", str(config), "--core", str(core), "--priority", str(_PRIORITY)]
-        try:
-            self._child = Child(
-                "simulated bus",
-                "dxlrun.simulation",
-                [*words, "--ledger", str(ledger)],
-                [config],
-                self._errors,
-            )
-        finally:
-            os.close(config)
-        ports = msgspec.convert(self._child.ready()["ports"], type=dict[str, str])
+        self._child = start_simulation(buses, FrontOptions(ledger, _PRIORITY, core), self._errors)
+        ports = first_message(self._child).ports or {}
         self.ports = tuple(ports[bus.name] for bus in buses)
         """The devices, in the order of the buses."""
 

@@ -15,7 +15,7 @@ from dxlrun.dynamixel.port.latency_timer import SYSTEM, shorten
 from dxlrun.dynamixel.port.ports import put_in_place, set_aside
 from dxlrun.dynamixel.port.serial_open import kept, let_go, open_serial
 from dxlrun.errors import PortError
-from dxlrun.run.channels.process import Line
+from dxlrun.run.channels.process import LineLost, LineReturned, MessageChannel
 
 FIRST_PAUSE_S = 0.1
 LONGEST_PAUSE_S = 2.0
@@ -149,10 +149,10 @@ class KeptLines:
 
 
 class LinesAgain:
-    """Asks whoever keeps the lines, over `line`, for those that are gone; see `port.Reopened`."""
+    """Asks the process that keeps the lines for those that are gone; see `port.Reopened`."""
 
-    def __init__(self, line: Line) -> None:
-        self._line = line
+    def __init__(self, channel: MessageChannel[LineReturned]) -> None:
+        self._channel = channel
         self._asked: set[int] = set()
         self._came: dict[int, int] = {}
 
@@ -160,10 +160,10 @@ class LinesAgain:
         """Return the descriptor of a line that is back, once; None until then. Never waits."""
         if index not in self._asked:
             self._asked.add(index)
-            self._line.send({"gone": index})
-        if not self._line.closed and select.select([self._line], [], [], 0)[0]:
-            for message in self._line.receive():
-                self._came[int(str(message["back"]))] = self._line.descriptors.pop(0)
+            self._channel.send(LineLost(index))
+        if not self._channel.closed and select.select([self._channel], [], [], 0)[0]:
+            for message in self._channel.receive():
+                self._came[message.bus] = self._channel.descriptors.pop(0)
         descriptor = self._came.pop(index, None)
         if descriptor is not None:
             self._asked.remove(index)

@@ -1,17 +1,27 @@
-"""Starting dxlrun's own processes, and talking to them in lines of JSON over a socket pair."""
+"""Processes of a run: how one starts another, and the typed messages between them, over a socket pair."""
 
 from __future__ import annotations
 
 import io
 import mmap
 import os
+import select
 import socket
 import subprocess
 import sys
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections import deque
+from collections.abc import Collection, Iterable, Sequence
 from contextlib import suppress
+from typing import Generic, TypeVar
 
 import msgspec
+
+from dxlrun.errors import PortError, ProcessFault
+
+START_TIMEOUT_S = 20.0
+"""For a child's first message; a cold import of numpy takes a second."""
+END_TIMEOUT_S = 10.0
+"""Also for a recorder on a slow disk, which reports after each step that it is at work."""
 
 _ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 """Importing numpy alone starts a thread for each core otherwise."""
@@ -58,7 +68,7 @@ def shared_memory(descriptor: int) -> memoryview:
 
 
 def whole(descriptor: int) -> bytes:
-    """Return everything in a nameless file, wherever its offset stands."""
+    """Return everything in a nameless file, wherever its offset is."""
     return os.pread(descriptor, os.fstat(descriptor).st_size, 0)
 
 
@@ -74,7 +84,7 @@ class Printed(io.TextIOBase):
         self._room = most
 
     def writable(self) -> bool:
-        """Say that it can be written."""
+        """Return True."""
         return True
 
     def fileno(self) -> int:
@@ -92,11 +102,67 @@ class Printed(io.TextIOBase):
         return len(text)
 
 
-class Line:
-    """One end of a conversation between two processes: JSON objects, one a line."""
+class Failed(msgspec.Struct, frozen=True, tag=True):
+    """A process does not start, or cannot do its work any more."""
 
-    def __init__(self, end: socket.socket) -> None:
+    sentence: str
+
+
+class Stop(msgspec.Struct, frozen=True, tag=True):
+    """Terminal to guardian: stop the robot in order."""
+
+
+class Cut(msgspec.Struct, frozen=True, tag=True):
+    """Terminal to guardian: kill the loop and cut torque."""
+
+
+class LineLost(msgspec.Struct, frozen=True, tag=True):
+    """Loop to guardian, and on to the terminal: the port of a bus is gone; let go of it."""
+
+    bus: int
+    """Index in the plan's buses."""
+
+
+class LineReturned(msgspec.Struct, frozen=True, tag=True):
+    """Guardian to loop and terminal: the port of a bus is open again; its descriptor comes along."""
+
+    bus: int
+
+
+class Finish(msgspec.Struct, frozen=True, tag=True):
+    """Supervisor to recorder: drain the rings and close the log."""
+
+
+class LateMetadata(msgspec.Struct, frozen=True, tag=True):
+    """Supervisor to recorder: what became known in the run, for the end of the log."""
+
+    records: dict[str, dict[str, str]]
+
+
+class Ready(msgspec.Struct, frozen=True, tag=True):
+    """Recorder to supervisor: the log is open."""
+
+
+class Draining(msgspec.Struct, frozen=True, tag=True):
+    """Recorder to supervisor: still at work on what the rings hold."""
+
+
+class Listening(msgspec.Struct, frozen=True, tag=True):
+    """Gateway to supervisor: clients can connect."""
+
+    socket: str
+    """Path."""
+
+
+Received = TypeVar("Received")
+
+
+class MessageChannel(Generic[Received]):
+    """One end of a conversation between two processes: JSON, one message a line."""
+
+    def __init__(self, end: socket.socket, received: msgspec.json.Decoder[Received]) -> None:
         self._socket = end
+        self._decoder = received
         self._pending = b""
         self.closed = False
         """True after the end of what the other end sent was read."""
@@ -107,10 +173,10 @@ class Line:
         """Return the descriptor, for select."""
         return self._socket.fileno()
 
-    def send(self, message: Mapping[str, object], descriptors: Sequence[int] = ()) -> None:
-        """Send one object, and open descriptors with it; never raises.
+    def send(self, message: object, descriptors: Sequence[int] = ()) -> None:
+        """Send one message, and open descriptors with it; never raises.
 
-        An end that is gone is noticed by the next receive, not here: what it said last is still to be read.
+        An end that is gone is noticed by the next receive, not here: its last messages are still to be read.
         """
         data = msgspec.json.encode(message) + b"\n"
         with suppress(OSError):
@@ -119,8 +185,8 @@ class Line:
             else:
                 self._socket.sendall(data)
 
-    def receive(self) -> list[dict[str, object]]:
-        """Return the objects that arrive in one read; waits for one read, sets `closed` at its end."""
+    def receive(self) -> list[Received]:
+        """Return the messages that arrive in one read; waits for one read, sets `closed` at its end."""
         try:
             chunk, descriptors, _, _ = socket.recv_fds(self._socket, 65536, _MOST_DESCRIPTORS)
             self.descriptors += descriptors
@@ -129,14 +195,82 @@ class Line:
         if not chunk or len(self._pending) > _LINE_LIMIT:
             self.closed = True
         *lines, self._pending = (self._pending + chunk).split(b"\n")
-        return [msgspec.json.decode(line, type=dict[str, object]) for line in lines]
+        return [self._decoder.decode(line) for line in lines]
 
     def close(self) -> None:
         """Close this end."""
         self._socket.close()
 
 
-def line_pair() -> tuple[Line, socket.socket]:
+def message_channel(
+    received: msgspec.json.Decoder[Received],
+) -> tuple[MessageChannel[Received], socket.socket]:
     """Return our end, and the other one to be inherited by a child (close it here after the start)."""
     ours, theirs = socket.socketpair()
-    return Line(ours), theirs
+    return MessageChannel(ours, received), theirs
+
+
+class Child(Generic[Received]):
+    """One process that this one started, and the channel to it."""
+
+    def __init__(  # noqa: PLR0917  how it is called, what is executed, and what it inherits
+        self,
+        name: str,
+        module: str,
+        arguments: list[str],
+        descriptors: list[int],
+        stderr: int,
+        received: msgspec.json.Decoder[Received],
+    ) -> None:
+        self.name = name
+        self.channel, theirs = message_channel(received)
+        control = ["--control-fd", str(theirs.fileno())]
+        self.process: subprocess.Popen[bytes] = start(
+            module, [*arguments, *control], [*descriptors, theirs.fileno()], stderr
+        )
+        theirs.close()
+        self._messages: deque[Received] = deque()
+
+    def message(self, timeout_s: float) -> Received | None:
+        """Return its next message; None when its end of the channel is closed.
+
+        Raises ProcessFault when none comes in time.
+        """
+        while not self._messages and not self.channel.closed:
+            ready, _, _ = select.select([self.channel], [], [], timeout_s)
+            if not ready:
+                raise ProcessFault(f"the {self.name} did not answer for {timeout_s:.0f} s")
+            self._messages.extend(self.channel.receive())
+        return self._messages.popleft() if self._messages else None
+
+    def poll(self, timeout_s: float) -> Received | None:
+        """Return the message that comes within `timeout_s`; None when none does."""
+        if not self._messages:
+            ready, _, _ = select.select([self.channel], [], [], timeout_s)
+            if ready:
+                self._messages.extend(self.channel.receive())
+        return self._messages.popleft() if self._messages else None
+
+    def ready(self) -> Received:
+        """Return its first message. Raises ProcessFault when it ends before it, PortError for Failed."""
+        message = self.message(START_TIMEOUT_S)
+        if message is None:
+            code = self.process.wait(END_TIMEOUT_S)
+            raise ProcessFault(f"the {self.name} ended while it started (exit code {code}); try --debug")
+        if isinstance(message, Failed):
+            raise PortError(message.sentence)
+        return message
+
+    def kill(self) -> None:
+        """End it at once, whatever it does."""
+        self.process.kill()
+        self.process.wait()
+        self.channel.close()
+
+    def end(self) -> None:
+        """Close the channel, which asks it to end in order; kill it when it does not."""
+        self.channel.close()
+        try:
+            self.process.wait(END_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            self.kill()
