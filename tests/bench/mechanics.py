@@ -12,7 +12,7 @@ import time
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.simulation import Load, ServoConfig
 from dxlrun.simulation.motion.mechanics import STEP_NS, Mechanics
-from dxlrun.simulation.servo.simulated_servo import SimulatedServo
+from dxlrun.simulation.servo.making import make_servo
 
 STEPS = 2000
 
@@ -23,9 +23,7 @@ def step_us(count: int, model: str, protocol: float, speed_item: str) -> float:
     load = Load(inertia=0.002, friction=0.02, gravity=0.1)
     table = control_table(model, protocol)
     servos = [
-        SimulatedServo(
-            ServoConfig(1, model, 1.0, load=load), 1_000_000, 0, None, protocol, mechanics=mechanics
-        )
+        make_servo(ServoConfig(1, model, 1.0, load=load), 1_000_000, 0, None, protocol, mechanics=mechanics)
         for _ in range(count)
     ]
     best = float("inf")

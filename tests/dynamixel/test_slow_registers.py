@@ -67,12 +67,12 @@ def test_a_hot_servo_is_told_ten_degrees_before_its_limit_and_when_it_has_cooled
     servo = rig.buses[0].servo(12)
     cycles(rig, 100)
     assert rig.events.of(EventCode.SERVO_HOT) == []
-    servo._body.temperature = servo.registers["temperature_limit"] - 8
+    servo.temperature = servo.registers["temperature_limit"] - 8
     cycles(rig, 70)
     ((source, text),) = rig.events.of(EventCode.SERVO_HOT)
     assert source == "main_12_joint"
     assert "its Temperature Limit (31) is 80 deg C" in text
-    servo._body.temperature = 40.0
+    servo.temperature = 40.0
     cycles(rig, 70)
     assert len(rig.events.of(EventCode.SERVO_HOT)) == 2
 

@@ -123,7 +123,7 @@ def test_fast_reads_need_a_firmware(make_line2: Any, firmware: int, answers: boo
 def test_a_fast_read_of_no_item_is_not_answered(line2: Any) -> None:
     line2.tell(BROADCAST, FAST_SYNC_READ, bytes.fromhex("00100400 0102"))
     assert line2.hear() == b""
-    assert any("does not answer the fast read 0x8a" in note for note in line2.notes())
+    assert any("does not reply to the fast read 0x8a" in note for note in line2.notes())
 
 
 def test_a_2xl_knows_no_fast_read(make_line2: Any) -> None:

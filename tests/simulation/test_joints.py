@@ -11,7 +11,7 @@ from dxlrun.dynamixel.control_table import all_tables, control_table
 from dxlrun.simulation import Load, ServoConfig
 from dxlrun.simulation.motion.mechanics import Mechanics
 from dxlrun.simulation.motion.motor import motor_of
-from dxlrun.simulation.servo.simulated_servo import SimulatedServo
+from dxlrun.simulation.servo.making import make_servo
 
 S = 1_000_000_000
 
@@ -213,7 +213,7 @@ def test_moving_status_tells_profile_and_arrival(make_line2: Any) -> None:
 def test_every_model_settles_where_it_should_without_much_overshoot() -> None:
     mechanics, tables = Mechanics(0), all_tables()
     servos = [
-        SimulatedServo(ServoConfig(1, each.model, 1.0), 57_600, 0, None, each.protocol, mechanics=mechanics)
+        make_servo(ServoConfig(1, each.model, 1.0), 57_600, 0, None, each.protocol, mechanics=mechanics)
         for each in tables
         if each.model != "XL-320"
     ]

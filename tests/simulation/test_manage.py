@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from dxlrun.simulation import ServoConfig
-from dxlrun.simulation.servo.simulated_servo import SimulatedServo
+from dxlrun.simulation.servo.making import make_servo
 from dxlrun.simulation.wire.protocol2 import ErrorNumber
 
 PING, READ, WRITE, REG_WRITE, ACTION, RESET, REBOOT, CLEAR, BACKUP = 1, 2, 3, 4, 5, 6, 8, 0x10, 0x20
@@ -251,7 +251,7 @@ def test_at_power_up_the_backup_comes_back_and_the_torque_on(make_line2: Any, mo
     ("firmware", "model"), [(51, "XL330-M288-FW51"), (52, "XL330-M288"), (None, "XL330-M288")]
 )
 def test_the_firmware_decides_the_control_table(firmware: int | None, model: str) -> None:
-    servo = SimulatedServo(ServoConfig(1, "XL330-M288", 0.0, firmware=firmware), 57_600, 0, protocol=2.0)
+    servo = make_servo(ServoConfig(1, "XL330-M288", 0.0, firmware=firmware), 57_600, 0, protocol=2.0)
     assert servo.registers.table.model == model
     assert servo.registers["firmware_version"] == (firmware or 52)
 

@@ -9,10 +9,17 @@ import pytest
 
 from dxlrun.dynamixel.control_table import ControlTable, all_tables, control_table
 from dxlrun.simulation import Load
-from dxlrun.simulation.motion.command import LIMP, Command
-from dxlrun.simulation.motion.mechanics import EAGER_NS, EASY_NS, STEP_NS, Mechanics
+from dxlrun.simulation.motion.control_law import LIMP, Command
+from dxlrun.simulation.motion.mechanics import (
+    AMBIENT_C,
+    COOLING_S,
+    EAGER_NS,
+    EASY_NS,
+    STALLED_RISE_C,
+    STEP_NS,
+    Mechanics,
+)
 from dxlrun.simulation.motion.motor import Motor, motor_of
-from dxlrun.simulation.motion.strain import AMBIENT_C, COOLING_S, STALLED_RISE_C
 
 MOTOR = Motor(stall_torque=2.0, damping=1 / 3, torque_per_ampere=2.0, voltage=12.0, inertia=0.003)
 S = 1_000_000_000

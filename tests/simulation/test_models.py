@@ -12,7 +12,7 @@ import pytest
 
 from dxlrun.dynamixel.control_table import ControlItem, ControlTable, all_tables
 from dxlrun.simulation import ServoConfig
-from dxlrun.simulation.servo.simulated_servo import SimulatedServo
+from dxlrun.simulation.servo.making import make_servo
 from dxlrun.simulation.wire.packets import InstructionPacket
 
 OLD = [table for table in all_tables() if table.protocol == 1.0]
@@ -73,7 +73,7 @@ class Desk:
         self.table = table
         rate = next(iter(table.baud_rates.values()))
         config = ServoConfig(1, table.model, 0.3)
-        self.servo = SimulatedServo(config, rate, 0, protocol=table.protocol)
+        self.servo = make_servo(config, rate, 0, protocol=table.protocol)
         self._wide = 2 if table.protocol == 2.0 else 1
         self.open_limits()
 

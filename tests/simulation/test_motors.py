@@ -17,7 +17,8 @@ from dxlrun.dynamixel.control_table import all_tables, control_table
 from dxlrun.simulation import ServoConfig
 from dxlrun.simulation.motion.mechanics import Mechanics
 from dxlrun.simulation.motion.motor import motor_of
-from dxlrun.simulation.motion.shaft import critical_d
+from dxlrun.simulation.servo.making import make_servo
+from dxlrun.simulation.servo.shaft import critical_d
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 
 S, STEP_NS = 1_000_000_000, 2_000_000
@@ -138,7 +139,7 @@ def reference(parameters: Identified, bench: Bench, way: float, seconds: float, 
 def simulated(model: str) -> tuple[SimulatedServo, Mechanics]:
     mechanics, bench = Mechanics(0), BENCH[model]
     config = ServoConfig(1, model, START)
-    servo = SimulatedServo(config, 1_000_000, 0, None, bench.protocol, mechanics=mechanics)
+    servo = make_servo(config, 1_000_000, 0, None, bench.protocol, mechanics=mechanics)
     servo.poke("shutdown", 0)  # BAM fed the XL330 with more than its limit
     servo.set_voltage(bench.voltage)
     servo.poke("torque_enable", 1)

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dxlrun.simulation.motion.command import LIMP, Command
-from dxlrun.simulation.motion.profile import Profiles
+from dxlrun.simulation.motion.control_law import LIMP, Command, Profiles
 
 DT = 0.002
 

@@ -7,8 +7,8 @@ import pytest
 
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.simulation import ServoConfig
-from dxlrun.simulation.memory.cells import Memory
-from dxlrun.simulation.servo.simulated_servo import SimulatedServo
+from dxlrun.simulation.servo.making import make_servo
+from dxlrun.simulation.servo.memory import Memory
 from dxlrun.simulation.wire.protocol1 import ErrorBit
 
 PING, READ, WRITE, REG_WRITE, ACTION, FACTORY_RESET, SYNC_WRITE, BULK_READ = 1, 2, 3, 4, 5, 6, 0x83, 0x92
@@ -384,13 +384,13 @@ def test_poke_sets_what_a_test_needs(line: Any) -> None:
 
 @pytest.mark.parametrize(("rate", "value"), [(1_000_000, 1), (57_600, 34), (117_647, 16), (2_000_000, 0)])
 def test_baud_rate_register_follows_the_line(rate: int, value: int) -> None:
-    servo = SimulatedServo(ServoConfig(1, "AX-12A", 0.0), rate, 0)
+    servo = make_servo(ServoConfig(1, "AX-12A", 0.0), rate, 0)
     assert servo.registers["baud_rate"] == value
 
 
 def test_a_baud_rate_that_no_servo_has_is_refused() -> None:
     with pytest.raises(ValueError, match="no baud rate near 5000"):
-        SimulatedServo(ServoConfig(1, "AX-12A", 0.0), 5000, 0)
+        make_servo(ServoConfig(1, "AX-12A", 0.0), 5000, 0)
 
 
 def test_values_and_bytes_of_the_registers_never_differ() -> None:

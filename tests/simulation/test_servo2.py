@@ -9,8 +9,8 @@ from unittest.mock import ANY
 import pytest
 
 from dxlrun.simulation import ServoConfig
-from dxlrun.simulation.servo.simulated_servo import SimulatedServo
-from dxlrun.simulation.servo.torque_body import HardwareError
+from dxlrun.simulation.servo.making import make_servo
+from dxlrun.simulation.servo.protocol2_servo import HardwareError
 from dxlrun.simulation.wire.protocol2 import ErrorNumber
 
 PING, READ, WRITE, REG_WRITE, ACTION, RESET, REBOOT, CLEAR = 1, 2, 3, 4, 5, 6, 8, 0x10
@@ -353,7 +353,7 @@ def test_a_shorter_watchdog_counts_at_once_and_a_longer_one_too(line2: Any) -> N
 def test_a_servo_at_rest_shows_at_once_who_turns_it_and_what_is_written(line2: Any) -> None:
     line2.wait(1.0)
     resting = line2.get("present_position")
-    assert line2.servo()._body.shaft.mechanics.still, "this test is about a servo at rest"
+    assert line2.servo().shaft.mechanics.still, "this test is about a servo at rest"
     assert line2.get("present_position") == resting
     line2.servo().turn_by_hand(line2.servo().position + 0.5)
     turned = line2.get("present_position")
@@ -370,9 +370,9 @@ def test_a_servo_at_rest_shows_at_once_who_turns_it_and_what_is_written(line2: A
 
 @pytest.mark.parametrize("rate", [9_600, 57_600, 1_000_000, 4_500_000])
 def test_baud_rates_of_the_manual(rate: int) -> None:
-    assert SimulatedServo(ServoConfig(1, "XM430-W350", 0.0), rate, 0, protocol=2.0).baud_rate == rate
+    assert make_servo(ServoConfig(1, "XM430-W350", 0.0), rate, 0, protocol=2.0).baud_rate == rate
 
 
 def test_a_baud_rate_that_no_servo_has_is_refused() -> None:
     with pytest.raises(ValueError, match="no baud rate near 500000"):
-        SimulatedServo(ServoConfig(1, "XM430-W350", 0.0), 500_000, 0, protocol=2.0)
+        make_servo(ServoConfig(1, "XM430-W350", 0.0), 500_000, 0, protocol=2.0)

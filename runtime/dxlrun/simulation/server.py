@@ -19,10 +19,10 @@ from dxlrun.simulation.configuration import SimulationConfig
 from dxlrun.simulation.control_line import ControlLine
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.faults.script import FaultScript
-from dxlrun.simulation.memory.cells import Memory
 from dxlrun.simulation.motion.mechanics import Mechanics, plant_of
 from dxlrun.simulation.pseudo_terminal import Link, PseudoTerminal
 from dxlrun.simulation.realtime import Patience
+from dxlrun.simulation.servo.memory import Memory
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 
 _HAPPENED = "fault: "

@@ -29,8 +29,9 @@ from dxlrun.simulation.bus.adapter import Adapter
 from dxlrun.simulation.bus.ledger import OTHER_HOST, Ledger
 from dxlrun.simulation.bus.line import ECHO, GroupReply, Line, Transmission, Turn, flipped
 from dxlrun.simulation.configuration import BusConfig, ServoConfig
-from dxlrun.simulation.memory.cells import IDENTITY
 from dxlrun.simulation.motion.mechanics import Mechanics
+from dxlrun.simulation.servo.making import make_servo
+from dxlrun.simulation.servo.memory import IDENTITY
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 from dxlrun.simulation.wire import protocol1, protocol2
 from dxlrun.simulation.wire.packets import Codec, GroupRead, InstructionPacket, Reply
@@ -197,7 +198,7 @@ class SimulatedBus:
 
     def add_servo(self, config: ServoConfig) -> SimulatedServo:
         """Connect one more servo to the line, now."""
-        servo = SimulatedServo(
+        servo = make_servo(
             config, self.baud_rate, self.now_ns, self.note, self.protocol, mechanics=self.mechanics
         )
         self.servos += (servo,)

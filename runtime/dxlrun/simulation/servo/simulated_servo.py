@@ -1,8 +1,10 @@
-"""A simulated servo as bus and tests see it: it hears instructions, answers, and can be broken.
+"""A simulated servo: it receives instructions, replies, moves its shaft, and can be broken.
 
-Where the e-Manual says nothing, `[i]` marks what was inferred; nothing here was compared with a servo yet.
+What both protocols share is here; `protocol1_servo` and `protocol2_servo` have the instructions of each, and
+how such a servo protects itself. Where the e-Manual has no answer, `[i]` marks what was inferred; nothing was
+compared with a real servo yet.
 
-Not modelled: other protocols than 1.0 and 2.0 on one line (a servo that is told to speak one falls silent),
+Not modelled: other protocols than 1.0 and 2.0 on one line (a servo that is set to another one falls silent),
 what the two shafts of a 2XL or 2XC share, servos that Drive Mode couples, and what firmware decides beyond
 the control table, the fast reads, Clear and Control Table Backup.
 """
@@ -10,16 +12,39 @@ the control table, the fast reads, Clear and Control Table Backup.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
+from typing import NamedTuple
 
-from dxlrun.dynamixel.control_table import ControlTable, control_table, models_by_number
-from dxlrun.simulation.configuration import ServoConfig
-from dxlrun.simulation.memory.cells import Memory
-from dxlrun.simulation.motion.mechanics import Mechanics
-from dxlrun.simulation.servo.bodies import make_body
-from dxlrun.simulation.servo.body import Body
+from dxlrun.simulation.motion.mechanics import SUPPLY_OHM
+from dxlrun.simulation.servo.memory import IDENTITY, LiveItem, Memory, Run
+from dxlrun.simulation.servo.shaft import Shaft
 from dxlrun.simulation.wire.packets import BROADCAST, GroupRead, InstructionPacket, ReadEntry, Reply
+
+BOOT_NS = 100_000_000
+"""How long a servo receives nothing after a reboot; no manual names it [i]."""
+
+_READS_KEPT = 1024
+"""So many reads are looked up only once: a host reads few places, rubbish goes everywhere."""
+
+_BY_TIME = frozenset(("realtime_tick",))
+"""What shows something else at another time, though no servo moves and nothing is written."""
+
+_SECONDARY_IDS = ("secondary_shadow_id", "secondary_id")
+
+Answer = tuple[int, bytes]
+"""Error and parameters of a reply."""
+
+
+class _Window(NamedTuple):
+    """A row of cells that is read."""
+
+    live: tuple[LiveItem, ...]
+    """What changes by itself in it."""
+    lasts: bool
+    """True: nothing of it does while no servo moves."""
 
 
 @dataclass(slots=True)
@@ -41,259 +66,377 @@ class ServoCounts:
         self.last_error = error
 
 
-class SimulatedServo:
-    """One servo: the bus calls `execute` and `reply_to_group_read`; tests look at registers and cause faults.
+class SimulatedServo(ABC):
+    """One servo: the bus calls `execute` and `reply_to_group_read`; faults and tests do the rest.
 
-    `note` is told of every refusal and every fault.
+    `note` is called with each refusal and each fault.
     """
 
-    def __init__(
-        self,
-        config: ServoConfig,
-        baud_rate: int,
-        start_ns: int,
-        note: Callable[[str], None] | None = None,
-        protocol: float = 1.0,
-        *,
-        mechanics: Mechanics | None = None,
-    ) -> None:
-        self._note = note or (lambda text: None)
-        table = _table(config, protocol)
-        self._body, self._instructions = make_body(
-            table,
-            mechanics or Mechanics(start_ns),
-            config.load,
-            config.position,
-            self._note,
-            firmware=config.firmware,
-        )
-        self.counts = ServoCounts()
-        self._silent = False
-        self.registers["id"] = config.servo_id
-        self._baud_item = (
-            "baud_rate" if "baud_rate" in table.items else "baud_rate_bus"
-        )  # the Y series has two
-        self.registers[self._baud_item] = _baud_value(self.registers, baud_rate)
-        self.registers["return_delay_time"] = min(254, round(config.return_delay_ns / 2000))
-        self._body.power_up()
-
-    @property
-    def registers(self) -> Memory:
+    def __init__(self, memory: Memory, shaft: Shaft, note: Callable[[str], None]) -> None:
+        self.registers = memory
         """Its control items, by name, as integers of the wire."""
-        return self._body.memory
+        self.shaft = shaft
+        self.note = note
+        self.counts = ServoCounts()
+        self.overload = False
+        """True while the shaft is loaded beyond the torque."""
+        self.wakes_on_goal = True
+        """Protocol 1.0: writing Goal Position (30) while Torque Enable (24) is 0 sets it to 1 [i]."""
+        self.answers_damaged = False
+        """True: a packet with a wrong checksum is answered by the manual's error; False: never [?]."""
+        self.boot_ns = BOOT_NS
+        """How long a reboot or a factory reset by an instruction takes: Protocol 2.0."""
+        self.servo_id = 0
+        """ID (3 or 7)."""
+        self.secondary_id: int | None = None
+        """Secondary ID (12), to which it never replies; None: it has none, or it is off.
 
-    @property
-    def body(self) -> Body:
-        """What it is without its line."""
-        return self._body
+        253 to 255 switch it off, and the ID goes first (e-Manual, X series).
+        """
+        self._silent = False
+        self._deaf_until_ns = shaft.now_ns
+        """Until then it boots and receives nothing."""
+        self._speaks = True
+        """False when it is set to another protocol."""
+        self._delay_ns = 0
+        """Return Delay Time (5, 9)."""
+        self._started_ns = self._received_ns = shaft.now_ns
+        self._registered: tuple[int, bytes] | None = None
+        self._live = {name: show for name, show in self._live_items().items() if name in memory}
+        self._windows: dict[tuple[int, int], _Window] = {}
+        self._secondary_item = next((each for each in _SECONDARY_IDS if each in memory), None)
+        self._voltage = 0.0
+        self.voltage = _supply(memory)
+        shaft.mechanics.watch(shaft.index, self._strained)
+        memory.watch(("return_delay_time",), self._set_delay)
+        memory.watch(IDENTITY, self._identify)
+
+    def _identify(self) -> None:
+        """Take over what it listens to."""
+        registers = self.registers
+        self.servo_id = registers["id"]
+        secondary = None if self._secondary_item is None else registers[self._secondary_item]
+        off = secondary is None or secondary > 252 or secondary == self.servo_id
+        self.secondary_id = None if off else secondary
+
+    def _set_delay(self) -> None:
+        self._delay_ns = self.registers["return_delay_time"] * 2000
 
     # What the bus asks
 
-    @property
-    def servo_id(self) -> int:
-        """ID."""
-        return self._body.servo_id
-
-    @property
-    def secondary_id(self) -> int | None:
-        """Secondary ID (12), to which it hears and never answers; None: it has none, or it is off."""
-        return self._body.secondary_id
-
     def listens_to(self, servo_id: int) -> bool:
         """Return whether an instruction to an ID, or to all, is for this servo."""
-        return servo_id == BROADCAST or servo_id in (self._body.servo_id, self._body.secondary_id)
+        return servo_id == BROADCAST or servo_id in (self.servo_id, self.secondary_id)
 
     @property
     def baud_rate(self) -> int:
-        """The rate at which it listens, bit/s."""
-        return _rate(self._body.memory, self._body.memory[self._baud_item])
+        """The rate at which it listens, bit/s; in Protocol 1.0 also by the formula 2e6 / (value + 1)."""
+        registers = self.registers
+        value, rates = registers[baud_item(registers)], registers.table.baud_rates
+        return rates.get(value, 2_000_000 // (value + 1) if registers.table.protocol == 1.0 else 0)
 
     def advance(self, now_ns: int) -> None:
         """Bring the shaft and the present registers to a time; going back is ignored."""
-        self._body.advance(now_ns)
-        self._body.refresh()
+        self.shaft.advance(now_ns)
+        self._refresh()
+
+    def receives(self, now_ns: int) -> bool:
+        """Take an instruction on the line at a time; return whether it reaches the servo."""
+        if self._silent or now_ns < self._deaf_until_ns or not self._speaks:
+            return False
+        self.shaft.advance(now_ns)
+        self._received_ns = self.shaft.now_ns
+        return True
 
     def execute(self, packet: InstructionPacket, now_ns: int) -> Reply | None:
         """Obey an instruction whose last byte arrived at `now_ns`; return the reply, None for silence."""
-        body, instructions = self._body, self._instructions
-        servo_id = body.servo_id  # a write of ID is still answered under the old one [i]
+        servo_id = self.servo_id  # a write of ID is still answered under the old one [i]
         own = packet.servo_id == servo_id
         if not (own or self.listens_to(packet.servo_id)) or not self.receives(now_ns):
             return None
-        answering = instructions.answers(packet, own)
-        delay_ns = instructions.delay_ns(packet, 10_000_000_000 // self.baud_rate) if answering else 0
-        error, parameters = instructions.obey(packet)
+        replies = self._replies_to(packet, own)
+        delay_ns = self._delay_of(packet) if replies else 0
+        error, parameters = self._obey(packet)
         if error:
-            said = f"{packet.instruction:#04x} {packet.parameters.hex(' ')}"
-            self._note(f"servo {servo_id} refuses {said}: {instructions.describe(error)}")
-            body.protect(error)
-        if not answering:
-            return None
-        return Reply(servo_id, error | body.state(), parameters, delay_ns)
+            refused = f"{packet.instruction:#04x} {packet.parameters.hex(' ')}"
+            self.note(f"servo {servo_id} refuses {refused}: {self._describe(error)}")
+            self.protect(error)
+        return Reply(servo_id, error | self._state(), parameters, delay_ns) if replies else None
 
-    def reply_to_group_read(self, reading: GroupRead, entry: ReadEntry, now_ns: int) -> Reply | None:
-        """Return its part of the answer to an instruction that ended at `now_ns`; None for silence."""
+    def reply_to_group_read(self, read: GroupRead, entry: ReadEntry, now_ns: int) -> Reply | None:
+        """Return its part of the reply to an instruction that ended at `now_ns`; None for silence."""
         if not self.receives(now_ns):
             return None
-        answer = self._instructions.reply_to_group_read(reading, entry)
+        answer = self._answer_group_read(read, entry)
         if answer is None:
             return None
-        body = self._body
-        # of a status that servos share only the first one waits
-        delay_ns = 0 if reading.fast and entry is not reading.entries[0] else body.delay_ns
-        return Reply(body.servo_id, answer[0] | body.state(), answer[1], delay_ns)
-
-    def receives(self, now_ns: int) -> bool:
-        """Take note of an instruction at a time; return whether it reaches the servo."""
-        body = self._body
-        if self._silent or now_ns < body.deaf_until_ns or not body.hears_protocol:
-            return False
-        body.hear(now_ns)
-        return True
+        # of a status packet that servos share only the first one waits
+        delay_ns = 0 if read.fast and entry is not read.entries[0] else self._delay_ns
+        return Reply(self.servo_id, answer[0] | self._state(), answer[1], delay_ns)
 
     def lasts(self, entry: ReadEntry) -> bool:
         """Return whether it replies the same until a servo moves or something is written."""
-        return self._body.lasts(entry.address, entry.length)
+        places = self.registers.places(entry.address, entry.length)
+        return all(self._window(target, last - first).lasts for target, first, last in places)
 
-    # What tests see and do
+    # What the protocols do differently
 
-    @property
-    def wakes_on_goal(self) -> bool:
-        """Whether writing Goal Position (30) of Protocol 1.0 switches the torque on [i]."""
-        return self._body.wakes_on_goal
+    @abstractmethod
+    def _replies_to(self, packet: InstructionPacket, own: bool) -> bool:
+        """Return whether a status packet follows; `own`: the instruction is to the servo's ID."""
 
-    @wakes_on_goal.setter
-    def wakes_on_goal(self, on: bool) -> None:
-        self._body.wakes_on_goal = on
+    def _delay_of(self, packet: InstructionPacket) -> int:
+        """Return how long the servo waits before it replies, ns."""
+        return self._delay_ns
 
-    @property
-    def answers_damaged(self) -> bool:
-        """Whether a packet with a wrong checksum gets the manual's error; a robot may do either [?]."""
-        return self._body.answers_damaged
+    @abstractmethod
+    def _obey(self, packet: InstructionPacket) -> Answer: ...
 
-    @answers_damaged.setter
-    def answers_damaged(self, on: bool) -> None:
-        self._body.answers_damaged = on
+    @abstractmethod
+    def _describe(self, error: int) -> str:
+        """Return an error in words."""
 
-    @property
-    def boot_ns(self) -> int:
-        """How long a reboot by an instruction takes [i]."""
-        return self._body.boot_ns
+    @abstractmethod
+    def _answer_group_read(self, read: GroupRead, entry: ReadEntry) -> Answer | None:
+        """Return the servo's part; None: it does not reply."""
 
-    @boot_ns.setter
-    def boot_ns(self, duration_ns: int) -> None:
-        self._body.boot_ns = duration_ns
+    @abstractmethod
+    def _refusal(self, run: Run) -> int:
+        """Return the error of a write, 0 when it is allowed."""
+
+    @abstractmethod
+    def _state(self) -> int:
+        """Return the bits of every reply's error that show the servo's state."""
+
+    @abstractmethod
+    def protect(self, refused: int = 0) -> None:
+        """Take the torque away when something is wrong for which Shutdown asks."""
+
+    @abstractmethod
+    def _start_up(self) -> None: ...
+
+    @abstractmethod
+    def _after_write(self, names: AbstractSet[str]) -> None:
+        """Do what the writing of some items does beside changing them."""
+
+    # Instructions that both protocols have
+
+    def _read(self, address: int, length: int) -> bytes | None:
+        """Return bytes of the table, None where it has none."""
+        memory = self.registers
+        if length < 1 or address + length > memory.size:
+            return None
+        if memory.cells(address, length).direct:
+            memory.show_all(self._window(address, length).live)
+            return memory.raw(address, length)
+        for target, first, last in memory.places(address, length):
+            memory.show_all(self._window(target, last - first).live)
+        return memory.read(address, length)
+
+    def _window(self, address: int, length: int) -> _Window:
+        """Return what changes by itself in some cells; looked up once."""
+        window = self._windows.get((address, length))
+        if window is None:
+            if len(self._windows) >= _READS_KEPT:
+                self._windows.clear()
+            names = [name for name in self._live if self.registers.overlaps(name, address, length)]
+            live = tuple(self.registers.live(name, self._live[name]) for name in names)
+            window = self._windows[address, length] = _Window(live, _BY_TIME.isdisjoint(names))
+        return window
+
+    def _write(self, address: int, data: bytes) -> int:
+        """Write, or return the error with which it is refused; 0 when it is not."""
+        memory = self.registers
+        runs = memory.runs(address, data)
+        for run in runs:
+            if error := self._refusal(run):
+                return error
+        for run in runs:
+            names = run.cells.names
+            memory.write(run)
+            self._after_write(names)
+            self.shaft.plan(names)
+        return 0
+
+    def _register(self, address: int, data: bytes) -> int:
+        """Keep a write for an Action, or return the error with which it is refused."""
+        for run in self.registers.runs(address, data):
+            if error := self._refusal(run):
+                return error
+        self._keep_registered((address, data))
+        return 0
+
+    def _act(self) -> int:
+        """Do the registered write; return its error."""
+        if self._registered is None:
+            return 0
+        address, data = self._registered
+        self._keep_registered(None)
+        return self._write(address, data)
+
+    def _keep_registered(self, write: tuple[int, bytes] | None) -> None:
+        self._registered = write
+        for name in ("registered", "registered_instruction"):
+            self.registers.show(name, write is not None)
+
+    def _set(self, name: str, wire: int) -> None:
+        """Set a control item as if it had been so before, with nothing refused."""
+        self.registers[name] = wire
+        self.shaft.plan((name,))
+
+    # What time and load do
+
+    def _live_items(self) -> Mapping[str, Callable[[], int]]:
+        """Return the items that change by themselves: worked out when they are read, not before."""
+        return {
+            **self.shaft.live(),
+            "present_temperature": lambda: round(self.temperature),
+            "present_inverter_temperature": lambda: round(self.temperature),
+            "present_motor_temperature": lambda: round(self.temperature),
+            "present_voltage": lambda: self._shown_voltage("present_voltage"),
+            "present_input_voltage": lambda: self._shown_voltage("present_input_voltage"),
+            "realtime_tick": lambda: (self.shaft.now_ns - self._started_ns) // 1_000_000 % 32768,
+        }
+
+    def _shown_voltage(self, name: str) -> int:
+        drawn = abs(self.shaft.duty * self.shaft.current)
+        return round((self._voltage - SUPPLY_OHM * drawn) / self.registers.table.items[name].scale)
+
+    def _strained(self) -> None:
+        """It became warmer or colder by a degree, or was overloaded for too long."""
+        if not self.overload and self.shaft.mechanics.overloaded(self.shaft.index):
+            self._overload(True)
+            self.note(f"servo {self.servo_id}: overload, it does not hold its load")
+        self.protect()
+
+    def _overload(self, on: bool) -> None:
+        self.overload = on
+        self.registers.version += 1
+
+    def _refresh(self) -> None:
+        """Bring all that can be read to the time."""
+        for name, show in self._live.items():
+            self.registers.show(name, show())
+
+    def power_up(self) -> None:
+        """Start: RAM is as it is at power-up, the shaft stays where it is."""
+        self._registered = None
+        self._overload(False)
+        self.registers.restore_ram()
+        self.shaft.power_up()
+        self._start_up()
+        self.protect()
+        self._refresh()
+
+    # What tests see and faults do
 
     @property
     def position(self) -> float:
         """Angle of the shaft, rad from raw 0, at the time of `advance` or of the last instruction."""
-        return self._body.shaft.angle
+        return self.shaft.angle
 
     @property
     def velocity(self) -> float:
         """Speed of the shaft, rad/s, counter-clockwise positive."""
-        return self._body.shaft.velocity
+        return self.shaft.velocity
 
     @property
     def torque_on(self) -> bool:
         """True when the motor holds or moves the shaft: torque enabled and its limit not 0."""
-        return self._body.shaft.torque_on
+        return self.shaft.torque_on
 
     @property
     def voltage(self) -> float:
-        """Its supply, V."""
-        return self._body.voltage
+        """Voltage of the supply, V; the servo sees less while it draws current."""
+        return self._voltage
+
+    @voltage.setter
+    def voltage(self, volts: float) -> None:
+        self._voltage = volts
+        self.shaft.mechanics.supply(self.shaft.index, volts)
 
     @property
     def temperature(self) -> float:
         """degrees C."""
-        return self._body.temperature
+        return float(self.shaft.mechanics.strain.temperature[self.shaft.index])
+
+    @temperature.setter
+    def temperature(self, celsius: float) -> None:
+        self.shaft.mechanics.heat(self.shaft.index, celsius)
 
     def silence(self, on: bool = True) -> None:
-        """Cut or mend its data line: it hears and answers nothing, and goes on with what it does."""
+        """Cut its data line, or restore it: it receives and sends nothing, and keeps moving."""
         self._silent = on
         self.registers.version += 1
-        self._note(f"servo {self.servo_id}: data line {'cut' if on else 'mended'}")
+        self.note(f"servo {self.servo_id}: data line {'cut' if on else 'restored'}")
 
     def reset(self) -> None:
         """Cut and give back its power: RAM is lost, the shaft stays where it is."""
-        self._note(f"servo {self.servo_id}: power cycle")
-        self._body.power_up()
+        self.note(f"servo {self.servo_id}: power cycle")
+        self.power_up()
 
     def cut_power(self, until_ns: int) -> None:
-        """Cut its power until a time: RAM is lost, and it neither moves nor hears anything before."""
+        """Cut its power until a time: RAM is lost, and it neither moves nor receives anything before."""
         self.reset()
-        self._body.deaf_until_ns = max(self._body.deaf_until_ns, until_ns)
+        self._boot_until(max(self._deaf_until_ns, until_ns))
+
+    def _boot_until(self, t_ns: int) -> None:
+        self._deaf_until_ns = t_ns
         self.registers.version += 1
 
     def poke(self, name: str, wire: int) -> None:
         """Set a control item as if it had been so before; the integer of the wire, no refusal."""
-        self._note(f"servo {self.servo_id}: {name} set to {wire}")
-        self._body.poke(name, wire)
+        self.note(f"servo {self.servo_id}: {name} set to {wire}")
+        self._set(name, wire)
 
     def trigger_overload(self) -> None:
         """Load the shaft beyond the torque.
 
         It ends with a power cycle, a reboot (Protocol 2.0), a write of Torque Limit (34, Protocol 1.0).
         """
-        self._body.overload = True
-        self.registers.version += 1
-        self._note(f"servo {self.servo_id}: overload")
-        self._body.protect()
+        self._overload(True)
+        self.note(f"servo {self.servo_id}: overload")
+        self.protect()
 
     def set_voltage(self, volts: float) -> None:
         """Supply it with another voltage, V."""
-        self._body.voltage = volts
-        self._note(f"servo {self.servo_id}: voltage {volts} V")
-        self._body.protect()
+        self.voltage = volts
+        self.note(f"servo {self.servo_id}: voltage {volts} V")
+        self.protect()
 
     def set_temperature(self, celsius: float) -> None:
         """Heat it, degrees C."""
-        self._body.temperature = celsius
-        self._note(f"servo {self.servo_id}: temperature {celsius} degC")
-        self._body.protect()
+        self.temperature = celsius
+        self.note(f"servo {self.servo_id}: temperature {celsius} degC")
+        self.protect()
 
     def turn(self, by: float, duration_ns: int) -> None:
         """Let a hand turn the shaft by an angle, rad, in a time; it gives way to a servo that has torque."""
 
         def gives_way(turned: float) -> None:
             came = f"gives way after {math.degrees(turned):.1f} of {math.degrees(by):g} deg"
-            self._note(f"servo {self.servo_id}: holds or drives its shaft, so the hand that turns it {came}")
+            self.note(f"servo {self.servo_id}: holds or drives its shaft, so the hand that turns it {came}")
 
-        shaft = self._body.shaft
-        shaft.mechanics.turn(shaft.index, by, duration_ns, gives_way)
+        self.shaft.mechanics.turn(self.shaft.index, by, duration_ns, gives_way)
 
     def turn_by_hand(self, angle: float) -> None:
         """Turn the shaft to an angle, rad; a servo with torque goes back to its goal."""
-        self._note(f"servo {self.servo_id}: turned by hand to {angle} rad")
-        self._body.shaft.rest_at(angle)
-        self._body.shaft.plan(self._body.shaft.items)
+        self.note(f"servo {self.servo_id}: turned by hand to {angle} rad")
+        self.shaft.rest_at(angle)
+        self.shaft.plan(self.shaft.items)
 
 
-def _table(config: ServoConfig, protocol: float) -> ControlTable:
-    """Return the table of a model, or the one that its number has with the firmware that was asked for."""
-    table = control_table(config.model, protocol)
-    if config.firmware is None:
-        return table
-    fitting = (
-        each for each in models_by_number(table.model_number, protocol) if each.firmware <= config.firmware
-    )
-    return next(fitting, table)
+def baud_item(memory: Memory) -> str:
+    """Return the item that decides the rate: the Y series has two."""
+    return "baud_rate" if "baud_rate" in memory else "baud_rate_bus"
 
 
-def _rate(memory: Memory, value: int) -> int:
-    """Return the manual's rate of a value, bit/s; in Protocol 1.0 also by its formula 2e6 / (value + 1)."""
-    rates = memory.table.baud_rates
-    if memory.table.protocol == 1.0:
-        return rates.get(value, 2_000_000 // (value + 1))
-    return rates.get(value, 0)
+def _supply(memory: Memory) -> float:
+    """Return the voltage at which a servo is tried, V.
 
-
-def _baud_value(memory: Memory, baud_rate: int) -> int:
-    for value, rate in memory.table.baud_rates.items():
-        if rate == baud_rate:
-            return value
-    value = round(2_000_000 / baud_rate) - 1  # e-Manual, Baud Rate (4): 2,000,000 / (value + 1)
-    if memory.table.protocol != 1.0 or not 0 <= value <= 254:
-        raise ValueError(f"the servo has no baud rate near {baud_rate} bit/s")
-    return value
+    The one that the manual's figures are for; else 12 V, or the middle of its limits.
+    """
+    if memory.table.nominal_voltage:
+        return memory.table.nominal_voltage
+    lowest, highest = memory.get("min_voltage_limit", 0), memory.get("max_voltage_limit", 999)
+    return 12.0 if lowest <= 120 <= highest else (lowest + highest) / 20

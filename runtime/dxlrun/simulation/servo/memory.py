@@ -250,6 +250,11 @@ class Memory:
         """Return whether a write would change the EEPROM area, also through Indirect Data."""
         return any(run.cells.eeprom for run in self.runs(address, data))
 
+    def overlaps(self, name: str, address: int, length: int) -> bool:
+        """Return whether any of some cells belongs to an item."""
+        start, end, _, _ = self._places[name]
+        return start < address + length and address < end
+
     def touches(self, address: int, length: int) -> bool:
         """Return whether any of some cells belongs to an item."""
         return self.cells(address, length).touched

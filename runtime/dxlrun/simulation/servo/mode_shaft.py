@@ -7,12 +7,12 @@ from collections.abc import Callable, Mapping
 from typing import ClassVar
 
 from dxlrun.simulation.configuration import Load
-from dxlrun.simulation.memory.access import watchdog_expired
-from dxlrun.simulation.memory.cells import Memory
-from dxlrun.simulation.motion.command import FREE, LIMP, Command
-from dxlrun.simulation.motion.gains import position_gains, velocity_gains
+from dxlrun.simulation.motion.control_law import FREE, LIMP, Command
 from dxlrun.simulation.motion.mechanics import Mechanics
-from dxlrun.simulation.motion.shaft import Shaft, Trajectory
+from dxlrun.simulation.motion.motor import Motor
+from dxlrun.simulation.servo.access import watchdog_expired
+from dxlrun.simulation.servo.memory import Memory
+from dxlrun.simulation.servo.shaft import Shaft, Trajectory, critical_d
 
 REVERSE, TIME_BASED = 0x01, 0x04
 """Bits of Drive Mode (10): clockwise is positive; Profile Velocity and Acceleration are durations in ms."""
@@ -26,6 +26,22 @@ _ARRIVED, _ON_THE_WAY = 0x01, 0x02
 
 _IN_POSITION_TICKS = 10
 """So near is "in position"; the manual of the X series names no number [i]."""
+
+
+SAMPLING_S = 1e-3
+"""What the e-Manual's conversions of gains include, as it says without a figure (X series, Velocity PI Gain
+(76, 78) and Position PID Gain (80 to 84)): they count in PWM units, ticks and velocity units [i]."""
+
+UNKNOWN_P = 150.0
+"""Duty per rad where the manual gives no initial gain: the PRO, P and Y lines, and the grippers [i].
+
+ROBOTIS' own examples for the PRO line wait until at most 20 ticks are left (DynamixelSDK,
+c++/example/protocol2.0, DXL_MOVING_STATUS_THRESHOLD); friction takes 1.3 % of the duty, and 20 ticks of the
+finest model are 0.000125 rad.
+"""
+
+UNKNOWN_VELOCITY_P, UNKNOWN_VELOCITY_I = 4.0, 40.0
+"""There, per part of the no-load speed that is missing, and per s of it [i]"""
 
 
 class ModeShaft(Shaft):
@@ -173,7 +189,7 @@ class ModeShaft(Shaft):
         most = (
             abs(torque) if mode == CURRENT_BASED and "goal_current" in memory else self._most_torque(torque)
         )
-        return position_gains(memory, self.motor)._replace(limit=limit, torque_limit=most)
+        return _position_gains(memory, self.motor)._replace(limit=limit, torque_limit=most)
 
     def _most_torque(self, torque: float) -> float:
         """Return what limits the torque beside a position or a speed, Nm.
@@ -189,7 +205,7 @@ class ModeShaft(Shaft):
         memory = self.memory
         speed = self._sign * memory.ticks("goal_velocity") * memory.table.rad_s_per_tick
         ramp = self._ramp_wanted * self._acceleration_unit or FREE
-        return velocity_gains(memory)._replace(turning=1.0, speed=speed, acceleration=ramp, limit=limit)
+        return _velocity_gains(memory)._replace(turning=1.0, speed=speed, acceleration=ramp, limit=limit)
 
     def _part(self, name: str, otherwise: str) -> float:
         memory = self.memory
@@ -252,3 +268,35 @@ def _kind(ramp: float, distance: float, speed: float, acceleration: float) -> in
     if not ramp:
         return _RECTANGULAR
     return _TRAPEZOIDAL if distance * acceleration > speed * speed else _TRIANGULAR
+
+
+def _position_gains(memory: Memory, motor: Motor) -> Command:
+    """Return the gains of position control: KP / 128, KI / 65536, KD / 16, KFF1 / 4 and KFF2 / 4.
+
+    Where the P gain was identified as another one, the others go with it [i].
+    """
+    table = memory.table
+    if table.items["position_p_gain"].initial is None or "goal_pwm" not in table.items:
+        d = critical_d(UNKNOWN_P, motor)
+        return Command(p_ccw=UNKNOWN_P, p_cw=UNKNOWN_P, d=d)
+    unit = 128 * motor.p_gain_duty or table.items["goal_pwm"].scale / table.rad_per_tick
+    p = memory["position_p_gain"] / 128 * unit
+    return Command(
+        p_ccw=p,
+        p_cw=p,
+        i=memory["position_i_gain"] / 65536 * unit / SAMPLING_S,
+        d=memory["position_d_gain"] / 16 * unit * SAMPLING_S,
+        feed_velocity=memory.get("feedforward_1st_gain") / 4 * unit * SAMPLING_S,
+        feed_acceleration=memory.get("feedforward_2nd_gain") / 4 * unit * SAMPLING_S**2,
+    )
+
+
+def _velocity_gains(memory: Memory) -> Command:
+    """Return the gains of velocity control, KVP / 128 and KVI / 65536, on the integrated speed."""
+    table = memory.table
+    if "goal_pwm" not in table.items or table.items["velocity_p_gain"].initial is None:
+        p, i = UNKNOWN_VELOCITY_P / table.max_speed, UNKNOWN_VELOCITY_I / table.max_speed
+        return Command(p_ccw=i, p_cw=i, d=p)
+    unit = table.items["goal_pwm"].scale / table.rad_s_per_tick
+    i = memory["velocity_i_gain"] / 65536 * unit / SAMPLING_S
+    return Command(p_ccw=i, p_cw=i, d=memory["velocity_p_gain"] / 128 * unit)

@@ -8,10 +8,10 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import ClassVar
 
 from dxlrun.simulation.configuration import Load
-from dxlrun.simulation.memory.cells import Memory
-from dxlrun.simulation.motion.command import LIMP, Command
+from dxlrun.simulation.motion.control_law import LIMP, Command
 from dxlrun.simulation.motion.mechanics import STEP_NS, Mechanics
 from dxlrun.simulation.motion.motor import Motor, motor_of
+from dxlrun.simulation.servo.memory import Memory
 
 Trajectory = tuple[float, float, float]
 """Goal, rad of the shaft, and the profile's speed, rad/s, and acceleration, rad/s^2."""

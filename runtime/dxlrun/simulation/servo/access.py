@@ -6,11 +6,12 @@ A write is refused as a whole [i].
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from enum import IntEnum, unique
+from types import MappingProxyType
 
-from dxlrun.dynamixel.control_table import ControlItem
-from dxlrun.simulation.memory.cells import Memory, Run, in_range
-from dxlrun.simulation.memory.choices import TORQUE_ENABLE_OF_P, choices
+from dxlrun.dynamixel.control_table import ControlItem, ControlTable
+from dxlrun.simulation.servo.memory import Memory, Run, in_range
 from dxlrun.simulation.wire.protocol1 import ErrorBit
 from dxlrun.simulation.wire.protocol2 import ErrorNumber
 
@@ -46,6 +47,9 @@ class OperatingMode(IntEnum):
     CURRENT_BASED_POSITION = 5
     PWM = 16
 
+
+TORQUE_ENABLE_OF_P = 512
+"""Address of Torque Enable on P, PRO(A), RH-P12-RN(A) and Y."""
 
 _POSITION = int(OperatingMode.POSITION)
 
@@ -99,7 +103,7 @@ class TorqueRules:
 
     def __init__(self, memory: Memory) -> None:
         self._memory = memory
-        self._choices = choices(memory.table)
+        self._choices = _choices(memory.table)
         self._signed = frozenset(item.name for item in memory.table.items.values() if item.signed)
         self._allowed: dict[str, tuple[int, int]] = {}
         """Least and greatest value that was allowed: what lies between them is allowed as well, until another
@@ -213,3 +217,38 @@ def _beyond_angle_limits(memory: Memory, name: str, wire: int) -> bool:
     if name != "goal_position" or "cw_angle_limit" not in memory or multi_turn_mode(memory):
         return False
     return not memory["cw_angle_limit"] <= wire <= memory["ccw_angle_limit"]
+
+
+def _choices(table: ControlTable) -> Mapping[str, frozenset[int]]:
+    """Return the items whose values the e-Manual lists one by one, with these; any other is out of range.
+
+    Sections "Operating Mode" and "Protocol Type" of the models' pages.
+    """
+    listed = {"operating_mode": _operating_modes(table), "protocol_type": _protocol_types(table)}
+    return MappingProxyType({name: frozenset(each) for name, each in listed.items() if name in table.items})
+
+
+def _operating_modes(table: ControlTable) -> tuple[int, ...]:
+    item = table.items.get("operating_mode")
+    if item is not None and item.minimum == 1:
+        return 1, 3  # L42-10-S300-R
+    if item is None or item.maximum == 3:
+        return 0, 1, 3  # Y
+    if item.maximum == 4:
+        return 0, 1, 3, 4  # PRO
+    if item.maximum == 5:
+        return 0, 5  # RH-P12-RN, RH-P12-RN(A)
+    if table.items["torque_enable"].address == TORQUE_ENABLE_OF_P:
+        return 0, 1, 3, 4, 16
+    return (0, 1, 3, 4, 5, 16) if "goal_current" in table.items else (1, 3, 4, 16)
+
+
+def _protocol_types(table: ControlTable) -> tuple[int, ...]:
+    item = table.items.get("protocol_type")
+    if item is None or item.minimum == item.maximum:
+        return (2,)  # Y
+    if item.maximum == 10:
+        return 2, 10  # P: Modbus-RTU
+    if item.maximum == 22:
+        return 2, 20, 21, 22  # X330, X335: S.BUS, iBUS, RC-PWM
+    return 1, 2

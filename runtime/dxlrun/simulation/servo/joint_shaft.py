@@ -7,11 +7,11 @@ from collections.abc import Callable, Mapping
 from typing import ClassVar
 
 from dxlrun.simulation.configuration import Load
-from dxlrun.simulation.memory.access import multi_turn_mode, wheel_mode
-from dxlrun.simulation.memory.cells import Memory
-from dxlrun.simulation.motion.command import FREE, Command
+from dxlrun.simulation.motion.control_law import FREE, Command
 from dxlrun.simulation.motion.mechanics import Mechanics
-from dxlrun.simulation.motion.shaft import Shaft, Trajectory, in_turn
+from dxlrun.simulation.servo.access import multi_turn_mode, wheel_mode
+from dxlrun.simulation.servo.memory import Memory
+from dxlrun.simulation.servo.shaft import Shaft, Trajectory, in_turn
 
 SLOPE_TICK = math.radians(300) / 1023
 """Unit of Compliance Slope (28), rad: 0x40 is about 18.8 degrees (manual of the RX-28, example 17)."""

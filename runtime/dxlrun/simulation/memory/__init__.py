@@ -1,1 +1,0 @@
-"""Memory: control tables of simulated servos, and what may be written to them."""

@@ -1,0 +1,70 @@
+"""Making the simulated servo of a model: which table, shaft and protocol it has."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from dxlrun.dynamixel.control_table import ControlTable, control_table, models_by_number
+from dxlrun.simulation.configuration import ServoConfig
+from dxlrun.simulation.motion.mechanics import Mechanics
+from dxlrun.simulation.servo.joint_shaft import JointShaft
+from dxlrun.simulation.servo.memory import Memory
+from dxlrun.simulation.servo.mode_shaft import ModeShaft
+from dxlrun.simulation.servo.protocol1_servo import Protocol1Servo
+from dxlrun.simulation.servo.protocol2_servo import Protocol2Servo
+from dxlrun.simulation.servo.simulated_servo import SimulatedServo, baud_item
+
+FIRMWARE = {1.0: 24, 2.0: 45}
+"""Firmware version of a simulated servo where its table asks for nothing newer; the manual gives none."""
+
+
+def make_servo(
+    config: ServoConfig,
+    baud_rate: int,
+    start_ns: int,
+    note: Callable[[str], None] | None = None,
+    protocol: float = 1.0,
+    *,
+    mechanics: Mechanics | None = None,
+) -> SimulatedServo:
+    """Return a servo that was just switched on, and listens at a rate, bit/s.
+
+    Raises LookupError for a model without a control table, ValueError for a rate that it does not have.
+    """
+    table = _table(config, protocol)
+    firmware = config.firmware
+    if firmware is None:
+        firmware = max(FIRMWARE[table.protocol], table.firmware, table.fast_sync_read_firmware or 0)
+    memory = Memory(table, firmware)
+    shaft = (ModeShaft if "operating_mode" in table.items else JointShaft)(
+        memory, mechanics or Mechanics(start_ns), config.load, config.position
+    )
+    servo = (Protocol1Servo if table.protocol == 1.0 else Protocol2Servo)(
+        memory, shaft, note or (lambda text: None)
+    )
+    memory["id"] = config.servo_id
+    memory[baud_item(memory)] = _baud_value(table, baud_rate)
+    memory["return_delay_time"] = min(254, round(config.return_delay_ns / 2000))
+    servo.power_up()
+    return servo
+
+
+def _table(config: ServoConfig, protocol: float) -> ControlTable:
+    """Return the table of a model, or the one that its number has with the firmware that was asked for."""
+    table = control_table(config.model, protocol)
+    if config.firmware is None:
+        return table
+    fitting = (
+        each for each in models_by_number(table.model_number, protocol) if each.firmware <= config.firmware
+    )
+    return next(fitting, table)
+
+
+def _baud_value(table: ControlTable, baud_rate: int) -> int:
+    for value, rate in table.baud_rates.items():
+        if rate == baud_rate:
+            return value
+    value = round(2_000_000 / baud_rate) - 1  # e-Manual, Baud Rate (4): 2,000,000 / (value + 1)
+    if table.protocol != 1.0 or not 0 <= value <= 254:
+        raise ValueError(f"the servo has no baud rate near {baud_rate} bit/s")
+    return value

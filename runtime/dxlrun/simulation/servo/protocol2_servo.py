@@ -1,0 +1,494 @@
+"""A simulated servo of Protocol 2.0: its instructions, Hardware Error Status with its latch, Bus Watchdog.
+
+The Y series tells of errors by Error Code instead, each of which takes the torque away. Not modelled of it:
+the time that switching its torque takes, its brake, and Controller State but for off, running and fault.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from collections.abc import Set as AbstractSet
+from enum import IntFlag, unique
+
+from dxlrun.dynamixel.control_table import ControlItem
+from dxlrun.simulation.servo.access import OperatingMode, TorqueRules, watchdog_expired
+from dxlrun.simulation.servo.memory import Memory, Run
+from dxlrun.simulation.servo.shaft import Shaft
+from dxlrun.simulation.servo.simulated_servo import Answer, SimulatedServo
+from dxlrun.simulation.wire.packets import BROADCAST, GroupRead, InstructionPacket, ReadEntry
+from dxlrun.simulation.wire.protocol2 import (
+    ALERT,
+    ErrorNumber,
+    Instruction,
+    ListedWrites,
+    bulk_writes,
+    sync_writes,
+)
+
+WATCHDOG_UNIT_NS = 20_000_000
+TORQUE_ON_AT_START, RAM_FROM_BACKUP = 0x01, 0x02
+"""Bits of Startup Configuration (60)."""
+TORQUE_ON_BY_GOAL = 0x08
+"""Bit of Drive Mode (10): a goal switches the torque on."""
+
+_GOALS = frozenset(("goal_pwm", "goal_current", "goal_velocity", "goal_position"))
+
+
+@unique
+class HardwareError(IntFlag):
+    """Hardware Error Status (70) and Shutdown (63)."""
+
+    VOLTAGE = 0x01
+    OVERHEATING = 0x04
+    ENCODER = 0x08
+    SHOCK = 0x10
+    OVERLOAD = 0x20
+
+
+_GAINS = (
+    "velocity_i_gain",
+    "velocity_p_gain",
+    "position_d_gain",
+    "position_i_gain",
+    "position_p_gain",
+    "feedforward_2nd_gain",
+    "feedforward_1st_gain",
+)
+_LIMITS = frozenset(("pwm_limit", "current_limit"))
+_PROFILE = ("profile_acceleration", "profile_velocity")
+_SPEAKS = (2, 20, 21, 22)
+"""Values of Protocol Type (13) with which a servo hears Protocol 2.0: without a remote control on the line it
+falls back from S.BUS, iBUS and RC-PWM (e-Manual, X330, Protocol Type (13))."""
+
+_XL320_BIT = {HardwareError.OVERLOAD: 0x01, HardwareError.OVERHEATING: 0x02, HardwareError.VOLTAGE: 0x04}
+"""The XL-320 orders them otherwise (e-Manual, XL-320, Shutdown (18))."""
+
+_ERROR_CODE = {HardwareError.OVERLOAD: 0x05, HardwareError.OVERHEATING: 0x04}
+_OVER_VOLTAGE, _LOW_VOLTAGE = 0x01, 0x02
+"""Error Code (153) of the Y series; the other codes are not modelled. Source: the maker's ROS package
+dynamixel_hardware_interface, ErrorCodeTable."""
+_HISTORY = 16
+_INVERTER_OFF, _RUNNING, _FAULT = 2, 5, 8
+"""Controller State (152) of the Y series."""
+SLOT_NS = 1_000_000
+"""What a servo's slot after a broadcast ping is longer than its reply [i]."""
+
+_PING, _SYNC_WRITE = int(Instruction.PING), int(Instruction.SYNC_WRITE)
+_PING_REPLY = 14
+_CLEAR_TURNS = bytes.fromhex("01 44 58 4c 22")
+_CLEAR_ERROR = bytes.fromhex("02 45 52 43 4c")
+_BACK_UP = bytes.fromhex("01 43 54 52 4c")
+_RESTORE = bytes.fromhex("02 43 54 52 4c")
+_CLEARS_SINCE = 42
+"""Firmware of MX (2.0) and X from which on Clear is known, and a reset of everything is not for all."""
+_KEPT_BY_RESET = {0xFF: (), 0x01: ("id",), 0x02: ("id", "baud_rate", "baud_rate_bus")}
+
+
+class Protocol2Servo(SimulatedServo):
+    """X, P, PRO and Y, the XL-320, grippers, and MX with firmware for Protocol 2.0."""
+
+    def __init__(self, memory: Memory, shaft: Shaft, note: Callable[[str], None]) -> None:
+        self._rules = TorqueRules(memory)
+        self._has_error_code = "error_code" in memory
+        """True for the Y series, which keeps its turns without power, too."""
+        self._alarm_item = "error_code" if self._has_error_code else "hardware_error_status"
+        self._backup: dict[str, int] = {}
+        self._shut_down = False
+        self._check_ns: int | None = None
+        """When the Bus Watchdog is checked next; None: never."""
+        super().__init__(memory, shaft, note)
+        memory.watch(("bus_watchdog", "torque_enable"), self._plan_watchdog)
+
+    def _identify(self) -> None:
+        super()._identify()
+        self._speaks = self.registers.get("protocol_type", 2) in _SPEAKS
+
+    # Instructions
+
+    def _replies_to(self, packet: InstructionPacket, own: bool) -> bool:
+        """Return whether a status packet follows (Status Return Level (68)); of broadcasts only to a ping.
+
+        Instructions to the Secondary ID get none, and a packet with a wrong CRC none, unless
+        `answers_damaged` asks for the manual's error.
+        """
+        if not own:
+            return packet.servo_id == BROADCAST and packet.intact and packet.instruction == _PING
+        if not packet.intact and not self.answers_damaged:
+            return False
+        if packet.intact and packet.instruction == _PING:
+            return True
+        level = 1 if packet.intact and packet.instruction == Instruction.READ else 2
+        return level <= self.registers["status_return_level"]
+
+    def _delay_of(self, packet: InstructionPacket) -> int:
+        """Return how long the servo waits: Return Delay Time, after a broadcast ping also for its slot."""
+        if packet.servo_id != BROADCAST or packet.instruction != _PING:
+            return self._delay_ns
+        byte_ns = 10_000_000_000 // self.baud_rate
+        return self._delay_ns + self.servo_id * (_PING_REPLY * byte_ns + SLOT_NS)
+
+    def _describe(self, error: int) -> str:
+        return repr(ErrorNumber(error))
+
+    def _obey(self, packet: InstructionPacket) -> Answer:
+        """Return error number and parameters of the reply."""
+        if not packet.intact:
+            return ErrorNumber.CRC, b""
+        parameters = packet.parameters
+        if packet.instruction == _SYNC_WRITE and packet.servo_id == BROADCAST:  # the most frequent by far
+            return self._write_listed(sync_writes(parameters)), b""
+        match packet.instruction:
+            case Instruction.PING:
+                memory = self.registers
+                answer: Answer = 0, memory.data("model_number") + memory.data("firmware_version")
+            case Instruction.READ if len(parameters) == 4:
+                answer = self._answer_read(_word(parameters, 0), _word(parameters, 2))
+            case Instruction.WRITE if len(parameters) >= 3:
+                answer = self._write_to(packet.servo_id, _word(parameters, 0), parameters[2:]), b""
+            case Instruction.REG_WRITE if len(parameters) >= 3:
+                answer = self._register_to(packet.servo_id, _word(parameters, 0), parameters[2:]), b""
+            case Instruction.ACTION if self._registered is not None:
+                answer = self._act(), b""
+            case Instruction.BULK_WRITE if packet.servo_id == BROADCAST:
+                answer = self._write_listed(bulk_writes(parameters)), b""
+            case _:
+                answer = self._manage(packet), b""
+        return answer
+
+    def _answer_group_read(self, read: GroupRead, entry: ReadEntry) -> Answer | None:
+        """Return its part of a sync or bulk read; None: it does not reply.
+
+        The form of a fast read has no room for an error without data [i].
+        """
+        registers = self.registers
+        if registers["status_return_level"] < 1:
+            return None
+        answer = self._answer_read(entry.address, entry.length)
+        if read.fast:
+            first = registers.table.fast_sync_read_firmware
+            if answer[0] or first is None or registers["firmware_version"] < first:
+                self.note(f"servo {self.servo_id} does not reply to the fast read {read.instruction:#04x}")
+                return None
+        return answer
+
+    def _answer_read(self, address: int, length: int) -> Answer:
+        """Return data, or an access error where no item is; cells between items are 0 [i]."""
+        data = self._read(address, length)
+        if data is None or not self.registers.touches(address, length):
+            return ErrorNumber.ACCESS, b""
+        return 0, data
+
+    def _write_to(self, servo_id: int, address: int, data: bytes) -> int:
+        """Write what an instruction to an ID brought; through the Secondary ID it cannot reach the EEPROM."""
+        if servo_id == self.secondary_id and self.registers.reaches_eeprom(address, data):
+            return ErrorNumber.ACCESS
+        return self._write(address, data)
+
+    def _register_to(self, servo_id: int, address: int, data: bytes) -> int:
+        if servo_id == self.secondary_id and self.registers.reaches_eeprom(address, data):
+            return ErrorNumber.ACCESS
+        return self._register(address, data)
+
+    def _write_listed(self, writes: ListedWrites | None) -> int:
+        """Do what a list says for this servo, in its order; a listed Secondary ID counts as well [i]."""
+        if writes is None:
+            return ErrorNumber.INSTRUCTION  # and nothing of it is done [i]
+        error, secondary = 0, self.secondary_id
+        listed = writes.get(self.servo_id, ())
+        if secondary is not None and secondary in writes:
+            listed = sorted((*listed, *writes[secondary]))
+        for _, servo_id, address, data in listed:
+            error = self._write_to(servo_id, address, data)
+        return error
+
+    def _manage(self, packet: InstructionPacket) -> int:
+        """Obey what is not reading or writing; an instruction error for what it does not know.
+
+        To its Secondary ID a servo does nothing of it that would change the EEPROM [i].
+        """
+        error: int = ErrorNumber.INSTRUCTION
+        match packet.instruction, packet.parameters:
+            case Instruction.REBOOT, b"":
+                self.reboot()
+                error = 0
+            case Instruction.FACTORY_RESET, parameters if len(parameters) == 1:
+                error = self._reset(parameters[0], packet.servo_id)
+            case Instruction.CLEAR, parameters if parameters == _CLEAR_TURNS and self._clears:
+                error = self.clear_turns()
+            case Instruction.CLEAR, parameters if parameters == _CLEAR_ERROR and self._has_error_code:
+                error = self.clear_error()
+            case Instruction.CONTROL_TABLE_BACKUP, parameters if parameters == _BACK_UP and self.keeps_backup:
+                error = self.back_up()
+            case Instruction.CONTROL_TABLE_BACKUP, parameters if parameters == _RESTORE and self.keeps_backup:
+                shadow = packet.servo_id == self.secondary_id
+                error = ErrorNumber.ACCESS if shadow else self.restore_backup()
+        return error
+
+    @property
+    def _clears(self) -> bool:
+        """True when it knows Clear: MX (2.0) and X since firmware 42; P and Y [i], not the XL-320."""
+        registers = self.registers
+        of_x = registers.table.items["torque_enable"].address == 64
+        old = of_x and registers["firmware_version"] < _CLEARS_SINCE
+        return "operating_mode" in registers and not old
+
+    def _reset(self, option: int, servo_id: int) -> int:
+        if servo_id == self.secondary_id:
+            return ErrorNumber.ACCESS
+        kept = _KEPT_BY_RESET.get(option)
+        # e-Manual, Factory Reset: a reset of everything "will NOT be activated" for all
+        if kept is None or (option == 0xFF and servo_id == BROADCAST and self._clears):
+            return ErrorNumber.INSTRUCTION
+        self.registers.restore_factory_values(keep=kept)
+        self.reboot()
+        return 0
+
+    # Bus Watchdog: its time begins again with each instruction to the servo; whether those to others count
+    # the manual does not mention [?]
+
+    def _plan_watchdog(self) -> None:
+        """Check the Bus Watchdog when its time runs out, or before."""
+        units = self._watchdog_units()
+        end_ns = self._received_ns + units * WATCHDOG_UNIT_NS
+        if units and (self._check_ns is None or end_ns < self._check_ns):
+            self._check_ns = end_ns
+            self.shaft.mechanics.call_at(end_ns, lambda: self._check_watchdog(end_ns))
+
+    def _watchdog_units(self) -> int:
+        """Return for how long the Bus Watchdog waits, in its unit; 0 while it does not."""
+        registers = self.registers
+        units = registers.get("bus_watchdog")
+        return units if units and registers.get("torque_enable") and not watchdog_expired(registers) else 0
+
+    def _check_watchdog(self, at_ns: int) -> None:
+        """Stop where the Bus Watchdog's time has run out; else check again when it does."""
+        if at_ns != self._check_ns:
+            return  # its time was made shorter since
+        self._check_ns = None
+        units = self._watchdog_units()
+        if not units or self.shaft.mechanics.grid_ns < self._received_ns + units * WATCHDOG_UNIT_NS:
+            self._plan_watchdog()
+            return
+        self.note(f"servo {self.servo_id}: bus watchdog after {units * 20} ms")
+        for name in _PROFILE:  # e-Manual, X series, Bus Watchdog (98), step 4 of the example
+            if name in self.registers:
+                self._set(name, 0)
+        self._set("bus_watchdog", -1)
+
+    # Protection
+
+    def _refusal(self, run: Run) -> int:
+        """Return the error number of a write, 0 when it is allowed.
+
+        After a shutdown the torque stays off until a reboot: a result fail [i].
+        """
+        error = self._rules.refusal(run)
+        if not error and self._shut_down and run.after.get("torque_enable"):
+            return ErrorNumber.RESULT_FAIL
+        return error
+
+    def _state(self) -> int:
+        """Return the alert bit while Hardware Error Status or Error Code shows something."""
+        return ALERT if self.registers.get(self._alarm_item) else 0
+
+    def protect(self, refused: int = 0) -> None:
+        """Show what is wrong, and switch the torque off until a reboot when Shutdown lists it."""
+        registers = self.registers
+        wrong = self._wrong()
+        if self._has_error_code:
+            self._show_error_code(wrong)
+        latched = registers.get("hardware_error_status") if self._shut_down else 0
+        shown = sum(_XL320_BIT[each] if "control_mode" in registers else each for each in wrong)
+        registers.show("hardware_error_status", shown | latched)
+        listed = bool(wrong) if self._has_error_code else shown & registers.get("shutdown")
+        if listed and not self._shut_down:
+            self._shut_down = True
+            named = f"error code {registers['error_code']:#04x}" if self._has_error_code else f"{shown:#04x}"
+            self.note(f"servo {self.servo_id}: shutdown, torque off: hardware error status {named}")
+            registers["torque_enable"] = 0
+            self.shaft.plan(("torque_enable",))
+        self._show_controller_state()
+
+    def reboot(self) -> None:
+        """Start again; the servo is deaf until it has."""
+        self.note(f"servo {self.servo_id}: reboot")
+        self.power_up()
+        self._boot_until(self.shaft.now_ns + self.boot_ns)
+
+    def power_up(self) -> None:
+        """Start: RAM is as it is at power-up, and so is the angle, but for the turns of the Y series."""
+        angle = self.shaft.angle
+        super().power_up()
+        if self._has_error_code:
+            self._rest_at(angle)
+
+    def clear_turns(self) -> int:
+        """Bring Present Position back into one turn; return the error: it must not move.
+
+        The Y series wants the torque off as well, and reboots. The goal is then the position [i].
+        """
+        if self.shaft.moving or (self._has_error_code and self.registers.get("torque_enable")):
+            return ErrorNumber.RESULT_FAIL
+        self._rest_at(self.shaft.within_a_turn(self.shaft.angle))
+        if self._has_error_code:
+            self.reboot()
+        return 0
+
+    def clear_error(self) -> int:
+        """Forget Error Code; return the error: what it tells of must be over (e-Manual, Y series)."""
+        if self._wrong():
+            return ErrorNumber.RESULT_FAIL
+        self.registers["error_code"] = 0
+        self.registers.reset(f"error_code_history_{number}" for number in range(1, _HISTORY + 1))
+        self._shut_down = False
+        self._show_controller_state()
+        return 0
+
+    @property
+    def keeps_backup(self) -> bool:
+        """True when it knows Control Table Backup: it then has Backup Ready.
+
+        e-Manual, Protocol 2.0, Control Table Backup (0x20), and the models' pages, Backup Ready.
+        """
+        return "backup_ready" in self.registers
+
+    def back_up(self) -> int:
+        """Keep EEPROM, gains, profile and indirect addresses; return the error: the torque must be off.
+
+        P keeps no indirect addresses; so does Y [i].
+        """
+        registers = self.registers
+        if registers.get("torque_enable"):
+            return ErrorNumber.RESULT_FAIL
+        self._backup = {
+            name: registers[name] for name, item in registers.table.items.items() if _is_kept(name, item)
+        }
+        registers.show("backup_ready", 1)
+        return 0
+
+    def restore_backup(self) -> int:
+        """Take back the EEPROM that was kept, and reboot; return the error: torque off, and a backup."""
+        registers = self.registers
+        if registers.get("torque_enable") or not self._backup:
+            return ErrorNumber.RESULT_FAIL
+        for name, wire in self._backup.items():
+            if registers.table.items[name].area == "EEPROM":
+                registers[name] = wire
+        self.reboot()
+        return 0
+
+    def _rest_at(self, angle: float) -> None:
+        self.shaft.rest_at(angle)
+        self.registers["goal_position"] = self.shaft.position_tick(angle)
+        self.shaft.plan(("goal_position",))
+
+    def _wrong(self) -> tuple[HardwareError, ...]:
+        registers = self.registers
+        wrong = [HardwareError.OVERLOAD] if self.overload else []
+        if "max_voltage_limit" in registers:
+            volts = round(self.voltage * 10)
+            if not registers["min_voltage_limit"] <= volts <= registers["max_voltage_limit"]:
+                wrong.append(HardwareError.VOLTAGE)
+        limit = "motor_temperature_limit" if self._has_error_code else "temperature_limit"
+        if round(self.temperature) > registers.get(limit, 255):
+            wrong.append(HardwareError.OVERHEATING)
+        return tuple(wrong)
+
+    def _show_error_code(self, wrong: tuple[HardwareError, ...]) -> None:
+        """Show the newest error; the same one does not count twice, and the history holds the last 16."""
+        registers = self.registers
+        low = round(self.voltage * 10) < registers["min_voltage_limit"]
+        codes = [_ERROR_CODE.get(each, _LOW_VOLTAGE if low else _OVER_VOLTAGE) for each in wrong]
+        names = [f"error_code_history_{number}" for number in range(1, _HISTORY + 1)]
+        history = [registers[name] for name in names if registers[name]]
+        for code in codes:
+            if code not in history:
+                history.append(code)
+                registers["error_code"] = code
+        for name, code in zip(names, history[-_HISTORY:], strict=False):
+            registers[name] = code
+
+    def _show_controller_state(self) -> None:
+        registers = self.registers
+        state = _RUNNING if registers.get("torque_enable") else _INVERTER_OFF
+        registers.show("controller_state", _FAULT if self._shut_down else state)
+
+    def _start_up(self) -> None:
+        registers = self.registers
+        self._shut_down = False
+        self._started_ns = self._received_ns = self.shaft.now_ns
+        if "torque_limit" in registers and "max_torque" in registers:
+            registers["torque_limit"] = registers["max_torque"]
+        registers.show("backup_ready", bool(self._backup))
+        self._reset_goals()
+        configuration = registers.get("startup_configuration")
+        if configuration & RAM_FROM_BACKUP:
+            for name, wire in self._backup.items():
+                if registers.table.items[name].area == "RAM":
+                    registers[name] = wire
+        if configuration & TORQUE_ON_AT_START:
+            registers["torque_enable"] = 1
+        self.shaft.plan(("torque_enable",))
+
+    def _after_write(self, names: AbstractSet[str]) -> None:
+        registers = self.registers
+        if "operating_mode" in names:
+            self._change_mode()
+        elif not _LIMITS.isdisjoint(names):
+            self._reset_goals()
+        if "torque_enable" in names and registers["torque_enable"]:
+            self._find_turn()
+        if "protocol_type" in names and registers["protocol_type"] not in _SPEAKS:
+            self.note(f"servo {self.servo_id} left Protocol 2.0: protocol type {registers['protocol_type']}")
+        by_goal = registers.get("drive_mode") & TORQUE_ON_BY_GOAL
+        if by_goal and not _GOALS.isdisjoint(names) and "torque_enable" not in names and not self._shut_down:
+            registers["torque_enable"] = 1
+        if self._has_error_code:
+            self._show_controller_state()
+
+    def _change_mode(self) -> None:
+        """Begin with another operating mode as the manual says (e-Manual, X series, Operating Mode (11)).
+
+        Gains, profile and the goals that limit are reset; position control knows one turn only.
+        """
+        registers = self.registers
+        registers.reset((*_GAINS, *_PROFILE))
+        self._find_turn()
+        registers["goal_position"] = self.shaft.position_tick(self.shaft.angle)
+        registers.show("goal_velocity", 0)
+        self._reset_goals()
+
+    def _find_turn(self) -> None:
+        """Bring Present Position into the turn that position control knows.
+
+        e-Manual, X series, Torque Enable (64): it is reset when mode or torque change.
+        """
+        shaft = self.shaft
+        if self.registers.get("operating_mode") != OperatingMode.POSITION or self._has_error_code:
+            return
+        inside = shaft.within_a_turn(shaft.angle)
+        if abs(inside - shaft.angle) > math.pi:
+            shaft.rest_at(inside)
+
+    def _reset_goals(self) -> None:
+        """Set Goal PWM and Goal Current to their limits; to 0 in the mode that obeys them [i]."""
+        registers = self.registers
+        mode = registers.get("operating_mode")
+        for goal, limit, obeyed in (
+            ("goal_pwm", "pwm_limit", OperatingMode.PWM),
+            ("goal_current", "current_limit", OperatingMode.CURRENT),
+        ):
+            if limit in registers:
+                registers.show(goal, 0 if mode == obeyed else registers[limit])
+
+
+def _is_kept(name: str, item: ControlItem) -> bool:
+    """Return whether a backup holds an item (e-Manual, Protocol 2.0, Control Table Backup (0x20))."""
+    if name.startswith("indirect_address_"):
+        return item.area == "RAM"
+    return item.access == "RW" and (item.area == "EEPROM" or name in _GAINS or name in _PROFILE)
+
+
+def _word(data: bytes, index: int) -> int:
+    return int.from_bytes(data[index : index + 2], "little")
