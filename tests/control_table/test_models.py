@@ -6,7 +6,7 @@ import pytest
 
 import dxlrun.dynamixel.control_table.models
 from dxlrun.dynamixel.control_table import add_control_table, control_table, model_names, models_by_number
-from dxlrun.dynamixel.control_table.protocol1 import resolve
+from dxlrun.dynamixel.control_table.sources import resolve
 
 MINE = {'model = "AX-12A"': 'model = "Mine-1"', 'aliases = ["AX-12", "AX-12+"]': "aliases = []"}
 

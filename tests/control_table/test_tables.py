@@ -73,7 +73,6 @@ def test_what_the_loop_needs_is_there_and_of_the_right_kind(table: ControlTable)
 
 @every_table
 def test_the_units_are_those_of_a_servo(table: ControlTable) -> None:
-    assert table.zero_tick == 0
     assert table.min_tick <= 0 < table.max_tick
     travel = math.degrees((table.max_tick - table.min_tick) * table.rad_per_tick)
     assert 100 < travel < 360.01

@@ -5,9 +5,9 @@ import pytest
 from dxlrun.cli.servos.servo_verbs import VERBS, Asked
 from dxlrun.clock import VirtualClock
 from dxlrun.dynamixel.control_table import all_tables
-from dxlrun.dynamixel.tools import changing, servo_backup
+from dxlrun.dynamixel.tools import one_servo, servo_backup
 from dxlrun.dynamixel.tools.one_servo import OneServo
-from dxlrun.dynamixel.tools.scanning import Wish, find
+from dxlrun.dynamixel.tools.scanning import Search, find
 from dxlrun.dynamixel.tools.tool_line import ToolLine
 from dxlrun.dynamixel.wire.protocol2 import Reset
 from dxlrun.errors import ServoFault
@@ -39,7 +39,7 @@ class Rig:
         servos = (ServoConfig(1, model, 2.0), *(ServoConfig(each, model, 1.5) for each in others))
         self.line = VirtualLine(servos, protocol, cannot)
         self.tool = ToolLine(self.line)
-        (found,) = find(self.tool, 1, Wish((protocol,), (RATE,)))
+        (found,) = find(self.tool, 1, Search((protocol,), (RATE,)))
         self.one = OneServo(self.tool, found)
         self.start = len(self.line.ledger.entries)
 
@@ -63,10 +63,10 @@ def test_a_change_of_the_address_that_did_not_happen_is_noticed():
     rig = Rig()
     lose_the_write(rig)
     with pytest.raises(ServoFault, match=r"was given ID \(7\) = 5, but still answers under its old one"):
-        changing.change_id(rig.one, 5)
+        one_servo.change_id(rig.one, 5)
     lose_the_write(rig)
     with pytest.raises(ServoFault, match=r"was given Baud Rate \(8\) = 3, but still answers at 57600 bit/s"):
-        changing.change_rate(rig.one, 1_000_000)
+        one_servo.change_rate(rig.one, 1_000_000)
     assert rig.one.read(["id", "baud_rate"]) == {"id": 1, "baud_rate": 1}
 
 
@@ -80,8 +80,8 @@ def test_another_servo_at_the_new_address_is_not_taken_for_it():
         rig.line.bus.servos[0].silence()
 
     rig.line.bus.after(5, swap)
-    with pytest.raises(ServoFault, match="who answers there is model number 1060, not 1020"):
-        changing.change_id(rig.one, 5)
+    with pytest.raises(ServoFault, match="the servo there is model number 1060, not 1020"):
+        one_servo.change_id(rig.one, 5)
 
 
 PROTOCOLS = [("AX-12A", 1.0), ("MX-64", 1.0), ("XM430-W350", 2.0), ("XL-320", 2.0)]
@@ -90,7 +90,7 @@ PROTOCOLS = [("AX-12A", 1.0), ("MX-64", 1.0), ("XM430-W350", 2.0), ("XL-320", 2.
 @pytest.mark.parametrize(("model", "protocol"), PROTOCOLS)
 def test_a_servo_gets_another_id_and_is_looked_for_there(model, protocol):
     rig = Rig(model, protocol)
-    assert changing.change_id(rig.one, 42) == "has ID 42; it had 1"
+    assert one_servo.change_id(rig.one, 42) == "has ID 42; it had 1"
     assert rig.servo.registers["id"] == 42
     assert rig.one.read(["id"]) == {"id": 42}
     assert rig.instructions().count(3) == 1  # EEPROM wears
@@ -98,21 +98,21 @@ def test_a_servo_gets_another_id_and_is_looked_for_there(model, protocol):
 
 def test_an_id_that_somebody_has_is_not_given():
     rig = Rig(others=(2,))
-    with pytest.raises(ServoFault, match="somebody else has ID 2 at 57600 bit/s; nothing was changed"):
-        changing.change_id(rig.one, 2)
+    with pytest.raises(ServoFault, match="another servo has ID 2 at 57600 bit/s; nothing was changed"):
+        one_servo.change_id(rig.one, 2)
     assert 3 not in rig.instructions()
 
 
 def test_a_lost_acknowledgement_of_an_id_decides_nothing():
     rig = Rig()
     rig.servo.poke("status_return_level", 1)
-    assert changing.change_id(rig.one, 5) == "has ID 5; it had 1"
+    assert one_servo.change_id(rig.one, 5) == "has ID 5; it had 1"
 
 
 @pytest.mark.parametrize(("model", "protocol"), PROTOCOLS)
 def test_a_servo_talks_at_another_rate(model, protocol):
     rig = Rig(model, protocol)
-    assert changing.change_rate(rig.one, 1_000_000) == "talks at 1000000 bit/s; it did at 57600"
+    assert one_servo.change_rate(rig.one, 1_000_000) == "talks at 1000000 bit/s; it did at 57600"
     assert rig.servo.baud_rate == 1_000_000
     assert rig.one.baud_rate == 1_000_000
 
@@ -121,7 +121,7 @@ def test_a_servo_talks_at_another_rate(model, protocol):
 def test_every_rate_of_the_table_can_be_set(model, protocol):
     rig = Rig(model, protocol)
     for rate in rig.one.table.baud_rates.values():
-        changing.change_rate(rig.one, rate)
+        one_servo.change_rate(rig.one, rate)
         assert rig.servo.baud_rate == pytest.approx(rate, rel=0.03)
 
 
@@ -130,11 +130,11 @@ def test_a_rate_is_not_given_that_the_adapter_or_the_model_does_not_have_or_some
     rig.line.bus.servos[1].poke("baud_rate", 3)
     rig.line.bus.servos[1].poke("id", 1)
     with pytest.raises(ServoFault, match="cannot run at 4500000 bit/s; nothing was changed"):
-        changing.change_rate(rig.one, 4_500_000)
+        one_servo.change_rate(rig.one, 4_500_000)
     with pytest.raises(LookupError):
-        changing.change_rate(rig.one, 12_345)
-    with pytest.raises(ServoFault, match="somebody else has ID 1 at 1000000 bit/s"):
-        changing.change_rate(rig.one, 1_000_000)
+        one_servo.change_rate(rig.one, 12_345)
+    with pytest.raises(ServoFault, match="another servo has ID 1 at 1000000 bit/s"):
+        one_servo.change_rate(rig.one, 1_000_000)
     assert 3 not in rig.instructions()
     assert rig.one.read(["id"]) == {"id": 1}  # and it is still talked to at its own
 
@@ -142,11 +142,11 @@ def test_a_rate_is_not_given_that_the_adapter_or_the_model_does_not_have_or_some
 @pytest.mark.parametrize(
     "change",
     [
-        lambda one: changing.change_id(one, 7),
-        lambda one: changing.change_rate(one, 1_000_000),
-        lambda one: changing.factory_reset(one, Reset.ALL),
+        lambda one: one_servo.change_id(one, 7),
+        lambda one: one_servo.change_rate(one, 1_000_000),
+        lambda one: one_servo.factory_reset(one, Reset.ALL),
         lambda one: one.write([one.register("return_delay_time", 0)]),
-        changing.back_up,
+        one_servo.back_up,
     ],
 )
 def test_nothing_in_the_eeprom_changes_while_the_servo_holds_torque(change):
@@ -161,7 +161,7 @@ def test_a_locked_eeprom_is_named():
     rig = Rig("AX-12A", 1.0)
     rig.servo.poke("lock", 1)
     with pytest.raises(ServoFault, match=r"Lock \(47\) is 1"):
-        changing.change_id(rig.one, 7)
+        one_servo.change_id(rig.one, 7)
     assert 3 not in rig.instructions()
 
 
@@ -177,7 +177,7 @@ def test_a_reboot_is_waited_for():
     rig = Rig()
     rig.servo.boot_ns = 1_500_000_000
     rig.servo.poke("position_p_gain", 3)
-    assert changing.reboot(rig.one) == "started anew, and holds no torque"
+    assert one_servo.reboot(rig.one) == "started anew, and holds no torque"
     assert rig.servo.registers["position_p_gain"] == 800
 
 
@@ -185,7 +185,7 @@ def test_a_servo_that_does_not_come_back_is_missed():
     rig = Rig()
     rig.servo.boot_ns = 60_000_000_000
     with pytest.raises(ServoFault, match="does not answer since 5 s; look for it: dxlrun scan"):
-        changing.reboot(rig.one)
+        one_servo.reboot(rig.one)
 
 
 def test_a_reboot_that_did_not_happen_is_noticed():
@@ -194,15 +194,15 @@ def test_a_reboot_that_did_not_happen_is_noticed():
     rig.line.bus.advance(rig.line.clock.now_ns())
     rig.line.bus.alter_next_instruction("lost", lambda data: b"")
     with pytest.raises(ServoFault, match="did not start anew: its Realtime Tick is"):
-        changing.reboot(rig.one)
+        one_servo.reboot(rig.one)
 
 
 def test_protocol_1_has_no_reboot_and_no_backup_of_its_own():
     rig = Rig("AX-12A", 1.0)
     with pytest.raises(ServoFault, match="knows no reboot"):
-        changing.reboot(rig.one)
+        one_servo.reboot(rig.one)
     with pytest.raises(ServoFault, match="no backup of their own"):
-        changing.back_up(rig.one)
+        one_servo.back_up(rig.one)
 
 
 @pytest.mark.parametrize(
@@ -216,9 +216,9 @@ def test_protocol_1_has_no_reboot_and_no_backup_of_its_own():
 def test_a_factory_reset_keeps_what_it_shall(keep, address):
     rig = Rig()
     rig.one.write([rig.one.register("return_delay_time", 7)])
-    changing.change_id(rig.one, 9)
-    changing.change_rate(rig.one, 1_000_000)
-    said = changing.factory_reset(rig.one, keep)
+    one_servo.change_id(rig.one, 9)
+    one_servo.change_rate(rig.one, 1_000_000)
+    said = one_servo.factory_reset(rig.one, keep)
     assert said == f"has the factory's values, ID {address[0]} at {address[1]} bit/s"
     assert (rig.servo.registers["id"], rig.servo.baud_rate) == address
     assert rig.servo.registers["return_delay_time"] == 250
@@ -226,31 +226,31 @@ def test_a_factory_reset_keeps_what_it_shall(keep, address):
 
 def test_a_factory_reset_of_protocol_1_keeps_nothing():
     rig = Rig("AX-12A", 1.0)
-    changing.change_id(rig.one, 9)
-    assert changing.factory_reset(rig.one, Reset.ALL) == "has the factory's values, ID 1 at 1000000 bit/s"
+    one_servo.change_id(rig.one, 9)
+    assert one_servo.factory_reset(rig.one, Reset.ALL) == "has the factory's values, ID 1 at 1000000 bit/s"
 
 
 def test_a_factory_reset_beside_a_servo_as_shipped_is_refused():
     rig = Rig(others=(2,))
-    changing.change_id(rig.one, 9)
+    one_servo.change_id(rig.one, 9)
     rig.line.bus.servos[1].poke("id", 1)
-    with pytest.raises(ServoFault, match="somebody else has ID 1"):
-        changing.factory_reset(rig.one, Reset.ALL)
+    with pytest.raises(ServoFault, match="another servo has ID 1"):
+        one_servo.factory_reset(rig.one, Reset.ALL)
     assert 6 not in rig.instructions()
 
 
 def test_a_servo_keeps_and_takes_back_its_own_backup():
     rig = Rig()
     rig.one.write([rig.one.register("return_delay_time", 7)])
-    assert changing.back_up(rig.one) == "stored its control table in its own backup"
+    assert one_servo.back_up(rig.one) == "stored its control table in its own backup"
     rig.one.write([rig.one.register("return_delay_time", 9)])
-    changing.take_back(rig.one)
+    one_servo.take_back(rig.one)
     assert rig.servo.registers["return_delay_time"] == 7
 
 
 def test_a_servo_without_a_backup_refuses_to_take_it_back():
     with pytest.raises(ServoFault, match="refuses the restoring: result fail"):
-        changing.take_back(Rig().one)
+        one_servo.take_back(Rig().one)
 
 
 @pytest.mark.parametrize(("model", "protocol"), PROTOCOLS)

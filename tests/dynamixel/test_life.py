@@ -9,7 +9,14 @@ import pytest
 from dxlrun.dynamixel.exchange.cyclic_reads import CyclicReads
 from dxlrun.dynamixel.exchange.samples import Samples
 from dxlrun.dynamixel.servo import life
-from dxlrun.dynamixel.servo.life import GETS_GOALS, TRANSITIONS, Event, IllegalTransition, Life, State
+from dxlrun.dynamixel.servo.life import (
+    GETS_GOALS,
+    TRANSITIONS,
+    IllegalTransition,
+    Life,
+    ServoEvent,
+    ServoState,
+)
 from dxlrun.dynamixel.servo.watchdog import RETURN_SPEED
 from dxlrun.interfaces import States
 from dxlrun.mode import Mode
@@ -28,8 +35,8 @@ def one(make_plan, make_rig):
 
 def put(servo, state):
     servo.states[0] = state
-    servo.losses[0] = life.Loss(True, False, False, False, 0) if state is State.OFFLINE else None
-    servo.reads.away[0] = state is State.OFFLINE
+    servo.losses[0] = life.Loss(True, False, False, False, 0) if state is ServoState.OFFLINE else None
+    servo.reads.away[0] = state is ServoState.OFFLINE
 
 
 @pytest.mark.parametrize(("state", "event"), sorted(LEGAL, key=str))
@@ -38,35 +45,37 @@ def test_what_follows_from_a_state_is_derived_at_each_transition(one, state, eve
     after = one.on(0, event)
     assert after is TRANSITIONS[state][event] is one.states[0]
     assert one.torqued[0] == (after in GETS_GOALS)
-    assert one.reads.away[0] == (after is State.OFFLINE)
-    slow = after in (State.STOPPED, State.RETURNING, State.OFFLINE)
+    assert one.reads.away[0] == (after is ServoState.OFFLINE)
+    slow = after in (ServoState.STOPPED, ServoState.RETURNING, ServoState.OFFLINE)
     np.testing.assert_equal(one.ceiling[0], RETURN_SPEED if slow else np.nan)
 
 
-@pytest.mark.parametrize(("state", "event"), sorted(set(itertools.product(State, Event)) - LEGAL, key=str))
+@pytest.mark.parametrize(
+    ("state", "event"), sorted(set(itertools.product(ServoState, ServoEvent)) - LEGAL, key=str)
+)
 def test_an_event_that_a_state_does_not_have_is_refused_and_changes_nothing(one, state, event):
     put(one, state)
     with pytest.raises(IllegalTransition, match=f"main_1_joint .* is {state.value}, where {event.value}"):
         one.on(0, event)
     assert one.states[0] is state
-    assert one.reads.away[0] == (state is State.OFFLINE)
+    assert one.reads.away[0] == (state is ServoState.OFFLINE)
 
 
 def test_no_state_gets_goals_but_by_torque_that_was_read():
     """A goal may switch torque on: only torque enable = 1, read after the last doubt, leads to goals."""
     for (state, event), after in ((pair, TRANSITIONS[pair[0]][pair[1]]) for pair in LEGAL):
         if after in GETS_GOALS and state not in GETS_GOALS:
-            assert event is Event.TORQUE_ON
+            assert event is ServoEvent.TORQUE_ON
             assert state in life.IN_DOUBT
 
 
 def test_a_latched_servo_gets_no_goals_on_any_way_but_a_return():
-    reached, new = {State.LATCHED}, {State.LATCHED}
+    reached, new = {ServoState.LATCHED}, {ServoState.LATCHED}
     while new:
         found = {TRANSITIONS[state][event] for state in new for event in TRANSITIONS[state]}
-        new = {state for state in found - reached if state is not State.OFFLINE}
+        new = {state for state in found - reached if state is not ServoState.OFFLINE}
         reached |= found
-    assert reached == {State.LATCHED, State.OFFLINE}
+    assert reached == {ServoState.LATCHED, ServoState.OFFLINE}
 
 
 @pytest.fixture
@@ -107,29 +116,29 @@ class Story:
 
     def lose(self):
         self.servo.silence()
-        self.until(State.OFFLINE)
+        self.until(ServoState.OFFLINE)
 
     def come_to(self, state):
         """Bring the servo into a state by what happens to a real one."""
-        if state is State.LIMP and self.plan.protocol == 2.0:
+        if state is ServoState.LIMP and self.plan.protocol == 2.0:
             return  # not started yet
         self.rig.hardware.start()
-        if state is State.LIMP:
+        if state is ServoState.LIMP:
             self.lose()
             self.servo.reset()
             self.servo.silence(False)
-        elif state is State.LATCHED:
+        elif state is ServoState.LATCHED:
             self.rig.hardware.let_go([1])
             for _ in range(5):
                 self.rig.cycle()
-        elif state is State.OFFLINE:
+        elif state is ServoState.OFFLINE:
             self.lose()
-        elif state in (State.RETURNING, State.STOPPED):
+        elif state in (ServoState.RETURNING, ServoState.STOPPED):
             self.rig.goals.position[1] += 1.0
             self.lose()
             self.servo.silence(False)
-            self.until(State.RETURNING)
-        if state in (State.HOLDING, State.STOPPED):
+            self.until(ServoState.RETURNING)
+        if state in (ServoState.HOLDING, ServoState.STOPPED):
             self.miss()
         self.until(state)
 
@@ -144,7 +153,7 @@ class Story:
 
     def torque_on(self):
         self.servo.silence(False)
-        self.until(State.TORQUED, State.RETURNING)
+        self.until(ServoState.TORQUED, ServoState.RETURNING)
 
     def torque_off(self):
         """A servo of Protocol 1.0 shuts down: its torque enable stays 1, its Torque Limit is 0."""
@@ -154,31 +163,31 @@ class Story:
             self.rig.cycle()
 
     def doubt(self):
-        if self.state is State.OFFLINE:
+        if self.state is ServoState.OFFLINE:
             self.rig.hardware.set_modes(np.array([0, Mode.VELOCITY, 0], np.uint8))
         for _ in range(30):
             self.miss()
 
     def watchdog(self):
-        if self.state is State.LIMP:
+        if self.state is ServoState.LIMP:
             self.rig.hardware.start()
             self.lose()
             self.servo.reset()
             self.servo.silence(False)
-            self.until(State.LIMP)
+            self.until(ServoState.LIMP)
         self.rig.clock.wait_until(self.rig.clock.now_ns() + 300_000_000)
         self.rig.cycle(idle=False)
 
     def caught_up(self):
-        self.until(State.TORQUED)
+        self.until(ServoState.TORQUED)
 
     def lost(self):
-        if self.state is State.LIMP:
-            self.come_to(State.TORQUED)
+        if self.state is ServoState.LIMP:
+            self.come_to(ServoState.TORQUED)
             self.lose()
             self.servo.reset()
             self.servo.silence(False)
-            self.until(State.LIMP)
+            self.until(ServoState.LIMP)
         self.rig.buses[0].unplug()
         self.rig.goals.position[0] += 0.1
         self.rig.hardware.write()
@@ -187,12 +196,12 @@ class Story:
 
     def returned(self):
         self.servo.silence(False)
-        self.until(State.RETURNING)
+        self.until(ServoState.RETURNING)
 
     def returned_limp(self):
         self.servo.reset()
         self.servo.silence(False)
-        self.until(State.LIMP)
+        self.until(ServoState.LIMP)
 
     def latch(self):
         self.rig.hardware.let_go([1])
@@ -200,7 +209,7 @@ class Story:
 
 @pytest.mark.parametrize(("state", "event"), sorted(LEGAL, key=str))
 def test_each_legal_transition_is_reached_by_what_a_servo_does(make_plan, make_rig, recorded, state, event):
-    story = Story(make_plan, make_rig, protocol=1.0 if event is Event.TORQUE_OFF else 2.0)
+    story = Story(make_plan, make_rig, protocol=1.0 if event is ServoEvent.TORQUE_OFF else 2.0)
     story.come_to(state)
     recorded.clear()
     getattr(story, event.name.lower())()
@@ -209,18 +218,18 @@ def test_each_legal_transition_is_reached_by_what_a_servo_does(make_plan, make_r
 
 def test_a_servo_that_is_lost_after_it_was_let_go_is_latched_again_when_it_is_back(make_plan, make_rig):
     story = Story(make_plan, make_rig)
-    story.come_to(State.LATCHED)
+    story.come_to(ServoState.LATCHED)
     story.lose()
     story.servo.silence(False)
-    story.until(State.LATCHED, State.LIMP, State.RETURNING)
-    assert story.state is State.LATCHED
+    story.until(ServoState.LATCHED, ServoState.LIMP, ServoState.RETURNING)
+    assert story.state is ServoState.LATCHED
     assert story.rig.torque() == [True, False, True]
 
 
 def test_torque_that_was_read_before_a_servo_was_let_go_gives_it_no_goals(make_plan, make_rig):
     """Its torque enable is still being read when the policy comes: the late 1 must not count."""
     story = Story(make_plan, make_rig, protocol=1.0)
-    story.come_to(State.HOLDING)
+    story.come_to(ServoState.HOLDING)
     rig = story.rig
     rig.restless = 0.02
     story.servo.silence(False)
@@ -230,7 +239,7 @@ def test_torque_that_was_read_before_a_servo_was_let_go_gives_it_no_goals(make_p
     since = len(rig.into_bus())
     for _ in range(20):
         rig.cycle()
-    assert story.state is State.LATCHED
+    assert story.state is ServoState.LATCHED
     goals = [packet for packet in rig.into_bus()[since:] if packet[4] == 0x83]
     assert goals
     assert not any(12 in packet[7:-1:5] for packet in goals)

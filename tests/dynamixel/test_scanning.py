@@ -5,7 +5,7 @@ import pytest
 from dxlrun.clock import VirtualClock
 from dxlrun.dynamixel.control_table import all_tables
 from dxlrun.dynamixel.tools import scanning
-from dxlrun.dynamixel.tools.scanning import Wish, find, known_rates, scan
+from dxlrun.dynamixel.tools.scanning import Search, find, known_rates, scan
 from dxlrun.dynamixel.tools.tool_line import ToolLine
 from dxlrun.errors import PortError
 from dxlrun.simulation import AdapterConfig, BusConfig, Ledger, ServoConfig
@@ -44,7 +44,7 @@ def names(scanned):
 
 def test_one_broadcast_ping_finds_all_servos_of_protocol_2():
     line = VirtualLine(two(1), two(7, "XL430-W250"), two(252, "XL-320"))
-    found = scan(ToolLine(line), Wish((2.0,), (57_600,)))
+    found = scan(ToolLine(line), Search((2.0,), (57_600,)))
     assert names(found) == [
         (2.0, 57_600, 1, "XM430-W350"),
         (2.0, 57_600, 7, "XL430-W250"),
@@ -59,7 +59,7 @@ def test_one_broadcast_ping_finds_all_servos_of_protocol_2():
 def test_every_model_is_known_by_its_number_and_can_be_drafted_from(protocol, rate):
     tables = [table for table in all_tables() if table.protocol == protocol]
     servos = [ServoConfig(number + 1, table.model, 0.5) for number, table in enumerate(tables)]
-    found = scan(ToolLine(VirtualLine(*servos, protocol=protocol, rate=rate)), Wish((protocol,), (rate,)))
+    found = scan(ToolLine(VirtualLine(*servos, protocol=protocol, rate=rate)), Search((protocol,), (rate,)))
     assert [one.model for one in found.servos] == [table.model for table in tables]
     assert {one.return_delay for one in found.servos} == {500_000}
     assert all(one.position is not None and one.lowest is not None for one in found.servos)
@@ -69,7 +69,7 @@ def test_every_model_is_known_by_its_number_and_can_be_drafted_from(protocol, ra
 def test_a_servo_at_another_rate_is_found_at_its_own():
     line = VirtualLine(two(3))
     line.bus.servo(3).poke("baud_rate", 3)  # 1 Mbit/s
-    found = scan(ToolLine(line), Wish((2.0,), ()))
+    found = scan(ToolLine(line), Search((2.0,), ()))
     assert names(found) == [(2.0, 1_000_000, 3, "XM430-W350")]
 
 
@@ -80,17 +80,17 @@ def test_who_answers_late_is_found_and_not_taken_for_two(protocol):
     line = VirtualLine(two(3, model), protocol=protocol, rate=1_000_000)
     for late_ns in (90_000_000, 0, 90_000_000, 0, 90_000_000):
         line.bus.delay_next(3, late_ns)
-    wish = Wish((protocol,), (1_000_000,), (1, 2, 3, 4))
-    found = scan(ToolLine(line), wish).servos
+    search = Search((protocol,), (1_000_000,), (1, 2, 3, 4))
+    found = scan(ToolLine(line), search).servos
     assert [(one.servo_id, one.model, one.remarks) for one in found] == [(3, model, ())]
     line.bus.delay_next(3, 90_000_000)
-    (found,) = find(ToolLine(line), 3, wish)
+    (found,) = find(ToolLine(line), 3, search)
     assert (found.model, found.remarks) == (model, ())
 
 
 def test_protocol_1_is_asked_id_by_id():
     line = VirtualLine(two(1, "AX-12A"), two(253, "MX-64"), protocol=1.0, rate=1_000_000)
-    found = scan(ToolLine(line), Wish((1.0,), (1_000_000,)))
+    found = scan(ToolLine(line), Search((1.0,), (1_000_000,)))
     assert names(found) == [(1.0, 1_000_000, 1, "AX-12A"), (1.0, 1_000_000, 253, "MX-64")]
     assert (found.servos[0].lowest, found.servos[0].highest) == (0, 1023)
     assert found.servos[0].return_delay == 500_000
@@ -100,7 +100,7 @@ def test_protocol_1_is_asked_id_by_id():
 def test_a_late_answer_is_noticed_and_asked_again():
     line = VirtualLine(two(5, "AX-12A"), protocol=1.0, rate=1_000_000)
     line.bus.delay_next(5, 3_000_000)  # it comes while the next ID is asked
-    found = scan(ToolLine(line), Wish((1.0,), (1_000_000,)))
+    found = scan(ToolLine(line), Search((1.0,), (1_000_000,)))
     assert names(found) == [(1.0, 1_000_000, 5, "AX-12A")]
 
 
@@ -109,7 +109,7 @@ def test_a_late_answer_is_noticed_and_asked_again():
 def test_an_adapter_that_keeps_replies_back_for_longer_than_is_known_makes_no_twins(model, protocol, ids):
     adapter = AdapterConfig(latency_timer_ns=16_000_000)
     line = VirtualLine(two(1, model), two(3, model), protocol=protocol, rate=1_000_000, adapter=adapter)
-    found = scan(ToolLine(line), Wish((protocol,), (1_000_000,), ids))
+    found = scan(ToolLine(line), Search((protocol,), (1_000_000,), ids))
     assert [(one.servo_id, one.model, one.remarks) for one in found.servos] == [
         (1, model, ()),
         (3, model, ()),
@@ -118,13 +118,13 @@ def test_an_adapter_that_keeps_replies_back_for_longer_than_is_known_makes_no_tw
 
 def test_two_servos_of_one_id_are_named():
     line = VirtualLine(two(2), ServoConfig(2, "XM430-W350", 1.0))
-    (found,) = scan(ToolLine(line), Wish((2.0,), (57_600,))).servos
+    (found,) = scan(ToolLine(line), Search((2.0,), (57_600,))).servos
     assert "do two servos have this ID?" in found.remarks[0]
 
 
 def test_two_servos_of_different_models_and_one_id_do_not_hide_each_other():
     line = VirtualLine(two(2), two(2, "XL430-W250"), two(3))
-    found = scan(ToolLine(line), Wish((2.0,), (57_600,)))
+    found = scan(ToolLine(line), Search((2.0,), (57_600,)))
     assert [one.servo_id for one in found.servos] == [2, 3]
     assert "garbled" in found.servos[0].remarks[0]
 
@@ -132,7 +132,7 @@ def test_two_servos_of_different_models_and_one_id_do_not_hide_each_other():
 def test_a_servo_that_answers_no_reads_is_listed_with_the_reason():
     line = VirtualLine(two(4, "AX-12A"), protocol=1.0, rate=1_000_000)
     line.bus.servo(4).poke("status_return_level", 0)
-    (found,) = scan(ToolLine(line), Wish((1.0,), (1_000_000,), (4,))).servos
+    (found,) = scan(ToolLine(line), Search((1.0,), (1_000_000,), (4,))).servos
     assert (found.model, found.model_number) == ("", -1)
     assert found.remarks == ("answers pings but no read: its Status Return Level (16) is 0",)
 
@@ -140,14 +140,14 @@ def test_a_servo_that_answers_no_reads_is_listed_with_the_reason():
 def test_an_unknown_model_is_listed_with_its_number():
     line = VirtualLine(two(4))
     line.bus.servo(4).poke("model_number", 999)
-    (found,) = scan(ToolLine(line), Wish((2.0,), (57_600,), (4,))).servos
+    (found,) = scan(ToolLine(line), Search((2.0,), (57_600,), (4,))).servos
     assert found.model == ""
     assert "model number 999" in found.remarks[0]
 
 
 def test_rates_that_the_adapter_cannot_are_left_out_and_told():
     line = VirtualLine(two(4), cannot=(10_500_000, 6_000_000))
-    found = scan(ToolLine(line), Wish((2.0,), (), (4,)))
+    found = scan(ToolLine(line), Search((2.0,), (), (4,)))
     assert found.left_out == (10_500_000, 6_000_000)
     assert len(found.servos) == 1
 
@@ -157,7 +157,7 @@ def test_rates_that_the_adapter_cannot_are_left_out_and_told():
 def test_an_adapter_that_echoes_is_refused(protocol, ids):
     line = VirtualLine(protocol=protocol, adapter=AdapterConfig(echo=True))
     with pytest.raises(PortError, match="echoes what it sends"):
-        scan(ToolLine(line), Wish((protocol,), (57_600,), ids))
+        scan(ToolLine(line), Search((protocol,), (57_600,), ids))
 
 
 def test_a_line_that_is_gone_ends_the_scan():
@@ -182,7 +182,9 @@ def test_the_rates_are_those_of_the_tables_and_the_usual_ones_come_first():
 
 def test_progress_goes_from_nothing_to_everything():
     shares = []
-    scan(ToolLine(VirtualLine()), Wish((1.0, 2.0), (57_600,), (1, 2)), lambda _, share: shares.append(share))
+    scan(
+        ToolLine(VirtualLine()), Search((1.0, 2.0), (57_600,), (1, 2)), lambda _, share: shares.append(share)
+    )
     assert shares[0] == 0.0
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
@@ -191,6 +193,6 @@ def test_progress_goes_from_nothing_to_everything():
 def test_few_ids_are_asked_one_by_one():
     few = tuple(range(scanning.FEW))
     line = VirtualLine(two(3), two(11))
-    found = scan(ToolLine(line), Wish((2.0,), (57_600,), few))
+    found = scan(ToolLine(line), Search((2.0,), (57_600,), few))
     assert [one.servo_id for one in found.servos] == [3, 11]
     assert all(data[4] != 0xFE for data in line.heard)

@@ -15,7 +15,7 @@ from dxlrun.dynamixel.port.ports import SerialPort, SerialPorts
 from dxlrun.dynamixel.port.serial_open import open_serial
 from dxlrun.dynamixel.servo.checks import survey
 from dxlrun.dynamixel.servo.identify import identify
-from dxlrun.dynamixel.servo.registers import Difference, compare
+from dxlrun.dynamixel.servo.registers import RegisterDifference, compare
 from dxlrun.dynamixel.servo.retry import extend_timeouts, setup_line
 from dxlrun.dynamixel.wire.transaction import Program
 from dxlrun.errors import StartUpError
@@ -103,14 +103,14 @@ def _look(plan: BusPlan) -> Program[Found]:
     )
     answered = {joint for joint, _ in surveyed.servos}
     for servo in plan.servos:
-        differences = [Difference(register, None) for register in servo.registers]
+        differences = [RegisterDifference(register, None) for register in servo.registers]
         if servo.joint in answered:
             differences = list((yield from compare(plan, servo, servo.registers, setup_line(plan))))
         found.registers += [_row(plan, servo, one) for one in differences]
     return found
 
 
-def _row(plan: BusPlan, servo: ServoPlan, one: Difference) -> RegisterRow:
+def _row(plan: BusPlan, servo: ServoPlan, one: RegisterDifference) -> RegisterRow:
     register = one.register
     item = control_table(servo.model, plan.protocol).items[register.name]
     action = "write" if one.differs else "nothing"

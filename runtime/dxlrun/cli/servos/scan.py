@@ -17,7 +17,7 @@ from dxlrun.errors import InputError
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from dxlrun.dynamixel.tools.scanning import FoundServo, Scanned, Wish
+    from dxlrun.dynamixel.tools.scanning import FoundServo, Scanned, Search
 
 Rates = Annotated[tuple[int, ...], Parameter(negative=(), show_default=False)]
 _HIGHEST_ID = 253
@@ -61,14 +61,14 @@ def scan(
     from dxlrun.dynamixel.tools import scanning
     from dxlrun.dynamixel.tools.tool_line import ToolLine, TunablePort
 
-    wish = read_wish(protocol, baud, ids)
+    search = read_search(protocol, baud, ids)
     if write is not None:
         from dxlrun.cli.servos.robot_draft import may_be_written
 
         may_be_written(write)
     load_models()
     with TunablePort(port) as line, progress_bar(hidden=as_json) as progress:
-        scanned = scanning.scan(ToolLine(line), wish, progress)
+        scanned = scanning.scan(ToolLine(line), search, progress)
         latency_ns = line.latency_ns
     for rate in scanned.left_out:
         say_warning(f"{port} cannot run at {rate} bit/s; nobody was looked for there")
@@ -83,9 +83,9 @@ def scan(
     return 0 if scanned.servos else 1
 
 
-def read_wish(protocol: float | None, baud: Sequence[int], ids: str | None) -> Wish:
+def read_search(protocol: float | None, baud: Sequence[int], ids: str | None) -> Search:
     """Return where to look; raises InputError with everything that is wrong."""
-    from dxlrun.dynamixel.tools.scanning import Wish
+    from dxlrun.dynamixel.tools.scanning import Search
 
     wrong = []
     if protocol not in (None, 1.0, 2.0):
@@ -102,7 +102,7 @@ def read_wish(protocol: float | None, baud: Sequence[int], ids: str | None) -> W
         wrong.append(str(error))
     if wrong:
         raise InputError("\n".join(wrong))
-    return Wish((2.0, 1.0) if protocol is None else (protocol,), tuple(dict.fromkeys(baud)), chosen)
+    return Search((2.0, 1.0) if protocol is None else (protocol,), tuple(dict.fromkeys(baud)), chosen)
 
 
 def read_ids(text: str) -> tuple[int, ...]:

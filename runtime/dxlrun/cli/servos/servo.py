@@ -10,7 +10,7 @@ from cyclopts import Parameter
 
 from dxlrun.cli.output.flags import Flag, JsonFlag
 from dxlrun.cli.output.terminal import out
-from dxlrun.cli.servos.scan import load_models, read_wish
+from dxlrun.cli.servos.scan import load_models, read_search
 from dxlrun.cli.servos.servo_verbs import VERBS, Asked, Keep
 from dxlrun.errors import InputError, ServoFault
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from dxlrun.dynamixel.control_table import ControlItem
     from dxlrun.dynamixel.tools.one_servo import OneServo
-    from dxlrun.dynamixel.tools.scanning import FoundServo, Wish
+    from dxlrun.dynamixel.tools.scanning import FoundServo, Search
     from dxlrun.dynamixel.tools.tool_line import ToolLine
 
 _HIGHEST_ID = 253
@@ -72,13 +72,13 @@ def servo(
     from dxlrun.dynamixel.tools.one_servo import OneServo
     from dxlrun.dynamixel.tools.tool_line import ToolLine, TunablePort
 
-    wish = read_wish(protocol, () if baud is None else (baud,), None)
+    search = read_search(protocol, () if baud is None else (baud,), None)
     asked = Asked(words, keep, yes)
     _check(servo_id, verb, asked)
     load_models()
     with TunablePort(port) as line:
         tool = ToolLine(line)
-        one = OneServo(tool, _find(tool, servo_id, wish))
+        one = OneServo(tool, _find(tool, servo_id, search))
         VERBS[verb].do(one, asked)
     _tell(one, verb, asked, as_json=as_json)
     return 1 if asked.declined else 0
@@ -101,11 +101,11 @@ def _check(servo_id: int, verb: str, asked: Asked) -> None:
     found.check(asked)
 
 
-def _find(tool: ToolLine, servo_id: int, wish: Wish) -> FoundServo:
+def _find(tool: ToolLine, servo_id: int, search: Search) -> FoundServo:
     """Look for the servo; raises ServoFault where it is not there, or is there more than once."""
     from dxlrun.dynamixel.tools.scanning import find
 
-    port, found = tool.port.name, find(tool, servo_id, wish)
+    port, found = tool.port.name, find(tool, servo_id, search)
     if not found:
         raise ServoFault(
             f"nobody with ID {servo_id} answers at {port}: check power, cable and ID; `dxlrun scan {port}` "

@@ -118,7 +118,7 @@ def _value(text: str) -> int | str:
 
 
 def _id(one: OneServo, asked: Asked) -> None:
-    from dxlrun.dynamixel.tools.changing import change_id
+    from dxlrun.dynamixel.tools.one_servo import change_id
     from dxlrun.dynamixel.wire.dialect import dialect_of
 
     new, highest = int(asked.words[0]), dialect_of(one.table.protocol).HIGHEST_ID
@@ -131,7 +131,7 @@ def _id(one: OneServo, asked: Asked) -> None:
 
 
 def _baud(one: OneServo, asked: Asked) -> None:
-    from dxlrun.dynamixel.tools.changing import change_rate
+    from dxlrun.dynamixel.tools.one_servo import change_rate
 
     new, rates = int(asked.words[0]), sorted(one.table.baud_rates.values())
     if new not in rates:
@@ -144,14 +144,14 @@ def _baud(one: OneServo, asked: Asked) -> None:
 
 
 def _reboot(one: OneServo, asked: Asked) -> None:
-    from dxlrun.dynamixel.tools.changing import reboot
+    from dxlrun.dynamixel.tools.one_servo import reboot
 
     if not one.holds_torque() or asked.confirmed(f"{one.called} holds torque: {_TORQUE_OFF}"):
         asked.done.append(reboot(one))
 
 
 def _factory_reset(one: OneServo, asked: Asked) -> None:
-    from dxlrun.dynamixel.tools.changing import factory_reset
+    from dxlrun.dynamixel.tools.one_servo import factory_reset
     from dxlrun.dynamixel.wire.protocol2 import Reset
 
     old = one.table.protocol == 1.0
@@ -170,7 +170,7 @@ def _factory_reset(one: OneServo, asked: Asked) -> None:
 
 def _backup(one: OneServo, asked: Asked) -> None:
     from dxlrun.dynamixel.tools import servo_backup
-    from dxlrun.dynamixel.tools.changing import back_up
+    from dxlrun.dynamixel.tools.one_servo import back_up
 
     if not asked.words:
         if asked.confirmed(f"{one.called}: the backup that it keeps itself is overwritten"):
@@ -191,7 +191,7 @@ def _new_file(asked: Asked) -> None:
 
 def _restore(one: OneServo, asked: Asked) -> None:
     from dxlrun.dynamixel.tools import servo_backup
-    from dxlrun.dynamixel.tools.changing import take_back
+    from dxlrun.dynamixel.tools.one_servo import take_back
 
     if not asked.words:
         if asked.confirmed(f"{one.called}: its EEPROM becomes that of the backup that it keeps itself"):

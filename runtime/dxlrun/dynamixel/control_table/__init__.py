@@ -1,10 +1,9 @@
-"""Control tables: what stands where in a servo's memory, in which unit.
+"""Control tables: the places of a servo's control items in its memory, and their units.
 
 `control_table("AX-12A")` is the table of a model, `control_table("MX-28", 2.0)` that of one of its firmwares.
 Protocol 1.0 tables are data files of ours, Protocol 2.0 tables the maker's, corrected in one visible file.
 """
 
-from dxlrun.dynamixel.control_table.item import SIGN_BIT, Access, Area, ControlItem, Encoding
 from dxlrun.dynamixel.control_table.models import (
     add_control_table,
     added_control_tables,
@@ -16,7 +15,17 @@ from dxlrun.dynamixel.control_table.models import (
     protocols_of,
 )
 from dxlrun.dynamixel.control_table.sources import read_control_table
-from dxlrun.dynamixel.control_table.table import CAPABILITIES, ControlTable, EffortUnit
+from dxlrun.dynamixel.control_table.table import (
+    CAPABILITIES,
+    SIGN_BIT,
+    Access,
+    Area,
+    ControlItem,
+    ControlTable,
+    EffortUnit,
+    Encoding,
+    side_by_side,
+)
 
 __all__ = [
     "CAPABILITIES",
@@ -36,4 +45,5 @@ __all__ = [
     "perhaps_meant",
     "protocols_of",
     "read_control_table",
+    "side_by_side",
 ]

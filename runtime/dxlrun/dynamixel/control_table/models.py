@@ -8,15 +8,14 @@ import re
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 
-from dxlrun.dynamixel.control_table.protocol1 import protocol1_listings
 from dxlrun.dynamixel.control_table.protocol2 import protocol2_listings
-from dxlrun.dynamixel.control_table.sources import Listing, read_control_table
+from dxlrun.dynamixel.control_table.sources import Listing, protocol1_listings, read_control_table
 from dxlrun.dynamixel.control_table.table import ControlTable
 
 _ADDED: dict[float, list[Listing]] = {1.0: [], 2.0: []}
 """Tables of plug-ins; they are added while a process starts, before its first robot is compiled."""
 _MOST_MEANT = 4
-"""More names of models are no help to a person."""
+"""More suggestions than this are no help."""
 _SERIES = re.compile(r"[0-9]?[A-Z]+[0-9]{3}")
 _TEXTS: dict[str, str] = {}
 """Name -> TOML text of the tables that were added."""
@@ -66,8 +65,8 @@ def understood(name: str, protocol: float) -> Listing | None:
     ways = [(key, names)]
     ways += [(key[:-1], names)] if key.endswith(("T", "R")) else []
     ways += [(key, series)] if _SERIES.fullmatch(key) else []
-    for wanted, keys in ways:
-        found = {listing.names[0]: listing for each, listing in keys if each == wanted}
+    for part, keys in ways:
+        found = {listing.names[0]: listing for each, listing in keys if each == part}
         if len(found) == 1:
             return next(iter(found.values()))
     return None
@@ -84,7 +83,7 @@ def model_names(protocol: float | None = None) -> tuple[str, ...]:
 
 
 def perhaps_meant(name: str, protocol: float | None = None) -> str:
-    """Return how to mend a name that no model has: those that begin with it, else the closest one."""
+    """Return a hint for a name that no model has: those that begin with it, else the closest one."""
     known = {_key(each): each for each in reversed(model_names(protocol))}
     key = _key(name)
     meant = sorted(each for each in known if key and each.startswith(key))
@@ -158,12 +157,12 @@ def _listings(protocol: float) -> tuple[Listing, ...]:
 
 @functools.cache
 def _shipped(protocol: float) -> Mapping[str, Listing]:
-    """The models of one protocol by name: the other one's are not looked at when nobody asks for them."""
+    """The models of one protocol by name: those of the other one are not read before they are needed."""
     found: dict[str, Listing] = {}
     listings = {1.0: protocol1_listings, 2.0: protocol2_listings}.get(protocol)
     for listing in listings() if listings is not None else ():
         for name in listing.names:
             if name in found:
-                raise ValueError(f"the model {name!r} stands in two control tables")
+                raise ValueError(f"the model {name!r} is in two control tables")
             found[name] = listing
     return MappingProxyType(found)

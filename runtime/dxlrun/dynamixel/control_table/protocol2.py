@@ -1,7 +1,7 @@
 """Control tables of Protocol 2.0: the maker's own data files in dynamixel-sdk, completed and corrected.
 
 The files give name, address and size of each item, and some units. What they lack (access, ranges, initial
-values, no-load speeds) stands in files of ours, what is wrong in them in `sdk_corrections.toml`, with a
+values, no-load speeds) is in files of ours, what is wrong in them in `sdk_corrections.toml`, with a
 reason each. Only the files are read; the SDK's code is never imported.
 """
 
@@ -51,7 +51,7 @@ _POSITIONS = frozenset(
         "present_position",
     }
 )
-"""Items with the unit of present position, as far as no layer says otherwise."""
+"""Items with the unit of present position, unless a layer has another."""
 
 _VELOCITIES = frozenset(
     {
@@ -63,7 +63,7 @@ _VELOCITIES = frozenset(
         "velocity_trajectory",
     }
 )
-"""Items with the unit of present velocity, as far as no layer says otherwise."""
+"""Items with the unit of present velocity, unless a layer has another."""
 
 
 def protocol2_listings() -> tuple[Listing, ...]:
@@ -130,7 +130,7 @@ def _listing(stem: str, path: Path, data: dict[str, object]) -> Listing:
 
 
 def _own_entries(stem: str, stems: Set[str], numbers: Mapping[str, int]) -> dict[str, object]:
-    """Return what is said of the model itself, its items left out."""
+    """Return the entries of the model itself, without its items."""
     family, _, version = stem.partition("_fw")
     newer = [int(each.removeprefix(f"{stem}_fw")) for each in stems if each.startswith(f"{stem}_fw")]
     data: dict[str, object] = {

@@ -1,20 +1,82 @@
-"""A control table: the items of one model, and what the room above the wire needs to know of it."""
+"""A control table: the control items of one model, their places and meanings, and what follows from them."""
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Literal
 
-from dxlrun.dynamixel.control_table.item import ControlItem
-
+Access = Literal["R", "RW"]
+Area = Literal["EEPROM", "RAM"]
+Encoding = Literal["unsigned", "sign_magnitude", "twos_complement"]
 EffortUnit = Literal["1", "A", "Nm"]
 
+SIGN_BIT = 10
+"""Direction bit of sign-magnitude items: 0 counter-clockwise, 1 clockwise (e-Manual, Present Speed (38))."""
 _HIGHEST_VOLTAGE = 4 / 3
 """Times the nominal voltage: 16 V of 12 V (e-Manual XM430-W350, Max Voltage Limit (32)), taken for all models
 [i]. Speed grows as the voltage [i]: that manual gives 46 rpm at 12 V and 57 rpm at 14.8 V."""
+
+
+@dataclass(frozen=True, slots=True)
+class ControlItem:
+    """One control item: an integer of 1, 2 or 4 bytes, little-endian, and what it means."""
+
+    name: str
+    address: int
+    size: int
+    access: Access
+    area: Area
+    minimum: int
+    """As the e-Manual gives it: of the integer on the wire, where a direction bit counts as a bit; with two's
+    complement of the signed number."""
+    maximum: int
+    initial: int | None
+    """Value of the integer on the wire after a factory reset or at power-up; None: the manual gives none."""
+    encoding: Encoding
+    unit: str
+    """SI unit of `scale`; empty for flags, numbers and steps; `1` for a fraction of the maximum."""
+    scale: float
+    """SI units per tick."""
+    page: str
+    """Section of the manual's page of this model."""
+    firmware: int = 0
+    """First firmware version that has the item; 0: every one."""
+
+    def encode(self, raw: int) -> bytes:
+        """Return the bytes of a signed number of ticks; raises ValueError when they do not hold it."""
+        wire = raw
+        if self.encoding == "sign_magnitude":
+            if abs(raw) >= 1 << SIGN_BIT:
+                raise ValueError(f"{self.name}: {raw} does not fit into {SIGN_BIT} bits and a direction")
+            wire = abs(raw) | (raw < 0) << SIGN_BIT
+        try:
+            return wire.to_bytes(self.size, "little", signed=self.encoding == "twos_complement")
+        except OverflowError:
+            raise ValueError(f"{self.name}: {raw} does not fit into {self.size} bytes") from None
+
+    def decode(self, data: bytes | bytearray | memoryview) -> int:
+        """Return the signed number of ticks; raises ValueError when `data` has not `size` bytes."""
+        if len(data) != self.size:
+            raise ValueError(f"{self.name}: {self.size} bytes are needed, {len(data)} were given")
+        wire = int.from_bytes(data, "little", signed=self.encoding == "twos_complement")
+        if self.encoding == "sign_magnitude":
+            magnitude = wire & ((1 << SIGN_BIT) - 1)
+            return -magnitude if wire >> SIGN_BIT & 1 else magnitude
+        return wire
+
+    @property
+    def title(self) -> str:
+        """The item as the e-Manual writes it: `Torque Enable (24)`."""
+        small = {"id": "ID", "cw": "CW", "ccw": "CCW"}
+        words = (small.get(word, word.capitalize()) for word in self.name.split("_"))
+        return f"{' '.join(words)} ({self.address})"
+
+    @property
+    def signed(self) -> bool:
+        """True when the integer on the wire is in two's complement, so that `minimum` may be below 0."""
+        return self.encoding == "twos_complement"
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,11 +136,6 @@ class ControlTable:
         return self.max_speed * _HIGHEST_VOLTAGE
 
     @property
-    def zero_tick(self) -> int:
-        """Tick at which theta is 0: always the raw position 0, on every model."""
-        return 0
-
-    @property
     def size(self) -> int:
         """Number of bytes from address 0 to the end of the last item."""
         return max(item.address + item.size for item in self.items.values())
@@ -112,16 +169,31 @@ def derived_capabilities(
     items: Mapping[str, ControlItem], goal_speed: str, present_speed: str, effort: str
 ) -> frozenset[str]:
     """Return the capabilities that follow from which items there are and where they stand."""
-
-    def side_by_side(*names: str) -> bool:
-        found = sorted((items[name].address, items[name].size) for name in names)
-        return all(address + size == after for (address, size), (after, _) in itertools.pairwise(found))
-
     has = {
         "operating_mode": "operating_mode" in items or "control_mode" in items,
         "hardware_error": "hardware_error_status" in items,
         "indirect": "indirect_address_1" in items,
-        "posvel": side_by_side(goal_speed, "goal_position"),
-        "state_block": side_by_side(effort, present_speed, "present_position"),
+        "posvel": len(side_by_side((items[goal_speed], items["goal_position"]))) == 1,
+        "state_block": len(side_by_side(items[name] for name in (effort, present_speed, "present_position")))
+        == 1,
     }
     return frozenset(name for name, yes in has.items() if yes)
+
+
+def side_by_side(
+    items: Iterable[ControlItem], most_bytes: int | None = None
+) -> tuple[tuple[ControlItem, ...], ...]:
+    """Group items that one read can fetch: each begins where the one before ends, at most so many bytes."""
+    blocks: list[list[ControlItem]] = []
+    for item in sorted(items, key=lambda one: one.address):
+        end = item.address + item.size
+        block = blocks[-1] if blocks else None
+        if (
+            block is not None
+            and block[-1].address + block[-1].size == item.address
+            and (most_bytes is None or end - block[0].address <= most_bytes)
+        ):
+            block.append(item)
+        else:
+            blocks.append([item])
+    return tuple(map(tuple, blocks))

@@ -85,7 +85,7 @@ _DRIVE_BITS: Mapping[int, str] = MappingProxyType(
 
 
 @dataclass(slots=True)
-class Survey:
+class BusSurvey:
     """What was found on one bus."""
 
     problems: list[str] = field(default_factory=list)
@@ -289,9 +289,9 @@ CHECKS: tuple[Check, ...] = (
 """In the order in which problems are reported; what each refuses is in failures.md."""
 
 
-def survey(plan: BusPlan, take_over: bool) -> Program[Survey]:
+def survey(plan: BusPlan, take_over: bool) -> Program[BusSurvey]:
     """Look at every servo of the bus, and collect all problems of all servos."""
-    found, line = Survey(), setup_line(plan)
+    found, line = BusSurvey(), setup_line(plan)
     yield listen(LISTEN_NS)
     if plan.servos and (yield from _echoes(plan, line, found)):
         return found
@@ -307,7 +307,9 @@ def survey(plan: BusPlan, take_over: bool) -> Program[Survey]:
     return found
 
 
-def inspect(plan: BusPlan, servo: ServoPlan, line: Line, found: Survey, *, take_over: bool) -> Program[bool]:
+def inspect(
+    plan: BusPlan, servo: ServoPlan, line: Line, found: BusSurvey, *, take_over: bool
+) -> Program[bool]:
     """Read what must fit the plan, and walk the table; return False when the servo cannot be read."""
     items = control_table(servo.model, plan.protocol).items
     declared = {one.name: one.value for one in servo.registers}
@@ -342,7 +344,7 @@ def inspect(plan: BusPlan, servo: ServoPlan, line: Line, found: Survey, *, take_
     return True
 
 
-def inspect_states(plan: BusPlan, servos: list[ServoPlan], line: Line, found: Survey) -> Program[None]:
+def inspect_states(plan: BusPlan, servos: list[ServoPlan], line: Line, found: BusSurvey) -> Program[None]:
     """Read every state twice: inside the limits, and no jump in between."""
     before: dict[int, tuple[int, int]] = {}
     for again in (False, True):
@@ -364,7 +366,7 @@ def inspect_states(plan: BusPlan, servos: list[ServoPlan], line: Line, found: Su
                 found.problems.append(f"{plan.label(servo)} {problem}")
 
 
-def _echoes(plan: BusPlan, line: Line, found: Survey) -> Program[bool]:
+def _echoes(plan: BusPlan, line: Line, found: BusSurvey) -> Program[bool]:
     """Find out whether the adapter echoes: a read cannot be mistaken for its own answer."""
     reply = yield line.read(plan.servos[0].servo_id, 0, 3)
     if reply.echoed:
@@ -375,7 +377,7 @@ def _echoes(plan: BusPlan, line: Line, found: Survey) -> Program[bool]:
     return reply.echoed
 
 
-def _answers(plan: BusPlan, servo: ServoPlan, line: Line, found: Survey) -> Program[bool]:
+def _answers(plan: BusPlan, servo: ServoPlan, line: Line, found: BusSurvey) -> Program[bool]:
     """Ping a servo three times; report silence and collisions."""
     answered = disturbed = 0
     for _ in range(PINGS):
@@ -410,7 +412,7 @@ def _unreadable(items: Mapping[str, ControlItem], line: Line, reply: Reply) -> s
     return "answers reads garbled: do two servos have its ID? If not, check cable and ground"
 
 
-def _misplaced(servo: ServoPlan, raw: int, found: Survey) -> str:
+def _misplaced(servo: ServoPlan, raw: int, found: BusSurvey) -> str:
     """Return what is wrong with a servo's position, or nothing."""
     if found.modes.get(servo.servo_id) != servo.start_mode:
         return ""  # its position counts in another mode; it is looked at again before it gets torque

@@ -18,7 +18,7 @@ from dxlrun.dynamixel.plan.bus_plan import BusPlan, RegisterValue, ServoPlan
 from dxlrun.dynamixel.plan.line import listen
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.servo import modes
-from dxlrun.dynamixel.servo.life import Event, Life
+from dxlrun.dynamixel.servo.life import Life, ServoEvent
 from dxlrun.dynamixel.servo.registers import Settled, merged, settle
 from dxlrun.dynamixel.servo.retry import retry
 from dxlrun.dynamixel.wire.transaction import Program
@@ -110,11 +110,11 @@ class DesiredState:
             problem = f"cannot follow: {error}"
         if problem:
             mode = yield from modes.mode_now(plan, servo)
-            self._life.on(index, Event.DOUBT)
+            self._life.on(index, ServoEvent.DOUBT)
         else:
             torque = yield from retry(plan.torque_reads[index])
             if not (torque.answered and torque.parameters[0] == 1):
-                self._life.on(index, Event.DOUBT)  # lost unnoticed, and a goal may switch it on
+                self._life.on(index, ServoEvent.DOUBT)  # lost unnoticed, and a goal may switch it on
         self._changing[index] = False
         if problem:
             self._report_mode(index, Severity.ERROR, f"{problem}; it is in {_words(mode)}")

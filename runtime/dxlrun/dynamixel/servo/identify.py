@@ -17,7 +17,7 @@ from dxlrun.dynamixel.servo.retry import extend_timeouts, retry, setup_line
 from dxlrun.dynamixel.wire.transaction import Outcome, Program, Reply
 from dxlrun.run.channels.packets import NoPackets, PacketSink
 
-_WHO_LENGTH = 3
+_IDENTITY_LENGTH = 3
 """Model number (2) and firmware version (1): the answer to a ping of Protocol 2.0, bytes 0..2 in 1.0."""
 
 
@@ -29,7 +29,7 @@ class Identity:
     model: str
     """Name of the control table."""
     number: int
-    """Model number as the servo said it; -1 when it said nothing."""
+    """Model number that the servo reports; -1 when it does not answer."""
     firmware: int
     problem: str
     """Why there is no model, one sentence."""
@@ -44,7 +44,7 @@ def identify(
     packets: PacketSink | None = None,
     beat: Callable[[], None] = lambda: None,
 ) -> Mapping[str, Identity]:
-    """Ask the servos of some joints who they are; return what each said, by joint.
+    """Read the model numbers of the servos of some joints; return their models, by joint.
 
     `plans` are made with any model of the bus' protocol: only ports, IDs and times count. Writes nothing to a
     servo. Raises PortError when a line is gone.
@@ -69,8 +69,8 @@ def _ask(plan: BusPlan, joints: Collection[str]) -> Program[tuple[Identity, ...]
         if servo.joint not in joints:
             continue
         reply = yield from retry(line.ping(servo.servo_id))
-        if reply.answered and line.dialect.PING_LENGTH < _WHO_LENGTH:
-            reply = yield from retry(line.read(servo.servo_id, 0, _WHO_LENGTH))
+        if reply.answered and line.dialect.PING_LENGTH < _IDENTITY_LENGTH:
+            reply = yield from retry(line.read(servo.servo_id, 0, _IDENTITY_LENGTH))
         identities.append(_identity(plan, servo, reply))
     return tuple(identities)
 

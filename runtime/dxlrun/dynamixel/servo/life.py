@@ -45,7 +45,7 @@ from dxlrun.run.channels.events import EventCode, EventSink, Severity
 
 
 @unique
-class State(Enum):
+class ServoState(Enum):
     """What a servo is doing."""
 
     LIMP = "limp"
@@ -65,7 +65,7 @@ class State(Enum):
 
 
 @unique
-class Event(Enum):
+class ServoEvent(Enum):
     """What happens to a servo."""
 
     ENGAGED = "engaged"
@@ -90,67 +90,67 @@ class Event(Enum):
     """A policy switches its torque off for the rest of the run."""
 
 
-_ONLINE = {Event.LOST: State.OFFLINE, Event.LATCH: State.LATCHED}
+_ONLINE = {ServoEvent.LOST: ServoState.OFFLINE, ServoEvent.LATCH: ServoState.LATCHED}
 """From every state in which a servo is read."""
 
-TRANSITIONS: Mapping[State, Mapping[Event, State]] = MappingProxyType(
+TRANSITIONS: Mapping[ServoState, Mapping[ServoEvent, ServoState]] = MappingProxyType(
     {
-        State.LIMP: {
-            Event.ENGAGED: State.HOLDING,
-            Event.TORQUE_OFF: State.LIMP,
-            Event.DOUBT: State.LIMP,
-            Event.WATCHDOG: State.LIMP,
+        ServoState.LIMP: {
+            ServoEvent.ENGAGED: ServoState.HOLDING,
+            ServoEvent.TORQUE_OFF: ServoState.LIMP,
+            ServoEvent.DOUBT: ServoState.LIMP,
+            ServoEvent.WATCHDOG: ServoState.LIMP,
             **_ONLINE,
         },
-        State.HOLDING: {
-            Event.TORQUE_ON: State.TORQUED,
-            Event.TORQUE_OFF: State.LIMP,
-            Event.DOUBT: State.HOLDING,
-            Event.WATCHDOG: State.STOPPED,
+        ServoState.HOLDING: {
+            ServoEvent.TORQUE_ON: ServoState.TORQUED,
+            ServoEvent.TORQUE_OFF: ServoState.LIMP,
+            ServoEvent.DOUBT: ServoState.HOLDING,
+            ServoEvent.WATCHDOG: ServoState.STOPPED,
             **_ONLINE,
         },
-        State.TORQUED: {
-            Event.TORQUE_OFF: State.LIMP,
-            Event.DOUBT: State.HOLDING,
-            Event.WATCHDOG: State.STOPPED,
+        ServoState.TORQUED: {
+            ServoEvent.TORQUE_OFF: ServoState.LIMP,
+            ServoEvent.DOUBT: ServoState.HOLDING,
+            ServoEvent.WATCHDOG: ServoState.STOPPED,
             **_ONLINE,
         },
-        State.STOPPED: {
-            Event.TORQUE_ON: State.RETURNING,
-            Event.TORQUE_OFF: State.LIMP,
-            Event.DOUBT: State.STOPPED,
-            Event.WATCHDOG: State.STOPPED,
+        ServoState.STOPPED: {
+            ServoEvent.TORQUE_ON: ServoState.RETURNING,
+            ServoEvent.TORQUE_OFF: ServoState.LIMP,
+            ServoEvent.DOUBT: ServoState.STOPPED,
+            ServoEvent.WATCHDOG: ServoState.STOPPED,
             **_ONLINE,
         },
-        State.RETURNING: {
-            Event.CAUGHT_UP: State.TORQUED,
-            Event.TORQUE_OFF: State.LIMP,
-            Event.DOUBT: State.STOPPED,
-            Event.WATCHDOG: State.STOPPED,
+        ServoState.RETURNING: {
+            ServoEvent.CAUGHT_UP: ServoState.TORQUED,
+            ServoEvent.TORQUE_OFF: ServoState.LIMP,
+            ServoEvent.DOUBT: ServoState.STOPPED,
+            ServoEvent.WATCHDOG: ServoState.STOPPED,
             **_ONLINE,
         },
-        State.OFFLINE: {
-            Event.RETURNED: State.STOPPED,
-            Event.RETURNED_LIMP: State.LIMP,
-            Event.DOUBT: State.OFFLINE,
-            Event.LOST: State.OFFLINE,
-            Event.LATCH: State.OFFLINE,  # `Loss.latched` keeps it until the servo is back
+        ServoState.OFFLINE: {
+            ServoEvent.RETURNED: ServoState.STOPPED,
+            ServoEvent.RETURNED_LIMP: ServoState.LIMP,
+            ServoEvent.DOUBT: ServoState.OFFLINE,
+            ServoEvent.LOST: ServoState.OFFLINE,
+            ServoEvent.LATCH: ServoState.OFFLINE,  # `Loss.latched` keeps it until the servo is back
         },
-        State.LATCHED: {
-            Event.TORQUE_OFF: State.LATCHED,
-            Event.DOUBT: State.LATCHED,
-            Event.WATCHDOG: State.LATCHED,
+        ServoState.LATCHED: {
+            ServoEvent.TORQUE_OFF: ServoState.LATCHED,
+            ServoEvent.DOUBT: ServoState.LATCHED,
+            ServoEvent.WATCHDOG: ServoState.LATCHED,
             **_ONLINE,
         },
     }
 )
 """Every legal transition; another event in a state is a mistake of this program."""
 
-GETS_GOALS = frozenset((State.TORQUED, State.RETURNING))
-IN_DOUBT = frozenset((State.HOLDING, State.STOPPED))
+GETS_GOALS = frozenset((ServoState.TORQUED, ServoState.RETURNING))
+IN_DOUBT = frozenset((ServoState.HOLDING, ServoState.STOPPED))
 """Their torque enable is read as soon as there is time for it."""
-POWERLESS = frozenset((State.LIMP, State.LATCHED))
-_SLOW = frozenset((State.STOPPED, State.RETURNING, State.OFFLINE))
+POWERLESS = frozenset((ServoState.LIMP, ServoState.LATCHED))
+_SLOW = frozenset((ServoState.STOPPED, ServoState.RETURNING, ServoState.OFFLINE))
 
 
 class IllegalTransition(LookupError):
@@ -189,7 +189,7 @@ class Life:
         self._now_ns = now_ns
         self.reads = reads
         """The cyclic reads, without the servos that are OFFLINE."""
-        self.states = [State.LIMP] * count
+        self.states = [ServoState.LIMP] * count
         """The state of each servo."""
         self.losses: list[Loss | None] = [None] * count
         """Of each servo that is OFFLINE."""
@@ -198,7 +198,7 @@ class Life:
         self.ceiling: Floats = np.full(count, np.nan)
         """Shape (servos,): the highest speeds toward positions, rad/s; NaN: as the goal says."""
 
-    def on(self, index: int, event: Event) -> State:
+    def on(self, index: int, event: ServoEvent) -> ServoState:
         """Change a servo's state by an event, and return it; raises IllegalTransition."""
         before = self.states[index]
         after = TRANSITIONS[before].get(event)
@@ -208,9 +208,9 @@ class Life:
         self.states[index] = after
         self.torqued[index] = after in GETS_GOALS
         self.ceiling[index] = RETURN_SPEED if after in _SLOW else np.nan
-        if event is Event.LOST:
+        if event is ServoEvent.LOST:
             self.reads.leave(index)
-        elif before is State.OFFLINE and after is not State.OFFLINE:
+        elif before is ServoState.OFFLINE and after is not ServoState.OFFLINE:
             self.losses[index] = None
             self.reads.join(index)
         return after
@@ -222,24 +222,24 @@ class Life:
         loss = Loss(
             had_torque=not powerless,
             limp_reported=powerless,
-            latched=state is State.LATCHED if earlier is None else earlier.latched,
+            latched=state is ServoState.LATCHED if earlier is None else earlier.latched,
             rebooted=rebooted or (earlier is not None and earlier.rebooted),
             probe_at_ns=self._now_ns() + probe_after_ns,
         )
-        self.on(index, Event.LOST)
+        self.on(index, ServoEvent.LOST)
         self.losses[index] = loss
         return loss
 
-    def latch(self, index: int) -> State:
+    def latch(self, index: int) -> ServoState:
         """Give a servo no torque for the rest of the run; return its state."""
         loss = self.losses[index]
         if loss is not None:
             loss.latched = True
-        return self.on(index, Event.LATCH)
+        return self.on(index, ServoEvent.LATCH)
 
     def offline(self, index: int) -> bool:
         """Return whether a servo is out of the exchange."""
-        return self.states[index] is State.OFFLINE
+        return self.states[index] is ServoState.OFFLINE
 
     def report(self, code: EventCode, severity: Severity, index: int, text: str) -> None:
         """Log an event of a servo; `text` stands behind its name."""

@@ -1,7 +1,7 @@
 """Mode switches of one servo: torque off, what selects the mode, what that resets, a goal that moves nothing.
 
-Programs of transactions, at the start and in the gaps between cycles; nothing here waits. A switch leaves the
-torque as it was: on again only where it had been on, where a servo refuses in the mode that it keeps.
+Programs for the start and for idle time. A switch leaves the torque as it was: on again only where it had
+been on, where a servo refuses in the mode that it keeps.
 
 Sources: e-Manual XM430-W350, Operating Mode (11), for what a change needs and what it resets; MX-64, CW/CCW
 Angle Limit (6, 8) and Torque Control Mode Enable (70).
@@ -9,11 +9,10 @@ Angle Limit (6, 8) and Torque Control Mode Enable (70).
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from dxlrun.dynamixel.control_table import ControlItem, control_table
+from dxlrun.dynamixel.control_table import ControlItem, control_table, side_by_side
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, GoalLayout, ModePlan, OwnLimit, ServoPlan
 from dxlrun.dynamixel.plan.mode_plan import in_mode, mode_in
 from dxlrun.dynamixel.plan.planning import plan_line, readable
@@ -26,10 +25,10 @@ from dxlrun.mode import Mode
 ENGAGE_SPEED = 0.5
 """rad/s. The goal is where the servo stands; should that be misread, it goes there slowly."""
 FARTHEST_INWARD = 1.0
-"""rad, no farther is a wheel led back [i]: one that made more turns than its servo counts would wind all of
+"""rad, no farther is a wheel taken back [i]: one that made more turns than its servo counts would wind all of
 them up."""
 LONGEST_BACK = 64
-"""Bytes; what stands farther apart is read back one by one."""
+"""Bytes; items farther apart are read back one by one."""
 _RESET = (
     "velocity_i_gain",
     "velocity_p_gain",
@@ -61,16 +60,16 @@ def enter(
     `again`: also one that has torque in this mode is held anew; without, it is left alone. `inward`: as in
     `hold`. Raises LookupError when the model does not have the mode.
     """
-    wanted, line = servo.mode_plan(mode), plan_line(plan)
+    desired, line = servo.mode_plan(mode), plan_line(plan)
     torque = yield from retry(line.read(servo.servo_id, servo.torque_address, 1))
-    names = [register.name for register in wanted.operating]
+    names = [register.name for register in desired.operating]
     found = yield from _read_items(plan, servo, names)
     if not torque.answered or found is None:
-        return "did not answer when its mode was asked for"
+        return "did not answer when its mode was read"
     enabled = bool(torque.parameters[0])
     problem = ""
-    if not in_mode(wanted, found):
-        problem = yield from _change(plan, servo, wanted, found, enabled=enabled)
+    if not in_mode(desired, found):
+        problem = yield from _change(plan, servo, desired, found, enabled=enabled)
     elif not again:
         return ""
     if problem and enabled:
@@ -80,7 +79,7 @@ def enter(
             back = yield from hold(plan, servo, servo.mode_plan(now), inward=inward)
             problem += f", and {back.problem}" if back.problem else ""
     elif enabled:
-        problem = (yield from hold(plan, servo, wanted, inward=inward)).problem
+        problem = (yield from hold(plan, servo, desired, inward=inward)).problem
     return problem
 
 
@@ -101,15 +100,15 @@ def settle_modes(plan: BusPlan) -> Program[SettledModes]:
     settled = SettledModes()
     for servo in plan.servos:
         settled.limits.append((yield from read_limits(plan, servo)))
-        wanted = servo.mode_plan(servo.start_mode)
-        found = yield from _read_items(plan, servo, [register.name for register in wanted.operating])
-        if found is not None and in_mode(wanted, found):
+        desired = servo.mode_plan(servo.start_mode)
+        found = yield from _read_items(plan, servo, [register.name for register in desired.operating])
+        if found is not None and in_mode(desired, found):
             continue
         # one that has torque takes no goal while its watchdog has stopped it
         problem = yield from watchdog.disarm(plan, servo)
         problem = problem or (yield from enter(plan, servo, servo.start_mode))
         if problem or found is None:
-            problem = problem or "did not answer when its mode was asked for"
+            problem = problem or "did not answer when its mode was read"
             settled.problems.append(f"{plan.label(servo)} {problem}")
             continue
         items = _items(plan, servo)
@@ -140,7 +139,7 @@ def hold(plan: BusPlan, servo: ServoPlan, mode: ModePlan, *, inward: bool = Fals
     """Hold a servo where it stands: a goal that moves nothing, torque on, both read back.
 
     One that stands outside its limits is refused; `inward`: it goes back to them, slowly, because one that
-    was led by an effort may have coasted over them, and without torque it would fall.
+    followed an effort may have coasted over them, and without torque it would fall.
     """
     line, position = plan_line(plan), None
     if mode.goals[-1].position is not None:
@@ -206,27 +205,27 @@ def _read_back(plan: BusPlan, servo: ServoPlan, layout: GoalLayout, data: bytes)
     if not all(reply.answered for reply in replies):
         return "did not answer when its torque was read back"
     enabled, found = replies[0].parameters[0], bytes(replies[-1].parameters[-place.size :])
-    wanted = data[place.offset : place.offset + place.size]
-    if enabled != 1 or found != wanted:
+    desired = data[place.offset : place.offset + place.size]
+    if enabled != 1 or found != desired:
         signed = place.encoding == "twos_complement"
-        given, has = (int.from_bytes(each, "little", signed=signed) for each in (wanted, found))
+        given, has = (int.from_bytes(each, "little", signed=signed) for each in (desired, found))
         return f"was given goal {given} and torque, but has goal {has} and torque enable {enabled}"
     return ""
 
 
 def _change(
-    plan: BusPlan, servo: ServoPlan, wanted: ModePlan, found: Mapping[str, int], *, enabled: bool
+    plan: BusPlan, servo: ServoPlan, desired: ModePlan, found: Mapping[str, int], *, enabled: bool
 ) -> Program[str]:
     """Change the mode with torque off, and give the servo again what it forgets over that."""
     line = plan_line(plan)
-    kept = yield from _read_items(plan, servo, _forgotten(plan, servo, wanted, found))
+    kept = yield from _read_items(plan, servo, _forgotten(plan, servo, desired, found))
     if kept is None:
         return "did not answer when its gains were read before its mode was changed"
     if enabled:
         reply = yield from retry(line.write(servo.servo_id, servo.torque_address, b"\0"))
         if not reply.answered:
             return "did not acknowledge torque off before its mode was changed" + _reason(plan, reply)
-    for register in wanted.operating:
+    for register in desired.operating:
         if found[register.name] != register.value and (
             problem := (yield from _write(plan, servo, register.name, register.value))
         ):
@@ -247,7 +246,7 @@ def _change(
 
 
 def _forgotten(
-    plan: BusPlan, servo: ServoPlan, wanted: ModePlan, found: Mapping[str, int]
+    plan: BusPlan, servo: ServoPlan, desired: ModePlan, found: Mapping[str, int]
 ) -> tuple[str, ...]:
     """Return the items whose values a change of the operating mode resets, and that outlive it."""
     items = _items(plan, servo)
@@ -255,7 +254,7 @@ def _forgotten(
         return ()
     names = [name for name in _RESET if name in items]
     names += [register.name for register in servo.registers if not register.eeprom]
-    if Mode.PWM not in {wanted.mode, mode_in(servo, found)} and "goal_pwm" in items:
+    if Mode.PWM not in {desired.mode, mode_in(servo, found)} and "goal_pwm" in items:
         names.append("goal_pwm")  # it limits every other mode, for a policy too
     return tuple(dict.fromkeys(names))
 
@@ -275,16 +274,8 @@ def _write(plan: BusPlan, servo: ServoPlan, name: str, value: int) -> Program[st
 
 def _read_items(plan: BusPlan, servo: ServoPlan, names: Sequence[str]) -> Program[dict[str, int] | None]:
     """Read items, those side by side at once; None when one of them does not come."""
-    items = sorted((_items(plan, servo)[name] for name in names), key=lambda item: item.address)
-    blocks: list[list[ControlItem]] = []
-    for before, item in itertools.pairwise((None, *items)):
-        assert item is not None  # noqa: S101  only the first of a pair can be
-        if before is not None and before.address + before.size == item.address:
-            blocks[-1].append(item)
-        else:
-            blocks.append([item])
     values: dict[str, int] = {}
-    for block in blocks:
+    for block in side_by_side(_items(plan, servo)[name] for name in names):
         start, end = block[0].address, block[-1].address + block[-1].size
         if end - start == 1 and readable(control_table(servo.model, plan.protocol), start, end + 1):
             end += 1  # torque enable is one byte, too: a late answer to that is none to this

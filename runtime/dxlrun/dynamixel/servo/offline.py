@@ -16,9 +16,9 @@ from dxlrun.dynamixel.exchange.gaps import Gaps, Urgency
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, RegisterValue
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.servo import modes, watchdog
-from dxlrun.dynamixel.servo.checks import Survey, inspect, inspect_states
+from dxlrun.dynamixel.servo.checks import BusSurvey, inspect, inspect_states
 from dxlrun.dynamixel.servo.desired import DesiredState
-from dxlrun.dynamixel.servo.life import Event, Life, Loss, State
+from dxlrun.dynamixel.servo.life import Life, Loss, ServoEvent, ServoState
 from dxlrun.dynamixel.servo.registers import settle
 from dxlrun.dynamixel.servo.retry import retry
 from dxlrun.dynamixel.wire.transaction import Outcome, Program, Reply, Transaction
@@ -131,7 +131,7 @@ class Offline:
 
     def look(self) -> None:
         """Let the coming idle time probe the servos that are due; called once a cycle."""
-        if State.OFFLINE not in self._life.states:
+        if ServoState.OFFLINE not in self._life.states:
             return
         now = self._idle.now_ns()
         for index, loss in enumerate(self._life.losses):
@@ -210,7 +210,7 @@ class Offline:
     def _take_back(self, index: int, loss: Loss, rejoined: Rejoined) -> None:
         """Let a servo that is in order take part again."""
         life = self._life
-        life.on(index, Event.RETURNED if rejoined.torqued else Event.RETURNED_LIMP)
+        life.on(index, ServoEvent.RETURNED if rejoined.torqued else ServoEvent.RETURNED_LIMP)
         self._desired.returned(index, rejoined.mode)
         self._desired.report_written(rejoined.written)
         holds = rejoined.torqued and not loss.latched
@@ -222,7 +222,7 @@ class Offline:
                 self.switch_off(index)
         elif holds and not self._plan.split:
             # the next states of a split bus were requested without it: there its torque is read again first
-            life.on(index, Event.TORQUE_ON)
+            life.on(index, ServoEvent.TORQUE_ON)
         if not (rejoined.torqued or loss.limp_reported):
             life.report_limp(index, 0)
 
@@ -262,7 +262,7 @@ def rejoin(
     """
     servo = plan.servos[servo_index]
     line, mode = plan_line(plan), servo.start_mode if mode is None else mode
-    found = Survey()
+    found = BusSurvey()
     if (yield from inspect(plan, servo, line, found, take_over=True)):
         yield from inspect_states(plan, [servo], line, found)
     if found.problems:

@@ -37,7 +37,7 @@ class Settled:
 
 
 @dataclass(frozen=True, slots=True)
-class Difference:
+class RegisterDifference:
     """A declared register and what the servo has there."""
 
     register: RegisterValue
@@ -63,12 +63,12 @@ class TorqueLimits:
 
 def compare(
     plan: BusPlan, servo: ServoPlan, registers: Sequence[RegisterValue], line: Line
-) -> Program[tuple[Difference, ...]]:
+) -> Program[tuple[RegisterDifference, ...]]:
     """Read registers of one servo; writes nothing."""
     found = []
     for register in registers:
         reply = yield from retry(line.read(servo.servo_id, register.address, register.size))
-        found.append(Difference(register, _integer(_item(plan, servo, register), reply)))
+        found.append(RegisterDifference(register, _integer(_item(plan, servo, register), reply)))
     return tuple(found)
 
 

@@ -19,9 +19,9 @@ from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.servo.checks import FORBIDDEN
 from dxlrun.dynamixel.servo.desired import DesiredState
-from dxlrun.dynamixel.servo.life import IN_DOUBT, Event, Life, State
+from dxlrun.dynamixel.servo.life import IN_DOUBT, Life, ServoEvent, ServoState
 from dxlrun.dynamixel.servo.offline import FIRST_PROBE_NS, Offline
-from dxlrun.dynamixel.servo.slow_registers import SlowRegisters
+from dxlrun.dynamixel.servo.slow_registers import SlowReads
 from dxlrun.dynamixel.servo.watchdog_monitor import WatchdogMonitor
 from dxlrun.dynamixel.wire.dialect import dialect_of
 from dxlrun.dynamixel.wire.protocol1 import StatusError
@@ -103,7 +103,7 @@ class Servos:
         self.watchdogs = WatchdogMonitor(plan, idle, self._life, self.desired, events)
         """Whether the Bus Watchdogs receive enough instructions."""
         self._offline = Offline(plan, idle, self._life, self.desired)
-        self._slow = SlowRegisters(plan, idle, self._life, self._offline, states)
+        self._slow = SlowReads(plan, idle, self._life, self._offline, states)
         self._missing = False  # a newest reply is
         self._reported_errors = [0] * count  # error byte of each servo
         self._alerts: list[int] = []  # servos with an alert whose hardware error was not read yet
@@ -139,12 +139,12 @@ class Servos:
     def engaged(self) -> None:
         """Take every servo for one that holds where it stands, as the start-up has read back."""
         for index in range(len(self._rows)):
-            self._life.on(index, Event.ENGAGED)
+            self._life.on(index, ServoEvent.ENGAGED)
 
     def confirmed(self) -> None:
         """Let every servo get goals: its torque was read again behind the first states."""
         for index, servo in enumerate(self._plan.servos):
-            self._life.on(index, Event.TORQUE_ON)
+            self._life.on(index, ServoEvent.TORQUE_ON)
             self.desired.entered(index, servo.start_mode)
 
     def watch(self) -> Program[list[str]]:
@@ -159,12 +159,12 @@ class Servos:
     def withhold_goals(self) -> None:
         """Send no goals any more: torque is being switched off."""
         for index in range(len(self._rows)):
-            self._life.on(index, Event.DOUBT)
+            self._life.on(index, ServoEvent.DOUBT)
 
     def let_go(self, rows: Collection[int]) -> None:
         """Switch the torque of joints off for the rest of the run, of an offline servo when it is back."""
         for index, row in enumerate(self._rows):
-            if row in rows and self._life.latch(index) is State.LATCHED:
+            if row in rows and self._life.latch(index) is ServoState.LATCHED:
                 self._offline.switch_off(index)
 
     # The line
@@ -217,12 +217,12 @@ class Servos:
 
     def prepare_goals(self, goals: Commands, states: States) -> None:
         """Let the returning servos that have caught up follow their goals as fast as these say."""
-        if State.RETURNING not in self._life.states:
+        if ServoState.RETURNING not in self._life.states:
             return
         for index, row in enumerate(self._rows):
             off = abs(goals.position[row] - states.position[row])
-            if self._life.states[index] is State.RETURNING and off < CAUGHT_UP:
-                self._life.on(index, Event.CAUGHT_UP)
+            if self._life.states[index] is ServoState.RETURNING and off < CAUGHT_UP:
+                self._life.on(index, ServoEvent.CAUGHT_UP)
 
     def _count_losses(self, now_ns: int) -> None:
         reads, life, missed = self.reads, self._life, self.reads.missed
@@ -239,7 +239,7 @@ class Servos:
             if not reads.asks(index):
                 continue
             missed[index] += 1
-            life.on(index, Event.DOUBT)
+            life.on(index, ServoEvent.DOUBT)
             if missed[index] == 1:
                 how = "sent a garbled reply" if reads.garbled[index] else "did not answer"
                 life.report(EventCode.READ_LOST, Severity.WARNING, index, how)
@@ -300,7 +300,7 @@ class Servos:
                 read = line.read(servos[index].servo_id, limit.address, limit.size)
                 return index, limit.name, self._read_torque_limit(index, read, limit.name)
         states = self._life.states
-        if State.HOLDING in states or State.STOPPED in states:
+        if ServoState.HOLDING in states or ServoState.STOPPED in states:
             for offset in range(1, len(servos) + 1):
                 index = (self._read_last + offset) % len(servos)
                 if states[index] in IN_DOUBT and fresh[index]:
@@ -329,10 +329,10 @@ class Servos:
             return  # lost or latched meanwhile: its return decides, or nothing gives it goals any more
         enabled = reply.parameters[0]
         if enabled == 1:
-            self._life.on(index, Event.TORQUE_ON)
+            self._life.on(index, ServoEvent.TORQUE_ON)
             return
         if self._hardware_errors[index] or self._reported_errors[index] & self._dialect.ALERT:
-            self._life.on(index, Event.TORQUE_OFF)  # a shutdown, whose reason was reported
+            self._life.on(index, ServoEvent.TORQUE_OFF)  # a shutdown, whose reason was reported
         else:
             self._life.lose(index).limp_reported = True  # it may have started anew
         self._life.report_limp(index, enabled)
@@ -344,7 +344,7 @@ class Servos:
             return
         self._strained.remove(index)
         if not any(reply.parameters) and not self._life.offline(index):
-            self._life.on(index, Event.TORQUE_OFF)
+            self._life.on(index, ServoEvent.TORQUE_OFF)
             text = f"has {name} = 0: it shut down, and gets no goals until the next run"
             self._life.report(EventCode.SERVO_LIMP, Severity.ERROR, index, text)
 
@@ -358,7 +358,7 @@ class Servos:
         if error == self._hardware_errors[index]:
             return
         self._hardware_errors[index] = self._shown[self._rows[index]] = error
-        self._life.on(index, Event.DOUBT)
+        self._life.on(index, ServoEvent.DOUBT)
         address = self._plan.servos[index].hardware_error_address
         text = f"has Hardware Error Status ({address}) = {error}: {describe_hardware_error(error)}"
         self._life.report(EventCode.SERVO_ERROR, Severity.ERROR, index, text)

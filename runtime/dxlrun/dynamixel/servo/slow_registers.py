@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dxlrun.dynamixel.control_table import ControlItem, control_table
+from dxlrun.dynamixel.control_table import ControlItem, control_table, side_by_side
 from dxlrun.dynamixel.exchange.gaps import Gaps, Urgency
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.dynamixel.plan.planning import plan_line
@@ -23,7 +23,7 @@ _Block = tuple[ControlItem, ...]
 """Items side by side, read by one instruction."""
 
 
-class SlowRegisters:
+class SlowReads:
     """Reads one block of one servo at a time, so that each servo's registers come once in the plan's period.
 
     Temperature and voltage go into the states; other items are logged when they change. Realtime Tick is read
@@ -136,22 +136,11 @@ def _round(plan: BusPlan) -> list[tuple[int, _Block | None]]:
     found: list[tuple[int, int, _Block | None]] = []
     for index, servo in enumerate(plan.servos):
         items = control_table(servo.model, plan.protocol).items
-        blocks: list[_Block | None] = [*_blocks([items[name] for name in servo.slow if name in items])]
+        blocks: list[_Block | None] = [*side_by_side(items[name] for name in servo.slow if name in items)]
         if "realtime_tick" in items:
             blocks.append(None)
         found += [(number, index, block) for number, block in enumerate(blocks)]
     return [(index, block) for _, index, block in sorted(found, key=lambda one: one[:2])]
-
-
-def _blocks(items: list[ControlItem]) -> list[_Block]:
-    """Return items in blocks that stand side by side."""
-    blocks: list[_Block] = []
-    for item in sorted(items, key=lambda one: one.address):
-        if blocks and blocks[-1][-1].address + blocks[-1][-1].size == item.address:
-            blocks[-1] = (*blocks[-1], item)
-        else:
-            blocks.append((item,))
-    return blocks
 
 
 def _limit_item(plan: BusPlan, index: int) -> ControlItem | None:

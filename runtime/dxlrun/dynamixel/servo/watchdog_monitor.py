@@ -7,7 +7,7 @@ from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.servo import watchdog
 from dxlrun.dynamixel.servo.desired import DesiredState
-from dxlrun.dynamixel.servo.life import Event, Life
+from dxlrun.dynamixel.servo.life import Life, ServoEvent
 from dxlrun.dynamixel.servo.registers import settle
 from dxlrun.dynamixel.wire.transaction import Program
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
@@ -64,7 +64,7 @@ class WatchdogMonitor:
             if watchdog.has_one(plan, servo) and not life.offline(index)
         ]
         for index in armed:
-            life.on(index, Event.WATCHDOG)
+            life.on(index, ServoEvent.WATCHDOG)
             if not self._reviving[index]:
                 self._reviving[index] = True
                 name = f"the Bus Watchdog of {plan.servos[index].joint}"

@@ -1,25 +1,29 @@
-"""One servo on a tool's line: read and write its control table, and switch its torque.
+"""One servo on a tool's line: its control table, torque, ID, rate, reboot, reset and own backup.
 
 What every run does is done by the same programs as there: registers are compared, only differences written
-and read back; torque comes with a goal where the servo stands.
+and read back; torque comes with a goal where the servo stands. Every change is confirmed by what is found
+afterwards. Sources: e-Manual, Protocol 1.0 and 2.0: Factory Reset (0x06), Reboot (0x08), Control Table Backup
+(0x20).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
-from dxlrun.dynamixel.control_table import ControlItem, ControlTable, control_table
+from dxlrun.dynamixel.control_table import ControlItem, ControlTable, control_table, side_by_side
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, RegisterValue, ServoPlan
 from dxlrun.dynamixel.plan.line import LONGEST_RETURN_DELAY_NS, listen
 from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
 from dxlrun.dynamixel.servo import modes, watchdog
-from dxlrun.dynamixel.servo.registers import Difference, Settled, compare, settle
+from dxlrun.dynamixel.servo.registers import RegisterDifference, Settled, compare, settle
 from dxlrun.dynamixel.servo.retry import extend_timeouts, retry
 from dxlrun.dynamixel.servo.watchdog import shown, tripped
 from dxlrun.dynamixel.tools.scanning import FoundServo
 from dxlrun.dynamixel.tools.tool_line import ToolLine
-from dxlrun.dynamixel.wire.transaction import Outcome, Program, Result
+from dxlrun.dynamixel.wire import protocol1, protocol2
+from dxlrun.dynamixel.wire.protocol2 import Reset
+from dxlrun.dynamixel.wire.transaction import Outcome, Program, Reply, Result, Transaction
 from dxlrun.errors import ServoFault
 from dxlrun.mode import Mode
 
@@ -27,11 +31,18 @@ LONGEST_READ = 64
 """Bytes of one read; neighbours are read together."""
 BLINK_NS = 300_000_000
 """How long the LED is on, and then off."""
+BOOT_NS = 5_000_000_000
+"""How long a rebooting servo is awaited."""
+_PINGED_EVERY_NS = 100_000_000
+_STORED_NS = 50_000_000
+"""What a servo may take to write its EEPROM [i]."""
+_TICK_MODULUS = 32_768
+_TICK_SPARE_MS = 500
 _LEDS = ("led", "led_red", "led_green", "led_blue")
 
 
 class OneServo:
-    """A servo that a tool was told to deal with; blocks, and raises ServoFault or PortError."""
+    """The servo that a tool works on; blocks, and raises ServoFault or PortError."""
 
     def __init__(self, tool: ToolLine, found: FoundServo) -> None:
         if not found.model or found.garbled:
@@ -42,7 +53,7 @@ class OneServo:
         self.move_to(found.servo_id, found.baud_rate)
 
     def move_to(self, servo_id: int, baud_rate: int) -> None:
-        """Deal with it under another ID, at another rate, from now on."""
+        """Address it by another ID, at another rate, from now on."""
         self.servo_id, self.baud_rate = servo_id, baud_rate
         self.tool.speak(self.table.protocol, baud_rate)
         self.plan = self._plan()
@@ -57,7 +68,7 @@ class OneServo:
         return self.plan.servos[0]
 
     def fail(self, text: str) -> ServoFault:
-        """Return the error that says something of this servo."""
+        """Return an error about this servo."""
         return ServoFault(f"{self.called}: {text}")
 
     # Registers
@@ -68,11 +79,11 @@ class OneServo:
         `refused`: what the servo's firmware does not have is left out; without, that is an error.
         """
         found: dict[str, int] = {}
-        for block in _blocks([self.table.items[name] for name in names]):
+        for block in side_by_side((self.table.items[name] for name in names), LONGEST_READ):
             found |= self.run(self._read_block(block, refused=refused))
         return {name: found[name] for name in names if name in found}
 
-    def differences(self, wanted: Sequence[RegisterValue]) -> tuple[Difference, ...]:
+    def differences(self, wanted: Sequence[RegisterValue]) -> tuple[RegisterDifference, ...]:
         """Compare registers with what they shall hold; writes nothing."""
         found = self.run(compare(self.plan, self._servo, wanted, self.tool.line))
         silent = [self.table.items[one.register.name].title for one in found if one.found is None]
@@ -81,7 +92,7 @@ class OneServo:
         return found
 
     def writable(self, wanted: Sequence[RegisterValue]) -> None:
-        """Make sure that nothing stands against writing registers: torque, or the lock of Protocol 1.0."""
+        """Make sure that registers can be written: no torque, and not the lock of Protocol 1.0."""
         stored = [self.table.items[one.name].title for one in wanted if one.eeprom]
         if not stored:
             return
@@ -135,7 +146,7 @@ class OneServo:
     # Torque and LED
 
     def holds_torque(self) -> bool:
-        """Say whether Torque Enable is on."""
+        """Return whether Torque Enable is on."""
         return bool(self.read(["torque_enable"])["torque_enable"])
 
     def torque(self, on: bool) -> tuple[str, ...]:
@@ -180,7 +191,7 @@ class OneServo:
     # Inside
 
     def run(self, program: Program[Result]) -> Result:
-        """Run a program patiently: somebody knows that the servo is there."""
+        """Run a program with longer timeouts: the servo is known to be there."""
         return self.tool.run(extend_timeouts(program))
 
     @property
@@ -248,22 +259,185 @@ class OneServo:
         return found
 
 
+def change_id(one: OneServo, new: int) -> str:
+    """Give a servo another ID; return what was done. Raises ServoFault, also where it is taken."""
+    one.writable([one.register("id", new)])
+    old, line = one.servo_id, one.tool.line
+    _free(one, new)
+    item = one.table.items["id"]
+    _written(one, line.write(old, item.address, bytes((new,))), f"{item.title} = {new}")
+    if _there(one, old) is not Outcome.TIMEOUT and _there(one, new) is Outcome.TIMEOUT:
+        raise one.fail(f"was given {item.title} = {new}, but still answers under its old one")
+    one.move_to(new, one.baud_rate)
+    _same(one)
+    if _there(one, old) is not Outcome.TIMEOUT:
+        raise one.fail(f"has its new ID, but a servo still answers under ID {old}: there were two")
+    return f"has ID {new}; it had {old}"
+
+
+def change_rate(one: OneServo, new: int) -> str:
+    """Let a servo talk at another rate, bit/s; return what was done.
+
+    Raises ServoFault, also where the adapter cannot, or another servo there has its ID; LookupError where the
+    model does not have the rate.
+    """
+    value = next((value for value, rate in one.table.baud_rates.items() if rate == new), None)
+    if value is None:
+        raise LookupError(f"{one.table.model} has no rate of {new} bit/s")
+    one.writable([one.register(rate_item(one), value)])
+    if not one.tool.can_run_at(new):
+        raise one.fail(f"the adapter at {one.tool.port.name} cannot run at {new} bit/s; nothing was changed")
+    old, item = one.baud_rate, one.table.items[rate_item(one)]
+    one.tool.speak(one.table.protocol, new)
+    try:
+        _free(one, one.servo_id)
+    finally:
+        one.tool.speak(one.table.protocol, old)
+    packet = one.tool.line.write(one.servo_id, item.address, value.to_bytes(item.size, "little"))
+    _written(one, packet, f"{item.title} = {value}")
+    one.move_to(one.servo_id, new)
+    if _there(one, one.servo_id) is Outcome.TIMEOUT:
+        one.move_to(one.servo_id, old)
+        if _there(one, one.servo_id) is Outcome.TIMEOUT:
+            port = one.tool.port.name
+            raise one.fail(
+                f"answers neither at {old} nor at {new} bit/s now; look for it: dxlrun scan {port}"
+            )
+        raise one.fail(f"was given {item.title} = {value}, but still answers at {old} bit/s")
+    _same(one)
+    return f"talks at {new} bit/s; it did at {old}"
+
+
+def rate_item(one: OneServo) -> str:
+    """Return the name of the item that holds a servo's rate; the Y series has two."""
+    return "baud_rate" if "baud_rate" in one.table.items else "baud_rate_bus"
+
+
+def reboot(one: OneServo) -> str:
+    """Reboot a servo, and wait until it answers; return what was done."""
+    if "reboot" not in one.table.capabilities:
+        raise one.fail("this model knows no reboot instruction; switch its power off and on")
+    before_ns = one.tool.port.clock.now_ns()
+    _written(one, one.tool.line.instruct(one.servo_id, protocol2.reboot(one.servo_id)), "the reboot")
+    _await(one)
+    if "realtime_tick" in one.table.items:
+        tick = one.read(["realtime_tick"])["realtime_tick"]
+        passed_ms = (one.tool.port.clock.now_ns() - before_ns) // 1_000_000
+        if tick > passed_ms + _TICK_SPARE_MS and passed_ms < _TICK_MODULUS:
+            raise one.fail(
+                f"did not start anew: its Realtime Tick is {tick} ms, {passed_ms} ms after the reboot"
+            )
+    return f"started anew, and holds {'' if one.holds_torque() else 'no '}torque"
+
+
+def factory_reset(one: OneServo, keep: Reset) -> str:
+    """Set a servo's control table to the factory's values; return what was done.
+
+    Protocol 1.0 keeps nothing. Where it gets the ID or the rate of the factory, these must be free.
+    """
+    items, table = one.table.items, one.table
+    one.writable([one.register("id", one.servo_id)])
+    servo_id, baud_rate = one.servo_id, one.baud_rate
+    if table.protocol == 1.0 or keep is Reset.ALL:
+        servo_id = items["id"].initial or 1
+    if table.protocol == 1.0 or keep is not Reset.KEEP_ID_AND_BAUD_RATE:
+        baud_rate = table.baud_rates[items[rate_item(one)].initial or 0]
+    if (servo_id, baud_rate) != (one.servo_id, one.baud_rate):
+        if not one.tool.can_run_at(baud_rate):
+            raise one.fail(f"the adapter cannot run at the factory's {baud_rate} bit/s; nothing was changed")
+        one.tool.speak(table.protocol, baud_rate)
+        try:
+            _free(one, servo_id)
+        finally:
+            one.tool.speak(table.protocol, one.baud_rate)
+    packet = (
+        protocol1.factory_reset(one.servo_id)
+        if table.protocol == 1.0
+        else protocol2.factory_reset(one.servo_id, keep)
+    )
+    _written(one, one.tool.line.instruct(one.servo_id, packet), "the factory reset")
+    one.move_to(servo_id, baud_rate)
+    _await(one)
+    _same(one)
+    return f"has the factory's values, ID {servo_id} at {baud_rate} bit/s"
+
+
+def back_up(one: OneServo) -> str:
+    """Let a servo store its control table in its own backup; return what was done."""
+    _has_backup(one)
+    _written(one, one.tool.line.instruct(one.servo_id, protocol2.back_up(one.servo_id)), "the backup")
+    if "backup_ready" in one.table.items and not one.read(["backup_ready"])["backup_ready"]:
+        raise one.fail("acknowledged the backup, but Backup Ready is 0: there is none")
+    return "stored its control table in its own backup"
+
+
+def take_back(one: OneServo) -> str:
+    """Let a servo take its EEPROM back from its own backup and start anew; return what was done."""
+    _has_backup(one)
+    _written(one, one.tool.line.instruct(one.servo_id, protocol2.restore(one.servo_id)), "the restoring")
+    _await(one)
+    _same(one)
+    return "took its EEPROM back from its own backup, and started anew"
+
+
+def _has_backup(one: OneServo) -> None:
+    if one.table.protocol == 1.0:
+        raise one.fail("servos of Protocol 1.0 have no backup of their own; give a file")
+    if one.holds_torque():
+        raise one.fail(f"holds torque; switch it off first: {one.command} torque off")
+
+
+def _written(one: OneServo, transaction: Transaction, what: str) -> None:
+    """Send a change; a missing acknowledgement decides nothing, what is found afterwards does."""
+
+    def program() -> Program[Reply]:
+        reply = yield transaction
+        yield listen(_STORED_NS)
+        return reply
+
+    reply = one.run(program())
+    if reply.outcome is Outcome.REFUSED:
+        raise one.fail(f"refuses {what}: {one.tool.line.dialect.describe_error(reply.error)}")
+
+
+def _there(one: OneServo, servo_id: int) -> Outcome:
+    """Ping an ID at the present rate."""
+
+    def program() -> Program[Outcome]:
+        reply = yield from retry(one.tool.line.ping(servo_id))
+        return reply.outcome
+
+    return one.tool.run(program())
+
+
+def _free(one: OneServo, servo_id: int) -> None:
+    if _there(one, servo_id) is not Outcome.TIMEOUT:
+        raise ServoFault(
+            f"{one.called}: another servo has ID {servo_id} at {one.tool.baud_rate} bit/s; nothing was "
+            "changed"
+        )
+
+
+def _same(one: OneServo) -> None:
+    """Make sure that the servo that answers now is of this model."""
+    number = one.read(["model_number"])["model_number"]
+    if number != one.table.model_number:
+        raise one.fail(f"the servo there is model number {number}, not {one.table.model_number}")
+
+
+def _await(one: OneServo) -> None:
+    """Wait until it answers."""
+    end_ns = one.tool.port.clock.now_ns() + BOOT_NS
+    while _there(one, one.servo_id) is not Outcome.OK:
+        if one.tool.port.clock.now_ns() > end_ns:
+            port = one.tool.port.name
+            raise one.fail(f"does not answer since {BOOT_NS * 1e-9:g} s; look for it: dxlrun scan {port}")
+        one.tool.wait(_PINGED_EVERY_NS)
+
+
 def _integer(item: ControlItem, data: bytes | memoryview, start: int) -> int:
     offset = item.address - start
     return int.from_bytes(data[offset : offset + item.size], "little", signed=item.signed)
-
-
-def _blocks(items: Sequence[ControlItem]) -> Iterator[list[ControlItem]]:
-    """Yield neighbours together, as far as one read takes them."""
-    block: list[ControlItem] = []
-    for item in sorted(items, key=lambda item: item.address):
-        joined = block and block[-1].address + block[-1].size == item.address
-        if block and (not joined or item.address + item.size - block[0].address > LONGEST_READ):
-            yield block
-            block = []
-        block.append(item)
-    if block:
-        yield block
 
 
 def _pause(duration_ns: int) -> Program[bool]:

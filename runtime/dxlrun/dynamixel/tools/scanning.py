@@ -1,8 +1,8 @@
-"""Scanning: who answers on a line, in which protocol and at which rate; nothing is written to a servo.
+"""Scanning: which servos answer on a line, in which protocol and at which rate; nothing is written.
 
-Protocol 2.0 is asked by one broadcast ping a rate, which each servo answers in a slot of its own;
-Protocol 1.0 ID by ID, because all its servos would answer at once (e-Manual, Protocol 1.0 and 2.0, Ping).
-Where anything is heard that is no whole answer every ID is asked again, patiently.
+Protocol 2.0 gets one broadcast ping a rate, which each servo answers in a slot of its own; Protocol 1.0 is
+pinged ID by ID, because all its servos would answer at once (e-Manual, Protocol 1.0 and 2.0, Ping). Where
+anything is received that is no whole reply every ID is pinged again, with longer timeouts.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from dxlrun.dynamixel.tools.tool_line import ToolLine, refuse_echo
 from dxlrun.dynamixel.wire.dialect import dialect_of
 from dxlrun.dynamixel.wire.transaction import BROADCAST_ID, Outcome, Program, Reply, Transaction
 
-SHORT_PATIENCE_NS = 2_000_000
-"""How long a servo that is probably not there is awaited beyond the latest moment by the wire."""
+SHORT_TIMEOUT_NS = 2_000_000
+"""How long a reply that probably does not come is awaited beyond the latest moment by the wire."""
 SLOT_NS = 3_000_000
 """After a broadcast ping: of each ID, beside the bytes of its answer (dynamixel-sdk, broadcastPing)."""
 LATE_NS = 20_000_000
-"""Behind the last question of a rate: what comes still, came late through the adapter."""
+"""After the last request at a rate: what still comes was late in the adapter."""
 LATE_OF_FEW_NS = 100_000_000
-"""The same where few are asked: there it may be the machine that is late."""
+"""The same where few IDs are pinged: there it may be the machine that is late."""
 FEW = 20
-"""So many IDs are quicker asked one by one."""
+"""So many IDs are quicker pinged one by one."""
 _USUAL = (1_000_000, 57_600, 115_200)
-_WHO_LENGTH = 3
+_IDENTITY_LENGTH = 3
 _LIMITS = (("min_position_limit", "max_position_limit"), ("cw_angle_limit", "ccw_angle_limit"))
 _TRIES = 2
 """Of a ping at a rate that is one of many."""
 _TRIES_ALONE = 4
-"""Where somebody said where the servo is: there it is awaited patiently."""
+"""Where protocol and rate are given: there it is awaited with longer timeouts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,9 +45,9 @@ class FoundServo:
     """bit/s"""
     servo_id: int
     model: str = ""
-    """Name of its control table; empty where there is none, or it did not say."""
+    """Name of its control table; empty where there is none, or it is not known."""
     model_number: int = -1
-    """-1: it did not say."""
+    """-1: not known."""
     firmware: int = 0
     position: int | None = None
     """Present position, ticks."""
@@ -63,8 +63,8 @@ class FoundServo:
 
 
 @dataclass(frozen=True, slots=True)
-class Wish:
-    """Where to look."""
+class Search:
+    """Protocols, rates and IDs to look at."""
 
     protocols: tuple[float, ...] = (2.0, 1.0)
     baud_rates: tuple[int, ...] = ()
@@ -81,7 +81,7 @@ class Wish:
         )
 
 
-EVERYWHERE = Wish()
+EVERYWHERE = Search()
 Progress = Callable[[str, float], None]
 
 
@@ -102,11 +102,11 @@ class Scanned:
     """Rates at which the adapter cannot run, bit/s."""
 
 
-def scan(tool: ToolLine, wish: Wish = EVERYWHERE, progress: Progress = lambda *_: None) -> Scanned:
+def scan(tool: ToolLine, search: Search = EVERYWHERE, progress: Progress = lambda *_: None) -> Scanned:
     """Look for servos; raises PortError when the line is gone, or its adapter echoes."""
     found: list[FoundServo] = []
     left_out: list[int] = []
-    lines = wish.lines()
+    lines = search.lines()
     for index, (protocol, baud_rate) in enumerate(lines):
         if not tool.speak(protocol, baud_rate):
             left_out.append(baud_rate)
@@ -116,16 +116,16 @@ def scan(tool: ToolLine, wish: Wish = EVERYWHERE, progress: Progress = lambda *_
         def beat(share: float, index: int = index, words: str = words) -> None:
             progress(words, (index + share) / len(lines))
 
-        ids = wish.ids or tuple(range(dialect_of(protocol).HIGHEST_ID + 1))
+        ids = search.ids or tuple(range(dialect_of(protocol).HIGHEST_ID + 1))
         beat(0.0)
         found += tool.run(_search(tool, ids, beat))
     return Scanned(tuple(found), tuple(dict.fromkeys(left_out)))
 
 
-def find(tool: ToolLine, servo_id: int, wish: Wish = EVERYWHERE) -> tuple[FoundServo, ...]:
+def find(tool: ToolLine, servo_id: int, search: Search = EVERYWHERE) -> tuple[FoundServo, ...]:
     """Look for one ID in every protocol and at every rate; raises PortError as `scan` does."""
     found: list[FoundServo] = []
-    lines = wish.lines()
+    lines = search.lines()
     tries = _TRIES_ALONE if len(lines) == 1 else _TRIES
     for protocol, baud_rate in lines:
         if servo_id <= dialect_of(protocol).HIGHEST_ID and tool.speak(protocol, baud_rate):
@@ -154,14 +154,14 @@ def _search(tool: ToolLine, ids: Sequence[int], beat: Callable[[float], None]) -
     line, heard = tool.line, tool.heard
     yield listen(LATE_NS)  # what still comes of the rate before
     heard.clear()
-    if line.dialect.PING_LENGTH >= _WHO_LENGTH and len(ids) > FEW:
+    if line.dialect.PING_LENGTH >= _IDENTITY_LENGTH and len(ids) > FEW:
         slot_ns = line.wire_ns(line.dialect.OVERHEAD + line.dialect.PING_LENGTH) + SLOT_NS
         asked = line.unanswered(line.dialect.ping(BROADCAST_ID))
         slots_ns = slot_ns * (len(ids) + 1) + line.latency_ns
         refuse_echo(tool.port.name, (yield replace(asked, due_ns=asked.due_ns + slots_ns)))
         there = heard.ids & set(ids)
     else:
-        there = yield from _one_by_one(tool, ids, SHORT_PATIENCE_NS, beat)
+        there = yield from _one_by_one(tool, ids, SHORT_TIMEOUT_NS, beat)
     if heard.noise:
         there |= yield from _one_by_one(tool, ids, None, beat)
     found: list[FoundServo] = []
@@ -171,15 +171,15 @@ def _search(tool: ToolLine, ids: Sequence[int], beat: Callable[[float], None]) -
 
 
 def _one_by_one(
-    tool: ToolLine, ids: Sequence[int], patience_ns: int | None, beat: Callable[[float], None]
+    tool: ToolLine, ids: Sequence[int], timeout_ns: int | None, beat: Callable[[float], None]
 ) -> Program[set[int]]:
-    """Ping every ID; return who is there, or seems to be."""
+    """Ping every ID; return those that are there, or seem to be."""
     line, heard = tool.line, tool.heard
     there: set[int] = set()
     suspected: list[int] = []
     for index, servo_id in enumerate(ids):
         ping = line.ping(servo_id)
-        reply = yield ping if patience_ns is None else _hurried(tool, ping, patience_ns)
+        reply = yield ping if timeout_ns is None else _hurried(tool, ping, timeout_ns)
         refuse_echo(tool.port.name, reply)
         if reply.answered:
             there.add(servo_id)
@@ -201,23 +201,23 @@ def _answering(line: Line, suspected: Sequence[int]) -> Program[set[int]]:
     return there
 
 
-def _hurried(tool: ToolLine, transaction: Transaction, patience_ns: int) -> Transaction:
-    return replace(transaction, timeout_ns=transaction.due_ns + tool.port.latency_ns + patience_ns)
+def _hurried(tool: ToolLine, transaction: Transaction, timeout_ns: int) -> Transaction:
+    return replace(transaction, timeout_ns=transaction.due_ns + tool.port.latency_ns + timeout_ns)
 
 
 def look(line: Line, servo_id: int) -> Program[FoundServo]:
-    """Ask a servo that is there what it is and how it is set; writes nothing."""
+    """Read the model and settings of a servo that is there; writes nothing."""
     dialect = line.dialect
     servo = FoundServo(dialect.PROTOCOL, line.baud_rate, servo_id)
     ping = yield from retry(line.ping(servo_id))
-    said = ping
-    if ping.answered and dialect.PING_LENGTH < _WHO_LENGTH:
-        said = yield from retry(line.read(servo_id, 0, _WHO_LENGTH))
-    if not said.answered:
-        garbled = Outcome.GARBLED in (ping.outcome, said.outcome)
-        return replace(servo, garbled=garbled, remarks=(_mute(ping, said, line),))
-    number, firmware = said.word(), said.parameters[2]
-    remarks = [dialect.describe_error(said.error)] if said.error else []
+    reply = ping
+    if ping.answered and dialect.PING_LENGTH < _IDENTITY_LENGTH:
+        reply = yield from retry(line.read(servo_id, 0, _IDENTITY_LENGTH))
+    if not reply.answered:
+        garbled = Outcome.GARBLED in (ping.outcome, reply.outcome)
+        return replace(servo, garbled=garbled, remarks=(_mute(ping, reply, line),))
+    number, firmware = reply.word(), reply.parameters[2]
+    remarks = [dialect.describe_error(reply.error)] if reply.error else []
     table = _table(number, firmware, dialect.PROTOCOL)
     if table is None:
         remarks.append(f"no control table has its model number {number}: a plug-in can add one")
@@ -227,7 +227,7 @@ def look(line: Line, servo_id: int) -> Program[FoundServo]:
 
 
 def _look_closer(line: Line, table: ControlTable, servo: FoundServo) -> Program[FoundServo]:
-    """Read what a robot file wants to know, and find two servos of one ID: they stand somewhere else."""
+    """Read what a robot file needs, and find two servos of one ID: their positions differ."""
     values: dict[str, int] = {}
     names = ["present_position", "return_delay_time", *(name for pair in _LIMITS for name in pair)]
     items = [table.items[name] for name in names if name in table.items]
@@ -259,13 +259,13 @@ def _look_closer(line: Line, table: ControlTable, servo: FoundServo) -> Program[
     )
 
 
-def _mute(ping: Reply, said: Reply, line: Line) -> str:
-    if Outcome.GARBLED in (ping.outcome, said.outcome):
+def _mute(ping: Reply, reply: Reply, line: Line) -> str:
+    if Outcome.GARBLED in (ping.outcome, reply.outcome):
         return "answers garbled: do two servos have this ID? If not, check cable and ground"
     if not ping.answered:
         return "answered once, and then no more: check its cable and power"
-    if said.outcome is Outcome.REFUSED:
-        return f"refuses to be read: {line.dialect.describe_error(said.error)}"
+    if reply.outcome is Outcome.REFUSED:
+        return f"refuses to be read: {line.dialect.describe_error(reply.error)}"
     return "answers pings but no read: its Status Return Level (16) is 0"
 
 

@@ -1,4 +1,4 @@
-"""A servo's registers in a file: all that can be written, stamped with who it was; and what goes back."""
+"""A servo's registers in a file: all that can be written, with model, ID and rate; and what is restored."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _LAST = "status_return_level"
 
 
 class ServoBackup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What stands in the file."""
+    """The content of the file."""
 
     format: Literal["dxlrun servo backup 1"]
     model: str
@@ -95,7 +95,7 @@ def registers_to_restore(path: Path, backup: ServoBackup, table: ControlTable) -
             found.append(RegisterValue(item.address, item.size, value, name, item.area == "EEPROM"))
     if wrong:
         raise InputError("\n".join(wrong))
-    return tuple(sorted(found, key=_turn))
+    return tuple(sorted(found, key=_order))
 
 
 def stamped(
@@ -107,7 +107,7 @@ def stamped(
     return ServoBackup(FORMAT, table.model, number, firmware, protocol, servo_id, rate, dict(values))
 
 
-def _turn(one: RegisterValue) -> tuple[bool, bool, bool, int]:
+def _order(one: RegisterValue) -> tuple[bool, bool, bool, int]:
     return one.name == _LAST, one.name not in _MODES, not one.eeprom, one.address
 
 

@@ -1,4 +1,4 @@
-"""Tool line: one serial line for tools, at one rate and in one protocol after the other; never in a run."""
+"""Tool line: one serial line for tools, in one protocol and at one rate after the other; never in a run."""
 
 from __future__ import annotations
 
@@ -59,14 +59,15 @@ class Tunable(Protocol):
         ...
 
     def tune(self, baud_rate: int) -> bool:
-        """Go on at another rate, bit/s; say whether the adapter can. Raises PortError when it is gone."""
+        """Change to a rate, bit/s; return whether the adapter can. Raises PortError when it is gone."""
         ...
 
 
 class TunablePort:
-    """A serial port, opened for this process alone; a context manager, which lets go of it.
+    """A serial port, opened for this process alone; a context manager, which closes it.
 
-    Raises PortError when it cannot be opened: it is not there, or somebody else has it, and who that is.
+    Raises PortError when it cannot be opened: it is not there, or another process has it, which
+    is named.
     """
 
     def __init__(self, path: str) -> None:
@@ -87,7 +88,7 @@ class TunablePort:
         self._serial.close()
 
     def tune(self, baud_rate: int) -> bool:
-        """Go on at another rate; what came at the old one and was not read is thrown away."""
+        """Change to a rate; what came at the old one and was not read is thrown away."""
         try:
             if self._serial.baudrate != baud_rate:
                 self._serial.baudrate = baud_rate
@@ -102,11 +103,11 @@ class TunablePort:
 
 
 class Heard(NoPackets):
-    """Keeps who was heard on a line, whether awaited or not."""
+    """Keeps which servos answered on a line, whether awaited or not."""
 
     def __init__(self) -> None:
         self.ids: set[int] = set()
-        """Whose intact status packets came."""
+        """IDs of the intact status packets that came."""
         self.noise = 0
         """Bytes that belonged to no intact packet."""
 
@@ -138,7 +139,7 @@ class ToolLine:
         self._bus: Bus | None = None
 
     def speak(self, protocol: float, baud_rate: int) -> bool:
-        """Go on in a protocol, at a rate; say whether the adapter can, and stay as it was where not."""
+        """Change to a protocol and a rate; return whether the adapter can, and stay as it was where not."""
         if not self.port.tune(baud_rate):
             return False
         port, latency_ns = self.port, self.port.most_latency_ns
@@ -164,11 +165,11 @@ class ToolLine:
             raise LookupError("speak a protocol first")
         (result,) = run([program], [bus], self.port.ports, self.port.clock, beat)
         if bus.failure is not None or result is None:
-            raise bus.failure or PortError(f"{self.port.name}: nothing came of it")
+            raise bus.failure or PortError(f"{self.port.name}: its program did not end")
         return result
 
     def wait(self, duration_ns: int) -> None:
-        """Let time pass, and hear what comes."""
+        """Let time pass, and take what comes."""
         self.run(_wait(duration_ns))
 
 

@@ -1,0 +1,133 @@
+"""The table of checks before torque: each row fails on what it is for, and on nothing that is in order."""
+
+from dataclasses import replace
+
+import pytest
+
+from dxlrun.dynamixel.control_table import control_table
+from dxlrun.dynamixel.plan.bus_plan import RegisterValue
+from dxlrun.dynamixel.plan.planning import plan_line
+from dxlrun.dynamixel.servo.checks import CHECKS, BusSurvey, inspect
+from dxlrun.dynamixel.wire.transaction import Outcome, Reply
+
+FITS = {
+    1.0: {"status_return_level": 2, "resolution_divider": 1, "ccw_angle_limit": 1023, "torque_limit": 1023},
+    2.0: {"status_return_level": 2, "min_position_limit": 0, "max_position_limit": 4095},
+}
+FAILS = (
+    (1.0, {"error": 0x04}, "reports an error: overheating"),
+    (1.0, {"model_number": 300}, "is model number 300, not a AX-12A (12): correct `model` or the ID"),
+    (1.0, {"status_return_level": 1}, "has Status Return Level (16) = 1, so it acknowledges no write"),
+    (1.0, {"ccw_angle_limit": 1000}, "has angle limits 0..1000, narrower than the joint's 0..1023"),
+    (1.0, {"torque_enable": 1}, "holds torque already"),
+    (1.0, {"torque_limit": 0}, "has Torque Limit (34) = 0: it shut itself down"),
+    (1.0, {"multi_turn_offset": 5}, "has Multi Turn Offset (20) = 5, which shifts every position: write 0"),
+    (
+        1.0,
+        {"resolution_divider": 2},
+        "has Resolution Divider (22) = 2, which changes what a tick is: write 1",
+    ),
+    (2.0, {"model_number": 30}, "is model number 30, not a XM430-W350 (1020)"),
+    (2.0, {"firmware_version": 30, "declared": "backup_ready"}, "came with firmware"),
+    (2.0, {"status_return_level": 0}, "so it acknowledges no write: write 2 there"),
+    (2.0, {"drive_mode": 5}, "so it turns the other way round and takes profiles for times: write 0 there"),
+    (2.0, {"drive_mode": 64}, "so it is unknown: write 0 there"),
+    (2.0, {"homing_offset": -3}, "has Homing Offset (20) = -3, which shifts every position"),
+    (2.0, {"min_position_limit": 700}, "has position limits 700..4095, narrower than the joint's"),
+    (2.0, {"startup_configuration": 1}, "so it switches torque on by itself at power-up: clear bit 0"),
+    (2.0, {"hardware_error_status": 32}, "reports in Hardware Error Status (70): overload error"),
+    (2.0, {"torque_enable": 1}, "holds torque already"),
+)
+DIFFERS = (
+    (
+        1.0,
+        {"return_delay_time": 100},
+        "Return Delay Time (5) is 100, 200 us, where the robot file assumes 500",
+    ),
+    (2.0, {"startup_configuration": 2}, "Startup Configuration bit 1 is set"),
+    (2.0, {"profile_acceleration": 9}, "Profile Acceleration (108) is 9: it reaches its goals late"),
+    (2.0, {"bus_watchdog": 5}, "Bus Watchdog (98) is 5, it would stop after 100 ms without an instruction"),
+    (
+        2.0,
+        {"bus_watchdog": 255},
+        "Bus Watchdog (98) is 255 (tripped), it has stopped the servo; it is cleared",
+    ),
+)
+
+
+@pytest.fixture
+def look(make_plan):
+    """Inspect one servo whose registers are as given."""
+
+    def look(protocol, change, *, take_over=False):
+        multi_turn = {"multi_turn_offset", "resolution_divider"} & set(change)
+        model = "MX-28" if multi_turn else "AX-12A" if protocol == 1.0 else "XM430-W350"
+        plan = make_plan((1,), protocol=protocol, model=model)
+        servo = plan.servos[0]
+        table = control_table(model, protocol)
+        if "declared" in change:
+            item = table.items[change["declared"]]
+            servo = replace(servo, registers=(RegisterValue(item.address, item.size, 0, item.name),))
+        values = dict.fromkeys(table.items, 0) | FITS[protocol]
+        values |= {"model_number": servo.model_number, "firmware_version": 52 if protocol == 2.0 else 24}
+        values |= {"return_delay_time": plan.return_delay_ns // 2_000}
+        if multi_turn:
+            values["ccw_angle_limit"] = 4095
+        values |= {name: value for name, value in change.items() if name in table.items}
+        memory = bytearray(table.size)
+        for item in table.items.values():
+            if not item.name.startswith("indirect"):
+                memory[item.address : item.address + item.size] = item.encode(values[item.name])
+        found, line = BusSurvey(), plan_line(plan)
+        program = inspect(plan, servo, line, found, take_over=take_over)
+        reads = {
+            line.read(1, start, length).packet: bytes(memory[start : start + length])
+            for start in range(table.size)
+            for length in range(1, 40)
+        }
+        read = next(program)
+        try:
+            while True:
+                data = reads[read.packet]
+                read = program.send(Reply(Outcome.OK, change.get("error", 0), data, 0, 0, False))
+        except StopIteration as end:
+            readable = end.value
+        assert readable is True
+        return found
+
+    return look
+
+
+@pytest.mark.parametrize("protocol", [1.0, 2.0])
+def test_a_servo_that_fits_has_neither_problem_nor_difference(look, protocol):
+    found = look(protocol, {})
+    assert (found.problems, found.differences) == ([], [])
+    assert len(found.servos) == len(found.modes) == 1
+
+
+@pytest.mark.parametrize(("protocol", "change", "sentence"), FAILS)
+def test_a_servo_that_does_not_fit_is_refused_with_one_sentence(look, protocol, change, sentence):
+    (problem,) = look(protocol, change).problems
+    assert problem.startswith("main_1_joint (ID 1 on bus main) ")
+    assert sentence in problem
+
+
+@pytest.mark.parametrize(("protocol", "change", "sentence"), DIFFERS)
+def test_what_refuses_nothing_is_reported(look, protocol, change, sentence):
+    found = look(protocol, change)
+    assert found.problems == []
+    ((joint, text),) = found.differences
+    assert joint == "main_1_joint"
+    assert sentence in text
+
+
+def test_a_servo_with_torque_is_accepted_when_the_robot_is_taken_over(look):
+    assert look(2.0, {"torque_enable": 1}, take_over=True).problems == []
+
+
+def test_every_row_of_the_table_has_a_case_here():
+    """A row that never fails guards nothing."""
+    items = {name for _, change, _ in FAILS + DIFFERS for name in change}
+    stand_in = {"error": "status_error", "ccw_angle_limit": "cw_angle_limit"}
+    items |= {stand_in[name] for name in items & set(stand_in)}
+    assert {check.item for check in CHECKS} <= items
