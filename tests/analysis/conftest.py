@@ -65,6 +65,7 @@ class Said:
     severity: Severity
     text: str
     source: str = "head"
+    data: bytes = b""
 
 
 Write = Callable[..., Path]
@@ -109,7 +110,7 @@ def make_log(
     batch.commit()
     ring = EventRing(Handover(log.take), VirtualClock(9))
     for said in events:
-        ring.emit(said.code, said.severity, said.source, said.text)
+        ring.emit(said.code, said.severity, said.source, said.text, said.data)
     if gaps:
         log.gap("loop/packets", gaps)
     if close:

@@ -180,18 +180,17 @@ def test_no_scheduler_is_recommended_that_was_granted(real_time: RealTime, helps
 
 
 @pytest.mark.parametrize(
-    ("severity", "text", "granted"),
+    ("data", "granted"),
     [
-        (Severity.INFO, "scheduler round_robin, priority 31", True),
-        (Severity.WARNING, "scheduler round_robin 31 was refused", False),
-        (Severity.WARNING, "memory is not locked", False),
+        (b'{"request":"scheduler","granted":true}', True),
+        (b'{"request":"scheduler","granted":false}', False),
+        (b'{"request":"locked memory","granted":true}', False),
+        (b"", False),
     ],
 )
-def test_what_was_granted_is_read_from_the_log(
-    write: Make, said: Make, severity: Severity, text: str, granted: bool
-) -> None:
+def test_what_was_granted_is_read_from_the_log(write: Make, said: Make, data: bytes, granted: bool) -> None:
     about = {"scheduler": {"policy": "round_robin"}, "kernel": {"version": "#1 SMP PREEMPT_RT"}}
-    path = write(events=[said(EventCode.SCHEDULER, severity, text, "loop")], metadata=about)
+    path = write(events=[said(EventCode.SCHEDULER, Severity.INFO, "in words", "loop", data)], metadata=about)
     assert figures_of(path).real_time == RealTime(True, granted, True)
 
 

@@ -37,7 +37,7 @@ PERIOD_NS = 20_000_000
 class Events:
     seen: list[tuple[EventCode, Severity, str, str]] = field(default_factory=list)
 
-    def emit(self, code: EventCode, severity: Severity, source: str, text: str) -> None:
+    def emit(self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b"") -> None:
         self.seen.append((code, severity, source, text))
 
     def of(self, code: EventCode) -> list[tuple[str, str]]:

@@ -37,7 +37,7 @@ class Rig:
         if eased:
             self.gate.apply(self.record.commands, self.record.goals, SLOW_START_NS)
 
-    def emit(self, code, severity, source, text):
+    def emit(self, code, severity, source, text, data=b""):
         self.told.append(text)
 
     def apply(self, **commands):

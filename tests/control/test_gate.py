@@ -41,7 +41,7 @@ class Rig:
         if eased:
             self.wait(SLOW_START_NS)
 
-    def emit(self, code, severity, source, text):
+    def emit(self, code, severity, source, text, data=b""):
         assert code == EventCode.GATE
         self.events.append((source, text))
 

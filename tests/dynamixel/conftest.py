@@ -55,7 +55,7 @@ class Events:
 
     list: list[tuple[EventCode, Severity, str, str]] = field(default_factory=list)
 
-    def emit(self, code, severity, source, text):
+    def emit(self, code, severity, source, text, data=b""):
         self.list.append((code, severity, source, text))
 
     def of(self, code):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import resource
 import tracemalloc
@@ -23,10 +24,11 @@ from rosbags.typesys.store import Typestore
 
 from dxlrun.clock import VirtualClock
 from dxlrun.errors import LogError
-from dxlrun.log import reader
+from dxlrun.log import reader, schemas
+from dxlrun.log.cdr import Codec
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import read_log
-from dxlrun.log.schemas import LogHeader, LogSummary, to_metadata
+from dxlrun.log.schemas import LogHeader, LogSummary, MessageType, to_metadata
 from dxlrun.run.channels.cycle import CycleLayout
 from dxlrun.run.channels.events import Event, EventCode, EventCounts, EventRing, Severity
 from dxlrun.run.channels.packets import LoggedPacket, PacketBatch, PacketKind
@@ -90,6 +92,28 @@ def test_a_long_text_in_pieces_as_the_first_release_wrote_it_is_read_as_one(
     for event in (*pieces, other):  # a slice of a log may begin inside such a text
         counts.add(event)
     assert [(group.count, group.text) for group in counts.groups] == [(1, "x" * 600), (1, "clamped")]
+
+
+def test_an_event_as_it_was_before_it_had_data_is_read(log: LogWriter, tmp_path: Path, cycle: Cycle) -> None:
+    older = MessageType(schemas.EVENT.name, schemas.EVENT.text.removesuffix("string data\n"), "")
+    for length in range(8):  # in each alignment
+        message = Codec(older).pack(7, EventCode.GATE, Severity.INFO, 0, "gate", "head", "x" * length)
+        log._add(log._event_channel, 7, message)
+    log.close()
+    read = read_log(tmp_path / "run.mcap").events
+    assert read == tuple(Event(7, EventCode.GATE, Severity.INFO, "head", "x" * n) for n in range(8))
+
+
+def test_the_data_of_an_event_come_back(log: LogWriter, tmp_path: Path) -> None:
+    ring = EventRing(Handover(log.take), VirtualClock(7))
+    ring.emit(EventCode.STEERED, Severity.INFO, "loop", "in words", b'{"kind":"pause"}')
+    ring.emit(EventCode.STEERED, Severity.INFO, "loop", "too long", b"x" * 5000)
+    log.gap("loop/packets", 3)
+    log.close()
+    first, long, gap = read_log(tmp_path / "run.mcap").events
+    assert first == Event(7, EventCode.STEERED, Severity.INFO, "loop", "in words", data=b'{"kind":"pause"}')
+    assert (long.text, long.data) == ("too long", b"")
+    assert json.loads(gap.data) == {"ring": "loop/packets", "lost": 3}
 
 
 def test_mcap_ros2_support_decodes_every_topic(

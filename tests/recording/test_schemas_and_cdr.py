@@ -78,7 +78,7 @@ def test_an_event_is_the_same_for_us_and_for_rosbags(
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(schemas.EVENT.text, schemas.EVENT.name))
     codec = Codec(schemas.EVENT)
-    data = codec.pack(t_ns, code, 30, 1, name, source, text)
+    data = codec.pack(t_ns, code, 30, 1, name, source, text, '{"a": 1}')
     theirs = store.deserialize_cdr(data, schemas.EVENT.name)
     ours = codec.unpack(data)
     assert {field: getattr(theirs, field) for field in codec.fields} == ours
@@ -139,7 +139,7 @@ def test_values_that_do_not_fit_their_field_are_refused() -> None:
 @pytest.mark.parametrize("cut", [3, 10, 30, 41, -1])
 def test_a_cut_message_is_refused(cut: int) -> None:
     codec = Codec(schemas.EVENT)
-    data = codec.pack(1, 2, 3, 0, "name", "source", "text")
+    data = codec.pack(1, 2, 3, 0, "name", "source", "text", "{}")
     with pytest.raises(ValueError, match=r"Event|longer than its message"):
         codec.unpack(data[:cut])
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ from dxlrun.analysis.steering import Act, Pause, Steering
 from dxlrun.control.loop_plan import TOLERATED_SKIPS
 from dxlrun.log.reader import UNREADABLE, Log, scan_log
 from dxlrun.log.schemas import FAILURES_NAME, SUMMARY_NAME
-from dxlrun.run.channels.events import EventCode, EventCounts, EventGroup, Severity
+from dxlrun.run.channels.events import EventCode, EventCounts, EventGroup, Granted, LostRecords
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,14 +81,13 @@ class Tally:
         self._invalid = invalid if self._invalid is None else self._invalid + invalid
         for event in log.events:
             self._events.add(event)
-            if (
-                event.code == EventCode.SCHEDULER
-                and event.source == "loop"
-                and event.text.startswith("scheduler ")
-            ):
-                self._granted = event.severity < Severity.WARNING
-            number = re.match(r"\d+", event.text) if event.code == EventCode.RECORDER_GAP else None
-            self._unread += int(number[0]) if number else 0
+            with suppress(*UNREADABLE):
+                if event.code == EventCode.SCHEDULER and event.source == "loop":
+                    granted = msgspec.json.decode(event.data, type=Granted)
+                    if granted.request == "scheduler":
+                        self._granted = granted.granted
+                elif event.code == EventCode.RECORDER_GAP:
+                    self._unread += msgspec.json.decode(event.data, type=LostRecords).lost
 
     def figures(self, log: Log) -> Figures:
         """Return the figures of all that was taken; `log`: what the file says of itself, which comes last."""

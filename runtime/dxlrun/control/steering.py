@@ -12,7 +12,7 @@ import numpy as np
 
 from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.loop_plan import ControllerPlan
-from dxlrun.run.channels.answers import Answer, Code, Done, Refusal, Waiting
+from dxlrun.run.channels.answers import Answer, Code, Done, Outcome, Refusal, Waiting
 from dxlrun.run.channels.commands import LOOP, Command, CommandSink, Inbox, TakenCommand
 from dxlrun.run.channels.cycle import CycleRecord
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
@@ -111,12 +111,12 @@ class Steering:
             execute = self._for_loop if command.controller == LOOP else self._for_controller
             answer = execute(command, time_ns)
             if isinstance(answer, Refusal):
-                source = command.controller or "loop"
-                text = f"{command.kind} from {command.origin} refused: {answer.text}"
-                self.events.emit(EventCode.COMMAND_REFUSED, Severity.WARNING, source, text)
+                self._report_refusal(command, answer)
             elif command.controller == LOOP:
                 text = f"{command.kind} {command.data.decode(errors='replace')}".strip()
-                self.events.emit(EventCode.STEERED, Severity.INFO, "loop", f"{text} from {command.origin}")
+                data = msgspec.json.encode(Outcome(command.kind, command.origin))
+                text = f"{text} from {command.origin}"
+                self.events.emit(EventCode.STEERED, Severity.INFO, "loop", text, data)
             else:
                 count += 1
             if answer is not None:
@@ -133,6 +133,12 @@ class Steering:
         """Answer the switches that waited for modes and have come to an end."""
         for number, refusal in self.manager.ended_switches():
             self.inbox.answer(number, refusal or Done(self.record.cycle))
+
+    def _report_refusal(self, command: Command, refusal: Refusal) -> None:
+        source = command.controller or "loop"
+        text = f"{command.kind} from {command.origin} refused: {refusal.text}"
+        data = msgspec.json.encode(Outcome(command.kind, command.origin, refusal))
+        self.events.emit(EventCode.COMMAND_REFUSED, Severity.WARNING, source, text, data)
 
     def _log(self, command: Command) -> None:
         record = self.record

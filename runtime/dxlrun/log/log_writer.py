@@ -22,7 +22,7 @@ from dxlrun.log.schemas import LOG_MODE, LogHeader, LogSummary, MessageType, to_
 from dxlrun.mode import Mode
 from dxlrun.run.channels.commands import decode_taken_command
 from dxlrun.run.channels.cycle import CycleLayout
-from dxlrun.run.channels.events import Event, EventCode, Severity, decode_event
+from dxlrun.run.channels.events import Event, EventCode, LostRecords, Severity, decode_event
 from dxlrun.run.channels.packets import split_packets
 from dxlrun.run.channels.ring import Payload, RecordKind
 
@@ -245,7 +245,14 @@ class LogWriter:
     def _write_event(self, event: Event) -> None:
         """Write one event, to /events and /rosout."""
         data = self._event.pack(
-            event.t_ns, event.code, event.severity, event.part, event.name, event.source, event.text
+            event.t_ns,
+            event.code,
+            event.severity,
+            event.part,
+            event.name,
+            event.source,
+            event.text,
+            event.data.decode(errors="replace"),
         )
         self._add(self._event_channel, event.t_ns, data)
         log = self._ros_log.pack(
@@ -259,7 +266,8 @@ class LogWriter:
         what = counted(lost, f"record of {source} was", f"records of {source} were")
         them = "it" if lost == 1 else "them"
         text = f"{what} overwritten or damaged before the recorder read {them}"
-        event = Event(self._last_ns, EventCode.RECORDER_GAP, Severity.ERROR, "recorder", text)
+        data = msgspec.json.encode(LostRecords(source, lost))
+        event = Event(self._last_ns, EventCode.RECORDER_GAP, Severity.ERROR, "recorder", text, data=data)
         self._guarded(lambda: self._write_event(event))
 
     def flush(self, *, sync: bool = False) -> None:

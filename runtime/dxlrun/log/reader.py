@@ -240,11 +240,18 @@ def _commands(messages: list[bytes]) -> tuple[TakenCommand, ...]:
     )
 
 
+_NO_TEXT = b"\1\0\0\0\0"
+"""An empty string in CDR."""
+
+
 def _events(messages: list[bytes]) -> tuple[Event, ...]:
     codec = Codec(schemas.EVENT)
     events: list[Event] = []
     for data in messages:
-        values = codec.unpack(data)
+        try:
+            values = codec.unpack(data)
+        except ValueError:  # a log from before events had data
+            values = codec.unpack(data + bytes(-len(data) % 4) + _NO_TEXT)
         event = Event(
             t_ns=cast("int", values["t_ns"]),
             code=cast("int", values["code"]),
@@ -252,6 +259,7 @@ def _events(messages: list[bytes]) -> tuple[Event, ...]:
             source=str(values["source"]),
             text=str(values["text"]),
             part=cast("int", values["part"]),
+            data=str(values["data"]).encode(),
         )
         if event.part and events and (events[-1].t_ns, events[-1].code) == (event.t_ns, event.code):
             last = events.pop()

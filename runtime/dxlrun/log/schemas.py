@@ -183,6 +183,7 @@ uint8[] data
 EVENT = MessageType(
     "dxlrun_msgs/msg/Event",
     """# Something that happened beside the regular cycle. part: 0; 1, 2 ... for what follows of a long text.
+# data: JSON for programs, where they need more than code and source; empty: none.
 int64 t_ns
 uint16 code
 uint8 severity
@@ -190,8 +191,9 @@ uint8 part
 string name
 string source
 string text
+string data
 """,
-    "RIHS01_52b75cd08e34ca10ea5c06c64fbfeb30f3e85c73af0478f1ca6c1b3aafb5d98e",
+    "RIHS01_bb5d71296111bd95596d72ee9d27a9e916286b9b85d6cda1a6993b5b41f5852e",
 )
 
 COMMAND = MessageType(

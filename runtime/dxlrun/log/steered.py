@@ -5,16 +5,17 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
-from dxlrun.log.reader import Log
+from dxlrun.log.reader import UNREADABLE, Log
+from dxlrun.run.channels.answers import Code, Outcome, Refusal
 from dxlrun.run.channels.commands import TakenCommand
 from dxlrun.run.channels.events import Event, EventCode
 
 POLICY = "policy"
 """Kind of the command that the loop leaves in the log when it begins a policy's steps."""
 _LOOP = "loop"
-_REFUSED = " refused: "
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,13 +82,18 @@ def _refusal(command: TakenCommand, told: deque[Event]) -> str:
     """Take the answer to a command out of those of its cycle; a controller's is there only if it refused."""
     source = command.controller or _LOOP
     for event in told:
-        if event.source != source or not event.text.startswith(command.kind):
+        outcome = _outcome(event, command)
+        if event.source != source or (outcome.kind, outcome.origin) != (command.kind, command.origin):
             continue
-        refused = f"{command.origin}{_REFUSED}"
-        if event.code == EventCode.STEERED and command.for_loop:
-            told.remove(event)
-            return ""
-        if event.code == EventCode.COMMAND_REFUSED and refused in event.text:
-            told.remove(event)
-            return event.text.split(refused, 1)[1]
+        told.remove(event)
+        return outcome.refusal.text if outcome.refusal else ""
     return ""
+
+
+def _outcome(event: Event, command: TakenCommand) -> Outcome:
+    try:
+        return msgspec.json.decode(event.data, type=Outcome)
+    except UNREADABLE:  # of a log from before events had data: taken in order
+        refused = event.code == EventCode.COMMAND_REFUSED
+        refusal = Refusal(Code.INVALID, {"problem": event.text}) if refused else None
+        return Outcome(command.kind, command.origin, refusal)

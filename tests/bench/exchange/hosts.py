@@ -84,7 +84,7 @@ class HostKind:
 class _Events:
     """Takes events and forgets them."""
 
-    def emit(self, code: EventCode, severity: Severity, source: str, text: str) -> None:
+    def emit(self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b"") -> None:
         """Forget it."""
 
 

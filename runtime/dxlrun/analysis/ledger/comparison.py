@@ -6,7 +6,6 @@ on the buses before and after is only counted.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,8 +19,8 @@ from dxlrun.analysis.ledger.lateness import Lateness, lateness
 from dxlrun.analysis.ledger.overruns import OverrunCauses, overrun_causes
 from dxlrun.analysis.ledger.streams import WAYS, Stream, Way, logged, seen
 from dxlrun.errors import InputError, counted
-from dxlrun.log.reader import Log
-from dxlrun.run.channels.events import EventCode
+from dxlrun.log.reader import UNREADABLE, Log
+from dxlrun.run.channels.events import Event, EventCode, LostRecords
 from dxlrun.run.channels.packets import LoggedPacket, PacketKind
 from dxlrun.simulation import LedgerEntry
 
@@ -213,10 +212,19 @@ def _declared(log: Log, span: Span, t_ns: int) -> str:
     if log.damage:
         return f"the log says: {log.damage[0]}"
     for event in log.events:
-        of_packets = event.code == EventCode.RECORDER_GAP and re.search(r"/packets\b", event.text)
-        if of_packets and -GRACE_NS <= event.t_ns - t_ns + GRACE_NS <= RING_NS:
+        if _of_packets(event) and -GRACE_NS <= event.t_ns - t_ns + GRACE_NS <= RING_NS:
             return f"the log says: {event.text}"
     return ""
+
+
+def _of_packets(event: Event) -> bool:
+    """Return whether an event declares that packets did not reach the log."""
+    if event.code != EventCode.RECORDER_GAP:
+        return False
+    try:
+        return msgspec.json.decode(event.data, type=LostRecords).ring.endswith("packets")
+    except UNREADABLE:
+        return False
 
 
 def _bus(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,7 +20,7 @@ from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.controllers.turns import every, fits
 from dxlrun.control.loop_plan import ControllerPlan, LoopPlan, ScheduledCommand
 from dxlrun.errors import ControllerFault, PlugInError
-from dxlrun.run.channels.answers import Code, Field, Refusal, Waiting
+from dxlrun.run.channels.answers import Code, Field, Outcome, Refusal, Waiting
 from dxlrun.run.channels.commands import CommandSink, NoCommands, TakenCommand
 from dxlrun.run.channels.cycle import MOST_CONTROLLERS, CycleRecord
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
@@ -244,9 +245,8 @@ class Manager:
             self._end_switch(group.number, refusal)
             for managed in group.entering:
                 name = managed.plan.name
-                self._events.emit(
-                    EventCode.COMMAND_REFUSED, Severity.WARNING, name, f"{name} is not activated: {problem}"
-                )
+                text = f"{name} is not activated: {problem}"
+                self._report_refusal(name, text, Outcome("switch", "", refusal))
             self.fault = self.fault or group.why or None
 
     def load(self, plan: ControllerPlan) -> int | Refusal:
@@ -368,8 +368,13 @@ class Manager:
             taken += refusal is None
             if refusal is not None:
                 text = f"{command.kind} from {command.origin} refused: {refusal.text}"
-                self._events.emit(EventCode.COMMAND_REFUSED, Severity.WARNING, command.controller, text)
+                outcome = Outcome(command.kind, command.origin, refusal)
+                self._report_refusal(command.controller, text, outcome)
         return taken
+
+    def _report_refusal(self, controller: str, text: str, outcome: Outcome) -> None:
+        data = msgspec.json.encode(outcome)
+        self._events.emit(EventCode.COMMAND_REFUSED, Severity.WARNING, controller, text, data)
 
     def _tell_taken(self, planned: int, command: ScheduledCommand) -> None:
         record = self._record

@@ -11,10 +11,12 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+import msgspec
+
 from dxlrun.control.loop_plan import Policy, SchedulerPlan
 from dxlrun.control.realtime import memory
 from dxlrun.control.realtime.rights import allow, user
-from dxlrun.run.channels.events import EventCode, EventSink, Severity
+from dxlrun.run.channels.events import EventCode, EventSink, Granted, Severity
 
 _PR_SET_TIMERSLACK = 29  # linux/prctl.h
 _TASKS = Path("/proc/self/task")
@@ -70,7 +72,8 @@ def tell(grants: Sequence[Grant], source: str, events: EventSink) -> None:
     """Leave in the log what became of the wishes of a process."""
     for grant in grants:
         severity = Severity.INFO if grant.granted else Severity.WARNING
-        events.emit(EventCode.SCHEDULER, severity, source, grant.told)
+        data = msgspec.json.encode(Granted(grant.wish, grant.granted))
+        events.emit(EventCode.SCHEDULER, severity, source, grant.told, data)
 
 
 def freeze_collector() -> Grant:

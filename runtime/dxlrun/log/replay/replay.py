@@ -72,7 +72,7 @@ def to_json(report: ReplayReport) -> bytes:
 class _Silence:
     """The events of a replay: the recorded ones are in the log."""
 
-    def emit(self, code: EventCode, severity: Severity, source: str, text: str) -> None:
+    def emit(self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b"") -> None:
         """Forget it."""
 
 

@@ -132,6 +132,14 @@ class Refusal(msgspec.Struct, frozen=True, tag="refused"):
 Answer: TypeAlias = Done | Waiting | Refusal
 
 
+class Outcome(msgspec.Struct, frozen=True):
+    """Data of the events STEERED and COMMAND_REFUSED: what became of a command from outside."""
+
+    kind: str
+    origin: str
+    refusal: Refusal | None = None
+
+
 def encode_answer(answer: Answer, most: int) -> bytes:
     """Return an answer as JSON of at most so many bytes; of a refusal's long texts as much as fits."""
     data = msgspec.json.encode(answer)

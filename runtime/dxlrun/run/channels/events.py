@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 from enum import IntEnum, unique
 from typing import Protocol
 
+import msgspec
+
 from dxlrun.run.channels.ring import RING_SECONDS, Appender, Payload, RecordKind, record_size
 
 
@@ -85,22 +87,39 @@ class EventCode(IntEnum):
     RECORDER_GAP = 61
 
 
+class LostRecords(msgspec.Struct, frozen=True):
+    """Data of RECORDER_GAP."""
+
+    ring: str
+    lost: int
+    """Records."""
+
+
+class Granted(msgspec.Struct, frozen=True):
+    """Data of SCHEDULER: whether the operating system granted a request of a process."""
+
+    request: str
+    granted: bool
+
+
 class EventSink(Protocol):
     """Takes events; never blocks, never raises."""
 
-    def emit(self, code: EventCode, severity: Severity, source: str, text: str) -> None:
-        """Record that `source` (a joint, a controller, a process) has something to tell."""
+    def emit(self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b"") -> None:
+        """Record an event of `source` (a joint, a controller, a process); `data`: JSON for programs."""
         ...
 
 
 LONGEST_SOURCE = 64
 LONGEST_TEXT = 8192
 """Characters; a longer text, such as a plug-in's traceback, is cut."""
-LONGEST_EVENT = 4 * LONGEST_TEXT + 4 * LONGEST_SOURCE + 64
+LONGEST_DATA = 4096
+"""Bytes; longer data are left out."""
+LONGEST_EVENT = 4 * LONGEST_TEXT + 4 * LONGEST_SOURCE + LONGEST_DATA + 64
 """Bytes of an event's record."""
 _USUAL_EVENT = 192
-_HEADER = struct.Struct("<qHBxI")
-"""Time, code, severity, length of the source; source and text follow."""
+_HEADER = struct.Struct("<qHBxII")
+"""Time, code, severity, lengths of source and data; source, data and text follow."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,6 +136,8 @@ class Event:
     text: str
     part: int = 0
     """Always 0 but in older logs, where 1, 2 ... are the following pieces of a long text."""
+    data: bytes = b""
+    """JSON for programs, where they need to know more than code and source; the text is for people."""
 
     @property
     def name(self) -> str:
@@ -188,14 +209,16 @@ class EventRing:
         self.errors = EventCounts()
         """What was emitted as an error, for a run without a log."""
 
-    def emit(self, code: EventCode, severity: Severity, source: str, text: str) -> None:
+    def emit(self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b"") -> None:
         """Record an event of `source` (a joint, a controller, a process), now."""
         t_ns = self._clock.now_ns()
         if severity >= Severity.ERROR:
             self.errors.add(Event(t_ns, code, severity, source, text))
         name = source[:LONGEST_SOURCE].encode(errors="replace")
-        header = _HEADER.pack(t_ns, code, severity, len(name))
-        self._writer.append(RecordKind.EVENT, header + name + text[:LONGEST_TEXT].encode(errors="replace"))
+        data = data if len(data) <= LONGEST_DATA else b""
+        header = _HEADER.pack(t_ns, code, severity, len(name), len(data))
+        shown = text[:LONGEST_TEXT].encode(errors="replace")
+        self._writer.append(RecordKind.EVENT, header + name + data + shown)
 
 
 def _known(code: int) -> int:
@@ -208,14 +231,14 @@ def _known(code: int) -> int:
 def decode_event(payload: Payload) -> Event:
     """Return the event of one record. Raises ValueError when it is not one."""
     try:
-        t_ns, code, severity, name_length = _HEADER.unpack_from(payload)
+        t_ns, code, severity, name_length, data_length = _HEADER.unpack_from(payload)
     except struct.error as error:
         raise ValueError(f"an event ends inside its header: {error}") from error
-    data = bytes(payload[_HEADER.size :])
-    if len(data) < name_length:
-        raise ValueError("an event ends inside its source")
-    source, text = data[:name_length], data[name_length:]
-    return Event(t_ns, _known(code), severity, source.decode(errors="replace"), text.decode(errors="replace"))
+    body, begin = bytes(payload[_HEADER.size :]), name_length + data_length
+    if len(body) < begin:
+        raise ValueError("an event ends inside its source or its data")
+    source, text = (part.decode(errors="replace") for part in (body[:name_length], body[begin:]))
+    return Event(t_ns, _known(code), severity, source, text, data=body[name_length:begin])
 
 
 def event_capacity(period_ns: int, servos: int) -> int:
