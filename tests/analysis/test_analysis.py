@@ -11,10 +11,12 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from dxlrun.analysis.output.terminal import render
-from dxlrun.analysis.report import Report, analyze_log, to_json
-from dxlrun.analysis.verdict import Verdict, microseconds
+from dxlrun.analysis.report import Report, analyze_log, parts
+from dxlrun.analysis.verdict import Verdict
 from dxlrun.errors import LogError
+from dxlrun.output.json import json_text
+from dxlrun.output.table import microseconds
+from dxlrun.output.terminal import show
 from dxlrun.run.channels.events import EventCode, Severity
 from dxlrun.run.channels.packets import PacketKind
 
@@ -27,7 +29,7 @@ GOALS = bytes.fromhex("fffffe0483")
 
 def shown(report: Report) -> str:
     console = Console(file=io.StringIO(), width=160)
-    console.print(render(report))
+    show(*parts(report), console=console)
     text: str = console.file.getvalue()  # type: ignore[attr-defined]  # a StringIO, given above
     return text
 
@@ -247,7 +249,7 @@ def test_the_terminal_says_the_verdict_first_and_every_number_after(
 
 
 def test_json_carries_the_whole_report(write: Make, cycle: Make) -> None:
-    read = json.loads(to_json(analyze_log(write([cycle(0)]))))
+    read = json.loads(json_text(analyze_log(write([cycle(0)]))))
     assert read["verdict"]["good"] is True
     assert read["periods"] == {
         "elapsed": 1,

@@ -14,12 +14,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from dxlrun.analysis.bus import Servo
-from dxlrun.analysis.figures.budget import budget_drawings
+from dxlrun.analysis.figures.drawing import SteeringMarks
+from dxlrun.analysis.figures.events import events_drawing, reply_drawing
 from dxlrun.analysis.figures.joints import joint_drawings
-from dxlrun.analysis.figures.latency import latency_drawings
-from dxlrun.analysis.figures.steered import SteeringMarks
-from dxlrun.analysis.figures.timeline import events_drawing
-from dxlrun.analysis.figures.wires import reply_drawing
+from dxlrun.analysis.figures.timing import budget_drawings, latency_drawings
 from dxlrun.analysis.latency import Punctuality
 from dxlrun.analysis.report import analyze
 from dxlrun.analysis.steering import Pause

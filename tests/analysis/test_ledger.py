@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.analysis.ledger.comparison import LedgerReport, compare, to_json
+from dxlrun.analysis.ledger.comparison import LedgerReport, compare
 from dxlrun.errors import InputError
 from dxlrun.log.reader import read_log
+from dxlrun.output.json import json_text
 from dxlrun.run.channels.packets import PacketKind
 from dxlrun.simulation import LedgerEntry
 
@@ -113,7 +114,7 @@ def test_a_reply_that_the_log_lacks_is_shown_with_its_bytes_and_time(judge: Call
     assert report.sentences == (
         "The log is not what the simulated buses saw: it differs in 1 place on main.",
     )
-    assert b'"way": "received"' in to_json(report)
+    assert '"way": "received"' in json_text(report)
 
 
 def test_a_byte_that_was_recorded_wrongly_is_shown_alone(judge: Callable, wires: list, entries):
@@ -122,7 +123,7 @@ def test_a_byte_that_was_recorded_wrongly_is_shown_alone(judge: Callable, wires:
     (found,) = judge(wires, entries).differences
 
     assert (found.way, found.only_log, found.only_ledger) == ("sent", b"\x55", b"\x24")
-    assert b'"only_log": "55"' in to_json(judge(wires, entries))
+    assert '"only_log": "55"' in json_text(judge(wires, entries))
 
 
 def test_a_packet_that_never_came_to_the_bus_is_a_difference(judge: Callable, wires: list, entries):

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.analysis.ledger.comparison import compare
-from dxlrun.analysis.ledger.lateness import lateness
-from dxlrun.analysis.ledger.ledger_tables import render_comparison
+from dxlrun.analysis.ledger.comparison import compare, parts
+from dxlrun.analysis.ledger.overruns import lateness
 from dxlrun.log.reader import read_log
+from dxlrun.output.table import Table
 from dxlrun.run.channels.packets import PacketKind
 from dxlrun.simulation import LedgerEntry
 
@@ -75,5 +75,5 @@ def test_a_person_reads_it_in_a_table_and_a_sentence(
     assert report.same
     said = "The loop overran 1 time, 1 time with a simulated reply that was more than 1 ms late."
     assert said in report.sentences
-    titles = [item.table.title for item in render_comparison(report).renderables if hasattr(item, "table")]
+    titles = [part.title for part in parts(report) if isinstance(part, Table) and part.rows]
     assert titles[:2] == ["Buses", "How late the simulated buses were"]

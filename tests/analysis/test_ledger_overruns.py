@@ -8,11 +8,10 @@ from typing import Any
 
 import pytest
 
-from dxlrun.analysis.ledger.comparison import compare
-from dxlrun.analysis.ledger.ledger_tables import render_comparison
-from dxlrun.analysis.ledger.overruns import overrun_causes
-from dxlrun.analysis.ledger.waits import transactions
+from dxlrun.analysis.ledger.comparison import compare, parts
+from dxlrun.analysis.ledger.overruns import overrun_causes, transactions
 from dxlrun.log.reader import read_log
+from dxlrun.output.table import Table
 from dxlrun.run.channels.packets import PacketKind
 from dxlrun.simulation import LedgerEntry
 
@@ -196,6 +195,6 @@ def test_a_person_reads_the_causes_and_the_worst_of_them(
         "The cause was the simulated servos 1 time, the kernel 0 times, which hands replies over, a late "
         f"wake-up 0 times, and our own work 0 times: 0.000% of {COUNT} cycles."
     )
-    tables = [item.table for item in render_comparison(report).renderables if hasattr(item, "table")]
+    tables = [part for part in parts(report) if isinstance(part, Table) and part.rows]
     assert tables[-1].title == "Why the loop overran; a cycle usually takes 5400 us"
     assert [cell.text for cell in tables[-1].rows[0]][1:4] == ["simulation", str(GONE), "17.00 ms"]

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.analysis.output.document import page
-from dxlrun.analysis.output.tables import tables
-from dxlrun.analysis.report import analyze, to_json
+from dxlrun.analysis.page import page
+from dxlrun.analysis.report import analyze, tables
 from dxlrun.log.reader import read_log
+from dxlrun.output.json import json_text
 from dxlrun.run.channels.events import EventCode, Severity
 from dxlrun.run.channels.packets import PacketKind
 
@@ -150,7 +150,7 @@ def test_the_numbers_are_those_of_the_report(run: Path, whole: Made) -> None:
     report = analyze(read_log(run))
     inside = re.search(r'<script type="application/json" id="report">(.*?)</script>', text, re.DOTALL)
     assert inside is not None
-    assert json.loads(inside[1]) == json.loads(to_json(report))
+    assert json.loads(inside[1]) == json.loads(json_text(report))
     shown = reader.words("td", "th")
     for table in tables(report):
         assert table.title in reader.words("caption")
@@ -223,7 +223,7 @@ def test_a_single_late_wake_up_among_many_is_drawn(write: Make, cycle: Make) -> 
 
 def test_no_display_is_needed_and_nothing_is_warned_of(run: Path) -> None:
     code = (
-        "import sys; from dxlrun.analysis.output.document import page;"
+        "import sys; from dxlrun.analysis.page import page;"
         "from dxlrun.analysis.report import analyze;"
         "from dxlrun.log.reader import read_log; log = read_log(sys.argv[1]);"
         "print(len(page(log, analyze(log)))); assert 'matplotlib.pyplot' not in sys.modules"

@@ -13,11 +13,10 @@ import pytest
 from rich.console import Console
 
 from dxlrun.analysis.latency import cycle_periods_ns
-from dxlrun.analysis.output.document import page
-from dxlrun.analysis.output.tables import steering_table
-from dxlrun.analysis.output.terminal import render
-from dxlrun.analysis.report import Report, analyze
+from dxlrun.analysis.page import page
+from dxlrun.analysis.report import Report, analyze, parts, steering_table
 from dxlrun.log.reader import Log, read_log
+from dxlrun.output.terminal import show
 from dxlrun.run.channels.commands import Command, QueueInbox
 from dxlrun.testing import VirtualRobot, simulated_robot
 
@@ -133,7 +132,7 @@ def test_a_pause_is_counted_in_periods_and_in_seconds(report: Report) -> None:
     assert (pause.begin_s, pause.end_s) == pytest.approx((0.2, 0.4))
     assert pause.periods == 15
     console = Console(file=io.StringIO(), width=160)
-    console.print(render(report))
+    show(*parts(report), console=console)
     shown = console.file.getvalue()  # type: ignore[attr-defined]  # a StringIO, given above
     assert "periods paused" in shown
     assert "pair, 50 Hz and 100 Hz, 0.9 s" in shown

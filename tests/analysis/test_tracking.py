@@ -14,12 +14,12 @@ import numpy.typing as npt
 import pytest
 
 from dxlrun.analysis.figures.joints import joint_drawings
-from dxlrun.analysis.output.tables import joints_table
-from dxlrun.analysis.report import analyze, to_json
+from dxlrun.analysis.report import analyze, joints_table
 from dxlrun.analysis.tracking import Joint, reachable, tracking
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import Log, read_log
 from dxlrun.log.schemas import LogHeader
+from dxlrun.output.json import json_text
 from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
 from dxlrun.run.channels.ring import RecordKind
 
@@ -195,7 +195,7 @@ def test_terminal_report_and_json_say_the_same(make: Make) -> None:
     (row,) = joints_table(report).rows
     told = dict(zip((column.name for column in joints_table(report).columns), row, strict=True))
     assert [told[name].text for name in ("worst", "lag", "at rest")] == ["0.0300", "59 ms", "0.0000"]
-    (as_json,) = json.loads(to_json(report))["joints"]
+    (as_json,) = json.loads(json_text(report))["joints"]
     assert as_json["lag_ms"] == pytest.approx(60.0, rel=0.02)
     assert as_json["worst_rad"] == pytest.approx(0.03)
     (drawing,) = joint_drawings(log, report.joints)

@@ -13,12 +13,13 @@ import pytest
 from dxlrun.analysis import bus, latency, steering
 from dxlrun.analysis.bus import BusTraffic
 from dxlrun.analysis.latency import Latency, Periods
-from dxlrun.analysis.output.document import page
-from dxlrun.analysis.report import analyze, analyze_log, to_json
-from dxlrun.analysis.tally import Figures, RealTime, Tally, figures_of
+from dxlrun.analysis.page import page
+from dxlrun.analysis.report import analyze, analyze_log
+from dxlrun.analysis.tally import RealTime, RunTotals, Tally, totals_of
 from dxlrun.analysis.verdict import Verdict, judge
 from dxlrun.log import log_writer
 from dxlrun.log.reader import Log, read_log, scan_log
+from dxlrun.output.json import json_text
 from dxlrun.run.channels.commands import Command
 from dxlrun.run.channels.events import EventCode, Severity
 from dxlrun.run.channels.packets import PacketKind
@@ -34,15 +35,15 @@ ASK = bytes.fromhex("ffff0504022406ca")
 ANSWER = bytes.fromhex("ffff05080000020000000000f0")
 
 
-def figures(**changed: Any) -> Figures:
-    """Figures of a good run, changed."""
+def totals(**changed: Any) -> RunTotals:
+    """Totals of a good run, changed."""
     account = Periods(1000, 1000, 0, 0, True, 50.0, 20.0, (50.0,))
-    good = Figures(account, Latency(80.0, 10.0, 5.0, 9, 0.0, 0.0, 0.0), joints=("elbow", "wrist"))
+    good = RunTotals(account, Latency(80.0, 10.0, 5.0, 9, 0.0, 0.0, 0.0), joints=("elbow", "wrist"))
     return replace(good, **changed)
 
 
 def test_a_good_run_is_good() -> None:
-    assert judge(figures()) == Verdict(
+    assert judge(totals()) == Verdict(
         True, ("The loop kept 50 Hz: 0 of 1000 periods skipped, worst wake-up 80 us late.",)
     )
 
@@ -89,11 +90,11 @@ def test_a_failure_beside_the_loop_is_the_runs(write: Make, cycle: Make) -> None
 @pytest.mark.parametrize(("skipped", "good"), [(0, True), (100, True), (101, False)])
 def test_as_many_periods_may_be_skipped_as_the_file_tolerates(skipped: int, good: bool) -> None:
     account = Periods(1000, 1000 - skipped, skipped, 0, True, 50.0, 20.0, (50.0,))
-    verdict = judge(figures(periods=account))
+    verdict = judge(totals(periods=account))
     assert verdict.good is good
     assert verdict.sentences[0].startswith("The loop kept" if good else "The loop did not keep 50 Hz: 101 of")
-    assert judge(figures(periods=account, tolerated_skips=0.5)).good
-    assert judge(figures(periods=account, tolerated_skips=0.0)).good is (skipped == 0)
+    assert judge(totals(periods=account, tolerated_skips=0.5)).good
+    assert judge(totals(periods=account, tolerated_skips=0.0)).good is (skipped == 0)
 
 
 def test_the_tolerance_is_that_of_the_robot_file_in_the_log(tmp_path: Path, write: Make, cycle: Make) -> None:
@@ -102,7 +103,7 @@ def test_the_tolerance_is_that_of_the_robot_file_in_the_log(tmp_path: Path, writ
     robot.write_text(text.replace("model: {urdf", "# {"))
     log = tmp_path / "simulated.mcap"
     simulated_robot(robot, duration_s=0.1, log=log).run()
-    assert figures_of(log).tolerated_skips == 0.6
+    assert totals_of(log).tolerated_skips == 0.6
 
     path = write([cycle(0), cycle(20, skipped=19)], plan={"loop": {"tolerated_skips": 0.6}})
     assert analyze_log(path).verdict.good
@@ -114,18 +115,18 @@ def test_the_tolerance_is_that_of_the_robot_file_in_the_log(tmp_path: Path, writ
 @pytest.mark.parametrize(("skipped", "good"), [(10, True), (11, False)])
 def test_a_short_run_may_skip_what_one_of_two_seconds_may(skipped: int, good: bool) -> None:
     short = Periods(20, 20 - skipped, skipped, 0, True, 50.0, 0.4, (50.0,))
-    assert judge(figures(periods=short)).good is good
+    assert judge(totals(periods=short)).good is good
 
 
 @pytest.mark.parametrize(("invalid", "good"), [(2, True), (3, False)])
 def test_two_replies_of_a_short_run_may_be_missing(invalid: int, good: bool) -> None:
     short = Periods(20, 20, 0, 0, True, 50.0, 0.4, (50.0,))
-    assert judge(figures(periods=short, invalid=(invalid, 0))).good is good
+    assert judge(totals(periods=short, invalid=(invalid, 0))).good is good
 
 
 @pytest.mark.parametrize(("invalid", "good"), [(0, True), (10, True), (11, False), (500, False)])
 def test_a_joint_may_be_unknown_in_one_cycle_of_a_hundred(invalid: int, good: bool) -> None:
-    verdict = judge(figures(invalid=(0, invalid)))
+    verdict = judge(totals(invalid=(0, invalid)))
     assert verdict.good is good
     if not good:
         assert verdict.sentences[0] == (
@@ -164,9 +165,12 @@ def test_what_hurt_most_comes_first(write: Make, cycle: Make, said: Make) -> Non
     ("real_time", "helps"),
     [
         (RealTime(), "`loop: {scheduler: {policy: round_robin}}` in the robot file helps."),
-        (RealTime(asked=True), "the real-time scheduler that the robot file asks for was not granted, and"),
         (
-            RealTime(asked=True, granted=True),
+            RealTime(requested=True),
+            "the real-time scheduler that the robot file asks for was not granted, and",
+        ),
+        (
+            RealTime(requested=True, granted=True),
             "the real-time scheduler was granted; a real-time kernel helps.",
         ),
         (RealTime(True, True, True), "scheduler and kernel are real-time ones, so it is the machine"),
@@ -174,7 +178,7 @@ def test_what_hurt_most_comes_first(write: Make, cycle: Make, said: Make) -> Non
 )
 def test_no_scheduler_is_recommended_that_was_granted(real_time: RealTime, helps: str) -> None:
     rough = Latency(900.0, 100.0, 50.0, 9, 0.03, 0.0, 0.0)
-    verdict = judge(figures(latency=rough, real_time=real_time))
+    verdict = judge(totals(latency=rough, real_time=real_time))
     assert verdict.good
     assert f"3.0% came later than 150 us; {helps}" in verdict.sentences[1]
 
@@ -191,7 +195,7 @@ def test_no_scheduler_is_recommended_that_was_granted(real_time: RealTime, helps
 def test_what_was_granted_is_read_from_the_log(write: Make, said: Make, data: bytes, granted: bool) -> None:
     about = {"scheduler": {"policy": "round_robin"}, "kernel": {"version": "#1 SMP PREEMPT_RT"}}
     path = write(events=[said(EventCode.SCHEDULER, Severity.INFO, "in words", "loop", data)], metadata=about)
-    assert figures_of(path).real_time == RealTime(True, granted, True)
+    assert totals_of(path).real_time == RealTime(True, granted, True)
 
 
 def exchanges(wire: Make, took_us: int, count: int = 5) -> list[Any]:
@@ -246,10 +250,10 @@ def test_replies_that_wait_for_the_next_cycle_are_not_late(write: Make, cycle: M
 
 def test_the_timer_of_a_port_by_its_id_has_a_command_too() -> None:
     line = BusTraffic("main", 9, 0, 9, 0, 90, 90, 15_900.0, 1000.0, "/dev/serial/by-id/usb-FTDI")
-    (sentence,) = [one for one in judge(figures(buses=(line,))).sentences if "timer" in one]
+    (sentence,) = [one for one in judge(totals(buses=(line,))).sentences if "timer" in one]
     assert "devices/$(basename $(readlink -f /dev/serial/by-id/usb-FTDI))/latency_timer" in sentence
     simulated = replace(line, port="sim")
-    assert not any("timer" in one for one in judge(figures(buses=(simulated,))).sentences)
+    assert not any("timer" in one for one in judge(totals(buses=(simulated,))).sentences)
 
 
 # One verdict
@@ -290,8 +294,8 @@ def test_a_log_counted_in_slices_is_the_log_counted_as_a_whole(
     assert max(len(one.cycles) for one in slices) < 20
     tally = Tally()
     tally.take(read_log(storm))
-    whole = tally.figures(read_log(storm))
-    assert figures_of(storm) == whole
+    whole = tally.totals(read_log(storm))
+    assert totals_of(storm) == whole
     assert whole.servos[0].lost
     assert len(whole.pauses) == 2
     assert whole.events
@@ -307,24 +311,24 @@ def test_an_event_is_not_cut_where_a_slice_ends(
         said(EventCode.LOOP_STARTED, Severity.INFO, ""),
     ]
     path = write(events=events)
-    assert figures_of(path).events == analyze_figures(path).events
-    assert figures_of(path).events[0].text == text
+    assert totals_of(path).events == analyze_totals(path).events
+    assert totals_of(path).events[0].text == text
 
 
-def analyze_figures(path: Path) -> Figures:
+def analyze_totals(path: Path) -> RunTotals:
     log = read_log(path)
     tally = Tally()
     tally.take(log)
-    return tally.figures(log)
+    return tally.totals(log)
 
 
 def test_page_and_json_and_run_say_the_same(storm: Path) -> None:
     log = read_log(storm)
     report = analyze(log)
-    said = judge(figures_of(storm))
+    said = judge(totals_of(storm))
     assert not said.good
     assert report.verdict == said
-    told = json.loads(to_json(report))["verdict"]
+    told = json.loads(json_text(report))["verdict"]
     assert (told["good"], tuple(told["sentences"])) == (said.good, said.sentences)
     text = page(log, report)
     assert "Verdict: not good" in text
@@ -335,5 +339,5 @@ def test_what_is_not_read_whole_is_told_of_a_scanned_log_too(storm: Path, tmp_pa
     cut = tmp_path / "cut.mcap"
     data = storm.read_bytes()
     cut.write_bytes(data[: len(data) * 2 // 3])
-    assert judge(figures_of(cut)) == analyze_log(cut).verdict
-    assert any("log is not whole" in sentence for sentence in judge(figures_of(cut)).sentences)
+    assert judge(totals_of(cut)) == analyze_log(cut).verdict
+    assert any("log is not whole" in sentence for sentence in judge(totals_of(cut)).sentences)

@@ -20,11 +20,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from types import CodeType, FrameType
 
-from dxlrun.compile.simulated import simulated_buses
-
 import dxlrun
 from dxlrun.clock import MonotonicClock
 from dxlrun.compile.plan import Plan
+from dxlrun.compile.simulated import simulated_buses
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.control.loop import StopFlag
 from dxlrun.dynamixel.port.ports import SerialPort, SerialPorts

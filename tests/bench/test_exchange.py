@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.analysis.ledger.waits import Transaction
+from dxlrun.analysis.ledger.overruns import Transaction
 from dxlrun.dynamixel.wire import protocol1
 from dxlrun.errors import ProcessFault
 from exchange.bus import Wish, bench_bus, chosen_hosts, to_json

@@ -43,7 +43,7 @@ def test_a_wrong_word_is_refused_and_nothing_is_measured(
 
 def test_the_exchange_is_shown_in_a_table(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*FEW, "--peers", "unrecorded,rustypot"]) == 0
-    head, first, second = capsys.readouterr().out.splitlines()
+    head, _, first, second = capsys.readouterr().out.splitlines()
     assert head.split()[:4] == ["against", "protocol", "servos", "host"]
     assert first.split()[:6] == ["canned", "2.0", "1", "x", "XM430-W350", "unrecorded"]
     assert "of it" in second

@@ -11,11 +11,12 @@ from dxlrun.cli import inputs
 from dxlrun.errors import DxlrunError, InputError, Mark, PortError, Problem
 
 
-def loaded_by(*words: str) -> tuple[int, set[str]]:
-    """Exit code and imported packages of a command line in a fresh interpreter."""
+def loaded_by(*words: str, whole: bool = False) -> tuple[int, set[str]]:
+    """Exit code and imported packages of a command line in a fresh interpreter; `whole`: modules."""
+    name = "name" if whole else "name.partition('.')[0]"
     code = (
         "import sys; from dxlrun.cli import main; code = main(sys.argv[1:]); "
-        "print('modules', code, *sorted({name.partition('.')[0] for name in sys.modules}))"
+        f"print('modules', code, *sorted({{{name} for name in sys.modules}}))"
     )
     run = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=True)
     words_out = run.stdout.splitlines()[-1].split()
@@ -30,7 +31,19 @@ def test_what_needs_no_robot_imports_neither_numpy_nor_pydantic(words: tuple[str
     _, modules = loaded_by(*words)
 
     assert "cyclopts" in modules
-    assert modules.isdisjoint({"numpy", "pydantic", "yaml", "mcap", "serial"})
+    assert modules.isdisjoint({"numpy", "pydantic", "yaml", "mcap", "serial", "msgspec", "markdown_it"})
+
+
+def test_a_command_is_imported_alone():
+    _, modules = loaded_by("check", "--help", whole=True)
+
+    assert {name for name in modules if name.startswith("dxlrun.")} == {
+        *("dxlrun.cli", "dxlrun.cli.app", "dxlrun.cli.inputs", "dxlrun.cli.run", "dxlrun.cli.check"),
+        *("dxlrun.output", "dxlrun.output.json", "dxlrun.output.table", "dxlrun.output.terminal"),
+        "dxlrun.errors",
+    }
+    assert "rich.markdown" not in modules
+    assert "cyclopts.completion" not in modules
 
 
 def test_the_version_is_that_of_the_package(dxlrun):

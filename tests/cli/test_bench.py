@@ -46,8 +46,8 @@ def test_the_runs_are_shown_in_a_table_and_the_rate_in_a_sentence(
     monkeypatch.setattr(highest_rate, "run_robot", run_robot)
     said = dxlrun("bench", "rate", ROBOT, "--seconds", "0.3")
     assert (said.code, said.err) == (0, "")
-    running, head, row, verdict = said.out.splitlines()
-    assert head.split()[:4] == ["rate", "Hz", "cycles", "overruns"]
+    running, head, _, row, verdict = said.out.splitlines()
+    assert head.split()[:4] == ["rate", "cycles", "overruns", "by"]
     assert row.split()[0] in running
     assert row.split()[-1] == "yes"
     assert verdict.startswith(

@@ -1,4 +1,4 @@
-"""Tables that are wider than their terminal."""
+"""Tables that are wider than their terminal, and colours where there is no terminal."""
 
 from __future__ import annotations
 
@@ -6,47 +6,97 @@ import io
 
 import pytest
 from rich.console import Console
-from rich.table import Table
 
-from dxlrun.cli.output.narrow import fitting
+from dxlrun.output.table import Cell, Column, Line, Table
+from dxlrun.output.terminal import show
+
+SERVOS = Table.of(
+    "",
+    [
+        Column("ID"),
+        Column("model", "name"),
+        Column("return delay", form="{} us"),
+        Column("firmware", detail=True),
+        Column("remark", "text"),
+    ],
+    [
+        (1, "XM430-W350", 500, 52, "its supply is a little low"),
+        (2, Cell("AX-12A", "error"), None, 24, None),
+    ],
+)
 
 
-def servos() -> Table:
-    table = Table(box=None, pad_edge=False)
-    for head in ("ID", "model", "return delay", "firmware"):
-        table.add_column(head)
-    table.add_row("1", "XM430-W350", "500 us", "52")
-    table.add_row("2", "AX-12A", "", "24")
-    return table
+def shown(*parts: Table | Line | str, width: int, terminal: bool = False) -> str:
+    console = Console(
+        file=io.StringIO(),
+        width=width,
+        force_terminal=terminal,
+        color_system="standard" if terminal else None,
+    )
+    show(*parts, console=console)
+    text: str = console.file.getvalue()  # type: ignore[attr-defined]  # a StringIO, given above
+    return "\n".join(line.rstrip() for line in text.splitlines())
 
 
 @pytest.mark.parametrize(
-    ("width", "shown"),
+    ("width", "expected"),
     [
         (
-            60,
-            "ID  model       return delay  firmware\n"
-            "1   XM430-W350  500 us        52      \n"
-            "2   AX-12A                    24      \n",
+            80,
+            "ID  model       return delay  firmware  remark\n"
+            "----\n"
+            " 1  XM430-W350        500 us        52  its supply is a little low\n"
+            " 2  AX-12A                          24",
+        ),
+        (
+            58,
+            "              return\n"
+            "ID model       delay firmware remark\n"
+            "----\n"
+            " 1 XM430-W350 500 us       52 its supply is a little low\n"
+            " 2 AX-12A                  24",
+        ),
+        (
+            49,
+            "              return\n"
+            "ID model       delay remark\n"
+            "----\n"
+            " 1 XM430-W350 500 us its supply is a little low\n"
+            " 2 AX-12A",
         ),
         (
             30,
-            "              return         \n"
-            "ID model      delay  firmware\n"
-            "1  XM430-W350 500 us 52      \n"
-            "2  AX-12A            24      \n",
-        ),
-        (
-            24,
             "ID 1: model XM430-W350,\n"
             "  return delay 500 us,\n"
-            "  firmware 52\n"
-            "ID 2: model AX-12A,\n"
-            "  firmware 24\n",
+            "  firmware 52, remark its\n"
+            "  supply is a little low\n"
+            "ID 2: model AX-12A, firmware\n"
+            "  24",
         ),
     ],
 )
-def test_a_table_that_does_not_fit_becomes_paragraphs_in_which_nothing_is_cut(width: int, shown: str) -> None:
-    console = Console(file=io.StringIO(), width=width)
-    console.print(fitting(servos(), width))
-    assert console.file.getvalue() == shown  # type: ignore[attr-defined]
+def test_a_table_that_does_not_fit_becomes_paragraphs_in_which_nothing_is_cut(
+    width: int, expected: str
+) -> None:
+    lines = shown(SERVOS, width=width).splitlines()
+    rule = {"\N{BOX DRAWINGS LIGHT HORIZONTAL}", " "}
+    ruled = ["----" if set(line) <= rule else line for line in lines]
+    assert "\n".join(ruled) == expected
+
+
+def test_a_long_text_is_folded_between_words() -> None:
+    table = Table.of("Events", [Column("event", "name"), Column("text", "text")], [("SETUP", "word " * 20)])
+    lines = shown(table, width=50).splitlines()
+    assert lines[:2] == ["", "Events"]
+    assert max(map(len, lines)) <= 50
+    assert " ".join(lines).split().count("word") == 20
+
+
+def test_a_row_needs_a_value_for_each_column() -> None:
+    with pytest.raises(ValueError, match="zip"):
+        Table.of("", [Column("ID"), Column("model")], [(1,)])
+
+
+def test_only_a_terminal_gets_colours() -> None:
+    assert "\x1b[31m" in shown(SERVOS, Line("bad", "error"), width=80, terminal=True)
+    assert "\x1b" not in shown(SERVOS, Line("bad", "error"), width=80)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import dxlrun as dxlrun_package
-from dxlrun.cli.output.models_tables import runs, unit_of
+from dxlrun.cli.models import runs, unit_of
 from dxlrun.control.controllers.hookspecs import HookSpecs
 from dxlrun.dynamixel.control_table import all_tables, control_table
 
@@ -17,8 +17,8 @@ def test_without_a_name_all_models_are_listed(dxlrun):
 
     assert (said.code, said.err) == (0, "")
     for table in all_tables():
-        assert f" {table.model} " in said.out
-    (line,) = (line for line in said.out.splitlines() if " XM430-W350 " in line)
+        assert f"\n{table.model} " in said.out
+    (line,) = (line for line in said.out.splitlines() if line.startswith("XM430-W350 "))
     assert line.split() == [
         *("XM430-W350", "1020", "2.0", "0.0879", "deg", "0..359.9", "deg", "46", "rpm", "4.1", "Nm"),
         *("present", "current", "in", "A"),
@@ -29,7 +29,7 @@ def test_a_protocol_can_be_chosen(dxlrun):
     said = dxlrun("models", "--protocol", "1.0")
 
     assert said.code == 0
-    assert " AX-12A " in said.out
+    assert "\nAX-12A " in said.out
     assert "XM430" not in said.out
 
 
@@ -65,23 +65,23 @@ def test_another_name_prints_it_too(dxlrun):
     ],
 )
 def test_a_name_prints_its_motor_as_far_as_the_manual_gives_it(dxlrun, model, line):
-    assert dxlrun("models", model).out.splitlines()[2] == line
+    assert dxlrun("models", model).out.splitlines()[2] == f"motor       {line}"
 
 
 def test_the_motor_that_is_simulated_is_told_with_its_source(dxlrun):
     known = dxlrun("models", "MX-64", "--protocol", "1").out.splitlines()[3:7]
     assert known == [
-        "simulated: no-load speed 68.76 rpm, time constant 15.1 ms, friction 0.1 Nm and 8% of the torque, "
+        "simulated   no-load speed 68.76 rpm, time constant 15.1 ms, friction 0.1 Nm and 8% of the torque, "
         "1.63 Nm/A",
-        "source of it: Rhoban BAM, bam/params/mx64/m3.json",
-        "P gain: 0.158 of full duty per rad of error and unit",
-        "source of it: Rhoban BAM, bam/dynamixel/actuator.py: 0.158, 5.06 at the P gain of 32",
+        "  source    Rhoban BAM, bam/params/mx64/m3.json",
+        "P gain      0.158 of full duty per rad of error and unit",
+        "  source    Rhoban BAM, bam/dynamixel/actuator.py: 0.158, 5.06 at the P gain of 32",
     ]
     scaled = dxlrun("models", "XM430-W350").out.splitlines()[3:5]
     assert scaled == [
-        "simulated: no-load speed 46 rpm, time constant 15.1 ms, friction 0.076 Nm and 8% of the torque, "
+        "simulated   no-load speed 46 rpm, time constant 15.1 ms, friction 0.076 Nm and 8% of the torque, "
         "1.78 Nm/A",
-        "source of it: [i] scaled from the MX-64: Rhoban BAM, bam/params/mx64/m3.json",
+        "  source    [i] scaled from the MX-64: Rhoban BAM, bam/params/mx64/m3.json",
     ]
     (told,) = json.loads(dxlrun("models", "XL330-M077", "--json").out)
     motor = told["simulated_motor"]

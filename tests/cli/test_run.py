@@ -208,7 +208,7 @@ def test_an_interrupt_while_the_log_is_read_leaves_the_summary_and_its_name(
     def interrupted(_: str) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("dxlrun.analysis.tally.figures_of", interrupted)
+    monkeypatch.setattr("dxlrun.analysis.tally.totals_of", interrupted)
     runs.answer = RunSummary(0, "ended", 100, 0, 2.03, (), log=str(logged), messages=9)
 
     said = dxlrun(torso)

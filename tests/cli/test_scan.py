@@ -46,7 +46,7 @@ def test_the_servos_are_a_table_and_a_robot_file_that_check_accepts(dxlrun, simu
     robot = tmp_path / "arm.yaml"
     said = dxlrun("scan", path, "--protocol", "2.0", *NARROW, "--write", robot)
     assert (said.code, said.err) == (0, "")
-    head, first, second, written = said.out.splitlines()
+    head, _, first, second, written = said.out.splitlines()
     assert head.split()[:2] == ["ID", "model"]
     assert first.split()[:2] == ["1", "XM430-W350"]
     assert second.split()[:6] == ["2", "XL430-W250", "1060", "45", "2.0", "1000000"]

@@ -12,7 +12,7 @@ from jsonschema import Draft202012Validator
 from pydantic import BaseModel
 
 from dxlrun.cli.app import run_tokens
-from dxlrun.cli.schema import schema_text
+from dxlrun.cli.examples import schema_text
 from dxlrun.description.json_schema import robot_schema
 from dxlrun.description.source.syntax import parse
 from dxlrun.description.source.tree import grow, literal

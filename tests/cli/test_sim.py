@@ -134,7 +134,7 @@ def test_a_robot_runs_against_it_as_against_a_real_one(
     code, out, err = sim.stop()
 
     assert code == 0, err
-    counts = re.search(r"bioloid_torso: ended after [\d.]+ s\. (\d+) packets heard, (\d+) answered", out)
+    counts = re.search(r"bioloid_torso: ended after [\d.]+ s\. (\d+) packets received, (\d+) answered", out)
     assert counts is not None
     heard, answered = map(int, counts.groups())
     assert heard > answered > 100  # a sync write is heard by each and answered by none
@@ -312,7 +312,7 @@ def test_on_a_terminal_a_table_lives_and_letters_are_shown(tmp_path: Path):
         process.send_signal(signal.SIGCONT)
         while termios.tcgetattr(terminal)[3] & termios.ECHO:
             drawn = len(shown)
-            until(rf"(?s).{{{drawn}}}.*heard")
+            until(rf"(?s).{{{drawn}}}.*asked")
         os.write(terminal, b"overlaod\x7f\x7f\x7foad servo=2")
         until("fault> overload servo=2")
         os.write(terminal, b"\n")

@@ -11,8 +11,7 @@ from io import StringIO
 import pytest
 from rich.console import Console
 
-from dxlrun.cli.output.sim_table import TableView, page
-from dxlrun.cli.output.sim_views import Shown
+from dxlrun.cli.sim_views import Shown, TableView, page
 from dxlrun.run.simulation_front import Look, ServoLook, TypedLines
 
 
@@ -38,15 +37,15 @@ def look(count: int, **changes: float) -> Look:
 
 def drawn(shown: Look, typed: str = "", height: int = 24, *, several: bool = False) -> list[str]:
     file = StringIO()
-    Console(file=file, width=100, height=height).print(page(shown, typed, height, several=several))
+    Console(file=file, width=100, height=height).print(page(shown, typed, 100, height, several=several))
     return [line.rstrip() for line in file.getvalue().splitlines()]
 
 
 def test_a_line_a_servo_says_what_it_does():
-    head, units, _, first, second, *_ = drawn(look(2))
+    head, _, first, second, *_ = drawn(look(2))
 
-    assert f"{head} {units}".split() == [
-        *("goal", "present", "ID", "model", "torque", "deg", "deg", "degC", "V", "errors", "heard", "said")
+    assert head.split() == [
+        *("ID", "model", "torque", "goal", "deg", "present", "deg", "degC", "V", "errors", "asked", "replies")
     ]
     assert first.split() == ["1", "XL430-W250", "on", "180.0", "90.0", "31", "11.9", "-", "101", "1"]
     assert second.split() == ["2", "XL430-W250", "-", "-", "90.0", "31", "11.9", "0x20", "102", "2"]
@@ -55,14 +54,14 @@ def test_a_line_a_servo_says_what_it_does():
 def test_eighty_columns_hold_it_whole():
     named = replace(look(1).servos[0], bus="left_arm", model="YM070-210-M001", heard=123456, answered=123456)
     file = StringIO()
-    Console(file=file, width=80).print(page(Look((named,)), "", 24, several=True))
+    Console(file=file, width=80).print(page(Look((named,)), "", 80, 24, several=True))
 
     assert "\N{HORIZONTAL ELLIPSIS}" not in file.getvalue()
     assert "left_arm" in file.getvalue()
 
 
 def test_buses_are_named_where_there_are_several():
-    assert drawn(look(1), several=True)[3].split()[:3] == ["main", "1", "XL430-W250"]
+    assert drawn(look(1), several=True)[2].split()[:3] == ["main", "1", "XL430-W250"]
 
 
 def test_what_is_typed_stands_below():

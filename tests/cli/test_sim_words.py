@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.cli.output.sim_views import PlainView, Shown, ending
-from dxlrun.cli.simulated.sim import link_of_each
-from dxlrun.cli.simulated.sim_inputs import AdapterWishes, read_faults, servo_bus, with_adapter
+from dxlrun.cli.sim import link_of_each
+from dxlrun.cli.sim_inputs import AdapterWishes, read_faults, servo_bus, with_adapter
+from dxlrun.cli.sim_views import PlainView, Shown, ending
 from dxlrun.errors import InputError
 from dxlrun.run.simulation_front import Look, ServoLook
 from dxlrun.simulation import BusConfig, ServoConfig
@@ -182,7 +182,7 @@ def test_the_last_line_says_what_passed():
     look = Look((servo,), {"median": 12.3, "p99": 80.0})
 
     assert ending("torso", 2.04, look) == (
-        "torso: ended after 2.0 s. 1 packet heard, 0 answered; "
+        "torso: ended after 2.0 s. 1 packet received, 0 answered; "
         "replies later than planned: median 12 us, p99 80 us"
     )
-    assert ending("torso", 2.04, Look()) == "torso: ended after 2.0 s. 0 packets heard, 0 answered"
+    assert ending("torso", 2.04, Look()) == "torso: ended after 2.0 s. 0 packets received, 0 answered"

@@ -11,7 +11,8 @@ import pytest
 from dxlrun.compile.plan import AdapterPlan, Plan
 from dxlrun.description import Description, read_robot
 from dxlrun.errors import ProcessFault
-from dxlrun.run.highest_rate import Run, highest_rate, to_json
+from dxlrun.output.json import json_text
+from dxlrun.run.highest_rate import Run, highest_rate
 from dxlrun.run.virtual_run import VirtualRobot
 
 ROBOT = """
@@ -77,7 +78,7 @@ def test_a_slower_adapter_brings_the_rate_down_to_what_nearly_all_cycles_keep(
     assert found.kept_hz == last.rate_hz < first.rate_hz
     # two reads a cycle wait up to 4 ms each
     assert 100 < last.rate_hz < 250
-    assert b'"kept_hz"' in to_json(found)
+    assert '"kept_hz"' in json_text(found)
 
 
 def test_a_run_without_a_cycle_is_an_error_with_a_hint(

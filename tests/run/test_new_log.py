@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from dxlrun.cli import main
-from dxlrun.cli.simulated.sim import _writable
+from dxlrun.cli.sim import _writable
 from dxlrun.errors import InputError
 from dxlrun.log.log_writer import LogFile
 from dxlrun.run.run_log import discard_log, ledger_of, new_log

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import pytest
 
-from dxlrun.cli.servos.robot_draft import draft, draft_file
+from dxlrun.cli.scan import draft, draft_file
 from dxlrun.compile import compile_files
 from dxlrun.dynamixel.control_table import all_tables
 from dxlrun.dynamixel.tools.scanning import FoundServo

@@ -1,4 +1,4 @@
-"""What a verdict is found by: counted slice by slice of a log, so that its length does not matter."""
+"""The totals of a run that a verdict is based on, counted slice by slice: a log may be of any length."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from dxlrun.analysis.bus import BusTraffic, Servo, Traffic
 from dxlrun.analysis.latency import Latency, Periods, Punctuality, Slowest, on_virtual_time
+from dxlrun.analysis.plan import plan_of
 from dxlrun.analysis.steering import Act, Pause, Steering
 from dxlrun.control.loop_plan import TOLERATED_SKIPS
 from dxlrun.log.reader import UNREADABLE, Log, scan_log
@@ -21,9 +22,9 @@ from dxlrun.run.channels.events import EventCode, EventCounts, EventGroup, Grant
 
 @dataclass(frozen=True, slots=True)
 class RealTime:
-    """What was asked of the operating system for the loop, and what it granted."""
+    """The real-time scheduling that the loop requested, and whether it was granted."""
 
-    asked: bool = False
+    requested: bool = False
     """A real-time scheduler."""
     granted: bool = False
     kernel: bool = False
@@ -31,8 +32,8 @@ class RealTime:
 
 
 @dataclass(frozen=True, slots=True)
-class Figures:
-    """One run in figures; everything that the rules of the verdict look at."""
+class RunTotals:
+    """One run in numbers: all that the rules of the verdict read."""
 
     periods: Periods
     latency: Latency | None = None
@@ -89,20 +90,20 @@ class Tally:
                 elif event.code == EventCode.RECORDER_GAP:
                     self._unread += msgspec.json.decode(event.data, type=LostRecords).lost
 
-    def figures(self, log: Log) -> Figures:
-        """Return the figures of all that was taken; `log`: what the file says of itself, which comes last."""
+    def totals(self, log: Log) -> RunTotals:
+        """Return the totals of all slices; `log`: the metadata of the file, which come last."""
         account, late = self._punctuality.finish()
         servos, buses = self._traffic.finish()
         acts, pauses = self._steering.finish()
         gaps = self._unread
         with suppress(KeyError, ValueError):
             gaps = int(log.metadata[SUMMARY_NAME]["gaps"])
-        return Figures(
+        return RunTotals(
             periods=account,
             latency=late,
             slowest=self._punctuality.slowest,
             virtual=on_virtual_time(log),
-            tolerated_skips=_tolerated_skips(log),
+            tolerated_skips=plan_of(log).loop.tolerated_skips,
             real_time=_real_time(log, granted=self._granted),
             joints=log.joints,
             invalid=() if self._invalid is None else tuple(self._invalid.tolist()),
@@ -117,31 +118,14 @@ class Tally:
         )
 
 
-def figures_of(path: str | Path) -> Figures:
+def totals_of(path: str | Path) -> RunTotals:
     """Count the log at a path, slice by slice. Raises LogError when it cannot be read."""
     tally = Tally()
-    return tally.figures(scan_log(path, tally.take))
-
-
-class _Loop(msgspec.Struct):
-    tolerated_skips: float = TOLERATED_SKIPS
-
-
-class _Plan(msgspec.Struct):
-    loop: _Loop = msgspec.field(default_factory=_Loop)
-
-
-def _tolerated_skips(log: Log) -> float:
-    """Return what the robot file tolerates; the default where the log has no readable plan."""
-    try:
-        plan = msgspec.json.decode(log.attachments.get("plan.json", b"{}"), type=_Plan)
-    except UNREADABLE:
-        return TOLERATED_SKIPS
-    return plan.loop.tolerated_skips
+    return tally.totals(scan_log(path, tally.take))
 
 
 def _real_time(log: Log, *, granted: bool) -> RealTime:
-    asked = log.metadata.get("scheduler", {}).get("policy", "other") != "other"
+    requested = log.metadata.get("scheduler", {}).get("policy", "other") != "other"
     kernel = log.metadata.get("kernel", {})
     real_time = any("PREEMPT_RT" in kernel.get(key, "") for key in ("version", "release"))
-    return RealTime(asked, granted, real_time)
+    return RealTime(requested, granted, real_time)

@@ -12,13 +12,13 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.analysis.plan import LoggedJoint, LoggedServo, plan_of
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.interfaces import Floats
-from dxlrun.log.reader import UNREADABLE, Log
+from dxlrun.log.reader import Log
 
 _REST_S = 0.3
 """A reachable trajectory that stands still for so long is at rest: its joint is to settle."""
@@ -222,45 +222,9 @@ def _rests(
 # The limits
 
 
-class _PlannedRegister(msgspec.Struct):
-    name: str
-    value: int
-
-
-class _PlannedServo(msgspec.Struct):
-    joint: str
-    model: str = ""
-    rad_per_tick: float = _TICK_RAD
-    rad_s_per_tick: float = 0.0
-    registers: list[_PlannedRegister] = []
-
-
-class _PlannedBus(msgspec.Struct):
-    protocol: float | None = None
-    servos: list[_PlannedServo] = []
-
-
-class _PlannedJoint(msgspec.Struct):
-    name: str
-    velocity: float | None = None
-    top_speed: float | None = None
-
-
-class _PlannedLoop(msgspec.Struct):
-    joints: list[_PlannedJoint] = []
-
-
-class _Planned(msgspec.Struct):
-    loop: _PlannedLoop = msgspec.field(default_factory=_PlannedLoop)
-    buses: list[_PlannedBus] = []
-
-
 def _limits(log: Log) -> dict[str, _Limits]:
     """Return the limits of each joint from the plan in the log; one without a readable plan has none."""
-    try:
-        plan = msgspec.json.decode(log.attachments.get("plan.json", b"{}"), type=_Planned)
-    except UNREADABLE:
-        return {}
+    plan = plan_of(log)
     joints = {joint.name: joint for joint in plan.loop.joints}
     return {
         servo.joint: _Limits(
@@ -274,13 +238,13 @@ def _limits(log: Log) -> dict[str, _Limits]:
     }
 
 
-def _speed(joint: _PlannedJoint | None) -> float:
+def _speed(joint: LoggedJoint | None) -> float:
     if joint is None:
         return math.inf
     return min(math.inf if limit is None else limit for limit in (joint.velocity, joint.top_speed))
 
 
-def _acceleration(servo: _PlannedServo, protocol: float | None) -> float:
+def _acceleration(servo: LoggedServo, protocol: float | None) -> float:
     """Return the acceleration that a servo's registers declare; 0 there is none."""
     declared = {each.name: each.value for each in servo.registers}
     for name in _ACCELERATIONS:

@@ -24,9 +24,10 @@ from enum import IntEnum, unique
 
 from dxlrun.analysis.bus import BusTraffic, Servo
 from dxlrun.analysis.steering import Act, Pause
-from dxlrun.analysis.tally import Figures
+from dxlrun.analysis.tally import RunTotals
 from dxlrun.dynamixel.port.latency_timer import late_replies
 from dxlrun.errors import counted
+from dxlrun.output.table import microseconds
 from dxlrun.run.channels.events import EventCode, EventGroup, Severity
 
 INVALID_SHARE = 0.01
@@ -97,23 +98,23 @@ class _Finding:
         return self.rank, -self.share
 
 
-def judge(figures: Figures) -> Verdict:
+def judge(totals: RunTotals) -> Verdict:
     """Return whether a run was good, and in sentences what was and what was not."""
     found = sorted(
         (
-            *(_Finding(_Rank.NEVER_RAN, f"The run failed: {told}.") for told in figures.failures),
-            *_loop(figures),
-            *_lines(figures),
-            *_lost_servos(figures),
-            *_invalid(figures),
-            *_slow(figures),
-            *_rough(figures),
-            *_steered(figures.acts, figures.pauses),
-            *_late_replies(figures.buses),
-            *_silent(figures.servos),
-            *_errors(figures.servos),
-            *_events(figures.events),
-            *_log(figures),
+            *(_Finding(_Rank.NEVER_RAN, f"The run failed: {told}.") for told in totals.failures),
+            *_loop(totals),
+            *_lines(totals),
+            *_lost_servos(totals),
+            *_invalid(totals),
+            *_slow(totals),
+            *_rough(totals),
+            *_steered(totals.acts, totals.pauses),
+            *_late_replies(totals.buses),
+            *_silent(totals.servos),
+            *_errors(totals.servos),
+            *_events(totals.events),
+            *_log(totals),
         ),
         key=lambda finding: finding.order,
     )
@@ -121,29 +122,29 @@ def judge(figures: Figures) -> Verdict:
     return Verdict(good, tuple(finding.sentence for finding in found))
 
 
-def _loop(figures: Figures) -> Iterable[_Finding]:
-    account, wake_ups = figures.periods, figures.latency
+def _loop(totals: RunTotals) -> Iterable[_Finding]:
+    account, wake_ups = totals.periods, totals.latency
     if not account.records:
         yield _Finding(_Rank.NEVER_RAN, "The loop never ran a cycle.")
         return
     share = account.skipped / account.elapsed
     judged = max(account.elapsed, _SHORT_RUN_S * account.rate_hz)
-    tolerable = account.skipped <= figures.tolerated_skips * judged
+    tolerable = account.skipped <= totals.tolerated_skips * judged
     kept = "kept" if tolerable else "did not keep"
     wake_up = f", worst wake-up {microseconds(wake_ups.max_us)} late" if wake_ups is not None else ""
-    wake_up = ", on virtual time" if figures.virtual else wake_up
+    wake_up = ", on virtual time" if totals.virtual else wake_up
     elapsed = counted(account.elapsed, "period", "periods")
-    tolerated = f"{figures.tolerated_skips * 100:.4g}% tolerated"
+    tolerated = f"{totals.tolerated_skips * 100:.4g}% tolerated"
     if judged > account.elapsed:
-        tolerated = f"{figures.tolerated_skips * judged:.0f} tolerated in a short run"
+        tolerated = f"{totals.tolerated_skips * judged:.0f} tolerated in a short run"
     shares = f" ({share:.2%}; {tolerated})" if account.skipped else ""
     sentence = f"The loop {kept} {account.rates}: {account.skipped} of {elapsed} skipped{shares}{wake_up}."
     yield _Finding(_Rank.REMARK if tolerable else _Rank.SHARE, sentence, 0.0 if tolerable else share)
 
 
-def _slow(figures: Figures) -> Iterable[_Finding]:
+def _slow(totals: RunTotals) -> Iterable[_Finding]:
     """Say which step made a cycle longer than its period, of the cycle that exceeds it most."""
-    slowest = figures.slowest
+    slowest = totals.slowest
     if slowest is None:
         return
     steps = ((slowest.read_ns, "read"), (slowest.update_ns, "update"), (slowest.write_ns, "write"))
@@ -155,11 +156,11 @@ def _slow(figures: Figures) -> Iterable[_Finding]:
     )
 
 
-def _rough(figures: Figures) -> Iterable[_Finding]:
-    wake_ups, real_time = figures.latency, figures.real_time
+def _rough(totals: RunTotals) -> Iterable[_Finding]:
+    wake_ups, real_time = totals.latency, totals.real_time
     if wake_ups is None or wake_ups.share_over_150_us <= ROUGH_SHARE:
         return
-    if not real_time.asked:
+    if not real_time.requested:
         helps = "`loop: {scheduler: {policy: round_robin}}` in the robot file helps"
     elif not real_time.granted:
         helps = "the real-time scheduler that the robot file asks for was not granted, and would help"
@@ -202,8 +203,8 @@ def _of(events: Iterable[EventGroup], *codes: EventCode) -> list[EventGroup]:
     return [said for said in events if said.code in codes and said.severity >= Severity.ERROR]
 
 
-def _lines(figures: Figures) -> Iterable[_Finding]:
-    for said in _of(figures.events, EventCode.PORT_LOST):
+def _lines(totals: RunTotals) -> Iterable[_Finding]:
+    for said in _of(totals.events, EventCode.PORT_LOST):
         times = "" if said.count == 1 else f" {said.count} times"
         yield _Finding(_Rank.LINE, f"Bus {said.source} was lost{times}: {_line(said)}.", said.count)
 
@@ -215,10 +216,10 @@ _HURTS = {
 }
 
 
-def _lost_servos(figures: Figures) -> Iterable[_Finding]:
+def _lost_servos(totals: RunTotals) -> Iterable[_Finding]:
     """Say of each servo that was lost, rebooted or let go what happened to it; the worst ones first."""
     by_source: dict[str, list[EventGroup]] = {}
-    for said in _of(figures.events, *_HURTS):
+    for said in _of(totals.events, *_HURTS):
         by_source.setdefault(said.source, []).append(said)
     if not by_source:
         return
@@ -240,12 +241,12 @@ def _joined(parts: Sequence[str]) -> str:
     return f"{', '.join(others)} and {last}" if others else last
 
 
-def _invalid(figures: Figures) -> Iterable[_Finding]:
+def _invalid(totals: RunTotals) -> Iterable[_Finding]:
     """Name the joints whose states were invalid too often; the cycles that were skipped have none."""
-    cycles = figures.periods.records
+    cycles = totals.periods.records
     shares = [
         (count / cycles, joint)
-        for joint, count in zip(figures.joints, figures.invalid, strict=False)
+        for joint, count in zip(totals.joints, totals.invalid, strict=False)
         if cycles and count > max(_FEW_INVALID, INVALID_SHARE * cycles)
     ]
     if shares:
@@ -330,20 +331,13 @@ def _line(said: EventGroup) -> str:
     return said.text.strip().splitlines()[-1] if said.text.strip() else said.name
 
 
-def _log(figures: Figures) -> Iterable[_Finding]:
-    faults = list(figures.damage)
-    if figures.gaps:
-        lost = counted(figures.gaps, "record was", "records were")
+def _log(totals: RunTotals) -> Iterable[_Finding]:
+    faults = list(totals.damage)
+    if totals.gaps:
+        lost = counted(totals.gaps, "record was", "records were")
         faults.append(f"{lost} lost on the way to the recorder")
-    if not figures.periods.agree:
-        missing = counted(figures.periods.missing, "period is", "periods are")
+    if not totals.periods.agree:
+        missing = counted(totals.periods.missing, "period is", "periods are")
         faults.append(f"{missing} neither recorded nor declared skipped")
     if faults:
         yield _Finding(_Rank.LOG, f"The log is not whole: {'; '.join(faults)}.")
-
-
-def microseconds(value: float) -> str:
-    """Return a time in us as a person writes it: us, ms or s."""
-    if value >= 1e6:
-        return f"{value / 1e6:.2f} s"
-    return f"{value / 1e3:.2f} ms" if value >= 1e4 else f"{value:.0f} us"

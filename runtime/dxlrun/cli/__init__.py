@@ -19,7 +19,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         from dxlrun.cli.app import run_tokens  # not above: importing the package must cost nothing
 
         return run_tokens(tuple(sys.argv[1:] if arguments is None else arguments))
-    except KeyboardInterrupt:  # while that was being imported, or an error being told
+    except KeyboardInterrupt:  # while that was being imported, or an error reported
         sys.stderr.write("interrupted\n")
         return 130
 

@@ -1,55 +1,42 @@
-"""The application: which commands there are, and what becomes of what they raise."""
+"""The application: which commands there are, and how their errors are reported."""
 
 from __future__ import annotations
 
 import os
+import re
 import sys
 import traceback
 from collections.abc import Mapping, Sequence
-from importlib import metadata
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 from cyclopts import App, CycloptsError
 
-from dxlrun.cli.analyze import analyze
-from dxlrun.cli.bench import bench
-from dxlrun.cli.check import check
-from dxlrun.cli.doctor import doctor
-from dxlrun.cli.examples import examples
-from dxlrun.cli.output.terminal import out, print_refusal, say_error, say_warning
-from dxlrun.cli.replay import replay
+from dxlrun.cli.inputs import COMMANDS, COMMANDS_WHILE_IT_RUNS
 from dxlrun.cli.run import run
-from dxlrun.cli.schema import schema
-from dxlrun.cli.servos.models import models
-from dxlrun.cli.servos.scan import scan
-from dxlrun.cli.servos.servo import servo
-from dxlrun.cli.simulated.sim import sim
-from dxlrun.cli.steering.steer import (
-    list_robots,
-    load,
-    pause,
-    rate,
-    resume,
-    send,
-    set_register,
-    stop,
-    switch,
-    unload,
-)
 from dxlrun.errors import DxlrunError, InputError, Problem, Refused
+from dxlrun.output.table import Table
+from dxlrun.output.terminal import out, print_error, print_refusal, print_warning, show
+
+if TYPE_CHECKING:
+    from cyclopts.help import HelpEntry, HelpPanel
+    from rich.console import Console, ConsoleOptions
 
 INTERRUPTED = 130
-"""128 + SIGINT, as shells say it."""
+"""128 + SIGINT, as shells have it."""
 
 _PIPED_HELP = 80
 """Columns."""
+_ROOM = "dxlrun.cli"
+_LISTING = ((), ("--help",), ("-h",), ("--install-completion",))
+"""How command lines begin that need all commands."""
 RUNNING = "Commands for a robot that runs"
 
 HELP = """Run a robot of Dynamixel servos from one YAML file.
 
 `dxlrun ROBOT.yaml` runs it, `dxlrun check ROBOT.yaml` looks at it without touching hardware,
 `dxlrun sim ROBOT.yaml` simulates its servos for other programs,
-`dxlrun analyze` says what happened in a run, `dxlrun list` shows the robots that run,
+`dxlrun analyze` reports what happened in a run, `dxlrun list` shows the robots that run,
 `dxlrun examples` has robots to start with."""
 
 USAGE = """Usage: dxlrun ROBOT.yaml [ARG:=VALUE ...] [OPTIONS]
@@ -59,43 +46,72 @@ USAGE = """Usage: dxlrun ROBOT.yaml [ARG:=VALUE ...] [OPTIONS]
 EPILOGUE = """Exit codes: 0 good, 1 the robot or the run failed, 2 the input is wrong, 130 interrupted."""
 
 
-def build() -> App:
-    """Return the application with all its commands."""
+def build(*, listed: bool) -> App:
+    """Return the application; a command is imported when it is used, or when all are to be `listed`."""
     app = App(
         name="dxlrun",
         help=HELP,
         help_epilogue=EPILOGUE,
+        help_format="plaintext",  # rich.markdown takes as long to import as all else together
+        help_formatter=_Help(),
         usage=USAGE,
         console=None if sys.stdout.isatty() else out(_PIPED_HELP),
-        version=lambda: metadata.version("dxlrun"),
-        suppress_keyboard_interrupt=False,  # an interrupt is said by us, like everything else
+        version=_version,
+        suppress_keyboard_interrupt=False,  # an interrupt is reported by `run_tokens`, like all else
     )
     app.default(run)
-    app.command(examples)
-    app.command(check)
-    app.command(analyze)
-    app.command(replay)
-    app.command(sim)
-    app.command(schema)
-    app.command(models)
-    app.command(scan)
-    app.command(servo)
-    app.command(doctor)
-    app.command(bench)
-    app.command(list_robots, name="list", group=RUNNING)
-    app.command(set_register, name="set", group=RUNNING)
-    app.register_install_completion_command(
-        help="Install tab completion for bash, zsh or fish (--shell), from the next shell on.",
-        version_flags=[],
-    )
-    for verb in (switch, send, rate, pause, resume, load, unload, stop):
-        app.command(verb, group=RUNNING)
+    for name, place in COMMANDS.items():
+        app.command(f"{_ROOM}.{place}", name=name)
+    for name, place in COMMANDS_WHILE_IT_RUNS.items():
+        app.command(f"{_ROOM}.{place}", name=name, group=RUNNING)
+    if listed:
+        for command in app.resolved_commands().values():
+            command.help = command.help.partition("\n\n")[0]  # a list needs no more: the rest takes time
+        app.register_install_completion_command(
+            help="Install tab completion for bash, zsh or fish (--shell), from the next shell on.",
+            version_flags=[],
+        )
     return app
+
+
+def _version() -> str:
+    from importlib import metadata  # not above: only --version needs it
+
+    return metadata.version("dxlrun")
+
+
+class _Help:
+    """Prints the help with the same tables as all results."""
+
+    def __call__(self, console: Console, options: ConsoleOptions, panel: HelpPanel) -> None:
+        """Print the commands or the parameters of one group."""
+        facts = ((" ".join(entry.display_labels_with_metavar), _about(entry)) for entry in panel.entries)
+        show(Table.facts(str(panel.title), facts), console=console)
+
+    def render_usage(self, console: Console, options: ConsoleOptions, usage: object) -> None:
+        """Print how a command is called."""
+        show(str(usage) if str(usage).startswith("Usage") else f"Usage: {usage}", console=console)
+
+    def render_description(self, console: Console, options: ConsoleOptions, description: object) -> None:
+        """Print what a command does."""
+        show(_filled(description), console=console, folded=True)
+
+
+def _about(entry: HelpEntry) -> str:
+    choices = f"One of {', '.join(entry.choices)}." if entry.choices else ""
+    default = f"Default: {entry.default}." if entry.default is not None else ""
+    return " ".join(filter(None, (_filled(entry.description), choices, default)))
+
+
+def _filled(text: object) -> str:
+    """Return a text of a docstring without the line breaks inside its paragraphs."""
+    plain = str(getattr(text, "primary_renderable", text) or "").strip()
+    return re.sub(r"(?<!\n)\n(?!\n)", " ", plain)
 
 
 def run_tokens(tokens: Sequence[str]) -> int:
     """Run one command line and return its exit code; nothing leaves here as a traceback but with --debug."""
-    app = build()
+    app = build(listed=tokens[:1] in _LISTING)
     try:
         if not tokens:
             app.help_print([])
@@ -106,7 +122,7 @@ def run_tokens(tokens: Sequence[str]) -> int:
         _refuse(tokens, ("interrupted",))
         return INTERRUPTED
     except BrokenPipeError:
-        # the reader went away (`dxlrun check ... | head`): nothing is left to say, not even at exit
+        # the reader went away (`dxlrun check ... | head`): print nothing more, not even at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except Exception as error:
@@ -128,14 +144,14 @@ def _refuse(
     problems: Sequence[Problem] = (),
     reason: Mapping[str, object] = MappingProxyType({}),
 ) -> None:
-    """Say why a command is not done: in lines for a person, or in JSON for a program that asked for it."""
+    """Report why a command was refused: in lines for a person, or with --json in JSON."""
     if "--json" in tokens:
         print_refusal(problems, sentences, reason)
         return
     for problem in problems:
-        (say_error if problem.severity == "error" else say_warning)(str(problem))
+        (print_error if problem.severity == "error" else print_warning)(str(problem))
     for sentence in sentences:
-        say_error(sentence if sentence == "interrupted" else f"dxlrun: {sentence}")
+        print_error(sentence if sentence == "interrupted" else f"dxlrun: {sentence}")
 
 
 def _explained(error: Exception) -> tuple[tuple[str, ...], int]:

@@ -1,30 +1,36 @@
-"""`dxlrun check ROBOT.yaml`: look at a robot file without touching hardware."""
+"""`dxlrun check ROBOT.yaml`: check a robot file without touching hardware."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-from cyclopts import Parameter
-
-from dxlrun.cli.inputs import compiled
-from dxlrun.cli.output.flags import Flag, JsonFlag, Motions
-from dxlrun.cli.output.terminal import out, problems_json, say_error, say_warning
-from dxlrun.errors import InputError
+from dxlrun.cli.inputs import Assignment, Flag, JsonFlag, Motions, compiled
+from dxlrun.errors import InputError, counted
+from dxlrun.output.json import problems_json
+from dxlrun.output.table import Column, Table, Value, numbers
+from dxlrun.output.terminal import print_error, print_warning, show, show_json
 
 if TYPE_CHECKING:
     from dxlrun.compile import Compiled
+    from dxlrun.compile.report import (
+        BusRow,
+        CheckReport,
+        ControllerRow,
+        JointRow,
+        MotionRow,
+        PolicyRow,
+        WayRow,
+    )
     from dxlrun.dynamixel.plan.bus_plan import BusPlan
-    from dxlrun.run.identification import Found
+    from dxlrun.run.identification import Found, RegisterRow
 
 
 def check(
     robot: Path,
     /,
-    *assignments: Annotated[str, Parameter(name="arg:=value")],
+    *assignments: Assignment,
     play: Motions = (),
     duration: float | None = None,
     online: Flag = False,
@@ -34,7 +40,7 @@ def check(
     """Check a robot file: joints, reach, controllers, claims, the time budget of each bus.
 
     Without --online no port is opened. Exit code 0, or 2 with every error as `file:line:column: what; how
-    to mend it`; with --online 1 where a servo holds another register than the file declares, or is not ready.
+    to fix it`; with --online 1 where a servo holds another register than the file declares, or is not ready.
 
     Parameters
     ----------
@@ -47,63 +53,228 @@ def check(
     duration
         As for a run: stop after this many seconds.
     online
-        Look at the servos too, and compare their registers with those of the file; nothing is written.
+        Read the servos too, and compare their registers with those of the file; nothing is written.
     as_json
         Print the result as JSON.
     debug
         Print the traceback of an error.
     """
-    result = compiled(robot, assignments, play, duration, _asked if online else None)
+    result = compiled(robot, assignments, play, duration, _ask_servos if online else None)
     found = _look(result) if online else None
     if as_json:
-        report: dict[str, object] = {"ok": True, "errors": [], "warnings": problems_json(result.warnings)}
-        report |= asdict(result.report)
-        if found is not None:
-            report["online"] = {"as_declared": found.as_declared, **asdict(found)}
-        _print_json(report)
+        show_json(_as_json(result, found))
         return 0 if found is None or found.as_declared else 1
-    _print_tables(result, found)
+    show(_verdict(result), *_tables(result.report))
+    if found is not None:
+        show(_registers(found.registers))
     for warning in result.warnings:
-        say_warning(str(warning))
+        print_warning(str(warning))
     if found is None:
         return 0
     for remark in found.remarks:
-        say_warning(remark)
+        print_warning(remark)
     for problem in found.problems:
-        say_error(problem)
+        print_error(problem)
     return 0 if found.as_declared else 1
 
 
-def _asked(buses: Sequence[BusPlan], joints: Sequence[str]) -> Mapping[str, str]:
+def _ask_servos(buses: Sequence[BusPlan], joints: Sequence[str]) -> Mapping[str, str]:
     from dxlrun.run.identification import ask_servos  # not above: most checks open no port
 
     return ask_servos(buses, joints)
 
 
 def _look(result: Compiled) -> Found:
-    """Look at the servos on real ports; raises InputError where there are none."""
+    """Read the servos on real ports; raises InputError where there are none."""
     from dxlrun.compile.buses import SIMULATED
     from dxlrun.run.identification import look
 
     buses = [bus for bus in result.plan.buses if bus.port != SIMULATED]
     if not buses:
         raise InputError(
-            f"every bus of {result.plan.robot} is simulated, so there is nobody to look at; "
+            f"every bus of {result.plan.robot} is simulated, so there are no servos to read; "
             "give it a port, such as port:=/dev/ttyUSB0"
         )
     return look(buses)
 
 
-def _print_json(value: dict[str, object]) -> None:
-    out().file.write(json.dumps(value, indent=2, ensure_ascii=False) + "\n")
+def _as_json(result: Compiled, found: Found | None) -> dict[str, object]:
+    from msgspec import to_builtins
+
+    report = {"ok": True, "errors": [], "warnings": problems_json(result.warnings)}
+    report |= to_builtins(result.report)
+    if found is not None:
+        report["online"] = {"as_declared": found.as_declared, **to_builtins(found)}
+    return report
 
 
-def _print_tables(result: Compiled, found: Found | None) -> None:
-    from dxlrun.cli.output.check_tables import registers, tables, verdict
+def _verdict(result: Compiled) -> str:
+    """Return the result in one line."""
+    report = result.report
+    active = sum(controller.active for controller in report.controllers)
+    joints = counted(len(report.joints), "joint", "joints")
+    controllers = counted(len(report.controllers), "controller", "controllers")
+    warnings = len(result.warnings)
+    return (
+        f"{report.robot}: good. {joints}, {active} of {controllers} active, {report.rate:g} Hz, "
+        f"{warnings or 'no'} warning{'s' * (warnings != 1)}"
+    )
 
-    console = out()
-    console.print(verdict(result), soft_wrap=True)
-    for table in tables(result.report, console.width):
-        console.print(table)
-    if found is not None and found.registers:
-        console.print(registers(found.registers, console.width))
+
+def _tables(report: CheckReport) -> Iterator[Table]:
+    yield _joints(report.joints)
+    yield _controllers(report.controllers, len(report.joints))
+    yield _buses(report.buses, report.rate)
+    yield _ways(report.ways)
+    yield _policies(report.policies)
+    yield _motions(report.motions, report.duration)
+
+
+def _joints(joints: Sequence[JointRow]) -> Table:
+    from dxlrun.compile.limits import degrees
+
+    def interval(lower: float, upper: float) -> str:
+        return f"{degrees(lower, signed=True)}..{degrees(upper, signed=True)}"
+
+    efforts = any(row.effort is not None for row in joints)
+    columns = [
+        *(Column(name, "name") for name in ("joint", "bus", "model", "mode")),
+        Column("ID"),
+        Column("reference"),
+        Column("direction", form="{:+d}"),
+        *numbers("limits", "reach"),
+        Column("velocity limit", form="{}/s", missing="none"),
+        *numbers(*["effort limit"] * efforts),
+    ]
+    rows = [
+        (
+            row.name,
+            row.bus,
+            row.model,
+            row.mode,
+            row.id,
+            degrees(row.reference),
+            row.direction,
+            interval(row.lower, row.upper) if row.bounded else "none",
+            interval(row.reach_lower, row.reach_upper) if row.bounded else "continuous",
+            None if row.velocity is None else degrees(row.velocity),
+            *["none" if row.effort is None else f"{row.effort:g} {row.effort_unit}".rstrip()] * efforts,
+        )
+        for row in joints
+    ]
+    return Table.of("Joints (deg)", columns, rows)
+
+
+def _controllers(controllers: Sequence[ControllerRow], joints: int) -> Table:
+    columns = [
+        *(Column(name, "name") for name in ("controller", "type", "from", "claims")),
+        Column("of", "text"),
+        Column("active", "name"),
+        Column("rate", form="{:g} Hz"),
+    ]
+    every = "the joint" if joints == 1 else f"all {joints} joints"
+    rows = [
+        (
+            row.name,
+            row.type,
+            row.distribution,
+            " + ".join(row.command) or "nothing",
+            (every if len(row.joints) == joints else ", ".join(row.joints)) if row.command else "",
+            "yes" if row.active else "no",
+            row.rate,
+        )
+        for row in controllers
+    ]
+    return Table.of("Controllers", columns, rows)
+
+
+def _buses(buses: Sequence[BusRow], rate: float) -> Table:
+    columns = [
+        Column("bus", "name"),
+        Column("port", "name"),
+        *numbers("baud rate", "servos", "bytes out + in"),
+        *(Column(name, form="{:.1f} ms") for name in ("wire", "return delay", "latency", "total")),
+        Column("highest rate", form="{:.0f} Hz"),
+        Column("of the period", form="{:.0%}"),
+    ]
+    rows: list[tuple[Value, ...]] = [
+        (
+            row.name,
+            row.port,
+            row.baud_rate,
+            row.servos,
+            f"{row.request_bytes} + {row.reply_bytes}",
+            *(value * 1e3 for value in (row.wire, row.return_delay, row.latency, row.total)),
+            row.highest_rate,
+            row.share,
+        )
+        for row in buses
+    ]
+    return Table.of(f"Time of one cycle on each bus ({rate:g} Hz leaves {1e3 / rate:.3g} ms)", columns, rows)
+
+
+def _ways(ways: Sequence[WayRow]) -> Table:
+    columns = [
+        *(Column(name, "name") for name in ("bus", "read by", "asked", "chosen")),
+        Column("bytes out + in"),
+        Column("total", form="{:.2f} ms"),
+        Column("highest rate", form="{:.0f} Hz"),
+        Column("waits", form="{:.2f} ms"),
+        Column("states are old", form="{:.2f} ms"),
+    ]
+    asked = {"together": "when a cycle begins", "split": "behind the goals"}
+    rows = [
+        (
+            row.bus,
+            row.way,
+            asked[row.asked],
+            "yes" if row.chosen else "",
+            f"{row.request_bytes} + {row.reply_bytes}",
+            row.total * 1e3,
+            row.highest_rate,
+            row.wait * 1e3,
+            row.age * 1e3,
+        )
+        for row in ways
+    ]
+    return Table.of("Ways to read the servos", columns, rows)
+
+
+def _policies(policies: Sequence[PolicyRow]) -> Table:
+    columns = [
+        Column("policy", "name"),
+        Column("does", "text"),
+        Column("when the loop is gone", "text"),
+        Column("at most", form="{:.1f} s"),
+    ]
+    rows = [(row.name, row.does, row.without_loop, row.longest or None) for row in policies]
+    return Table.of("Policies", columns, rows)
+
+
+def _motions(motions: Sequence[MotionRow], duration: float | None) -> Table:
+    ending = "" if duration is None else f" (the run ends at {duration:g} s)"
+    columns = [
+        Column("file", "name"),
+        Column("controller", "name"),
+        Column("start", form="{:g} s"),
+        Column("end", form="{:g} s"),
+        *numbers("points", "commands"),
+    ]
+    rows = [(row.file, row.controller, row.start, row.end, row.points, row.commands) for row in motions]
+    return Table.of(f"Motions{ending}", columns, rows)
+
+
+def _registers(registers: Sequence[RegisterRow]) -> Table:
+    """Return the declared registers beside those of the servos."""
+    columns = [
+        *(Column(name, "name") for name in ("joint", "item", "area")),
+        *numbers("address", "declared"),
+        Column("found", missing="no answer"),
+        Column("a run would"),
+    ]
+    action = {"nothing": "leave it", "write": "write it", "": "not start"}
+    rows = [
+        (row.joint, row.item, row.area, row.address, row.declared, row.found, action[row.action])
+        for row in registers
+    ]
+    return Table.of("Registers", columns, rows)

@@ -1,17 +1,18 @@
-"""`dxlrun examples`: the robots and motions that come along, to be looked at, copied and run."""
+"""`dxlrun examples` and `dxlrun schema`: robots to begin with, and what editors need to check their files."""
 
 from __future__ import annotations
 
 import json
 import re
+import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
-from dxlrun.cli.output.flags import Flag, JsonFlag
-from dxlrun.cli.output.terminal import out
+from dxlrun.cli.inputs import Flag, JsonFlag
 from dxlrun.errors import DxlrunError, InputError
+from dxlrun.output.terminal import show, show_json
 
 if TYPE_CHECKING:
     from dxlrun.description import MotionDescription, Robot
@@ -65,15 +66,12 @@ def examples(
         raise InputError(f"there is no example {name}; {suggestion(stem, tuple(known))}")
     example = _example(known[stem])
     _copy(source, directory, example.files)
-    console = out()
+    copied = [str(directory / file) for file in example.files]
     if as_json:
-        copied = [str(directory / file) for file in example.files]
-        console.file.write(json.dumps({"robot": copied[0], "files": copied}, indent=2) + "\n")
+        show_json({"robot": copied[0], "files": copied})
         return 0
-    for file in example.files:
-        console.print(str(directory / file), markup=False, soft_wrap=True)
     motion = f" --play {directory / 'motions' / example.motions[0]}.yaml" if example.playable else ""
-    console.print(f"next: dxlrun {directory / example.files[0]}{motion}", markup=False, soft_wrap=True)
+    show(*copied, f"next: dxlrun {copied[0]}{motion}")
     return 0
 
 
@@ -87,25 +85,21 @@ def examples_directory() -> Path:
 
 
 def _list(found: Sequence[Example], *, as_json: bool) -> None:
-    console = out()
     if as_json:
-        console.file.write(json.dumps([asdict(one) for one in found], indent=2) + "\n")
+        show_json(found)
         return
-    from rich.table import Table
+    from dxlrun.output.table import Column, Table
 
-    from dxlrun.cli.output.narrow import fitting
-
-    table = Table("example", box=None, pad_edge=False)
-    table.add_column("servos", justify="right")
-    for head in ("motions", "about"):
-        table.add_column(head, overflow="fold")
-    for one in found:
-        table.add_row(one.name, str(one.servos), ", ".join(one.motions), one.about)
-    console.print(fitting(table, console.width))
-    console.print(
+    columns = [
+        Column("example", "name"),
+        Column("servos"),
+        Column("motions", "text"),
+        Column("about", "text"),
+    ]
+    rows = [(one.name, one.servos, ", ".join(one.motions), one.about) for one in found]
+    show(
+        Table.of("", columns, rows),
         f"`dxlrun examples NAME [DIR]` copies one and its motions into DIR, without it {_HERE}",
-        markup=False,
-        soft_wrap=True,
     )
 
 
@@ -134,7 +128,7 @@ def _example(path: Path) -> Example:
 
 
 def _fits(motion: MotionDescription, robot: Robot) -> bool:
-    """Say whether a motion is for controllers and joints that a robot has."""
+    """Return whether a motion is for controllers and joints that a robot has."""
     from dxlrun.description.motion import FormulaPart
 
     joints: set[str] = set()
@@ -178,3 +172,52 @@ def _copy(source: Path, directory: Path, files: Sequence[str]) -> None:
 
 def _holds(path: Path, text: bytes) -> bool:
     return path.is_file() and path.read_bytes() == text
+
+
+def schema(
+    kind: Literal["robot", "motion", "fragment"] = "robot",
+    /,
+    *,
+    output: Path | None = None,
+    debug: Flag = False,
+) -> int:
+    """Print the JSON Schema of robot files, with the parameters of all installed controllers.
+
+    Editors with a YAML language server use it when the file's first line is
+    `# yaml-language-server: $schema=robot.schema.json`.
+
+    Parameters
+    ----------
+    kind
+        Which files: robot, motion, or fragment (what a robot file includes).
+    output
+        Write it into this file instead.
+    debug
+        Print the traceback of an error.
+    """
+    text = schema_text(kind)
+    if output is None:
+        sys.stdout.write(text)
+        return 0
+    try:
+        output.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{output} cannot be written ({error.strerror}); choose another --output") from None
+    return 0
+
+
+def schema_text(kind: Literal["robot", "motion", "fragment"], *, only: str = "") -> str:
+    """Return a schema as JSON; with `only`, of the controllers whose distribution's name begins so."""
+    from dxlrun.description.json_schema import fragment_schema, motion_schema, robot_schema
+
+    if kind == "motion":
+        made = motion_schema()
+    else:
+        from dxlrun.control.controllers.plugins import load_plugins
+
+        offers = load_plugins().controllers.items()
+        parameters = {
+            name: offer.controller.Parameters for name, offer in offers if offer.distribution.startswith(only)
+        }
+        made = robot_schema(parameters) if kind == "robot" else fragment_schema(parameters)
+    return json.dumps(made, indent=2, ensure_ascii=False) + "\n"

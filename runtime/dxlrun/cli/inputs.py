@@ -1,46 +1,57 @@
-"""Robot file, arguments and motions from the command line to a compiled robot."""
+"""What the commands have in common: their names, shared options, and a robot file with its arguments."""
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
 
 from dxlrun.errors import InputError
 
 if TYPE_CHECKING:
     from dxlrun.compile import Ask, Compiled
 
-COMMANDS = (
-    "analyze",
-    "bench",
-    "check",
-    "doctor",
-    "examples",
-    "models",
-    "replay",
-    "scan",
-    "schema",
-    "servo",
-    "sim",
-)
-COMMANDS_WHILE_IT_RUNS = (
-    "list",
-    "set",
-    "switch",
-    "send",
-    "rate",
-    "pause",
-    "resume",
-    "load",
-    "unload",
-    "stop",
-)
+COMMANDS = {
+    "examples": "examples:examples",
+    "check": "check:check",
+    "analyze": "logs:analyze",
+    "replay": "logs:replay",
+    "sim": "sim:sim",
+    "schema": "examples:schema",
+    "models": "models:models",
+    "scan": "scan:scan",
+    "servo": "servo:servo",
+    "doctor": "machine:doctor",
+    "bench": "machine:bench",
+}
+"""Where each command is, in this room; it is imported when it is used."""
+COMMANDS_WHILE_IT_RUNS = {
+    "list": "steering.steer:list_robots",
+    "set": "steering.steer:set_register",
+    "switch": "steering.steer:switch",
+    "send": "steering.steer:send",
+    "rate": "steering.steer:rate",
+    "pause": "steering.steer:pause",
+    "resume": "steering.steer:resume",
+    "load": "steering.steer:load",
+    "unload": "steering.steer:unload",
+    "stop": "steering.steer:stop",
+}
+"""Commands for a robot that runs, in the same way."""
 
+Flag = Annotated[bool, Parameter(negative=(), show_default=False)]
+"""An option without a value."""
+JsonFlag = Annotated[bool, Parameter(name="--json", negative=(), show_default=False)]
+"""`--json`."""
+Motions = Annotated[tuple[Path, ...], Parameter(negative=(), show_default=False)]
+"""Motion files; the option may be given several times."""
+Assignment = Annotated[str, Parameter(name="arg:=value")]
+"""An argument of the robot file."""
 
 SHORTEST_S, LONGEST_S = 1e-6, 1e9
-"""Of a run, s; 31 years are nearly for ever, and still fit into the log's nanoseconds."""
+"""Of a run, s; 31 years still fit into the log's nanoseconds."""
 
 
 def compiled(
@@ -72,10 +83,10 @@ def parse_assignments(assignments: Sequence[str]) -> dict[str, str]:
     for word in assignments:
         name, sign, value = word.partition(":=")
         if not sign or not name:
-            mend = (
+            hint = (
                 "a motion needs its own --play" if word.endswith((".yaml", ".yml")) else "write name:=value"
             )
-            raise InputError(f"{word!r} is no argument of the robot file; {mend}")
+            raise InputError(f"{word!r} is no argument of the robot file; {hint}")
         if name in arguments:
             raise InputError(f"argument {name} is given twice; give it once")
         arguments[name] = value
@@ -91,7 +102,9 @@ def _known_file(robot: Path) -> None:
         raise InputError(f"{word} is a directory; give the robot file in it")
     if robot.suffix in (".yaml", ".yml") or len(robot.parts) > 1:
         raise InputError(f"there is no robot file {word}; check the path")
-    known = COMMANDS + COMMANDS_WHILE_IT_RUNS
+    known = sorted(COMMANDS) + list(COMMANDS_WHILE_IT_RUNS)
+    import difflib  # not above: it is for mistakes
+
     close = difflib.get_close_matches(word, known, n=1)
     hint = (
         f"did you mean {close[0]}?"

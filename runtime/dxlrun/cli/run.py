@@ -4,21 +4,18 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-from cyclopts import Parameter
-
-from dxlrun.cli.inputs import compiled
-from dxlrun.cli.output.flags import Flag, Motions
-from dxlrun.cli.output.terminal import out, say_error, say_warning
+from dxlrun.cli.inputs import Assignment, Flag, Motions, compiled
 from dxlrun.errors import InputError, LogError, counted
+from dxlrun.output.terminal import out, print_error, print_warning, show
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from rich.console import Console
 
-    from dxlrun.analysis.tally import Figures
+    from dxlrun.analysis.tally import RunTotals
     from dxlrun.analysis.verdict import Verdict
     from dxlrun.compile.plan import Plan
     from dxlrun.dynamixel.plan.bus_plan import BusPlan
@@ -28,7 +25,7 @@ if TYPE_CHECKING:
 def run(
     robot: Path,
     /,
-    *assignments: Annotated[str, Parameter(name="arg:=value")],
+    *assignments: Assignment,
     duration: float | None = None,
     play: Motions = (),
     no_record: Flag = False,
@@ -72,7 +69,7 @@ def run(
         )
     result = compiled(robot, assignments, play, duration, None if virtual else _ask_servos)
     for warning in result.warnings:
-        say_warning(str(warning))
+        print_warning(str(warning))
     if ledger is not None:
         _check_ledger(ledger, result.plan)
     from dxlrun.run.run_summary import RunOptions
@@ -89,7 +86,7 @@ def run(
         from dxlrun.run.supervisor import run_robot
 
         summary = run_robot(result.plan, options, console)
-    return show(summary, result.plan, console)
+    return show_summary(summary, result.plan, console)
 
 
 def _check_ledger(ledger: Path, plan: Plan) -> None:
@@ -118,24 +115,24 @@ def _ask_servos(buses: Sequence[BusPlan], joints: Sequence[str]) -> Mapping[str,
 
 def _verdict(summary: RunSummary, plan: Plan, console: Console) -> Verdict:
     """Return the verdict by the rules of `analyze`: on the log, or without one on what the loop counted."""
-    from dxlrun.analysis.tally import figures_of
+    from dxlrun.analysis.tally import totals_of
     from dxlrun.analysis.verdict import Verdict, judge
 
     if summary.log is None:
-        return judge(_figures(summary, plan))
+        return judge(_totals(summary, plan))
     try:
         with console.status("reading the log"):
-            return judge(figures_of(summary.log))
+            return judge(totals_of(summary.log))
     except LogError as error:
         return Verdict(good=False, sentences=(f"The log cannot be read: {error}.",))
 
 
-def _figures(summary: RunSummary, plan: Plan) -> Figures:
+def _totals(summary: RunSummary, plan: Plan) -> RunTotals:
     from dxlrun.analysis.latency import Periods
-    from dxlrun.analysis.tally import Figures
+    from dxlrun.analysis.tally import RunTotals
 
     elapsed, rate_hz = summary.cycles + summary.skipped, 1e9 / plan.loop.period_ns
-    return Figures(
+    return RunTotals(
         Periods(
             elapsed,
             summary.cycles,
@@ -152,36 +149,34 @@ def _figures(summary: RunSummary, plan: Plan) -> Figures:
     )
 
 
-def show(summary: RunSummary, plan: Plan, console: Console) -> int:
+def show_summary(summary: RunSummary, plan: Plan, console: Console) -> int:
     """Print how the run went: what failed and what was not granted to stderr, the rest to stdout.
 
     Return the exit code: 1 also where the verdict is that the run was not good.
     """
     robot = plan.robot
     for remark in summary.remarks:
-        say_warning(f"{robot}: {remark}")
+        print_warning(f"{robot}: {remark}")
     for sentence in summary.sentences:
-        say_error(f"{robot}: {sentence}")
+        print_error(f"{robot}: {sentence}")
     try:
         verdict = _verdict(summary, plan, console)
     except KeyboardInterrupt:  # a log may be long; its name is printed all the same
-        say_warning(
+        print_warning(
             f"{robot}: interrupted while the log was read, so the verdict is that of the loop's counts"
         )
         summary = replace(summary, exit_code=summary.exit_code or 130)
         verdict = _verdict(replace(summary, log=None), plan, console)
     code = 1 if summary.cycles and not verdict.good else summary.exit_code
     word = {0: "good", 130: "interrupted"}.get(code, "failed")
-    console.print(
+    lines = [
         f"{robot}: {word}. {summary.elapsed_s:.1f} s, {counted(summary.cycles, 'cycle', 'cycles')}, "
-        f"{counted(summary.skipped, 'period', 'periods')} skipped",
-        soft_wrap=True,
-    )
-    for sentence in verdict.sentences if summary.cycles else ():  # why it never ran was said already
-        console.print(f"  {sentence}", markup=False, soft_wrap=True)
+        f"{counted(summary.skipped, 'period', 'periods')} skipped"
+    ]
+    if summary.cycles:  # why a run had none was printed above
+        lines += [f"  {sentence}" for sentence in verdict.sentences]
     if summary.log is not None:
-        held = counted(summary.messages, "message", "messages")
-        console.print(f"log: {summary.log} ({held})", markup=False, soft_wrap=True)
-        if summary.cycles:
-            console.print(f"next: dxlrun analyze {summary.log}", markup=False, soft_wrap=True)
+        lines.append(f"log: {summary.log} ({counted(summary.messages, 'message', 'messages')})")
+        lines += [f"next: dxlrun analyze {summary.log}"] * bool(summary.cycles)
+    show(*lines, console=console)
     return code

@@ -14,7 +14,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import msgspec
 import numpy as np
 from rich.console import Console
 
@@ -90,11 +89,6 @@ def highest_rate(
         rate = _round(min(_STEP * rate, 1e6 / tries[-1].p999_us))
     kept = tries[-1].rate_hz if tries and tries[-1].kept else None
     return HighestRate(description.robot.name, round(computed, 1), kept, tuple(tries))
-
-
-def to_json(result: HighestRate) -> bytes:
-    """Encode what was found."""
-    return msgspec.json.format(msgspec.json.encode(result))
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from dxlrun.analysis.ledger.waits import Sent, transactions
+from dxlrun.analysis.ledger.overruns import Sent, transactions
 from dxlrun.simulation import LedgerEntry, read_ledger
 from exchange.canned import CannedResponder
 from exchange.case import Case

@@ -7,12 +7,9 @@ import math
 import sys
 from collections.abc import Sequence
 
-from rich.table import Table
-
-from dxlrun.cli.output.narrow import fitting
-from dxlrun.cli.output.progress import progress_bar
-from dxlrun.cli.output.terminal import out, say_error, say_warning
 from dxlrun.errors import DxlrunError, InputError
+from dxlrun.output.table import Column, Table, Value, numbers
+from dxlrun.output.terminal import print_error, print_warning, progress_bar, show
 from exchange.bus import Against, BusBench, Wish, bench_bus, chosen_hosts, to_json
 from exchange.case import Case
 from exchange.figures import HostFigures
@@ -63,10 +60,10 @@ def main(words: Sequence[str] | None = None) -> int:
         return _measure(parser().parse_args(words))
     except DxlrunError as error:
         for sentence in str(error).splitlines():
-            say_error(f"tests/bench/exchange: {sentence}")
+            print_error(f"tests/bench/exchange: {sentence}")
         return error.exit_code
     except KeyboardInterrupt:
-        say_error("interrupted")
+        print_error("interrupted")
         return _INTERRUPTED
 
 
@@ -76,12 +73,11 @@ def _measure(options: argparse.Namespace) -> int:
     with progress_bar(hidden=options.json) as progress:
         result = bench_bus(cases, Wish(chosen_hosts(names), options.seconds, not options.raw), progress)
     for name in result.missing:
-        say_warning(f"{name} is not installed and was left out; `pip install '.[test]'` installs it")
+        print_warning(f"{name} is not installed and was left out; `pip install '.[test]'` installs it")
     if options.json:
         sys.stdout.write(to_json(result).decode() + "\n")
     else:
-        console = out()
-        console.print(fitting(bus_table(result), console.width))
+        show(bus_table(result))
     unmeasured = [
         f"{one.host} ({case.servos} x {case.model}, {case.against})"
         for case in result.cases
@@ -89,7 +85,7 @@ def _measure(options: argparse.Namespace) -> int:
         if not one.exchanges
     ]
     if unmeasured:
-        say_error(f"without a whole exchange, so not measured: {', '.join(unmeasured)}")
+        print_error(f"without a whole exchange, so not measured: {', '.join(unmeasured)}")
     return 1 if unmeasured else 0
 
 
@@ -131,29 +127,30 @@ def _counts(text: str) -> list[int]:
 def bus_table(result: BusBench) -> Table:
     """Return the table of an exchange's cost; ratios are those of the first host of each case."""
     wired = any(case.baud_rate for case in result.cases)
-    table = Table(box=None, pad_edge=False)
-    for head in ("against", "protocol", "servos", "host"):
-        table.add_column(head)
-    for head in ("10 % us", "median us", "99 % us", "processor us", "bytes", "wall", "processor", "lost"):
-        table.add_column(head, justify="right")
-    for head in ("wire us", "late us", "x wire") if wired else ():
-        table.add_column(head, justify="right")
+    columns = [
+        *(Column(name, "name") for name in ("against", "protocol", "servos", "host")),
+        *numbers("10 % us", "median us", "99 % us", "processor us", "bytes", "wall", "processor", "lost"),
+        *(numbers("wire us", "late us", "x wire") if wired else ()),
+    ]
+    rows: list[tuple[Value, ...]] = []
     for case in result.cases:
         against = "canned" if case.baud_rate is None else f"{case.baud_rate / 1e6:g} Mbit/s"
         for one in case.hosts:
             times = (one.p10_us, one.median_us, one.p99_us, one.processor_us)
-            table.add_row(
-                against,
-                f"{case.protocol:.1f}",
-                f"{case.servos} x {case.model}",
-                one.host,
-                *(_number(value, 0) for value in times),
-                f"{one.sent_bytes:g} + {one.received_bytes:g}",
-                *_ratios(case.hosts[0], one),
-                str(one.lost),
-                *(_wire(one) if wired else ()),
+            rows.append(
+                (
+                    against,
+                    f"{case.protocol:.1f}",
+                    f"{case.servos} x {case.model}",
+                    one.host,
+                    *(_number(value, 0) for value in times),
+                    f"{one.sent_bytes:g} + {one.received_bytes:g}",
+                    *_ratios(case.hosts[0], one),
+                    one.lost,
+                    *(_wire(one) if wired else ()),
+                )
             )
-    return table
+    return Table.of("", columns, rows)
 
 
 def _ratios(first: HostFigures, one: HostFigures) -> tuple[str, str]:

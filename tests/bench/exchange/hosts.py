@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from dxlrun.analysis.ledger.waits import Sent
+from dxlrun.analysis.ledger.overruns import Sent
 from dxlrun.clock import MonotonicClock
 from dxlrun.compile.plan import Plan
 from dxlrun.control.controllers.plugins import load_plugins

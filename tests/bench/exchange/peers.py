@@ -9,7 +9,7 @@ of goals; ours has SI units at both ends. With `values=False` they leave the byt
 
 from __future__ import annotations
 
-from dxlrun.analysis.ledger.waits import Sent
+from dxlrun.analysis.ledger.overruns import Sent
 from dxlrun.errors import InputError
 from exchange.case import Case, Registers
 

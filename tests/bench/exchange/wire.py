@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.analysis.ledger.waits import Transaction
+from dxlrun.analysis.ledger.overruns import Transaction
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""How figures are drawn: sizes, colours by role, and SVG that takes its colours from the page.
+"""How figures are drawn: SVG with the page's colours, many samples on few columns, the time axis of a run.
 
 matplotlib is imported here and in the other modules of this room only, because it takes seconds; `Figure` is
 used without pyplot, so nothing global is kept and no display is needed.
@@ -13,9 +13,16 @@ from dataclasses import dataclass
 from xml.etree import ElementTree as ET
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
+from numpy.typing import NDArray
+
+from dxlrun.analysis.latency import ROUGH_NS, first_deadline_ns
+from dxlrun.analysis.steering import Pause, Steering
+from dxlrun.interfaces import Floats
+from dxlrun.log.reader import Log
 
 WIDTH = 9.0
 """Inches of 72 points; the page scales it."""
@@ -176,3 +183,147 @@ def reference(axes: Axes, us: float, words: str, *, vertical: bool, colour: str 
         color=colour,
         fontsize=7.5,
     )
+
+
+# Columns
+
+
+COLUMNS = 900
+"""About as many as a figure has pixels across."""
+
+
+@dataclass(frozen=True, slots=True)
+class Columns:
+    """How `count` samples are laid on columns of `width` samples each, the last one perhaps shorter."""
+
+    count: int
+    most: int = COLUMNS
+
+    @property
+    def width(self) -> int:
+        """Samples a column."""
+        return max(1, -(-self.count // self.most))
+
+    @property
+    def number(self) -> int:
+        """Columns."""
+        return -(-self.count // self.width)
+
+    @property
+    def whole(self) -> bool:
+        """True where each sample has a column of its own: nothing is left out."""
+        return self.width == 1
+
+    def envelope(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
+        """Return the samples to draw: all, or the smallest and the largest of each column; NaN = gap.
+
+        x, y: shape (count,). A column without any number is NaN.
+        """
+        if self.whole:
+            return x, y
+        low = self._rows(np.where(np.isnan(y), np.inf, y), np.inf).argmin(axis=1)
+        high = self._rows(np.where(np.isnan(y), -np.inf, y), -np.inf).argmax(axis=1)
+        first = np.arange(self.number) * self.width
+        picked = np.sort(np.stack([first + low, first + high], axis=1), axis=1).ravel()
+        return x[picked], y[picked]
+
+    def largest(self, y: Floats) -> NDArray[np.intp]:
+        """Return the index of the largest sample of each column."""
+        first = np.arange(self.number) * self.width
+        picked: NDArray[np.intp] = first + self._rows(y, -np.inf).argmax(axis=1)
+        return picked
+
+    def bounds(self, y: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return the smallest sample of each column, the median, and the largest; y has no NaN."""
+        rows = self._rows(y, np.nan)
+        return np.nanmin(rows, axis=1), np.nanmedian(rows, axis=1), np.nanmax(rows, axis=1)
+
+    def marked(self, flags: NDArray[np.bool_]) -> NDArray[np.intp]:
+        """Return the index of the first marked sample of each column that has one."""
+        rows = self._rows(flags.astype(np.float64), 0.0)
+        first = np.arange(self.number) * self.width
+        picked: NDArray[np.intp] = (first + rows.argmax(axis=1))[rows.any(axis=1)]
+        return picked
+
+    def said(self, what: str) -> str:
+        """Return the sentence that says how the figure was drawn; empty where every sample is shown."""
+        return (
+            ""
+            if self.whole
+            else f"Each column of the figure stands for {self.width} cycles and shows {what}."
+        )
+
+    def _rows(self, y: Floats, filler: float) -> Floats:
+        missing = self.number * self.width - self.count
+        return np.concatenate([y, np.full(missing, filler)]).reshape(self.number, self.width)
+
+
+# The time axis
+
+
+def run_time_s(log: Log) -> Floats:
+    """Return the time of each cycle's deadline since the loop's first, s."""
+    times: Floats = (log.cycles["scheduled_ns"] - first_deadline_ns(log)) / 1e9
+    return times
+
+
+@dataclass(frozen=True, slots=True)
+class Marks:
+    """Cycles in which one joint's samples have to be read with care; shape (cycles,) each."""
+
+    late: NDArray[np.bool_]
+    """Woke later than 150 us after the deadline."""
+    skipped: NDArray[np.bool_]
+    """At least one period was skipped right before."""
+    silent: NDArray[np.bool_]
+    """No intact reply: the state is an old one."""
+    clamped: NDArray[np.bool_]
+    """The last gate changed the command."""
+
+    @classmethod
+    def of(cls, log: Log, row: int) -> Marks:
+        """Return the marks of the joint in this row."""
+        cycles = log.cycles
+        return cls(
+            late=(cycles["woken_ns"] - cycles["scheduled_ns"]) > ROUGH_NS,
+            skipped=cycles["skipped"] > 0,
+            silent=~cycles["valid"][:, row],
+            clamped=cycles["clamped"][:, row] != 0,
+        )
+
+
+_FEW_CHANGES = 60
+"""More lines would bury the curves."""
+_MARKED = ("switch", "rate", "load", "unload", "policy")
+
+
+@dataclass(frozen=True, slots=True)
+class SteeringMarks:
+    """When a run was steered, s since the loop's first deadline."""
+
+    times: tuple[float, ...]
+    """Of switches, changes of the rate, loaded and unloaded controllers, and of a policy's beginning."""
+    pauses: tuple[Pause, ...]
+
+    @classmethod
+    def of(cls, log: Log) -> SteeringMarks:
+        """Return the marks of a log; of very many changes none."""
+        steering = Steering()
+        steering.take(log)
+        acts, pauses = steering.finish()
+        times = tuple(act.time_s for act in acts if act.kind in _MARKED and not act.refusal)
+        return cls(times if len(times) <= _FEW_CHANGES else (), pauses)
+
+    def draw(self, axes: Axes) -> None:
+        """Shade the pauses, and draw a dotted line where something was changed."""
+        for pause in self.pauses:
+            axes.axvspan(pause.begin_s, pause.end_s, color=MUTED, alpha=0.15, linewidth=0)
+        for time in self.times:
+            axes.axvline(time, color=PURPLE, linewidth=0.8, linestyle=":")
+
+    @property
+    def said(self) -> str:
+        """The sentence that says what the marks are; empty where there are none."""
+        parts = ["Shaded: the loop was paused."] if self.pauses else []
+        parts += ["Dotted lines: it was steered otherwise."] if self.times else []
+        return " ".join(parts)

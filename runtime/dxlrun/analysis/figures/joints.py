@@ -18,14 +18,15 @@ from dxlrun.analysis.figures.drawing import (
     ORANGE,
     PURPLE,
     WARNING,
+    Columns,
     Drawing,
+    Marks,
+    SteeringMarks,
     Words,
     draw,
+    run_time_s,
     time_axis,
 )
-from dxlrun.analysis.figures.envelope import Columns
-from dxlrun.analysis.figures.run_time import Marks, run_time_s
-from dxlrun.analysis.figures.steered import SteeringMarks
 from dxlrun.analysis.tracking import Joint, reachable
 from dxlrun.interfaces import Floats
 from dxlrun.log.reader import Log

@@ -6,20 +6,20 @@ on the buses before and after is only counted.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
 
 from dxlrun.analysis.bus import joints_of
-from dxlrun.analysis.ledger.alignment import Span, differing
 from dxlrun.analysis.ledger.faults import FaultAnswers, UncausedEvent, answered, uncaused
-from dxlrun.analysis.ledger.lateness import Lateness, lateness
-from dxlrun.analysis.ledger.overruns import OverrunCauses, overrun_causes
-from dxlrun.analysis.ledger.streams import WAYS, Stream, Way, logged, seen
+from dxlrun.analysis.ledger.overruns import Lateness, OverrunCauses, lateness, overrun_causes
+from dxlrun.analysis.ledger.streams import WAYS, Span, Stream, Way, differing, logged, seen
+from dxlrun.analysis.report import once
 from dxlrun.errors import InputError, counted
 from dxlrun.log.reader import UNREADABLE, Log
+from dxlrun.output.table import Cell, Column, Line, Part, Table, Value, flagged, microseconds, numbers
 from dxlrun.run.channels.events import Event, EventCode, LostRecords
 from dxlrun.run.channels.packets import LoggedPacket, PacketKind
 from dxlrun.simulation import LedgerEntry
@@ -27,6 +27,9 @@ from dxlrun.simulation import LedgerEntry
 GRACE_NS = 250_000_000
 """What the bus sees so long after the log's last record still belongs to the run; the next run takes longer
 to start."""
+_MOST_SHOWN = 20
+"""Differences and faults in a table; `--json` has all."""
+_MOST_BYTES = 16
 RING_NS = 20_000_000_000
 """A recorder that lost records lost them at most so long before it says so: twice what a ring holds."""
 
@@ -130,20 +133,6 @@ def compare(log: Log, entries: Sequence[LedgerEntry], ledger: Path) -> LedgerRep
         lateness=late,
         causes=causes,
     )
-
-
-def to_json(report: LedgerReport) -> bytes:
-    """Return a report as JSON, indented; bytes are hexadecimal digits."""
-    plain = msgspec.to_builtins(report, builtin_types=(bytes,))
-    return msgspec.json.format(msgspec.json.encode(_hex(plain)), indent=2)
-
-
-def _hex(value: object) -> object:
-    if isinstance(value, bytes):
-        return value.hex()
-    if isinstance(value, Mapping):
-        return {key: _hex(item) for key, item in value.items()}
-    return [_hex(item) for item in value] if isinstance(value, list | tuple) else value
 
 
 def last_of(log: Log) -> int:
@@ -304,3 +293,156 @@ def _said_of(late: Lateness | None, causes: OverrunCauses | None) -> list[str]:
             f"{counted(causes.own_work, 'time', 'times')}: {causes.own_share:.3%} of {causes.cycles} cycles."
         )
     return said
+
+
+# The comparison as tables
+
+
+def parts(report: LedgerReport) -> tuple[Part, ...]:
+    """Return what a terminal shows: sentences, then one table a subject that has rows."""
+    first, *others = report.sentences
+    return (
+        Line(first, "good" if report.good else "error"),
+        *others,
+        _buses_table(report.buses),
+        _differences_table(report.differences),
+        _faults_table(report.faults),
+        _uncaused_table(report.uncaused),
+        *(
+            []
+            if report.lateness is None or not report.lateness.max_us
+            else [_lateness_table(report.lateness)]
+        ),
+        *([] if report.causes is None else [_overruns_table(report.causes)]),
+    )
+
+
+def _buses_table(buses: Sequence[ComparedBus]) -> Table:
+    columns = [
+        Column("bus", "name"),
+        *numbers("sent", "bytes", "replies", "bytes", "noise", "differences", "declared"),
+        Column("outside the run", form="{} B"),
+    ]
+    rows = [
+        (
+            bus.name,
+            bus.sent_packets,
+            bus.sent_bytes,
+            bus.replies,
+            bus.received_bytes,
+            flagged(bus.noise_bytes, f"{bus.noise_bytes} B"),
+            flagged(bus.differences, tone="error"),
+            flagged(bus.declared),
+            bus.outside_bytes,
+        )
+        for bus in buses
+    ]
+    return Table.of("Buses", columns, rows)
+
+
+def _differences_table(differences: Sequence[Difference]) -> Table:
+    columns = [
+        Column("at, s", form="{:.6f}"),
+        Column("bus", "name"),
+        Column("host", "name"),
+        Column("only in the log", "text"),
+        Column("only in the ledger", "text"),
+        Column("declared", "text"),
+    ]
+    rows = [
+        (
+            one.seconds,
+            one.bus,
+            one.way,
+            Cell(_bytes(one.only_log), "plain" if one.declared else "error"),
+            Cell(_bytes(one.only_ledger), "plain" if one.declared else "error"),
+            one.declared or "-",
+        )
+        for one in differences[:_MOST_SHOWN]
+    ]
+    return Table.of(_title("Differences", len(differences)), columns, rows)
+
+
+def _faults_table(faults: Sequence[FaultAnswers]) -> Table:
+    """Return the injected faults, each beside the first event that may answer it."""
+    columns = [
+        Column("at, s", form="{:.6f}"),
+        Column("bus", "name"),
+        Column("fault", "text"),
+        Column("after"),
+        Column("event of the log", "text"),
+    ]
+    rows = []
+    for fault in faults[:_MOST_SHOWN]:
+        first = fault.answers[0] if fault.answers else None
+        event = Cell(f"{first.name}: {once(f'{first.source}: {first.text}')}" if first else "none within 2 s")
+        if fault.unanswered:
+            event = Cell(f"none of {', '.join(fault.unanswered)} within 2 s", "error")
+        after = microseconds(first.after_ms * 1000) if first else "-"
+        rows.append((fault.seconds, fault.bus, fault.text, after, event))
+    return Table.of(_title("Injected faults", len(faults)), columns, rows)
+
+
+def _uncaused_table(events: Sequence[UncausedEvent]) -> Table:
+    columns = [Column("at, s", form="{:.6f}"), Column("event", "name"), Column("text", "text")]
+    rows = [
+        (one.seconds, Cell(one.name, "error"), once(f"{one.source}: {one.text}"))
+        for one in events[:_MOST_SHOWN]
+    ]
+    return Table.of(_title("Events without a cause", len(events)), columns, rows)
+
+
+def _lateness_table(late: Lateness) -> Table:
+    rows: list[tuple[Value, ...]] = [
+        ("deliveries", late.deliveries),
+        ("late, median", microseconds(late.median_us)),
+        ("  99 %", microseconds(late.p99_us)),
+        ("  maximum", microseconds(late.max_us)),
+        ("later than 1 ms", late.rough),
+        ("overruns of the loop", late.overruns),
+        ("  beside one later than 1 ms", late.overruns_beside),
+    ]
+    return Table.of("How late the simulated buses were", [Column("simulation", "name"), Column("")], rows)
+
+
+def _overruns_table(causes: OverrunCauses) -> Table:
+    """Return the worst overruns, each split into what was late."""
+    columns = [
+        Column("at, s", form="{:.6f}"),
+        Column("cause", "name"),
+        *numbers(
+            "periods left out",
+            "late servos",
+            "kept by the kernel",
+            "late wake-up",
+            "own work beyond the usual",
+        ),
+    ]
+    worst = sorted(
+        causes.overruns,
+        key=lambda one: one.simulation_us + one.kernel_us + one.wake_up_us + one.own_us,
+        reverse=True,
+    )
+    rows: list[tuple[Value, ...]] = [
+        (
+            one.seconds,
+            Cell(one.cause, "warning" if one.cause == "own work" else "plain"),
+            one.skipped,
+            *map(microseconds, (one.simulation_us, one.kernel_us, one.wake_up_us, max(0.0, one.own_us))),
+        )
+        for one in worst[:_MOST_SHOWN]
+    ]
+    title = f"Why the loop overran; a cycle usually takes {microseconds(causes.usual_us)}"
+    more = "" if len(worst) <= _MOST_SHOWN else f"; the worst {_MOST_SHOWN} of {len(worst)}, --json has all"
+    return Table.of(title + more, columns, rows)
+
+
+def _title(what: str, number: int) -> str:
+    return what if number <= _MOST_SHOWN else f"{what}: the first {_MOST_SHOWN} of {number}; --json has all"
+
+
+def _bytes(data: bytes) -> str:
+    if not data:
+        return "-"
+    more = f" ... {len(data)} bytes" if len(data) > _MOST_BYTES else ""
+    return data[:_MOST_BYTES].hex(" ") + more

@@ -15,23 +15,26 @@ largest of them is the cause; but a cycle that would have overrun with all of th
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.analysis.ledger.streams import logged, seen
-from dxlrun.analysis.ledger.waits import Transaction, transactions
-from dxlrun.log.reader import UNREADABLE, Log
+from dxlrun.analysis.plan import LoggedBus, plan_of
+from dxlrun.log.reader import Log
 from dxlrun.run.channels.packets import PacketKind
 from dxlrun.simulation import LedgerEntry
 
 Cause = Literal["simulation", "kernel", "wake-up", "own work"]
 _BITS_A_BYTE = 10
 Longs = NDArray[np.int64]
+Sent = Sequence[tuple[int, int]]
+"""When a host began to write, ns, and how many bytes; all that it wrote, in order."""
+LATE_REPLY_NS = 1_000_000
+"""A reply later than this can cost a loop its period [i]: at 1 kHz it is one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,24 +119,6 @@ def overrun_causes(log: Log, by_bus: Mapping[str, Sequence[LedgerEntry]]) -> Ove
     )
 
 
-class _Bus(msgspec.Struct):
-    name: str
-    baud_rate: int = 0
-
-
-class _Plan(msgspec.Struct):
-    buses: list[_Bus] = []
-
-
-def _baud_rates(log: Log) -> dict[str, int]:
-    """Return the rate of each bus by the log's plan; a log without one leaves waiting for the line unseen."""
-    try:
-        plan = msgspec.json.decode(log.attachments.get("plan.json", b"{}"), type=_Plan)
-    except UNREADABLE:
-        return {}
-    return {bus.name: bus.baud_rate for bus in plan.buses}
-
-
 def _overrun(seconds: float, skipped: int, parts: tuple[int, int, int, int], *, too_long: bool) -> Overrun:
     simulation, kernel, wake_up, own = parts
     causes: tuple[Cause, ...] = ("own work", "wake-up", "kernel", "simulation")  # in doubt it is our own
@@ -145,7 +130,7 @@ def _found(log: Log, bus: int, entries: Sequence[LedgerEntry]) -> tuple[list[Tra
     """Return what was answered on a bus, and how long the kernel kept the end of each answer, ns."""
     packets = sorted((p for p in log.packets if p.bus == bus), key=lambda packet: packet.first_ns)
     sent = [(p.first_ns, len(p.data)) for p in packets if p.kind is PacketKind.INSTRUCTION]
-    rate = _baud_rates(log).get(log.buses[bus])
+    rate = plan_of(log).by_name.get(log.buses[bus], LoggedBus()).baud_rate
     found = list(transactions(entries, sent, _BITS_A_BYTE * 1e9 / rate if rate else 0.0))
     got, given = logged(packets, "received"), seen(entries, "received")
     most = min(len(got.data), len(given.data))
@@ -188,3 +173,123 @@ class _Waits:
         waited = (index >= 0) & (handed <= self.read[index])
         np.add.at(in_read, index[waited], beyond[waited])
         return in_read
+
+
+# What a host waited for on a simulated bus
+#
+# A simulated servo is a process, so it takes an instruction later than a real one would, and hands its reply
+# over later. The ledger records both:
+#
+# - `in`: when the bytes were taken. When the host wrote them is known only of hosts that record it. Bytes
+#   that had to wait for the line anyway are not late.
+# - `out`: how long after it had passed the wire a reply was handed over.
+#
+# Only what a host waits for counts: the last reply of a transaction, and the instruction before it.
+
+
+@dataclass(frozen=True, slots=True)
+class Transaction:
+    """An instruction that was answered."""
+
+    handed_ns: int
+    """When the host was given the end of the last reply."""
+    late_ns: int
+    """How much sooner that could have been."""
+    taken: int
+    """Bytes that went to the servos until then, since the ledger began."""
+    given: int
+    """Bytes that came back."""
+
+
+def transactions(entries: Sequence[LedgerEntry], sent: Sent, byte_ns: float) -> Iterator[Transaction]:
+    """Yield what was answered on one bus; without `sent` only the replies' lateness counts."""
+    written = _written(entries, sent)
+    free_ns = could_be_free_ns = waited_ns = 0.0
+    taken = given = 0
+    last: LedgerEntry | None = None
+    for number, entry in enumerate(entries):
+        if entry.direction == "out":
+            last = entry
+            given += len(entry.data)
+        elif entry.direction == "in":
+            if last is not None:
+                yield _answered(last, waited_ns, taken, given)
+                last = None
+            wire_ns = len(entry.data) * byte_ns
+            could = max(min(written.get(number, entry.t_ns), entry.t_ns), could_be_free_ns)
+            began = max(entry.t_ns, free_ns)
+            waited_ns = began - could
+            could_be_free_ns, free_ns = could + wire_ns, began + wire_ns
+            taken += len(entry.data)
+    if last is not None:
+        yield _answered(last, waited_ns, taken, given)
+
+
+def _answered(last: LedgerEntry, waited_ns: float, taken: int, given: int) -> Transaction:
+    return Transaction(last.t_ns + last.late_ns, round(last.late_ns + waited_ns), taken, given)
+
+
+def _written(entries: Sequence[LedgerEntry], sent: Sent) -> dict[int, int]:
+    """Return by number of an `in` when the host began to write its first byte; {} when they do not match."""
+    ends = np.cumsum([count for _, count in sent])
+    taken = sum(len(entry.data) for entry in entries if entry.direction == "in")
+    if not len(ends) or taken > ends[-1]:
+        return {}
+    found: dict[int, int] = {}
+    offset = 0
+    for number, entry in enumerate(entries):
+        if entry.direction == "in":
+            found[number] = sent[int(np.searchsorted(ends, offset, side="right"))][0]
+            offset += len(entry.data)
+    return found
+
+
+# How late the replies were over the whole run
+
+
+@dataclass(frozen=True, slots=True)
+class Lateness:
+    """How long after it was due the host got what the simulated servos sent, us; zero on virtual time.
+
+    Of answers that it got together the last one counts: the others waited for it.
+    """
+
+    deliveries: int
+    median_us: float
+    p99_us: float
+    max_us: float
+    rough: int
+    """Deliveries that were later than 1 ms."""
+    overruns: int
+    """Cycles of the loop before which periods were skipped."""
+    overruns_beside: int
+    """Those of them in whose time a delivery was later than 1 ms: the simulation may be why."""
+
+
+def lateness(log: Log, entries: Iterable[LedgerEntry]) -> Lateness | None:
+    """Return how late the buses were; None where the ledger has no delivery. `entries` of the run."""
+    late_ns: dict[tuple[str, int], int] = {}
+    for entry in entries:
+        if entry.direction == "out":
+            handed = (entry.bus, entry.t_ns + entry.late_ns)
+            late_ns[handed] = min(late_ns.get(handed, entry.late_ns), entry.late_ns)
+    if not late_ns:
+        return None
+    late = np.array(list(late_ns.values()), np.int64)
+    handed_ns = np.array([at_ns for _, at_ns in late_ns], np.int64)
+    handed_over = np.sort(handed_ns[late > LATE_REPLY_NS])
+    after = log.cycles[log.cycles["skipped"] > 0]
+    begins = after["scheduled_ns"] - (after["skipped"] + 1).astype(np.int64) * log.period_ns
+    beside = np.searchsorted(handed_over, after["woken_ns"], side="right") > np.searchsorted(
+        handed_over, begins, side="left"
+    )
+    median, p99 = np.percentile(late, [50, 99])
+    return Lateness(
+        deliveries=len(late),
+        median_us=float(median) / 1e3,
+        p99_us=float(p99) / 1e3,
+        max_us=float(late.max()) / 1e3,
+        rough=len(handed_over),
+        overruns=len(after),
+        overruns_beside=int(beside.sum()),
+    )

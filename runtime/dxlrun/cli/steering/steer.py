@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from dxlrun.cli.output.flags import Flag, JsonFlag
-from dxlrun.cli.output.terminal import out, say_error
+from dxlrun.cli.inputs import Flag, JsonFlag
 from dxlrun.errors import DxlrunError, InputError, Refused, suggestion
+from dxlrun.output.terminal import out, print_error
 
 if TYPE_CHECKING:
     from dxlrun.remote.client import Executed, RemoteRobot
@@ -73,7 +73,7 @@ def list_robots(*, robot: str | None = None, as_json: JsonFlag = False, debug: F
             with connect(name, "dxlrun list") as one:
                 found.append({**one.info(), "name": name})
         except DxlrunError as error:  # it may have ended meanwhile; the others are listed
-            say_error(f"dxlrun: {error}")
+            print_error(f"dxlrun: {error}")
             code = 1
     console = out()
     if as_json:

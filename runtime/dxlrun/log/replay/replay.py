@@ -6,8 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import msgspec
-
 from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.controllers.plugins import PlugIns, load_plugins
 from dxlrun.control.gate import Gate
@@ -61,12 +59,6 @@ class ReplayReport:
         ended = f"; then {self.fault}" if self.fault else ""
         differ = "differs" if self.different == 1 else "differ"
         return f"{self.robot}: {self.different} of {self.compared} replayed cycles {differ}{ended}"
-
-
-def to_json(report: ReplayReport) -> bytes:
-    """Return the report as JSON, with its sentence."""
-    content = msgspec.to_builtins(report) | {"same": report.same, "sentence": report.sentence}
-    return msgspec.json.format(msgspec.json.encode(content))
 
 
 class _Silence:

@@ -1,4 +1,4 @@
-"""Elements of the page: built as a tree, so that it is well-formed and every text is escaped."""
+"""HTML elements, built as a tree, so that a page is well-formed and every text is escaped."""
 
 from __future__ import annotations
 
@@ -6,10 +6,9 @@ from collections.abc import Iterable
 from xml.etree import ElementTree as ET
 from xml.etree.ElementTree import Element
 
-from dxlrun.analysis.figures.drawing import Drawing
-from dxlrun.analysis.output.tables import Table
+from dxlrun.output.table import Table
 
-__all__ = ["Element", "clean", "drawing_of", "paragraph", "section", "table_of"]
+__all__ = ["Element", "clean", "figure", "paragraph", "section", "table_element"]
 
 
 def section(name: str, title: str, parts: Iterable[Element]) -> Element:
@@ -27,15 +26,16 @@ def paragraph(text: str, kind: str = "") -> Element:
     return element
 
 
-def clean(text: str) -> str:
-    """Replace what no document may hold, such as the escape character in a text from a log."""
-    return "".join(
-        character if character.isprintable() or character == "\n" else "\N{REPLACEMENT CHARACTER}"
-        for character in text
-    )
+def figure(name: str, title: str, drawing: Element, caption: str) -> Element:
+    """Return a drawing with its title above and its caption below."""
+    element = Element("figure", {"id": name})
+    ET.SubElement(element, "h3").text = clean(title)
+    element.append(drawing)
+    ET.SubElement(element, "figcaption").text = clean(caption)
+    return element
 
 
-def table_of(table: Table) -> Element:
+def table_element(table: Table) -> Element:
     """Return a table with its title as caption; a table without column names gets names of rows only."""
     scroll = Element("div", {"class": "table"})
     element = ET.SubElement(scroll, "table")
@@ -55,11 +55,9 @@ def table_of(table: Table) -> Element:
     return scroll
 
 
-def drawing_of(drawing: Drawing) -> Element:
-    """Return a figure with its title above and its caption below."""
-    words = drawing.words
-    element = Element("figure", {"id": words.name})
-    ET.SubElement(element, "h3").text = clean(words.title)
-    element.append(drawing.svg)
-    ET.SubElement(element, "figcaption").text = clean(words.caption)
-    return element
+def clean(text: str) -> str:
+    """Replace what no document may hold, such as the escape character in a text from a log."""
+    return "".join(
+        character if character.isprintable() or character == "\n" else "\N{REPLACEMENT CHARACTER}"
+        for character in text
+    )

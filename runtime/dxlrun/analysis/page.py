@@ -5,21 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
-from dxlrun.analysis.figures.budget import budget_drawings
+from dxlrun.analysis.figures.drawing import Drawing
+from dxlrun.analysis.figures.events import events_drawing, reply_drawing
 from dxlrun.analysis.figures.joints import joint_drawings
-from dxlrun.analysis.figures.latency import latency_drawings
-from dxlrun.analysis.figures.timeline import events_drawing
-from dxlrun.analysis.figures.wires import reply_drawing
+from dxlrun.analysis.figures.timing import budget_drawings, latency_drawings
 from dxlrun.analysis.latency import first_deadline_ns, on_virtual_time
-from dxlrun.analysis.output.elements import Element, clean, drawing_of, paragraph, section, table_of
-from dxlrun.analysis.output.facts import began, facts
-from dxlrun.analysis.output.tables import (
-    Cell,
-    Column,
-    Table,
+from dxlrun.analysis.report import (
+    Report,
+    began,
     buses_table,
     controllers_table,
     events_table,
+    facts,
     joints_table,
     loop_table,
     servos_table,
@@ -27,9 +24,10 @@ from dxlrun.analysis.output.tables import (
     steps_table,
     tone_of,
 )
-from dxlrun.analysis.report import Report, to_json
-from dxlrun.analysis.verdict import microseconds
 from dxlrun.log.reader import Log
+from dxlrun.output.html import Element, clean, figure, paragraph, section, table_element
+from dxlrun.output.json import json_text
+from dxlrun.output.table import Cell, Column, Table, microseconds
 from dxlrun.run.channels.events import Severity
 
 _STYLE_SHEET = Path(__file__).with_name("page.css")
@@ -51,7 +49,7 @@ def page(log: Log, report: Report) -> str:
     )
     ET.SubElement(head, "style").text = _STYLE_SHEET.read_text(encoding="utf-8")
     numbers = ET.SubElement(head, "script", {"type": "application/json", "id": "report"})
-    numbers.text = to_json(report).decode().replace("<", "\\u003c")  # no text in it ends the element
+    numbers.text = json_text(report).replace("<", "\\u003c")  # no text in it ends the element
     body = ET.SubElement(html, "body")
     body.append(_header(log, report))
     main = ET.SubElement(body, "main")
@@ -111,7 +109,7 @@ def _contents(sections: list[Element]) -> Element:
 
 def _sections(log: Log, report: Report) -> list[Element]:
     found = [
-        section("run", "The run", [table_of(table) for table in facts(log, report)]),
+        section("run", "The run", [table_element(table) for table in facts(log, report)]),
         _latency(log, report),
         _budget(log, report),
         _joints(log, report),
@@ -123,82 +121,92 @@ def _sections(log: Log, report: Report) -> list[Element]:
 
 
 def _latency(log: Log, report: Report) -> Element:
-    parts = [table_of(loop_table(report))]
+    parts = [table_element(loop_table(report))]
     if on_virtual_time(log):
         parts.append(
             paragraph("The run was on virtual time: every wake-up is exact, so there is no latency to show.")
         )
     elif report.latency is not None:
-        parts += [drawing_of(drawing) for drawing in latency_drawings(log, report.latency)]
+        parts += [_figure(drawing) for drawing in latency_drawings(log, report.latency)]
     return section("latency", "Wake-up latency", parts)
 
 
 def _budget(log: Log, report: Report) -> Element:
     tables = [table for table in (steps_table(report), controllers_table(report)) if table.rows]
-    parts = [table_of(table) for table in tables]
+    parts = [table_element(table) for table in tables]
     if len(log.cycles):
         first, second = budget_drawings(log)
-        parts = [drawing_of(first), *parts, drawing_of(second)]
+        parts = [_figure(first), *parts, _figure(second)]
     return section("budget", "Where the time of a cycle goes", parts)
 
 
 def _joints(log: Log, report: Report) -> Element:
-    parts = [table_of(joints_table(report))] if report.joints else []
+    parts = [table_element(joints_table(report))] if report.joints else []
     if len(log.cycles) and report.joints:
         parts.append(
             paragraph(
-                "Desired is what the controllers wanted, sent is the goal after the last gate, read is what "
-                "the servo said. Marked are cycles that woke later than 150 us (late), that follow skipped "
-                "periods, that got no intact reply, or whose command the last gate changed (clamped)."
+                "Desired is the controllers' command, sent is the goal after the gate, read is what the "
+                "servo reported. Marked are cycles that woke later than 150 us (late), that follow skipped "
+                "periods, that got no intact reply, or whose command the gate changed (clamped)."
             )
         )
-        parts += [drawing_of(drawing) for drawing in joint_drawings(log, report.joints)]
+        parts += [_figure(drawing) for drawing in joint_drawings(log, report.joints)]
     return section("joints", "Joints", parts)
 
 
 def _wires(report: Report) -> Element:
-    parts = [table_of(table) for table in (buses_table(report), servos_table(report)) if table.rows]
+    parts = [table_element(table) for table in (buses_table(report), servos_table(report)) if table.rows]
     drawing = reply_drawing(report.servos)
     if drawing is not None:
-        parts.append(drawing_of(drawing))
+        parts.append(_figure(drawing))
     return section("buses", "Buses and servos", parts)
 
 
 def _steering(report: Report) -> Element:
     table = steering_table(report.steering)
-    return section("steering", "Steered from outside", [table_of(table)] if table.rows else [])
+    return section("steering", "Steered from outside", [table_element(table)] if table.rows else [])
 
 
 def _events(log: Log, report: Report) -> Element:
-    parts = [table_of(events_table(report.events))] if report.events else []
+    parts = [table_element(events_table(report.events))] if report.events else []
     drawing = events_drawing(log)
     if drawing is not None:
-        parts = [drawing_of(drawing), *parts, *_each_event(log)]
+        parts = [_figure(drawing), *parts, *_each_event(log)]
     return section("events", "Events", parts)
 
 
 def _each_event(log: Log) -> list[Element]:
-    """Return the events one by one; of very many, the first ones that are warnings or errors, and say so."""
+    """Return the events one by one; of very many only the first warnings and errors."""
     ordered = sorted(log.events, key=lambda event: event.t_ns)
     chosen, title = ordered, "Each event"
     if len(ordered) > _MOST_EVENTS:
-        grave = [event for event in ordered if event.severity >= Severity.WARNING]
-        chosen = grave[:_MOST_EVENTS]
+        severe = [event for event in ordered if event.severity >= Severity.WARNING]
+        chosen = severe[:_MOST_EVENTS]
         title = (
-            f"Warnings and errors: {len(chosen)} of {len(grave)} (the log holds all {len(ordered)} events)"
+            f"Warnings and errors: {len(chosen)} of {len(severe)} (the log holds all {len(ordered)} events)"
         )
     start = first_deadline_ns(log)
-    rows = tuple(
+    rows = [
         (
-            Cell(f"{(event.t_ns - start) / 1e9:.3f}"),
+            (event.t_ns - start) / 1e9,
             Cell(event.name, tone_of(event.severity)),
-            Cell(event.source),
-            Cell(event.text),
+            event.source,
+            event.text,
         )
         for event in chosen
+    ]
+    columns = (
+        Column("s", form="{:.3f}"),
+        Column("event", "name"),
+        Column("source", "name"),
+        Column("text", "text"),
     )
-    columns = (Column("s"), Column("event", "name"), Column("source", "name"), Column("text", "text"))
-    return [table_of(Table(title, columns, rows))] if rows else []
+    return [table_element(Table.of(title, columns, rows))] if rows else []
+
+
+def _figure(drawing: Drawing) -> Element:
+    words = drawing.words
+    return figure(words.name, words.title, drawing.svg, words.caption)
 
 
 def _footer(log: Log) -> Element:

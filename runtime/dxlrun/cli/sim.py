@@ -10,10 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import compiled
-from dxlrun.cli.output.flags import Flag, JsonFlag
-from dxlrun.cli.output.terminal import out, say_error, say_warning
-from dxlrun.cli.simulated.sim_inputs import (
+from dxlrun.cli.inputs import Assignment, Flag, JsonFlag, compiled
+from dxlrun.cli.sim_inputs import (
     Absent,
     AdapterWishes,
     Mistakes,
@@ -24,11 +22,12 @@ from dxlrun.cli.simulated.sim_inputs import (
     with_adapter,
 )
 from dxlrun.errors import InputError
+from dxlrun.output.terminal import out, print_error, print_warning, show
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from dxlrun.cli.output.sim_views import Shown
+    from dxlrun.cli.sim_views import Shown
     from dxlrun.run.simulation_front import FrontOptions, Served
     from dxlrun.simulation import BusConfig, SimulationConfig, UrdfBodies
     from dxlrun.simulation.faults.fault import Fault
@@ -44,7 +43,7 @@ Seed = Annotated[int, Parameter(show_default=False)]
 def sim(
     robot: Path | None = None,
     /,
-    *assignments: Annotated[str, Parameter(name="arg:=value")],
+    *assignments: Assignment,
     servo: Words = (),
     baud: int | None = None,
     protocol: float | None = None,
@@ -115,7 +114,7 @@ def sim(
     wishes = AdapterWishes(latency_ns, split, echo, absent)
     buses = tuple(with_adapter(bus, wishes, seed) for bus in told.buses)
     refuse_what_cannot_be(buses, planned, seed)
-    from dxlrun.cli.output.sim_views import Shown, ending
+    from dxlrun.cli.sim_views import Shown, ending
     from dxlrun.run.channels.process import spare_core
     from dxlrun.run.simulation_front import FrontOptions
     from dxlrun.simulation import SimulationConfig
@@ -132,13 +131,11 @@ def sim(
     options = FrontOptions(ledger, told.priority, spare_core(told.loop_cores))
     served = _serve(config, options, shown, as_json=as_json)
     if not as_json:
-        out().print(ending(title, served.elapsed_s, served.look), markup=False, soft_wrap=True)
-        if ledger is not None:
-            out().print(f"ledger: {ledger}", markup=False, soft_wrap=True)
+        show(ending(title, served.elapsed_s, served.look), *[f"ledger: {ledger}"] * (ledger is not None))
     if debug:
         sys.stderr.write(served.printed)
     for sentence in served.sentences:
-        say_error(f"{title}: {sentence}")
+        print_error(f"{title}: {sentence}")
     return 1 if served.sentences else 0
 
 
@@ -180,7 +177,7 @@ def _told(
         raise InputError(f"{' and '.join(given)} and a robot file exclude each other; leave one of them out")
     result = compiled(robot, assignments, (), None)
     for warning in result.warnings:
-        say_warning(str(warning))
+        print_warning(str(warning))
     from dxlrun.compile.simulated import simulated_bodies, simulated_buses
 
     plan = result.plan
@@ -253,7 +250,7 @@ def _writable(ledger: Path | None) -> None:
 
 def _serve(config: SimulationConfig, options: FrontOptions, shown: Shown, *, as_json: bool) -> Served:
     """Serve it to whom stdout leads: a program, a pipe, or a person at a terminal."""
-    from dxlrun.cli.output.sim_views import JsonView, PlainView
+    from dxlrun.cli.sim_views import JsonView, PlainView
     from dxlrun.run.simulation_front import TypedLines, serve
 
     typed = TypedLines(sys.stdin.fileno())
@@ -261,7 +258,7 @@ def _serve(config: SimulationConfig, options: FrontOptions, shown: Shown, *, as_
         return serve(config, options, JsonView(shown), typed)
     if not sys.stdout.isatty() or not typed.in_foreground:
         return serve(config, options, PlainView(shown), typed)
-    from dxlrun.cli.output.sim_table import TableView
+    from dxlrun.cli.sim_views import TableView
 
     view = TableView(shown, out())
     with view.showing():

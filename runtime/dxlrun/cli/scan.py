@@ -1,8 +1,4 @@
-"""Robot draft: a robot file for the servos that a scan found, which a person then completes.
-
-What nobody can read out of a servo (what a joint is called, where its zero is, which way it turns) is
-assumed, and said in a comment beside it.
-"""
+"""`dxlrun scan PORT`: the servos that answer on a serial port, and a draft of a robot file for them."""
 
 from __future__ import annotations
 
@@ -12,12 +8,22 @@ import re
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
-from dxlrun.compile import compile_files
-from dxlrun.dynamixel.control_table import ControlTable, control_table
-from dxlrun.dynamixel.tools.scanning import FoundServo
+from cyclopts import Parameter
+
+from dxlrun.cli.inputs import Flag, JsonFlag
 from dxlrun.errors import InputError, ServoFault
+from dxlrun.output.terminal import print_error, print_warning, progress_bar, show, show_json
 
+if TYPE_CHECKING:
+    from dxlrun.dynamixel.control_table import ControlTable
+    from dxlrun.dynamixel.tools.scanning import FoundServo, Scanned, Search
+    from dxlrun.output.table import Table
+
+Rates = Annotated[tuple[int, ...], Parameter(negative=(), show_default=False)]
+_HIGHEST_ID = 253
+_FASTEST = 10_500_000
 _SLOW = 30
 """deg/s, the velocity limit of each drafted joint: slow enough to step back from."""
 _LONGEST_STEP = 3
@@ -27,6 +33,156 @@ _SHARE = 0.5
 """Of the period, at most, that a cycle takes on the bus."""
 _LONGEST_DELAY_NS = 500_000
 """Where no servo said its own: as they are shipped (protocol.md, Line)."""
+
+
+def scan(
+    port: str,
+    /,
+    *,
+    protocol: float | None = None,
+    baud: Rates = (),
+    ids: str | None = None,
+    write: Path | None = None,
+    as_json: JsonFlag = False,
+    debug: Flag = False,
+) -> int:
+    """Look for servos on a serial port: both protocols, every baud rate, every ID; writes nothing.
+
+    It takes about half a minute; --protocol, --baud and --ids make it quicker. Exit code 0, or 1 when nobody
+    answered.
+
+    Parameters
+    ----------
+    port
+        The adapter, for example /dev/ttyUSB0; `dxlrun doctor` lists those that are plugged in.
+    protocol
+        Only this protocol, 1.0 or 2.0.
+    baud
+        Only this rate, bit/s; may be given several times.
+    ids
+        Only these IDs, for example 1-20 or 1,4,7.
+    write
+        Write a robot file for the servos that were found, to be completed by hand.
+    as_json
+        Print the result as JSON.
+    debug
+        Print the traceback of an error.
+    """
+    from dxlrun.dynamixel.tools import scanning
+    from dxlrun.dynamixel.tools.tool_line import ToolLine, TunablePort
+
+    search = read_search(protocol, baud, ids)
+    if write is not None:
+        may_be_written(write)
+    load_models()
+    with TunablePort(port) as line, progress_bar(hidden=as_json) as progress:
+        scanned = scanning.scan(ToolLine(line), search, progress)
+        latency_ns = line.latency_ns
+    for rate in scanned.left_out:
+        print_warning(f"{port} cannot run at {rate} bit/s; nobody was looked for there")
+    narrowed = protocol is not None or bool(baud) or ids is not None
+    _show(port, scanned, narrowed=narrowed, as_json=as_json)
+    if write is not None and scanned.servos:
+        draft_file(write, port, scanned.servos, latency_ns)
+        if not as_json:
+            show(f"robot file: {write}; complete it, then `dxlrun check {write}`")
+    return 0 if scanned.servos else 1
+
+
+def read_search(protocol: float | None, baud: Sequence[int], ids: str | None) -> Search:
+    """Return where to look; raises InputError with everything that is wrong."""
+    from dxlrun.dynamixel.tools.scanning import Search
+
+    wrong = []
+    if protocol not in (None, 1.0, 2.0):
+        wrong.append(f"there is no Protocol {protocol:g}; --protocol is 1.0 or 2.0")
+    wrong += [
+        f"--baud {rate} is no rate of a servo; give bit/s from 9600 to {_FASTEST}"
+        for rate in baud
+        if not 9_600 <= rate <= _FASTEST
+    ]
+    chosen: tuple[int, ...] = ()
+    try:
+        chosen = () if ids is None else read_ids(ids)
+    except InputError as error:
+        wrong.append(str(error))
+    if wrong:
+        raise InputError("\n".join(wrong))
+    return Search((2.0, 1.0) if protocol is None else (protocol,), tuple(dict.fromkeys(baud)), chosen)
+
+
+def read_ids(text: str) -> tuple[int, ...]:
+    """Return the IDs of `1-20` or `1,4,7`; raises InputError."""
+    found: set[int] = set()
+    for part in text.split(","):
+        first, dash, last = part.partition("-")
+        if not first.strip().isdecimal() or (dash and not last.strip().isdecimal()):
+            raise InputError(f"--ids {text}: {part!r} is no ID; give for example 1-20 or 1,4,7")
+        span = range(int(first), int(last if dash else first) + 1)
+        if not span or span[-1] > _HIGHEST_ID:
+            raise InputError(f"--ids {text}: {part} is no ID of a servo; they are 0..{_HIGHEST_ID}")
+        found.update(span)
+    return tuple(sorted(found))
+
+
+def load_models() -> None:
+    """Know the models that plug-ins bring along, too."""
+    from dxlrun.control.controllers.plugins import load_plugins
+
+    load_plugins()
+
+
+def _show(port: str, scanned: Scanned, *, narrowed: bool, as_json: bool) -> None:
+    if as_json:
+        show_json({"port": port, "servos": scanned.servos, "left_out": scanned.left_out})
+        return
+    if not scanned.servos:
+        print_error(
+            f"nobody answers at {port}: check power, cable, and that the adapter is the one of the servos; "
+            "`dxlrun doctor` lists the adapters"
+            + "; without --protocol, --baud and --ids everything is tried"
+            * narrowed
+        )
+        return
+    show(_table(scanned.servos))
+    for servo in scanned.servos:
+        for remark in servo.remarks:
+            print_warning(f"ID {servo.servo_id} at {servo.baud_rate} bit/s: {remark}")
+
+
+def _table(servos: Sequence[FoundServo]) -> Table:
+    from dxlrun.output.table import Column, Table
+
+    columns = [
+        Column("ID"),
+        Column("model", "name", missing="unknown"),
+        Column("number"),
+        Column("firmware"),
+        Column("protocol", form="{:.1f}"),
+        Column("baud rate"),
+        Column("position"),
+        Column("return delay", form="{:g} us"),
+    ]
+    rows = [
+        (
+            servo.servo_id,
+            servo.model or None,
+            servo.model_number if servo.model_number >= 0 else None,
+            servo.firmware if servo.model_number >= 0 else None,
+            servo.protocol,
+            servo.baud_rate,
+            servo.position,
+            None if servo.return_delay is None else servo.return_delay / 1000,
+        )
+        for servo in servos
+    ]
+    return Table.of("", columns, rows)
+
+
+# The draft of a robot file
+#
+# What cannot be read from a servo (the name of its joint, where its zero is, which way it turns) is assumed,
+# and marked by a comment beside it.
 
 
 def draft_file(path: Path, port: str, servos: Sequence[FoundServo], latency_ns: int) -> str:
@@ -70,6 +226,8 @@ def draft(stem: str, port: str, servos: Sequence[FoundServo], latency_ns: int) -
             "one to another rate, two protocols need two ports; or scan one of them alone by --protocol and "
             "--baud"
         )
+    from dxlrun.compile import compile_files
+
     text = _text(stem, port, known, latency_ns, rate=1)
     with tempfile.TemporaryDirectory() as folder:
         trial = Path(folder) / "draft.yaml"
@@ -130,6 +288,8 @@ def _robot_name(stem: str) -> str:
 
 
 def _joint(servo: FoundServo, velocity: int) -> list[str]:
+    from dxlrun.dynamixel.control_table import control_table
+
     table = control_table(servo.model, servo.protocol)
     reference = _middle(table)
     entries = [

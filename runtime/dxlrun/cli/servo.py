@@ -1,21 +1,31 @@
-"""What `dxlrun servo` can do: each verb reads its words, asks where it must, and tells what was done."""
+"""`dxlrun servo PORT ID VERB`: one servo, its registers, its address, its state."""
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from dxlrun.cli.output.terminal import say_warning
+from cyclopts import Parameter
+
+from dxlrun.cli.inputs import Flag, JsonFlag
+from dxlrun.cli.scan import load_models, read_search
 from dxlrun.errors import InputError, ServoFault
+from dxlrun.output.terminal import print_warning, show, show_json
 
 if TYPE_CHECKING:
+    from dxlrun.dynamixel.control_table import ControlItem
     from dxlrun.dynamixel.plan.bus_plan import RegisterValue
     from dxlrun.dynamixel.tools.one_servo import OneServo
+    from dxlrun.dynamixel.tools.scanning import FoundServo, Search
+    from dxlrun.dynamixel.tools.tool_line import ToolLine
+    from dxlrun.output.table import Table
 
+_HIGHEST_ID = 253
 Keep = Literal["nothing", "id", "id-and-baud"]
 _TORQUE_OFF = "its torque goes off, and what it holds falls"
 _ELSEWHERE: Mapping[str, str] = MappingProxyType(
@@ -28,6 +38,154 @@ _ELSEWHERE: Mapping[str, str] = MappingProxyType(
     }
 )
 """What `set` does not do, as more than a write belongs to it."""
+
+
+def servo(
+    port: str,
+    servo_id: Annotated[int, Parameter(name="ID")],
+    verb: Annotated[str, Parameter(name="VERB")],
+    /,
+    *words: Annotated[str, Parameter(name="WORD", allow_leading_hyphen=False)],
+    protocol: float | None = None,
+    baud: int | None = None,
+    keep: Keep | None = None,
+    yes: Flag = False,
+    as_json: JsonFlag = False,
+    debug: Flag = False,
+) -> int:
+    """Deal with one servo on a port that no run uses: its registers, ID, baud rate, torque.
+
+    VERB is one of: get [ITEM...], set ITEM VALUE, id NEW, baud RATE, reboot, factory-reset, backup [FILE],
+    restore [FILE], blink [TIMES], torque on|off. What changes the EEPROM is asked for first, needs the torque
+    off, and is looked at afterwards. Without FILE the servo's own backup is meant.
+
+    Parameters
+    ----------
+    port
+        The adapter, for example /dev/ttyUSB0.
+    servo_id
+        ID of the servo; `dxlrun scan` shows who is there.
+    verb
+        What to do.
+    words
+        What the verb needs.
+    protocol
+        Protocol of the servo, 1.0 or 2.0; without it both are tried.
+    baud
+        Its rate, bit/s; without it all are tried.
+    keep
+        What a factory reset keeps; without it ID and baud rate (Protocol 2.0), or nothing (Protocol 1.0).
+    yes
+        Do not ask before the EEPROM is changed.
+    as_json
+        Print the result as JSON.
+    debug
+        Print the traceback of an error.
+    """
+    from dxlrun.dynamixel.tools.one_servo import OneServo
+    from dxlrun.dynamixel.tools.tool_line import ToolLine, TunablePort
+
+    search = read_search(protocol, () if baud is None else (baud,), None)
+    asked = Asked(words, keep, yes)
+    _check(servo_id, verb, asked)
+    load_models()
+    with TunablePort(port) as line:
+        tool = ToolLine(line)
+        one = OneServo(tool, _find(tool, servo_id, search))
+        VERBS[verb].do(one, asked)
+    _show(one, verb, asked, as_json=as_json)
+    return 1 if asked.declined else 0
+
+
+def _check(servo_id: int, verb: str, asked: Asked) -> None:
+    """Refuse words that mean nothing before the port is opened; raises InputError."""
+    if not 0 <= servo_id <= _HIGHEST_ID:
+        raise InputError(f"{servo_id} is no ID of a servo; they are 0..{_HIGHEST_ID}")
+    found = VERBS.get(verb)
+    if found is None:
+        from dxlrun.errors import suggestion
+
+        raise InputError(f"a servo cannot {verb}; {suggestion(verb, tuple(VERBS))}")
+    if not found.fewest <= len(asked.words) <= found.most:
+        said = " ".join(asked.words) or "nothing"
+        raise InputError(f"{verb} takes {found.usage or 'no words'}, not {said}")
+    if asked.keep is not None and verb != "factory-reset":
+        raise InputError(f"--keep belongs to factory-reset, not to {verb}; leave it out")
+    found.check(asked)
+
+
+def _find(tool: ToolLine, servo_id: int, search: Search) -> FoundServo:
+    """Look for the servo; raises ServoFault where it is not there, or is there more than once."""
+    from dxlrun.dynamixel.tools.scanning import find
+
+    port, found = tool.port.name, find(tool, servo_id, search)
+    if not found:
+        raise ServoFault(
+            f"nobody with ID {servo_id} answers at {port}: check power, cable and ID; `dxlrun scan {port}` "
+            "shows who is there"
+        )
+    if len(found) > 1:
+        places = "; ".join(f"Protocol {each.protocol} at {each.baud_rate} bit/s" for each in found)
+        raise ServoFault(
+            f"ID {servo_id} answers more than once ({places}); say which by --protocol and --baud"
+        )
+    return found[0]
+
+
+def _show(one: OneServo, verb: str, asked: Asked, *, as_json: bool) -> None:
+    if as_json:
+        identity = {
+            "id": one.servo_id,
+            "model": one.table.model,
+            "firmware": one.found.firmware,
+            "protocol": one.table.protocol,
+            "baud_rate": one.baud_rate,
+        }
+        result = {"servo": identity, "verb": verb, "done": asked.done, "declined": asked.declined}
+        show_json(result | {"registers": asked.registers})
+        return
+    if verb == "get":
+        show(_registers(asked.registers, one.table.items))
+    show(*(f"{one.called}: {sentence}" for sentence in asked.done))
+    if asked.declined:
+        show("nothing was changed")
+
+
+def _registers(values: Mapping[str, int], items: Mapping[str, ControlItem]) -> Table:
+    from dxlrun.output.table import Column, Table
+
+    columns = [
+        Column("item", "name"),
+        Column("address"),
+        Column("area", "name"),
+        Column("access", "name"),
+        Column("value"),
+        Column("is", "name"),
+    ]
+    rows = [
+        (name, items[name].address, items[name].area, items[name].access, value, _meaning(items[name], value))
+        for name, value in values.items()
+    ]
+    return Table.of("", columns, rows)
+
+
+def _meaning(item: ControlItem, value: int) -> str:
+    """Return a value with its unit; empty for what has none."""
+    from dxlrun.dynamixel.servo.watchdog import tripped
+
+    if tripped(item, value):
+        return "tripped"
+    if not item.unit:
+        return ""
+    quantity = item.decode(value.to_bytes(item.size, "little", signed=item.signed)) * item.scale
+    if item.unit == "s" and abs(quantity) < 1:
+        return f"{quantity * 1e3:.6g} ms" if abs(quantity) >= 1e-3 else f"{quantity * 1e6:.6g} us"
+    if item.unit.startswith("rad"):
+        return f"{math.degrees(quantity):.6g} {item.unit.replace('rad', 'deg')}"
+    return f"{quantity * 100:.6g} %" if item.unit == "1" else f"{quantity:.6g} {item.unit}"
+
+
+# The verbs: each reads its words, asks for confirmation where it must, and reports what was done
 
 
 @dataclass(slots=True)
@@ -201,7 +359,7 @@ def _restore(one: OneServo, asked: Asked) -> None:
     backup = servo_backup.read_backup(path)
     wanted = servo_backup.registers_to_restore(path, backup, one.table)
     if backup.firmware != one.found.firmware:
-        say_warning(f"{path} was made with firmware {backup.firmware}; this servo has {one.found.firmware}")
+        print_warning(f"{path} was made with firmware {backup.firmware}; this servo has {one.found.firmware}")
     differing = [each.register for each in one.differences(wanted) if each.differs]
     if not differing:
         asked.done.append(f"has everything that {path} restores already")

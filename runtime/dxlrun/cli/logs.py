@@ -1,8 +1,7 @@
-"""`dxlrun analyze [LOG ...]`: report what happened in a run, or in several with one line each."""
+"""`dxlrun analyze` and `dxlrun replay`: what a log holds, and whether its controllers do the same again."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -10,15 +9,19 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from dxlrun.cli.output.flags import Flag, JsonFlag
-from dxlrun.cli.output.terminal import out, say_error
+from dxlrun.cli.inputs import Assignment, Flag, JsonFlag, parse_assignments
 from dxlrun.errors import InputError, LogError
+from dxlrun.output.terminal import print_error, print_warning, show, show_json
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from dxlrun.analysis.report import Report
     from dxlrun.log.reader import Log
+    from dxlrun.log.replay import Difference, ReplayReport
+    from dxlrun.output.table import Part
+
+Settings = Annotated[
+    tuple[str, ...], Parameter(name="--set", negative=(), show_default=False, allow_leading_hyphen=False)
+]
 
 
 def analyze(
@@ -61,16 +64,14 @@ def analyze(
         raise InputError("\n".join(missing))
     if report is not None:
         _check_target(report)
-    console = out()
     if len(logs) > 1:
-        return _analyze_each(logs, console, as_json=as_json)
+        return _analyze_each(logs, as_json=as_json)
     log = logs[0] if logs else newest_log()
     if ledger is not None:
         if report is not None:
             raise InputError("a report does not hold a comparison; give --report and --ledger one at a time")
         return _compare(log, ledger, as_json=as_json)
     from dxlrun.analysis import report as analysis
-    from dxlrun.analysis.output.terminal import render
     from dxlrun.log.reader import read_log
 
     read = read_log(log)
@@ -78,13 +79,13 @@ def analyze(
     if report is not None:
         _write(read, result, report)
     if as_json:
-        console.file.write(analysis.to_json(result).decode() + "\n")
+        show_json(result)
         return 0 if result.verdict.good else 1
     if not logs:
-        console.print(f"log: {log}", markup=False, soft_wrap=True)
-    console.print(render(result))
+        show(f"log: {log}")
+    show(*analysis.parts(result))
     if report is not None:
-        console.print(f"\nreport: {report}", markup=False, soft_wrap=True)
+        show(f"\nreport: {report}")
     return 0 if result.verdict.good else 1
 
 
@@ -106,52 +107,48 @@ def newest_log() -> Path:
     return logs[-1]
 
 
-def _analyze_each(logs: Sequence[Path], console: Console, *, as_json: bool) -> int:
+def _analyze_each(logs: Sequence[Path], *, as_json: bool) -> int:
     """Print a line for each log, or a JSON list; one that cannot be read does not hide the others."""
-    from dxlrun.analysis import report as analysis
+    from dxlrun.analysis.report import analyze_log
 
     code = 0
-    results: list[str] = []
+    results: list[object] = []
     for log in logs:
         try:
-            result = analysis.analyze_log(log)
+            result = analyze_log(log)
         except LogError as error:
             code = error.exit_code
             if as_json:
-                results.append(json.dumps({"log": str(log), "ok": False, "errors": [{"what": str(error)}]}))
+                results.append({"log": str(log), "ok": False, "errors": [{"what": str(error)}]})
             else:
-                say_error(f"dxlrun: {error}")
+                print_error(f"dxlrun: {error}")
             continue
         verdict = result.verdict
         code = code if verdict.good else max(code, 1)
-        if as_json:
-            results.append(analysis.to_json(result).decode())
-            continue
-        first = " ".join(verdict.sentences[:1])
-        console.print(f"{log}: {verdict.word}. {first}", markup=False, soft_wrap=True)
+        results.append(result)
+        if not as_json:
+            show(f"{log}: {verdict.word}. {' '.join(verdict.sentences[:1])}")
     if as_json:
-        console.file.write(f"[{','.join(results)}]\n")
+        show_json(results)
     return code
 
 
 def _compare(log: Path, ledger: Path, *, as_json: bool) -> int:
-    """Say where a log and a ledger differ; return 1 when they do, or do not answer each other."""
+    """Show where a log and a ledger differ; return 1 when they do, or do not explain each other."""
     if not ledger.is_file():
         raise InputError(
             f"there is no ledger {ledger}; a run on simulated buses in real time leaves one beside its log, "
             f"here {log.with_suffix('.ledger.jsonl')}, and `dxlrun sim` writes where its --ledger says"
         )
-    from dxlrun.analysis.ledger.comparison import compare, to_json
-    from dxlrun.analysis.ledger.ledger_tables import render_comparison
+    from dxlrun.analysis.ledger.comparison import compare, parts
     from dxlrun.log.reader import read_log
     from dxlrun.simulation import read_ledger
 
     result = compare(read_log(log), read_ledger(ledger), ledger)
-    console = out()
     if as_json:
-        console.file.write(to_json(result).decode() + "\n")
+        show_json(result)
     else:
-        console.print(render_comparison(result))
+        show(*parts(result))
     return 0 if result.good else 1
 
 
@@ -168,10 +165,73 @@ def _check_target(target: Path) -> None:
 
 
 def _write(log: Log, result: Report, target: Path) -> None:
-    from dxlrun.analysis.output.document import page
+    from dxlrun.analysis.page import page
 
     text = page(log, result)
     try:
         target.write_text(text, encoding="utf-8")
     except OSError as error:
         raise InputError(f"the report {target} cannot be written: {error.strerror or error}") from error
+
+
+def replay(
+    log: Path,
+    /,
+    *assignments: Assignment,
+    settings: Settings = (),
+    as_json: JsonFlag = False,
+    debug: Flag = False,
+) -> int:
+    """Run the controllers of a log again on its inputs, and compare their commands and the goals bit for bit.
+
+    Parameters
+    ----------
+    log
+        The log of a run, an .mcap file.
+    assignments
+        Other arguments for the robot file that is in the log.
+    settings
+        Another value of a controller's parameter: CONTROLLER.PARAMETER=VALUE; may be given several times.
+    as_json
+        Print the result as JSON.
+    debug
+        Print the traceback of an error.
+    """
+    if not log.is_file():
+        raise InputError(f"there is no log {log}; a run prints at its end where its log is")
+    arguments = parse_assignments(assignments)
+    import msgspec
+
+    from dxlrun.log.replay import replay_log
+    from dxlrun.log.replay.changes import Setting
+
+    report = replay_log(log, [Setting.parse(text) for text in settings], arguments)
+    for remark in report.remarks:
+        print_warning(f"{report.robot}: {remark}")
+    if report.stopped:
+        print_warning(f"{report.robot}: {report.stopped}")
+    if as_json:
+        content = msgspec.to_builtins(report)
+        show_json(content | {"same": report.same, "sentence": report.sentence})
+    else:
+        show(*_replayed(report))
+    return 0 if report.same else 1
+
+
+def _replayed(report: ReplayReport) -> tuple[Part, ...]:
+    from dxlrun.output.table import Column, Table, numbers
+
+    if report.first is None:
+        return (report.sentence,)
+    columns = [Column("cycles that differ", "name"), *numbers("commands", "goals")]
+    rows = [(joint.joint, joint.commands, joint.goals) for joint in report.joints]
+    return report.sentence, _first(report.first), Table.of("", columns, rows)
+
+
+def _first(first: Difference) -> str:
+    place = f"first: cycle {first.cycle}, {first.time_s:.3f} s, "
+    values = f"recorded {first.recorded}, replayed {first.replayed}"
+    if first.joint is None:
+        return f"{place}controller {first.controller}: {values}"
+    owner = f"controller {first.controller}" if first.controller else "no controller"
+    return f"{place}{first.joint}, {owner}: {first.what}: {values}"

@@ -1,0 +1,341 @@
+"""Figures of the loop's timing: wake-up latency, and the time that each step of a cycle takes.
+
+The latency is shown as in M. A. Araujo, UFU 2017, Figures 25 to 30: per iteration, as a histogram to 150 us,
+and cumulative. Logarithmic axes: the tails are what matters.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
+from numpy.typing import NDArray
+
+from dxlrun.analysis.figures.drawing import (
+    BLUE,
+    DASHED,
+    ERROR,
+    GREEN,
+    INK,
+    MUTED,
+    ORANGE,
+    PAPER,
+    PURPLE,
+    WARNING,
+    Columns,
+    Drawing,
+    SteeringMarks,
+    Words,
+    draw,
+    duration_ticks,
+    reference,
+    run_time_s,
+    time_axis,
+)
+from dxlrun.analysis.latency import ROUGH_NS, Latency, cycle_periods_ns
+from dxlrun.interfaces import Floats
+from dxlrun.log.reader import Log
+from dxlrun.output.table import microseconds
+
+_ROUGH_US = ROUGH_NS / 1000
+_LEAST_US = 1.0
+"""Logarithmic axes begin here; earlier wake-ups are drawn here."""
+_MOST_POINTS = 4000
+_SHARES = (1e-6, 1e-5, 1e-4, 1e-3, 0.01, 0.1, 0.5, 0.9, 0.99, 0.999, 0.9999, 0.99999, 0.999999)
+
+
+def lateness_us(log: Log) -> Floats:
+    """Return how much later than its deadline each cycle woke, us."""
+    late: Floats = (log.cycles["woken_ns"] - log.cycles["scheduled_ns"]) / 1e3
+    return late
+
+
+def latency_drawings(log: Log, statistics: Latency) -> tuple[Drawing, ...]:
+    """Return the three figures of the wake-up latency; `log` has at least one cycle."""
+    late = lateness_us(log)
+    summary = (
+        f"{len(late)} wake-ups; mean {statistics.mean_us:.2f} us, standard deviation "
+        f"{statistics.deviation_us:.2f} us, mode {statistics.mode_us} us, maximum "
+        f"{microseconds(statistics.max_us)}."
+    )
+    return (
+        _per_iteration(log, late, summary),
+        _histogram(late, statistics, summary),
+        _cumulative(log, late, summary),
+    )
+
+
+def _per_iteration(log: Log, late: Floats, summary: str) -> Drawing:
+    columns = Columns(len(late))
+    numbers = log.cycles["cycle"].astype(np.float64)
+    shown = np.maximum(late, _LEAST_US)
+
+    def fill(figure: Figure) -> None:
+        axes = figure.subplots()
+        axes.set_yscale("log")
+        if columns.whole:
+            axes.plot(numbers, shown, ".", color=BLUE, markersize=3.5, markeredgewidth=0)
+        else:
+            x = numbers[:: columns.width]
+            low, middle, high = columns.bounds(shown)
+            axes.fill_between(x, low, high, color=BLUE, alpha=0.35, linewidth=0, label="smallest to largest")
+            axes.plot(x, middle, color=BLUE, linewidth=0.9, label="median")
+            axes.legend(loc="upper right", ncols=2)
+        worst = columns.largest(shown)
+        rough = worst[shown[worst] > _ROUGH_US]
+        axes.plot(numbers[rough], shown[rough], "v", color=WARNING, markersize=4, markeredgewidth=0)
+        _reference_lines(axes, log, late, vertical=False)
+        axes.set_ylim(_LEAST_US * 0.8, max(float(shown.max()), _ROUGH_US) * 2)
+        axes.set_xlabel("iteration (period since the loop's first deadline)")
+        axes.set_ylabel("wake-up latency")
+        duration_ticks(axes, "y")
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
+        axes.xaxis.set_major_locator(MaxNLocator(nbins=8, integer=True))
+
+    words = Words(
+        "latency-iterations",
+        "Delay of each iteration",
+        f"Wake-up latency over the number of the iteration, logarithmic from 1 us. {summary}",
+        f"{summary} Triangles: later than 150 us. What is below 1 us is drawn at 1 us. "
+        f"{columns.said('the smallest, the median and the largest delay')}".strip(),
+    )
+    return draw(words, 2.7, fill)
+
+
+def _histogram(late: Floats, statistics: Latency, summary: str) -> Drawing:
+    beyond = int(np.count_nonzero(late > _ROUGH_US))
+    first = min(0, int(np.floor(late.min())))
+    counts, edges = np.histogram(late[late <= _ROUGH_US], bins=np.arange(first, 152))
+
+    def fill(figure: Figure) -> None:
+        axes = figure.subplots()
+        axes.stairs(counts, edges, fill=True, color=BLUE, alpha=0.75, baseline=0.5)
+        axes.set_yscale("log")
+        axes.set_ylim(0.5, max(2.0, float(counts.max(initial=0)) * 2))
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
+        axes.yaxis.set_minor_locator(NullLocator())
+        axes.set_xlim(first, 151)
+        axes.set_xlabel("wake-up latency, us (bins of 1 us)")
+        axes.set_ylabel("wake-ups in the bin")
+
+    rest = (
+        f"{beyond} of {len(late)} wake-ups ({statistics.share_over_150_us:.3%}) are later than 150 us and "
+        "lie beyond the right edge."
+        if beyond
+        else "No wake-up is later than 150 us."
+    )
+    words = Words(
+        "latency-histogram",
+        "Histogram of the delays up to 150 us",
+        f"Histogram of the wake-up latency from 0 to 150 us, logarithmic count. {summary} {rest}",
+        rest,
+    )
+    return draw(words, 2.4, fill)
+
+
+def _cumulative(log: Log, late: Floats, summary: str) -> Drawing:
+    ordered = np.sort(np.maximum(late, _LEAST_US))
+    share = (np.arange(len(ordered)) + 0.5) / len(ordered)
+    kept = _kept(len(ordered))
+
+    def fill(figure: Figure) -> None:
+        axes = figure.subplots()
+        axes.set_xscale("log")
+        axes.set_yscale("logit")
+        axes.plot(ordered[kept], share[kept], color=BLUE, linewidth=1.3, marker=".", markersize=2.5)
+        edge = min(0.05, 0.4 / len(ordered))
+        axes.set_ylim(edge, 1 - edge)
+        axes.set_xlim(_LEAST_US * 0.9, max(float(ordered[-1]), _ROUGH_US) * 1.5)
+        axes.yaxis.set_major_locator(FixedLocator([value for value in _SHARES if edge <= value <= 1 - edge]))
+        axes.yaxis.set_minor_locator(NullLocator())
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{100 * value:.6g} %"))
+        duration_ticks(axes, "x")
+        _reference_lines(axes, log, late, vertical=True)
+        axes.set_xlabel("wake-up latency (logarithmic)")
+        axes.set_ylabel("share of wake-ups up to it (logit)")
+
+    words = Words(
+        "latency-cumulative",
+        "Cumulative distribution of the delays",
+        "Share of the wake-ups that came up to a delay, from 1 us to the largest, on a logit axis that "
+        f"stretches both tails. {summary}",
+        "A logit axis stretches both ends: 99 %, 99.9 % and 99.99 % are equally far apart, and the last "
+        "point is the largest delay of the run.",
+    )
+    return draw(words, 2.9, fill)
+
+
+def _kept(count: int) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+    """Return which ordered samples to draw: all, or the more the nearer to an end, and both tails whole."""
+    if count <= _MOST_POINTS:
+        return np.arange(count)
+    quarter = _MOST_POINTS // 4
+    steps = np.geomspace(1, count / 2, quarter).astype(np.intp)
+    tails = np.arange(quarter)
+    picked = np.concatenate([tails, steps, count - 1 - steps, count - 1 - tails])
+    return np.unique(np.clip(picked, 0, count - 1))
+
+
+def _reference_lines(axes: Axes, log: Log, late: Floats, *, vertical: bool) -> None:
+    reference(axes, _ROUGH_US, "150 us", vertical=vertical, colour=MUTED)
+    period_us = float(cycle_periods_ns(log).min()) / 1e3
+    name = "one period" if period_us * 1e3 == log.period_ns else "the shortest period"
+    if late.max() > period_us / 4:
+        reference(
+            axes,
+            period_us,
+            f"{name}, {microseconds(period_us)}",
+            vertical=vertical,
+            colour=WARNING,
+        )
+
+
+# The budget of a cycle
+
+
+_STEPS = (
+    ("wake-up", "scheduled_ns", "woken_ns", PURPLE),
+    ("read", "woken_ns", "read_ns", BLUE),
+    ("update", "read_ns", "updated_ns", GREEN),
+    ("write", "updated_ns", "written_ns", ORANGE),
+)
+_FEW = 5
+"""So many periods are drawn with a line each."""
+_MOST_PERIODS = 2.5
+"""The axis ends here: one cycle of a second would flatten all others. What is beyond is marked and said."""
+
+_Rows = NDArray[np.float64]
+"""Shape (steps, cycles), ms."""
+
+
+def budget_drawings(log: Log) -> tuple[Drawing, ...]:
+    """Return the figures of the cycle's budget; `log` has at least one cycle."""
+    cycles = log.cycles
+    steps = np.stack(
+        [(cycles[end] - cycles[begin]) / 1e6 for _, begin, end, _ in _STEPS]
+    )  # (steps, cycles), ms
+    return _typical(log, steps), _over_time(log, steps)
+
+
+def _typical(log: Log, steps: _Rows) -> Drawing:
+    periods = sorted(set((cycle_periods_ns(log) / 1e6).tolist()))
+    period = periods[-1]
+    worst = steps[:, int(steps.sum(axis=0).argmax())]
+    bars = (
+        ("longest cycle", worst),
+        ("99 % of each step", np.percentile(steps, 99, axis=1)),
+        ("median of each step", np.median(steps, axis=1)),
+    )
+    end = _end(period, [float(values.sum()) for _, values in bars])
+
+    def fill(figure: Figure) -> None:
+        axes = figure.subplots()
+        for row, (_, values) in enumerate(bars):
+            left = 0.0
+            for (_, _, _, colour), value in zip(_STEPS, values, strict=True):
+                axes.barh(row, value, left=left, height=0.55, color=colour, linewidth=0)
+                left += float(value)
+            beyond = left > end
+            axes.annotate(
+                f"goes on to {microseconds(left * 1e3)}" if beyond else microseconds(left * 1e3),
+                xy=(min(left, end), row),
+                xytext=(-4 if beyond else 4, 0),
+                textcoords="offset points",
+                ha="right" if beyond else "left",
+                va="center",
+                color=PAPER if beyond else INK,
+            )
+        axes.set_yticks(range(len(bars)), [name for name, _ in bars])
+        axes.grid(visible=False, axis="y")
+        axes.set_xlim(0, end)
+        axes.set_xlabel("time since the cycle's deadline, ms")
+        for one in periods if len(periods) <= _FEW else (periods[0], period):
+            axes.axvline(one, color=ERROR, linewidth=0.9, linestyle=DASHED)
+        _legend(axes)
+
+    lines = f"The dashed line is the period, {period:g} ms"
+    if len(periods) > 1:
+        lines = f"The dashed lines are the periods, {periods[0]:g} ms to {period:g} ms"
+    said = "; ".join(f"{name}: {microseconds(float(values.sum()) * 1e3)}" for name, values in reversed(bars))
+    words = Words(
+        "budget-typical",
+        "Budget of a cycle",
+        f"Stacked bars of wake-up, read, update and write in ms against the period of {period:g} ms. {said}.",
+        f"{said[0].upper()}{said[1:]}. {lines}; what is left of it is "
+        "idle. The steps' 99 % need not come in the same cycle.",
+    )
+    return draw(words, 1.9, fill)
+
+
+def _over_time(log: Log, steps: _Rows) -> Drawing:
+    periods = cycle_periods_ns(log) / 1e6
+    period = float(periods.max())
+    steering = SteeringMarks.of(log)
+    total = steps.sum(axis=0)
+    columns = Columns(steps.shape[1])
+    picked = columns.largest(total)
+    end = _end(period, [float(total.max())])
+    beyond = picked[total[picked] > end]
+    times = run_time_s(log)
+
+    def fill(figure: Figure) -> None:
+        axes = figure.subplots()
+        below = np.zeros(len(picked))
+        for (_, _, _, colour), values in zip(_STEPS, steps, strict=True):
+            above = below + values[picked]
+            axes.fill_between(times[picked], below, above, color=colour, linewidth=0, step="mid")
+            below = above
+        if not columns.whole:
+            middle = columns.bounds(total)[1]
+            axes.plot(times[picked], middle, color=INK, linewidth=1.0, label="median cycle")
+        axes.plot(
+            times[beyond],
+            np.full(len(beyond), end * 0.985),
+            "^",
+            color=ERROR,
+            markersize=5,
+            markeredgewidth=0,
+        )
+        axes.set_ylim(0, end)
+        axes.set_ylabel("time since the\ncycle's deadline, ms")
+        if periods.min() < period:
+            axes.step(times, periods, where="post", color=ERROR, linewidth=0.9, linestyle=DASHED)
+        else:
+            axes.axhline(period, color=ERROR, linewidth=0.9, linestyle=DASHED)
+        steering.draw(axes)
+        time_axis(axes)
+        _legend(axes)
+
+    over = int(np.count_nonzero(total > periods))
+    told = (
+        f"{over} of {len(total)} cycles ended later than one period after their deadline."
+        if over
+        else "Every cycle fits its period."
+    )
+    cut = (
+        f" Triangles: {np.count_nonzero(total > end)} cycles go beyond the figure, the longest to "
+        f"{microseconds(float(total.max()) * 1e3)}."
+        if len(beyond)
+        else ""
+    )
+    drawn = columns.said("its longest cycle, and the median as a line")
+    words = Words(
+        "budget-time",
+        "Duration of the steps over the run",
+        f"Stacked areas of wake-up, read, update and write in ms over the time of the run in s. {told}{cut}",
+        " ".join(f"{told}{cut} {drawn} {steering.said}".split()),
+    )
+    return draw(words, 2.6, fill)
+
+
+def _end(period: float, values: list[float]) -> float:
+    """Return where the axis ends, ms: the period in sight, and never more than a few of it."""
+    return min(max(*values, period) * 1.12, _MOST_PERIODS * period)
+
+
+def _legend(axes: Axes) -> None:
+    for name, _, _, colour in _STEPS:
+        axes.fill_between([], [], [], color=colour, linewidth=0, label=name)
+    axes.plot([], [], color=ERROR, linewidth=0.9, linestyle=DASHED, label="period")
+    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=6, borderaxespad=0.2, labelcolor=MUTED)

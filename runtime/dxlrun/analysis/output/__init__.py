@@ -1,1 +1,0 @@
-"""Output: a report as tables for the terminal, and as one HTML file."""

@@ -1,0 +1,282 @@
+"""`dxlrun models`: the servo models that dxlrun knows, and their control tables."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from typing import TYPE_CHECKING
+
+from dxlrun.cli.inputs import Flag, JsonFlag
+from dxlrun.errors import InputError
+from dxlrun.output.table import Column, Table, numbers
+from dxlrun.output.terminal import show, show_json
+
+if TYPE_CHECKING:
+    from dxlrun.dynamixel.control_table import ControlItem, ControlTable
+    from dxlrun.simulation.motion.motor import Motor
+
+_PER_SI = {
+    "rad": ("deg", 180 / math.pi),
+    "rad/s": ("rpm", 30 / math.pi),
+    "rad/s^2": ("deg/s^2", 180 / math.pi),
+    "s": ("ms", 1e3),
+    "A": ("mA", 1e3),
+    "1": ("%", 100.0),
+}
+"""SI unit -> the unit that people read, and its factor; the others stay as they are."""
+
+
+def models(
+    name: str | None = None,
+    /,
+    *,
+    protocol: float | None = None,
+    as_json: JsonFlag = False,
+    debug: Flag = False,
+) -> int:
+    """List the servo models that a robot file can name, or print the control table of one.
+
+    Parameters
+    ----------
+    name
+        A model, for example AX-12A; without it all are listed.
+    protocol
+        Only those of this protocol, 1.0 or 2.0.
+    as_json
+        Print the result as JSON.
+    debug
+        Print the traceback of an error.
+    """
+    from dxlrun.control.controllers.plugins import load_plugins
+
+    load_plugins()  # they may bring servo models along
+    tables = _tables(name, protocol)
+    if as_json:
+        show_json([_as_json(table, items=name is not None) for table in tables])
+    elif name is None:
+        show(_overview(tables))
+    else:
+        for table in tables:
+            show(_title(table), _facts(table), _items(table))
+    return 0
+
+
+def _tables(name: str | None, protocol: float | None) -> list[ControlTable]:
+    """Return the tables that were requested; raises InputError when there is none."""
+    from dxlrun.dynamixel.control_table import all_tables, control_table, perhaps_meant, protocols_of
+
+    if protocol not in (None, 1.0, 2.0):
+        raise InputError(f"there is no Protocol {protocol:g}; --protocol is 1.0 or 2.0")
+    if name is None:
+        return [table for table in all_tables() if protocol in (None, table.protocol)]
+    chosen = [each for each in (1.0, 2.0) if protocol in (None, each)]
+    found = [control_table(name, each) for each in protocols_of(name) if each in chosen]
+    if not found:
+        speaks = "" if protocol is None else f" of Protocol {protocol:.1f}"
+        raise InputError(f"there is no model {name}{speaks}; {perhaps_meant(name, protocol)}")
+    return found
+
+
+def _motor_json(table: ControlTable) -> dict[str, object]:
+    """Return the motor of the simulated servo, in SI units."""
+    from dxlrun.simulation.motion.motor import motor_of
+
+    motor = motor_of(table)
+    return {
+        **asdict(motor),
+        "no_load_speed": motor.no_load_speed,
+        "time_constant": motor.time_constant,
+        "voltage": motor.voltage or None,
+        "p_gain_duty": motor.p_gain_duty or None,
+        "gain_source": motor.gain_source or None,
+    }
+
+
+def _as_json(table: ControlTable, *, items: bool) -> dict[str, object]:
+    value: dict[str, object] = {
+        "model": table.model,
+        "aliases": list(table.aliases),
+        "model_number": table.model_number,
+        "protocol": table.protocol,
+        "firmware": table.firmware,
+        "rad_per_tick": table.rad_per_tick,
+        "min_tick": table.min_tick,
+        "max_tick": table.max_tick,
+        "rad_s_per_tick": table.rad_s_per_tick,
+        "max_speed_tick": table.max_speed_tick,
+        "effort_per_tick": table.effort_per_tick,
+        "effort_unit": table.effort_unit,
+        "max_speed": table.max_speed,
+        "stall_torque": table.stall_torque or None,
+        "stall_current": table.stall_current or None,
+        "nominal_voltage": table.nominal_voltage or None,
+        "gear_ratio": table.gear_ratio or None,
+        "simulated_motor": _motor_json(table),
+        "capabilities": sorted(table.capabilities),
+        "baud_rates": dict(table.baud_rates),
+    }
+    if items:
+        value["items"] = [asdict(item) for item in table.items.values()]
+    return value
+
+
+# Tables
+
+
+def _overview(tables: Sequence[ControlTable]) -> Table:
+    """Return one row a model."""
+    columns = [
+        Column("model", "name"),
+        Column("also named", "text"),
+        Column("number"),
+        Column("protocol", form="{:.1f}"),
+        Column("resolution", form="{:.3g} deg"),
+        *numbers("travel", "no-load speed", "stall torque"),
+        Column("effort", "text"),
+    ]
+    rows = [
+        (
+            table.model,
+            ", ".join(table.aliases),
+            table.model_number,
+            table.protocol,
+            math.degrees(table.rad_per_tick),
+            _travel(table),
+            _speed(table),
+            _torque(table),
+            _effort(table),
+        )
+        for table in tables
+    ]
+    return Table.of("", columns, rows)
+
+
+def _title(table: ControlTable) -> str:
+    names = f" ({', '.join(table.aliases)})" if table.aliases else ""
+    firmware = f", from firmware {table.firmware} on" if table.firmware else ""
+    return f"{table.model}{names}: model number {table.model_number}, Protocol {table.protocol:.1f}{firmware}"
+
+
+def _facts(table: ControlTable) -> Table:
+    """Return what holds for the whole model."""
+    from dxlrun.dynamixel.control_table import CAPABILITIES
+    from dxlrun.simulation.motion.motor import motor_of
+
+    facts = [
+        ("travel", f"{_travel(table)}, a tick is {math.degrees(table.rad_per_tick):.6g} deg"),
+        ("motor", _motor(table)),
+        *_simulated(motor_of(table)),
+        ("effort", _effort(table)),
+        ("can", "; ".join(CAPABILITIES[name] for name in sorted(table.capabilities))),
+        ("baud rates", ", ".join(str(rate) for rate in sorted(table.baud_rates.values()))),
+    ]
+    return Table.facts("", facts)
+
+
+def _items(table: ControlTable) -> Table:
+    """Return one row an item; items that repeat themselves share one."""
+    columns = [
+        Column("item", "name"),
+        *numbers("address", "size"),
+        Column("access", "name"),
+        Column("area", "name"),
+        *numbers("unit", "range", "initial"),
+        Column("section of the manual", "text"),
+    ]
+    return Table.of("Control table", columns, map(_item, runs(tuple(table.items.values()))))
+
+
+def _item(run: Sequence[ControlItem]) -> tuple[str | int, ...]:
+    first, last = run[0], run[-1]
+    alone = first is last
+    initial = "" if first.initial is None else str(first.initial)
+    return (
+        first.name if alone else f"{first.name}..{last.name.rpartition('_')[2]}",
+        first.address if alone else f"{first.address}..{last.address}",
+        first.size,
+        first.access,
+        first.area,
+        unit_of(first),
+        f"{first.minimum}..{first.maximum}",
+        initial if first.initial == last.initial else f"{initial}..{last.initial}",
+        first.page + (f", from firmware {first.firmware}" if first.firmware else ""),
+    )
+
+
+def runs(items: Sequence[ControlItem]) -> Iterator[list[ControlItem]]:
+    """Yield the items in groups: `name_1`, `name_2`, ... side by side are one group."""
+    group: list[ControlItem] = []
+    for item in items:
+        if group and not _continues(group[-1], item):
+            yield group
+            group = []
+        group.append(item)
+    if group:
+        yield group
+
+
+def _continues(before: ControlItem, item: ControlItem) -> bool:
+    counted = re.fullmatch(r"(.*_)(\d+)", before.name)
+    return (
+        counted is not None
+        and item.name == f"{counted[1]}{int(counted[2]) + 1}"
+        and (item.address, item.size) == (before.address + before.size, before.size)
+        and (item.minimum, item.maximum, item.access) == (before.minimum, before.maximum, before.access)
+    )
+
+
+def unit_of(item: ControlItem) -> str:
+    """Return what a tick is, in the units that people read."""
+    if not item.unit:
+        return ""
+    unit, factor = _PER_SI.get(item.unit, (item.unit, 1.0))
+    return f"{item.scale * factor:.4g} {unit}"
+
+
+def _travel(table: ControlTable) -> str:
+    low, high = (math.degrees(tick * table.rad_per_tick) for tick in (table.min_tick, table.max_tick))
+    return f"{low:.4g}..{high:.4g} deg"
+
+
+def _speed(table: ControlTable) -> str:
+    return f"{table.max_speed * 30 / math.pi:.4g} rpm"
+
+
+def _torque(table: ControlTable) -> str:
+    return f"{table.stall_torque:.3g} Nm" if table.stall_torque else ""
+
+
+def _motor(table: ControlTable) -> str:
+    """Return what the motor does at its nominal voltage, as far as the manual gives it."""
+    known = [f"no-load speed {_speed(table)}"]
+    if table.nominal_voltage:
+        known[0] += f" at {table.nominal_voltage:.3g} V"
+    known.append(f"stall torque {_torque(table) or 'not given'}")
+    if table.stall_current:
+        known.append(f"stall current {table.stall_current:.3g} A")
+    if table.gear_ratio:
+        known.append(f"gear {table.gear_ratio:.5g} : 1")
+    return ", ".join(known)
+
+
+def _simulated(motor: Motor) -> Iterator[tuple[str, str]]:
+    """Yield how the simulated servo's motor moves, and the source of these figures."""
+    known = [
+        f"no-load speed {motor.no_load_speed * 30 / math.pi:.4g} rpm",
+        f"time constant {motor.time_constant * 1e3:.1f} ms",
+        f"friction {motor.friction:.2g} Nm and {motor.load_friction:.0%} of the torque",
+        f"{motor.torque_per_ampere:.3g} Nm/A",
+    ]
+    yield "simulated", ", ".join(known)
+    yield "  source", motor.source
+    if motor.p_gain_duty:
+        yield "P gain", f"{motor.p_gain_duty:.4g} of full duty per rad of error and unit"
+        yield "  source", motor.gain_source
+
+
+def _effort(table: ControlTable) -> str:
+    if table.effort_unit == "1":
+        return "fraction of the maximum load"
+    return f"{table.effort_item.replace('_', ' ')} in {table.effort_unit}"

@@ -1,1 +1,0 @@
-"""Output: tables and lines for terminals and programs."""

@@ -1,1 +1,0 @@
-"""Commands about servos on a port, and about models."""

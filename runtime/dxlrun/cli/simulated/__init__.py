@@ -1,1 +1,0 @@
-"""`dxlrun sim`: simulated servos for other programs."""

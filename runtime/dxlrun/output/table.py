@@ -1,0 +1,99 @@
+"""Tables and lines as data: the same numbers for a terminal and for a page."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+Tone = Literal["plain", "good", "warning", "error"]
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One cell; its tone draws the eye to what is not as it should be."""
+
+    text: str
+    tone: Tone = "plain"
+
+
+Value = Cell | str | float | None
+"""A cell's content (int included); None: there is none."""
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """One column, and how its values are written."""
+
+    name: str
+    kind: Literal["name", "number", "text"] = "number"
+    """Numbers stand right; only a text may be folded into several lines."""
+    form: str = "{}"
+    """A format string, with the unit."""
+    missing: str = ""
+    """In place of None."""
+    detail: bool = False
+    """Left out where there is no room for it."""
+
+    def cell(self, value: Value) -> Cell:
+        """Return a value as it is shown."""
+        if isinstance(value, Cell):
+            return value
+        return Cell(self.missing if value is None else self.form.format(value))
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Rows of cells under columns; without any column name the first one names the rows."""
+
+    title: str
+    columns: tuple[Column, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+
+    @classmethod
+    def of(cls, title: str, columns: Iterable[Column], rows: Iterable[Iterable[Value]]) -> Table:
+        """Return the table of rows that have one value a column."""
+        columns = tuple(columns)
+        cells = (zip(columns, row, strict=True) for row in rows)
+        return cls(title, columns, tuple(tuple(column.cell(value) for column, value in row) for row in cells))
+
+    @classmethod
+    def facts(cls, title: str, facts: Iterable[tuple[str, Value]]) -> Table:
+        """Return names with their values, those without a value left out."""
+        columns = (Column("", "name"), Column("", "text"))
+        return cls.of(title, columns, ((name, value) for name, value in facts if value not in (None, "")))
+
+    def marked(self, rows: Iterable[bool]) -> Table:
+        """Return it with all cells of these rows as errors."""
+        pairs = zip(self.rows, rows, strict=True)
+        cells = (tuple(Cell(cell.text, "error") for cell in row) if bad else row for row, bad in pairs)
+        return replace(self, rows=tuple(cells))
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A sentence on a line of its own; never broken, so that what is in it can be copied."""
+
+    text: str
+    tone: Tone = "plain"
+
+
+Part = Table | Line | str
+"""What is shown; a string is a plain line."""
+
+
+def flagged(count: int, text: str = "", tone: Tone = "warning") -> Cell:
+    """Return the cell of a count, of a text about it, with a tone unless it is 0."""
+    return Cell(text or str(count), tone if count else "plain")
+
+
+def numbers(*names: str) -> Sequence[Column]:
+    """Return columns of numbers."""
+    return [Column(name) for name in names]
+
+
+def microseconds(value: float) -> str:
+    """Return a time in us as a person writes it: us, ms or s."""
+    if value >= 1e6:
+        return f"{value / 1e6:.2f} s"
+    return f"{value / 1e3:.2f} ms" if value >= 1e4 else f"{value:.0f} us"

@@ -1,0 +1,233 @@
+"""The terminal: results to stdout, errors to stderr; colours only on a terminal, plain text into a pipe.
+
+rich is imported when something is shown, so that a command line which shows nothing does not load it.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import textwrap
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from typing import IO, TYPE_CHECKING, cast
+
+from dxlrun.output.json import json_text, problems_json
+from dxlrun.output.table import Line, Part, Table, Tone
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table as RichTable
+    from rich.text import Text
+
+    from dxlrun.errors import Problem
+
+STYLES: dict[Tone, str] = {"plain": "", "good": "green", "warning": "yellow", "error": "red"}
+_PIPE = 200
+"""Columns of a pipe: wide enough not to break a table."""
+_WIDEST = 120
+"""Text is folded here: a longer line is hard to read, however wide the terminal."""
+_FOLDED = 28
+"""Columns that are left at least to what may be folded."""
+_REFRESH_S = 0.25
+
+
+def out(pipe: int = _PIPE) -> Console:
+    """Return the console for results; a pipe gets plain text, `pipe` columns wide."""
+    return _console(sys.stdout.isatty(), pipe, stderr=False)
+
+
+def show(*parts: Part, console: Console | None = None, folded: bool = False) -> None:
+    """Print lines and tables; a table without rows is left out.
+
+    Lines are not broken, so that a command in them can be copied, unless they are to be `folded`.
+    """
+    from rich.text import Text
+
+    console = console or out()
+    for part in parts:
+        if isinstance(part, Table):
+            if part.rows:
+                _show_table(part, console)
+        else:
+            line = Line(part) if isinstance(part, str) else part
+            console.print(Text(line.text, style=STYLES[line.tone]), soft_wrap=not folded)
+    console.file.flush()  # a reader behind a pipe waits for it
+
+
+def show_json(value: object) -> None:
+    """Print a result as JSON: dataclasses by their fields."""
+    sys.stdout.write(json_text(value) + "\n")
+
+
+def print_error(line: str) -> None:
+    """Print one error to stderr, unbroken, so that an editor can jump to its `file:line:column`."""
+    _print_to_stderr(line, "bold red")
+
+
+def print_warning(line: str) -> None:
+    """Print one warning to stderr, unbroken."""
+    _print_to_stderr(line, "yellow")
+
+
+def print_refusal(
+    problems: Sequence[Problem], sentences: Sequence[str], reason: Mapping[str, object]
+) -> None:
+    """Print on stdout, as one line of JSON, why a command with --json was refused.
+
+    `problems` have places in files; `sentences` are errors without one; `reason` is a running robot's: a code
+    with its fields.
+    """
+    errors = [problem for problem in problems if problem.severity == "error"]
+    refusal = {
+        "ok": False,
+        "errors": [*problems_json(errors), *({"what": sentence, **reason} for sentence in sentences)],
+        "warnings": problems_json([problem for problem in problems if problem.severity == "warning"]),
+    }
+    with suppress(OSError):  # the reader is gone; the exit code is left
+        sys.stdout.write(json.dumps(refusal, ensure_ascii=False) + "\n")
+        sys.stdout.flush()
+
+
+@contextmanager
+def progress_bar(*, hidden: bool) -> Iterator[Callable[[str, float], None]]:
+    """Give what shows a text and the share that is done, on a terminal.
+
+    It has no thread: the bar is drawn when it is called, so a measurement between two calls is undisturbed.
+    """
+    if hidden or not sys.stderr.isatty():
+        yield lambda *_: None
+        return
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+
+    columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn()
+    console = _console(terminal=True, pipe=_PIPE, stderr=True)
+    with Progress(*columns, console=console, auto_refresh=False, transient=True) as progress:
+        task = progress.add_task("", total=1.0)
+        drawn = 0.0
+
+        def draw(text: str, share: float) -> None:
+            nonlocal drawn
+            if time.monotonic() - drawn > _REFRESH_S:
+                drawn = time.monotonic()
+                progress.update(task, description=text, completed=share, refresh=True)
+
+        yield draw
+
+
+def fitted(table: Table, width: int) -> RichTable | Text:
+    """Return a table for a terminal of `width` columns: nothing is cut.
+
+    Where it does not fit, its heads are broken at blanks, then its details are left out, then each row
+    becomes a paragraph.
+    """
+    from rich.text import Text
+
+    for tight, details in ((False, True), (True, True), (False, False), (True, False)):
+        chosen = [index for index, column in enumerate(table.columns) if details or not column.detail]
+        if _width(table, chosen, tight=tight) <= width:
+            return _rich_table(table, chosen, tight=tight)
+    return Text("\n".join(_paragraphs(table, width)))
+
+
+def _show_table(table: Table, console: Console) -> None:
+    from rich.text import Text
+
+    if table.title:
+        console.print(Text(f"\n{table.title}", style="bold"))
+    width = min(console.width, _WIDEST) if console.is_terminal else console.width
+    shown = fitted(table, width)
+    if isinstance(shown, Text):  # a wider table is better than paragraphs
+        width = console.width
+        shown = fitted(table, width)
+    console.print(shown, width=width)
+
+
+def _width(table: Table, chosen: Sequence[int], *, tight: bool) -> int:
+    """Return how many columns a table takes at least."""
+    total = 0
+    for index in chosen:
+        column = table.columns[index]
+        head = max(map(len, column.name.split(" "))) if tight else len(column.name)
+        longest = max(len(row[index].text) for row in table.rows)
+        total += max(head, min(longest, _FOLDED) if column.kind == "text" else longest)
+    return total + (len(chosen) - 1) * (1 if tight else 2)
+
+
+def _rich_table(table: Table, chosen: Sequence[int], *, tight: bool) -> RichTable:
+    from rich import box
+    from rich.table import Table as RichTable
+    from rich.text import Text
+
+    headed = any(column.name for column in table.columns)
+    shown = RichTable(
+        box=box.SIMPLE_HEAD if headed else None,
+        show_header=headed,
+        header_style="dim",
+        padding=(0, (0 if tight else 1) + (not headed), 0, 0),
+        pad_edge=False,
+        show_edge=False,
+    )
+    for index in chosen:
+        column = table.columns[index]
+        shown.add_column(
+            column.name.replace(" ", "\n") if tight else column.name,
+            justify="right" if column.kind == "number" else "left",
+            overflow="fold",
+            no_wrap=column.kind != "text",
+        )
+    for row in table.rows:
+        shown.add_row(*(Text(row[index].text, style=STYLES[row[index].tone]) for index in chosen))
+    return shown
+
+
+def _paragraphs(table: Table, width: int) -> Iterator[str]:
+    """Yield each row as `joint: bus main, ID 3, ...`, broken between words."""
+    names = [column.name for column in table.columns]
+    for first, *rest in table.rows:
+        subject = f"{names[0]} {first.text}" if first.text.isdigit() else first.text
+        facts = (
+            f"{name} {cell.text}".strip() for name, cell in zip(names[1:], rest, strict=True) if cell.text
+        )
+        yield textwrap.fill(
+            f"{subject}: {', '.join(facts)}",
+            max(width - 1, 20),
+            subsequent_indent="  ",
+            break_on_hyphens=False,
+        )
+
+
+def _print_to_stderr(line: str, style: str) -> None:
+    from rich.text import Text
+
+    # a path or a name may hold line breaks or escape sequences; one problem stays one line
+    safe = "".join(
+        character if character.isprintable() else "\N{REPLACEMENT CHARACTER}" for character in line
+    )
+    with suppress(OSError):  # full, or gone: the exit code is left
+        _console(sys.stderr.isatty(), _PIPE, stderr=True).print(Text(safe, style=style), soft_wrap=True)
+
+
+def _console(terminal: bool, pipe: int, *, stderr: bool) -> Console:
+    from rich.console import Console
+
+    if terminal:
+        return Console(stderr=stderr, highlight=False, force_terminal=True)
+    file = cast("IO[str]", _WithoutPadding(sys.stderr if stderr else sys.stdout))
+    return Console(file=file, highlight=False, force_terminal=False, width=pipe)
+
+
+class _WithoutPadding:
+    """A stream that gets no blanks before the end of a line: rich fills the last column of a table."""
+
+    def __init__(self, stream: IO[str]) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        """Write text of whole lines, as a console does."""
+        self._stream.write("\n".join(line.rstrip(" ") for line in text.split("\n")))
+        return len(text)
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._stream, name)
