@@ -4,9 +4,8 @@ import pytest
 
 from dxlrun.clock import VirtualClock
 from dxlrun.compile import compile_files
-from dxlrun.dynamixel.servo.identify import identify
+from dxlrun.dynamixel.tools.inspection import identify, read_models
 from dxlrun.errors import PortError, StartUpError
-from dxlrun.run.identification import ask_servos
 from dxlrun.simulation import BusConfig, Ledger, ServoConfig
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.virtual_ports import VirtualPorts
@@ -95,7 +94,7 @@ def test_a_robot_file_is_compiled_with_what_the_servo_says(simulated_line, tmp_p
     checked = compile_files(robot, {}, [])
     assert [servo.model for servo in checked.plan.buses[0].servos] == ["XM430-W350"] * 2
     assert [problem.severity for problem in checked.warnings if "reports its model" in problem.what]
-    compiled = compile_files(robot, {}, [], None, ask_servos)
+    compiled = compile_files(robot, {}, [], None, read_models)
     assert [servo.model for servo in compiled.plan.buses[0].servos] == ["XL-320", "XM430-W350"]
     assert [problem for problem in compiled.warnings if "reports its model" in problem.what] == []
     assert compiled.plan.buses[0].servos[0].rad_per_tick == pytest.approx(math.radians(300) / 1023)
@@ -104,7 +103,7 @@ def test_a_robot_file_is_compiled_with_what_the_servo_says(simulated_line, tmp_p
 def test_a_simulated_servo_is_not_asked(tmp_path):
     robot = tmp_path / "robot.yaml"
     robot.write_text(ROBOT.replace("PORT", "sim"))
-    compiled = compile_files(robot, {}, [], None, ask_servos)
+    compiled = compile_files(robot, {}, [], None, read_models)
     assert compiled.plan.buses[0].servos[0].model == "XM430-W350"
 
 
@@ -113,5 +112,5 @@ def test_who_does_not_answer_is_said_before_the_run(simulated_line, tmp_path):
     robot = tmp_path / "robot.yaml"
     robot.write_text(ROBOT.replace("PORT", path))
     with pytest.raises(StartUpError, match=r"shoulder \(ID 1 on bus main\) does not answer"):
-        compile_files(robot, {}, [], None, ask_servos)
+        compile_files(robot, {}, [], None, read_models)
     assert finish() != ()

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
         WayRow,
     )
     from dxlrun.dynamixel.plan.bus_plan import BusPlan
-    from dxlrun.run.identification import Found, RegisterRow
+    from dxlrun.dynamixel.tools.inspection import Found, RegisterRow
 
 
 def check(
@@ -59,7 +59,7 @@ def check(
     debug
         Print the traceback of an error.
     """
-    result = compiled(robot, assignments, play, duration, _ask_servos if online else None)
+    result = compiled(robot, assignments, play, duration, _read_models if online else None)
     found = _look(result) if online else None
     if as_json:
         show_json(_as_json(result, found))
@@ -78,16 +78,16 @@ def check(
     return 0 if found.as_declared else 1
 
 
-def _ask_servos(buses: Sequence[BusPlan], joints: Sequence[str]) -> Mapping[str, str]:
-    from dxlrun.run.identification import ask_servos  # not above: most checks open no port
+def _read_models(buses: Sequence[BusPlan], joints: Sequence[str]) -> Mapping[str, str]:
+    from dxlrun.dynamixel.tools.inspection import read_models  # not above: most checks open no port
 
-    return ask_servos(buses, joints)
+    return read_models(buses, joints)
 
 
 def _look(result: Compiled) -> Found:
     """Read the servos on real ports; raises InputError where there are none."""
     from dxlrun.compile.buses import SIMULATED
-    from dxlrun.run.identification import look
+    from dxlrun.dynamixel.tools.inspection import look
 
     buses = [bus for bus in result.plan.buses if bus.port != SIMULATED]
     if not buses:

@@ -67,7 +67,7 @@ def run(
             "on virtual time nothing ends a run, and its log would fill the disk: give "
             "--duration SECONDS, or --play MOTION.yaml"
         )
-    result = compiled(robot, assignments, play, duration, None if virtual else _ask_servos)
+    result = compiled(robot, assignments, play, duration, None if virtual else _read_models)
     for warning in result.warnings:
         print_warning(str(warning))
     if ledger is not None:
@@ -106,11 +106,11 @@ def _check_ledger(ledger: Path, plan: Plan) -> None:
         raise InputError(f"the ledger {ledger} cannot be written: {error.strerror or error}") from error
 
 
-def _ask_servos(buses: Sequence[BusPlan], joints: Sequence[str]) -> Mapping[str, str]:
+def _read_models(buses: Sequence[BusPlan], joints: Sequence[str]) -> Mapping[str, str]:
     """Ask for the models of joints that say `model: auto`; most robots have none, so it is imported late."""
-    from dxlrun.run.identification import ask_servos
+    from dxlrun.dynamixel.tools.inspection import read_models
 
-    return ask_servos(buses, joints)
+    return read_models(buses, joints)
 
 
 def _verdict(summary: RunSummary, plan: Plan, console: Console) -> Verdict:

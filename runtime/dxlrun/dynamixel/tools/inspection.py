@@ -1,0 +1,198 @@
+"""Inspection before a run: which models answer, and what a start would find; nothing is written."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+
+from dxlrun.clock import Clock, MonotonicClock
+from dxlrun.dynamixel.control_table import control_table, models_by_number
+from dxlrun.dynamixel.exchange.bus import Bus
+from dxlrun.dynamixel.exchange.pump import run
+from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
+from dxlrun.dynamixel.plan.line import listen
+from dxlrun.dynamixel.port.ports import Ports, SerialPort, SerialPorts
+from dxlrun.dynamixel.port.serial_open import open_serial
+from dxlrun.dynamixel.servo.checks import LISTEN_NS, survey
+from dxlrun.dynamixel.servo.registers import RegisterDifference, compare
+from dxlrun.dynamixel.servo.retry import extend_timeouts, retry, setup_line
+from dxlrun.dynamixel.wire.transaction import Outcome, Program, Reply, Result
+from dxlrun.errors import StartUpError
+from dxlrun.run.channels.packets import NoPackets
+
+_IDENTITY_LENGTH = 3
+"""Model number (2) and firmware version (1): the reply to a ping of Protocol 2.0, bytes 0..2 in 1.0."""
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """What answered for one joint; either `model` or `problem` is empty."""
+
+    joint: str
+    model: str
+    """Name of the control table."""
+    problem: str
+    """Why there is no model, one sentence."""
+
+
+@dataclass(frozen=True, slots=True)
+class RegisterRow:
+    """One declared register and what the servo holds there."""
+
+    joint: str
+    item: str
+    address: int
+    area: str
+    """`EEPROM` or `RAM`."""
+    declared: int
+    """The integer on the wire, as `found`."""
+    found: int | None
+    """None: it did not answer."""
+    action: str
+    """What a run would do: `nothing`, `write`, or empty where it would not start."""
+
+
+@dataclass(slots=True)
+class Found:
+    """What was read of the servos, in the order of the plans."""
+
+    registers: list[RegisterRow] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
+    """Why a run would not start, one sentence each."""
+    remarks: list[str] = field(default_factory=list)
+    """What else differs from what the robot file assumes."""
+
+    @property
+    def as_declared(self) -> bool:
+        """True when a run would start, and would write no register."""
+        return not self.problems and all(row.found == row.declared for row in self.registers)
+
+
+def read_models(buses: Sequence[BusPlan], joints: Sequence[str]) -> Mapping[str, str]:
+    """Return the models of the servos of `joints` (`model: auto`), by joint; opens their ports, closes them.
+
+    Raises StartUpError with a sentence for every servo that cannot be identified, PortError when a port
+    cannot be opened or is gone.
+    """
+    concerned = [bus for bus in buses if any(servo.joint in joints for servo in bus.servos)]
+    with _lines(concerned) as ports:
+        found = identify(concerned, joints, ports, MonotonicClock())
+    problems = [one.problem for one in found.values() if one.problem]
+    if problems:
+        raise StartUpError("\n".join(problems))
+    return {joint: one.model for joint, one in found.items()}
+
+
+def look(buses: Sequence[BusPlan]) -> Found:
+    """Check every servo as a start does, and every declared register; opens the ports, closes them.
+
+    Raises PortError when a port cannot be opened or is gone.
+    """
+    with _lines(buses) as ports:
+        found = _run([_look(plan) for plan in buses], buses, ports, MonotonicClock())
+    together = Found()
+    for one in found:
+        together.registers += one.registers
+        together.problems += one.problems
+        together.remarks += one.remarks
+    if together.problems:
+        together.registers = [replace(row, action="") for row in together.registers]
+    return together
+
+
+def identify(
+    plans: Sequence[BusPlan], joints: Collection[str], ports: Ports, clock: Clock
+) -> Mapping[str, Identity]:
+    """Read the model numbers of the servos of some joints; return their models, by joint.
+
+    `plans` are made with any model of the bus' protocol: only ports, IDs and times count. Raises PortError
+    when a line is gone.
+    """
+    found = _run([_identify(plan, joints) for plan in plans], plans, ports, clock)
+    return {one.joint: one for identities in found for one in identities}
+
+
+def _run(
+    programs: Sequence[Program[Result]], plans: Sequence[BusPlan], ports: Ports, clock: Clock
+) -> list[Result]:
+    """Run one program a bus with longer timeouts; raises PortError when a line is gone."""
+    lines = [
+        Bus(index, plan, port, clock, NoPackets())
+        for index, (plan, port) in enumerate(zip(plans, ports.ports, strict=True))
+    ]
+    found = run([extend_timeouts(program) for program in programs], lines, ports, clock)
+    for line in lines:
+        if line.failure is not None:
+            raise line.failure
+    return [one for one in found if one is not None]
+
+
+def _look(plan: BusPlan) -> Program[Found]:
+    surveyed = yield from survey(plan, take_over=False)
+    remarks = [f"{joint}: {difference}" for joint, difference in surveyed.differences]
+    found = Found(problems=surveyed.problems, remarks=remarks)
+    answered = {joint for joint, _ in surveyed.servos}
+    for servo in plan.servos:
+        differences = [RegisterDifference(register, None) for register in servo.registers]
+        if servo.joint in answered:
+            differences = list((yield from compare(plan, servo, servo.registers, setup_line(plan))))
+        found.registers += [_row(plan, servo, one) for one in differences]
+    return found
+
+
+def _row(plan: BusPlan, servo: ServoPlan, one: RegisterDifference) -> RegisterRow:
+    register = one.register
+    item = control_table(servo.model, plan.protocol).items[register.name]
+    action = "write" if one.differs else "nothing"
+    return RegisterRow(servo.joint, item.name, item.address, item.area, register.value, one.found, action)
+
+
+def _identify(plan: BusPlan, joints: Collection[str]) -> Program[tuple[Identity, ...]]:
+    line = setup_line(plan)
+    yield listen(LISTEN_NS)
+    identities: list[Identity] = []
+    for servo in plan.servos:
+        if servo.joint not in joints:
+            continue
+        reply = yield from retry(line.ping(servo.servo_id))
+        if reply.answered and line.dialect.PING_LENGTH < _IDENTITY_LENGTH:
+            reply = yield from retry(line.read(servo.servo_id, 0, _IDENTITY_LENGTH))
+        identities.append(_identity(plan, servo, reply))
+    return tuple(identities)
+
+
+def _identity(plan: BusPlan, servo: ServoPlan, reply: Reply) -> Identity:
+    name = plan.label(servo)
+    if not reply.answered:
+        how = (
+            f"does not answer at {plan.baud_rate} bit/s: check power, cable, and ID"
+            if reply.outcome is Outcome.TIMEOUT
+            else "answers garbled: do two servos have its ID?"
+        )
+        problem = f"{name} {how}; its model is not known, so write it in the robot file"
+        return Identity(servo.joint, "", problem)
+    number, firmware = reply.word(), reply.parameters[2]
+    for table in models_by_number(number, plan.protocol):
+        if table.firmware <= firmware:
+            return Identity(servo.joint, table.model, "")
+    problem = (
+        f"{name} is model number {number}, firmware {firmware}, and no control table of Protocol "
+        f"{plan.protocol} has it: a plug-in can add one"
+    )
+    return Identity(servo.joint, "", problem)
+
+
+@contextmanager
+def _lines(buses: Sequence[BusPlan]) -> Iterator[SerialPorts]:
+    """Open the ports of some buses for this process alone, and close them."""
+    opened = []
+    try:
+        for bus in buses:
+            opened.append(open_serial(bus.port, bus.baud_rate))
+        yield SerialPorts(
+            [SerialPort(port.fileno(), bus.port) for port, bus in zip(opened, buses, strict=True)]
+        )
+    finally:
+        for port in opened:
+            port.close()
