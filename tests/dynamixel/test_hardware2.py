@@ -80,7 +80,7 @@ def test_a_cycle_is_one_sync_read_and_one_sync_write(started, ticks):
     ]
 
 
-def test_the_exchange_takes_what_protocol_md_says(started):
+def test_the_exchange_takes_what_protocol_md_has(started):
     start = started.clock.now_ns()
     started.hardware.read()
     assert started.clock.now_ns() - start == 220_000 + 8 * 210_000
@@ -107,7 +107,7 @@ def test_velocity_has_the_joints_sign(started):
 
 
 @pytest.mark.parametrize("others_answer", [False, True])
-def test_an_absent_servo_costs_the_others_one_cycle_at_most(started, others_answer):
+def test_a_silent_servo_costs_the_others_one_cycle_at_most(started, others_answer):
     started.buses[0].absent = "slot" if others_answer else "silent"
     started.cycle()
     started.buses[0].servo(13).silence()
@@ -147,7 +147,7 @@ def test_a_servo_that_rebooted_stays_out_of_the_goals(started):
     assert "Torque Enable (64)" in text
 
 
-def test_stop_limps_everybody(started):
+def test_stop_limps_every_servo(started):
     assert started.hardware.stop() == ()
     assert started.torque() == [False] * 8
 
@@ -241,7 +241,7 @@ def test_a_declared_register_that_older_firmware_does_not_have_is_refused(make_r
     )
 
 
-def test_an_overload_behind_a_standing_alert_is_told(started):
+def test_an_overload_behind_a_standing_alert_is_reported(started):
     started.cycle()
     servo = started.buses[0].servo(14)
     servo.poke("hardware_error_status", 0x01)
@@ -257,7 +257,7 @@ def test_an_overload_behind_a_standing_alert_is_told(started):
     assert [source for source, _ in started.events.of(EventCode.SERVO_LIMP)] == ["arm_14_joint"]
 
 
-def test_a_ramp_of_another_program_is_told(make_rig, make_x):
+def test_a_ramp_of_another_program_is_reported(make_rig, make_x):
     rig = make_rig(make_x((11, 12)))
     rig.buses[0].servo(12).poke("profile_acceleration", 5)
     rig.hardware.start()
@@ -274,7 +274,7 @@ def test_a_ramp_of_another_program_is_told(make_rig, make_x):
         ("bus_watchdog", -1, "it has stopped the servo; it is cleared"),
     ],
 )
-def test_what_an_earlier_run_left_is_told(make_rig, make_x, register, value, said):
+def test_what_an_earlier_run_left_is_reported(make_rig, make_x, register, value, said):
     rig = make_rig(make_x((11, 12), model="XL330-M288"))
     rig.buses[0].servo(12).poke(register, value)
     rig.hardware.start()
@@ -315,7 +315,7 @@ def test_joint_position_of_an_x(make_x):
     assert joint_position(servo, 2048) == pytest.approx(0.0, abs=0.002)
 
 
-def test_an_alert_is_read_once_and_told_in_the_manuals_words(started):
+def test_an_alert_is_read_once_and_reported_in_the_manuals_words(started):
     started.cycle()
     started.buses[0].servo(14).poke("hardware_error_status", 0x20)
     for _ in range(4):

@@ -84,7 +84,7 @@ def test_a_lost_servo_leaves_the_exchange_and_is_asked_once_a_second(start, make
     assert "missed 4 replies in a row" in text
 
 
-def test_a_bus_that_stands_still_for_a_moment_loses_nobody_at_any_rate(start, make_x):
+def test_a_bus_that_stands_still_for_a_moment_loses_no_servo_at_any_rate(start, make_x):
     """Three cycles at 500 Hz are less than a USB adapter, or a machine, stands still for now and then."""
     rig = start(make_x())
     begun = rig.clock.now_ns()
@@ -383,7 +383,7 @@ def test_registers_that_a_reboot_took_are_written_again(start, make_x):
     assert len(rig.events.of(EventCode.REGISTER_WRITTEN)) == 5
 
 
-def test_a_servo_with_a_hardware_error_does_not_come_back_and_says_so_once(start, make_x):
+def test_a_servo_with_a_hardware_error_does_not_come_back_and_is_reported_once(start, make_x):
     rig = start(make_x(returning=True))
     servo = rig.buses[0].servo(13)
     servo.silence()
@@ -408,7 +408,7 @@ def test_the_watchdog_is_armed_at_the_start_and_disarmed_at_the_end(start, make_
     assert [servo.registers["bus_watchdog"] for servo in rig.buses[0].servos] == [0] * 4
 
 
-def test_who_is_lost_at_a_high_rate_is_told_with_all_that_it_missed(start, make_x):
+def test_a_servo_that_is_lost_at_a_high_rate_is_reported_with_all_that_it_missed(start, make_x):
     rig = start(make_x())
     rig.period_ns = 4_000_000
     rig.buses[0].servo(13).silence()
@@ -431,7 +431,7 @@ def _once_armed(rig, servo_id, what):
     servo.registers.watch(("bus_watchdog",), written)
 
 
-def test_nobody_is_stopped_because_the_answers_of_others_are_lost_while_they_are_armed(make_rig, make_x):
+def test_no_servo_is_stopped_because_the_answers_of_others_are_lost_while_they_are_armed(make_rig, make_x):
     rig = make_rig(make_x(watchdog=10))
     _once_armed(rig, 14, lambda servo_id: rig.buses[0].truncate_next(servo_id, 0))
     rig.hardware.start()
@@ -442,7 +442,7 @@ def test_nobody_is_stopped_because_the_answers_of_others_are_lost_while_they_are
     assert rig.events.of(EventCode.WATCHDOG) == []
 
 
-def test_nobody_is_stopped_because_the_adapter_is_slow_while_they_are_armed(make_rig, make_x):
+def test_no_servo_is_stopped_because_the_adapter_is_slow_while_they_are_armed(make_rig, make_x):
     rig = make_rig(make_x(range(11, 23), watchdog=10))
     for servo_id in range(11, 23):
         _once_armed(rig, servo_id, lambda one: rig.buses[0].delay_next(one, 60_000_000))
@@ -451,7 +451,7 @@ def test_nobody_is_stopped_because_the_adapter_is_slow_while_they_are_armed(make
     assert rig.events.of(EventCode.WATCHDOG) == []
 
 
-def test_who_was_stopped_while_others_were_armed_is_revived(make_rig, make_x):
+def test_a_servo_that_was_stopped_while_others_were_armed_is_revived(make_rig, make_x):
     rig = make_rig(make_x(watchdog=10))
     _once_armed(rig, 14, lambda one: [rig.buses[0].truncate_next(one, 0) for _ in range(3)])
     rig.hardware.start()
@@ -506,7 +506,7 @@ def test_one_stopped_servo_among_others_that_are_left_holding_stays_stopped(star
     assert servos[1].position == pytest.approx(stood, abs=0.002)
 
 
-def test_nobody_is_stopped_because_others_are_silent_when_all_are_left_holding(start, make_x):
+def test_no_servo_is_stopped_because_others_are_silent_when_all_are_left_holding(start, make_x):
     rig = start(make_x(range(11, 23), watchdog=10))
     cycles(rig, 5)
     servos = rig.buses[0].servos
@@ -519,7 +519,7 @@ def test_nobody_is_stopped_because_others_are_silent_when_all_are_left_holding(s
     assert "arm_14_joint (ID 14 on bus arm) did not answer when its Bus Watchdog (98) was read" in told
 
 
-def test_nobody_is_stopped_because_disarming_all_takes_longer_than_a_watchdog(start, make_plan):
+def test_no_servo_is_stopped_because_disarming_all_takes_longer_than_a_watchdog(start, make_plan):
     rig = start(_with(make_plan(range(1, 25), protocol=2.0, model="XM430-W350"), False, watchdog=2))
     rig.period_ns = 25_000_000
     cycles(rig, 5)
@@ -653,7 +653,7 @@ def _tick(tick, sent_ns, last_ns=None):
         (100, 17_000, None),  # unseen for too long
     ],
 )
-def test_a_tick_tells_a_reboot(tick, after_ms, rebooted):
+def test_a_tick_shows_a_reboot(tick, after_ms, rebooted):
     ticks = RealtimeTicks(1)
     assert ticks.rebooted(0, _tick(30_000, 0)) is None
     assert ticks.rebooted(0, _tick(tick, after_ms * 1_000_000)) is rebooted
@@ -731,7 +731,7 @@ def test_a_servo_of_protocol_1_that_was_let_go_gets_no_goal_which_would_switch_i
     assert goals == [[1, 5]] * 30
 
 
-def test_an_end_without_a_line_raises_nothing_and_names_everybody(start, make_x):
+def test_an_end_without_a_line_raises_nothing_and_names_every_servo(start, make_x):
     rig = start(make_x(watchdog=10))
     cycles(rig, 3)
     rig.buses[0].unplug()

@@ -132,6 +132,6 @@ def test_the_guardians_path_imports_no_numpy():
     assert result.stdout.strip() == "False"
 
 
-def test_nobody_to_limp(make_rig, make_plan):
+def test_no_servo_to_limp(make_rig, make_plan):
     rig = make_rig(make_plan(()))
     assert limp(rig.plans, rig.ports, rig.clock, rig.packets) == ()

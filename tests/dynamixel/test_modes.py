@@ -174,7 +174,7 @@ def test_torque_is_off_while_the_mode_is_written_and_no_goal_is_sent_meanwhile(a
     assert (source, "is in velocity mode" in text) == ("main_1_joint", True)
 
 
-def test_gains_that_somebody_set_outlive_a_change_and_others_begin_with_those_of_the_mode(arm):
+def test_gains_that_a_tool_set_outlive_a_change_and_others_begin_with_those_of_the_mode(arm):
     servo = arm.buses[0].servo(1)
     servo.poke("position_p_gain", 700)
     servo.poke("profile_acceleration", 12)
@@ -243,7 +243,7 @@ def test_of_two_modes_that_are_selected_alike_the_one_of_the_start_counts(make_p
         assert mode_in(plan.servos[0], wheel) is mode
 
 
-def test_a_model_without_the_mode_says_so_and_stays(make_one):
+def test_a_model_without_the_mode_is_named_and_stays(make_one):
     rig = make_one("XL430-W250", 2.0)
     rig.hardware.set_modes(np.array([Mode.EFFORT, 0], dtype=np.uint8))
     rig.cycle()
@@ -253,7 +253,7 @@ def test_a_model_without_the_mode_says_so_and_stays(make_one):
     assert "XL430-W250 of main_1_joint has no mode effort" in text
 
 
-def test_a_later_wish_replaces_the_one_that_is_on_its_way(arm):
+def test_a_later_request_replaces_the_one_that_is_on_its_way(arm):
     for mode in (Mode.VELOCITY, Mode.PWM):
         arm.hardware.set_modes(np.array([mode, 0], dtype=np.uint8))
     change(arm, Mode.EFFORT)
@@ -314,7 +314,7 @@ def test_a_continuous_joint_turns_as_a_wheel_and_goes_to_positions_over_turns(
     assert rig.states.position[0] == pytest.approx(began - 15.0, abs=0.02)
 
 
-def test_a_wheel_of_a_model_that_controls_no_speed_tells_its_speed_in_the_same_unit(make_rig, make_plan):
+def test_a_wheel_of_a_model_that_controls_no_speed_reports_its_speed_in_the_same_unit(make_rig, make_plan):
     plan = make_plan((1, 2), continuous=True, lower=-np.inf, upper=np.inf, return_delay_ns=0)
     rig = make_rig(plan)
     rig.hardware.start()
@@ -409,7 +409,7 @@ def write_of_mode(data):
     return data[4] == 1 and data[7:10] == b"\x03\x0b\x00"
 
 
-def test_a_wish_that_comes_in_the_middle_of_a_change_is_followed(arm):
+def test_a_request_that_comes_in_the_middle_of_a_change_is_followed(arm):
     wish = np.array([Mode.PWM, 0], dtype=np.uint8)
     left = [wish]
     when(arm, write_of_mode, lambda: left and arm.hardware.set_modes(left.pop()))
@@ -420,7 +420,7 @@ def test_a_wish_that_comes_in_the_middle_of_a_change_is_followed(arm):
     assert arm.buses[0].servo(1).registers["operating_mode"] == 16
 
 
-def test_a_wish_that_comes_while_a_servo_is_taken_back_is_carried_out_once(arm):
+def test_a_request_that_comes_while_a_servo_is_taken_back_is_carried_out_once(arm):
     servo, left = arm.buses[0].servo(1), []
     servo.silence()
     for _ in range(20):

@@ -104,7 +104,7 @@ def storm(make_rig, make_plan):
 @pytest.mark.campaign
 @pytest.mark.parametrize("protocol", [1.0, 2.0])
 @pytest.mark.parametrize("seed", range(STORMS))
-def test_a_storm_of_wishes(storm, protocol, seed):
+def test_a_storm_of_requests(storm, protocol, seed):
     rig, wishes, started = storm(protocol, seed)
     assert all(len(answers) == 1 for answers in wishes.answers)
     assert writes_below(rig, RAM[protocol], started) == []

@@ -74,7 +74,7 @@ def test_a_servo_at_another_rate_is_found_at_its_own():
 
 
 @pytest.mark.parametrize("protocol", [1.0, 2.0])
-def test_who_answers_late_is_found_and_not_taken_for_two(protocol):
+def test_a_servo_that_answers_late_is_found_and_not_taken_for_two(protocol):
     """A machine that stands still for 90 ms, at the first ping and in the middle of looking closer."""
     model = "AX-12A" if protocol == 1.0 else "XM430-W350"
     line = VirtualLine(two(3, model), protocol=protocol, rate=1_000_000)
@@ -145,7 +145,7 @@ def test_an_unknown_model_is_listed_with_its_number():
     assert "model number 999" in found.remarks[0]
 
 
-def test_rates_that_the_adapter_cannot_are_left_out_and_told():
+def test_rates_that_the_adapter_cannot_are_left_out_and_reported():
     line = VirtualLine(two(4), cannot=(10_500_000, 6_000_000))
     found = scan(ToolLine(line), Search((2.0,), (), (4,)))
     assert found.left_out == (10_500_000, 6_000_000)

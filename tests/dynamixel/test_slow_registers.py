@@ -62,7 +62,7 @@ def test_slow_registers_make_no_cycle_late_and_wait_for_ever_where_there_is_no_t
     assert rig.events.of(EventCode.OVERRUN) == []
 
 
-def test_a_hot_servo_is_told_ten_degrees_before_its_limit_and_when_it_has_cooled(start):
+def test_a_hot_servo_is_reported_ten_degrees_before_its_limit_and_when_it_has_cooled(start):
     rig = start()
     servo = rig.buses[0].servo(12)
     cycles(rig, 100)
@@ -77,7 +77,7 @@ def test_a_hot_servo_is_told_ten_degrees_before_its_limit_and_when_it_has_cooled
     assert len(rig.events.of(EventCode.SERVO_HOT)) == 2
 
 
-def test_another_item_is_told_when_it_changes(start):
+def test_another_item_is_reported_when_it_changes(start):
     rig = start(items=("position_p_gain",))
     cycles(rig, 120)
     rig.buses[0].servo(12).poke("position_p_gain", 640)

@@ -110,7 +110,7 @@ def test_an_adapter_that_echoes_is_named(make_rig):
     assert "echoes" in problem
 
 
-def test_a_return_delay_beside_the_plan_is_told_with_its_consequence(make_rig):
+def test_a_return_delay_beside_the_plan_is_reported_with_its_consequence(make_rig):
     rig = make_rig()
     rig.buses[0].servo(1).poke("return_delay_time", 0)
     rig.hardware.start()
@@ -281,7 +281,7 @@ def test_answers_that_come_late_are_those_to_what_was_asked(make_rig):
     assert asked.count(protocol1.ping(6)) == 3  # nobody was asked twice
 
 
-def test_a_robot_without_power_is_told_within_two_seconds(make_rig):
+def test_a_robot_without_power_is_reported_within_two_seconds(make_rig):
     rig = make_rig()
     for servo in rig.buses[0].servos:
         servo.silence()

@@ -44,7 +44,7 @@ def writes(rig, since=0):
     return [(packet[4], int.from_bytes(packet[8:10], "little"), packet[10:-2]) for packet in sent]
 
 
-def test_a_gain_is_changed_between_cycles_read_back_and_told(started):
+def test_a_gain_is_changed_between_cycles_read_back_and_reported(started):
     answers, before = [], len(started.into_bus())
     started.hardware.set_register(1, "position_p_gain", 900, answers.append)
     assert answers == []
@@ -68,7 +68,7 @@ def test_what_a_servo_has_already_is_not_written(started):
     assert writes(started, before) == []
 
 
-def test_a_servo_that_refuses_is_told_and_keeps_what_it_had(started):
+def test_a_servo_that_refuses_is_reported_and_keeps_what_it_had(started):
     answers = []
     started.hardware.set_register(0, "velocity_p_gain", 20_000, answers.append)
     for _ in range(3):
@@ -78,7 +78,7 @@ def test_a_servo_that_refuses_is_told_and_keeps_what_it_had(started):
     assert started.events.of(EventCode.REGISTER_DIFFERS) == [("arm_11_joint", answer)]
 
 
-def test_a_servo_that_is_silent_is_told(started):
+def test_a_servo_that_is_silent_is_reported(started):
     answers = []
     started.buses[0].servo(11).silence()
     started.hardware.set_register(0, "position_p_gain", 900, answers.append)
@@ -106,7 +106,7 @@ def test_nothing_else_than_ram_is_written_whatever_comes_out_of_the_mailbox(star
     assert answers == [f"arm_11_joint has no register {item} that could be written now"]
 
 
-def test_many_wishes_are_done_in_their_order_and_no_cycle_is_late(started):
+def test_many_requests_are_done_in_their_order_and_no_cycle_is_late(started):
     answers = []
     for value in (500, 600, 700):
         for row in (0, 1):
@@ -160,7 +160,7 @@ def test_a_servo_comes_back_into_the_mode_in_which_it_was(started):
     assert [write for write in writes(started, before) if write[1] == 11] == []
 
 
-def test_a_mode_that_was_wanted_while_a_servo_was_away_is_entered_when_it_is_back(started):
+def test_a_mode_that_was_requested_while_a_servo_was_away_is_entered_when_it_is_back(started):
     started.buses[0].servo(11).silence()
     for _ in range(5):
         started.cycle()

@@ -14,7 +14,7 @@ def started(make_rig):
     return rig
 
 
-def test_an_unplugged_adapter_is_told_once_costs_its_own_servos_only_and_stop_still_speaks(
+def test_an_unplugged_adapter_is_reported_once_costs_its_own_servos_only_and_stop_still_speaks(
     make_rig, make_plan
 ):
     rig = make_rig(make_plan((1, 2), name="left"), make_plan((1, 7), name="right", first_row=2))

@@ -22,7 +22,7 @@ _TEXTS: dict[str, str] = {}
 
 
 def control_table(model: str, protocol: float | None = None) -> ControlTable:
-    """Return the control table of a model or of one of its aliases; `understood` says which names are.
+    """Return the control table of a model or of one of its aliases; `understood` has the rules.
 
     MX servos carry one name with two firmwares: `protocol` then decides. Raises LookupError when the model is
     unknown, does not speak the protocol, or speaks both and none was given.

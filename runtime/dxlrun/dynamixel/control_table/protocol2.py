@@ -67,7 +67,7 @@ _VELOCITIES = frozenset(
 
 
 def protocol2_listings() -> tuple[Listing, ...]:
-    """Return all models of the SDK and those of our own; their tables are built when they are asked for.
+    """Return all models of the SDK and those of our own; their tables are built when they are needed.
 
     Raises LookupError when dynamixel-sdk is not installed; `Listing.build` raises ValueError when a data file
     is broken.

@@ -66,7 +66,7 @@ _PROTOCOL1 = Path(__file__).parent / "tables" / "protocol1"
 
 
 def protocol1_listings() -> tuple[Listing, ...]:
-    """Return the models of all data files; their tables are built when they are asked for.
+    """Return the models of all data files; their tables are built when they are needed.
 
     Raises ValueError or KeyError when a data file is broken.
     """

@@ -87,7 +87,7 @@ class ControlTable:
     """
 
     model: str
-    """The model's own name, also when it was asked for by another one."""
+    """The model's own name, also where an alias was given."""
     aliases: tuple[str, ...]
     """Names of models with the same table."""
     model_number: int

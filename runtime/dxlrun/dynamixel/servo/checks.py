@@ -127,12 +127,12 @@ class Check(NamedTuple):
     """The servo gets no torque; False: the difference is reported."""
 
 
-def _neutral(item: str, wanted: int, why: Callable[[Inspected, int], str]) -> Check:
+def _neutral(item: str, value: int, why: Callable[[Inspected, int], str]) -> Check:
     """Return the check of a register that must have the one value that the plan counts on."""
     return Check(
         item,
-        lambda _, raw: raw != wanted,
-        lambda found, raw: f"has {found.title(item)} = {raw}, {why(found, raw)}: write {wanted} there",
+        lambda _, raw: raw != value,
+        lambda found, raw: f"has {found.title(item)} = {raw}, {why(found, raw)}: write {value} there",
     )
 
 

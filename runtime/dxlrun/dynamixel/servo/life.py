@@ -196,7 +196,7 @@ class Life:
         self.torqued: NDArray[np.bool_] = np.zeros(count, dtype=np.bool_)
         """Shape (servos,): the servos that get goals; the memory of the kernel, too."""
         self.ceiling: Floats = np.full(count, np.nan)
-        """Shape (servos,): the highest speeds toward positions, rad/s; NaN: as the goal says."""
+        """Shape (servos,): the highest speeds toward positions, rad/s; NaN: no limit but that of the goal."""
 
     def on(self, index: int, event: ServoEvent) -> ServoState:
         """Change a servo's state by an event, and return it; raises IllegalTransition."""

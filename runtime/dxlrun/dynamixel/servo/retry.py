@@ -46,15 +46,17 @@ def extend_timeouts(
     """
     left_ns = MOST_SILENCE_NS
     try:
-        wanted = next(program)
+        request = next(program)
         while True:
-            longer_ns = min(most_ns, left_ns) if wanted.awaited else 0
-            reply = yield replace(wanted, timeout_ns=wanted.timeout_ns + longer_ns) if longer_ns else wanted
-            if extra_ns is not None and wanted.awaited and reply.answered:
-                extra_ns.append(reply.last_ns - reply.sent_ns - wanted.due_ns)
+            longer_ns = min(most_ns, left_ns) if request.awaited else 0
+            reply = (
+                yield replace(request, timeout_ns=request.timeout_ns + longer_ns) if longer_ns else request
+            )
+            if extra_ns is not None and request.awaited and reply.answered:
+                extra_ns.append(reply.last_ns - reply.sent_ns - request.due_ns)
             if reply.outcome in (Outcome.TIMEOUT, Outcome.GARBLED):
                 left_ns -= longer_ns
-            wanted = program.send(reply)
+            request = program.send(reply)
     except StopIteration as end:
         result: Result = end.value
         return result

@@ -101,7 +101,7 @@ class StartUp:
         """How much later than by the wire the replies on each bus came."""
 
     def look(self, take_over: bool) -> None:
-        """Check every servo; bring registers and modes to what the plan says; learn how each answers."""
+        """Check every servo; bring registers and modes to those of the plan; learn how each answers."""
         surveys = self._run([survey(plan, take_over) for plan in self._plans])
         for one in surveys:
             self._log(EventCode.SETUP, Severity.INFO, one.servos)

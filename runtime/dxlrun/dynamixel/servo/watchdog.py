@@ -54,7 +54,7 @@ def disarm(plan: BusPlan, servo: ServoPlan) -> Program[str]:
     """Clear a servo's watchdog if it is armed or has stopped the servo; return what went wrong.
 
     Also where the plan wants none: an earlier run that was killed may have left it armed. A servo that it
-    stopped with torque goes on to its old goal [i], at full speed as its profile was reset: it gets a slow
+    stopped with torque moves to its old goal [i], at full speed as its profile was reset: it gets a slow
     one before.
     """
     if (item := item_of(plan, servo)) is None:

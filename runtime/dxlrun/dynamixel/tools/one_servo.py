@@ -83,17 +83,17 @@ class OneServo:
             found |= self.run(self._read_block(block, refused=refused))
         return {name: found[name] for name in names if name in found}
 
-    def differences(self, wanted: Sequence[RegisterValue]) -> tuple[RegisterDifference, ...]:
+    def differences(self, desired: Sequence[RegisterValue]) -> tuple[RegisterDifference, ...]:
         """Compare registers with what they shall hold; writes nothing."""
-        found = self.run(compare(self.plan, self._servo, wanted, self.tool.line))
+        found = self.run(compare(self.plan, self._servo, desired, self.tool.line))
         silent = [self.table.items[one.register.name].title for one in found if one.found is None]
         if silent:
             raise self.fail(f"did not answer when {', '.join(silent)} was read")
         return found
 
-    def writable(self, wanted: Sequence[RegisterValue]) -> None:
+    def writable(self, desired: Sequence[RegisterValue]) -> None:
         """Make sure that registers can be written: no torque, and not the lock of Protocol 1.0."""
-        stored = [self.table.items[one.name].title for one in wanted if one.eeprom]
+        stored = [self.table.items[one.name].title for one in desired if one.eeprom]
         if not stored:
             return
         if self.holds_torque():
@@ -104,16 +104,16 @@ class OneServo:
         if self.table.protocol == 1.0 and "lock" in self.table.items and self.read(["lock"])["lock"]:
             raise self.fail("its Lock (47) is 1, which keeps the EEPROM as it is until its power is cut")
 
-    def write(self, wanted: Sequence[RegisterValue]) -> tuple[str, ...]:
+    def write(self, desired: Sequence[RegisterValue]) -> tuple[str, ...]:
         """Write the registers that differ, in order, and read each back; return what was written.
 
         Before goals, which a servo refuses while its Bus Watchdog is tripped, that is cleared; so is it where
         the watchdog itself is written.
         """
-        self.writable(wanted)
-        tripping = any(one.name.startswith(("goal_", "bus_watchdog")) for one in wanted)
+        self.writable(desired)
+        tripping = any(one.name.startswith(("goal_", "bus_watchdog")) for one in desired)
         cleared = self.clear_watchdog(armed=False) if tripping else ()
-        settled: Settled = self.run(settle(self.plan, self._servo, wanted, self.tool.line))
+        settled: Settled = self.run(settle(self.plan, self._servo, desired, self.tool.line))
         if settled.problems:
             before = [f"written before that: {text}" for _, text in settled.written]
             raise ServoFault("\n".join([*settled.problems, *before]))

@@ -156,9 +156,9 @@ def _search(tool: ToolLine, ids: Sequence[int], beat: Callable[[float], None]) -
     heard.clear()
     if line.dialect.PING_LENGTH >= _IDENTITY_LENGTH and len(ids) > FEW:
         slot_ns = line.wire_ns(line.dialect.OVERHEAD + line.dialect.PING_LENGTH) + SLOT_NS
-        asked = line.unanswered(line.dialect.ping(BROADCAST_ID))
+        ping = line.unanswered(line.dialect.ping(BROADCAST_ID))
         slots_ns = slot_ns * (len(ids) + 1) + line.latency_ns
-        refuse_echo(tool.port.name, (yield replace(asked, due_ns=asked.due_ns + slots_ns)))
+        refuse_echo(tool.port.name, (yield replace(ping, due_ns=ping.due_ns + slots_ns)))
         there = heard.ids & set(ids)
     else:
         there = yield from _one_by_one(tool, ids, SHORT_TIMEOUT_NS, beat)
