@@ -48,7 +48,7 @@ def test_another_host_that_asks_between_the_exchanges_leaves_an_event(build, way
     rig, dialect = build(way)
     bus = rig.buses[0]
     for number in range(2):
-        bus.other_host(dialect.read(2, 24, 1), rig.clock.now_ns() + IDLE_NS, heard=heard)
+        bus.other_host(dialect.read(2, 24, 1), rig.clock.now_ns() + IDLE_NS, received=heard)
         assert told(rig) == []
         rig.cycle()
         assert rig.states.valid.all()

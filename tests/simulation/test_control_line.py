@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.simulation.control_line import ControlLine
 from dxlrun.simulation.pseudo_terminal import Link
+from dxlrun.simulation.server import ControlLine
 
 
 def test_what_nobody_reads_from_the_control_socket_is_dropped() -> None:

@@ -29,7 +29,7 @@ from dxlrun.simulation import (
 )
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.pseudo_terminal import PseudoTerminal
-from dxlrun.simulation.realtime import Patience
+from dxlrun.simulation.realtime import PollBudget
 
 PING_1 = bytes.fromhex("ff ff 01 02 01 fb")
 PONG_1 = bytes.fromhex("ff ff 01 02 00 fc")
@@ -136,7 +136,7 @@ def test_what_does_not_fit_into_the_terminal_is_lost_and_noted() -> None:
         bus.inject_noise(bytes(4000), now - 10**8)
         terminal.deliver(now)
     assert any("it does not read" in entry.note for entry in bus.ledger.entries)
-    terminal.listen()  # the host has said nothing
+    terminal.read()  # the host has said nothing
     terminal.receive(10**11)
     terminal.close()
     assert not [entry for entry in bus.ledger.entries if entry.direction == "in"]
@@ -148,11 +148,11 @@ def test_what_a_host_writes_while_others_are_served_is_not_of_the_moment_before(
     with opened(terminal.path) as port:
         os.write(port, READ_1)
         select.select([terminal], [], [])
-        terminal.listen()
+        terminal.read()
         os.write(port, READ_1)
         select.select([terminal], [], [])
         terminal.receive(10**9)
-        terminal.listen()
+        terminal.read()
         terminal.receive(2 * 10**9)
     terminal.close()
     heard = [(entry.t_ns, entry.data) for entry in bus.ledger.entries if entry.direction == "in"]
@@ -357,18 +357,18 @@ def test_no_reply_is_there_before_wire_time_and_return_delay_have_passed(start_b
 
 
 def test_polling_is_bounded_and_sleeping_is_not_endless() -> None:
-    patience, now, polled = Patience(0), 0, 0
+    budget, now, polled = PollBudget(0), 0, 0
     for _ in range(100_000):  # something is always due in 60 us
-        wait_s = patience.until(now + 60_000, now)
+        wait_s = budget.sleep_s(now + 60_000, now)
         assert wait_s is not None
         spent = 1_000 if wait_s == 0 else round(wait_s * 1e9)
         polled += spent if wait_s == 0 else 0
         now += spent
-        patience.woke(now)
+        budget.woke(now)
     assert polled < now / 6 + 25_000_000
-    assert patience.until(None, now) is None
-    assert patience.until(now - 5, now + 10**9) == 0
-    assert patience.until(now + 3 * 10**9, now + 2 * 10**9) == pytest.approx(1.0, abs=1e-3)
+    assert budget.sleep_s(None, now) is None
+    assert budget.sleep_s(now - 5, now + 10**9) == 0
+    assert budget.sleep_s(now + 3 * 10**9, now + 2 * 10**9) == pytest.approx(1.0, abs=1e-3)
 
 
 def test_a_host_that_floods_the_line_feels_its_rate(start_buses: Any) -> None:

@@ -23,8 +23,8 @@ _CBAUD, _BOTHER = 0o010017, 0o010000
 class PseudoTerminal:
     """The master's end; a slave's descriptor stays open here, so that hosts may come and go.
 
-    A terminal that was never told a rate has that of the bus; a host that sets another one talks at that
-    rate, and servos at the old one hear nothing.
+    A terminal without a rate of its own has that of the bus; a host that sets another one sends at that rate,
+    and servos at the old one receive nothing.
 
     What a USB adapter would not do [i]: a host that throws its output away (`tcflush(TCOFLUSH)`, pyserial's
     `reset_output_buffer`) right after writing loses what the kernel has not handed over yet; pypot 5.0 does
@@ -35,7 +35,7 @@ class PseudoTerminal:
         self.bus = bus
         self._link = link
         self._master, self._slave = self._new_pair()
-        self._told = b""
+        self._settings = b""
         """Settings of the terminal when the host last wrote."""
         self._taken = b""
         """What the host wrote and the bus was not handed yet."""
@@ -76,7 +76,7 @@ class PseudoTerminal:
                 self.bus.note(f"the link does not follow the adapter: {error}")
         return True
 
-    def listen(self) -> None:
+    def read(self) -> None:
         """Take what the host has written."""
         with suppress(BlockingIOError):
             self._taken += os.read(self._master, 4096)
@@ -87,8 +87,8 @@ class PseudoTerminal:
         if not data:
             return
         settings = _settings(self._slave)
-        if settings != self._told:  # the host's rate can only be another one then
-            self._told = settings
+        if settings != self._settings:  # the host's rate can only be another one then
+            self._settings = settings
             rate = _rate(settings)
             if rate not in (0, self.bus.baud_rate):
                 self.bus.change_rate(rate)

@@ -19,9 +19,9 @@ _PAUSE_NS = 100_000
 
 
 def prepare(priority: int, core: int) -> str:
-    """Ask for a real-time priority (SCHED_FIFO; 0: none) and a core (-1: any); say what was granted.
+    """Ask for a real-time priority (SCHED_FIFO; 0: none) and a core (-1: any); return what was granted.
 
-    Never raises: a simulation without real time is a simulation, and its ledger says how late it was.
+    Never raises: a simulation without real time is a simulation, and its ledger shows how late it was.
     """
     gc.collect()
     gc.freeze()
@@ -32,7 +32,7 @@ def prepare(priority: int, core: int) -> str:
 def _take_core(core: int) -> str:
     allowed = os.sched_getaffinity(0)
     if core < 0:
-        return "no core of its own was asked for"
+        return "no core of its own was requested"
     if len(allowed) < 2:
         return "no core of its own: there is only one"
     if core not in allowed:
@@ -46,20 +46,21 @@ def _take_core(core: int) -> str:
 
 def _take_priority(priority: int) -> str:
     if priority <= 0:
-        return "no real-time priority was asked for"
+        return "no real-time priority was requested"
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
-        return f"no real-time priority {priority}: {reason}; `dxlrun doctor` says how to allow it"
+        return f"no real-time priority {priority}: {reason}; `dxlrun doctor` shows how to allow it"
     return f"real-time priority {priority}"
 
 
-class Patience:
+class PollBudget:
     """Decides how long to sleep before something is due, and when to poll the clock instead.
 
-    Polling is punctual and costs the processor; it is bounded to a sixth of the time, and who works half of
-    the time does not poll at all. Beyond that, replies are handed over a little late, several at once.
+    Polling is punctual and costs the processor; it is bounded to a sixth of the time, and a process that
+    works half of the time does not poll at all. Beyond that, replies are handed over a little late, several
+    at once.
     """
 
     def __init__(self, now_ns: int) -> None:
@@ -67,7 +68,7 @@ class Patience:
         self._asked_ns = self._woken_ns = now_ns
         self._polls = False
 
-    def until(self, due_ns: int | None, now_ns: int, easy_ns: int | None = None) -> float | None:
+    def sleep_s(self, due_ns: int | None, now_ns: int, easy_ns: int | None = None) -> float | None:
         """Return for how long to sleep, s; 0: poll; None: for ever. `easy_ns`: what need not be punctual."""
         self._asked_ns = now_ns
         worked_ns = now_ns - self._woken_ns
@@ -84,7 +85,7 @@ class Patience:
         return 0.0 if self._polls or left_ns <= 0 else _PAUSE_NS * 1e-9
 
     def woke(self, now_ns: int) -> None:
-        """Take note of how long it has really waited."""
+        """Account for how long it has really waited."""
         self._woken_ns = now_ns
         waited_ns = now_ns - self._asked_ns
         spent_ns = waited_ns if self._polls else 0

@@ -1,4 +1,4 @@
-"""Serving simulated buses in real time: one thread that waits for all lines together, and for nobody else."""
+"""Serving simulated buses in real time: one thread that waits for all lines together."""
 
 from __future__ import annotations
 
@@ -16,12 +16,11 @@ from dxlrun.errors import InputError
 from dxlrun.simulation.bus.ledger import SOME_ENTRIES, Ledger
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.configuration import SimulationConfig
-from dxlrun.simulation.control_line import ControlLine
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.simulation.motion.mechanics import Mechanics, plant_of
 from dxlrun.simulation.pseudo_terminal import Link, PseudoTerminal
-from dxlrun.simulation.realtime import Patience
+from dxlrun.simulation.realtime import PollBudget
 from dxlrun.simulation.servo.memory import Memory
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 
@@ -32,19 +31,76 @@ MOST_BACKLOG_NS = 20_000_000
 So it feels the rate of its line, as with an adapter."""
 
 GATHER_NS = 250_000
-"""Answers of a read in turn that follow one so closely are handed over together with it, as in two
-microframes of USB: each hand-over costs the processor, and the host's, more than an answer."""
+"""Replies that follow one so closely are handed over together with it, as in two microframes of USB: each
+hand-over costs the processor, and the host's, more than a reply."""
 
 IDLE_NS = 300_000
 """So long the mechanics of a few steps and the lines of the ledger may take."""
 
+_LONGEST_LINE = 1 << 16
+_MOST_UNREAD = 1 << 18
 
 _GOAL_MODES = (3, 4, 5)
 """Operating Mode (11): position, extended position, current-based position (e-Manual, X series)."""
 
 
-class _Question(msgspec.Struct):
-    """A line of the starter."""
+class ControlLine:
+    """The line to the process that started the simulation: JSON objects, one a line.
+
+    Never a reason to wait: what the other end does not read in time is dropped, whole lines of it.
+    """
+
+    def __init__(self, end: socket.socket) -> None:
+        self._socket = end
+        end.setblocking(False)
+        self._received = b""
+        self._unsent = bytearray()
+        self.closed = False
+        """True after the other end hung up."""
+
+    def fileno(self) -> int:
+        """Return the descriptor, for epoll."""
+        return self._socket.fileno()
+
+    @property
+    def has_unsent(self) -> bool:
+        """True when `flush` is to be called as soon as the socket takes something."""
+        return bool(self._unsent)
+
+    def receive(self) -> list[bytes]:
+        """Return the lines that were completed by what has arrived; sets `closed` at the end."""
+        try:
+            chunk = self._socket.recv(65536)
+        except BlockingIOError:
+            return []
+        except OSError:  # the other end closed without having read everything
+            chunk = b""
+        if not chunk:
+            self.closed = True
+        *lines, self._received = (self._received + chunk).split(b"\n")
+        if len(self._received) > _LONGEST_LINE:
+            self._received = b""
+        return lines
+
+    def send(self, message: Mapping[str, object]) -> None:
+        """Send an object, now or when the socket takes it; never raises, never waits."""
+        line = msgspec.json.encode(message) + b"\n"
+        if len(self._unsent) + len(line) <= _MOST_UNREAD:
+            self._unsent += line
+            self.flush()
+
+    def flush(self) -> None:
+        """Send what could not be sent before."""
+        try:
+            del self._unsent[: self._socket.send(self._unsent)]
+        except BlockingIOError:
+            return
+        except OSError:  # the other end hung up; `receive` finds that out
+            self._unsent.clear()
+
+
+class _Request(msgspec.Struct):
+    """A line of the process that started the simulation."""
 
     look: bool = False
     fault: str | None = None
@@ -69,29 +125,27 @@ class Server:
             PseudoTerminal(bus, Link(Path(config.links[bus.name])) if bus.name in config.links else None)
             for bus in self._buses
         )
-        self._patience = Patience(self.start_ns)
+        self._polling = PollBudget(self.start_ns)
         self._stopped = False
         self._waiting = select.epoll()
         self._by_descriptor: dict[int, PseudoTerminal] = {}
         self._held: dict[int, int] = {}
         """Terminals that are not read before a time, by descriptor."""
-        self._told = select.EPOLLIN
-        """What is waited for on the line to the starter."""
 
     def run(self, granted: str = "") -> None:
-        """Tell the ports and what real time was granted, then serve."""
-        self._ledger.on_note = self._tell_fault
+        """Report the ports and what real time was granted, then serve."""
+        self._ledger.on_note = self._report_fault
         with _wake_on_sigterm() as wake, self._waiting as waiting:
             waiting.register(wake, select.EPOLLIN)
-            waiting.register(self._line, self._told)
+            waiting.register(self._line, select.EPOLLIN)
             self._plug()
             self._line.send({"ports": self._ports(), "real_time": granted})
             while not self._stopped:
-                self._turn(wake.fileno())
+                self._serve_once(wake.fileno())
         for terminal in self._terminals:
             terminal.close()
 
-    def _turn(self, wake: int) -> None:
+    def _serve_once(self, wake: int) -> None:
         now_ns = time.monotonic_ns()
         soonest_ns = None
         for bus in self._buses:
@@ -100,12 +154,12 @@ class Server:
                 soonest_ns = due_ns
         easy_ns = None
         if soonest_ns is None or soonest_ns - now_ns > IDLE_NS:  # no reply is about to leave
-            easy_ns = self._use_pause(now_ns)
+            easy_ns = self._work_in_idle_time(now_ns)
             now_ns = time.monotonic_ns()
         ready = self._wait(soonest_ns, easy_ns, now_ns)
         # What was due before the host wrote goes out first: the host could have read it.
         now_ns = time.monotonic_ns()
-        self._patience.woke(now_ns)
+        self._polling.woke(now_ns)
         if soonest_ns is not None and soonest_ns <= now_ns:
             for terminal in self._terminals:
                 due_ns = terminal.bus.next_delivery_ns(GATHER_NS)
@@ -116,15 +170,15 @@ class Server:
                 break
             for number, _ in ready:
                 if number in self._by_descriptor:
-                    self._by_descriptor[number].listen()
-            now_ns = time.monotonic_ns()  # nobody is answered before it was written, though others take long
+                    self._by_descriptor[number].read()
+            now_ns = time.monotonic_ns()  # no host gets a reply before it wrote, though other lines take long
             for number, _ in ready:
-                self._hear(number, wake, now_ns)
+                self._read_ready(number, wake, now_ns)
             ready = self._waiting.poll(0)  # a host that drives all buses writes to them in one go
         self._ledger.flush_if_due(now_ns)
 
-    def _use_pause(self, now_ns: int) -> int | None:
-        """Do what nobody waits for; return when there is more of it."""
+    def _work_in_idle_time(self, now_ns: int) -> int | None:
+        """Do what is not urgent; return when there is more of it."""
         self._mechanics.advance(now_ns)
         self._ledger.encode(SOME_ENTRIES)
         times = [self._ledger.flush_due_ns(), self._mechanics.due_ns()]
@@ -133,24 +187,22 @@ class Server:
                 del self._held[number]
                 self._waiting.register(number, select.EPOLLIN)
             times += self._held.values()
-        told = select.EPOLLIN | select.EPOLLOUT if self._line.has_unsent else select.EPOLLIN
-        if told != self._told:
-            self._told = told
-            self._waiting.modify(self._line, told)
+        unsent = select.EPOLLOUT if self._line.has_unsent else 0
+        self._waiting.modify(self._line, select.EPOLLIN | unsent)
         return min([t_ns for t_ns in times if t_ns is not None], default=None)
 
     def _wait(self, due_ns: int | None, easy_ns: int | None, now_ns: int) -> list[tuple[int, int]]:
-        """Wait until a reply is due, or something else is to be done, or somebody has written: return who."""
-        poll, patience = self._waiting.poll, self._patience
-        sleep_s = patience.until(due_ns, now_ns, easy_ns)
+        """Wait until a reply is due, there is other work, or a host has written; return what is ready."""
+        poll, polling = self._waiting.poll, self._polling
+        sleep_s = polling.sleep_s(due_ns, now_ns, easy_ns)
         if sleep_s is None or sleep_s > 0.0:
-            # no longer than asked for, to the microsecond: an epoll itself counts milliseconds
+            # select keeps to the microsecond, an epoll by itself counts milliseconds
             select.select((self._waiting,), (), (), sleep_s)
             if (ready := poll(0)) or due_ns is None:
                 return ready
             now_ns = time.monotonic_ns()
-            patience.woke(now_ns)
-            if patience.until(due_ns, now_ns) != 0.0:
+            polling.woke(now_ns)
+            if polling.sleep_s(due_ns, now_ns) != 0.0:
                 return ready
         while not (ready := poll(0)) and due_ns is not None and time.monotonic_ns() < due_ns:
             pass
@@ -162,8 +214,8 @@ class Server:
             self._plug()
             self._line.send({"ports": self._ports()})
 
-    def _hear(self, number: int, wake: int, now_ns: int) -> None:
-        """Take what somebody has written."""
+    def _read_ready(self, number: int, wake: int, now_ns: int) -> None:
+        """Read what is ready at a descriptor."""
         terminal = self._by_descriptor.get(number)
         if terminal is not None:
             self._receive(number, terminal, now_ns)
@@ -171,7 +223,7 @@ class Server:
             self._stopped = True
         elif number == self._line.fileno():
             self._line.flush()
-            self._listen(now_ns)
+            self._answer_requests(now_ns)
 
     def _receive(self, number: int, terminal: PseudoTerminal, now_ns: int) -> None:
         bus = terminal.bus
@@ -198,23 +250,23 @@ class Server:
     def _ports(self) -> dict[str, str]:
         return {terminal.bus.name: terminal.path for terminal in self._terminals}
 
-    def _tell_fault(self, note: str) -> None:
+    def _report_fault(self, note: str) -> None:
         if note.startswith(_HAPPENED):
             self._line.send({"happened": note.removeprefix(_HAPPENED)})
 
-    def _listen(self, now_ns: int) -> None:
-        """Do what the starter asks for; what is no question of ours is told so."""
+    def _answer_requests(self, now_ns: int) -> None:
+        """Answer the lines of the process that started the simulation."""
         for text in self._line.receive():
             try:
-                question = msgspec.json.decode(text, type=_Question)
+                request = msgspec.json.decode(text, type=_Request)
             except msgspec.MsgspecError as error:
-                self._line.send({"error": f"this is no question to a simulation: {error}"})
+                self._line.send({"error": f"not a request to a simulation: {error}"})
                 continue
-            if question.look:
+            if request.look:
                 looks = [look for bus in self._buses for look in servo_looks(bus, now_ns)]
                 self._line.send({"servos": looks, "lateness_us": lateness_us(self._buses)})
-            if question.fault is not None:
-                self._line.send(self._inject(question.fault, now_ns))
+            if request.fault is not None:
+                self._line.send(self._inject(request.fault, now_ns))
         self._stopped = self._stopped or self._line.closed
 
     def _inject(self, text: str, now_ns: int) -> dict[str, object]:

@@ -75,8 +75,8 @@ class VirtualPorts:
         """Let virtual time pass until bytes arrive or `deadline_ns`; return the lines with bytes."""
         while True:
             # time passes for the servos of a lost line, too
-            heard = [index for index, port in enumerate(self._ports) if port.collect()]
-            ready = [index for index in heard if index not in self._lost]
+            received = [index for index, port in enumerate(self._ports) if port.collect()]
+            ready = [index for index in received if index not in self._lost]
             now_ns = self._clock.now_ns()
             if ready or now_ns >= deadline_ns:
                 return ready
@@ -84,7 +84,7 @@ class VirtualPorts:
             self._clock.wait_until(min([deadline_ns, *due]))
 
     def reopen(self, index: int) -> bool:
-        """Ask for a lost line again: it is back as soon as its adapter is plugged in."""
+        """Request a lost line again: it is back as soon as its adapter is plugged in."""
         self._lost.add(index)
         bus = self._buses[index]
         bus.advance(self._clock.now_ns())

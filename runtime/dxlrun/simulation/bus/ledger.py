@@ -63,7 +63,7 @@ class Ledger:
         self.error: str | None = None
         """Why the file is not complete; None: it is."""
         self.on_note: Callable[[str], None] | None = None
-        """Who is told of each note."""
+        """Called with each note."""
         self._keep = keep
         self._file: IO[bytes] | None = None
         if path is not None:

@@ -54,7 +54,7 @@ class Transmission:
     data: bytes
     note: str = ""
     group: GroupReply | None = None
-    """The group read that goes on when this has passed."""
+    """The group read that continues when this has passed."""
     turn: int = 0
     """Which of its turns this is."""
     turn_end_ns: int = 0

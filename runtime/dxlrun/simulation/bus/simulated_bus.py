@@ -248,18 +248,18 @@ class SimulatedBus:
         """Let a servo's next reply start later."""
         self.alter_next(servo_id, f"its reply delayed by {delay_ns} ns", bytes, delay_ns=delay_ns)
 
-    def other_host(self, packet: bytes, at_ns: int, *, heard: bool = True) -> None:
+    def other_host(self, packet: bytes, at_ns: int, *, received: bool = True) -> None:
         """Let another host on the line send an instruction packet at a time: the servos execute it, and this
         host receives the instruction and their replies.
 
-        `heard=False`: it sends by the adapter of this host, which gives back the replies only.
+        `received=False`: it sends by the adapter of this host, which gives back the replies only.
         """
 
         def send() -> None:
             self._withdraw_waiting()
             self.note(f"{OTHER_HOST} {packet.hex(' ')}")
             start_ns, end_ns = self.now_ns, self.now_ns + self._line.duration_ns(len(packet))
-            if heard:
+            if received:
                 self._line.send(Transmission(start_ns, end_ns, packet, "another host"))
             instruction = self._codec.receiver().feed(packet, 0)
             if instruction is not None:

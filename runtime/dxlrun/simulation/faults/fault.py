@@ -87,7 +87,7 @@ FLIPPED_BITS = 0x01
 HOT_CELSIUS = 90.0
 """Above Temperature Limit (31) as every model has it from the factory: 85 degrees C at most."""
 BOOT_NS = 100_000_000
-"""How long a servo that starts again hears nothing; no manual names it [i]."""
+"""How long a servo that starts again receives nothing; no manual names it [i]."""
 BROWNOUT_NS = 200_000_000
 BABBLE_NS = 200_000_000
 BABBLE_PAUSE_NS = 2_000_000
@@ -110,20 +110,18 @@ KINDS: Mapping[str, Kind] = {
         ("copies", "count", *WHEN),
     ),
     "noise": Kind(
-        "bytes that nobody sent are on the line: those of data= (hex), or size= random ones (default 8)",
+        "bytes that no servo sent are on the line: those of data= (hex), or size= random ones (default 8)",
         (),
         ("data", "size", *WHEN),
     ),
-    "silence": Kind(
-        "the data line of a servo is cut: it goes on with what it does", ("servo",), ("for", *WHEN)
-    ),
+    "silence": Kind("the data line of a servo is cut: it keeps moving", ("servo",), ("for", *WHEN)),
     "babble": Kind(
         "a servo sends random bytes (size=, default 8) every 2 ms (every=) for 200 ms (for=), unasked",
         ("servo",),
         ("for", "every", "size", *WHEN),
     ),
     "reboot": Kind(
-        "a servo starts again by itself: RAM is lost, and it hears nothing for 100 ms (for=)",
+        "a servo starts again by itself: RAM is lost, and it receives nothing for 100 ms (for=)",
         ("servo",),
         ("for", *WHEN),
     ),
@@ -160,7 +158,7 @@ KINDS: Mapping[str, Kind] = {
 def parse_fault(text: str) -> Fault:
     """Return the fault of one line such as `silence servo=3 at=1s for=500ms`.
 
-    Raises InputError with one sentence that says what is wrong and how to write it.
+    Raises InputError with one sentence: what is wrong and how to write it.
     """
     words = text.split()
     if not words:

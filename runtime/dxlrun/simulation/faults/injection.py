@@ -1,8 +1,8 @@
 """What each kind of fault does to a bus when its moment has come.
 
-Simpler than the world: noise and a babbling servo reach the host and spoil what it says meanwhile, but no
+Simpler than the world: noise and a babbling servo reach the host and spoil what servos send meanwhile, but no
 servo takes their bytes for an instruction; a supply changes from one moment to the next; a servo without
-power is limp at once; a second servo with an ID stands where the first one stands, and carries no load [i].
+power is limp at once; a second servo with an ID is at the angle of the first one, and carries no load [i].
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Hold:
 
 
 Holds = dict[tuple[str, int], Hold]
-"""By kind and whom it holds; one for all faults of a script, since they may overlap."""
+"""By kind and what it holds; one for all faults of a script, since they may overlap."""
 
 
 @dataclass(slots=True)
@@ -79,15 +79,15 @@ class Injection:
             self.enter()
         return named
 
-    def hold(self, whom: object, restore: Callable[[], None]) -> None:
+    def hold(self, target: object, restore: Callable[[], None]) -> None:
         """Call `restore` when the fault's `for=` is over, and that of the last one that overlaps with it."""
-        hold = self.holds.setdefault((self.fault.kind, id(whom)), Hold(restore))
+        hold = self.holds.setdefault((self.fault.kind, id(target)), Hold(restore))
         hold.faults += 1
 
         def release() -> None:
             hold.faults -= 1
             if not hold.faults:
-                del self.holds[self.fault.kind, id(whom)]
+                del self.holds[self.fault.kind, id(target)]
                 hold.restore()
 
         if self.fault.for_ns is not None:

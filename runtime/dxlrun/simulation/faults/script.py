@@ -62,8 +62,8 @@ _OF_HOST: frozenset[str] = frozenset(("lose", "corrupt", "truncate"))
 class FaultScript:
     """Faults that happen to buses at their times; what they leave open is drawn from `seed`.
 
-    A fault that happens stands in the ledger as a note, `fault: ` and its text, exactly once: one of a packet
-    when that packet passes, any other at its time. A storm's faults stand there one by one.
+    A fault that happens is a note in the ledger, `fault: ` and its text, exactly once: one of a packet
+    when that packet passes, any other at its time. A storm's faults are there one by one.
     """
 
     def __init__(self, faults: Sequence[Fault], seed: int = 0) -> None:
@@ -108,11 +108,11 @@ class FaultScript:
 
     @property
     def waiting(self) -> tuple[Fault, ...]:
-        """Faults that have not happened, so far or for ever: a servo that is not asked loses no reply."""
+        """Faults that have not happened, so far or for ever: a servo that is not read loses no reply."""
         return tuple(each.fault for each in self._injections if not each.happened)
 
     def _placed(self, fault: Fault, index: int, since_ns: int) -> list[Injection]:
-        """Return what a line stands for; raises InputError when it could not happen."""
+        """Return what a line means; raises InputError when it could not happen."""
         chosen = _chosen(fault, self._buses)
         if fault.at_ns is not None and fault.at_ns < since_ns:
             raise InputError(f"it is {since_ns / 1e9:.3f} s after the start already; leave at= out for now")
@@ -137,7 +137,7 @@ def _chosen(fault: Fault, buses: Sequence[SimulatedBus]) -> Sequence[SimulatedBu
     if not chosen:
         raise InputError(f"there is no bus {fault.bus!r}; write {names}")
     if len(chosen) > 1 and fault.kind != "storm":
-        raise InputError(f"there are {len(chosen)} buses; say which one: {names}")
+        raise InputError(f"there are {len(chosen)} buses; choose one: {names}")
     for bus in chosen:
         ids = sorted({servo.servo_id for servo in bus.servos})
         if fault.servo is not None and fault.servo not in ids:

@@ -40,7 +40,7 @@ class Command(NamedTuple):
     acceleration: float = FREE
     """rad/s^2 of the trajectory"""
     turning: float = 0.0
-    """1: the trajectory goes on for ever at `speed`"""
+    """1: the trajectory continues for ever at `speed`"""
     p_ccw: float = 0.0
     """duty per rad of error, where the goal is counter-clockwise of the shaft"""
     p_cw: float = 0.0
@@ -73,7 +73,7 @@ ROWS = {name: row for row, name in enumerate(Command._fields)}
 
 
 class Profiles:
-    """Position and velocity that the servos' controllers want now.
+    """Position and velocity that the servos' controllers follow.
 
     At most the profile's speed, reached and left with the profile's acceleration (e-Manual, X series,
     Profile Velocity (112)). The manual's jerk control is not modelled. A new goal begins with the velocity
@@ -99,13 +99,13 @@ class Profiles:
         self._dt, self._per_dt = np.full(size, dt_s), np.full(size, 1.0 / dt_s)
         self._ramp, self._back, self._half = np.zeros(size), np.zeros(size), np.zeros(size)
         self._per_braking, self._one, self._one_half = np.zeros(size), np.ones(size), np.full(size, 0.5)
-        self._error, self._wanted, self._reach = np.zeros(size), np.zeros(size), np.zeros(size)
+        self._error, self._next_speed, self._reach = np.zeros(size), np.zeros(size), np.zeros(size)
         self._turning = np.zeros(size, dtype=bool)
         self._turns = False
         self.commanded()
 
     def commanded(self) -> None:
-        """Take note that commands were changed."""
+        """Prepare for changed commands."""
         np.not_equal(self._commands[ROWS["turning"]], 0.0, out=self._turning)
         self._turns = bool(self._turning.any())
         for index, acceleration in enumerate(self._acceleration.tolist()):
@@ -127,36 +127,36 @@ class Profiles:
         return bool(abs(self._goal[index] - self.position[index]) < _ARRIVED)
 
     def step(self) -> None:
-        """Let the trajectories go on by one step."""
+        """Continue the trajectories by one step."""
         if self.arrived:
             return
-        error, wanted, reach = self._error, self._wanted, self._reach
+        error, next_speed, reach = self._error, self._next_speed, self._reach
         np.subtract(self._goal, self.position, out=error)
         np.abs(error, out=reach)
         # Braking by a dt in each of n steps from v on takes n v - n (n - 1) / 2 a dt in steps of dt: for the
         # rest of the way the least n with which it can end at rest, and the v that ends exactly there.
-        np.multiply(reach, self._per_braking, out=wanted)
-        np.add(wanted, self._one, out=wanted)
-        np.sqrt(wanted, out=wanted)
-        np.subtract(wanted, self._one, out=wanted)
-        np.multiply(wanted, self._one_half, out=wanted)
-        np.ceil(wanted, out=wanted)
-        np.maximum(wanted, self._one, out=wanted)
+        np.multiply(reach, self._per_braking, out=next_speed)
+        np.add(next_speed, self._one, out=next_speed)
+        np.sqrt(next_speed, out=next_speed)
+        np.subtract(next_speed, self._one, out=next_speed)
+        np.multiply(next_speed, self._one_half, out=next_speed)
+        np.ceil(next_speed, out=next_speed)
+        np.maximum(next_speed, self._one, out=next_speed)
         np.multiply(reach, self._per_dt, out=reach)
-        np.divide(reach, wanted, out=reach)
-        np.subtract(wanted, self._one, out=wanted)
-        np.multiply(wanted, self._half, out=wanted)
-        np.add(wanted, reach, out=wanted)
-        np.minimum(wanted, self._speed, out=wanted)
-        np.copysign(wanted, error, out=wanted)
+        np.divide(reach, next_speed, out=reach)
+        np.subtract(next_speed, self._one, out=next_speed)
+        np.multiply(next_speed, self._half, out=next_speed)
+        np.add(next_speed, reach, out=next_speed)
+        np.minimum(next_speed, self._speed, out=next_speed)
+        np.copysign(next_speed, error, out=next_speed)
         if self._turns:
-            np.copyto(wanted, self._speed, where=self._turning)
-        np.subtract(wanted, self.velocity, out=wanted)
-        np.minimum(wanted, self._ramp, out=wanted)
-        np.maximum(wanted, self._back, out=self.change)
+            np.copyto(next_speed, self._speed, where=self._turning)
+        np.subtract(next_speed, self.velocity, out=next_speed)
+        np.minimum(next_speed, self._ramp, out=next_speed)
+        np.maximum(next_speed, self._back, out=self.change)
         np.add(self.velocity, self.change, out=self.velocity)
-        np.multiply(self.velocity, self._dt, out=wanted)
-        np.add(self.position, wanted, out=self.position)
+        np.multiply(self.velocity, self._dt, out=next_speed)
+        np.add(self.position, next_speed, out=self.position)
 
     def look(self) -> None:
         """Find out whether all trajectories have come to their ends: then they are there exactly."""
@@ -210,7 +210,7 @@ class ControlLaw:
         return bool((np.abs(self._rows["i"] * self._error) * self._within > _UNWOUND).any())
 
     def commanded(self) -> None:
-        """Take note that commands were changed: what nobody uses is not computed."""
+        """Prepare for changed commands: what no servo uses is not computed."""
         rows = self._rows
         self._feed = rows["d"] + rows["feed_velocity"]
         self._feeds, self._damps = bool(self._feed.any()), bool(self._d.any())
@@ -226,7 +226,7 @@ class ControlLaw:
         self._turns = bool(self._turning.any())
         self._least = -self._limit
         self._stall_d = self._d * self.stall
-        # an integrated speed that would ask for more than the limit is held there: no windup
+        # an integrated speed that would need more than the limit is held there: no windup
         held = self._turning & (self._p > 0.0)
         self._longest = np.where(held, self._limit / np.maximum(self._p, 1e-9), FREE)
         if not self._damps:

@@ -1,6 +1,6 @@
 """All servos of one simulation as mechanics: stepped together on one grid of time.
 
-In each step the profiles say where the servos' controllers want to be, the control law which torque their
+In each step the profiles give where the servos' controllers want to be, the control law which torque their
 motors give, and the plant what it moves. Commands act at the next point of the grid; between its points
 angles go on with their velocity. While nothing moves, nothing is computed.
 """
@@ -23,7 +23,7 @@ STEP_NS = 2_000_000
 """Step of the grid. The fastest thing in a servo here is its motor's time constant: 13.6 ms and more."""
 
 EAGER_NS, EASY_NS = 4_000_000, 1_000_000_000
-"""In real time it is let go on so often while servos move and while they only cool: to catch up with a long
+"""In real time it is advanced so often while servos move and while they only cool: to catch up with a long
 pause of the host would delay the next reply."""
 
 STRAIN_NS = 100_000_000
@@ -117,7 +117,7 @@ class Mechanics:
         return self._motors[index]
 
     def watch(self, index: int, act: Callable[[], None]) -> None:
-        """Let a servo be told when its temperature changes by a degree, or when it is overloaded."""
+        """Call `act` when a servo's temperature changes by a degree, or when it is overloaded."""
         self._watchers[index] = act
 
     def supply(self, index: int, volts: float) -> None:
@@ -127,7 +127,7 @@ class Mechanics:
         self._wake()
 
     def command(self, index: int, command: Command) -> None:
-        """Command a servo; its trajectory goes on from where it is, that of a limp one from the shaft."""
+        """Command a servo; its trajectory continues from where it is, that of a limp one from the shaft."""
         was_limp = self._commands[ROWS["limit"], index] == 0.0
         was_turning = self._commands[ROWS["turning"], index] != 0.0
         self._commands[:, index] = command
@@ -157,14 +157,14 @@ class Mechanics:
     def turn(self, index: int, by: float, duration_ns: int, gives_way: Callable[[float], None]) -> None:
         """Let a hand turn a shaft evenly by an angle, rad, from now on.
 
-        It gives way to a servo that drives or holds its shaft; `gives_way` is then told how far it came, rad.
+        It gives way to a servo that drives or holds its shaft; `gives_way` is then called with its way, rad.
         """
         steps = max(1, round(duration_ns / STEP_NS))
         self._hands[index] = _Hand(by / (steps * STEP_NS * 1e-9), steps, gives_way)
         self._disturb()
 
     def heat(self, index: int, celsius: float) -> None:
-        """Bring a servo to a temperature, degrees C; it goes back to that of its load."""
+        """Bring a servo to a temperature, degrees C; it returns to that of its load."""
         self.strain.temperature[index] = celsius
         self.strain.calm = False
         self.version += 1
@@ -180,7 +180,7 @@ class Mechanics:
         heapq.heappush(self._agenda, (t_ns, next(self._order), action))
 
     def due_ns(self) -> int | None:
-        """Return when it should be let go on in real time, though nobody asks; None: it has nothing to do."""
+        """Return when it should be advanced in real time, whatever hosts do; None: it has nothing to do."""
         if not self._motors:
             return None
         if not self.still:
@@ -198,11 +198,11 @@ class Mechanics:
         self._busy = True  # what is called on the way may look at the time, not change it
         try:
             while self.grid_ns + STEP_NS <= now_ns:
-                self._go_on(now_ns)
+                self._advance_once(now_ns)
         finally:
             self._busy = False
 
-    def _go_on(self, now_ns: int) -> None:
+    def _advance_once(self, now_ns: int) -> None:
         """Take one step, or as many as nothing happens in."""
         while self._agenda and self._agenda[0][0] <= self.grid_ns:
             heapq.heappop(self._agenda)[2]()

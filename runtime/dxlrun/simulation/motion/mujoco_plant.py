@@ -2,8 +2,8 @@
 
 What is taken of the URDF: its tree, masses and inertias (of a link without `inertial`: those of its collision
 shapes at the density of water), `dynamics` of its joints, gravity along -z of its first link, which does not
-move. What is not: meshes, contacts, limits of joints; and joints that no servo turns stand still. Only hinges
-are turned: how far the turn of a servo would move a slide is said nowhere.
+move. What is not: meshes, contacts, limits of joints; and joints that no servo turns do not move. Only hinges
+are turned: how far the turn of a servo would move a slide is not defined.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def mujoco_plant(bodies: UrdfBodies) -> PlantMaker:
         import mujoco  # noqa: F401 (it may be there and yet not load)
     except ImportError as error:
         raise InputError(f"{NEEDS_MUJOCO}; {INSTALL_MUJOCO}") from error
-    from xml.etree import ElementTree  # only who has a URDF pays for it
+    from xml.etree import ElementTree  # only robots with a URDF need it
 
     try:
         # no DTD can be in it: the robot file's compiler refuses one
@@ -56,8 +56,8 @@ def mujoco_plant(bodies: UrdfBodies) -> PlantMaker:
         text = ElementTree.tostring(root, encoding="unicode")
         _compiled(text, {})
     except (ValueError, SyntaxError) as error:  # a ParseError of XML is a SyntaxError
-        told = " ".join(str(error).split())
-        raise InputError(f"MuJoCo cannot take the URDF: {told}; correct it") from error
+        reason = " ".join(str(error).split())
+        raise InputError(f"MuJoCo cannot take the URDF: {reason}; correct it") from error
     if not turned:
         raise InputError(
             "physics: mujoco turns no joint: no hinge of the URDF has the name of a joint of the robot file; "
@@ -83,7 +83,7 @@ class MujocoPlant:
         model = _compiled(urdf, {turned[row].name: joints[row] for row in rows})
         data = mujoco.MjData(model)
         self._model, self._data, self._step = model, data, mujoco.mj_step
-        # views that stay; all joints are hinges, so that coordinate and speed stand at a joint's own number
+        # views that stay; all joints are hinges, so that coordinate and speed have a joint's own number
         self._damping, self._force = model.dof_damping, data.qfrc_applied
         self._turn, self._speed = data.qpos, data.qvel
         self._numbers = np.array([model.joint(turned[row].name).id for row in rows], dtype=np.intp)

@@ -1,7 +1,7 @@
 """What simulated servos move: joints with inertia, friction and gravity, all of them in one step.
 
-The servos say with which torque they drive at standstill and how much of it each rad/s takes away; a plant
-turns that into motion. `IndependentJoints` is the plant of joints that do not feel one another.
+The servos give the torque with which they drive at standstill and how much of it each rad/s takes away; a
+plant turns that into motion. `IndependentJoints` is the plant of joints that do not feel one another.
 """
 
 from __future__ import annotations

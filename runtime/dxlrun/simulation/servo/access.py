@@ -1,4 +1,4 @@
-"""Which writes a simulated servo refuses, and with which error; `[i]` marks what no manual says.
+"""Which writes a simulated servo refuses, and with which error; `[i]` marks what no manual has.
 
 A write is refused as a whole [i].
 """
@@ -66,7 +66,7 @@ class LockRules:
         A cell that no item owns, a read-only item, a locked one and a value out of its range are each a range
         error [i]; a goal outside the angle limits is an angle limit error (e-Manual, Goal Position (30)).
 
-        A Moving Speed with a direction bit is taken in joint mode too [i]: the manual says only "0 ~ 1,023
+        A Moving Speed with a direction bit is taken in joint mode too [i]: the manual has only "0 ~ 1,023
         can be used", but pypot writes the bit to every motor with `orientation: indirect`, and Poppy moves.
         """
         if not run.cells.items:
@@ -191,7 +191,7 @@ class TorqueRules:
 
 
 def watchdog_expired(memory: Memory) -> bool:
-    """Return whether Bus Watchdog (98) shows that its time ran out: -1, which nobody can write."""
+    """Return whether Bus Watchdog (98) shows that its time ran out: -1, which no host can write."""
     item = memory.table.items.get("bus_watchdog")
     return item is not None and memory["bus_watchdog"] > item.maximum
 

@@ -18,7 +18,7 @@ SLOPE_TICK = math.radians(300) / 1023
 
 SLOPE_TIMES_P = 1024
 """P gain 32 is as stiff as slope 32, 8 as slope 128 (e-Manual, MX-28, PID Gains (26, 27, 28)); an identified
-P gain (`Motor.p_gain_duty`) goes before that."""
+P gain (`Motor.p_gain_duty`) has priority."""
 
 _MID_OF_CURRENT = {"current": 2048, "sensed_current": 512}
 """Tick of no current: MX-64, Current (68), 4.5 mA a tick; EX-106+, Sensed Current (56), 10 mA a tick."""
@@ -108,7 +108,7 @@ class JointShaft(Shaft):
         return _sign_magnitude(self.velocity / unit, table.max_speed_tick)
 
     def _present_load(self) -> int:
-        """Return the output, which is what the servo tells as load (e-Manual, Present Load (40))."""
+        """Return the output, which is what the servo shows as load (e-Manual, Present Load (40))."""
         fraction = self.memory.table.items["present_load"].scale
         return _sign_magnitude(self.duty / fraction, 1023)
 
@@ -189,7 +189,7 @@ class JointShaft(Shaft):
     def _pid(self, limit: float) -> Command:
         """Kp = P / 8, Ki = I * 1000 / 2048, Kd = D * 4 / 1000, in one unit (e-Manual, MX-28, PID Gains).
 
-        What Punch does beside PID gains no manual says: nothing here [?].
+        What Punch does beside PID gains is in no manual: nothing here [?].
         """
         memory = self.memory
         unit = 8 * (self.motor.p_gain_duty or 1 / (SLOPE_TIMES_P * SLOPE_TICK))

@@ -14,11 +14,11 @@ _CELLS_KEPT = 1024
 """So many places of a table are looked up only once: a host writes few of them, rubbish goes everywhere."""
 
 IDENTITY = ("id", "secondary_id", "secondary_shadow_id", "baud_rate", "baud_rate_bus", "protocol_type")
-"""Items that say what the servo hears."""
+"""Items that decide what the servo receives."""
 
 
 class Cells(NamedTuple):
-    """What stands in a row of cells."""
+    """What is in a row of cells."""
 
     items: tuple[ControlItem, ...]
     """Their items; none when a cell belongs to no item."""
@@ -28,13 +28,13 @@ class Cells(NamedTuple):
     touched: bool
     """True when one of them belongs to an item."""
     direct: bool
-    """True when none of them stands for another one."""
+    """True when none of them is Indirect Data."""
     read_only: bool
     """True when one of the items is."""
     eeprom: bool
     """True when one of the items is in the EEPROM area."""
     single: str
-    """Name of the item that they are, whole, where none of them stands for another cell; else empty."""
+    """Name of the item that they are, whole, where none of them is Indirect Data; else empty."""
 
 
 class LiveItem(NamedTuple):
@@ -64,7 +64,7 @@ class Run(NamedTuple):
 class Memory:
     """Bytes of a control table; `memory[name]` is the integer of the wire, never negative.
 
-    Cells of Indirect Data stand for the cells whose addresses the Indirect Addresses hold.
+    Cells of Indirect Data are those cells whose addresses the Indirect Addresses hold.
     """
 
     def __init__(self, table: ControlTable, firmware: int) -> None:
@@ -74,7 +74,7 @@ class Memory:
         """Bytes from address 0 to the end of the last item."""
         self._memory = bytearray(self.size)
         self._values: dict[str, int] = {}  # the same as in the bytes: looked up far more often than written
-        self._cells_at: dict[tuple[int, int], Cells] = {}  # hosts ask for the same again and again
+        self._cells_at: dict[tuple[int, int], Cells] = {}  # hosts access the same again and again
         self._item_at: dict[int, ControlItem] = {
             address: item
             for item in table.items.values()
@@ -126,7 +126,7 @@ class Memory:
         self._values[name] = wire
         self.version += 1
         if name in self._watchers:
-            self._tell((name,))
+            self._notify((name,))
 
     def watch(self, names: Iterable[str], act: Callable[[], None]) -> None:
         """Let something be done now, and whenever one of some items changes; others may stay the same."""
@@ -134,7 +134,7 @@ class Memory:
             self._watchers.setdefault(name, []).append(act)
         act()
 
-    def _tell(self, names: Iterable[str]) -> None:
+    def _notify(self, names: Iterable[str]) -> None:
         for act in dict.fromkeys(act for name in names for act in self._watchers.get(name, ())):
             act()
 
@@ -150,7 +150,7 @@ class Memory:
             self[name] = lowest if wire < lowest else min(wire, highest)
 
     def live(self, name: str, show: Callable[[], int]) -> LiveItem:
-        """Return an item that shows what a function says; raises KeyError when the model has none."""
+        """Return an item that shows what a function returns; raises KeyError when the model has none."""
         start, end, _, mask = self._places[name]
         return LiveItem(name, show, *self._bounds[name], start, end, mask)
 
@@ -166,7 +166,7 @@ class Memory:
                 self._memory[start:end] = wire.to_bytes(end - start, "little")
                 values[name] = wire
                 if name in self._watchers:
-                    self._tell((name,))
+                    self._notify((name,))
 
     def ticks(self, name: str) -> int:
         """Return the signed number of ticks of an item."""
@@ -194,7 +194,7 @@ class Memory:
         return bytes(data)
 
     def raw(self, address: int, length: int) -> bytes:
-        """Return the bytes of cells of the table, as they stand there."""
+        """Return the bytes of cells of the table."""
         return bytes(self._memory[address : address + length])
 
     def runs(self, address: int, data: bytes) -> tuple[Run, ...]:
@@ -283,7 +283,7 @@ class Memory:
             self._values.update(run.after)
             self.version += 1
         if not self._watchers.keys().isdisjoint(run.after):
-            self._tell(run.after)
+            self._notify(run.after)
 
     @staticmethod
     def _initial(item: ControlItem) -> int:

@@ -45,7 +45,7 @@ UNKNOWN_VELOCITY_P, UNKNOWN_VELOCITY_I = 4.0, 40.0
 
 
 class ModeShaft(Shaft):
-    """Moves by the goal of its mode, with the profile that stands beside it.
+    """Moves by the goal of its mode, with the profile beside it.
 
     Where Profile Velocity is 0 there is no profile (a step), where Profile Acceleration is 0 it is
     rectangular (e-Manual, X series, Profile Velocity (112)); velocity control uses the acceleration only.
@@ -101,7 +101,7 @@ class ModeShaft(Shaft):
         self._rad_per_tick = memory.table.rad_per_tick
         self._sign, self._offset = 1, 0
         memory.watch(("drive_mode", "homing_offset"), self._orient)
-        self._velocity_wanted, self._ramp_wanted = 0, 0
+        self._goal_speed_ticks, self._ramp_ticks = 0, 0
         memory.watch((self._speed_item, self._ramp_item), self._note_profile)
 
     def within_a_turn(self, angle: float) -> float:
@@ -157,7 +157,7 @@ class ModeShaft(Shaft):
         return self._profile_kind | (_ARRIVED if near else 0)
 
     def _orient(self) -> None:
-        """Take note of how the servo counts angles."""
+        """Take over how the servo counts angles."""
         self._sign = -1 if self.memory.get("drive_mode") & REVERSE else 1
         self._offset = self.memory.ticks("homing_offset") if "homing_offset" in self.memory else 0
 
@@ -204,7 +204,7 @@ class ModeShaft(Shaft):
     def _turn(self, limit: float) -> Command:
         memory = self.memory
         speed = self._sign * memory.ticks("goal_velocity") * memory.table.rad_s_per_tick
-        ramp = self._ramp_wanted * self._acceleration_unit or FREE
+        ramp = self._ramp_ticks * self._acceleration_unit or FREE
         return _velocity_gains(memory)._replace(turning=1.0, speed=speed, acceleration=ramp, limit=limit)
 
     def _part(self, name: str, otherwise: str) -> float:
@@ -229,7 +229,7 @@ class ModeShaft(Shaft):
 
     def _new_trajectory(self, *, afresh: bool = False) -> Trajectory | None:
         memory, table = self.memory, self.memory.table
-        velocity, ramp = self._velocity_wanted, self._ramp_wanted
+        velocity, ramp = self._goal_speed_ticks, self._ramp_ticks
         aimed = (memory["goal_position"], velocity, ramp)
         if aimed == self._aimed and not afresh:
             return None
@@ -257,8 +257,8 @@ class ModeShaft(Shaft):
         return goal, speed, acceleration
 
     def _note_profile(self) -> None:
-        self._velocity_wanted = self._profile(self._speed_item)
-        self._ramp_wanted = self._profile(self._ramp_item)
+        self._goal_speed_ticks = self._profile(self._speed_item)
+        self._ramp_ticks = self._profile(self._ramp_item)
 
     def _profile(self, name: str) -> int:
         return abs(self.memory.ticks(name)) if name in self.memory else 0

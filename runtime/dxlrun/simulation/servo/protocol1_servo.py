@@ -1,6 +1,6 @@
 """A simulated servo of Protocol 1.0: its instructions, error bits, Torque Limit 0, and the EEPROM's lock.
 
-`[i]` marks what no manual says.
+`[i]` marks what no manual has.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """A simulated servo of Protocol 2.0: its instructions, Hardware Error Status with its latch, Bus Watchdog.
 
-The Y series tells of errors by Error Code instead, each of which takes the torque away. Not modelled of it:
+The Y series reports errors in Error Code instead, each of which takes the torque away. Not modelled of it:
 the time that switching its torque takes, its brake, and Controller State but for off, running and fault.
 """
 
@@ -58,7 +58,7 @@ _GAINS = (
 _LIMITS = frozenset(("pwm_limit", "current_limit"))
 _PROFILE = ("profile_acceleration", "profile_velocity")
 _SPEAKS = (2, 20, 21, 22)
-"""Values of Protocol Type (13) with which a servo hears Protocol 2.0: without a remote control on the line it
+"""Values of Protocol Type (13) with which a servo obeys Protocol 2.0: without a remote control on the line it
 falls back from S.BUS, iBUS and RC-PWM (e-Manual, X330, Protocol Type (13))."""
 
 _XL320_BIT = {HardwareError.OVERLOAD: 0x01, HardwareError.OVERHEATING: 0x02, HardwareError.VOLTAGE: 0x04}
@@ -191,7 +191,7 @@ class Protocol2Servo(SimulatedServo):
         return self._register(address, data)
 
     def _write_listed(self, writes: ListedWrites | None) -> int:
-        """Do what a list says for this servo, in its order; a listed Secondary ID counts as well [i]."""
+        """Do the writes of a list to this servo, in its order; a listed Secondary ID counts as well [i]."""
         if writes is None:
             return ErrorNumber.INSTRUCTION  # and nothing of it is done [i]
         error, secondary = 0, self.secondary_id
@@ -326,7 +326,7 @@ class Protocol2Servo(SimulatedServo):
     def clear_turns(self) -> int:
         """Bring Present Position back into one turn; return the error: it must not move.
 
-        The Y series wants the torque off as well, and reboots. The goal is then the position [i].
+        The Y series needs the torque off as well, and reboots. The goal is then the position [i].
         """
         if self.shaft.moving or (self._has_error_code and self.registers.get("torque_enable")):
             return ErrorNumber.RESULT_FAIL
@@ -336,7 +336,7 @@ class Protocol2Servo(SimulatedServo):
         return 0
 
     def clear_error(self) -> int:
-        """Forget Error Code; return the error: what it tells of must be over (e-Manual, Y series)."""
+        """Forget Error Code; return the error: its causes must be over (e-Manual, Y series)."""
         if self._wrong():
             return ErrorNumber.RESULT_FAIL
         self.registers["error_code"] = 0
@@ -448,7 +448,7 @@ class Protocol2Servo(SimulatedServo):
             self._show_controller_state()
 
     def _change_mode(self) -> None:
-        """Begin with another operating mode as the manual says (e-Manual, X series, Operating Mode (11)).
+        """Begin with another operating mode as in the manual (e-Manual, X series, Operating Mode (11)).
 
         Gains, profile and the goals that limit are reset; position control knows one turn only.
         """

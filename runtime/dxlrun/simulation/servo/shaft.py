@@ -59,7 +59,7 @@ class Shaft(ABC):
 
     @property
     def moving(self) -> bool:
-        """True while its trajectory moves, or it is faster than it can tell from rest."""
+        """True while its trajectory moves, or it is faster than its threshold."""
         return self._under_way or abs(self.velocity) > self._noticed_speed
 
     @property
@@ -81,7 +81,7 @@ class Shaft(ABC):
                 self.mechanics.advance(now_ns)
 
     def plan(self, written: Iterable[str]) -> None:
-        """Command what was written, if it asks for something else."""
+        """Command what was written, if that is something else."""
         if self.items.isdisjoint(written):
             return
         if self._goes_to_goal and self.aims.issuperset(written):
@@ -128,7 +128,7 @@ class Shaft(ABC):
 
     @abstractmethod
     def _new_trajectory(self, *, afresh: bool = False) -> Trajectory | None:
-        """Return the trajectory that the registers command; None: it is the one that goes on already."""
+        """Return the trajectory that the registers command; None: it is the current one."""
 
     @property
     def _under_way(self) -> bool:

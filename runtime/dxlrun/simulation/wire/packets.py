@@ -1,4 +1,4 @@
-"""What the two protocols have in common for a servo: an instruction packet, a reply, reads in turn."""
+"""What the two protocols have in common for a servo: an instruction packet, a reply, group reads."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ BROADCAST = 0xFE
 
 
 class InstructionPacket(NamedTuple):
-    """One packet that stood on the line."""
+    """One packet on the line."""
 
     servo_id: int
     instruction: int
@@ -19,7 +19,7 @@ class InstructionPacket(NamedTuple):
     end: int
     """Index behind its last byte, in the bytes that completed it."""
     raw: bytes = b""
-    """All of its bytes, as they stood on the line."""
+    """All of its bytes, as they were on the line."""
 
 
 class Reply(NamedTuple):
@@ -32,7 +32,7 @@ class Reply(NamedTuple):
 
 
 class ReadEntry(NamedTuple):
-    """What one servo of a list is asked for."""
+    """What is read of one servo of a list."""
 
     servo_id: int
     address: int
@@ -89,7 +89,7 @@ class Codec(Protocol):
         """Return the bytes of a status packet."""
 
     def group_read(self, packet: InstructionPacket) -> GroupRead | None:
-        """Return what a packet asks several servos for; None: it is no such instruction, or a wrong one."""
+        """Return the group read that a packet is; None: it is none, or its parameters are wrong."""
 
     def fast_status(self, lengths: tuple[int, ...]) -> FastStatus:
         """Return an empty status packet for so many bytes of so many servos."""

@@ -57,7 +57,7 @@ def status_packet(servo_id: int, error: int, parameters: bytes = b"") -> bytes:
 
 
 def group_read(packet: InstructionPacket) -> GroupRead | None:
-    """Return what a bulk read asks for; None: it is none, or its parameters are wrong."""
+    """Return the group read that a packet is; None: it is none, or its parameters are wrong."""
     if not packet.intact or packet.servo_id != BROADCAST or packet.instruction != Instruction.BULK_READ:
         return None
     listed = packet.parameters[1:]
@@ -129,7 +129,7 @@ def _packet(data: bytes | bytearray, end: int) -> InstructionPacket:
 
 
 def _packet_at(data: bytes | bytearray, start: int) -> InstructionPacket | None:
-    """Return the packet that stands whole at `start`, None when there is none."""
+    """Return the packet that is whole at `start`, None when there is none."""
     head = data[start : start + 4]
     if len(head) < 4 or not _may_begin(head):
         return None

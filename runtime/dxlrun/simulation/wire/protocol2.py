@@ -22,10 +22,10 @@ HEADER = b"\xff\xff\xfd"
 RESERVED = 0x00
 STATUS = 0x55
 ALERT = 0x80
-"""Bit of a status packet's error: look at Hardware Error Status. It does not say that anything failed."""
+"""Bit of a status packet's error: look at Hardware Error Status. It does not mean that anything failed."""
 
 LONGEST = 0xFFFF
-"""What a packet's length can say."""
+"""The greatest length of a packet."""
 
 _OVERHEAD = 7
 """Bytes that the length does not count: header, reserved byte, ID, length."""
@@ -59,7 +59,7 @@ _LONGEST_KNOWN = 1265
 """Bytes that list all servos of a line once: longer lists are rubbish, and not kept."""
 
 _FAST_READS = frozenset((Instruction.FAST_SYNC_READ, Instruction.FAST_BULK_READ))
-_READS_IN_TURN = _FAST_READS | {Instruction.SYNC_READ, Instruction.BULK_READ}
+_GROUP_READS = _FAST_READS | {Instruction.SYNC_READ, Instruction.BULK_READ}
 
 
 @unique
@@ -82,7 +82,7 @@ def crc16(data: bytes | bytearray, crc: int = 0) -> int:
 
 
 def stuffed(body: bytes) -> bytes:
-    """Return instruction and parameters as they stand on the line: no header can be seen in them."""
+    """Return instruction and parameters as they are on the line: no header is in them."""
     return body.replace(HEADER, _STUFFED)
 
 
@@ -109,7 +109,7 @@ class FastStatusPacket:
     def __init__(self, lengths: tuple[int, ...]) -> None:
         self._head = _head(BROADCAST, _fast_length(lengths)) + bytes((STATUS,))
         self._crc = 0
-        self._told = b""
+        self._sent_crc = b""
         """The CRC so far as it was sent: it counts for the next one."""
 
     def part(self, reply: Reply) -> bytes:
@@ -117,9 +117,9 @@ class FastStatusPacket:
         servo_id, error, parameters, _ = reply
         data = b"%b%c%c%b" % (self._head, error, servo_id, parameters)
         self._head = b""
-        self._crc = crc = umts(self._told + data, self._crc)
-        self._told = told = crc.to_bytes(2, "little")
-        return data + told
+        self._crc = crc = umts(self._sent_crc + data, self._crc)
+        self._sent_crc = sent = crc.to_bytes(2, "little")
+        return data + sent
 
 
 def fast_status(lengths: tuple[int, ...]) -> FastStatusPacket:
@@ -128,25 +128,25 @@ def fast_status(lengths: tuple[int, ...]) -> FastStatusPacket:
 
 
 def group_read(packet: InstructionPacket) -> GroupRead | None:
-    """Return what a sync or bulk read asks for; None: it is none, or its parameters are wrong."""
-    if packet.instruction not in _READS_IN_TURN or not packet.intact or packet.servo_id != BROADCAST:
+    """Return the group read that a packet is; None: it is none, or its parameters are wrong."""
+    if packet.instruction not in _GROUP_READS or not packet.intact or packet.servo_id != BROADCAST:
         return None
-    known = _reading if len(packet.parameters) <= _LONGEST_KNOWN else _reading.__wrapped__
+    known = _group_read if len(packet.parameters) <= _LONGEST_KNOWN else _group_read.__wrapped__
     return known(packet.instruction, packet.parameters)
 
 
-@lru_cache(maxsize=16)  # hosts ask again and again for the same
-def _reading(instruction: int, parameters: bytes) -> GroupRead | None:
+@lru_cache(maxsize=16)  # hosts read the same again and again
+def _group_read(instruction: int, parameters: bytes) -> GroupRead | None:
     fast = instruction in _FAST_READS
     if instruction in (Instruction.SYNC_READ, Instruction.FAST_SYNC_READ):
         entries = _sync_entries(parameters)
     else:
         entries = _bulk_entries(parameters)
     # A fast status is one packet [i]: with an absent servo in it, it stays short.
-    reading = GroupRead(instruction, entries, fast=fast, has_slots=not fast)
-    if not entries or (fast and _fast_length(reading.lengths) > LONGEST):
+    read = GroupRead(instruction, entries, fast=fast, has_slots=not fast)
+    if not entries or (fast and _fast_length(read.lengths) > LONGEST):
         return None
-    return reading
+    return read
 
 
 def _sync_entries(parameters: bytes) -> tuple[ReadEntry, ...]:
@@ -164,12 +164,12 @@ def _bulk_entries(parameters: bytes) -> tuple[ReadEntry, ...]:
 
 
 ListedWrites = Mapping[int, Sequence[tuple[int, int, int, bytes]]]
-"""What a list says for each ID: place in the list, ID, address, data."""
+"""The writes of a list for each ID: place in the list, ID, address, data."""
 
 
-@lru_cache(maxsize=1)  # the servos of a line ask one after the other for the same
+@lru_cache(maxsize=1)  # each servo of a line looks itself up
 def sync_writes(parameters: bytes) -> ListedWrites | None:
-    """Return what a sync write says for each ID; None: its parameters are wrong."""
+    """Return the writes of a sync write by ID; None: its parameters are wrong."""
     address, length = _word(parameters, 0), _word(parameters, 2)
     if length == 0 or len(parameters) < 5 + length or (len(parameters) - 4) % (length + 1):
         return None
@@ -182,7 +182,7 @@ def sync_writes(parameters: bytes) -> ListedWrites | None:
 
 @lru_cache(maxsize=1)
 def bulk_writes(parameters: bytes) -> ListedWrites | None:
-    """Return what a bulk write says for each ID; None: its parameters are wrong."""
+    """Return the writes of a bulk write by ID; None: its parameters are wrong."""
     writes: dict[int, list[tuple[int, int, int, bytes]]] = {}
     start = 0
     while start < len(parameters):
@@ -227,9 +227,9 @@ class InstructionReceiver:
                 return known(bytes(data[start:end]), end)
         index = start
         while index < len(data):
-            wanted = max(1, _size(buffer) - len(buffer)) if len(buffer) >= _OVERHEAD else 1
-            buffer += data[index : index + wanted]
-            index = min(len(data), index + wanted)
+            missing = max(1, _size(buffer) - len(buffer)) if len(buffer) >= _OVERHEAD else 1
+            buffer += data[index : index + missing]
+            index = min(len(data), index + missing)
             while buffer and not _may_begin(buffer):
                 del buffer[0]
             if len(buffer) >= _OVERHEAD and len(buffer) == _size(buffer):
