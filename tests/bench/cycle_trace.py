@@ -16,7 +16,6 @@ import tty
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
 from types import CodeType, FrameType
 
@@ -27,10 +26,9 @@ from dxlrun.compile.simulated import simulated_buses
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.control.loop import StopFlag
 from dxlrun.dynamixel.port.ports import SerialPort, SerialPorts
-from dxlrun.run.assembly import assemble, cycle_layout
+from dxlrun.run.assembly import Sinks, assemble
 from dxlrun.run.channels.commands import NoCommands
-from dxlrun.run.channels.cycle import CycleRecord
-from dxlrun.run.channels.packets import PACKET_SLOT, PacketBatch
+from dxlrun.run.channels.packets import LONGEST_BATCH, PacketBatch
 from dxlrun.run.channels.ring import RingWriter, create
 from dxlrun.testing import plan_of
 from exchange.simulated import SimulatedServos
@@ -50,36 +48,24 @@ class Events:
         """Forget it."""
 
 
-@dataclass(slots=True)
-class Traced:
-    """Sinks of the loop that begin and end the trace of a cycle, and have its packets in a ring."""
+class Trace:
+    """Counts the functions of each cycle."""
 
-    packets: PacketBatch
-    cycles: RingWriter
-    events: Events = field(default_factory=Events)
-    commands: NoCommands = field(default_factory=NoCommands)
-    traced: list[Calls] = field(default_factory=list)
-    count: int = 0
-    calls: Calls = field(default_factory=Counter)
+    def __init__(self) -> None:
+        self.cycles: list[Calls] = []
+        self._calls: Calls = Counter()
 
-    def begin(self, record: CycleRecord) -> None:
-        """Commit what was exchanged at the start."""
-        self.packets.commit()
-
-    def append(self, record: CycleRecord) -> None:
-        """Put a finished cycle into the rings and begin with the next."""
-        self.packets.commit()
-        self.cycles.append(record.raw)
+    def next(self, count: int, skipped: int) -> None:
+        """End the trace of a cycle that is in the rings, and begin the next."""
         sys.setprofile(None)
-        self.count += 1
-        if self.count > WARM_UP:
-            self.traced.append(self.calls)
-            self.calls = Counter()
+        if count > WARM_UP:
+            self.cycles.append(self._calls)
+            self._calls = Counter()
             sys.setprofile(self._note)
 
     def _note(self, frame: FrameType, event: str, _: object) -> None:
-        if event == "call":
-            self.calls[frame.f_code] += 1
+        if event == "call" and frame.f_code.co_filename != __file__:
+            self._calls[frame.f_code] += 1
 
 
 @contextmanager
@@ -102,9 +88,10 @@ def simulated(plan: Plan) -> Iterator[list[SerialPort]]:
 def steady_cycle(robot: Path = ROBOT) -> Calls:
     """Return the functions of the most frequent cycle and how often it calls each."""
     plan = plan_of(robot, duration_s=SECONDS)
-    layout = cycle_layout(plan)
-    rings = create("packets", PACKET_SLOT, 4096), create("cycles", layout.size, 4096)
-    sinks = Traced(PacketBatch(RingWriter(rings[0])), RingWriter(rings[1]))
+    trace = Trace()
+    rings = [create(name, 1 << 22, LONGEST_BATCH) for name in ("cycles", "packets")]
+    cycles, packets = map(RingWriter, rings)
+    sinks = Sinks(cycles, PacketBatch(packets), Events(), NoCommands(), trace.next)
     with simulated(plan) as ports:
         assembled = assemble(
             plan,
@@ -123,7 +110,7 @@ def steady_cycle(robot: Path = ROBOT) -> Calls:
             assembled.hardware.stop()
     for ring in rings:
         os.close(ring)
-    kinds = Counter(frozenset(calls.items()) for calls in sinks.traced)
+    kinds = Counter(frozenset(calls.items()) for calls in trace.cycles)
     return Counter(dict(kinds.most_common(1)[0][0]))
 
 

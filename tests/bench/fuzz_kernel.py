@@ -1,8 +1,8 @@
 """Campaign: the exchange kernel and the packet-by-packet parser on the same lines.
 
 Two robots of equal plans, one with the kernel, one without, get the same bytes at the same times: replies
-that are good, cut, stuffed, late, shifted, doubled, foreign or noisy, in one piece or many. Lines are lost,
-servos leave the exchange and join it. After each cycle
+that are good, cut, stuffed, late, shifted, doubled, foreign or noisy, in one piece or many. Lines are lost
+and come back, servos leave the exchange and join it, and idle time is used in between. After each cycle
 everything that a run shows is compared: bytes sent, the log, states, ages, what is known of each servo,
 events. A stream is the bytes of one line after one read.
 
@@ -28,9 +28,11 @@ import numpy as np
 from dxlrun.clock import VirtualClock
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.exchange import kernel
-from dxlrun.dynamixel.hardware import DynamixelHardware
+from dxlrun.dynamixel.exchange.bus import NEVER
+from dxlrun.dynamixel.hardware import DynamixelHardware, Reader
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
+from dxlrun.dynamixel.servo.life import Event
 from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.errors import PortError
 from dxlrun.interfaces import Commands, States
@@ -62,6 +64,8 @@ class Tally:
     """Cycles that the kernel read to their end."""
     interrupted: int = 0
     """Cycles that it began and the parser ended."""
+    reopened: int = 0
+    """Lines that were lost and came back."""
 
 
 class Line:
@@ -114,13 +118,17 @@ class Lines:
     def __init__(self, plans):
         self.clock = VirtualClock(1_000_000)
         self.ports = [Line(self.clock) for _ in plans]
+        self.back = False
+        """True when lines that are lost can be opened again."""
 
     def wait(self, deadline_ns):
         self.clock.wait_until(min([deadline_ns, *(at for line in self.ports for at, _ in line.arriving)]))
         return [index for index, line in enumerate(self.ports) if line.ready]
 
     def reopen(self, index):
-        return False
+        if self.back:
+            self.ports[index] = Line(self.clock)
+        return self.back
 
 
 class Events:
@@ -131,6 +139,14 @@ class Events:
 
     def emit(self, *event):
         self.list.append(event)
+
+
+class Hardware(DynamixelHardware):
+    """Reports when the parser reads."""
+
+    def _parse(self):
+        self.parsed()
+        super()._parse()
 
 
 class Side:
@@ -145,7 +161,7 @@ class Side:
         )
         count = sum(len(plan.servos) for plan in plans)
         self.states, self.goals = States.empty(count), Commands.empty(count)
-        self.hardware = DynamixelHardware(
+        self.hardware = Hardware(
             plans,
             self.lines,
             self.lines.clock,
@@ -156,21 +172,27 @@ class Side:
             lambda: None,
             library=library,
         )
+        self.hardware.parsed = self._parsed
         for servos in self.hardware._servos:
-            servos.torqued[:] = True
-        self.by_kernel = 0
+            for servo in range(len(servos.torqued)):
+                servos._life.on(servo, Event.ENGAGED)
+                servos._life.on(servo, Event.TORQUE_ON)
+        self.began = self.ended = 0
+        """Cycles that the kernel began, and that it read to their end."""
+
+    def _parsed(self):
+        self.parsed = True
 
     def prepare(self):
         """Plan the next cycle; return the reads of each bus, none where it is lost."""
-        self.hardware._prepare()
+        self.hardware._plan_reads()
         found = []
         for bus, servos in self.hardware._lines:
             if bus.failure is not None:
                 found.append([])
                 continue
             reads = servos.reads
-            shapes = [reads._shape[one.group] % len(one.patient) for one in reads._queue]
-            found.append([one.patient[shape] for one, shape in zip(reads._queue, shapes, strict=True)])
+            found.append([reads._in_length(one.patient, one.group) for one in reads.plan().queue])
         return found
 
     def change(self, number, row, servo, rng):
@@ -185,34 +207,70 @@ class Side:
                 servos.goals.set_mode(servo, mode)
                 self.states.mode[row] = mode
             case 2:
-                servos.torqued[servo] = not servos.torqued[servo]
+                if not servos._life.offline(servo):
+                    servos._life.on(servo, Event.DOUBT if servos.torqued[servo] else Event.TORQUE_ON)
             case 3:
                 servos.ceiling[servo] = rng.choice((math.nan, 0.0, 0.5, 3.0))
             case 4:
                 servos.goals.weaken(rng.choice((0.0, 0.3, 1.0)))
             case 5:
-                (servos.reads.join if servos.reads.away[servo] else servos.reads.leave)(servo)
+                if servos._life.offline(servo):
+                    servos._life.on(servo, Event.RETURNED)
+                else:
+                    servos._life.lose(servo, NEVER)
             case _:
                 if rng.random() < 0.2:
                     self.lines.ports[number].lost = True
 
-    def cycle(self, replies, goals, idle_ns):
-        """Write goals, use the idle time, read once; return everything that a run shows."""
+    def reopen(self):
+        """Open the lines again that are lost; their servos take part at once. Returns how many they were."""
+        hardware = self.hardware
+        lost = [index for index, bus in enumerate(hardware._buses) if bus.failure is not None]
+        self.lines.back = True
+        hardware._reopen_lines()
+        self.lines.back = False
+        for index in lost:
+            _, servos = hardware._lines[index]
+            for servo in range(len(IDS)):
+                servos._life.on(servo, Event.RETURNED)
+                servos._life.on(servo, Event.TORQUE_ON)
+        return len(lost)
+
+    def answer(self, replies):
+        """Prepare the replies of the lines to the reads of a cycle."""
+        for line, mine in zip(self.lines.ports, replies, strict=True):
+            line.replies = list(mine)
+
+    def write(self, goals, idle_ns):
+        """Write goals and use the idle time."""
         self.log.clear()
         self.events.list.clear()
-        hardware, clock = self.hardware, self.lines.clock
-        for line, mine in zip(self.lines.ports, replies, strict=True):
-            line.replies, line.sent = list(mine), []
+        hardware = self.hardware
+        for line in self.lines.ports:
+            line.sent = []
         self.goals.values[:] = goals
         hardware.write()
-        if hardware._split:
-            hardware._await_states(clock.now_ns() + idle_ns)
+        if idle_ns:
+            hardware.idle(self.lines.clock.now_ns() + idle_ns)
+
+    def read(self):
+        """Read once; return everything that a run shows of the cycle, and the time."""
+        hardware, clock = self.hardware, self.lines.clock
+        hardware._plan_reads()
+        began, self.parsed = hardware._reader is Reader.KERNEL, False
         hardware.read()
-        self.by_kernel += hardware._planned
+        self.began += began
+        self.ended += began and not self.parsed
         self.packets.commit()
         found = self.found(), clock.now_ns()
         clock.wait_until(clock.now_ns() + PERIOD_NS)
         return found
+
+    def cycle(self, replies, goals, idle_ns=0):
+        """Write goals, then read once."""
+        self.answer(replies)
+        self.write(goals, idle_ns)
+        return self.read()
 
     def found(self):
         """Return everything that a run shows of a cycle, by name."""
@@ -379,25 +437,34 @@ def campaign(streams: int, seed: int, names: Sequence[str] = tuple(ROBOTS)) -> T
                 for side in (ours, theirs):
                     side.change(where, where * len(IDS) + servo, servo, random.Random(seed_of_change))
                 standing = {rng.choice(IDS): rng.choice((0x80, 0x04, 0x20))} if rng.random() < 0.2 else {}
-            reads = theirs.prepare()
-            planned = ours.prepare()
-            assert planned == reads, f"{seed} {name} {count} {split} {number}: {planned} instead of {reads}"
+            if rng.random() < 0.2:
+                theirs.reopen()
+                tally.reopened += ours.reopen()
             victim = rng.randrange(count) if number % 6 == 5 else -1
-            replies = [
-                answered(mine, dialect, rng, index == victim, standing) for index, mine in enumerate(reads)
-            ]
             goals, idle_ns = moved(goals, rng), rng.choice((0, 0, 1_000_000, 5_000_000))
-            began = ours.hardware._planned
-            found, expected = ours.cycle(replies, goals, idle_ns), theirs.cycle(replies, goals, idle_ns)
-            assert found == expected, difference(found, expected, f"{seed} {name} {count} {split} {number}")
-            tally.interrupted += began and not ours.hardware._planned
+            where = f"{seed} {name} {count} {split} {number}"
+            replies: list[list[object]] = []
+            for step in ("answer", "write") if split else ("write", "answer"):
+                if step == "write":
+                    ours.write(goals, idle_ns)
+                    theirs.write(goals, idle_ns)
+                    continue
+                reads, expected = ours.prepare(), theirs.prepare()
+                assert reads == expected, f"{where}: {reads} instead of {expected}"
+                replies = [
+                    answered(mine, dialect, rng, index == victim, standing)
+                    for index, mine in enumerate(reads)
+                ]
+                ours.answer(replies)
+                theirs.answer(replies)
+            found, expected = ours.read(), theirs.read()
+            assert found == expected, difference(found, expected, where)
             lost = [bus.failure is not None for bus in ours.hardware._buses]
             tally.streams += sum(len(mine) for mine, gone in zip(replies, lost, strict=True) if not gone)
             tally.cycles += 1
-            if any(lost):
-                break
-        assert not theirs.by_kernel
-        tally.by_kernel += ours.by_kernel
+        assert not theirs.began
+        tally.by_kernel += ours.ended
+        tally.interrupted += ours.began - ours.ended
     return tally
 
 

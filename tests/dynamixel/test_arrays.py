@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dxlrun.dynamixel.exchange.goal_arrays import GoalArrays
+from dxlrun.dynamixel.exchange.goals import GoalArrays
 from dxlrun.dynamixel.wire import protocol1
 from dxlrun.interfaces import Commands
 
@@ -18,7 +18,7 @@ speeds = st.floats(-100, 100) | st.sampled_from([float("nan"), 0.0, -0.0])
 def test_the_sync_write_is_what_the_units_of_one_servo_say(plan8, positions, velocities, ticks):
     goals = Commands(np.array([positions, velocities, [np.nan] * 8, [np.nan] * 8]))
     included = np.array([True, False] + [True] * 6)
-    packets = GoalArrays(plan8).packets(goals, included)
+    packets = list(GoalArrays(plan8).packets(goals, included))
     expected = {
         servo.servo_id: ticks.position(servo, positions[servo.row]).to_bytes(2, "little")
         + ticks.speed(servo, velocities[servo.row]).to_bytes(2, "little")
@@ -38,7 +38,7 @@ def test_a_smaller_packet_after_a_bigger_one_is_whole(plan8):
     (everybody,) = arrays.packets(goals, np.ones(8, dtype=bool))
     (one,) = arrays.packets(goals, np.arange(8) == 7)
     goals.position[:] = 0.1
-    arrays.packets(goals, np.ones(8, dtype=bool))
+    list(arrays.packets(goals, np.ones(8, dtype=bool)))
     goals.position[:] = 0.0
     (again,) = arrays.packets(goals, np.ones(8, dtype=bool))
     assert protocol1.parse_status(one).parameters[:3] == bytes((30, 4, 21))

@@ -1,8 +1,7 @@
 import pytest
 
 from dxlrun.clock import VirtualClock
-from dxlrun.dynamixel.exchange.bus import Bus
-from dxlrun.dynamixel.exchange.pump import run
+from dxlrun.dynamixel.exchange.bus import Bus, run
 from dxlrun.dynamixel.plan.line import Line, listen
 from dxlrun.dynamixel.wire import protocol1
 from dxlrun.dynamixel.wire.transaction import Outcome

@@ -3,8 +3,7 @@
 import pytest
 
 from dxlrun.clock import VirtualClock
-from dxlrun.dynamixel.exchange.bus import Bus
-from dxlrun.dynamixel.exchange.pump import pump
+from dxlrun.dynamixel.exchange.bus import Bus, pump
 from dxlrun.dynamixel.plan.line import Line
 from dxlrun.dynamixel.wire import protocol2
 from dxlrun.dynamixel.wire.transaction import Outcome

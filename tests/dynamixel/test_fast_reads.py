@@ -188,11 +188,8 @@ def test_replies_are_due_by_the_return_delays_that_the_servos_have(make_rig, mak
     rig.buses[0].servo(2).poke("return_delay_time", 250)
     rig.hardware.start()
     (reads,) = [servos.reads for servos in rig.hardware._servos]
-    first = reads.advance(None)
-    assert first.due_ns == plan.reads[0].due_ns
-    reads._queue_of = None
-    reads.begin()
-    assert [request.patient[0].due_ns for request in reads._queue] == [300_000, 700_000]
+    assert plan.reads[0].due_ns == 300_000
+    assert [request.patient[0].due_ns for request in reads.plan().queue] == [300_000, 700_000]
 
 
 def test_no_way_of_protocol_1_is_a_fast_one(make_plan):

@@ -3,9 +3,8 @@ from dataclasses import dataclass
 
 import pytest
 
-from dxlrun.dynamixel.exchange.bus import Bus
+from dxlrun.dynamixel.exchange.bus import Bus, pump
 from dxlrun.dynamixel.exchange.gaps import STARVED, STARVED_AGAIN, Gaps, Urgency
-from dxlrun.dynamixel.exchange.pump import pump
 from dxlrun.dynamixel.plan.line import listen
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.wire import protocol2
@@ -57,7 +56,7 @@ def rounds(make_rig, make_plan):
     )
     rig = make_rig(plan)
     bus = Bus(0, plan, rig.ports.ports[0], rig.clock, rig.packets)
-    return Rounds(rig, bus, Gaps(plan, rig.events, rig.clock.now_ns))
+    return Rounds(rig, bus, Gaps(plan, rig.events, bus))
 
 
 def reading(rounds, servo_id, *addresses):
@@ -174,22 +173,20 @@ def test_a_transaction_that_a_cycle_cut_off_is_asked_again(rounds):
 
 def test_a_gap_begins_nothing_on_a_line_that_was_late_until_that_is_forgotten(rounds):
     found = []
-    now = rounds.rig.clock.now_ns()
-    rounds.gaps.came(now, now - 400_000)  # its cyclic reply came so late
+    rounds.bus._note_lateness(400_000)  # of its cyclic reply
     rounds.add(reading(rounds, 11, 7), found.append, Urgency.SLOW, "a read")
     assert rounds.gap(READ_NS + 150_000) == []
-    assert rounds.gaps.late_ns == 400_000
+    assert rounds.bus.late_ns == 400_000
     for _ in range(200):
-        rounds.gaps.came(now, now)
-    assert rounds.gaps.late_ns < 50_000
+        rounds.bus._note_lateness(0)
+    assert rounds.bus.late_ns < 50_000
     assert len(rounds.gap(READ_NS + 150_000)) == 1
     assert found == [[11]]
 
 
 def test_one_reply_that_came_a_second_late_does_not_close_the_gaps_of_the_next_seconds(rounds):
     found = []
-    now = rounds.rig.clock.now_ns()
-    rounds.gaps.came(now, now - 1_000_000_000)  # the process was not running
+    rounds.bus._note_lateness(1_000_000_000)  # the process was not running
     rounds.add(reading(rounds, 11, 7), found.append, Urgency.MODE, "the mode of a servo")
     assert len(rounds.gap(5_000_000)) == 1
     assert found == [[11]]
@@ -200,4 +197,4 @@ def test_a_line_whose_reads_all_go_as_they_should_is_not_late(make_rig, make_pla
     rig.hardware.start()
     for _ in range(20):
         rig.cycle()
-    assert rig.hardware._gaps[0].late_ns < 100_000
+    assert rig.hardware._buses[0].late_ns < 100_000

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from dxlrun.dynamixel.exchange.goal_arrays import REPEATED, GoalArrays
+from dxlrun.dynamixel.exchange.goals import REPEATED, GoalArrays
 from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.interfaces import Commands
 from dxlrun.mode import Mode
@@ -55,7 +55,7 @@ def test_a_goal_is_sent_when_it_changed_once_more_and_every_so_many_cycles(plan8
             asked = [max(0, count - 1) for count in asked]
             for servo in wanted:
                 last[servo] = cycle
-            packets = arrays.packets(goals, included)
+            packets = list(arrays.packets(goals, included))
             sent = {key for packet in packets for key in records(packet, 1.0)}
             assert sent == {plan8.servos[servo].servo_id for servo in wanted}
             assert len(packets) == bool(wanted)

@@ -15,7 +15,9 @@ import pytest
 
 from dxlrun.clock import MonotonicClock
 from dxlrun.dynamixel.exchange import kernel
-from dxlrun.dynamixel.hardware import DynamixelHardware
+from dxlrun.dynamixel.exchange.bus import FREE_NS
+from dxlrun.dynamixel.exchange.cyclic_reads import CALM_CYCLES
+from dxlrun.dynamixel.hardware import DynamixelHardware, Reader
 from dxlrun.dynamixel.port.ports import SerialPort, SerialPorts
 from dxlrun.dynamixel.wire import protocol2
 from dxlrun.interfaces import Commands, States
@@ -78,7 +80,7 @@ def test_an_interrupt_on_virtual_time_comes_out_of_the_kernel(make_rig, make_pla
     rig.hardware.start()
     for _ in range(5):
         rig.cycle()
-    assert rig.hardware._planned
+    assert rig.hardware._reader is Reader.KERNEL
     port = rig.ports.ports[0]
     owner = {"wait": rig.ports, "now_ns": rig.hardware._kernel}.get(call, port)
 
@@ -101,7 +103,7 @@ def two_lines(make_rig, make_plan):
     rig.hardware.start()
     for _ in range(5):
         rig.cycle()
-    assert rig.hardware._planned
+    assert rig.hardware._reader is Reader.KERNEL
     return rig
 
 
@@ -113,7 +115,6 @@ def test_no_row_is_valid_of_a_line_that_took_no_goals(two_lines, accident):
     rig.goals.position[:] += 0.1
     rig.hardware.write()
     assert rig.hardware._buses[0].failure is not None
-    assert rig.hardware._planned
     if accident:  # on the other line: the parser ends the cycle
         rig.ports.ports[1]._arrived += b"\x55"
     rig.hardware.read()  # no gap came between, in which the lost line is set aside
@@ -127,12 +128,12 @@ def test_what_is_sent_behind_goals_is_awaited_from_when_they_are_off_the_wire(ma
     for _ in range(5):
         rig.cycle()
     (bus,) = rig.hardware._buses
-    assert rig.hardware._planned == compiled
+    assert rig.hardware._reader is (Reader.KERNEL if compiled else Reader.PARSER)
     rig.hardware.read()
     rig.goals.position[:] += 0.1
     before_ns = rig.clock.now_ns()
     rig.hardware.write()
-    assert bus.free_ns == before_ns + len(rig.into_bus()[-1]) * bus.byte_ns
+    assert bus.words[FREE_NS] == before_ns + len(rig.into_bus()[-1]) * bus.byte_ns
 
 
 def test_goals_go_out_behind_what_the_parser_sent(make_rig, make_plan):
@@ -144,13 +145,13 @@ def test_goals_go_out_behind_what_the_parser_sent(make_rig, make_plan):
     rig.hardware.read()
     rig.goals.position[:] += 0.1
     bus.send(bytes(100))  # such as reduced limits of torque
-    before_ns = bus.free_ns
+    before_ns = bus.words[FREE_NS]
     rig.hardware.write()
-    assert rig.hardware._kernel.free_at(0) == before_ns + len(rig.into_bus()[-1]) * bus.byte_ns
+    assert bus.words[FREE_NS] == before_ns + len(rig.into_bus()[-1]) * bus.byte_ns
 
 
 @pytest.mark.parametrize(
-    ("buses", "servos", "compiled"), [(32, 1, True), (33, 1, False), (1, 150, True), (1, 250, False)]
+    ("buses", "servos", "compiled"), [(32, 1, True), (33, 1, False), (1, 150, True), (1, 250, True)]
 )
 def test_a_robot_that_the_kernel_has_no_room_for_is_left_to_the_parser(
     fuzz, make_plan, buses, servos, compiled
@@ -185,10 +186,10 @@ def test_a_reply_from_before_its_request_is_stray_however_late_the_host_looks(fu
         if gone and number == 6:
             replies[0] = [(reads[0][0].packet, None)]
         if number == 15:
-            assert side.hardware._planned
+            assert side.hardware._reader is Reader.KERNEL
             line.arriving.append((side.lines.clock.now_ns(), before))
             line.stall_ns = 2_000_000  # longer than the wire takes for both
-        side.cycle(replies, goals, 0)
+        side.cycle(replies, goals)
         before = replies[1][0][1][0][1]
     assert str(side.hardware._buses[0].failure) == ("it is gone" if gone else "None")
     logged = [packet for packet in side.log if packet.bus == 1]
@@ -212,8 +213,8 @@ def test_a_doubled_reply_is_logged_in_the_same_cycle_by_kernel_and_parser(fuzz, 
             if number == 6 and index != 1:  # at the instant of the other lines' last replies
                 pieces = [(2_000_000, b"".join([*answers, answers[0]])), (2_000_000, answers[0])]
             replies.append([(read.packet, pieces)])
-        assert number != 6 or side.hardware._planned == compiled
-        side.cycle(replies, goals, 0)
+        assert number != 6 or side.hardware._reader is (Reader.KERNEL if compiled else Reader.PARSER)
+        side.cycle(replies, goals)
         counts.append(
             [sum(p.bus == bus and p.kind is PacketKind.STATUS for p in side.log) for bus in range(3)]
         )
@@ -248,9 +249,8 @@ class TestOnDescriptors:
             library=kernel.load(),
         )
         (servos,) = hardware._servos
-        while servos.reads.program is None:  # as after some cycles in which every servo answered
-            servos.reads.changed = True
-            servos.reads.prepare()
+        while servos.reads.plan().program is None:  # as after some cycles in which every servo answered
+            servos.reads.end()
         yield plan, hardware, ours, states, rig
         for end in (ours, theirs):
             os.close(end)
@@ -269,14 +269,14 @@ class TestOnDescriptors:
         assert kinds == [PacketKind.INSTRUCTION, PacketKind.STATUS, PacketKind.STATUS]
         sent, first, _ = rig.packets.list
         assert sent.first_ns <= sent.last_ns <= first.first_ns
-        assert hardware._planned
+        assert hardware._servos[0].reads._calm == CALM_CYCLES  # the parser has read none
 
     def test_silence_ends_in_the_parser_and_the_loop_shows_that_it_lives(self, line):
         _, hardware, _, states, rig = line
         hardware.read()
         assert states.valid.tolist() == [False, False]
         assert len(rig.beats) > 5  # a beat a millisecond while replies are awaited
-        assert not hardware._planned
+        assert hardware._servos[0].reads._calm == 0  # the parser ended the cycle
 
     def test_a_line_that_hangs_up_is_gone_and_names_its_port(self, line):
         _, hardware, ours, states, _ = line
@@ -315,3 +315,47 @@ def test_the_build_takes_a_compiler_with_options_and_goes_on_without_one(
     target = module.compile_kernel(tmp_path)
     assert (target is not None) == built
     assert not built or kernel.load(target) is not None
+
+
+def test_a_split_bus_is_asked_once_however_often_goals_are_written(make_rig, make_plan):
+    rig = make_rig(make_plan((1, 2), model="XM430-W350", protocol=2.0, reference=np.pi, split=True))
+    rig.hardware.start()
+    for _ in range(5):
+        rig.cycle()
+    assert rig.hardware._reader is Reader.KERNEL
+    shared = rig.hardware._kernel._kernel
+    awaited = shared.reserved
+    rig.hardware.read()
+    assert shared.reserved == 0
+    rig.hardware.write()
+    asked = len(rig.into_bus())
+    for _ in range(3):
+        rig.hardware.write()
+    assert len(rig.into_bus()) == asked  # goals that did not change, and no second request
+    assert shared.reserved >= awaited
+    rig.clock.wait_until(rig.clock.now_ns() + rig.period_ns)
+    rig.hardware.read()
+    assert shared.reserved == 0
+    assert rig.states.valid.all()
+
+
+@pytest.mark.parametrize("compiled", [True, False], ids=["kernel", "parser"])
+@pytest.mark.parametrize(
+    "case", [("AX-12A", 1.0, [50, 20]), ("XM430-W350", 2.0, [113, 37])], ids=["protocol 1", "protocol 2"]
+)
+def test_goals_beyond_one_sync_write_are_split(fuzz, make_plan, compiled, case):
+    model, protocol, counts = case
+    plan = make_plan(range(sum(counts)), model=model, protocol=protocol)
+    side = fuzz.Side([plan], kernel.load() if compiled else None, 2048)
+    side.goals.values[:] = 0.0
+    side.hardware.write()
+    (line,) = side.lines.ports
+    side.packets.commit()
+    assert [packet.data for packet in side.log] == line.sent
+    size = plan.servos[0].goal.length + 1
+    for packet, count in zip(line.sent, counts, strict=True):
+        if protocol == 1.0:
+            assert packet[3] == len(packet) - 4 == 4 + count * size
+            assert (sum(packet[2:]) & 0xFF) == 0xFF
+        else:
+            assert int.from_bytes(packet[5:7], "little") == len(packet) - 7

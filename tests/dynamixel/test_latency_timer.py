@@ -100,9 +100,9 @@ def with_a_timer(tmp_path, latency_ms, port="sim"):
     plan = plan_of(path, duration_s=0.2)
     (bus,) = plan.buses
     robot = VirtualRobot(plan)
-    for one in robot.robot.hardware._set_up._plans:
+    for one in robot.robot.hardware._start_up._plans:
         assert one is bus
-    robot.robot.hardware._set_up._plans = [replace(bus, latency_ns=latency_ms * MS, port=port)]
+    robot.robot.hardware._start_up._plans = [replace(bus, latency_ns=latency_ms * MS, port=port)]
     return robot
 
 

@@ -81,9 +81,14 @@ def test_a_plan_survives_json(make_plan, model, protocol):
     assert msgspec.json.decode(msgspec.json.encode(plan), type=BusPlan) == plan
 
 
-def test_too_many_servos_for_one_sync_write_are_refused(make_plan):
-    with pytest.raises(ValueError, match="second bus"):
-        make_plan(tuple(range(51)))
+@pytest.mark.parametrize(("model", "protocol", "most"), [("AX-12A", 1.0, 50), ("XM430-W350", 2.0, 113)])
+def test_goals_beyond_one_sync_write_are_counted_as_two(make_plan, model, protocol, most):
+    def goal_bytes(count):
+        return make_plan(tuple(range(count)), model=model, protocol=protocol).budget.goal_bytes
+
+    per_servo = goal_bytes(most) - goal_bytes(most - 1)
+    assert goal_bytes(most + 1) == goal_bytes(most) + goal_bytes(1)
+    assert goal_bytes(2) == goal_bytes(1) + per_servo
 
 
 def test_the_middle_of_an_ax_is_exact(make_plan):

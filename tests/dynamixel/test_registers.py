@@ -6,8 +6,7 @@ import pytest
 
 from dxlrun.compile.registers import UnfitRegister, declarable, register_value
 from dxlrun.dynamixel.control_table import all_tables, control_table
-from dxlrun.dynamixel.exchange.bus import Bus
-from dxlrun.dynamixel.exchange.pump import run
+from dxlrun.dynamixel.exchange.bus import Bus, run
 from dxlrun.dynamixel.plan.bus_plan import RegisterValue
 from dxlrun.dynamixel.servo.offline import rejoin
 from dxlrun.dynamixel.servo.registers import compare, settle

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dxlrun.dynamixel.exchange.jumps import MARGIN_NS, MARGIN_RAD, SAY_AGAIN_NS, Jumps
-from dxlrun.dynamixel.exchange.samples import Samples
+from dxlrun.dynamixel.exchange.samples import MARGIN_NS, MARGIN_RAD, REPORT_AGAIN_NS, Jumps, Samples
 from dxlrun.dynamixel.plan.units import joint_position
 from dxlrun.interfaces import States
 from dxlrun.mode import Mode
@@ -223,7 +222,7 @@ class TestJumps:
         ((source, text),) = robot.events.of(EventCode.IMPLAUSIBLE)
         assert source == "main_3_joint"
         assert "jumped by 86 deg in 10 ms" in text
-        assert SAY_AGAIN_NS == SECOND_NS
+        assert REPORT_AGAIN_NS == SECOND_NS
 
     def test_who_was_not_seen_for_long_may_be_elsewhere(self, robot):
         robot.turn(0.0, 0.0)

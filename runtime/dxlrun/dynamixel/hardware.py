@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence, Set
 from contextlib import suppress
+from enum import Enum, auto, unique
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.clock import Clock
-from dxlrun.dynamixel.exchange.bus import NEVER, Bus
+from dxlrun.dynamixel.exchange.bus import LATE_NS, NEVER, Bus, LineState, clear, pump, run
 from dxlrun.dynamixel.exchange.cyclic_reads import MOST_BROKEN
 from dxlrun.dynamixel.exchange.gaps import Gaps
-from dxlrun.dynamixel.exchange.kernel import Answer, Kernel, Library, LineState, holds
-from dxlrun.dynamixel.exchange.pump import clear, pump, run
+from dxlrun.dynamixel.exchange.kernel import Answer, Kernel, KernelLine, Library, holds
 from dxlrun.dynamixel.exchange.samples import Samples
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.dynamixel.port.ports import Ports
@@ -39,6 +39,16 @@ FIRST_READS_NS = (0, 60_000_000, 240_000_000)
 that stands still, may spoil one or two."""
 IDLE_MARGIN_NS = 150_000
 """The gap is left so long before the deadline: a stock kernel wakes some 50-100 us late."""
+
+
+@unique
+class Reader(Enum):
+    """What reads the next states."""
+
+    UNPLANNED = auto()
+    KERNEL = auto()
+    PARSER = auto()
+    """Or the rest of them, where the kernel was interrupted."""
 
 
 class DynamixelHardware:
@@ -74,16 +84,16 @@ class DynamixelHardware:
         self._take_over = take_over
         self._restore_torque = restore_torque
         self._full_torque: list[list[int]] = []
-        self._asked = [False] * len(self._plans)
-        """Lines whose reads of the next cycle began already, or are done."""
-        self._prepared = False  # the next cycle is planned
-        self._planned = False  # the kernel reads in it
-        self._split = [index for index, plan in enumerate(self._plans) if plan.split]
+        self._reader = Reader.UNPLANNED
+        """What reads the next states."""
+        self._split = any(plan.split for plan in self._plans)
         self._buses = tuple(
             Bus(index, plan, port, clock, packets)
             for index, (plan, port) in enumerate(zip(self._plans, ports.ports, strict=True))
         )
-        self._gaps = tuple(Gaps(plan, events, clock.now_ns) for plan in self._plans)
+        self._gaps = tuple(
+            Gaps(plan, events, bus) for plan, bus in zip(self._plans, self._buses, strict=True)
+        )
         self._samples = Samples(self._plans, states, events)
         self._servos = tuple(
             Servos(plan, bus, gaps, events, states, arrays)
@@ -96,12 +106,13 @@ class DynamixelHardware:
         if library is not None and holds(self._plans, packets):
             self._kernel = Kernel(
                 library,
-                self._plans,
+                [
+                    KernelLine(plan, bus, servos.goals, servos.torqued, servos.ceiling)
+                    for plan, (bus, servos) in zip(self._plans, self._lines, strict=True)
+                ],
                 self._samples,
                 states,
                 goals,
-                [servos.torqued for servos in self._servos],
-                [servos.ceiling for servos in self._servos],
                 packets,
                 ports,
                 clock,
@@ -124,93 +135,85 @@ class DynamixelHardware:
                 self._full_torque = self._start_up.restore_limits()
             self._first_states()
             self._start_up.watch()
+            for bus in self._buses:
+                bus.words[LATE_NS] = 0  # servos that write their EEPROM answer late: no cycle does that
         except BaseException as error:  # also an interrupt: nothing may leave here with torque on
             for sentence in self.stop() or (TAKEN_BACK,):
                 error.add_note(sentence)
             raise
 
     def read(self) -> None:
-        """Read every servo once, on all lines at once; of a line that is gone every row is invalid.
+        """Read every servo once, on all lines at once; of a line that is lost every row is invalid.
 
-        The kernel does so as long as all goes as planned; from where it does not the parser goes on. A split
-        bus was asked behind the goals before: only what is not there yet is awaited.
+        The kernel reads as long as everything comes as planned; the parser continues where it does not. A
+        split bus was asked behind the goals before: only what is not there yet is awaited.
         """
-        if not self._prepared:
-            self._prepare()
-        self._prepared = False
+        self._plan_reads()
+        reader, self._reader = self._reader, Reader.UNPLANNED
         now_ns = self._clock.now_ns()
         for servos in self._servos:
             servos.watchdogs.sent(now_ns)
         self._samples.follow_modes()
-        if self._kernel is not None and self._planned:
+        if self._kernel is not None and reader is Reader.KERNEL:
             answer = self._kernel.read()
             if answer is not Answer.UNEXPECTED:
                 for bus, servos in self._lines:
                     if bus.failure is not None:
-                        servos.settle(self._clock.now_ns())
+                        self._settle(servos)
                 if answer is Answer.LOOK:
                     self._samples.settle(self._clock.now_ns())
+                self._report_failures()
                 return
             self._interrupt(self._kernel)
         self._parse()
 
-    def _prepare(self) -> None:
-        """Plan the next cycle, for the kernel if there is one and every line that is there has a plan."""
-        self._prepared = True
-        if self._planned and all(map(_is_steady, self._lines)):
+    def _plan_reads(self) -> None:
+        """Plan the next reads, once a cycle and before any of them is sent.
+
+        The kernel does them if every line that is there has a program for it.
+        """
+        if self._reader is not Reader.UNPLANNED:
             return
-        for servos in self._servos:
-            servos.reads.prepare()
-        if self._kernel is not None:
-            programs = [
-                None if bus.failure is not None else servos.reads.program for bus, servos in self._lines
-            ]
-            self._planned = all(
-                bus.failure is not None
-                or (program is not None and not bus.pending and self._kernel.fits(program))
-                for (bus, _), program in zip(self._lines, programs, strict=True)
-            )
-            for index, program in enumerate(programs):
-                self._kernel.set_program(index, program if self._planned else None)
+        kernel, ready = self._kernel, self._kernel is not None
+        for index, (bus, servos) in enumerate(self._lines):
+            program = servos.reads.plan().program
+            if bus.failure is None and kernel is not None:
+                fits = program is not None and kernel.plan(index, program)
+                ready = ready and fits and not bus.pending
+        self._reader = Reader.KERNEL if ready else Reader.PARSER
 
     def _interrupt(self, kernel: Kernel) -> None:
-        """Let the parser go on where the kernel ended."""
-        self._planned = False
-        for index, line in enumerate(kernel.interrupt()):
-            bus, servos = self._lines[index]
-            bus.free_ns = kernel.free_at(index)
-            self._asked[index] = True
-            if line is None:
+        """Let the parser continue where the kernel ended."""
+        for (bus, servos), line in zip(self._lines, kernel.interrupt(), strict=True):
+            if bus.failure is not None:
                 continue
             if line.failure is not None:
                 bus.fail(line.failure)
-            elif line.state is LineState.AWAITING:
-                bus.take_over(servos.reads, servos.reads.resume(line.done), line)
+            if line.done or line.state is not LineState.IDLE or line.failure is not None:
+                servos.reads.begin(line.done)
+                bus.continue_from(servos.reads, line)
             else:
-                bus.due_ns = line.due_ns
                 bus.take_pieces(line)
-                if line.state is LineState.IDLE and line.done:
-                    servos.reads.begin_at(line.done)
-                    bus.load(servos.reads)
-                elif line.state is LineState.IDLE:
-                    self._asked[index] = False
 
     def _parse(self) -> None:
         """Read packet by packet what was not read in this cycle."""
-        clear(self._buses, self._ports, self._asked)
-        for asked, (bus, servos) in zip(self._asked, self._lines, strict=True):
-            if not asked:
-                servos.reads.begin()
-                bus.load(servos.reads)
+        waiting = [(bus, servos) for bus, servos in self._lines if not servos.reads.begun]
+        clear([bus for bus, _ in waiting], self._ports)
+        for bus, servos in waiting:
+            servos.reads.begin()
+            bus.load(servos.reads)
         pump(self._buses, self._ports, self._clock, self._beat)
-        self._asked = [False] * len(self._asked)
-        now_ns = self._clock.now_ns()
         for servos in self._servos:
-            servos.settle(now_ns)
-            if servos.reads.given_up:
-                self._tell_plain_reads()
-        self._samples.settle(now_ns)
+            self._settle(servos)
+        self._samples.settle(self._clock.now_ns())
         self._report_failures()
+
+    def _settle(self, servos: Servos) -> None:
+        """End the parser's cycle on one line."""
+        servos.settle(self._clock.now_ns())
+        servos.reads.end()
+        if servos.reads.given_up:
+            self._tell_plain_reads()
 
     def write(self) -> None:
         """Send the goals, one sync write a line and layout, on every line that is there.
@@ -220,43 +223,35 @@ class DynamixelHardware:
         for servos in self._servos:
             servos.prepare_goals(self._goals, self._states)
         if self._split:
-            self._prepare()
+            self._plan_reads()
         if self._kernel is not None:
             self._write_by_kernel(self._kernel)
         else:
             for bus, servos in self._lines:
-                for packet in servos.goals.packets(self._goals, servos.torqued, servos.ceiling):
+                if bus.failure is None:
                     with suppress(PortError):  # reported below; the other lines get their goals
-                        bus.send(packet)
-        if self._split and not self._planned:
+                        for packet in servos.goals.packets(self._goals, servos.torqued, servos.ceiling):
+                            bus.send(packet)
+        if self._split and self._reader is Reader.PARSER:
             self._ask_behind()
         self._report_failures()
 
     def _write_by_kernel(self, kernel: Kernel) -> None:
-        for index, (bus, servos) in enumerate(self._lines):
-            kernel.set_writes(index, servos.goals.sync_writes if bus.failure is None else ())
-            kernel.occupy(index, bus.free_ns)
-        answer = kernel.write()
-        for index, bus in enumerate(
-            self._buses
-        ):  # what the gaps and the parser send goes out behind these goals
-            bus.free_ns = kernel.free_at(index)
+        answer = kernel.write(asks=self._split and self._reader is Reader.KERNEL)
         if answer is Answer.LOOK:
-            self._planned = False
+            self._reader = Reader.PARSER
         elif answer is Answer.UNEXPECTED:
             for index, failure in kernel.failures().items():
                 self._buses[index].fail(failure)
-                kernel.set_program(index, None)
 
     def _ask_behind(self) -> None:
+        """Send the first read of every split bus that was not asked yet."""
         clear(self._buses, self._ports)
-        for index in self._split:
-            bus, servos = self._lines[index]
-            if bus.failure is None:
+        for plan, (bus, servos) in zip(self._plans, self._lines, strict=True):
+            if plan.split and bus.failure is None and not servos.reads.begun:
                 servos.reads.begin()
                 bus.load(servos.reads)
                 bus.step(self._clock.now_ns())
-                self._asked[index] = True
 
     def set_modes(self, modes: NDArray[np.uint8]) -> None:
         """Bring joints into modes in the gaps between cycles; UNKNOWN leaves one as it is."""
@@ -282,50 +277,44 @@ class DynamixelHardware:
                     bus.send(packet)
 
     def idle(self, until_ns: int) -> None:
-        """Do on each line what waits for a gap and fits this one; see `gaps` for what is done even so.
+        """Do on each line what waits for idle time and fits this one; see `gaps` for what is done even so.
 
         On a split bus the states come first.
         """
         self._reopen_lines()
         latest = until_ns - IDLE_MARGIN_NS
-        self._await_states(latest)
-        end = latest if any(map(self._busy, range(len(self._buses)))) else NEVER  # late states may be awaited
+        late = self._await_states(latest) if self._split else ()
         working: list[Bus] = []
         for index, (bus, servos) in enumerate(self._lines):
             gaps = self._gaps[index]
             if bus.failure is not None:
                 gaps.abandon()
-                continue
-            servos.look()
-            if not self._busy(index) and gaps.begin(latest):
-                bus.load(gaps)
-                working.append(bus)
+            elif index not in late:
+                servos.look()
+                if gaps.begin(latest):
+                    bus.load(gaps)
+                    working.append(bus)
         if working:
             clear(self._buses, self._ports)
-            pump(self._buses, self._ports, self._clock, self._beat, end)
+            pump(self._buses, self._ports, self._clock, self._beat, latest if late else NEVER)
             for bus in working:
                 if bus.busy:
                     bus.drop()
-        if not self._prepared:
-            self._prepare()  # here nothing waits for it
+        self._plan_reads()  # here nothing waits for it
 
-    def _await_states(self, latest_ns: int) -> None:
-        """Take note of when the states came, and await those of split buses until `latest_ns`."""
-        kernel = self._kernel
-        if kernel is not None and self._planned:
-            for index, (bus, servos) in enumerate(self._lines):
-                arrival = kernel.arrival(index)
-                if bus.failure is None and index not in self._split and arrival is not None:
-                    due_ns, at_ns = arrival
-                    servos.arrived(at_ns, due_ns)
-            if self._split and kernel.read(latest_ns, everything=False) is Answer.UNEXPECTED:
-                self._interrupt(kernel)
-        if any(self._asked):
+    def _await_states(self, latest_ns: int) -> list[int]:
+        """Await the states of split buses until `latest_ns`; return the lines of which some are not there."""
+        kernel = self._kernel if self._reader is Reader.KERNEL else None
+        if kernel is not None and kernel.read(latest_ns, everything=False) is Answer.UNEXPECTED:
+            self._reader = Reader.PARSER
+            self._interrupt(kernel)
+        if any(bus.busy for bus in self._buses):
             pump(self._buses, self._ports, self._clock, self._beat, latest_ns)
-
-    def _busy(self, index: int) -> bool:
-        """Say whether replies are awaited on a line."""
-        return self._buses[index].busy or (self._kernel is not None and self._kernel.awaits(index))
+        return [
+            index
+            for index, bus in enumerate(self._buses)
+            if bus.busy or (kernel is not None and kernel.awaits(index))
+        ]
 
     def stop(self) -> tuple[str, ...]:
         """Switch torque off on every servo, and read it back; return a sentence per failure."""
@@ -372,6 +361,7 @@ class DynamixelHardware:
         for index, (bus, servos) in enumerate(zip(self._buses, self._servos, strict=True)):
             if bus.failure is not None and self._ports.reopen(index):
                 bus.renew(self._ports.ports[index])
+                servos.goals.renew()
                 servos.found()
 
     def _limp(self) -> tuple[LimpOutcome, ...]:
@@ -382,7 +372,7 @@ class DynamixelHardware:
             self._reopen_lines()
             for bus, servos in zip(self._buses, self._servos, strict=True):
                 servos.withhold_goals()
-                bus.failure = None  # a line that is back, or was only stuck, gets its chance
+                bus.retry()  # a line that is back, or was only stuck, gets its chance
             outcomes = limp_buses(
                 self._plans, self._buses, self._ports, self._clock, deadline_ns=deadline_ns, beat=self._beat
             )
@@ -432,9 +422,3 @@ class DynamixelHardware:
                 f"{', '.join(silent)} did not answer after torque was switched on: check cable and power"
             )
         self._start_up.confirm()
-
-
-def _is_steady(line: tuple[Bus, Servos]) -> bool:
-    """Say whether the next cycle of a line is planned as the one before."""
-    bus, servos = line
-    return not (servos.reads.changed or bus.pending) and bus.failure is None

@@ -1,42 +1,96 @@
-"""Bus: one resumable transaction machine per serial line; `pump` is the one wait that serves all of them.
+"""Bus: one serial line as a transaction machine that never blocks; `pump` is the one wait that serves all.
 
-A machine never waits: it writes an instruction, is fed the bytes that arrive, and is told the time. Whoever
-pumps it decides when: read, write, or the gap before the next deadline.
+A bus writes an instruction, is fed the bytes that arrive, and is handed the time. `pump` executes the jobs of
+all buses side by side: the cyclic reads, what is done in idle time, set-up and tools.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from array import array
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from enum import IntEnum, unique
+from typing import TypeAlias
 
 from dxlrun.clock import Clock
-from dxlrun.dynamixel.exchange.listening import AWAITING, DRAINING, NEVER, READY, RESTING, Listener
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
-from dxlrun.dynamixel.port.ports import Port
+from dxlrun.dynamixel.plan.line import BITS_PER_BYTE
+from dxlrun.dynamixel.port.ports import Port, Ports
+from dxlrun.dynamixel.wire.dialect import Dialect, dialect_of
+from dxlrun.dynamixel.wire.receiver import Receiver
 from dxlrun.dynamixel.wire.transaction import (
     BROADCAST_ID,
     Job,
     Outcome,
+    Program,
+    ProgramJob,
+    Reply,
+    Result,
+    Status,
     Transaction,
 )
 from dxlrun.errors import PortError
 from dxlrun.run.channels.packets import PacketKind, PacketSink
 
-if TYPE_CHECKING:  # the guardian makes servos limp without numpy
-    from dxlrun.dynamixel.exchange.kernel import Interrupted
-
+NEVER = 1 << 62
 QUIET_BYTES = 20
-"""A line that was silent for so many byte times is silent (protocol.md: drain until it is)."""
+"""A line that was silent for so many byte times is silent (docs/protocol.md: drain until it is)."""
 LEAST_QUIET_NS = 200_000
 DRAIN_LIMIT_NS = 5_000_000
 """A line that babbles longer than this is not waited for."""
+LOST_LINE_STEP_NS = 200_000
+"""How often the other lines are looked at while one is lost."""
+BEAT_NS = 1_000_000
+"""The longest time between two signs of life, beside one wait."""
+MOST_LATE_NS = 1_000_000
+"""A reply that is later is an accident, as when this process was not running, and no property of the line."""
+_FORGOTTEN = 6
+"""With each reply that is less late, 2 ** -6 of a line's lateness is forgotten."""
 
-_INSTRUCTION = PacketKind.INSTRUCTION
-_OK = Outcome.OK
+FREE_NS, LATE_NS, LOST = range(3)
+"""What `Bus.words` holds, which the exchange kernel shares: when everything that was sent is off the wire;
+how late replies came at worst lately, beside the adapter's latency; 1 while the line is lost."""
 
-__all__ = ["NEVER", "Bus"]
+_READY, _AWAITING, _RESTING, _DRAINING = range(4)
+# to look into an Enum takes as long as to pack a packet's record
+_SENT, _OK, _TIMEOUT = Outcome.SENT, Outcome.OK, Outcome.TIMEOUT
+_INSTRUCTION, _STATUS = PacketKind.INSTRUCTION, PacketKind.STATUS
+
+_Shape: TypeAlias = tuple[int, int]
+"""ID and number of parameter bytes of a status packet."""
+_FAST: _Shape = (BROADCAST_ID, 0)
+"""Of the one status packet of a fast form, whatever its length."""
 
 
-class Bus(Listener):
+@unique
+class LineState(IntEnum):
+    """Where the exchange kernel is on a line in a cycle."""
+
+    IDLE = 0
+    AWAITING = 1
+    """A read was sent."""
+    THROUGH = 2
+    """All its reads are done."""
+
+
+@dataclass(frozen=True, slots=True)
+class Interrupted:
+    """Where a line stood when the exchange kernel ended: the parser continues there."""
+
+    state: LineState
+    done: int
+    """How many of its reads are done; the next one was sent where the line is AWAITING."""
+    sent_ns: int
+    deadline_ns: int
+    received_ns: int
+    """When the replies to the read before it came."""
+    pieces: tuple[tuple[bytes, int], ...]
+    """What was received beyond them, and when, ns: of the awaited replies, or stray."""
+    failure: PortError | None
+    """Why the next one could not be sent."""
+
+
+class Bus:
     """Executes transactions on one line; every byte that goes over it is reported to the packet sink.
 
     A reply counts only when ID and length are exact and when it comes no sooner than the wire allows. Of
@@ -45,63 +99,128 @@ class Bus(Listener):
     """
 
     __slots__ = (
+        "_awaited",
+        "_before",
+        "_cyclic",
+        "_deadline_ns",
+        "_dialect",
         "_drain_end_ns",
-        "_now_ns",
+        "_earliest_ns",
+        "_job",
+        "_last_byte_ns",
+        "_latency_ns",
+        "_open",
+        "_owed",
         "_port",
         "_quiet_ns",
+        "_receiver",
+        "_refused",
+        "_reply",
+        "_sent_ns",
+        "_sink",
+        "_state",
+        "byte_ns",
         "failure",
-        "free_ns",
+        "index",
         "name",
+        "noise_bytes",
+        "now_ns",
+        "unrequested",
+        "words",
     )
 
     def __init__(self, index: int, plan: BusPlan, port: Port, clock: Clock, packets: PacketSink) -> None:
-        super().__init__(index, plan, packets)
+        self.index = index
+        """Its number in the log."""
         self.name = plan.name
+        self.now_ns = clock.now_ns
         self.failure: PortError | None = None
-        """Why the line is gone; a bus with a failure does nothing more."""
-        self._port = port
-        self._now_ns = clock.now_ns
+        """Why the line is lost; a bus with a failure does nothing more."""
+        self.noise_bytes = 0
+        """Bytes that belonged to no intact packet, since the start."""
+        self.unrequested = 0
+        """Packets since the start that no request of this host explains: instructions of another one, and the
+        replies to them."""
+        self.words = array("q", (0, 0, 0))
+        """Memory that the exchange kernel shares, see `FREE_NS`."""
+        self.byte_ns = BITS_PER_BYTE * 1_000_000_000 // plan.baud_rate
+        """What a byte takes on the wire, ns."""
+        self._latency_ns = plan.latency_ns
         self._quiet_ns = max(QUIET_BYTES * self.byte_ns, LEAST_QUIET_NS) + plan.latency_ns
-        self.free_ns = 0
-        """When everything that was sent is off the wire."""
-        self._drain_end_ns = 0
+        self._port = port
+        self._sink = packets
+        self._dialect: Dialect = dialect_of(plan.protocol)
+        self._receiver = Receiver(self._take_status, self._take_noise, self._dialect)
+        cyclic = {
+            (servo.servo_id, servo.state.length + more)  # as many as late replies are distinguished by
+            for servo in plan.servos
+            for more in range(1 + servo.state.spare)
+        }
+        self._cyclic = frozenset(cyclic | {_FAST}) if any(plan.fast) else frozenset(cyclic)
+        self._owed: dict[_Shape, int] = {}
+        """Replies that did not come in time and may come late, beside those to cyclic reads."""
+        self._job: Job | None = None
+        self._before: Transaction | None = None  # the one before the awaited one
+        self._awaited: Transaction | None = None
+        self._reply = Reply(_SENT, 0, b"", 0, 0, False)
+        self._state = _READY
+        self._sent_ns = self._earliest_ns = self._deadline_ns = self._drain_end_ns = 0
+        self._last_byte_ns = -NEVER
+        self._open = 0  # a bit for each status that is still awaited
+        self._refused = False
+
+    # The line
 
     @property
     def busy(self) -> bool:
         """True while a job is under way."""
         return self._job is not None
 
-    def renew(self, port: Port) -> None:
-        """Go on with a line that is back in the place of one that is gone; its job is forgotten."""
-        self._port = port
-        self.failure = None
-        self.drop()
-        self._receiver.flush()  # the half of a packet that the lost line brought is nobody's
-
-    def load(self, job: Job) -> None:
-        """Take a job; the next `step` begins it. What an aborted job left behind is forgotten."""
-        self._owe()
-        self._awaited = None
-        self._state = READY
-        if self.failure is None:
-            self._job = job
-            self._reply.strays = 0
-
-    def drop(self) -> None:
-        """Forget the loaded job; what still comes for it belongs to nobody."""
-        self._owe()
-        self._job = self._awaited = None
-        self._state = READY
-
     @property
     def pending(self) -> bool:
         """True while the beginning of a packet has arrived, which a new request takes for noise."""
         return self._receiver.pending > 0
 
-    def send(self, packet: bytes | bytearray | memoryview) -> None:
-        """Send a prepared packet that nobody answers, between two jobs; does not wait.
+    @property
+    def late_ns(self) -> int:
+        """How late replies on this line came at worst lately, beside the adapter's latency."""
+        return self.words[LATE_NS]
 
-        The next transaction starts when the packet is off the wire. Raises PortError when the line is gone.
+    def load(self, job: Job) -> None:
+        """Take a job; the next `step` begins it. What an aborted job left behind is forgotten."""
+        self.drop()
+        if self.failure is None:
+            self._job = job
+            self._reply.strays = 0
+
+    def drop(self) -> None:
+        """Forget the loaded job; what still comes for it is stray."""
+        self._note_owed()
+        self._job = self._awaited = None
+        self._state = _READY
+
+    def fail(self, error: PortError) -> None:
+        """Count the line as lost; its job is forgotten."""
+        self.failure = error
+        self.words[LOST] = 1
+        self._job = None
+
+    def retry(self) -> None:
+        """Use the line again, which may be back or was only stuck."""
+        self.failure = None
+        self.words[LOST] = 0
+
+    def renew(self, port: Port) -> None:
+        """Continue on a line that is back in the place of one that was lost; its job is forgotten."""
+        self._port = port
+        self.retry()
+        self.drop()
+        self._receiver.flush()  # the lost line may have brought half a packet
+
+    def send(self, packet: bytes | bytearray | memoryview) -> None:
+        """Send a prepared packet without a reply, between two jobs; does not wait.
+
+        The next transaction starts when the packet is off the wire. Raises PortError when the line is lost.
         """
         if self.failure is None:
             try:
@@ -111,47 +230,41 @@ class Bus(Listener):
         if self.failure is not None:
             raise self.failure
 
-    def hear(self) -> int:
-        """Take what the line has, and go on; return when to come back at the latest, as `step` does.
-
-        Called when the line has bytes.
-        """
-        self._receive()
-        return self.step(self._now_ns())
-
-    def take_over(self, job: Job, transaction: Transaction, line: Interrupted) -> None:
-        """Go on with a job whose transaction the kernel has sent."""
+    def continue_from(self, job: Job, line: Interrupted) -> None:
+        """Continue with a job in whose transaction the exchange kernel was interrupted."""
         self.load(job)
-        if self._job is None:
-            return
-        if self.pending:
-            self._receiver.flush()
-        self._last_byte_ns = max(self._last_byte_ns, line.heard_ns)
-        self._await(transaction, line.sent_ns)
-        self._deadline_ns = line.deadline_ns
+        if line.state is LineState.AWAITING and self._job is not None:
+            if self.pending:
+                self._receiver.flush()
+            self._awaited = transaction = job.advance(None)
+            assert transaction is not None  # noqa: S101  its instruction was sent
+            self._last_byte_ns = max(self._last_byte_ns, line.received_ns)
+            self._await(transaction, line.sent_ns)
+            self._deadline_ns = line.deadline_ns
         self.take_pieces(line)
 
     def take_pieces(self, line: Interrupted) -> None:
-        """Take what the kernel received beyond the replies that it has kept."""
+        """Take what the exchange kernel received beyond the replies that it has kept."""
         for data, at_ns in line.pieces:
             self._last_byte_ns = at_ns
             self._receiver.feed(data, at_ns)
             self._skip_headers()
 
-    def _receive(self) -> None:
-        if self.failure is None:
-            try:
-                if self._receiver.read_from(self._port, self._now_ns):
-                    self._last_byte_ns = self._now_ns()
-                    self._skip_headers()
-            except PortError as error:
-                self.fail(error)
+    # Time
+
+    def hear(self) -> int:
+        """Take what the line has, and continue; return when to come back at the latest, as `step` does.
+
+        Called when the line has bytes.
+        """
+        self._receive()
+        return self.step(self.now_ns())
 
     def step(self, now_ns: int) -> int:
         """Do what is due; return when to come back at the latest, NEVER when there is nothing to do."""
         try:
             while self._job is not None:
-                if self._state == READY:
+                if self._state == _READY:
                     now_ns = self._begin(self._job)
                 elif now_ns < self._deadline_ns:
                     return self._deadline_ns
@@ -161,35 +274,29 @@ class Bus(Listener):
             self.fail(error)
         return NEVER
 
-    def _end(self, now_ns: int) -> None:
-        """Do what is due at a transaction's deadline."""
-        # bytes may have come while this process was not running: look before giving up
-        self._receive()
-        if self._state == AWAITING:
-            self._give_up(now_ns)
-        elif self._state == DRAINING and self._quiet_at() > now_ns:
-            self._deadline_ns = self._quiet_at()
-        elif self._state in (RESTING, DRAINING):
-            self._receiver.flush()
-            self._state = READY
-
-    def fail(self, error: PortError) -> None:
-        """Take the line for gone; its job is forgotten."""
-        self.failure = error
-        self._job = None
+    def _receive(self) -> None:
+        if self.failure is None:
+            try:
+                if self._receiver.read_from(self._port, self.now_ns):
+                    self._last_byte_ns = self.now_ns()
+                    self._skip_headers()
+            except PortError as error:
+                self.fail(error)
 
     def _begin(self, job: Job) -> int:
         """Hand the reply to the job and start its next transaction; return the time after that."""
-        reply = self._reply
-        self._before = self._awaited
-        self._awaited = transaction = job.advance(None if self._awaited is None else reply)
+        reply, done = self._reply, self._awaited
+        if done is not None and reply.outcome is _OK:
+            self._note_lateness(reply.last_ns - reply.sent_ns - done.due_ns - self._latency_ns)
+        self._before = done
+        self._awaited = transaction = job.advance(None if done is None else reply)
         if transaction is None:
             self._job = None
             return 0
         if self.pending:
             self._receiver.flush()
         packet = transaction.packet
-        now_ns = self._write(packet, transaction.servo_id) if packet else self._now_ns()
+        now_ns = self._write(packet, transaction.servo_id) if packet else self.now_ns()
         self._await(transaction, self._sent_ns if packet else now_ns)
         # this process may have stood still before the bytes left
         self._deadline_ns = max(self._deadline_ns, now_ns + transaction.timeout_ns)
@@ -197,26 +304,268 @@ class Bus(Listener):
 
     def _write(self, packet: bytes | bytearray | memoryview, servo_id: int) -> int:
         """Send a packet; return the time after that."""
-        now_ns = self._now_ns
+        now_ns, words = self.now_ns, self.words
         before = now_ns()
         self._port.write(packet)
         after = now_ns()
         self._sink.packet(self.index, _INSTRUCTION, servo_id, before, after, packet)
         # a second packet waits in the adapter until the first is off the wire
-        start = self._sent_ns = self.free_ns if self.free_ns > before else before
-        self.free_ns = start + len(packet) * self.byte_ns
+        free = words[FREE_NS]
+        start = self._sent_ns = free if free > before else before  # a third of the time of max()
+        words[FREE_NS] = start + len(packet) * self.byte_ns
         return after
+
+    def _await(self, transaction: Transaction, started_ns: int) -> None:
+        """Await the replies to a transaction whose instruction is on its way."""
+        reply = self._reply
+        reply.parameters = b""
+        reply.error = reply.strays = 0
+        reply.echoed = False
+        reply.sent_ns = self._sent_ns = started_ns
+        if transaction.awaited:
+            reply.outcome = _TIMEOUT
+            self._state = _AWAITING
+            self._earliest_ns = started_ns + (len(transaction.packet) + self._dialect.OVERHEAD) * self.byte_ns
+            self._deadline_ns = started_ns + transaction.timeout_ns
+            self._open = (1 << len(transaction.awaited)) - 1
+            self._refused = False
+        else:
+            reply.outcome = _SENT
+            self._state = _RESTING
+            self._deadline_ns = started_ns + transaction.due_ns
+
+    def _end(self, now_ns: int) -> None:
+        """Do what is due at a transaction's deadline."""
+        # bytes may have come while this process was not running: look before giving up
+        self._receive()
+        if self._state == _AWAITING:
+            self._give_up(now_ns)
+        elif self._state == _DRAINING and self._quiet_at() > now_ns:
+            self._deadline_ns = self._quiet_at()
+        elif self._state in (_RESTING, _DRAINING):
+            self._receiver.flush()
+            self._state = _READY
 
     def _give_up(self, now_ns: int) -> None:
         """End a transaction of which not every reply came in time."""
         self._receiver.flush()  # the reply may stand behind a false header
-        if self._state != AWAITING:
+        if self._state != _AWAITING:
             return
-        self._owe()
-        self._reply.outcome = Outcome.GARBLED if self._reply.strays else Outcome.TIMEOUT
+        self._note_owed()
+        self._reply.outcome = Outcome.GARBLED if self._reply.strays else _TIMEOUT
         self._drain_end_ns = now_ns + DRAIN_LIMIT_NS
         self._deadline_ns = self._quiet_at()
-        self._state = DRAINING if self._deadline_ns > now_ns else READY
+        self._state = _DRAINING if self._deadline_ns > now_ns else _READY
 
     def _quiet_at(self) -> int:
         return min(self._last_byte_ns + self._quiet_ns, self._drain_end_ns)
+
+    def _note_lateness(self, late_ns: int) -> None:
+        """Keep how late replies come: idle time begins nothing that would end as late. As in kernel.c."""
+        kept_ns = self.words[LATE_NS]
+        kept_ns -= (kept_ns >> _FORGOTTEN) + 1
+        self.words[LATE_NS] = max(min(late_ns, MOST_LATE_NS), kept_ns, 0)
+
+    # What arrives: match received packets to the pending request, count the rest as stray
+
+    def _skip_headers(self) -> None:
+        # as many bytes as an awaited reply has, and it is not whole: its header is a false one
+        receiver, awaited = self._receiver, self._awaited
+        while awaited is not None and self._state == _AWAITING and receiver.pending >= awaited.widest:
+            receiver.skip_header()
+
+    def _take_noise(self, data: memoryview, first_ns: int, last_ns: int) -> None:
+        self._sink.packet(self.index, PacketKind.NOISE, BROADCAST_ID, first_ns, last_ns, data)
+        # a status of a fast form that is cut off, or spoilt at a place: the parts before it are good
+        unused = len(data) - (self._take_fast(data, last_ns) if self._is_fast(data) else 0)
+        if unused:
+            self.noise_bytes += unused
+            self._reply.strays += 1
+
+    def _take_status(self, packet: memoryview, first_ns: int, last_ns: int) -> None:
+        self._sink.packet(self.index, _STATUS, packet[self._dialect.ID_AT], first_ns, last_ns, packet)
+        if self._is_fast(packet):
+            if not self._take_fast(packet, last_ns):
+                self._count_stray(packet)
+            return
+        status = self._dialect.opened(packet) if self._state == _AWAITING else None
+        index = -1 if status is None else self._place(status, last_ns)
+        if status is None or index < 0 or self._job is None:
+            self._count_stray(packet)
+            return
+        reply = self._reply
+        reply.error, reply.parameters, reply.last_ns = status.error, bytes(status.parameters), last_ns
+        self._open &= ~(1 << index)
+        if status.error and self._refuses(status, index):
+            self._refused = True
+        else:
+            self._job.status(index, reply)
+        if not self._open:
+            reply.outcome = Outcome.REFUSED if self._refused else _OK
+            self._state = _READY
+
+    def _place(self, status: Status, last_ns: int) -> int:
+        """Return which of the awaited statuses this is; -1 when it is none of them."""
+        servo_id, error, parameters = status
+        length = len(parameters)
+        # an echo, or left over from before, comes sooner than the wire allows
+        if self._awaited is None or last_ns < self._earliest_ns + length * self.byte_ns:
+            return -1
+        for index, one in enumerate(self._awaited.awaited):
+            if one.servo_id == servo_id and self._open >> index & 1:
+                return index if length == one.length or (error and self._refuses(status, index)) else -1
+        return -1
+
+    def _refuses(self, status: Status, index: int) -> bool:
+        assert self._awaited is not None  # noqa: S101  a status has its place
+        length = self._awaited.awaited[index].length
+        return self._dialect.refused(status.error, len(status.parameters), length)
+
+    def _is_fast(self, data: memoryview) -> bool:
+        """Check whether a fast form is awaited, and this looks like its one status, whole or not."""
+        awaited = self._awaited
+        return (
+            awaited is not None
+            and awaited.fast
+            and self._state == _AWAITING
+            and bytes(data[: self._dialect.ID_AT + 1]) == self._dialect.HEADER + bytes((BROADCAST_ID,))
+        )
+
+    def _take_fast(self, data: memoryview, last_ns: int) -> int:
+        """Take what is good of the one status of a fast form; return the number of its bytes."""
+        awaited, job = self._awaited, self._job
+        if awaited is None or job is None:
+            return 0
+        parts, used = _good_parts(self._dialect, awaited, data)
+        if last_ns < self._sent_ns + (len(awaited.packet) + used) * self.byte_ns:
+            return 0  # sooner than the wire allows: left over from before
+        reply = self._reply
+        for index, part in enumerate(parts):
+            reply.error, reply.parameters, reply.last_ns = part.error, part.parameters, last_ns
+            self._open &= ~(1 << index)
+            job.status(index, reply)
+        if not self._open:
+            reply.outcome = _OK
+            self._state = _READY
+        return used
+
+    def _note_owed(self) -> None:
+        """Note the replies to a transaction that is given up; they may still come."""
+        if self._awaited is None:
+            return
+        self._before = self._awaited
+        if self._state == _AWAITING:
+            for index, one in enumerate(self._awaited.awaited):
+                shape = one.servo_id, one.length
+                if self._open >> index & 1 and shape not in self._cyclic:
+                    self._owed[shape] = self._owed.get(shape, 0) + 1
+
+    def _count_stray(self, packet: memoryview) -> None:
+        self._reply.strays += 1
+        if self._awaited is not None and packet == self._awaited.packet:
+            self._reply.echoed = True
+        elif not self._explained(packet):
+            self.unrequested += 1
+
+    def _explained(self, packet: memoryview) -> bool:
+        """Check whether a stray packet can be a reply to this host: a late one, or a second one.
+
+        Replies are distinguished by ID and length, so those to another host that reads what this one reads
+        are taken for late ones.
+        """
+        status = self._dialect.opened(packet)
+        if status is None:
+            return False
+        shape = _FAST if status.servo_id == BROADCAST_ID else (status.servo_id, len(status.parameters))
+        if shape in self._cyclic or shape in _shapes(self._awaited) or shape in _shapes(self._before):
+            return True
+        owed = self._owed.pop(shape, 0)
+        if owed > 1:
+            self._owed[shape] = owed - 1
+        return owed > 0
+
+
+def _shapes(transaction: Transaction | None) -> list[_Shape]:
+    """Return ID and length of the replies to a transaction."""
+    return [] if transaction is None else [(one.servo_id, one.length) for one in transaction.awaited]
+
+
+def _good_parts(dialect: Dialect, transaction: Transaction, data: memoryview) -> tuple[list[Status], int]:
+    """Return what is good of the one status of a fast form that is cut off or spoilt, and its bytes."""
+    if dialect.size_at(data, 0, len(data)) != transaction.widest:
+        return [], 0
+    awaited = transaction.awaited
+    try:
+        parts = dialect.fast_answers(data, [one.length for one in awaited])
+    except ValueError:  # spoilt before its first part
+        return [], 0
+    count = 0
+    while count < len(parts) and parts[count].servo_id == awaited[count].servo_id:
+        count += 1
+    used = dialect.fast_size(sum(one.length for one in awaited[:count]), count) if count else 0
+    return parts[:count], used
+
+
+def clear(buses: Iterable[Bus], ports: Ports) -> None:
+    """Take what lines have before something is asked on them.
+
+    What came before a request must not be taken for its reply, and replies come in the order of requests: one
+    that is too many would shift all that follow.
+    """
+    here = {bus.index: bus for bus in buses if bus.failure is None}
+    for index in ports.wait(0):
+        if index in here:
+            here[index].hear()
+
+
+def pump(
+    buses: Sequence[Bus], ports: Ports, clock: Clock, beat: Callable[[], None], until_ns: int = NEVER
+) -> None:
+    """Execute the jobs of all buses side by side: one wait over all ports, until every job is finished.
+
+    All that can be sent is sent before anything is awaited. Ends at `until_ns` in any case, and a job that is
+    not finished then continues in the next call. `beat` is called before a wait, if it was not within
+    BEAT_NS. Raises nothing: a line that is lost has its `failure`, and the others continue.
+    """
+    clock_ns, wait = clock.now_ns, ports.wait
+    now_ns, beat_ns = clock_ns(), 0
+    deadlines = [bus.step(now_ns) for bus in buses]
+    while (deadline := min(deadlines)) != NEVER and now_ns < until_ns:
+        if now_ns >= beat_ns:
+            beat()
+            beat_ns = now_ns + BEAT_NS
+        deadline = min(deadline, until_ns)
+        ready = wait(deadline)
+        heard = not ready
+        for index in ready:
+            bus = buses[index]
+            if bus.failure is None:
+                heard = True
+                deadlines[index] = bus.hear()
+        if not heard:
+            # a line that is lost is ready for ever: look at the others now and then instead of waiting
+            clock.wait_until(min(deadline, clock_ns() + LOST_LINE_STEP_NS))
+            for bus in buses:
+                bus.hear()
+        now_ns = clock_ns()
+        if now_ns >= deadline or not heard:
+            deadlines = [bus.step(now_ns) for bus in buses]
+
+
+def run(
+    programs: Sequence[Program[Result]],
+    buses: Sequence[Bus],
+    ports: Ports,
+    clock: Clock,
+    beat: Callable[[], None] = lambda: None,
+) -> list[Result | None]:
+    """Run one program a bus to its end, blocking, side by side; for set-up and tools, never in the loop.
+
+    Returns what each program returned; None where the line is lost, and the bus' `failure` says why.
+    """
+    jobs = [ProgramJob(program) for program in programs]
+    for bus, job in zip(buses, jobs, strict=True):
+        bus.load(job)
+    clear(buses, ports)
+    pump(buses, ports, clock, beat)
+    return [job.result for job in jobs]

@@ -7,10 +7,10 @@ reply can be there in time, and a program that did not end goes on in the next g
 from __future__ import annotations
 
 from bisect import insort
-from collections.abc import Callable
 from dataclasses import replace
 from enum import IntEnum, unique
 
+from dxlrun.dynamixel.exchange.bus import Bus
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.dynamixel.plan.line import SHORT_PATIENCE_NS
 from dxlrun.dynamixel.wire.transaction import Outcome, Program, Reply, Transaction
@@ -18,10 +18,6 @@ from dxlrun.run.channels.events import EventCode, EventSink, Severity
 
 LEAST_PATIENCE_NS = 100_000
 """A reply is awaited at least so long beyond the moment at which it is due; a servo is late by less."""
-_FORGOTTEN = 6
-"""By 2 ** -6 of itself the lateness of a line is forgotten with each reply that is less late."""
-_LATEST_NS = 1_000_000
-"""More than this is an accident of one reply, as after this process stood still, and not the line's way."""
 STARVED = 50
 """Cycles after which an urgent program goes on though the gap is too short: a skipped period is better than a
 joint that gets no goals for the rest of the run."""
@@ -97,24 +93,21 @@ class Gaps:
     """
 
     __slots__ = (
+        "_bus",
         "_count",
         "_current",
         "_events",
-        "_latency_ns",
         "_plan",
         "_tasks",
         "_until_ns",
-        "late_ns",
         "now_ns",
     )
 
-    def __init__(self, plan: BusPlan, events: EventSink, now_ns: Callable[[], int]) -> None:
+    def __init__(self, plan: BusPlan, events: EventSink, bus: Bus) -> None:
         self._plan = plan
         self._events = events
-        self.now_ns = now_ns
-        self._latency_ns = plan.latency_ns
-        self.late_ns = 0
-        """How late replies on this line came at worst in the last moment, beside the adapter's latency."""
+        self._bus = bus
+        self.now_ns = bus.now_ns
         self._tasks: list[_Task] = []  # in the order of their turns
         self._current: _Task | None = None
         self._until_ns = 0
@@ -135,17 +128,6 @@ class Gaps:
         self._count += 1
         insort(self._tasks, _Task(program, (urgency, self._count), name, servo), key=_turn)
 
-    def came(self, at_ns: int, due_ns: int) -> None:
-        """Take note of when a reply came and when it was due: a gap begins nothing that would end as late.
-
-        Who answers behind its gap talks into the next cyclic read, which costs far more than it brings.
-        """
-        late_ns = at_ns - due_ns - self._latency_ns
-        forgotten_ns = self.late_ns - (self.late_ns >> _FORGOTTEN) - 1
-        if late_ns > forgotten_ns:
-            forgotten_ns = min(late_ns, _LATEST_NS)
-        self.late_ns = forgotten_ns if forgotten_ns > 0 else 0  # a third of the time of max()
-
     @property
     def waiting(self) -> int:
         """How many programs have not come to their end."""
@@ -162,8 +144,6 @@ class Gaps:
     def advance(self, reply: Reply | None) -> Transaction | None:
         """Give a reply to the program that waits for it, return the next transaction that fits the gap."""
         if reply is not None and self._current is not None:
-            if reply.answered and (asked := self._current.next) is not None:
-                self.came(reply.last_ns, reply.sent_ns + asked.due_ns)
             self._resume(self._current, replace(reply, parameters=bytes(reply.parameters)))
         first = reply is None
         while (task := self._ready()) is not None:
@@ -219,7 +199,8 @@ class Gaps:
         left_ns = self._until_ns - self.now_ns()
         latest_ns = wanted.due_ns
         if wanted.awaited:
-            latest_ns += self._latency_ns + max(self.late_ns, LEAST_PATIENCE_NS)
+            # a reply behind the end would disturb the next cyclic read, which costs far more than this brings
+            latest_ns += self._plan.latency_ns + max(self._bus.late_ns, LEAST_PATIENCE_NS)
         if latest_ns > left_ns:
             if not first or not self._forced(task, latest_ns, left_ns):
                 return None

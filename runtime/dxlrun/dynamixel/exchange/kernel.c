@@ -6,7 +6,7 @@
  * until then is left in the line's buffer, and the packet-by-packet parser in Python goes on from there.
  *
  * All lengths come from the plan, none from the wire. Arithmetic is IEEE double in the order in which
- * `samples.py` and `goal_arrays.py` do it, so that both give the same bits; build with -ffp-contract=off.
+ * `samples.py` and `goals.py` do it, so that both give the same bits; build with -ffp-contract=off.
  */
 
 #define _GNU_SOURCE
@@ -25,13 +25,15 @@
 #define MOST_PIECES 32
 #define LONGEST_SYNC_WRITE 6200
 #define RECORD_HEADER 24 /* bus, kind, ID, pad, length, two times: packets.py */
-#define REPEATED 50      /* cycles: goal_arrays.py */
+#define REPEATED 50      /* cycles: goals.py */
 #define NEVER ((int64_t)1 << 62)
 #define WRITE_TIMEOUT_NS 20000000 /* port.py */
 #define LEAST_NAP_NS 15000
 
 enum { OK, WAITING, FULL, UNEXPECTED, LOOK };
 enum { IDLE, AWAITING, THROUGH };
+enum { FREE_NS, LATE_NS, LOST }; /* words of a line that the parser shares: bus.py */
+#define MOST_LATE_NS 1000000     /* bus.py */
 enum { INSTRUCTION = 1, STATUS = 2 };
 enum { UNSIGNED, TWOS_COMPLEMENT, SIGN_MAGNITUDE };
 
@@ -63,12 +65,12 @@ typedef struct { /* one read instruction and its replies, to the byte */
     int64_t due_ns, timeout_ns, least_ns, record_bytes;
 } Read;
 
-typedef struct { /* one goal item of one servo: goal_arrays.Cell */
+typedef struct { /* one goal item of one servo: goals.Cell */
     int32_t at, size, interface, magnitude, mirrored, low, high, free;
     double sign, offset, unit;
 } Cell;
 
-typedef struct { /* goal_arrays.SyncWrite */
+typedef struct { /* goals.SyncWrite */
     const int32_t *members; /* indices on the bus */
     const int32_t *rows;
     const uint8_t *ids;
@@ -92,8 +94,9 @@ typedef struct { /* one serial line */
     const uint8_t *included; /* which servos may get goals */
     const double *ceiling;   /* rad/s of each servo, NaN: none */
     uint8_t *buffer;
-    int64_t byte_ns, free_ns, sent_ns, due_ns, deadline_ns, at_ns;
-    int32_t descriptor, bus, protocol, active, split;
+    int64_t *words;
+    int64_t byte_ns, latency_ns, sent_ns, due_ns, deadline_ns, at_ns;
+    int32_t descriptor, bus, protocol, planned, split;
     int32_t first_servo, servo_count;
     int32_t room, read_count, write_count;
     int32_t state, done, have, pieces;
@@ -141,6 +144,8 @@ static int64_t clock_ns(void)
 
 static int64_t now_ns(const Kernel *k) { return k->now ? k->now() : clock_ns(); }
 
+static int is_read(const Line *l) { return l->planned && !l->words[LOST]; }
+
 /* Waits for bytes on any line; `ready` has a flag a line. Returns the number of lines with bytes. */
 static int32_t wait_for(Kernel *k, int64_t deadline_ns, uint8_t *ready)
 {
@@ -150,7 +155,7 @@ static int32_t wait_for(Kernel *k, int64_t deadline_ns, uint8_t *ready)
     if (k->wait)
         return k->wait(deadline_ns, ready);
     for (int32_t i = 0; i < k->line_count; i++)
-        if (k->lines[i].active) {
+        if (is_read(&k->lines[i])) {
             set[count] = (struct pollfd){k->lines[i].descriptor, POLLIN, 0};
             line[count++] = i;
         }
@@ -358,7 +363,7 @@ static int32_t poll_for_replies(Kernel *k, int64_t deadline_ns, uint8_t *ready)
     int64_t now = clock_ns(), soonest = NEVER, latest = 0, until;
     for (int32_t i = 0; i < k->line_count; i++) {
         const Line *l = &k->lines[i];
-        if (l->active && l->state == AWAITING) {
+        if (is_read(l) && l->state == AWAITING) {
             if (l->due_ns > latest)
                 latest = l->due_ns;
             if (l->due_ns > now && l->due_ns < soonest)
@@ -414,6 +419,15 @@ static void take_state(Kernel *k, const Line *l, const Part *part, int64_t at_ns
     k->at_ns[i] = at_ns;
 }
 
+/* Counts what was sent from `before` on: it waits in the adapter behind what was sent before. Returns when the
+ * first of it is on the wire. */
+static int64_t occupy(Line *l, int64_t before, int32_t size)
+{
+    int64_t start = l->words[FREE_NS] > before ? l->words[FREE_NS] : before;
+    l->words[FREE_NS] = start + size * l->byte_ns;
+    return start;
+}
+
 /* Sends the next read of a line; OK, FULL, or UNEXPECTED when the line is gone. */
 static int ask(Kernel *k, Line *l)
 {
@@ -429,14 +443,21 @@ static int ask(Kernel *k, Line *l)
     int64_t after = now_ns(k);
     put_record(k, l, INSTRUCTION, r->id, before, after, r->instruction, r->instruction_size);
     k->reserved += r->record_bytes - RECORD_HEADER - r->instruction_size;
-    /* it waits in the adapter behind what was sent before */
-    l->sent_ns = l->free_ns > before ? l->free_ns : before;
-    l->free_ns = l->sent_ns + r->instruction_size * l->byte_ns;
+    l->sent_ns = occupy(l, before, r->instruction_size);
     l->due_ns = l->sent_ns + r->due_ns;
     /* this process may have stood still before the bytes left */
     l->deadline_ns = (l->sent_ns > after ? l->sent_ns : after) + r->timeout_ns;
     l->state = AWAITING;
     return OK;
+}
+
+/* Keeps how late the replies on a line come, as `Bus` does: idle time begins nothing that would end as late. */
+static void note_lateness(Line *l, int64_t late_ns)
+{
+    int64_t kept = l->words[LATE_NS] - (l->words[LATE_NS] >> 6) - 1;
+    if (late_ns > kept)
+        kept = late_ns < MOST_LATE_NS ? late_ns : MOST_LATE_NS;
+    l->words[LATE_NS] = kept > 0 ? kept : 0;
 }
 
 static int keep_replies(Kernel *k, Line *l, const Read *r, int64_t at)
@@ -451,6 +472,7 @@ static int keep_replies(Kernel *k, Line *l, const Read *r, int64_t at)
         take_state(k, l, &r->parts[i], r->fast ? at : piece_of(l, r->parts[i].end - 1)->at_ns);
     if (k->polling.enabled)
         dxl_polling_came(&k->polling, l->due_ns, at);
+    note_lateness(l, at - l->due_ns - l->latency_ns);
     l->at_ns = at;
     l->state = IDLE;
     l->have = l->pieces = 0;
@@ -499,6 +521,7 @@ static int hear(Kernel *k, Line *l)
 static int settle(Kernel *k, int64_t now)
 {
     int32_t n = k->servo_count;
+    k->reserved = 0;
     for (int32_t i = 0; i < k->line_count; i++) {
         Line *l = &k->lines[i];
         l->state = IDLE;
@@ -531,18 +554,18 @@ int32_t dxl_read(Kernel *k, int64_t until_ns, int32_t all)
     int32_t idle = 0;
     for (int32_t i = 0; i < k->line_count; i++) { /* now, as the parser may settle this cycle */
         const Line *l = &k->lines[i];
-        if (!l->active)
+        if (!is_read(l))
             memset(k->fresh + l->first_servo, 0, (size_t)l->servo_count);
     }
     for (int32_t i = 0; all && i < k->line_count; i++)
-        idle += k->lines[i].active && k->lines[i].state == IDLE;
+        idle += is_read(&k->lines[i]) && k->lines[i].state == IDLE;
     if (idle && wait_for(k, 0, ready)) /* what came before a request must not be taken for its reply */
         for (int32_t i = 0; i < k->line_count; i++)
-            if (ready[i] && k->lines[i].active && k->lines[i].state == IDLE)
+            if (ready[i] && is_read(&k->lines[i]) && k->lines[i].state == IDLE)
                 return UNEXPECTED;
     for (int32_t i = 0; i < k->line_count; i++) {
         Line *l = &k->lines[i];
-        if (l->active && l->state == IDLE && (all || l->done)) {
+        if (is_read(l) && l->state == IDLE && (all || l->done)) {
             int answer = ask(k, l);
             if (answer != OK)
                 return answer;
@@ -552,7 +575,7 @@ int32_t dxl_read(Kernel *k, int64_t until_ns, int32_t all)
         int64_t deadline = NEVER;
         for (int32_t i = 0; i < k->line_count; i++) {
             const Line *l = &k->lines[i];
-            if (l->active && l->state == AWAITING && l->deadline_ns < deadline)
+            if (is_read(l) && l->state == AWAITING && l->deadline_ns < deadline)
                 deadline = l->deadline_ns;
         }
         if (deadline == NEVER)
@@ -569,7 +592,7 @@ int32_t dxl_read(Kernel *k, int64_t until_ns, int32_t all)
         /* every line that has bytes is heard, whatever came on another: the parser does so, too */
         int answer = OK;
         for (int32_t i = 0; i < k->line_count; i++) {
-            int one = ready[i] && k->lines[i].active ? hear(k, &k->lines[i]) : OK;
+            int one = ready[i] && is_read(&k->lines[i]) ? hear(k, &k->lines[i]) : OK;
             if (one > answer)
                 answer = one;
         }
@@ -673,7 +696,7 @@ static int32_t build(Kernel *k, const Line *l, SyncWrite *w, uint8_t *packet)
 static int write_goals(Kernel *k, Line *l)
 {
     uint8_t packet[LONGEST_SYNC_WRITE];
-    for (; !l->gone && k->write_number < l->write_count; k->write_number++) {
+    for (; !l->words[LOST] && !l->gone && k->write_number < l->write_count; k->write_number++) {
         SyncWrite *w = &l->writes[k->write_number];
         if (!has_room(k, RECORD_HEADER + 16 + (w->length + 1) * w->count * 4 / 3))
             return FULL;
@@ -682,16 +705,19 @@ static int write_goals(Kernel *k, Line *l)
         if (!size || !send_all(k, l, packet, size))
             continue;
         put_record(k, l, INSTRUCTION, 0xfe, before, now_ns(k), packet, size);
-        l->free_ns = (l->free_ns > before ? l->free_ns : before) + size * l->byte_ns;
+        occupy(l, before, size);
     }
     k->write_number = 0;
     return OK;
 }
 
-/* Sends the goals that are due on every line, then asks split lines for their next states. FULL: commit the
- * log and call again; LOOK: split lines have bytes that nothing asked for, and are not asked; UNEXPECTED: a
- * line is gone, the others have their goals and are asked. */
-int32_t dxl_write(Kernel *k)
+/* Whether a line is asked behind the goals. */
+static int is_due(const Line *l) { return l->split && is_read(l) && l->state == IDLE && !l->done; }
+
+/* Sends the goals that are due on every line; with `asks`, then asks split lines for their next states, unless
+ * they were asked already. FULL: commit the log and call again; LOOK: split lines have bytes that nothing asked
+ * for, and are not asked; UNEXPECTED: a line is gone, the others have their goals and are asked. */
+int32_t dxl_write(Kernel *k, int32_t asks)
 {
     uint8_t ready[MOST_LINES];
     int32_t n = k->line_count, gone = 0;
@@ -699,15 +725,15 @@ int32_t dxl_write(Kernel *k)
         if (write_goals(k, &k->lines[k->write_line]) == FULL)
             return FULL;
     int32_t split = 0, early = 0;
-    for (int32_t i = 0; i < n; i++)
-        split += k->lines[i].split && k->lines[i].active;
+    for (int32_t i = 0; asks && i < n; i++)
+        split += is_due(&k->lines[i]);
     if (split && k->write_line == n)
         wait_for(k, 0, ready);
     for (int32_t i = 0; split && k->write_line == n && i < n; i++)
-        early += ready[i] && k->lines[i].active;
+        early += ready[i] && is_read(&k->lines[i]) && k->lines[i].state == IDLE;
     for (; split && !early && k->write_line < 2 * n; k->write_line++) {
         Line *l = &k->lines[k->write_line - n];
-        if (l->split && l->active && !l->gone && ask(k, l) == FULL)
+        if (is_due(l) && !l->gone && ask(k, l) == FULL)
             return FULL;
     }
     k->write_line = 0;

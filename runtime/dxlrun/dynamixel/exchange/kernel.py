@@ -1,4 +1,4 @@
-"""Kernel: lays out the plan of a cycle for `kernel.c`, which executes it, and says how that went.
+"""Exchange kernel: lays out the plan of a cycle for `kernel.c`, which executes it.
 
 The kernel is one shared object without Python in it, called through ctypes; it is built with the package
 where a C compiler is found. Without it every cycle goes through the packet-by-packet parser (`bus`), which
@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.clock import Clock
-from dxlrun.dynamixel.exchange.goal_arrays import SyncWrite
-from dxlrun.dynamixel.exchange.pump import LOST_LINE_STEP_NS
+from dxlrun.dynamixel.exchange.bus import BEAT_NS, LOST_LINE_STEP_NS, NEVER, Bus, Interrupted, LineState
+from dxlrun.dynamixel.exchange.goals import GoalArrays, SyncWrite
 from dxlrun.dynamixel.exchange.samples import Samples
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, Field
 from dxlrun.dynamixel.plan.line import BITS_PER_BYTE
@@ -35,9 +35,6 @@ from dxlrun.run.channels.packets import RECORD_HEADER, PacketLog
 LIBRARY = Path(__file__).with_name("libkernel.so")
 """Where the build puts the compiled kernel."""
 SOURCE = Path(__file__).with_name("kernel.c")
-NEVER = 1 << 62
-BEAT_NS = 1_000_000
-"""After so long a wait the kernel returns, so that the loop can show that it lives."""
 MOST_LINES = 32
 _LONGEST_SYNC_WRITE = 6200
 _MOST_PIECES = 32
@@ -64,17 +61,6 @@ class Answer(IntEnum):
 
 
 _ANSWERS = tuple(Answer)  # to make one of a number takes longer than the call
-
-
-@unique
-class LineState(IntEnum):
-    """What a line of the kernel does."""
-
-    IDLE = 0
-    AWAITING = 1
-    """A read was sent."""
-    THROUGH = 2
-    """All its reads of this cycle are done."""
 
 
 class _Field(ctypes.Structure):
@@ -137,9 +123,9 @@ class _Line(ctypes.Structure):
     _fields_ = (
         ("reads", POINTER(_Read)),
         ("writes", POINTER(_SyncWrite)),
-        *((name, c_void_p) for name in ("included", "ceiling", "buffer")),
-        *((name, c_int64) for name in ("byte_ns", "free_ns", "sent_ns", "due_ns", "deadline_ns", "at_ns")),
-        *((name, c_int32) for name in ("descriptor", "bus", "protocol", "active", "split")),
+        *((name, c_void_p) for name in ("included", "ceiling", "buffer", "words")),
+        *((name, c_int64) for name in ("byte_ns", "latency_ns", "sent_ns", "due_ns", "deadline_ns", "at_ns")),
+        *((name, c_int32) for name in ("descriptor", "bus", "protocol", "planned", "split")),
         *((name, c_int32) for name in ("first_servo", "servo_count", "room", "read_count", "write_count")),
         *((name, c_int32) for name in ("state", "done", "have", "pieces", "gone", "unused")),
         ("piece", _Piece * _MOST_PIECES),
@@ -208,7 +194,7 @@ class Library:
     """The functions of the compiled kernel."""
 
     read: Callable[[c_void_p, int, int], int]
-    write: Callable[[c_void_p], int]
+    write: Callable[[c_void_p, int], int]
     abandon: Callable[[c_void_p], None]
     handle: ctypes.CDLL
 
@@ -224,7 +210,8 @@ def load(path: Path = LIBRARY) -> Library | None:
     if found != [crc32(source), *map(ctypes.sizeof, _STRUCTS)]:
         return None
     handle.dxl_read.argtypes = (c_void_p, c_int64, c_int32)
-    handle.dxl_write.argtypes = handle.dxl_abandon.argtypes = (c_void_p,)
+    handle.dxl_write.argtypes = (c_void_p, c_int32)
+    handle.dxl_abandon.argtypes = (c_void_p,)
     handle.dxl_abandon.restype = None
     return Library(handle.dxl_read, handle.dxl_write, handle.dxl_abandon, handle)
 
@@ -319,81 +306,70 @@ def _fast_replies(plan: BusPlan, read: PlannedRead) -> _Replies:
     return expected, known, [_Packet(0, size, BROADCAST_ID)], parts
 
 
-@dataclass(frozen=True, slots=True)
-class Interrupted:
-    """Where a line stood when the kernel ended: the parser goes on from there."""
-
-    state: LineState
-    done: int
-    """How many of its reads are done; the next one was sent where the line is AWAITING."""
-    sent_ns: int
-    deadline_ns: int
-    heard_ns: int
-    """When the replies to the read before it came."""
-    due_ns: int
-    """When the replies to its newest read were due."""
-    pieces: tuple[tuple[bytes, int], ...]
-    """What was received beyond them, and when, ns: of the awaited replies, or stray."""
-    failure: PortError | None
-    """Why the next one could not be sent."""
-
-
 def holds(plans: Sequence[BusPlan], packets: PacketLog) -> bool:
-    """Say whether the kernel has room for every line and every goal packet of a robot; a goal packet must fit
-    into the log's batch, too. Else the parser does all.
+    """Check whether the kernel has room for every line and every goal packet of a robot; a goal packet must
+    fit into the log's batch, too. Else the parser does all.
     """
     room = (
         _LONGEST_SYNC_WRITE if packets.desk is None else min(_LONGEST_SYNC_WRITE, len(packets.desk.records))
     )
-    layouts = [
-        (layout.length, len(plan.servos))
+    layouts = {
+        (plan.protocol, layout.length)
         for plan in plans
         for servo in plan.servos
         for mode in servo.modes
         for layout in mode.goals
-    ]
+    }
     return len(plans) <= MOST_LINES and all(
-        length <= _MOST_RECORD and RECORD_HEADER + 16 + (length + 1) * count * 4 // 3 <= room
-        for length, count in layouts
+        length <= _MOST_RECORD and room >= RECORD_HEADER + 16 + dialect_of(protocol).MOST_GOAL_BYTES * 4 // 3
+        for protocol, length in layouts
     )
 
 
+@dataclass(frozen=True, slots=True)
+class KernelLine:
+    """What the exchange kernel has of one bus; the arrays are shared."""
+
+    plan: BusPlan
+    bus: Bus
+    goals: GoalArrays
+    included: NDArray[np.bool_]
+    """Which of its servos may get goals."""
+    ceiling: Floats
+    """The highest speed of each toward a position, rad/s; NaN: no limit."""
+
+
 class Kernel:
-    """The lines of a robot as the kernel knows them."""
+    """The lines of a robot as the exchange kernel has them; only for a robot that it `holds`."""
 
     def __init__(  # noqa: PLR0917  the arrays and lines that the hardware has
         self,
         library: Library,
-        plans: Sequence[BusPlan],
+        lines: Sequence[KernelLine],
         samples: Samples,
         states: States,
         goals: Commands,
-        included: Sequence[NDArray[np.bool_]],
-        ceilings: Sequence[Floats],
         packets: PacketLog,
         ports: Ports,
         clock: Clock,
         beat: Callable[[], None],
     ) -> None:
-        """`included`, `ceilings`: of each bus, which of its servos may get goals, and how fast they may go to
-        positions, rad/s, NaN: no limit. Only for a robot that the kernel `holds`.
-        """
         self._library = library
-        self._plans = plans
+        self._known = tuple(lines)
         self._packets = packets
         self._ports = ports
         self._beat = beat
         self._clock = clock
         self._now_ns = clock.now_ns
         self._raised: BaseException | None = None
-        self._kept: list[object] = [samples, states, goals, *included, *ceilings]
-        self._buffers = [ctypes.create_string_buffer(_ROOM) for _ in plans]
-        self._programs: list[Program | None] = [None] * len(plans)
-        self._writes: list[tuple[SyncWrite, ...] | None] = [None] * len(plans)
-        self._written: list[object] = [None] * len(plans)
+        self._kept: list[object] = [samples, states, goals]
+        self._buffers = [ctypes.create_string_buffer(_ROOM) for _ in lines]
+        self._programs: list[Program | None] = [None] * len(lines)
+        self._writes: list[tuple[SyncWrite, ...]] = [()] * len(lines)
+        self._written: list[object] = [None] * len(lines)
         self._kernel = _Kernel(beat_ns=BEAT_NS)
-        self._lines = self._laid_lines(plans, included, ceilings)
-        self._lay_states(plans, samples, states, goals)
+        self._lines = self._laid_lines()
+        self._lay_states([line.plan for line in lines], samples, states, goals)
         self._lay_ports()
         desk = packets.desk
         self._room = NEVER
@@ -404,24 +380,24 @@ class Kernel:
             self._kernel.desk_room = self._room
         self._pointer = ctypes.cast(ctypes.pointer(self._kernel), c_void_p)
 
-    def _laid_lines(
-        self, plans: Sequence[BusPlan], included: Sequence[NDArray[np.bool_]], ceilings: Sequence[Floats]
-    ) -> ctypes.Array[_Line]:
-        lines = (_Line * max(len(plans), 1))()
+    def _laid_lines(self) -> ctypes.Array[_Line]:
+        lines = (_Line * max(len(self._known), 1))()
         first = 0
-        for index, (line, plan) in enumerate(zip(lines, plans, strict=False)):
-            line.included = included[index].ctypes.data
-            line.ceiling = ceilings[index].ctypes.data
+        for index, (line, known) in enumerate(zip(lines, self._known, strict=False)):
+            plan = known.plan
+            line.included = known.included.ctypes.data
+            line.ceiling = known.ceiling.ctypes.data
             line.buffer = ctypes.addressof(self._buffers[index])
+            line.words, _ = known.bus.words.buffer_info()
             line.room = _ROOM
-            line.byte_ns = BITS_PER_BYTE * 1_000_000_000 // plan.baud_rate
+            line.byte_ns, line.latency_ns = known.bus.byte_ns, plan.latency_ns
             line.bus = index
             line.protocol = int(plan.protocol)
             line.split = plan.split
             line.first_servo, line.servo_count = first, len(plan.servos)
             first += len(plan.servos)
         self._kernel.lines = lines
-        self._kernel.line_count = len(plans)
+        self._kernel.line_count = len(self._known)
         return lines
 
     def _lay_states(
@@ -486,11 +462,11 @@ class Kernel:
         return -1 if self._raised else count
 
     def _wait(self, deadline_ns: int, ready: ctypes._Pointer[c_uint8]) -> int:
-        indices: Sequence[int] = range(len(self._plans))  # after an exception: all lines, whose calls fail
+        indices: Sequence[int] = range(len(self._known))  # after an exception: all lines, whose calls fail
         try:
             if self._raised is None:
                 heard = self._ports.wait(deadline_ns)
-                indices = [index for index in heard if self._lines[index].active]
+                indices = [index for index in heard if self._is_read(index)]
                 if heard and not indices:  # a line that is gone is ready for ever: let time pass
                     self._clock.wait_until(min(deadline_ns, self._now_ns() + LOST_LINE_STEP_NS))
         except BaseException as error:
@@ -498,6 +474,9 @@ class Kernel:
         for index in indices:
             ready[index] = 1
         return len(indices)
+
+    def _is_read(self, index: int) -> bool:
+        return bool(self._lines[index].planned) and self._known[index].bus.failure is None
 
     def _raise(self) -> None:
         """Raise what came up while the kernel was at work."""
@@ -510,32 +489,22 @@ class Kernel:
         """Begin to poll for replies as the ports say; before real time."""
         self._kernel.polling = Polling.of(self._ports.polling)
 
-    def fits(self, program: Program) -> bool:
-        """Say whether the log's batch has room for what the lines have at once, and a line's buffer too."""
-        sizes = [read.size for read in program.reads[: program.count]]
-        return program.bytes * len(self._plans) <= self._room and max(sizes, default=0) <= _ROOM // 4
-
-    def set_program(self, index: int, program: Program | None) -> None:
-        """Read a bus by a program from now on; None: not at all."""
+    def plan(self, index: int, program: Program) -> bool:
+        """Read a bus by a program from the next cycle on; False where there is no room for it: the log's
+        batch must hold what the lines have at once, a line's buffer the replies to one read.
+        """
         if program is not self._programs[index]:
+            sizes = [read.size for read in program.reads[: program.count]]
+            if program.bytes * len(self._known) > self._room or max(sizes, default=0) > _ROOM // 4:
+                return False
             line = self._lines[index]
             self._programs[index] = program
-            line.active = int(program is not None and program.count > 0)
-            line.gone = 0
-            if program is not None:
-                line.reads, line.read_count = program.reads, program.count
-
-    def set_writes(self, index: int, writes: tuple[SyncWrite, ...]) -> None:
-        """Send the goals of a bus by these sync writes from now on."""
-        if writes is not self._writes[index]:
-            self._writes[index] = writes
-            laid = [_laid_write(one) for one in writes]
-            array = (_SyncWrite * max(len(laid), 1))(*(one for one, _ in laid))
-            self._written[index] = (array, [kept for _, kept in laid])
-            self._lines[index].writes, self._lines[index].write_count = array, len(laid)
+            line.planned = int(program.count > 0)
+            line.reads, line.read_count = program.reads, program.count
+        return True
 
     def read(self, until_ns: int = NEVER, *, everything: bool = True) -> Answer:
-        """Read every servo once; without `everything`, go on with the lines that were asked before."""
+        """Read every servo once; without `everything`, continue with the lines that were asked before."""
         while True:
             answer = _ANSWERS[self._library.read(self._pointer, until_ns, everything)]
             if self._raised is not None:
@@ -549,20 +518,31 @@ class Kernel:
             else:
                 return answer
 
-    def write(self) -> Answer:
-        """Send the goals that are due, and ask split buses for their next states.
+    def write(self, *, asks: bool) -> Answer:
+        """Send the goals that are due; with `asks`, ask split buses for their next states, unless they were.
 
         LOOK: those have bytes that nothing asked for, and were not asked. UNEXPECTED: see `failures`.
         """
-        while (answer := _ANSWERS[self._library.write(self._pointer)]) is Answer.FULL:
+        for index, known in enumerate(self._known):
+            if known.goals.sync_writes is not self._writes[index]:
+                self._take_writes(index, known.goals.sync_writes)
+        while (answer := _ANSWERS[self._library.write(self._pointer, asks)]) is Answer.FULL:
             self._packets.commit()
         if self._raised is not None:
             self._raise()
         return answer
 
+    def _take_writes(self, index: int, writes: tuple[SyncWrite, ...]) -> None:
+        """Lay the sync writes of a bus out, which are others after a change of mode or limits."""
+        self._writes[index] = writes
+        laid = [_laid_write(one) for one in writes]
+        array = (_SyncWrite * max(len(laid), 1))(*(one for one, _ in laid))
+        self._written[index] = (array, [kept for _, kept in laid])
+        self._lines[index].writes, self._lines[index].write_count = array, len(laid)
+
     def failures(self) -> dict[int, PortError]:
         """Return why lines took no more bytes, by index, once."""
-        found = {index: self._failure(index) for index in range(len(self._plans))}
+        found = {index: self._failure(index) for index in range(len(self._known))}
         return {index: failure for index, failure in found.items() if failure is not None}
 
     def _failure(self, index: int) -> PortError | None:
@@ -571,38 +551,21 @@ class Kernel:
         code, line.gone = line.gone, 0
         return self._ports.ports[index].failure(code) if code else None
 
-    def arrival(self, index: int) -> tuple[int, int] | None:
-        """Return when the newest read of a bus was due, and when its replies came, ns; None: it has none."""
-        line = self._lines[index]
-        return (line.due_ns, line.at_ns) if line.active else None
-
-    def free_at(self, index: int) -> int:
-        """Return when everything that was sent on a line is off the wire, ns."""
-        return int(self._lines[index].free_ns)
-
-    def occupy(self, index: int, until_ns: int) -> None:
-        """Take note that something else was sent on a line, which is off the wire at `until_ns`."""
-        line = self._lines[index]
-        line.free_ns = max(line.free_ns, until_ns)
-
     def awaits(self, index: int) -> bool:
-        """Say whether replies on a line are awaited now."""
+        """Check whether replies on a line are awaited now."""
         return bool(self._lines[index].state == LineState.AWAITING)
 
-    def interrupt(self) -> list[Interrupted | None]:
-        """End the cycle; return where each line stands, None for one that is not read."""
-        found: list[Interrupted | None] = []
-        for index, line in enumerate(self._lines[: len(self._plans)]):
-            if not line.active:
-                found.append(None)
-                continue
+    def interrupt(self) -> list[Interrupted]:
+        """End the cycle; return where each line stands."""
+        found: list[Interrupted] = []
+        for index, line in enumerate(self._lines[: len(self._known)]):
             ends = [0, *(line.piece[number].end for number in range(line.pieces))]
             data = self._buffers[index].raw
             pieces = tuple(
                 (data[start:end], line.piece[number].at_ns)
                 for number, (start, end) in enumerate(pairwise(ends))
             )
-            times = line.sent_ns, line.deadline_ns, line.at_ns, line.due_ns
+            times = line.sent_ns, line.deadline_ns, line.at_ns
             found.append(Interrupted(LineState(line.state), line.done, *times, pieces, self._failure(index)))
         self._library.abandon(self._pointer)
         return found

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 from dxlrun.dynamixel.control_table import ControlItem, ControlTable
 from dxlrun.dynamixel.plan.bus_plan import (
@@ -20,12 +21,14 @@ from dxlrun.dynamixel.plan.bus_plan import (
 from dxlrun.dynamixel.plan.line import Line
 from dxlrun.dynamixel.plan.mode_plan import LACKS, mode_plans, own_limits, position_layout, position_reach
 from dxlrun.dynamixel.plan.reads import choose_reads
-from dxlrun.dynamixel.wire.dialect import dialect_of
+from dxlrun.dynamixel.wire.dialect import Dialect, dialect_of
 from dxlrun.dynamixel.wire.transaction import BROADCAST_ID, Transaction
 from dxlrun.mode import Mode
 
 MOST_SPARE = 2
 """Two longer forms of a read tell its late replies from the newest (`exchange`)."""
+
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +73,7 @@ def bus_plan(
     """
     line = Line(baud_rate, latency_ns, return_delay_ns, dialect_of(protocol))
     servos = tuple(_servo(joint) for joint in joints)
-    goals = [_empty_goals(name, line, layout, servos) for layout in goal_layouts(servos)]
+    goals = [packet for layout in goal_layouts(servos) for packet in _empty_goals(line, layout, servos)]
     reads = choose_reads(line, servos, [joint.table for joint in joints], goals)
     return BusPlan(
         name=name,
@@ -111,16 +114,19 @@ def goal_layouts(servos: Sequence[ServoPlan]) -> tuple[GoalLayout, ...]:
     return tuple(dict.fromkeys(goal for servo in servos for goal in servo.mode_plan(servo.start_mode).goals))
 
 
-def _empty_goals(name: str, line: Line, layout: GoalLayout, servos: Sequence[ServoPlan]) -> bytes:
-    """Return a sync write of zeros to everybody of one layout, to know its size; it is never sent."""
-    count = sum(layout in servo.mode_plan(servo.start_mode).goals for servo in servos)
-    most = line.dialect.MOST_GOAL_BYTES // (layout.length + 1)
-    if count > most:
-        raise ValueError(
-            f"bus {name} has {count} servos; the goals of {most} fit one sync write: "
-            "put the others on a second bus"
-        )
-    return line.dialect.sync_write_records(layout.address, layout.length, bytes((layout.length + 1) * count))
+def goal_parts(dialect: Dialect, layout: GoalLayout, servos: Sequence[Item]) -> list[Sequence[Item]]:
+    """Split servos of one goal block into as many as one sync write takes."""
+    most = dialect.MOST_GOAL_BYTES // (layout.length + 1)
+    return [servos[start : start + most] for start in range(0, len(servos), most)]
+
+
+def _empty_goals(line: Line, layout: GoalLayout, servos: Sequence[ServoPlan]) -> list[bytes]:
+    """Return the sync writes of zeros to all servos of one layout, for their sizes; they are never sent."""
+    here = [servo for servo in servos if layout in servo.mode_plan(servo.start_mode).goals]
+    return [
+        line.dialect.sync_write_records(layout.address, layout.length, bytes((layout.length + 1) * len(part)))
+        for part in goal_parts(line.dialect, layout, here)
+    ]
 
 
 def _torque_off(line: Line, servos: Sequence[ServoPlan]) -> list[Transaction]:

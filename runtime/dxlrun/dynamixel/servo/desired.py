@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.exchange.gaps import Gaps, Urgency
-from dxlrun.dynamixel.exchange.goal_arrays import GoalArrays
+from dxlrun.dynamixel.exchange.goals import GoalArrays
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, RegisterValue, ServoPlan
 from dxlrun.dynamixel.plan.line import listen
 from dxlrun.dynamixel.plan.planning import plan_line

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from dxlrun.dynamixel.exchange.bus import Bus
 from dxlrun.dynamixel.exchange.cyclic_reads import CyclicReads
 from dxlrun.dynamixel.exchange.gaps import Gaps, Urgency
-from dxlrun.dynamixel.exchange.goal_arrays import GoalArrays
+from dxlrun.dynamixel.exchange.goals import GoalArrays
 from dxlrun.dynamixel.exchange.samples import BusSamples
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.dynamixel.plan.planning import plan_line
@@ -206,14 +206,8 @@ class Servos:
         if self._missing or self._samples.fresh.tobytes() != self._every_fresh:
             self._count_losses(now_ns)
             self._missing = any(self.reads.missed)
-        elif self._rows:
-            self.arrived(int(self._samples.at_ns[-1]), self._bus.due_ns)
         if self.reads.errors != self._reported_errors:
             self._report_errors()
-
-    def arrived(self, at_ns: int, due_ns: int) -> None:
-        """Record when the last reply of a cycle came and when it was due; see `Gaps.came`."""
-        self._idle.came(at_ns, due_ns)
 
     def prepare_goals(self, goals: Commands, states: States) -> None:
         """Let the returning servos that have caught up follow their goals as fast as these say."""

@@ -14,8 +14,7 @@ from typing import Protocol, TypeVar
 
 from dxlrun.clock import Clock
 from dxlrun.dynamixel.control_table import control_table
-from dxlrun.dynamixel.exchange.bus import Bus
-from dxlrun.dynamixel.exchange.pump import run
+from dxlrun.dynamixel.exchange.bus import Bus, run
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.plan.line import PATIENCE_NS, listen
 from dxlrun.dynamixel.plan.planning import plan_line

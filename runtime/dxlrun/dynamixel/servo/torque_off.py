@@ -10,8 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from dxlrun.clock import Clock
-from dxlrun.dynamixel.exchange.bus import Bus
-from dxlrun.dynamixel.exchange.pump import run
+from dxlrun.dynamixel.exchange.bus import Bus, run
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.plan.line import listen
 from dxlrun.dynamixel.port.ports import Ports

@@ -8,8 +8,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from dxlrun.clock import Clock, MonotonicClock
-from dxlrun.dynamixel.exchange.bus import Bus
-from dxlrun.dynamixel.exchange.pump import run
+from dxlrun.dynamixel.exchange.bus import Bus, run
 from dxlrun.dynamixel.plan.bus_plan import Budget, BusPlan
 from dxlrun.dynamixel.plan.line import LONGEST_RETURN_DELAY_NS, Line, listen
 from dxlrun.dynamixel.port.latency_timer import latency_timer, shorten

@@ -34,8 +34,8 @@ ID_AT = 4
 HIGHEST_ID = 0xFC
 PING_LENGTH = 3
 """Parameters of the answer to a ping: model number (2), firmware version (1)."""
-MOST_GOAL_BYTES = 4096
-"""Parameters of a sync write; far below what LEN can say, far above any robot's bus."""
+MOST_GOAL_BYTES = 1024
+"""Parameters of a sync write behind address and length: stuffed, they still fit a batch of the log."""
 STATUS = 0x55
 ALERT = 0x80
 """Bit of the error byte: read Hardware Error Status; it comes with good data."""

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, Field, GoalLayout, ModePlan, OwnLimit, Scale, ServoPlan
+from dxlrun.dynamixel.plan.planning import goal_parts
 from dxlrun.dynamixel.wire.dialect import Dialect, dialect_of
 from dxlrun.interfaces import COMMAND_INTERFACES, CommandName, Commands, Floats
 from dxlrun.mode import Mode
@@ -81,18 +82,17 @@ class GoalArrays:
     beside a position: the most that it may take, NaN = all that the servo's own limit lets it.
     """
 
-    __slots__ = ("_cycle", "_fraction", "_limits", "_modes", "_plan", "_unlimited", "sync_writes")
+    __slots__ = ("_fraction", "_limits", "_modes", "_plan", "_unlimited", "sync_writes")
 
     def __init__(self, plan: BusPlan) -> None:
         self._plan = plan
         self._modes: list[Mode] = [servo.start_mode for servo in plan.servos]
         self._limits: list[dict[str, int]] = [{} for _ in plan.servos]
         self._fraction = 1.0
-        self._cycle = 0
         self._unlimited = [math.nan] * len(plan.servos)
         self.sync_writes: tuple[SyncWrite, ...] = ()
         """One for each mode and block of goals, in the order in which they are sent; new after a change."""
-        self._rebuild()
+        self.renew()
 
     @property
     def modes(self) -> Sequence[Mode]:
@@ -108,31 +108,32 @@ class GoalArrays:
             if mode is not Mode.UNKNOWN:
                 self._plan.servos[index].mode_plan(mode)
             self._modes[index] = mode
-            self._rebuild()
+            self.renew()
 
     def set_limits(self, index: int, limits: Mapping[OwnLimit, int]) -> None:
         """Keep the goals of a servo within the limits that were read of it, ticks."""
         self._limits[index] = {limit.of: value for limit, value in limits.items()}
-        self._rebuild()
+        self.renew()
 
     def weaken(self, fraction: float) -> None:
         """Let no goal ask for more effort or PWM than a fraction of the servo's limit."""
         self._fraction = fraction
-        self._rebuild()
+        self.renew()
 
-    def packets(self, goals: Commands, included: Bools, ceiling: Floats | None = None) -> Sequence[bytes]:
-        """Return the packets for the servos that are `included`, shape (servos,), and whose goal is due.
+    def packets(self, goals: Commands, included: Bools, ceiling: Floats | None = None) -> Iterator[bytes]:
+        """Build one packet after the other for servos that are `included`, shape (servos,), with a goal due.
 
         `ceiling`, shape (servos,): the highest speed toward a position, rad/s; NaN: no other than the goal's.
         """
-        self._cycle += 1
         values: list[list[float]] = goals.values.tolist()
         here: list[bool] = included.tolist()
         most: list[float] = self._unlimited if ceiling is None else ceiling.tolist()
-        found = [one.packet(self._cycle, values, here, most) for one in self.sync_writes]
-        return [packet for packet in found if packet is not None]
+        for one in self.sync_writes:
+            if (packet := one.packet(values, here, most)) is not None:
+                yield packet
 
-    def _rebuild(self) -> None:
+    def renew(self) -> None:
+        """Build the sync writes anew; every goal is sent again, as after the line was lost."""
         groups: dict[tuple[Mode, tuple[GoalLayout, ...]], list[int]] = {}
         servos = self._plan.servos
         for index, (servo, mode) in enumerate(zip(servos, self._modes, strict=True)):
@@ -144,15 +145,13 @@ class GoalArrays:
                 dialect,
                 layout,
                 LEADS.get(mode, "position"),
-                members,
-                [servos[index] for index in members],
-                [
-                    _cells(servos[index], mode, layout, self._limits[index], self._fraction)
-                    for index in members
-                ],
+                part,
+                [servos[index] for index in part],
+                [_cells(servos[index], mode, layout, self._limits[index], self._fraction) for index in part],
             )
             for (mode, layouts), members in groups.items()
             for layout in layouts
+            for part in goal_parts(dialect, layout, members)
         )
 
 
@@ -161,6 +160,7 @@ class SyncWrite:
 
     __slots__ = (
         "_again",
+        "_cycle",
         "_dialect",
         "_sent_at",
         "_served",
@@ -196,20 +196,18 @@ class SyncWrite:
         self._again = [False] * len(servos)  # the goal changed in the cycle before
         self._served = [False] * len(servos)  # the servo could get a goal in the cycle before
         self._sent_at = [0] * len(servos)
+        self._cycle = 0
 
     def packet(
-        self,
-        cycle: int,
-        values: Sequence[Sequence[float]],
-        included: Sequence[bool],
-        ceiling: Sequence[float],
+        self, values: Sequence[Sequence[float]], included: Sequence[bool], ceiling: Sequence[float]
     ) -> bytes | None:
-        """Return the packet with the goals that are due; None: none is.
+        """Return the packet with the goals that are due in a cycle; None: none is. As `build` in kernel.c.
 
         `values`: the goals of all joints, in the rows of COMMAND_INTERFACES; `included`, `ceiling`: of each
         servo of the bus.
         """
-        lead, due = values[self.lead], bytearray()
+        self._cycle += 1
+        cycle, lead, due = self._cycle, values[self.lead], bytearray()
         for number, (index, row) in enumerate(zip(self.members, self.rows, strict=True)):
             served = included[index] and not math.isnan(lead[row])
             ticks = [cell.tick(values[cell.interface][row], ceiling[index]) for cell in self.cells[number]]
