@@ -5,13 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from dxlrun.compile.problems import Problems
-from dxlrun.compile.samples import Sample
 from dxlrun.control.controllers.controller import CommandModel
 from dxlrun.control.loop_plan import JointPlan
 from dxlrun.errors import Mark
+
+if TYPE_CHECKING:
+    from dxlrun.compile.samples import Sample  # not at run time: formulas are parsed for motions alone
 
 _TOLERANCE = 1e-6
 """rad; far below a tick (5e-3 rad on an AX-12), far above the rounding of degrees."""

@@ -14,7 +14,6 @@ controller leads the joints to the first point.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,6 +22,7 @@ from pydantic import ValidationError
 from dxlrun.compile.controllers import CompiledController
 from dxlrun.compile.joints import CompiledJoint
 from dxlrun.compile.limits import Interval, check_limits, check_speeds
+from dxlrun.compile.plan import MotionPart
 from dxlrun.compile.problems import Problems
 from dxlrun.compile.samples import Quantity, Sample, formula_samples, formula_texts, listed_samples
 from dxlrun.control.controllers.controller import Controller
@@ -58,29 +58,17 @@ class UnfitError(ValueError):
         self.fix = fix
 
 
-@dataclass(frozen=True, slots=True)
-class CompiledPart:
-    """One part of a motion, ready for the loop; times since the loop's first deadline."""
-
-    file: str
-    controller: str
-    start_ns: int
-    end_ns: int
-    points: int
-    commands: tuple[ScheduledCommand, ...]
-
-
 def compile_motion(
     motion: MotionDescription,
     controllers: Mapping[str, CompiledController],
     names: tuple[str, ...],
     joints: Mapping[str, CompiledJoint],
     problems: Problems,
-) -> list[CompiledPart]:
+) -> list[MotionPart]:
     """Return the parts that could be compiled; `names` are all controllers of the robot file."""
     limits = {name: Interval(joint.plan.lower, joint.plan.upper) for name, joint in joints.items()}
     plans = {name: joint.plan for name, joint in joints.items()}
-    parts: list[CompiledPart] = []
+    parts: list[MotionPart] = []
     if not _affordable(motion, problems):
         return parts
     for index, part in enumerate(motion.motion.motions):
@@ -106,7 +94,7 @@ def compile_motion(
             continue
         end_ns = part.start + lead_ns + samples[-1].t_ns + _settle_ns(controller)
         parts.append(
-            CompiledPart(str(motion.path), part.controller, part.start, end_ns, len(samples), commands)
+            MotionPart(str(motion.path), part.controller, part.start, end_ns, len(samples), commands)
         )
     return parts
 

@@ -5,9 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-import msgspec
-
-from dxlrun.control.loop_plan import LoopPlan
+from dxlrun.control.loop_plan import LoopPlan, ScheduledCommand
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 
 
@@ -77,11 +75,27 @@ class Plan:
         return any(bus.port == "sim" for bus in self.buses)
 
 
+@dataclass(frozen=True, slots=True)
+class MotionPart:
+    """One part of a motion, ready for the loop; times since the loop's first deadline."""
+
+    file: str
+    controller: str
+    start_ns: int
+    end_ns: int
+    points: int
+    commands: tuple[ScheduledCommand, ...]
+
+
 def to_json(plan: Plan) -> bytes:
     """Encode a plan; bytes are base64."""
+    import msgspec  # not above: to check a robot needs no JSON
+
     return msgspec.json.encode(plan)
 
 
 def from_json(data: bytes) -> Plan:
     """Decode a plan; raises msgspec.ValidationError when it is not one."""
+    import msgspec
+
     return msgspec.json.decode(data, type=Plan)

@@ -2,30 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from dxlrun.compile.controllers import CompiledController
 from dxlrun.compile.joints import CompiledJoint
-from dxlrun.compile.motions import CompiledPart
+from dxlrun.compile.plan import MotionPart, Plan
+from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.control.policy_plan import POLICIES, PolicyPlan
-from dxlrun.description import Description
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, ReadWay
 from dxlrun.mode import Mode
-
-
-@dataclass(frozen=True, slots=True)
-class Checked:
-    """Everything that passed the checks, before it becomes a plan."""
-
-    description: Description
-    joints: Mapping[str, CompiledJoint]
-    buses: Sequence[BusPlan]
-    controllers: Mapping[str, CompiledController]
-    parts: Sequence[CompiledPart]
-    end_ns: int | None
-    policies: PolicyPlan
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,20 +138,22 @@ class CheckReport:
     """s; None: the run continues until it is stopped."""
 
 
-def check_report(checked: Checked) -> CheckReport:
-    """Return the rows of what was checked."""
-    rate = checked.description.robot.loop.rate
-    modes = {servo.joint: servo.start_mode for bus in checked.buses for servo in bus.servos}
+def check_report(
+    plan: Plan, rate: float, joints: Sequence[CompiledJoint], parts: Sequence[MotionPart]
+) -> CheckReport:
+    """Return what was decided for a robot whose loop has a `rate`, Hz, in rows."""
+    loop, buses = plan.loop, plan.buses
+    modes = {servo.joint: servo.start_mode for bus in buses for servo in bus.servos}
     return CheckReport(
-        robot=checked.description.robot.name,
+        robot=plan.robot,
         rate=rate,
-        joints=tuple(_joint_row(joint, modes[joint.plan.name]) for joint in checked.joints.values()),
-        controllers=tuple(_controller_row(controller, rate) for controller in checked.controllers.values()),
-        buses=tuple(_bus_row(bus, rate) for bus in checked.buses),
-        ways=tuple(row for bus in checked.buses for row in _way_rows(bus, rate)),
-        policies=_policy_rows(checked.policies, checked.buses),
-        motions=tuple(_motion_row(part) for part in checked.parts),
-        duration=None if checked.end_ns is None else checked.end_ns * 1e-9,
+        joints=tuple(_joint_row(joint, modes[joint.plan.name]) for joint in joints),
+        controllers=tuple(_controller_row(controller, rate) for controller in loop.controllers),
+        buses=tuple(_bus_row(bus, rate) for bus in buses),
+        ways=tuple(row for bus in buses for row in _way_rows(bus, rate)),
+        policies=_policy_rows(loop.policies, buses),
+        motions=tuple(_motion_row(part) for part in parts),
+        duration=None if loop.end_ns is None else loop.end_ns * 1e-9,
     )
 
 
@@ -190,8 +178,7 @@ def _joint_row(joint: CompiledJoint, mode: Mode) -> JointRow:
     )
 
 
-def _controller_row(controller: CompiledController, rate: float) -> ControllerRow:
-    plan = controller.plan
+def _controller_row(plan: ControllerPlan, rate: float) -> ControllerRow:
     return ControllerRow(
         name=plan.name,
         type=plan.type,
@@ -282,7 +269,7 @@ def _on_returned_servo(buses: Sequence[BusPlan]) -> str:
     return f"hold {', '.join(held)} where they stand, the others limp"
 
 
-def _motion_row(part: CompiledPart) -> MotionRow:
+def _motion_row(part: MotionPart) -> MotionRow:
     return MotionRow(
         file=part.file,
         controller=part.controller,

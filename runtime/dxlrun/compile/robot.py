@@ -6,16 +6,14 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 from dxlrun.compile.buses import SIMULATED, compile_buses, slowest_period_ns
 from dxlrun.compile.controllers import compile_controllers, compile_modes
-from dxlrun.compile.joints import AUTO, check_twins, compile_joints, compile_urdf
-from dxlrun.compile.motions import compile_motion
-from dxlrun.compile.plan import Plan, SimulationPlan
+from dxlrun.compile.joints import AUTO, CompiledJoint, check_twins, compile_joints, compile_urdf
+from dxlrun.compile.plan import MotionPart, Plan, SimulationPlan
 from dxlrun.compile.policies import compile_policies
 from dxlrun.compile.problems import Problems, independent_errors, left_out_names
-from dxlrun.compile.report import Checked, CheckReport, check_report
 from dxlrun.compile.simulation import compile_simulation
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.control.loop_plan import MOST_SHARE, LoopPlan, SchedulerPlan
@@ -23,6 +21,9 @@ from dxlrun.description import Description, MotionDescription, Survey, read_moti
 from dxlrun.description.robot import Loop
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.errors import InputError, Problem
+
+if TYPE_CHECKING:
+    from dxlrun.compile.report import CheckReport
 
 Ask: TypeAlias = Callable[[Sequence[BusPlan], Sequence[str]], Mapping[str, str]]
 """Read the models of the servos of joints: takes the buses and the joints, returns models by joint."""
@@ -32,11 +33,21 @@ _HIGHEST = 98
 
 @dataclass(frozen=True, slots=True)
 class Compiled:
-    """A plan that can be run, and what a person should know about it."""
+    """A plan that can be run, what it was compiled from, and what should be looked at."""
 
     plan: Plan
     warnings: tuple[Problem, ...]
-    report: CheckReport
+    rate: float
+    """Of the loop, Hz, as the file has it."""
+    joints: tuple[CompiledJoint, ...]
+    parts: tuple[MotionPart, ...]
+
+    @property
+    def report(self) -> CheckReport:
+        """Everything that was decided, in rows."""
+        from dxlrun.compile.report import check_report  # not above: only `dxlrun check` shows it
+
+        return check_report(self.plan, self.rate, self.joints, self.parts)
 
 
 def compile_files(
@@ -131,38 +142,47 @@ def compile_robot(
     modes = compile_modes(description, joints, controllers, problems)
     buses = compile_buses(description, joints, modes, problems)
     policies = compile_policies(description, joints, buses, problems)
-    names = (*description.robot.controllers, *left_out_names(description, "controllers"))
-    parts = [
-        part for motion in motions for part in compile_motion(motion, controllers, names, joints, problems)
-    ]
+    parts: list[MotionPart] = []
+    if motions:
+        from dxlrun.compile.motions import compile_motion  # not above: most checks and runs play none
+
+        names = (*description.robot.controllers, *left_out_names(description, "controllers"))
+        for motion in motions:
+            parts += compile_motion(motion, controllers, names, joints, problems)
     problems.refuse()
-    end_ns = duration_ns
-    if end_ns is None and parts:
-        end_ns = max(part.end_ns for part in parts)
-    checked = Checked(description, joints, buses, controllers, parts, end_ns, policies)
-    return Compiled(_plan(checked, urdf, simulation), problems.warnings, check_report(checked))
-
-
-def _plan(checked: Checked, urdf: str | None, simulation: SimulationPlan) -> Plan:
-    description, robot = checked.description, checked.description.robot
-    commands = [command for part in checked.parts for command in part.commands]
+    if duration_ns is None and parts:
+        duration_ns = max(part.end_ns for part in parts)
+    commands = (command for part in parts for command in part.commands)
+    settings = description.robot.loop
     loop = LoopPlan(
-        period_ns=round(1e9 / robot.loop.rate),
-        scheduler=_scheduler_plan(robot.loop),
-        joints=tuple(joint.plan for joint in checked.joints.values()),
-        controllers=tuple(controller.plan for controller in checked.controllers.values()),
+        period_ns=round(1e9 / settings.rate),
+        scheduler=_scheduler_plan(settings),
+        joints=tuple(joint.plan for joint in joints.values()),
+        controllers=tuple(controller.plan for controller in controllers.values()),
         commands=tuple(sorted(commands, key=lambda command: command.at_ns)),
-        end_ns=checked.end_ns,
-        policies=checked.policies,
-        overrun=robot.loop.overrun,
-        tolerated_skips=robot.loop.tolerated_skips,
-        least_period_ns=_least_period_ns(robot.loop, checked.buses),
-        slowest_period_ns=slowest_period_ns(checked.buses),
+        end_ns=duration_ns,
+        policies=policies,
+        overrun=settings.overrun,
+        tolerated_skips=settings.tolerated_skips,
+        least_period_ns=_least_period_ns(settings, buses),
+        slowest_period_ns=slowest_period_ns(buses),
     )
+    plan = _plan(description, loop, buses, urdf, simulation)
+    return Compiled(plan, problems.warnings, settings.rate, tuple(joints.values()), tuple(parts))
+
+
+def _plan(
+    description: Description,
+    loop: LoopPlan,
+    buses: Sequence[BusPlan],
+    urdf: str | None,
+    simulation: SimulationPlan,
+) -> Plan:
+    robot = description.robot
     return Plan(
         robot=robot.name,
         loop=loop,
-        buses=tuple(checked.buses),
+        buses=tuple(buses),
         exit_timeout_ns=robot.policies.exit_timeout,
         recording_directory=robot.recording.directory,
         source_file=str(description.path),

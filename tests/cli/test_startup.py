@@ -1,0 +1,70 @@
+"""Start-up: which modules a command imports; how long that takes is measured by tests/bench/startup.py."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+LOADED = """
+import contextlib, io, json, sys
+from dxlrun.cli import main
+with contextlib.redirect_stdout(io.StringIO()):
+    assert main(sys.argv[1:]) == 0
+print(json.dumps(sorted(sys.modules)))
+"""
+RUN_TIME = {
+    "dxlrun.control": ("gate", "loop", "realtime", "safe_motion", "steering"),
+    "dxlrun.dynamixel": ("exchange", "hardware", "port", "servo/life", "servo/servos", "tools"),
+    "dxlrun.log": ("recorder", "log_writer", "reader", "replay"),
+}
+"""Rooms of which `check` needs the plans, and the parts that it does not."""
+
+
+def loaded(*words: str) -> set[str]:
+    """Return the modules that a process has imported after a command."""
+    done = subprocess.run(
+        [sys.executable, "-c", LOADED, *words], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    found: list[str] = json.loads(done.stdout)
+    return set(found)
+
+
+def beneath(modules: set[str], *packages: str) -> set[str]:
+    """Return the modules that are one of these packages, or in one."""
+    return {name for name in modules if any(f"{name}.".startswith(f"{each}.") for each in packages)}
+
+
+@pytest.fixture(scope="module")
+def checked() -> set[str]:
+    return loaded("check", "robots/bioloid_torso.yaml")
+
+
+def test_check_imports_no_part_that_runs(checked: set[str]) -> None:
+    run_time = (f"{room}.{part.replace('/', '.')}" for room, parts in RUN_TIME.items() for part in parts)
+    assert beneath(checked, *run_time, "dxlrun.simulation", "dxlrun.remote", "dxlrun.analysis") == set()
+    assert beneath(checked, "dxlrun.run") <= beneath(checked, "dxlrun.run.channels") | {"dxlrun.run"}
+
+
+def test_check_imports_no_library_that_it_does_not_use(checked: set[str]) -> None:
+    unused = "mujoco mcap starlette uvicorn lz4 zstandard serial matplotlib simpleeval"
+    assert beneath(checked, *unused.split()) == set()
+
+
+def test_check_imports_what_it_uses(checked: set[str]) -> None:
+    """The other side: the names above are those of modules that exist."""
+    assert checked >= {"dxlrun.compile.robot", "dxlrun.description.robot", "pydantic", "yaml"}
+    for room, parts in RUN_TIME.items():
+        folder = ROOT / "runtime" / room.replace(".", "/")
+        assert {part for part in parts if not any(folder.glob(f"{part}*"))} == set()
+
+
+def test_a_virtual_run_imports_neither_gateway_nor_physics() -> None:
+    ran = loaded("robots/bioloid_torso.yaml", "--virtual", "--duration", "0.1", "--no-record")
+    assert "dxlrun.simulation.server" not in ran
+    assert beneath(ran, "mujoco", "starlette", "uvicorn", "matplotlib", "dxlrun.remote") == set()
+    assert "dxlrun.run.virtual_run" in ran
