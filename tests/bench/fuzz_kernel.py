@@ -32,7 +32,7 @@ from dxlrun.dynamixel.exchange.bus import NEVER
 from dxlrun.dynamixel.hardware import DynamixelHardware, Reader
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
-from dxlrun.dynamixel.servo.life import Event
+from dxlrun.dynamixel.servo.life import ServoEvent
 from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.errors import PortError
 from dxlrun.interfaces import Commands, States
@@ -175,8 +175,8 @@ class Side:
         self.hardware.parsed = self._parsed
         for servos in self.hardware._servos:
             for servo in range(len(servos.torqued)):
-                servos._life.on(servo, Event.ENGAGED)
-                servos._life.on(servo, Event.TORQUE_ON)
+                servos._life.on(servo, ServoEvent.ENGAGED)
+                servos._life.on(servo, ServoEvent.TORQUE_ON)
         self.began = self.ended = 0
         """Cycles that the kernel began, and that it read to their end."""
 
@@ -208,14 +208,16 @@ class Side:
                 self.states.mode[row] = mode
             case 2:
                 if not servos._life.offline(servo):
-                    servos._life.on(servo, Event.DOUBT if servos.torqued[servo] else Event.TORQUE_ON)
+                    servos._life.on(
+                        servo, ServoEvent.DOUBT if servos.torqued[servo] else ServoEvent.TORQUE_ON
+                    )
             case 3:
                 servos.ceiling[servo] = rng.choice((math.nan, 0.0, 0.5, 3.0))
             case 4:
                 servos.goals.weaken(rng.choice((0.0, 0.3, 1.0)))
             case 5:
                 if servos._life.offline(servo):
-                    servos._life.on(servo, Event.RETURNED)
+                    servos._life.on(servo, ServoEvent.RETURNED)
                 else:
                     servos._life.lose(servo, NEVER)
             case _:
@@ -232,8 +234,8 @@ class Side:
         for index in lost:
             _, servos = hardware._lines[index]
             for servo in range(len(IDS)):
-                servos._life.on(servo, Event.RETURNED)
-                servos._life.on(servo, Event.TORQUE_ON)
+                servos._life.on(servo, ServoEvent.RETURNED)
+                servos._life.on(servo, ServoEvent.TORQUE_ON)
         return len(lost)
 
     def answer(self, replies):
