@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from dxlrun.control.realtime.rights import UNLIMITED
+from dxlrun.control.realtime import UNLIMITED
 from dxlrun.run.doctor import Finding, Machine, diagnose, may_schedule
 
 GOOD = {

@@ -12,8 +12,8 @@ from contextlib import suppress
 
 import pytest
 
+from dxlrun.control import realtime
 from dxlrun.control.controllers.activity import Activity
-from dxlrun.control.realtime import grants as realtime
 from dxlrun.run.channels.events import EventCode
 from dxlrun.run.channels.heartbeat import Heartbeat, Step, create
 

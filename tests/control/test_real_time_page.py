@@ -7,10 +7,10 @@ from typing import get_args
 
 import pluggy
 
+from dxlrun.control import realtime
 from dxlrun.control.controllers.contract import hook_breach
 from dxlrun.control.controllers.hookspecs import GROUP, HookSpecs
 from dxlrun.control.loop_plan import OverrunPolicy
-from dxlrun.control.realtime import margin
 from dxlrun.control.schedule import MOST_CAUGHT_UP
 from dxlrun.description.robot import Scheduler
 
@@ -40,7 +40,7 @@ def test_every_wish_is_on_the_page():
 
 
 def test_the_numbers_of_polling_are_those_of_the_program():
-    assert (margin.AUTO_SHARE, margin.MOST_SHARE, margin._TRIES) == (10, 2, 32)
+    assert (realtime.AUTO_SHARE, realtime.MOST_SHARE, realtime._TRIES) == (10, 2, 32)
     assert "sleeps 32 times" in FLAT
     assert "at most a tenth of the period" in FLAT
     assert "never more than half of the period" in FLAT

@@ -13,10 +13,9 @@ import threading
 import pytest
 
 from dxlrun.clock import MonotonicClock
+from dxlrun.control import realtime
 from dxlrun.control.loop_plan import SchedulerPlan
-from dxlrun.control.realtime import grants as realtime
-from dxlrun.control.realtime import memory, rights
-from dxlrun.control.realtime.margin import Pacing, overshoot_ns
+from dxlrun.control.realtime import Pacing, overshoot_ns
 
 
 @pytest.fixture
@@ -42,14 +41,14 @@ def may(monkeypatch):
 
     def set_rights(*capabilities, memlock=8 << 20, rtprio=0):
         limits = {resource.RLIMIT_MEMLOCK: memlock, resource.RLIMIT_RTPRIO: rtprio}
-        monkeypatch.setattr(rights, "has_capability", lambda bit: bit in capabilities)
+        monkeypatch.setattr(realtime, "has_capability", lambda bit: bit in capabilities)
         monkeypatch.setattr(resource, "getrlimit", lambda which: (limits[which],) * 2)
 
     return set_rights
 
 
 def test_everything_is_asked_for_and_the_policy_last(asked, may, monkeypatch, tmp_path):
-    may(rights.IPC_LOCK)
+    may(realtime.IPC_LOCK)
     monkeypatch.setattr(realtime, "IDLE_LATENCY", tmp_path / "cpu_dma_latency")
     realtime.IDLE_LATENCY.touch()
     plan = SchedulerPlan("fifo", 40, True, cores=(0, 1, 2, 3), idle_latency=True)
@@ -58,7 +57,7 @@ def test_everything_is_asked_for_and_the_policy_last(asked, may, monkeypatch, tm
     (pid, policy, parameters) = asked.pop()
     assert (pid, policy, parameters.sched_priority) == (0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, 40)
     assert asked == ["gc", "prctl", ("cores", (0, 1, 2, 3)), "mallopt", "mallopt", "mlockall"]
-    assert [grant.wish for grant in grants[1:]] == [
+    assert [grant.request for grant in grants[1:]] == [
         "timer slack",
         "cores",
         "memory in place",
@@ -84,16 +83,16 @@ def test_a_refused_policy_says_what_is_lost_and_how_to_allow_it(asked, monkeypat
     assert not grant.granted
     assert "round_robin 31 was refused" in grant.sentence
     assert "may delay it" in grant.sentence
-    assert "rtprio 32" in grant.mend  # the guardian needs one more
-    assert "rtprio 32" in realtime.apply_to_guardian(32, lock=False)[0].mend
-    assert grant.told == f"{grant.sentence}: {grant.mend}"
+    assert "rtprio 32" in grant.fix  # the guardian needs one more
+    assert "rtprio 32" in realtime.apply_to_guardian(32, lock=False)[0].fix
+    assert grant.text == f"{grant.sentence}: {grant.fix}"
 
 
 def test_memory_is_not_locked_where_later_allocations_would_fail(asked, may):
     may()
     grant = realtime.lock_memory()
-    assert (grant.wish, grant.granted) == ("locked memory", False)
-    assert "memlock unlimited" in grant.mend
+    assert (grant.request, grant.granted) == ("locked memory", False)
+    assert "memlock unlimited" in grant.fix
     assert asked == []
 
 
@@ -132,12 +131,12 @@ def test_one_core_is_said_in_the_singular(asked, monkeypatch):
 def test_a_refused_idle_latency_says_the_rule_that_allows_it(asked, monkeypatch):
     monkeypatch.setattr(os, "open", refuse)
     grant = realtime.apply(SchedulerPlan("other", 31, False, idle_latency=True))[-1]
-    assert (grant.wish, grant.granted) == ("idle latency", False)
-    assert 'KERNEL=="cpu_dma_latency", OWNER="' in grant.mend
+    assert (grant.request, grant.granted) == ("idle latency", False)
+    assert 'KERNEL=="cpu_dma_latency", OWNER="' in grant.fix
 
 
 def test_another_system_is_told_and_not_a_crash(asked, may, monkeypatch):
-    may(rights.IPC_LOCK)
+    may(realtime.IPC_LOCK)
     monkeypatch.setattr(sys, "platform", "plan9")
     monkeypatch.delattr(os, "sched_setscheduler")
     monkeypatch.delattr(os, "sched_setaffinity")
@@ -148,14 +147,14 @@ def test_another_system_is_told_and_not_a_crash(asked, may, monkeypatch):
 
 
 def test_a_c_library_without_mallopt_is_told(asked, monkeypatch):
-    monkeypatch.setattr(memory, "libc", object)
+    monkeypatch.setattr(realtime, "libc", object)
     grant = realtime.apply(SchedulerPlan("other", 31, False))[2]
-    assert (grant.wish, grant.granted) == ("memory in place", False)
+    assert (grant.request, grant.granted) == ("memory in place", False)
     assert "mallopt is missing" in grant.sentence
 
 
 def test_the_guardian_asks_for_one_priority_above_the_loop(asked, may):
-    may(rights.IPC_LOCK)
+    may(realtime.IPC_LOCK)
     locked, scheduler = realtime.apply_to_guardian(32, lock=True)
     assert locked.granted
     assert scheduler.sentence == "scheduler round_robin, priority 32"
@@ -164,20 +163,20 @@ def test_the_guardian_asks_for_one_priority_above_the_loop(asked, may):
 
 @pytest.mark.parametrize(
     ("capabilities", "rtprio", "highest"),
-    [((rights.SYS_NICE,), 0, 99), ((), 0, 0), ((), 40, 40), ((), resource.RLIM_INFINITY, 99)],
+    [((realtime.SYS_NICE,), 0, 99), ((), 0, 0), ((), 40, 40), ((), resource.RLIM_INFINITY, 99)],
 )
 def test_the_highest_priority_is_what_limit_and_capability_allow(may, capabilities, rtprio, highest):
     may(*capabilities, rtprio=rtprio)
-    assert rights.highest_priority() == highest
+    assert realtime.highest_priority() == highest
 
 
 def test_capabilities_are_read_from_the_kernels_mask(tmp_path):
     status = tmp_path / "status"
     status.write_text("Name:\tx\nCapEff:\t0000000000804000\n")
-    assert rights.has_capability(rights.SYS_NICE, status)
-    assert rights.has_capability(rights.IPC_LOCK, status)
-    assert not rights.has_capability(12, status)
-    assert not rights.has_capability(rights.SYS_NICE, tmp_path / "nothing")
+    assert realtime.has_capability(realtime.SYS_NICE, status)
+    assert realtime.has_capability(realtime.IPC_LOCK, status)
+    assert not realtime.has_capability(12, status)
+    assert not realtime.has_capability(realtime.SYS_NICE, tmp_path / "nothing")
 
 
 # The margin that is polled
@@ -258,15 +257,14 @@ def outcome(script):
 
 WISHES = """
 import gc, json, os, resource
-from dxlrun.control.realtime import grants as realtime
-from dxlrun.control.realtime import rights
+from dxlrun.control import realtime
 from dxlrun.control.loop_plan import SchedulerPlan
 {before}
 plan = SchedulerPlan('round_robin', 31, True, cores=(min(os.sched_getaffinity(0)),), idle_latency=True)
-may = (rights.lockable_bytes() == rights.UNLIMITED, rights.highest_priority() >= 31)
+may = (realtime.lockable_bytes() == realtime.UNLIMITED, realtime.highest_priority() >= 31)
 grants = realtime.apply(plan) + realtime.apply_to_guardian(32, True)
 print(json.dumps({{
-    "granted": [[one.wish, one.granted] for one in grants], "told": [one.told for one in grants],
+    "granted": [[one.request, one.granted] for one in grants], "told": [one.text for one in grants],
     "collector": gc.isenabled(), "threads": realtime.thread_count(), "may": may,
     "policy": os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK, "cores": len(os.sched_getaffinity(0)),
 }}))
@@ -315,24 +313,25 @@ def test_a_real_process_gets_what_its_rights_say():
 
 
 FAULTS = """
-from dxlrun.control.realtime import memory
+import resource
+from dxlrun.control import realtime
 {before}
-before = memory.page_faults()
+before = sum(resource.getrusage(resource.RUSAGE_SELF)[6:8])
 for size in range(100_000, 4_000_000, 100_000):
     bytearray(size)
-print(memory.page_faults() - before)
+print(sum(resource.getrusage(resource.RUSAGE_SELF)[6:8]) - before)
 """
 
 
 def test_touched_memory_is_there_when_it_is_needed():
     """Arrays that come and go, each bigger than the one before: none misses a page once all was prepared."""
     assert outcome(FAULTS.format(before="")) > 100
-    assert outcome(FAULTS.format(before="memory.keep_freed(); memory.touch()")) < 10
+    assert outcome(FAULTS.format(before="realtime.keep_freed(); realtime.touch()")) < 10
 
 
 def test_the_collector_is_off_and_what_lives_is_frozen():
     script = (
-        "import gc, json\nfrom dxlrun.control.realtime import grants as realtime\n"
+        "import gc, json\nfrom dxlrun.control import realtime\n"
         "realtime.freeze_collector()\nprint(json.dumps([gc.isenabled(), gc.get_freeze_count() > 1000]))\n"
     )
     assert outcome(script) == [False, True]

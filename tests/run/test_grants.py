@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from dxlrun.control.realtime.grants import Grant
+from dxlrun.control.realtime import Grant
 from dxlrun.run.channels.events import EventCode
 from dxlrun.run.grant_table import ProcessGrant, granted_text, refusals, show_grants
 

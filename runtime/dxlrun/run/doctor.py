@@ -9,12 +9,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from dxlrun.control.realtime.grants import IDLE_LATENCY, allow_idle_latency
-from dxlrun.control.realtime.rights import (
+from dxlrun.control.realtime import (
+    IDLE_LATENCY,
     IPC_LOCK,
     SYS_NICE,
     UNLIMITED,
     allow,
+    allow_idle_latency,
     has_capability,
     highest_priority,
     lockable_bytes,

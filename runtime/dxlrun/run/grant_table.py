@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from dxlrun.control.realtime.grants import Grant
+from dxlrun.control.realtime import Grant
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +23,7 @@ class ProcessGrant:
     @property
     def name(self) -> str:
         """The wish; whose it is where it is not the loop's."""
-        return self.grant.wish if self.process == "loop" else f"{self.process}: {self.grant.wish}"
+        return self.grant.request if self.process == "loop" else f"{self.process}: {self.grant.request}"
 
 
 def show_grants(grants: Sequence[ProcessGrant], out: Console) -> None:
@@ -35,7 +35,7 @@ def show_grants(grants: Sequence[ProcessGrant], out: Console) -> None:
         answer = Text("yes", "green") if one.grant.granted else Text("no", "yellow")
         table.add_row(one.name, answer, Text(one.grant.sentence))
     out.print(table)
-    for mend in dict.fromkeys(one.grant.mend for one in grants if one.grant.mend):
+    for mend in dict.fromkeys(one.grant.fix for one in grants if one.grant.fix):
         out.print(Text(f"  {mend}", "yellow"), soft_wrap=True)  # unbroken: it is there to be copied
 
 
@@ -45,7 +45,7 @@ def refusals(grants: Sequence[ProcessGrant], out: Console) -> tuple[str, ...]:
         return ()
     refused = (one for one in grants if not one.grant.granted)
     return tuple(
-        one.grant.told if one.process == "loop" else f"{one.process}: {one.grant.told}" for one in refused
+        one.grant.text if one.process == "loop" else f"{one.process}: {one.grant.text}" for one in refused
     )
 
 

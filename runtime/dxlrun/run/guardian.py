@@ -23,8 +23,8 @@ import msgspec
 from msgspec.json import Decoder
 
 from dxlrun.clock import MonotonicClock
+from dxlrun.control import realtime
 from dxlrun.control.policy_plan import TORQUE_STAYS, Last
-from dxlrun.control.realtime import grants as realtime
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.dynamixel.port.ports import SerialPort, SerialPorts
 from dxlrun.dynamixel.port.reopening import KeptLines, Wanted
@@ -164,7 +164,7 @@ class LastHand:
 
     def tell_grants(self, grants: Sequence[realtime.Grant]) -> None:
         """Put into the log what the operating system granted to this process."""
-        realtime.tell(grants, "guardian", self._events)
+        realtime.log_grants(grants, "guardian", self._events)
 
     def tell(self, text: str, severity: Severity) -> None:
         """Put a sentence into the log."""

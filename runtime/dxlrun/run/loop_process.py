@@ -21,13 +21,13 @@ from msgspec.json import Decoder
 
 from dxlrun.clock import MonotonicClock
 from dxlrun.compile.plan import Plan, from_json
+from dxlrun.control import realtime
 from dxlrun.control.controllers.activity import Activity
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.control.loop import StopFlag
 from dxlrun.control.loop_plan import SchedulerPlan
 from dxlrun.control.policy_plan import TORQUE_STAYS, Last
-from dxlrun.control.realtime import grants as realtime
-from dxlrun.control.realtime.margin import Pacing
+from dxlrun.control.realtime import Pacing
 from dxlrun.dynamixel.hardware import TAKEN_BACK
 from dxlrun.dynamixel.port.ports import MOST_SHARE, ReplyPolling, SerialPort, SerialPorts
 from dxlrun.dynamixel.port.reopening import LinesAgain
@@ -236,8 +236,8 @@ def _prepare(  # noqa: PLR0917  what a loop's process has
     heartbeat.beat()
     grants = (*grants, pacing.measure(plan.loop.period_ns, heartbeat.beat))
     if ports.polling:
-        ports.polling.margin_ns = pacing.wanted_ns
-    realtime.tell(grants, "loop", sinks.events)
+        ports.polling.margin_ns = pacing.measured_ns
+    realtime.log_grants(grants, "loop", sinks.events)
     os.pwrite(job.grants, msgspec.json.encode(grants), 0)
     heartbeat.beat()
 

@@ -12,7 +12,7 @@ from msgspec.json import Decoder
 
 from dxlrun.compile.plan import Plan, to_json
 from dxlrun.compile.simulated import simulated_bodies, simulated_buses
-from dxlrun.control.realtime.grants import Grant, guardian_priority
+from dxlrun.control.realtime import Grant, guardian_priority
 from dxlrun.log.schemas import LogHeader, Recorded, RecorderJob
 from dxlrun.remote.job import Descriptors, GatewayJob
 from dxlrun.run.assembly import cycle_layout

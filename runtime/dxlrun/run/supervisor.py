@@ -16,7 +16,7 @@ from typing import Literal
 from rich.console import Console
 
 from dxlrun.compile.plan import Plan
-from dxlrun.control.realtime.grants import Grant
+from dxlrun.control.realtime import Grant
 from dxlrun.dynamixel.port.ports import put_in_place, set_aside
 from dxlrun.dynamixel.port.serial_open import let_go
 from dxlrun.errors import ProcessFault, counted

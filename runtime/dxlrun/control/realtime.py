@@ -1,0 +1,409 @@
+"""Real time: ask the operating system for what the plan requests, and report what was not granted.
+
+`apply` prepares the loop's process, `apply_to_guardian` the guardian's; `Pacing` measures how long before a
+deadline the clock is polled; what a process may ask for, and the command that allows more, is at the end.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import os
+import struct
+import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import msgspec
+
+from dxlrun.clock import MonotonicClock
+from dxlrun.control.loop_plan import MOST_SHARE, Policy, SchedulerPlan
+from dxlrun.run.channels.events import EventCode, EventSink, Granted, Severity
+
+_PR_SET_TIMERSLACK = 29  # linux/prctl.h
+_TASKS = Path("/proc/self/task")
+IDLE_LATENCY = Path("/dev/cpu_dma_latency")
+"""As long as it is held open, cores wake from idle within the microseconds written to it
+(kernel: Documentation/power/pm_qos_interface.rst)."""
+_AGAIN = "and log in again"
+
+
+@dataclass(frozen=True, slots=True)
+class Grant:
+    """One request to the operating system, and what became of it."""
+
+    request: str
+    """collector, timer slack, memory in place, locked memory, cores, idle latency, scheduler, polling"""
+    granted: bool
+    sentence: str
+    """For a person; names the consequence where something was refused."""
+    fix: str = ""
+    """What to do where something was refused; empty where nothing helps."""
+
+    @property
+    def text(self) -> str:
+        """Sentence and fix."""
+        return f"{self.sentence}: {self.fix}" if self.fix else self.sentence
+
+
+def apply(plan: SchedulerPlan) -> tuple[Grant, ...]:
+    """Prepare the calling thread for the loop; never raises.
+
+    Order matters: what allocates comes first, the policy last, so that nothing slow runs with priority.
+    """
+    return (
+        freeze_collector(),
+        _attempt("timer slack", _timer_slack),
+        *((_attempt("cores", lambda: _stay_on(plan.cores)),) if plan.cores else ()),
+        _attempt("memory in place", _keep_memory),
+        *((lock_memory(),) if plan.lock_memory else ()),
+        *((_attempt("idle latency", _wake_at_once),) if plan.idle_latency else ()),
+        *((_policy_of(plan),) if plan.policy != "other" else ()),
+    )
+
+
+def apply_to_guardian(priority: int, lock: bool) -> tuple[Grant, ...]:
+    """Prepare the guardian's process; a priority of 0 asks for none; never raises."""
+    return (
+        *((lock_memory(),) if lock else ()),
+        *((set_policy("round_robin", priority),) if priority else ()),
+    )
+
+
+def log_grants(grants: Sequence[Grant], source: str, events: EventSink) -> None:
+    """Log what became of a process' requests."""
+    for grant in grants:
+        severity = Severity.INFO if grant.granted else Severity.WARNING
+        data = msgspec.json.encode(Granted(grant.request, grant.granted))
+        events.emit(EventCode.SCHEDULER, severity, source, grant.text, data)
+
+
+def freeze_collector() -> Grant:
+    """Collect garbage once, take what is left out of every later search, and switch the collector off.
+
+    The loop makes no cycles of references, so nothing piles up; a collection takes milliseconds.
+    """
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    return Grant("collector", True, "the garbage collector is frozen and off")
+
+
+def set_policy(policy: Policy, priority: int, limit: int | None = None) -> Grant:
+    """Give the calling thread a real-time policy; a child process does not inherit it; never raises.
+
+    `limit` is the rtprio that a refusal asks for, where other processes need more than `priority`.
+    """
+    return _attempt("scheduler", lambda: _set_policy(policy, priority, limit or priority))
+
+
+def lock_memory() -> Grant:
+    """Lock all memory, now and later, but only where later allocations cannot fail by it; never raises."""
+    return _attempt("locked memory", _lock_memory)
+
+
+def _policy_of(plan: SchedulerPlan) -> Grant:
+    return set_policy(plan.policy, plan.priority, guardian_priority(plan))
+
+
+def guardian_priority(plan: SchedulerPlan) -> int:
+    """Return the priority of the guardian, one above the loop's; 0: none."""
+    return 0 if plan.policy == "other" else min(plan.priority + 1, 99)
+
+
+def thread_count() -> int:
+    """Return the number of threads of this process, in a microsecond; 1 where that is not known."""
+    tasks = _tasks()
+    return 1 if tasks is None else os.fstat(tasks).st_nlink - 2
+
+
+@cache
+def _tasks() -> int | None:
+    """Return a descriptor of the directory that has a directory in it for each thread."""
+    try:
+        return os.open(_TASKS, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError:
+        return None
+
+
+def _attempt(request: str, act: Callable[[], Grant]) -> Grant:
+    """Return what became of a request; whatever fails is a refusal, because a robot runs without it too."""
+    try:
+        return act()
+    except (AttributeError, OSError, ValueError) as error:
+        return Grant(request, False, f"{request}: this system does not offer it ({error})")
+
+
+def _set_policy(policy: Policy, priority: int, limit: int) -> Grant:
+    if policy == "other":
+        return Grant("scheduler", True, "the ordinary scheduler was asked for")
+    kind = os.SCHED_FIFO if policy == "fifo" else os.SCHED_RR
+    try:
+        os.sched_setscheduler(0, kind | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
+    except PermissionError:
+        return Grant(
+            "scheduler",
+            False,
+            f"scheduler {policy} {priority} was refused, it runs with ordinary priority and any busy "
+            "program may delay it by milliseconds",
+            f"allow it with `{allow('rtprio', limit)}` {_AGAIN}",
+        )
+    return Grant("scheduler", True, f"scheduler {policy}, priority {priority}")
+
+
+def _timer_slack() -> Grant:
+    """Ask the kernel to wake an ordinary thread within 1 ns of the timer instead of 50 us (prctl(2))."""
+    succeed(libc().prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(1), 0, 0, 0))
+    return Grant("timer slack", True, "timer slack 1 ns")
+
+
+def _stay_on(cores: Sequence[int]) -> Grant:
+    """Bind the calling thread to cores; the kernel drops those that there are not (sched_setaffinity(2))."""
+    before = os.sched_getaffinity(0)
+    try:
+        os.sched_setaffinity(0, cores)
+    except OSError:
+        return Grant(
+            "cores",
+            False,
+            f"there is no core {_listed(cores)} for this process, it runs on {_listed(sorted(before))}",
+            "write others under loop.scheduler.cores",
+        )
+    found = sorted(os.sched_getaffinity(0))
+    if missing := sorted(set(cores) - set(found)):
+        return Grant(
+            "cores",
+            False,
+            f"there is no core {_listed(missing)} for this process, it runs on {_listed(found)}",
+            "take it out of loop.scheduler.cores",
+        )
+    return Grant("cores", True, f"stays on {'core' if len(found) == 1 else 'cores'} {_listed(found)}")
+
+
+def _listed(cores: Sequence[int]) -> str:
+    return ", ".join(map(str, cores))
+
+
+def _keep_memory() -> Grant:
+    kept = keep_freed()
+    touch()
+    how = "what is freed is kept" if kept else "what is freed goes back to the kernel, mallopt is missing"
+    return Grant("memory in place", kept, f"{HEAP >> 20} MiB of heap and the stack are touched, {how}")
+
+
+def _lock_memory() -> Grant:
+    if not may_lock():
+        return Grant(
+            "locked memory",
+            False,
+            "memory is not locked, a page that was swapped out may delay it by milliseconds",
+            f"allow it with `{allow('memlock', 'unlimited')}` {_AGAIN}",
+        )
+    _lock_all()
+    return Grant("locked memory", True, "all memory is locked")
+
+
+def _wake_at_once() -> Grant:
+    """Keep the cores from deep idle states for as long as this process lives."""
+    try:
+        descriptor = os.open(IDLE_LATENCY, os.O_WRONLY)
+    except PermissionError:
+        return Grant(
+            "idle latency",
+            False,
+            "cores may sleep deeply and wake some 100 us late",
+            f"allow it with `{allow_idle_latency()}`",
+        )
+    os.write(descriptor, struct.pack("i", 0))  # never closed: the request ends with the descriptor
+    return Grant("idle latency", True, "cores are kept from deep idle states")
+
+
+def allow_idle_latency(account: str = "") -> str:
+    """Return the command that lets a user (this one) keep cores from deep idle states, for good."""
+    rule = f'KERNEL=="cpu_dma_latency", OWNER="{account or user()}"'
+    return (
+        f"echo '{rule}' | sudo tee /etc/udev/rules.d/70-dxlrun.rules && sudo udevadm control --reload && "
+        "sudo udevadm trigger --name-match=cpu_dma_latency"
+    )
+
+
+# Memory
+
+HEAP = 8 << 20
+"""Bytes of heap that are touched; a loop of 20 servos allocates some kB in a cycle and frees them [i]."""
+_STACK_DEPTH = 800
+"""Lists in each other, whose text is made in one C call a list: 800 touch some 100 kB of stack [measured];
+the recursion limit of Python is 1000."""
+_MCL_CURRENT, _MCL_FUTURE = 1, 2  # asm-generic/mman.h
+_M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4  # glibc, malloc.h
+
+
+def libc() -> ctypes.CDLL:
+    """Return the C library. Raises OSError on a system that is not Linux."""
+    if not sys.platform.startswith("linux"):
+        raise OSError(f"{sys.platform} is not Linux")
+    return ctypes.CDLL(None, use_errno=True)
+
+
+def succeed(code: int) -> None:
+    """Raise OSError when a call of the C library returned something else than 0."""
+    if code != 0:
+        raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+
+
+def may_lock() -> bool:
+    """Return whether all memory may be locked: under a limit a later allocation would fail."""
+    return lockable_bytes() == UNLIMITED
+
+
+def _lock_all() -> None:
+    """Lock all memory, now and later (mlockall(2)). Raises OSError."""
+    succeed(libc().mlockall(_MCL_CURRENT | _MCL_FUTURE))
+
+
+def keep_freed() -> bool:
+    """Have malloc give nothing back to the kernel: the next allocation finds it touched (mallopt(3)).
+
+    Returns False where the C library has no mallopt (musl): the pages then come and go.
+    """
+    try:
+        mallopt = libc().mallopt
+    except AttributeError:
+        return False
+    return all(mallopt(option, value) == 1 for option, value in ((_M_TRIM_THRESHOLD, -1), (_M_MMAP_MAX, 0)))
+
+
+def touch() -> None:
+    """Touch heap and stack once, so that no page is missing when a cycle first comes that far."""
+    bytearray(HEAP)  # zeroed, so each page is written; freed at once, and kept by `keep_freed`
+    nested: list[object] = []
+    for _ in range(_STACK_DEPTH):
+        nested = [nested]
+    with suppress(RecursionError):  # called from deep down, or a Python with a lower limit: less is touched
+        repr(nested)
+
+
+# Polling before a deadline
+
+AUTO_SHARE = 10
+"""Where the file does not set it, at most one part in so many of the period is polled."""
+_TRIES = 32
+_NAP_NS = 2_000_000
+"""All tries together take 64 ms; longer sleeps overshoot more, which _RESERVE is for."""
+_QUANTILE = 0.95
+_RESERVE = 1.5
+"""Sleeps of 20 ms overshoot 1.4 times as much as those of 2 ms [measured, round_robin, x86-64]."""
+
+
+def overshoot_ns(nap_ns: int) -> int:
+    """Return how late a sleep of so many ns wakes, ns."""
+    deadline_ns = time.monotonic_ns() + nap_ns
+    time.sleep(nap_ns * 1e-9)
+    return time.monotonic_ns() - deadline_ns
+
+
+class Pacing:
+    """Sets a clock's margin to what was measured once, bounded by the file and by the period."""
+
+    def __init__(self, clock: MonotonicClock, most_ns: int | None) -> None:
+        self._clock = clock
+        self._most_ns = most_ns
+        self.measured_ns = clock.spin_ns
+        """The margin that was measured, without the bounds."""
+
+    def measure(
+        self, period_ns: int, beat: Callable[[], None], nap: Callable[[int], int] = overshoot_ns
+    ) -> Grant:
+        """Sleep a few times, set the margin for a period, and report it; `beat` is called between.
+
+        The margin covers 19 of 20 sleeps and half as much again.
+        """
+        late: list[int] = []
+        for _ in range(_TRIES):
+            late.append(nap(min(_NAP_NS, period_ns)))
+            beat()
+        usual_ns = sorted(late)[int(_QUANTILE * _TRIES)]
+        self.measured_ns = round(_RESERVE * usual_ns)
+        self(period_ns)
+        margin_ns = self._clock.spin_ns
+        return Grant(
+            "polling",
+            True,
+            f"polls the clock for {margin_ns / 1e3:.0f} us before each deadline, {margin_ns / period_ns:.1%} "
+            f"of a core; 19 of 20 sleeps woke at most {usual_ns / 1e3:.0f} us late"
+            + ("" if margin_ns >= usual_ns else ", so that some cycles begin late"),
+        )
+
+    def __call__(self, period_ns: int) -> None:
+        """Keep the margin within its share of another period, ns."""
+        most_ns = period_ns // AUTO_SHARE if self._most_ns is None else self._most_ns
+        self._clock.spin_ns = min(self.measured_ns, most_ns, period_ns // MOST_SHARE)
+
+
+# What a process may ask for
+
+IPC_LOCK, SYS_NICE = 14, 23
+"""Capabilities, by their bit (linux/capability.h)."""
+LIMITS = Path("/etc/security/limits.d/dxlrun.conf")
+UNLIMITED = -1
+_STATUS = Path("/proc/self/status")
+
+
+def has_capability(bit: int, status: Path = _STATUS) -> bool:
+    """Return whether this process has an effective capability; False where the system has none."""
+    try:
+        text = status.read_text()
+    except OSError:
+        return False
+    masks = (line.split()[1] for line in text.splitlines() if line.startswith("CapEff:"))
+    return any(int(mask, 16) >> bit & 1 for mask in masks)
+
+
+def highest_priority() -> int:
+    """Return the highest real-time priority that this process may take by its limit (RLIMIT_RTPRIO).
+
+    99 with CAP_SYS_NICE. 0: none, or the system has no such limit.
+    """
+    import resource
+
+    if has_capability(SYS_NICE):
+        return 99
+    limit = getattr(resource, "RLIMIT_RTPRIO", None)
+    return 0 if limit is None else _finite(resource.getrlimit(limit)[0], 99)
+
+
+def lockable_bytes() -> int:
+    """Return how much memory this process may lock (RLIMIT_MEMLOCK); UNLIMITED, also with CAP_IPC_LOCK."""
+    import resource
+
+    if has_capability(IPC_LOCK):
+        return UNLIMITED
+    return _finite(resource.getrlimit(resource.RLIMIT_MEMLOCK)[0], UNLIMITED)
+
+
+def allow(limit: str, value: int | str, account: str = "") -> str:
+    """Return the command that raises a limit of a user (this one) from the next log-in on, limits.conf(5)."""
+    return f"echo '{account or user()} - {limit} {value}' | sudo tee -a {LIMITS}"
+
+
+def user() -> str:
+    """Return this user as limits.conf(5) names one."""
+    if not hasattr(os, "getuid"):
+        return sys.platform
+    import pwd
+
+    number = os.getuid()
+    try:
+        return pwd.getpwuid(number).pw_name
+    except KeyError:
+        return f"{number}:{number}"
+
+
+def _finite(limit: int, unlimited: int) -> int:
+    import resource
+
+    return unlimited if limit == resource.RLIM_INFINITY else limit
