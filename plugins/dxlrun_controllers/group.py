@@ -1,15 +1,15 @@
-"""Group controllers: forward one command a joint until the next one comes."""
+"""Group controllers: forward one command a joint, of one or two interfaces, until the next one comes."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from dxlrun import CommandModel, Context, Controller, Interfaces, ParametersModel
+from dxlrun import CommandModel, Context, Controller, Floats, Interfaces, ParametersModel
 
 JointNames = Annotated[tuple[str, ...], Field(min_length=1)]
 
@@ -46,6 +46,27 @@ class PosEffortCommand(CommandModel):
     """Nm, A or the fraction of maximum, as the model measures it; shape (joints,); the magnitude counts"""
 
 
+class VelocitiesCommand(CommandModel):
+    """One velocity a joint."""
+
+    velocities: tuple[float, ...]
+    """rad/s, shape (joints,), with their signs"""
+
+
+class EffortsCommand(CommandModel):
+    """One effort a joint."""
+
+    efforts: tuple[float, ...]
+    """Nm, A or the fraction of maximum, as the model measures it; shape (joints,), with their signs"""
+
+
+class PwmCommand(CommandModel):
+    """One PWM a joint."""
+
+    pwm: tuple[Annotated[float, Field(ge=-1, le=1)], ...]
+    """Fraction of the full voltage, -1..1, shape (joints,): 20 for 20 % is refused"""
+
+
 def check_size(what: str, found: int, joints: tuple[str, ...]) -> None:
     """Raise ValueError when a command does not have one value a joint."""
     if found != len(joints):
@@ -53,112 +74,97 @@ def check_size(what: str, found: int, joints: tuple[str, ...]) -> None:
 
 
 def hold(context: Context) -> None:
-    """Command what was last sent, so that nothing moves; what the servo says where nothing was sent."""
+    """Command what was last sent, or the position that was read where nothing was sent: nothing moves."""
     commands, goals = context.commands, context.goals
     np.copyto(commands.position, goals.position)
     np.copyto(commands.position, context.states.position, where=np.isnan(goals.position))
     np.copyto(commands.velocity, goals.velocity)
 
 
-class JointGroupPositionController(Controller[GroupParameters]):
+class _GroupController(Controller[GroupParameters]):
+    """Forwards the newest command; each field of it is for one interface, in the order of `claimed`."""
+
+    Parameters = GroupParameters
+    claimed: ClassVar[tuple[Literal["position", "velocity", "effort", "pwm"], ...]]
+
+    @classmethod
+    def interfaces(cls, parameters: GroupParameters, joints: tuple[str, ...]) -> Interfaces:
+        """Claim the controller's interfaces of the parameters' joints."""
+        return Interfaces(parameters.joints, cls.claimed)
+
+    @classmethod
+    def prepare(cls, kind: str, command: CommandModel, parameters: GroupParameters) -> NDArray[np.float64]:
+        """Return the fields one after the other, shape (interfaces * joints,).
+
+        Raises ValueError for a wrong size.
+        """
+        if kind not in cls.Commands:
+            return super().prepare(kind, command, parameters)
+        fields = command.model_dump()
+        for what, values in fields.items():
+            check_size(what, len(values), parameters.joints)
+        return np.concatenate([np.array(values, dtype=np.float64) for values in fields.values()])
+
+    def on_activate(self, time_ns: int) -> None:
+        """Hold positions where the joints are; velocities, efforts and PWM begin with 0."""
+        if "position" in self.claimed:
+            hold(self.context)
+        else:
+            self._commands(0).fill(0.0)
+
+    def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
+        """Take new values."""
+        for index, values in enumerate(data.reshape(len(self.claimed), -1)):
+            np.copyto(self._commands(index), values)
+
+    def update(self, time_ns: int, period_ns: int) -> None:
+        """Keep the last command: the manager takes the arrays as they are."""
+
+    def _commands(self, index: int) -> Floats:
+        array: Floats = getattr(self.context.commands, self.claimed[index])
+        return array
+
+
+class JointGroupPositionController(_GroupController):
     """Forwards positions; the servos go there as fast as they can."""
 
-    Parameters = GroupParameters
+    claimed = ("position",)
     Commands: ClassVar[Mapping[str, type[CommandModel]]] = {"positions": PositionsCommand}
 
-    @classmethod
-    def interfaces(cls, parameters: GroupParameters, joints: tuple[str, ...]) -> Interfaces:
-        """Claim the position of the parameters' joints."""
-        return Interfaces(parameters.joints, ("position",))
 
-    @classmethod
-    def prepare(cls, kind: str, command: CommandModel, parameters: GroupParameters) -> NDArray[np.float64]:
-        """Return the positions, rad, shape (joints,). Raises ValueError for a wrong size."""
-        if not isinstance(command, PositionsCommand):
-            return super().prepare(kind, command, parameters)
-        check_size("positions", len(command.positions), parameters.joints)
-        return np.array(command.positions, dtype=np.float64)
-
-    def on_activate(self, time_ns: int) -> None:
-        """Hold where the joints are."""
-        hold(self.context)
-
-    def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
-        """Take new positions."""
-        np.copyto(self.context.commands.position, data)
-
-    def update(self, time_ns: int, period_ns: int) -> None:
-        """Keep the last command: the manager takes it as it stands."""
-
-
-class JointGroupPosVelController(Controller[GroupParameters]):
+class JointGroupPosVelController(_GroupController):
     """Forwards positions, and the speeds at which the servos go there."""
 
-    Parameters = GroupParameters
+    claimed = ("position", "velocity")
     Commands: ClassVar[Mapping[str, type[CommandModel]]] = {"posvel": PosVelCommand}
 
-    @classmethod
-    def interfaces(cls, parameters: GroupParameters, joints: tuple[str, ...]) -> Interfaces:
-        """Claim position and velocity of the parameters' joints."""
-        return Interfaces(parameters.joints, ("position", "velocity"))
 
-    @classmethod
-    def prepare(cls, kind: str, command: CommandModel, parameters: GroupParameters) -> NDArray[np.float64]:
-        """Return positions, then velocities, shape (2 * joints,). Raises ValueError for a wrong size."""
-        if not isinstance(command, PosVelCommand):
-            return super().prepare(kind, command, parameters)
-        check_size("positions", len(command.positions), parameters.joints)
-        check_size("velocities", len(command.velocities), parameters.joints)
-        return np.array((*command.positions, *command.velocities), dtype=np.float64)
-
-    def on_activate(self, time_ns: int) -> None:
-        """Hold where the joints are."""
-        hold(self.context)
-
-    def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
-        """Take new positions and speeds."""
-        commands = self.context.commands
-        joints = len(commands.position)
-        np.copyto(commands.position, data[:joints])
-        np.copyto(commands.velocity, data[joints:])
-
-    def update(self, time_ns: int, period_ns: int) -> None:
-        """Keep the last command: the manager takes it as it stands."""
-
-
-class JointGroupPosEffortController(Controller[GroupParameters]):
-    """Forwards positions, and how much effort the servos may take to be there: a gripper holds gently.
+class JointGroupPosEffortController(_GroupController):
+    """Forwards positions, and the highest effort of the servos there: a gripper holds gently.
 
     Until the first command a servo may take as much as its own limit lets it.
     """
 
-    Parameters = GroupParameters
+    claimed = ("position", "effort")
     Commands: ClassVar[Mapping[str, type[CommandModel]]] = {"poseffort": PosEffortCommand}
 
-    @classmethod
-    def interfaces(cls, parameters: GroupParameters, joints: tuple[str, ...]) -> Interfaces:
-        """Claim position and effort of the parameters' joints."""
-        return Interfaces(parameters.joints, ("position", "effort"))
 
-    @classmethod
-    def prepare(cls, kind: str, command: CommandModel, parameters: GroupParameters) -> NDArray[np.float64]:
-        """Return positions, then efforts, shape (2 * joints,). Raises ValueError for a wrong size."""
-        if not isinstance(command, PosEffortCommand):
-            return super().prepare(kind, command, parameters)
-        check_size("positions", len(command.positions), parameters.joints)
-        check_size("efforts", len(command.efforts), parameters.joints)
-        return np.array((*command.positions, *command.efforts), dtype=np.float64)
+class JointGroupVelocityController(_GroupController):
+    """Forwards velocities: wheels, and joints that turn at a speed."""
 
-    def on_activate(self, time_ns: int) -> None:
-        """Hold where the joints are."""
-        hold(self.context)
+    claimed = ("velocity",)
+    Commands: ClassVar[Mapping[str, type[CommandModel]]] = {"velocities": VelocitiesCommand}
 
-    def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
-        """Take new positions and efforts."""
-        commands = self.context.commands
-        joints = len(commands.position)
-        np.copyto(commands.position, data[:joints])
-        np.copyto(commands.effort, data[joints:])
 
-    def update(self, time_ns: int, period_ns: int) -> None:
-        """Keep the last command: the manager takes it as it stands."""
+class JointGroupEffortController(_GroupController):
+    """Forwards efforts: torques or currents. Without a command joints have none, so they give way."""
+
+    claimed = ("effort",)
+    Commands: ClassVar[Mapping[str, type[CommandModel]]] = {"efforts": EffortsCommand}
+
+
+class JointGroupPwmController(_GroupController):
+    """Forwards PWM: a voltage, without any control behind it."""
+
+    claimed = ("pwm",)
+    Commands: ClassVar[Mapping[str, type[CommandModel]]] = {"pwm": PwmCommand}

@@ -3,26 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BeforeValidator, Field, TypeAdapter
 
 from dxlrun import Angle, CommandModel, Context, Controller, Duration, Floats, Interfaces, ParametersModel
-from dxlrun_controllers.group import JointNames, hold
-from dxlrun_controllers.spline import Sample, Trajectory
-from dxlrun_controllers.trajectory_command import TrajectoryCommand, flat_trajectory
+from dxlrun_controllers.group import JointNames, check_size, hold
+from dxlrun_controllers.spline import CUBIC, LINEAR, QUINTIC, Sample, Trajectory, flatten
 
 CLOSING_SPEED = 0.5
-"""rad/s, posvel at the end of a trajectory: with the wanted speed of 0 a servo that lags would creep the rest
-of its way at one tick (0.012 rad/s)."""
+"""rad/s, posvel at the end of a trajectory: with its speed of 0 a servo that lags would creep the rest of its
+way at one tick (0.012 rad/s)."""
 
 
 class Tolerances(ParametersModel):
-    """How far a joint may be off; what is left out is not watched."""
+    """How far a joint may be off; a tolerance that is left out is not checked."""
 
     path: Angle | None = None
-    """On the way: beyond it the trajectory is aborted and the joints hold where they were wanted last."""
+    """On the way: beyond it the trajectory is aborted and the joints hold the desired position of then."""
     goal: Angle | None = None
     """At the end: the goal counts as reached when every joint is nearer than this."""
     goal_time: Duration = 0
@@ -35,14 +35,50 @@ class TrajectoryParameters(ParametersModel):
     joints: JointNames
     """The joints, in the order in which points name them."""
     command_interface: Literal["position", "posvel"] = "position"
-    """`posvel` commands the magnitude of the wanted velocity beside the position."""
+    """`posvel` commands the magnitude of the desired velocity beside the position."""
     tolerances: Tolerances = Tolerances()
 
 
-class JointTrajectoryController(Controller[TrajectoryParameters]):
-    """Plays one trajectory at a time; a new one takes over from what is wanted then, without a jump.
+_DURATION: TypeAdapter[int] = TypeAdapter(Duration)
 
-    Time decides what is wanted, never the number of updates: a late cycle shortens nothing.
+
+def _seconds(value: object) -> object:
+    """Accept `500 ms` beside a bare number, which counts seconds."""
+    return _DURATION.validate_python(value) * 1e-9 if isinstance(value, str) else value
+
+
+Seconds = Annotated[float, BeforeValidator(_seconds), Field(ge=0)]
+
+
+class TrajectoryPoint(CommandModel):
+    """Where the joints are to be at a time."""
+
+    time: Seconds
+    """s since the trajectory's start"""
+    positions: tuple[float, ...]
+    """rad, shape (joints,)"""
+    velocities: tuple[float, ...] | None = None
+    """rad/s, shape (joints,)"""
+    accelerations: tuple[float, ...] | None = None
+    """rad/s^2, shape (joints,)"""
+
+
+class TrajectoryCommand(CommandModel):
+    """A trajectory: linear when only positions are given, cubic with velocities, quintic with accelerations.
+
+    What only some points give is not used. The joints go from where they are to the first point in
+    `start_in` and the first point's time; when both are 0, at once, as the last gate lets them.
+    """
+
+    points: Annotated[tuple[TrajectoryPoint, ...], Field(min_length=1)]
+    start_in: Seconds = 0.0
+    """s until the trajectory's start, from the moment at which the command is taken"""
+
+
+class JointTrajectoryController(Controller[TrajectoryParameters]):
+    """Plays one trajectory at a time; a new one begins at the desired state of then, without a jump.
+
+    Time decides the desired state, never the number of updates: a late cycle shortens nothing.
     """
 
     Parameters = TrajectoryParameters
@@ -68,10 +104,10 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         return flat_trajectory(command, parameters.joints)
 
     def on_configure(self, context: Context) -> None:
-        """Make room for everything that the loop will need."""
+        """Make room for everything that the loop needs."""
         super().on_configure(context)
         joints = len(context.joints)
-        self._wanted = Sample(joints)
+        self._desired = Sample(joints)
         self._trajectory = Trajectory(joints)
         self._error = np.zeros(joints)
         self._start_ns = 0
@@ -87,16 +123,16 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._rest(self.context.commands.position)
 
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
-        """Begin a trajectory from what is wanted now."""
+        """Begin a trajectory from the desired state."""
         if self._moving:
-            self._trajectory.sample(self._elapsed(time_ns), self._wanted)
+            self._trajectory.sample(self._elapsed(time_ns), self._desired)
             self.context.say(f"trajectory preempted after {self._elapsed(time_ns):.3f} s")
-        self._trajectory.load(data, self._wanted)
+        self._trajectory.load(data, self._desired)
         self._start_ns = time_ns
         self._moving, self._settling = True, False
 
     def update(self, time_ns: int, period_ns: int) -> None:
-        """Command what the trajectory wants at `time_ns`; hold when there is none."""
+        """Command the trajectory's state at `time_ns`; hold when there is none."""
         if self._moving:
             self._follow(self._elapsed(time_ns))
         elif self._settling:
@@ -106,18 +142,18 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         return (time_ns - self._start_ns) * 1e-9
 
     def _follow(self, elapsed: float) -> None:
-        commands, wanted, trajectory = self.context.commands, self._wanted, self._trajectory
+        commands, desired, trajectory = self.context.commands, self._desired, self._trajectory
         if elapsed >= trajectory.duration_s:
-            trajectory.sample(elapsed, wanted)
-            np.copyto(commands.position, wanted.position)
+            trajectory.sample(elapsed, desired)
+            np.copyto(commands.position, desired.position)
             self._moving, self._settling = False, True
             self._close_in()
             self._settle(elapsed)
             return
         if self.parameters.command_interface == "posvel":
-            trajectory.sample(elapsed, wanted)
-            np.copyto(commands.position, wanted.position)
-            np.abs(wanted.velocity, out=commands.velocity)
+            trajectory.sample(elapsed, desired)
+            np.copyto(commands.position, desired.position)
+            np.abs(desired.velocity, out=commands.velocity)
         else:
             trajectory.position(elapsed, commands.position)
         path = self.parameters.tolerances.path
@@ -128,7 +164,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             self.context.say(f"trajectory aborted after {elapsed:.3f} s: {self._off()}, holding")
 
     def _settle(self, elapsed: float) -> None:
-        """Say whether the goal was reached, once."""
+        """Log whether the goal was reached, once."""
         tolerances = self.parameters.tolerances
         if tolerances.goal is None or self._worst(silent=np.inf) <= tolerances.goal:
             self._settling = False
@@ -138,18 +174,18 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             self.context.say(f"trajectory missed its goal after {elapsed:.3f} s: {self._off()}, holding")
 
     def _rest(self, position: Floats) -> None:
-        """Want `position`, at rest."""
-        np.copyto(self._wanted.position, position)
-        self._wanted.velocity.fill(0.0)
-        self._wanted.acceleration.fill(0.0)
+        """Make `position`, at rest, the desired state."""
+        np.copyto(self._desired.position, position)
+        self._desired.velocity.fill(0.0)
+        self._desired.acceleration.fill(0.0)
 
     def _close_in(self) -> None:
-        """Let servos that lag go the rest of their way."""
+        """Give servos that lag a speed for the rest of their way."""
         if self.parameters.command_interface == "posvel":
             np.copyto(self.context.commands.velocity, self._closing)
 
     def _worst(self, silent: float) -> float:
-        """Return the largest distance from what is wanted, rad; `silent` for a joint without reply."""
+        """Return the largest distance from the commands, rad; `silent` for a joint without a reply."""
         states, error = self.context.states, self._error
         np.subtract(states.position, self.context.commands.position, out=error)
         np.abs(error, out=error)
@@ -161,3 +197,31 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         if np.isinf(self._error[row]):
             return f"joint {self.context.joints[row]} does not answer"
         return f"joint {self.context.joints[row]} is {self._error[row]:.4f} rad off"
+
+
+def flat_trajectory(command: TrajectoryCommand, joints: tuple[str, ...]) -> Floats:
+    """Return the command as a flat array. Raises ValueError for a wrong size or times that do not grow."""
+    times = np.array([point.time for point in command.points])
+    stalled = np.flatnonzero(np.diff(times) <= 0)
+    if len(stalled):
+        index = int(stalled[0]) + 1
+        raise ValueError(
+            f"the times of a trajectory must grow: point {index + 1} is at {times[index]:g} s, "
+            f"the one before at {times[index - 1]:g} s"
+        )
+    points = np.zeros((len(times), 3, len(joints)))
+    given = [True, True]
+    for index, point in enumerate(command.points):
+        check_size(f"positions in point {index + 1}", len(point.positions), joints)
+        points[index, 0] = point.positions
+        for derivative, (what, values) in enumerate(
+            (("velocities", point.velocities), ("accelerations", point.accelerations))
+        ):
+            if values is None:
+                given[derivative] = False
+                continue
+            check_size(f"{what} in point {index + 1}", len(values), joints)
+            points[index, derivative + 1] = values
+    velocities, accelerations = given
+    order = LINEAR if not velocities else QUINTIC if accelerations else CUBIC
+    return flatten(order, times, points, command.start_in)

@@ -1,4 +1,4 @@
-"""The standard controllers' door: the same hooks as anybody's."""
+"""The standard controllers as a plug-in: the same hooks as any other package."""
 
 from __future__ import annotations
 
@@ -6,15 +6,13 @@ from collections.abc import Mapping
 from typing import Any
 
 from dxlrun import CONTRACT_VERSION, Controller, hookimpl
-from dxlrun_controllers.drive import (
-    JointGroupEffortController,
-    JointGroupPwmController,
-    JointGroupVelocityController,
-)
 from dxlrun_controllers.group import (
+    JointGroupEffortController,
     JointGroupPosEffortController,
     JointGroupPositionController,
     JointGroupPosVelController,
+    JointGroupPwmController,
+    JointGroupVelocityController,
 )
 from dxlrun_controllers.joint_state_broadcaster import JointStateBroadcaster
 from dxlrun_controllers.joint_trajectory_controller import JointTrajectoryController

@@ -20,7 +20,7 @@ _HEAD = 4
 
 
 class Sample:
-    """What is wanted of the joints at one time; shape (joints,) each: rad, rad/s, rad/s^2."""
+    """The desired state of the joints at one time; shape (joints,) each: rad, rad/s, rad/s^2."""
 
     __slots__ = ("acceleration", "position", "velocity")
 
@@ -138,7 +138,7 @@ class Trajectory:
             solve(order, self._bridge_s, start, self._first, self._bridge[:order])
 
     def sample(self, t: float, sample: Sample) -> None:
-        """Write what is wanted `t` s after `load`; after the end: the last position, at rest."""
+        """Write the desired state `t` s after `load`; after the end: the last position, at rest."""
         if t >= self.duration_s:
             np.copyto(sample.position, self._last[0])
             sample.velocity.fill(0.0)

@@ -11,9 +11,14 @@ from dxlrun.compile.limits import beyond_limits
 from dxlrun.control.controllers.controller import CommandModel
 from dxlrun.control.loop_plan import JointPlan
 from dxlrun.dynamixel.control_table import control_table
-from dxlrun_controllers.drive import EffortsCommand, VelocitiesCommand
-from dxlrun_controllers.group import PosEffortCommand, PositionsCommand, PosVelCommand
-from dxlrun_controllers.trajectory_command import TrajectoryCommand
+from dxlrun_controllers.group import (
+    EffortsCommand,
+    PosEffortCommand,
+    PositionsCommand,
+    PosVelCommand,
+    VelocitiesCommand,
+)
+from dxlrun_controllers.joint_trajectory_controller import TrajectoryCommand
 
 FREE = JointPlan("free", -2.0, 2.0, None, top_speed=8.0, top_effort=3.0)
 BOUND = JointPlan("bound", -1.0, 1.0, 2.0, 0.5, top_speed=8.0, top_effort=3.0)

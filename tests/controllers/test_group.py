@@ -4,15 +4,13 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from dxlrun_controllers.drive import (
-    JointGroupEffortController,
-    JointGroupPwmController,
-    JointGroupVelocityController,
-)
 from dxlrun_controllers.group import (
+    JointGroupEffortController,
     JointGroupPosEffortController,
     JointGroupPositionController,
     JointGroupPosVelController,
+    JointGroupPwmController,
+    JointGroupVelocityController,
 )
 from dxlrun_controllers.joint_state_broadcaster import JointStateBroadcaster
 

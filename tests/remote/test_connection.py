@@ -15,10 +15,9 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.remote import connection
+from dxlrun.remote import server
 from dxlrun.remote.client import RemoteRobot
-from dxlrun.remote.connection import MOST_CONNECTIONS, MOST_OF_PROCESS
-from dxlrun.remote.process import serve
+from dxlrun.remote.server import MOST_CONNECTIONS, MOST_OF_PROCESS, serve
 from dxlrun.remote.sockets import MOST_BYTES
 
 STOP = b"POST /stop HTTP/1.1\r\nHost: x\r\nContent-Length: 0\r\n\r\n"
@@ -131,7 +130,7 @@ def test_stop_is_taken_from_another_process_while_one_floods_the_socket_with_con
 
 def test_a_process_has_some_connections_and_leaves_those_of_others_alone(door, monkeypatch):
     process = iter([1, *[2] * 40, *range(3, 60)])
-    monkeypatch.setattr(connection, "_peer", lambda _: (next(process), os.getuid()))
+    monkeypatch.setattr(server, "_peer", lambda _: (next(process), os.getuid()))
 
     async def remain(count, ends):
         while (left := [end for end in ends if not end[0].at_eof()])[count:]:
@@ -154,7 +153,7 @@ def test_a_process_has_some_connections_and_leaves_those_of_others_alone(door, m
 
 
 def test_a_connection_that_says_nothing_is_closed(door, monkeypatch):
-    monkeypatch.setattr(connection, "SILENCE_S", 0.02)
+    monkeypatch.setattr(server, "SILENCE_S", 0.02)
 
     async def act():
         ends = [await door.connect(data) for data in (b"", GO[:30], GO + b"Content-Length: 20\r\n\r\n{")]
@@ -273,7 +272,7 @@ def test_connections_that_came_and_went_leave_nothing_in_memory(door):
         assert await door.stopped()
         await asyncio.sleep(0.01)
         gc.collect()
-        return sum(isinstance(one, connection.Connection) for one in gc.get_objects())
+        return sum(isinstance(one, server.Connection) for one in gc.get_objects())
 
     assert door.open(act) <= 5
 

@@ -16,7 +16,7 @@ from pydantic import create_model
 
 from dxlrun.compile.limits import BeyondLimit
 from dxlrun.control.loop_plan import ControllerPlan
-from dxlrun.remote import connection, gateway, link
+from dxlrun.remote import gateway, link, server
 from dxlrun.remote.gateway import MOST_OPERATIONS, MOST_SET_POINTS
 from dxlrun.remote.preparation import Prepared, RefusedRequest, _of_motions, in_si
 from dxlrun.remote.sockets import MOST_BYTES
@@ -570,5 +570,5 @@ def test_the_page_gives_the_limits_that_are_kept():
     assert f"within {link.ANSWER_S:g} s and two of its periods, {2 * link.ANSWER_S:g} s at most" in page
     assert f"of the last {link.KEPT_EVENTS} events (fewer when their texts have more than" in page
     assert f"more than {link.KEPT_TEXT >> 20} MiB together" in page
-    assert f"A process may keep {connection.MOST_OF_PROCESS} connections, all together" in page
-    assert f"all together {connection.MOST_CONNECTIONS}." in page
+    assert f"A process may keep {server.MOST_OF_PROCESS} connections, all together" in page
+    assert f"all together {server.MOST_CONNECTIONS}." in page

@@ -6,14 +6,14 @@ import os
 from contextlib import suppress
 
 NICENESS = 10
-"""The robot comes first: a busy gateway gets what loop, guardian and recorder leave over."""
+"""A busy gateway gets the processor time that loop, guardian and recorder leave."""
 
 
 def main() -> None:
-    """Step back before anything is imported, which is most of the gateway's work in a short run."""
+    """Lower the priority before the imports, which are most of the gateway's work in a short run."""
     with suppress(OSError):
         os.nice(NICENESS)
-    from dxlrun.remote.process import main as serve_run
+    from dxlrun.remote.server import main as serve_run
 
     serve_run()
 

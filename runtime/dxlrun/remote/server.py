@@ -1,0 +1,185 @@
+"""Server: the gateway's process, and its connections: a timeout for each, limits for a process and for all.
+
+A client may hang in the middle of a request, never read its answer, or open connections without end. A
+process above its limit loses the connection of its own that was silent longest, so a flood closes none of
+another process, whose `stop` is served. The process ID comes from the kernel (SO_PEERCRED, unix(7)).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ctypes
+import math
+import os
+import signal
+import socket
+import struct
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+
+import msgspec
+import uvicorn
+from msgspec.json import Decoder
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from dxlrun.compile.plan import Plan, from_json
+from dxlrun.control.controllers.plugins import load_plugins
+from dxlrun.errors import DxlrunError
+from dxlrun.remote.gateway import Gateway
+from dxlrun.remote.job import GatewayJob
+from dxlrun.remote.link import Link
+from dxlrun.remote.preparation import Preparation
+from dxlrun.remote.sockets import listen
+from dxlrun.run.channels import process
+from dxlrun.run.channels.process import Failed, Finish, Listening, MessageChannel
+
+MOST_CONNECTIONS = 64
+MOST_OF_PROCESS = 16
+"""Connections of one process: three processes that flood leave a quarter of all to others."""
+SILENCE_S = 30.0
+"""After so long without a byte from the other side, whatever it waits for, a connection is closed."""
+
+_CREDENTIALS = struct.Struct("3i")
+_PR_SET_PDEATHSIG = 1
+
+
+def main() -> None:
+    """Run the gateway's process: `--job-fd N --control-fd M`."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    sys.stdout = sys.stderr = process.Printed(sys.stderr.fileno())
+    # a plug-in's endless `prepare` must not outlive the run
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    job = msgspec.json.decode(process.whole(int(sys.argv[2])), type=GatewayJob)
+    control = socket.socket(fileno=int(sys.argv[4]))
+    channel = MessageChannel(control, Decoder(Finish))  # carries nothing here: the gateway ends with it
+    plan: Plan = from_json(process.whole(job.plan))
+    try:
+        link = Link(plan, job.memory)
+        joints = {joint.name: joint for joint in plan.loop.joints}
+        gateway = Gateway(link, Preparation(joints, load_plugins()), job.log)
+        listener, path = listen(plan.robot)
+    except (DxlrunError, OSError) as error:
+        channel.send(Failed(str(error)))
+        sys.exit(1)
+    channel.send(Listening(str(path)))
+    try:
+        asyncio.run(serve(link, gateway, listener, control))
+    finally:
+        path.unlink(missing_ok=True)
+
+
+async def serve(link: Link, gateway: Gateway, listener: socket.socket, control: socket.socket) -> None:
+    """Serve until the other end of `control` is closed, or the link fails, whose error is raised."""
+    config = uvicorn.Config(
+        gateway.app(),
+        http=Connection,
+        ws="none",
+        lifespan="off",
+        log_config=None,
+        log_level="critical",
+        access_log=False,
+        proxy_headers=False,
+        server_header=False,
+        backlog=MOST_CONNECTIONS,
+        timeout_keep_alive=math.ceil(SILENCE_S) + 1,  # the connection's own timeout ends before
+        timeout_graceful_shutdown=1,
+        h11_max_incomplete_event_size=16384,
+    )
+    server = _Server(config)
+
+    def end(*_: object) -> None:
+        server.should_exit = True
+
+    def hung_up() -> None:
+        with suppress(OSError):
+            if control.recv(4096):
+                return
+        end()
+
+    asyncio.get_running_loop().add_reader(control.fileno(), hung_up)
+    watching = asyncio.create_task(link.watch())
+    watching.add_done_callback(end)
+    await server.serve(sockets=[listener])
+    watching.cancel()
+    with suppress(asyncio.CancelledError):
+        await watching
+
+
+class _Server(uvicorn.Server):
+    """Leaves signals alone: the supervisor closes the control socket to end it."""
+
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Capture none."""
+        yield
+
+
+class Connection(H11Protocol):
+    """HTTP/1.1 on one connection, closed when it is silent for too long, or one of too many."""
+
+    def connection_made(  # type: ignore[override]  # uvicorn leaves its type open
+        self, transport: asyncio.Transport
+    ) -> None:
+        """Begin, unless the client is another user's; close another connection when there are too many."""
+        super().connection_made(transport)
+        self.last_byte_s = self.loop.time()
+        self._timer = self.loop.call_later(SILENCE_S, self._check)
+        process, user = _peer(transport)
+        if user not in (0, os.getuid()):  # the socket's mode forbids it too
+            transport.abort()
+            return
+        self.client = (f"process {process}", 0)
+        crowded = self._crowded()
+        if crowded:
+            min(crowded, key=lambda one: (one.busy, one.last_byte_s)).transport.abort()
+
+    def _crowded(self) -> list[Connection]:
+        """Return the connections of which one must be closed because of this one: those of its process when
+        that has too many, of the process that has most when there are too many; none otherwise."""
+        others = [
+            one
+            for one in self.connections
+            if isinstance(one, Connection) and one is not self and not one.transport.is_closing()
+        ]
+        process = self.client
+        counts = Counter(one.client for one in others)
+        if counts[process] < MOST_OF_PROCESS:
+            if len(others) < MOST_CONNECTIONS:
+                return []
+            ((process, _),) = counts.most_common(1)
+        return [one for one in others if one.client == process]
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Leave nothing behind: a timer would keep all of it until the timeout."""
+        self._timer.cancel()
+        self._unset_keepalive_if_required()
+        super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        """Take bytes."""
+        self.last_byte_s = self.loop.time()
+        super().data_received(data)
+
+    @property
+    def busy(self) -> bool:
+        """True while one of its requests is answered."""
+        return self.cycle is not None and not self.cycle.response_complete
+
+    def _check(self) -> None:
+        """Close it when it was silent for too long, else look again when that may be."""
+        silent_s = self.loop.time() - self.last_byte_s
+        if silent_s >= SILENCE_S:
+            self.transport.abort()  # not close: that would wait for a reader that may never read
+        else:
+            self._timer = self.loop.call_later(SILENCE_S - silent_s + 0.01, self._check)
+
+
+def _peer(transport: asyncio.Transport) -> tuple[int, int]:
+    """Return process ID and user ID of a client."""
+    end = transport.get_extra_info("socket")
+    process, user, _ = _CREDENTIALS.unpack(
+        end.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+    )
+    return process, user
