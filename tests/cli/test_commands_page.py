@@ -19,7 +19,7 @@ Dxlrun = Callable[..., Any]
 
 
 def rows(text: str) -> list[str]:
-    """Return what stands on the left of a table of the help."""
+    """Return the left column of the tables of a help."""
     return re.findall(r"^│ (?:\*  )?([\w-]\S*(?: \(-h\))?)", text, re.MULTILINE)
 
 

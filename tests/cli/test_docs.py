@@ -1,11 +1,12 @@
-"""The pages of the repository: what they tell a reader to type works, and what they name is there.
+"""The pages of the repository: their commands work, and the files, names and pages in them exist.
 
-Each page with commands has a test that runs them; those of five are run here. Where a page names hardware,
+Each page with commands has a test that runs them; those of six are run here. Where a page names hardware,
 the command gets a simulated line instead; a run gets virtual time.
 """
 
 from __future__ import annotations
 
+import ast
 import json
 import re
 import shlex
@@ -62,7 +63,7 @@ Dxlrun = Callable[..., Any]
 
 
 def commands(page: str) -> list[str]:
-    """Return the lines that a reader types, without what is remarked behind them."""
+    """Return the lines that a reader types, without the remarks behind them."""
     lines = re.findall(r"^    (dxlrun .+)$", PAGES[page], re.MULTILINE)
     return [line.partition("  #")[0].strip() for line in lines]
 
@@ -74,7 +75,7 @@ def spans(text: str) -> list[str]:
 
 @pytest.fixture
 def clone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The directory that the reader stands in, with the robots and motions of the clone."""
+    """The working directory of the reader, with the robots and motions of the clone."""
     (tmp_path / "robots").symlink_to(ROOT / "robots")
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -83,14 +84,14 @@ def clone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def served(monkeypatch: pytest.MonkeyPatch) -> list[SimulationConfig]:
     """What `dxlrun sim` was about to serve."""
-    asked: list[SimulationConfig] = []
+    configs: list[SimulationConfig] = []
 
     def serve(config: SimulationConfig, *_: object, **__: object) -> Served:
-        asked.append(config)
+        configs.append(config)
         return Served(1.0, Look(), ())
 
     monkeypatch.setattr(sim, "_serve", serve)
-    return asked
+    return configs
 
 
 def test_every_page_with_commands_has_a_test_that_runs_them() -> None:
@@ -120,8 +121,8 @@ def test_commands_inside_sentences_exist_with_their_options(dxlrun: Dxlrun, page
 def test_bus_md_its_checks_say_what_the_page_says(dxlrun: Dxlrun, clone: Path) -> None:
     split, ftdi = [line for line in commands("bus.md") if " check " in line]
     assert "read:=split" in split
-    told = dxlrun(*shlex.split(split)[1:])
-    assert (told.code, told.err) == (0, "")
+    result = dxlrun(*shlex.split(split)[1:])
+    assert (result.code, result.err) == (0, "")
     refused = dxlrun(*shlex.split(ftdi)[1:])
     assert refused.code == 2
     (highest,) = re.findall(r"highest rate that is left, (\d+ Hz)", PAGES["bus.md"])
@@ -162,8 +163,8 @@ def test_tools_md_its_commands_do_what_they_say(
     assert (found.code, found.err) == (0, "")
     assert "XM430-W350" in found.out
     for line in servo:  # EEPROM is written without a question here; the rate is given, to be quick
-        told = dxlrun(*shlex.split(line.replace("/dev/ttyUSB0", path))[1:], "--yes", "--baud", "1000000")
-        assert (told.code, told.err) == (0, ""), line
+        result = dxlrun(*shlex.split(line.replace("/dev/ttyUSB0", path))[1:], "--yes", "--baud", "1000000")
+        assert (result.code, result.err) == (0, ""), line
     assert '"id":7' in (clone / "elbow.json").read_text().replace(" ", "")
     sent = [entry.data for entry in finish() if entry.direction == "in"]
     writes = {(data[4], data[8], data[10:-2]) for data in sent if data[2:3] == b"\xfd" and data[7] == 3}
@@ -195,9 +196,9 @@ def test_a_log_is_compared_with_its_ledger_as_the_page_says(dxlrun: Dxlrun, clon
     ledger = shlex.split(run)[-1]
     given = {"LOG": str(log), "logs/*.mcap": str(log), "FILE": ledger, "LEDGER": ledger}
     words = [given.get(word, word) for word in shlex.split(analyze)[1:]]
-    told = dxlrun(*[ledger if word.endswith("*.ledger.jsonl") else word for word in words])
-    assert told.code == 0, told.out + told.err
-    assert re.match(r"The log is what (the bus|all \d+ buses) saw, to the byte", told.out)
+    result = dxlrun(*[ledger if word.endswith("*.ledger.jsonl") else word for word in words])
+    assert result.code == 0, result.out + result.err
+    assert re.match(r"The log is what (the bus|all \d+ buses) saw, to the byte", result.out)
 
 
 @pytest.mark.parametrize("robot", sorted((ROOT / "robots").glob("*.yaml")), ids=lambda path: path.stem)
@@ -266,11 +267,54 @@ def test_what_the_code_cites_is_in_the_repository() -> None:
         assert any(heading.startswith(section.lower()) for heading in headings), section
 
 
+def defined(path: Path) -> set[str]:
+    """Return the names that a file defines; a method as `Class.method`, in C every word."""
+    if path.suffix != ".py":
+        return set(re.findall(r"\w+", path.read_text()))
+    names: set[str] = set()
+    functions = ast.FunctionDef | ast.AsyncFunctionDef
+    for node in ast.parse(path.read_text()).body:
+        names |= {
+            name.id for name in ast.walk(node) if isinstance(name, ast.Name) and not hasattr(node, "name")
+        }
+        if isinstance(node, functions | ast.ClassDef):
+            names.add(node.name)
+        if isinstance(node, ast.ClassDef):
+            names |= {f"{node.name}.{one.name}" for one in node.body if isinstance(one, functions)}
+    return names
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_the_names_that_a_page_gives_with_their_file_exist(page: str) -> None:
+    found = re.findall(r"`([\w/.-]+\.(?:py|c))::([\w.]+)`", PAGES[page])
+    assert found or page != "architecture.md"
+    for file, name in found:
+        paths = [root / file for root in (ROOT, ROOT / "runtime/dxlrun") if (root / file).exists()]
+        assert paths, file
+        assert name in defined(paths[0]), f"{file}::{name}"
+
+
+def test_a_name_that_a_file_lacks_is_noticed(tmp_path: Path) -> None:
+    path = tmp_path / "line.py"
+    methods = "    def send(self):\n        width = LIMIT\n\n    async def ask(self): ...\n"
+    path.write_text(f"LIMIT = 3\n\n\nclass Line:\n{methods}")
+    assert defined(path) == {"LIMIT", "Line", "Line.send", "Line.ask"}
+
+
+def test_architecture_md_has_every_room() -> None:
+    page = PAGES["architecture.md"]
+    rooms = set(re.findall(r"`([\w/]+(?:/|\.py))`", page[page.index("## Rooms") : page.index("## The plan")]))
+    for folder in ("", "dynamixel/"):
+        entries = (ROOT / "runtime/dxlrun" / folder).iterdir()
+        names = {f"{folder}{one.name}" + "/" * one.is_dir() for one in entries if "__" not in one.name}
+        assert {name for name in names if name.endswith((".py", "/"))} - rooms == set()
+
+
 def test_architecture_md_names_what_the_code_has() -> None:
     code = "\n".join(path.read_text() for path in SOURCES if path.relative_to(ROOT).parts[0] != "tests")
     names = re.findall(r"`([A-Za-z_]\w+(?:\.[a-z_]\w+)?)(?:\(\))?`", PAGES["architecture.md"])
     names = [name for name in names if not name.endswith((".py", ".so", ".toml"))]
-    assert {"CyclicReads.status", "keep_replies"} <= set(names)
+    assert {"CyclicReads.status", "CALM_CYCLES"} <= set(names)
     for name in names:
         for word in name.split("."):
             assert re.search(rf"\b{word}\b", code), name
@@ -281,7 +325,7 @@ def test_architecture_md_its_command_and_its_reply_are_these_bytes(tmp_path: Pat
     page = PAGES["architecture.md"]
     (line,) = commands("architecture.md")
     _, _, controller, kind, *words = shlex.split(line)
-    wanted, request, reply = map(bytes.fromhex, re.findall(r"^(FF FF [\dA-F ]+)$", page, re.MULTILINE))
+    command, request, reply = map(bytes.fromhex, re.findall(r"^(FF FF [\dA-F ]+)$", page, re.MULTILINE))
     plan = plan_of(ROOT / "robots/bioloid_torso.yaml")
     preparation = Preparation({joint.name: joint for joint in plan.loop.joints}, load_plugins())
     (head,) = (one for one in plan.loop.controllers if one.name == controller)
@@ -295,7 +339,9 @@ def test_architecture_md_its_command_and_its_reply_are_these_bytes(tmp_path: Pat
     robot.run()
     assert isinstance(robot.inbox.answers[1], Done)
     entries = robot.ledger.entries
-    assert [one.data for one in entries if one.direction == "in"].count(wanted) == 2  # once more, as it says
+    assert [one.data for one in entries if one.direction == "in"].count(
+        command
+    ) == 2  # once more, as on the page
     (at,) = (index for index, one in enumerate(entries) if one.data == reply)
     assert entries[at - 1].data == request
     recorded = read_log(log)
