@@ -1,6 +1,8 @@
 """A servo's life: each legal transition is reached by what a simulated servo does, the others are refused."""
 
 import itertools
+import os
+import random
 from dataclasses import replace
 
 import numpy as np
@@ -95,9 +97,9 @@ def recorded(monkeypatch):
 class Story:
     """Servo 12 of a bus of three, which lives through something."""
 
-    def __init__(self, make_plan, make_rig, protocol=2.0):
+    def __init__(self, make_plan, make_rig, protocol=2.0, *, split=False):
         model = {} if protocol == 1.0 else {"protocol": 2.0, "model": "XM430-W350"}
-        plan = make_plan((11, 12, 13), name="arm", return_delay_ns=0, **model)
+        plan = make_plan((11, 12, 13), name="arm", return_delay_ns=0, split=split, **model)
         self.plan = replace(plan, watchdog_ticks=10 if protocol == 2.0 else 0)
         self.rig = make_rig(self.plan)
         self.servo = self.rig.buses[0].servo(12)
@@ -244,3 +246,67 @@ def test_torque_that_was_read_before_a_servo_was_let_go_gives_it_no_goals(make_p
     assert goals
     assert not any(12 in packet[7:-1:5] for packet in goals)
     assert rig.torque() == [True, False, True]
+
+
+STORMS = int(os.environ.get("DXLRUN_STORMS", "12"))
+
+
+@pytest.mark.parametrize("protocol", [1.0, 2.0])
+@pytest.mark.parametrize("seed", range(STORMS))
+def test_whatever_happens_in_whatever_order_only_legal_transitions_follow(
+    make_plan, make_rig, seed, protocol
+):
+    """And no goal goes to a servo whose torque was not read as on since the last doubt."""
+    chance = random.Random(seed)
+    story = Story(make_plan, make_rig, protocol, split=seed % 3 == 2)
+    rig, line = story.rig, story.rig.buses[0]
+    rig.hardware.start()
+    rig.restless = 0.002  # a goal to each in every cycle
+    let_go: set[int] = set()
+
+    def pull():
+        line.unplug()
+        if chance.random() < 0.7:
+            rig.cycle(idle=chance.random() < 0.5)
+        line.plug_in()
+
+    def let_one_go():
+        let_go.add(chance.randrange(3))
+        rig.hardware.let_go(let_go)
+
+    happenings = (
+        lambda: chance.choice(line.servos).silence(chance.random() < 0.5),
+        lambda: chance.choice(line.servos).reset(),
+        lambda: chance.choice(line.servos).poke("torque_enable", 0),
+        lambda: chance.choice(line.servos).trigger_overload(),
+        lambda: line.truncate_next(chance.choice((11, 12, 13)), chance.randrange(6)),
+        lambda: rig.hardware.set_modes(np.array([chance.choice((0, 1, 2)) for _ in range(3)], np.uint8)),
+        lambda: rig.clock.wait_until(rig.clock.now_ns() + 300_000_000),
+        pull,
+        let_one_go,
+    )
+    for _ in range(60):
+        # the rarer, the worse
+        chance.choices(happenings, (9, 2, 2, 1, 6, 3, 2, 2, 1))[0]()
+        for _ in range(chance.randrange(1, 12)):
+            begun = len(rig.into_bus())
+            rig.hardware.read()
+            rig.hardware.write()
+            gets = [
+                servo.servo_id for servo, on in zip(story.plan.servos, story.life.torqued, strict=True) if on
+            ]
+            for packet in rig.into_bus()[begun:]:
+                assert set(goals_in(packet, protocol)) <= set(gets)
+            rig.hardware.idle(rig.clock.now_ns() + 15_000_000)
+            rig.clock.wait_until(rig.clock.now_ns() + 5_000_000)
+            for index in let_go:
+                assert story.life.states[index] in (ServoState.LATCHED, ServoState.OFFLINE)
+
+
+def goals_in(packet, protocol):
+    """Return the IDs that a packet gives goals: of a sync write to whatever but the watchdogs."""
+    if protocol == 1.0:
+        return packet[7 : -1 : packet[6] + 1] if packet[4] == 0x83 else b""
+    if packet[7] != 0x83 or packet[8:10] == b"\x62\x00":
+        return b""
+    return packet[12 : -2 : packet[10] + 1]

@@ -12,15 +12,15 @@
 
 What drives it are programs, generators that yield transactions to a bus and end in an event:
 
-| program | file | ends in |
+| program | file | events |
 |---|---|---|
-| start-up: look, set up, hold, confirm | `startup.py`, `checks.py` | ENGAGED, TORQUE_ON |
+| start-up: check, set up, hold, confirm | `startup.py`, `checks.py` | ENGAGED, TORQUE_ON |
 | read torque enable, hardware error, torque limit | `servos.py` | TORQUE_ON, TORQUE_OFF, DOUBT, LOST |
-| probe an offline servo, and take it back | `offline.py` | RETURNED, RETURNED_LIMP |
+| probe an offline servo, and take it back | `offline.py` | RETURNED (then TORQUE_ON) or RETURNED_LIMP |
 | read Realtime Tick, which shows a reboot | `offline.py`, `slow_registers.py` | LOST |
-| switch off for the rest of the run | `offline.py` | LATCHED; LOST where it fails |
-| change a mode | `desired.py`, `modes.py` | DOUBT |
-| revive a servo that its Bus Watchdog stopped | `watchdog.py` | STOPPED; LOST where it fails |
+| switch torque off for the rest of the run | `offline.py` | LATCH, then LOST where it fails |
+| change a mode | `desired.py`, `modes.py` | DOUBT where torque was not confirmed |
+| revive a servo its watchdog stopped | `watchdog_monitor.py` | WATCHDOG, then LOST where it fails |
 
 The cyclic exchange itself has three events: a lost reply is DOUBT, many in a row are LOST, and a position
 near the goal is CAUGHT_UP. Which servos get goals, how fast they may follow them, and which are read in a
@@ -169,8 +169,10 @@ class Loss:
     """It is to be LATCHED when it is back."""
     rebooted: bool
     """A reboot was counted since it took part."""
-    probe_at_ns: int | None
-    """When it is probed next; None while it is."""
+    probe_at_ns: int
+    """When it is probed next."""
+    probing: bool = False
+    """A probe is under way, or waits for idle time."""
     problem: str = ""
     """Why it could not be taken back, as reported last."""
 
@@ -208,34 +210,35 @@ class Life:
         self.states[index] = after
         self.torqued[index] = after in GETS_GOALS
         self.ceiling[index] = RETURN_SPEED if after in _SLOW else np.nan
+        loss = self.losses[index]
         if event is ServoEvent.LOST:
+            self.losses[index] = self._loss(before, loss)
             self.reads.leave(index)
-        elif before is ServoState.OFFLINE and after is not ServoState.OFFLINE:
+        elif loss is not None and event is ServoEvent.LATCH:
+            loss.latched = True
+        elif loss is not None and after is not ServoState.OFFLINE:
             self.losses[index] = None
             self.reads.join(index)
         return after
 
-    def lose(self, index: int, probe_after_ns: int = 0, *, rebooted: bool = False) -> Loss:
+    def lose(self, index: int, probe_after_ns: int = 0) -> Loss:
         """Take a servo out of the exchange, to be probed after a while until it is in order."""
-        state, earlier = self.states[index], self.losses[index]
-        powerless = state in POWERLESS if earlier is None else earlier.limp_reported
-        loss = Loss(
-            had_torque=not powerless,
-            limp_reported=powerless,
-            latched=state is ServoState.LATCHED if earlier is None else earlier.latched,
-            rebooted=rebooted or (earlier is not None and earlier.rebooted),
-            probe_at_ns=self._now_ns() + probe_after_ns,
-        )
         self.on(index, ServoEvent.LOST)
-        self.losses[index] = loss
+        loss = self.losses[index]
+        assert loss is not None  # noqa: S101  a servo that is lost has one
+        loss.probe_at_ns += probe_after_ns
         return loss
 
-    def latch(self, index: int) -> ServoState:
-        """Give a servo no torque for the rest of the run; return its state."""
-        loss = self.losses[index]
-        if loss is not None:
-            loss.latched = True
-        return self.on(index, ServoEvent.LATCH)
+    def _loss(self, before: ServoState, earlier: Loss | None) -> Loss:
+        """Return what is known of a servo that is lost, in a state or once more."""
+        powerless = before in POWERLESS if earlier is None else earlier.limp_reported
+        return Loss(
+            had_torque=not powerless,
+            limp_reported=powerless,
+            latched=before is ServoState.LATCHED if earlier is None else earlier.latched,
+            rebooted=earlier is not None and earlier.rebooted,
+            probe_at_ns=self._now_ns(),
+        )
 
     def offline(self, index: int) -> bool:
         """Return whether a servo is out of the exchange."""

@@ -135,8 +135,8 @@ class Offline:
             return
         now = self._idle.now_ns()
         for index, loss in enumerate(self._life.losses):
-            if loss is not None and loss.probe_at_ns is not None and loss.probe_at_ns <= now:
-                loss.probe_at_ns = None
+            if loss is not None and not loss.probing and loss.probe_at_ns <= now:
+                loss.probing = True
                 name = f"the return of {self._plan.servos[index].joint}"
                 self._idle.add(self._probe(index, loss), Urgency.REPAIR, name, index)
 
@@ -180,7 +180,7 @@ class Offline:
         if problem and problem != loss.problem:
             loss.problem = problem
             self._life.report(EventCode.SERVO_LOST, Severity.ERROR, index, problem)
-        loss.probe_at_ns = self._idle.now_ns() + PROBE_NS
+        loss.probing, loss.probe_at_ns = False, self._idle.now_ns() + PROBE_NS
 
     def _rejoin(self, index: int, reply: Reply) -> Program[Rejoined]:
         """Bring a servo that answered to its desired state, with or without torque."""
@@ -217,7 +217,7 @@ class Offline:
         how = "holding where it stands" if holds else "limp: it gets no goals"
         life.report(EventCode.SERVO_BACK, Severity.INFO, index, f"is in order and takes part again, {how}")
         if loss.latched:
-            life.latch(index)
+            life.on(index, ServoEvent.LATCH)
             if rejoined.torqued:
                 self.switch_off(index)
         elif holds and not self._plan.split:

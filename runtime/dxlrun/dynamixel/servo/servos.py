@@ -164,7 +164,7 @@ class Servos:
     def let_go(self, rows: Collection[int]) -> None:
         """Switch the torque of joints off for the rest of the run, of an offline servo when it is back."""
         for index, row in enumerate(self._rows):
-            if row in rows and self._life.latch(index) is ServoState.LATCHED:
+            if row in rows and self._life.on(index, ServoEvent.LATCH) is ServoState.LATCHED:
                 self._offline.switch_off(index)
 
     # The line

@@ -84,7 +84,7 @@ class SlowReads:
         rebooted = yield from self._offline.tick(index)
         self._reading = False
         if rebooted and not self._life.offline(index):
-            self._life.lose(index, rebooted=True)
+            self._life.lose(index).rebooted = True
 
     def _read(self, index: int, block: _Block) -> Program[None]:
         start, end = block[0].address, block[-1].address + block[-1].size
