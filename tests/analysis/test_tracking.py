@@ -201,5 +201,5 @@ def test_terminal_report_and_json_say_the_same(make: Make) -> None:
     (drawing,) = joint_drawings(log, report.joints)
     assert (
         "worst 0.0300 rad (position minus what was reachable), lag 59 ms, settled after"
-        in drawing.words.caption
+        in drawing.caption.text
     )

@@ -76,7 +76,7 @@ def test_nobody_is_an_answer_too(dxlrun, simulated_line):
     path, _ = simulated_line(BusConfig("main", 1_000_000, (), 2.0))
     said = dxlrun("scan", path, *NARROW)
     assert said.code == 1
-    assert f"nobody answers at {path}" in said.err
+    assert f"no servo answers at {path}" in said.err
 
 
 HOLD = """

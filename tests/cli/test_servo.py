@@ -79,8 +79,8 @@ def test_registers_are_read_and_written_and_the_eeprom_only_when_it_was_asked_fo
     assert servo(1, "set", "position_p_gain", "900", *NEW).out.strip().endswith("was 800 and is 900")
     refused = servo(1, "set", "return_delay_time", "0", *NEW)
     assert refused.code == 2
-    assert "Return Delay Time (9) is 250 and becomes 0 (EEPROM): nobody can be asked here" in refused.err
-    assert "give --yes" in refused.err
+    assert "Return Delay Time (9) is 250 and becomes 0 (EEPROM): not a terminal, cannot ask" in refused.err
+    assert "add --yes" in refused.err
     done = servo(1, "set", "return_delay_time", "100 us", "--yes", "--json", *NEW)
     result = json.loads(done.out)
     assert result["done"] == ["Return Delay Time (9) was 250 and is 50"]
@@ -143,7 +143,7 @@ def test_a_servo_moves_to_another_id_and_rate_and_is_started_anew_and_reset(one)
     assert "has the factory's values, ID 9 at 57600 bit/s" in reset.out
     missing = servo(9, "get", *fast)
     assert missing.code == 1
-    assert "nobody with ID 9 answers at" in missing.err
+    assert "no servo with ID 9 answers at" in missing.err
     assert len(writes(finish())) == 2
 
 

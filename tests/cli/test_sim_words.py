@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from dxlrun.cli.sim import link_of_each
-from dxlrun.cli.sim_inputs import AdapterWishes, read_faults, servo_bus, with_adapter
+from dxlrun.cli.sim_inputs import AdapterOptions, read_faults, servo_bus, with_adapter
 from dxlrun.cli.sim_views import PlainView, Shown, ending
 from dxlrun.errors import InputError
 from dxlrun.run.simulation_front import Look, ServoLook
@@ -67,7 +67,7 @@ def test_a_name_with_two_firmwares_follows_the_protocol():
             ],
         ),
         (["--servo", "AX-12A:1,2,1"], ["ID 1 is given to AX-12A and to AX-12A; give every servo its own"]),
-        (["--servo", "MX-28:1"], ["MX-28 exists with Protocol 1.0 and with 2.0; say which one by --p"]),
+        (["--servo", "MX-28:1"], ["MX-28 exists with Protocol 1.0 and with 2.0; choose one by --p"]),
         (["--servo", "MX-28:1", "--protocol", "3"], ["there is no Protocol 3; --protocol is 1.0 or 2.0"]),
         (["--servo", "AX-12A:1", "--protocol", "2"], ["AX-12A speaks Protocol 1.0, not 2.0"]),
         (["--servo", "AX-12A:1", "--servo", "XM430-W350:2"], ["a bus has one protocol"]),
@@ -128,12 +128,12 @@ def test_every_wrong_fault_is_told_with_its_place(dxlrun, tmp_path: Path):
 
 
 def test_options_replace_what_the_robot_file_says_of_the_adapter():
-    wishes = AdapterWishes(4_000_000, "random", echo=True, absent="slot")
-    bus = with_adapter(BUS, wishes, 7)
+    options = AdapterOptions(4_000_000, "random", echo=True, absent="slot")
+    bus = with_adapter(BUS, options, 7)
 
     assert (bus.adapter.latency_timer_ns, bus.adapter.split, bus.adapter.echo) == (4_000_000, "random", True)
     assert (bus.adapter.seed, bus.absent) == (7, "slot")
-    assert with_adapter(bus, AdapterWishes(), 7) == bus
+    assert with_adapter(bus, AdapterOptions(), 7) == bus
 
 
 def test_one_bus_has_the_link_itself_and_several_have_its_name_and_theirs(tmp_path: Path):
@@ -151,7 +151,7 @@ def test_what_is_no_link_is_never_replaced(tmp_path: Path):
     (tmp_path / "file").write_text("precious")
     (tmp_path / "dangling").symlink_to("/dev/pts/nowhere")
 
-    with pytest.raises(InputError, match="stands there already and is no link"):
+    with pytest.raises(InputError, match="exists and is no link"):
         link_of_each([BUS], tmp_path / "file")
     assert link_of_each([BUS], tmp_path / "dangling") == {"main": tmp_path / "dangling"}
 

@@ -1,1 +1,1 @@
-"""What a log tells about a run: latency, bus, tracking; numbers, and a verdict in words."""
+"""Analysis of a log: latency, traffic, tracking; numbers, and a verdict in words."""

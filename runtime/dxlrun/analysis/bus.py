@@ -1,4 +1,8 @@
-"""What happened on the wires: who was asked, who answered, how soon, with which error bits."""
+"""Traffic of each bus and servo: requests, replies, reply times, error bits; by the bytes in the log.
+
+The packets are parsed here anew, so that nothing depends on what the run believed. Sources: ROBOTIS e-Manual,
+Protocol 1.0 and Protocol 2.0, instruction and status packets.
+"""
 
 from __future__ import annotations
 
@@ -89,15 +93,15 @@ class BusTraffic:
     bytes_in: int
     extra_us: float | None = None
     """Median of how much longer than wire and return delay a complete exchange took: what the adapter adds;
-    None where the log's plan does not tell, and where replies wait for the next cycle."""
+    None where the log's plan does not have it, and where replies wait for the next cycle."""
     planned_latency_us: float | None = None
     """What the plan expects of that."""
     port: str = ""
 
 
 @dataclass(frozen=True, slots=True)
-class Question:
-    """What one instruction asks: the servos that have to answer, and how many bytes of data each."""
+class Request:
+    """The replies that one instruction requests: from which servos, with how many bytes of data each."""
 
     servo_ids: tuple[int, ...] = ()
     sizes: tuple[int, ...] = ()
@@ -138,7 +142,7 @@ class _Line:
     broadcasts: int = 0
     extra_us: Counter[int] = field(default_factory=Counter)
     """How much longer than wire and return delay each complete exchange took."""
-    asked: Question = field(default_factory=Question)
+    asked: Request = field(default_factory=Request)
     open: set[int] = field(default_factory=set)
     """Servos that have not answered yet."""
     asked_ns: int = 0
@@ -191,7 +195,7 @@ class _Line:
             self.broadcasts += 1
         else:
             self.counts[packet.servo_id].instructions += 1
-        self.asked = question(packet.data)
+        self.asked = request_of(packet.data)
         self.asked_ns = packet.first_ns
         self.awaited_ns = self.free_ns = max(self.free_ns, packet.first_ns) + self._wire_ns(len(packet.data))
         self.open = set(self.asked.servo_ids)
@@ -311,34 +315,34 @@ def joints_of(log: Log) -> dict[tuple[str, int], str]:
 
 
 def is_protocol_2(data: bytes) -> bool:
-    """Tell the protocol by the header; a Protocol 1.0 packet of ID 253 has no length 0."""
+    """Return the protocol by the header; a Protocol 1.0 packet of ID 253 has no length 0."""
     return data.startswith(_HEADER_2)
 
 
 @lru_cache(maxsize=1024)
-def question(data: bytes) -> Question:
-    """Return who has to answer an instruction at every status return level: pings and reads."""
+def request_of(data: bytes) -> Request:
+    """Return the servos that answer an instruction at every status return level: pings and reads."""
     second = is_protocol_2(data)
     servo_id, code = (_byte(data, 4), _byte(data, 7)) if second else (_byte(data, 2), _byte(data, 4))
     if code in (_PING, _READ):
-        return Question() if servo_id == BROADCAST_ID else Question((servo_id,))
+        return Request() if servo_id == BROADCAST_ID else Request((servo_id,))
     if not second:
-        return _entries(data[6:-1], 3, 1) if code == _BULK_READ else Question()
+        return _entries(data[6:-1], 3, 1) if code == _BULK_READ else Request()
     body = data[8:-2].replace(_STUFFED, _PLAIN)
     if code in (_SYNC_READ, _FAST_SYNC_READ):
-        return Question(tuple(body[4:]), (int.from_bytes(body[2:4], "little"),) * len(body[4:]))
-    return _entries(body, 5, 0) if code in (_BULK_READ, _FAST_BULK_READ) else Question()
+        return Request(tuple(body[4:]), (int.from_bytes(body[2:4], "little"),) * len(body[4:]))
+    return _entries(body, 5, 0) if code in (_BULK_READ, _FAST_BULK_READ) else Request()
 
 
-def _entries(body: bytes, width: int, at: int) -> Question:
+def _entries(body: bytes, width: int, at: int) -> Request:
     """Return the servos of a bulk read: entries of `width` bytes, the ID at `at`, the size first or last."""
     entries = [body[start : start + width] for start in range(0, len(body) - width + 1, width)]
     sizes = (entry[0] if at else int.from_bytes(entry[3:5], "little") for entry in entries)
-    return Question(tuple(entry[at] for entry in entries), tuple(sizes))
+    return Request(tuple(entry[at] for entry in entries), tuple(sizes))
 
 
-def replies(servo_id: int, data: bytes, asked: Question) -> Iterator[Reply]:
-    """Yield the answers in one status packet; `asked` tells the blocks of a fast one apart."""
+def replies(servo_id: int, data: bytes, asked: Request) -> Iterator[Reply]:
+    """Yield the replies in one status packet; `asked` gives the sizes of the blocks of a fast one."""
     if not is_protocol_2(data):
         yield Reply(servo_id, _byte(data, 4), 1)
     elif servo_id != BROADCAST_ID:

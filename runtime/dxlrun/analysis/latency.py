@@ -20,9 +20,9 @@ DISORDER_NS = RING_SECONDS * 1_000_000_000
 """A log has the records of several rings in the order in which the recorder got them: no further apart."""
 _MS = 1_000_000
 _LAST_BIN = 100_000
-"""us; what is later stands in the last bin."""
+"""us; what is later is in the last bin."""
 _MOST_RATES = 4
-"""More are not said one by one."""
+"""More are not listed one by one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +100,7 @@ class Periods:
 
 
 def on_virtual_time(log: Log) -> bool:
-    """Tell whether the run's clock was virtual: its times are computed, and say nothing of this machine."""
+    """Return whether the run's clock was virtual: its times are computed, not measured."""
     return log.metadata.get("run", {}).get("clock") == "virtual"
 
 
@@ -186,7 +186,7 @@ class Punctuality:
 
     def __init__(self) -> None:
         self._held: NDArray[np.void] | None = None
-        """The newest cycle: how long its period is says the next one."""
+        """The newest cycle: its period ends with the next one."""
         self._records = self._skipped = self._elapsed = 0
         self._agree = True
         self._first = True

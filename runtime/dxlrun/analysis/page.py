@@ -205,8 +205,8 @@ def _each_event(log: Log) -> list[Element]:
 
 
 def _figure(drawing: Drawing) -> Element:
-    words = drawing.words
-    return figure(words.name, words.title, drawing.svg, words.caption)
+    about = drawing.caption
+    return figure(about.name, about.title, drawing.svg, about.text)
 
 
 def _footer(log: Log) -> Element:

@@ -21,7 +21,7 @@ _CYCLE = np.dtype([(name, "i8") for name in ("cycle", "scheduled_ns", "woken_ns"
 
 
 class _Data(msgspec.Struct):
-    """What the JSON of the loop's commands may say; each kind has some of it."""
+    """The keys of the loop's commands; each kind has some of them."""
 
     activate: tuple[str, ...] = ()
     deactivate: tuple[str, ...] = ()
@@ -36,7 +36,7 @@ class _Data(msgspec.Struct):
 
 @dataclass(frozen=True, slots=True)
 class Act:
-    """One thing that somebody asked, or a stream of set-points."""
+    """One command from outside, or a stream of set-points."""
 
     time_s: float
     """Since the loop's first deadline."""
@@ -151,7 +151,7 @@ class Steering:
     def _add(self, one: Steered) -> None:
         command, found = one.command, self._acts
         index, last = self._streams.pop(command.controller, (-1, None))
-        if last is not None and found[index].refusal == one.refusal and _goes_on(last, command):
+        if last is not None and found[index].refusal == one.refusal and _continues(last, command):
             found[index] = _one_more(found[index], command)
         else:
             index = len(found)
@@ -178,8 +178,8 @@ class Steering:
         return int(self._cycles["scheduled_ns"][index]) if index >= 0 else self._start_ns
 
 
-def _goes_on(last: TakenCommand, command: TakenCommand) -> bool:
-    """Say whether a set-point belongs to the stream of the one before."""
+def _continues(last: TakenCommand, command: TakenCommand) -> bool:
+    """Return whether a set-point belongs to the stream of the one before."""
     return (
         bool(command.lease_ns)
         and (command.kind, command.origin) == (last.kind, last.origin)
@@ -212,7 +212,7 @@ def _stream(command: TakenCommand, count: int) -> str:
 
 
 def _words(command: TakenCommand) -> str:
-    """Return a command as a person says it; what cannot be read as it is."""
+    """Return a command in words; unreadable data as they are."""
     if not command.for_loop:
         return f"{command.kind} for {command.controller}"
     try:

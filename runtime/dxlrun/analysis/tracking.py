@@ -1,6 +1,6 @@
 """How the joints followed their goals, and how fresh their states were.
 
-No servo is at its goal in the cycle after it was sent: it goes there at the speed that it was told, or at its
+No servo is at its goal in the cycle after it was sent: it goes there at the commanded speed, or at its
 highest. So what a joint did is compared with its reachable trajectory: from where it stood towards the goals
 that were sent, within the limits of velocity and acceleration, without delay. What is left is the servo's
 lag, its settling, and the error with which it comes to rest.
@@ -21,13 +21,13 @@ from dxlrun.interfaces import Floats
 from dxlrun.log.reader import Log
 
 _REST_S = 0.3
-"""A reachable trajectory that stands still for so long is at rest: its joint is to settle."""
+"""A reachable trajectory that does not change for so long is at rest: its joint is to settle."""
 _SETTLED_PART, _SETTLED_TICKS = 0.02, 2
 """Settled: so near to where it stays, as a part of the way or in ticks, whichever is more."""
 _MOVED_TICKS = 4
-"""Ways shorter than this tell no lag: what is read are ticks."""
+"""Shorter ways give no lag: positions are read in ticks."""
 _TICK_RAD = math.tau / 4096
-"""Where the log's plan does not tell the servo's"""
+"""Where the log's plan does not have the servo's"""
 _ACCELERATIONS = ("profile_acceleration", "goal_acceleration")
 
 Flags = NDArray[np.bool_]
@@ -61,7 +61,7 @@ class Joint:
 
 @dataclass(frozen=True, slots=True)
 class _Limits:
-    """What a servo can do, as the log's plan tells it."""
+    """What a servo can do, by the log's plan."""
 
     speed: float = math.inf
     """rad/s"""
@@ -116,8 +116,8 @@ def _reachable(log: Log, row: int, limits: _Limits) -> Floats:
     cycles, count = log.cycles, len(log.cycles)
     goal: Floats = cycles["goal_position"][:, row].astype(np.float64)
     position = np.where(cycles["valid"][:, row], cycles["position"][:, row], np.nan)
-    told = np.abs(cycles["goal_velocity"][:, row])
-    speed = np.where(np.isfinite(told), np.maximum(told, limits.slowest), math.inf)
+    commanded = np.abs(cycles["goal_velocity"][:, row])
+    speed = np.where(np.isfinite(commanded), np.maximum(commanded, limits.slowest), math.inf)
     speed = np.minimum(speed, limits.speed)
     times = cycles["read_ns"] * 1e-9
     way = np.full(count, np.nan)
@@ -153,13 +153,13 @@ def _go(start: int, way: Floats, sent: _Sent, acceleration: float) -> int:
     at = float(way[start - 1]) if start else math.nan
     velocity = 0.0
     for cycle in range(start, len(way)):
-        wanted = float(sent.goal[cycle - 1]) if cycle else math.nan
-        if not (math.isfinite(at) and math.isfinite(wanted)):
-            # it begins where the joint stands when it has a goal
+        desired = float(sent.goal[cycle - 1]) if cycle else math.nan
+        if not (math.isfinite(at) and math.isfinite(desired)):
+            # it begins at the joint's position when it gets a goal
             at, velocity = float(sent.position[cycle]) if math.isfinite(sent.goal[cycle]) else math.nan, 0.0
             way[cycle] = at
             continue
-        left, dt = wanted - at, float(sent.steps[cycle])
+        left, dt = desired - at, float(sent.steps[cycle])
         fastest = math.copysign(float(sent.speed[cycle - 1]), left)
         if acceleration < math.inf:
             # from where it can still brake: v^2 / 2a and half of this step's way are what is left
@@ -170,7 +170,7 @@ def _go(start: int, way: Floats, sent: _Sent, acceleration: float) -> int:
         else:
             velocity = fastest
         if abs(left) <= abs(velocity) * dt:
-            way[cycle] = wanted
+            way[cycle] = desired
             return cycle + 1
         at += velocity * dt
         way[cycle] = at

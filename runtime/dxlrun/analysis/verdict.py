@@ -1,7 +1,7 @@
 """The verdict: whether a run was good, and what a person wants to know first, in sentences.
 
 The one set of rules: the terminal at the end of a run, `analyze`, its page and its JSON all use it, and the
-exit code is 1 where it says that a run was not good. What hurt most comes first. A run was not good when
+exit code is 1 where a run was not good. The most severe finding comes first. A run was not good when
 
 - a line or a servo was lost, a servo rebooted or lost its torque, the loop never ran a cycle, or another
   process of the run failed;
@@ -10,9 +10,9 @@ exit code is 1 where it says that a run was not good. What hurt most comes first
   least;
 - an error was logged, a servo reported one, or the log is not whole.
 
-All else is told and forgiven: a lost packet is data. Wake-ups are *rough* when more than 1 % are later than
-150 us (M. A. Araujo, UFU 2017, measured 1.74 % at 1 kHz under stress on a stock kernel, none on a real-time
-kernel). Replies are *late* when the adapter adds 2 ms more than the plan expects.
+All else is reported and tolerated: a lost packet is data. Wake-ups are *rough* when more than 1 % are later
+than 150 us (M. A. Araujo, UFU 2017, measured 1.74 % at 1 kHz under stress on a stock kernel, none on a
+real-time kernel). Replies are *late* when the adapter adds 2 ms more than the plan expects.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from dxlrun.run.channels.events import EventCode, EventGroup, Severity
 INVALID_SHARE = 0.01
 """More invalid states of a joint than this, and the run was not good."""
 _FEW_INVALID = 2
-"""So few tell nothing, however short the run: a servo that misses three replies in a row is lost."""
+"""So few are tolerated however short the run: a servo that misses three replies in a row is lost."""
 _SHORT_RUN_S = 2.0
-"""A shorter run may skip as much as one of this: a machine that stands still once is not overloaded."""
+"""A shorter run may skip as much as one of this: a machine that stalls once is not overloaded."""
 ROUGH_SHARE = 0.01
 _LATE_US = 2000
 _MOST_NAMED = 3
@@ -63,7 +63,7 @@ class Verdict:
 
     good: bool
     sentences: tuple[str, ...]
-    """What hurt most first."""
+    """The most severe first."""
 
     @property
     def word(self) -> str:
@@ -73,7 +73,7 @@ class Verdict:
 
 @unique
 class _Rank(IntEnum):
-    """What hurts how much; the first ones most."""
+    """Severity of a finding; the first is the worst."""
 
     NEVER_RAN = 0
     """Nor to its end, where a process of the run failed."""
@@ -102,7 +102,7 @@ def judge(totals: RunTotals) -> Verdict:
     """Return whether a run was good, and in sentences what was and what was not."""
     found = sorted(
         (
-            *(_Finding(_Rank.NEVER_RAN, f"The run failed: {told}.") for told in totals.failures),
+            *(_Finding(_Rank.NEVER_RAN, f"The run failed: {failed}.") for failed in totals.failures),
             *_loop(totals),
             *_lines(totals),
             *_lost_servos(totals),
@@ -143,7 +143,7 @@ def _loop(totals: RunTotals) -> Iterable[_Finding]:
 
 
 def _slow(totals: RunTotals) -> Iterable[_Finding]:
-    """Say which step made a cycle longer than its period, of the cycle that exceeds it most."""
+    """Report the longest step of the cycle that exceeds its period most."""
     slowest = totals.slowest
     if slowest is None:
         return
@@ -175,7 +175,7 @@ def _rough(totals: RunTotals) -> Iterable[_Finding]:
 
 
 def _steered(acts: Sequence[Act], pauses: Sequence[Pause]) -> Iterable[_Finding]:
-    """Say what was asked of the loop from outside."""
+    """Report the commands from outside."""
     asked = [act for act in acts if act.origin != "loop"]
     if not asked:
         return
@@ -200,13 +200,13 @@ def _steered(acts: Sequence[Act], pauses: Sequence[Pause]) -> Iterable[_Finding]
 
 
 def _of(events: Iterable[EventGroup], *codes: EventCode) -> list[EventGroup]:
-    return [said for said in events if said.code in codes and said.severity >= Severity.ERROR]
+    return [group for group in events if group.code in codes and group.severity >= Severity.ERROR]
 
 
 def _lines(totals: RunTotals) -> Iterable[_Finding]:
-    for said in _of(totals.events, EventCode.PORT_LOST):
-        times = "" if said.count == 1 else f" {said.count} times"
-        yield _Finding(_Rank.LINE, f"Bus {said.source} was lost{times}: {_line(said)}.", said.count)
+    for group in _of(totals.events, EventCode.PORT_LOST):
+        times = "" if group.count == 1 else f" {group.count} times"
+        yield _Finding(_Rank.LINE, f"Bus {group.source} was lost{times}: {_line(group)}.", group.count)
 
 
 _HURTS = {
@@ -217,23 +217,25 @@ _HURTS = {
 
 
 def _lost_servos(totals: RunTotals) -> Iterable[_Finding]:
-    """Say of each servo that was lost, rebooted or let go what happened to it; the worst ones first."""
+    """Report each servo that was lost, rebooted or lost its torque; the worst ones first."""
     by_source: dict[str, list[EventGroup]] = {}
-    for said in _of(totals.events, *_HURTS):
-        by_source.setdefault(said.source, []).append(said)
+    for group in _of(totals.events, *_HURTS):
+        by_source.setdefault(group.source, []).append(group)
     if not by_source:
         return
-    told = []
-    for source, happened in sorted(by_source.items(), key=lambda item: -sum(said.count for said in item[1])):
+    failed = []
+    for source, happened in sorted(
+        by_source.items(), key=lambda item: -sum(group.count for group in item[1])
+    ):
         parts = [
-            what if said.count == 1 else f"{what} {said.count} times"
+            what if group.count == 1 else f"{what} {group.count} times"
             for code, what in _HURTS.items()
-            for said in happened
-            if said.code == code
+            for group in happened
+            if group.code == code
         ]
-        told.append(f"{source} {_joined(parts)}")
-    named = "; ".join(told[:_MOST_NAMED])
-    yield _Finding(_Rank.SERVO, f"Servos failed: {named}{_more('; and', len(told))}.")
+        failed.append(f"{source} {_joined(parts)}")
+    named = "; ".join(failed[:_MOST_NAMED])
+    yield _Finding(_Rank.SERVO, f"Servos failed: {named}{_more('; and', len(failed))}.")
 
 
 def _joined(parts: Sequence[str]) -> str:
@@ -312,23 +314,25 @@ def _name(servo: Servo) -> str:
     return f"servo {servo.servo_id} ({servo.joint or servo.bus})"
 
 
-_TOLD = frozenset((*_HURTS, EventCode.PORT_LOST, EventCode.RECORDER_GAP))
-"""Events that other rules tell of."""
+_OTHER_RULES = frozenset((*_HURTS, EventCode.PORT_LOST, EventCode.RECORDER_GAP))
+"""Events that other rules report."""
 
 
 def _events(events: Sequence[EventGroup]) -> Iterable[_Finding]:
-    grave = [said for said in events if said.severity >= Severity.ERROR and said.code not in _TOLD]
-    if grave:
-        count = sum(said.count for said in grave)
-        first = min(grave, key=lambda said: said.t_ns)
+    severe = [
+        group for group in events if group.severity >= Severity.ERROR and group.code not in _OTHER_RULES
+    ]
+    if severe:
+        count = sum(group.count for group in severe)
+        first = min(severe, key=lambda group: group.t_ns)
         number = "One error was" if count == 1 else f"{count} errors were"
         sentence = f"{number} logged; the first, of {first.source}: {_line(first)}"
         yield _Finding(_Rank.ERROR, sentence)
 
 
-def _line(said: EventGroup) -> str:
+def _line(group: EventGroup) -> str:
     """Return the last line of an event's text: of a traceback what was raised."""
-    return said.text.strip().splitlines()[-1] if said.text.strip() else said.name
+    return group.text.strip().splitlines()[-1] if group.text.strip() else group.name
 
 
 def _log(totals: RunTotals) -> Iterable[_Finding]:

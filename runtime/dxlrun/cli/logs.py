@@ -1,4 +1,4 @@
-"""`dxlrun analyze` and `dxlrun replay`: what a log holds, and whether its controllers do the same again."""
+"""`dxlrun analyze` and `dxlrun replay`: report on a log, and run its controllers again."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def _compare(log: Path, ledger: Path, *, as_json: bool) -> int:
     if not ledger.is_file():
         raise InputError(
             f"there is no ledger {ledger}; a run on simulated buses in real time leaves one beside its log, "
-            f"here {log.with_suffix('.ledger.jsonl')}, and `dxlrun sim` writes where its --ledger says"
+            f"here {log.with_suffix('.ledger.jsonl')}, and `dxlrun sim` writes one with --ledger"
         )
     from dxlrun.analysis.ledger.comparison import compare, parts
     from dxlrun.log.reader import read_log

@@ -58,9 +58,9 @@ def run(
         Write what the simulated buses saw to this file, for `dxlrun analyze LOG --ledger FILE`; without it
         a run writes it beside its log, one on virtual time not at all.
     no_gateway
-        Let nobody steer the run.
+        Run without a gateway: the run cannot be steered.
     debug
-        Print the traceback of an error, and what the processes said.
+        Print the traceback of an error, and the output of the processes.
     """
     if virtual and duration is None and not play:
         raise InputError(
@@ -95,7 +95,7 @@ def _check_ledger(ledger: Path, plan: Plan) -> None:
 
     if not plan.simulated:
         raise InputError(
-            f"a ledger tells what simulated buses saw, and {plan.robot} has none: give the argument "
+            f"a ledger records what simulated buses saw, and {plan.robot} has none: give the argument "
             "port:=sim, or leave out --ledger"
         )
     if not ledger.parent.is_dir():
@@ -107,7 +107,7 @@ def _check_ledger(ledger: Path, plan: Plan) -> None:
 
 
 def _read_models(buses: Sequence[BusPlan], joints: Sequence[str]) -> Mapping[str, str]:
-    """Ask for the models of joints that say `model: auto`; most robots have none, so it is imported late."""
+    """Return the models of joints with `model: auto`; most robots have none, so it is imported late."""
     from dxlrun.dynamixel.tools.inspection import read_models
 
     return read_models(buses, joints)

@@ -32,7 +32,7 @@ _RATES = (100, 50, 25, 20, 10, 5, 2, 1)
 _SHARE = 0.5
 """Of the period, at most, that a cycle takes on the bus."""
 _LONGEST_DELAY_NS = 500_000
-"""Where no servo said its own: as they are shipped (protocol.md, Line)."""
+"""Where no servo reported its own: as they are shipped (protocol.md, Line)."""
 
 
 def scan(
@@ -48,8 +48,8 @@ def scan(
 ) -> int:
     """Look for servos on a serial port: both protocols, every baud rate, every ID; writes nothing.
 
-    It takes about half a minute; --protocol, --baud and --ids make it quicker. Exit code 0, or 1 when nobody
-    answered.
+    It takes about half a minute; --protocol, --baud and --ids make it quicker. Exit code 0, or 1 when no
+    servo answered.
 
     Parameters
     ----------
@@ -73,13 +73,13 @@ def scan(
 
     search = read_search(protocol, baud, ids)
     if write is not None:
-        may_be_written(write)
+        check_target(write)
     load_models()
     with TunablePort(port) as line, progress_bar(hidden=as_json) as progress:
         scanned = scanning.scan(ToolLine(line), search, progress)
         latency_ns = line.latency_ns
     for rate in scanned.left_out:
-        print_warning(f"{port} cannot run at {rate} bit/s; nobody was looked for there")
+        print_warning(f"{port} cannot run at {rate} bit/s, so this rate was left out")
     narrowed = protocol is not None or bool(baud) or ids is not None
     _show(port, scanned, narrowed=narrowed, as_json=as_json)
     if write is not None and scanned.servos:
@@ -126,7 +126,7 @@ def read_ids(text: str) -> tuple[int, ...]:
 
 
 def load_models() -> None:
-    """Know the models that plug-ins bring along, too."""
+    """Add the models of plug-ins."""
     from dxlrun.control.controllers.plugins import load_plugins
 
     load_plugins()
@@ -138,7 +138,7 @@ def _show(port: str, scanned: Scanned, *, narrowed: bool, as_json: bool) -> None
         return
     if not scanned.servos:
         print_error(
-            f"nobody answers at {port}: check power, cable, and that the adapter is the one of the servos; "
+            f"no servo answers at {port}: check power, cable, and that the adapter is the one of the servos; "
             "`dxlrun doctor` lists the adapters"
             + "; without --protocol, --baud and --ids everything is tried"
             * narrowed
@@ -191,7 +191,7 @@ def draft_file(path: Path, port: str, servos: Sequence[FoundServo], latency_ns: 
     Raises InputError where it is there or cannot be written, ServoFault where these servos cannot be one bus:
     one port is one bus, of one protocol and one rate.
     """
-    may_be_written(path)
+    check_target(path)
     text = draft(path.stem, port, servos, latency_ns)
     try:
         path.write_text(text)
@@ -200,7 +200,7 @@ def draft_file(path: Path, port: str, servos: Sequence[FoundServo], latency_ns: 
     return text
 
 
-def may_be_written(path: Path) -> None:
+def check_target(path: Path) -> None:
     """Raise InputError where `draft_file` would write nothing, whatever the servos are."""
     if path.exists():
         raise InputError(f"{path} is there already and is not overwritten; choose another file")
@@ -217,14 +217,14 @@ def draft(stem: str, port: str, servos: Sequence[FoundServo], latency_ns: int) -
         raise ServoFault("no servo of a known model was found, so there is no robot file to write")
     lines = sorted({(servo.protocol, servo.baud_rate) for servo in known})
     if len(lines) > 1:
-        told = [
+        found = [
             f"Protocol {protocol} at {rate} bit/s: ID {_ids(known, protocol, rate)}"
             for protocol, rate in lines
         ]
         raise ServoFault(
-            f"these servos cannot share a bus ({'; '.join(told)}); `dxlrun servo {port} ID baud RATE` brings "
-            "one to another rate, two protocols need two ports; or scan one of them alone by --protocol and "
-            "--baud"
+            f"these servos cannot share a bus ({'; '.join(found)}); `dxlrun servo {port} ID baud RATE` "
+            "brings one to another rate, two protocols need two ports; or scan one of them alone by "
+            "--protocol and --baud"
         )
     from dxlrun.compile import compile_files
 
@@ -249,7 +249,7 @@ def _text(stem: str, port: str, servos: Sequence[FoundServo], latency_ns: int, r
     names = ", ".join(_name(servo) for servo in servos)
     return "\n".join(
         [
-            f"# Drafted by `dxlrun scan {port}`. What a servo cannot tell is assumed:",
+            f"# Drafted by `dxlrun scan {port}`. What cannot be read from a servo is assumed:",
             "# check every line that has a comment.",
             "# Then: dxlrun check THIS_FILE --online",
             f"name: {_robot_name(stem)}",
@@ -266,7 +266,7 @@ def _text(stem: str, port: str, servos: Sequence[FoundServo], latency_ns: int, r
             f"    return_delay_time: {delay_ns / 1000:g} us  # as found",
             "",
             "loop:",
-            f"  rate: {rate}  # `dxlrun check` tells the highest that is possible",
+            f"  rate: {rate}  # `dxlrun check` prints the highest that is possible",
             "",
             f"# Every joint is held to {velocity} deg/s, so that the first commands move it slowly. Once its",
             "# limits and direction are right, raise its limits.velocity; without a limit it moves as fast",

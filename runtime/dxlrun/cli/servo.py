@@ -53,7 +53,7 @@ def servo(
     as_json: JsonFlag = False,
     debug: Flag = False,
 ) -> int:
-    """Deal with one servo on a port that no run uses: its registers, ID, baud rate, torque.
+    """Read or change one servo on a port that no run uses: its registers, ID, baud rate, torque.
 
     VERB is one of: get [ITEM...], set ITEM VALUE, id NEW, baud RATE, reboot, factory-reset, backup [FILE],
     restore [FILE], blink [TIMES], torque on|off. What changes the EEPROM is asked for first, needs the torque
@@ -64,7 +64,7 @@ def servo(
     port
         The adapter, for example /dev/ttyUSB0.
     servo_id
-        ID of the servo; `dxlrun scan` shows who is there.
+        ID of the servo; `dxlrun scan` lists the servos.
     verb
         What to do.
     words
@@ -107,8 +107,8 @@ def _check(servo_id: int, verb: str, asked: Asked) -> None:
 
         raise InputError(f"a servo cannot {verb}; {suggestion(verb, tuple(VERBS))}")
     if not found.fewest <= len(asked.words) <= found.most:
-        said = " ".join(asked.words) or "nothing"
-        raise InputError(f"{verb} takes {found.usage or 'no words'}, not {said}")
+        given = " ".join(asked.words) or "nothing"
+        raise InputError(f"{verb} takes {found.usage or 'no words'}, not {given}")
     if asked.keep is not None and verb != "factory-reset":
         raise InputError(f"--keep belongs to factory-reset, not to {verb}; leave it out")
     found.check(asked)
@@ -121,13 +121,13 @@ def _find(tool: ToolLine, servo_id: int, search: Search) -> FoundServo:
     port, found = tool.port.name, find(tool, servo_id, search)
     if not found:
         raise ServoFault(
-            f"nobody with ID {servo_id} answers at {port}: check power, cable and ID; `dxlrun scan {port}` "
-            "shows who is there"
+            f"no servo with ID {servo_id} answers at {port}: check power, cable and ID; `dxlrun scan {port}` "
+            "lists the servos"
         )
     if len(found) > 1:
         places = "; ".join(f"Protocol {each.protocol} at {each.baud_rate} bit/s" for each in found)
         raise ServoFault(
-            f"ID {servo_id} answers more than once ({places}); say which by --protocol and --baud"
+            f"ID {servo_id} answers more than once ({places}); choose one by --protocol and --baud"
         )
     return found[0]
 
@@ -202,11 +202,13 @@ class Asked:
     declined: bool = False
 
     def confirmed(self, question: str) -> bool:
-        """Ask the person at the terminal; raises InputError where nobody is there and --yes is not given."""
+        """Ask for confirmation; raises InputError without a terminal, unless --yes is given."""
         if self.yes:
             return True
         if not sys.stdin.isatty():
-            raise InputError(f"{question}: nobody can be asked here, so nothing was changed; give --yes")
+            raise InputError(
+                f"{question}: not a terminal, cannot ask for confirmation, nothing was changed; add --yes"
+            )
         sys.stderr.write(f"{question}. Go on? [y/N] ")
         sys.stderr.flush()
         self.declined = sys.stdin.readline().strip().lower() not in ("y", "yes")
@@ -215,7 +217,7 @@ class Asked:
 
 @dataclass(frozen=True, slots=True)
 class Verb:
-    """One thing that can be done."""
+    """What one verb takes and does."""
 
     usage: str
     """Its words."""
@@ -249,23 +251,23 @@ def _set(one: OneServo, asked: Asked) -> None:
     if name in one.table.items and one.table.items[name].access == "R":
         raise InputError(f"{one.table.items[name].title} can only be read; `get` shows it")
     try:
-        wanted = any_value(one.table, name, _value(text))
+        target = any_value(one.table, name, _value(text))
     except ValueError as error:  # also an UnfitRegister
         raise InputError(str(error)) from None
     item = one.table.items[name].title
-    (found,) = one.differences([wanted])
+    (found,) = one.differences([target])
     if not found.differs:
-        asked.done.append(f"{item} is {wanted.value} already")
-        if not wanted.eeprom:  # a goal that is there already is not pursued while its Bus Watchdog is tripped
-            asked.done += one.write([wanted])
+        asked.done.append(f"{item} is {target.value} already")
+        if not target.eeprom:  # a goal that is there already is not pursued while its Bus Watchdog is tripped
+            asked.done += one.write([target])
         return
-    assert found.found is not None  # noqa: S101  `differs` says so
-    change = f"{item} is {shown(one.table.items[name], found.found)} and becomes {wanted.value}"
-    if wanted.eeprom:
-        one.writable([wanted])
+    assert found.found is not None  # noqa: S101  implied by `differs`
+    change = f"{item} is {shown(one.table.items[name], found.found)} and becomes {target.value}"
+    if target.eeprom:
+        one.writable([target])
         if not asked.confirmed(f"{one.called}: {change} (EEPROM)"):
             return
-    asked.done += one.write([wanted])
+    asked.done += one.write([target])
 
 
 def _value(text: str) -> int | str:
@@ -357,10 +359,10 @@ def _restore(one: OneServo, asked: Asked) -> None:
         return
     path = Path(asked.words[0])
     backup = servo_backup.read_backup(path)
-    wanted = servo_backup.registers_to_restore(path, backup, one.table)
+    target = servo_backup.registers_to_restore(path, backup, one.table)
     if backup.firmware != one.found.firmware:
         print_warning(f"{path} was made with firmware {backup.firmware}; this servo has {one.found.firmware}")
-    differing = [each.register for each in one.differences(wanted) if each.differs]
+    differing = [each.register for each in one.differences(target) if each.differs]
     if not differing:
         asked.done.append(f"has everything that {path} restores already")
         return
@@ -368,13 +370,13 @@ def _restore(one: OneServo, asked: Asked) -> None:
     names = ", ".join(each.name for each in differing)
     if not asked.confirmed(f"{one.called}: {names} become as in {path}; its ID and its rate stay"):
         return
-    asked.done += _written_back(one, wanted)
+    asked.done += _written_back(one, target)
 
 
-def _written_back(one: OneServo, wanted: Sequence[RegisterValue]) -> tuple[str, ...]:
+def _written_back(one: OneServo, target: Sequence[RegisterValue]) -> tuple[str, ...]:
     """Write, and look at all of it again: a mode that comes back resets registers beside it."""
-    written = one.write(wanted)
-    left = [each.register.name for each in one.differences(wanted) if each.differs]
+    written = one.write(target)
+    left = [each.register.name for each in one.differences(target) if each.differs]
     if left:
         raise ServoFault(
             f"{one.called}: {', '.join(left)} changed again while others were written; try again"

@@ -13,7 +13,7 @@ from cyclopts import Parameter
 from dxlrun.cli.inputs import Assignment, Flag, JsonFlag, compiled
 from dxlrun.cli.sim_inputs import (
     Absent,
-    AdapterWishes,
+    AdapterOptions,
     Mistakes,
     Split,
     read_faults,
@@ -36,7 +36,7 @@ Words = Annotated[tuple[str, ...], Parameter(negative=(), show_default=False, al
 _ABOVE_LOOP = 2
 """The guardian is one above the loop."""
 _PRIORITY = 31 + _ABOVE_LOOP
-"""Where no robot file says the loop's: above that of a loop that says nothing else."""
+"""Without a robot file: above a loop with the default priority."""
 Seed = Annotated[int, Parameter(show_default=False)]
 
 
@@ -66,7 +66,7 @@ def sim(
     Parameters
     ----------
     robot
-        A robot file: each of its buses is simulated, whatever its port says.
+        A robot file: each of its buses is simulated, whatever its port is.
     assignments
         Arguments of the robot file, for example rate:=25.
     servo
@@ -94,41 +94,42 @@ def sim(
     echo
         The adapter gives back what is sent, as some half-duplex adapters do.
     absent
-        What those after an absent servo do in a sync or bulk read: answer never (silent), or later (slot).
+        What the servos after one that is missing do in a sync or bulk read: answer never (silent), or later
+        (slot).
     as_json
         Print the ports as JSON, then a line of JSON for each fault.
     debug
-        Print the traceback of an error, and what the process of the servos said.
+        Print the traceback of an error, and the output of the servos' process.
     """
     mistakes = Mistakes()
     with mistakes.collected():
         planned = read_faults(fault, faults)
     with mistakes.collected():
-        _writable(ledger)
+        _check_ledger(ledger)
     with mistakes.collected():
         latency_ns = read_latency(latency_timer)
     with mistakes.collected():
-        told = _told(robot, assignments, servo, baud, protocol)
-        links = link_of_each(told.buses, link)
+        simulated = _simulated(robot, assignments, servo, baud, protocol)
+        links = link_of_each(simulated.buses, link)
     mistakes.refuse()
-    wishes = AdapterWishes(latency_ns, split, echo, absent)
-    buses = tuple(with_adapter(bus, wishes, seed) for bus in told.buses)
-    refuse_what_cannot_be(buses, planned, seed)
+    adapter = AdapterOptions(latency_ns, split, echo, absent)
+    buses = tuple(with_adapter(bus, adapter, seed) for bus in simulated.buses)
+    check_simulated(buses, planned, seed)
     from dxlrun.cli.sim_views import Shown, ending
     from dxlrun.run.channels.process import spare_core
     from dxlrun.run.simulation_front import FrontOptions
     from dxlrun.simulation import SimulationConfig
 
-    title = told.title
+    title = simulated.title
     config = SimulationConfig(
         buses=buses,
         faults=tuple(str(each) for each in planned),
         seed=seed,
         links={bus: str(path) for bus, path in links.items()},
-        bodies=told.bodies,
+        bodies=simulated.bodies,
     )
-    shown = Shown(title, buses, links, told.hint)
-    options = FrontOptions(ledger, told.priority, spare_core(told.loop_cores))
+    shown = Shown(title, buses, links, simulated.hint)
+    options = FrontOptions(ledger, simulated.priority, spare_core(simulated.loop_cores))
     served = _serve(config, options, shown, as_json=as_json)
     if not as_json:
         show(ending(title, served.elapsed_s, served.look), *[f"ledger: {ledger}"] * (ledger is not None))
@@ -140,8 +141,8 @@ def sim(
 
 
 @dataclass(frozen=True, slots=True)
-class _Told:
-    """What is to be simulated."""
+class _Simulated:
+    """What is to be simulated, by a robot file or by `--servo`."""
 
     title: str
     buses: tuple[BusConfig, ...]
@@ -155,20 +156,20 @@ class _Told:
     """A command line that uses it when the port is added."""
 
 
-def _told(
+def _simulated(
     robot: Path | None,
     assignments: Sequence[str],
     servo: Sequence[str],
     baud: int | None,
     protocol: float | None,
-) -> _Told:
-    """Return what the robot file says, or `--servo`."""
+) -> _Simulated:
+    """Return what the robot file describes, or `--servo`."""
     if robot is None:
         if not servo:
             raise InputError(
                 "there is nothing to simulate; give a robot file, or servos such as --servo XL430-W250:1-3"
             )
-        return _Told("simulation", (servo_bus(servo, baud, protocol),))
+        return _Simulated("simulation", (servo_bus(servo, baud, protocol),))
     options = {"--servo": servo or None, "--baud": baud, "--protocol": protocol}
     given = [name for name, value in options.items() if value is not None]
     if servo and not robot.is_file():
@@ -185,7 +186,7 @@ def _told(
     others = [word for word in assignments if not word.startswith("port:=")]
     hint = shlex.join(["dxlrun", str(robot), *others])
     takes_port = len(plan.buses) == 1 and "port" in plan.arguments
-    return _Told(
+    return _Simulated(
         title=plan.robot,
         buses=simulated_buses(everywhere),
         bodies=simulated_bodies(everywhere),
@@ -195,10 +196,10 @@ def _told(
     )
 
 
-def refuse_what_cannot_be(buses: Sequence[BusConfig], faults: Sequence[Fault], seed: int) -> None:
-    """Put the buses together as their process will, so that what is wrong is said before anything starts.
+def check_simulated(buses: Sequence[BusConfig], faults: Sequence[Fault], seed: int) -> None:
+    """Build the buses as their process will, so that mistakes are reported before anything starts.
 
-    Raises InputError for a servo that cannot be as it is told, and for each fault that could never happen.
+    Raises InputError for a servo that cannot be simulated, and for each fault that could never happen.
     """
     from dxlrun.simulation import Ledger
     from dxlrun.simulation.bus.simulated_bus import SimulatedBus
@@ -215,7 +216,7 @@ def refuse_what_cannot_be(buses: Sequence[BusConfig], faults: Sequence[Fault], s
 def link_of_each(buses: Sequence[BusConfig], link: Path | None) -> dict[str, Path]:
     """Return the link of each bus: LINK itself for one bus, LINK.NAME for several.
 
-    Raises InputError when something that is no link stands there, or no link can be made there.
+    Raises InputError where there is something that is no link, or no link can be made.
     """
     if link is None:
         return {}
@@ -225,7 +226,7 @@ def link_of_each(buses: Sequence[BusConfig], link: Path | None) -> dict[str, Pat
     if not link.parent.is_dir():
         wrong.append(f"--link {link}: there is no directory {link.parent}; make it first")
     wrong += [
-        f"--link {path} stands there already and is no link; it is not replaced, choose another --link"
+        f"--link {path} exists and is no link; it is not replaced, choose another --link"
         for path in links.values()
         if path.exists() and not path.is_symlink()
     ]
@@ -234,8 +235,8 @@ def link_of_each(buses: Sequence[BusConfig], link: Path | None) -> dict[str, Pat
     return {name: path.absolute() for name, path in links.items()}
 
 
-def _writable(ledger: Path | None) -> None:
-    """Refuse a ledger that cannot be written with one sentence, before anything starts."""
+def _check_ledger(ledger: Path | None) -> None:
+    """Raise InputError for a ledger that cannot be written, before anything starts."""
     if ledger is None:
         return
     from dxlrun.simulation.bus.ledger import for_group
@@ -249,7 +250,7 @@ def _writable(ledger: Path | None) -> None:
 
 
 def _serve(config: SimulationConfig, options: FrontOptions, shown: Shown, *, as_json: bool) -> Served:
-    """Serve it to whom stdout leads: a program, a pipe, or a person at a terminal."""
+    """Serve it with the output that suits stdout: JSON, lines in a pipe, or a table on a terminal."""
     from dxlrun.cli.sim_views import JsonView, PlainView
     from dxlrun.run.simulation_front import TypedLines, serve
 

@@ -1,4 +1,4 @@
-"""What `dxlrun sim` is told: servos by name, fault lines, the adapter; from words to buses."""
+"""The options of `dxlrun sim`: servos by name, fault lines, the adapter; from words to buses."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ Absent = Literal["silent", "slot"]
 
 _SERVO = re.compile(r"(.+?):(\d+(?:-\d+)?(?:,\d+(?:-\d+)?)*)", re.ASCII)
 _HIGHEST_ID = {1.0: 253, 2.0: 252}
-"""254 is the broadcast ID; 253 stands in the header of Protocol 2.0 (e-Manual, Packet ID)."""
+"""254 is the broadcast ID; 253 is part of the header of Protocol 2.0 (e-Manual, Packet ID)."""
 _MOST_DIGITS = 9
 BUS = "main"
 """Name of the bus that `--servo` makes."""
 
 
 @dataclass(frozen=True, slots=True)
-class AdapterWishes:
-    """The options about the adapter; None: as the robot file says."""
+class AdapterOptions:
+    """The options about the adapter; None: as in the robot file."""
 
     latency_timer_ns: int | None = None
     split: Split | None = None
@@ -38,7 +38,7 @@ class AdapterWishes:
 
 
 class Mistakes:
-    """What is wrong in parts of a command line that have nothing to do with one another, told together."""
+    """Mistakes in independent parts of a command line, reported together."""
 
     def __init__(self) -> None:
         self._errors: list[InputError] = []
@@ -99,17 +99,17 @@ def read_latency(text: str | None) -> int | None:
         raise InputError(f"--latency-timer {text!r}: {error}") from None
 
 
-def with_adapter(bus: BusConfig, wishes: AdapterWishes, seed: int) -> BusConfig:
-    """Return a bus behind the adapter that the options want."""
-    told, wished_ns = bus.adapter, wishes.latency_timer_ns
+def with_adapter(bus: BusConfig, options: AdapterOptions, seed: int) -> BusConfig:
+    """Return a bus behind an adapter with these options."""
+    given, latency_ns = bus.adapter, options.latency_timer_ns
     adapter = replace(
-        told,
-        latency_timer_ns=told.latency_timer_ns if wished_ns is None else wished_ns,
-        split=wishes.split or told.split,
-        echo=wishes.echo or told.echo,
+        given,
+        latency_timer_ns=given.latency_timer_ns if latency_ns is None else latency_ns,
+        split=options.split or given.split,
+        echo=options.echo or given.echo,
         seed=seed,
     )
-    return replace(bus, adapter=adapter, absent=wishes.absent or bus.absent)
+    return replace(bus, adapter=adapter, absent=options.absent or bus.absent)
 
 
 def read_faults(lines: Sequence[str], file: Path | None) -> tuple[Fault, ...]:
@@ -151,9 +151,9 @@ def _faults_of(file: Path) -> tuple[list[Fault], list[Problem]]:
         try:
             faults.append(parse_fault(line))
         except InputError as error:
-            what, _, mend = str(error).rpartition("; ")
+            what, _, fix = str(error).rpartition("; ")
             column = 1 + len(whole) - len(whole.lstrip())
-            problems.append(Problem(Mark(str(file), number, column), what, mend))
+            problems.append(Problem(Mark(str(file), number, column), what, fix))
     return faults, problems
 
 
@@ -200,23 +200,23 @@ def _unknown(models: Sequence[str]) -> list[str]:
     ]
 
 
-def _protocol(models: Sequence[str], wanted: float | None) -> float:
-    """Return the one protocol that all models speak, or that is wanted of them."""
+def _protocol(models: Sequence[str], chosen: float | None) -> float:
+    """Return the protocol that was chosen, or the one that all models have in common."""
     from dxlrun.dynamixel.control_table import protocols_of
 
-    if wanted not in (None, 1.0, 2.0):
-        raise InputError(f"there is no Protocol {wanted:g}; --protocol is 1.0 or 2.0")
+    if chosen not in (None, 1.0, 2.0):
+        raise InputError(f"there is no Protocol {chosen:g}; --protocol is 1.0 or 2.0")
     spoken = {model: protocols_of(model) for model in models}
-    if wanted is not None:
-        strange = [model for model, protocols in spoken.items() if wanted not in protocols]
+    if chosen is not None:
+        strange = [model for model, protocols in spoken.items() if chosen not in protocols]
         if strange:
             raise InputError(
                 "\n".join(
-                    f"{model} speaks Protocol {spoken[model][0]:.1f}, not {wanted:.1f}; leave --protocol out"
+                    f"{model} speaks Protocol {spoken[model][0]:.1f}, not {chosen:.1f}; leave --protocol out"
                     for model in strange
                 )
             )
-        return wanted
+        return chosen
     common = [each for each in (1.0, 2.0) if all(each in protocols for protocols in spoken.values())]
     if not common:
         first = next(model for model, protocols in spoken.items() if protocols == (1.0,))
@@ -229,7 +229,7 @@ def _protocol(models: Sequence[str], wanted: float | None) -> float:
         names = " and ".join(spoken)
         exist = "exists" if len(spoken) == 1 else "exist"
         raise InputError(
-            f"{names} {exist} with Protocol 1.0 and with 2.0; say which one by --protocol 1.0 or 2.0"
+            f"{names} {exist} with Protocol 1.0 and with 2.0; choose one by --protocol 1.0 or 2.0"
         )
     return common[0]
 
@@ -253,24 +253,26 @@ def _check_ids(models: Sequence[tuple[str, Sequence[int]]], protocol: float) -> 
         raise InputError("\n".join(wrong))
 
 
-def _baud_rate(tables: Sequence[ControlTable], wanted: int | None) -> int:
-    """Return the rate that is wanted when every servo has it, else the one that they are shipped with."""
-    if wanted is None:
+def _baud_rate(tables: Sequence[ControlTable], chosen: int | None) -> int:
+    """Return the rate that was chosen, or without one the rate that the servos are shipped with."""
+    if chosen is None:
         shipped = {table.model: _shipped_rate(table) for table in tables}
         rates = set(shipped.values())
         if len(rates) > 1 or None in rates:
-            said = ", ".join(f"{model} {rate or 'an unknown rate'}" for model, rate in shipped.items())
-            raise InputError(f"the servos are shipped with different baud rates ({said}); give one by --baud")
+            rated = ", ".join(f"{model} {rate or 'an unknown rate'}" for model, rate in shipped.items())
+            raise InputError(
+                f"the servos are shipped with different baud rates ({rated}); give one by --baud"
+            )
         return next(rate for rate in rates if rate is not None)
     wrong = [
-        f"an {table.model} has no baud rate of {wanted} bit/s; "
+        f"an {table.model} has no baud rate of {chosen} bit/s; "
         f"it has {', '.join(str(rate) for rate in sorted(table.baud_rates.values()))}"
         for table in tables
-        if wanted not in table.baud_rates.values() and not _by_formula(table, wanted)
+        if chosen not in table.baud_rates.values() and not _by_formula(table, chosen)
     ]
     if wrong:
         raise InputError("\n".join(wrong))
-    return wanted
+    return chosen
 
 
 def _shipped_rate(table: ControlTable) -> int | None:

@@ -43,7 +43,7 @@ ROLES = {
     WARNING: "warning",
     ERROR: "error",
 }
-"""Each colour drawn is a role; the page's style sheet says what it looks like, in light and in dark."""
+"""Each colour drawn is a role; the page's style sheet defines it, in light and in dark."""
 
 _STYLE: dict[str, object] = {
     "axes.axisbelow": True,
@@ -85,37 +85,37 @@ _REFERENCE = re.compile(r"(?<=url\(#)[\w.-]+|(?<=href=\"#)[\w.-]+")
 
 
 @dataclass(frozen=True, slots=True)
-class Words:
-    """What is said about a figure."""
+class Caption:
+    """Title and caption of a figure."""
 
     name: str
     """Unique in the page; letters, digits and dashes."""
     title: str
     alt: str
-    """What a person who does not see it has to know: the axes with their units, and the finding."""
-    caption: str
+    """For readers who cannot see it: the axes with their units, and the finding."""
+    text: str
 
 
 @dataclass(frozen=True, slots=True)
 class Drawing:
     """One figure of the report."""
 
-    words: Words
+    caption: Caption
     svg: ET.Element
     """Without a namespace; each colour is a variable of the page's style sheet."""
 
 
-def draw(words: Words, height: float, fill: Callable[[Figure], None]) -> Drawing:
+def draw(caption: Caption, height: float, fill: Callable[[Figure], None]) -> Drawing:
     """Return the drawing that `fill` makes on an empty figure of `height` inches."""
     with mpl.rc_context(_STYLE):  # type: ignore[arg-type]  # the stubs want one literal type for all keys
         figure = Figure(figsize=(WIDTH, height), layout="constrained")
         fill(figure)
         stream = io.StringIO()
         figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
-    return Drawing(words, _svg(stream.getvalue(), words))
+    return Drawing(caption, _svg(stream.getvalue(), caption))
 
 
-def _svg(text: str, words: Words) -> ET.Element:
+def _svg(text: str, caption: Caption) -> ET.Element:
     """Return matplotlib's SVG as part of a page: own identifiers, title, description, the page's colours."""
     for colour, role in ROLES.items():
         text = text.replace(colour, f"var(--{role})")
@@ -127,23 +127,23 @@ def _svg(text: str, words: Words) -> ET.Element:
         element.attrib.clear()
         for key, value in old.items():
             if key != "id" or value in used:
-                element.set(_NAMESPACE.sub("", key), _named(key, value, words.name))
+                element.set(_NAMESPACE.sub("", key), _named(key, value, caption.name))
     for parent in [root, *root.iter("defs")]:
         for child in [child for child in parent if child.tag in {"metadata", "style"}]:
             parent.remove(child)  # a style here would hold for the whole page, which has it in its own sheet
     for key in ("width", "height", "version"):
         root.attrib.pop(key, None)
     root.set("role", "img")
-    root.set("aria-labelledby", f"{words.name}-title {words.name}-desc")
-    for number, (tag, said) in enumerate((("title", words.title), ("desc", words.alt))):
-        element = ET.Element(tag, {"id": f"{words.name}-{tag}"})
-        element.text = said
+    root.set("aria-labelledby", f"{caption.name}-title {caption.name}-desc")
+    for number, (tag, content) in enumerate((("title", caption.title), ("desc", caption.alt))):
+        element = ET.Element(tag, {"id": f"{caption.name}-{tag}"})
+        element.text = content
         root.insert(number, element)
     return root
 
 
 def _named(key: str, value: str, name: str) -> str:
-    """Return an attribute whose identifier, or reference to one, is the one of the page."""
+    """Return an attribute with its identifier, or the reference to one, made unique in the page."""
     if key == "id":
         return f"{name}-{value}"
     if key.endswith("href"):
@@ -215,7 +215,7 @@ class Columns:
         return self.width == 1
 
     def envelope(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-        """Return the samples to draw: all, or the smallest and the largest of each column; NaN = gap.
+        """Return the samples to draw: all, or the smallest and the largest of each column; NaN = no sample.
 
         x, y: shape (count,). A column without any number is NaN.
         """
@@ -245,13 +245,9 @@ class Columns:
         picked: NDArray[np.intp] = (first + rows.argmax(axis=1))[rows.any(axis=1)]
         return picked
 
-    def said(self, what: str) -> str:
-        """Return the sentence that says how the figure was drawn; empty where every sample is shown."""
-        return (
-            ""
-            if self.whole
-            else f"Each column of the figure stands for {self.width} cycles and shows {what}."
-        )
+    def note(self, what: str) -> str:
+        """Return how the figure was drawn, in a sentence; empty where every sample is shown."""
+        return "" if self.whole else f"Each column of the figure shows {what} of {self.width} cycles."
 
     def _rows(self, y: Floats, filler: float) -> Floats:
         missing = self.number * self.width - self.count
@@ -322,8 +318,8 @@ class SteeringMarks:
             axes.axvline(time, color=PURPLE, linewidth=0.8, linestyle=":")
 
     @property
-    def said(self) -> str:
-        """The sentence that says what the marks are; empty where there are none."""
+    def note(self) -> str:
+        """What the marks are, in a sentence; empty where there are none."""
         parts = ["Shaded: the loop was paused."] if self.pauses else []
         parts += ["Dotted lines: it was steered otherwise."] if self.times else []
         return " ".join(parts)

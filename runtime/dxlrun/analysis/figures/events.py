@@ -15,9 +15,9 @@ from dxlrun.analysis.figures.drawing import (
     MUTED,
     ORANGE,
     WARNING,
+    Caption,
     Drawing,
     SteeringMarks,
-    Words,
     draw,
     time_axis,
 )
@@ -60,17 +60,17 @@ def events_drawing(log: Log) -> Drawing | None:
         axes.margins(x=0.03)
         axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=3, borderaxespad=0.2)
 
-    told = ", ".join(
+    counts = ", ".join(
         f"{name} {np.count_nonzero(grades == grade)}" for grade, (name, *_) in enumerate(_SHAPES)
     )
     number = counted(len(log.events), "event", "events")
-    words = Words(
+    caption = Caption(
         "events-timeline",
         "Events over the run",
-        f"Events over the time of the run in s, one row a kind. {number}: {told}.",
-        f"{number}: {told}. Before 0 s the servos are set up. {steering.said}".strip(),
+        f"Events over the time of the run in s, one row a kind. {number}: {counts}.",
+        f"{number}: {counts}. Before 0 s the servos are set up. {steering.note}".strip(),
     )
-    return draw(words, 0.9 + 0.17 * len(kinds), fill)
+    return draw(caption, 0.9 + 0.17 * len(kinds), fill)
 
 
 def _grade(severity: int) -> int:
@@ -107,11 +107,11 @@ def reply_drawing(servos: Sequence[Servo]) -> Drawing | None:
         axes.set_xlabel("reply time, ms")
         axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2, borderaxespad=0.2)
 
-    told = f"The slowest reply, of servo {slowest.servo_id}, took {microseconds(slowest.reply_max_us)}."
-    words = Words(
+    slow = f"The slowest reply, of servo {slowest.servo_id}, took {microseconds(slowest.reply_max_us)}."
+    caption = Caption(
         "reply-times",
         "Reply time of each servo",
-        f"Median and slowest reply time of each servo in ms. {told}",
-        f"{told} From before the instruction is written to after the reply's last byte is read.",
+        f"Median and slowest reply time of each servo in ms. {slow}",
+        f"{slow} From before the instruction is written to after the reply's last byte is read.",
     )
-    return draw(words, 0.9 + 0.21 * len(shown), fill)
+    return draw(caption, 0.9 + 0.21 * len(shown), fill)

@@ -1,4 +1,4 @@
-"""One figure a joint: position as it was wanted, sent and read, velocity, and the cycles that stand out."""
+"""One figure a joint: position as desired, sent and read, velocity, and the cycles to read with care."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from dxlrun.analysis.figures.drawing import (
     ORANGE,
     PURPLE,
     WARNING,
+    Caption,
     Columns,
     Drawing,
     Marks,
     SteeringMarks,
-    Words,
     draw,
     run_time_s,
     time_axis,
@@ -59,7 +59,7 @@ def _spread(axes: Axes, least: float) -> None:
 
 
 def _followed(joint: Joint) -> str:
-    """Say lag, settling and error at rest, as far as they are known."""
+    """Return lag, settling and error at rest in words, as far as they are known."""
     parts = []
     if joint.lag_ms is not None:
         parts.append(f", lag {joint.lag_ms:.0f} ms")
@@ -83,7 +83,7 @@ class _JointPlot:
     steering: SteeringMarks
 
     def drawing(self) -> Drawing:
-        """Return the figure and what is said about it."""
+        """Return the figure with title and caption."""
         joint = self.joint
         error = "No goal was sent, or no position was read."
         if joint.rms_rad is not None and joint.worst_rad is not None:
@@ -91,18 +91,18 @@ class _JointPlot:
                 f"Error rms {joint.rms_rad:.4f} rad, worst {joint.worst_rad:.4f} rad (position minus what "
                 f"was reachable){_followed(joint)}."
             )
-        told = ", ".join(f"{name} {np.count_nonzero(flags)}" for name, flags, _ in self._reasons())
-        words = Words(
+        counts = ", ".join(f"{name} {np.count_nonzero(flags)}" for name, flags, _ in self._reasons())
+        caption = Caption(
             f"joint-{self.row}",
             joint.name,
-            "Position in rad (wanted by the controller, sent to the servo, read) and velocity in rad/s of "
-            f"{joint.name} over the time of the run in s. {error} Cycles: {told}.",
+            "Position in rad (desired by the controller, sent to the servo, read) and velocity in rad/s of "
+            f"{joint.name} over the time of the run in s. {error} Cycles: {counts}.",
             " ".join(
-                f"{error} Cycles: {told}. {self.columns.said('the smallest and the largest value')} "
-                f"{self.steering.said}".split()
+                f"{error} Cycles: {counts}. {self.columns.note('the smallest and the largest value')} "
+                f"{self.steering.note}".split()
             ),
         )
-        return draw(words, 3.9, self._fill)
+        return draw(caption, 3.9, self._fill)
 
     def _reasons(self) -> tuple[tuple[str, NDArray[np.bool_], str], ...]:
         """Return the reasons to read a cycle with care: name, cycles, colour."""
@@ -133,7 +133,7 @@ class _JointPlot:
         time_axis(strip)
 
     def _lines(self, axes: Axes, what: str) -> None:
-        """Draw what was wanted, sent and read; a cycle without a reply is a gap in what was read."""
+        """Draw the desired, sent and read values; a cycle without a reply interrupts the line."""
         cycles, row = self.log.cycles, self.row
         read = np.where(cycles["valid"][:, row], cycles[what][:, row], np.nan)
         series: tuple[tuple[str, Floats, dict[str, object]], ...] = (

@@ -23,10 +23,10 @@ from dxlrun.analysis.figures.drawing import (
     PAPER,
     PURPLE,
     WARNING,
+    Caption,
     Columns,
     Drawing,
     SteeringMarks,
-    Words,
     draw,
     duration_ticks,
     reference,
@@ -93,14 +93,14 @@ def _per_iteration(log: Log, late: Floats, summary: str) -> Drawing:
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
         axes.xaxis.set_major_locator(MaxNLocator(nbins=8, integer=True))
 
-    words = Words(
+    caption = Caption(
         "latency-iterations",
         "Delay of each iteration",
         f"Wake-up latency over the number of the iteration, logarithmic from 1 us. {summary}",
         f"{summary} Triangles: later than 150 us. What is below 1 us is drawn at 1 us. "
-        f"{columns.said('the smallest, the median and the largest delay')}".strip(),
+        f"{columns.note('the smallest, the median and the largest delay')}".strip(),
     )
-    return draw(words, 2.7, fill)
+    return draw(caption, 2.7, fill)
 
 
 def _histogram(late: Floats, statistics: Latency, summary: str) -> Drawing:
@@ -125,13 +125,13 @@ def _histogram(late: Floats, statistics: Latency, summary: str) -> Drawing:
         if beyond
         else "No wake-up is later than 150 us."
     )
-    words = Words(
+    caption = Caption(
         "latency-histogram",
         "Histogram of the delays up to 150 us",
         f"Histogram of the wake-up latency from 0 to 150 us, logarithmic count. {summary} {rest}",
         rest,
     )
-    return draw(words, 2.4, fill)
+    return draw(caption, 2.4, fill)
 
 
 def _cumulative(log: Log, late: Floats, summary: str) -> Drawing:
@@ -155,7 +155,7 @@ def _cumulative(log: Log, late: Floats, summary: str) -> Drawing:
         axes.set_xlabel("wake-up latency (logarithmic)")
         axes.set_ylabel("share of wake-ups up to it (logit)")
 
-    words = Words(
+    caption = Caption(
         "latency-cumulative",
         "Cumulative distribution of the delays",
         "Share of the wake-ups that came up to a delay, from 1 us to the largest, on a logit axis that "
@@ -163,7 +163,7 @@ def _cumulative(log: Log, late: Floats, summary: str) -> Drawing:
         "A logit axis stretches both ends: 99 %, 99.9 % and 99.99 % are equally far apart, and the last "
         "point is the largest delay of the run.",
     )
-    return draw(words, 2.9, fill)
+    return draw(caption, 2.9, fill)
 
 
 def _kept(count: int) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
@@ -203,7 +203,7 @@ _STEPS = (
 _FEW = 5
 """So many periods are drawn with a line each."""
 _MOST_PERIODS = 2.5
-"""The axis ends here: one cycle of a second would flatten all others. What is beyond is marked and said."""
+"""The axis ends here: one cycle of a second would flatten all others. What is beyond is marked."""
 
 _Rows = NDArray[np.float64]
 """Shape (steps, cycles), ms."""
@@ -257,15 +257,18 @@ def _typical(log: Log, steps: _Rows) -> Drawing:
     lines = f"The dashed line is the period, {period:g} ms"
     if len(periods) > 1:
         lines = f"The dashed lines are the periods, {periods[0]:g} ms to {period:g} ms"
-    said = "; ".join(f"{name}: {microseconds(float(values.sum()) * 1e3)}" for name, values in reversed(bars))
-    words = Words(
+    totals = "; ".join(
+        f"{name}: {microseconds(float(values.sum()) * 1e3)}" for name, values in reversed(bars)
+    )
+    caption = Caption(
         "budget-typical",
         "Budget of a cycle",
-        f"Stacked bars of wake-up, read, update and write in ms against the period of {period:g} ms. {said}.",
-        f"{said[0].upper()}{said[1:]}. {lines}; what is left of it is "
+        "Stacked bars of wake-up, read, update and write in ms against the period of "
+        f"{period:g} ms. {totals}.",
+        f"{totals[0].upper()}{totals[1:]}. {lines}; what is left of it is "
         "idle. The steps' 99 % need not come in the same cycle.",
     )
-    return draw(words, 1.9, fill)
+    return draw(caption, 1.9, fill)
 
 
 def _over_time(log: Log, steps: _Rows) -> Drawing:
@@ -308,7 +311,7 @@ def _over_time(log: Log, steps: _Rows) -> Drawing:
         _legend(axes)
 
     over = int(np.count_nonzero(total > periods))
-    told = (
+    late = (
         f"{over} of {len(total)} cycles ended later than one period after their deadline."
         if over
         else "Every cycle fits its period."
@@ -319,14 +322,14 @@ def _over_time(log: Log, steps: _Rows) -> Drawing:
         if len(beyond)
         else ""
     )
-    drawn = columns.said("its longest cycle, and the median as a line")
-    words = Words(
+    drawn = columns.note("its longest cycle, and the median as a line")
+    caption = Caption(
         "budget-time",
         "Duration of the steps over the run",
-        f"Stacked areas of wake-up, read, update and write in ms over the time of the run in s. {told}{cut}",
-        " ".join(f"{told}{cut} {drawn} {steering.said}".split()),
+        f"Stacked areas of wake-up, read, update and write in ms over the time of the run in s. {late}{cut}",
+        " ".join(f"{late}{cut} {drawn} {steering.note}".split()),
     )
-    return draw(words, 2.6, fill)
+    return draw(caption, 2.6, fill)
 
 
 def _end(period: float, values: list[float]) -> float:

@@ -1,4 +1,4 @@
-"""A log beside the ledger of the simulated buses it ran on: is what one says what the other saw?
+"""Comparison of a log with the ledger of the simulated buses that it ran on.
 
 The ledger is the judge: the runtime cannot edit it. Compared is the time of the run; what other programs did
 on the buses before and after is only counted.
@@ -31,7 +31,7 @@ _MOST_SHOWN = 20
 """Differences and faults in a table; `--json` has all."""
 _MOST_BYTES = 16
 RING_NS = 20_000_000_000
-"""A recorder that lost records lost them at most so long before it says so: twice what a ring holds."""
+"""A recorder that lost records lost them at most so long before its event: twice what a ring holds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +68,7 @@ class ComparedBus:
 
 @dataclass(frozen=True, slots=True)
 class LedgerReport:
-    """Everything that `dxlrun analyze LOG --ledger LEDGER` says."""
+    """All results of `dxlrun analyze LOG --ledger LEDGER`."""
 
     log: str
     ledger: str
@@ -83,9 +83,9 @@ class LedgerReport:
     faults: tuple[FaultAnswers, ...]
     """What was injected during the run."""
     uncaused: tuple[UncausedEvent, ...]
-    """Events that tell of a fault where the ledger has none."""
+    """Events that report a fault where the ledger has none."""
     lateness: Lateness | None
-    """None where no servo said anything."""
+    """None where no servo sent anything."""
     causes: OverrunCauses | None
     """Why the loop overran; None where it had no cycle."""
 
@@ -125,7 +125,11 @@ def compare(log: Log, entries: Sequence[LedgerEntry], ledger: Path) -> LedgerRep
         ledger=str(ledger),
         same=same,
         good=same and not causeless and not any(fault.unanswered for fault in faults),
-        sentences=(*_sentences(buses), *_said_of_faults(faults, causeless), *_said_of(late, causes)),
+        sentences=(
+            *_sentences(buses),
+            *_fault_sentences(faults, causeless),
+            *_overrun_sentences(late, causes),
+        ),
         buses=tuple(buses),
         differences=tuple(sorted(differences, key=lambda difference: difference.seconds)),
         faults=faults,
@@ -195,7 +199,7 @@ def _when(span: Span, mine: Stream, theirs: Stream) -> int:
 
 
 def _declared(log: Log, span: Span, t_ns: int) -> str:
-    """Return how the log says itself that it lacks these bytes; empty when it does not."""
+    """Return how the log itself explains that it lacks these bytes; empty when it does not."""
     if span.log_stop > span.log_start:
         return ""
     if log.damage:
@@ -240,28 +244,28 @@ def _bus(
 
 def _sentences(buses: Sequence[ComparedBus]) -> list[str]:
     bad = [bus for bus in buses if bus.differences]
-    said: list[str] = []
+    sentences: list[str] = []
     if bad:
         where = ", ".join(f"{counted(bus.differences, 'place', 'places')} on {bus.name}" for bus in bad)
-        said.append(f"The log is not what the simulated buses saw: it differs in {where}.")
+        sentences.append(f"The log is not what the simulated buses saw: it differs in {where}.")
     else:
         sent = counted(sum(bus.sent_packets for bus in buses), "packet", "packets")
         got = counted(sum(bus.replies for bus in buses), "reply", "replies")
         lines = "the bus" if len(buses) == 1 else f"all {len(buses)} buses"
-        said.append(f"The log is what {lines} saw, to the byte: {sent} out, {got} in.")
+        sentences.append(f"The log is what {lines} saw, to the byte: {sent} out, {got} in.")
     declared = sum(bus.declared for bus in buses)
     if declared:
-        said.append(f"The log itself explains {counted(declared, 'difference', 'differences')}.")
-    return said
+        sentences.append(f"The log itself explains {counted(declared, 'difference', 'differences')}.")
+    return sentences
 
 
-def _said_of_faults(faults: Sequence[FaultAnswers], causeless: Sequence[UncausedEvent]) -> list[str]:
-    said: list[str] = []
+def _fault_sentences(faults: Sequence[FaultAnswers], causeless: Sequence[UncausedEvent]) -> list[str]:
+    sentences: list[str] = []
     if faults:
         silent = sum(1 for fault in faults if not fault.answers)
         borne = f"; the log has no answer to {silent} of them" if silent else "; the log answers each"
         were = "fault was" if len(faults) == 1 else "faults were"
-        said.append(f"{len(faults)} {were} injected{borne}.")
+        sentences.append(f"{len(faults)} {were} injected{borne}.")
     unnoticed = [fault for fault in faults if fault.unanswered]
     if unnoticed:
         first = unnoticed[0]
@@ -270,29 +274,31 @@ def _said_of_faults(faults: Sequence[FaultAnswers], causeless: Sequence[Uncaused
             if len(unnoticed) == 1
             else (f"{len(unnoticed)} faults that had to be noticed were not")
         )
-        said.append(f"{what}: {first.text}, by no event of {', '.join(first.unanswered)} within 2 s.")
+        sentences.append(f"{what}: {first.text}, by no event of {', '.join(first.unanswered)} within 2 s.")
     if causeless:
         first_event = causeless[0]
         what = "1 event has" if len(causeless) == 1 else f"{len(causeless)} events have"
-        said.append(f"{what} no cause in the ledger; the first: {first_event.name} of {first_event.source}.")
-    return said
+        sentences.append(
+            f"{what} no cause in the ledger; the first: {first_event.name} of {first_event.source}."
+        )
+    return sentences
 
 
-def _said_of(late: Lateness | None, causes: OverrunCauses | None) -> list[str]:
+def _overrun_sentences(late: Lateness | None, causes: OverrunCauses | None) -> list[str]:
     """Return what a person must know of the simulation before they blame the loop."""
     if late is None or not late.overruns:
         return []
     overran = f"The loop overran {counted(late.overruns, 'time', 'times')}"
     beside = "never" if not late.overruns_beside else counted(late.overruns_beside, "time", "times")
-    said = [f"{overran}, {beside} with a simulated reply that was more than 1 ms late."]
+    sentences = [f"{overran}, {beside} with a simulated reply that was more than 1 ms late."]
     if causes is not None and causes.overruns:
-        said.append(
+        sentences.append(
             f"The cause was the simulated servos {counted(causes.simulation, 'time', 'times')}, the kernel "
             f"{counted(causes.kernel, 'time', 'times')}, which hands replies over, a late wake-up "
             f"{counted(causes.wake_up, 'time', 'times')}, and our own work "
             f"{counted(causes.own_work, 'time', 'times')}: {causes.own_share:.3%} of {causes.cycles} cycles."
         )
-    return said
+    return sentences
 
 
 # The comparison as tables

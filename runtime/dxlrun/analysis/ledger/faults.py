@@ -24,7 +24,7 @@ LATE_NS = 1_000_000
 """A simulated reply that is later than this can be a lost one for the host [i]."""
 _EVER = 1 << 62
 _SHORTEST_PERIODS = 4
-"""A servo that is silent for so many periods has missed a read, whatever was retried."""
+"""A servo that is silent for so many periods has missed a read, with all retries."""
 
 _MISSED = frozenset((EventCode.READ_LOST, EventCode.SERVO_LOST))
 _GARBLED = _MISSED | {EventCode.BUS_NOISE}
@@ -46,7 +46,7 @@ class _Kind:
     leaves: frozenset[EventCode] = frozenset()
     """What the servo has of it until it is started again."""
     due: bool = False
-    """The runtime must notice it, when it lasts some periods; False: it may be borne in silence."""
+    """The runtime must report it, when it lasts some periods; False: it may tolerate it."""
 
 
 _KINDS: Mapping[str, _Kind] = {
@@ -102,21 +102,21 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class FaultAnswers:
-    """One injected fault with what the runtime said within two seconds."""
+    """One injected fault with the events that the runtime logged within two seconds."""
 
     seconds: float
     """Since the log's first packet."""
     bus: str
     text: str
     answers: tuple[Answer, ...]
-    """In order of time; empty: the runtime said nothing, as of a fault that it bears in silence."""
+    """In order of time; empty: none, as for a fault that it tolerates."""
     unanswered: tuple[str, ...] = ()
-    """Joints and buses of which the runtime had to say something and did not."""
+    """Joints and buses whose event is missing."""
 
 
 @dataclass(frozen=True, slots=True)
 class UncausedEvent:
-    """An event that tells of a fault where the ledger has none."""
+    """An event that reports a fault where the ledger has none."""
 
     seconds: float
     """Since the log's first packet."""
@@ -153,7 +153,7 @@ def answered(
 ) -> tuple[FaultAnswers, ...]:
     """Return each injected fault of a ledger with the events that answer it.
 
-    `begin_ns`: from when seconds are counted; `period_ns`: the loop's, which says what cannot be borne.
+    `begin_ns`: from when seconds are counted; `period_ns`: the loop's: a shorter fault may be missed.
     """
     faults = faults_in(entries)
     return tuple(
@@ -175,7 +175,7 @@ def answered(
 def uncaused(
     entries: Iterable[LedgerEntry], events: Sequence[Event], joints: Joints, begin_ns: int
 ) -> tuple[UncausedEvent, ...]:
-    """Return the events that tell of a fault where nothing in the ledger can be why, in order of time.
+    """Return the events that report a fault without a cause in the ledger, in order of time.
 
     What the host did to itself (it was late, its disk was full) is not judged: no ledger knows it.
     """
@@ -218,15 +218,15 @@ def _at(event: Event, bus: str, servo: int | None, joints: Joints) -> bool:
     """Return whether an event's source is this servo or its bus; None: any servo of the bus."""
     if event.source == bus:
         return True
-    whose = {joint for (of, servo_id), joint in joints.items() if of == bus and servo in (None, servo_id)}
-    return event.source in whose
+    names = {joint for (of, servo_id), joint in joints.items() if of == bus and servo in (None, servo_id)}
+    return event.source in names
 
 
 def _names(event: Event, bus: str, servo: int | None, joints: Joints) -> bool:
     """Return whether a sentence is about this servo, or about this bus."""
     if servo is None:
-        whose = [joint for (of, _), joint in joints.items() if of == bus]
-        return f"bus {bus}" in event.text or any(joint in event.text for joint in whose)
+        names = [joint for (of, _), joint in joints.items() if of == bus]
+        return f"bus {bus}" in event.text or any(joint in event.text for joint in names)
     return f"(ID {servo} on bus {bus})" in event.text
 
 
@@ -263,8 +263,8 @@ def _unanswered(
     soon = [event for event in events if entry.t_ns <= event.t_ns <= entry.t_ns + WINDOW_NS]
     if any(event.code == EventCode.PORT_LOST and event.source == entry.bus for event in soon):
         return ()
-    told = {event.source for event in soon if event.code in kind.answers}
-    return tuple(sorted(asked - silent - told))
+    answered_by = {event.source for event in soon if event.code in kind.answers}
+    return tuple(sorted(asked - silent - answered_by))
 
 
 def _running(events: Sequence[Event], t_ns: int) -> bool:
@@ -328,7 +328,7 @@ def _causes_of(entry: LedgerEntry) -> list[_Cause]:
 
 
 def _may_cause(cause: _Cause, event: Event, since_ns: int, joints: Joints) -> bool:
-    """Return whether a cause is why an event came, whose source was silent since `since_ns` already."""
+    """Return whether a cause is the reason of an event, whose source was silent since `since_ns` already."""
     if event.code not in cause.codes or cause.begin_ns > event.t_ns or cause.end_ns + WINDOW_NS < since_ns:
         return False
     if event.code in _SENTENCES:

@@ -4,8 +4,8 @@ A cycle that ended behind the next deadline is split into what its servos were l
 the kernel kept replies, what it woke late, and what its own work took beyond the median of all cycles. The
 largest of them is the cause; but a cycle that would have overrun with all of them punctual, too, is our own.
 
-- A servo's lateness counts as far as the loop waited for it: within the read, or in the gap behind the
-  deadline. Several buses are waited for at once, so the latest one counts.
+- A servo's lateness counts as far as the loop waited for it: within the read, or in the idle time behind
+  the deadline. Several buses are waited for at once, so the latest one counts.
 - The kernel keeps a reply from when the servos' process has written it until the loop has it, beyond the
   median of this bus: a worker of the kernel carries the bytes through a pseudo-terminal, and it, or the loop,
   had no processor. Only where the log is what the ledger has, to the byte; else it counts as our own.
@@ -81,11 +81,11 @@ def overrun_causes(log: Log, by_bus: Mapping[str, Sequence[LedgerEntry]]) -> Ove
     woken = cycles["woken_ns"].astype(np.int64)
     scheduled = cycles["scheduled_ns"].astype(np.int64)
     waits = _Waits(scheduled, woken, cycles["read_ns"].astype(np.int64))
-    servos, gap, kept = (np.zeros(len(cycles), np.int64) for _ in range(3))
+    servos, idle, kept = (np.zeros(len(cycles), np.int64) for _ in range(3))
     for index, name in enumerate(log.buses):
         found, kept_ns = _found(log, index, by_bus[name])
-        in_read, in_gap = waits.late(found)
-        servos, gap = np.maximum(servos, in_read), np.maximum(gap, in_gap)
+        in_read, in_idle = waits.late(found)
+        servos, idle = np.maximum(servos, in_read), np.maximum(idle, in_idle)
         kept = np.maximum(kept, waits.kept(found, kept_ns))
     work = cycles["written_ns"].astype(np.int64) - woken - servos
     usual = int(np.median(work))
@@ -98,9 +98,9 @@ def overrun_causes(log: Log, by_bus: Mapping[str, Sequence[LedgerEntry]]) -> Ove
             (int(woken[index]) - int(woken[0])) / 1e9,
             int(cycles["skipped"][index + 1]),
             (
-                int(servos[index] + gap[index]),
+                int(servos[index] + idle[index]),
                 int(kernel[index]),
-                int(woken[index] - scheduled[index] - gap[index]),
+                int(woken[index] - scheduled[index] - idle[index]),
                 int(work[index]) - usual,
             ),
             too_long=bool(work[index] > log.period_ns),
@@ -151,7 +151,7 @@ class _Waits:
     def late(self, found: Iterable[Transaction]) -> tuple[Longs, Longs]:
         """Return how long each cycle waited for late servos of a bus: in its read, behind its deadline."""
         scheduled, woken = self.scheduled, self.woken
-        in_read, in_gap = np.zeros(len(woken), np.int64), np.zeros(len(woken), np.int64)
+        in_read, in_idle = np.zeros(len(woken), np.int64), np.zeros(len(woken), np.int64)
         for one in found:
             index = int(np.searchsorted(woken, one.handed_ns, side="right")) - 1
             if index >= 0 and one.handed_ns <= self.read[index]:
@@ -159,8 +159,8 @@ class _Waits:
                 in_read[index] += min(one.late_ns, one.handed_ns - int(woken[index]))
             elif index + 1 < len(woken) and one.handed_ns > scheduled[index + 1]:
                 waited = min(one.late_ns, one.handed_ns - int(scheduled[index + 1]))
-                in_gap[index + 1] = max(in_gap[index + 1], waited)
-        return in_read, in_gap
+                in_idle[index + 1] = max(in_idle[index + 1], waited)
+        return in_read, in_idle
 
     def kept(self, found: Sequence[Transaction], kept_ns: Longs) -> Longs:
         """Return how long the kernel kept answers of a bus from the read of each cycle, beyond the median."""
@@ -263,7 +263,7 @@ class Lateness:
     overruns: int
     """Cycles of the loop before which periods were skipped."""
     overruns_beside: int
-    """Those of them in whose time a delivery was later than 1 ms: the simulation may be why."""
+    """Those of them in whose time a delivery was later than 1 ms: the simulation may be the cause."""
 
 
 def lateness(log: Log, entries: Iterable[LedgerEntry]) -> Lateness | None:

@@ -68,7 +68,7 @@ class Stream:
 
 
 def logged(packets: Sequence[LoggedPacket], way: Way) -> Stream:
-    """Return what the runtime says it sent (before each write) or got (after each packet's last read).
+    """Return what the runtime logged as sent (before each write) or received (after each packet's last read).
 
     `packets` of one bus, in order of time.
     """
