@@ -15,7 +15,7 @@ import pytest
 from dxlrun.control import realtime
 from dxlrun.control.controllers.activity import Activity
 from dxlrun.run.channels.events import EventCode
-from dxlrun.run.channels.heartbeat import Heartbeat, Step, create
+from dxlrun.run.channels.heartbeat import ControllerMethod, Heartbeat, create
 
 CALLS = {
     "activate": "on_activate",
@@ -132,7 +132,12 @@ def test_a_thread_that_no_hook_sees_is_counted_once_and_only_while_the_robot_run
     threads = [1]
     activity = Activity(page, lambda: threads[0])
     started = []
-    for step, count in ((Step.ON_CONFIGURE, 2), (Step.UPDATE, 2), (Step.UPDATE, 4), (Step.UPDATE, 3)):
+    for step, count in (
+        (ControllerMethod.ON_CONFIGURE, 2),
+        (ControllerMethod.UPDATE, 2),
+        (ControllerMethod.UPDATE, 4),
+        (ControllerMethod.UPDATE, 3),
+    ):
         activity.begin(0, step)
         threads[0] = count
         started.append(activity.end())
@@ -155,7 +160,7 @@ def test_the_count_sees_a_thread_of_foreign_machine_code(page, no_thread_ends):
     body = run(lambda _: go.wait() and None)
     handle = ctypes.c_ulong()
     activity = Activity(page, realtime.thread_count)
-    activity.begin(0, Step.UPDATE)
+    activity.begin(0, ControllerMethod.UPDATE)
     assert libc.pthread_create(ctypes.byref(handle), None, body, None) == 0
     assert activity.end() == "started 1 thread"
     go.set()
@@ -164,7 +169,7 @@ def test_the_count_sees_a_thread_of_foreign_machine_code(page, no_thread_ends):
 
 def test_after_a_call_everything_can_be_started_again(page):
     activity = Activity(page)
-    activity.begin(0, Step.UPDATE)
+    activity.begin(0, ControllerMethod.UPDATE)
     with pytest.raises(RuntimeError, match="a controller cannot start a thread while the robot runs"):
         thread()
     assert activity.end() == "tried to start a thread"
@@ -179,7 +184,7 @@ def test_the_page_names_what_is_called_until_it_returns(page):
     for place, name in ((0, "arm"), (62, "h\u00e4nd" * 100)):
         activity.name_controller(place, name)
     for place in (0, 62):
-        for step in tuple(Step)[1:]:
+        for step in tuple(ControllerMethod)[1:]:
             activity.begin(place, step)
             seen.append(page.activity)
             activity.end()

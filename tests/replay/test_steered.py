@@ -19,9 +19,9 @@ from hypothesis import strategies as st
 
 from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.errors import LogError
+from dxlrun.log.client_commands import client_commands, policy_begun
 from dxlrun.log.reader import Log, read_log
 from dxlrun.log.replay import replay_log
-from dxlrun.log.steered import policy_begun, steered
 from dxlrun.run.channels.commands import Command, QueueInbox
 from dxlrun.run.channels.events import EventCode
 from dxlrun.testing import VirtualRobot, simulated_robot
@@ -167,10 +167,10 @@ def whole(path: Path) -> Log:
 def test_a_steered_run(tell: Callable[[str], Path], story: str) -> None:
     log = whole(tell(story))
     asked = [command for _, commands in sorted(STORIES[story].items()) for command in commands]
-    told = [(one.command.controller, one.command.kind, one.command.lease_ns) for one in steered(log)]
+    told = [(one.command.controller, one.command.kind, one.command.lease_ns) for one in client_commands(log)]
     assert told == [(one.controller, one.kind, one.lease_ns) for one in asked]
     refused = [event.text for event in log.events if event.code == EventCode.COMMAND_REFUSED]
-    assert [one.refusal for one in steered(log) if one.refusal] == [
+    assert [one.refusal for one in client_commands(log) if one.refusal] == [
         text.split(" refused: ", 1)[1] for text in refused
     ]
 

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from dxlrun.control.realtime import Grant
 from dxlrun.run.channels.events import EventCode
-from dxlrun.run.grant_table import ProcessGrant, granted_text, refusals, show_grants
+from dxlrun.run.run_summary import ProcessGrant, granted_text, refusals, show_grants
 
 GRANTS = (
     ProcessGrant("loop", Grant("timer slack", True, "timer slack 1 ns")),

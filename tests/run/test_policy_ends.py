@@ -17,7 +17,7 @@ from dxlrun.run.channels.heartbeat import Heartbeat, Phase
 from dxlrun.run.channels.packets import PacketBatch, PacketKind, decode_packets
 from dxlrun.run.channels.ring import Handover, Record, RecordKind, RingReader, RingWriter
 from dxlrun.run.guardian import LastHand
-from dxlrun.run.run_processes import Memory, guardian_job
+from dxlrun.run.run_processes import RunMemory, guardian_job
 from dxlrun.simulation.virtual_ports import VirtualPorts
 from dxlrun.testing import VirtualRobot, plan_of, simulated_robot
 
@@ -116,7 +116,7 @@ def test_the_guardian_holds_only_a_robot_that_was_running(
     robot = tmp_path / "holding.yaml"
     robot.write_text((tmp_path / "pair.yaml").read_text() + "policies: {on_fault: hold}\n")
     plan = plan_of(robot)
-    memory = Memory.create(plan)
+    memory = RunMemory.create(plan)
     Heartbeat(memory.heartbeat).enter(phase)
     limp: list[str] = []
     monkeypatch.setattr(LastHand, "limp", lambda hand, ports, how, severity: limp.append(how) or [how])
@@ -140,7 +140,7 @@ policies: {on_fault: hold}
 
 
 @pytest.fixture
-def last_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[VirtualRobot, LastHand, Memory]:
+def last_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[VirtualRobot, LastHand, RunMemory]:
     """A robot whose loop dies in the middle of a run, and the last hand on its simulated servos."""
     (tmp_path / "wheels.yaml").write_text(WHEELS)
     robot = simulated_robot(tmp_path / "wheels.yaml", duration_s=0.4)
@@ -151,7 +151,7 @@ def last_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[VirtualR
         hardware.read()
         hardware.write()
         hardware.idle(robot.clock.wait_until(robot.clock.now_ns() + 20_000_000))
-    memory = Memory.create(robot.plan)
+    memory = RunMemory.create(robot.plan)
     Heartbeat(memory.heartbeat).enter(Phase.RUNNING)
     hand = LastHand(guardian_job(robot.plan, {}, memory, take_over=False))
     hand._clock = robot.clock  # type: ignore[assignment]  # the time of the simulated servos
@@ -169,7 +169,7 @@ def records(ring: int, kind: RecordKind) -> list[bytes]:
 
 
 def test_a_guardian_that_leaves_torque_on_stops_what_is_led_by_a_velocity(
-    last_hand: tuple[VirtualRobot, LastHand, Memory],
+    last_hand: tuple[VirtualRobot, LastHand, RunMemory],
 ) -> None:
     robot, hand, _ = last_hand
     wheel = robot.buses[0].servo(1)
@@ -182,7 +182,7 @@ def test_a_guardian_that_leaves_torque_on_stops_what_is_led_by_a_velocity(
 
 @pytest.mark.parametrize("silent", [False, True])
 def test_the_last_hand_names_who_did_not_confirm_torque_off(
-    last_hand: tuple[VirtualRobot, LastHand, Memory], silent: bool
+    last_hand: tuple[VirtualRobot, LastHand, RunMemory], silent: bool
 ) -> None:
     robot, hand, memory = last_hand
     robot.buses[0].servo(2).silence(silent)
@@ -200,7 +200,7 @@ def test_the_last_hand_names_who_did_not_confirm_torque_off(
 
 def test_what_the_loop_had_on_its_desk_when_it_died_comes_into_the_log(start: Start, tmp_path: Path) -> None:
     plan = plan_of(tmp_path / "pair.yaml")
-    memory = Memory.create(plan)
+    memory = RunMemory.create(plan)
     desk = PacketBatch(RingWriter(memory.packets), process.shared_memory(memory.desk))
     desk.packet(0, PacketKind.INSTRUCTION, 3, 1, 2, b"half a cycle")
     master, slave = os.openpty()

@@ -18,14 +18,14 @@ from dxlrun.compile import compile_robot
 from dxlrun.compile.simulated import simulated_buses
 from dxlrun.control.loop import StopFlag
 from dxlrun.description import read_robot
-from dxlrun.dynamixel.exchange import pump
+from dxlrun.dynamixel.exchange import bus
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.port.reopening import KeptLines
 from dxlrun.interfaces import Commands, States
 from dxlrun.run import guardian
 from dxlrun.run.channels import heartbeat, process
 from dxlrun.run.channels.events import EventRing
-from dxlrun.run.channels.heartbeat import Heartbeat, Phase, Standstill, Step
+from dxlrun.run.channels.heartbeat import ControllerMethod, Heartbeat, Phase, Standstill
 from dxlrun.run.channels.packets import NoPackets
 from dxlrun.run.channels.process import Cut, LineLost, Stop
 from dxlrun.run.channels.ring import Handover
@@ -40,7 +40,7 @@ from dxlrun.run.guardian import (
     standstill_timeout_ns,
 )
 from dxlrun.run.loop_process import AskedToStop, Pulse
-from dxlrun.run.run_processes import Memory, guardian_job
+from dxlrun.run.run_processes import RunMemory, guardian_job
 from dxlrun.simulation import Ledger
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.virtual_ports import VirtualPorts
@@ -99,12 +99,12 @@ def test_standstill_timeout(phase: Phase, rate: int, patience: int) -> None:
         (
             Phase.LOADING,
             "LOADING_TIMEOUT_NS",
-            Step.ON_CONFIGURE,
+            ControllerMethod.ON_CONFIGURE,
             "unused",
             " in on_configure of controller arm",
         ),
-        (Phase.LOADING, "LOADING_TIMEOUT_NS", Step.NONE, "unused", ""),
-        (Phase.DONE, "ENDING_TIMEOUT_NS", Step.NONE, "done", ""),
+        (Phase.LOADING, "LOADING_TIMEOUT_NS", ControllerMethod.NONE, "unused", ""),
+        (Phase.DONE, "ENDING_TIMEOUT_NS", ControllerMethod.NONE, "done", ""),
     ],
 )
 def test_a_loop_that_never_gets_on_is_ended(  # noqa: PLR0917  fixtures
@@ -113,14 +113,14 @@ def test_a_loop_that_never_gets_on_is_ended(  # noqa: PLR0917  fixtures
     monkeypatch: pytest.MonkeyPatch,
     phase: Phase,
     patience: str,
-    called: Step,
+    called: ControllerMethod,
     ending: str,
     how: str,
 ) -> None:
     """Such as one whose plug-in waits for a server in on_configure, or for a child process at the end."""
     monkeypatch.setattr(guardian, patience, 100 * MS)
     plan = plan_of(tmp_path / "pair.yaml")
-    memory = Memory.create(plan)
+    memory = RunMemory.create(plan)
     page = Heartbeat(memory.heartbeat)
     page.name_controller(1, "arm")
     page.enter(phase)
@@ -156,7 +156,7 @@ def test_a_stop_anywhere_in_the_set_up_leaves_nobody_with_torque(
     start: object, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Ask to stop at the first transaction, at the second ...: until one set-up is through without us."""
-    monkeypatch.setattr(pump, "BEAT_NS", 0)
+    monkeypatch.setattr(bus, "BEAT_NS", 0)
     given = []
     while (found := set_up(tmp_path, len(given) + 1)) is not None:
         given.append(found)
@@ -222,7 +222,7 @@ def test_a_line_whose_other_end_is_gone_still_gives_what_it_said_last() -> None:
 def watcher(start: object, tmp_path: Path) -> Iterator[tuple[Guardian, socket.socket, Heartbeat]]:
     """A guardian of the robot `pair` on virtual time, the terminal's end of its line, and the loop's page."""
     plan = compile_robot(read_robot(tmp_path / "pair.yaml", {}), [], None).plan
-    memory = Memory.create(plan)
+    memory = RunMemory.create(plan)
     control, terminal = process.message_channel(Decoder(Stop | Cut))
     made = Guardian(guardian_job(plan, {}, memory, take_over=False), control)
     made._clock = VirtualClock(0)  # type: ignore[assignment]  # so that the test says how time passes

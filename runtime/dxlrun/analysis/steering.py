@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.analysis.latency import DISORDER_NS, begins, first_deadline_ns
+from dxlrun.log.client_commands import ClientCommand, client_commands, policy_begun
 from dxlrun.log.reader import UNREADABLE, Log
-from dxlrun.log.steered import Steered, policy_begun, steered
 from dxlrun.run.channels.commands import TakenCommand
 from dxlrun.run.channels.events import Event, EventCode
 
@@ -126,7 +126,7 @@ class Steering:
         begun = policy_begun(replace(self._log, cycles=self._cycles, commands=tuple(commands)))
         self._digest(None)
         if begun is not None:
-            self._acts.append(_act(Steered(begun, ""), self._start_ns))
+            self._acts.append(_act(ClientCommand(begun, ""), self._start_ns))
         if self._since is not None and len(self._cycles):
             end = int(self._cycles["cycle"][-1]) + 1 if begun is None else begun.cycle
             if end > self._since[0]:
@@ -140,7 +140,7 @@ class Steering:
             return
         now = [one for one in self._commands if until_ns is None or one.t_ns < until_ns]
         part = replace(log, cycles=self._cycles, events=tuple(self._events), commands=tuple(now))
-        for one in steered(part):
+        for one in client_commands(part):
             self._add(one)
         self._last = now[-1] if now else self._last
         if until_ns is not None:
@@ -148,7 +148,7 @@ class Steering:
             self._events = [event for event in self._events if event.t_ns >= until_ns]
             self._cycles = self._cycles[self._cycles["updated_ns"] >= until_ns]
 
-    def _add(self, one: Steered) -> None:
+    def _add(self, one: ClientCommand) -> None:
         command, found = one.command, self._acts
         index, last = self._streams.pop(command.controller, (-1, None))
         if last is not None and found[index].refusal == one.refusal and _continues(last, command):
@@ -192,7 +192,7 @@ def _one_more(act: Act, command: TakenCommand) -> Act:
     return replace(act, set_points=count, what=_stream(command, count))
 
 
-def _act(one: Steered, start_ns: int) -> Act:
+def _act(one: ClientCommand, start_ns: int) -> Act:
     command = one.command
     streamed = bool(command.lease_ns)
     return Act(

@@ -16,7 +16,7 @@ from dxlrun.output.terminal import print_error, print_warning, show, show_json
 if TYPE_CHECKING:
     from dxlrun.analysis.report import Report
     from dxlrun.log.reader import Log
-    from dxlrun.log.replay import Difference, ReplayReport
+    from dxlrun.log.replay import ReplayDifference, ReplayReport
     from dxlrun.output.table import Part
 
 Settings = Annotated[
@@ -202,8 +202,7 @@ def replay(
     arguments = parse_assignments(assignments)
     import msgspec
 
-    from dxlrun.log.replay import replay_log
-    from dxlrun.log.replay.changes import Setting
+    from dxlrun.log.replay import Setting, replay_log
 
     report = replay_log(log, [Setting.parse(text) for text in settings], arguments)
     for remark in report.remarks:
@@ -228,7 +227,7 @@ def _replayed(report: ReplayReport) -> tuple[Part, ...]:
     return report.sentence, _first(report.first), Table.of("", columns, rows)
 
 
-def _first(first: Difference) -> str:
+def _first(first: ReplayDifference) -> str:
     place = f"first: cycle {first.cycle}, {first.time_s:.3f} s, "
     values = f"recorded {first.recorded}, replayed {first.replayed}"
     if first.joint is None:

@@ -51,7 +51,7 @@ Read: TypeAlias = "Callable[[memoryview, int], tuple[Value, int]]"
 
 
 @dataclass(frozen=True, slots=True)
-class Field:
+class MessageField:
     """One field of a definition."""
 
     name: str
@@ -59,12 +59,12 @@ class Field:
     sequence: bool
 
 
-def parse(message: MessageType) -> dict[str, tuple[Field, ...]]:
+def parse(message: MessageType) -> dict[str, tuple[MessageField, ...]]:
     """Return the fields of a message and of all it depends on, by type name without `msg/`.
 
     Raises ValueError for what our messages do not use: constants, defaults, fixed arrays, bounds.
     """
-    definitions: dict[str, tuple[Field, ...]] = {}
+    definitions: dict[str, tuple[MessageField, ...]] = {}
     name = message.name
     for block in re.split(r"^=+$", message.text, flags=re.MULTILINE):
         fields = []
@@ -76,7 +76,7 @@ def parse(message: MessageType) -> dict[str, tuple[Field, ...]]:
                 match = _FIELD.match(text)
                 if match is None:
                     raise ValueError(f"{message.name}: cannot lay out {line!r}")
-                fields.append(Field(match[3], match[1], match[2] is not None))
+                fields.append(MessageField(match[3], match[1], match[2] is not None))
         definitions[name.replace("/msg/", "/")] = tuple(fields)
     return definitions
 
@@ -130,7 +130,7 @@ class Codec:
         return value
 
 
-def _lead(fields: Sequence[Field]) -> tuple[struct.Struct, int]:
+def _lead(fields: Sequence[MessageField]) -> tuple[struct.Struct, int]:
     """Return the layout of the numbers that a message begins with, padding included, and their count."""
     form, at, count = "<", 0, 0
     for field in fields:
@@ -261,7 +261,7 @@ def _texts() -> tuple[Write, Read]:
     return write, read
 
 
-def _nested(name: str, definitions: Mapping[str, tuple[Field, ...]]) -> tuple[Write, Read]:
+def _nested(name: str, definitions: Mapping[str, tuple[MessageField, ...]]) -> tuple[Write, Read]:
     fields = definitions[name]
     steps = [_field(field, definitions) for field in fields]
     names = [field.name for field in fields]
@@ -281,7 +281,7 @@ def _nested(name: str, definitions: Mapping[str, tuple[Field, ...]]) -> tuple[Wr
     return write, read
 
 
-def _field(field: Field, definitions: Mapping[str, tuple[Field, ...]]) -> tuple[Write, Read]:
+def _field(field: MessageField, definitions: Mapping[str, tuple[MessageField, ...]]) -> tuple[Write, Read]:
     if field.kind in _PRIMITIVES:
         return _numbers(field.kind) if field.sequence else _number(field.kind)
     if field.kind == "string":

@@ -14,7 +14,7 @@ import msgspec
 from msgspec.json import Decoder
 
 from dxlrun.log.log_writer import LogWriter
-from dxlrun.log.schemas import LogSummary, Recorded, RecorderJob
+from dxlrun.log.schemas import LogClosed, LogSummary, RecorderJob
 from dxlrun.run.channels import process
 from dxlrun.run.channels.process import Draining, Failed, Finish, LateMetadata, MessageChannel, Ready
 from dxlrun.run.channels.ring import Gap, RingReader
@@ -114,7 +114,7 @@ def main() -> int:
         supervisor.send(Failed(f"the log cannot be written: {error.strerror or error} ({job.path})"))
         return 1
     summary = recorder.run(lambda: bool(stop))
-    supervisor.send(Recorded(summary))
+    supervisor.send(LogClosed(summary))
     return 1 if summary.error or summary.gaps else 0
 
 

@@ -270,7 +270,7 @@ class LogSummary:
     """Messages that were lost with the unfinished chunk when writing stopped, and records that came later."""
 
 
-class Recorded(msgspec.Struct, frozen=True, tag=True):
+class LogClosed(msgspec.Struct, frozen=True, tag=True):
     """Recorder to supervisor: the log is closed."""
 
     summary: LogSummary

@@ -50,7 +50,7 @@ class Sinks:
 
 
 @dataclass(frozen=True, slots=True)
-class Robot:
+class AssembledRobot:
     """A robot, ready to be started."""
 
     hardware: DynamixelHardware
@@ -81,7 +81,7 @@ def assemble(
     patience: Callable[[int], None] = lambda _: None,
     pace: Callable[[int], None] = lambda _: None,
     activity: Activity | None = None,
-) -> Robot:
+) -> AssembledRobot:
     """Build everything between the ports and the log; configures the controllers, sends nothing."""
     record = CycleRecord(cycle_layout(plan))
     hardware = DynamixelHardware(
@@ -126,4 +126,4 @@ def assemble(
         overrun_hooks=plugins.overrun_hooks,
     )
     manager.configure()
-    return Robot(hardware, manager, loop, record)
+    return AssembledRobot(hardware, manager, loop, record)

@@ -77,7 +77,7 @@ class LoopJob:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class LoopOutcome:
     """What the loop's process leaves behind for the terminal."""
 
     reason: str
@@ -170,7 +170,7 @@ def beside_simulation(plan: Plan) -> SchedulerPlan:
     return replace(scheduler, cores=tuple(sorted(others))) if simulated else scheduler
 
 
-def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks) -> Outcome:
+def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks) -> LoopOutcome:
     """Execute the plan from plug-ins to torque off."""
     stop = StopFlag()
     signal.signal(signal.SIGTERM, lambda *_: stop.request())
@@ -203,7 +203,7 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks) -> Outcom
     except AskedToStop as asked:
         sinks.events.emit(EventCode.SETUP, Severity.INFO, "loop", "the set-up was given up on request")
         notes: list[str] = getattr(asked, "__notes__", [])
-        return Outcome("stopped", sentences=tuple(note for note in notes if note != TAKEN_BACK))
+        return LoopOutcome("stopped", sentences=tuple(note for note in notes if note != TAKEN_BACK))
     failures: tuple[str, ...] = ()
     last: Last = "limp"
     try:
@@ -218,7 +218,7 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks) -> Outcom
             robot.hardware.release()
     detail = (result.detail,) if result.detail else ()
     remarks = (TORQUE_STAYS,) if last == "hold" else ()
-    return Outcome(
+    return LoopOutcome(
         result.reason,
         result.cycles,
         result.skipped,
@@ -261,11 +261,11 @@ def main() -> None:
         outcome = _run(from_json(process.whole(job.plan)), job, heartbeat, sinks)
         outcome = replace(outcome, errors=events.errors.groups)
     except DxlrunError as error:
-        outcome = Outcome("start-up", sentences=error.sentences)
+        outcome = LoopOutcome("start-up", sentences=error.sentences)
         events.emit(EventCode.SETUP, Severity.ERROR, "loop", "\n".join(error.sentences))
     except Exception as error:  # the last resort: the run ends with a sentence and the log has the traceback
         sentence = f"dxlrun itself failed: {type(error).__name__}: {error}; --debug shows where"
-        outcome = Outcome("fault", sentences=(sentence,), traceback=traceback.format_exc())
+        outcome = LoopOutcome("fault", sentences=(sentence,), traceback=traceback.format_exc())
         sys.stderr.write(outcome.traceback)
         events.emit(EventCode.LOOP_STOPPED, Severity.FATAL, "loop", outcome.traceback)
     sinks.packets.commit()

@@ -13,7 +13,7 @@ from msgspec.json import Decoder
 from dxlrun.compile.plan import Plan, to_json
 from dxlrun.compile.simulated import simulated_bodies, simulated_buses
 from dxlrun.control.realtime import Grant, guardian_priority
-from dxlrun.log.schemas import LogHeader, Recorded, RecorderJob
+from dxlrun.log.schemas import LogClosed, LogHeader, RecorderJob
 from dxlrun.remote.job import Descriptors, GatewayJob
 from dxlrun.run.assembly import cycle_layout
 from dxlrun.run.channels import heartbeat, mailbox, process, ring
@@ -23,11 +23,11 @@ from dxlrun.run.channels.events import LONGEST_EVENT, event_capacity
 from dxlrun.run.channels.packets import DESK_SIZE, LONGEST_BATCH, packet_capacity
 from dxlrun.run.channels.process import Child, Draining, Failed, Listening, Ready
 from dxlrun.run.guardian import GUARDIAN_MESSAGES, GuardianJob, GuardianMessage
-from dxlrun.run.loop_process import LoopJob, Outcome
+from dxlrun.run.loop_process import LoopJob, LoopOutcome
 from dxlrun.run.simulation_front import FrontOptions, SimulationMessage, first_message, start_simulation
 from dxlrun.simulation import SimulationConfig
 
-RecorderMessage = Ready | Draining | Failed | Recorded
+RecorderMessage = Ready | Draining | Failed | LogClosed
 RECORDER_MESSAGES: Decoder[RecorderMessage] = Decoder(RecorderMessage)
 GatewayMessage = Listening | Failed
 GATEWAY_MESSAGES: Decoder[GatewayMessage] = Decoder(GatewayMessage)
@@ -39,7 +39,7 @@ _LONGEST_TAKEN = LONGEST_COMMAND + 64
 
 
 @dataclass(frozen=True, slots=True)
-class Memory:
+class RunMemory:
     """Descriptors of everything that the processes of a run share; nameless, gone with the last of them."""
 
     plan: int
@@ -58,7 +58,7 @@ class Memory:
     stderr: int
 
     @classmethod
-    def create(cls, plan: Plan) -> Memory:
+    def create(cls, plan: Plan) -> RunMemory:
         """Create it all, rings sized for ten seconds of this robot."""
         servos = sum(len(bus.servos) for bus in plan.buses)
         period, cycle = plan.loop.period_ns, cycle_layout(plan).size
@@ -80,10 +80,10 @@ class Memory:
             stderr=process.memory_file("dxlrun-stderr"),
         )
 
-    def outcome(self) -> Outcome | None:
+    def outcome(self) -> LoopOutcome | None:
         """Return what the loop's process left behind; None when it did not get to it."""
         try:
-            return msgspec.json.decode(process.whole(self.result), type=Outcome)
+            return msgspec.json.decode(process.whole(self.result), type=LoopOutcome)
         except msgspec.MsgspecError:  # nothing, or what was cut short
             return None
 
@@ -105,7 +105,7 @@ class Memory:
 
 
 def start_simulated_buses(
-    plan: Plan, ledger: Path | None, memory: Memory
+    plan: Plan, ledger: Path | None, memory: RunMemory
 ) -> tuple[Child[SimulationMessage], dict[str, str]]:
     """Start the simulated servos; return the process and the pseudo-terminal of each simulated bus.
 
@@ -127,7 +127,7 @@ def start_simulated_buses(
         raise
 
 
-def start_recorder(log: Path, header: LogHeader, memory: Memory) -> Child[RecorderMessage]:
+def start_recorder(log: Path, header: LogHeader, memory: RunMemory) -> Child[RecorderMessage]:
     """Start the recorder and wait until the log is open."""
     job = RecorderJob(str(log), header, memory.rings())
     descriptor = process.memory_file("dxlrun-recorder", msgspec.json.encode(job))
@@ -149,7 +149,7 @@ def start_recorder(log: Path, header: LogHeader, memory: Memory) -> Child[Record
     return child
 
 
-def start_gateway(log: Path | None, memory: Memory) -> Child[GatewayMessage]:
+def start_gateway(log: Path | None, memory: RunMemory) -> Child[GatewayMessage]:
     """Start the gateway; it reports its socket when it is ready, and the run does not wait for that.
 
     Raises OSError when the system has no process left.
@@ -178,7 +178,7 @@ def start_gateway(log: Path | None, memory: Memory) -> Child[GatewayMessage]:
         os.close(descriptor)
 
 
-def guardian_job(plan: Plan, ports: Mapping[str, str], memory: Memory, *, take_over: bool) -> GuardianJob:
+def guardian_job(plan: Plan, ports: Mapping[str, str], memory: RunMemory, *, take_over: bool) -> GuardianJob:
     """Return what the guardian is to do, and through it the loop."""
     loop = LoopJob(
         memory.plan,

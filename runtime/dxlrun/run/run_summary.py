@@ -1,4 +1,4 @@
-"""Options, progress and summary of a run, the same on both clocks."""
+"""What a terminal shows of a run: its options, what the system granted, its progress and its summary."""
 
 from __future__ import annotations
 
@@ -10,9 +10,13 @@ from typing import TYPE_CHECKING
 from dxlrun.errors import counted
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rich.console import Console
     from rich.status import Status
 
     from dxlrun.compile.plan import Plan
+    from dxlrun.control.realtime import Grant
     from dxlrun.run.channels.events import EventGroup
 
 _REFRESH_S = 0.1
@@ -92,3 +96,48 @@ class Progress:
         else:
             self._status.console.print(line, markup=False, soft_wrap=True)
             self._status.console.file.flush()
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessGrant:
+    """What the operating system granted to one process of the run, or refused."""
+
+    process: str
+    """loop, guardian"""
+    grant: Grant
+
+    @property
+    def name(self) -> str:
+        """What was asked for; with the process where that is not the loop."""
+        return self.grant.request if self.process == "loop" else f"{self.process}: {self.grant.request}"
+
+
+def show_grants(grants: Sequence[ProcessGrant], out: Console) -> None:
+    """Print a table, and the commands that fix what was refused; only on a terminal."""
+    if not out.is_terminal:
+        return
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table("real time", "granted", "", box=None, pad_edge=False, header_style="bold")
+    for one in grants:
+        answer = Text("yes", "green") if one.grant.granted else Text("no", "yellow")
+        table.add_row(one.name, answer, Text(one.grant.sentence))
+    out.print(table)
+    for fix in dict.fromkeys(one.grant.fix for one in grants if one.grant.fix):
+        out.print(Text(f"  {fix}", "yellow"), soft_wrap=True)  # unbroken: it is there to be copied
+
+
+def refusals(grants: Sequence[ProcessGrant], out: Console) -> tuple[str, ...]:
+    """Return what was not granted, one sentence each, where no table has shown it."""
+    if out.is_terminal:
+        return ()
+    refused = (one for one in grants if not one.grant.granted)
+    return tuple(
+        one.grant.text if one.process == "loop" else f"{one.process}: {one.grant.text}" for one in refused
+    )
+
+
+def granted_text(grants: Sequence[ProcessGrant]) -> dict[str, str]:
+    """Return the table as the log's metadata carries it."""
+    return {one.name: f"{'yes' if one.grant.granted else 'no'}: {one.grant.sentence}" for one in grants}

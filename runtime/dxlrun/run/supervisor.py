@@ -20,7 +20,7 @@ from dxlrun.control.realtime import Grant
 from dxlrun.dynamixel.port.ports import put_in_place, set_aside
 from dxlrun.dynamixel.port.serial_open import let_go
 from dxlrun.errors import ProcessFault, counted
-from dxlrun.log.schemas import FAILURES_NAME, Recorded
+from dxlrun.log.schemas import FAILURES_NAME, LogClosed
 from dxlrun.run.channels import process
 from dxlrun.run.channels.events import Severity
 from dxlrun.run.channels.heartbeat import Heartbeat, Phase, Standstill
@@ -36,21 +36,28 @@ from dxlrun.run.channels.process import (
     Listening,
     Stop,
 )
-from dxlrun.run.grant_table import ProcessGrant, granted_text, refusals, show_grants
 from dxlrun.run.guardian import Ended, GuardianJob, GuardianMessage, LastHand, Started
-from dxlrun.run.loop_process import Outcome
+from dxlrun.run.loop_process import LoopOutcome
 from dxlrun.run.run_log import discard_log, epoch_offset_ns, incomplete_log, ledger_of, log_header, new_log
 from dxlrun.run.run_processes import (
     GatewayMessage,
-    Memory,
     RecorderMessage,
+    RunMemory,
     guardian_job,
     start_gateway,
     start_guardian,
     start_recorder,
     start_simulated_buses,
 )
-from dxlrun.run.run_summary import Progress, RunOptions, RunSummary
+from dxlrun.run.run_summary import (
+    ProcessGrant,
+    Progress,
+    RunOptions,
+    RunSummary,
+    granted_text,
+    refusals,
+    show_grants,
+)
 from dxlrun.run.simulation_front import SimulationMessage
 
 _POLL_S = 0.1
@@ -86,7 +93,7 @@ class _Run:
 
     plan: Plan
     options: RunOptions
-    memory: Memory
+    memory: RunMemory
     signals: _Signals
     out: Console
     simulation: Child[SimulationMessage] | None = None
@@ -280,7 +287,7 @@ class _Run:
             while (message := recorder.message(END_TIMEOUT_S)) is not None:
                 if isinstance(message, Failed):
                     self.sentences.append(incomplete_log(message.sentence))
-                elif isinstance(message, Recorded):
+                elif isinstance(message, LogClosed):
                     closed = True
                     self.messages = message.summary.messages
                     if gaps := message.summary.gaps:
@@ -304,7 +311,7 @@ def run_robot(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
     Raises PortError (a port is missing, busy, forbidden) and ProcessFault (a child did not start).
     """
     signals = _Signals()
-    run = _Run(plan, options, Memory.create(plan), signals, out)
+    run = _Run(plan, options, RunMemory.create(plan), signals, out)
     began = time.monotonic()
     with signals.caught():
         try:
@@ -339,9 +346,9 @@ def _summary(run: _Run, elapsed_s: float) -> RunSummary:
     heartbeat = Heartbeat(run.memory.heartbeat)
     sentences: list[str] = []
     if outcome is None and run.ended is not None and run.ended.ending == "done":
-        outcome = Outcome("stopped")  # while it was still loading: no byte had been sent
+        outcome = LoopOutcome("stopped")  # while it was still loading: no byte had been sent
     elif outcome is None:
-        outcome = Outcome("fault", heartbeat.cycles, heartbeat.skipped, _last_words(run.memory))
+        outcome = LoopOutcome("fault", heartbeat.cycles, heartbeat.skipped, _last_words(run.memory))
     sentences += outcome.sentences
     if run.ended is not None and run.ended.ending != "done":
         sentences += run.ended.outcome
@@ -363,7 +370,7 @@ def _summary(run: _Run, elapsed_s: float) -> RunSummary:
     )
 
 
-def _last_words(memory: Memory) -> tuple[str, ...]:
+def _last_words(memory: RunMemory) -> tuple[str, ...]:
     """Return what was printed last, by whichever process, if anything was: one of them ended early."""
     lines = process.whole(memory.stderr).decode(errors="replace").strip().splitlines()
     return (f"the run's processes printed last: {lines[-1]} (--debug shows all)",) if lines else ()

@@ -92,6 +92,16 @@ class VirtualRobot:
         )
 
     @property
+    def cycles(self) -> int:
+        """How many cycles ran."""
+        return self.sinks.ran
+
+    @property
+    def skipped(self) -> int:
+        """How many periods were skipped."""
+        return self.sinks.skipped
+
+    @property
     def record(self) -> CycleRecord:
         """The memory of the cycle that ran last."""
         return self.robot.record
@@ -168,7 +178,7 @@ def run_virtual(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
                 sys.stderr.write(traceback.format_exc())
             result, refused = LoopResult(0, 0, "fault"), error.sentences
         except KeyboardInterrupt:
-            result = LoopResult(robot.sinks.ran, robot.sinks.skipped, "stopped")
+            result = LoopResult(robot.cycles, robot.skipped, "stopped")
     incomplete = [ledger.error] if ledger.error else []
     if robot.log_error:
         incomplete.append(incomplete_log(robot.log_error))

@@ -17,9 +17,9 @@ from functools import cache
 from typing import ClassVar, Protocol
 
 from dxlrun.errors import counted
-from dxlrun.run.channels.heartbeat import Step
+from dxlrun.run.channels.heartbeat import ControllerMethod
 
-_LOADING = int(Step.ON_CONFIGURE)
+_LOADING = int(ControllerMethod.ON_CONFIGURE)
 """The last step before the robot runs."""
 # found at once, twice a call
 _ident, _process = threading.get_ident, os.getpid
@@ -75,7 +75,7 @@ class Activity:
         """Name the controller in this place, before anything of it is called."""
         self._page.name_controller(place, name)
 
-    def begin(self, place: int, step: Step) -> None:
+    def begin(self, place: int, step: ControllerMethod) -> None:
         """Show what is called next; while the robot runs, refuse what it must not start."""
         self._page.call(place, step)
         if step > _LOADING:

@@ -16,7 +16,7 @@ from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.errors import ControllerFault
 from dxlrun.interfaces import Commands, Floats
 from dxlrun.run.channels.cycle import Clamp, CycleRecord
-from dxlrun.run.channels.heartbeat import Step
+from dxlrun.run.channels.heartbeat import ControllerMethod
 
 PERIOD_CAP = 5
 """A controller is never told a period longer than this many nominal ones: a law that integrates would jump.
@@ -72,7 +72,7 @@ class Managed:
         for claim in self._claimed:
             claim.forget()
         self.gather()
-        self._call(Step.ON_ACTIVATE, "", self._controller.on_activate, time_ns)
+        self._call(ControllerMethod.ON_ACTIVATE, "", self._controller.on_activate, time_ns)
         self._last_ns = -1
         self._due_number = 0
         self._held = False
@@ -82,7 +82,7 @@ class Managed:
     def deactivate(self, time_ns: int) -> None:
         """Let the controller let go. Raises ControllerFault; its joints are released all the same."""
         self.release()
-        self._call(Step.ON_DEACTIVATE, "", self._controller.on_deactivate, time_ns)
+        self._call(ControllerMethod.ON_DEACTIVATE, "", self._controller.on_deactivate, time_ns)
 
     def release(self) -> None:
         """Take its commands out of the robot's: the gate holds what it last let through."""
@@ -100,7 +100,9 @@ class Managed:
         self._held = False
         self.until_ns = until_ns
         self.gather()
-        self._call(Step.ON_COMMAND, f" ({kind})", self._controller.on_command, kind, data, time_ns)
+        self._call(
+            ControllerMethod.ON_COMMAND, f" ({kind})", self._controller.on_command, kind, data, time_ns
+        )
 
     def hold(self) -> None:
         """Take its commands out of the robot's, and update it no more, until the next command."""
@@ -139,7 +141,7 @@ class Managed:
         self._due_number = (number // self._every + 1) * self._every
         self.gather()
         capped_ns = min(period_ns, PERIOD_CAP * self._nominal_ns)
-        self._call(Step.UPDATE, "", self._controller.update, time_ns, capped_ns)
+        self._call(ControllerMethod.UPDATE, "", self._controller.update, time_ns, capped_ns)
         changed = [claim for claim in self._claimed if not claim.stands()]
         for claim in changed:
             np.isfinite(claim.own, self._finite)
@@ -170,7 +172,12 @@ class Managed:
         claim.seen |= self._finite
 
     def _call(
-        self, step: Step, what: str, call: Callable[P, object], *arguments: P.args, **named: P.kwargs
+        self,
+        step: ControllerMethod,
+        what: str,
+        call: Callable[P, object],
+        *arguments: P.args,
+        **named: P.kwargs,
     ) -> None:
         """Call a method of the controller. Raises ControllerFault for what it raises and what it starts."""
         self._activity.begin(self._place, step)

@@ -24,7 +24,7 @@ from dxlrun.run.channels.answers import Code, Field, Outcome, Refusal, Waiting
 from dxlrun.run.channels.commands import CommandSink, NoCommands, TakenCommand
 from dxlrun.run.channels.cycle import MOST_CONTROLLERS, CycleRecord
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
-from dxlrun.run.channels.heartbeat import Step
+from dxlrun.run.channels.heartbeat import ControllerMethod
 
 
 class Manager:
@@ -415,7 +415,7 @@ class Manager:
 
     def _configured(self, index: int, plan: ControllerPlan) -> Managed:
         self._activity.name_controller(index, plan.name)
-        self._activity.begin(index, Step.INIT)
+        self._activity.begin(index, ControllerMethod.INIT)
         try:
             controller = self._plugins.built(plan)
         finally:
@@ -425,7 +425,7 @@ class Manager:
         gathering = Gathering(self._record, rows)
         say, publish = self._sayer(plan.name), self._publisher(1 << index)
         context = new_context(plan, joints, gathering, period_ns=self._period_ns, say=say, publish=publish)
-        self._activity.begin(index, Step.ON_CONFIGURE)
+        self._activity.begin(index, ControllerMethod.ON_CONFIGURE)
         try:
             controller.on_configure(context)
         except (Exception, SystemExit) as error:  # foreign code: one sentence instead of its traceback

@@ -1,6 +1,6 @@
-"""Replay: the controllers of a log run again on what they were given then, and must want the same."""
+"""Replay: the controllers of a log run again on the inputs in it, and must command the same."""
 
-from dxlrun.log.replay.comparison import Difference, JointDifferences
-from dxlrun.log.replay.replay import ReplayReport, replay_log
+from dxlrun.log.replay.changes import Setting
+from dxlrun.log.replay.replay import JointDifferences, ReplayDifference, ReplayReport, replay_log
 
-__all__ = ["Difference", "JointDifferences", "ReplayReport", "replay_log"]
+__all__ = ["JointDifferences", "ReplayDifference", "ReplayReport", "Setting", "replay_log"]

@@ -1,23 +1,138 @@
-"""Inputs beside the servos': what clients asked of the loop, given to the same cycles again."""
+"""Recorded inputs: the clock, the servos and the clients of a loop, fed from a log; goals are taken by none.
+
+These are the seams of the loop: a replay changes nothing above them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import fields
 
-from dxlrun.errors import LogError
-from dxlrun.log.steered import Steered
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.control.loop import StopFlag
+from dxlrun.errors import LogError, PortError
+from dxlrun.interfaces import COMMAND_INTERFACES, States
+from dxlrun.log.client_commands import ClientCommand
 from dxlrun.run.channels.answers import Answer, Refusal
 from dxlrun.run.channels.commands import Command, TakenCommand
 from dxlrun.run.channels.cycle import CycleRecord
 
+_STATES = tuple(field.name for field in fields(States) if field.name != "motion")  # which shows three of them
+
+
+class RecordedClock:
+    """Time as the loop read it in the recorded run, at each place where it matters to controllers."""
+
+    __slots__ = ("_now_ns", "wake_ns")
+
+    def __init__(self, now_ns: int) -> None:
+        self._now_ns = now_ns
+        self.wake_ns = now_ns
+        """When the next wait ends."""
+
+    def now_ns(self) -> int:
+        """Return recorded time, ns."""
+        return self._now_ns
+
+    def wait_until(self, deadline_ns: int) -> int:
+        """Return when the loop woke then, ns."""
+        self._now_ns = self.wake_ns
+        return self._now_ns
+
+    def move(self, now_ns: int) -> None:
+        """Let it be `now_ns`."""
+        self._now_ns = now_ns
+
+
+class RecordedHardware:
+    """Servos with the states of the run, bit for bit, that take no goals; see `control.hardware`.
+
+    After each cycle it moves the clock to the deadline of the next recorded one, so that the loop skips the
+    periods that were skipped. After the cycle before number `ends` of them it asks the loop to stop: those
+    from there on are a policy's. After the last one there is no bus any more.
+    """
+
+    def __init__(
+        self,
+        cycles: NDArray[np.void],
+        activation: np.void,
+        record: CycleRecord,
+        clock: RecordedClock,
+        stop: StopFlag,
+        *,
+        ends: int,
+    ) -> None:
+        self._ends = ends
+        self._states = {name: np.ascontiguousarray(cycles[name]) for name in _STATES}
+        self._due, self._woken, self._read, self._written = (
+            cycles[name].tolist() for name in ("scheduled_ns", "woken_ns", "read_ns", "written_ns")
+        )
+        self._activation = activation
+        self._record = record
+        self._clock = clock
+        self._stop = stop
+        self._index = 0
+
+    def start(self) -> None:
+        """Fill states and goals with those of the activation."""
+        record = self._record
+        for name in _STATES:
+            np.copyto(getattr(record.states, name), self._activation[name])
+        for interface in COMMAND_INTERFACES:
+            np.copyto(getattr(record.goals, interface), self._activation[f"goal_{interface}"])
+
+    def idle(self, until_ns: int) -> None:
+        """Let the coming wait end when it ended then. Raises PortError behind the last cycle."""
+        if self._index == len(self._woken):
+            raise PortError("the log ends")
+        self._clock.wake_ns = self._woken[self._index]
+
+    def read(self) -> None:
+        """Fill the states of this cycle."""
+        for name in _STATES:
+            np.copyto(getattr(self._record.states, name), self._states[name][self._index])
+        self._clock.move(self._read[self._index])
+
+    def write(self) -> None:
+        """Take no goals: go to where the next cycle was due."""
+        following = self._index + 1
+        if following < len(self._due):
+            self._clock.move(self._due[following])
+        else:
+            self._clock.move(self._written[self._index])
+        if following == self._ends:
+            self._stop.request()
+        self._index = following
+
+    def set_modes(self, modes: NDArray[np.uint8]) -> None:
+        """Switch nothing: the states have the mode of each servo."""
+
+    def set_register(self, row: int, item: str, value: int, done: Callable[[str], None]) -> None:
+        """Write nothing and report nothing: the states have the result."""
+
+    def limit_torque(self, fraction: float) -> None:
+        """Limit nothing: the states have the result."""
+
+    def stop(self) -> tuple[str, ...]:
+        """Do nothing: no servo has torque."""
+        return ()
+
+    def let_go(self, rows: Sequence[int]) -> None:
+        """Do nothing: the states have the result."""
+
+    def release(self) -> None:
+        """Do nothing: no servo holds."""
+
 
 class RecordedInbox:
-    """Where the loop finds in each cycle what it found then, however much that was.
+    """Gives each cycle the commands that it took in the run, however many.
 
     `remarks`: a sentence for each command that was done in the run and is refused now, or the other way.
     """
 
-    def __init__(self, steered: Iterable[Steered], record: CycleRecord) -> None:
+    def __init__(self, steered: Iterable[ClientCommand], record: CycleRecord) -> None:
         self.remarks: list[str] = []
         self._steered = tuple(steered)
         self._answered: set[int] = set()
@@ -44,16 +159,17 @@ class RecordedInbox:
             return
         command = then.command
         what = f"{command.kind} for {command.controller or 'the loop'} in cycle {command.cycle}"
-        was, now = (one or "done" for one in (then.refusal, refusal))
-        self.remarks.append(f"{what} was {_told(was)} in the run and is {_told(now)} in the replay")
+        self.remarks.append(
+            f"{what} was {_outcome(then.refusal)} in the run and is {_outcome(refusal)} in the replay"
+        )
 
 
-def _told(outcome: str) -> str:
-    return outcome if outcome == "done" else f"refused ({outcome})"
+def _outcome(refusal: str) -> str:
+    return f"refused ({refusal})" if refusal else "done"
 
 
 class PlannedCommands:
-    """Takes what the replayed loop hands over; a planned command belongs into the cycle that took it then."""
+    """Checks that each planned command is taken by the same cycle as in the run."""
 
     def __init__(self, commands: Iterable[TakenCommand], log: str) -> None:
         self._log = log

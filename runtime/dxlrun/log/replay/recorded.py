@@ -16,8 +16,8 @@ from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.loop_plan import LoopPlan
 from dxlrun.control.policy_plan import PolicyName, PolicyPlan
 from dxlrun.errors import LogError
+from dxlrun.log.client_commands import ClientCommand, client_commands, policy_begun, unlogged_commands
 from dxlrun.log.reader import UNREADABLE, Log
-from dxlrun.log.steered import Steered, policy_begun, steered, untold
 from dxlrun.run.channels.commands import TakenCommand
 from dxlrun.run.channels.events import EventCode
 
@@ -46,7 +46,7 @@ class RecordedPlan:
 
 
 @dataclass(frozen=True, slots=True)
-class Recorded:
+class RecordedInputs:
     """The inputs of one run."""
 
     log: Path
@@ -58,8 +58,8 @@ class Recorded:
     """States and goals when the controllers were activated."""
     start_ns: int
     """Deadline of cycle 0."""
-    steered: tuple[Steered, ...]
-    """What clients asked of the loop."""
+    steered: tuple[ClientCommand, ...]
+    """The commands from outside."""
     commands: tuple[TakenCommand, ...]
     """All that cycles took."""
     ends: int
@@ -73,7 +73,7 @@ class Recorded:
     remarks: tuple[str, ...]
 
 
-def recorded(log: Log) -> Recorded:
+def recorded(log: Log) -> RecordedInputs:
     """Return the inputs that a log holds. Raises LogError when it does not hold them from the start."""
     plan = _plan(log)
     cycles, path = log.cycles, log.path
@@ -97,13 +97,13 @@ def recorded(log: Log) -> Recorded:
     usable, stopped = _until_gap(log)
     usable, ends, stopped = _until_policy(log, usable, stopped)
     remarks = () if log.complete else log.damage
-    return Recorded(
+    return RecordedInputs(
         log=path,
         plan=plan,
         loop=_loop(log, plan.loop),
         activation=activation,
         start_ns=start_ns,
-        steered=steered(log),
+        steered=client_commands(log),
         commands=log.commands,
         ends=ends,
         cycles=cycles[:usable],
@@ -140,7 +140,7 @@ def _plan(log: Log) -> RecordedPlan:
         )
     data = log.attachments.get(PLAN)
     if data is None:
-        raise LogError(f"{log.path}: the log has no attachment {PLAN}, so nobody knows its controllers")
+        raise LogError(f"{log.path}: the log has no attachment {PLAN}, so its controllers are unknown")
     try:
         plan = msgspec.json.decode(data, type=RecordedPlan)
     except UNREADABLE as error:
@@ -231,7 +231,7 @@ def _until_gap(log: Log) -> tuple[int, str]:
         if command.cycle in at and not command.for_loop:
             held[at[command.cycle]] += 1
     missing = held < cycles["command_count"]
-    missing[[at[cycle] for cycle in untold(log)]] = True
+    missing[[at[cycle] for cycle in unlogged_commands(log)]] = True
     short = np.flatnonzero(missing)
     if len(short) and int(short[0]) < usable:
         usable = int(short[0])

@@ -1,4 +1,4 @@
-"""Replay: the same manager, gate and loop on a log's inputs; the report on what was wanted otherwise."""
+"""Replay: manager, gate and loop of a run on the inputs in its log, compared bit by bit."""
 
 from __future__ import annotations
 
@@ -6,25 +6,67 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.controllers.plugins import PlugIns, load_plugins
 from dxlrun.control.gate import Gate
 from dxlrun.control.loop import Loop, LoopResult, StopFlag
 from dxlrun.control.loop_plan import LoopPlan
-from dxlrun.errors import counted
+from dxlrun.errors import LogError, counted
+from dxlrun.interfaces import COMMAND_INTERFACES, Floats
 from dxlrun.log.reader import read_log
 from dxlrun.log.replay.changes import Setting, with_arguments, with_settings
-from dxlrun.log.replay.comparison import Comparison, Difference, JointDifferences
-from dxlrun.log.replay.hardware import RecordedClock, RecordedHardware
-from dxlrun.log.replay.inputs import PlannedCommands, RecordedInbox
-from dxlrun.log.replay.recorded import Recorded, recorded, version_remarks
+from dxlrun.log.replay.inputs import PlannedCommands, RecordedClock, RecordedHardware, RecordedInbox
+from dxlrun.log.replay.recorded import RecordedInputs, recorded, version_remarks
 from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
 from dxlrun.run.channels.events import EventCode, Severity
+
+_COMMANDS = tuple(f"command_{interface}" for interface in COMMAND_INTERFACES)
+_GOALS = tuple(f"goal_{interface}" for interface in COMMAND_INTERFACES)
+_COMPARED = (*_COMMANDS, *_GOALS)
+"""In the order in which they are computed: what differs first is the cause of the rest."""
+_WHAT = {
+    **{f"command_{interface}": f"command of the {interface}" for interface in COMMAND_INTERFACES},
+    **{
+        f"goal_{interface}": f"goal of the {interface}, after the last gate"
+        for interface in COMMAND_INTERFACES
+    },
+}
+_Words = NDArray[np.uint64]
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayDifference:
+    """One value that is not the same."""
+
+    cycle: int
+    time_s: float
+    """Of the cycle's wake-up, since the loop's first deadline."""
+    what: str
+    """`command of the position`, `goal of the velocity ...`, `active`."""
+    joint: str | None
+    """None: a controller was active in one of the two and not in the other."""
+    controller: str | None
+    """The one that claims the joint; None when none does."""
+    recorded: str
+    """The shortest number with these bits, and the bits where they are not a finite number's."""
+    replayed: str
+
+
+@dataclass(frozen=True, slots=True)
+class JointDifferences:
+    """In how many cycles one joint's values differ."""
+
+    joint: str
+    commands: int
+    goals: int
 
 
 @dataclass(frozen=True, slots=True)
 class ReplayReport:
-    """What `dxlrun replay` says about a log."""
+    """The result of `dxlrun replay`."""
 
     log: str
     robot: str
@@ -33,7 +75,7 @@ class ReplayReport:
     compared: int
     different: int
     """Cycles in which anything differs."""
-    first: Difference | None
+    first: ReplayDifference | None
     joints: tuple[JointDifferences, ...]
     """Those of which anything differs."""
     fault: str
@@ -71,7 +113,7 @@ class _Silence:
 def replay_log(
     log: Path, settings: Sequence[Setting] = (), arguments: Mapping[str, str] | None = None
 ) -> ReplayReport:
-    """Run the controllers of a log on its inputs and compare what they want; changes are made before.
+    """Run the controllers of a log on its inputs and compare what they command; changes are made before.
 
     Raises LogError when the log does not hold the inputs, PlugInError when a controller is not to be had,
     InputError when a change does not fit, ControllerFault when a controller cannot be configured.
@@ -98,7 +140,7 @@ def replay_log(
 
 
 def _run(
-    inputs: Recorded, plan: LoopPlan, plugins: PlugIns
+    inputs: RecordedInputs, plan: LoopPlan, plugins: PlugIns
 ) -> tuple[Comparison, LoopResult, tuple[str, ...]]:
     """Put recorded hardware, clock and clients into the loop that runs robots, and run it."""
     names = tuple(joint.name for joint in plan.joints)
@@ -109,7 +151,7 @@ def _run(
     taken = PlannedCommands(inputs.commands, str(inputs.log))
     manager = Manager(plan, plugins, record, events, clock, commands=taken)
     inbox = RecordedInbox(inputs.steered, record)
-    comparison = Comparison(plan, inputs.cycles, inputs.start_ns, lambda: manager.plans)
+    comparison = Comparison(plan, inputs.cycles, inputs.start_ns, manager)
     loop = Loop(
         clock=clock,
         hardware=hardware,
@@ -127,3 +169,125 @@ def _run(
     hardware.start()
     result = loop.run()
     return comparison, result, tuple(inbox.remarks)
+
+
+class Comparison:
+    """The sink of a replayed loop: compares each cycle as it comes; NaN and zero by their bits too."""
+
+    def __init__(
+        self,
+        plan: LoopPlan,
+        cycles: NDArray[np.void],
+        start_ns: int,
+        manager: Manager,
+    ) -> None:
+        self.first: ReplayDifference | None = None
+        self._plan = plan
+        self._manager = manager
+        self._cycles = cycles
+        self._start_ns = start_ns
+        self._recorded: dict[str, _Words] = {
+            name: np.ascontiguousarray(cycles[name]).view("<u8") for name in _COMPARED
+        }
+        self._differs = {name: np.zeros(bits.shape, dtype=np.bool_) for name, bits in self._recorded.items()}
+        self._activity = np.zeros(len(cycles), dtype=np.bool_)
+        self._index = 0
+
+    @property
+    def compared(self) -> int:
+        """Number of cycles that were compared."""
+        return self._index
+
+    @property
+    def different(self) -> int:
+        """In how many cycles anything differs."""
+        any_of = self._activity.copy()
+        for differs in self._differs.values():
+            any_of |= differs.any(axis=1)
+        return int(np.count_nonzero(any_of))
+
+    def joints(self) -> tuple[JointDifferences, ...]:
+        """Return the joints of which anything differs, in the order of rows."""
+        differs = self._differs
+        commands, goals = (
+            np.logical_or.reduce([differs[name] for name in names]).sum(axis=0)
+            for names in (_COMMANDS, _GOALS)
+        )
+        return tuple(
+            JointDifferences(joint.name, int(command), int(goal))
+            for joint, command, goal in zip(self._plan.joints, commands, goals, strict=True)
+            if command or goal
+        )
+
+    def begin(self, record: CycleRecord) -> None:
+        """Nothing was commanded yet."""
+
+    def append(self, record: CycleRecord) -> None:
+        """Compare one finished cycle. Raises LogError when its inputs are not the recorded ones."""
+        index = self._index
+        row = self._cycles[index]
+        if record.cycle == row["cycle"] and record.scheduled_ns != row["scheduled_ns"]:
+            raise LogError(
+                f"cycle {record.cycle} was due {self._since_start(int(row['scheduled_ns']))} in the run and "
+                f"{self._since_start(record.scheduled_ns)} in the replay: a change of the rate in the log is "
+                "not the one that was made, or the dxlrun that made the log counts in another way"
+            )
+        if record.cycle != row["cycle"] or record.period_ns != row["period_ns"]:
+            raise LogError(
+                f"cycle {int(row['cycle'])} was given a period of {int(row['period_ns'])} ns in the run and "
+                f"cycle {record.cycle} {record.period_ns} ns in the replay: the log is damaged, or was made "
+                "by a dxlrun whose loop counts in another way"
+            )
+        active = record.active & 0xFFFFFFFFFFFFFFFF
+        if active != int(row["active"]):
+            self._activity[index] = True
+            self.first = self.first or self._of_activity(index, active)
+        for name, values in zip(_COMPARED, _values(record), strict=True):
+            bits: _Words = values.view(np.uint64)
+            np.not_equal(bits, self._recorded[name][index], out=self._differs[name][index])
+            if self.first is None and self._differs[name][index].any():
+                self.first = self._of_joint(index, name, bits, active)
+        self._index += 1
+
+    def _since_start(self, time_ns: int) -> str:
+        return f"at {(time_ns - self._start_ns) * 1e-9:.6f} s"
+
+    def _of_activity(self, index: int, active: int) -> ReplayDifference:
+        recorded = int(self._cycles["active"][index])
+        changed = recorded ^ active
+        bit = (changed & -changed).bit_length() - 1
+        states = [("active" if mask >> bit & 1 else "not active") for mask in (recorded, active)]
+        cycle, time_s = self._when(index)
+        plans = self._manager.plans
+        # one that the replay could not load has no name here
+        name = plans[bit].name if bit < len(plans) else f"number {bit}, loaded in the run"
+        return ReplayDifference(cycle, time_s, "active", None, name, *states)
+
+    def _of_joint(self, index: int, name: str, bits: _Words, active: int) -> ReplayDifference:
+        row = int(np.argmax(self._differs[name][index]))
+        joint = self._plan.joints[row].name
+        cycle, time_s = self._when(index)
+        both = active | int(self._cycles["active"][index])
+        owner = self._owner(joint, both)
+        values = [_shortest(int(words[row])) for words in (self._recorded[name][index], bits)]
+        return ReplayDifference(cycle, time_s, _WHAT[name], joint, owner, *values)
+
+    def _when(self, index: int) -> tuple[int, float]:
+        row = self._cycles[index]
+        return int(row["cycle"]), (int(row["woken_ns"]) - self._start_ns) * 1e-9
+
+    def _owner(self, joint: str, active: int) -> str | None:
+        for bit, controller in enumerate(self._manager.plans):
+            if active >> bit & 1 and controller.command and joint in controller.joints:
+                return controller.name
+        return None
+
+
+def _values(record: CycleRecord) -> tuple[Floats, ...]:
+    return *record.commands.values, *record.goals.values
+
+
+def _shortest(bits: int) -> str:
+    """Return a number as text from which its bits can be read again; a bare `nan` would hide its payload."""
+    value = float(np.uint64(bits).view(np.float64))
+    return repr(value) if np.isfinite(value) else f"{value} (bits {bits:#018x})"

@@ -34,7 +34,7 @@ class Phase(IntEnum):
 
 
 @unique
-class Step(IntEnum):
+class ControllerMethod(IntEnum):
     """What of a controller is called."""
 
     NONE = 0
@@ -46,7 +46,7 @@ class Step(IntEnum):
     ON_DEACTIVATE = 6
 
     def __str__(self) -> str:
-        return "__init__" if self is Step.INIT else self.name.lower()
+        return "__init__" if self is ControllerMethod.INIT else self.name.lower()
 
 
 def create() -> int:
@@ -104,7 +104,7 @@ class Heartbeat:
         if not step:
             return ""
         name = bytes(self._memory[_NAMES + place * _NAME_BYTES :][:_NAME_BYTES]).rstrip(b"\0")
-        return f"{Step(step)} of controller {name.decode(errors='replace')}"
+        return f"{ControllerMethod(step)} of controller {name.decode(errors='replace')}"
 
     @property
     def looks(self) -> int:

@@ -1,4 +1,4 @@
-"""What was steered, as a log tells it: each command from outside, and what became of it."""
+"""Commands from outside in a log, each with the reason for which it was refused, if it was."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ _LOOP = "loop"
 
 
 @dataclass(frozen=True, slots=True)
-class Steered:
-    """One command that no plan foresaw."""
+class ClientCommand:
+    """One command that is not in the plan."""
 
     command: TakenCommand
     refusal: str
-    """Why nothing was done; empty where it was done, or where the event that tells it is lost."""
+    """Why nothing was done; empty where it was done, or where the event with the refusal is lost."""
 
 
-def steered(log: Log) -> tuple[Steered, ...]:
-    """Return every command that came from outside, with what became of it, in the order of the cycles."""
-    told = _told(log)
+def client_commands(log: Log) -> tuple[ClientCommand, ...]:
+    """Return every command that came from outside, in the order of the cycles."""
+    answers = _answers(log)
     last = policy_begun(log)
     found = []
     for command in log.commands:
         if command.planned < 0 and command is not last:
-            found.append(Steered(command, _refusal(command, told.get(command.cycle, deque()))))
+            found.append(ClientCommand(command, _refusal(command, answers.get(command.cycle, deque()))))
     return tuple(found)
 
 
 def policy_begun(log: Log) -> TakenCommand | None:
-    """Return what tells in which cycle the steps of a policy begin; None where no policy had any.
+    """Return the loop's own record of the cycle in which a policy's steps begin; None: no policy had any.
 
-    The loop says it before that cycle wakes up; a client's command of this kind has the cycle's own time.
+    Its time is before that cycle's wake-up; a client's command of this kind has the cycle's own time.
     """
     last = log.commands[-1] if log.commands else None
     if last is None or not last.for_loop or (last.kind, last.origin) != (POLICY, _LOOP):
@@ -50,8 +50,8 @@ def policy_begun(log: Log) -> TakenCommand | None:
     return None if len(woken) and int(woken[0]) <= last.t_ns else last
 
 
-def untold(log: Log) -> tuple[int, ...]:
-    """Return the cycles of which events tell more commands for the loop than the log has."""
+def unlogged_commands(log: Log) -> tuple[int, ...]:
+    """Return the cycles whose events answer more commands for the loop than the log has."""
     named_loop = any(controller.name == _LOOP for controller in log.controllers)
     held: dict[int, int] = {}
     for command in log.commands:
@@ -59,33 +59,33 @@ def untold(log: Log) -> tuple[int, ...]:
             held[command.cycle] = held.get(command.cycle, 0) + 1
     missing = (
         cycle
-        for cycle, events in _told(log).items()
+        for cycle, events in _answers(log).items()
         if sum(event.source == _LOOP for event in events) > held.get(cycle, 0)
     )
     return tuple(sorted(missing))
 
 
-def _told(log: Log) -> dict[int, deque[Event]]:
+def _answers(log: Log) -> dict[int, deque[Event]]:
     """Return the events that answer commands, by the cycle in which they happened."""
     woken, updated, numbers = (log.cycles[name] for name in ("woken_ns", "updated_ns", "cycle"))
-    told: dict[int, deque[Event]] = {}
+    answers: dict[int, deque[Event]] = {}
     for event in log.events:
         if event.code not in (EventCode.STEERED, EventCode.COMMAND_REFUSED):
             continue
         index = int(np.searchsorted(woken, event.t_ns, side="right")) - 1
         if index >= 0 and event.t_ns <= updated[index]:
-            told.setdefault(int(numbers[index]), deque()).append(event)
-    return told
+            answers.setdefault(int(numbers[index]), deque()).append(event)
+    return answers
 
 
-def _refusal(command: TakenCommand, told: deque[Event]) -> str:
+def _refusal(command: TakenCommand, answers: deque[Event]) -> str:
     """Take the answer to a command out of those of its cycle; a controller's is there only if it refused."""
     source = command.controller or _LOOP
-    for event in told:
+    for event in answers:
         outcome = _outcome(event, command)
         if event.source != source or (outcome.kind, outcome.origin) != (command.kind, command.origin):
             continue
-        told.remove(event)
+        answers.remove(event)
         return outcome.refusal.text if outcome.refusal else ""
     return ""
 
