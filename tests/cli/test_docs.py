@@ -201,6 +201,19 @@ def test_a_log_is_compared_with_its_ledger_as_the_page_says(dxlrun: Dxlrun, clon
     assert re.match(r"The log is what (the bus|all \d+ buses) saw, to the byte", result.out)
 
 
+def test_analyze_md_its_commands_read_logs(dxlrun: Dxlrun, clone: Path) -> None:
+    lines = [line for line in commands("analyze.md") if "--ledger" not in line]
+    assert len(lines) == 3
+    for _ in range(2):
+        assert dxlrun("robots/single_joint.yaml", "--virtual", "--duration", "0.5").code == 0
+    logs = sorted(str(path) for path in (clone / "logs").glob("*.mcap"))
+    for line in lines:
+        words = shlex.split(line)[1:]
+        given = [one for word in words for one in {"LOG": logs[:1], "logs/*.mcap": logs}.get(word, [word])]
+        assert dxlrun(*given).code == 0, line
+    assert (clone / "run.html").exists()
+
+
 @pytest.mark.parametrize("robot", sorted((ROOT / "robots").glob("*.yaml")), ids=lambda path: path.stem)
 def test_every_robot_of_the_clone_is_checked_and_runs(
     dxlrun: Dxlrun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, robot: Path
