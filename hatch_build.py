@@ -1,7 +1,7 @@
 """Build hook: compiles the exchange's kernel where a C compiler is found, else leaves it out.
 
 `pip install .` is one command in both cases. Without the kernel every cycle goes through the parser in
-Python; `dxlrun doctor` and the log say which of the two is in use. The object carries a checksum of
+Python; `dxlrun doctor` and the log show which of the two is in use. The object carries a checksum of
 its source, so that an old one is never used.
 """
 
@@ -25,7 +25,7 @@ FLAGS = ("-std=c11", "-O2", "-fPIC", "-shared", "-ffp-contract=off", "-Wall", "-
 
 
 def compile_kernel(root: Path) -> Path | None:
-    """Compile the kernel; return where it is, None where that was not possible."""
+    """Compile the kernel; return its path, None where that is not possible."""
     found = os.environ.get("CC") or shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
     compiler = shlex.split(found or "")  # CC may have options, or a compiler cache in front
     source, target = root / FOLDER / "kernel.c", root / FOLDER / "libkernel.so"

@@ -1,4 +1,4 @@
-"""dxlrun: what the author of a plug-in needs, and who steers a running robot; nothing else.
+"""dxlrun: the names for authors of plug-ins and for programs that steer a running robot; nothing else.
 
 `import dxlrun` is light: each name is imported when it is first used, so that neither numpy nor pydantic is
 loaded for a command line that only prints its help.

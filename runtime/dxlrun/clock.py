@@ -45,7 +45,7 @@ class MonotonicClock:
 
 
 class VirtualClock:
-    """Time that passes only when somebody waits; two runs from one seed see the same times."""
+    """Time that passes only by waiting; two runs from one seed have the same times."""
 
     __slots__ = ("_now_ns",)
 

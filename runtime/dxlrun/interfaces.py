@@ -28,10 +28,10 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class States:
-    """What the servos said: one row a joint; an invalid row keeps its last values and its age grows."""
+    """States of the joints: one row a joint; an invalid row keeps its last values and its age grows."""
 
     motion: Floats
-    """Shape (3, joints): position, velocity and effort, for whoever wants them at once."""
+    """Shape (3, joints): position, velocity and effort, for use all at once."""
     position: Floats = field(init=False)
     velocity: Floats = field(init=False)
     effort: Floats = field(init=False)
@@ -68,13 +68,13 @@ class States:
 
 @dataclass(frozen=True, slots=True)
 class Commands:
-    """What somebody wants of the joints: one row a joint, NaN = not commanded.
+    """Commands of the joints: one row a joint, NaN = not commanded.
 
     Which of them count depends on the joint's mode, see `mode_of`.
     """
 
     values: Floats
-    """Shape (4, joints): all of them, in the order of COMMAND_INTERFACES, for whoever wants them at once."""
+    """Shape (4, joints): all of them, in the order of COMMAND_INTERFACES, for use all at once."""
     position: Floats = field(init=False)
     """rad"""
     velocity: Floats = field(init=False)

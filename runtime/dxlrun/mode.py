@@ -1,6 +1,6 @@
-"""Modes: what a servo makes of its goals, and which command interfaces go together.
+"""Modes: what a servo does with its goals, and which command interfaces go together.
 
-Without numpy, because the guardian reads a bus' plan and shall be light.
+Without numpy: the guardian reads a bus' plan and is light.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from enum import IntEnum, unique
 
 @unique
 class Mode(IntEnum):
-    """What a servo makes of its goals; the number is in the log."""
+    """What a servo does with its goals; the number is in the log."""
 
     UNKNOWN = 0
     """Not known, or changing now: the joint gets no goals."""

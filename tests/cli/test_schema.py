@@ -13,9 +13,8 @@ from pydantic import BaseModel
 
 from dxlrun.cli.app import run_tokens
 from dxlrun.cli.examples import schema_text
+from dxlrun.description.document import grow, literal, parse
 from dxlrun.description.json_schema import robot_schema
-from dxlrun.description.source.syntax import parse
-from dxlrun.description.source.tree import grow, literal
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 ROBOT = """\

@@ -11,20 +11,23 @@ import pytest
 from dxlrun.description.bus import Adapter, Bus, BusSimulation, SlowRegisters
 from dxlrun.description.form import Form
 from dxlrun.description.motion import Formula, FormulaPart, Motion, Point, PointsPart, Target
-from dxlrun.description.policies import GroupPolicies, Policies, PoseStep, TorqueStep
 from dxlrun.description.robot import (
     ControllerEntry,
     Gateway,
+    GroupPolicies,
     Joint,
     JointSimulation,
     Limits,
     Loop,
+    Policies,
+    PoseStep,
     Processes,
     Recording,
     Robot,
     RobotModel,
     Scheduler,
     Simulation,
+    TorqueStep,
 )
 
 PAGE = (Path(__file__).parents[2] / "docs" / "robot-file.md").read_text()

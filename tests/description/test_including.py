@@ -9,10 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dxlrun.description.source.including import MOST_FILES, MOST_LEVELS, merged
-from dxlrun.description.source.marks import KeyPath
-from dxlrun.description.source.syntax import parse
-from dxlrun.description.source.tree import grow, literal
+from dxlrun.description.document import KeyPath, grow, literal, parse
+from dxlrun.description.including import MOST_FILES, MOST_LEVELS, merged
 from dxlrun.errors import Mark
 
 HEAD = """\

@@ -48,7 +48,7 @@ DAMAGES = [
     ("time: 1 s", "time: §1", "motions[0].points[0].time: 1 has no unit; write a duration"),
     ("position: 90 deg", "position: §90", "motions[0].points[0].joints.yaw.position: 90 has no unit; write an"),
     ("velocity: 0.5 rad/s", "velocity: §0.5 rad", "motions[0].points[0].joints.yaw.velocity: '0.5 rad' has the unit"),
-    ("{position: 0 rad}", "§{}", "motions[0].points[0].joints.pitch: the target says nothing; give it"),
+    ("{position: 0 rad}", "§{}", "motions[0].points[0].joints.pitch: the target is empty; give it"),
     ("{time: 2 s, ", "§{", "motions[0].points[1] has no time; add `time: 1 s`"),
     ("{time: 2 s, ", "{time: 2 s, §tiem: 3, ", "motions[0].points[1] has an unknown key 'tiem'; did you mean time?"),
     ("start: 500 ms", "§samples: 5", "motions[0].samples is not possible; a part has either points, or"),

@@ -8,8 +8,7 @@ import pytest
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from dxlrun.description import Marks, problems_of
-from dxlrun.description.source.syntax import parse
-from dxlrun.description.source.tree import grow, literal
+from dxlrun.description.document import grow, literal, parse
 from dxlrun.description.units import Angle
 
 

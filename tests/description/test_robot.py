@@ -10,8 +10,17 @@ from pydantic import ValidationError
 
 from dxlrun.description.bus import Adapter, Bus
 from dxlrun.description.form import Form
-from dxlrun.description.policies import Policies, PoseStep, TorqueStep
-from dxlrun.description.robot import ControllerEntry, Joint, Limits, Loop, Robot, Scheduler
+from dxlrun.description.robot import (
+    ControllerEntry,
+    Joint,
+    Limits,
+    Loop,
+    Policies,
+    PoseStep,
+    Robot,
+    Scheduler,
+    TorqueStep,
+)
 from dxlrun.errors import Mark
 
 DAMAGES = [

@@ -9,7 +9,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dxlrun.description.source.scalars import plain_value, text_of
+from dxlrun.description.document import plain_value, text_of
 
 
 @pytest.mark.parametrize("text", ["yes", "no", "on", "off", "y", "Yes", "OFF", "tRUE", "nUll", "1:30", "190:20:30",

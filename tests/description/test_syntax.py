@@ -11,10 +11,8 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dxlrun.description import read_robot
-from dxlrun.description.source import syntax
-from dxlrun.description.source.scalars import plain_value
-from dxlrun.description.source.tree import grow, literal
+from dxlrun.description import document, read_robot
+from dxlrun.description.document import grow, literal, plain_value
 from dxlrun.errors import InputError, Mark
 
 WRONG = [
@@ -44,7 +42,7 @@ WRONG = [
 @pytest.fixture(params=["CSafeLoader", "SafeLoader"])
 def loader(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     # where PyYAML was built without libyaml, the same file must give the same answer
-    monkeypatch.setattr(syntax, "_Loader", getattr(yaml, request.param))
+    monkeypatch.setattr(document, "_Loader", getattr(yaml, request.param))
 
 
 @pytest.mark.usefixtures("loader")
@@ -57,7 +55,7 @@ def test_a_syntax_error_is_one_problem_in_plain_words(desk: Any, text: str, what
 
 @pytest.mark.usefixtures("loader")
 def test_quotes_decide_between_text_and_number() -> None:
-    tree = syntax.parse("a: 5\nb: '5'\nc: \"5\"\nd: |\n  5\n", "f")
+    tree = document.parse("a: 5\nb: '5'\nc: \"5\"\nd: |\n  5\n", "f")
     assert grow(tree, "f", literal).data == {"a": 5, "b": "5", "c": "5", "d": "5\n"}
 
 
@@ -114,7 +112,7 @@ def test_duplicate_merge_empty_and_compound_keys_are_refused_together(desk: Any,
 
 
 def test_an_anchor_may_be_used_and_stands_where_it_was_written() -> None:
-    grown = grow(syntax.parse("a: &x {b: 1}\nc: *x\n", "f"), "f", literal)
+    grown = grow(document.parse("a: &x {b: 1}\nc: *x\n", "f"), "f", literal)
     assert grown.data == {"a": {"b": 1}, "c": {"b": 1}}
     assert grown.marks.value("c", "b") == Mark("f", 1, 11)
 
@@ -122,7 +120,7 @@ def test_an_anchor_may_be_used_and_stands_where_it_was_written() -> None:
 @pytest.mark.usefixtures("loader")
 def test_an_anchor_bomb_is_refused_before_it_grows(desk: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        "dxlrun.description.source.tree.MOST_NODES", 10_000
+        "dxlrun.description.document.MOST_NODES", 10_000
     )  # the true limit takes seconds to reach
     lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
     lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 20)]
@@ -156,7 +154,7 @@ def test_size_and_number_of_values_are_limited(desk: Any) -> None:
 @given(st.text(alphabet="ab:-[]{}&*!'\"|>#%@ \n\t,?${}<01~.", max_size=60))
 def test_any_text_gives_a_tree_or_one_refusal(text: str) -> None:
     try:
-        grown = grow(syntax.parse(text, "f"), "f", literal)
+        grown = grow(document.parse(text, "f"), "f", literal)
     except InputError as error:
         refused = error.problems
     else:
@@ -177,7 +175,7 @@ def test_any_text_gives_a_tree_or_one_refusal(text: str) -> None:
     max_leaves=10), min_size=1, max_size=4))  # fmt: skip
 def test_what_a_foreign_writer_wrote_reads_back_with_marks_at_the_values(data: dict[str, object]) -> None:
     text = yaml.safe_dump(data)
-    grown = grow(syntax.parse(text, "f"), "f", literal)
+    grown = grow(document.parse(text, "f"), "f", literal)
     assert grown.data == data
     lines = text.split("\n")
     for path, mark in grown.marks.values.items():

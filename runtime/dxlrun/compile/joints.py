@@ -13,8 +13,8 @@ from dxlrun.compile.problems import Problems
 from dxlrun.compile.registers import compile_registers
 from dxlrun.control.loop_plan import JointPlan
 from dxlrun.description import Description
+from dxlrun.description.document import read_text
 from dxlrun.description.robot import Joint
-from dxlrun.description.source.syntax import read_text
 from dxlrun.description.units import EffortUnit
 from dxlrun.dynamixel.control_table import ControlTable, control_table, perhaps_meant, protocols_of
 from dxlrun.dynamixel.plan.bus_plan import RegisterValue

@@ -29,7 +29,7 @@ from dxlrun.control.controllers.controller import Controller
 from dxlrun.control.loop_plan import ScheduledCommand
 from dxlrun.description import MotionDescription
 from dxlrun.description.motion import FormulaPart, PointsPart
-from dxlrun.description.source.problems import sentences_of
+from dxlrun.description.problems import sentences_of
 from dxlrun.errors import Mark, suggestion
 
 TRAJECTORY = "trajectory"

@@ -20,7 +20,7 @@ from dxlrun.control.policy_plan import (
     longest_pose_ns,
 )
 from dxlrun.description import Description
-from dxlrun.description.policies import PoseStep, TorqueStep
+from dxlrun.description.robot import PoseStep, TorqueStep
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.errors import suggestion
 

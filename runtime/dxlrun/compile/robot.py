@@ -17,13 +17,14 @@ from dxlrun.compile.problems import Problems, independent_errors, left_out_names
 from dxlrun.compile.simulation import compile_simulation
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.control.loop_plan import MOST_SHARE, LoopPlan, SchedulerPlan
-from dxlrun.description import Description, MotionDescription, Survey, read_motion, survey_robot
+from dxlrun.description.reading import Description, Survey, survey_robot
 from dxlrun.description.robot import Loop
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.errors import InputError, Problem
 
 if TYPE_CHECKING:
     from dxlrun.compile.report import CheckReport
+    from dxlrun.description import MotionDescription
 
 Ask: TypeAlias = Callable[[Sequence[BusPlan], Sequence[str]], Mapping[str, str]]
 """Read the models of the servos of joints: takes the buses and the joints, returns models by joint."""
@@ -71,6 +72,8 @@ def compile_files(
     except InputError as error:
         problems += _placed(error)
     for path in motions:
+        from dxlrun.description.motion import read_motion  # not above: most checks and runs play none
+
         try:
             read.append(read_motion(path))
         except InputError as error:
@@ -144,7 +147,7 @@ def compile_robot(
     policies = compile_policies(description, joints, buses, problems)
     parts: list[MotionPart] = []
     if motions:
-        from dxlrun.compile.motions import compile_motion  # not above: most checks and runs play none
+        from dxlrun.compile.motions import compile_motion  # as above
 
         names = (*description.robot.controllers, *left_out_names(description, "controllers"))
         for motion in motions:

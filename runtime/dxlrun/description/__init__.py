@@ -7,18 +7,16 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from dxlrun.description import units
-    from dxlrun.description.motion import Motion
+    from dxlrun.description.document import KeyPath, Marks
+    from dxlrun.description.motion import Motion, MotionDescription, read_motion
+    from dxlrun.description.problems import problems_of
     from dxlrun.description.reading import (
         Description,
-        MotionDescription,
         Survey,
-        read_motion,
         read_robot,
         survey_robot,
     )
     from dxlrun.description.robot import Robot
-    from dxlrun.description.source.marks import KeyPath, Marks
-    from dxlrun.description.source.problems import problems_of
 
 __all__ = [
     "Description",
@@ -37,14 +35,14 @@ __all__ = [
 
 _HOMES = {
     "Description": "reading",
-    "KeyPath": "source.marks",
-    "Marks": "source.marks",
+    "KeyPath": "document",
+    "Marks": "document",
     "Motion": "motion",
-    "MotionDescription": "reading",
+    "MotionDescription": "motion",
     "Robot": "robot",
     "Survey": "reading",
-    "problems_of": "source.problems",
-    "read_motion": "reading",
+    "problems_of": "problems",
+    "read_motion": "motion",
     "read_robot": "reading",
     "survey_robot": "reading",
 }

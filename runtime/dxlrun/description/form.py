@@ -1,4 +1,4 @@
-"""Form: what all parts of the files have in common, and what a name may be."""
+"""Form: the base of all parts of the files, what a name may be, and errors of validators."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*", re.ASCII)
 
 
 def refuse(what: str, fix: str) -> PydanticCustomError:
-    """Return the error of a validator that says what is wrong, and apart from it how to fix it."""
+    """Return the error of a validator: what is wrong and, apart from it, how to fix it.
+
+    It is a ValueError too.
+    """
     return PydanticCustomError("dxlrun", "{what}; {fix}", {"what": what, "fix": fix})
 
 

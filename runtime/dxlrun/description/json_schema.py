@@ -14,12 +14,12 @@ from typing import Any
 
 from pydantic import BaseModel
 
+from dxlrun.description.arguments import Argument
+from dxlrun.description.document import plain_value
+from dxlrun.description.including import KEY as INCLUDE
+from dxlrun.description.including import MOST_FILES
 from dxlrun.description.motion import Motion
 from dxlrun.description.robot import Robot
-from dxlrun.description.source.arguments import Argument
-from dxlrun.description.source.including import KEY as INCLUDE
-from dxlrun.description.source.including import MOST_FILES
-from dxlrun.description.source.scalars import plain_value
 
 Schema = dict[str, Any]
 """A JSON Schema: values are whatever JSON has, so nothing narrower than Any is true."""
@@ -117,7 +117,7 @@ def _entry_of(kind: str, entry: Schema, parameters: Schema) -> Schema:
 
 
 def _any_entry(entry: Schema, kinds: list[str]) -> Schema:
-    """Return the schema of an entry that each type adds to; a type that stands elsewhere says nothing."""
+    """Return the schema of an entry that each type adds to; any other type is left to `dxlrun check`."""
     written = {
         "description": entry["properties"]["type"]["description"],
         "anyOf": [{"enum": kinds}, {"$ref": "#/$defs/argument"}],
@@ -159,7 +159,7 @@ class _Shaper:
         return {key: value for key, value in shaped.items() if key not in ("default", "examples")}
 
     def _alternatives(self, shaped: Schema) -> Schema:
-        """Return what may stand at one place: as the model says, or an argument, or a grouped number."""
+        """Return what may stand at one place: the values of the model, an argument, or a grouped number."""
         about = {key: shaped.pop(key) for key in _ABOUT if key in shaped}
         arms: list[Schema] = []
         for arm in shaped.pop("anyOf", [None]):
@@ -188,16 +188,16 @@ def _readable(about: Schema, kinds: set[str | None]) -> Schema:
 
     A default of a quantity is held in SI, and None means that a key is left out: neither can be written.
     """
-    told = dict(about)
+    found = dict(about)
     text = kinds <= {"string", "null"}
     scalar = kinds <= {*_SCALARS, "null"}
-    default = told.pop("default", None)
+    default = found.pop("default", None)
     if scalar and default is not None and (isinstance(default, str) or not text):
-        told["default"] = default
-    examples = told.pop("examples", None)
+        found["default"] = default
+    examples = found.pop("examples", None)
     if scalar and examples:
-        told["examples"] = examples if text else [plain_value(str(each)) for each in examples]
-    return told
+        found["examples"] = examples if text else [plain_value(str(each)) for each in examples]
+    return found
 
 
 def _without_required(node: Any) -> Any:  # noqa: ANN401 (any part of a JSON document)

@@ -1,14 +1,20 @@
-"""Motion: the form of a motion file: parts for controllers, each of listed points or of formulas of time."""
+"""Motion: the form of a motion file, and reading one."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, ClassVar, Self
 
-from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
+from pydantic import BeforeValidator, Discriminator, Field, Tag, ValidationError, model_validator
 
+from dxlrun.description.arguments import refuse_arguments
+from dxlrun.description.document import Marks, grow, parse, read_text
 from dxlrun.description.form import Form, Name, refuse
+from dxlrun.description.problems import problems_of
 from dxlrun.description.units import Angle, AngularAcceleration, AngularVelocity, Duration
+from dxlrun.errors import InputError
 
 
 def _expression(value: object) -> object:
@@ -34,7 +40,7 @@ class Target(Form):
     @model_validator(mode="after")
     def _says_something(self) -> Self:
         if self.position is None and self.velocity is None and self.acceleration is None:
-            raise refuse("the target says nothing", "give it a position, as in {position: 30 deg}")
+            raise refuse("the target is empty", "give it a position, as in {position: 30 deg}")
         return self
 
 
@@ -105,3 +111,29 @@ class Motion(Form):
     motions: Annotated[tuple[Part, ...], Field(strict=False)] = Field(
         min_length=1, description="What each controller does.", examples=["[{controller: head, ...}]"]
     )
+
+
+@dataclass(frozen=True, slots=True)
+class MotionDescription:
+    """A motion file whose form is right, with the place of everything in it."""
+
+    motion: Motion
+    marks: Marks
+    path: Path
+    text: str
+    """As it was read."""
+
+
+def read_motion(path: Path) -> MotionDescription:
+    """Read a motion file; raises InputError with all problems of its form."""
+    text, file = read_text(path), str(path)
+    grown = grow(parse(text, file), file, refuse_arguments)
+    problems = [*grown.problems]
+    try:
+        motion = Motion.model_validate(grown.data)
+    except ValidationError as error:
+        problems += problems_of(error, grown.marks, model=Motion, unknown=grown.unknown)
+        raise InputError(sorted(problems, key=lambda problem: problem.mark)) from None
+    if problems:
+        raise InputError(sorted(problems, key=lambda problem: problem.mark))
+    return MotionDescription(motion, grown.marks, path, text)

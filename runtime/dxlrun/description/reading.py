@@ -1,4 +1,4 @@
-"""Reading: a file -> a frozen description, or every problem of the file at once."""
+"""Reading: a robot file -> a frozen description, or every problem of its form at once."""
 
 from __future__ import annotations
 
@@ -6,18 +6,15 @@ import copy
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 from pydantic import ValidationError
 
-from dxlrun.description.motion import Motion
+from dxlrun.description.arguments import COMMAND_LINE, Arguments
+from dxlrun.description.document import KeyPath, Marks
+from dxlrun.description.including import merged, read_sources
+from dxlrun.description.problems import places_of, problems_of
 from dxlrun.description.robot import Robot
-from dxlrun.description.source.arguments import COMMAND_LINE, Arguments, refuse_arguments
-from dxlrun.description.source.including import merged, read_sources
-from dxlrun.description.source.marks import KeyPath, Marks
-from dxlrun.description.source.problems import places_of, problems_of
-from dxlrun.description.source.pruning import Guess, prune
-from dxlrun.description.source.syntax import parse, read_text
-from dxlrun.description.source.tree import grow
 from dxlrun.errors import InputError, Problem
 
 
@@ -48,17 +45,6 @@ class Survey:
     problems: tuple[Problem, ...]
     otherwise: Description | None = None
     """The same with other guesses, where there are any: what is wrong with both does not depend on them."""
-
-
-@dataclass(frozen=True, slots=True)
-class MotionDescription:
-    """A motion file whose form is right, with the place of everything in it."""
-
-    motion: Motion
-    marks: Marks
-    path: Path
-    text: str
-    """As it was read."""
 
 
 def read_robot(path: Path, arguments: Mapping[str, str]) -> Description:
@@ -109,21 +95,73 @@ def _validated(data: dict[str, object]) -> tuple[Robot | None, ValidationError |
         return None, error
 
 
-def read_motion(path: Path) -> MotionDescription:
-    """Read a motion file; raises InputError with all problems of its form."""
-    text, file = read_text(path), str(path)
-    grown = grow(parse(text, file), file, refuse_arguments)
-    problems = [*grown.problems]
-    try:
-        motion = Motion.model_validate(grown.data)
-    except ValidationError as error:
-        problems += problems_of(error, grown.marks, model=Motion, unknown=grown.unknown)
-        raise InputError(_in_order(problems)) from None
-    if problems:
-        raise InputError(_in_order(problems))
-    return MotionDescription(motion, grown.marks, path, text)
-
-
 def _in_order(problems: Iterable[Problem]) -> list[Problem]:
     """Return the problems as a person meets them: first what was typed, then the file from its top."""
     return sorted(problems, key=lambda problem: (problem.mark.file != COMMAND_LINE, problem.mark))
+
+
+Guess = Literal[0, 1]
+_RATES = (1.0, 1000.0)
+_ENTRIES: Mapping[str, tuple[Mapping[str, object], Mapping[str, object]]] = {
+    "buses": (
+        {"port": "sim", "protocol": 1.0, "baud_rate": 9_600},
+        {"port": "sim", "protocol": 2.0, "baud_rate": 4_000_000},
+    ),
+    "joints": (
+        {"bus": "guessed", "id": 0, "model": "AX-12A", "reference": "0 deg", "direction": 1},
+        {"bus": "guessed otherwise", "id": 1, "model": "XL430-W250", "reference": "9 deg", "direction": -1},
+    ),
+}
+
+
+def prune(data: dict[str, object], wrong: Iterable[KeyPath], guess: Guess) -> frozenset[KeyPath]:
+    """Take what is wrong out of `data` and put guesses where a key is needed; return what was left out.
+
+    Single keys go, so that their default counts; an entry of buses, joints or controllers goes where its name
+    is wrong, or where nothing can be guessed.
+    """
+    left_out: set[KeyPath] = set()
+    for path in wrong:
+        if path:
+            left_out |= _take_out(data, path, guess)
+    data.setdefault("name", "unnamed")
+    data.setdefault("buses", {"unnamed": {}})
+    loop = data.setdefault("loop", {})
+    if isinstance(loop, dict):
+        loop.setdefault("rate", _RATES[guess])
+    for section, guesses in _ENTRIES.items():
+        entries = data.get(section)
+        for entry in entries.values() if isinstance(entries, dict) else ():
+            if isinstance(entry, dict):
+                for key, value in guesses[guess].items():
+                    entry.setdefault(key, value)
+    return frozenset(left_out)
+
+
+def _take_out(data: dict[str, object], path: KeyPath, guess: Guess) -> set[KeyPath]:
+    name = str(path[0])
+    section = data.get(name)
+    if len(path) == 1 or not isinstance(section, dict):
+        data.pop(name, None)
+        return {path[:1]}
+    if name not in (*_ENTRIES, "controllers"):
+        section.pop(path[1], None)
+        if not section:  # an empty mapping may lack what was wrong
+            del data[name]
+        return {path[:2]}
+    entry = section.get(path[1])
+    if len(path) == 2 or not isinstance(entry, dict):
+        if name in _ENTRIES and path[1] in section and not isinstance(entry, dict):
+            section[path[1]] = {}  # its name stands, and others refer to it
+            return set()
+        section.pop(path[1], None)
+        return {path[:2]}
+    entry.pop(path[2], None)
+    if (name, path[2]) == ("controllers", "type"):
+        del section[path[1]]
+        return {path[:2]}
+    if path[2:] in (("active",), ("continuous",)):
+        entry[path[2]] = bool(guess)
+    if name == "buses":  # what a cycle takes depends on nearly every key of a bus: with this it is guessed
+        entry.pop("baud_rate", None)
+    return set()

@@ -1,8 +1,8 @@
 """Units: angles, speeds and times as a person writes them, `60 deg` or `500 us`, held in SI.
 
 Use `Angle`, `AngularVelocity`, `AngularAcceleration`, `Torque`, `Effort`, `Inertia` and `Duration` as types
-of a model's fields. They take text with a unit; a bare number is an error, because nobody can see whether
-`60` was meant in deg or rad. In JSON they are written back as text that they read to the same value.
+of a model's fields. They take text with a unit; a bare number is an error, because `60`
+could be deg or rad. In JSON they are written back as text that they read to the same value.
 """
 
 from __future__ import annotations
@@ -15,6 +15,8 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field, PlainSerializer, WithJsonSchema
 from pydantic_core import PydanticCustomError
+
+from dxlrun.description.form import refuse
 
 # at most three digits of exponent: Fraction("1e-999999999") would fill the memory
 _QUANTITY = re.compile(
@@ -62,22 +64,22 @@ _LONGEST_NS = 10**9 * _DURATION_NS["s"]  # 31 years; stays inside 64 bits when a
 
 
 def angle(text: str) -> float:
-    """Return an angle, rad, from `60 deg` or `1.05 rad`; raises ValueError that says how to write one."""
+    """Return an angle, rad, from `60 deg` or `1.05 rad`; raises ValueError with an example."""
     return _si(text, "an angle", _ANGLE, "60 deg or 1.05 rad")
 
 
 def angular_velocity(text: str) -> float:
-    """Return a speed, rad/s, from `2 rad/s`, `30 deg/s` or `5 rpm`; raises ValueError that says how."""
+    """Return a speed, rad/s, from `2 rad/s`, `30 deg/s` or `5 rpm`; raises ValueError with an example."""
     return _si(text, "an angular velocity", _ANGULAR_VELOCITY, "2 rad/s, 30 deg/s or 5 rpm")
 
 
 def angular_acceleration(text: str) -> float:
-    """Return an acceleration, rad/s^2, from `10 rad/s^2` or `90 deg/s^2`; raises ValueError that says how."""
+    """Return an acceleration, rad/s^2, from `10 rad/s^2` or `90 deg/s^2`; raises ValueError."""
     return _si(text, "an angular acceleration", _ANGULAR_ACCELERATION, "10 rad/s^2 or 90 deg/s^2")
 
 
 def torque(text: str) -> float:
-    """Return a torque, Nm, from `0.3 Nm` or `20 mNm`; raises ValueError that says how to write one."""
+    """Return a torque, Nm, from `0.3 Nm` or `20 mNm`; raises ValueError with an example."""
     return _si(text, "a torque", _TORQUE, "0.3 Nm or 20 mNm")
 
 
@@ -92,7 +94,7 @@ def effort(text: str) -> tuple[float, EffortUnit]:
     scale, counted = _EFFORT[unit]
     value = float(number) * scale
     if not 0 < value < math.inf:
-        raise _refusal(f"{text!r} is no effort above 0", f"write one such as {written}")
+        raise refuse(f"{text!r} is no effort above 0", f"write one such as {written}")
     return value, counted
 
 
@@ -102,28 +104,28 @@ def inertia(text: str) -> float:
 
 
 def share(text: str) -> float:
-    """Return a share from 0 to 1 from `5 %`; raises ValueError that says how to write one."""
+    """Return a share from 0 to 1 from `5 %`; raises ValueError with an example."""
     value = _si(text, "a share", {"%": 1e-2}, "5 %")
     if not 0.0 <= value <= 1.0:
-        raise _refusal(f"{text!r} is no share from 0 % to 100 %", "write one such as 5 %")
+        raise refuse(f"{text!r} is no share from 0 % to 100 %", "write one such as 5 %")
     return value
 
 
 def duration(text: str) -> int:
-    """Return a time, ns, from `500 us`, `1 ms`, `2 s` or `1 min`; raises ValueError that says how."""
+    """Return a time, ns, from `500 us`, `1 ms`, `2 s` or `1 min`; raises ValueError with an example."""
     written = "500 us, 1 ms, 2 s or 1 min"
     number, unit = _split(text, "a duration", _DURATION_NS, written)
     value = round(Fraction(number) * _DURATION_NS[unit])  # exact: 0.1 ms is 100000 ns
     if not 0 <= value <= _LONGEST_NS:
-        raise _refusal(f"{text!r} is no duration from 0 s to 31 years", f"write one such as {written}")
+        raise refuse(f"{text!r} is no duration from 0 s to 31 years", f"write one such as {written}")
     return value
 
 
 def quantity(text: str, unit: str) -> float:
     """Return a quantity in an SI unit of the control tables, from text with any unit of its kind.
 
-    `unit` is rad, rad/s, rad/s^2, s, V, A, Nm, degC or 1 (a fraction: `40 %`). Raises ValueError that says
-    how to write one.
+    `unit` is rad, rad/s, rad/s^2, s, V, A, Nm, degC or 1 (a fraction: `40 %`). Raises ValueError
+    with an example.
     """
     return _si(text, *_TABLE_UNITS[unit])
 
@@ -132,32 +134,27 @@ def _si(text: str, what: str, units: Mapping[str, float], written: str) -> float
     number, unit = _split(text, what, units, written)
     value = float(number) * units[unit]
     if not math.isfinite(value):
-        raise _refusal(f"{text!r} is too large", f"write {what} such as {written}")
+        raise refuse(f"{text!r} is too large", f"write {what} such as {written}")
     return value
 
 
 def _split(text: object, what: str, units: Mapping[str, object], written: str) -> tuple[str, str]:
     """Return number and unit of a quantity; both are known to be right."""
     if isinstance(text, int | float) and not isinstance(text, bool):
-        raise _refusal(f"{text} has no unit", f"write {what} with its unit, such as {written}")
+        raise refuse(f"{text} has no unit", f"write {what} with its unit, such as {written}")
     if not isinstance(text, str):
-        raise _refusal(f"this is not {what}", f"write {what} such as {written}")
+        raise refuse(f"this is not {what}", f"write {what} such as {written}")
     match = _QUANTITY.fullmatch(text.strip()) if len(text) <= _LONGEST else None
     number = match[1].replace("_", "") if match else ""
     if match is None or not any(character.isdigit() for character in number.split("e")[0].split("E")[0]):
-        raise _refusal(f"{text[:_LONGEST]!r} is not {what}", f"write {what} such as {written}")
+        raise refuse(f"{text[:_LONGEST]!r} is not {what}", f"write {what} such as {written}")
     if not match[2]:
-        raise _refusal(f"{text!r} has no unit", f"write {what} with its unit, such as {written}")
+        raise refuse(f"{text!r} has no unit", f"write {what} with its unit, such as {written}")
     if match[2] not in units:
-        raise _refusal(
+        raise refuse(
             f"{text!r} has the unit {match[2]}, which is not one of {what}", f"write it as {written}"
         )
     return number, match[2]
-
-
-def _refusal(what: str, fix: str) -> PydanticCustomError:
-    # a ValueError too; what and how to fix it travel apart, so that reports can place them
-    return PydanticCustomError("dxlrun", "{what}; {fix}", {"what": what, "fix": fix})
 
 
 def _auto_duration(value: str) -> int | str:
@@ -167,7 +164,7 @@ def _auto_duration(value: str) -> int | str:
         return duration(value)
     except PydanticCustomError as error:
         context = error.context or {}
-        raise _refusal(str(context["what"]), f"{context['fix']}, or auto") from error
+        raise refuse(str(context["what"]), f"{context['fix']}, or auto") from error
 
 
 def _polling(value: str) -> int | str:
@@ -177,7 +174,7 @@ def _polling(value: str) -> int | str:
         return duration(value)
     except PydanticCustomError as error:
         context = error.context or {}
-        raise _refusal(str(context["what"]), f"{context['fix']}, auto or off") from error
+        raise refuse(str(context["what"]), f"{context['fix']}, auto or off") from error
 
 
 def _text_schema(example: str, units: Mapping[str, object], *others: dict[str, object]) -> WithJsonSchema:

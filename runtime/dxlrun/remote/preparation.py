@@ -25,8 +25,8 @@ from dxlrun.control.controllers.plugins import Offer, PlugIns
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan
 from dxlrun.control.steering import Register
 from dxlrun.description.form import Name
+from dxlrun.description.problems import sentences_of
 from dxlrun.description.robot import ControllerEntry
-from dxlrun.description.source.problems import sentences_of
 from dxlrun.description.units import angle, angular_acceleration, angular_velocity, duration
 from dxlrun.dynamixel.control_table import ControlTable, control_table
 from dxlrun.errors import suggestion

@@ -154,7 +154,7 @@ def set_register(joint: str, item: str, value: str, /, *, chosen: Chosen = ONLY_
     value
         Whole number as in the e-Manual, or a quantity with its unit, such as '10 rad/s^2'.
     """
-    from dxlrun.description.source.scalars import plain_value
+    from dxlrun.description.document import plain_value
 
     number = plain_value(value)
     given = number if isinstance(number, int) and not isinstance(number, bool) else value

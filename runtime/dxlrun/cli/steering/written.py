@@ -10,8 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from dxlrun.description.source.syntax import parse, read_text
-from dxlrun.description.source.tree import Grown, grow, literal
+from dxlrun.description.document import Grown, grow, literal, parse, read_text
 from dxlrun.errors import DxlrunError, InputError, Problem, Refused
 
 _WORDS = "command line"

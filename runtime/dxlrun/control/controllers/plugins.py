@@ -69,7 +69,7 @@ class PlugIns:
             parameters = offer.controller.Parameters.model_validate_json(plan.parameters)
             return offer.controller(parameters)
         except ValidationError as error:
-            from dxlrun.description.source.problems import sentences_of
+            from dxlrun.description.problems import sentences_of
 
             wrong = "; ".join(sentences_of(error, plan.name, offer.controller.Parameters, _MOST_MISTAKES))
             raise PlugInError(f"the parameters of a controller: {wrong}") from error

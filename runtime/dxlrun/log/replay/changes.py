@@ -15,7 +15,7 @@ from dxlrun.compile import compile_robot
 from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.loop_plan import ControllerPlan, LoopPlan
 from dxlrun.description import read_robot
-from dxlrun.description.source.problems import sentences_of
+from dxlrun.description.problems import sentences_of
 from dxlrun.errors import InputError, suggestion
 from dxlrun.log.replay.recorded import RecordedPlan
 

@@ -1,6 +1,6 @@
 """Including: a robot file and the fragments that it names become one document.
 
-`include: [fragments/head.yaml]` is relative to the file that says it. Mappings are merged, key by key, at
+`include: [fragments/head.yaml]` is relative to the file that has it. Mappings are merged, key by key, at
 every depth; of two values the including file's counts, of two fragments the later one's. Marks stay with the
 file in which a value stands. A fragment that is reached twice counts once, where it is reached first.
 """
@@ -11,10 +11,19 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from dxlrun.description.source.marks import KeyPath, Marks
-from dxlrun.description.source.problems import shown
-from dxlrun.description.source.syntax import LARGEST_FILE, Tree, parse, read_text
-from dxlrun.description.source.tree import Fill, Grown, grow, literal
+from dxlrun.description.document import (
+    LARGEST_FILE,
+    Fill,
+    Grown,
+    KeyPath,
+    Marks,
+    Tree,
+    grow,
+    literal,
+    parse,
+    read_text,
+)
+from dxlrun.description.problems import shown
 from dxlrun.errors import InputError, Mark, Problem
 
 KEY = "include"

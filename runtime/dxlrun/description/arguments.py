@@ -12,16 +12,14 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
-from pydantic_core import PydanticCustomError
 
-from dxlrun.description.source.marks import KeyPath, Marks
-from dxlrun.description.source.problems import problems_of
-from dxlrun.description.source.scalars import plain_value, text_of
-from dxlrun.description.source.tree import Filled, literal
+from dxlrun.description.document import Filled, KeyPath, Marks, literal, plain_value, text_of
+from dxlrun.description.form import refuse
+from dxlrun.description.problems import problems_of
 from dxlrun.errors import Mark, Problem
 
 COMMAND_LINE = "command line"
-"""Stands for a file in the mark of what is wrong with `name:=value`."""
+"""The file in the mark of a problem of `name:=value`."""
 
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*", re.ASCII)
 _USE = re.compile(r"\$\$\{|\$\{([^{}]*)(\}?)")
@@ -29,14 +27,7 @@ _USE = re.compile(r"\$\$\{|\$\{([^{}]*)(\}?)")
 
 def _scalar(value: object) -> object:
     if isinstance(value, dict | list):
-        raise PydanticCustomError(
-            "dxlrun",
-            "{what}; {fix}",
-            {
-                "what": "the default of an argument is one value",
-                "fix": "write text, a number, true or false",
-            },
-        )
+        raise refuse("the default of an argument is one value", "write text, a number, true or false")
     return value
 
 

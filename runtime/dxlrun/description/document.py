@@ -1,0 +1,410 @@
+"""Document: the bytes of a YAML file -> plain values, each with its place in the file.
+
+PyYAML does the scanning (YAML's grammar has two hundred rules). Nothing is constructed by it, so no tag of a
+file can name a class; limits are checked on its stream of events, before a tree exists. Arguments are put in
+while the values are made.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import stat
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+import yaml
+from yaml.reader import Reader
+
+from dxlrun.errors import InputError, Mark, Problem
+
+KeyPath = tuple[str | int, ...]
+"""The way from the top of a document to a value: keys of mappings, indices of lists."""
+LARGEST_FILE = 1 << 20
+"""Bytes."""
+DEEPEST = 32
+"""Mappings and lists inside each other."""
+MOST_NODES = 200_000
+"""Keys, values, mappings and lists of a file, with every use of an anchor counted."""
+
+_SCALARS: Mapping[str, object] = {
+    **dict.fromkeys(("", "~", "null", "Null", "NULL")),
+    **dict.fromkeys(("true", "True", "TRUE"), True),
+    **dict.fromkeys(("false", "False", "FALSE"), False),
+    **dict.fromkeys((".nan", ".NaN", ".NAN"), math.nan),
+    **{f"{sign}{word}": float(f"{sign}inf") for sign in ("", "+", "-") for word in (".inf", ".Inf", ".INF")},
+}
+# underscores between digits are ours: 1_000_000 is easier to count than 1000000
+_INT = re.compile(r"[-+]?[0-9]+(?:_[0-9]+)*")
+_BASED = re.compile(r"0o[0-7]+|0x[0-9a-fA-F]+")
+_FLOAT = re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:_[0-9]+)*(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?")
+_LONGEST_NUMBER = 64
+"""Characters; more is text: the conversion of a million digits takes long."""
+_Loader: type[yaml.SafeLoader] = getattr(
+    yaml, "CSafeLoader", yaml.SafeLoader
+)  # the fast one where it was built
+
+
+@dataclass(frozen=True, slots=True)
+class Marks:
+    """The places of all keys and values of one file, and which values came from arguments."""
+
+    file: str
+    values: Mapping[KeyPath, Mark]
+    keys: Mapping[KeyPath, Mark]
+    origins: Mapping[KeyPath, str] = field(default_factory=dict)
+    """`rate:=100` for each value in which an argument was put."""
+
+    def value(self, *path: str | int) -> Mark:
+        """Return the place of a value, or else of the nearest parent that the file has."""
+        return self.values.get(path) or self._parent(path)
+
+    def key(self, *path: str | int) -> Mark:
+        """Return the place of a key, of a list's item (it has no key), or of the nearest parent."""
+        return self.keys.get(path) or self.values.get(path) or self._parent(path)
+
+    def has(self, path: KeyPath) -> bool:
+        """Return whether the file has a value there."""
+        return path in self.values
+
+    def _parent(self, path: KeyPath) -> Mark:
+        for end in range(len(path) - 1, -1, -1):
+            mark = self.keys.get(path[:end]) or self.values.get(path[:end])
+            if mark is not None:
+                return mark
+        return Mark(self.file)
+
+
+class _Place(Protocol):
+    """PyYAML's mark; its two scanners have a class each."""
+
+    line: int
+    column: int
+
+
+@dataclass(frozen=True, slots=True)
+class Tree:
+    """A file's nodes, and what is wrong with them although they could be read."""
+
+    root: yaml.MappingNode
+    problems: tuple[Problem, ...]
+
+
+def read_text(path: Path, language: str = "YAML") -> str:
+    """Return the text of a file; raises InputError when it is missing, too large, or no UTF-8.
+
+    `language` is what the problems call it.
+    """
+    file = str(path)
+    try:
+        mode = path.stat().st_mode
+        data = b""
+        if stat.S_ISREG(mode):  # reading a pipe or a device might never end
+            with path.open("rb") as stream:
+                data = stream.read(LARGEST_FILE + 1)
+    except FileNotFoundError:
+        raise refusal(Mark(file), "there is no such file", "check the path; it counts from here") from None
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        raise refusal(
+            Mark(file), f"the file cannot be read ({reason})", "check its name and its rights"
+        ) from None
+    if not stat.S_ISREG(mode):
+        kind = "a directory" if stat.S_ISDIR(mode) else "not a regular file"
+        raise refusal(Mark(file), f"this is {kind}", f"name a {language} file")
+    if len(data) > LARGEST_FILE:
+        raise refusal(
+            Mark(file), f"the file is larger than {LARGEST_FILE // 1024} KiB", "split it, or thin it out"
+        )
+    return _decoded(data, file, language)
+
+
+def _decoded(data: bytes, file: str, language: str) -> str:
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        before = error.object[: error.start].decode("utf-8")
+        what = f"the byte 0x{error.object[error.start]:02x} is no UTF-8"
+        raise refusal(_mark_at(before, len(before), file), what, "save the file as UTF-8") from None
+    if found := Reader.NON_PRINTABLE.search(text):
+        what = f"the character U+{ord(found[0]):04X} cannot stand in {language}"
+        raise refusal(_mark_at(text, found.start(), file), what, "take it out")
+    return text
+
+
+def parse(text: str, file: str) -> Tree:
+    """Return the nodes of a text whose top is a mapping; raises InputError when it is no such YAML."""
+    try:
+        problems = tuple(_refused_tags(text, file))
+        root = yaml.compose(text, _Loader)
+    except yaml.MarkedYAMLError as error:
+        raise InputError([_explained(error, text, file)]) from None
+    except yaml.YAMLError as error:
+        raise refusal(Mark(file), f"this is not YAML ({error})", "correct it") from None
+    if root is None:
+        raise refusal(Mark(file), "the file is empty", "describe a robot or a motion in it")
+    if not isinstance(root, yaml.MappingNode):
+        raise refusal(node_mark(root, file), "the file is not a mapping", "write `key: value` lines")
+    return Tree(root, problems)
+
+
+def _refused_tags(text: str, file: str) -> Iterator[Problem]:
+    """Yield a problem for each tag; raises InputError beyond the limits."""
+    depth = nodes = documents = 0
+    for event in yaml.parse(text, _Loader):
+        mark = _mark(event.start_mark, file)
+        if isinstance(event, yaml.DocumentStartEvent):
+            documents += 1
+            if documents > 1:
+                raise refusal(mark, "a second document starts here", "keep one document a file")
+        elif isinstance(event, yaml.CollectionStartEvent):
+            depth += 1
+            if depth > DEEPEST:
+                raise refusal(mark, f"this is nested deeper than {DEEPEST} levels", "make it flatter")
+        elif isinstance(event, yaml.CollectionEndEvent):
+            depth -= 1
+        if isinstance(event, yaml.NodeEvent):
+            nodes += 1
+            if nodes > MOST_NODES:
+                raise refusal(mark, f"the file has more than {MOST_NODES} values", "split it")
+            tag = getattr(event, "tag", None)  # an alias has none
+            if tag is not None:
+                yield Problem(
+                    mark,
+                    f"the tag {tag.replace('tag:yaml.org,2002:', '!!')} is refused",
+                    "write the value without a tag",
+                )
+
+
+def node_mark(node: yaml.Node, file: str) -> Mark:
+    """Return where a node starts."""
+    return _mark(node.start_mark, file)
+
+
+def _mark(place: _Place | None, file: str) -> Mark:
+    # PyYAML counts from 0
+    return Mark(file) if place is None else Mark(file, place.line + 1, place.column + 1)
+
+
+def refusal(mark: Mark, what: str, fix: str) -> InputError:
+    """Return an InputError with one problem."""
+    return InputError([Problem(mark, what, fix)])
+
+
+def _mark_at(text: str, index: int, file: str) -> Mark:
+    lines = text[:index].split("\n")
+    return Mark(file, len(lines), len(lines[-1]) + 1)
+
+
+def _explained(error: yaml.MarkedYAMLError, text: str, file: str) -> Problem:
+    """Return the error of the scanner or parser in words of ours, with its fix."""
+    place = error.problem_mark or error.context_mark
+    opened = error.context_mark
+    reported = error.problem or ""
+    if "unexpected end of stream" in reported and opened is not None:
+        place = opened
+    mark = _mark(place, file)
+    since = f" (opened in line {opened.line + 1})" if opened is not None else ""
+    line = (text.splitlines() or [""])[min(mark.line, len(text.splitlines())) - 1] if text else ""
+    character = line[mark.column - 1 : mark.column]
+    if "expected ',' or" in reported and line[: mark.column - 1].endswith("$"):
+        return Problem(mark, "${...} stands inside { } or [ ] without quotes", 'put it in quotes: "${name}"')
+    if "cannot start any token" in reported and character == "\t":
+        return Problem(mark, "there is a tab in the indentation", "indent with spaces")
+    for part, what, fix in _WORDS:
+        if part in reported:
+            return Problem(mark, what.format(since=since, character=character), fix)
+    return Problem(mark, f"this is not YAML ({reported})", "correct it")
+
+
+_WORDS = (
+    ("cannot start any token", "a value cannot start with {character}", "put it in quotes"),
+    (
+        "mapping values are not allowed",
+        "there is a ':' where none can be",
+        "indent the keys of a mapping alike, and put a text with ': ' in quotes",
+    ),
+    ("unexpected ':'", "a ':' stands where none can be", "write `key: value` with a space behind the ':'"),
+    ("entries are not allowed", "a list cannot start here", "start it on a new line, or write [a, b]"),
+    ("unexpected end of stream", "a quote is opened here and never closed", "close it"),
+    ("expected ',' or", "a comma is missing, or a bracket{since} is not closed", "add it"),
+    ("could not find expected ':'", "a key has no ':'", "write `key: value`"),
+    (
+        "expected key",
+        "this line is indented unlike the lines that it belongs to",
+        "indent it like its neighbours",
+    ),
+    ("'-' indicator", "this line does not belong to the list above it", "start it with '- ', or indent it"),
+    (
+        "block end",
+        "this line is indented unlike the lines that it belongs to",
+        "indent it like its neighbours",
+    ),
+    ("undefined alias", "this alias names no anchor above it", "write the value itself"),
+    ("duplicate anchor", "this anchor was given before", "give it another name"),
+    ("node content", "a value is missing here", "write one, or put the character in quotes"),
+    ("unknown escape", "a backslash stands before a character that it does not change", "use single quotes"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Filled:
+    """A scalar after arguments were put into it."""
+
+    value: object
+    origin: str | None = None
+    """`rate:=100` when an argument is in it."""
+    problems: tuple[tuple[str, str], ...] = ()
+    """What is wrong, and how to fix it."""
+    unknown: bool = False
+    """The value could not be made; further checks of it are skipped."""
+
+
+Fill = Callable[[KeyPath, str, bool], Filled]
+"""Path, text and whether it was quoted -> the value."""
+
+
+def literal(path: KeyPath, text: str, quoted: bool) -> Filled:
+    """Return what a scalar means as it stands."""
+    return Filled(text if quoted else plain_value(text))
+
+
+@dataclass(frozen=True, slots=True)
+class Grown:
+    """A document as plain values, with marks, and what was wrong on the way."""
+
+    data: dict[str, object]
+    marks: Marks
+    problems: tuple[Problem, ...]
+    unknown: frozenset[KeyPath]
+    """Where a problem was already reported, so that the value there means nothing."""
+
+
+def grow(tree: Tree, file: str, fill: Fill) -> Grown:
+    """Return the values of a tree; raises InputError when its anchors make it endless or huge."""
+    grower = _Grower(tree, file, fill)
+    return Grown(
+        grower.mapping(tree.root, ()),
+        Marks(file, grower.values, grower.keys, grower.origins),
+        (*tree.problems, *grower.problems),
+        frozenset(grower.unknown),
+    )
+
+
+class _Grower:
+    """Walks a tree once; depth is bounded by DEEPEST, so it may recurse."""
+
+    def __init__(self, tree: Tree, file: str, fill: Fill) -> None:
+        self._file = file
+        self._fill = fill
+        self._tagged = {problem.mark for problem in tree.problems}
+        self._nodes = 0
+        self.values: dict[KeyPath, Mark] = {}
+        self.keys: dict[KeyPath, Mark] = {}
+        self.origins: dict[KeyPath, str] = {}
+        self.problems: list[Problem] = []
+        self.unknown: set[KeyPath] = set()
+
+    def value(self, node: yaml.Node, path: KeyPath) -> object:
+        """Return what a node means."""
+        if isinstance(node, yaml.MappingNode):
+            return self.mapping(node, path)
+        self._enter(node, path)
+        if isinstance(node, yaml.SequenceNode):
+            return [self.value(item, (*path, index)) for index, item in enumerate(node.value)]
+        assert isinstance(node, yaml.ScalarNode)  # noqa: S101 (YAML has three kinds of nodes)
+        return self._scalar(node, path)
+
+    def mapping(self, node: yaml.MappingNode, path: KeyPath) -> dict[str, object]:
+        """Return a mapping; keys are text as written, the first of two equal ones counts."""
+        self._enter(node, path)
+        result: dict[str, object] = {}
+        for key_node, value_node in node.value:
+            key = self._key(key_node)
+            if key is None:
+                continue
+            here = (*path, key)
+            mark = node_mark(key_node, self._file)
+            if key in result:
+                what = f"{'.'.join(map(str, here))} was already given in line {self.keys[here].line}"
+                self.problems.append(Problem(mark, what, "keep one of the two"))
+                continue
+            self.keys[here] = mark
+            result[key] = self.value(value_node, here)
+        return result
+
+    def _enter(self, node: yaml.Node, path: KeyPath) -> None:
+        mark = node_mark(node, self._file)
+        self._nodes += 1
+        if len(path) > DEEPEST:
+            what = f"this is nested deeper than {DEEPEST} levels, or an anchor contains itself"
+            raise refusal(mark, what, "make it flatter")
+        if self._nodes > MOST_NODES:
+            what = f"the file has more than {MOST_NODES} values when its anchors are put in"
+            raise refusal(mark, what, "write fewer")
+        self.values[path] = mark
+        if mark in self._tagged:
+            self.unknown.add(path)
+
+    def _key(self, node: yaml.Node) -> str | None:
+        mark = node_mark(node, self._file)
+        if not isinstance(node, yaml.ScalarNode):
+            self.problems.append(
+                Problem(mark, "a mapping or a list cannot be a key", "write a word before the ':'")
+            )
+            return None
+        if node.value == "<<" and not _quoted(node):
+            self.problems.append(Problem(mark, "the merge key << is not YAML 1.2", "write the keys out"))
+            return None
+        if not node.value:
+            self.problems.append(Problem(mark, "a key is empty", "write a word before the ':'"))
+            return None
+        if "${" in node.value:
+            self.problems.append(Problem(mark, "arguments are not put into keys", "write the key out"))
+            return None
+        return str(node.value)
+
+    def _scalar(self, node: yaml.ScalarNode, path: KeyPath) -> object:
+        filled = self._fill(path, node.value, _quoted(node))
+        mark = self.values[path]
+        self.problems.extend(Problem(mark, what, fix) for what, fix in filled.problems)
+        if filled.unknown:
+            self.unknown.add(path)
+        if filled.origin is not None:
+            self.origins[path] = filled.origin
+        return filled.value
+
+
+def _quoted(node: yaml.ScalarNode) -> bool:
+    # a plain scalar has the style None in one scanner of PyYAML, "" in the other
+    return bool(node.style)
+
+
+def plain_value(text: str) -> object:
+    """Return what a scalar without quotes means: None, bool, int, float or str.
+
+    As the core schema of YAML 1.2: `yes` and `on` are text, `010` is ten. PyYAML follows YAML 1.1, where `no`
+    is false and `1:30` is ninety; so only its syntax is used, not its values.
+    """
+    if text in _SCALARS:
+        return _SCALARS[text]
+    if len(text) > _LONGEST_NUMBER:
+        return text
+    if _INT.fullmatch(text):
+        return int(text)
+    if _BASED.fullmatch(text):
+        return int(text, 0)
+    return float(text) if _FLOAT.fullmatch(text) else text
+
+
+def text_of(value: object) -> str:
+    """Return the text that `plain_value` reads to the same value."""
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, float) and not math.isfinite(value):
+        return ".nan" if math.isnan(value) else ("-.inf" if value < 0 else ".inf")
+    return str(value)

@@ -1,0 +1,390 @@
+"""Problems: what pydantic found, as sentences of ours at the place in the file where each thing is."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Iterable, Mapping, Set
+from dataclasses import dataclass
+from types import UnionType
+from typing import Annotated, ClassVar, Protocol, Union, get_args, get_origin, runtime_checkable
+
+from pydantic import BaseModel, Tag, ValidationError
+from pydantic_core import ErrorDetails
+
+from dxlrun.description.document import KeyPath, Marks, plain_value, text_of
+from dxlrun.errors import Mark, Problem
+
+
+def problems_of(
+    error: ValidationError,
+    marks: Marks,
+    prefix: KeyPath = (),
+    *,
+    model: type[BaseModel] | None = None,
+    unknown: Set[KeyPath] = frozenset(),
+) -> list[Problem]:
+    """Return one problem for each place that a model refused, in file order.
+
+    `prefix` is where the model's data stands in the file. With `model`, unknown keys get the nearest known
+    one and missing keys an example. `unknown` paths and what is below them are skipped.
+    """
+    return _problems(error.errors(include_url=False), marks, prefix, model, unknown)
+
+
+def _problems(
+    errors: Iterable[ErrorDetails],
+    marks: Marks,
+    prefix: KeyPath,
+    model: type[BaseModel] | None,
+    unknown: Set[KeyPath] = frozenset(),
+) -> list[Problem]:
+    found: dict[KeyPath, list[_Error]] = {}
+    for details in errors:
+        error = _Error(details, marks, prefix, model)
+        if error.meant and not any(error.path[:end] in unknown for end in range(len(error.path) + 1)):
+            found.setdefault(error.path, []).append(error)
+    problems = [_merged(errors, marks) for errors in found.values()]
+    return sorted(problems, key=lambda problem: problem.mark)
+
+
+def sentences_of(error: ValidationError, what: str, model: type[BaseModel], most: int) -> list[str]:
+    """Return one sentence for each of the first places that a model refused in data without a file.
+
+    `what` is what the data are called: `posvel of head has no velocities; add ...`.
+    """
+    errors = error.errors(include_url=False)[:most]
+    places: dict[KeyPath, Mark] = {}
+    for details in errors:
+        location = details["loc"]
+        places |= {(what, *location[:end]): Mark(what) for end in range(len(location) + 1)}
+    problems = _problems(errors, Marks(what, places, places), (what,), model)
+    return [f"{problem.what}; {problem.fix}" for problem in problems]
+
+
+def places_of(error: ValidationError, marks: Marks) -> list[KeyPath]:
+    """Return every place that a model refused."""
+    return [_Error(details, marks, (), None).path for details in error.errors(include_url=False)]
+
+
+class _Error:
+    """One error of pydantic, and the place in the file that it is about."""
+
+    def __init__(
+        self, details: ErrorDetails, marks: Marks, prefix: KeyPath, model: type[BaseModel] | None
+    ) -> None:
+        self.kind = details["type"]
+        self.context: Mapping[str, object] = details.get("ctx", {})
+        self.input: object = details["input"]
+        self.model = model
+        self.location = details["loc"]
+        of_key = self.location[-1:] == ("[key]",)
+        location = self.location[:-1] if of_key else self.location
+        self.missing = self.kind in ("missing", "missing_argument")
+        path = _in_file(location[:-1] if self.missing else location, marks, prefix)
+        self.path: KeyPath = (*path, location[-1]) if self.missing else path
+        self.at_key = of_key or self.missing or self.kind == "extra_forbidden"
+
+    @property
+    def meant(self) -> bool:
+        """False for what follows from another error: a list is not too short because its items are wrong."""
+        least = self.context.get("min_length")
+        return not (
+            self.kind == "too_short"
+            and isinstance(least, int)
+            and isinstance(self.input, list | dict)
+            and len(self.input) >= least
+        )
+
+    @property
+    def name(self) -> str:
+        """The path as text: `joints.head.limits.position[1]`."""
+        return path_text(self.path)
+
+    def field(self) -> Field | None:
+        """Return the model's field of the key."""
+        return None if self.model is None else field_at(self.model, self.location)
+
+
+def path_text(path: KeyPath) -> str:
+    """Return a path as text: `joints.head.limits.position[1]`."""
+    text = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in path)
+    return text.removeprefix(".") or "the file"
+
+
+def _in_file(location: Iterable[str | int], marks: Marks, prefix: KeyPath) -> KeyPath:
+    """Return the part of pydantic's location that the file has; names of union members are not in it."""
+    path = prefix
+    for step in location:
+        if marks.has((*path, step)):
+            path = (*path, step)
+    return path
+
+
+def _merged(errors: list[_Error], marks: Marks) -> Problem:
+    """Return one problem of a place; the members of a union each have complained about it."""
+    first = errors[0]
+    mark = marks.key(*first.path) if first.at_key else marks.value(*first.path)
+    expected = list(
+        dict.fromkeys(each_expected for each in errors if (each_expected := _expected(each)) is not None)
+    )
+    if expected:
+        origin = marks.origins.get(first.path)
+        given = shown(first.input) + (f" (argument {origin})" if origin else "")
+        return Problem(mark, f"{first.name} is {given}, but must be {' or '.join(expected)}", _remedy(first))
+    what, fix = _sentence(first)
+    if (origin := marks.origins.get(first.path)) is not None:
+        what = f"{what} (argument {origin})"
+    return Problem(mark, what, fix)
+
+
+def shown(value: object) -> str:
+    """Return a value as an error shows it."""
+    if value is None:
+        return "empty"
+    if isinstance(value, dict):
+        return "a mapping"
+    if isinstance(value, list | tuple):
+        return "a list"
+    if isinstance(value, str):
+        return f"the text {value!r}" if len(value) <= 40 else f"the text {value[:40] + '...'!r}"
+    return text_of(value)
+
+
+_NUMBER = "a number"
+_WHOLE = "a whole number"
+_BOOL = "true or false"
+_TEXT = "text"
+_TYPES: Mapping[str, str] = {
+    "int_type": _WHOLE,
+    "int_parsing": _WHOLE,
+    "int_from_float": _WHOLE,
+    "int_parsing_size": "a whole number of ordinary size",
+    "float_type": _NUMBER,
+    "float_parsing": _NUMBER,
+    "finite_number": "a finite number",
+    "bool_type": _BOOL,
+    "bool_parsing": _BOOL,
+    "string_type": _TEXT,
+    "none_required": "empty",
+    "dict_type": "a mapping",
+    "mapping_type": "a mapping",
+    "model_type": "a mapping",
+    "model_attributes_type": "a mapping",
+    "dataclass_type": "a mapping",
+    "list_type": "a list",
+    "tuple_type": "a list",
+    "set_type": "a list",
+    "frozen_set_type": "a list",
+    "iterable_type": "a list",
+}
+_BOUNDS: Mapping[str, str] = {
+    "greater_than": "greater than {gt}",
+    "greater_than_equal": "at least {ge}",
+    "less_than": "less than {lt}",
+    "less_than_equal": "at most {le}",
+    "multiple_of": "a multiple of {multiple_of}",
+    "literal_error": "{expected}",
+    "enum": "{expected}",
+}
+_REMEDIES: Mapping[str, str] = {
+    _WHOLE: "write digits only, without quotes and without a point",
+    _NUMBER: "write a number without quotes",
+    _BOOL: "write true or false without quotes (yes, no, on and off are text)",
+    _TEXT: "put it in quotes",
+    "a mapping": "write `key: value` lines below it, or {key: value, ...} behind it",
+    "a list": "write [a, b, ...]",
+}
+
+
+def _expected(error: _Error) -> str | None:
+    """Return what the value must be, for errors that need no other words."""
+    if error.kind in _BOUNDS:
+        plain = {key: _bound(value) for key, value in error.context.items()}
+        return _BOUNDS[error.kind].format(**plain)
+    return _TYPES.get(error.kind)
+
+
+def _bound(value: object) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value).replace("'", "")
+
+
+def _remedy(error: _Error) -> str:
+    """Return how to fix a value of a wrong type or outside its range."""
+    expected = _TYPES.get(error.kind, "")
+    if error.kind in ("literal_error", "enum"):
+        return "write it so"
+    written = plain_value(error.input) if isinstance(error.input, str) else None
+    if isinstance(written, int | float) and expected in (_WHOLE, _NUMBER, _BOOL):
+        return "take the quotes away" if expected != _WHOLE or isinstance(written, int) else _REMEDIES[_WHOLE]
+    if expected == _TEXT and isinstance(error.input, bool | int | float):
+        return f'put it in quotes: "{text_of(error.input)}"'
+    return _example(error) or _REMEDIES.get(expected, "correct it")
+
+
+def _example(error: _Error) -> str:
+    field = error.field()
+    key = error.path[-1] if error.path else ""
+    if field is None or field.example is None or not isinstance(key, str):
+        return ""
+    return f"write for example `{key}: {field.example}`"
+
+
+def _sentence(error: _Error) -> tuple[str, str]:
+    """Return what is wrong and how to fix it, for the kinds that need more than a value."""
+    sentence = _SENTENCES.get(error.kind)
+    return sentence(error) if sentence is not None else (f"{error.name}: {error.kind}", "correct it")
+
+
+def _sentence_missing(error: _Error) -> tuple[str, str]:
+    key = error.path[-1]
+    parent = path_text(error.path[:-1])
+    if isinstance(key, int):
+        return f"{parent} has too few values", "add the others"
+    field = error.field()
+    example = "..." if field is None or field.example is None else field.example
+    return f"{parent} has no {key}", f"add `{key}: {example}`"
+
+
+def _sentence_unknown(error: _Error) -> tuple[str, str]:
+    key, parent = str(error.path[-1]), path_text(error.path[:-1])
+    known, refused = ((), {}) if error.model is None else keys_at(error.model, error.location[:-1])
+    if key in refused:
+        return f"{path_text(error.path)} is not possible", refused[key]
+    close = difflib.get_close_matches(key.lower().replace("-", "_"), known, n=1)
+    if close:
+        return f"{parent} has an unknown key {key!r}", f"did you mean {close[0]}?"
+    return (
+        f"{parent} has an unknown key {key!r}",
+        f"take it out; known keys: {', '.join(known)}" if known else "take it out",
+    )
+
+
+def _sentence_length(error: _Error) -> tuple[str, str]:
+    least, most = error.context.get("min_length"), error.context.get("max_length")
+    if error.kind in ("too_long", "string_too_long"):
+        return f"{error.name} is too long", f"keep {most} at most"
+    if error.kind == "string_too_short":
+        return f"{error.name} is too short", "write something"
+    return f"{error.name} has too few entries", f"write at least {least}"
+
+
+def _sentence_own(error: _Error) -> tuple[str, str]:
+    """Return the error of a validator, of ours or of a plug-in: `what; how to fix it`."""
+    if "what" in error.context and "fix" in error.context:
+        what, fix = str(error.context["what"]), str(error.context["fix"])
+    else:
+        what, _, fix = str(error.context.get("error", "it is refused")).partition("; ")
+    return f"{error.name}: {what}", fix or "correct it"
+
+
+def _sentence_json(error: _Error) -> tuple[str, str]:
+    return f"{error.name} is no JSON ({error.context.get('error')})", "correct it"
+
+
+def _sentence_pattern(error: _Error) -> tuple[str, str]:
+    pattern = error.context.get("pattern")
+    return f"{error.name} is {shown(error.input)}, which does not match {pattern}", "correct it"
+
+
+_SENTENCES: Mapping[str, Callable[[_Error], tuple[str, str]]] = {
+    "missing": _sentence_missing,
+    "missing_argument": _sentence_missing,
+    "extra_forbidden": _sentence_unknown,
+    "too_short": _sentence_length,
+    "too_long": _sentence_length,
+    "string_too_short": _sentence_length,
+    "string_too_long": _sentence_length,
+    "string_pattern_mismatch": _sentence_pattern,
+    "json_invalid": _sentence_json,
+    "value_error": _sentence_own,
+    "assertion_error": _sentence_own,
+    "dxlrun": _sentence_own,
+}
+
+
+@runtime_checkable
+class Refusing(Protocol):
+    """A model that knows why some keys, which a person may expect, are not possible."""
+
+    refused: ClassVar[Mapping[str, str]]
+    """Key -> what to do instead."""
+
+
+@runtime_checkable
+class ReadBefore(Protocol):
+    """A model of a file that has keys which were taken out before the model sees it."""
+
+    read_before: ClassVar[tuple[str, ...]]
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """One key of a model."""
+
+    example: str | None
+    """As it is written in the file."""
+
+
+def field_at(model: type[BaseModel], location: tuple[str | int, ...]) -> Field | None:
+    """Return the field at pydantic's location, or None when it is no field of a model."""
+    if not location:
+        return None
+    owner, key = _follow(model, location[:-1]), location[-1]
+    if owner is None or not isinstance(key, str):
+        return None
+    info = owner.model_fields.get(key)
+    if info is None:
+        return None
+    return Field(str(info.examples[0]) if info.examples else None)
+
+
+def keys_at(
+    model: type[BaseModel], location: tuple[str | int, ...]
+) -> tuple[tuple[str, ...], Mapping[str, str]]:
+    """Return the keys that the model at a location takes, and the refused ones with a sentence each."""
+    owner = _follow(model, location)
+    if owner is None:
+        return (), {}
+    refused: Mapping[str, str] = owner.refused if isinstance(owner, Refusing) else {}
+    before = owner.read_before if isinstance(owner, ReadBefore) else ()
+    return (*owner.model_fields, *before), refused
+
+
+def _follow(model: type[BaseModel], location: tuple[str | int, ...]) -> type[BaseModel] | None:
+    """Return the model at a location; steps that name a union's member choose it."""
+    at: object = model
+    for step in location:
+        at = _inner(at, step)
+    at = _without_none(at)
+    return at if isinstance(at, type) and issubclass(at, BaseModel) else None
+
+
+def _inner(at: object, step: str | int) -> object:
+    at = _without_none(at)
+    if get_origin(at) in (Union, UnionType):
+        return next((arm for arm in get_args(at) if step in _names(arm)), None)
+    if isinstance(at, type) and issubclass(at, BaseModel):
+        info = at.model_fields.get(str(step))
+        return None if info is None else info.annotation
+    arguments = get_args(at)
+    if get_origin(at) is dict:
+        return arguments[1]
+    return arguments[0] if arguments and isinstance(step, int) else None
+
+
+def _without_none(at: object) -> object:
+    """Return an annotation without `Annotated` and without the None of an optional."""
+    while get_origin(at) is Annotated:
+        at = get_args(at)[0]
+    if get_origin(at) in (Union, UnionType):
+        arms = [arm for arm in get_args(at) if arm is not type(None)]
+        if len(arms) == 1:
+            return _without_none(arms[0])
+    return at
+
+
+def _names(arm: object) -> tuple[str, ...]:
+    """Return by which names pydantic calls a member of a union."""
+    tags = [note.tag for note in get_args(arm) if isinstance(note, Tag)]
+    plain = _without_none(arm)
+    return (*tags, plain.__name__) if isinstance(plain, type) else tuple(tags)

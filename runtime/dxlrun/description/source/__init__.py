@@ -1,1 +1,0 @@
-"""Source: YAML text with marks, includes and arguments to one tree."""
