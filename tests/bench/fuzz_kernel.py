@@ -77,7 +77,7 @@ class Line:
         self.clock = clock
         self.replies, self.arriving, self.sent = [], [], []
         self.stall_ns = 0
-        """How long the host stands still behind each read."""
+        """How long the host pauses after each read."""
         self.lost = False
         """True where the line takes no bytes: its adapter is gone."""
 

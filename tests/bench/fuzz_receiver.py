@@ -89,7 +89,7 @@ def damaged(packet: bytes, rng: random.Random) -> bytes:
 
 
 def noise(dialect: Dialect, rng: random.Random) -> bytes:
-    """Return bytes of nobody, often with something like a header."""
+    """Return random bytes, often with something like a header."""
     made = rng.randbytes(rng.randint(0, 30))
     return made + dialect.HEADER[: rng.randint(0, 4)] + made[:3] if rng.random() < 0.5 else made
 
@@ -109,7 +109,7 @@ def replies(dialect: Dialect, rng: random.Random) -> list[bytes]:
 
 
 def batch(dialect: Dialect, rng: random.Random) -> tuple[bytes, list[bytes], list[bytes]]:
-    """Return a stream, its intact packets that no rubbish stands before, and all intact ones."""
+    """Return a stream, its intact packets without rubbish before them, and all intact ones."""
     stream, certain, intact = bytearray(), [], []
     clean = True
     while len(intact) < BATCH:

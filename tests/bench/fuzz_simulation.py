@@ -1,7 +1,7 @@
 """Campaign: random and mutated bytes for simulated servos of every model, of both protocols.
 
 Nothing may be raised; whatever is answered consists of whole status packets with right checksums; where no
-intact packet stands in what was said since the last pause, nothing is answered at all; memory does not grow;
+intact packet is in the bytes since the last pause, there is no reply at all; memory does not grow;
 and after each servo's share, set back to how it was, it still answers a ping. Packets and checksums are made
 and judged by code of this file.
 
@@ -27,7 +27,7 @@ from dxlrun.simulation import BusConfig, Ledger, ServoConfig
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 
 PER_SERVO = 250
-"""Strings that one servo hears before another takes its place."""
+"""Strings that one servo receives before another takes its place."""
 PER_PAUSE = 10
 """Strings that follow each other without a pause that would end a packet."""
 INSTRUCTIONS = (1, 2, 3, 4, 5, 6, 8, 0x10, 0x20, 0x82, 0x83, 0x8A, 0x92, 0x93, 0x9A, 0x55, 0x77)
@@ -90,33 +90,33 @@ def holds_intact_packet(protocol: float, data: bytes) -> bool:
     return False
 
 
-def judge(protocol: float, said: bytes) -> int:
-    """Return the number of status packets; raises AssertionError when anything else was said."""
+def judge(protocol: float, reply: bytes) -> int:
+    """Return the number of status packets; raises AssertionError for anything else."""
     answers = 0
-    while said:
-        size = _status1(said) if protocol == 1.0 else _status2(said)
+    while reply:
+        size = _status1(reply) if protocol == 1.0 else _status2(reply)
         answers += 1
-        said = said[size:]
+        reply = reply[size:]
     return answers
 
 
-def _status1(said: bytes) -> int:
-    assert said[:2] == b"\xff\xff", said.hex(" ")
-    size = 4 + said[3]
-    assert len(said) >= size, said.hex(" ")
-    assert sum(said[2:size]) & 0xFF == 0xFF, said.hex(" ")
+def _status1(reply: bytes) -> int:
+    assert reply[:2] == b"\xff\xff", reply.hex(" ")
+    size = 4 + reply[3]
+    assert len(reply) >= size, reply.hex(" ")
+    assert sum(reply[2:size]) & 0xFF == 0xFF, reply.hex(" ")
     return size
 
 
-def _status2(said: bytes) -> int:
-    assert said[:4] == b"\xff\xff\xfd\x00", said.hex(" ")
-    assert said[7] == 0x55, said.hex(" ")
-    size = 7 + int.from_bytes(said[5:7], "little")
-    if said[4] == BROADCAST:  # a fast status stays short where servos are missing: one of its CRCs ends it
-        ends = range(min(size, len(said)), 11, -1)
-        size = next((end for end in ends if _right_crc(said[:end])), 0)
-    assert size <= len(said), said.hex(" ")
-    assert _right_crc(said[:size]), said.hex(" ")
+def _status2(reply: bytes) -> int:
+    assert reply[:4] == b"\xff\xff\xfd\x00", reply.hex(" ")
+    assert reply[7] == 0x55, reply.hex(" ")
+    size = 7 + int.from_bytes(reply[5:7], "little")
+    if reply[4] == BROADCAST:  # a fast status stays short where servos are missing: one of its CRCs ends it
+        ends = range(min(size, len(reply)), 11, -1)
+        size = next((end for end in ends if _right_crc(reply[:end])), 0)
+    assert size <= len(reply), reply.hex(" ")
+    assert _right_crc(reply[:size]), reply.hex(" ")
     return size
 
 
@@ -125,7 +125,7 @@ def _right_crc(status: bytes) -> bool:
 
 
 class Host:
-    """One simulated servo and the bytes that are said to it."""
+    """One simulated servo and the bytes that are sent to it."""
 
     def __init__(self, table: ControlTable, rng: random.Random, tally: Tally) -> None:
         self.protocol, self.table, self.rng, self.tally = table.protocol, table, rng, tally
@@ -137,32 +137,32 @@ class Host:
         self.now_ns = 0
         self.pause_ns = 2_000_000 if table.protocol == 2.0 else 101_000_000
 
-    def say(self, data: bytes) -> bytes:
+    def send(self, data: bytes) -> bytes:
         """Say something; return all that is answered."""
         self.bus.receive(data, self.now_ns)
         self.now_ns += len(data) * 10_000_000_000 // self.rate
-        said = b""
+        reply = b""
         while (due := self.bus.next_due_ns()) is not None:
             self.now_ns = max(self.now_ns, due)
-            said += self.bus.take(self.now_ns)
-        return said
+            reply += self.bus.take(self.now_ns)
+        return reply
 
     def run(self) -> None:
         """Say strings until the next pause, and judge what comes back."""
         gentle = self.rng.random() < 0.5
-        heard, said = b"", b""
+        sent, reply = b"", b""
         for _ in range(PER_PAUSE):
             string = self._string(gentle)
-            heard += string
-            said += self.say(string)
+            sent += string
+            reply += self.send(string)
             self.tally.strings += 1
         self.now_ns += self.pause_ns
-        if holds_intact_packet(self.protocol, heard):
+        if holds_intact_packet(self.protocol, sent):
             self.tally.intact += 1
         else:
-            assert said == b"", f"{heard.hex(' ')} was answered by {said.hex(' ')}"
+            assert reply == b"", f"{sent.hex(' ')} was answered by {reply.hex(' ')}"
             self.tally.silent += 1
-        self.tally.answers += judge(self.protocol, said)
+        self.tally.answers += judge(self.protocol, reply)
 
     def set_back(self) -> None:
         """Make it reachable as it was, and expect the answer to a ping."""
@@ -173,10 +173,10 @@ class Host:
         item = "baud_rate" if "baud_rate" in self.table.items else "baud_rate_bus"
         servo.poke(item, next(value for value, rate in self.table.baud_rates.items() if rate == self.rate))
         self.now_ns += 300_000_000
-        assert judge(self.protocol, self.say(packet(self.protocol, 1, 1, b""))) == 1
+        assert judge(self.protocol, self.send(packet(self.protocol, 1, 1, b""))) == 1
 
     def _string(self, gentle: bool) -> bytes:
-        """Return bytes of nobody, a damaged packet or, where it is not gentle, an intact one."""
+        """Return random bytes, a damaged packet or, where it is not gentle, an intact one."""
         kind = self.rng.random()
         if kind < 0.25:
             return self._noise()

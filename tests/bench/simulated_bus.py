@@ -3,7 +3,7 @@
     python tests/bench/simulated_bus.py [--transactions 1000] [--seconds 10] [--priority N --core N]
 
 First: reads of 10 bytes at 57600, 1 M, 2 M and 4 Mbit/s; by how much later than wire time and return delay
-the host has the last byte, as the host sees it. Then: 20 servos on 4 buses at 4 Mbit/s, each bus asked 1,000
+the host has the last byte, as the host sees it. Then: 20 servos on 4 buses at 4 Mbit/s, each bus read 1,000
 times a second with a sync write of goals and a sync read of 10 bytes.
 """
 
@@ -63,8 +63,8 @@ def serving(buses: Sequence[BusConfig], options: Sequence[str]) -> Iterator[Runn
             theirs.close()
             os.close(reader)
             try:
-                with ours.makefile("rb") as said:
-                    first = json.loads(said.readline())
+                with ours.makefile("rb") as output:
+                    first = json.loads(output.readline())
                 yield Running(child, first["ports"], first["real_time"])
             finally:
                 ours.close()
@@ -129,7 +129,7 @@ def show_lateness(transactions: int, options: Sequence[str]) -> None:
 
 @dataclass
 class Asked:
-    """One bus, as its host sees it: it asks again when it got everything, or has waited for 5 ms in vain."""
+    """One bus, as its host sees it: it reads again when it has everything, or after 5 ms."""
 
     port: int
     asked_ns: int = 0
@@ -138,7 +138,7 @@ class Asked:
     given_up: int = 0
 
     def turn(self, question: bytes, now_ns: int) -> None:
-        """Take what has come; ask again."""
+        """Take what has come; read again."""
         with contextlib.suppress(BlockingIOError):
             self.missing -= len(os.read(self.port, 4096))
         if self.missing > 0 and now_ns - self.asked_ns < 5_000_000:
@@ -181,7 +181,7 @@ def show_load(seconds: float, options: Sequence[str]) -> None:
         host_s = time.process_time() - host_s
         answered = sum(host.answered for host in hosts)
         print(
-            f"{BUSES * SERVOS_A_BUS} servos on {BUSES} buses at 4 Mbit/s, {elapsed_s:.1f} s, asked 1000 "
+            f"{BUSES * SERVOS_A_BUS} servos on {BUSES} buses at 4 Mbit/s, {elapsed_s:.1f} s, read 1000 "
             f"times a second: each bus answered {answered / BUSES / elapsed_s:.0f} times a second whole "
             f"({sum(host.given_up for host in hosts)} answers had not come in 5 ms, the host was late "
             f"{late} times); the simulator used {spent_s / elapsed_s:.2f} of a core, "
@@ -197,13 +197,13 @@ def main() -> None:
     parser.add_argument("--priority", type=int, default=0)
     parser.add_argument("--core", type=int, default=-1)
     options = parser.parse_args()
-    wishes = ("--priority", str(options.priority), "--core", str(options.core))
+    settings = ("--priority", str(options.priority), "--core", str(options.core))
     if options.priority > 1:  # the host comes after the simulator and before everything else
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(options.priority - 1))
     if options.transactions:
-        show_lateness(options.transactions, wishes)
+        show_lateness(options.transactions, settings)
     if options.seconds:
-        show_load(options.seconds, wishes)
+        show_load(options.seconds, settings)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""docs/bench.md says what is so."""
+"""The figures and commands of docs/bench.md are those of the program."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ import pytest
 from dxlrun.analysis.ledger.overruns import Transaction
 from dxlrun.dynamixel.wire import protocol1
 from dxlrun.errors import ProcessFault
-from exchange.bus import Wish, bench_bus, chosen_hosts, to_json
+from exchange.bus import Settings, bench_bus, chosen_hosts, to_json
 from exchange.canned import CannedResponder
 from exchange.case import Case, Registers
 from exchange.figures import host_figures, wire_figures
@@ -28,7 +28,7 @@ from exchange.rounds import Measured, measure
 from exchange.wire import judge
 
 SECONDS = 0.2
-PATIENCE_S = 60.0
+TIMEOUT_S = 60.0
 """How long a test waits for what must come; it decides nothing but when to give up."""
 ALL = [kind.name for kind in HOSTS]
 
@@ -40,7 +40,7 @@ def by_name(hosts: Any) -> dict[str, Any]:
 @pytest.mark.parametrize("protocol", [1.0, 2.0])
 def test_every_host_exchanges_the_same_bytes_with_the_canned_responder(protocol: float) -> None:
     case = Case(protocol, 3)
-    (found,) = bench_bus([("canned", case)], Wish(chosen_hosts(ALL), SECONDS)).cases
+    (found,) = bench_bus([("canned", case)], Settings(chosen_hosts(ALL), SECONDS)).cases
     hosts = by_name(found.hosts)
     assert set(hosts) == set(ALL) if protocol == 2.0 else set(hosts) == {n for n in ALL if "fast" not in n}
     registers = Registers.of(case.plan(wire=False))
@@ -58,10 +58,10 @@ def test_every_host_exchanges_the_same_bytes_with_the_canned_responder(protocol:
 
 def test_on_simulated_servos_the_ledger_says_how_many_bytes_an_exchange_has() -> None:
     case = Case(2.0, 2)
-    wish = Wish(chosen_hosts(["ours", "rustypot"]), 2 * SECONDS)
+    settings = Settings(chosen_hosts(["ours", "rustypot"]), 2 * SECONDS)
     budget = case.plan(wire=True).buses[0].budget
     for _ in range(10):  # behind a lost reply a servo gets no goals, and machines stand still now and then
-        (found,) = bench_bus([("simulated", case)], wish).cases
+        (found,) = bench_bus([("simulated", case)], settings).cases
         ours = by_name(found.hosts)["ours"]
         if not ours.lost:
             break
@@ -71,19 +71,19 @@ def test_on_simulated_servos_the_ledger_says_how_many_bytes_an_exchange_has() ->
 
 
 def test_a_host_that_is_not_installed_is_left_out_and_said() -> None:
-    nobody = HostKind("nobody", "no_such_module_at_all", HOSTS[0].make)
-    told: list[tuple[str, float]] = []
-    wish = Wish([nobody, *chosen_hosts(["unrecorded"])], 0.05)
-    found = bench_bus([("canned", Case(2.0, 1))], wish, lambda *words: told.append(words))
-    assert found.missing == ("nobody",)
+    absent_host = HostKind("absent", "no_such_module_at_all", HOSTS[0].make)
+    reported: list[tuple[str, float]] = []
+    settings = Settings([absent_host, *chosen_hosts(["unrecorded"])], 0.05)
+    found = bench_bus([("canned", Case(2.0, 1))], settings, lambda *words: reported.append(words))
+    assert found.missing == ("absent",)
     assert [one.host for one in found.cases[0].hosts] == ["unrecorded"]
-    assert told[-1] == ("canned: Protocol 2.0, 1 x XM430-W350", 1.0)
+    assert reported[-1] == ("canned: Protocol 2.0, 1 x XM430-W350", 1.0)
     assert b'"exchanges"' in to_json(found)
 
 
 def test_the_core_is_given_back() -> None:
     before = os.sched_getaffinity(0)
-    bench_bus([("canned", Case(2.0, 1))], Wish(chosen_hosts(["unrecorded"]), 0.02))
+    bench_bus([("canned", Case(2.0, 1))], Settings(chosen_hosts(["unrecorded"]), 0.02))
     assert os.sched_getaffinity(0) == before
 
 
@@ -92,7 +92,7 @@ def test_the_core_is_given_back() -> None:
 
 @pytest.fixture
 def learned() -> tuple[Terminal, Callable[..., bytes]]:
-    """A responder that learned to answer a ping, then goals that nobody answers."""
+    """A responder that learned to answer a ping, then goals without a reply."""
     terminal = Terminal(Case(1.0, 1).simulated("main"))
     host = os.open(terminal.path, os.O_RDWR | os.O_NOCTTY)
 
@@ -100,10 +100,10 @@ def learned() -> tuple[Terminal, Callable[..., bytes]]:
         """Write, let the responder take all of it, and hear an answer of some size."""
         left, heard = os.write(host, data), b""
         while left > 0:
-            assert select.select([terminal], [], [], PATIENCE_S)[0]
+            assert select.select([terminal], [], [], TIMEOUT_S)[0]
             left -= terminal.receive()
         while len(heard) < size:
-            assert select.select([host], [], [], PATIENCE_S)[0], f"only {heard.hex(' ')} came"
+            assert select.select([host], [], [], TIMEOUT_S)[0], f"only {heard.hex(' ')} came"
             heard += os.read(host, 1000)
         assert not select.select([host], [], [], 0)[0]
         return heard
@@ -153,7 +153,7 @@ def test_a_responder_that_ended_is_an_error_and_is_not_waited_for() -> None:
 
 
 class Made:
-    """A host whose exchanges are lost when they are told to."""
+    """A host whose exchanges are lost on request."""
 
     def __init__(self, lost: set[int]) -> None:
         self.count = 0
@@ -166,7 +166,7 @@ class Made:
         self.count += 1
         return self.count not in self.lost
 
-    def mend(self) -> None:
+    def recover(self) -> None:
         pass
 
     def sent(self) -> tuple[()]:
@@ -177,10 +177,10 @@ class Made:
 
 
 def test_a_turn_with_a_lost_reply_counts_only_as_lost_and_the_host_is_mended() -> None:
-    mended: list[str] = []
+    recovered: list[str] = []
     hosts = {"good": Made(set()), "bad": Made({2, 6})}
-    found = measure(hosts, 1e-6, most=5, recover=mended.append)
-    assert mended == ["bad", "bad"]
+    found = measure(hosts, 1e-6, most=5, recover=recovered.append)
+    assert recovered == ["bad", "bad"]
     assert (found["good"].lost, found["bad"].lost) == (0, 2)
     assert found["good"].exchanges > 0
     assert found["bad"].walls_ns == []

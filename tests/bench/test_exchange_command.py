@@ -23,7 +23,7 @@ FOLDER = Path(__file__).parent / "exchange"
             ("--peers", "ours,theirs"),
             "--peers: there is no theirs; there are ours, polled, unrecorded, sdk",
         ),
-        (("--peers", ""), "--peers says nothing; there are ours"),
+        (("--peers", ""), "--peers is empty; there are ours"),
         (("--protocol", "3.0"), "--protocol: there is no 3.0; there are 1.0, 2.0"),
         (("--against", "nothing"), "--against: there is no nothing; there are canned, simulated"),
         (("--servos", "1,many"), "--servos 1,many: give numbers from 1 to 50, for example 1,8,20"),

@@ -30,7 +30,7 @@ _MOST_MENDS = 100
 
 
 @dataclass(frozen=True, slots=True)
-class Wish:
+class Settings:
     """How each case is measured."""
 
     hosts: Sequence[HostKind]
@@ -57,23 +57,23 @@ def chosen_hosts(names: Sequence[str]) -> list[HostKind]:
 
 
 def bench_bus(
-    cases: Sequence[tuple[Against, Case]], wish: Wish, progress: Progress = lambda *_: None
+    cases: Sequence[tuple[Against, Case]], settings: Settings, progress: Progress = lambda *_: None
 ) -> BusBench:
     """Measure each case, against canned replies or simulated servos with a wire."""
-    missing = tuple(kind.name for kind in wish.hosts if kind.missing)
+    missing = tuple(kind.name for kind in settings.hosts if kind.missing)
     ours, theirs = cores()
     found: list[CaseFigures] = []
     with on_core(ours):
         for number, (against, case) in enumerate(cases):
             words = f"{against}: Protocol {case.protocol:.1f}, {case.servos} x {case.model}"
 
-            def told(share: float, words: str = words, number: int = number) -> None:
+            def report(share: float, words: str = words, number: int = number) -> None:
                 progress(words, (number + share) / len(cases))
 
-            able = [kind for kind in wish.hosts if not kind.missing and case.protocol in kind.protocols]
+            able = [kind for kind in settings.hosts if not kind.missing and case.protocol in kind.protocols]
             if able:
                 measured = _canned if against == "canned" else _simulated
-                found.append(measured(case, replace(wish, hosts=able), theirs, told))
+                found.append(measured(case, replace(settings, hosts=able), theirs, report))
     return BusBench((ours, theirs), tuple(found), missing)
 
 
@@ -83,28 +83,28 @@ def to_json(result: BusBench) -> bytes:
 
 
 @contextmanager
-def _made(case: Case, wish: Wish, ports: Sequence[str], *, wire: bool) -> Iterator[dict[str, Host]]:
+def _made(case: Case, settings: Settings, ports: Sequence[str], *, wire: bool) -> Iterator[dict[str, Host]]:
     plan = case.plan(wire=wire)
     with ExitStack() as stack:
         hosts: dict[str, Host] = {}
-        for kind, port in zip(wish.hosts, ports, strict=True):
-            hosts[kind.name] = kind.make(port, case, plan, wish.values)
+        for kind, port in zip(settings.hosts, ports, strict=True):
+            hosts[kind.name] = kind.make(port, case, plan, settings.values)
             stack.callback(hosts[kind.name].close)
         yield hosts
 
 
-def _canned(case: Case, wish: Wish, core: int, progress: Callable[[float], None]) -> CaseFigures:
+def _canned(case: Case, settings: Settings, core: int, progress: Callable[[float], None]) -> CaseFigures:
     with ExitStack() as stack:
-        responder = CannedResponder([case.simulated(kind.name) for kind in wish.hosts], core)
+        responder = CannedResponder([case.simulated(kind.name) for kind in settings.hosts], core)
         stack.callback(responder.close)
-        hosts = stack.enter_context(_made(case, wish, responder.ports, wire=False))
+        hosts = stack.enter_context(_made(case, settings, responder.ports, wire=False))
         numbers = {name: number for number, name in enumerate(hosts)}
         steps = {name: responder.rehearse(numbers[name], host, first=True) for name, host in hosts.items()}
 
         def recover(name: str) -> None:
             responder.rehearse(numbers[name], hosts[name], first=False)
 
-        found = measure(hosts, wish.seconds, recover=recover, progress=progress)
+        found = measure(hosts, settings.seconds, recover=recover, progress=progress)
     sizes = {
         name: (float(sum(sent for sent, _ in each)), float(sum(got for _, got in each)))
         for name, each in steps.items()
@@ -113,21 +113,21 @@ def _canned(case: Case, wish: Wish, core: int, progress: Callable[[float], None]
     return CaseFigures("canned", case.protocol, case.model, case.servos, None, hosts_)
 
 
-def _simulated(case: Case, wish: Wish, core: int, progress: Callable[[float], None]) -> CaseFigures:
+def _simulated(case: Case, settings: Settings, core: int, progress: Callable[[float], None]) -> CaseFigures:
     with tempfile.TemporaryDirectory(prefix="dxlrun-bench-") as folder, ExitStack() as stack:
         ledger = Path(folder) / "ledger.jsonl"
-        with SimulatedServos([case.simulated(kind.name) for kind in wish.hosts], core, ledger) as servos:
-            hosts = stack.enter_context(_made(case, wish, servos.ports, wire=True))
+        with SimulatedServos([case.simulated(kind.name) for kind in settings.hosts], core, ledger) as servos:
+            hosts = stack.enter_context(_made(case, settings, servos.ports, wire=True))
             for host in hosts.values():
                 host.start()
 
             def recover(name: str) -> None:
                 for _ in range(_MOST_MENDS):
-                    hosts[name].mend()
+                    hosts[name].recover()
                     if hosts[name].exchange():
                         return
 
-            found = measure(hosts, wish.seconds, recover=recover, progress=progress)
+            found = measure(hosts, settings.seconds, recover=recover, progress=progress)
             sent = {name: host.sent() for name, host in hosts.items()}
         entries = read_ledger(ledger)
     sizes: dict[str, tuple[float, float]] = dict.fromkeys(found, (0.0, 0.0))
@@ -158,6 +158,6 @@ def _judged(
             for start, walls_ in zip(one.starts_ns, one.walls_ns, strict=True)
         ]
     )
-    told = judge(transactions(entries, sent, byte_ns), starts, walls)
-    size = told.sent_bytes, told.received_bytes
-    return size, wire_figures(walls.astype(float), told.late_ns.astype(float), sum(size) * byte_ns)
+    lateness = judge(transactions(entries, sent, byte_ns), starts, walls)
+    size = lateness.sent_bytes, lateness.received_bytes
+    return size, wire_figures(walls.astype(float), lateness.late_ns.astype(float), sum(size) * byte_ns)

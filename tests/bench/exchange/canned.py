@@ -50,7 +50,7 @@ class CannedResponder:
         Returns the steps. Raises ProcessFault when its exchanges never become alike.
         """
         self._do(port, "rehearse")
-        host.start() if first else host.mend()
+        host.start() if first else host.recover()
         before: Steps = ()
         alike = 0
         for _ in range(_MOST_REHEARSALS):
@@ -63,7 +63,7 @@ class CannedResponder:
             before = steps if good else ()
             if not good:
                 self._do(port, "rehearse")
-                host.mend()
+                host.recover()
         raise ProcessFault(
             "the exchanges were never alike while the servos answered; nothing can be measured"
         )
@@ -89,5 +89,5 @@ class CannedResponder:
         except BrokenPipeError:
             answer = b""
         if not answer:
-            raise ProcessFault("the canned responder ended; what it printed says why")
+            raise ProcessFault("the canned responder ended; its output has the reason")
         return msgspec.json.decode(answer, type=_Answer)

@@ -1,4 +1,4 @@
-"""A case to be measured: a bus of equal servos, as a robot file says it, and the registers of an exchange."""
+"""A case to be measured: a bus of equal servos, as in a robot file, and the registers of an exchange."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Case:
             "direction: 1, limits: {position: [-90 deg, 90 deg]}}\n"
             for each in self.ids
         )
-        # hosts take turns, so a servo hears nothing of one for longer than a watchdog waits
+        # hosts take turns, so one host is silent for longer than a watchdog waits
         watchdog = ", bus_watchdog: 0 ms" if self.protocol == 2.0 else ""
         return (
             "name: bench\n"

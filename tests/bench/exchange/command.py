@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dxlrun.errors import DxlrunError, InputError
 from dxlrun.output.table import Column, Table, Value, numbers
 from dxlrun.output.terminal import print_error, print_warning, progress_bar, show
-from exchange.bus import Against, BusBench, Wish, bench_bus, chosen_hosts, to_json
+from exchange.bus import Against, BusBench, Settings, bench_bus, chosen_hosts, to_json
 from exchange.case import Case
 from exchange.figures import HostFigures
 from exchange.hosts import HOSTS
@@ -48,7 +48,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument(
         "--raw",
         action="store_true",
-        help="the peers leave bytes raw and send bytes made before; ours goes on to SI units",
+        help="the peers leave bytes raw and send bytes made before; ours still has SI units",
     )
     made.add_argument("--json", action="store_true", help="print the result as JSON")
     return made
@@ -71,7 +71,7 @@ def _measure(options: argparse.Namespace) -> int:
     cases = _cases(options)
     names = _words("--peers", options.peers, [kind.name for kind in HOSTS])
     with progress_bar(hidden=options.json) as progress:
-        result = bench_bus(cases, Wish(chosen_hosts(names), options.seconds, not options.raw), progress)
+        result = bench_bus(cases, Settings(chosen_hosts(names), options.seconds, not options.raw), progress)
     for name in result.missing:
         print_warning(f"{name} is not installed and was left out; `pip install '.[test]'` installs it")
     if options.json:
@@ -108,7 +108,7 @@ def _cases(options: argparse.Namespace) -> list[tuple[Against, Case]]:
 def _words(option: str, text: str, known: list[str]) -> list[str]:
     words = [word.strip() for word in text.split(",") if word.strip()]
     if not words:
-        raise InputError(f"{option} says nothing; there are {', '.join(known)}")
+        raise InputError(f"{option} is empty; there are {', '.join(known)}")
     if unknown := [word for word in words if word not in known]:
         raise InputError(f"{option}: there is no {', '.join(unknown)}; there are {', '.join(known)}")
     return words

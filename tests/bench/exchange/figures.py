@@ -39,7 +39,7 @@ class HostFigures:
     """An exchange."""
     received_bytes: float
     p10_us: float
-    """On a busy machine the quickest tenth still tells who takes less."""
+    """On a busy machine the quickest tenth still shows which host takes less."""
     median_us: float
     p99_us: float
     processor_us: float

@@ -50,12 +50,12 @@ class Host(Protocol):
         """Read every servo and write every goal; False when a reply was lost."""
         ...
 
-    def mend(self) -> None:
+    def recover(self) -> None:
         """Come back to whole exchanges after a lost reply; servos answer."""
         ...
 
     def sent(self) -> Sent:
-        """Return when it wrote what since it was asked last; nothing when it does not know."""
+        """Return what it wrote and when, since the last call; nothing when that is unknown."""
         ...
 
     def close(self) -> None:
@@ -139,8 +139,8 @@ class Ours:
         self._commit()
         return self._valid.tobytes() == self._everybody  # as cheap as what the peers return
 
-    def mend(self) -> None:
-        """Exchange, and use the gap for what is owed to a servo that was silent."""
+    def recover(self) -> None:
+        """Exchange, and use idle time for a servo that did not answer."""
         self.exchange()
         self._hardware.idle(time.monotonic_ns() + _IDLE_NS)
 
@@ -149,7 +149,7 @@ class Ours:
         found: list[tuple[int, int]] = []
         while self._recorded is not None and (record := self._recorded.read()) is not None:
             if isinstance(record, Gap):
-                return ()  # bytes are counted: without some of them nothing can be said
+                return ()  # bytes are counted: without some of them there is no result
             found += [
                 (packet.first_ns, len(packet.data))
                 for packet in decode_packets(record.payload)

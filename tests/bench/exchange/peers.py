@@ -1,8 +1,8 @@
 """Peers: the maker's SDK and rustypot, each as one class that exchanges with all servos in one call.
 
 They use the same registers as we do, by the quickest calls they have for that [i]: groups of the SDK,
-raw addresses of rustypot. Protocol 1.0 has no sync read and an AX no bulk read, so there they ask one by one.
-In Protocol 2.0 both can ask by sync read, and by fast sync read when they are told to.
+raw addresses of rustypot. Protocol 1.0 has no sync read and an AX no bulk read: there they read one by one.
+In Protocol 2.0 both can use sync read, and fast sync read as an option.
 Each ends with what a program works with, integers of position, velocity and effort, and begins with integers
 of goals; ours has SI units at both ends. With `values=False` they leave the bytes as they are.
 """
@@ -13,7 +13,7 @@ from dxlrun.analysis.ledger.overruns import Sent
 from dxlrun.errors import InputError
 from exchange.case import Case, Registers
 
-PATIENCE_S = 1.0
+TIMEOUT_S = 1.0
 """rustypot waits so long for a reply; the SDK has a time of its own."""
 
 
@@ -56,7 +56,7 @@ class Sdk:
             self._write.changeParam(each, self._goal(tick) if self._values else prepared)
         return bool(self._write.txPacket() == self._good) and good
 
-    def mend(self) -> None:
+    def recover(self) -> None:
         """Throw away what is left, and exchange."""
         self._port.clearPort()
         self.exchange()
@@ -114,9 +114,9 @@ class Rustypot:
 
         self._bus: rustypot.AxPyController | rustypot.Xl430PyController
         if case.protocol == 1.0:
-            self._bus = rustypot.AxPyController(path, case.baud_rate, PATIENCE_S)
+            self._bus = rustypot.AxPyController(path, case.baud_rate, TIMEOUT_S)
         else:
-            self._bus = rustypot.Xl430PyController(path, case.baud_rate, PATIENCE_S)
+            self._bus = rustypot.Xl430PyController(path, case.baud_rate, TIMEOUT_S)
             self._bus.set_fast_sync_read(fast)
         self._ids, self._registers, self._values = list(case.ids), registers, values
         self._turn = 0
@@ -140,7 +140,7 @@ class Rustypot:
             return False
         return True
 
-    def mend(self) -> None:
+    def recover(self) -> None:
         """Exchange; it throws away what is left by itself."""
         self.exchange()
 

@@ -62,9 +62,9 @@ class Terminal:
 
     def do(self, what: Does) -> tuple[Step, ...]:
         """Let servos answer, remember what they answer from now on, or answer that from now on."""
-        self.receive()  # what the host wrote last, and nobody answers, may still be on its way
+        self.receive()  # the last bytes of the host, without a reply, may still be on their way
         if what == "play":
-            if self._waiting:  # the host ends its exchange with what nobody answers
+            if self._waiting:  # the host ends its exchange with bytes without a reply
                 self._steps.append(Step(self._waiting, b""))
             self._playing, self._learning = bool(self._steps), False
         else:
@@ -121,14 +121,14 @@ def main() -> None:
 
 
 def _serve(terminals: Sequence[Terminal]) -> None:
-    asked = sys.stdin.fileno()
+    requests = sys.stdin.fileno()
     by_descriptor = {terminal.fileno(): terminal for terminal in terminals}
     with select.epoll() as waiting:
-        for descriptor in (asked, *by_descriptor):
+        for descriptor in (requests, *by_descriptor):
             waiting.register(descriptor, select.EPOLLIN)
         while True:
             for descriptor, _ in waiting.poll():
-                if descriptor != asked:
+                if descriptor != requests:
                     by_descriptor[descriptor].receive()
                 elif line := sys.stdin.buffer.readline():  # one at a time: the starter awaits each answer
                     request = json.loads(line)

@@ -65,7 +65,9 @@ def measure(
             progress(min(1.0, share))
             first = number // 2 % len(names)
             order = names[first:] + names[:first]
-            for name in order[:: 1 if number % 2 else -1]:  # nobody is always first, or always behind another
+            for name in order[
+                :: 1 if number % 2 else -1
+            ]:  # no host is always first, or always behind another
                 if not _turn(hosts[name], found[name], most, turn_ns):
                     recover(name)
             number += 1
@@ -115,7 +117,7 @@ def _undisturbed() -> Iterator[None]:
 
 
 def cores() -> tuple[int, int]:
-    """Return the core for the host and the one for who answers: two different ones where there are two."""
+    """Return the core for the host and the one for the responder: two different ones where there are two."""
     allowed = sorted(os.sched_getaffinity(0))
     return allowed[0], allowed[-1]
 

@@ -33,7 +33,9 @@ class SimulatedServos:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._child.end()
-        told = process.whole(self._errors).decode(errors="replace").strip()
+        printed = process.whole(self._errors).decode(errors="replace").strip()
         os.close(self._errors)
         if error is None and self._child.process.returncode:
-            raise ProcessFault(f"the simulated bus ended: {told.splitlines()[-1] if told else 'no word'}")
+            raise ProcessFault(
+                f"the simulated bus ended: {printed.splitlines()[-1] if printed else 'no output'}"
+            )

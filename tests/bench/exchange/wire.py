@@ -1,4 +1,4 @@
-"""What the simulated bus' ledger says of a measurement: bytes on the wire, and the servos' own lateness."""
+"""A measurement in the simulated bus' ledger: bytes on the wire, and the servos' own lateness."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dxlrun.analysis.ledger.overruns import Transaction
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """What the ledger says of the exchanges of a host."""
+    """The exchanges of a host, in the ledger."""
 
     late_ns: NDArray[np.int64]
     """Of each, how much sooner its transactions could have ended."""
