@@ -9,7 +9,6 @@ from __future__ import annotations
 import random
 from collections import deque
 from collections.abc import Sequence
-from typing import NamedTuple
 
 from dxlrun.simulation.bus.line import Transmission
 from dxlrun.simulation.configuration import AdapterConfig
@@ -25,13 +24,8 @@ _LONGEST_PIECE = 8
 """Bytes of the longest piece of `random`."""
 
 
-class HandOver(NamedTuple):
-    """Bytes for the host."""
-
-    planned_ns: int
-    data: bytes
-    ended: Sequence[Transmission]
-    """What the host has now received to its end."""
+HandOver = tuple[int, bytes, Sequence[Transmission]]
+"""When bytes are planned for the host, the bytes, and what the host has then received to its end."""
 
 
 class Adapter:
@@ -67,7 +61,7 @@ class Adapter:
     def next_ns(self, passing: Sequence[Transmission]) -> int | None:
         """Return when the next bytes are handed over, were nothing to disturb them; None: never."""
         if self._burst:
-            return self._burst[0].planned_ns
+            return self._burst[0][0]
         if not (self._arrived or passing):
             return None
         if self._timer_ns:
@@ -77,27 +71,27 @@ class Adapter:
 
     def hand_over(self, now_ns: int, passing: Sequence[Transmission]) -> list[HandOver]:
         """Return what the host receives by a time."""
-        given = []
-        while (due_ns := self.next_ns(passing)) is not None and due_ns <= now_ns:
-            if not self._timer_ns:
-                given.append(self._next_of_first(due_ns, passing))
-                continue
-            if not self._burst:
-                self._timed_ns = due_ns
-                self._burst.extend(self._pieces(due_ns, self._gather(due_ns, BURST, passing)))
-            given.append(self._burst.popleft())
+        given: list[HandOver] = []
+        if self._timer_ns:
+            while (due_ns := self.next_ns(passing)) is not None and due_ns <= now_ns:
+                if not self._burst:
+                    self._timed_ns = due_ns
+                    self._burst.extend(self._pieces(due_ns, self._gather(due_ns, BURST, passing)))
+                given.append(self._burst.popleft())
+            return given
+        while self._arrived or passing:
+            first = self._arrived[0] if self._arrived else passing[0]
+            begin, end, size = first.given, first.given + self._piece, len(first.data)
+            due_ns = first.due_ns if end >= size else first.passed_ns(end - 1)
+            if due_ns > now_ns:
+                break
+            first.given = end
+            if end >= size:
+                self._arrived.popleft()  # what has passed to its end has arrived
+            ended = (first,) if end >= size else ()
+            given.append((due_ns, first.data[begin:end], ended))
+            self._piece = self._next_piece()
         return given
-
-    def _next_of_first(self, due_ns: int, passing: Sequence[Transmission]) -> HandOver:
-        """Take the next piece of what was on the wire first."""
-        first = self._arrived[0] if self._arrived else passing[0]
-        begin, end = first.given, first.given + self._piece
-        first.given = end
-        self._piece = self._next_piece()
-        if end < len(first.data):
-            return HandOver(due_ns, first.data[begin:end], ())
-        self._arrived.popleft()  # what has passed to its end has arrived
-        return HandOver(due_ns, first.data[begin:], (first,))
 
     def _timer_end_ns(self, queue: Sequence[Transmission]) -> int:
         """Return when the timer runs out with a byte there, or so many are there that it does not count.
@@ -131,27 +125,24 @@ class Adapter:
                 ended.append(each)
         while self._arrived and self._arrived[0].given == len(self._arrived[0].data):
             self._arrived.popleft()
-        return HandOver(now_ns, data, ended)
+        return now_ns, data, ended
 
     def _pieces(self, due_ns: int, burst: HandOver) -> list[HandOver]:
-        """Return a burst in pieces, so far from each other that a host can tell them apart [i]."""
+        """Return a burst in pieces, so far from each other that a host can distinguish them [i]."""
         if self._split == "whole":
             return [burst]
+        _, data, ended = burst
         pieces: list[HandOver] = []
         start = 0
-        while start < len(burst.data):
-            end = min(len(burst.data), start + self._piece)
+        while start < len(data):
+            end = min(len(data), start + self._piece)
             self._piece = self._next_piece()
-            ended = burst.ended if end == len(burst.data) else ()
-            pieces.append(HandOver(due_ns + len(pieces) * 10_000, burst.data[start:end], ended))
+            planned_ns = due_ns + len(pieces) * 10_000
+            pieces.append((planned_ns, data[start:end], ended if end == len(data) else ()))
             start = end
         return pieces
 
     def _next_piece(self) -> int:
-        match self._split:
-            case "whole":
-                return UNREAD_LIMIT
-            case "byte":
-                return 1
-            case "random":
-                return self._chance.randint(1, _LONGEST_PIECE)
+        if self._split == "random":
+            return self._chance.randint(1, _LONGEST_PIECE)
+        return UNREAD_LIMIT if self._split == "whole" else 1

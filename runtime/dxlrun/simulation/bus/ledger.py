@@ -47,6 +47,10 @@ class LedgerEntry(NamedTuple):
     """`out`, in real time: how long after it should have been the host got the last of them."""
 
 
+Fields = tuple[int, str, Direction, bytes, str, int]
+"""Those of an entry: a busy bus has thousands of them a second."""
+
+
 def for_group(path: str, flags: int) -> int:
     """Open a file for `open`; a new one can be read by its user and group only."""
     return os.open(path, flags, _MODE)
@@ -68,7 +72,7 @@ class Ledger:
         self._file: IO[bytes] | None = None
         if path is not None:
             self._file = open(path, "wb", _BUFFER, opener=for_group)  # noqa: SIM115  `close` closes it
-        self._new: list[LedgerEntry] = []
+        self._new: list[Fields] = []
         """Entries that are not encoded yet."""
         self._unflushed_ns: int | None = None
 
@@ -83,11 +87,10 @@ class Ledger:
         late_ns: int = 0,
     ) -> None:
         """Enter bytes or a note; `encode` and `flush_if_due` bring it into a file, at the latest its end."""
-        entry = LedgerEntry(t_ns, bus, direction, data, note, late_ns)
         if self._keep:
-            self.entries.append(entry)
+            self.entries.append(LedgerEntry(t_ns, bus, direction, data, note, late_ns))
         if self._file is not None:
-            self._new.append(entry)
+            self._new.append((t_ns, bus, direction, data, note, late_ns))
             if self._unflushed_ns is None:
                 self._unflushed_ns = t_ns
             if len(self._new) >= _MOST_ENTRIES:
@@ -159,7 +162,7 @@ def _begin(bus: str, direction: Direction) -> str:
     return f', "bus": {json.dumps(bus)}, "direction": "{direction}", "bytes": "'
 
 
-def _line(entry: LedgerEntry) -> str:
+def _line(entry: Fields) -> str:
     t_ns, bus, direction, data, note, late_ns = entry
     text = json.dumps(note) if note else '""'
     late = f', "late_ns": {late_ns}' if late_ns else ""

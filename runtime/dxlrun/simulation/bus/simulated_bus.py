@@ -91,7 +91,7 @@ class SimulatedBus:
         self.host_free_ns = start_ns
         """When the last byte that the host handed over has passed the wire."""
         self.lateness_ns: deque[int] = deque(maxlen=1000)
-        """How long after its time the host received what it received last, in real time."""
+        """How long after its time the host received the last bytes of each hand-over, in real time."""
         self._codec: Codec = protocol2 if config.protocol == 2.0 else protocol1
         self._receiver = self._codec.receiver()
         self._line = Line(config.baud_rate, self.note)
@@ -177,15 +177,16 @@ class SimulatedBus:
         self._pass_time(now_ns)
         if self._wedged:
             return b""
-        taken = b""
+        taken, late_ns = [], 0
         for planned_ns, data, ended in self._adapter.hand_over(now_ns, self._line.passing):
-            late_ns = 0 if handed_ns is None else handed_ns - planned_ns
             if handed_ns is not None:
-                self.lateness_ns.append(late_ns)
+                late_ns = handed_ns - planned_ns
             for each in ended:
                 self.ledger.add(each.due_ns, self.name, "out", each.data, each.note, late_ns=late_ns)
-            taken += data
-        return taken
+            taken.append(data)
+        if taken and handed_ns is not None:
+            self.lateness_ns.append(late_ns)
+        return b"".join(taken)
 
     # What tests see and do
 
@@ -319,7 +320,7 @@ class SimulatedBus:
             self.note(f"{len(each.data)} bytes to the host are lost: it does not read")
         group = each.group
         if group is None or group is not self._group or group.sent > each.turn + 1:
-            return
+            return  # no reply waits for its end
         if not each.broken:
             self._send_turns(group, each.due_ns)
         elif group.has_slots:
@@ -445,7 +446,7 @@ class SimulatedBus:
             plain = alone and len(turn.replies) == 1 and not self._reply_faults.get(turn.servo_id)
             if sent_any and not plain:
                 return  # it is decided when the reply before it has passed
-            slot_ns = self._line.duration_ns(turn.slot_bytes)
+            slot_ns = self._line.duration_ns(turn.slot_bytes) if group.has_slots else 0
             end_ns = due_ns = free_ns + slot_ns
             sent = False
             for reply, data in turn.replies:  # two servos with one ID send at once
