@@ -7,6 +7,7 @@ everything that a run shows is compared: bytes sent, the log, states, ages, what
 events. A stream is the bytes of one line after one read.
 
     python tests/bench/fuzz_kernel.py 2000000 --seed 1 --processes 2
+    python tests/bench/fuzz_kernel.py 200000 --processes 2 --sanitized
 
 CI runs a seeded sample of it (tests/dynamixel/test_kernel.py).
 """
@@ -15,13 +16,18 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import random
+import shutil
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import zip_longest
+from pathlib import Path
+from zlib import crc32
 
 import numpy as np
 
@@ -49,6 +55,8 @@ ROBOTS = {
     "single reads beside a bulk read": (("AX-12A", "MX-28"), 1.0),
     "two layouts": (("XM430-W350", "XL-320"), 2.0),
 }
+LIBRARY = "DXLRUN_FUZZ_KERNEL"
+"""Environment variable: the compiled kernel that is used instead of the installed one."""
 PERIOD_NS = 20_000_000
 CYCLES = 60
 """Cycles of one robot; the sixth of each six has an accident."""
@@ -425,7 +433,7 @@ def difference(found, expected, where):
 def campaign(streams: int, seed: int, names: Sequence[str] = tuple(ROBOTS)) -> Tally:
     """Compare so many streams; raises AssertionError where kernel and parser differ."""
     rng, tally = random.Random(seed), Tally()
-    library = kernel.load()
+    library = kernel.load(Path(os.environ.get(LIBRARY, kernel.LIBRARY)))
     assert library is not None, "the kernel was not built"
     while tally.streams < streams:
         name, count, split = rng.choice(names), rng.choice((1, 1, 3)), rng.random() < 0.3
@@ -470,14 +478,34 @@ def campaign(streams: int, seed: int, names: Sequence[str] = tuple(ROBOTS)) -> T
     return tally
 
 
+def sanitized(folder: str) -> dict[str, str]:
+    """Compile the kernel with the sanitizers of gcc; return the environment in which Python can load it."""
+    gcc, source, target = shutil.which("gcc") or "gcc", kernel.SOURCE, str(Path(folder, "libkernel.so"))
+    flags = ["-std=c11", "-O1", "-g", "-fPIC", "-shared", "-ffp-contract=off", "-fno-sanitize-recover=all"]
+    flags += ["-fsanitize=address,undefined", f"-DSOURCE_CRC={crc32(source.read_bytes())}u"]
+    subprocess.run([gcc, *flags, "-o", target, str(source), "-lm"], check=True)
+    found = [
+        subprocess.check_output([gcc, f"-print-file-name={name}"], text=True).strip()
+        for name in ("libasan.so", "libubsan.so")
+    ]
+    # CPython keeps memory until its end, which is no leak of the kernel
+    return {
+        **os.environ,
+        "LD_PRELOAD": " ".join(found),
+        "ASAN_OPTIONS": "detect_leaks=0",
+        LIBRARY: target,
+    }
+
+
 def main() -> None:
     """Run the campaign, in several processes by seeds that follow each other."""
     parser = argparse.ArgumentParser()
     parser.add_argument("streams", type=int, nargs="?", default=2_000_000)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--processes", type=int, default=1)
+    parser.add_argument("--sanitized", action="store_true", help="with AddressSanitizer and UBSan of gcc")
     chosen = parser.parse_args()
-    if chosen.processes == 1:
+    if chosen.processes == 1 and not chosen.sanitized:
         began = time.monotonic()
         tally = campaign(chosen.streams, chosen.seed)
         sys.stdout.write(f"seed {chosen.seed}: {tally}, {time.monotonic() - began:.0f} s\n")
@@ -485,8 +513,10 @@ def main() -> None:
     share = -(-chosen.streams // chosen.processes)
     seeds = range(chosen.seed, chosen.seed + chosen.processes)
     command = [sys.executable, __file__, str(share), "--seed"]
-    children = [subprocess.Popen([*command, str(seed)]) for seed in seeds]
-    sys.exit(max(child.wait() for child in children))
+    with tempfile.TemporaryDirectory() as folder:
+        environment = sanitized(folder) if chosen.sanitized else None
+        children = [subprocess.Popen([*command, str(seed)], env=environment) for seed in seeds]
+        sys.exit(max(abs(child.wait()) for child in children))
 
 
 if __name__ == "__main__":
