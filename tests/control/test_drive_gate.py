@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dxlrun.control.drive_gate import BRAKING_S
-from dxlrun.control.gate import Gate
+from dxlrun.control.gate import BRAKING_S, Gate
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan, LoopPlan, SchedulerPlan
 from dxlrun.control.policy_plan import SLOW_SPEED, SLOW_START_NS
 from dxlrun.interfaces import COMMAND_INTERFACES
