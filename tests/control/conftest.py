@@ -247,7 +247,7 @@ class Robot:
             stop=self.stop,
             inbox=self.inbox,
             commands=self,
-            patience=self.patience.append,
+            cycle_limit=self.patience.append,
         )
         self.manager.configure()
         self.hardware.start()

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from dxlrun.control.lost_servos import LostServos
+from dxlrun.control.loop import LostServos
 from dxlrun.control.policy_plan import GroupPolicy, PolicyPlan
 from dxlrun.interfaces import States
 from dxlrun.run.channels.commands import LOOP, Command

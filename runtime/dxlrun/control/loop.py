@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
@@ -13,16 +13,13 @@ from dxlrun.clock import Clock
 from dxlrun.control.controllers.managed import PERIOD_CAP
 from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.gate import Gate
-from dxlrun.control.hardware import Hardware
-from dxlrun.control.loop_plan import ControllerPlan, LoopPlan
-from dxlrun.control.lost_servos import LostServos
+from dxlrun.control.loop_plan import ControllerPlan, LoopPlan, OverrunPolicy
 from dxlrun.control.overrun import OverrunHook, Overruns
-from dxlrun.control.policy_plan import Last, PolicyName
+from dxlrun.control.policy_plan import GroupPolicy, Last, PolicyName, PolicyPlan
 from dxlrun.control.safe_motion import SafeMotion
-from dxlrun.control.schedule import Schedule
 from dxlrun.control.steering import Steering
 from dxlrun.errors import PortError, counted
-from dxlrun.interfaces import LOST_CYCLES
+from dxlrun.interfaces import LOST_AGE_NS, LOST_CYCLES, States
 from dxlrun.run.channels.answers import Code, Refusal
 from dxlrun.run.channels.commands import LOOP, CommandSink, Inbox, NoCommands, NoInbox, TakenCommand
 from dxlrun.run.channels.cycle import CycleRecord
@@ -31,22 +28,82 @@ from dxlrun.run.channels.events import EventCode, EventSink, Severity
 MOST_RATE = 100_000.0
 """Hz; as in the robot file."""
 LEAST_RATE = 1.0
-"""Hz, of what is asked while the loop runs: a wish is heard once a cycle, `stop` too, and the guardian's
-patience follows the rate."""
+"""Hz, the lowest rate that can be requested while the loop runs: requests are taken once a cycle, `stop` too,
+and the guardian's limit follows the rate."""
 PAUSED_CYCLE_NS = 200_000_000
-"""How long a cycle may take while the loop is paused: a controller may be loaded in it. The guardian has
-patience for some of them."""
+"""How long a cycle may take while the loop is paused: a controller may be loaded in it."""
+
+MOST_CAUGHT_UP = 5
+"""Deadlines that `catch_up` makes up for in a row, what is more is skipped; the guardian waits as long."""
 
 
 @dataclass(slots=True)
 class StopFlag:
-    """The wish to stop; set by a signal's handler, seen at the next cycle."""
+    """The request to stop; set by a signal's handler, seen at the next cycle."""
 
     requested: bool = False
 
     def request(self) -> None:
         """Ask the loop to end orderly."""
         self.requested = True
+
+
+class Hardware(Protocol):
+    """Joints that can be read and commanded; the arrays (States, goals) are given when it is built."""
+
+    def start(self) -> None:
+        """Run the start-up sequence to torque on; the first states and goals (= present) are then filled.
+
+        Raises StartUpError (a servo is not as planned; all found problems in one message, no torque
+        left on) or PortError.
+        """
+        ...
+
+    def read(self) -> None:
+        """Fill the state arrays; a lost packet makes its row invalid, it is never an exception."""
+        ...
+
+    def write(self) -> None:
+        """Send the goal arrays."""
+        ...
+
+    def set_modes(self, modes: NDArray[np.uint8]) -> None:
+        """Bring joints into these modes (interfaces.Mode, shape (joints,), UNKNOWN = leave it as it is).
+
+        Returns at once: it is done in idle time. Meanwhile `states.mode` of such a joint is
+        UNKNOWN and it gets no goal; it becomes the new mode when that was read back, or what it was before
+        when the servo refused, which an event reports. A later call replaces what is still waiting.
+        """
+        ...
+
+    def set_register(self, row: int, item: str, value: int, done: Callable[[str], None]) -> None:
+        """Write a RAM item of a joint's servo in idle time and read it back.
+
+        Returns at once. `done` is called once, here or later: with an empty text when the servo has
+        it, else with what went wrong. `item` and `value` (the integer on the wire) were checked against the
+        control table. A servo that is reset gets it again, with what the robot file declares.
+        """
+        ...
+
+    def limit_torque(self, fraction: float) -> None:
+        """Let no servo exert more than a fraction of its own limit; the next start-up takes it back."""
+        ...
+
+    def idle(self, until_ns: int) -> None:
+        """Use the idle time before the next cycle; return before `until_ns` by a margin."""
+        ...
+
+    def stop(self) -> tuple[str, ...]:
+        """Switch torque off on every servo, read it back, raise nothing; return a sentence per failure."""
+        ...
+
+    def let_go(self, rows: Sequence[int]) -> None:
+        """Switch the torque of these joints off in the coming idle time, for the rest of the run."""
+        ...
+
+    def release(self) -> None:
+        """Leave the robot holding with its torque on, in place of `stop`: nothing is sent any more."""
+        ...
 
 
 class CycleSink(Protocol):
@@ -71,7 +128,7 @@ class LoopResult:
     detail: str = ""
     """One sentence where the reason is a fault."""
     last: Last = "limp"
-    """How the policy leaves the robot; who started the hardware sees to it."""
+    """How the policy leaves the robot; done by the code that started the hardware."""
     invalid: tuple[int, ...] = ()
     """Cycles in which the state of each joint was not valid."""
 
@@ -99,10 +156,10 @@ class Loop:
     inbox: Inbox = field(default_factory=NoInbox)
     commands: CommandSink = field(default_factory=NoCommands)
     """Takes what came through the inbox, for the log."""
-    patience: Callable[[int], None] = lambda _: None
-    """Tells the guardian how long a cycle may take from now on, ns."""
+    cycle_limit: Callable[[int], None] = lambda _: None
+    """Sets how long the guardian lets a cycle take from now on, ns."""
     pace: Callable[[int], None] = lambda _: None
-    """Tells the clock another period, ns, so that its polling stays a small share of it."""
+    """Gives the clock another period, ns, so that its polling stays a small share of it."""
     overrun_hooks: tuple[OverrunHook, ...] = ()
     """Plug-ins that decide what becomes of a late cycle."""
     schedule: Schedule = field(init=False)
@@ -146,7 +203,7 @@ class Loop:
         )
         self.gate.begin()
         self.gate.ease_in()
-        self._tell_start()
+        self._log_start()
         self.manager.activate(0)
         try:
             reason, detail = self._cycle_until_end()
@@ -163,7 +220,7 @@ class Loop:
             policy, sentence = self._given_up
             reason, detail = "fault", detail or sentence
         last = self._wind_up(policy)
-        self._tell_end(reason, detail)
+        self._log_end(reason, detail)
         invalid = tuple((self._cycles - self._valid).tolist())
         return LoopResult(self._cycles, self._skipped, reason, detail, last, invalid)
 
@@ -185,7 +242,7 @@ class Loop:
         if refusal := self.manager.change_period(period_ns):
             return refusal
         self.schedule.change(self._cycle, period_ns)
-        self._tell_patience()
+        self._set_cycle_limit()
         self.pace(period_ns)
         return None
 
@@ -194,7 +251,7 @@ class Loop:
         if self.paused:
             return Refusal(Code.PAUSED_ALREADY)
         self.paused = self._stood = True
-        self._tell_patience()
+        self._set_cycle_limit()
         return None
 
     def resume(self) -> Refusal | None:
@@ -203,7 +260,7 @@ class Loop:
             return Refusal(Code.NOT_PAUSED)
         self.paused = False
         self.gate.ease_in()
-        self._tell_patience()
+        self._set_cycle_limit()
         return None
 
     def load(self, plan: ControllerPlan) -> int | Refusal:
@@ -225,7 +282,7 @@ class Loop:
         self.stop.request()
 
     def expire(self, controller: str) -> str:
-        """Hold a controller whose stream of commands ended, or end the run, as the policy says."""
+        """Hold a controller whose stream of commands ended, or end the run, by the policy."""
         policy = self.plan.policies.on_stale_command
         if policy.goes_on:
             self.manager.hold(controller)
@@ -235,11 +292,11 @@ class Loop:
 
     # Inside
 
-    def _tell_patience(self) -> None:
-        """Tell the guardian how long a cycle may take; what this one took until now counts no more."""
+    def _set_cycle_limit(self) -> None:
+        """Set how long a cycle may take; what this one took until now does not count."""
         self.beat()
         period_ns = self.schedule.period_ns
-        self.patience(max(period_ns, PAUSED_CYCLE_NS) if self.paused else period_ns)
+        self.cycle_limit(max(period_ns, PAUSED_CYCLE_NS) if self.paused else period_ns)
 
     def _cycle_until_end(self) -> tuple[Literal["ended", "stopped", "fault"], str]:
         """Run cycles; return why they ended, and a sentence for a fault."""
@@ -299,8 +356,8 @@ class Loop:
         self.steering.answer_late()
 
     def _controllers_time(self) -> int:
-        """Return the time of this cycle for controllers, which never goes back: who was late when a pause
-        began may catch up in it."""
+        """Return the time of this cycle for controllers, which never goes back: a cycle that was late
+        when a pause began may catch up in it."""
         schedule = self.schedule
         time_ns = schedule.time_ns(self._woken_ns)
         if time_ns < self._time_ns:
@@ -310,7 +367,7 @@ class Loop:
         return self._time_ns
 
     def _miss(self) -> None:
-        """Other servos are lost than in the cycle before: do what the policy says."""
+        """Apply the policies: other servos are lost than in the cycle before."""
         ending, limp = self._lost.judge(self.plan.policies)
         for group in limp:
             self.hardware.let_go(sorted(group.rows))
@@ -333,7 +390,7 @@ class Loop:
         limit_ns = self.plan.policies.limit_ns
         motion = SafeMotion(policy, limit_ns, self.record, self.plan.joints, self.hardware)
         if not motion.over:
-            self._tell_policy(name, policy.text)
+            self._log_policy(name, policy.text)
             if self.paused:
                 self.resume()
             self._motion = motion
@@ -350,7 +407,7 @@ class Loop:
             self.events.emit(EventCode.POLICY, Severity.WARNING, "loop", f"{name}: torque stays on")
         return policy.last
 
-    def _tell_policy(self, name: PolicyName, text: str) -> None:
+    def _log_policy(self, name: PolicyName, text: str) -> None:
         """Leave in the log in which cycle a policy begins."""
         self.events.emit(EventCode.POLICY, Severity.INFO, "loop", f"{name}: {text}")
         data = f'{{"policy":"{name}"}}'.encode()
@@ -358,7 +415,7 @@ class Loop:
         self.commands.take(begun)
 
     def _next(self) -> bool:
-        """Go to the next cycle, past those that are declared skipped; say whether that is to end the run."""
+        """Go to the next cycle, past those that are declared skipped; return whether that ends the run."""
         cycle, schedule = self._cycle, self.schedule
         now_ns, policy, next_ns = self.clock.now_ns(), self.plan.overrun, schedule.deadline_ns(cycle + 1)
         if self._stood:
@@ -395,17 +452,108 @@ class Loop:
         self._late = late
         return bool(skipped) and policy == "stop"
 
-    def _tell_start(self) -> None:
-        """Leave in the log what the controllers are activated with: nothing else tells it."""
+    def _log_start(self) -> None:
+        """Log what the controllers are activated with."""
         record = self.record
         record.cycle = -1
         record.scheduled_ns = self.schedule.start_ns
         record.woken_ns = record.read_ns = record.updated_ns = record.written_ns = self.clock.now_ns()
         self.sink.begin(record)
 
-    def _tell_end(self, reason: str, detail: str) -> None:
+    def _log_end(self, reason: str, detail: str) -> None:
         severity = Severity.FATAL if reason == "fault" else Severity.INFO
         cycles = counted(self._cycles, "cycle", "cycles")
         skipped = counted(self._skipped, "period", "periods")
         text = f"loop {reason} after {cycles}, {skipped} skipped"
         self.events.emit(EventCode.LOOP_STOPPED, severity, "loop", f"{text}: {detail}" if detail else text)
+
+
+@dataclass(slots=True)
+class Schedule:
+    """When each cycle is due, on a grid that keeps its phase; times in ns of the loop's clock.
+
+    Cycle n is due at origin + (n - first) * period. A change of the period begins a new grid at a deadline of
+    the old one.
+    """
+
+    period_ns: int
+    start_ns: int = 0
+    """The first deadline."""
+    paused_ns: int = 0
+    """For how long the controllers' time stood still."""
+    _origin_ns: int = field(default=0, init=False)
+    _first: int = field(default=0, init=False)
+
+    def start(self, now_ns: int) -> None:
+        """Make the first deadline one period from now."""
+        self.start_ns = self._origin_ns = now_ns + self.period_ns
+        self._first = 0
+        self.paused_ns = 0
+
+    def deadline_ns(self, cycle: int) -> int:
+        """Return when a cycle is due."""
+        return self._origin_ns + (cycle - self._first) * self.period_ns
+
+    def time_ns(self, now_ns: int) -> int:
+        """Return the controllers' time: since the first deadline, pauses left out."""
+        return now_ns - self.start_ns - self.paused_ns
+
+    def change(self, cycle: int, period_ns: int) -> None:
+        """Let the cycles after `cycle` follow in another period, from its deadline on."""
+        self._origin_ns = self.deadline_ns(cycle)
+        self._first = cycle
+        self.period_ns = period_ns
+
+    def following(self, cycle: int, now_ns: int, policy: OverrunPolicy) -> int:
+        """Return the cycle to run after `cycle` that ended at `now_ns`.
+
+        `skip`: the first whose deadline has not passed, so that two cycles never follow each other in a
+        burst. `catch_up`: the next one, as long as at most MOST_CAUGHT_UP are due. `stop`: as `skip`.
+        """
+        passed = now_ns - self._origin_ns
+        first = self._first + -(-passed // self.period_ns)
+        if policy == "catch_up":
+            first -= MOST_CAUGHT_UP
+        return max(cycle + 1, first)
+
+
+class LostServos:
+    """Counts the replies that each joint missed in a row."""
+
+    __slots__ = ("_all", "_limp", "_missed", "rows")
+
+    def __init__(self, joints: int) -> None:
+        self.rows: frozenset[int] = frozenset()
+        """Rows of the joints that are lost now."""
+        self._limp: set[str] = set()  # names of groups that a lost servo has left without torque
+        self._missed = np.zeros(joints, dtype=np.int64)
+        self._all = bytes([True]) * joints
+
+    def look(self, states: States) -> bool:
+        """Take the states of a cycle; return whether `rows` is another one now."""
+        valid, age_ns = states.valid, states.age_ns
+        if valid.tobytes() == self._all and not np.count_nonzero(self._missed):
+            return False
+        self._missed += 1
+        self._missed[valid] = 0
+        lost = (self._missed >= LOST_CYCLES) & ((age_ns >= LOST_AGE_NS) | (age_ns < 0))
+        rows = frozenset(np.flatnonzero(lost).tolist())
+        changed = rows != self.rows
+        self.rows = rows
+        return changed
+
+    def judge(self, policies: PolicyPlan) -> tuple[dict[PolicyName, list[int]], list[GroupPolicy]]:
+        """Return which policies end the run, for which lost rows, and which groups become limp by now."""
+        ending: dict[PolicyName, list[int]] = {}
+        limp: list[GroupPolicy] = []
+        for row in sorted(self.rows):
+            group = policies.of_lost(row)
+            if group is None:
+                if not policies.on_lost_servo.goes_on:
+                    ending.setdefault("on_lost_servo", []).append(row)
+            elif group.on_lost_servo == "stop":
+                ending.setdefault("on_fault", []).append(row)
+            elif group.on_lost_servo == "limp" and group.name not in self._limp:
+                self._limp.add(group.name)
+                limp.append(group)
+        return ending, limp

@@ -78,7 +78,7 @@ def assemble(
     stop: StopFlag,
     take_over: bool = False,
     inbox: Inbox | None = None,
-    patience: Callable[[int], None] = lambda _: None,
+    cycle_limit: Callable[[int], None] = lambda _: None,
     pace: Callable[[int], None] = lambda _: None,
     activity: Activity | None = None,
 ) -> AssembledRobot:
@@ -121,7 +121,7 @@ def assemble(
         stop=stop,
         inbox=inbox or NoInbox(),
         commands=sinks.commands,
-        patience=patience,
+        cycle_limit=cycle_limit,
         pace=pace,
         overrun_hooks=plugins.overrun_hooks,
     )

@@ -191,7 +191,7 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks) -> LoopOu
         stop=stop,
         take_over=job.take_over,
         inbox=Mailbox(job.mailbox, RingWriter(job.answers)),
-        patience=heartbeat.may_take,
+        cycle_limit=heartbeat.may_take,
         pace=pacing,
         activity=Activity(heartbeat, realtime.thread_count),
     )

@@ -47,7 +47,7 @@ class RecordedClock:
 
 
 class RecordedHardware:
-    """Servos with the states of the run, bit for bit, that take no goals; see `control.hardware`.
+    """Servos with the states of the run, bit for bit, that take no goals; see `control.loop.Hardware`.
 
     After each cycle it moves the clock to the deadline of the next recorded one, so that the loop skips the
     periods that were skipped. After the cycle before number `ends` of them it asks the loop to stop: those
