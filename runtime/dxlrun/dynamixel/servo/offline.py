@@ -18,7 +18,7 @@ from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.servo import modes, watchdog
 from dxlrun.dynamixel.servo.checks import BusSurvey, inspect, inspect_states
 from dxlrun.dynamixel.servo.desired import DesiredState
-from dxlrun.dynamixel.servo.life import Life, Loss, ServoEvent, ServoState
+from dxlrun.dynamixel.servo.life import Life, Loss, ServoEvent
 from dxlrun.dynamixel.servo.registers import settle
 from dxlrun.dynamixel.servo.retry import retry
 from dxlrun.dynamixel.wire.transaction import Outcome, Program, Reply, Transaction
@@ -105,9 +105,7 @@ class Rejoined:
     problems: tuple[str, ...]
     """Why it may take no part, one sentence each."""
     torqued: bool
-    """True when torque enable was read as 1, and a goal that was written as `goal`."""
-    goal: int | None
-    """Goal position in ticks as it was written; None: it is limp, its mode has none, or none was."""
+    """True when torque enable was read as 1."""
     written: tuple[tuple[str, str], ...]
     """Joint, and what was written into its registers."""
     mode: Mode = Mode.UNKNOWN
@@ -130,9 +128,7 @@ class Offline:
         self._tick_reads = [_tick_read(plan, index) for index in range(count)]
 
     def look(self) -> None:
-        """Let the coming idle time probe the servos that are due; called once a cycle."""
-        if ServoState.OFFLINE not in self._life.states:
-            return
+        """Let the coming idle time probe the servos that are due; called while one is offline."""
         now = self._idle.now_ns()
         for index, loss in enumerate(self._life.losses):
             if loss is not None and not loss.probing and loss.probe_at_ns <= now:
@@ -197,7 +193,7 @@ class Offline:
             self._life.report(EventCode.SERVO_LIMP, Severity.ERROR, index, _OTHER_TURN)
         rejoined = yield from rejoin(plan, index, torque, mode, self._desired.registers(index))
         if not rejoined.problems and (problem := (yield from watchdog.arm(plan, servo))):
-            rejoined = Rejoined((problem,), False, None, rejoined.written)
+            rejoined = Rejoined((problem,), False, rejoined.written)
         return rejoined
 
     def _may_get_torque(self, index: int) -> bool:
@@ -266,7 +262,7 @@ def rejoin(
     if (yield from inspect(plan, servo, line, found, take_over=True)):
         yield from inspect_states(plan, [servo], line, found)
     if found.problems:
-        return Rejoined(tuple(found.problems), False, None, ())
+        return Rejoined(tuple(found.problems), False, ())
     settled = yield from settle(plan, servo, servo.registers if registers is None else registers, line)
     written = tuple(settled.written)
     if not settled.problems and (problem := (yield from modes.enter(plan, servo, mode, again=False))):
@@ -276,11 +272,11 @@ def rejoin(
         settled.problems.append(f"{plan.label(servo)} did not answer when its torque was read")
     if settled.problems or not torque:
         holds = not settled.problems and enabled.parameters[0] == 1
-        return Rejoined(tuple(settled.problems), holds, None, written, mode)
+        return Rejoined(tuple(settled.problems), holds, written, mode)
     held = yield from modes.hold(plan, servo, servo.mode_plan(mode))
     if held.problem:
-        return Rejoined((f"{plan.label(servo)} {held.problem}",), False, None, written)
-    return Rejoined((), True, held.goal, written, mode)
+        return Rejoined((f"{plan.label(servo)} {held.problem}",), False, written)
+    return Rejoined((), True, written, mode)
 
 
 def _tick_read(plan: BusPlan, index: int) -> Transaction | None:

@@ -270,7 +270,8 @@ class Servos:
         down, and torque enable of one that waits for its goals. Only a servo that answers is read.
         """
         self._report_noise(self._idle.now_ns())
-        self._offline.look()
+        if not self._life.calm:
+            self._offline.look()
         self._slow.look()
         if not self._reading and (due := self._due()) is not None:
             index, what, program = due
@@ -282,22 +283,21 @@ class Servos:
         """Return the servo that is read next, what of it, and the program; None: nothing is due."""
         if any(self._reported_errors) or self._alert_cycles:
             self._repeat_alerts()
-        servos, fresh, line = self._plan.servos, self._samples.fresh, plan_line(self._plan)
+        servos, fresh = self._plan.servos, self._samples.fresh
         for index in self._alerts:
             address = servos[index].hardware_error_address
             if address is not None and fresh[index]:
-                read = line.read(servos[index].servo_id, address, 1)
+                read = plan_line(self._plan).read(servos[index].servo_id, address, 1)
                 return index, "hardware error status", self._read_hardware_error(index, read)
         for index in self._strained:
             limit = servos[index].torque_limit
             if limit is not None and fresh[index]:
-                read = line.read(servos[index].servo_id, limit.address, limit.size)
+                read = plan_line(self._plan).read(servos[index].servo_id, limit.address, limit.size)
                 return index, limit.name, self._read_torque_limit(index, read, limit.name)
-        states = self._life.states
-        if ServoState.HOLDING in states or ServoState.STOPPED in states:
+        if not self._life.calm:
             for offset in range(1, len(servos) + 1):
                 index = (self._read_last + offset) % len(servos)
-                if states[index] in IN_DOUBT and fresh[index]:
+                if self._life.states[index] in IN_DOUBT and fresh[index]:
                     return index, "torque enable", self._read_torque(index)
         return None
 
