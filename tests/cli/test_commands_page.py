@@ -19,8 +19,8 @@ Dxlrun = Callable[..., Any]
 
 
 def rows(text: str) -> list[str]:
-    """Return the left column of the tables of a help."""
-    return re.findall(r"^│ (?:\*  )?([\w-]\S*(?: \(-h\))?)", text, re.MULTILINE)
+    """Return the first word of each row in the tables of a help."""
+    return [row.split()[0] for row in re.findall(r"^(\S+(?: \S+)*?) {2,}\S", text, re.MULTILINE)]
 
 
 def test_every_command_has_a_section(dxlrun: Dxlrun) -> None:
@@ -35,12 +35,34 @@ def test_every_command_has_a_section(dxlrun: Dxlrun) -> None:
         assert option in dxlrun("--help").out
 
 
+WRONG = """name: wrong
+buses:
+  main: {port: sim, protocol: 1.0, baud_rate: 1_000_000}
+loop: {rate: 50}
+joints:
+  left_joint: {bus: main, id: 1, model: AX-12A, reference: 150 deg, direction: 1}
+  neck_joint: {bus: mian, id: 3, model: AX-12A, reference: 150 deg, direction: 1}
+  back_joint: {bus: main, id: 1, model: AX-12A, reference: 150 deg, direction: 1}
+  tail_joint: {bus: main, id: 4, model: AX-12A, reference: 150, direction: 1}
+"""
+
+
+def test_a_wrong_file_is_reported_as_the_page_has_it(
+    dxlrun: Dxlrun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "robot.yaml").write_text(WRONG)
+    (shown,) = re.findall(r"```\n(robot.yaml:.*?)```", PAGE, re.DOTALL)
+    checked = dxlrun("check", "robot.yaml")
+    assert (checked.code, checked.err) == (2, shown)
+
+
 @pytest.mark.parametrize("heading", SECTIONS)
 def test_every_option_of_a_command_is_there(dxlrun: Dxlrun, heading: str) -> None:
     words = [] if heading == RUN else heading.split()
     options = {row for row in rows(dxlrun(*words, "--help").out) if row.startswith("--")}
     if heading == RUN:
-        options -= {"--help (-h)", "--install-completion", "--version"}
+        options -= {"--help", "--install-completion", "--version"}
     assert "--debug" in options
     assert ("--json" in options) == (heading not in {RUN, "schema"})
     assert ("--robot" in options) == (heading in {"list", *STEER})
