@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import subprocess
 import sys
 import tarfile
 import zipfile
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -117,22 +119,46 @@ def test_the_wheel_has_every_robot_and_motion(tmp_path: Path) -> None:
     assert shipped == {path.relative_to(ROOT / "robots"): path.read_bytes() for path in tracked}
 
 
-CROWDED = {
-    "runtime/dxlrun": 16,  # the rooms, and the modules that every room uses
-    "runtime/dxlrun/dynamixel/control_table/tables/protocol1": 16,  # a data file a model
-}
+RUNTIME = ROOT / "runtime"
+MOST_ENTRIES = 14
+
+
+def entries(folder: Path) -> list[Path]:
+    """Return what a reader finds in a folder: its modules and rooms."""
+    made = {"__init__.py", "py.typed", "__pycache__"}
+    return [path for path in folder.iterdir() if path.name not in made and path.suffix != ".so"]
 
 
 def test_no_folder_of_the_package_is_crowded() -> None:
-    """A reader takes in a dozen entries or so at a glance; more of them want a room of their own."""
-    made = {"__init__.py", "py.typed", "__pycache__"}
-    crowded, folders = {}, 0
-    for room in (ROOT / "runtime", ROOT / "plugins"):
-        for folder in (path for path in room.rglob("*") if path.is_dir() and path.name not in made):
-            entries = {path for path in folder.iterdir() if path.name not in made and path.suffix != ".so"}
-            name = str(folder.relative_to(ROOT))
-            folders += 1
-            if len(entries) > CROWDED.get(name, 14):
-                crowded[name] = len(entries)
-    assert crowded == {}
-    assert folders > 20
+    """A reader takes in a dozen entries or so at a glance; more of them need a room of their own."""
+    rooms = [path.parent for base in ("runtime", "plugins") for path in (ROOT / base).rglob("__init__.py")]
+    assert {str(room.relative_to(ROOT)) for room in rooms if len(entries(room)) > MOST_ENTRIES} == set()
+    assert len(rooms) > 20
+
+
+def imports() -> dict[str, set[str]]:
+    """Return which of our modules each module imports: also in functions, and for type checking only."""
+    modules: dict[str, Path] = {}
+    for path in (RUNTIME / "dxlrun").rglob("*.py"):
+        modules[".".join(path.relative_to(RUNTIME).with_suffix("").parts).removesuffix(".__init__")] = path
+    found: dict[str, set[str]] = {name: set() for name in modules}
+    for name, path in modules.items():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                found[name] |= {alias.name for alias in node.names} & set(modules)
+            elif isinstance(node, ast.ImportFrom):
+                for alias in node.names:  # a module, or a name in one
+                    inner = f"{node.module}.{alias.name}"
+                    found[name] |= {inner if inner in modules else str(node.module)} & set(modules)
+    return found
+
+
+def test_no_modules_import_each_other_in_a_circle() -> None:
+    """Imports for type checking included: what needs each other to be understood is one module."""
+    found = imports()
+    assert len(found) > 150
+    assert "dxlrun.compile.report" in found["dxlrun.compile.robot"]  # for type checking, and in a function
+    try:
+        tuple(TopologicalSorter(found).static_order())
+    except CycleError as circle:
+        pytest.fail(" <- ".join(circle.args[1]))
