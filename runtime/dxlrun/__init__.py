@@ -32,8 +32,8 @@ if TYPE_CHECKING:
         Refused,
         StartUpError,
     )
-    from dxlrun.interfaces import Commands, Floats, States
     from dxlrun.remote.client import RemoteRobot, Stream, connect, running
+    from dxlrun.run.channels.cycle import Commands, Floats, States
 
 __all__ = [
     "CONTRACT_VERSION",
@@ -89,7 +89,7 @@ _ROOMS = {
         "Refused",
         "StartUpError",
     ),
-    "dxlrun.interfaces": ("Commands", "Floats", "States"),
+    "dxlrun.run.channels.cycle": ("Commands", "Floats", "States"),
     "dxlrun.remote.client": ("RemoteRobot", "Stream", "connect", "running"),
 }
 _HOME = {name: room for room, names in _ROOMS.items() for name in names}

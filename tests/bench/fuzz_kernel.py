@@ -32,6 +32,7 @@ from zlib import crc32
 import numpy as np
 
 from dxlrun.clock import VirtualClock
+from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.exchange import kernel
 from dxlrun.dynamixel.exchange.bus import NEVER
@@ -41,8 +42,7 @@ from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
 from dxlrun.dynamixel.servo.life import ServoEvent
 from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.errors import PortError
-from dxlrun.interfaces import Commands, States
-from dxlrun.mode import Mode
+from dxlrun.run.channels.cycle import Commands, States
 from dxlrun.run.channels.packets import PacketBatch, decode_packets
 from dxlrun.run.channels.ring import Handover
 

@@ -9,8 +9,8 @@ import pytest
 
 from dxlrun.compile import Compiled
 from dxlrun.compile.plan import from_json, to_json
+from dxlrun.description.modes import Mode
 from dxlrun.errors import Problem
-from dxlrun.mode import Mode
 
 TEXT = """\
 name: cart

@@ -3,8 +3,8 @@ from collections.abc import Callable
 import pytest
 
 from dxlrun.compile import Compiled
+from dxlrun.description.modes import Mode
 from dxlrun.errors import Problem
-from dxlrun.mode import Mode
 
 Find = Callable[..., tuple[Problem, ...]]
 

@@ -24,7 +24,7 @@ from dxlrun.control.loop_plan import (
     ScheduledCommand,
     SchedulerPlan,
 )
-from dxlrun.mode import Mode
+from dxlrun.description.modes import Mode
 from dxlrun.run.channels.answers import Refusal
 from dxlrun.run.channels.commands import LOOP, Command, QueueInbox
 from dxlrun.run.channels.cycle import CycleLayout, CycleRecord

@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from dxlrun.control.gate import BRAKING_S, Gate
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan, LoopPlan, SchedulerPlan
 from dxlrun.control.policy_plan import SLOW_SPEED, SLOW_START_NS
-from dxlrun.interfaces import COMMAND_INTERFACES
-from dxlrun.mode import Mode
+from dxlrun.description.modes import COMMAND_INTERFACES, Mode
 from dxlrun.run.channels.cycle import Clamp, CycleLayout, CycleRecord
 
 DT_NS = 20_000_000

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from dxlrun.control.gate import Gate
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan, LoopPlan, SchedulerPlan
 from dxlrun.control.policy_plan import SLOW_SPEED, SLOW_START_NS
-from dxlrun.mode import Mode
+from dxlrun.description.modes import Mode
 from dxlrun.run.channels.cycle import Clamp, CycleLayout, CycleRecord
 from dxlrun.run.channels.events import EventCode
 

@@ -10,7 +10,7 @@ import pytest
 from dxlrun.control.controllers.claims import claimed_modes, start_modes
 from dxlrun.control.controllers.mode_switch import PATIENCE_NS
 from dxlrun.control.loop_plan import JointPlan
-from dxlrun.mode import Mode, mode_of
+from dxlrun.description.modes import Mode, mode_of
 from dxlrun.run.channels.answers import Code, Done, Waiting
 from dxlrun.run.channels.events import EventCode
 

@@ -10,7 +10,7 @@ import pytest
 from dxlrun.control.loop import PAUSED_CYCLE_NS
 from dxlrun.control.policy_plan import HOLD, LIMP, Policy, PolicyPlan, Step
 from dxlrun.control.safe_motion import ARRIVED, MODES_NS, SETTLE_NS, STAND_NS
-from dxlrun.mode import Mode
+from dxlrun.description.modes import Mode
 
 PERIOD_NS = 20_000_000
 POSE = Policy((Step("pose home at 60 deg/s", 10**9, (0.3, None), 1.0),), "limp")

@@ -19,7 +19,7 @@ from dxlrun.dynamixel.exchange import kernel
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
-from dxlrun.interfaces import Commands, States
+from dxlrun.run.channels.cycle import Commands, States
 from dxlrun.run.channels.events import EventCode, Severity
 from dxlrun.run.channels.packets import LoggedPacket, PacketBatch, PacketKind, decode_packets
 from dxlrun.run.channels.ring import Handover

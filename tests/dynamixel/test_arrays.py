@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from dxlrun.dynamixel.exchange.goals import GoalArrays
 from dxlrun.dynamixel.wire import protocol1
-from dxlrun.interfaces import Commands
+from dxlrun.run.channels.cycle import Commands
 
 angles = st.floats(-10, 10) | st.just(float("nan"))
 speeds = st.floats(-100, 100) | st.sampled_from([float("nan"), 0.0, -0.0])

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.servo import modes
 from dxlrun.dynamixel.servo.torque_off import limp, stand
-from dxlrun.mode import Mode
 from dxlrun.run.channels.events import EventCode
 
 

@@ -10,9 +10,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.plan.mode_plan import in_mode
 from dxlrun.dynamixel.wire.dialect import dialect_of
-from dxlrun.mode import Mode
 
 SEEDS = int(os.environ.get("DXLRUN_HOSTILE", "1"))
 ROBOTS = {

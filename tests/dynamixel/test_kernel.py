@@ -20,7 +20,7 @@ from dxlrun.dynamixel.exchange.cyclic_reads import CALM_CYCLES
 from dxlrun.dynamixel.hardware import DynamixelHardware, Reader
 from dxlrun.dynamixel.port.ports import SerialPort, SerialPorts
 from dxlrun.dynamixel.wire import protocol2
-from dxlrun.interfaces import Commands, States
+from dxlrun.run.channels.cycle import Commands, States
 from dxlrun.run.channels.packets import PacketKind
 from dxlrun.testing import simulated_robot
 

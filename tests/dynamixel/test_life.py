@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.exchange.cyclic_reads import CyclicReads
 from dxlrun.dynamixel.exchange.samples import Samples
 from dxlrun.dynamixel.servo import life
@@ -20,8 +21,7 @@ from dxlrun.dynamixel.servo.life import (
     ServoState,
 )
 from dxlrun.dynamixel.servo.watchdog import RETURN_SPEED
-from dxlrun.interfaces import States
-from dxlrun.mode import Mode
+from dxlrun.run.channels.cycle import States
 
 LEGAL = {(state, event) for state, events in TRANSITIONS.items() for event in events}
 

@@ -9,8 +9,8 @@ import random
 import numpy as np
 import pytest
 
+from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.plan.mode_plan import in_mode
-from dxlrun.mode import Mode
 from dxlrun.run.channels.events import EventCode
 
 STORMS = int(os.environ.get("DXLRUN_MODE_STORMS", "6"))

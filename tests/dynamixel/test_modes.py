@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.plan.mode_plan import mode_in, position_reach
 from dxlrun.dynamixel.wire import protocol2
 from dxlrun.errors import StartUpError
-from dxlrun.mode import Mode
 from dxlrun.run.channels.events import EventCode
 
 P, V, E, W, C = Mode.POSITION, Mode.VELOCITY, Mode.EFFORT, Mode.PWM, Mode.EFFORT_POSITION

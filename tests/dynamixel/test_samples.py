@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.exchange.samples import MARGIN_NS, MARGIN_RAD, REPORT_AGAIN_NS, Jumps, Samples
 from dxlrun.dynamixel.plan.units import joint_position
-from dxlrun.interfaces import States
-from dxlrun.mode import Mode
+from dxlrun.run.channels.cycle import States
 from dxlrun.run.channels.events import EventCode
 
 MS = 1_000_000

@@ -18,7 +18,7 @@ from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.port.ports import SerialPort, SerialPorts
 from dxlrun.dynamixel.port.serial_open import _ROBOT, let_go, open_serial
 from dxlrun.errors import PortError
-from dxlrun.interfaces import Commands, States
+from dxlrun.run.channels.cycle import Commands, States
 from dxlrun.simulation import BusConfig, ServoConfig
 
 

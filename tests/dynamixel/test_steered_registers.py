@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from dxlrun.mode import Mode
+from dxlrun.description.modes import Mode
 from dxlrun.run.channels.events import EventCode
 
 WRITE = 3

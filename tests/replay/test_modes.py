@@ -8,9 +8,9 @@ import msgspec
 import numpy as np
 import pytest
 
+from dxlrun.description.modes import Mode
 from dxlrun.log.reader import Log, read_log
 from dxlrun.log.replay import replay_log
-from dxlrun.mode import Mode
 from dxlrun.run.channels.answers import Answer, Done
 from dxlrun.run.channels.commands import Command, QueueInbox
 from dxlrun.run.channels.events import EventCode

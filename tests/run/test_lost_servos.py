@@ -12,8 +12,8 @@ import pytest
 
 from dxlrun.control.loop import LostServos
 from dxlrun.control.policy_plan import GroupPolicy, PolicyPlan
-from dxlrun.interfaces import States
 from dxlrun.run.channels.commands import LOOP, Command
+from dxlrun.run.channels.cycle import States
 from dxlrun.run.channels.events import EventCode
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import read_log, simulated_robot

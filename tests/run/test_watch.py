@@ -21,9 +21,9 @@ from dxlrun.description import read_robot
 from dxlrun.dynamixel.exchange import bus
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.port.reopening import KeptLines
-from dxlrun.interfaces import Commands, States
 from dxlrun.run import guardian
 from dxlrun.run.channels import heartbeat, process
+from dxlrun.run.channels.cycle import Commands, States
 from dxlrun.run.channels.events import EventRing
 from dxlrun.run.channels.heartbeat import ControllerMethod, Heartbeat, Phase, Standstill
 from dxlrun.run.channels.packets import NoPackets

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from dxlrun.analysis.plan import LoggedJoint, LoggedServo, plan_of
 from dxlrun.dynamixel.control_table import control_table
-from dxlrun.interfaces import Floats
 from dxlrun.log.reader import Log
+from dxlrun.run.channels.cycle import Floats
 
 _REST_S = 0.3
 """A reachable trajectory that does not change for so long is at rest: its joint is to settle."""

@@ -16,9 +16,9 @@ from dxlrun.control.controllers.controller import Interfaces, ParametersModel
 from dxlrun.control.controllers.plugins import Offer, PlugIns
 from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.description import Description, problems_of
+from dxlrun.description.modes import Mode, mode_of
 from dxlrun.dynamixel.plan.mode_plan import LACKS, controls_speed, model_modes
 from dxlrun.errors import suggestion
-from dxlrun.mode import Mode, mode_of
 from dxlrun.run.channels.cycle import MOST_CONTROLLERS
 
 _RATE_TOLERANCE = 1e-6

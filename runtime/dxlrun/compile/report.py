@@ -10,8 +10,8 @@ from dxlrun.compile.joints import CompiledJoint
 from dxlrun.compile.plan import MotionPart, Plan
 from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.control.policy_plan import POLICIES, PolicyPlan
+from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, ReadWay
-from dxlrun.mode import Mode
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from dxlrun.control.loop_plan import JointPlan, LoopPlan
 from dxlrun.control.policy_plan import SLOW_SPEED, SLOW_START_NS
-from dxlrun.interfaces import Commands, Floats, States
-from dxlrun.mode import Mode
-from dxlrun.run.channels.cycle import Clamp, CycleRecord
+from dxlrun.description.modes import Mode
+from dxlrun.run.channels.cycle import Clamp, Commands, CycleRecord, Floats, States
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
 
 BRAKING_S = 0.1

@@ -19,10 +19,9 @@ from dxlrun.control.policy_plan import GroupPolicy, Last, PolicyName, PolicyPlan
 from dxlrun.control.safe_motion import SafeMotion
 from dxlrun.control.steering import Steering
 from dxlrun.errors import PortError, counted
-from dxlrun.interfaces import LOST_AGE_NS, LOST_CYCLES, States
 from dxlrun.run.channels.answers import Code, Refusal
 from dxlrun.run.channels.commands import LOOP, CommandSink, Inbox, NoCommands, NoInbox, TakenCommand
-from dxlrun.run.channels.cycle import CycleRecord
+from dxlrun.run.channels.cycle import LOST_AGE_NS, LOST_CYCLES, CycleRecord, States
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
 
 MOST_RATE = 100_000.0

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from dxlrun.control.policy_plan import PolicyPlan
-from dxlrun.mode import Mode
+from dxlrun.description.modes import Mode
 
 TOLERATED_SKIPS = 0.1
 """As the robot file's default. Measured: 50 Hz, simulated servos, no real-time rights, two cores that five

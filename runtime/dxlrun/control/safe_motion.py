@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from dxlrun.control.loop_plan import JointPlan
 from dxlrun.control.policy_plan import SETTLE_NS, Policy, Step
-from dxlrun.interfaces import Floats
-from dxlrun.mode import Mode
-from dxlrun.run.channels.cycle import CycleRecord
+from dxlrun.description.modes import Mode
+from dxlrun.run.channels.cycle import CycleRecord, Floats
 
 ARRIVED = 0.05
 """rad; so near to its pose a joint counts as there. Ten ticks of an AX-12: friction holds it off by some."""

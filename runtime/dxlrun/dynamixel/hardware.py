@@ -23,7 +23,7 @@ from dxlrun.dynamixel.servo.servos import Servos
 from dxlrun.dynamixel.servo.startup import StartUp, report_failures
 from dxlrun.dynamixel.servo.torque_off import LimpOutcome, limp_buses
 from dxlrun.errors import PortError, StartUpError
-from dxlrun.interfaces import Commands, States
+from dxlrun.run.channels.cycle import Commands, States
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
 from dxlrun.run.channels.packets import PacketLog
 

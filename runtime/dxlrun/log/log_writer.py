@@ -15,11 +15,11 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
+from dxlrun.description.modes import Mode
 from dxlrun.errors import counted
 from dxlrun.log import schemas
 from dxlrun.log.cdr import ENCAPSULATION, Codec
 from dxlrun.log.schemas import LOG_MODE, LogHeader, LogSummary, MessageType, to_metadata
-from dxlrun.mode import Mode
 from dxlrun.run.channels.commands import decode_taken_command
 from dxlrun.run.channels.cycle import CycleLayout
 from dxlrun.run.channels.events import Event, EventCode, LostRecords, Severity, decode_event

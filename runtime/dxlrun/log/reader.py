@@ -21,11 +21,11 @@ from mcap.records import Attachment, Channel, Chunk, McapRecord, Metadata
 from mcap.stream_reader import StreamReader
 from numpy.typing import NDArray
 
+from dxlrun.description.modes import Mode
 from dxlrun.errors import LogError
 from dxlrun.log import schemas
 from dxlrun.log.cdr import ENCAPSULATION, Codec
 from dxlrun.log.schemas import LoggedController, LogHeader, from_metadata
-from dxlrun.mode import Mode
 from dxlrun.run.channels.commands import TakenCommand, data_of
 from dxlrun.run.channels.cycle import CycleLayout
 from dxlrun.run.channels.events import Event

@@ -34,7 +34,7 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from dxlrun.control.steering import Rate, Switch
-from dxlrun.mode import Mode
+from dxlrun.description.modes import Mode
 from dxlrun.remote.link import Link, Loaded
 from dxlrun.remote.preparation import (
     Preparation,

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from dxlrun.analysis.latency import ROUGH_NS, first_deadline_ns
 from dxlrun.analysis.steering import Pause, Steering
-from dxlrun.interfaces import Floats
 from dxlrun.log.reader import Log
+from dxlrun.run.channels.cycle import Floats
 
 WIDTH = 9.0
 """Inches of 72 points; the page scales it."""

@@ -23,9 +23,9 @@ from dxlrun.analysis.figures.drawing import (
 )
 from dxlrun.analysis.latency import first_deadline_ns
 from dxlrun.errors import counted
-from dxlrun.interfaces import Floats
 from dxlrun.log.reader import Log
 from dxlrun.output.table import microseconds
+from dxlrun.run.channels.cycle import Floats
 from dxlrun.run.channels.events import Severity
 
 _SHAPES = (

@@ -28,8 +28,8 @@ from dxlrun.analysis.figures.drawing import (
     time_axis,
 )
 from dxlrun.analysis.tracking import Joint, reachable
-from dxlrun.interfaces import Floats
 from dxlrun.log.reader import Log
+from dxlrun.run.channels.cycle import Floats
 
 _LEAST_RAD, _LEAST_RAD_S = 0.1, 0.5
 _APART_RAD = 1e-6

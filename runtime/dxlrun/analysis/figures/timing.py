@@ -34,9 +34,9 @@ from dxlrun.analysis.figures.drawing import (
     time_axis,
 )
 from dxlrun.analysis.latency import ROUGH_NS, Latency, cycle_periods_ns
-from dxlrun.interfaces import Floats
 from dxlrun.log.reader import Log
 from dxlrun.output.table import microseconds
+from dxlrun.run.channels.cycle import Floats
 
 _ROUGH_US = ROUGH_NS / 1000
 _LEAST_US = 1.0

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan
-from dxlrun.mode import Mode, mode_of
+from dxlrun.description.modes import Mode, mode_of
 
 
 class Claimant(Protocol):

@@ -9,7 +9,7 @@ import numpy as np
 from dxlrun.control.controllers.controller import Context, JointLimits
 from dxlrun.control.controllers.gathering import Gathering
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan
-from dxlrun.interfaces import Commands, Floats
+from dxlrun.run.channels.cycle import Commands, Floats
 
 
 def new_context(

@@ -14,8 +14,7 @@ import pluggy
 
 from dxlrun.control.controllers.controller import CommandModel, Controller, Interfaces, ParametersModel
 from dxlrun.control.controllers.hookspecs import HookSpecs
-from dxlrun.interfaces import COMMAND_INTERFACES
-from dxlrun.mode import mode_of
+from dxlrun.description.modes import COMMAND_INTERFACES, mode_of
 
 ControllerClass = type[Controller[Any]]
 Breach = tuple[str, str]

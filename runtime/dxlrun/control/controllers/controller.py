@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
-from dxlrun.interfaces import CommandName, Commands, Floats, States
+from dxlrun.description.modes import CommandName
+from dxlrun.run.channels.cycle import Commands, Floats, States
 
 CONTRACT_VERSION = 1
 """Grows when a controller written for the version before would misbehave."""

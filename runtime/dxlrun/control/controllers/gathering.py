@@ -8,8 +8,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.interfaces import Commands, States
-from dxlrun.run.channels.cycle import CycleRecord
+from dxlrun.run.channels.cycle import Commands, CycleRecord, States
 
 _Element = TypeVar("_Element", bound=np.generic)
 Place = slice | NDArray[np.intp]

@@ -14,8 +14,7 @@ from dxlrun.control.controllers.controller import Context, Controller
 from dxlrun.control.controllers.gathering import Place, place_of
 from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.errors import ControllerFault
-from dxlrun.interfaces import Commands, Floats
-from dxlrun.run.channels.cycle import Clamp, CycleRecord
+from dxlrun.run.channels.cycle import Clamp, Commands, CycleRecord, Floats
 from dxlrun.run.channels.heartbeat import ControllerMethod
 
 PERIOD_CAP = 5

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dxlrun.control.controllers.claims import claimed_modes, conflicts, told
 from dxlrun.control.controllers.managed import Managed
 from dxlrun.control.loop_plan import JointPlan
-from dxlrun.mode import Mode
+from dxlrun.description.modes import Mode
 from dxlrun.run.channels.answers import Code, Field, Refusal
 
 PATIENCE_NS = 5_000_000_000

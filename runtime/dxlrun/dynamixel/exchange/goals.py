@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.description.modes import COMMAND_INTERFACES, CommandName, Mode
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, Field, GoalLayout, ModePlan, OwnLimit, Scale, ServoPlan
 from dxlrun.dynamixel.plan.planning import goal_parts
 from dxlrun.dynamixel.wire.dialect import Dialect, dialect_of
-from dxlrun.interfaces import COMMAND_INTERFACES, CommandName, Commands, Floats
-from dxlrun.mode import Mode
+from dxlrun.run.channels.cycle import Commands, Floats
 
 REPEATED = 50
 """Cycles after which an unchanged goal is sent again: a sync write has no acknowledgement."""

@@ -29,7 +29,7 @@ from dxlrun.dynamixel.port.ports import Ports, ReplyPolling
 from dxlrun.dynamixel.wire.dialect import dialect_of
 from dxlrun.dynamixel.wire.transaction import BROADCAST_ID, Transaction
 from dxlrun.errors import PortError
-from dxlrun.interfaces import Commands, Floats, States
+from dxlrun.run.channels.cycle import Commands, Floats, States
 from dxlrun.run.channels.packets import RECORD_HEADER, PacketLog
 
 LIBRARY = Path(__file__).with_name("libkernel.so")

@@ -8,10 +8,10 @@ from itertools import accumulate
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, Field, ServoPlan
-from dxlrun.interfaces import Floats, States
-from dxlrun.mode import Mode
+from dxlrun.run.channels.cycle import Floats, States
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
 
 _WHEEL_MODES = (Mode.VELOCITY, Mode.PWM)

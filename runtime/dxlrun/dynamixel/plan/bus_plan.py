@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.wire.transaction import Transaction
-from dxlrun.mode import Mode
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,6 +17,7 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import Literal
 
+from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import ControlItem, ControlTable
 from dxlrun.dynamixel.plan.bus_plan import (
     Field,
@@ -27,7 +28,6 @@ from dxlrun.dynamixel.plan.bus_plan import (
     Scale,
     ServoPlan,
 )
-from dxlrun.mode import Mode
 
 _CURRENT, _VELOCITY, _POSITION, _EXTENDED, _CURRENT_BASED, _PWM = 0, 1, 3, 4, 5, 16
 """Operating Mode (11)"""

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
+from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import ControlItem, ControlTable
 from dxlrun.dynamixel.plan.bus_plan import (
     BusPlan,
@@ -23,7 +24,6 @@ from dxlrun.dynamixel.plan.mode_plan import LACKS, mode_plans, own_limits, posit
 from dxlrun.dynamixel.plan.reads import choose_reads
 from dxlrun.dynamixel.wire.dialect import Dialect, dialect_of
 from dxlrun.dynamixel.wire.transaction import BROADCAST_ID, Transaction
-from dxlrun.mode import Mode
 
 MOST_SPARE = 2
 """Two longer forms of a read tell its late replies from the newest (`exchange`)."""

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import NamedTuple
 
+from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import ControlItem, control_table
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.plan.line import Line, listen
@@ -23,7 +24,6 @@ from dxlrun.dynamixel.servo.watchdog import shown, tripped
 from dxlrun.dynamixel.wire.protocol1 import StatusError, describe_error
 from dxlrun.dynamixel.wire.protocol2 import describe_hardware_error
 from dxlrun.dynamixel.wire.transaction import Outcome, Program, Reply
-from dxlrun.mode import Mode
 
 RETURN_ALL = 2
 """Status Return Level: every instruction is answered."""

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.exchange.gaps import Gaps, Urgency
 from dxlrun.dynamixel.exchange.goals import GoalArrays
@@ -22,7 +23,6 @@ from dxlrun.dynamixel.servo.life import Life, ServoEvent
 from dxlrun.dynamixel.servo.registers import Settled, merged, settle
 from dxlrun.dynamixel.servo.retry import retry
 from dxlrun.dynamixel.wire.transaction import Program
-from dxlrun.mode import Mode
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
 
 PAUSES_NS = (50_000_000, 150_000_000)

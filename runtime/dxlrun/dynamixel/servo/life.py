@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 from dxlrun.dynamixel.exchange.cyclic_reads import CyclicReads
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.dynamixel.servo.watchdog import RETURN_SPEED
-from dxlrun.interfaces import Floats
+from dxlrun.run.channels.cycle import Floats
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import ControlItem, control_table, side_by_side
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, GoalLayout, ModePlan, OwnLimit, ServoPlan
 from dxlrun.dynamixel.plan.mode_plan import in_mode, mode_in
@@ -20,7 +21,6 @@ from dxlrun.dynamixel.plan.units import ticks_in
 from dxlrun.dynamixel.servo import watchdog
 from dxlrun.dynamixel.servo.retry import retry
 from dxlrun.dynamixel.wire.transaction import Outcome, Program, Reply
-from dxlrun.mode import Mode
 
 ENGAGE_SPEED = 0.5
 """rad/s. The goal is where the servo stands; should that be misread, it goes there slowly."""

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.exchange.gaps import Gaps, Urgency
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, RegisterValue
@@ -22,7 +23,6 @@ from dxlrun.dynamixel.servo.life import Life, Loss, ServoEvent
 from dxlrun.dynamixel.servo.registers import settle
 from dxlrun.dynamixel.servo.retry import retry
 from dxlrun.dynamixel.wire.transaction import Outcome, Program, Reply, Transaction
-from dxlrun.mode import Mode
 from dxlrun.run.channels.events import EventCode, Severity
 
 PROBE_NS = 1_000_000_000

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import ControlItem, control_table
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, RegisterValue, ServoPlan, TorqueLimit
 from dxlrun.dynamixel.plan.line import Line
@@ -21,7 +22,6 @@ from dxlrun.dynamixel.servo.retry import ATTEMPTS, retry, setup_line
 from dxlrun.dynamixel.servo.watchdog import shown
 from dxlrun.dynamixel.wire.dialect import dialect_of
 from dxlrun.dynamixel.wire.transaction import Outcome, Program, Reply
-from dxlrun.mode import Mode
 
 
 @dataclass(slots=True)

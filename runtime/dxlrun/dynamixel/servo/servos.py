@@ -28,7 +28,7 @@ from dxlrun.dynamixel.wire.protocol1 import StatusError
 from dxlrun.dynamixel.wire.protocol2 import describe_hardware_error
 from dxlrun.dynamixel.wire.transaction import Program, Reply, Transaction
 from dxlrun.errors import counted
-from dxlrun.interfaces import LOST_AGE_NS, LOST_CYCLES, Commands, Floats, States
+from dxlrun.run.channels.cycle import LOST_AGE_NS, LOST_CYCLES, Commands, Floats, States
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
 
 NOISE_EVENT_NS = 1_000_000_000

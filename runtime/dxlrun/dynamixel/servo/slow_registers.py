@@ -10,7 +10,7 @@ from dxlrun.dynamixel.plan.reads import TEMPERATURES, VOLTAGES
 from dxlrun.dynamixel.servo.life import Life
 from dxlrun.dynamixel.servo.offline import Offline
 from dxlrun.dynamixel.wire.transaction import Program
-from dxlrun.interfaces import Floats, States
+from dxlrun.run.channels.cycle import Floats, States
 from dxlrun.run.channels.events import EventCode, Severity
 
 _LIMITS = ("temperature_limit", "motor_temperature_limit")

@@ -13,6 +13,7 @@ from statistics import median
 from typing import Protocol, TypeVar
 
 from dxlrun.clock import Clock
+from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.exchange.bus import Bus, run
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
@@ -29,8 +30,7 @@ from dxlrun.dynamixel.servo.retry import LONGER_NS, extend_timeouts, retry, setu
 from dxlrun.dynamixel.servo.servos import Servos
 from dxlrun.dynamixel.wire.transaction import Program, Result
 from dxlrun.errors import PortError, StartUpError
-from dxlrun.interfaces import Commands
-from dxlrun.mode import Mode
+from dxlrun.run.channels.cycle import Commands
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
 
 GROUP = 3

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from dxlrun.clock import Clock
+from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.exchange.bus import Bus, run
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.plan.line import listen
@@ -17,7 +18,6 @@ from dxlrun.dynamixel.port.ports import Ports
 from dxlrun.dynamixel.servo import modes
 from dxlrun.dynamixel.servo.retry import retry
 from dxlrun.dynamixel.wire.transaction import Outcome, Program, Reply, Transaction
-from dxlrun.mode import Mode
 from dxlrun.run.channels.packets import PacketSink
 
 LONGER_NS = (0, 60_000_000, 180_000_000)

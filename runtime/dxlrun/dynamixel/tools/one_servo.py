@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
+from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import ControlItem, ControlTable, control_table, side_by_side
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, RegisterValue, ServoPlan
 from dxlrun.dynamixel.plan.line import LONGEST_RETURN_DELAY_NS, listen
@@ -25,7 +26,6 @@ from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.dynamixel.wire.protocol2 import Reset
 from dxlrun.dynamixel.wire.transaction import Outcome, Program, Reply, Result, Transaction
 from dxlrun.errors import ServoFault
-from dxlrun.mode import Mode
 
 LONGEST_READ = 64
 """Bytes of one read; neighbours are read together."""

@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.control.loop import StopFlag
+from dxlrun.description.modes import COMMAND_INTERFACES
 from dxlrun.errors import LogError, PortError
-from dxlrun.interfaces import COMMAND_INTERFACES, States
 from dxlrun.log.client_commands import ClientCommand
 from dxlrun.run.channels.answers import Answer, Refusal
 from dxlrun.run.channels.commands import Command, TakenCommand
-from dxlrun.run.channels.cycle import CycleRecord
+from dxlrun.run.channels.cycle import CycleRecord, States
 
 _STATES = tuple(field.name for field in fields(States) if field.name != "motion")  # which shows three of them
 

@@ -14,13 +14,13 @@ from dxlrun.control.controllers.plugins import PlugIns, load_plugins
 from dxlrun.control.gate import Gate
 from dxlrun.control.loop import Loop, LoopResult, StopFlag
 from dxlrun.control.loop_plan import LoopPlan
+from dxlrun.description.modes import COMMAND_INTERFACES
 from dxlrun.errors import LogError, counted
-from dxlrun.interfaces import COMMAND_INTERFACES, Floats
 from dxlrun.log.reader import read_log
 from dxlrun.log.replay.changes import Setting, with_arguments, with_settings
 from dxlrun.log.replay.inputs import PlannedCommands, RecordedClock, RecordedHardware, RecordedInbox
 from dxlrun.log.replay.recorded import RecordedInputs, recorded, version_remarks
-from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
+from dxlrun.run.channels.cycle import CycleLayout, CycleRecord, Floats
 from dxlrun.run.channels.events import EventCode, Severity
 
 _COMMANDS = tuple(f"command_{interface}" for interface in COMMAND_INTERFACES)

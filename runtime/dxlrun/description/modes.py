@@ -1,4 +1,4 @@
-"""Modes: what a servo does with its goals, and which command interfaces go together.
+"""Modes: the command interfaces of a joint, which of them go together, and what a servo then does.
 
 Without numpy: the guardian reads a bus' plan and is light.
 """
@@ -7,6 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from enum import IntEnum, unique
+from typing import Literal
+
+CommandName = Literal["position", "velocity", "effort", "pwm"]
+
+COMMAND_INTERFACES: tuple[CommandName, ...] = ("position", "velocity", "effort", "pwm")
 
 
 @unique

@@ -1,1 +1,0 @@
-"""dynamixel/control_table/tables/protocol1"""
