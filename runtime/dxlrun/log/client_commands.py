@@ -93,7 +93,11 @@ def _refusal(command: TakenCommand, answers: deque[Event]) -> str:
 def _outcome(event: Event, command: TakenCommand) -> Outcome:
     try:
         return msgspec.json.decode(event.data, type=Outcome)
-    except UNREADABLE:  # of a log from before events had data: taken in order
-        refused = event.code == EventCode.COMMAND_REFUSED
-        refusal = Refusal(Code.INVALID, {"problem": event.text}) if refused else None
-        return Outcome(command.kind, command.origin, refusal)
+    except UNREADABLE:  # of the first release, whose events had no data: the text names kind and client
+        refused = f"{command.kind} from {command.origin} refused: "
+        if event.code == EventCode.STEERED and event.text.startswith(command.kind):
+            return Outcome(command.kind, command.origin)
+        if event.code == EventCode.COMMAND_REFUSED and event.text.startswith(refused):
+            problem = event.text.removeprefix(refused)
+            return Outcome(command.kind, command.origin, Refusal(Code.INVALID, {"problem": problem}))
+        return Outcome("", "")

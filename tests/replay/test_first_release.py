@@ -1,0 +1,44 @@
+"""A log of the first release: it can still be read, analysed and replayed.
+
+`first_release.mcap` was written by that release: the torso on virtual time for 0.4 s, with pause, resume,
+another rate, a set-point for the head, and three commands that were refused.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from dxlrun.log.client_commands import client_commands
+from dxlrun.log.reader import read_log
+from dxlrun.log.replay import replay_log
+
+LOG = Path(__file__).with_name("first_release.mcap")
+
+
+def test_it_is_read_whole_with_long_texts_joined() -> None:
+    log = read_log(LOG)
+    assert log.complete
+    assert not log.damage
+    (torque_on,) = [event for event in log.events if event.name == "torque_on"]
+    assert all(joint in torque_on.text for joint in log.joints)
+    assert len(log.packets) > 100
+
+
+def test_its_commands_have_their_refusals() -> None:
+    found = [(one.command.kind, one.refusal) for one in client_commands(read_log(LOG))]
+    assert found == [
+        ("pause", ""),
+        ("pause", "the loop is paused already"),
+        ("resume", ""),
+        ("switch", "there is no controller nobody"),
+        ("posvel", ""),
+        ("rate", ""),
+        ("posvel", "there is no such controller as nothere"),
+    ]
+
+
+def test_its_replay_is_bit_exact() -> None:
+    report = replay_log(LOG)
+    assert report.same, report.sentence
+    assert report.compared == report.cycles > 20
+    assert not report.stopped
