@@ -16,7 +16,7 @@ from dxlrun.run.channels.events import Severity, decode_event
 from dxlrun.run.channels.heartbeat import Heartbeat, Phase
 from dxlrun.run.channels.packets import PacketBatch, PacketKind, decode_packets
 from dxlrun.run.channels.ring import Handover, Record, RecordKind, RingReader, RingWriter
-from dxlrun.run.guardian import LastHand
+from dxlrun.run.guardian import SafeStop
 from dxlrun.run.run_processes import RunMemory, guardian_job
 from dxlrun.simulation.virtual_ports import VirtualPorts
 from dxlrun.testing import VirtualRobot, plan_of, simulated_robot
@@ -119,9 +119,9 @@ def test_the_guardian_holds_only_a_robot_that_was_running(
     memory = RunMemory.create(plan)
     Heartbeat(memory.heartbeat).enter(phase)
     limp: list[str] = []
-    monkeypatch.setattr(LastHand, "limp", lambda hand, ports, how, severity: limp.append(how) or [how])
-    monkeypatch.setattr(LastHand, "stand", lambda hand, ports: ())
-    said = LastHand(guardian_job(plan, {}, memory, take_over=False)).end((), "it died", Severity.ERROR)
+    monkeypatch.setattr(SafeStop, "limp", lambda safe_stop, ports, how, severity: limp.append(how) or [how])
+    monkeypatch.setattr(SafeStop, "stand", lambda safe_stop, ports: ())
+    said = SafeStop(guardian_job(plan, {}, memory, take_over=False)).end((), "it died", Severity.ERROR)
     assert bool(limp) is not holds
     assert ("torque stays on" in " ".join(said)) is holds
 
@@ -140,8 +140,8 @@ policies: {on_fault: hold}
 
 
 @pytest.fixture
-def last_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[VirtualRobot, LastHand, RunMemory]:
-    """A robot whose loop dies in the middle of a run, and the last hand on its simulated servos."""
+def safe_stop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[VirtualRobot, SafeStop, RunMemory]:
+    """A robot whose loop dies in the middle of a run, and what makes its simulated servos safe."""
     (tmp_path / "wheels.yaml").write_text(WHEELS)
     robot = simulated_robot(tmp_path / "wheels.yaml", duration_s=0.4)
     hardware = robot.robot.hardware
@@ -153,13 +153,13 @@ def last_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[VirtualR
         hardware.idle(robot.clock.wait_until(robot.clock.now_ns() + 20_000_000))
     memory = RunMemory.create(robot.plan)
     Heartbeat(memory.heartbeat).enter(Phase.RUNNING)
-    hand = LastHand(guardian_job(robot.plan, {}, memory, take_over=False))
-    hand._clock = robot.clock  # type: ignore[assignment]  # the time of the simulated servos
+    safe_stop = SafeStop(guardian_job(robot.plan, {}, memory, take_over=False))
+    safe_stop._clock = robot.clock  # type: ignore[assignment]  # the time of the simulated servos
     lines = VirtualPorts(robot.clock, robot.buses)
     monkeypatch.setattr(
-        hand, "_take_over", lambda _: (lines, PacketBatch(Handover(lambda kind, payload: None)))
+        safe_stop, "_take_over", lambda _: (lines, PacketBatch(Handover(lambda kind, payload: None)))
     )
-    return robot, hand, memory
+    return robot, safe_stop, memory
 
 
 def records(ring: int, kind: RecordKind) -> list[bytes]:
@@ -169,12 +169,12 @@ def records(ring: int, kind: RecordKind) -> list[bytes]:
 
 
 def test_a_guardian_that_leaves_torque_on_stops_what_is_led_by_a_velocity(
-    last_hand: tuple[VirtualRobot, LastHand, RunMemory],
+    safe_stop: tuple[VirtualRobot, SafeStop, RunMemory],
 ) -> None:
-    robot, hand, _ = last_hand
+    robot, safe_stop, _ = safe_stop
     wheel = robot.buses[0].servo(1)
     assert wheel.registers["goal_velocity"] > 0
-    said = hand.end((), "it died", Severity.ERROR)
+    said = safe_stop.end((), "it died", Severity.ERROR)
     assert said == ["it died", TORQUE_STAYS, "left (ID 1 on bus main) stands: its goal is 0"]
     assert wheel.registers["goal_velocity"] == 0
     assert [servo.torque_on for servo in robot.buses[0].servos] == [True, True]
@@ -182,11 +182,11 @@ def test_a_guardian_that_leaves_torque_on_stops_what_is_led_by_a_velocity(
 
 @pytest.mark.parametrize("silent", [False, True])
 def test_the_last_hand_names_who_did_not_confirm_torque_off(
-    last_hand: tuple[VirtualRobot, LastHand, RunMemory], silent: bool
+    safe_stop: tuple[VirtualRobot, SafeStop, RunMemory], silent: bool
 ) -> None:
-    robot, hand, memory = last_hand
+    robot, safe_stop, memory = safe_stop
     robot.buses[0].servo(2).silence(silent)
-    _, result = hand.limp((), "torque was cut on request", Severity.WARNING)
+    _, result = safe_stop.limp((), "torque was cut on request", Severity.WARNING)
     event = decode_event(records(memory.guardian, RecordKind.EVENT)[-1])
     assert event.text == f"torque was cut on request; {result}"
     if silent:
@@ -204,7 +204,7 @@ def test_what_the_loop_had_on_its_desk_when_it_died_comes_into_the_log(start: St
     desk = PacketBatch(RingWriter(memory.packets), process.shared_memory(memory.desk))
     desk.packet(0, PacketKind.INSTRUCTION, 3, 1, 2, b"half a cycle")
     master, slave = os.openpty()
-    LastHand(guardian_job(plan, {}, memory, take_over=False))._take_over([slave])
+    SafeStop(guardian_job(plan, {}, memory, take_over=False))._take_over([slave])
     (batch,) = records(memory.guardian, RecordKind.PACKETS)
     (packet,) = decode_packets(batch)
     assert packet.data == b"half a cycle"

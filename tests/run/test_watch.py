@@ -35,8 +35,8 @@ from dxlrun.run.guardian import (
     LONGEST_LOOK_NS,
     Ended,
     Guardian,
-    Handing,
-    LastHand,
+    LineReturns,
+    SafeStop,
     standstill_timeout_ns,
 )
 from dxlrun.run.loop_process import AskedToStop, Pulse
@@ -130,7 +130,7 @@ def test_a_loop_that_never_gets_on_is_ended(  # noqa: PLR0917  fixtures
     watcher = Guardian(guardian_job(plan, {}, memory, take_over=False), control)
     lines = KeptLines(())
     with terminal, loops_end, subprocess.Popen(["/bin/sleep", "60"]) as loop:
-        ended = watcher._watch(loop, Handing(lines, line, control, LastHand(watcher._job)))
+        ended = watcher._watch(loop, LineReturns(lines, line, control, SafeStop(watcher._job)))
         assert loop.returncode == -signal.SIGKILL
     control.close()
     line.close()

@@ -336,7 +336,7 @@ class Loop:
         self.gate.apply(record.commands, record.goals, dt_ns)
         updated_ns = now_ns()
         self.hardware.write()
-        record.tell(read_ns, updated_ns, now_ns())
+        record.set_times(read_ns, updated_ns, now_ns())
         self.sink.append(record)
         self._cycles += 1
         self._valid += record.valid

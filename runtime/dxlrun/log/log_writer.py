@@ -285,7 +285,7 @@ class LogWriter:
     def close(self) -> LogSummary:
         """Finish the file and return what is in it; a second call returns the same.
 
-        Its error tells too when the file is not there any more.
+        Its error is set too when the file is not there any more.
         """
         if self._summary is not None:
             return self._summary
@@ -369,7 +369,7 @@ class LogFile:
         self._size = 0
 
     def write(self, data: bytes | bytearray | memoryview) -> int:
-        """Write all of `data`; the kernel may take it in pieces, and the last piece tells of a full disk."""
+        """Write all of `data`; the kernel may take it in pieces, and the last piece shows a full disk."""
         if os.fstat(self._descriptor).st_size < self._size:
             raise OSError(errno.EIO, "the file was cut by another program")
         rest = memoryview(data)

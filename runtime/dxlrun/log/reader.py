@@ -1,4 +1,4 @@
-"""Reading a log: whole, unfinished after a kill, or damaged; what can be read is read, the rest is said."""
+"""Reading a log: whole, unfinished after a kill, or damaged; the unreadable is reported."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _FOR_OTHERS = frozenset(
         schemas.ROBOT_DESCRIPTION_TOPIC,
     )
 )
-"""What other tools read; the same stands in the other topics."""
+"""What other tools read; the same is in the other topics."""
 _DAMAGE = (McapError, zstandard.ZstdError, struct.error, UnicodeDecodeError, EOFError)
 UNREADABLE = (msgspec.MsgspecError, ValueError, RecursionError)
 """What msgspec raises for JSON in a log (the plan, data of a command) that is damaged or too deep."""
@@ -133,9 +133,9 @@ def read_log(path: str | Path) -> Log:
 def scan_log(path: str | Path, take: Callable[[Log], None]) -> Log:
     """Read a log slice by slice, in memory that does not grow with it: `take` gets each as a log of its own.
 
-    A slice has the cycles, packets, events and commands of a chunk of the file; an event that goes on in the
-    next one is continued there by one of `part` > 0. Return what is left: a log without them, with all that
-    the file says of itself. Raises LogError as read_log, and where a packet of a slice cannot be read.
+    A slice has the cycles, packets, events and commands of a chunk of the file; an event that goes beyond
+    it is continued in the next one by one of `part` > 0. Return what is left: a log without them, with all
+    that the file contains about itself. Raises LogError as read_log, and where a packet cannot be read.
     """
     path = Path(path)
 
@@ -312,7 +312,7 @@ def _open_channel(identifier: int, topic: str, found: _Found) -> None:
 
 
 def _decompressed(chunk: Chunk, found: _Found) -> bytes:
-    """Return the records of a chunk; EOFError when it is not what it says, or more than a log can have."""
+    """Return the records of a chunk; EOFError when it contradicts its header, or more than a log can have."""
     size = chunk.uncompressed_size
     if size > _LARGEST_CHUNK:
         raise EOFError(f"it is {size} bytes long when decompressed, and a chunk has {_LARGEST_CHUNK} at most")
@@ -320,7 +320,7 @@ def _decompressed(chunk: Chunk, found: _Found) -> bytes:
         raise EOFError(f"the file becomes more than {_MOST_EXPANDED} times as long when decompressed")
     found.room -= size
     if chunk.compression == "zstd":
-        # not decompress(): it believes the length in the frame, whatever the chunk says
+        # not decompress(): it believes the length in the frame, not that of the chunk
         data = zstandard.ZstdDecompressor().stream_reader(chunk.data).read(size + 1)
     elif chunk.compression == "lz4":
         try:

@@ -141,7 +141,7 @@ LATCHED = f"""- history: 1
   liveliness_lease_duration:
     {_FOREVER}
   avoid_ros_namespace_conventions: false"""
-"""Quality of service as rosbag2 writes it: keep last, reliable, transient local, so that who comes later gets
+"""Quality of service as rosbag2 writes it: keep last, reliable, transient local, so that late subscribers get
 the message too. The integers are those of rmw/types.h; older rosbag2 reads no words here."""
 
 

@@ -1,8 +1,8 @@
-"""Guardian: the last hand on the ports.
+"""Guardian: the process that keeps the ports, and leaves the robot safe when its loop is gone.
 
 A small process, one priority above the loop. It opens, locks and keeps the ports' descriptors, executes the
-loop's process on them as its child, and watches that child: by its pidfd, which tells at once that it ended,
-and by its heartbeat, which tells that it hangs. A loop that is gone before it reported DONE, or that stands
+loop's process on them as its child, and watches that child: by its pidfd, which shows at once that it ended,
+and by its heartbeat, which shows that it hangs. A loop that is gone before it reported DONE, or that stands
 still, is killed and reaped, and then every servo is made limp with the packets that the plan prepared. A line
 that the loop has lost is opened again and handed over.
 """
@@ -76,7 +76,7 @@ class GuardianJob:
     records: int
     """The guardian's ring: its packets and its events."""
     loop_packets: int
-    """The loop's ring of packets: says whether the batch on the desk is in it."""
+    """The loop's ring of packets: shows whether the batch on the desk is in it."""
     desk: int
     """The loop's unfinished batch of packets."""
     stderr: int
@@ -97,11 +97,11 @@ class Started(msgspec.Struct, frozen=True, tag=True):
 
 
 class Ended(msgspec.Struct, frozen=True, tag=True):
-    """Guardian to terminal: the loop is gone, and the robot is left as its policy says."""
+    """Guardian to terminal: the loop is gone, and the robot is left as by its policy."""
 
     ending: Ending
     outcome: tuple[str, ...] = ()
-    """What the guardian did in the place of the loop, one sentence each."""
+    """What the guardian did instead of the loop, one sentence each."""
 
 
 GuardianMessage = Started | LineLost | LineReturned | Ended | Failed
@@ -110,8 +110,8 @@ _REQUESTS: Decoder[Stop | Cut] = Decoder(Stop | Cut)
 _LINES_LOST = Decoder(LineLost)
 
 
-class LastHand:
-    """Switches torque off in the place of a loop that is gone, and tells log and terminal what came of it."""
+class SafeStop:
+    """Switches torque off instead of a loop that is gone, and reports the result to log and terminal."""
 
     def __init__(self, job: GuardianJob) -> None:
         self._job = job
@@ -128,7 +128,7 @@ class LastHand:
         if self._job.last == "limp" or self._heartbeat.phase is not Phase.RUNNING:
             return self.limp(descriptors, how, severity)
         standing = self.stand(descriptors)
-        self.tell("; ".join([how, TORQUE_STAYS, *standing]), severity)
+        self.report("; ".join([how, TORQUE_STAYS, *standing]), severity)
         return [how, TORQUE_STAYS, *standing]
 
     def stand(self, descriptors: Sequence[int]) -> tuple[str, ...]:
@@ -144,13 +144,13 @@ class LastHand:
         outcome = limp(self._job.buses, ports, self._clock, packets, beat=self._heartbeat.look)
         packets.commit()
         silent = [str(one) for one in outcome if not one.confirmed]
-        everybody = "the servo" if len(outcome) == 1 else f"all {len(outcome)} servos"
+        servos = "the servo" if len(outcome) == 1 else f"all {len(outcome)} servos"
         result = (
-            f"torque off was confirmed by {everybody}"
+            f"torque off was confirmed by {servos}"
             if not silent
             else f"torque off was sent, but not confirmed by {', '.join(silent)}"
         )
-        self.tell(f"{how}; {result}", Severity.ERROR if silent else severity)
+        self.report(f"{how}; {result}", Severity.ERROR if silent else severity)
         return [how, result]
 
     def _take_over(self, descriptors: Sequence[int]) -> tuple[SerialPorts, PacketBatch]:
@@ -162,16 +162,16 @@ class LastHand:
         )
         return ports, PacketBatch(self._ring)
 
-    def tell_grants(self, grants: Sequence[realtime.Grant]) -> None:
+    def report_grants(self, grants: Sequence[realtime.Grant]) -> None:
         """Put into the log what the operating system granted to this process."""
         realtime.log_grants(grants, "guardian", self._events)
 
-    def tell(self, text: str, severity: Severity) -> None:
+    def report(self, text: str, severity: Severity) -> None:
         """Put a sentence into the log."""
         self._events.emit(EventCode.GUARDIAN, severity, "guardian", text)
 
 
-class Handing:
+class LineReturns:
     """Opens the lines again that the loop has lost, and hands them to the loop and to the terminal."""
 
     def __init__(
@@ -179,12 +179,12 @@ class Handing:
         lines: KeptLines,
         loop: MessageChannel[LineLost],
         terminal: MessageChannel[Stop | Cut],
-        hand: LastHand,
+        safe_stop: SafeStop,
     ) -> None:
         self._lines = lines
         self._loop = loop
         self._terminal = terminal
-        self._hand = hand
+        self._safe_stop = safe_stop
 
     @property
     def watched(self) -> list[int]:
@@ -197,13 +197,13 @@ class Handing:
             for message in self._loop.receive():
                 self._terminal.send(message)
                 if not self._lines.lost(message.bus):
-                    self._hand.tell("a line is gone and is not opened again", Severity.ERROR)
+                    self._safe_stop.report("a line is gone and is not opened again", Severity.ERROR)
         if self._lines.fileno() in ready:
             for opened in self._lines.returned():
                 if opened.done:
-                    self._hand.tell(opened.done, Severity.INFO)
+                    self._safe_stop.report(opened.done, Severity.INFO)
                 if opened.wrong:
-                    self._hand.tell(opened.wrong, Severity.ERROR)
+                    self._safe_stop.report(opened.wrong, Severity.ERROR)
                 for channel in (self._loop, self._terminal):
                     channel.send(LineReturned(opened.index), [self._lines.descriptors[opened.index]])
 
@@ -216,7 +216,7 @@ class Guardian:
         self._control = control
         self._clock = MonotonicClock()
         self._heartbeat = Heartbeat(job.heartbeat)
-        self._hand = LastHand(job)
+        self._safe_stop = SafeStop(job)
         self._still = Standstill(LONGEST_LOOK_NS, self._clock.now_ns())
         self._stop_by_ns = _NEVER
         self._killed: Literal["hung", "late", "cut"] | None = None
@@ -232,26 +232,26 @@ class Guardian:
         )
         # before the loop is executed, which inherits none of it
         grants = realtime.apply_to_guardian(self._job.priority, self._job.lock_memory)
-        self._hand.tell_grants(grants)
+        self._safe_stop.report_grants(grants)
         for sentence in lines.done:
-            self._hand.tell(sentence, Severity.INFO)
+            self._safe_stop.report(sentence, Severity.INFO)
         loop_channel, theirs = process.message_channel(_LINES_LOST)
         loop = self._execute(lines.descriptors, theirs.fileno())
         theirs.close()
         # the terminal gets the ports too: should this process die, they are still held, and still open
         self._control.send(Started(loop.pid, grants), lines.descriptors)
-        ending = self._watch(loop, Handing(lines, loop_channel, self._control, self._hand))
+        ending = self._watch(loop, LineReturns(lines, loop_channel, self._control, self._safe_stop))
         outcome: list[str] = []
         how = self._how(ending, loop)
         if ending == "unused":
             outcome = [f"{how}; nothing had been sent to the robot"]
-            self._hand.tell(outcome[0], Severity.ERROR)
+            self._safe_stop.report(outcome[0], Severity.ERROR)
         elif ending != "done":
             lines.returned()  # one that came back in this moment is to hear it, too
             if ending == "cut":
-                outcome = self._hand.limp(lines.descriptors, how, Severity.WARNING)
+                outcome = self._safe_stop.limp(lines.descriptors, how, Severity.WARNING)
             else:
-                outcome = self._hand.end(lines.descriptors, how, Severity.ERROR)
+                outcome = self._safe_stop.end(lines.descriptors, how, Severity.ERROR)
         lines.close()
         self._control.send(Ended(ending, tuple(outcome)))
 
@@ -264,16 +264,16 @@ class Guardian:
             self._job.stderr,
         )
 
-    def _watch(self, loop: subprocess.Popen[bytes], handing: Handing) -> Ending:
+    def _watch(self, loop: subprocess.Popen[bytes], returns: LineReturns) -> Ending:
         """Return how the loop ended; it is dead and reaped then."""
         watched = os.pidfd_open(loop.pid)
         nap = min(max(self._job.period_ns, LEAST_NAP_NS), LONGEST_NAP_NS) * 1e-9
         while True:
-            ready, _, _ = select.select([*self._watched(watched), *handing.watched], [], [], nap)
+            ready, _, _ = select.select([*self._watched(watched), *returns.watched], [], [], nap)
             self._heartbeat.look()
             if watched in ready:
                 return self._ending(loop.wait())
-            handing.look(ready)
+            returns.look(ready)
             request = self._request() if self._control.fileno() in ready else None
             if request == "stop":
                 self._stop_by_ns = min(self._stop_by_ns, self._clock.now_ns() + self._job.exit_timeout_ns)
@@ -284,7 +284,7 @@ class Guardian:
                 loop.kill()
 
     def _ending(self, code: int) -> Ending:
-        """Say how a loop ended that was killed for a reason, or ended by itself."""
+        """Return how a loop ended that was killed for a reason, or ended by itself."""
         phase, killed = self._heartbeat.phase, self._killed
         if phase is Phase.DONE and (code in (0, 1) or killed == "hung"):
             return "done"
@@ -319,7 +319,7 @@ class Guardian:
         return "stop" if messages or self._control.closed else None
 
     def _how(self, ending: Ending, loop: subprocess.Popen[bytes]) -> str:
-        """Say how the loop came to its end, and in which controller's code."""
+        """Return how the loop came to its end, and in which controller's code."""
         if ending == "cut":
             return "torque was cut on request"
         called = self._heartbeat.activity
@@ -348,7 +348,7 @@ def _duration(time_ns: float) -> str:
 
 
 def _manner(code: int | None) -> str:
-    """Say how a process ended."""
+    """Return how a process ended."""
     if code is not None and code < 0:
         return f"signal {signal.Signals(-code).name}"
     return f"exit code {code}"

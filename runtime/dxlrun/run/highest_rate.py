@@ -2,7 +2,7 @@
 
 The first run has nearly the rate that the buses allow by computation. A run that overran is followed by one
 at the rate that nearly all its cycles would have kept. Everything is as in a run: all processes, the
-controllers, each in its share of the cycles, and the recording; the robot holds still where it stands.
+controllers, each in its share of the cycles, and the recording; the robot holds its position.
 """
 
 from __future__ import annotations
@@ -117,7 +117,9 @@ def _try(plan: Plan, rate: float, run: Run) -> Tried:
     path = run(replace(plan, loop=replace(plan.loop, period_ns=round(1e9 / rate))))
     log = read_log(path)
     if not len(log.cycles):
-        raise ProcessFault(f"{plan.robot} ran no cycle at {rate:g} Hz; `dxlrun` with the robot file says why")
+        raise ProcessFault(
+            f"{plan.robot} ran no cycle at {rate:g} Hz; run `dxlrun` with the robot file to see why"
+        )
     cycle_us = (log.cycles["written_ns"] - log.cycles["scheduled_ns"]).astype(float) / 1e3
     overruns = int((log.cycles["skipped"] > 0).sum())
     simulated = min(overruns, _by_simulation(log, path)) if overruns else 0

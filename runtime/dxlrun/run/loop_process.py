@@ -1,6 +1,6 @@
 """The loop's process: plug-ins, set-up on the bus, real time, the loop, torque off.
 
-One thread, executed afresh (no fork), on descriptors that the guardian opened. It learns of a wish to stop
+One thread, executed afresh (no fork), on descriptors that the guardian opened. It is asked to stop
 by SIGTERM, which the guardian sends, or the kernel when the guardian is gone.
 """
 
@@ -136,7 +136,7 @@ def _looked_at(heartbeat: Heartbeat) -> Callable[[str], None]:
 
 
 class AskedToStop(Exception):
-    """Somebody asked to stop before the robot ran: no torque may be switched on any more."""
+    """A stop was requested before the robot ran: no torque may be switched on any more."""
 
 
 @dataclass(slots=True)
@@ -161,7 +161,7 @@ def _reply_polling(wish_ns: int | None) -> ReplyPolling | None:
 
 
 def beside_simulation(plan: Plan) -> SchedulerPlan:
-    """Return the scheduler's wishes: off the core of simulated servos, whose process goes before the loop."""
+    """Return the scheduler's plan, off the core of simulated servos: their process has more priority."""
     scheduler = plan.loop.scheduler
     others = os.sched_getaffinity(0) - {process.spare_core(())}
     if scheduler.policy == "other" or scheduler.cores or not others:
@@ -196,7 +196,7 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks) -> LoopOu
         activity=Activity(heartbeat, realtime.thread_count),
     )
     heartbeat.enter(Phase.SETUP)
-    # before anybody has torque: it takes a while, and a Bus Watchdog waits for the first cycle
+    # before any servo has torque: it takes a while, and a Bus Watchdog waits for the first cycle
     _prepare(plan, job, heartbeat, sinks, ports, pacing)
     try:
         robot.hardware.start()
@@ -231,7 +231,7 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks) -> LoopOu
 def _prepare(  # noqa: PLR0917  what a loop's process has
     plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks, ports: SerialPorts, pacing: Pacing
 ) -> None:
-    """Ask the operating system for real time, measure how late sleeps wake, and tell both."""
+    """Ask the operating system for real time, measure how late sleeps wake, and report both."""
     grants = realtime.apply(beside_simulation(plan))
     heartbeat.beat()
     grants = (*grants, pacing.measure(plan.loop.period_ns, heartbeat.beat))

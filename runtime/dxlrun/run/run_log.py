@@ -1,4 +1,4 @@
-"""What a log says about its run before the first cycle: files, versions, kernel, wishes."""
+"""The log of a run before its first cycle: a file of its own, and the header that explains it."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def new_log(directory: Path, robot: str) -> Path:
 
 
 def ledger_of(log: Path) -> Path:
-    """Return where the simulated buses leave what they saw and said."""
+    """Return where the simulated buses leave their ledger."""
     return log.with_suffix(".ledger.jsonl")
 
 

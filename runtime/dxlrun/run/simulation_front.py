@@ -1,6 +1,6 @@
 """Front: the process in this terminal while simulated servos serve other programs.
 
-It starts the process of the simulated buses, hands it the faults that a person types, tells an audience what
+It starts the process of the simulated buses, hands it the faults that a person types, shows an audience what
 comes back, and ends it in order when SIGINT or SIGTERM comes.
 """
 
@@ -124,13 +124,13 @@ def first_message(child: Child[SimulationMessage]) -> SimulationMessage:
 
 
 class Audience(Protocol):
-    """Whom the front tells what happens."""
+    """What shows a simulation: a terminal, or JSON."""
 
     look_every_s: float | None
     """How often it wants a look; None: never."""
 
     def opened(self, ports: Mapping[str, str], real_time: str) -> None:
-        """Take the device of each bus, and what the system granted of real time; told once."""
+        """Take the device of each bus, and what the system granted of real time; called once."""
 
     def moved(self, ports: Mapping[str, str]) -> None:
         """Take the new devices: empty for an adapter that was pulled, another name when it is back."""
@@ -145,7 +145,7 @@ class Audience(Protocol):
         """Take what is wrong with a line that was typed."""
 
     def help(self) -> None:
-        """Tell which faults there are."""
+        """Show which faults there are."""
 
     def look(self, look: Look, typed: str) -> None:
         """Take the newest look, and what was typed so far of the next line."""
@@ -267,7 +267,7 @@ class _Front:
         self.sentences: list[str] = []
 
     def run(self) -> None:
-        """Tell the ports, then pass on what comes from either side until it is stopped."""
+        """Show the ports, then pass on what comes from either side until it is stopped."""
         first = first_message(self._child)
         self._ports = first.ports or {}
         self._audience.opened(self._ports, first.real_time)
@@ -323,14 +323,14 @@ class _Front:
                 self._audience.refused(message.error)
 
     def _move(self, ports: dict[str, str]) -> None:
-        """Tell what is another port now."""
+        """Show the ports that changed."""
         moved = {bus: port for bus, port in ports.items() if port != self._ports.get(bus)}
         self._ports = ports
         if moved:
             self._audience.moved(moved)
 
     def _last_look(self) -> None:
-        """Take what is still to be told, and the servos' last counts."""
+        """Show what has happened until now, and take the servos' last counts."""
         before = self.newest
         self._child.channel.send({"look": True})
         deadline = time.monotonic() + _LAST_LOOK_S
@@ -343,7 +343,7 @@ class _Front:
 
 @contextmanager
 def _stop_signals() -> Iterator[socket.socket]:
-    """Give a socket that says the numbers of signals; SIGINT and SIGTERM do nothing else meanwhile."""
+    """Give a socket with the numbers of signals; SIGINT and SIGTERM do nothing else meanwhile."""
     wake, signalled = socket.socketpair()
     signalled.setblocking(False)
     before = {number: signal.signal(number, lambda *_: None) for number in _STOPS}

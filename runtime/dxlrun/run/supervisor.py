@@ -36,7 +36,7 @@ from dxlrun.run.channels.process import (
     Listening,
     Stop,
 )
-from dxlrun.run.guardian import Ended, GuardianJob, GuardianMessage, LastHand, Started
+from dxlrun.run.guardian import Ended, GuardianJob, GuardianMessage, SafeStop, Started
 from dxlrun.run.loop_process import LoopOutcome
 from dxlrun.run.run_log import discard_log, epoch_offset_ns, incomplete_log, ledger_of, log_header, new_log
 from dxlrun.run.run_processes import (
@@ -205,7 +205,7 @@ class _Run:
                 self.recorder.channel.send(LateMetadata({"granted": granted_text(self.grants)}))
 
     def _look_after_gateway(self, heartbeat: Heartbeat) -> None:
-        """Start it when the loop runs, so that nothing waits for it; without it the robot goes on."""
+        """Start it when the loop runs, so that nothing waits for it; the run does not need it."""
         if self.gateway is None:
             if self.steerable and heartbeat.phase is Phase.RUNNING:
                 try:
@@ -238,10 +238,10 @@ class _Run:
                 self.socket.unlink(missing_ok=True)
 
     def _without_guardian(self, loop: int, guardian: Child[GuardianMessage], job: GuardianJob) -> None:
-        """The guardian is gone: the kernel told the loop to stop; see that it does, or cut torque here."""
+        """The guardian is gone, and the kernel has signalled the loop: see that it stops, or cut torque."""
         give_up = time.monotonic() + self.plan.exit_timeout_ns * 1e-9
         while not (gone := bool(select.select([loop], [], [], _POLL_S)[0])):
-            # the second wish may have been told to a guardian that did not hear it any more
+            # the second request may have gone to a guardian that did not read it any more
             if time.monotonic() > give_up or self.signals.count > 1:
                 signal.pidfd_send_signal(loop, signal.SIGKILL)
                 select.select([loop], [], [])
@@ -250,13 +250,13 @@ class _Run:
         self.sentences.append("the guardian ended in the middle of the run")
         cut = self.signals.count > 1
         if phase is Phase.DONE and not cut:
-            self.sentences.append("the loop stopped and left the robot as its policy says")
+            self.sentences.append("the loop stopped and left the robot as its policy demands")
         elif phase is not Phase.LOADING:
             called = Heartbeat(self.memory.heartbeat).activity
             where = f" in {called}" if called else ""
             how = f"the loop ended too{where}" if gone else f"the loop did not stop{where} and was killed"
-            hand = LastHand(job)
-            leave = hand.limp if cut else hand.end
+            safe_stop = SafeStop(job)
+            leave = safe_stop.limp if cut else safe_stop.end
             self.sentences += leave(guardian.channel.descriptors, how, Severity.ERROR)
 
     def end(self) -> None:
@@ -292,7 +292,7 @@ class _Run:
                     self.messages = message.summary.messages
                     if gaps := message.summary.gaps:
                         self.sentences.append(
-                            f"the log lacks {counted(gaps, 'record', 'records')}, and says so: "
+                            f"the log lacks {counted(gaps, 'record', 'records')}, which is declared in it: "
                             "the recorder was too slow"
                         )
             recorder.end()

@@ -38,7 +38,7 @@ class VirtualRobot:
     """A robot and its simulated servos on virtual time; two of them from one plan do exactly the same.
 
     `log`: where the log goes, None for no log. `ledger`: where the simulated buses enter what they see, None
-    for one in memory; it is closed with the log. Every bus of the plan is simulated, whatever its port says.
+    for one in memory; it is closed with the log. Every bus of the plan is simulated, whatever its port.
     Raises InputError when the plan has a bus that is not `sim`.
     """
 
@@ -160,7 +160,7 @@ def run_virtual(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
     """Run a plan on virtual time for the command line; the log has the times of the virtual clock."""
     log = new_log(Path(plan.recording_directory), plan.robot) if options.record else None
     try:
-        # nobody asks a command line for the entries afterwards: memory stays bounded
+        # a command line does not need the entries afterwards: memory stays bounded
         ledger = Ledger(options.ledger, keep=False)
         robot = VirtualRobot(plan, log=log, take_over=options.take_over, ledger=ledger)
     except BaseException:

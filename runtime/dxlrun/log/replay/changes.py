@@ -75,10 +75,10 @@ def _changed(plan: ControllerPlan, setting: Setting) -> ControllerPlan:
 
 
 def _asked(plan: ControllerPlan, joints: tuple[str, ...], plugins: PlugIns) -> ControllerPlan:
-    """Let the controller check its new parameters, and say anew what it claims."""
+    """Let the controller check its new parameters, and return its claims anew."""
     offer = plugins.controllers.get(plan.type)
     if offer is None:
-        return plan  # the manager says it
+        return plan  # the manager reports it
     try:
         parameters = offer.controller.Parameters.model_validate_json(plan.parameters)
         interfaces = offer.controller.interfaces(parameters, joints)

@@ -23,11 +23,11 @@ from dxlrun.run.channels.events import EventCode
 
 PLAN = "plan.json"
 _LIBRARIES = ("dxlrun", "numpy")
-"""Whose version may change a command."""
+"""A different version of these may change a command."""
 
 
 class _Begun(msgspec.Struct):
-    """Data of the command that tells of a policy."""
+    """Data of the command that marks the begin of a policy."""
 
     policy: PolicyName
 
@@ -177,8 +177,8 @@ def _version(log: Log) -> str:
 def _check_times(log: Log, start_ns: int, period_ns: int) -> None:
     """Refuse times that no loop can have had; a replay would follow them without an end.
 
-    The time between two deadlines is as many periods as their numbers say; another period begins only in a
-    cycle that took a change of the rate, and none is known where cycles are lost.
+    The time between two deadlines is as many periods as their numbers differ by; another period begins only
+    in a cycle that took a change of the rate, and none is known where cycles are lost.
     """
     cycles = log.cycles
     number, due, woken = cycles["cycle"], cycles["scheduled_ns"], cycles["woken_ns"]
@@ -255,10 +255,10 @@ def _until_policy(log: Log, usable: int, stopped: str) -> tuple[int, int, str]:
     """
     cycles, policy = log.cycles, policy_begun(log)
     if policy is None:
-        told = [
+        begun = [
             event.t_ns for event in log.events if (event.code, event.source) == (EventCode.POLICY, "loop")
         ]
-        ends = int(np.searchsorted(cycles["woken_ns"], told[0], side="right")) if told else usable
+        ends = int(np.searchsorted(cycles["woken_ns"], begun[0], side="right")) if begun else usable
         if ends >= usable:
             return usable, usable, stopped
         return ends, ends, f"the log misses in which cycle a policy began after cycle {ends - 1}"

@@ -280,7 +280,7 @@ class CycleRecord:
             hardware_error=array["hardware_error"][0],
             mode=array["mode"][0],
         )
-        """What the servos said."""
+        """The servos' states."""
         self.commands = Commands(_rows(array, "command_position", len(COMMAND_INTERFACES)))
         """What the controllers want, merged; NaN = not commanded."""
         self.goals = Commands(_rows(array, "goal_position", len(COMMAND_INTERFACES)))
@@ -310,7 +310,7 @@ class CycleRecord:
         words = self.words
         words[0], words[1], words[2], words[6] = cycle, scheduled_ns, woken_ns, period_ns
 
-    def tell(self, read_ns: int, updated_ns: int, written_ns: int) -> None:
+    def set_times(self, read_ns: int, updated_ns: int, written_ns: int) -> None:
         """Take when the parts of a cycle ended."""
         words = self.words
         words[3], words[4], words[5] = read_ns, updated_ns, written_ns

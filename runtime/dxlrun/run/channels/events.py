@@ -1,4 +1,4 @@
-"""Events: what happened beside the regular cycle, as the log tells it."""
+"""Events: what happened beside the regular cycle, for the log and for clients."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class EventCode(IntEnum):
     LOOP_STOPPED = 2
     OVERRUN = 3
     SCHEDULER = 4
-    """A wish about scheduler, memory or collector, and whether it was granted."""
+    """A request about scheduler, memory or collector, and whether it was granted."""
     SETUP = 10
     TORQUE_ON = 11
     TORQUE_OFF = 12
@@ -174,7 +174,7 @@ class EventCounts:
         self._groups: dict[tuple[int, int, str], EventGroup] = {}
 
     def add(self, event: Event) -> None:
-        """Count an event; one of `part` > 0 goes on with the text of the one before."""
+        """Count an event; one of `part` > 0 continues the text of the one before."""
         key = (event.code, event.severity, event.source)
         group = self._groups.get(key)
         if group is None:

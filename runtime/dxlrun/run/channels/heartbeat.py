@@ -22,7 +22,7 @@ _STEP_BITS = 8
 
 @unique
 class Phase(IntEnum):
-    """How far the loop's process has come; the guardian's patience depends on it."""
+    """How far the loop's process has come; the guardian's timeout depends on it."""
 
     LOADING = 0
     """No byte has been sent; plug-ins are imported and configured."""
@@ -30,7 +30,7 @@ class Phase(IntEnum):
     RUNNING = 2
     STOPPING = 3
     DONE = 4
-    """The loop itself has left the robot as its policy says: limp, as far as servos answered, or holding."""
+    """The loop itself has left the robot as by its policy: limp, as far as servos answered, or holding."""
 
 
 @unique
@@ -57,7 +57,7 @@ def create() -> int:
 
 
 class Heartbeat:
-    """The page, mapped; the loop writes, everybody else only reads."""
+    """The page, mapped; the loop writes, other processes only read."""
 
     __slots__ = ("_beats", "_memory", "_words")
 
@@ -67,7 +67,7 @@ class Heartbeat:
         self._beats = 0
 
     def beat(self) -> None:
-        """Show that the loop goes on; called once a cycle, and while replies are awaited."""
+        """Show that the loop is alive; called once a cycle, and while replies are awaited."""
         self._beats += 1
         self._words[_BEATS] = self._beats
 
@@ -128,7 +128,7 @@ class Heartbeat:
 
     @property
     def cycle_ns(self) -> int:
-        """How long a cycle may take, ns; 0 while nobody has said it."""
+        """How long a cycle may take, ns; 0 before the loop has set it."""
         return self._words[_CYCLE_NS]
 
     @property

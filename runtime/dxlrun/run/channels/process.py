@@ -124,7 +124,7 @@ class LineLost(msgspec.Struct, frozen=True, tag=True):
 
 
 class LineReturned(msgspec.Struct, frozen=True, tag=True):
-    """Guardian to loop and terminal: the port of a bus is open again; its descriptor comes along."""
+    """Guardian to loop and terminal: the port of a bus is open again; its descriptor is sent with it."""
 
     bus: int
 

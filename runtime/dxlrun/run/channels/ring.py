@@ -18,8 +18,8 @@ that was overtaken, or finds damage, looks for the next mark that is one, and de
 records it missed.
 
 Tested on x86-64 only. Python has no memory barriers: that a reader sees a record before the head behind it
-follows from the order in which x86-64 makes stores visible. On other processors (ARM) the CRC-32 still tells
-a torn record from a whole one, but that has not been run there.
+follows from the order in which x86-64 makes stores visible. On other processors (ARM) the CRC-32 still
+shows a torn record, but that has not been run there.
 """
 
 from __future__ import annotations
@@ -219,7 +219,7 @@ class RingReader(_Ring):
         head = self.head  # again: a writer that overtook this copy is further
         if found is None:
             found = self._search(head)
-        if found is None:  # at least one was there; the number of the next one says how many more
+        if found is None:  # at least one was there; the number of the next one shows how many more
             self.position, self._number = head, (self._number + 1) % _NUMBERS
             return Gap(1)
         number, record = found
