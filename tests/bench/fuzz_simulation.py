@@ -41,7 +41,7 @@ class Tally:
 
     strings: int = 0
     intact: int = 0
-    """Runs of strings in which an intact packet stood."""
+    """Runs of strings with an intact packet."""
     silent: int = 0
     """Runs of strings that had to stay unanswered."""
     answers: int = 0
@@ -138,7 +138,7 @@ class Host:
         self.pause_ns = 2_000_000 if table.protocol == 2.0 else 101_000_000
 
     def send(self, data: bytes) -> bytes:
-        """Say something; return all that is answered."""
+        """Send bytes; return all that is answered."""
         self.bus.receive(data, self.now_ns)
         self.now_ns += len(data) * 10_000_000_000 // self.rate
         reply = b""
@@ -148,7 +148,7 @@ class Host:
         return reply
 
     def run(self) -> None:
-        """Say strings until the next pause, and judge what comes back."""
+        """Send strings until the next pause, and judge what comes back."""
         gentle = self.rng.random() < 0.5
         sent, reply = b"", b""
         for _ in range(PER_PAUSE):
@@ -234,7 +234,7 @@ class Host:
 
 
 def campaign(protocol: float, count: int, seed: int) -> Tally:
-    """Say `count` strings to servos of all models in turn; raises AssertionError when a promise is broken."""
+    """Send `count` strings to servos of all models in turn; raises AssertionError at a broken promise."""
     rng, tally = random.Random(seed), Tally()
     tables = [table for table in all_tables() if table.protocol == protocol]
     rng.shuffle(tables)

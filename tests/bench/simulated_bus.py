@@ -94,13 +94,13 @@ def words(*numbers: int) -> bytes:
 
 
 def lateness_us(port: int, rate: int, transactions: int) -> list[float]:
-    """Ask one servo again and again; return by how much later than possible each reply was there, us."""
-    question = packet(1, 0x02, words(PRESENT, PRESENT_BYTES))
-    bound_ns = (len(question) + STATUS_BYTES) * 10_000_000_000 // rate + RETURN_DELAY_NS
+    """Read one servo again and again; return by how much later than possible each reply was there, us."""
+    request = packet(1, 0x02, words(PRESENT, PRESENT_BYTES))
+    bound_ns = (len(request) + STATUS_BYTES) * 10_000_000_000 // rate + RETURN_DELAY_NS
     late = []
     for _ in range(transactions):
         start_ns = time.monotonic_ns()
-        os.write(port, question)
+        os.write(port, request)
         left = STATUS_BYTES
         while left:
             select.select([port], [], [])
@@ -128,26 +128,26 @@ def show_lateness(transactions: int, options: Sequence[str]) -> None:
 
 
 @dataclass
-class Asked:
+class Host:
     """One bus, as its host sees it: it reads again when it has everything, or after 5 ms."""
 
     port: int
-    asked_ns: int = 0
+    sent_ns: int = 0
     missing: int = 0
     answered: int = 0
     given_up: int = 0
 
-    def turn(self, question: bytes, now_ns: int) -> None:
+    def serve(self, request: bytes, now_ns: int) -> None:
         """Take what has come; read again."""
         with contextlib.suppress(BlockingIOError):
             self.missing -= len(os.read(self.port, 4096))
-        if self.missing > 0 and now_ns - self.asked_ns < 5_000_000:
+        if self.missing > 0 and now_ns - self.sent_ns < 5_000_000:
             return
-        self.answered += self.asked_ns > 0 and self.missing == 0
+        self.answered += self.sent_ns > 0 and self.missing == 0
         self.given_up += self.missing > 0
         self.missing = SERVOS_A_BUS * STATUS_BYTES
-        self.asked_ns = now_ns
-        os.write(self.port, question)
+        self.sent_ns = now_ns
+        os.write(self.port, request)
 
 
 def show_load(seconds: float, options: Sequence[str]) -> None:
@@ -157,7 +157,7 @@ def show_load(seconds: float, options: Sequence[str]) -> None:
     buses = tuple(BusConfig(str(index), 4_000_000, servos, 2.0) for index in range(BUSES))
     read = packet(0xFE, 0x82, words(PRESENT, PRESENT_BYTES) + ids)
     with serving(buses, options) as running, contextlib.ExitStack() as stack:
-        hosts = [Asked(stack.enter_context(opened(path))) for path in running.ports.values()]
+        hosts = [Host(stack.enter_context(opened(path))) for path in running.ports.values()]
         for host in hosts:
             os.write(host.port, packet(0xFE, 0x83, words(64, 1) + b"".join(bytes((each, 1)) for each in ids)))
             os.set_blocking(host.port, False)
@@ -166,9 +166,9 @@ def show_load(seconds: float, options: Sequence[str]) -> None:
         while (now_ns := time.monotonic_ns()) - began_ns < seconds * 1e9:
             goal = 2048 + turn % 400
             data = b"".join(bytes((each,)) + goal.to_bytes(4, "little") for each in ids)
-            question = packet(0xFE, 0x83, words(GOAL_POSITION, 4) + data) + read
+            request = packet(0xFE, 0x83, words(GOAL_POSITION, 4) + data) + read
             for host in hosts:
-                host.turn(question, now_ns)
+                host.serve(request, now_ns)
             turn += 1
             wait_ns = began_ns + turn * PERIOD_NS - time.monotonic_ns()
             late += wait_ns <= 0

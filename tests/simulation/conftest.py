@@ -66,25 +66,25 @@ class Line:
     def send(self, servo_id: int, instruction: int, *parameters: int) -> None:
         self.ports.ports[0].write(packet(servo_id, instruction, *parameters))
 
-    def hear(self, wait_ns: int = 10_000_000) -> bytes:
+    def receive(self, wait_ns: int = 10_000_000) -> bytes:
         """Return everything that arrives in a time."""
         deadline = self.clock.now_ns() + wait_ns
-        heard = bytearray()
+        received = bytearray()
         buffer = memoryview(bytearray(4096))
         while self.ports.wait(deadline):
-            heard += buffer[: self.ports.ports[0].read_into(buffer)]
-        return bytes(heard)
+            received += buffer[: self.ports.ports[0].read_into(buffer)]
+        return bytes(received)
 
     def ask(self, servo_id: int, instruction: int, *parameters: int) -> Answer | None:
         """Send an instruction; return the one status packet that answers it, None for silence."""
         self.send(servo_id, instruction, *parameters)
-        heard = self.hear()
-        if not heard:
+        received = self.receive()
+        if not received:
             return None
-        assert heard[:2] == b"\xff\xff"
-        assert heard[3] == len(heard) - 4
-        assert sum(heard[2:]) & 0xFF == 0xFF
-        return Answer(heard[2], heard[4], heard[5:-1])
+        assert received[:2] == b"\xff\xff"
+        assert received[3] == len(received) - 4
+        assert sum(received[2:]) & 0xFF == 0xFF
+        return Answer(received[2], received[4], received[5:-1])
 
     def write(self, servo_id: int, address: int, *data: int) -> int:
         """Write bytes and return the error byte of the answer."""
@@ -109,16 +109,16 @@ class Line:
 class Line2(Line):
     """One bus of Protocol 2.0."""
 
-    def tell(self, servo_id: int, instruction: int, parameters: bytes = b"") -> None:
+    def instruct(self, servo_id: int, instruction: int, parameters: bytes = b"") -> None:
         self.ports.ports[0].write(packet2(servo_id, instruction, parameters))
 
     def statuses(self, wait_ns: int = 10_000_000) -> list[Answer]:
         """Return the status packets that arrive in a time; nothing else may."""
-        heard, answers = self.hear(wait_ns), []
-        while heard:
-            assert heard[:4] == b"\xff\xff\xfd\x00"
-            size = 7 + int.from_bytes(heard[5:7], "little")
-            status, heard = heard[:size], heard[size:]
+        received, answers = self.receive(wait_ns), []
+        while received:
+            assert received[:4] == b"\xff\xff\xfd\x00"
+            size = 7 + int.from_bytes(received[5:7], "little")
+            status, received = received[:size], received[size:]
             assert status[7] == 0x55
             assert crc(status[:-2]) == int.from_bytes(status[-2:], "little")
             parameters = status[9:-2].replace(b"\xff\xff\xfd\xfd", b"\xff\xff\xfd")
@@ -127,7 +127,7 @@ class Line2(Line):
 
     def request(self, servo_id: int, instruction: int, parameters: bytes = b"") -> Answer | None:
         """Send an instruction; return the one status packet that answers it, None for silence."""
-        self.tell(servo_id, instruction, parameters)
+        self.instruct(servo_id, instruction, parameters)
         answers = self.statuses()
         assert len(answers) < 2
         return answers[0] if answers else None
@@ -220,12 +220,12 @@ def line(make_line: Callable[..., Line]) -> Line:
 class Running:
     child: subprocess.Popen[bytes]
     control: socket.socket
-    said: IO[bytes]
+    sent: IO[bytes]
     ports: dict[str, str]
     path: Path
 
     def hang_up(self) -> int:
-        self.said.close()
+        self.sent.close()
         self.control.close()
         return self.child.wait(PATIENCE_S)
 
@@ -257,8 +257,8 @@ def start_buses(tmp_path: Path) -> Iterator[Callable[[Sequence[BusConfig]], Runn
             os.close(reader)
             stack.callback(child.wait)
             stack.callback(child.kill)
-            said = stack.enter_context(ours.makefile("rb"))
-            return Running(child, ours, said, json.loads(said.readline())["ports"], path)
+            sent = stack.enter_context(ours.makefile("rb"))
+            return Running(child, ours, sent, json.loads(sent.readline())["ports"], path)
 
         yield run
 

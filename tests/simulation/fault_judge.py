@@ -3,8 +3,8 @@
 1 every byte sent is a legal instruction; 2 no goal outside the limits, no step over the maximum; 3 no
 torque-on without a look at the servo first; 4 each recorded sample is what that servo sent in that cycle;
 5 the log has every byte; 6 each accepted command has a known client and is in the log; 7 each fault that
-no run bears in silence leaves an event of its servo or bus, and no event is without a cause; 8 nobody who
-hears keeps torque.
+no run bears in silence leaves an event of its servo or bus, and no event is without a cause; 8 no servo
+that is reached keeps torque.
 
 The packets are taken apart by fault_wire.py, which has its own addresses and units and nothing of the host's.
 """
@@ -15,7 +15,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from fault_wire import FACTS, READ, Said, Told, angle, data_of, instructions, stands_at, states, written
+from fault_wire import (
+    FACTS,
+    READ,
+    Instruction,
+    StateReply,
+    angle,
+    data_of,
+    instructions,
+    stands_at,
+    states,
+    written,
+)
 
 from dxlrun.analysis.bus import joints_of
 from dxlrun.analysis.ledger.faults import answered, uncaused
@@ -33,30 +44,30 @@ from dxlrun.testing import VirtualRobot
 
 MS = 1_000_000
 SOME_CYCLES = 100
-"""In so many cycles somebody answers and gets a goal, or there was nothing to judge."""
+"""In so many cycles a servo answers and gets a goal, or there was nothing to judge."""
 LATEST = 2
 """Cycles; see `samples_are_what_was_sent`."""
 REPLY_NS = 2 * MS
 """No servo here needs longer for an answer: 500 us of return delay and some 20 bytes at 1 Mbit/s."""
 SOON_NS = 2_000_000_000
-"""Within this time a fault that somebody can see is told."""
+"""Within this time a fault that can be seen is reported."""
 BUMP = 0.1
-"""rad: so near to where the servo stands is the goal with which it gets its torque again."""
+"""rad: so near to where the servo is lies the goal with which it gets its torque again."""
 ROUNDING = 1e-9
 """rad, between two orders of the same arithmetic; a tick of an XM430 is 1.5e-3."""
 IDENTITY = 6
-"""An item that begins before this address is part of who a servo is: model number, firmware, ID."""
+"""An item that begins before this address identifies a servo: model number, firmware, ID."""
 
 
 @dataclass
 class Witness:
-    """Sees what the bytes of one bus do not tell: who has torque, every 2 ms, and what was held back."""
+    """Sees what the bytes of one bus do not show: servos with torque, every 2 ms, and what was held back."""
 
     bus: SimulatedBus
     torque: dict[object, int] = field(default_factory=dict)
     found: list[tuple[int, int, float]] = field(default_factory=list)
-    """When a servo's torque enable went from 0 to 1, whose, and where it stood, rad from its raw 0."""
-    delayed: list[Told] = field(default_factory=list)
+    """When a servo's torque enable went from 0 to 1, its ID, and where it was, rad from its raw 0."""
+    delayed: list[StateReply] = field(default_factory=list)
     """Replies that a fault held back, and since when each is on its way again."""
 
     def __post_init__(self) -> None:
@@ -67,7 +78,7 @@ class Witness:
             def held_back(reply: bytes) -> bytes:
                 if delay_ns:
                     data = data_of(reply, bus.protocol)
-                    self.delayed.append(Told(bus.now_ns + delay_ns, servo_id, data, bus.now_ns))
+                    self.delayed.append(StateReply(bus.now_ns + delay_ns, servo_id, data, bus.now_ns))
                 return bytes(change(reply))
 
             alter_next(servo_id, text, held_back, delay_ns=delay_ns, copies=copies)
@@ -86,7 +97,7 @@ class Witness:
 
 
 def alone(bus: SimulatedBus) -> list[SimulatedServo]:
-    """Return the servos whose ID nobody else has: of two, one answers and the other obeys, unseen."""
+    """Return the servos whose ID no other servo has: of two, one answers and the other obeys, unseen."""
     ids = [servo.servo_id for servo in bus.servos]
     return [servo for servo in bus.servos if ids.count(servo.servo_id) == 1]
 
@@ -127,12 +138,12 @@ class Trial:
         entries = self.robot.ledger.entries
         for number, (bus, witness) in enumerate(zip(self.robot.plan.buses, self.witnesses, strict=True)):
             mine = [entry for entry in entries if entry.bus == bus.name]
-            said = list(instructions(mine, bus))
-            told = list(states(mine, bus))
-            goals_are_within_limits(said, bus, self.robot)
-            nobody_wakes_without_a_look(said, witness, bus, log)
+            sent = list(instructions(mine, bus))
+            replies = list(states(mine, bus))
+            goals_are_within_limits(sent, bus, self.robot)
+            no_servo_wakes_without_a_look(sent, witness, bus, log)
             if not self.refusal:
-                samples_are_what_was_sent(told, witness, bus, log)
+                samples_are_what_was_sent(replies, witness, bus, log)
             the_log_is_the_wire(mine, log, number)
             everybody_who_hears_is_limp(self.robot, number, (*self.robot.failures, *self.refusal))
         faults_and_events_answer_each_other(entries, log)
@@ -141,17 +152,17 @@ class Trial:
 # Invariants 2 and 3
 
 
-def goals_are_within_limits(said: Sequence[Said], bus: BusPlan, robot: VirtualRobot) -> None:
+def goals_are_within_limits(sent: Sequence[Instruction], bus: BusPlan, robot: VirtualRobot) -> None:
     joints, period_ns = robot.plan.loop.joints, robot.plan.loop.period_ns
     before: dict[int, tuple[int, float]] = {}
     count = 0
-    woken = {(t_ns, servo.servo_id) for t_ns, servo, on in written(said, bus, "torque_enable") if on}
+    woken = {(t_ns, servo.servo_id) for t_ns, servo, on in written(sent, bus, "torque_enable") if on}
     last_on = dict.fromkeys((servo.servo_id for servo in bus.servos), -1)
-    for t_ns, servo, raw in written(said, bus, "goal_position"):
+    for t_ns, servo, raw in written(sent, bus, "goal_position"):
         goal, joint, tick = angle(servo, raw), joints[servo.row], FACTS[servo.model].rad_per_tick
         assert joint.lower - tick <= goal <= joint.upper + tick, (t_ns, joint.name)
         on_ns = max((at for at, one in woken if one == servo.servo_id and at <= t_ns), default=-1)
-        if on_ns != last_on[servo.servo_id]:  # it was away meanwhile, and its goal is where it stands
+        if on_ns != last_on[servo.servo_id]:  # it was away meanwhile, and its goal is where it is
             last_on[servo.servo_id] = on_ns
             before.pop(servo.servo_id, None)
         if joint.velocity is not None and servo.servo_id in before:
@@ -164,21 +175,23 @@ def goals_are_within_limits(said: Sequence[Said], bus: BusPlan, robot: VirtualRo
     assert count or robot.result is None or robot.result.cycles < SOME_CYCLES
 
 
-def nobody_wakes_without_a_look(said: Sequence[Said], witness: Witness, bus: BusPlan, log: Log) -> None:
-    """After the set-up torque comes only by policy, to a servo that was looked at, and where it stands."""
+def no_servo_wakes_without_a_look(
+    sent: Sequence[Instruction], witness: Witness, bus: BusPlan, log: Log
+) -> None:
+    """After the set-up torque comes only by policy, to a servo that was looked at, and where it is."""
     started = [event.t_ns for event in log.events if event.code == EventCode.LOOP_STARTED]
     if not started:
         return
     by_id = {servo.servo_id: servo for servo in bus.servos}
-    goals = list(written(said, bus, "goal_position"))
-    for t_ns, servo_id, stands in witness.found:
+    goals = list(written(sent, bus, "goal_position"))
+    for t_ns, servo_id, shaft_rad in witness.found:
         if t_ns <= started[0] + 2 * MS:
             continue
         servo = by_id[servo_id]
         assert servo.torque_on_return, (t_ns, servo.joint)
         looks = [
             one
-            for one in said
+            for one in sent
             if t_ns - SOON_NS < one.t_ns <= t_ns
             and (one.servo_id, one.instruction) == (servo_id, READ)
             and one.parameters[0] < IDENTITY
@@ -186,8 +199,8 @@ def nobody_wakes_without_a_look(said: Sequence[Said], witness: Witness, bus: Bus
         assert looks, (t_ns, servo.joint)
         goal = [raw for at_ns, one, raw in goals if one is servo and at_ns <= t_ns][-1]
         where = angle(servo, goal)
-        assert abs(where - servo.direction * (stands - servo.reference)) < BUMP, (t_ns, servo.joint)
-    asked = {(t_ns, servo.servo_id) for t_ns, servo, on in written(said, bus, "torque_enable") if on}
+        assert abs(where - servo.direction * (shaft_rad - servo.reference)) < BUMP, (t_ns, servo.joint)
+    asked = {(t_ns, servo.servo_id) for t_ns, servo, on in written(sent, bus, "torque_enable") if on}
     for t_ns, servo_id in asked:
         assert t_ns <= started[0] or by_id[servo_id].torque_on_return, (t_ns, servo_id)
 
@@ -195,14 +208,16 @@ def nobody_wakes_without_a_look(said: Sequence[Said], witness: Witness, bus: Bus
 # Invariant 4: each recorded sample equals what that servo sent in that cycle
 
 
-def samples_are_what_was_sent(told: Sequence[Told], witness: Witness, bus: BusPlan, log: Log) -> None:
+def samples_are_what_was_sent(
+    replies: Sequence[StateReply], witness: Witness, bus: BusPlan, log: Log
+) -> None:
     """Look for each sample among the intact states of its cycle; what was asked for earlier is none.
 
     A limit of today's runtime: it knows a late reply by its length, and asks for three lengths in turn. One
-    that is LATEST cycles late is always known; one that is later, on a line that goes on losing replies, may
+    that is LATEST cycles late is always known; one that is later, on a line that keeps losing replies, may
     pass for current.
     """
-    asked_ns = held_back(told, witness.delayed)
+    asked_ns = held_back(replies, witness.delayed)
     judged = {servo.servo_id for servo in alone(witness.bus)}
     at = 0
     valid = 0
@@ -210,10 +225,10 @@ def samples_are_what_was_sent(told: Sequence[Told], witness: Witness, bus: BusPl
         since_ns = int(log.cycles["woken_ns"][max(0, number - LATEST)])
         # on a split bus the states are asked for behind the goals of the cycle before
         begin_ns = int(log.cycles["updated_ns"][number - 1] if bus.split and number else cycle["woken_ns"])
-        while at < len(told) and told[at].t_ns < begin_ns:
+        while at < len(replies) and replies[at].t_ns < begin_ns:
             at += 1
         end = at
-        while end < len(told) and told[end].t_ns <= cycle["read_ns"]:
+        while end < len(replies) and replies[end].t_ns <= cycle["read_ns"]:
             end += 1
         for servo in bus.servos:
             if not cycle["valid"][servo.row] or servo.servo_id not in judged:
@@ -221,7 +236,7 @@ def samples_are_what_was_sent(told: Sequence[Told], witness: Witness, bus: BusPl
             valid += 1
             sent = [
                 stands_at(servo, each.data)
-                for each in told[at:end]
+                for each in replies[at:end]
                 if each.servo_id == servo.servo_id and not since_ns <= asked_ns.get(each, -1) < begin_ns
             ]
             recorded = float(cycle["position"][servo.row])
@@ -232,11 +247,11 @@ def samples_are_what_was_sent(told: Sequence[Told], witness: Witness, bus: BusPl
     assert valid or not judged or len(log.cycles) < SOME_CYCLES
 
 
-def held_back(told: Sequence[Told], delayed: Sequence[Told]) -> dict[Told, int]:
+def held_back(replies: Sequence[StateReply], delayed: Sequence[StateReply]) -> dict[StateReply, int]:
     """Return the states that a fault held back, and when the host had asked for each."""
-    asked_ns: dict[Told, int] = {}
+    asked_ns: dict[StateReply, int] = {}
     for late in delayed:
-        for each in told:
+        for each in replies:
             on_time = late.t_ns <= each.t_ns <= late.t_ns + REPLY_NS
             if on_time and (each.servo_id, each.data) == (late.servo_id, late.data):
                 asked_ns[each] = late.asked_ns
@@ -261,16 +276,16 @@ def the_log_is_the_wire(entries: Sequence[LedgerEntry], log: Log, number: int) -
         return b"".join(entry.data for entry in entries if entry.direction == direction)
 
     pulled = any(entry.note == "adapter unplugged" for entry in entries)
-    said, heard = logged(PacketKind.INSTRUCTION), logged(PacketKind.STATUS, PacketKind.NOISE)
+    sent, received = logged(PacketKind.INSTRUCTION), logged(PacketKind.STATUS, PacketKind.NOISE)
     if not pulled:
-        assert b"".join(said) == wire("in")
-        assert wire("out").startswith(b"".join(heard))
-        assert sum(map(len, heard)) > len(wire("out")) - 4096
+        assert b"".join(sent) == wire("in")
+        assert wire("out").startswith(b"".join(received))
+        assert sum(map(len, received)) > len(wire("out")) - 4096
         return
-    assert b"".join(said) == wire("in")
-    told, at = wire("out"), 0
-    for each in heard:
-        at = told.index(each, at) + len(each)
+    assert b"".join(sent) == wire("in")
+    replies, at = wire("out"), 0
+    for each in received:
+        at = replies.index(each, at) + len(each)
 
 
 def everybody_who_hears_is_limp(robot: VirtualRobot, number: int, sentences: Sequence[str]) -> None:
@@ -278,12 +293,12 @@ def everybody_who_hears_is_limp(robot: VirtualRobot, number: int, sentences: Seq
     bus = robot.buses[number]
     bus.advance(robot.clock.now_ns())
     on = {servo.servo_id for servo in alone(bus) if servo.registers["torque_enable"]}
-    told = {
+    replies = {
         servo.servo_id
         for servo in robot.plan.buses[number].servos
         if any(f"{servo.joint} (ID " in sentence and "torque off" in sentence for sentence in sentences)
     }
-    assert on <= told
+    assert on <= replies
 
 
 # Invariant 7

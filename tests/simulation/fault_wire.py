@@ -14,13 +14,13 @@ from dxlrun.simulation import LedgerEntry
 
 PING, READ, WRITE, SYNC_WRITE, SYNC_READ, FAST_SYNC_READ, BULK_READ = 0x01, 0x02, 0x03, 0x83, 0x82, 0x8A, 0x92
 HOST_SAYS = frozenset((PING, READ, WRITE, SYNC_WRITE, SYNC_READ, FAST_SYNC_READ, BULK_READ))
-EVERYBODY, STATUS = 254, 0x55
+BROADCAST, STATUS = 254, 0x55
 HEADER = b"\xff\xff\xfd\x00"
 Item = Literal["torque_enable", "goal_position", "present_position"]
 
 
 class Facts(NamedTuple):
-    """What the e-Manual says of a model: the angle of a tick, and address and size of each item."""
+    """What the e-Manual has about a model: the angle of a tick, and address and size of each item."""
 
     rad_per_tick: float
     items: Mapping[Item, tuple[int, int]]
@@ -71,7 +71,7 @@ def crc(data: bytes) -> int:
     return value
 
 
-class Said(NamedTuple):
+class Instruction(NamedTuple):
     """An instruction of the host."""
 
     t_ns: int
@@ -80,7 +80,7 @@ class Said(NamedTuple):
     parameters: bytes
 
 
-class Told(NamedTuple):
+class StateReply(NamedTuple):
     """A state that a servo sent, and when the host asked for it where that is known."""
 
     t_ns: int
@@ -95,10 +95,10 @@ def data_of(reply: bytes, protocol: float) -> bytes:
         return reply[5:-1]
     if not reply.startswith(HEADER):
         return reply[2:-2]
-    return reply[10:-2] if reply[4] == EVERYBODY else reply[9:-2]
+    return reply[10:-2] if reply[4] == BROADCAST else reply[9:-2]
 
 
-def instructions(entries: Sequence[LedgerEntry], bus: BusPlan) -> Iterator[Said]:
+def instructions(entries: Sequence[LedgerEntry], bus: BusPlan) -> Iterator[Instruction]:
     """Take apart all that the host sent; whatever is no legal instruction fails."""
     known = {servo.servo_id for servo in bus.servos}
     for entry in entries:
@@ -106,8 +106,8 @@ def instructions(entries: Sequence[LedgerEntry], bus: BusPlan) -> Iterator[Said]
         while data:
             servo_id, instruction, parameters, data = _first(data, bus.protocol)
             assert instruction in HOST_SAYS, entry
-            assert servo_id in known | {EVERYBODY}, entry
-            yield Said(entry.t_ns, servo_id, instruction, parameters)
+            assert servo_id in known | {BROADCAST}, entry
+            yield Instruction(entry.t_ns, servo_id, instruction, parameters)
 
 
 def _first(data: bytes, protocol: float) -> tuple[int, int, bytes, bytes]:
@@ -126,14 +126,14 @@ def _first(data: bytes, protocol: float) -> tuple[int, int, bytes, bytes]:
     return data[4], data[7], parameters, data[end:]
 
 
-def writes(said: Said, protocol: float) -> Iterator[tuple[int, int, bytes]]:
+def writes(sent: Instruction, protocol: float) -> Iterator[tuple[int, int, bytes]]:
     """Return servo, address and bytes of all that an instruction writes."""
     width = 1 if protocol == 1.0 else 2
-    parameters = said.parameters
+    parameters = sent.parameters
     address = int.from_bytes(parameters[:width], "little")
-    if said.instruction == WRITE:
-        yield said.servo_id, address, parameters[width:]
-    elif said.instruction == SYNC_WRITE:
+    if sent.instruction == WRITE:
+        yield sent.servo_id, address, parameters[width:]
+    elif sent.instruction == SYNC_WRITE:
         size = int.from_bytes(parameters[width : 2 * width], "little")
         blocks = parameters[2 * width :]
         assert len(blocks) % (size + 1) == 0
@@ -141,21 +141,21 @@ def writes(said: Said, protocol: float) -> Iterator[tuple[int, int, bytes]]:
             yield blocks[at], address, blocks[at + 1 : at + 1 + size]
 
 
-def written(said: Sequence[Said], bus: BusPlan, item: Item) -> Iterator[tuple[int, ServoPlan, int]]:
+def written(sent: Sequence[Instruction], bus: BusPlan, item: Item) -> Iterator[tuple[int, ServoPlan, int]]:
     """Return when which servo got which value in an item."""
     places = [(servo, *FACTS[servo.model].items[item]) for servo in bus.servos]
-    for one in said:
+    for one in sent:
         for servo_id, address, data in writes(one, bus.protocol):
             for servo, place, size in places:
                 at = place - address
-                if servo_id in (servo.servo_id, EVERYBODY) and 0 <= at <= len(data) - size:
+                if servo_id in (servo.servo_id, BROADCAST) and 0 <= at <= len(data) - size:
                     yield one.t_ns, servo, int.from_bytes(data[at : at + size], "little", signed=size == 4)
 
 
-def states(entries: Sequence[LedgerEntry], bus: BusPlan) -> Iterator[Told]:
-    """Return every intact state that passed the wire, wherever it stands among the bytes.
+def states(entries: Sequence[LedgerEntry], bus: BusPlan) -> Iterator[StateReply]:
+    """Return every intact state that passed the wire, wherever it is among the bytes.
 
-    The host asks for some bytes more now and then, to tell a late reply from the one it waits for.
+    The host asks for some bytes more now and then, to distinguish a late reply from the one it waits for.
     """
     lengths = {
         length
@@ -170,17 +170,17 @@ def states(entries: Sequence[LedgerEntry], bus: BusPlan) -> Iterator[Told]:
     yield from sorted(found)
 
 
-def _states1(entry: LedgerEntry) -> Iterator[Told]:
+def _states1(entry: LedgerEntry) -> Iterator[StateReply]:
     rest = entry.data
     while (start := rest.find(b"\xff\xff")) >= 0:
         rest = rest[start:]
         body = rest[: 4 + (rest[3] if len(rest) > 5 else 0)]
         if len(body) > 5 and len(body) == 4 + body[3] and sum(body[2:]) & 0xFF == 0xFF:
-            yield Told(entry.t_ns, body[2], body[5:-1])
+            yield StateReply(entry.t_ns, body[2], body[5:-1])
         rest = rest[1:]
 
 
-def _states2(entry: LedgerEntry) -> Iterator[Told]:
+def _states2(entry: LedgerEntry) -> Iterator[StateReply]:
     rest = entry.data
     while (start := rest.find(HEADER)) >= 0:
         rest = rest[start:]
@@ -188,16 +188,16 @@ def _states2(entry: LedgerEntry) -> Iterator[Told]:
         if len(rest) >= end and crc(rest[: end - 2]) == int.from_bytes(rest[end - 2 : end], "little"):
             servo_id, instruction, parameters, _ = _first(rest, 2.0)
             if instruction == STATUS:
-                yield Told(entry.t_ns, servo_id, parameters[1:])
+                yield StateReply(entry.t_ns, servo_id, parameters[1:])
         rest = rest[4:]
 
 
-def _shared(sent: Sequence[LedgerEntry], lengths: Sequence[int]) -> Iterator[Told]:
+def _shared(sent: Sequence[LedgerEntry], lengths: Sequence[int]) -> Iterator[StateReply]:
     """Return the parts of the statuses of fast forms, up to the first broken one of each."""
     stream = b"".join(entry.data for entry in sent)
     times = [entry.t_ns for entry in sent for _ in entry.data]
     start = -1
-    while (start := stream.find(HEADER + bytes((EVERYBODY,)), start + 1)) >= 0:
+    while (start := stream.find(HEADER + bytes((BROADCAST,)), start + 1)) >= 0:
         size = int.from_bytes(stream[start + 5 : start + 7], "little")
         for length in lengths:
             if (size - 1) % (length + 4):
@@ -209,5 +209,5 @@ def _shared(sent: Sequence[LedgerEntry], lengths: Sequence[int]) -> Iterator[Tol
                     stream[end : end + 2], "little"
                 ):
                     break
-                yield Told(times[end + 1], stream[at + 1], stream[at + 2 : end])
+                yield StateReply(times[end + 1], stream[at + 1], stream[at + 2 : end])
                 at = end + 2

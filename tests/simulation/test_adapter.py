@@ -47,10 +47,13 @@ def test_the_latency_timer_keeps_a_short_reply_back(timer_ms: int) -> None:
     bus = new_bus(AdapterConfig(latency_timer_ns=timer_ms * MS))
     bus.receive(PING_1, 0)
     assert handed_over(bus) == [(timer_ms * MS, PONG_1)]
-    assert [entry.t_ns for entry in bus.ledger.entries] == [0, PONG_ENDS]  # the ledger tells of the wire
+    assert [entry.t_ns for entry in bus.ledger.entries] == [
+        0,
+        PONG_ENDS,
+    ]  # the ledger has the times of the wire
 
 
-def test_a_host_that_asks_at_once_waits_a_whole_timer_for_each_reply() -> None:
+def test_a_host_that_requests_at_once_waits_a_whole_timer_for_each_reply() -> None:
     bus = new_bus(AdapterConfig(latency_timer_ns=16 * MS))
     now = 0
     for turn in range(1, 9):
@@ -117,16 +120,16 @@ def test_every_byte_comes_once_in_order_and_not_before_it_passed(
         bus.inject_noise(data, now)
         arrivals += [(now + (index + 1) * BYTE, byte) for index, byte in enumerate(data)]
         now += len(data) * BYTE
-    heard = bytearray()
+    received = bytearray()
     for t_ns in range(0, now + 17 * MS, look_ns):
         part = bus.take(t_ns)
-        for index in range(len(heard), len(heard) + len(part)):
+        for index in range(len(received), len(received) + len(part)):
             assert arrivals[index][0] <= t_ns
-        heard += part
-    heard += bus.take(now + 1000 * MS)
-    assert bytes(heard) == bytes(byte for _, byte in arrivals)
+        received += part
+    received += bus.take(now + 1000 * MS)
+    assert bytes(received) == bytes(byte for _, byte in arrivals)
     assert bus.next_due_ns() is None
-    assert b"".join(each.data for each in bus.ledger.entries if each.direction == "out") == bytes(heard)
+    assert b"".join(each.data for each in bus.ledger.entries if each.direction == "out") == bytes(received)
 
 
 def test_an_adapter_that_echoes_gives_the_host_its_own_bytes_first() -> None:
@@ -145,7 +148,7 @@ def test_a_collision_in_a_reply_that_is_half_handed_over_takes_only_the_rest() -
     assert any("sends into" in note for note in notes(bus))
 
 
-def test_a_wedged_adapter_takes_bytes_and_gives_none_until_it_is_mended() -> None:
+def test_a_wedged_adapter_takes_bytes_and_gives_none_until_it_works_again() -> None:
     bus = new_bus(AdapterConfig())
     bus.wedge(True)
     bus.receive(PING_1, 0)
@@ -188,15 +191,15 @@ def test_a_port_does_not_outlive_its_adapter_though_it_comes_back() -> None:
 # Hooks for faults
 
 
-def test_what_the_servos_hear_of_an_instruction_can_be_changed_or_lost() -> None:
+def test_what_the_servos_receive_of_an_instruction_can_be_changed_or_lost() -> None:
     bus = new_bus(AdapterConfig())
     bus.alter_next_instruction("lost", lambda packet: b"")
     bus.alter_next_instruction("byte 5 flipped", lambda packet: packet[:5] + bytes((packet[5] ^ 1,)))
-    heard = []
+    received = []
     for turn in range(3):
         bus.receive(PING_1, turn * 10 * MS)
-        heard.append(b"".join(data for _, data in handed_over(bus, (turn + 1) * 10 * MS - 1)))
-    assert heard == [b"", b"", PONG_1]
+        received.append(b"".join(data for _, data in handed_over(bus, (turn + 1) * 10 * MS - 1)))
+    assert received == [b"", b"", PONG_1]
     assert notes(bus)[:2] == [
         "the servos receive another instruction: lost",
         "the servos receive another instruction: byte 5 flipped",
@@ -261,14 +264,14 @@ def test_each_servo_counts_instructions_and_replies(make_packet: Callable[..., b
     assert two.last_error == 0x08  # range (e-Manual, Protocol 1.0, Error)
 
 
-# Who is read in turn
+# Group reads
 
 
 def sync_read(line: Any) -> None:
-    line.tell(0xFE, 0x82, bytes.fromhex("84000400 010203"))
+    line.instruct(0xFE, 0x82, bytes.fromhex("84000400 010203"))
 
 
-def test_who_waits_for_its_turn_gives_up_when_it_hears_another_instruction(
+def test_a_servo_that_waits_for_its_turn_gives_up_when_it_receives_another_instruction(
     make_line2: Any, make_packet2: Any
 ) -> None:
     line = make_line2((1, 2, 3), return_delay_ns=500_000)
@@ -286,8 +289,8 @@ def test_who_cannot_make_out_the_one_before_it_takes_it_for_absent(
     line.bus.corrupt_next(1, index=10)
     line.bus.truncate_next(2, 0)
     sync_read(line)
-    heard = line.hear()
-    assert heard[15:][4:5] == bytes(ids)
+    received = line.receive()
+    assert received[15:][4:5] == bytes(ids)
 
 
 def test_the_host_that_talks_into_a_chain_ends_it(make_line2: Any) -> None:
@@ -295,8 +298,8 @@ def test_the_host_that_talks_into_a_chain_ends_it(make_line2: Any) -> None:
     sync_read(line)  # 17 bytes; the first status from 270 to 420 us
     start = line.clock.now_ns()
     line.bus.receive(b"\x55", start + 400_000)
-    heard = line.hear()
-    assert len(heard) == 13
+    received = line.receive()
+    assert len(received) == 13
     assert any("wait for it in vain" in note for note in line.notes())
 
 
@@ -304,9 +307,9 @@ def test_two_servos_with_one_id_garble_their_turn_and_break_the_chain(make_line2
     line = make_line2((1, 2, 3), return_delay_ns=100_000)
     twin = line.bus.add_servo(ServoConfig(2, "XM430-W350", 1.0, 100_000))
     sync_read(line)
-    heard = line.hear()
-    assert heard[:5] == bytes.fromhex("fffffd00 01")
-    assert len(heard) == 2 * 15
+    received = line.receive()
+    assert received[:5] == bytes.fromhex("fffffd00 01")
+    assert len(received) == 2 * 15
     twin.poke("id", 9)  # on the line of its own from now on
     sync_read(line)
     assert [each.servo_id for each in line.statuses()] == [1, 2, 3]

@@ -91,13 +91,13 @@ def test_who_talks_into_a_reply_loses_both() -> None:
     assert any("sends into" in entry.note for entry in bus.ledger.entries)
 
 
-def test_a_host_that_sends_within_the_return_delay_is_heard() -> None:
+def test_a_host_that_sends_within_the_return_delay_is_received() -> None:
     bus = new_bus(delay_ns=500_000)
     bus.receive(READ_1, 0)
     bus.receive(PING_1, 100_000)  # over at 160 us; its reply begins at 660 us, into the first one
-    heard = bus.take(10**12)
-    assert len(heard) == 14
-    assert heard[:8] == bytes.fromhex("ff ff 01 08 00 87 01 00")  # the begin of the first reply, alone
+    received = bus.take(10**12)
+    assert len(received) == 14
+    assert received[:8] == bytes.fromhex("ff ff 01 08 00 87 01 00")  # the begin of the first reply, alone
     assert any("at once" in entry.note for entry in bus.ledger.entries)
 
 
@@ -111,17 +111,17 @@ def test_two_servos_with_one_id_garble_what_differs() -> None:
     assert sum(reply[2:]) & 0xFF != 0xFF
 
 
-def test_faults_hit_one_reply_each_and_stand_in_the_ledger() -> None:
+def test_faults_hit_one_reply_each_and_are_in_the_ledger() -> None:
     bus = new_bus()
     bus.corrupt_next(1)
     bus.truncate_next(1, 4)
     bus.truncate_next(1, 0)
     bus.delay_next(1, 3_000_000)
-    heard = []
+    received = []
     for index in range(5):
         bus.receive(PING_1, index * 10_000_000)
-        heard.append((bus.take(index * 10_000_000 + 1_000_000), bus.take(index * 10_000_000 + 9_000_000)))
-    assert heard == [
+        received.append((bus.take(index * 10_000_000 + 1_000_000), bus.take(index * 10_000_000 + 9_000_000)))
+    assert received == [
         (PONG_1[:-1] + b"\xfd", b""),
         (PONG_1[:4], b""),
         (b"", b""),
@@ -168,7 +168,7 @@ def test_a_servo_that_is_not_there_is_named() -> None:
         new_bus().servo(5)
 
 
-def test_bytes_that_nobody_takes_do_not_pile_up() -> None:
+def test_bytes_that_no_host_takes_do_not_pile_up() -> None:
     bus = new_bus(delay_ns=0)
     for index in range(1_000):
         bus.ledger.entries.clear()

@@ -1,4 +1,4 @@
-"""What stands between the simulated buses and their users: the control socket, and links to the terminals."""
+"""What is between the simulated buses and their users: the control socket, and links to the terminals."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dxlrun.simulation.pseudo_terminal import Link
 from dxlrun.simulation.server import ControlLine
 
 
-def test_what_nobody_reads_from_the_control_socket_is_dropped() -> None:
+def test_what_is_not_read_from_the_control_socket_is_dropped() -> None:
     ours, theirs = socket.socketpair()
     with ours, theirs:
         line = ControlLine(theirs)
@@ -22,15 +22,15 @@ def test_what_nobody_reads_from_the_control_socket_is_dropped() -> None:
         ours.sendall(b"one\ntw")
         assert line.receive() == [b"one"]
         ours.sendall(b"o\n" + bytes(70_000))
-        said = [each for _ in range(3) for each in line.receive()]
-        assert said == [b"two"]
+        sent = [each for _ in range(3) for each in line.receive()]
+        assert sent == [b"two"]
         ours.close()
         line.receive()
         line.flush()
         assert line.closed
 
 
-def test_a_link_never_replaces_a_file_and_goes_only_where_it_was_put(tmp_path: Path) -> None:
+def test_a_link_never_replaces_a_file_and_is_removed_only_where_it_was_put(tmp_path: Path) -> None:
     file, link = tmp_path / "file", tmp_path / "link"
     file.write_text("mine")
     with pytest.raises(FileExistsError, match="is no link"):

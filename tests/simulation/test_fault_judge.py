@@ -124,8 +124,8 @@ def shared_line(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 
 def test_another_host_on_the_line_leaves_an_event_that_has_its_cause_in_the_ledger(shared_line: Run):
-    told = [event for event in shared_line.log.events if event.code == EventCode.UNREQUESTED]
-    assert [(event.source, event.severity) for event in told] == [("main", Severity.WARNING)]
+    noted = [event for event in shared_line.log.events if event.code == EventCode.UNREQUESTED]
+    assert [(event.source, event.severity) for event in noted] == [("main", Severity.WARNING)]
     report = compare(shared_line.log, shared_line.entries, Path("ledger"))
     assert (report.good, report.uncaused) == (True, ())
 

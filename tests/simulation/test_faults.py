@@ -31,10 +31,10 @@ def happened(line: Any) -> list[str]:
 
 
 def ping(line: Any, servo_id: int = 1) -> bytes:
-    """Return what the host hears after a ping."""
+    """Return what the host receives after a ping."""
     line.send(servo_id, PING)
-    heard: bytes = line.hear()
-    return heard
+    received: bytes = line.receive()
+    return received
 
 
 # Packets
@@ -43,7 +43,7 @@ def ping(line: Any, servo_id: int = 1) -> bytes:
 def test_a_lost_reply_is_missing_once_and_the_servo_obeyed(line: Any) -> None:
     inject(line, "lose servo=1")
     line.send(1, WRITE, LED, 1)
-    assert line.hear() == b""
+    assert line.receive() == b""
     assert line.servo(1).registers["led"] == 1
     assert ping(line) == PONG[1]
     assert happened(line) == ["lose servo=1"]
@@ -56,16 +56,16 @@ def test_the_reply_of_another_servo_is_not_touched(line: Any) -> None:
     assert [str(fault) for fault in script.waiting] == ["lose servo=1"]
 
 
-def test_several_replies_are_lost_one_after_the_other_and_the_fault_is_told_once(line: Any) -> None:
+def test_several_replies_are_lost_one_after_the_other_and_the_fault_is_noted_once(line: Any) -> None:
     inject(line, "lose servo=1 count=3")
     assert [ping(line) for _ in range(4)] == [b"", b"", b"", PONG[1]]
     assert happened(line) == ["lose servo=1 count=3"]
 
 
-def test_a_lost_instruction_is_heard_by_no_servo(line: Any) -> None:
+def test_a_lost_instruction_reaches_no_servo(line: Any) -> None:
     inject(line, "lose from=host")
     line.send(1, WRITE, LED, 1)
-    assert line.hear() == b""
+    assert line.receive() == b""
     assert line.servo(1).registers["led"] == 0
     assert ping(line) == PONG[1]
     assert happened(line) == ["lose from=host"]
@@ -85,8 +85,10 @@ def test_a_corrupted_reply_differs_in_the_bits_that_were_asked_for(
     line: Any, text: str, wrong: dict[int, int]
 ) -> None:
     inject(line, text)
-    heard = ping(line)
-    assert {index: a ^ b for index, (a, b) in enumerate(zip(heard, PONG[1], strict=True)) if a != b} == wrong
+    received = ping(line)
+    assert {
+        index: a ^ b for index, (a, b) in enumerate(zip(received, PONG[1], strict=True)) if a != b
+    } == wrong
     assert ping(line) == PONG[1]
     assert happened(line) == [text]
 
@@ -94,7 +96,7 @@ def test_a_corrupted_reply_differs_in_the_bits_that_were_asked_for(
 def test_a_corrupted_instruction_is_not_obeyed(line: Any) -> None:
     inject(line, "corrupt from=host byte=6")
     line.send(1, WRITE, LED, 1)
-    line.hear()
+    line.receive()
     assert line.servo(1).registers["led"] == 0
     assert happened(line) == ["corrupt from=host byte=6"]
 
@@ -132,33 +134,33 @@ def test_a_duplicated_reply_comes_several_times(line: Any, text: str, times: int
 
 def test_noise_comes_between_the_packets(line: Any) -> None:
     inject(line, "noise data=ff00fd")
-    assert line.hear() == b"\xff\x00\xfd"
+    assert line.receive() == b"\xff\x00\xfd"
     assert ping(line) == PONG[1]
     assert happened(line) == ["noise data=ff00fd"]
 
 
 def test_random_noise_is_that_of_the_seed(make_line: Callable[..., Any]) -> None:
-    heard = []
+    received = []
     for seed in (1, 1, 2):
         line = make_line()
         inject(line, "noise size=20", seed=seed)
-        heard.append(line.hear())
-    assert {len(each) for each in heard} == {20}
-    assert heard[0] == heard[1] != heard[2]
+        received.append(line.receive())
+    assert {len(each) for each in received} == {20}
+    assert received[0] == received[1] != received[2]
 
 
 def test_a_babbling_servo_talks_until_its_time_is_over(line: Any) -> None:
     inject(line, "babble servo=1 size=4 every=1ms for=10ms")
-    assert len(line.hear(20 * MS)) == 40
-    assert line.hear(20 * MS) == b""
+    assert len(line.receive(20 * MS)) == 40
+    assert line.receive(20 * MS) == b""
     assert happened(line) == ["babble servo=1 size=4 every=1ms for=10ms"]
 
 
-def test_a_babbling_servo_spoils_what_the_host_says(line: Any) -> None:
+def test_a_babbling_servo_spoils_what_the_host_sends(line: Any) -> None:
     inject(line, "babble servo=1 size=100 every=1ms for=50ms")
-    line.hear(MS // 2)
+    line.receive(MS // 2)
     line.send(2, WRITE, LED, 1)
-    line.hear(100 * MS)
+    line.receive(100 * MS)
     assert line.servo(2).registers["led"] == 0
     assert any("collision" in note for note in line.notes())
 
@@ -180,9 +182,9 @@ def test_an_unplugged_adapter_is_gone_and_comes_back(line: Any) -> None:
 def test_a_wedged_adapter_takes_bytes_and_gives_none(line: Any) -> None:
     inject(line, "wedge for=50ms")
     line.send(1, WRITE, LED, 1)
-    assert line.hear(40 * MS) == b""
+    assert line.receive(40 * MS) == b""
     assert ping(line, 2) == b""
-    line.hear(20 * MS)
+    line.receive(20 * MS)
     assert ping(line) == PONG[1]
     assert happened(line) == ["wedge for=50ms"]
 
@@ -195,7 +197,7 @@ def test_a_silent_servo_keeps_what_it_has_and_speaks_again(line: Any) -> None:
     inject(line, "silence servo=1 for=50ms")
     assert ping(line) == b""
     assert ping(line, 2) == PONG[2]
-    line.hear(50 * MS)
+    line.receive(50 * MS)
     assert ping(line) == PONG[1]
     assert line.read(1, TORQUE_ENABLE, 1) == 1
     assert happened(line) == ["silence servo=1 for=50ms"]
@@ -203,9 +205,9 @@ def test_a_silent_servo_keeps_what_it_has_and_speaks_again(line: Any) -> None:
 
 def test_a_servo_is_silent_until_the_last_of_two_faults_ends(line: Any) -> None:
     inject(line, "silence servo=1 at=0s for=20ms", "silence servo=1 at=10ms for=50ms")
-    line.hear(40 * MS)
+    line.receive(40 * MS)
     assert ping(line) == b""
-    line.hear(20 * MS)
+    line.receive(20 * MS)
     assert ping(line) == PONG[1]
     assert len(happened(line)) == 2
 
@@ -215,12 +217,12 @@ def test_a_rebooted_servo_is_deaf_and_has_lost_its_ram_alone(line: Any) -> None:
         line.write(servo_id, TORQUE_ENABLE, 1)
     inject(line, "reboot servo=1 for=50ms")
     assert ping(line) == b""
-    line.hear(50 * MS)
+    line.receive(50 * MS)
     assert [line.read(servo_id, TORQUE_ENABLE, 1) for servo_id in (1, 2)] == [0, 1]
     assert happened(line) == ["reboot servo=1 for=50ms"]
 
 
-def test_a_servo_that_nobody_asked_for_long_reboots_at_the_time_of_the_fault(line2: Any) -> None:
+def test_a_servo_that_was_not_read_for_long_reboots_at_the_time_of_the_fault(line2: Any) -> None:
     inject(line2, "reboot servo=1 at=1s")
     line2.wait(2.0)
     assert line2.get("realtime_tick", 1) == pytest.approx(1000, abs=15)
@@ -231,7 +233,7 @@ def test_a_brown_out_takes_the_power_of_every_servo(line: Any) -> None:
         line.write(servo_id, TORQUE_ENABLE, 1)
     inject(line, "brownout for=50ms")
     assert [ping(line, servo_id) for servo_id in (1, 2)] == [b"", b""]
-    line.hear(50 * MS)
+    line.receive(50 * MS)
     assert [line.read(servo_id, TORQUE_ENABLE, 1) for servo_id in (1, 2)] == [0, 0]
     assert happened(line) == ["brownout for=50ms"]
 
@@ -248,18 +250,18 @@ def test_a_wrong_voltage_is_an_error_as_long_as_it_lasts(line: Any) -> None:
     for wrong in (0x01, 0):  # e-Manual, Protocol 1.0, Error: bit 0, Input Voltage
         answer = line.ask(1, PING)
         assert answer.error == wrong
-        line.hear(60 * MS)
+        line.receive(60 * MS)
     assert line.read(1, 42, 1) == 120
     assert happened(line) == ["voltage servo=1 volts=5.1 for=50ms"]
 
 
 def test_two_wrong_voltages_leave_the_one_that_was_before(line: Any) -> None:
     inject(line, "voltage volts=5 at=0s for=20ms", "voltage servo=1 volts=20 at=10ms for=50ms")
-    line.hear(100 * MS)
+    line.receive(100 * MS)
     assert [line.read(servo_id, 42, 1) for servo_id in (1, 2)] == [120, 120]
 
 
-def test_an_overloaded_servo_tells_it(line: Any) -> None:
+def test_an_overloaded_servo_reports_it(line: Any) -> None:
     inject(line, "overload servo=1")
     answer = line.ask(1, PING)
     assert answer.error == 0x20  # e-Manual, Protocol 1.0, Error: bit 5, Overload
@@ -267,7 +269,7 @@ def test_an_overloaded_servo_tells_it(line: Any) -> None:
     assert happened(line) == ["overload servo=1"]
 
 
-def test_a_hot_servo_of_protocol_2_switches_off_and_tells_it(line2: Any) -> None:
+def test_a_hot_servo_of_protocol_2_switches_off_and_reports_it(line2: Any) -> None:
     line2.set("torque_enable", 1)
     inject(line2, "overheat servo=1")
     answer = line2.request(1, PING)
@@ -354,7 +356,7 @@ def test_two_servos_with_one_id_talk_at_once(line: Any) -> None:
     assert len(twins) == 2
     twins[1].poke("led", 1)
     line.send(1, READ, LED, 1)
-    line.hear()
+    line.receive()
     assert any("collision" in note for note in line.notes())
     assert happened(line) == ["duplicate_id servo=1"]
 
@@ -381,26 +383,26 @@ def test_times_count_from_the_start_of_the_simulation(make_line: Callable[..., A
 
 def test_a_fault_waits_for_its_packet(line: Any) -> None:
     inject(line, "silence servo=1 packet=3")
-    heard = [ping(line) for _ in range(5)]
-    assert heard[:2] == [PONG[1]] * 2
-    assert heard[3:] == [b""] * 2
+    received = [ping(line) for _ in range(5)]
+    assert received[:2] == [PONG[1]] * 2
+    assert received[3:] == [b""] * 2
 
 
 def test_a_fault_by_hand_happens_now(line: Any) -> None:
     line.clock.wait_until(5_000 * MS)
     inject(line, "silence servo=1")
     assert ping(line) == b""
-    (told,) = (entry for entry in line.ledger.entries if entry.note == "fault: silence servo=1")
-    assert told.t_ns == 5_000 * MS
+    (noted,) = (entry for entry in line.ledger.entries if entry.note == "fault: silence servo=1")
+    assert noted.t_ns == 5_000 * MS
 
 
 def test_faults_by_hand_overlap_with_those_of_the_script(line: Any) -> None:
     script = inject(line, "silence servo=1 for=50ms")
-    line.hear()
+    line.receive()
     script.add(parse_fault("silence servo=1 for=10ms"), line.clock.now_ns())
-    line.hear(20 * MS)
+    line.receive(20 * MS)
     assert ping(line) == b""
-    line.hear(20 * MS)
+    line.receive(20 * MS)
     assert ping(line) == PONG[1]
     with pytest.raises(InputError, match="bus main has no servo 9; its servos are 1, 2"):
         script.add(parse_fault("silence servo=9"), line.clock.now_ns())

@@ -131,7 +131,7 @@ def test_a_storm_breaks_no_promise(name: str, storm: str, tmp_path: Path, judge:
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("name", ROBOT_OF)
-def test_a_start_that_fails_after_torque_was_given_leaves_nobody_with_it(
+def test_a_start_that_fails_after_torque_was_given_leaves_no_servo_with_it(
     name: str, tmp_path: Path, judge: Any
 ) -> None:
     """Storms in the set-up, until enough starts have failed when some servos had their torque."""

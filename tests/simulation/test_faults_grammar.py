@@ -38,7 +38,7 @@ VALUES: dict[str, tuple[str, ...]] = {
 
 
 def drawn(chance: random.Random, kind: str) -> str:
-    """Return a line of a kind; some of them say what excludes each other."""
+    """Return a line of a kind; some of them have keys that exclude each other."""
     keys = [*KINDS[kind].needs, *(key for key in KINDS[kind].takes if chance.random() < 0.4)]
     return " ".join((kind, *(f"{key}={chance.choice(_values(kind, key))}" for key in keys)))
 
@@ -64,7 +64,7 @@ def test_the_sample_has_a_value_for_every_key() -> None:
 
 
 @pytest.mark.parametrize("protocol", [1, 2])
-def test_faults_of_every_kind_together_end_nothing_and_are_told_once(
+def test_faults_of_every_kind_together_end_nothing_and_are_noted_once(
     protocol: int, request: pytest.FixtureRequest
 ) -> None:
     make = request.getfixturevalue("make_line" if protocol == 1 else "make_line2")

@@ -31,7 +31,7 @@ def three_buses() -> tuple[SimulatedBus, ...]:
     )
 
 
-def test_all_that_could_never_happen_is_told_at_once_and_nothing_is_planned() -> None:
+def test_all_that_could_never_happen_is_reported_at_once_and_nothing_is_planned() -> None:
     buses = three_buses()
     script = FaultScript(
         [
@@ -94,13 +94,13 @@ def test_a_storm_without_a_seed_takes_that_of_the_script() -> None:
     assert faults_of(stormy(storm, seed=1)) != faults_of(stormy(storm, seed=2))
 
 
-def test_a_storm_has_every_kind_that_passes_and_each_fault_stands_in_the_ledger_once() -> None:
-    told = faults_of(stormy("storm seed=7 faults=100 within=2s"))
-    assert {text.split()[0] for text in told} == set(PASSING)
-    assert max(Counter(told).values()) == 1
-    assert len(told) == 100
-    assert all(str(parse_fault(text)) == text for text in told)
-    assert all(0 <= (parse_fault(text).at_ns or 0) <= 2_000 * MS for text in told)
+def test_a_storm_has_every_kind_that_passes_and_each_fault_is_in_the_ledger_once() -> None:
+    noted = faults_of(stormy("storm seed=7 faults=100 within=2s"))
+    assert {text.split()[0] for text in noted} == set(PASSING)
+    assert max(Counter(noted).values()) == 1
+    assert len(noted) == 100
+    assert all(str(parse_fault(text)) == text for text in noted)
+    assert all(0 <= (parse_fault(text).at_ns or 0) <= 2_000 * MS for text in noted)
 
 
 def test_the_lines_of_a_storm_in_the_ledger_make_the_same_storm_again() -> None:
@@ -110,9 +110,9 @@ def test_the_lines_of_a_storm_in_the_ledger_make_the_same_storm_again() -> None:
 
 
 def test_a_storm_has_only_the_kinds_that_it_names() -> None:
-    told = faults_of(stormy("storm seed=1 faults=12 within=1s kinds=lose,overheat at=1s"))
-    assert {text.split()[0] for text in told} == {"lose", "overheat"}
-    assert all(1_000 * MS <= (parse_fault(text).at_ns or 0) <= 2_000 * MS for text in told)
+    noted = faults_of(stormy("storm seed=1 faults=12 within=1s kinds=lose,overheat at=1s"))
+    assert {text.split()[0] for text in noted} == {"lose", "overheat"}
+    assert all(1_000 * MS <= (parse_fault(text).at_ns or 0) <= 2_000 * MS for text in noted)
 
 
 def test_a_storm_over_several_buses_names_the_bus_of_each_fault() -> None:

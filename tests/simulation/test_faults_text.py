@@ -60,7 +60,7 @@ def test_a_line_can_be_written_in_other_ways_and_has_one_canonical_text() -> Non
 
 
 @pytest.mark.parametrize(
-    ("line", "said"),
+    ("line", "message"),
     [
         ("", "a fault is missing; write one such as: lose servo=3 at=2s"),
         ("loose servo=3", "there is no fault 'loose'; did you mean lose?"),
@@ -99,10 +99,10 @@ def test_a_line_can_be_written_in_other_ways_and_has_one_canonical_text() -> Non
         ("storm faults=3 within=1s kinds=los", "a storm has no 'los'; did you mean lose?"),
     ],
 )
-def test_a_wrong_line_is_refused_with_one_sentence_that_mends_it(line: str, said: str) -> None:
+def test_a_wrong_line_is_refused_with_one_sentence_that_corrects_it(line: str, message: str) -> None:
     with pytest.raises(InputError) as refused:
         parse_fault(line)
-    assert said in str(refused.value)
+    assert message in str(refused.value)
     assert len(refused.value.sentences) == 1
 
 

@@ -1,4 +1,4 @@
-"""Whatever a host says, a bus does not fall over, and whatever it answers can be trusted.
+"""Whatever a host sends, a bus does not fall over, and whatever it answers can be trusted.
 
 The campaign of 1,000,000 strings is tests/bench/fuzz_simulation.py; a seeded sample of it runs here.
 """
@@ -29,20 +29,20 @@ SMALL = settings(
 )
 
 
-def check1(heard: bytes) -> None:
+def check1(received: bytes) -> None:
     """Fail when the bytes are anything but status packets with good checksums."""
-    while heard:
-        assert heard[:2] == b"\xff\xff"
-        packet, heard = heard[: 4 + heard[3]], heard[4 + heard[3] :]
+    while received:
+        assert received[:2] == b"\xff\xff"
+        packet, received = received[: 4 + received[3]], received[4 + received[3] :]
         assert sum(packet[2:]) & 0xFF == 0xFF
 
 
-def check2(heard: bytes) -> None:
+def check2(received: bytes) -> None:
     """Fail when the bytes are anything but status packets with good CRCs."""
-    while heard:
-        assert heard[:4] == b"\xff\xff\xfd\x00"
-        size = 7 + int.from_bytes(heard[5:7], "little")
-        packet, heard = heard[:size], heard[size:]
+    while received:
+        assert received[:4] == b"\xff\xff\xfd\x00"
+        size = 7 + int.from_bytes(received[5:7], "little")
+        packet, received = received[:size], received[size:]
         assert packet[7] == 0x55
         assert crc16(packet[:-2]) == int.from_bytes(packet[-2:], "little")
 
@@ -89,7 +89,7 @@ def test_noise_on_protocol_1(make_line: Any, model: str, pieces: list[bytes]) ->
     line = make_line((1,), model)
     for piece in pieces:
         line.ports.ports[0].write(piece)
-        check1(line.hear())
+        check1(line.receive())
 
 
 @pytest.mark.parametrize("model", ["XM430-W350", "XL-320", "YM070-210-M001", "PH42-020-S300"])
@@ -99,7 +99,7 @@ def test_noise_on_protocol_2(make_line2: Any, model: str, pieces: list[bytes]) -
     line = make_line2((1,), model)
     for piece in pieces:
         line.ports.ports[0].write(piece)
-        check2(line.hear())
+        check2(line.receive())
 
 
 @pytest.mark.parametrize("model", ["AX-12A", "MX-64"])
@@ -109,7 +109,7 @@ def test_any_packet_of_protocol_1(make_line: Any, model: str, packets: list[tupl
     line = make_line((1,), model)
     for packet in packets:
         line.ports.ports[0].write(framed1(*packet))
-        check1(line.hear())
+        check1(line.receive())
 
 
 @pytest.mark.parametrize("model", ["XM430-W350", "XL-320", "YM070-210-M001"])
@@ -121,7 +121,7 @@ def test_any_packet_of_protocol_2(make_line2: Any, model: str, packets: list[tup
     for packet in packets:
         line.ports.ports[0].write(framed2(*packet))
         if packet[1] not in (0x8A, 0x9A):
-            check2(line.hear())
+            check2(line.receive())
         line.wait(0.2)
 
 
@@ -153,5 +153,5 @@ def test_a_broken_checksum_is_never_obeyed(
     packet = bytearray(framed1(1, 0x03, bytes((24,)) + parameters))
     packet[4 + place % (len(packet) - 4)] ^= 1 << bit
     line.ports.ports[0].write(packet)
-    assert line.hear() == (framed1(1, ErrorBit.CHECKSUM, b"") if answers else b"")
+    assert line.receive() == (framed1(1, ErrorBit.CHECKSUM, b"") if answers else b"")
     assert line.read(1, 24, 1) == 0

@@ -10,13 +10,13 @@ import pytest
 TICK = math.tau / 4096
 
 
-def exchange(line: Any, heard: str) -> bytes:
-    line.ports.ports[0].write(bytes.fromhex(heard))
-    return line.hear(20_000_000)
+def exchange(line: Any, received: str) -> bytes:
+    line.ports.ports[0].write(bytes.fromhex(received))
+    return line.receive(20_000_000)
 
 
 @pytest.mark.parametrize(
-    ("servo_id", "heard", "said"),
+    ("servo_id", "received", "replied"),
     [
         (1, "ff ff 01 02 01 fb", "ff ff 01 02 00 fc"),
         (1, "ff ff 01 04 02 2b 01 cc", "ff ff 01 03 00 20 db"),  # 32 degrees C
@@ -26,10 +26,10 @@ def exchange(line: Any, heard: str) -> bytes:
     ],
     ids=["ping", "read", "write to all", "reg write", "factory reset"],
 )
-def test_exchanges_of_protocol_1(make_line: Any, servo_id: int, heard: str, said: str) -> None:
+def test_exchanges_of_protocol_1(make_line: Any, servo_id: int, received: str, replied: str) -> None:
     line = make_line((servo_id,), "RX-64")
     line.servo(servo_id).set_temperature(32)
-    assert exchange(line, heard) == bytes.fromhex(said)
+    assert exchange(line, received) == bytes.fromhex(replied)
     assert line.bus.servos[0].servo_id == 1
 
 
@@ -52,15 +52,15 @@ def test_sync_write_of_protocol_1(make_line: Any) -> None:
 def test_bulk_read_of_protocol_1(make_line: Any) -> None:
     line = make_line((1, 2), "MX-28", position=0x80 * TICK)
     line.servo(1).poke("goal_position", 0x80)
-    said = exchange(line, "ff ff fe 09 92 00 02 01 1e 02 02 24 1d")
-    assert said == bytes.fromhex("ff ff 01 04 00 80 00 7a  ff ff 02 04 00 80 00 79")
+    replied = exchange(line, "ff ff fe 09 92 00 02 01 1e 02 02 24 1d")
+    assert replied == bytes.fromhex("ff ff 01 04 00 80 00 7a  ff ff 02 04 00 80 00 79")
 
 
 def test_a_servo_that_is_listed_twice_answers_a_bulk_read_once(make_line: Any) -> None:
     line = make_line((1, 2), "MX-28")
     line.send(0xFE, 0x92, 0, 2, 1, 30, 1, 2, 43, 2, 1, 36)  # e-Manual: "only the first [...] is processed"
-    said = line.hear(20_000_000)
-    assert [said[2], said[8 + 2], len(said)] == [1, 2, 8 + 7]
+    replied = line.receive(20_000_000)
+    assert [replied[2], replied[8 + 2], len(replied)] == [1, 2, 8 + 7]
 
 
 def turn(line: Any, positions: dict[int, int]) -> None:

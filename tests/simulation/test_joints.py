@@ -126,8 +126,8 @@ def test_the_wheel_of_an_mx_keeps_its_speed_under_load_and_that_of_an_ax_does_no
         put(line, "moving_speed", 300)
         wait(line, 3)
         table = line.servo().registers.table
-        wanted = 300 * table.rad_s_per_tick if model == "MX-64" else 300 / 1023 * table.max_speed
-        part[model] = line.servo().velocity / wanted
+        expected = 300 * table.rad_s_per_tick if model == "MX-64" else 300 / 1023 * table.max_speed
+        part[model] = line.servo().velocity / expected
     assert part["MX-64"] == pytest.approx(1.0, abs=0.01)
     assert part["AX-12A"] < 0.5
 
@@ -179,7 +179,7 @@ def test_a_servo_that_holds_a_heavy_load_gets_hot_and_lets_go(make_line2: Any) -
     assert line.servo().position == pytest.approx(2.0 - math.pi / 2, abs=0.04)  # it hangs, but for friction
 
 
-def test_an_x_servo_sags_as_its_p_gain_says(make_line2: Any) -> None:
+def test_an_x_servo_sags_by_its_p_gain(make_line2: Any) -> None:
     line = make_line2(
         (1,), "XM430-W350", position=2.0, load=Load(gravity=1.0, gravity_angle=2.0 - math.pi / 2)
     )
@@ -193,7 +193,7 @@ def test_an_x_servo_sags_as_its_p_gain_says(make_line2: Any) -> None:
     assert line.get("present_current") == pytest.approx(torque / 4.1 * 2.3 / 0.00269, abs=3)
 
 
-def test_moving_status_tells_profile_and_arrival(make_line2: Any) -> None:
+def test_moving_status_shows_profile_and_arrival(make_line2: Any) -> None:
     line = make_line2((1,), "XM430-W350", position=1.0)
     line.set("profile_velocity", 50)
     line.set("profile_acceleration", 5)

@@ -107,7 +107,7 @@ def test_a_disk_that_fills_while_entries_are_added_ends_the_file_too() -> None:
         assert "No space left" in str(ledger.error)
 
 
-def test_what_does_not_fit_at_the_end_is_told() -> None:
+def test_what_does_not_fit_at_the_end_is_reported() -> None:
     ledger = Ledger(Path("/dev/full"))
     fill(ledger)
     ledger.close()

@@ -34,7 +34,7 @@ URDF = f"""<robot name="arm"><link name="base"/>
 <inertia ixx="1e-9" iyy="1e-9" izz="1e-9" ixy="0" ixz="0" iyz="0"/></inertial></link>
 <joint name="shoulder" type="continuous"><parent link="base"/><child link="arm"/><axis xyz="0 1 0"/></joint>
 </robot>"""
-"""About +y: the arm sinks as its angle grows; the servo, which stands the other way round, turns back."""
+"""About +y: the arm sinks as its angle grows; the servo, which is mounted the other way round, turns back."""
 
 
 @pytest.fixture

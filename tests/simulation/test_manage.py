@@ -47,7 +47,7 @@ def test_nothing_is_answered_under_a_secondary_id(line2: Any) -> None:
     line2.set("secondary_shadow_id", 100)
     assert line2.request(100, PING) is None
     assert line2.request(100, READ, b"\x84\x00\x04\x00") is None
-    line2.tell(BROADCAST, SYNC_READ, bytes.fromhex("84000400 64"))
+    line2.instruct(BROADCAST, SYNC_READ, bytes.fromhex("84000400 64"))
     assert line2.statuses() == []
 
 
@@ -68,7 +68,7 @@ def test_the_eeprom_is_closed_to_a_secondary_id(line2: Any) -> None:
 def test_a_listed_secondary_id_is_written_to(line2: Any) -> None:
     for servo_id in (1, 2):
         line2.set("secondary_shadow_id", 100, servo_id)
-    line2.tell(BROADCAST, SYNC_WRITE, bytes.fromhex("41000100 64 01"))
+    line2.instruct(BROADCAST, SYNC_WRITE, bytes.fromhex("41000100 64 01"))
     assert [line2.get("led", each) for each in (1, 2)] == [1, 1]
 
 
@@ -96,7 +96,7 @@ def test_a_new_baud_rate_counts_from_the_next_instruction(line2: Any) -> None:
     assert line2.request(1, PING) is not None
 
 
-def test_another_protocol_type_is_the_end_of_hearing(line2: Any) -> None:
+def test_another_protocol_type_is_the_end_of_replies(line2: Any) -> None:
     assert line2.set("protocol_type", 1) == 0
     assert line2.request(1, PING) is None
     line2.servo().poke("protocol_type", 2)
@@ -134,7 +134,7 @@ def test_clear_came_with_firmware_42(line2: Any) -> None:
 def test_a_reset_of_everything_was_for_all_before_firmware_42(make_line2: Any) -> None:
     line = make_line2((7,))
     line.servo(7).poke("firmware_version", 41)
-    line.tell(BROADCAST, RESET, b"\xff")
+    line.instruct(BROADCAST, RESET, b"\xff")
     assert line.bus.servos[0].servo_id == 1
 
 
@@ -142,7 +142,7 @@ def test_a_reset_of_everything_was_for_all_before_firmware_42(make_line2: Any) -
 def test_a_reset_that_keeps_the_id_is_for_all_and_not_answered(line2: Any, option: int) -> None:
     for servo_id in (1, 2):
         line2.set("drive_mode", 1, servo_id)
-    line2.tell(BROADCAST, RESET, bytes((option,)))
+    line2.instruct(BROADCAST, RESET, bytes((option,)))
     assert line2.statuses() == []
     assert [each.registers["drive_mode"] for each in line2.bus.servos] == [0, 0]
     assert [each.servo_id for each in line2.bus.servos] == [1, 2]
@@ -150,7 +150,7 @@ def test_a_reset_that_keeps_the_id_is_for_all_and_not_answered(line2: Any, optio
 
 def test_a_reboot_of_all_is_not_answered(line2: Any) -> None:
     line2.set("led", 1)
-    line2.tell(BROADCAST, REBOOT)
+    line2.instruct(BROADCAST, REBOOT)
     assert line2.statuses() == []
     boot(line2)
     assert line2.get("led") == 0
@@ -215,8 +215,8 @@ def test_backup_and_fast_reads_came_with_a_firmware(
 ) -> None:
     line = make_line2((1,), model, firmware=firmware)
     assert line.request(1, BACKUP, BACK_UP) == (DONE if backs_up else UNKNOWN)
-    line.tell(BROADCAST, FAST_SYNC_READ, bytes.fromhex("0000 0200 01"))
-    assert bool(line.hear()) == reads_fast
+    line.instruct(BROADCAST, FAST_SYNC_READ, bytes.fromhex("0000 0200 01"))
+    assert bool(line.receive()) == reads_fast
 
 
 @pytest.mark.parametrize(
@@ -321,7 +321,7 @@ def test_goals_of_a_y_servo_go_as_far_as_its_position_limits(make_line2: Any) ->
     assert line.set("goal_position", 2_000_001) == ErrorNumber.DATA_LIMIT
 
 
-def test_a_y_servo_tells_of_errors_by_code_and_forgets_them_when_they_are_over(make_line2: Any) -> None:
+def test_a_y_servo_reports_errors_by_code_and_forgets_them_when_they_are_over(make_line2: Any) -> None:
     line = make_line2((1,), "YM070-210-M001")
     line.set("torque_enable", 1)
     assert line.get("controller_state") == 5
@@ -379,9 +379,9 @@ def test_a_sync_read_goes_through_indirect_data(line2: Any) -> None:
     for servo_id in (1, 2):
         for index in range(4):
             assert line2.set(f"indirect_address_{index + 1}", 132 + index, servo_id) == 0
-    line2.tell(BROADCAST, SYNC_READ, bytes.fromhex("e000 0400 0102"))
-    said = line2.statuses()
-    assert [int.from_bytes(each.parameters, "little") for each in said] == [
+    line2.instruct(BROADCAST, SYNC_READ, bytes.fromhex("e000 0400 0102"))
+    replied = line2.statuses()
+    assert [int.from_bytes(each.parameters, "little") for each in replied] == [
         line2.get("present_position", each) for each in (1, 2)
     ]
 

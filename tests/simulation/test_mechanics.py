@@ -1,4 +1,4 @@
-"""Motor, load and control law of simulated servos, against what paper and pencil say."""
+"""Motor, load and control law of simulated servos, against paper and pencil."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_every_model_has_a_motor_that_turns() -> None:
         (speed, table.max_speed) for table, speed in zip(tables, speeds, strict=True) if is_scaled(table)
     ]
     assert len(manual) == len(tables) - 7  # MX-64 and MX-106 of both protocols, XL-320, XL330-M288 of two
-    assert all(speed == pytest.approx(told) for speed, told in manual)
+    assert all(speed == pytest.approx(noted) for speed, noted in manual)
 
 
 def test_current_control_holds_the_torque_up_to_what_the_voltage_gives() -> None:
@@ -239,12 +239,12 @@ def test_copper_warms_by_the_square_of_the_torque_and_cools_again() -> None:
     assert mechanics.strain.temperature[0] == pytest.approx(AMBIENT_C, abs=0.1)
 
 
-def test_a_load_that_cannot_be_held_is_told_after_a_second_and_a_hard_start_is_not() -> None:
-    told = []
+def test_a_load_that_cannot_be_held_is_reported_after_a_second_and_a_hard_start_is_not() -> None:
+    noted = []
     blocked = one(pid(5.0, 1.0), Load(friction=3.0))
-    blocked.watch(0, lambda: told.append(blocked.grid_ns) if blocked.overloaded(0) else None)
+    blocked.watch(0, lambda: noted.append(blocked.grid_ns) if blocked.overloaded(0) else None)
     blocked.advance(3 * S)
-    assert told[0] == pytest.approx(S, abs=200_000_000)
+    assert noted[0] == pytest.approx(S, abs=200_000_000)
     starting = one(pid(5.0, 50.0), Load(inertia=0.1))
     starting.advance(3 * S)
     assert not starting.overloaded(0)
@@ -256,7 +256,7 @@ def test_torque_figures_are_those_of_the_tables() -> None:
     assert np.isclose(motor.torque_per_ampere, 4.1 / 2.3)
 
 
-def test_in_real_time_it_goes_on_often_while_it_moves_and_seldom_while_it_cools() -> None:
+def test_in_real_time_it_advances_often_while_it_moves_and_seldom_while_it_cools() -> None:
     mechanics = one(pid(5.0, 1.0))
     mechanics.advance(100_000_000)
     assert mechanics.due_ns() == mechanics.grid_ns + EAGER_NS

@@ -1,4 +1,4 @@
-"""Every model: each control item read and written, and each wrong access refused as the manual says.
+"""Every model: each control item read and written, and each wrong access refused as in the manual.
 
 What a model has comes from its control table; what a servo may do with it is stated here once more, by hand.
 """
@@ -22,7 +22,7 @@ READ, WRITE = 0x02, 0x03
 RANGE_BIT, ANGLE_BIT = 0x08, 0x02
 DATA_RANGE, DATA_LENGTH, DATA_LIMIT, ACCESS = 4, 5, 6, 7
 STATE = {1.0: 0x01 | 0x04 | 0x20, 2.0: 0x80}
-"""Bits that tell the servo's state, not what came of an instruction: some limits make it an error."""
+"""Bits that show the servo's state, not what came of an instruction: some limits make it an error."""
 
 MODES = (  # section "Operating Mode" of the models' pages
     ("YM*", {0, 1, 3}),
@@ -59,7 +59,7 @@ LIMITS = (
     "max_position_limit",
 )
 MEASURED = ("current",)
-"""The manual lets it be written, and the servo goes on to show what it measures (MX-64, MX-106)."""
+"""The manual lets it be written, and the servo keeps showing what it measures (MX-64, MX-106)."""
 
 
 def by_model(table: ControlTable) -> str:
@@ -160,13 +160,13 @@ def verdict2(table: ControlTable, item: ControlItem, value: int) -> int:
 def test_every_item_is_read_as_the_servo_holds_it(table: ControlTable) -> None:
     desk = Desk(table)
     for item in table.items.values():
-        if not item.name.startswith("indirect_data"):  # they stand for other items
+        if not item.name.startswith("indirect_data"):  # they are other items
             assert desk.read(item) == desk.servo.registers.data(item.name), item.name
     assert desk.read(table.items["model_number"]) == table.model_number.to_bytes(2, "little")
 
 
 @pytest.mark.parametrize("table", OLD + NEW, ids=by_model)
-def test_every_value_is_written_or_refused_as_the_manual_says(table: ControlTable) -> None:
+def test_every_value_is_written_or_refused_as_in_the_manual(table: ControlTable) -> None:
     desk = Desk(table)
     registers = desk.servo.registers
     for item in table.items.values():
@@ -174,11 +174,11 @@ def test_every_value_is_written_or_refused_as_the_manual_says(table: ControlTabl
             continue
         before = registers[item.name]
         for value in values(item):
-            wanted = verdict1(item, value) if table.protocol == 1.0 else verdict2(table, item, value)
+            expected = verdict1(item, value) if table.protocol == 1.0 else verdict2(table, item, value)
             last = registers.data(item.name)
-            assert desk.write(item, wire(item, value)) == wanted, (item.name, value)
+            assert desk.write(item, wire(item, value)) == expected, (item.name, value)
             now = registers.data(item.name)
-            assert now == (last if wanted else wire(item, value)), (item.name, value)
+            assert now == (last if expected else wire(item, value)), (item.name, value)
             if item.name in CHANGES_THE_LINE:
                 registers[item.name] = before
         if item.access == "RW" and item.name not in (*CHANGES_THE_LINE, *MEASURED):
@@ -220,8 +220,8 @@ def test_a_wrong_length_and_a_locked_eeprom_are_the_manual_s_errors(table: Contr
     ]
     for item in items:
         if item.size > 1:
-            wanted = ACCESS if item.access == "R" else DATA_LENGTH
-            assert desk.write(item, desk.servo.registers.data(item.name)[:-1]) == wanted, item.name
+            expected = ACCESS if item.access == "R" else DATA_LENGTH
+            assert desk.write(item, desk.servo.registers.data(item.name)[:-1]) == expected, item.name
     assert desk.write(table.items["torque_enable"], b"\x01") == 0
     for item in items:
         if item.area == "EEPROM":

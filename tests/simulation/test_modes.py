@@ -1,4 +1,4 @@
-"""How a servo with operating modes moves, judged by what it tells."""
+"""How a servo with operating modes moves, judged by what it shows."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def test_position_control_knows_one_turn(line2: Any) -> None:
     assert line2.get("goal_position") == line2.get("present_position")
 
 
-def test_homing_offset_shifts_what_is_told_and_wanted(line2: Any) -> None:
+def test_homing_offset_shifts_position_and_goal(line2: Any) -> None:
     line2.set("homing_offset", 100)
     assert line2.get("present_position") == round(2.0 / TICK) + 100
     assert move(line2, 1100) == near(1100)
@@ -197,7 +197,7 @@ def test_goal_pwm_limits_position_control(line2: Any) -> None:
     assert line2.servo().velocity == pytest.approx(speed_at(177 / 885), rel=0.01)
 
 
-def test_a_goal_wakes_it_only_where_drive_mode_says_so(line2: Any) -> None:
+def test_a_goal_wakes_it_only_where_drive_mode_has_the_bit(line2: Any) -> None:
     line2.set("drive_mode", 8)
     line2.set("goal_position", 3000)
     assert line2.get("torque_enable") == 1

@@ -240,7 +240,7 @@ def test_the_output_for_a_rad_of_error_is_that_which_was_identified(
     assert servo.registers[item] == control_table(model, protocol).items[item].initial
 
 
-def test_models_that_nothing_was_published_of_keep_the_manual_s_figures_and_say_so() -> None:
+def test_models_that_nothing_was_published_of_keep_the_manual_s_figures_marked_so() -> None:
     for table in all_tables():
         motor, identified = motor_of(table), table.model.partition("-FW")[0] in BENCH
         assert motor.source.startswith("[i] scaled from the ") != identified, table.model

@@ -157,13 +157,13 @@ def test_the_shoulder_feels_what_the_elbow_does() -> None:
     assert folded.angle == pytest.approx([0.0, math.pi / 2], abs=1e-6)
 
 
-def test_servos_are_told_apart_by_their_joints_names() -> None:
+def test_servos_are_distinguished_by_their_joints_names() -> None:
     plant = _plant(TWO, UrdfJoint("elbow", 1.0, -1), UrdfJoint("shoulder", 3.0, 1))
     _run(plant, 1.0, drive=[-PULL, 3 * PULL], damping=0.5)
     assert plant.angle == pytest.approx([1.0, 3.0], abs=1e-6)
 
 
-def test_what_the_urdf_does_not_turn_moves_by_itself_and_what_nobody_turns_stands() -> None:
+def test_what_the_urdf_does_not_turn_moves_by_itself_and_what_no_servo_turns_rests() -> None:
     urdf = _urdf(
         _link("upper"), _link("lower"), _link("finger"), _joint("shoulder", "base", "upper"),
         _joint("elbow", "upper", "lower"),
@@ -179,7 +179,7 @@ def test_what_the_urdf_does_not_turn_moves_by_itself_and_what_nobody_turns_stand
     assert plant.angle[2] == alone.angle[0] > 1.5
 
 
-def test_a_joint_with_a_servo_of_its_own_mimics_nobody() -> None:
+def test_a_joint_with_a_servo_of_its_own_mimics_no_joint() -> None:
     mimic = TWO.replace('name="elbow"', 'name="wrist"').replace(
         "</joint></robot>", '<mimic joint="shoulder" multiplier="1"/></joint></robot>'
     )
@@ -219,7 +219,7 @@ def test_two_runs_are_the_same_to_the_last_bit() -> None:
 
 
 def test_missing_meshes_and_pictures_are_no_error() -> None:
-    mesh = '<geometry><mesh filename="package://nobody/has/this.stl"/></geometry>'
+    mesh = '<geometry><mesh filename="package://no_package/has/this.stl"/></geometry>'
     shapes = f"<visual>{mesh}</visual><collision>{mesh}</collision>"
     urdf = _urdf(
         '<material name="wood"><texture filename="wood.png"/></material>',
@@ -266,7 +266,7 @@ def test_the_torso_moves() -> None:
         ),
     ],
 )
-def test_a_urdf_that_cannot_be_moved_is_told_in_a_sentence(urdf: str, sentence: str) -> None:
+def test_a_urdf_that_cannot_be_moved_is_reported_in_a_sentence(urdf: str, sentence: str) -> None:
     with pytest.raises(InputError, match=sentence) as caught:
         mujoco_plant(UrdfBodies(urdf, (UrdfJoint("shoulder", 0.0, 1),)))
     assert len(caught.value.sentences) == 1

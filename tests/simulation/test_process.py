@@ -57,14 +57,14 @@ def opened(path: str) -> Iterator[int]:
         os.close(port)
 
 
-def hear(port: int, size: int) -> bytes:
-    heard = b""
-    while len(heard) < size:
-        assert select.select([port], [], [], PATIENCE_S)[0], f"only {heard.hex(' ')} came"
+def receive(port: int, size: int) -> bytes:
+    received = b""
+    while len(received) < size:
+        assert select.select([port], [], [], PATIENCE_S)[0], f"only {received.hex(' ')} came"
         arrived = os.read(port, 256)
-        assert arrived, f"the terminal is gone after {heard.hex(' ')}"
-        heard += arrived
-    return heard
+        assert arrived, f"the terminal is gone after {received.hex(' ')}"
+        received += arrived
+    return received
 
 
 def test_it_answers_as_a_servo_on_a_serial_port(start: Callable[[], Any]) -> None:
@@ -73,23 +73,23 @@ def test_it_answers_as_a_servo_on_a_serial_port(start: Callable[[], Any]) -> Non
     with opened(running.ports["main"]) as main, opened(running.ports["arm"]) as arm:
         os.write(main, PING_1)
         os.write(arm, PING_1)
-        assert hear(main, 6) == PONG_1
-        assert hear(arm, 6) == PONG_1
+        assert receive(main, 6) == PONG_1
+        assert receive(arm, 6) == PONG_1
     assert running.hang_up() == 0
 
 
 def test_the_ledger_holds_exactly_what_passed_and_no_reply_is_early(start: Callable[[], Any]) -> None:
     running = start()
-    heard = b""
+    received = b""
     with opened(running.ports["main"]) as port:
         for _ in range(20):
             os.write(port, READ_1)
-            heard += hear(port, 12)
+            received += receive(port, 12)
     assert running.hang_up() == 0
     entries = running.ledger()
     assert [entry.direction for entry in entries] == ["in", "out"] * 20
     assert b"".join(entry.data for entry in entries if entry.direction == "in") == READ_1 * 20
-    assert b"".join(entry.data for entry in entries if entry.direction == "out") == heard
+    assert b"".join(entry.data for entry in entries if entry.direction == "out") == received
     for asked, answered in zip(entries[::2], entries[1::2], strict=True):
         assert answered.t_ns - asked.t_ns == 700_000  # 8 bytes, 500 us, 12 bytes; on the bus' own clock
     for answered, asked in zip(entries[1::2], entries[2::2], strict=False):
@@ -101,7 +101,7 @@ def test_hosts_may_come_and_go(start: Callable[[], Any]) -> None:
     for _ in range(3):
         with opened(running.ports["main"]) as port:
             os.write(port, PING_1)
-            assert hear(port, 6) == PONG_1
+            assert receive(port, 6) == PONG_1
     assert running.hang_up() == 0
 
 
@@ -112,7 +112,7 @@ def test_interrupt_is_left_to_the_front_process_and_sigterm_ends_in_order(
     with opened(running.ports["main"]) as port:
         os.kill(running.child.pid, signal.SIGINT)
         os.write(port, PING_1)
-        assert hear(port, 6) == PONG_1
+        assert receive(port, 6) == PONG_1
     os.kill(running.child.pid, signal.SIGTERM)
     assert running.child.wait(PATIENCE_S) == 0
     assert [entry.data for entry in running.ledger()] == [PING_1, PONG_1]
@@ -125,18 +125,18 @@ def test_a_host_that_never_reads_does_not_stop_it(start: Callable[[], Any]) -> N
             os.write(port, READ_1)
     with opened(running.ports["arm"]) as port:
         os.write(port, PING_1)
-        assert hear(port, 6) == PONG_1
+        assert receive(port, 6) == PONG_1
     assert running.hang_up() == 0
 
 
 def test_what_does_not_fit_into_the_terminal_is_lost_and_noted() -> None:
     bus = SimulatedBus(BUSES[0], Ledger(), 0)
     terminal = PseudoTerminal(bus)
-    for now in range(10**9, 10**11, 10**9):  # 400 kB, and nobody reads
+    for now in range(10**9, 10**11, 10**9):  # 400 kB, and no host reads
         bus.inject_noise(bytes(4000), now - 10**8)
         terminal.deliver(now)
     assert any("it does not read" in entry.note for entry in bus.ledger.entries)
-    terminal.read()  # the host has said nothing
+    terminal.read()  # the host has sent nothing
     terminal.receive(10**11)
     terminal.close()
     assert not [entry for entry in bus.ledger.entries if entry.direction == "in"]
@@ -155,8 +155,8 @@ def test_what_a_host_writes_while_others_are_served_is_not_of_the_moment_before(
         terminal.read()
         terminal.receive(2 * 10**9)
     terminal.close()
-    heard = [(entry.t_ns, entry.data) for entry in bus.ledger.entries if entry.direction == "in"]
-    assert heard == [(10**9, READ_1), (2 * 10**9, READ_1)]
+    received = [(entry.t_ns, entry.data) for entry in bus.ledger.entries if entry.direction == "in"]
+    assert received == [(10**9, READ_1), (2 * 10**9, READ_1)]
 
 
 def test_configurations_pass_as_they_are() -> None:
@@ -216,11 +216,11 @@ def test_a_starter_that_ends_before_it_has_read_the_ports_ends_it(tmp_path: Path
         assert child.returncode == 0
 
 
-def test_a_full_disk_does_not_stop_it_and_is_told_at_the_end(tmp_path: Path) -> None:
+def test_a_full_disk_does_not_stop_it_and_is_reported_at_the_end(tmp_path: Path) -> None:
     with bare(tmp_path / "config", "--ledger", "/dev/full") as (child, control):
-        with control.makefile("rb") as said, opened(json.loads(said.readline())["ports"]["main"]) as port:
+        with control.makefile("rb") as sent, opened(json.loads(sent.readline())["ports"]["main"]) as port:
             os.write(port, PING_1)
-            assert hear(port, 6) == PONG_1
+            assert receive(port, 6) == PONG_1
         control.close()
         assert b"No space left" in child.communicate(timeout=PATIENCE_S)[1]
         assert child.returncode == 1
@@ -231,36 +231,36 @@ class Talk:
     """Lines of JSON with the process."""
 
     control: socket.socket
-    said: IO[bytes]
+    sent: IO[bytes]
 
     def ask(self, **question: object) -> dict[str, Any]:
         self.control.sendall(json.dumps(question).encode() + b"\n")
         return self.next()
 
     def next(self) -> dict[str, Any]:
-        answer: dict[str, Any] = json.loads(self.said.readline())
+        answer: dict[str, Any] = json.loads(self.sent.readline())
         return answer
 
 
 @contextlib.contextmanager
 def talking(path: Path, config: SimulationConfig, *options: str) -> Iterator[tuple[Talk, dict[str, Any]]]:
-    """Start it and give what it says first; it must end in order."""
+    """Start it and give what it sends first; it must end in order."""
     with bare(path, *options, config=config) as (child, control):
         control.settimeout(PATIENCE_S)
-        with control.makefile("rb") as said:
-            talk = Talk(control, said)
+        with control.makefile("rb") as sent:
+            talk = Talk(control, sent)
             yield talk, talk.next()
         control.close()
         assert child.communicate(timeout=PATIENCE_S)[1] == b""
         assert child.returncode == 0
 
 
-def test_a_look_tells_of_every_servo(tmp_path: Path) -> None:
+def test_a_look_shows_every_servo(tmp_path: Path) -> None:
     with talking(tmp_path / "config", SimulationConfig(BUSES)) as (talk, first):
         assert talk.ask(look=True)["lateness_us"] == {}
         with opened(first["ports"]["main"]) as port:
             os.write(port, PING_1)
-            hear(port, 6)
+            receive(port, 6)
         look = talk.ask(look=True)
     one, two, other = look["servos"]
     assert (one["bus"], one["id"], one["model"]) == ("main", 1, "AX-12A")
@@ -270,7 +270,7 @@ def test_a_look_tells_of_every_servo(tmp_path: Path) -> None:
     assert 0 <= look["lateness_us"]["median"] <= look["lateness_us"]["maximum"]
 
 
-def test_faults_by_hand_happen_and_are_told(tmp_path: Path) -> None:
+def test_faults_by_hand_happen_and_are_reported(tmp_path: Path) -> None:
     with talking(tmp_path / "config", SimulationConfig(BUSES)) as (talk, first):
         assert "bus" in talk.ask(fault="lose servo=1")["error"]  # there are two
         assert "error" in talk.ask(fault="explode")
@@ -280,11 +280,11 @@ def test_faults_by_hand_happen_and_are_told(tmp_path: Path) -> None:
             os.write(port, PING_1)
             assert talk.next() == {"happened": "lose bus=main servo=1"}
             os.write(port, PING_1)
-            assert hear(port, 6) == PONG_1
+            assert receive(port, 6) == PONG_1
 
 
 @pytest.mark.parametrize(
-    ("config", "said_so"),
+    ("config", "reason"),
     [
         (SimulationConfig(BUSES, faults=("lose bus=main servo=9",)), "no servo 9"),
         (SimulationConfig(BUSES, links={"main": "/nowhere/link"}), "/nowhere/link"),
@@ -292,11 +292,11 @@ def test_faults_by_hand_happen_and_are_told(tmp_path: Path) -> None:
     ],
 )
 def test_what_cannot_be_served_is_refused_with_a_sentence(
-    tmp_path: Path, config: SimulationConfig, said_so: str
+    tmp_path: Path, config: SimulationConfig, reason: str
 ) -> None:
     with bare(tmp_path / "config", config=config) as (child, control):
-        with control.makefile("rb") as said:
-            assert said_so in json.loads(said.readline())["error"]
+        with control.makefile("rb") as sent:
+            assert reason in json.loads(sent.readline())["error"]
         assert child.communicate(timeout=PATIENCE_S)[1] == b""
         assert child.returncode == 2
 
@@ -320,11 +320,11 @@ def test_an_unplugged_adapter_hangs_up_and_comes_back_under_another_name(tmp_pat
             assert os.readlink(link) == after
             with opened(str(link)) as again:
                 os.write(again, PING_1)
-                assert hear(again, 6) == PONG_1
+                assert receive(again, 6) == PONG_1
     assert not link.is_symlink()
 
 
-def test_real_time_is_asked_for_and_what_was_granted_is_said(tmp_path: Path) -> None:
+def test_real_time_is_requested_and_what_was_granted_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "bus.jsonl"
     options = ("--priority", "1", "--core", "1023", "--ledger", str(path))
     with talking(tmp_path / "config", SimulationConfig(BUSES), *options) as (_, first):
@@ -348,7 +348,7 @@ def test_no_reply_is_there_before_wire_time_and_return_delay_have_passed(start_b
             for _ in range(40):
                 asked_ns = time.monotonic_ns()
                 os.write(port, ping)
-                hear(port, 14)
+                receive(port, 14)
                 assert time.monotonic_ns() - asked_ns >= bound_ns
     assert running.hang_up() == 0
     replies = [entry for entry in running.ledger() if entry.direction == "out"]

@@ -64,7 +64,7 @@ def test_another_goal_on_the_way_is_taken_up_with_the_velocity_that_it_has() -> 
     assert after[-1][0] == pytest.approx(-1.0)
 
 
-def test_turning_goes_on_for_ever_and_never_arrives() -> None:
+def test_turning_continues_for_ever_and_never_arrives() -> None:
     profiles = profile(Command(speed=-2.0, acceleration=10.0, turning=1.0))
     seen = run(profiles, 1.2)
     assert seen[round(0.1 / DT) - 1][1] == pytest.approx(-1.0)

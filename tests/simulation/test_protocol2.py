@@ -105,7 +105,7 @@ def test_stuffing_hides_every_header_and_comes_off_again(body: bytes) -> None:
     assert b"\xff\xff\xfd\x00" not in stuffed(body)
 
 
-def test_stuffing_as_the_manual_tells_it() -> None:
+def test_stuffing_as_in_the_manual() -> None:
     assert stuffed(bytes.fromhex("fffffd")) == bytes.fromhex("fffffdfd")
     assert stuffed(bytes.fromhex("03 fffffdfd 00")) == bytes.fromhex("03 fffffdfdfd 00")
     assert stuffed(bytes.fromhex("ffff fffffd")) == bytes.fromhex("ffff fffffdfd")
@@ -117,12 +117,12 @@ def test_stuffing_as_the_manual_tells_it() -> None:
     st.lists(st.integers(1, 20), min_size=1, max_size=20),
 )
 def test_packets_are_found_however_they_are_cut(packets: Any, cuts: list[int]) -> None:
-    line, wanted = b"", []
+    line, expected = b"", []
     for servo_id, instruction, parameters in packets:
         body = stuffed(bytes((instruction,)) + parameters)
         head = b"\xff\xff\xfd\x00" + bytes((servo_id,)) + (len(body) + 2).to_bytes(2, "little")
         line += head + body + crc16(head + body).to_bytes(2, "little")
-        wanted.append((servo_id, instruction, parameters))
+        expected.append((servo_id, instruction, parameters))
     receiver, found, at = InstructionReceiver(), [], 0
     while at < len(line):
         piece = line[at : at + cuts[at % len(cuts)]]
@@ -132,7 +132,7 @@ def test_packets_are_found_however_they_are_cut(packets: Any, cuts: list[int]) -
             assert packet.intact
             found.append((packet.servo_id, packet.instruction, packet.parameters))
             start = packet.end
-    assert found == wanted
+    assert found == expected
     assert receiver.pending == 0
 
 
@@ -199,7 +199,7 @@ def test_reads_in_turn(instruction: int, parameters: str, fast: bool, entries: t
     ("servo_id", "instruction", "parameters", "intact"),
     [
         (1, 0x82, "840004000102", True),  # not to all
-        (0xFE, 0x82, "84000400", True),  # nobody is listed
+        (0xFE, 0x82, "84000400", True),  # no servo is listed
         (0xFE, 0x92, "01900002", True),
         (0xFE, 0x02, "84000400", True),
         (0xFE, 0x82, "840004000102", False),

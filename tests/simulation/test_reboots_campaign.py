@@ -1,11 +1,11 @@
 """Campaign: a servo reboots at a random byte of the wire, in a set-up, in a cycle, in a gap, at the end.
 
-Judged by the simulated bus' ledger alone, see fault_judge.py: nobody who rebooted gets torque that no policy
-gives, no value of the time before is taken for one of the time after, and the others go on.
+Judged by the simulated bus' ledger alone, see fault_judge.py: no servo that rebooted gets torque without a
+policy, no value of the time before is taken for one of the time after, and the others go on.
 
 No servo is back sooner than 50 ms after it lost its power [i]: at 50 Hz it misses a read. On Protocol 1.0
-nothing would tell a shorter reboot, and the next goal would switch its torque on (protocol.md). On Protocol
-2.0 its clock tells it, which is read once a second.
+nothing would show a shorter reboot, and the next goal would switch its torque on (protocol.md). On Protocol
+2.0 its clock shows it, which is read once a second.
 
 CI reboots 4 times from a fixed seed. The full campaign before a release:
 
@@ -31,7 +31,7 @@ BYTE_NS = 10_000
 """At 1 Mbit/s."""
 DURATION_S = 3.0
 LATEST_BYTE = 150_000
-"""Some 1.5 s: a reboot at the very end is seen by nobody any more."""
+"""Some 1.5 s: a reboot at the very end is no longer seen."""
 ROBOT = """\
 name: eight
 loop: {rate: 50}
@@ -44,7 +44,7 @@ MODELS = {1.0: ("AX-12A", 150), 2.0: ("XM430-W350", 180)}
 
 
 def reboots() -> list[Any]:
-    """Return protocols in turn, who reboots, at which byte, and for how long nobody hears it, ms."""
+    """Return protocols in turn, the servo that reboots, at which byte, and for how long it is silent, ms."""
     chance = random.Random(int(os.environ.get("DXLRUN_REBOOT_SEED", "1")))
     drawn = []
     for index in range(int(os.environ.get("DXLRUN_REBOOTS", "4"))):
@@ -81,5 +81,5 @@ def test_a_reboot_at_any_byte_breaks_no_promise(  # noqa: PLR0917  what was draw
         (servo,) = (one for one in robot.buses[0].servos if one.servo_id == servo_id)
         assert not servo.registers["torque_enable"]
         joint = f"j{servo_id}"
-        said = [event.name for event in log.events if event.source == joint and event.t_ns > begun_ns]
-        assert {"servo_limp", "servo_rebooted", "servo_lost"} & set(said), said
+        sent = [event.name for event in log.events if event.source == joint and event.t_ns > begun_ns]
+        assert {"servo_limp", "servo_rebooted", "servo_lost"} & set(sent), sent

@@ -24,7 +24,7 @@ def test_ping_is_answered_without_parameters(line: Any) -> None:
     assert line.ask(1, PING) == (1, 0, b"")
 
 
-def test_nobody_answers_for_an_id_that_is_not_there(line: Any) -> None:
+def test_an_id_that_is_not_there_gets_no_reply(line: Any) -> None:
     assert line.ask(9, PING) is None
 
 
@@ -90,11 +90,11 @@ def test_what_it_does_not_know_is_an_instruction_error(
     assert line.ask(1, instruction, *parameters) == (1, ErrorBit.INSTRUCTION, b"")
 
 
-@pytest.mark.parametrize(("answers", "said"), [(False, ""), (True, "ff ff 01 02 10 ec")])
-def test_a_wrong_checksum_is_not_obeyed(line: Any, answers: bool, said: str) -> None:
+@pytest.mark.parametrize(("answers", "replied"), [(False, ""), (True, "ff ff 01 02 10 ec")])
+def test_a_wrong_checksum_is_not_obeyed(line: Any, answers: bool, replied: str) -> None:
     line.servo().answers_damaged = answers
     line.ports.ports[0].write(bytes.fromhex("ff ff 01 04 03 19 01 00"))
-    assert line.hear() == bytes.fromhex(said)
+    assert line.receive() == bytes.fromhex(replied)
     assert line.servo().registers["led"] == 0
     assert any("CHECKSUM" in note for note in line.notes())
 
@@ -105,7 +105,7 @@ def test_broadcasts_are_obeyed_and_never_answered(line: Any) -> None:
     line.ports.ports[0].write(bytes.fromhex("ff ff fe 04 03 19 01 00"))  # wrong checksum
     line.send(BROADCAST, BULK_READ, 0, 2, 1, 30, 2, 2, 36)
     line.send(BROADCAST, READ, 36, 2)
-    assert line.hear() == b""
+    assert line.receive() == b""
     assert [line.servo(each).registers["led"] for each in (1, 2)] == [1, 1]
     assert line.read(1, 26, 2) == 7 | 8 << 8
     assert line.read(2, 26, 2) == 9 | 10 << 8
@@ -113,7 +113,7 @@ def test_broadcasts_are_obeyed_and_never_answered(line: Any) -> None:
 
 def test_a_sync_write_of_a_wrong_length_changes_nothing(line: Any) -> None:
     line.send(BROADCAST, SYNC_WRITE, 25, 1, 1, 1, 2)
-    assert line.hear() == b""
+    assert line.receive() == b""
     assert line.servo().registers["led"] == 0
     assert any("INSTRUCTION" in note for note in line.notes())
 
@@ -124,7 +124,7 @@ def test_a_lone_servo_answers_a_broadcast_ping(make_line: Any) -> None:
 
 def test_two_servos_collide_on_a_broadcast_ping(line: Any) -> None:
     line.send(BROADCAST, PING)
-    assert line.hear() == bytes.fromhex("ff ff 00 02 00 f8")  # ID 1 & 2, checksums fc & fb: no packet
+    assert line.receive() == bytes.fromhex("ff ff 00 02 00 f8")  # ID 1 & 2, checksums fc & fb: no packet
     assert any("collision" in note for note in line.notes())
 
 
@@ -133,7 +133,7 @@ def test_a_broadcast_is_answered_at_no_status_return_level(line: Any, level: int
     line.send(BROADCAST, WRITE, 16, level)
     for instruction, parameters in ((READ, (36, 2)), (WRITE, (25, 1)), (REG_WRITE, (25, 0)), (ACTION, ())):
         line.send(BROADCAST, instruction, *parameters)
-    assert line.hear() == b""
+    assert line.receive() == b""
     assert line.servo().registers["led"] == 0
 
 
@@ -155,7 +155,7 @@ def test_reg_write_waits_for_action(line: Any) -> None:
         assert line.read(servo_id, 44, 1) == 1
         assert line.read(servo_id, 25, 1) == 0
     line.send(BROADCAST, ACTION)
-    assert line.hear() == b""
+    assert line.receive() == b""
     for servo_id in (1, 2):
         assert line.read(servo_id, 44, 1) == 0
         assert line.read(servo_id, 25, 1) == 1
@@ -210,7 +210,7 @@ def test_a_new_baud_rate_counts_from_the_next_instruction(line: Any) -> None:
 
 def test_return_delay_is_that_of_its_register(line: Any) -> None:
     line.write(1, 5, 100)
-    line.hear()
+    line.receive()
     start = line.clock.now_ns()
     line.send(1, PING)
     line.ports.wait(start + 10_000_000)
@@ -244,7 +244,7 @@ def test_waking_by_a_goal_can_be_switched_off(line: Any) -> None:
     line.clock.wait_until(2_000_000_000)
     assert line.read(1, 24, 1) == 0
     assert line.servo().position == 2.0
-    line.write(1, 24, 1)  # and then it goes to the goal that stands there
+    line.write(1, 24, 1)  # and then it moves to the goal that is there
     line.clock.wait_until(4_000_000_000)
     assert line.read(1, 36, 2) == pytest.approx(700, abs=2)
 
@@ -266,7 +266,7 @@ def test_a_sync_write_with_the_direction_bit_of_the_speed_moves_a_joint(make_lin
     line = make_line((1, 2), model, position=2.0)
     start = line.servo(1).position
     line.send(0xFE, 0x83, 30, 4, 1, *low_high(700), *low_high(1024 + 100), 2, *low_high(700), *low_high(100))
-    assert line.hear() == b""
+    assert line.receive() == b""
     for servo_id in (1, 2):
         assert line.read(servo_id, 30, 2) == 700
     line.clock.wait_until(line.clock.now_ns() + 200_000_000)
@@ -321,7 +321,7 @@ def test_position_of_a_wheel_stays_in_its_range(line: Any) -> None:
     assert len(seen) > 50
 
 
-def test_a_servo_turned_by_hand_tells_so(line: Any) -> None:
+def test_a_servo_turned_by_hand_shows_it(line: Any) -> None:
     line.servo().turn_by_hand(1.0)
     assert line.read(1, 36, 2) == round(1.0 / TICK)
 
@@ -331,7 +331,7 @@ def test_a_servo_turned_by_hand_tells_so(line: Any) -> None:
 
 def test_overload_takes_the_torque_until_the_limit_is_written(line: Any) -> None:
     line.write(1, 30, *low_high(700))
-    line.hear()
+    line.receive()
     line.servo().trigger_overload()
     assert line.ask(1, READ, 24, 1) == (1, ErrorBit.OVERLOAD, b"\x01")  # torque enable stays
     assert line.read(1, 34, 2) == 0

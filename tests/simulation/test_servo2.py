@@ -21,19 +21,19 @@ TICK = math.tau / 4096
 CLEAR_TURNS = bytes.fromhex("01 44584c22")
 
 
-def test_ping_tells_model_and_firmware(line2: Any) -> None:
+def test_ping_returns_model_and_firmware(line2: Any) -> None:
     line2.servo().poke("firmware_version", 0x26)
     assert line2.request(1, PING) == (1, 0, (1020).to_bytes(2, "little") + b"\x26")
 
 
 def test_a_broadcast_ping_is_answered_in_slots_by_id(make_line2: Any) -> None:
     line = make_line2((7, 1, 30))
-    line.tell(BROADCAST, PING)
+    line.instruct(BROADCAST, PING)
     assert [each.servo_id for each in line.statuses(400_000_000)] == [1, 7, 30]
     assert not any("collision" in note for note in line.notes())
 
 
-def test_nobody_answers_for_an_id_that_is_not_there(line2: Any) -> None:
+def test_an_id_that_is_not_there_gets_no_reply(line2: Any) -> None:
     assert line2.request(9, PING) is None
 
 
@@ -49,15 +49,15 @@ def test_packets_of_the_manual_go_in_and_come_out(make_line2: Any) -> None:
         ("fffffd00 01 0800 10 0144584c22 b1dc", "fffffd00 01 0400 55 00 a10c"),
         ("fffffd00 01 0400 06 01 a1e6", "fffffd00 01 0400 55 00 a10c"),
     ]
-    for heard, said in talk:
-        if heard == "fffffd00 01 0800 10 0144584c22 b1dc":
+    for received, replied in talk:
+        if received == "fffffd00 01 0800 10 0144584c22 b1dc":
             line.servo().poke("firmware_version", 42)  # the first one that knows Clear
-        line.ports.ports[0].write(bytes.fromhex(heard))
-        assert line.hear() == bytes.fromhex(said)
+        line.ports.ports[0].write(bytes.fromhex(received))
+        assert line.receive() == bytes.fromhex(replied)
     line.wait(1)
     line.bus.baud_rate = 57_600  # the factory's, which reset option 1 does not keep
     line.ports.ports[0].write(bytes.fromhex("fffffd00 01 0300 08 2f4e"))
-    assert line.hear() == bytes.fromhex("fffffd00 01 0400 55 00 a10c")
+    assert line.receive() == bytes.fromhex("fffffd00 01 0400 55 00 a10c")
 
 
 @pytest.mark.parametrize(
@@ -88,11 +88,11 @@ def test_errors_of_the_manual(line2: Any, instruction: int, parameters: bytes, e
     assert any("refuses" in note for note in line2.notes())
 
 
-@pytest.mark.parametrize(("answers", "said"), [(False, []), (True, [(1, ErrorNumber.CRC, b"")])])
-def test_a_wrong_crc_is_not_obeyed(line2: Any, answers: bool, said: list[Any]) -> None:
+@pytest.mark.parametrize(("answers", "replied"), [(False, []), (True, [(1, ErrorNumber.CRC, b"")])])
+def test_a_wrong_crc_is_not_obeyed(line2: Any, answers: bool, replied: list[Any]) -> None:
     line2.servo().answers_damaged = answers
     line2.ports.ports[0].write(bytes.fromhex("fffffd00 01 0600 03 410001 0000"))
-    assert line2.statuses() == said
+    assert line2.statuses() == replied
     assert line2.get("led") == 0
 
 
@@ -142,7 +142,7 @@ def test_reg_write_waits_for_action(line2: Any) -> None:
     for servo_id in (1, 2):
         assert line2.request(servo_id, REG_WRITE, b"\x41\x00\x01") == (servo_id, 0, b"")
         assert line2.get("registered_instruction", servo_id) == 1
-    line2.tell(BROADCAST, ACTION)
+    line2.instruct(BROADCAST, ACTION)
     assert line2.statuses() == []
     assert [line2.get("led", each) for each in (1, 2)] == [1, 1]
     assert [line2.get("registered_instruction", each) for each in (1, 2)] == [0, 0]
@@ -150,9 +150,9 @@ def test_reg_write_waits_for_action(line2: Any) -> None:
 
 
 def test_sync_write_and_bulk_write_give_each_its_own(line2: Any) -> None:
-    line2.tell(BROADCAST, SYNC_WRITE, bytes.fromhex("74000400 01 96000000 02 aa000000"))
+    line2.instruct(BROADCAST, SYNC_WRITE, bytes.fromhex("74000400 01 96000000 02 aa000000"))
     assert [line2.get("goal_position", each) for each in (1, 2)] == [150, 170]
-    line2.tell(BROADCAST, BULK_WRITE, bytes.fromhex("01 20000200 9b00 02 1f000100 46"))
+    line2.instruct(BROADCAST, BULK_WRITE, bytes.fromhex("01 20000200 9b00 02 1f000100 46"))
     assert line2.get("max_voltage_limit", 1) == 155
     assert line2.get("temperature_limit", 2) == 70
     assert line2.statuses() == []
@@ -170,7 +170,7 @@ def test_sync_write_and_bulk_write_give_each_its_own(line2: Any) -> None:
 def test_writes_to_many_of_a_wrong_length_change_nothing(
     line2: Any, instruction: int, parameters: str
 ) -> None:
-    line2.tell(BROADCAST, instruction, bytes.fromhex(parameters))
+    line2.instruct(BROADCAST, instruction, bytes.fromhex(parameters))
     assert line2.statuses() == []
     assert line2.get("led") == 0
     assert any("INSTRUCTION" in note for note in line2.notes())
@@ -193,7 +193,7 @@ def test_factory_reset_keeps_what_is_asked_for(
 
 def test_a_reset_of_everything_is_not_for_all(line2: Any) -> None:
     line2.set("drive_mode", 1)
-    line2.tell(BROADCAST, RESET, b"\xff")
+    line2.instruct(BROADCAST, RESET, b"\xff")
     assert line2.statuses() == []
     assert line2.get("drive_mode") == 1
 
@@ -256,7 +256,7 @@ def test_an_alert_is_no_failed_transaction(line2: Any) -> None:
     assert line2.get("led") == 1
 
 
-def test_every_status_tells_of_an_error_as_long_as_it_lasts(make_line2: Any) -> None:
+def test_every_status_has_the_alert_bit_as_long_as_an_error_lasts(make_line2: Any) -> None:
     line = make_line2((1, 2))
     line.servo().trigger_overload()
     for instruction, parameters in (
@@ -268,14 +268,14 @@ def test_every_status_tells_of_an_error_as_long_as_it_lasts(make_line2: Any) -> 
     ):
         assert line.request(1, instruction, parameters) == (1, ALERT, ANY)
     assert line.request(1, 0x07).error == ALERT | ErrorNumber.INSTRUCTION
-    line.tell(BROADCAST, 0x82, bytes.fromhex("84000400 0102"))
+    line.instruct(BROADCAST, 0x82, bytes.fromhex("84000400 0102"))
     assert [each.error for each in line.statuses()] == [ALERT, 0]
-    line.tell(BROADCAST, 0x8A, bytes.fromhex("84000400 0102"))
-    fast = line.hear()
+    line.instruct(BROADCAST, 0x8A, bytes.fromhex("84000400 0102"))
+    fast = line.receive()
     assert (fast[8], fast[8 + 8]) == (ALERT, 0)
 
 
-def test_what_shutdown_does_not_list_is_only_told(line2: Any) -> None:
+def test_what_shutdown_does_not_list_is_only_reported(line2: Any) -> None:
     line2.set("shutdown", 0)
     line2.set("torque_enable", 1)
     line2.servo().set_temperature(81)
@@ -350,7 +350,7 @@ def test_a_shorter_watchdog_counts_at_once_and_a_longer_one_too(line2: Any) -> N
     assert line2.get("torque_enable") == 1
 
 
-def test_a_servo_at_rest_shows_at_once_who_turns_it_and_what_is_written(line2: Any) -> None:
+def test_a_servo_at_rest_shows_at_once_what_turns_it_and_what_is_written(line2: Any) -> None:
     line2.wait(1.0)
     resting = line2.get("present_position")
     assert line2.servo().shaft.mechanics.still, "this test is about a servo at rest"

@@ -76,10 +76,10 @@ def test_an_unplugged_adapter_is_a_port_error() -> None:
 def test_a_planned_fault_happens_while_somebody_waits(make_line: Callable[..., Any]) -> None:
     line = make_line()
     line.bus.at(3_000_000, lambda: line.bus.inject_noise(b"\x55", 3_000_000))
-    assert line.hear() == b"\x55"
+    assert line.receive() == b"\x55"
 
 
-def test_a_lost_line_is_back_when_its_adapter_is_and_holds_nobody_up_meanwhile() -> None:
+def test_a_lost_line_is_back_when_its_adapter_is_and_delays_no_other_meanwhile() -> None:
     clock, ports, virtual = two_buses()
     virtual.ports[0].unplug()
     assert ports.wait(5_000) == [0]

@@ -22,7 +22,7 @@ def positions(line: Any, *ids: int) -> dict[int, bytes]:
 @pytest.mark.parametrize("ids", [(1, 2, 3), (3, 1, 2), (2,)])
 def test_sync_read_answers_in_the_order_of_its_list(make_line2: Any, ids: tuple[int, ...]) -> None:
     line = make_line2((1, 2, 3))
-    line.tell(BROADCAST, SYNC_READ, POSITION + bytes(ids))
+    line.instruct(BROADCAST, SYNC_READ, POSITION + bytes(ids))
     data = positions(line, *ids)
     assert line.statuses() == [(each, 0, data[each]) for each in ids]
 
@@ -30,16 +30,16 @@ def test_sync_read_answers_in_the_order_of_its_list(make_line2: Any, ids: tuple[
 def test_a_servo_waits_for_the_one_before_it(make_line2: Any) -> None:
     line = make_line2((1, 2), return_delay_ns=100_000)
     start = line.clock.now_ns()
-    line.tell(BROADCAST, SYNC_READ, POSITION + b"\x01\x02")
-    line.hear()
+    line.instruct(BROADCAST, SYNC_READ, POSITION + b"\x01\x02")
+    line.receive()
     instruction, status = 16 * 10_000, 15 * 10_000
     times = [entry.t_ns - start for entry in line.ledger.entries if entry.direction == "out"]
     assert times == [instruction + 100_000 + status, instruction + 2 * (100_000 + status)]
 
 
-def test_after_an_absent_servo_nobody_answers(make_line2: Any) -> None:
+def test_after_an_absent_servo_no_servo_replies(make_line2: Any) -> None:
     line = make_line2((1, 3))
-    line.tell(BROADCAST, SYNC_READ, POSITION + b"\x01\x02\x03")
+    line.instruct(BROADCAST, SYNC_READ, POSITION + b"\x01\x02\x03")
     assert [each.servo_id for each in line.statuses()] == [1]
     assert any("servo 2 does not reply" in note for note in line.notes())
 
@@ -47,7 +47,7 @@ def test_after_an_absent_servo_nobody_answers(make_line2: Any) -> None:
 def test_or_they_wait_for_its_time(make_line2: Any) -> None:
     line = make_line2((1, 3))
     line.bus.absent = "slot"
-    line.tell(BROADCAST, SYNC_READ, POSITION + b"\x01\x02\x03")
+    line.instruct(BROADCAST, SYNC_READ, POSITION + b"\x01\x02\x03")
     assert [each.servo_id for each in line.statuses()] == [1, 3]
 
 
@@ -56,12 +56,12 @@ def test_a_cut_data_line_and_a_low_return_level_are_as_absent(make_line2: Any) -
     line.bus.absent = "slot"
     line.servo(1).silence()
     line.servo(2).poke("status_return_level", 0)
-    line.tell(BROADCAST, SYNC_READ, POSITION + b"\x01\x02\x03")
+    line.instruct(BROADCAST, SYNC_READ, POSITION + b"\x01\x02\x03")
     assert [each.servo_id for each in line.statuses()] == [3]
 
 
 def test_an_error_has_no_data_and_does_not_break_the_chain(line2: Any) -> None:
-    line2.tell(BROADCAST, SYNC_READ, bytes.fromhex("00100400 0102"))
+    line2.instruct(BROADCAST, SYNC_READ, bytes.fromhex("00100400 0102"))
     assert line2.statuses() == [(1, 7, b""), (2, 7, b"")]
 
 
@@ -69,7 +69,7 @@ def test_bulk_read_asks_each_for_its_own(line2: Any) -> None:
     line2.servo(1).set_voltage(11.9)
     line2.servo(2).set_temperature(36)
     line2.ports.ports[0].write(bytes.fromhex("fffffd00 fe 0d00 92 0190000200 0292000100 1a05"))
-    assert line2.hear() == bytes.fromhex("fffffd00 01 0600 55 00 7700 c369 fffffd00 02 0500 55 00 24 8ba9")
+    assert line2.receive() == bytes.fromhex("fffffd00 01 0600 55 00 7700 c369 fffffd00 02 0500 55 00 24 8ba9")
 
 
 def test_sync_read_of_the_manual(make_line2: Any) -> None:
@@ -77,7 +77,7 @@ def test_sync_read_of_the_manual(make_line2: Any) -> None:
     line.servo(1).turn_by_hand(166 * TICK)
     line.servo(2).turn_by_hand(2079 * TICK)
     line.ports.ports[0].write(bytes.fromhex("fffffd00 fe 0900 82 840004000102 cefa"))
-    assert line.hear() == bytes.fromhex(
+    assert line.receive() == bytes.fromhex(
         "fffffd00 01 0800 55 00 a6000000 8cc0 fffffd00 02 0800 55 00 1f080000 babe"
     )
 
@@ -87,60 +87,60 @@ def test_sync_read_of_the_manual(make_line2: Any) -> None:
     [(FAST_SYNC_READ, POSITION + b"\x02\x01"), (FAST_BULK_READ, bytes.fromhex("0284000400 0184000400"))],
 )
 def test_fast_reads_share_one_status(line2: Any, instruction: int, parameters: bytes) -> None:
-    line2.tell(BROADCAST, instruction, parameters)
+    line2.instruct(BROADCAST, instruction, parameters)
     data = positions(line2, 1, 2)
-    heard = line2.hear()
-    assert heard[:8] == bytes.fromhex("fffffd00 fe 1100 55")
-    assert heard[8:14] == b"\x00\x02" + data[2]
-    assert heard[16:22] == b"\x00\x01" + data[1]
-    assert len(heard) == 7 + 17
+    received = line2.receive()
+    assert received[:8] == bytes.fromhex("fffffd00 fe 1100 55")
+    assert received[8:14] == b"\x00\x02" + data[2]
+    assert received[16:22] == b"\x00\x01" + data[1]
+    assert len(received) == 7 + 17
 
 
 def test_a_fast_read_has_one_return_delay(make_line2: Any) -> None:
     line = make_line2((1, 2), return_delay_ns=100_000)
     start = line.clock.now_ns()
-    line.tell(BROADCAST, FAST_SYNC_READ, POSITION + b"\x01\x02")
-    line.hear()
+    line.instruct(BROADCAST, FAST_SYNC_READ, POSITION + b"\x01\x02")
+    line.receive()
     assert max(entry.t_ns for entry in line.ledger.entries) - start == (16 + 24) * 10_000 + 100_000
 
 
 def test_a_fast_read_stays_short_where_a_servo_is_absent(make_line2: Any) -> None:
     line = make_line2((1, 3))
-    line.tell(BROADCAST, FAST_SYNC_READ, POSITION + b"\x01\x02\x03")
-    heard = line.hear()
-    assert len(heard) == 8 + 8
-    assert int.from_bytes(heard[5:7], "little") == 1 + 3 * 8
+    line.instruct(BROADCAST, FAST_SYNC_READ, POSITION + b"\x01\x02\x03")
+    received = line.receive()
+    assert len(received) == 8 + 8
+    assert int.from_bytes(received[5:7], "little") == 1 + 3 * 8
 
 
 @pytest.mark.parametrize(("firmware", "answers"), [(44, False), (45, True), (46, True)])
 def test_fast_reads_need_a_firmware(make_line2: Any, firmware: int, answers: bool) -> None:
     line = make_line2((1,))
     line.servo(1).poke("firmware_version", firmware)
-    line.tell(BROADCAST, FAST_SYNC_READ, POSITION + b"\x01")
-    assert (line.hear() != b"") == answers
+    line.instruct(BROADCAST, FAST_SYNC_READ, POSITION + b"\x01")
+    assert (line.receive() != b"") == answers
 
 
 def test_a_fast_read_of_no_item_is_not_answered(line2: Any) -> None:
-    line2.tell(BROADCAST, FAST_SYNC_READ, bytes.fromhex("00100400 0102"))
-    assert line2.hear() == b""
+    line2.instruct(BROADCAST, FAST_SYNC_READ, bytes.fromhex("00100400 0102"))
+    assert line2.receive() == b""
     assert any("does not reply to the fast read 0x8a" in note for note in line2.notes())
 
 
 def test_a_2xl_knows_no_fast_read(make_line2: Any) -> None:
     line = make_line2((1,), "2XL430-W250")
-    line.tell(BROADCAST, FAST_SYNC_READ, POSITION + b"\x01")
-    assert line.hear() == b""
+    line.instruct(BROADCAST, FAST_SYNC_READ, POSITION + b"\x01")
+    assert line.receive() == b""
 
 
-@pytest.mark.parametrize(("absent", "heard"), [("silent", 15 + 3), ("slot", 15 + 3 + 15)])
-def test_a_cut_answer_is_to_those_after_it_as_none(make_line2: Any, absent: str, heard: int) -> None:
+@pytest.mark.parametrize(("absent", "received"), [("silent", 15 + 3), ("slot", 15 + 3 + 15)])
+def test_a_cut_answer_is_to_those_after_it_as_none(make_line2: Any, absent: str, received: int) -> None:
     line = make_line2((1, 2, 3))
     line.bus.absent = absent
     line.bus.truncate_next(2, 3)
-    line.tell(BROADCAST, SYNC_READ, POSITION + b"\x01\x02\x03")
-    assert len(line.hear()) == heard
-    line.tell(BROADCAST, SYNC_READ, POSITION + b"\x01\x02\x03")
-    assert len(line.hear()) == 3 * 15
+    line.instruct(BROADCAST, SYNC_READ, POSITION + b"\x01\x02\x03")
+    assert len(line.receive()) == received
+    line.instruct(BROADCAST, SYNC_READ, POSITION + b"\x01\x02\x03")
+    assert len(line.receive()) == 3 * 15
 
 
 def test_a_pause_of_more_than_1500_us_ends_an_instruction(make_line2: Any, make_packet2: Any) -> None:
@@ -162,11 +162,11 @@ def bulk(*entries: tuple[int, int, int]) -> list[int]:
 def test_mx_answer_a_bulk_group_read(make_line: Any) -> None:
     line = make_line((1, 2, 3), "MX-28")
     line.send(BROADCAST, BULK_READ, *bulk((3, 36, 2), (1, 30, 4), (2, 43, 1)))
-    heard = line.hear()
-    assert (heard[2], heard[3]) == (3, 4)
-    assert (heard[8 + 2], heard[8 + 3]) == (1, 6)
-    assert (heard[18 + 2], heard[18 + 3]) == (2, 3)
-    assert len(heard) == 8 + 10 + 7
+    received = line.receive()
+    assert (received[2], received[3]) == (3, 4)
+    assert (received[8 + 2], received[8 + 3]) == (1, 6)
+    assert (received[18 + 2], received[18 + 3]) == (2, 3)
+    assert len(received) == 8 + 10 + 7
 
 
 def test_the_manual_s_bulk_read(make_line: Any) -> None:
@@ -175,26 +175,26 @@ def test_the_manual_s_bulk_read(make_line: Any) -> None:
     line.servo(2).turn_by_hand(0x300 * line.servo(2).registers.table.rad_per_tick)
     # e-Manual, Protocol 1.0, Bulk Read: goal position of ID 1, present position of ID 2
     line.ports.ports[0].write(bytes.fromhex("ffff fe 09 92 00 02011e 020224 1d"))
-    assert line.hear() == bytes.fromhex("ffff 01 04 00 0002 f8 ffff 02 04 00 0003 f6")
+    assert line.receive() == bytes.fromhex("ffff 01 04 00 0002 f8 ffff 02 04 00 0003 f6")
 
 
 def test_an_absent_servo_breaks_the_bulk_read_of_protocol_1(make_line: Any) -> None:
     line = make_line((1, 3), "MX-64")
     line.bus.absent = "slot"  # of Protocol 2.0 only
     line.send(BROADCAST, BULK_READ, *bulk((1, 36, 2), (2, 36, 2), (3, 36, 2)))
-    assert len(line.hear()) == 8
+    assert len(line.receive()) == 8
 
 
 def test_a_bulk_read_of_one_is_not_answered(make_line: Any) -> None:
     line = make_line((1,), "MX-106")
     line.send(BROADCAST, BULK_READ, *bulk((1, 36, 2)))
-    assert line.hear() == b""
+    assert line.receive() == b""
 
 
 def test_an_ax_among_mx_breaks_the_chain(make_line: Any) -> None:
     line = make_line((1, 2), "AX-12A")
     line.send(BROADCAST, BULK_READ, *bulk((1, 36, 2), (2, 36, 2)))
-    assert line.hear() == b""
+    assert line.receive() == b""
 
 
 def test_mx_have_gains_that_are_remembered(make_line: Any) -> None:
