@@ -2,7 +2,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from dxlrun.control.controllers.claims import conflicts, told
+from dxlrun.control.controllers.claims import conflicts, conflicts_text
 
 
 @dataclass(frozen=True)
@@ -16,7 +16,7 @@ def test_each_pair_that_wants_the_same_joints_is_told_once() -> None:
     found = conflicts(
         [Wants("left", ("a", "b", "c")), Wants("right", ("d",)), Wants("whole", tuple("abcde"))]
     )
-    assert told(found) == (
+    assert conflicts_text(found) == (
         "controllers left and whole both command joint a and 2 more; "
         "controllers right and whole both command joint d"
     )
@@ -24,4 +24,4 @@ def test_each_pair_that_wants_the_same_joints_is_told_once() -> None:
 
 def test_who_only_looks_is_in_nobodys_way() -> None:
     found = conflicts([Wants("all", ("a",)), Wants("eyes", ("a",), command=())])
-    assert (found, told(found)) == ((), "")
+    assert (found, conflicts_text(found)) == ((), "")

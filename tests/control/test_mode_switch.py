@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dxlrun.control.controllers.claims import claimed_modes, start_modes
-from dxlrun.control.controllers.mode_switch import PATIENCE_NS
+from dxlrun.control.controllers.mode_switch import MODE_TIMEOUT_NS
 from dxlrun.control.loop_plan import JointPlan
 from dxlrun.description.modes import Mode, mode_of
 from dxlrun.run.channels.answers import Code, Done, Waiting
@@ -115,7 +115,7 @@ def test_controllers_of_one_switch_enter_in_the_same_cycle(robot: Any) -> None:
 def test_joints_that_never_come_into_their_modes_keep_the_controller_out(story: Story) -> None:
     story.slow = 10**6
     story.at[2] = lambda: story.switch(["press"], ["arm"])
-    result = story.run(PATIENCE_NS // PERIOD_NS + 10)
+    result = story.run(MODE_TIMEOUT_NS // PERIOD_NS + 10)
     assert result.reason == "ended"
     (text,) = story.text(EventCode.COMMAND_REFUSED)
     assert text == "press: press is not activated: j1 did not come into effort mode within 5 s"
@@ -220,7 +220,7 @@ def test_a_fallback_whose_modes_never_come_ends_the_run(robot: Any) -> None:
 
     robot.script("arm", breaks, command=("position",), fallback="press")
     robot.script("press", holds, command=("effort",), active=False)
-    result = Story(robot, slow=10**6).run(PATIENCE_NS // PERIOD_NS + 10)
+    result = Story(robot, slow=10**6).run(MODE_TIMEOUT_NS // PERIOD_NS + 10)
     assert (result.reason, "enough" in result.detail) == ("fault", True)
 
 

@@ -8,8 +8,8 @@ from typing import get_args
 import pluggy
 
 from dxlrun.control import realtime
-from dxlrun.control.controllers.contract import hook_breach
 from dxlrun.control.controllers.hookspecs import GROUP, HookSpecs
+from dxlrun.control.controllers.plugins import hook_breach
 from dxlrun.control.loop import MOST_CAUGHT_UP
 from dxlrun.control.loop_plan import OverrunPolicy
 from dxlrun.description.robot import Scheduler

@@ -67,7 +67,7 @@ WRONG = {
     "import math": (
         "import no_such_thing",
         f"{WHO} cannot be imported (ModuleNotFoundError: No module named 'no_such_thing'); "
-        "reinstall it, or tell its author",
+        "reinstall it, or report it to its author",
     ),
     "return 1": (
         "return 7",

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from dxlrun.errors import StartUpError
+from dxlrun.run.channels.answers import Code, Refusal
 from dxlrun.run.channels.commands import LOOP, Command
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import simulated_robot
@@ -269,7 +270,7 @@ def test_who_asks_for_something_during_a_policy_is_told_that_the_run_ends(
     switch = Command(1, LOOP, "switch", b'{"deactivate":["pair"]}', "anna")
     robot.buses[0].at(START_NS + 100_000_000, lambda: robot.inbox.waiting.append(switch))
     robot.run()
-    assert robot.inbox.answers == {1: "the run is ending"}
+    assert robot.inbox.answers == {1: Refusal(Code.RUN_ENDING)}
     check_pose(robot)
 
 
@@ -341,7 +342,8 @@ def test_a_rate_at_which_the_policies_would_not_end_in_time_is_refused(
     robot = built(duration_s=0.1, on_exit="[{pose: home, speed: 30 deg/s}, limp]")
     robot.inbox.waiting.append(Command(1, LOOP, "rate", f'{{"rate": {rate}}}'.encode(), "anna"))
     robot.run()
-    assert ("to end the run within exit_timeout" in robot.inbox.answers[1]) is refused
+    answer = robot.inbox.answers[1]
+    assert (isinstance(answer, Refusal) and answer.code is Code.RATE_UNDER_EXIT) is refused
 
 
 @pytest.mark.parametrize("steps", ["pose", "less torque"])

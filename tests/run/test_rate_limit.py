@@ -7,6 +7,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from dxlrun.run.channels.answers import Code, Done, Refusal
 from dxlrun.run.channels.commands import LOOP, Command
 from dxlrun.testing import simulated_robot
 
@@ -28,9 +29,13 @@ def test_the_slowest_bus_bounds_the_rate(tmp_path: Path, share: float, refused: 
     path.write_text(ROBOT)
     robot = simulated_robot(path, duration_s=0.2)
     highest = min(bus.budget.highest_rate_hz for bus in robot.plan.buses)
-    wish = msgspec.json.encode({"rate": share * highest})
-    robot.inbox.waiting.append(Command(1, LOOP, "rate", wish, "anna", 0))
+    request = msgspec.json.encode({"rate": share * highest})
+    robot.inbox.waiting.append(Command(1, LOOP, "rate", request, "anna", 0))
     result = robot.run()
-    assert robot.inbox.answers == {1: f"the buses allow at most {highest:.4g} Hz" if refused else ""}
+    answer = robot.inbox.answers[1]
+    if refused:
+        assert answer == Refusal(Code.RATE_OVER_BUSES, {"highest": pytest.approx(highest)})
+    else:
+        assert isinstance(answer, Done)
     assert result.skipped == 0
     assert (result.cycles > 11) == (not refused)

@@ -11,9 +11,8 @@ from pydantic import ValidationError
 from dxlrun.compile.joints import CompiledJoint
 from dxlrun.compile.problems import Problems, joint_mark
 from dxlrun.control.controllers.claims import conflicts, start_modes
-from dxlrun.control.controllers.contract import interfaces_breach
 from dxlrun.control.controllers.controller import Interfaces, ParametersModel
-from dxlrun.control.controllers.plugins import Offer, PlugIns
+from dxlrun.control.controllers.plugins import Offer, PlugIns, interfaces_breach
 from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.description import Description, problems_of
 from dxlrun.description.modes import Mode, mode_of

@@ -19,9 +19,8 @@ from dxlrun.compile.limits import BeyondLimit, beyond_limits
 from dxlrun.compile.motions import TRAJECTORY
 from dxlrun.compile.plan import Plan
 from dxlrun.compile.registers import UnfitRegister, steered_value
-from dxlrun.control.controllers.contract import ControllerClass, interfaces_breach
 from dxlrun.control.controllers.controller import Interfaces, ParametersModel
-from dxlrun.control.controllers.plugins import Offer, PlugIns
+from dxlrun.control.controllers.plugins import ControllerClass, Offer, PlugIns, interfaces_breach
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan
 from dxlrun.control.steering import Register
 from dxlrun.description.form import Name

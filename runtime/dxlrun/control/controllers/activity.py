@@ -20,7 +20,7 @@ from dxlrun.errors import counted
 from dxlrun.run.channels.heartbeat import ControllerMethod
 
 _LOADING = int(ControllerMethod.ON_CONFIGURE)
-"""The last step before the robot runs."""
+"""The last method before the robot runs."""
 # found at once, twice a call
 _ident, _process = threading.get_ident, os.getpid
 
@@ -32,18 +32,18 @@ class ActivityPage(Protocol):
         """Keep the name of the controller in this place, before anything of it is called."""
         ...
 
-    def call(self, place: int, step: int) -> None:
-        """Show what is called now, and of the controller in which place; a step of 0: nothing."""
+    def call(self, place: int, method: int) -> None:
+        """Show what is called now, and of the controller in which place; a method of 0: nothing."""
         ...
 
 
 class NoPage:
-    """No other process looks on."""
+    """No other process reads what runs."""
 
     def name_controller(self, place: int, name: str) -> None:
         """Forget it."""
 
-    def call(self, place: int, step: int) -> None:
+    def call(self, place: int, method: int) -> None:
         """Forget it."""
 
 
@@ -75,15 +75,15 @@ class Activity:
         """Name the controller in this place, before anything of it is called."""
         self._page.name_controller(place, name)
 
-    def begin(self, place: int, step: ControllerMethod) -> None:
+    def begin(self, place: int, method: ControllerMethod) -> None:
         """Show what is called next; while the robot runs, refuse what it must not start."""
-        self._page.call(place, step)
-        if step > _LOADING:
+        self._page.call(place, method)
+        if method > _LOADING:
             self.thread = _ident()
             Activity.guarded = self
 
     def end(self) -> str:
-        """Show that it returned, or raised; return what it did against the rules, empty when that is nothing.
+        """Show that it returned, or raised; return which rule it broke, empty for none.
 
         A child that a controller forked and that came back from the call ends here: there is one loop only.
         """
@@ -129,9 +129,9 @@ def _audit(event: str, _: tuple[object, ...]) -> None:
 
 @cache
 def _guard() -> None:
-    """Look at every start of a thread or a process from now on.
+    """Check every start of a thread or a process from now on.
 
-    Before Python 3.12 no audit event tells of a thread, and none tells of the processes of multiprocessing
+    Before Python 3.12 no audit event reports a thread, and none reports the processes of multiprocessing
     that are not forked.
     """
     sys.addaudithook(_audit)

@@ -11,7 +11,7 @@ from dxlrun.description.modes import Mode, mode_of
 
 
 class Claimant(Protocol):
-    """Somebody that may claim joints; a ControllerPlan is one."""
+    """What may claim joints; a ControllerPlan is one."""
 
     @property
     def name(self) -> str:
@@ -25,13 +25,13 @@ class Claimant(Protocol):
 
     @property
     def command(self) -> tuple[str, ...]:
-        """The command interfaces that it claims on each of them; empty: it only looks."""
+        """The command interfaces that it claims on each of them; empty: it only reads."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class Conflict:
-    """Two controllers that want the same joint."""
+    """Two controllers that claim the same joint."""
 
     joint: str
     holder: str
@@ -45,7 +45,7 @@ def conflicts(claimants: Iterable[Claimant]) -> tuple[Conflict, ...]:
     """Return every joint that a later controller claims although an earlier one has it.
 
     A claim of one interface of a joint keeps all others of the joint away too: position and speed of a servo
-    belong together, and a stale speed of another controller is how a robot surprises its people.
+    belong together, and a stale speed of another controller would move the robot in an unexpected way.
     """
     holders: dict[str, str] = {}
     found: list[Conflict] = []
@@ -59,8 +59,8 @@ def conflicts(claimants: Iterable[Claimant]) -> tuple[Conflict, ...]:
     return tuple(found)
 
 
-def told(found: Iterable[Conflict]) -> str:
-    """Say who stands in whose way: each pair once, however many joints it is about; empty for nobody."""
+def conflicts_text(found: Iterable[Conflict]) -> str:
+    """Return conflicts in words: each pair of controllers once, with its first joint; empty for none."""
     pairs: dict[tuple[str, str], list[Conflict]] = {}
     for conflict in found:
         pairs.setdefault((conflict.holder, conflict.other), []).append(conflict)
@@ -70,7 +70,7 @@ def told(found: Iterable[Conflict]) -> str:
 
 
 def claimed_modes(claimants: Iterable[Claimant]) -> dict[str, Mode]:
-    """Return the mode that each claimed joint needs, by its name; joints that nobody claims are not in it.
+    """Return the mode that each claimed joint needs, by its name; other joints are not in it.
 
     Raises ValueError for command interfaces that no mode has together.
     """

@@ -1,4 +1,4 @@
-"""Controller: the contract between dxlrun and whoever writes the law of motion."""
+"""Controller: the contract between dxlrun and the author of a law of motion."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ class Interfaces:
     """What a controller asks of the robot, decided by its parameters.
 
     `command` interfaces are claimed on every joint of `joints`: no other active controller may have one of
-    the same joint. They say in which mode the joints are driven (`interfaces.mode_of`): `position` alone or
-    with `velocity` (the speed toward it); `velocity`, `effort` or `pwm` alone; or `position` with `effort`
-    (the most that the servo may exert). Nothing needs to be claimed to be read: everybody sees every state.
+    the same joint. They determine the mode in which the joints are driven (`interfaces.mode_of`): `position`
+    alone or with `velocity` (the speed toward it); `velocity`, `effort` or `pwm` alone; or `position` with
+    `effort` (the most that the servo may exert). States are read without a claim.
     """
 
     joints: tuple[str, ...]
@@ -107,9 +107,9 @@ class Controller(ABC, Generic[P]):
     @classmethod
     @abstractmethod
     def interfaces(cls, parameters: P, joints: tuple[str, ...]) -> Interfaces:
-        """Say which joints and command interfaces it wants; `joints` are all joints of the robot.
+        """Return the joints and command interfaces that it needs; `joints` are all joints of the robot.
 
-        Joints that the robot does not have, and joints named twice, are refused by whoever asks.
+        Joints that the robot does not have, and joints named twice, are refused when the robot is compiled.
         """
 
     @classmethod

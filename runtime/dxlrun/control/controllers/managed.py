@@ -1,91 +1,162 @@
-"""One controller under the manager: its private arrays, its rows of the robot's arrays, its rules."""
+"""Managed: one controller of a running robot: its arrays, its calls, and the rules for its commands."""
 
 from __future__ import annotations
 
+import math
 import traceback
-from collections.abc import Callable, Collection
-from typing import Any, ParamSpec
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import fields
+from functools import partial
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.control.controllers.activity import Activity
-from dxlrun.control.controllers.controller import Context, Controller
-from dxlrun.control.controllers.gathering import Place, place_of
-from dxlrun.control.loop_plan import ControllerPlan
+from dxlrun.control.controllers.controller import Context, Controller, JointLimits
+from dxlrun.control.controllers.plugins import PlugIns
+from dxlrun.control.loop_plan import ControllerPlan, JointPlan
 from dxlrun.errors import ControllerFault
-from dxlrun.run.channels.cycle import Clamp, Commands, CycleRecord, Floats
+from dxlrun.run.channels.cycle import Clamp, Commands, CycleRecord, Floats, States
+from dxlrun.run.channels.events import EventCode, EventSink, Severity
 from dxlrun.run.channels.heartbeat import ControllerMethod
 
 PERIOD_CAP = 5
-"""A controller is never told a period longer than this many nominal ones: a law that integrates would jump.
-The guardian ends a loop that stands still for as long."""
+"""A controller never gets a period longer than this many nominal ones: a law that integrates would jump.
+The guardian ends a loop that stops for as long."""
 
 _TRACEBACK = 6000
 P = ParamSpec("P")
 
 
+def rate_fits(rate: float | None, period_ns: int) -> bool:
+    """Return whether a controller's own rate can be kept: the loop's is a multiple of it."""
+    if rate is None:
+        return True
+    divider = 1e9 / period_ns / rate if rate > 0 else 0.0
+    return math.isfinite(divider) and round(divider) >= 1 and abs(divider - round(divider)) < 1e-6 * divider
+
+
+def rate_divider(rate: float | None, period_ns: int) -> int:
+    """Return every how many cycles a controller is updated; its rate fits."""
+    return 1 if rate is None else max(1, round(1e9 / period_ns / rate))
+
+
 class Managed:
-    """A configured controller; gathers before its update, checks and scatters after it."""
+    """A controller with its rows of the robot's arrays: gathered before an update, checked and merged after.
+
+    `place` is that of the controller: its bit in the record's masks.
+    """
 
     def __init__(
         self,
         plan: ControllerPlan,
-        controller: Controller[Any],
-        context: Context,
-        rows: NDArray[np.intp],
-        record: CycleRecord,
-        *,
-        gather: Callable[[], None],
         place: int,
+        *,
+        joints: Sequence[JointPlan],
+        record: CycleRecord,
+        events: EventSink,
         activity: Activity,
+        period_ns: int,
     ) -> None:
-        """`gather` brings the context's states and goals up to date; `place` is that of the controller."""
+        """`joints` are all joints of the robot; `period_ns` is the loop's."""
         self.plan = plan
         self.bit = 1 << place
-        """Of the record's mask of active controllers."""
-        self._place = place
-        self._activity = activity
         self.active = False
+        self.failed = False
+        """True when it broke its contract."""
         self.until_ns = 0
         """When its stream of commands runs out, ns of the clock; 0: there is none."""
-        self._controller = controller
-        self.gather = gather
-        self._rows = rows
+        self.waiting = False
+        """True while one of the joints that it claims is lost."""
+        rows = {joint.name: row for row, joint in enumerate(joints)}
+        self.rows: NDArray[np.intp] = np.array([rows[joint] for joint in plan.joints], dtype=np.intp)
+        """Rows of its joints in the robot's arrays."""
+        self._place = place
         self._record = record
-        self._nominal_ns = context.period_ns
-        self._every = plan.every
+        self._activity = activity
+        self._controller: Controller[Any]
+        self._gathering = _Gathering(record, self.rows)
+        self._divider = plan.every
+        self._nominal_ns = plan.every * period_ns
+        self._context = self._new_context([joints[row] for row in self.rows], events)
         self._held = False
-        self._waiting = False
         self._last_ns = -1
-        self._due_number = 0
-        self._finite = np.zeros(len(rows), dtype=np.bool_)
-        columns = place_of(rows)
+        self._due_cycle = 0
+        self._finite = np.zeros(len(self.rows), dtype=np.bool_)
+        columns = _columns(self.rows)
         self._claimed = tuple(
-            _Claim(name, _array(context.commands, name), _array(record.commands, name), columns)
+            _Claim(name, _array(self._context.commands, name), _array(record.commands, name), columns)
             for name in plan.command
         )
+
+    def _new_context(self, joints: Sequence[JointPlan], events: EventSink) -> Context:
+        return Context(
+            name=self.plan.name,
+            joints=self.plan.joints,
+            period_ns=self._nominal_ns,
+            limits=JointLimits(
+                lower=_row([joint.lower if joint.bounded else -np.inf for joint in joints]),
+                upper=_row([joint.upper if joint.bounded else np.inf for joint in joints]),
+                velocity=_row([joint.velocity for joint in joints]),
+                effort=_row([joint.effort for joint in joints]),
+            ),
+            states=self._gathering.states,
+            goals=self._gathering.goals,
+            commands=Commands.empty(len(joints)),
+            # neither knows this object: a circle would stay when the controller is unloaded
+            say=partial(events.emit, EventCode.CONTROLLER_SAYS, Severity.INFO, self.plan.name),
+            publish=partial(_publish, self._record, self.bit),
+        )
+
+    # Life
+
+    def configure(self, plugins: PlugIns) -> None:
+        """Build and configure the controller; allocates. Raises PlugInError and ControllerFault."""
+        name = self.plan.name
+        self._activity.name_controller(self._place, name)
+        with self._shown(ControllerMethod.INIT):
+            self._controller = plugins.built(self.plan)
+        with self._shown(ControllerMethod.ON_CONFIGURE):
+            try:
+                self._controller.on_configure(self._context)
+            except (Exception, SystemExit) as error:  # foreign code: one sentence instead of its traceback
+                raise ControllerFault(
+                    f"controller {name} raised in on_configure: {type(error).__name__}: {error}"
+                ) from error
+        plugins.after_each(f"of controller {name}")
+
+    @contextmanager
+    def _shown(self, method: ControllerMethod) -> Iterator[None]:
+        self._activity.begin(self._place, method)
+        try:
+            yield
+        finally:
+            self._activity.end()
 
     def activate(self, time_ns: int) -> None:
         """Let the controller take over its joints. Raises ControllerFault."""
         for claim in self._claimed:
             claim.forget()
-        self.gather()
+        self._gathering.gather()
         self._call(ControllerMethod.ON_ACTIVATE, "", self._controller.on_activate, time_ns)
         self._last_ns = -1
-        self._due_number = 0
+        self._due_cycle = 0
         self._held = False
         self.until_ns = 0
         self.active = True
+        self._record.active |= self.bit
 
     def deactivate(self, time_ns: int) -> None:
-        """Let the controller let go. Raises ControllerFault; its joints are released all the same."""
+        """Let the controller leave its joints. Raises ControllerFault; they are released all the same."""
         self.release()
         self._call(ControllerMethod.ON_DEACTIVATE, "", self._controller.on_deactivate, time_ns)
 
     def release(self) -> None:
         """Take its commands out of the robot's: the gate holds what it last let through."""
         self.active = False
+        self._record.active &= ~self.bit
         self.until_ns = 0
         self._withdraw()
 
@@ -93,12 +164,14 @@ class Managed:
         for claim in self._claimed:
             claim.withdraw()
 
+    # In a cycle
+
     def command(self, kind: str, data: NDArray[np.float64], time_ns: int, until_ns: int = 0) -> None:
         """Hand over a prepared command, which runs out at `until_ns` unless that is 0. Raises
         ControllerFault."""
         self._held = False
         self.until_ns = until_ns
-        self.gather()
+        self._gathering.gather()
         self._call(
             ControllerMethod.ON_COMMAND, f" ({kind})", self._controller.on_command, kind, data, time_ns
         )
@@ -109,59 +182,51 @@ class Managed:
         self._withdraw()
 
     def wait_for(self, lost: Collection[int]) -> bool:
-        """Hold its joints as long as one that it claims is lost, of these rows; return whether that changed
-        anything for the robot."""
-        waiting = bool(self._claimed) and any(row in lost for row in self._rows.tolist())
-        changed = waiting != self._waiting
-        self._waiting = waiting
+        """Hold its joints as long as one that it claims is lost, of these rows.
+
+        Returns whether that changed anything for the robot.
+        """
+        waiting = bool(self._claimed) and any(row in lost for row in self.rows.tolist())
+        changed = waiting != self.waiting
+        self.waiting = waiting
         if waiting and self.active:
             self._withdraw()
         return changed and self.active
 
-    @property
-    def waiting(self) -> bool:
-        """True while one of the joints that it claims is lost."""
-        return self._waiting
+    def change_period(self, period_ns: int) -> None:
+        """Keep its own rate in another period of the loop."""
+        self._divider = rate_divider(self.plan.rate, period_ns)
+        self._nominal_ns = self._divider * period_ns
+        self._due_cycle = 0  # counted anew
 
-    def pace(self, period_ns: int, every: int) -> None:
-        """Let it be updated in every n-th of the loop's periods."""
-        self._every = every
-        self._nominal_ns = every * period_ns
-        self._due_number = 0  # turns are counted anew
+    def due(self, cycle: int) -> bool:
+        """Return whether the controller is updated in this cycle; a skipped one is made up for next."""
+        return cycle >= self._due_cycle and not (self._held or self.waiting)
 
-    def due(self, number: int) -> bool:
-        """Say whether the controller is updated in this period; a skipped turn is made up in the next one."""
-        return number >= self._due_number and not (self._held or self._waiting)
-
-    def update(self, number: int, time_ns: int) -> None:
+    def update(self, cycle: int, time_ns: int) -> None:
         """Update and merge its commands into the robot's. Raises ControllerFault."""
         period_ns = self._nominal_ns if self._last_ns < 0 else time_ns - self._last_ns
         self._last_ns = time_ns
-        self._due_number = (number // self._every + 1) * self._every
-        self.gather()
+        self._due_cycle = (cycle // self._divider + 1) * self._divider
+        self._gathering.gather()
         capped_ns = min(period_ns, PERIOD_CAP * self._nominal_ns)
         self._call(ControllerMethod.UPDATE, "", self._controller.update, time_ns, capped_ns)
-        changed = [claim for claim in self._claimed if not claim.stands()]
+        changed = [claim for claim in self._claimed if not claim.unchanged()]
         for claim in changed:
             np.isfinite(claim.own, self._finite)
             if np.count_nonzero(self._finite) < self._finite.size:  # a tenth of the time of all()
-                self._judge(claim)
+                self._check(claim)
             elif not claim.all_seen:
                 claim.seen.fill(True)
                 claim.all_seen = True
         for claim in changed:
             claim.merge()
 
-    @property
-    def rows(self) -> NDArray[np.intp]:
-        """Rows of its joints in the robot's arrays."""
-        return self._rows
-
-    def _judge(self, claim: _Claim) -> None:
+    def _check(self, claim: _Claim) -> None:
         """Accept NaN where nothing was commanded yet. Raises ControllerFault for everything else."""
         wrong = ~self._finite & (claim.seen | np.isinf(claim.own))
         if wrong.any():
-            self._record.clamped[self._rows[wrong]] |= np.uint8(Clamp.NOT_FINITE)
+            self._record.clamped[self.rows[wrong]] |= np.uint8(Clamp.NOT_FINITE)
             first = int(np.flatnonzero(wrong)[0])
             after = " after a finite value" if claim.seen[first] else ""
             raise ControllerFault(
@@ -172,14 +237,14 @@ class Managed:
 
     def _call(
         self,
-        step: ControllerMethod,
+        method: ControllerMethod,
         what: str,
         call: Callable[P, object],
         *arguments: P.args,
         **named: P.kwargs,
     ) -> None:
         """Call a method of the controller. Raises ControllerFault for what it raises and what it starts."""
-        self._activity.begin(self._place, step)
+        self._activity.begin(self._place, method)
         raised: BaseException | None = None
         try:
             call(*arguments, **named)
@@ -189,13 +254,13 @@ class Managed:
             breach = self._activity.end()
         if breach:
             raise self._fault(
-                f"{breach} in {step}{what}: while the robot runs that would stop the loop; "
+                f"{breach} in {method}{what}: while the robot runs that would stop the loop; "
                 "start a process in on_configure instead",
                 raised,
             ) from raised
         if raised is not None:
-            told = " ".join(f"{type(raised).__name__}: {raised}".split())
-            raise self._fault(f"raised in {step}{what}: {told}", raised) from raised
+            shown = " ".join(f"{type(raised).__name__}: {raised}".split())
+            raise self._fault(f"raised in {method}{what}: {shown}", raised) from raised
 
     def _fault(self, what: str, raised: BaseException | None) -> ControllerFault:
         fault = ControllerFault(f"controller {self.plan.name} {what}")
@@ -204,12 +269,63 @@ class Managed:
         return fault
 
 
+_Element = TypeVar("_Element", bound=np.generic)
+Columns = slice | NDArray[np.intp]
+"""Rows of some joints: a slice where they are equally far apart, which numpy takes in a tenth of the time."""
+
+
+def _columns(rows: NDArray[np.intp]) -> Columns:
+    """Return the rows as a slice if they are equally far apart, in either direction: any two are."""
+    if not rows.size:
+        return rows
+    first, last = int(rows[0]), int(rows[-1])
+    step = int(rows[1]) - first if rows.size > 1 else 1
+    if not step or not np.array_equal(rows, first + step * np.arange(rows.size)):
+        return rows
+    return slice(first, last + step if last + step >= 0 else None, step)
+
+
+class _Gathering:
+    """States and goals of some rows, read-only for their controller.
+
+    Rows that are equally far apart are shown as they are; others are copied by `gather`.
+    """
+
+    __slots__ = ("_pairs", "goals", "states")
+
+    def __init__(self, record: CycleRecord, rows: NDArray[np.intp]) -> None:
+        place = _columns(rows)
+        self._pairs: list[tuple[NDArray[np.generic], NDArray[np.generic], NDArray[np.intp]]] = []
+        sources = [getattr(record.states, field.name) for field in fields(States) if field.init]
+        self.states = States(*(self._shown(source, place) for source in sources))
+        self.goals = Commands(self._shown(record.goals.values, place))
+
+    def gather(self) -> None:
+        """Copy what must be copied."""
+        for source, own, rows in self._pairs:
+            source.take(rows, axis=-1, out=own, mode="clip")
+
+    def _shown(self, source: NDArray[_Element], place: Columns) -> NDArray[_Element]:
+        if isinstance(place, slice):
+            shown = source[..., place]
+        else:
+            own = source[..., place]
+            self._pairs.append((source, own, place))
+            shown = own.view()
+        shown.flags.writeable = False
+        return shown
+
+
+def _publish(record: CycleRecord, bit: int) -> None:
+    record.published |= bit
+
+
 class _Claim:
     """A claimed interface: the controller's own array, the robot's, and where it was ever finite."""
 
     __slots__ = ("_merged", "_place", "_shown", "_taken", "all_seen", "interface", "own", "seen")
 
-    def __init__(self, interface: str, own: Floats, merged: Floats, place: Place) -> None:
+    def __init__(self, interface: str, own: Floats, merged: Floats, place: Columns) -> None:
         self.interface = interface
         self.own = own
         self.seen = np.zeros(len(own), dtype=np.bool_)
@@ -226,13 +342,13 @@ class _Claim:
         self.all_seen = False
         self._taken = b""
 
-    def stands(self) -> bool:
-        """Say whether what is commanded is what was judged and merged before, and is still in its place."""
+    def unchanged(self) -> bool:
+        """Return whether the commands are those that were checked and merged before, and still merged."""
         own = self.own.tobytes()
         return own == self._taken and self._shown is not None and self._shown.tobytes() == own
 
     def merge(self) -> None:
-        """Put what was judged into the robot's commands."""
+        """Put what was checked into the robot's commands."""
         self._taken = self.own.tobytes()
         if self._shown is None:
             self._merged[self._place] = self.own
@@ -247,3 +363,8 @@ class _Claim:
 def _array(commands: Commands, interface: str) -> Floats:
     array: Floats = getattr(commands, interface)
     return array
+
+
+def _row(values: Sequence[float | None]) -> Floats:
+    """Return the values of the joints; NaN where there is none."""
+    return np.array([np.nan if value is None else value for value in values], dtype=np.float64)

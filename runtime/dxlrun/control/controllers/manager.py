@@ -1,8 +1,8 @@
-"""Manager: brings the plan's controllers to life, updates them in turn, ends one that breaks its contract."""
+"""Manager: configure, activate and update the controllers of a robot; end one that breaks its contract."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import msgspec
@@ -12,19 +12,15 @@ from numpy.typing import NDArray
 from dxlrun.clock import Clock
 from dxlrun.control.controllers.activity import Activity
 from dxlrun.control.controllers.claims import conflicts
-from dxlrun.control.controllers.context import new_context
-from dxlrun.control.controllers.gathering import Gathering
-from dxlrun.control.controllers.managed import Managed
+from dxlrun.control.controllers.managed import Managed, rate_divider, rate_fits
 from dxlrun.control.controllers.mode_switch import ModeSwitch, SetModes
 from dxlrun.control.controllers.plugins import PlugIns
-from dxlrun.control.controllers.turns import every, fits
 from dxlrun.control.loop_plan import ControllerPlan, LoopPlan, ScheduledCommand
 from dxlrun.errors import ControllerFault, PlugInError
 from dxlrun.run.channels.answers import Code, Field, Outcome, Refusal, Waiting
 from dxlrun.run.channels.commands import CommandSink, NoCommands, TakenCommand
 from dxlrun.run.channels.cycle import MOST_CONTROLLERS, CycleRecord
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
-from dxlrun.run.channels.heartbeat import ControllerMethod
 
 
 class Manager:
@@ -45,9 +41,9 @@ class Manager:
         set_modes: SetModes | None = None,
         activity: Activity | None = None,
     ) -> None:
-        """`set_modes` asks the hardware for other modes of joints; without it they stay as they are.
+        """`set_modes` requests other modes of joints from the hardware; without it they stay as they are.
 
-        `activity` is where the controller is shown whose code runs.
+        `activity` shows which controller's code runs.
         """
         self.fault: str | None = None
         self._plan = plan
@@ -57,29 +53,28 @@ class Manager:
         self._clock = clock
         self._taken = commands or NoCommands()
         self._activity = activity or Activity()
-        self._rows = {joint.name: row for row, joint in enumerate(plan.joints)}
         self._period_ns = plan.period_ns
         self._managed: tuple[Managed, ...] = ()
+        """By their places; those that were unloaded keep theirs until another one gets it."""
         self._named: dict[str, Managed] = {}
+        """Those that are loaded."""
         self._commands: tuple[tuple[ScheduledCommand, NDArray[np.float64]], ...] = ()
         self._next = 0
-        self._streaming = False  # nobody can have a stream of commands
         self._lost: Collection[int] = ()
         self._modes = ModeSwitch(plan.joints, record.states.mode, set_modes)
-        self._failed: set[str] = set()
         self._ended: list[tuple[int, Refusal | None]] = []
 
     def configure(self) -> None:
         """Build and configure every controller, decode every command; allocates, before real time.
 
-        Raises PlugInError (a type is not to be had, parameters do not fit it) and ControllerFault (one raised
-        in on_configure, or two that start active want one joint).
+        Raises PlugInError (a type is not available, parameters do not fit it) and ControllerFault (one raised
+        in on_configure, or two that start active claim one joint).
         """
         clash = conflicts(controller for controller in self._plan.controllers if controller.active)
         if clash:
             raise ControllerFault("; ".join(str(conflict) for conflict in clash))
         self._managed = tuple(
-            self._configured(index, controller) for index, controller in enumerate(self._plan.controllers)
+            self._configured(place, controller) for place, controller in enumerate(self._plan.controllers)
         )
         self._named = {managed.plan.name: managed for managed in self._managed}
         self._commands = tuple(
@@ -87,20 +82,20 @@ class Manager:
         )
 
     def activate(self, time_ns: int) -> None:
-        """Activate what the plan wants active; states and goals must be fresh. A fault is in `fault`."""
+        """Activate the controllers that start active; states and goals are fresh. A fault is in `fault`."""
         self._enter([one for one in self._managed if one.plan.active and not one.active], time_ns, None, "")
 
     def begin(self) -> None:
-        """Begin a cycle, before its states are read: ask for modes; nobody was updated in it yet."""
+        """Begin a cycle, before its states are read: request modes."""
         self._modes.ask(self._managed)
         self._record.renew()
 
-    def update(self, turn: int, time_ns: int) -> str | None:
-        """Hand over the commands that are due and update every active controller whose turn it is.
+    def update(self, cycle: int, time_ns: int) -> str | None:
+        """Hand over the commands that are due and update every active controller that is due.
 
-        `turn` counts the periods since the first deadline, `time_ns` is the controllers' time; pauses are in
+        `cycle` counts the periods since the first deadline, `time_ns` is the controllers' time; pauses are in
         neither. A controller that breaks its contract is ended, its fallback takes over, or its joints are
-        held by the gate; the others go on. Returns `fault`.
+        held by the gate; the others are updated all the same. Returns `fault`.
         """
         now_ns, took_ns = self._clock.now_ns, self._record.controller_ns
         if self._modes.awaited:
@@ -108,10 +103,10 @@ class Manager:
         if self._next < len(self._commands):
             self._record.command_count += self._hand_over(time_ns)
         for index, managed in enumerate(self._managed):
-            if managed.active and managed.due(turn):
+            if managed.active and managed.due(cycle):
                 begin_ns = now_ns()
                 try:
-                    managed.update(turn, time_ns)
+                    managed.update(cycle, time_ns)
                 except ControllerFault as fault:
                     self._end(managed, fault, time_ns)
                 if index < len(took_ns):
@@ -130,7 +125,7 @@ class Manager:
         """Hand a prepared command to a controller.
 
         `until_ns` is when it runs out, ns of the clock, unless another one follows (see `stale`); 0: never.
-        The next one of a stream is told by no event.
+        Of a stream, only the first one has an event.
         """
         managed = self._named.get(controller)
         if managed is None:
@@ -140,24 +135,20 @@ class Manager:
             code = Code.NOT_ACTIVE_YET if entering else Code.NOT_ACTIVE
             return Refusal(code, {"controller": controller})
         streaming = until_ns and managed.until_ns
-        self._streaming = self._streaming or until_ns > 0
         try:
             managed.command(kind, data, time_ns, until_ns)
         except ControllerFault as fault:
             self._end(managed, fault, time_ns)
             return _refused_by(managed, str(fault))
         if not streaming:
-            self._tell(EventCode.COMMAND, managed, f"{kind} from {origin}")
+            self._log(EventCode.COMMAND, managed, f"{kind} from {origin}")
         return None
 
     def stale(self, now_ns: int) -> list[str]:
         """Return the controllers whose stream of commands has run out, each of them once."""
-        if not self._streaming:
-            return []
         stale = [managed for managed in self._managed if 0 < managed.until_ns < now_ns]
         for managed in stale:
             managed.until_ns = 0
-        self._streaming = any(managed.until_ns for managed in self._managed)
         return [managed.plan.name for managed in stale]
 
     def hold(self, controller: str) -> None:
@@ -169,20 +160,20 @@ class Manager:
     def wait_for(self, lost: Collection[int]) -> tuple[int, ...]:
         """Hold every controller that claims a lost joint, of these rows, as long as it is lost.
 
-        Returns the rows of those that go on again. A controller that is activated meanwhile waits too.
+        Returns the rows of those that are commanded again. One that is activated meanwhile waits too.
         """
         self._lost = lost
-        going: list[int] = []
+        resumed: list[int] = []
         for managed in self._managed:
             if not managed.wait_for(lost):
                 continue
-            text, severity = "goes on: all its joints answer again", Severity.INFO
+            text, severity = "resumes: all its joints answer again", Severity.INFO
             if managed.waiting:
                 text, severity = "is held until all its joints answer again", Severity.WARNING
             else:
-                going += managed.rows.tolist()
+                resumed += managed.rows.tolist()
             self._events.emit(EventCode.POLICY, severity, managed.plan.name, text)
-        return tuple(going)
+        return tuple(resumed)
 
     def switch(
         self, activate: Sequence[str], deactivate: Sequence[str], time_ns: int, number: int | None = None
@@ -231,7 +222,7 @@ class Manager:
             return self._activate_all(entering, time_ns)
         self._modes.await_modes(entering, time_ns, number, why)
         for managed in entering:
-            self._tell(EventCode.MODE, managed, "waits until its joints are in their modes")
+            self._log(EventCode.MODE, managed, "waits until its joints are in their modes")
         return Waiting(tuple(managed.plan.name for managed in entering))
 
     def _admit(self, time_ns: int) -> None:
@@ -253,36 +244,35 @@ class Manager:
         """Configure one more controller, inactive; return its place. Only while the loop is paused."""
         if plan.name in self._named:
             return Refusal(Code.NAME_TAKEN, {"controller": plan.name})
-        if plan.rate is not None and not fits(plan, self._period_ns):
-            return _not_divided(plan.name, plan.rate, self._period_ns)
-        index = self._free_index()
-        if index >= MOST_CONTROLLERS:
+        if not rate_fits(plan.rate, self._period_ns):
+            return _not_divided(plan, self._period_ns)
+        place = self._free_place()
+        if place >= MOST_CONTROLLERS:
             return Refusal(Code.TOO_MANY_CONTROLLERS, {"most": MOST_CONTROLLERS})
-        if unknown := tuple(joint for joint in plan.joints if joint not in self._rows):
+        known = {joint.name for joint in self._plan.joints}
+        if unknown := tuple(joint for joint in plan.joints if joint not in known):
             return Refusal(Code.UNKNOWN_JOINT, {"joint": unknown})
         begin_ns = self._clock.now_ns()
         try:
-            turns = every(plan, self._period_ns)
-            managed = self._configured(index, replace(plan, active=False, every=turns))
+            divider = rate_divider(plan.rate, self._period_ns)
+            managed = self._configured(place, replace(plan, active=False, every=divider))
         except (ControllerFault, PlugInError) as error:
             return Refusal(Code.CONTROLLER_FAULT, {"controller": plan.name, "problem": str(error)})
-        self._failed.discard(plan.name)  # that was another one
-        managed.pace(self._period_ns, turns)
         managed.wait_for(self._lost)
-        self._managed = (*self._managed[:index], managed, *self._managed[index + 1 :])
+        self._managed = (*self._managed[:place], managed, *self._managed[place + 1 :])
         self._named[plan.name] = managed
-        self._tell_loaded(managed, "loaded", begin_ns)
-        return index
+        self._log_loaded(managed, "loaded", begin_ns)
+        return place
 
-    def _free_index(self) -> int:
+    def _free_place(self) -> int:
         """Return a place for a controller; those of the plan keep theirs, also when they were unloaded.
 
         The log shows each controller by its place.
         """
-        for index in range(len(self._plan.controllers), len(self._managed)):
-            there = self._managed[index]
-            if self._named.get(there.plan.name) is not there:  # the name may live on in another place
-                return index
+        for place in range(len(self._plan.controllers), len(self._managed)):
+            there = self._managed[place]
+            if self._named.get(there.plan.name) is not there:  # the name may be another's by now
+                return place
         return len(self._managed)
 
     def unload(self, name: str) -> Refusal | None:
@@ -294,18 +284,17 @@ class Manager:
             return Refusal(Code.STILL_ACTIVE, {"controller": name})
         begin_ns = self._clock.now_ns()
         del self._named[name]
-        self._tell_loaded(managed, "unloaded", begin_ns)
+        self._log_loaded(managed, "unloaded", begin_ns)
         return None
 
     def change_period(self, period_ns: int) -> Refusal | None:
         """Let every controller keep its own rate in another period of the loop."""
         for managed in self._named.values():
-            plan = managed.plan
-            if plan.rate is not None and not fits(plan, period_ns):
-                return _not_divided(plan.name, plan.rate, period_ns)
+            if not rate_fits(managed.plan.rate, period_ns):
+                return _not_divided(managed.plan, period_ns)
         self._period_ns = period_ns
         for managed in self._named.values():
-            managed.pace(period_ns, every(managed.plan, period_ns))
+            managed.change_period(period_ns)
         return None
 
     @property
@@ -319,50 +308,49 @@ class Manager:
         return tuple(managed.plan for managed in self._managed)
 
     def deactivate(self, time_ns: int) -> None:
-        """Deactivate whoever is active, the last one first; raises nothing, a fault is in `fault`."""
+        """Deactivate all controllers, the last one first; raises nothing, a fault is in `fault`."""
         for managed in reversed(self._managed):
             if managed.active:
                 self._deactivate(managed, time_ns)
         for number in self._modes.end():
             self._end_switch(number, Refusal(Code.RUN_ENDING))
 
-    def _activate_all(self, wanted: Sequence[Managed], time_ns: int) -> Refusal | None:
+    def _activate_all(self, entering: Sequence[Managed], time_ns: int) -> Refusal | None:
         """Activate controllers whose claims were checked together, then the fallbacks of those that failed:
         a fallback that came first could have a joint that belongs to one of the others.
 
         Returns the first fault; the other controllers are active all the same.
         """
-        failed: list[tuple[Managed, str]] = []  # no faults, which hold this frame: nobody collects circles
-        for managed in wanted:
+        # no faults in it, which hold this frame: the collector is off, so such a circle would stay
+        failed: list[tuple[Managed, str]] = []
+        for managed in entering:
             try:
                 managed.activate(time_ns)
             except ControllerFault as fault:
                 self._take_out(managed, fault)
                 failed.append((managed, str(fault)))
             else:
-                self._record.active |= managed.bit
-                self._tell(EventCode.CONTROLLER_ACTIVATED, managed, "active")
+                self._log(EventCode.CONTROLLER_ACTIVATED, managed, "active")
         for managed, why in failed:
             self._fall_back(managed, why, time_ns)
         return _refused_by(*failed[0]) if failed else None
 
     def _deactivate(self, managed: Managed, time_ns: int) -> None:
-        self._record.active &= ~managed.bit
         self._modes.changed()
         try:
             managed.deactivate(time_ns)
         except ControllerFault as fault:
-            self._take_out(managed, fault)  # nobody takes over from one that was leaving anyway
+            self._take_out(managed, fault)  # without a fallback: it was leaving anyway
             self.fault = self.fault or str(fault)
         else:
-            self._tell(EventCode.CONTROLLER_DEACTIVATED, managed, "inactive")
+            self._log(EventCode.CONTROLLER_DEACTIVATED, managed, "inactive")
 
     def _hand_over(self, time_ns: int) -> int:
         """Give each command whose time has come to its controller; return how many were taken."""
         taken = 0
         while self._next < len(self._commands) and self._commands[self._next][0].at_ns <= time_ns:
             command, data = self._commands[self._next]
-            self._tell_taken(self._next, command)
+            self._log_taken(self._next, command)
             self._next += 1
             refusal = self.hand(command.controller, command.kind, data, command.origin, time_ns)
             taken += refusal is None
@@ -376,7 +364,7 @@ class Manager:
         data = msgspec.json.encode(outcome)
         self._events.emit(EventCode.COMMAND_REFUSED, Severity.WARNING, controller, text, data)
 
-    def _tell_taken(self, planned: int, command: ScheduledCommand) -> None:
+    def _log_taken(self, planned: int, command: ScheduledCommand) -> None:
         record = self._record
         self._taken.take(
             TakenCommand(
@@ -385,88 +373,51 @@ class Manager:
         )
 
     def _end(self, managed: Managed, fault: ControllerFault, time_ns: int) -> None:
-        """Take a controller that broke its contract out of the robot, say so, let its fallback take over."""
+        """Take a controller that broke its contract out of the robot, and let its fallback take over."""
         self._take_out(managed, fault)
         self._fall_back(managed, str(fault), time_ns)
 
     def _take_out(self, managed: Managed, fault: ControllerFault) -> None:
         managed.release()
-        self._record.active &= ~managed.bit
         self._modes.changed()
         text = "\n".join([str(fault), *getattr(fault, "__notes__", ())])
         self._events.emit(EventCode.CONTROLLER_FAULT, Severity.ERROR, managed.plan.name, text)
-        self._failed.add(managed.plan.name)
+        managed.failed = True
 
     def _fall_back(self, managed: Managed, why: str, time_ns: int) -> None:
         """Let a fallback take over, but for one that broke its own contract before: two that fall back on
         each other would do so for ever."""
-        name = managed.plan.fallback
-        if not name or name in self._failed or self._refuse((name,), ()):
+        fallback = self._named.get(managed.plan.fallback)
+        if fallback is None or fallback.failed or self._refuse((fallback.plan.name,), ()):
             self.fault = self.fault or why
         else:
-            self._enter([self._named[name]], time_ns, None, why)
+            self._enter([fallback], time_ns, None, why)
 
-    def _tell_loaded(self, managed: Managed, what: str, begin_ns: int) -> None:
+    def _log_loaded(self, managed: Managed, what: str, begin_ns: int) -> None:
         text = f"{what} in {(self._clock.now_ns() - begin_ns) / 1e6:.1f} ms, while the loop stood still"
-        self._tell(EventCode.CONTROLLER_LOADED, managed, text)
+        self._log(EventCode.CONTROLLER_LOADED, managed, text)
 
-    def _tell(self, code: EventCode, managed: Managed, text: str) -> None:
+    def _log(self, code: EventCode, managed: Managed, text: str) -> None:
         self._events.emit(code, Severity.INFO, managed.plan.name, text)
 
-    def _configured(self, index: int, plan: ControllerPlan) -> Managed:
-        self._activity.name_controller(index, plan.name)
-        self._activity.begin(index, ControllerMethod.INIT)
-        try:
-            controller = self._plugins.built(plan)
-        finally:
-            self._activity.end()
-        rows = np.array([self._rows[joint] for joint in plan.joints], dtype=np.intp)
-        joints = [self._plan.joints[row] for row in rows]
-        gathering = Gathering(self._record, rows)
-        say, publish = self._sayer(plan.name), self._publisher(1 << index)
-        context = new_context(plan, joints, gathering, period_ns=self._period_ns, say=say, publish=publish)
-        self._activity.begin(index, ControllerMethod.ON_CONFIGURE)
-        try:
-            controller.on_configure(context)
-        except (Exception, SystemExit) as error:  # foreign code: one sentence instead of its traceback
-            raise ControllerFault(
-                f"controller {plan.name} raised in on_configure: {type(error).__name__}: {error}"
-            ) from error
-        finally:
-            self._activity.end()
-        self._plugins.after_each(f"of controller {plan.name}")
-        return Managed(
+    def _configured(self, place: int, plan: ControllerPlan) -> Managed:
+        managed = Managed(
             plan,
-            controller,
-            context,
-            rows,
-            self._record,
-            gather=gathering.gather,
-            place=index,
+            place,
+            joints=self._plan.joints,
+            record=self._record,
+            events=self._events,
             activity=self._activity,
+            period_ns=self._period_ns,
         )
-
-    def _sayer(self, name: str) -> Callable[[str], None]:
-        def say(text: str) -> None:
-            self._events.emit(EventCode.CONTROLLER_SAYS, Severity.INFO, name, text)
-
-        return say
-
-    def _publisher(self, bit: int) -> Callable[[], None]:
-        def publish() -> None:
-            self._record.published |= bit
-
-        return publish
+        managed.configure(self._plugins)
+        return managed
 
 
 def _refused_by(managed: Managed, problem: str) -> Refusal:
     return Refusal(Code.CONTROLLER_FAULT, {"controller": managed.plan.name, "problem": problem})
 
 
-def _not_divided(controller: str, controller_rate: float, period_ns: int) -> Refusal:
-    fields: dict[str, Field] = {
-        "controller": controller,
-        "controller_rate": controller_rate,
-        "rate": 1e9 / period_ns,
-    }
-    return Refusal(Code.RATE_NOT_DIVIDED, fields)
+def _not_divided(plan: ControllerPlan, period_ns: int) -> Refusal:
+    fields: dict[str, Field] = {"controller": plan.name, "controller_rate": plan.rate or 0.0}
+    return Refusal(Code.RATE_NOT_DIVIDED, fields | {"rate": 1e9 / period_ns})

@@ -1,4 +1,4 @@
-"""Mode switch: controllers that enter when all their joints are in the modes that they need."""
+"""Mode switch: controllers that wait until all their joints are in the modes that they need."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.control.controllers.claims import claimed_modes, conflicts, told
+from dxlrun.control.controllers.claims import claimed_modes, conflicts, conflicts_text
 from dxlrun.control.controllers.managed import Managed
 from dxlrun.control.loop_plan import JointPlan
 from dxlrun.description.modes import Mode
 from dxlrun.run.channels.answers import Code, Field, Refusal
 
-PATIENCE_NS = 5_000_000_000
-"""How long controllers wait for modes: twenty servos that take their turns in short gaps need less than one
-second, a servo that came back from a reset some more. [i]"""
+MODE_TIMEOUT_NS = 5_000_000_000
+"""How long controllers wait for modes: twenty servos, one after the other in short idle times, need less than
+one second, a servo that came back from a reset some more. [i]"""
 _STILL = (Mode.POSITION, Mode.VELOCITY)
-"""Modes in which a joint holds still by itself: it stays in them when nobody claims it."""
+"""Modes in which a joint holds still by itself: it stays in them when no controller claims it."""
 
 SetModes = Callable[[NDArray[np.uint8]], None]
 """Hardware.set_modes"""
@@ -43,13 +43,13 @@ class Group:
 
 
 class ModeSwitch:
-    """Who waits for which modes, and what is asked of the hardware for it; times are the controllers'.
+    """Controllers that wait for modes, and the modes that are requested; times are the controllers'.
 
-    A joint that is claimed, or about to be, is asked into the mode of its claim. One that nobody claims stays
-    in position or velocity mode, where it holds still, and is asked out of others into its rest mode.
+    A joint that is claimed, or about to be, is brought into the mode of its claim. One that is not claimed
+    stays in position or velocity mode, where it holds still, and is brought from others into its rest mode.
     """
 
-    __slots__ = ("_asked", "_groups", "_joints", "_modes", "_rows", "_set_modes")
+    __slots__ = ("_groups", "_joints", "_modes", "_requested", "_rows", "_set_modes")
 
     def __init__(
         self, joints: Sequence[JointPlan], modes: NDArray[np.uint8], set_modes: SetModes | None
@@ -60,60 +60,60 @@ class ModeSwitch:
         self._modes = modes
         self._set_modes = set_modes
         self._groups: list[Group] = []
-        self._asked = True
+        self._requested = True
 
     @property
     def awaited(self) -> bool:
-        """True while anybody waits."""
+        """True while a controller waits."""
         return bool(self._groups)
 
     @property
     def entering(self) -> tuple[Managed, ...]:
-        """Who waits."""
+        """The controllers that wait."""
         return tuple(managed for group in self._groups for managed in group.entering)
 
     def changed(self) -> None:
-        """Claims are other ones than before: modes are asked for anew."""
-        self._asked = False
+        """Claims have changed: request modes anew."""
+        self._requested = False
 
     def await_modes(self, entering: Iterable[Managed], time_ns: int, number: int | None, why: str) -> None:
         """Let controllers wait, together, until all their joints are in their modes."""
-        self._groups.append(Group(tuple(entering), time_ns + PATIENCE_NS, number, why))
-        self._asked = False
+        self._groups.append(Group(tuple(entering), time_ns + MODE_TIMEOUT_NS, number, why))
+        self._requested = False
 
     def ready(self, entering: Iterable[Managed]) -> bool:
-        """Say whether all joints of these controllers are in the modes that they need."""
+        """Return whether all joints of these controllers are in the modes that they need."""
         return not self._missing(entering)
 
     def due(self, time_ns: int) -> tuple[list[Group], list[Group]]:
-        """Return the groups that may enter now, and those whose modes will not come; both wait no more.
+        """Return the groups that may enter now, and those that are given up; neither waits any more.
 
-        They will not when the time is over, and when a joint is in another mode although it was asked: on the
-        way it would be in none.
+        One is given up after the timeout, and when a joint is in another mode although another was requested:
+        a joint that changes its mode is in none.
         """
         ready, late = [], []
         for group in self._groups:
             missing = self._missing(group.entering)
-            refused = self._asked and any(now != Mode.UNKNOWN for _, now in missing.values())
+            refused = self._requested and any(now != Mode.UNKNOWN for _, now in missing.values())
             if not missing:
                 ready.append(group)
             elif refused or time_ns >= group.until_ns:
                 late.append(group)
         self._groups = [group for group in self._groups if group not in ready and group not in late]
         if late:
-            self._asked = False
+            self._requested = False
         return ready, late
 
     def problem(self, group: Group) -> str:
         """Return which joints did not come into their modes, in words."""
         missing = self._missing(group.entering)
         stays = [
-            f"{joint} stays in {_said(now)} mode instead of {_said(mode)} mode"
+            f"{joint} stays in {_shown(now)} mode instead of {_shown(mode)} mode"
             for joint, (mode, now) in missing.items()
             if now != Mode.UNKNOWN
         ]
         late = [
-            f"{joint} did not come into {_said(mode)} mode within {PATIENCE_NS * 1e-9:g} s"
+            f"{joint} did not come into {_shown(mode)} mode within {MODE_TIMEOUT_NS * 1e-9:g} s"
             for joint, (mode, now) in missing.items()
             if now == Mode.UNKNOWN
         ]
@@ -128,33 +128,33 @@ class ModeSwitch:
                 self._groups[index] = replace(group, entering=left)
                 ended = None if left else group.number
         self._groups = [group for group in self._groups if group.entering]
-        self._asked = False
+        self._requested = False
         return ended
 
     def end(self) -> list[int | None]:
         """End all waiting, and ask for no modes any more; return the numbers of the commands that waited."""
         numbers = [group.number for group in self._groups]
         self._groups = []
-        self._asked = True
+        self._requested = True
         return numbers
 
     def ask(self, managed: Iterable[Managed]) -> None:
-        """Ask the hardware for modes, once for each change of claims of those of them who are active."""
-        if self._asked:
+        """Request modes from the hardware, once for each change of the active controllers' claims."""
+        if self._requested:
             return
-        self._asked = True
+        self._requested = True
         active = (one for one in managed if one.active)
         claimed = claimed_modes(one.plan for one in (*active, *self.entering))
-        wanted = np.zeros(len(self._joints), dtype=np.uint8)
+        modes = np.zeros(len(self._joints), dtype=np.uint8)
         for row, joint in enumerate(self._joints):
             now = self._modes[row]
             mode = claimed.get(joint.name)
             if mode is None:
                 mode = Mode(now) if now in _STILL else joint.rest
             if mode != now:
-                wanted[row] = mode
-        if self._set_modes is not None and wanted.any():
-            self._set_modes(wanted)
+                modes[row] = mode
+        if self._set_modes is not None and modes.any():
+            self._set_modes(modes)
 
     def refuse(
         self,
@@ -179,7 +179,7 @@ class ModeSwitch:
         if not found:
             return None
         fields: dict[str, Field] = {
-            "conflict": told(found),
+            "conflict": conflicts_text(found),
             "joints": tuple(conflict.joint for conflict in found),
             "holders": tuple(conflict.holder for conflict in found),
             "others": tuple(conflict.other for conflict in found),
@@ -193,5 +193,5 @@ class ModeSwitch:
         return {joint: (mode, now[joint]) for joint, mode in claimed.items() if mode != now[joint]}
 
 
-def _said(mode: Mode) -> str:
+def _shown(mode: Mode) -> str:
     return mode.name.lower().replace("_", " with ")

@@ -1,7 +1,12 @@
-"""Plug-ins: finds the packages that offer controllers, one by one; a broken one never takes others along."""
+"""Plug-ins: find the packages that offer controllers, and check them against the contract.
+
+Foreign code is checked when it is loaded, so that its author reads one sentence with a fix, and no run meets
+a traceback; a plug-in that is broken leaves the others usable.
+"""
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -12,15 +17,37 @@ from typing import Any, cast
 import pluggy
 from pydantic import ValidationError
 
-from dxlrun.control.controllers.contract import ControllerClass, controller_breach, hook_breach
-from dxlrun.control.controllers.controller import CONTRACT_VERSION, Controller
+from dxlrun.control.controllers.controller import (
+    CONTRACT_VERSION,
+    CommandModel,
+    Controller,
+    Interfaces,
+    ParametersModel,
+)
 from dxlrun.control.controllers.hookspecs import GROUP, HookSpecs
 from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.control.overrun import Decide, OverrunHook
+from dxlrun.description.modes import COMMAND_INTERFACES, mode_of
 from dxlrun.dynamixel.control_table import add_control_table
 from dxlrun.errors import ControllerFault, PlugInError
 
 _MOST_MISTAKES = 5
+ControllerClass = type[Controller[Any]]
+Breach = tuple[str, str]
+"""What is wrong, and how to fix it."""
+
+_METHODS = (
+    "__init__",
+    "interfaces",
+    "prepare",
+    "on_configure",
+    "on_activate",
+    "on_command",
+    "update",
+    "on_deactivate",
+)
+"""Called by dxlrun, all by position."""
+_HOOKS = tuple(name for name in vars(HookSpecs) if name.startswith("dxlrun_"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,16 +58,16 @@ class Offer:
     """The robot file's name for it."""
     controller: ControllerClass
     distribution: str
-    """Who published it: `name version`."""
+    """Its publisher: `name version`."""
 
 
-def _look_away(name: str) -> None:
+def _any_threads(name: str) -> None:
     """Do nothing: processes without a loop may have threads."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlugIns:
-    """All controllers that are installed, and why others are not to be had."""
+    """All controllers that are installed, and why others are not available."""
 
     controllers: Mapping[str, Offer]
     """By type."""
@@ -48,14 +75,14 @@ class PlugIns:
     """One sentence a plug-in that could not be used, by its entry point's name, and one a type that two
     plug-ins offer, by the type's name."""
     overrun_hooks: tuple[OverrunHook, ...] = ()
-    """Who is asked what becomes of a late cycle, in this order."""
-    after_each: Callable[[str], None] = _look_away
+    """They decide what becomes of a late cycle, in this order."""
+    after_each: Callable[[str], None] = _any_threads
     """Called with a name after foreign code prepared something; it may raise PlugInError."""
 
     def built(self, plan: ControllerPlan) -> Controller[Any]:
         """Return a new controller of the plan's type.
 
-        Raises PlugInError (the type is not to be had, parameters do not fit it), and ControllerFault for
+        Raises PlugInError (the type is not available, parameters do not fit it), and ControllerFault for
         whatever else its class raises.
         """
         offer = self.controllers.get(plan.type)
@@ -87,7 +114,7 @@ class _Found:
     overrun: Decide | None = None
 
 
-def load_plugins(after_each: Callable[[str], None] = _look_away) -> PlugIns:
+def load_plugins(after_each: Callable[[str], None] = _any_threads) -> PlugIns:
     """Import every entry point of the group `dxlrun` and ask it for its controllers and servo models.
 
     `after_each` is called with the plug-in's name and distribution after its import, broken or not; what it
@@ -125,7 +152,7 @@ def _publisher(entry_point: EntryPoint) -> str:
     return f"{distribution.name} {distribution.version}" if distribution else "an unknown distribution"
 
 
-def _told(error: BaseException) -> str:
+def _one_line(error: BaseException) -> str:
     """Return an error in one line."""
     return " ".join(f"{type(error).__name__}: {error}".split())
 
@@ -137,13 +164,15 @@ def _free_key(name: str, publisher: str, taken: Mapping[str, str]) -> str:
 def _load(entry_point: EntryPoint, publisher: str) -> _Found:
     """Return what one plug-in offers. Raises PlugInError with one sentence that names its distribution."""
 
-    def refuse(what: str, mend: str) -> PlugInError:
-        return PlugInError(f"plug-in {entry_point.name} of {publisher} {what}; {mend}")
+    def refuse(what: str, fix: str) -> PlugInError:
+        return PlugInError(f"plug-in {entry_point.name} of {publisher} {what}; {fix}")
 
     try:
         module = entry_point.load()
     except (Exception, SystemExit) as error:  # foreign code: whatever it does on import is its fault alone
-        raise refuse(f"cannot be imported ({_told(error)})", "reinstall it, or tell its author") from error
+        raise refuse(
+            f"cannot be imported ({_one_line(error)})", "reinstall it, or report it to its author"
+        ) from error
     manager = pluggy.PluginManager(GROUP)
     manager.add_hookspecs(HookSpecs)
     try:
@@ -152,7 +181,7 @@ def _load(entry_point: EntryPoint, publisher: str) -> _Found:
             manager.register(module, entry_point.name)
             manager.check_pending()
     except Exception as error:  # foreign code, see above: looking at an object may run its code
-        raise refuse(f"has a wrong hook ({_told(error)})", "tell its author") from error
+        raise refuse(f"has a wrong hook ({_one_line(error)})", "report it to its author") from error
     if breach is not None:
         raise refuse(*breach)
     try:
@@ -160,11 +189,9 @@ def _load(entry_point: EntryPoint, publisher: str) -> _Found:
         mappings = manager.hook.dxlrun_controllers()
         servo_models = manager.hook.dxlrun_servo_models()
     except (Exception, SystemExit) as error:  # foreign code, see above
-        raise refuse(f"raised in a hook ({_told(error)})", "tell its author") from error
+        raise refuse(f"raised in a hook ({_one_line(error)})", "report it to its author") from error
     if not contracts:
-        raise refuse(
-            "does not say for which contract it was written", "it must implement the hook dxlrun_contract"
-        )
+        raise refuse("does not declare its contract", "it must implement the hook dxlrun_contract")
     if contracts != [CONTRACT_VERSION]:
         raise refuse(
             f"was written for contract {contracts[0]!r}, this dxlrun has contract {CONTRACT_VERSION}",
@@ -187,10 +214,10 @@ def _overrun(manager: pluggy.PluginManager) -> Decide | None:
 
 
 def _call(
-    function: Callable[..., object], wanted: Sequence[str], cycle: int, scheduled_ns: int, actual_ns: int
+    function: Callable[..., object], names: Sequence[str], cycle: int, scheduled_ns: int, actual_ns: int
 ) -> object:
     given = {"cycle": cycle, "scheduled_ns": scheduled_ns, "actual_ns": actual_ns}
-    return function(**{name: given[name] for name in wanted})
+    return function(**{name: given[name] for name in names})
 
 
 def _add_servo_models(models: object, refuse: Callable[[str, str], PlugInError]) -> None:
@@ -207,7 +234,8 @@ def _add_servo_models(models: object, refuse: Callable[[str, str], PlugInError])
             add_control_table(model if isinstance(model, str) else model.read_text("utf-8"))
         except (OSError, ValueError) as error:
             raise refuse(
-                f"offers a servo model {where}that cannot be used ({_told(error)})", "tell its author"
+                f"offers a servo model {where}that cannot be used ({_one_line(error)})",
+                "report it to its author",
             ) from error
 
 
@@ -224,7 +252,105 @@ def _offer(
         raise refuse(f"offers a controller under {name!r}", "the type must be a string")
     breach = controller_breach(controller)
     if breach is not None:
-        what, mend = breach
+        what, fix = breach
         shown = controller.__qualname__ if isinstance(controller, type) else repr(controller)
-        raise refuse(f"offers {shown} as {name}, {what}", mend)
+        raise refuse(f"offers {shown} as {name}, {what}", fix)
     return Offer(name, cast("ControllerClass", controller), publisher)
+
+
+# The contract
+
+
+def hook_breach(plugin: object, manager: pluggy.PluginManager) -> Breach | None:
+    """Check the hooks that a module implements: their names, their marks, their arguments."""
+    for name in dir(plugin):
+        hook = getattr(plugin, name, None)
+        marked = manager.parse_hookimpl_opts(plugin, name) is not None
+        if not marked:
+            if name in _HOOKS and callable(hook):
+                return f"has a function {name} that is not marked as a hook", "put @dxlrun.hookimpl above it"
+            continue
+        if name not in _HOOKS:
+            return f"implements a hook {name} that dxlrun does not have", f"hooks are {', '.join(_HOOKS)}"
+        expected = [*inspect.signature(getattr(HookSpecs, name)).parameters][1:]
+        found = [*inspect.signature(hook).parameters] if callable(hook) else []
+        if not set(found) <= set(expected):
+            return (
+                f"implements {name}({', '.join(found)}), but the hook is {name}({', '.join(expected)})",
+                "take the other arguments out",
+            )
+    return None
+
+
+def controller_breach(controller: object) -> Breach | None:
+    """Check a class that is offered as a controller."""
+    if not (isinstance(controller, type) and issubclass(controller, Controller)):
+        return "which is no controller", "derive a class from dxlrun.Controller"
+    missing = sorted(getattr(controller, "__abstractmethods__", ()))
+    if missing:
+        return f"which has no method {' and no method '.join(missing)}", "write it"
+    for name in _METHODS:
+        if not _takes(getattr(controller, name), getattr(Controller, name)):
+            return (
+                f"whose {name}{_arguments(getattr(controller, name))} cannot be called as "
+                f"{name}{_arguments(getattr(Controller, name))}",
+                "give it these arguments",
+            )
+    return _declaration_breach(controller)
+
+
+def interfaces_breach(interfaces: object) -> Breach | None:
+    """Check what a controller's `interfaces` returned."""
+    if not isinstance(interfaces, Interfaces):
+        return f"returns {interfaces!r} from interfaces", "return dxlrun.Interfaces(joints, command)"
+    for what, names in (("joints", interfaces.joints), ("command", interfaces.command)):
+        if not isinstance(names, tuple) or not all(isinstance(name, str) for name in names):
+            return f"asks for {what} {names!r}", f"{what} of dxlrun.Interfaces is a tuple of names"
+    unknown = [name for name in interfaces.command if name not in COMMAND_INTERFACES]
+    if unknown:
+        return (
+            f"asks for the command interface {', '.join(unknown)}",
+            f"command interfaces are {', '.join(COMMAND_INTERFACES)}",
+        )
+    try:
+        mode_of(interfaces.command or ("position",))
+    except ValueError as error:
+        return (
+            f"asks for command interfaces that do not go together: {error}",
+            "ask for position (with velocity or effort beside it), or for velocity, effort or pwm alone",
+        )
+    return None
+
+
+def _declaration_breach(controller: ControllerClass) -> Breach | None:
+    if not _is_model(controller.Parameters, ParametersModel):
+        return "whose Parameters is no model of parameters", "derive it from dxlrun.ParametersModel"
+    commands: object = controller.Commands
+    if not isinstance(commands, Mapping) or not all(
+        isinstance(kind, str) and _is_model(model, CommandModel) for kind, model in commands.items()
+    ):
+        return "whose Commands is no mapping of names to models", "write {name: class of dxlrun.CommandModel}"
+    publishes: object = controller.publishes
+    if not isinstance(publishes, tuple) or not all(isinstance(topic, str) for topic in publishes):
+        return "whose publishes is no tuple of topics", 'write publishes = ("/joint_states",)'
+    return None
+
+
+def _is_model(found: object, base: type) -> bool:
+    return isinstance(found, type) and issubclass(found, base)
+
+
+def _takes(found: Callable[..., object], contract: Callable[..., object]) -> bool:
+    """Return whether a method can be called as the contract's: by position, with as many arguments."""
+    if found is contract:  # inherited
+        return True
+    count = len(inspect.signature(contract).parameters)
+    try:
+        inspect.signature(found).bind(*range(count))
+    except (TypeError, ValueError):  # ValueError: nothing is known about its arguments
+        return False
+    return True
+
+
+def _arguments(method: Callable[..., object]) -> str:
+    return f"({', '.join(str(name) for name in inspect.signature(method).parameters if name != 'self')})"
