@@ -13,7 +13,7 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from dxlrun.analysis.bus import Servo
+from dxlrun.analysis.bus import ServoTraffic
 from dxlrun.analysis.figures.drawing import SteeringMarks
 from dxlrun.analysis.figures.events import events_drawing, reply_drawing
 from dxlrun.analysis.figures.joints import joint_drawings
@@ -356,8 +356,10 @@ def test_the_period_is_drawn_as_it_changed(figures: list[Figure], short: Log) ->
     assert verticals(figures[0].axes[0]) == [10.0, 20.0]
 
 
-def answering(servo_id: int, median_us: float, slowest_us: float, lost: int = 0) -> Servo:
-    return Servo("main", servo_id, f"joint_{servo_id}", 9, 9, lost, 9 - lost, 0, (), median_us, slowest_us)
+def answering(servo_id: int, median_us: float, slowest_us: float, lost: int = 0) -> ServoTraffic:
+    return ServoTraffic(
+        "main", servo_id, f"joint_{servo_id}", 9, 9, lost, 9 - lost, 0, (), median_us, slowest_us
+    )
 
 
 def test_each_servo_has_its_median_and_its_slowest_reply(figures: list[Figure]) -> None:

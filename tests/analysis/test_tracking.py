@@ -15,7 +15,7 @@ import pytest
 
 from dxlrun.analysis.figures.joints import joint_drawings
 from dxlrun.analysis.report import analyze, joints_table
-from dxlrun.analysis.tracking import Joint, reachable, tracking
+from dxlrun.analysis.tracking import JointTracking, reachable, tracking
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import Log, read_log
 from dxlrun.log.schemas import LogHeader
@@ -73,7 +73,7 @@ def ramp(count: int, at: int, goal: float, speed: float, delay: int = 0) -> Way:
     return np.clip((np.arange(count) - at - delay) * DT * speed, 0.0, goal)
 
 
-def only(log: Log) -> Joint:
+def only(log: Log) -> JointTracking:
     (joint,) = tracking(log)
     return joint
 

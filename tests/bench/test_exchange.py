@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.analysis.ledger.overruns import Transaction
+from dxlrun.analysis.ledger.overruns import LedgerTransaction
 from dxlrun.dynamixel.wire import protocol1
 from dxlrun.errors import ProcessFault
 from exchange.bus import Settings, bench_bus, chosen_hosts, to_json
@@ -215,10 +215,10 @@ def test_the_servos_lateness_is_taken_out_before_the_exchange_is_compared_with_i
 
 def test_a_transaction_belongs_to_the_exchange_that_waited_for_it() -> None:
     answered = [
-        Transaction(handed_ns=150, late_ns=3, taken=10, given=20),
-        Transaction(handed_ns=250, late_ns=4, taken=30, given=40),
-        Transaction(handed_ns=270, late_ns=5, taken=31, given=41),
-        Transaction(handed_ns=990, late_ns=90, taken=99, given=99),  # behind the last of them
+        LedgerTransaction(handed_ns=150, late_ns=3, taken=10, given=20),
+        LedgerTransaction(handed_ns=250, late_ns=4, taken=30, given=40),
+        LedgerTransaction(handed_ns=270, late_ns=5, taken=31, given=41),
+        LedgerTransaction(handed_ns=990, late_ns=90, taken=99, given=99),  # behind the last of them
     ]
     found = judge(answered, np.array([100, 200, 300]), np.array([100, 100, 100]))
     assert found.late_ns.tolist() == [3, 9, 0]

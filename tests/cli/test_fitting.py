@@ -7,7 +7,7 @@ import io
 import pytest
 from rich.console import Console
 
-from dxlrun.output.table import Cell, Column, Line, Table
+from dxlrun.output.table import Cell, Column, Sentence, Table
 from dxlrun.output.terminal import show
 
 SERVOS = Table.of(
@@ -26,7 +26,7 @@ SERVOS = Table.of(
 )
 
 
-def shown(*parts: Table | Line | str, width: int, terminal: bool = False) -> str:
+def shown(*parts: Table | Sentence | str, width: int, terminal: bool = False) -> str:
     console = Console(
         file=io.StringIO(),
         width=width,
@@ -98,5 +98,5 @@ def test_a_row_needs_a_value_for_each_column() -> None:
 
 
 def test_only_a_terminal_gets_colours() -> None:
-    assert "\x1b[31m" in shown(SERVOS, Line("bad", "error"), width=80, terminal=True)
-    assert "\x1b" not in shown(SERVOS, Line("bad", "error"), width=80)
+    assert "\x1b[31m" in shown(SERVOS, Sentence("bad", "error"), width=80, terminal=True)
+    assert "\x1b" not in shown(SERVOS, Sentence("bad", "error"), width=80)

@@ -53,7 +53,7 @@ ALERT = 0x80
 
 
 @dataclass(frozen=True, slots=True)
-class Servo:
+class ServoTraffic:
     """One servo's traffic over the whole log, set-up and shutdown included."""
 
     bus: str
@@ -100,7 +100,7 @@ class BusTraffic:
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class LoggedRequest:
     """The replies that one instruction requests: from which servos, with how many bytes of data each."""
 
     servo_ids: tuple[int, ...] = ()
@@ -109,7 +109,7 @@ class Request:
 
 
 @dataclass(frozen=True, slots=True)
-class Reply:
+class LoggedReply:
     """The answer of one servo; a fast status packet holds several."""
 
     servo_id: int
@@ -132,7 +132,7 @@ class _Count:
 
 
 @dataclass(slots=True)
-class _Line:
+class _BusCount:
     """Pairs instructions with replies on one bus: a reply counts until the bus' next instruction."""
 
     plan: LoggedBus
@@ -142,7 +142,7 @@ class _Line:
     broadcasts: int = 0
     extra_us: Counter[int] = field(default_factory=Counter)
     """How much longer than wire and return delay each complete exchange took."""
-    asked: Request = field(default_factory=Request)
+    asked: LoggedRequest = field(default_factory=LoggedRequest)
     open: set[int] = field(default_factory=set)
     """Servos that have not answered yet."""
     asked_ns: int = 0
@@ -202,7 +202,7 @@ class _Line:
         for servo_id in self.open:
             self.counts[servo_id].asked += 1
 
-    def _answer(self, reply: Reply, at_ns: int) -> None:
+    def _answer(self, reply: LoggedReply, at_ns: int) -> None:
         count = self.counts[reply.servo_id]
         count.replies += 1
         count.protocol = reply.protocol
@@ -229,19 +229,19 @@ class Traffic:
     __slots__ = ("_lines",)
 
     def __init__(self) -> None:
-        self._lines: dict[str, _Line] = {}
+        self._lines: dict[str, _BusCount] = {}
 
     def take(self, log: Log) -> None:
         """Count the packets of the next slice. Raises LogError when one cannot be read."""
         for name in log.buses if not self._lines else ():
-            self._lines[name] = _Line(plan_of(log).by_name.get(name, LoggedBus(name)))
+            self._lines[name] = _BusCount(plan_of(log).by_name.get(name, LoggedBus(name)))
         by_bus: list[list[LoggedPacket]] = [[] for _ in log.buses]
         for packet in log.packets:
             by_bus[packet.bus].append(packet)
         for line, packets in zip(self._lines.values(), by_bus, strict=True):
             line.take(packets)
 
-    def finish(self) -> tuple[tuple[Servo, ...], tuple[BusTraffic, ...]]:
+    def finish(self) -> tuple[tuple[ServoTraffic, ...], tuple[BusTraffic, ...]]:
         """Return the traffic of each servo and of each bus."""
         for line in self._lines.values():
             line.finish()
@@ -274,9 +274,9 @@ def median(counts: Mapping[int, int]) -> float:
     return ((lower or 0) + (upper or 0)) / 2
 
 
-def _servo(bus: LoggedBus, servo_id: int, count: _Count) -> Servo:
+def _servo(bus: LoggedBus, servo_id: int, count: _Count) -> ServoTraffic:
     joints = {servo.servo_id: servo.joint for servo in bus.servos}
-    return Servo(
+    return ServoTraffic(
         bus=bus.name,
         servo_id=servo_id,
         joint=joints.get(servo_id, ""),
@@ -291,7 +291,7 @@ def _servo(bus: LoggedBus, servo_id: int, count: _Count) -> Servo:
     )
 
 
-def _bus(line: _Line) -> BusTraffic:
+def _bus(line: _BusCount) -> BusTraffic:
     return BusTraffic(
         name=line.plan.name,
         instructions=line.packets[PacketKind.INSTRUCTION],
@@ -320,38 +320,38 @@ def is_protocol_2(data: bytes) -> bool:
 
 
 @lru_cache(maxsize=1024)
-def request_of(data: bytes) -> Request:
+def request_of(data: bytes) -> LoggedRequest:
     """Return the servos that answer an instruction at every status return level: pings and reads."""
     second = is_protocol_2(data)
     servo_id, code = (_byte(data, 4), _byte(data, 7)) if second else (_byte(data, 2), _byte(data, 4))
     if code in (_PING, _READ):
-        return Request() if servo_id == BROADCAST_ID else Request((servo_id,))
+        return LoggedRequest() if servo_id == BROADCAST_ID else LoggedRequest((servo_id,))
     if not second:
-        return _entries(data[6:-1], 3, 1) if code == _BULK_READ else Request()
+        return _entries(data[6:-1], 3, 1) if code == _BULK_READ else LoggedRequest()
     body = data[8:-2].replace(_STUFFED, _PLAIN)
     if code in (_SYNC_READ, _FAST_SYNC_READ):
-        return Request(tuple(body[4:]), (int.from_bytes(body[2:4], "little"),) * len(body[4:]))
-    return _entries(body, 5, 0) if code in (_BULK_READ, _FAST_BULK_READ) else Request()
+        return LoggedRequest(tuple(body[4:]), (int.from_bytes(body[2:4], "little"),) * len(body[4:]))
+    return _entries(body, 5, 0) if code in (_BULK_READ, _FAST_BULK_READ) else LoggedRequest()
 
 
-def _entries(body: bytes, width: int, at: int) -> Request:
+def _entries(body: bytes, width: int, at: int) -> LoggedRequest:
     """Return the servos of a bulk read: entries of `width` bytes, the ID at `at`, the size first or last."""
     entries = [body[start : start + width] for start in range(0, len(body) - width + 1, width)]
     sizes = (entry[0] if at else int.from_bytes(entry[3:5], "little") for entry in entries)
-    return Request(tuple(entry[at] for entry in entries), tuple(sizes))
+    return LoggedRequest(tuple(entry[at] for entry in entries), tuple(sizes))
 
 
-def replies(servo_id: int, data: bytes, asked: Request) -> Iterator[Reply]:
+def replies(servo_id: int, data: bytes, asked: LoggedRequest) -> Iterator[LoggedReply]:
     """Yield the replies in one status packet; `asked` gives the sizes of the blocks of a fast one."""
     if not is_protocol_2(data):
-        yield Reply(servo_id, _byte(data, 4), 1)
+        yield LoggedReply(servo_id, _byte(data, 4), 1)
     elif servo_id != BROADCAST_ID:
-        yield Reply(servo_id, _byte(data, 8), 2)
+        yield LoggedReply(servo_id, _byte(data, 8), 2)
     else:
         at = 8
         for size in asked.sizes:  # a block: error, ID, data, CRC
             if at + 1 < len(data):
-                yield Reply(data[at + 1], data[at], 2)
+                yield LoggedReply(data[at + 1], data[at], 2)
             at += size + 4
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from dxlrun.analysis.bus import BusTraffic, Servo
+from dxlrun.analysis.bus import BusTraffic, ServoTraffic
 from dxlrun.analysis.latency import (
     Duration,
     Latency,
@@ -20,11 +20,22 @@ from dxlrun.analysis.latency import (
 from dxlrun.analysis.plan import LoggedBus, plan_of
 from dxlrun.analysis.steering import Act, Pause
 from dxlrun.analysis.tally import Tally
-from dxlrun.analysis.tracking import Joint, tracking
+from dxlrun.analysis.tracking import JointTracking, tracking
 from dxlrun.analysis.verdict import Verdict, judge
 from dxlrun.errors import counted
 from dxlrun.log.reader import Log, read_log
-from dxlrun.output.table import Cell, Column, Line, Part, Table, Tone, Value, flagged, microseconds, numbers
+from dxlrun.output.table import (
+    Cell,
+    Column,
+    Part,
+    Sentence,
+    Table,
+    Tone,
+    Value,
+    flagged,
+    microseconds,
+    numbers,
+)
 from dxlrun.run.channels.events import EventCode, EventGroup, Severity
 
 _MOST_ACTS = 100
@@ -53,9 +64,9 @@ class Report:
     """None where the loop never ran a cycle."""
     steps: tuple[Duration, ...]
     controllers: tuple[Duration, ...]
-    servos: tuple[Servo, ...]
+    servos: tuple[ServoTraffic, ...]
     buses: tuple[BusTraffic, ...]
-    joints: tuple[Joint, ...]
+    joints: tuple[JointTracking, ...]
     events: tuple[EventCount, ...]
     steering: tuple[Act, ...]
     """Commands from outside, a stream as one."""
@@ -114,7 +125,7 @@ def _events(events: Iterable[EventGroup]) -> tuple[EventCount, ...]:
 def parts(report: Report) -> tuple[Part, ...]:
     """Return what a terminal shows: the verdict first, then the tables."""
     tone: Tone = "good" if report.verdict.good else "warning"
-    return (*(Line(sentence, tone) for sentence in report.verdict.sentences), *tables(report))
+    return (*(Sentence(sentence, tone) for sentence in report.verdict.sentences), *tables(report))
 
 
 def tables(report: Report) -> tuple[Table, ...]:

@@ -61,7 +61,7 @@ class Pause:
     periods: int
 
 
-class Steering:
+class SteeringHistory:
     """Counts what was asked, slice by slice of a log; streams are one act each, so that little is kept.
 
     An answer and its cycle may be in a later slice than the command: the newest are kept until all are there.

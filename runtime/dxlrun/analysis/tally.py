@@ -10,10 +10,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.analysis.bus import BusTraffic, Servo, Traffic
+from dxlrun.analysis.bus import BusTraffic, ServoTraffic, Traffic
 from dxlrun.analysis.latency import Latency, Periods, Punctuality, Slowest, on_virtual_time
 from dxlrun.analysis.plan import plan_of
-from dxlrun.analysis.steering import Act, Pause, Steering
+from dxlrun.analysis.steering import Act, Pause, SteeringHistory
 from dxlrun.control.loop_plan import TOLERATED_SKIPS
 from dxlrun.log.reader import UNREADABLE, Log, scan_log
 from dxlrun.log.schemas import FAILURES_NAME, SUMMARY_NAME
@@ -46,7 +46,7 @@ class RunTotals:
     joints: tuple[str, ...] = ()
     invalid: tuple[int, ...] = ()
     """Cycles in which the state of each joint was not valid."""
-    servos: tuple[Servo, ...] = ()
+    servos: tuple[ServoTraffic, ...] = ()
     buses: tuple[BusTraffic, ...] = ()
     events: tuple[EventGroup, ...] = ()
     """In the order of the first of each."""
@@ -67,7 +67,7 @@ class Tally:
     def __init__(self) -> None:
         self._punctuality = Punctuality()
         self._traffic = Traffic()
-        self._steering = Steering()
+        self._steering = SteeringHistory()
         self._invalid: NDArray[np.int64] | None = None
         self._events = EventCounts()
         self._granted = False

@@ -34,7 +34,7 @@ Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
-class Joint:
+class JointTracking:
     """One joint over all cycles."""
 
     name: str
@@ -73,7 +73,7 @@ class _Limits:
     """rad/s; a speed of 0 would be none"""
 
 
-def tracking(log: Log) -> tuple[Joint, ...]:
+def tracking(log: Log) -> tuple[JointTracking, ...]:
     """Return freshness and tracking of each joint; rows in the order of the log."""
     limits = _limits(log)
     return tuple(_joint(log, row, name, limits.get(name, _Limits())) for row, name in enumerate(log.joints))
@@ -84,7 +84,7 @@ def reachable(log: Log, row: int) -> Floats:
     return _reachable(log, row, _limits(log).get(log.joints[row], _Limits()))
 
 
-def _joint(log: Log, row: int, name: str, limits: _Limits) -> Joint:
+def _joint(log: Log, row: int, name: str, limits: _Limits) -> JointTracking:
     cycles = log.cycles
     valid = cycles["valid"][:, row]
     ages = cycles["age_ns"][:, row]
@@ -95,7 +95,7 @@ def _joint(log: Log, row: int, name: str, limits: _Limits) -> Joint:
     known = error[np.isfinite(error)]
     rests = tuple(_rests(times, way, error, limits))
     settled = [settling for settling, _ in rests if settling is not None]
-    return Joint(
+    return JointTracking(
         name=name,
         invalid=int(np.count_nonzero(~valid)),
         oldest_ms=max(0.0, float(ages.max(initial=0)) / 1e6),

@@ -22,7 +22,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum, unique
 
-from dxlrun.analysis.bus import BusTraffic, Servo
+from dxlrun.analysis.bus import BusTraffic, ServoTraffic
 from dxlrun.analysis.steering import Act, Pause
 from dxlrun.analysis.tally import RunTotals
 from dxlrun.dynamixel.port.latency_timer import late_replies
@@ -269,7 +269,7 @@ def _late_replies(buses: Sequence[BusTraffic]) -> Iterable[_Finding]:
         yield _Finding(_Rank.REMARK, f"{sentence[0].upper()}{sentence[1:]}.")
 
 
-def _silent(servos: Sequence[Servo]) -> Iterable[_Finding]:
+def _silent(servos: Sequence[ServoTraffic]) -> Iterable[_Finding]:
     asked = [servo for servo in servos if servo.asked]
     if not asked:
         return
@@ -291,7 +291,7 @@ def _all(count: int) -> str:
     return "The servo" if count == 1 else f"All {count} servos"
 
 
-def _errors(servos: Sequence[Servo]) -> Iterable[_Finding]:
+def _errors(servos: Sequence[ServoTraffic]) -> Iterable[_Finding]:
     troubled = [servo for servo in servos if servo.errors]
     if not troubled:
         return
@@ -310,7 +310,7 @@ def _more(joining: str, count: int, one: str = "more servo", many: str = "more s
     return f"{joining} {counted(beyond, one, many)}" if beyond > 0 else ""
 
 
-def _name(servo: Servo) -> str:
+def _name(servo: ServoTraffic) -> str:
     return f"servo {servo.servo_id} ({servo.joint or servo.bus})"
 
 

@@ -49,14 +49,14 @@ def doctor(*, as_json: JsonFlag = False, debug: Flag = False) -> int:
 
 def _findings(findings: Sequence[Finding], missing: int) -> Iterator[Part]:
     """Yield a table of everything that was checked, then the fixes, then the verdict."""
-    from dxlrun.output.table import Cell, Column, Line, Table
+    from dxlrun.output.table import Cell, Column, Sentence, Table
 
     columns = (Column("", "name"), Column("", "name"), Column("", "text"))
     rows = ((one.what, Cell(one.state, _TONES[one.state]), one.found) for one in findings)
     yield Table.of("", columns, rows)
     for one in findings:
         if one.mend:
-            yield Line(f"{one.what}: {one.why}", _TONES[one.state])
+            yield Sentence(f"{one.what}: {one.why}", _TONES[one.state])
             yield f"    {one.mend}"
     worse = sum(one.state == "worse" for one in findings)
     verdict = "robots run here" if not missing else "no robot runs here like this"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import shlex
@@ -15,8 +14,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from dxlrun.errors import counted
-from dxlrun.output.table import Column, Line, Table, Tone, numbers
-from dxlrun.output.terminal import fitted, out, print_error, show
+from dxlrun.output.table import Column, Sentence, Table, Tone, numbers
+from dxlrun.output.terminal import fitted, out, print_error, show, show_json_line
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -118,7 +117,7 @@ class PlainView:
         """Print nothing: a table in lines would scroll the faults away."""
 
     def _print(self, line: str, tone: Tone = "plain") -> None:
-        show(Line(line, tone), console=self._console)
+        show(Sentence(line, tone), console=self._console)
 
 
 class TableView(PlainView):
@@ -176,34 +175,30 @@ class JsonView:
     def opened(self, ports: Mapping[str, str], real_time: str) -> None:
         """Write where the buses are."""
         named = {bus: self._shown.port(bus, ports) for bus in ports}
-        self._write({"ports": named, "devices": dict(ports), "real_time": real_time})
+        show_json_line({"ports": named, "devices": dict(ports), "real_time": real_time})
 
     def moved(self, ports: Mapping[str, str]) -> None:
         """Write where the buses are now."""
-        self._write({"devices": dict(ports)})
+        show_json_line({"devices": dict(ports)})
 
     def fault(self, text: str) -> None:
         """Write a fault that happened."""
-        self._write({"fault": text})
+        show_json_line({"fault": text})
 
     def accepted(self, text: str) -> None:
         """Write how a line was understood: it may be planned for later."""
-        self._write({"understood": text})
+        show_json_line({"understood": text})
 
     def refused(self, sentence: str) -> None:
         """Write what is wrong with a line that was typed."""
-        self._write({"error": sentence})
+        show_json_line({"error": sentence})
 
     def help(self) -> None:
         """Write the faults there are."""
-        self._write({"faults": list(fault_lines())})
+        show_json_line({"faults": list(fault_lines())})
 
     def look(self, look: Look, typed: str) -> None:
         """Write nothing."""
-
-    def _write(self, value: Mapping[str, object]) -> None:
-        sys.stdout.write(json.dumps(value, ensure_ascii=False) + "\n")
-        sys.stdout.flush()
 
 
 def fault_lines() -> Sequence[str]:

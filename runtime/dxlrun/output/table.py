@@ -71,14 +71,14 @@ class Table:
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class Sentence:
     """A sentence on a line of its own; never broken, so that what is in it can be copied."""
 
     text: str
     tone: Tone = "plain"
 
 
-Part = Table | Line | str
+Part = Table | Sentence | str
 """What is shown; a string is a plain line."""
 
 

@@ -14,10 +14,11 @@ from contextlib import contextmanager, suppress
 from typing import IO, TYPE_CHECKING, cast
 
 from dxlrun.output.json import json_text, problems_json
-from dxlrun.output.table import Line, Part, Table, Tone
+from dxlrun.output.table import Part, Sentence, Table, Tone
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.constrain import Constrain
     from rich.table import Table as RichTable
     from rich.text import Text
 
@@ -27,9 +28,11 @@ STYLES: dict[Tone, str] = {"plain": "", "good": "green", "warning": "yellow", "e
 _PIPE = 200
 """Columns of a pipe: wide enough not to break a table."""
 _WIDEST = 120
-"""Text is folded here: a longer line is hard to read, however wide the terminal."""
+"""Text is folded here: a longer line is hard to read, however wide the terminal, or in a pipe."""
 _FOLDED = 28
 """Columns that are left at least to what may be folded."""
+_LONGEST_WORD = 40
+"""A longer one, such as a path, may be broken in a table."""
 _REFRESH_S = 0.25
 
 
@@ -51,7 +54,7 @@ def show(*parts: Part, console: Console | None = None, folded: bool = False) -> 
             if part.rows:
                 _show_table(part, console)
         else:
-            line = Line(part) if isinstance(part, str) else part
+            line = Sentence(part) if isinstance(part, str) else part
             console.print(Text(line.text, style=STYLES[line.tone]), soft_wrap=not folded)
     console.file.flush()  # a reader behind a pipe waits for it
 
@@ -59,6 +62,12 @@ def show(*parts: Part, console: Console | None = None, folded: bool = False) -> 
 def show_json(value: object) -> None:
     """Print a result as JSON: dataclasses by their fields."""
     sys.stdout.write(json_text(value) + "\n")
+
+
+def show_json_line(value: object) -> None:
+    """Print one object of a stream of JSON, at once."""
+    sys.stdout.write(json.dumps(value, ensure_ascii=False) + "\n")
+    sys.stdout.flush()  # a reader behind a pipe waits for it
 
 
 def print_error(line: str) -> None:
@@ -86,8 +95,7 @@ def print_refusal(
         "warnings": problems_json([problem for problem in problems if problem.severity == "warning"]),
     }
     with suppress(OSError):  # the reader is gone; the exit code is left
-        sys.stdout.write(json.dumps(refusal, ensure_ascii=False) + "\n")
-        sys.stdout.flush()
+        show_json_line(refusal)
 
 
 @contextmanager
@@ -116,18 +124,20 @@ def progress_bar(*, hidden: bool) -> Iterator[Callable[[str, float], None]]:
         yield draw
 
 
-def fitted(table: Table, width: int) -> RichTable | Text:
+def fitted(table: Table, width: int) -> Constrain | Text:
     """Return a table for a terminal of `width` columns: nothing is cut.
 
     Where it does not fit, its heads are broken at blanks, then its details are left out, then each row
-    becomes a paragraph.
+    becomes a paragraph. Texts are folded between words.
     """
+    from rich.constrain import Constrain
     from rich.text import Text
 
     for tight, details in ((False, True), (True, True), (False, False), (True, False)):
         chosen = [index for index, column in enumerate(table.columns) if details or not column.detail]
-        if _width(table, chosen, tight=tight) <= width:
-            return _rich_table(table, chosen, tight=tight)
+        least = _width(table, chosen, tight=tight)
+        if least <= width:
+            return Constrain(_rich_table(table, chosen, tight=tight), min(width, max(least, _WIDEST)))
     return Text("\n".join(_paragraphs(table, width)))
 
 
@@ -136,23 +146,26 @@ def _show_table(table: Table, console: Console) -> None:
 
     if table.title:
         console.print(Text(f"\n{table.title}", style="bold"))
-    width = min(console.width, _WIDEST) if console.is_terminal else console.width
-    shown = fitted(table, width)
-    if isinstance(shown, Text):  # a wider table is better than paragraphs
-        width = console.width
-        shown = fitted(table, width)
-    console.print(shown, width=width)
+    shown = fitted(table, console.width)
+    console.print(shown, soft_wrap=isinstance(shown, Text))
 
 
 def _width(table: Table, chosen: Sequence[int], *, tight: bool) -> int:
     """Return how many columns a table takes at least."""
-    total = 0
-    for index in chosen:
-        column = table.columns[index]
-        head = max(map(len, column.name.split(" "))) if tight else len(column.name)
-        longest = max(len(row[index].text) for row in table.rows)
-        total += max(head, min(longest, _FOLDED) if column.kind == "text" else longest)
-    return total + (len(chosen) - 1) * (1 if tight else 2)
+    names = [table.columns[index].name for index in chosen]
+    heads = [name.split(" ") if tight else [name] for name in names]
+    widths = (max(*map(len, head), _least(table, index)) for head, index in zip(heads, chosen, strict=True))
+    return sum(widths) + (len(chosen) - 1) * (1 if tight else 2)
+
+
+def _least(table: Table, index: int) -> int:
+    """Return how many columns the cells of one column take at least: a text may be folded between words."""
+    texts = [row[index].text for row in table.rows]
+    longest = max(map(len, texts))
+    if table.columns[index].kind != "text":
+        return longest
+    word = max((len(word) for text in texts for word in text.split()), default=0)
+    return max(min(longest, _FOLDED), min(word, _LONGEST_WORD))
 
 
 def _rich_table(table: Table, chosen: Sequence[int], *, tight: bool) -> RichTable:
@@ -176,6 +189,7 @@ def _rich_table(table: Table, chosen: Sequence[int], *, tight: bool) -> RichTabl
             justify="right" if column.kind == "number" else "left",
             overflow="fold",
             no_wrap=column.kind != "text",
+            min_width=_least(table, index),
         )
     for row in table.rows:
         shown.add_row(*(Text(row[index].text, style=STYLES[row[index].tone]) for index in chosen))
@@ -195,6 +209,7 @@ def _paragraphs(table: Table, width: int) -> Iterator[str]:
             max(width - 1, 20),
             subsequent_indent="  ",
             break_on_hyphens=False,
+            break_long_words=False,
         )
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.analysis.ledger.overruns import Transaction
+from dxlrun.analysis.ledger.overruns import LedgerTransaction
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,14 +22,16 @@ class Judged:
     received_bytes: float
 
 
-def judge(found: Iterable[Transaction], starts_ns: NDArray[np.int64], walls_ns: NDArray[np.int64]) -> Judged:
+def judge(
+    found: Iterable[LedgerTransaction], starts_ns: NDArray[np.int64], walls_ns: NDArray[np.int64]
+) -> Judged:
     """Put transactions to the exchanges, by when these began and how long they took, in order.
 
     Between the first transaction of one exchange and that of the next, the bytes of one exchange pass, also
     when the servos take its last ones after the host has gone on.
     """
     late = np.zeros(len(starts_ns), np.int64)
-    first: dict[int, Transaction] = {}
+    first: dict[int, LedgerTransaction] = {}
     for one in found:
         index = int(np.searchsorted(starts_ns, one.handed_ns, side="right")) - 1
         if index >= 0 and one.handed_ns <= starts_ns[index] + walls_ns[index]:

@@ -20,7 +20,7 @@ from matplotlib.ticker import FuncFormatter, NullFormatter
 from numpy.typing import NDArray
 
 from dxlrun.analysis.latency import ROUGH_NS, first_deadline_ns
-from dxlrun.analysis.steering import Pause, Steering
+from dxlrun.analysis.steering import Pause, SteeringHistory
 from dxlrun.log.reader import Log
 from dxlrun.run.channels.cycle import Floats
 
@@ -264,7 +264,7 @@ def run_time_s(log: Log) -> Floats:
 
 
 @dataclass(frozen=True, slots=True)
-class Marks:
+class JointMarks:
     """Cycles in which one joint's samples have to be read with care; shape (cycles,) each."""
 
     late: NDArray[np.bool_]
@@ -277,7 +277,7 @@ class Marks:
     """The last gate changed the command."""
 
     @classmethod
-    def of(cls, log: Log, row: int) -> Marks:
+    def of(cls, log: Log, row: int) -> JointMarks:
         """Return the marks of the joint in this row."""
         cycles = log.cycles
         return cls(
@@ -304,7 +304,7 @@ class SteeringMarks:
     @classmethod
     def of(cls, log: Log) -> SteeringMarks:
         """Return the marks of a log; of very many changes none."""
-        steering = Steering()
+        steering = SteeringHistory()
         steering.take(log)
         acts, pauses = steering.finish()
         times = tuple(act.time_s for act in acts if act.kind in _MARKED and not act.refusal)

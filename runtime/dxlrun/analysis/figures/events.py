@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from dxlrun.analysis.bus import Servo
+from dxlrun.analysis.bus import ServoTraffic
 from dxlrun.analysis.figures.drawing import (
     BLUE,
     COLUMNS,
@@ -85,7 +85,7 @@ def _apart(times: Floats, rows: Floats) -> tuple[Floats, Floats]:
     return times[first], rows[first]
 
 
-def reply_drawing(servos: Sequence[Servo]) -> Drawing | None:
+def reply_drawing(servos: Sequence[ServoTraffic]) -> Drawing | None:
     """Return the figure of the reply times; None where no servo answered what it was asked."""
     shown = [servo for servo in servos if servo.asked > servo.lost]
     if not shown:

@@ -21,13 +21,13 @@ from dxlrun.analysis.figures.drawing import (
     Caption,
     Columns,
     Drawing,
-    Marks,
+    JointMarks,
     SteeringMarks,
     draw,
     run_time_s,
     time_axis,
 )
-from dxlrun.analysis.tracking import Joint, reachable
+from dxlrun.analysis.tracking import JointTracking, reachable
 from dxlrun.log.reader import Log
 from dxlrun.run.channels.cycle import Floats
 
@@ -41,11 +41,11 @@ _REACHABLE: dict[str, object] = {"color": PURPLE, "linewidth": 0.9, "linestyle":
 _READ: dict[str, object] = {"color": BLUE, "linewidth": 1.1}
 
 
-def joint_drawings(log: Log, joints: tuple[Joint, ...]) -> tuple[Drawing, ...]:
+def joint_drawings(log: Log, joints: tuple[JointTracking, ...]) -> tuple[Drawing, ...]:
     """Return a figure for each joint, in the order of the log; `log` has at least one cycle."""
     times, columns, steering = run_time_s(log), Columns(len(log.cycles)), SteeringMarks.of(log)
     return tuple(
-        _JointPlot(log, row, joint, times, columns, Marks.of(log, row), steering).drawing()
+        _JointPlot(log, row, joint, times, columns, JointMarks.of(log, row), steering).drawing()
         for row, joint in enumerate(joints)
     )
 
@@ -58,7 +58,7 @@ def _spread(axes: Axes, least: float) -> None:
         axes.set_ylim(low - missing, high + missing)
 
 
-def _followed(joint: Joint) -> str:
+def _followed(joint: JointTracking) -> str:
     """Return lag, settling and error at rest in words, as far as they are known."""
     parts = []
     if joint.lag_ms is not None:
@@ -76,10 +76,10 @@ class _JointPlot:
 
     log: Log
     row: int
-    joint: Joint
+    joint: JointTracking
     times: Floats
     columns: Columns
-    marks: Marks
+    marks: JointMarks
     steering: SteeringMarks
 
     def drawing(self) -> Drawing:

@@ -15,11 +15,11 @@ import msgspec
 from dxlrun.analysis.bus import joints_of
 from dxlrun.analysis.ledger.faults import FaultAnswers, UncausedEvent, answered, uncaused
 from dxlrun.analysis.ledger.overruns import Lateness, OverrunCauses, lateness, overrun_causes
-from dxlrun.analysis.ledger.streams import WAYS, Span, Stream, Way, differing, logged, seen
+from dxlrun.analysis.ledger.streams import WAYS, ByteStream, Span, Way, differing, logged, seen
 from dxlrun.analysis.report import once
 from dxlrun.errors import InputError, counted
 from dxlrun.log.reader import UNREADABLE, Log
-from dxlrun.output.table import Cell, Column, Line, Part, Table, Value, flagged, microseconds, numbers
+from dxlrun.output.table import Cell, Column, Part, Sentence, Table, Value, flagged, microseconds, numbers
 from dxlrun.run.channels.events import Event, EventCode, LostRecords
 from dxlrun.run.channels.packets import LoggedPacket, PacketKind
 from dxlrun.simulation import LedgerEntry
@@ -35,7 +35,7 @@ RING_NS = 20_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class Difference:
+class StreamDifference:
     """Bytes that are in one record of a bus and not in the other."""
 
     seconds: float
@@ -78,7 +78,7 @@ class LedgerReport:
     """The same, and each fault was noticed that no run bears in silence, and each event has a cause."""
     sentences: tuple[str, ...]
     buses: tuple[ComparedBus, ...]
-    differences: tuple[Difference, ...]
+    differences: tuple[StreamDifference, ...]
     """In order of time."""
     faults: tuple[FaultAnswers, ...]
     """What was injected during the run."""
@@ -107,7 +107,7 @@ def compare(log: Log, entries: Sequence[LedgerEntry], ledger: Path) -> LedgerRep
             "a ledger is only good for the runs that used its simulated buses"
         )
     buses: list[ComparedBus] = []
-    differences: list[Difference] = []
+    differences: list[StreamDifference] = []
     for index, name in enumerate(log.buses):
         packets = sorted((p for p in log.packets if p.bus == index), key=lambda packet: packet.first_ns)
         found = _differences(log, packets, by_bus[name], (begin_ns, end_ns))
@@ -167,9 +167,9 @@ def _by_bus(log: Log, entries: Sequence[LedgerEntry], ledger: Path) -> dict[str,
 
 def _differences(
     log: Log, packets: Sequence[LoggedPacket], entries: Sequence[LedgerEntry], run: tuple[int, int]
-) -> list[Difference]:
+) -> list[StreamDifference]:
     """Return how the log and the ledger of one bus differ during the run."""
-    found: list[Difference] = []
+    found: list[StreamDifference] = []
     begin_ns = min((packet.first_ns for packet in log.packets), default=0)
     looked_ns = max((packet.last_ns for packet in packets), default=run[0])
     name = log.buses[packets[0].bus] if packets else (entries[0].bus if entries else "")
@@ -181,7 +181,7 @@ def _differences(
             unread = way == "received" and trailing and t_ns >= looked_ns
             late = "came after the host had read for the last time" if unread else ""
             found.append(
-                Difference(
+                StreamDifference(
                     seconds=(t_ns - begin_ns) / 1e9,
                     bus=name,
                     way=way,
@@ -193,7 +193,7 @@ def _differences(
     return found
 
 
-def _when(span: Span, mine: Stream, theirs: Stream) -> int:
+def _when(span: Span, mine: ByteStream, theirs: ByteStream) -> int:
     in_ledger = span.ledger_stop > span.ledger_start
     return theirs.time_at(span.ledger_start) if in_ledger else mine.time_at(span.log_start)
 
@@ -221,7 +221,7 @@ def _of_packets(event: Event) -> bool:
 
 
 def _bus(
-    name: str, packets: Sequence[LoggedPacket], found: Sequence[Difference], outside: int
+    name: str, packets: Sequence[LoggedPacket], found: Sequence[StreamDifference], outside: int
 ) -> ComparedBus:
     size = dict.fromkeys(PacketKind, 0)
     number = dict.fromkeys(PacketKind, 0)
@@ -308,7 +308,7 @@ def parts(report: LedgerReport) -> tuple[Part, ...]:
     """Return what a terminal shows: sentences, then one table a subject that has rows."""
     first, *others = report.sentences
     return (
-        Line(first, "good" if report.good else "error"),
+        Sentence(first, "good" if report.good else "error"),
         *others,
         _buses_table(report.buses),
         _differences_table(report.differences),
@@ -346,7 +346,7 @@ def _buses_table(buses: Sequence[ComparedBus]) -> Table:
     return Table.of("Buses", columns, rows)
 
 
-def _differences_table(differences: Sequence[Difference]) -> Table:
+def _differences_table(differences: Sequence[StreamDifference]) -> Table:
     columns = [
         Column("at, s", form="{:.6f}"),
         Column("bus", "name"),

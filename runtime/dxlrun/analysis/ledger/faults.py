@@ -91,7 +91,7 @@ Joints = Mapping[tuple[str, int], str]
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class EventAnswer:
     """An event of the log that came soon after a fault, of its servo or bus and of a kind that fits it."""
 
     name: str
@@ -108,7 +108,7 @@ class FaultAnswers:
     """Since the log's first packet."""
     bus: str
     text: str
-    answers: tuple[Answer, ...]
+    answers: tuple[EventAnswer, ...]
     """In order of time; empty: none, as for a fault that it tolerates."""
     unanswered: tuple[str, ...] = ()
     """Joints and buses whose event is missing."""
@@ -162,7 +162,7 @@ def answered(
             bus=entry.bus,
             text=entry.note.removeprefix(MARK),
             answers=tuple(
-                Answer(event.name, event.source, event.text, (event.t_ns - entry.t_ns) / 1e6)
+                EventAnswer(event.name, event.source, event.text, (event.t_ns - entry.t_ns) / 1e6)
                 for event in events
                 if 0 <= event.t_ns - entry.t_ns <= WINDOW_NS and _answers(event, entry, joints)
             ),

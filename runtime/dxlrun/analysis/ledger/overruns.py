@@ -126,7 +126,7 @@ def _overrun(seconds: float, skipped: int, parts: tuple[int, int, int, int], *, 
     return Overrun(seconds, skipped, cause, *(part / 1e3 for part in parts))
 
 
-def _found(log: Log, bus: int, entries: Sequence[LedgerEntry]) -> tuple[list[Transaction], Longs]:
+def _found(log: Log, bus: int, entries: Sequence[LedgerEntry]) -> tuple[list[LedgerTransaction], Longs]:
     """Return what was answered on a bus, and how long the kernel kept the end of each answer, ns."""
     packets = sorted((p for p in log.packets if p.bus == bus), key=lambda packet: packet.first_ns)
     sent = [(p.first_ns, len(p.data)) for p in packets if p.kind is PacketKind.INSTRUCTION]
@@ -148,7 +148,7 @@ class _Waits:
     woken: Longs
     read: Longs
 
-    def late(self, found: Iterable[Transaction]) -> tuple[Longs, Longs]:
+    def late(self, found: Iterable[LedgerTransaction]) -> tuple[Longs, Longs]:
         """Return how long each cycle waited for late servos of a bus: in its read, behind its deadline."""
         scheduled, woken = self.scheduled, self.woken
         in_read, in_idle = np.zeros(len(woken), np.int64), np.zeros(len(woken), np.int64)
@@ -162,7 +162,7 @@ class _Waits:
                 in_idle[index + 1] = max(in_idle[index + 1], waited)
         return in_read, in_idle
 
-    def kept(self, found: Sequence[Transaction], kept_ns: Longs) -> Longs:
+    def kept(self, found: Sequence[LedgerTransaction], kept_ns: Longs) -> Longs:
         """Return how long the kernel kept answers of a bus from the read of each cycle, beyond the median."""
         in_read = np.zeros(len(self.woken), np.int64)
         if not found:
@@ -188,7 +188,7 @@ class _Waits:
 
 
 @dataclass(frozen=True, slots=True)
-class Transaction:
+class LedgerTransaction:
     """An instruction that was answered."""
 
     handed_ns: int
@@ -201,7 +201,7 @@ class Transaction:
     """Bytes that came back."""
 
 
-def transactions(entries: Sequence[LedgerEntry], sent: Sent, byte_ns: float) -> Iterator[Transaction]:
+def transactions(entries: Sequence[LedgerEntry], sent: Sent, byte_ns: float) -> Iterator[LedgerTransaction]:
     """Yield what was answered on one bus; without `sent` only the replies' lateness counts."""
     written = _written(entries, sent)
     free_ns = could_be_free_ns = waited_ns = 0.0
@@ -225,8 +225,8 @@ def transactions(entries: Sequence[LedgerEntry], sent: Sent, byte_ns: float) -> 
         yield _answered(last, waited_ns, taken, given)
 
 
-def _answered(last: LedgerEntry, waited_ns: float, taken: int, given: int) -> Transaction:
-    return Transaction(last.t_ns + last.late_ns, round(last.late_ns + waited_ns), taken, given)
+def _answered(last: LedgerEntry, waited_ns: float, taken: int, given: int) -> LedgerTransaction:
+    return LedgerTransaction(last.t_ns + last.late_ns, round(last.late_ns + waited_ns), taken, given)
 
 
 def _written(entries: Sequence[LedgerEntry], sent: Sent) -> dict[int, int]:

@@ -37,7 +37,7 @@ _BLOCK = 1 << 16
 
 
 @dataclass(frozen=True, slots=True)
-class Stream:
+class ByteStream:
     """Bytes in their order, in pieces that have one time each."""
 
     data: bytes
@@ -58,16 +58,16 @@ class Stream:
         piece = int(np.searchsorted(self.times, t_ns, side="left"))
         return int(self.ends[piece - 1]) if piece else 0
 
-    def between(self, begin_ns: int, end_ns: int) -> Stream:
+    def between(self, begin_ns: int, end_ns: int) -> ByteStream:
         """Return the pieces from `begin_ns` to `end_ns`, both included."""
         first = int(np.searchsorted(self.times, begin_ns, side="left"))
         last = int(np.searchsorted(self.times, end_ns, side="right"))
         start = int(self.ends[first - 1]) if first else 0
         stop = int(self.ends[last - 1]) if last else 0
-        return Stream(self.data[start:stop], self.ends[first:last] - start, self.times[first:last])
+        return ByteStream(self.data[start:stop], self.ends[first:last] - start, self.times[first:last])
 
 
-def logged(packets: Sequence[LoggedPacket], way: Way) -> Stream:
+def logged(packets: Sequence[LoggedPacket], way: Way) -> ByteStream:
     """Return what the runtime logged as sent (before each write) or received (after each packet's last read).
 
     `packets` of one bus, in order of time.
@@ -79,13 +79,13 @@ def logged(packets: Sequence[LoggedPacket], way: Way) -> Stream:
     return _stream((packet.data, packet.last_ns) for packet in chosen)
 
 
-def seen(entries: Iterable[LedgerEntry], way: Way) -> Stream:
+def seen(entries: Iterable[LedgerEntry], way: Way) -> ByteStream:
     """Return what the simulated bus took from the host or gave to it. `entries` of one bus."""
     direction = "in" if way == "sent" else "out"
     return _stream((entry.data, entry.t_ns) for entry in entries if entry.direction == direction)
 
 
-def _stream(pieces: Iterable[tuple[bytes, int]]) -> Stream:
+def _stream(pieces: Iterable[tuple[bytes, int]]) -> ByteStream:
     data = bytearray()
     ends: list[int] = []
     times: list[int] = []
@@ -94,7 +94,7 @@ def _stream(pieces: Iterable[tuple[bytes, int]]) -> Stream:
         ends.append(len(data))
         times.append(t_ns)
     rising = np.maximum.accumulate(np.array(times, np.int64)) if times else np.zeros(0, np.int64)
-    return Stream(bytes(data), np.array(ends, np.int64), rising)
+    return ByteStream(bytes(data), np.array(ends, np.int64), rising)
 
 
 # Where two streams that should be one differ: the fewest bytes that one of them lacks, in place
@@ -110,7 +110,7 @@ class Span:
     ledger_stop: int
 
 
-def differing(log: Stream, ledger: Stream) -> list[Span]:
+def differing(log: ByteStream, ledger: ByteStream) -> list[Span]:
     """Return where the streams differ, in order; empty when they are the same bytes."""
     spans: list[Span] = []
     at = there = 0
@@ -142,7 +142,7 @@ def _same_from(one: bytes, at: int, other: bytes, there: int) -> int:
     return most
 
 
-def _in_step_again(log: Stream, at: int, ledger: Stream, there: int) -> tuple[int, int]:
+def _in_step_again(log: ByteStream, at: int, ledger: ByteStream, there: int) -> tuple[int, int]:
     """Return the nearest place behind a difference from which both go on alike; their ends if none is."""
     here_ns, there_ns = log.time_at(at), ledger.time_at(there)
     # what lies far behind the other in time can have no partner there: one of them has a hole
@@ -158,7 +158,9 @@ def _in_step_again(log: Stream, at: int, ledger: Stream, there: int) -> tuple[in
     return best[1:] if best[1] >= 0 else _beyond(log, at, ledger, there)
 
 
-def _anchored(log: Stream, here: int, ledger: Stream, there: int, skipped: int) -> tuple[int, int, int]:
+def _anchored(
+    log: ByteStream, here: int, ledger: ByteStream, there: int, skipped: int
+) -> tuple[int, int, int]:
     """Return the cost of going on at `here`, and from where in both; a cost beyond reach where none is alike.
 
     The same request goes out in every cycle, so where its bytes are found is not yet where it is: what was
@@ -176,7 +178,7 @@ def _anchored(log: Stream, here: int, ledger: Stream, there: int, skipped: int) 
     return best
 
 
-def _beyond(log: Stream, at: int, ledger: Stream, there: int) -> tuple[int, int]:
+def _beyond(log: ByteStream, at: int, ledger: ByteStream, there: int) -> tuple[int, int]:
     """Go on where both are a reach later: nothing nearby is alike."""
     later_ns = max(log.time_at(at), ledger.time_at(there)) + _REACH_NS // 10
     return max(at + 1, log.first_from(later_ns)), max(there + 1, ledger.first_from(later_ns))

@@ -5,9 +5,7 @@ Each is one request to the gateway of the run: executed at the start of a cycle,
 
 from __future__ import annotations
 
-import json
-import textwrap
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -16,7 +14,8 @@ from cyclopts import Parameter
 
 from dxlrun.cli.inputs import Flag, JsonFlag
 from dxlrun.errors import DxlrunError, InputError, Refused, suggestion
-from dxlrun.output.terminal import out, print_error
+from dxlrun.output.table import Column, Table
+from dxlrun.output.terminal import print_error, show, show_json, show_json_line
 
 if TYPE_CHECKING:
     from dxlrun.remote.client import Executed, RemoteRobot
@@ -75,16 +74,13 @@ def list_robots(*, robot: str | None = None, as_json: JsonFlag = False, debug: F
         except DxlrunError as error:  # it may have ended meanwhile; the others are listed
             print_error(f"dxlrun: {error}")
             code = 1
-    console = out()
     if as_json:
-        console.file.write(json.dumps(found, indent=2, ensure_ascii=False) + "\n")
+        show_json(found)
         return code
     for info in found:
-        console.print(headline(info), markup=False, soft_wrap=True)
-        for line in controllers(info, console.width):
-            console.print(line, markup=False, soft_wrap=True)
+        show(headline(info), controllers(info))
     if not names:
-        console.print("no robot runs that could be steered; `dxlrun ROBOT.yaml` starts one", soft_wrap=True)
+        show("no robot runs that could be steered; `dxlrun ROBOT.yaml` starts one")
     return code
 
 
@@ -257,12 +253,11 @@ def _robot(chosen: Chosen, verb: str) -> RemoteRobot:
 
 
 def _done(robot: RemoteRobot, chosen: Chosen, done: Executed | None, sentence: str) -> int:
-    console = out()
     if chosen.as_json:
         cycle = {} if done is None else {"cycle": done.cycle}
-        console.file.write(json.dumps({"robot": robot.name, "done": True} | cycle) + "\n")
+        show_json_line({"robot": robot.name, "done": True} | cycle)
     else:
-        console.print(sentence, markup=False, soft_wrap=True)
+        show(sentence)
     return 0
 
 
@@ -274,24 +269,27 @@ def headline(info: Mapping[str, object]) -> str:
     return f"{info['name']}: {info['rate']:g} Hz{paused}, {info['cycles']} cycles, {periods}, {log}"
 
 
-def controllers(info: Mapping[str, object], width: int) -> Iterator[str]:
-    """Yield a line for each controller, and below it its joints in their order, wrapped to the terminal."""
-    rows = info["controllers"]
-    listed = rows if isinstance(rows, list) else []
-    longest = max((len(one["name"]) for one in listed), default=0)
-    for one in listed:
-        takes = "; ".join(command(kind, schema) for kind, schema in one["takes"].items())
-        line = f"  {one['name']:{longest}}  {state(one):8}  {one['rate']:6g} Hz  {takes}"
-        yield line.rstrip()
-        if one["command"]:  # a broadcaster has no joints of its own
-            yield textwrap.fill(
-                "moves " + ", ".join(one["joints"]),
-                max(width - 1, 20),
-                initial_indent="      ",
-                subsequent_indent="      ",
-                break_long_words=False,
-                break_on_hyphens=False,
-            )
+def controllers(info: Mapping[str, object]) -> Table:
+    """Return a row for each controller, with the commands that it takes and its joints in their order."""
+    columns = [
+        Column("controller", "name"),
+        Column("state", "name"),
+        Column("rate", form="{:g} Hz"),
+        Column("takes", "text"),
+        Column("moves", "text"),
+    ]
+    listed = info["controllers"]
+    rows = [
+        (
+            one["name"],
+            state(one),
+            one["rate"],
+            "; ".join(command(kind, schema) for kind, schema in one["takes"].items()),
+            ", ".join(one["joints"]) if one["command"] else "",  # a broadcaster has no joints of its own
+        )
+        for one in (listed if isinstance(listed, list) else [])
+    ]
+    return Table.of("", columns, rows)
 
 
 def state(controller: Mapping[str, object]) -> str:
