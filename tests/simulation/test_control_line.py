@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.simulation.pseudo_terminal import Link
+from dxlrun.simulation.pseudo_terminal import DeviceLink
 from dxlrun.simulation.server import ControlLine
 
 
@@ -34,8 +34,8 @@ def test_a_link_never_replaces_a_file_and_is_removed_only_where_it_was_put(tmp_p
     file, link = tmp_path / "file", tmp_path / "link"
     file.write_text("mine")
     with pytest.raises(FileExistsError, match="is no link"):
-        Link(file).point("/dev/null")
-    one, other = Link(link), Link(link)
+        DeviceLink(file).point("/dev/null")
+    one, other = DeviceLink(link), DeviceLink(link)
     one.point("/dev/null")
     other.point("/dev/zero")
     one.remove()

@@ -9,7 +9,7 @@ import pytest
 
 from dxlrun.dynamixel.control_table import ControlTable, all_tables, control_table
 from dxlrun.simulation import Load
-from dxlrun.simulation.motion.control_law import LIMP, Command
+from dxlrun.simulation.motion.control_law import LIMP, ServoCommand
 from dxlrun.simulation.motion.mechanics import (
     AMBIENT_C,
     COOLING_S,
@@ -25,7 +25,7 @@ MOTOR = Motor(stall_torque=2.0, damping=1 / 3, torque_per_ampere=2.0, voltage=12
 S = 1_000_000_000
 
 
-def one(command: Command = LIMP, load: Load | None = None, angle: float = 0.0) -> Mechanics:
+def one(command: ServoCommand = LIMP, load: Load | None = None, angle: float = 0.0) -> Mechanics:
     mechanics = Mechanics(0)
     mechanics.add(MOTOR, load or Load(), angle)
     mechanics.command(0, command)
@@ -36,8 +36,8 @@ def state(mechanics: Mechanics) -> tuple[float, float]:
     return float(mechanics.plant.angle[0]), float(mechanics.plant.velocity[0])
 
 
-def pid(p: float, goal: float, **rest: float) -> Command:
-    return Command(goal=goal, p_ccw=p, p_cw=p, limit=1.0)._replace(**rest)
+def pid(p: float, goal: float, **rest: float) -> ServoCommand:
+    return ServoCommand(goal=goal, p_ccw=p, p_cw=p, limit=1.0)._replace(**rest)
 
 
 def is_scaled(table: ControlTable) -> bool:
@@ -49,28 +49,28 @@ def is_scaled(table: ControlTable) -> bool:
 
 @pytest.mark.parametrize("duty", [1.0, 0.5, -0.25])
 def test_an_unloaded_motor_turns_at_its_duty_of_the_no_load_speed(duty: float) -> None:
-    mechanics = one(Command(bias=duty, limit=1.0))
+    mechanics = one(ServoCommand(bias=duty, limit=1.0))
     mechanics.advance(S)
     assert state(mechanics)[1] == pytest.approx(6.0 * duty)
 
 
 def test_speed_falls_with_torque_in_a_line_down_to_stall() -> None:
-    half = one(Command(bias=1.0, limit=1.0), Load(friction=1.0))
+    half = one(ServoCommand(bias=1.0, limit=1.0), Load(friction=1.0))
     half.advance(S)
     assert state(half)[1] == pytest.approx(3.0)
-    stalled = one(Command(bias=1.0, limit=1.0), Load(friction=2.01))
+    stalled = one(ServoCommand(bias=1.0, limit=1.0), Load(friction=2.01))
     stalled.advance(S)
     assert state(stalled) == (0.0, 0.0)
 
 
 def test_it_comes_to_speed_with_the_time_constant_of_motor_and_load() -> None:
-    mechanics = one(Command(bias=1.0, limit=1.0), Load(inertia=0.03))
+    mechanics = one(ServoCommand(bias=1.0, limit=1.0), Load(inertia=0.03))
     mechanics.advance(100_000_000)  # 0.033 kg m^2 * 6 rad/s / 2 Nm = 0.099 s
     assert state(mechanics)[1] == pytest.approx(6.0 * (1 - math.exp(-0.1 / 0.099)), rel=0.02)
 
 
 def test_less_voltage_is_less_speed_and_less_torque() -> None:
-    mechanics = one(Command(bias=1.0, limit=1.0), Load(friction=0.5))
+    mechanics = one(ServoCommand(bias=1.0, limit=1.0), Load(friction=0.5))
     mechanics.supply(0, 9.0)
     mechanics.advance(S)
     assert state(mechanics)[1] == pytest.approx(6.0 * 0.75 - 0.5 / MOTOR.damping)
@@ -80,7 +80,7 @@ def test_every_model_has_a_motor_that_turns() -> None:
     mechanics, tables = Mechanics(0), all_tables()
     for table in tables:
         index = mechanics.add(motor_of(table), Load(), 0.0)
-        mechanics.command(index, Command(bias=1.0, limit=1.0))
+        mechanics.command(index, ServoCommand(bias=1.0, limit=1.0))
     mechanics.advance(S // 2)
     speeds = [motor_of(table).no_load_speed for table in tables]
     assert mechanics.plant.velocity == pytest.approx(speeds, rel=1e-3)
@@ -92,10 +92,10 @@ def test_every_model_has_a_motor_that_turns() -> None:
 
 
 def test_current_control_holds_the_torque_up_to_what_the_voltage_gives() -> None:
-    mechanics = one(Command(bias=1.0, limit=1.0, torque_limit=0.5), Load(inertia=1.0))
+    mechanics = one(ServoCommand(bias=1.0, limit=1.0, torque_limit=0.5), Load(inertia=1.0))
     mechanics.advance(S)
     assert state(mechanics)[1] == pytest.approx(0.5 / 1.003, rel=0.01)
-    free = one(Command(bias=1.0, limit=1.0, torque_limit=0.5))
+    free = one(ServoCommand(bias=1.0, limit=1.0, torque_limit=0.5))
     free.advance(S)
     assert state(free)[1] == pytest.approx(6.0)
 
@@ -214,7 +214,7 @@ def times_of(mechanics: Mechanics, planned: tuple[int, ...]) -> list[int]:
 
 
 def test_what_is_planned_happens_at_its_time_moving_or_at_rest() -> None:
-    for command in (LIMP, Command(bias=1.0, limit=1.0)):
+    for command in (LIMP, ServoCommand(bias=1.0, limit=1.0)):
         assert times_of(one(command), (1_500_000_001, 300_000_000)) == [300_000_000, 1_502_000_000]
 
 
@@ -230,7 +230,7 @@ def test_a_servo_at_rest_wakes_for_a_new_goal() -> None:
 
 
 def test_copper_warms_by_the_square_of_the_torque_and_cools_again() -> None:
-    mechanics = one(Command(bias=0.5, limit=1.0), Load(friction=2.0))
+    mechanics = one(ServoCommand(bias=0.5, limit=1.0), Load(friction=2.0))
     mechanics.advance(60 * S)
     warm = AMBIENT_C + STALLED_RISE_C * 0.25 * (1 - math.exp(-60 / COOLING_S))
     assert mechanics.strain.temperature[0] == pytest.approx(warm, rel=0.01)

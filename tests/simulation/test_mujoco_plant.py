@@ -17,7 +17,7 @@ from dxlrun.simulation.configuration import NO_LOAD
 from dxlrun.simulation.motion.mechanics import Mechanics
 from dxlrun.simulation.motion.motor import Motor
 from dxlrun.simulation.motion.mujoco_plant import mujoco_plant
-from dxlrun.simulation.motion.plant import IndependentJoints, Joint, Plant
+from dxlrun.simulation.motion.plant import IndependentJoints, Plant, PlantJoint
 
 STEP_S = 0.002
 MASS, ARM = 0.5, 0.2
@@ -63,7 +63,7 @@ def _plant(
     urdf: str, *joints: UrdfJoint, angles: Sequence[float] = (), load: Load = NO_LOAD, rotor: Motor = ROTOR
 ) -> Plant:
     placed = [angles[row] if angles else joint.reference for row, joint in enumerate(joints)]
-    return mujoco_plant(UrdfBodies(urdf, joints))([Joint(rotor, load, angle) for angle in placed])
+    return mujoco_plant(UrdfBodies(urdf, joints))([PlantJoint(rotor, load, angle) for angle in placed])
 
 
 def _run(plant: Plant, seconds: float, drive: float | Sequence[float] = 0.0, damping: float = 0.0) -> None:
@@ -76,7 +76,7 @@ def _run(plant: Plant, seconds: float, drive: float | Sequence[float] = 0.0, dam
 def test_a_joint_without_weight_moves_as_an_independent_one(rotor: Motor) -> None:
     load = Load(inertia=MASS * ARM**2, friction=0.05)
     bodies = _plant(FLAT, UrdfJoint("shoulder", 0.0, 1), load=load, rotor=rotor)
-    alone = IndependentJoints([Joint(rotor, load, 0.0)])
+    alone = IndependentJoints([PlantJoint(rotor, load, 0.0)])
     rng = np.random.default_rng(3)
     ways = []
     for _ in range(200):
@@ -93,7 +93,7 @@ def test_a_joint_without_weight_moves_as_an_independent_one(rotor: Motor) -> Non
 def test_a_joint_with_weight_swings_as_an_independent_one() -> None:
     load = Load(inertia=MASS * ARM**2, gravity=PULL, gravity_angle=-math.pi / 2)
     bodies = _plant(ONE, UrdfJoint("shoulder", 0.0, 1))
-    alone = IndependentJoints([Joint(ROTOR, load, 0.0)])
+    alone = IndependentJoints([PlantJoint(ROTOR, load, 0.0)])
     _run(bodies, 0.5, damping=0.02)
     _run(alone, 0.5, damping=0.02)
     assert alone.angle[0] < -math.pi / 2, "it swung past the bottom, beyond the limit that is drawn"
@@ -131,7 +131,7 @@ def test_friction_holds_what_it_can_hold() -> None:
 def test_friction_of_the_gear_grows_with_what_pulls_at_it(pulled: float, falls: bool, bodies: bool) -> None:
     gear = dataclasses.replace(ROTOR, load_friction=0.2)
     # held with 1 - p of the pull: friction is 0.2 of the sum of both, which the difference must not exceed
-    plant: Plant = IndependentJoints([Joint(gear, Load(MASS * ARM**2, 0.0, PULL, -math.pi / 2), 0.0)])
+    plant: Plant = IndependentJoints([PlantJoint(gear, Load(MASS * ARM**2, 0.0, PULL, -math.pi / 2), 0.0)])
     if bodies:
         plant = _plant(ONE, UrdfJoint("shoulder", 0.0, 1), rotor=gear)
     _run(plant, 2.0, drive=(1 - pulled) * PULL, damping=0.05)
@@ -174,7 +174,7 @@ def test_what_the_urdf_does_not_turn_moves_by_itself_and_what_no_servo_turns_res
     three_links = PULL * (1 + 2 + 3)
     _run(plant, 1.0, drive=[0.0, three_links, 0.02], damping=0.5)
     assert plant.angle[:2] == pytest.approx([0.5, 0.0], abs=1e-6)
-    alone = IndependentJoints([Joint(ROTOR, NO_LOAD, 1.5)])
+    alone = IndependentJoints([PlantJoint(ROTOR, NO_LOAD, 1.5)])
     _run(alone, 1.0, drive=0.02, damping=0.5)
     assert plant.angle[2] == alone.angle[0] > 1.5
 
@@ -193,7 +193,7 @@ def test_a_joint_with_a_servo_of_its_own_mimics_no_joint() -> None:
 def test_a_servo_that_is_added_later_moves_by_itself() -> None:
     make = mujoco_plant(UrdfBodies(ONE, (UrdfJoint("shoulder", 0.0, 1),)))
     assert len(make(()).angle) == 0
-    plant = make([Joint(ROTOR, NO_LOAD, 0.0), Joint(ROTOR, NO_LOAD, 2.0)])
+    plant = make([PlantJoint(ROTOR, NO_LOAD, 0.0), PlantJoint(ROTOR, NO_LOAD, 2.0)])
     _run(plant, 1.0, drive=[PULL, 0.0], damping=0.1)
     assert plant.angle == pytest.approx([0.0, 2.0], abs=1e-6)
 

@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dxlrun.simulation.motion.control_law import LIMP, Command, Profiles
+from dxlrun.simulation.motion.control_law import LIMP, Profiles, ServoCommand
 
 DT = 0.002
 
 
-def profile(command: Command, start: float = 0.0) -> Profiles:
+def profile(command: ServoCommand, start: float = 0.0) -> Profiles:
     return Profiles(np.array([command]).T.copy(), np.array([start]), DT)
 
 
@@ -30,7 +30,7 @@ def run(profiles: Profiles, seconds: float) -> list[tuple[float, float]]:
 def test_from_rest_it_reaches_the_goal_within_its_bounds_and_never_passes_it(
     start: float, goal: float, speed: float, acceleration: float
 ) -> None:
-    profiles = profile(Command(goal=goal, speed=speed, acceleration=acceleration), start)
+    profiles = profile(ServoCommand(goal=goal, speed=speed, acceleration=acceleration), start)
     distance = abs(goal - start)
     seen = run(profiles, distance / speed + speed / acceleration + 2 * (distance / acceleration) ** 0.5 + 0.1)
     low, high = min(start, goal) - 1e-9, max(start, goal) + 1e-9
@@ -43,19 +43,19 @@ def test_from_rest_it_reaches_the_goal_within_its_bounds_and_never_passes_it(
 
 def test_a_long_way_takes_the_time_of_a_trapezoid() -> None:
     # 0.2 s up to 2 rad/s, 0.2 s down, 0.4 rad in both: 2.6 rad at 2 rad/s between
-    seen = run(profile(Command(goal=3.0, speed=2.0, acceleration=10.0)), 2.0)
+    seen = run(profile(ServoCommand(goal=3.0, speed=2.0, acceleration=10.0)), 2.0)
     arrived = next(index for index, (position, _) in enumerate(seen) if position > 3.0 - 1e-6)
     assert arrived * DT == pytest.approx(0.2 + 1.3 + 0.2, abs=3 * DT)
     assert seen[round(0.85 / DT)] == pytest.approx((1.5, 2.0), abs=2 * 2.0 * DT)
 
 
 def test_without_acceleration_it_is_a_rectangle_and_without_speed_a_step() -> None:
-    assert run(profile(Command(goal=1.0, speed=2.0)), 0.3)[-1] == pytest.approx((0.6, 2.0))
-    assert run(profile(Command(goal=1.0)), DT)[0][0] == pytest.approx(1.0)
+    assert run(profile(ServoCommand(goal=1.0, speed=2.0)), 0.3)[-1] == pytest.approx((0.6, 2.0))
+    assert run(profile(ServoCommand(goal=1.0)), DT)[0][0] == pytest.approx(1.0)
 
 
 def test_another_goal_on_the_way_is_taken_up_with_the_velocity_that_it_has() -> None:
-    profiles = profile(Command(goal=3.0, speed=2.0, acceleration=10.0))
+    profiles = profile(ServoCommand(goal=3.0, speed=2.0, acceleration=10.0))
     before = run(profiles, 0.5)[-1]
     profiles.aim(0, -1.0, 2.0, 10.0)
     after = run(profiles, 3.0)
@@ -65,7 +65,7 @@ def test_another_goal_on_the_way_is_taken_up_with_the_velocity_that_it_has() -> 
 
 
 def test_turning_continues_for_ever_and_never_arrives() -> None:
-    profiles = profile(Command(speed=-2.0, acceleration=10.0, turning=1.0))
+    profiles = profile(ServoCommand(speed=-2.0, acceleration=10.0, turning=1.0))
     seen = run(profiles, 1.2)
     assert seen[round(0.1 / DT) - 1][1] == pytest.approx(-1.0)
     assert seen[-1] == pytest.approx((-0.2 - 2.0, -2.0), abs=0.01)

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dxlrun.simulation.wire.packets import GroupRead, InstructionPacket, ReadEntry, Reply
+from dxlrun.simulation.wire.packets import GroupRead, InstructionPacket, ReadEntry, ServoReply
 from dxlrun.simulation.wire.protocol2 import (
     FastStatusPacket,
     Instruction,
@@ -154,8 +154,8 @@ def test_ids_that_cannot_be_begin_no_packet(servo_id: int) -> None:
 
 def test_fast_status_of_the_manual_s_form() -> None:
     status = FastStatusPacket((4, 4))
-    first = status.part(Reply(1, 0, bytes.fromhex("a6000000"), 0))
-    second = status.part(Reply(2, 0x80, bytes.fromhex("1f080000"), 0))
+    first = status.part(ServoReply(1, 0, bytes.fromhex("a6000000"), 0))
+    second = status.part(ServoReply(2, 0x80, bytes.fromhex("1f080000"), 0))
     whole = first + second
     assert whole[:8] == bytes.fromhex("fffffd00 fe 1100 55")
     assert int.from_bytes(whole[5:7], "little") == len(whole) - 7
@@ -167,7 +167,7 @@ def test_fast_status_of_the_manual_s_form() -> None:
 
 def test_fast_bulk_status_of_the_manual() -> None:
     status = FastStatusPacket((4, 2, 1))
-    parts = [status.part(Reply(each, 0, bytes.fromhex(data), 0)) for each, data in FAST_BULK]
+    parts = [status.part(ServoReply(each, 0, bytes.fromhex(data), 0)) for each, data in FAST_BULK]
     assert b"".join(parts) == bytes.fromhex(
         "fffffd00 fe 1400 55 00 03 a6000000 67a4  00 07 a501 2474  00 04 1f d9c1"
     )
@@ -178,7 +178,7 @@ FAST_BULK = ((3, "a6000000"), (7, "a501"), (4, "1f"))
 
 def test_fast_status_is_not_stuffed() -> None:
     data = bytes.fromhex("fffffd00")
-    assert data + bytes(0) in FastStatusPacket((4,)).part(Reply(1, 0, data, 0))[8:]
+    assert data + bytes(0) in FastStatusPacket((4,)).part(ServoReply(1, 0, data, 0))[8:]
 
 
 @pytest.mark.parametrize(

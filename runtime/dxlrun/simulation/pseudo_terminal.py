@@ -31,7 +31,7 @@ class PseudoTerminal:
     so before each packet.
     """
 
-    def __init__(self, bus: SimulatedBus, link: Link | None = None) -> None:
+    def __init__(self, bus: SimulatedBus, link: DeviceLink | None = None) -> None:
         self.bus = bus
         self._link = link
         self._master, self._slave = self._new_pair()
@@ -127,7 +127,7 @@ class PseudoTerminal:
             self._link.remove()
 
 
-class Link:
+class DeviceLink:
     """Points at one path after the other; never replaces anything that is not a link."""
 
     def __init__(self, path: Path) -> None:

@@ -19,7 +19,7 @@ from dxlrun.simulation.configuration import SimulationConfig
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.simulation.motion.mechanics import Mechanics, plant_of
-from dxlrun.simulation.pseudo_terminal import Link, PseudoTerminal
+from dxlrun.simulation.pseudo_terminal import DeviceLink, PseudoTerminal
 from dxlrun.simulation.realtime import PollBudget
 from dxlrun.simulation.servo.memory import Memory
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
@@ -122,7 +122,9 @@ class Server:
         self._faults = FaultScript([parse_fault(text) for text in config.faults], config.seed)
         self._faults.attach(self._buses, start_ns=self.start_ns)
         self._terminals = tuple(
-            PseudoTerminal(bus, Link(Path(config.links[bus.name])) if bus.name in config.links else None)
+            PseudoTerminal(
+                bus, DeviceLink(Path(config.links[bus.name])) if bus.name in config.links else None
+            )
             for bus in self._buses
         )
         self._polling = PollBudget(self.start_ns)

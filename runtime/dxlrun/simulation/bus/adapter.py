@@ -28,7 +28,7 @@ HandOver = tuple[int, bytes, Sequence[Transmission]]
 """When bytes are planned for the host, the bytes, and what the host has then received to its end."""
 
 
-class Adapter:
+class SimulatedAdapter:
     """Holds what has passed the wire until the host receives it."""
 
     def __init__(self, config: AdapterConfig, start_ns: int) -> None:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from dxlrun.simulation.wire.packets import Reply
+from dxlrun.simulation.wire.packets import ServoReply
 
 MOST_PASSING = 512
 """Packets on their way to the host at once: a host that floods a line on virtual time fills no memory."""
@@ -25,7 +25,7 @@ class Turn(NamedTuple):
     """One servo's turn in a group read."""
 
     servo_id: int
-    replies: tuple[tuple[Reply, bytes], ...]
+    replies: tuple[tuple[ServoReply, bytes], ...]
     """Reply and its bytes; two servos may share an ID, and an absent one has none."""
     slot_bytes: int
     """Bytes of a whole reply: the turn is over when they would have passed."""
@@ -73,7 +73,7 @@ class Transmission:
         return self.note != ECHO and self.first_ns < end_ns and begin_ns < self.due_ns
 
 
-class Line:
+class SimulatedLine:
     """What servos and noise put on one line, in the order in which it ends."""
 
     def __init__(self, baud_rate: int, note: Callable[[str], None]) -> None:

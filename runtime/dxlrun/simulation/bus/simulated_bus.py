@@ -25,16 +25,16 @@ from dataclasses import replace
 from operator import attrgetter
 from typing import NamedTuple
 
-from dxlrun.simulation.bus.adapter import Adapter
+from dxlrun.simulation.bus.adapter import SimulatedAdapter
 from dxlrun.simulation.bus.ledger import OTHER_HOST, Ledger
-from dxlrun.simulation.bus.line import ECHO, GroupReply, Line, Transmission, Turn, flipped
+from dxlrun.simulation.bus.line import ECHO, GroupReply, SimulatedLine, Transmission, Turn, flipped
 from dxlrun.simulation.configuration import BusConfig, ServoConfig
 from dxlrun.simulation.motion.mechanics import Mechanics
 from dxlrun.simulation.servo.making import make_servo
 from dxlrun.simulation.servo.memory import IDENTITY
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 from dxlrun.simulation.wire import protocol1, protocol2
-from dxlrun.simulation.wire.packets import Codec, GroupRead, InstructionPacket, Reply
+from dxlrun.simulation.wire.packets import Codec, GroupRead, InstructionPacket, ServoReply
 
 _STATUS_BYTES = 11
 """Bytes of a status packet of Protocol 2.0 without data: the slot of an absent servo is as long [i]."""
@@ -94,8 +94,8 @@ class SimulatedBus:
         """How long after its time the host received the last bytes of each hand-over, in real time."""
         self._codec: Codec = protocol2 if config.protocol == 2.0 else protocol1
         self._receiver = self._codec.receiver()
-        self._line = Line(config.baud_rate, self.note)
-        self._adapter = Adapter(config.adapter, start_ns)
+        self._line = SimulatedLine(config.baud_rate, self.note)
+        self._adapter = SimulatedAdapter(config.adapter, start_ns)
         self._wedged = False
         self._group: GroupReply | None = None
         """The group read whose replies are under way."""
@@ -491,7 +491,7 @@ class SimulatedBus:
             first_ns += duration_ns
         return copies > 0
 
-    def _status(self, reply: Reply) -> bytes:
+    def _status(self, reply: ServoReply) -> bytes:
         return self._codec.status_packet(reply.servo_id, reply.error, reply.parameters)
 
     def _count_packet(self) -> None:

@@ -7,7 +7,6 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from dxlrun.description.units import duration
 from dxlrun.errors import InputError
 
 
@@ -258,6 +257,9 @@ def _number(lowest: float, highest: float) -> Callable[[str], float]:
 
 
 def _time(text: str) -> int:
+    # not above: the process of the simulated buses needs pydantic for nothing else, and it is slow to import
+    from dxlrun.description.units import duration
+
     try:
         return duration(text)
     except ValueError:

@@ -27,7 +27,7 @@ _UNWOUND = 1e-6
 """duty/s; an integral that changes the duty more slowly is as good as constant."""
 
 
-class Command(NamedTuple):
+class ServoCommand(NamedTuple):
     """The inside of one servo for the time until the next command; what is left out is switched off.
 
     `duty` is a part of the supply's voltage at the motor, -1 to 1. Angles are those of the shaft.
@@ -65,10 +65,10 @@ class Command(NamedTuple):
     """Nm, most torque where the motor's current is controlled"""
 
 
-LIMP = Command()
+LIMP = ServoCommand()
 """No torque: the shaft follows what turns it, and the motor brakes it as with closed terminals [i]."""
 
-ROWS = {name: row for row, name in enumerate(Command._fields)}
+ROWS = {name: row for row, name in enumerate(ServoCommand._fields)}
 """Row of each number in an array of all servos."""
 
 

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from dxlrun.simulation.configuration import Load, UrdfBodies
-from dxlrun.simulation.motion.control_law import LIMP, ROWS, Command, ControlLaw, Profiles
+from dxlrun.simulation.motion.control_law import LIMP, ROWS, ControlLaw, Profiles, ServoCommand
 from dxlrun.simulation.motion.motor import Motor
-from dxlrun.simulation.motion.plant import Floats, IndependentJoints, Joint, Plant, PlantMaker
+from dxlrun.simulation.motion.plant import Floats, IndependentJoints, Plant, PlantJoint, PlantMaker
 
 STEP_NS = 2_000_000
 """Step of the grid. The fastest thing in a servo here is its motor's time constant: 13.6 ms and more."""
@@ -126,7 +126,7 @@ class Mechanics:
         self.law.stall[index] = motor.stall_torque * (volts / motor.voltage if motor.voltage else 1.0)
         self._wake()
 
-    def command(self, index: int, command: Command) -> None:
+    def command(self, index: int, command: ServoCommand) -> None:
         """Command a servo; its trajectory continues from where it is, that of a limp one from the shaft."""
         was_limp = self._commands[ROWS["limit"], index] == 0.0
         was_turning = self._commands[ROWS["turning"], index] != 0.0
@@ -140,7 +140,7 @@ class Mechanics:
         self._wake()
 
     def aim(self, index: int, goal: float, speed: float, acceleration: float) -> None:
-        """Change the goal of a servo and its profile, and nothing else; as in `Command`."""
+        """Change the goal of a servo and its profile, and nothing else; as in `ServoCommand`."""
         self.profiles.aim(index, goal, speed, acceleration)
         self.strain.calm = False
         self._disturb()
@@ -266,7 +266,7 @@ class Mechanics:
 
     def _drives(self, index: int) -> bool:
         """Return whether a servo is commanded to a position, a speed, or a torque that is not 0."""
-        command = Command(*self._commands[:, index].tolist())
+        command = ServoCommand(*self._commands[:, index].tolist())
         able = command.limit > 0.0 and command.torque_limit > 0.0
         return able and any((command.bias, command.turning, command.p_ccw, command.p_cw))
 
@@ -292,7 +292,7 @@ class Mechanics:
         count, dt_s = len(self._motors), STEP_NS * 1e-9
         self.plant: Plant = self._make_plant(
             [
-                Joint(motor, load, float(each))
+                PlantJoint(motor, load, float(each))
                 for motor, load, each in zip(self._motors, self._loads, angle, strict=True)
             ]
         )

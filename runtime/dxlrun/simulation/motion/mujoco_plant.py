@@ -15,7 +15,7 @@ import numpy as np
 
 from dxlrun.errors import InputError
 from dxlrun.simulation.configuration import UrdfBodies, UrdfJoint
-from dxlrun.simulation.motion.plant import Floats, IndependentJoints, Joint, PlantMaker
+from dxlrun.simulation.motion.plant import Floats, IndependentJoints, PlantJoint, PlantMaker
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
@@ -69,7 +69,7 @@ def mujoco_plant(bodies: UrdfBodies) -> PlantMaker:
 class MujocoPlant:
     """Joints that feel one another through their bodies; those without a body move by themselves."""
 
-    def __init__(self, urdf: str, turned: Mapping[int, UrdfJoint], joints: Sequence[Joint]) -> None:
+    def __init__(self, urdf: str, turned: Mapping[int, UrdfJoint], joints: Sequence[PlantJoint]) -> None:
         import mujoco
 
         self.angle: Floats = np.array([joint.angle for joint in joints], dtype=np.float64)
@@ -139,7 +139,7 @@ def _make_movable(root: Element, turned: Set[str]) -> None:
                 link.remove(shape)
 
 
-def _compiled(urdf: str, turned: Mapping[str, Joint]) -> MjModel:
+def _compiled(urdf: str, turned: Mapping[str, PlantJoint]) -> MjModel:
     """Return the model with the rotors and frictions of servos at the joints of these names.
 
     Raises ValueError when MuJoCo cannot take the URDF.

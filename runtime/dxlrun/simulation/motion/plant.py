@@ -20,7 +20,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Joint:
+class PlantJoint:
     """One servo's shaft as a plant takes it over."""
 
     motor: Motor
@@ -48,7 +48,7 @@ class Plant(Protocol):
         """Put a joint somewhere, rad, at rest."""
 
 
-PlantMaker = Callable[[Sequence[Joint]], Plant]
+PlantMaker = Callable[[Sequence[PlantJoint]], Plant]
 """Makes the plant of some joints; called again when a servo is added later, with the joints as they are."""
 
 
@@ -59,7 +59,7 @@ class IndependentJoints:
     of `Motor` and of `Load`.
     """
 
-    def __init__(self, joints: Sequence[Joint]) -> None:
+    def __init__(self, joints: Sequence[PlantJoint]) -> None:
         self.angle: Floats = np.array([joint.angle for joint in joints], dtype=np.float64)
         self.velocity: Floats = np.zeros(len(joints))
         self._inverse_inertia = np.array([1.0 / (each.motor.inertia + each.load.inertia) for each in joints])

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import ClassVar
 
 from dxlrun.simulation.configuration import Load
-from dxlrun.simulation.motion.control_law import FREE, Command
+from dxlrun.simulation.motion.control_law import FREE, ServoCommand
 from dxlrun.simulation.motion.mechanics import Mechanics
 from dxlrun.simulation.servo.access import multi_turn_mode, wheel_mode
 from dxlrun.simulation.servo.memory import Memory
@@ -153,31 +153,31 @@ class JointShaft(Shaft):
         ramp = aimed[2] * table.items["goal_acceleration"].scale if aimed[2] else FREE
         return goal, speed, ramp
 
-    def _command(self) -> Command:
+    def _command(self) -> ServoCommand:
         memory, table = self.memory, self.memory.table
         limit = memory["torque_limit"] / 1023
         if memory.get("torque_ctrl_mode_enable"):
             ampere = memory.ticks("goal_torque") * table.items["goal_torque"].scale
             torque = ampere * self.motor.torque_per_ampere
-            return Command(bias=math.copysign(limit, torque), limit=limit, torque_limit=abs(torque))
+            return ServoCommand(bias=math.copysign(limit, torque), limit=limit, torque_limit=abs(torque))
         if wheel_mode(memory):
             return self._wheel(limit)
         return self._pid(limit) if "p_gain" in memory else self._compliance(limit)
 
-    def _wheel(self, limit: float) -> Command:
+    def _wheel(self, limit: float) -> ServoCommand:
         table, ticks = self.memory.table, self.memory.ticks("moving_speed")
         if not self._controls_speed:
-            return Command(bias=ticks / table.max_speed_tick, limit=limit)
+            return ServoCommand(bias=ticks / table.max_speed_tick, limit=limit)
         stiff, damped = _WHEEL_I / table.max_speed, _WHEEL_P / table.max_speed
         speed = ticks * table.rad_s_per_tick
-        return Command(turning=1.0, speed=speed, p_ccw=stiff, p_cw=stiff, d=damped, limit=limit)
+        return ServoCommand(turning=1.0, speed=speed, p_ccw=stiff, p_cw=stiff, d=damped, limit=limit)
 
-    def _compliance(self, limit: float) -> Command:
+    def _compliance(self, limit: float) -> ServoCommand:
         memory = self.memory
         punch = memory["punch"] / 1023
         unit = memory.table.rad_per_tick
         seen = unit / 2 if punch else 0.0  # less than half a tick of error is none
-        return Command(
+        return ServoCommand(
             p_ccw=(1.0 - punch) / (_slope(memory["ccw_compliance_slope"]) * SLOPE_TICK),
             p_cw=(1.0 - punch) / (_slope(memory["cw_compliance_slope"]) * SLOPE_TICK),
             margin_ccw=max(seen, memory["ccw_compliance_margin"] * unit),
@@ -186,7 +186,7 @@ class JointShaft(Shaft):
             limit=limit,
         )
 
-    def _pid(self, limit: float) -> Command:
+    def _pid(self, limit: float) -> ServoCommand:
         """Kp = P / 8, Ki = I * 1000 / 2048, Kd = D * 4 / 1000, in one unit (e-Manual, MX-28, PID Gains).
 
         What Punch does beside PID gains is in no manual: nothing here [?].
@@ -194,7 +194,7 @@ class JointShaft(Shaft):
         memory = self.memory
         unit = 8 * (self.motor.p_gain_duty or 1 / (SLOPE_TIMES_P * SLOPE_TICK))
         p = memory["p_gain"] / 8 * unit
-        return Command(
+        return ServoCommand(
             p_ccw=p,
             p_cw=p,
             i=memory["i_gain"] * 1000 / 2048 * unit,

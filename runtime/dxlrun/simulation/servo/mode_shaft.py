@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import ClassVar
 
 from dxlrun.simulation.configuration import Load
-from dxlrun.simulation.motion.control_law import FREE, LIMP, Command
+from dxlrun.simulation.motion.control_law import FREE, LIMP, ServoCommand
 from dxlrun.simulation.motion.mechanics import Mechanics
 from dxlrun.simulation.motion.motor import Motor
 from dxlrun.simulation.servo.access import watchdog_expired
@@ -170,18 +170,18 @@ class ModeShaft(Shaft):
         threshold = self.memory.get("moving_threshold", 1)
         return max(threshold, 0.5) * self.memory.table.rad_s_per_tick
 
-    def _command(self) -> Command:
+    def _command(self) -> ServoCommand:
         memory, mode = self.memory, self.memory["operating_mode"]
         if watchdog_expired(memory):
             return LIMP
         duty = self._part("goal_pwm", "pwm_limit")
         limit = memory.get("pwm_limit", round(1 / self._pwm_unit)) * self._pwm_unit
         if mode == PWM:
-            return Command(bias=duty, limit=limit)
+            return ServoCommand(bias=duty, limit=limit)
         limit = min(limit, abs(duty)) if "goal_pwm" in memory else limit
         torque = self._goal_torque()
         if mode == CURRENT:
-            return Command(bias=math.copysign(limit, torque), limit=limit, torque_limit=abs(torque))
+            return ServoCommand(bias=math.copysign(limit, torque), limit=limit, torque_limit=abs(torque))
         if mode == VELOCITY:
             return self._turn(limit)._replace(torque_limit=self._most_torque(torque))
         if not self._controls_position:
@@ -201,7 +201,7 @@ class ModeShaft(Shaft):
             return FREE
         return abs(torque) or self.memory["torque_limit"] * self._torque_unit
 
-    def _turn(self, limit: float) -> Command:
+    def _turn(self, limit: float) -> ServoCommand:
         memory = self.memory
         speed = self._sign * memory.ticks("goal_velocity") * memory.table.rad_s_per_tick
         ramp = self._ramp_ticks * self._acceleration_unit or FREE
@@ -270,7 +270,7 @@ def _kind(ramp: float, distance: float, speed: float, acceleration: float) -> in
     return _TRAPEZOIDAL if distance * acceleration > speed * speed else _TRIANGULAR
 
 
-def _position_gains(memory: Memory, motor: Motor) -> Command:
+def _position_gains(memory: Memory, motor: Motor) -> ServoCommand:
     """Return the gains of position control: KP / 128, KI / 65536, KD / 16, KFF1 / 4 and KFF2 / 4.
 
     Where the P gain was identified as another one, the others go with it [i].
@@ -278,10 +278,10 @@ def _position_gains(memory: Memory, motor: Motor) -> Command:
     table = memory.table
     if table.items["position_p_gain"].initial is None or "goal_pwm" not in table.items:
         d = critical_d(UNKNOWN_P, motor)
-        return Command(p_ccw=UNKNOWN_P, p_cw=UNKNOWN_P, d=d)
+        return ServoCommand(p_ccw=UNKNOWN_P, p_cw=UNKNOWN_P, d=d)
     unit = 128 * motor.p_gain_duty or table.items["goal_pwm"].scale / table.rad_per_tick
     p = memory["position_p_gain"] / 128 * unit
-    return Command(
+    return ServoCommand(
         p_ccw=p,
         p_cw=p,
         i=memory["position_i_gain"] / 65536 * unit / SAMPLING_S,
@@ -291,12 +291,12 @@ def _position_gains(memory: Memory, motor: Motor) -> Command:
     )
 
 
-def _velocity_gains(memory: Memory) -> Command:
+def _velocity_gains(memory: Memory) -> ServoCommand:
     """Return the gains of velocity control, KVP / 128 and KVI / 65536, on the integrated speed."""
     table = memory.table
     if "goal_pwm" not in table.items or table.items["velocity_p_gain"].initial is None:
         p, i = UNKNOWN_VELOCITY_P / table.max_speed, UNKNOWN_VELOCITY_I / table.max_speed
-        return Command(p_ccw=i, p_cw=i, d=p)
+        return ServoCommand(p_ccw=i, p_cw=i, d=p)
     unit = table.items["goal_pwm"].scale / table.rad_s_per_tick
     i = memory["velocity_i_gain"] / 65536 * unit / SAMPLING_S
-    return Command(p_ccw=i, p_cw=i, d=memory["velocity_p_gain"] / 128 * unit)
+    return ServoCommand(p_ccw=i, p_cw=i, d=memory["velocity_p_gain"] / 128 * unit)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import ClassVar
 
 from dxlrun.simulation.configuration import Load
-from dxlrun.simulation.motion.control_law import LIMP, Command
+from dxlrun.simulation.motion.control_law import LIMP, ServoCommand
 from dxlrun.simulation.motion.mechanics import STEP_NS, Mechanics
 from dxlrun.simulation.motion.motor import Motor, motor_of
 from dxlrun.simulation.servo.memory import Memory
@@ -32,7 +32,7 @@ class Shaft(ABC):
         self._torque_per_ampere = self.motor.torque_per_ampere
         self.index = mechanics.add(self.motor, load, angle)
         self.now_ns = mechanics.grid_ns
-        self._last: Command | None = None
+        self._last: ServoCommand | None = None
         self._goes_to_goal = False
 
     @property
@@ -115,7 +115,7 @@ class Shaft(ABC):
         """Return the items that show the motion, each with what it shows now, in ticks."""
 
     @abstractmethod
-    def _command(self) -> Command:
+    def _command(self) -> ServoCommand:
         """Return what the registers command while torque is on, the trajectory to a goal left out."""
 
     @property

@@ -21,7 +21,7 @@ from typing import NamedTuple
 from dxlrun.simulation.motion.mechanics import SUPPLY_OHM
 from dxlrun.simulation.servo.memory import IDENTITY, LiveItem, Memory, Run
 from dxlrun.simulation.servo.shaft import Shaft
-from dxlrun.simulation.wire.packets import BROADCAST, GroupRead, InstructionPacket, ReadEntry, Reply
+from dxlrun.simulation.wire.packets import BROADCAST, GroupRead, InstructionPacket, ReadEntry, ServoReply
 
 BOOT_NS = 100_000_000
 """How long a servo receives nothing after a reboot; no manual names it [i]."""
@@ -148,7 +148,7 @@ class SimulatedServo(ABC):
         self._received_ns = self.shaft.now_ns
         return True
 
-    def execute(self, packet: InstructionPacket, now_ns: int) -> Reply | None:
+    def execute(self, packet: InstructionPacket, now_ns: int) -> ServoReply | None:
         """Obey an instruction whose last byte arrived at `now_ns`; return the reply, None for silence."""
         servo_id = self.servo_id  # a write of ID is still answered under the old one [i]
         own = packet.servo_id == servo_id
@@ -161,9 +161,9 @@ class SimulatedServo(ABC):
             refused = f"{packet.instruction:#04x} {packet.parameters.hex(' ')}"
             self.note(f"servo {servo_id} refuses {refused}: {self._describe(error)}")
             self.protect(error)
-        return Reply(servo_id, error | self._state(), parameters, delay_ns) if replies else None
+        return ServoReply(servo_id, error | self._state(), parameters, delay_ns) if replies else None
 
-    def reply_to_group_read(self, read: GroupRead, entry: ReadEntry, now_ns: int) -> Reply | None:
+    def reply_to_group_read(self, read: GroupRead, entry: ReadEntry, now_ns: int) -> ServoReply | None:
         """Return its part of the reply to an instruction that ended at `now_ns`; None for silence."""
         if not self.receives(now_ns):
             return None
@@ -172,7 +172,7 @@ class SimulatedServo(ABC):
             return None
         # of a status packet that servos share only the first one waits
         delay_ns = 0 if read.fast and entry is not read.entries[0] else self._delay_ns
-        return Reply(self.servo_id, answer[0] | self._state(), answer[1], delay_ns)
+        return ServoReply(self.servo_id, answer[0] | self._state(), answer[1], delay_ns)
 
     def lasts(self, entry: ReadEntry) -> bool:
         """Return whether it replies the same until a servo moves or something is written."""

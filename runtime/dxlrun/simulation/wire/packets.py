@@ -22,7 +22,7 @@ class InstructionPacket(NamedTuple):
     """All of its bytes, as they were on the line."""
 
 
-class Reply(NamedTuple):
+class ServoReply(NamedTuple):
     """What a servo sends back, and how long after the instruction's last byte it starts to."""
 
     servo_id: int
@@ -73,7 +73,7 @@ class Receiver(Protocol):
 class FastStatus(Protocol):
     """A status packet that several servos put together."""
 
-    def part(self, reply: Reply) -> bytes:
+    def part(self, reply: ServoReply) -> bytes:
         """Return the bytes that the next servo adds."""
 
 

@@ -13,7 +13,7 @@ from functools import lru_cache
 
 from fastcrc.crc16 import umts
 
-from dxlrun.simulation.wire.packets import BROADCAST, GroupRead, InstructionPacket, ReadEntry, Reply
+from dxlrun.simulation.wire.packets import BROADCAST, GroupRead, InstructionPacket, ReadEntry, ServoReply
 
 LONGEST_PAUSE_NS = 1_500_000
 """Longest gap inside an instruction."""
@@ -112,7 +112,7 @@ class FastStatusPacket:
         self._sent_crc = b""
         """The CRC so far as it was sent: it counts for the next one."""
 
-    def part(self, reply: Reply) -> bytes:
+    def part(self, reply: ServoReply) -> bytes:
         """Return the bytes that the next servo adds; the first one also sends the header."""
         servo_id, error, parameters, _ = reply
         data = b"%b%c%c%b" % (self._head, error, servo_id, parameters)
