@@ -2,7 +2,8 @@
 
 Five servos of Protocol 2.0 (robots/open_manipulator_x.yaml) on a simulated bus in a process of its own, the
 loop as a run assembles it, with the exchange kernel and the rings of a log; the recorder is another process
-and not part of it. A cycle begins when the one before is in the ring. The most frequent cycle is printed.
+and not part of it. A cycle begins when the one before is in the ring. The most frequent cycle is printed;
+functions of numpy and of the standard library are not counted.
 
     python tests/bench/cycle_trace.py [ROBOT.yaml]
 """
@@ -20,6 +21,7 @@ from pathlib import Path
 from types import CodeType, FrameType
 
 import dxlrun
+import dxlrun_controllers
 from dxlrun.clock import MonotonicClock
 from dxlrun.compile.plan import Plan
 from dxlrun.compile.simulated import simulated_buses
@@ -34,6 +36,7 @@ from dxlrun.testing import plan_of
 from exchange.simulated import SimulatedServos
 
 ROBOT = Path(__file__).parents[2] / "robots" / "open_manipulator_x.yaml"
+ROOTS = tuple(str(Path(module.__file__ or "").parent) for module in (dxlrun, dxlrun_controllers))
 WARM_UP = 30
 """Cycles before the trace begins."""
 SECONDS = 1.5
@@ -64,7 +67,7 @@ class Trace:
             sys.setprofile(self._note)
 
     def _note(self, frame: FrameType, event: str, _: object) -> None:
-        if event == "call" and frame.f_code.co_filename != __file__:
+        if event == "call" and frame.f_code.co_filename.startswith(ROOTS):
             self._calls[frame.f_code] += 1
 
 
@@ -114,18 +117,23 @@ def steady_cycle(robot: Path = ROBOT) -> Calls:
     return Counter(dict(kinds.most_common(1)[0][0]))
 
 
+def by_file(calls: Calls) -> dict[str, list[str]]:
+    """Return the names of the functions, by file."""
+    found: dict[str, list[str]] = {}
+    for code, count in calls.items():
+        path = Path(code.co_filename)
+        name = str(path.relative_to(next(Path(root).parent for root in ROOTS if str(path).startswith(root))))
+        found.setdefault(name, []).append(code.co_qualname + (f" x{count}" if count > 1 else ""))
+    return dict(sorted(found.items()))
+
+
 def main() -> None:
     """Print the functions by file."""
     calls = steady_cycle(*map(Path, sys.argv[1:2]))
-    root = Path(dxlrun.__file__).parents[1]
-    by_file: dict[str, list[str]] = {}
-    for code, count in calls.items():
-        path = Path(code.co_filename)
-        name = str(path.relative_to(root) if path.is_relative_to(root) else path.name)
-        by_file.setdefault(name, []).append(code.co_qualname + (f" x{count}" if count > 1 else ""))
-    for name, functions in sorted(by_file.items()):
+    files = by_file(calls)
+    for name, functions in files.items():
         sys.stdout.write(f"{len(functions):3}  {name}: {', '.join(sorted(functions))}\n")
-    sys.stdout.write(f"{len(calls)} functions in {len(by_file)} files, {sum(calls.values())} calls\n")
+    sys.stdout.write(f"{len(calls)} functions in {len(files)} files, {sum(calls.values())} calls\n")
 
 
 if __name__ == "__main__":

@@ -332,38 +332,29 @@ class Loop:
             self.steering.refuse()
             self._motion.command()
         else:
-            self._command(cycle, self._controllers_time())
+            if self._lost.look(record.states):
+                self._miss()
+            time_ns = schedule.time_ns(woken_ns)
+            if (
+                time_ns < self._time_ns
+            ):  # it never goes back: a cycle that was late when a pause began catches up
+                schedule.paused_ns -= self._time_ns - time_ns
+            else:
+                self._time_ns = time_ns
+            record.command_count = self.steering.take(self._time_ns)
+            if self.paused:
+                record.commands.clear()
+            else:
+                self.manager.update(cycle - self._paused_cycles, self._time_ns)
+            self.steering.answer_late()
         self.gate.apply(record.commands, record.goals, dt_ns)
         updated_ns = now_ns()
         self.hardware.write()
         record.set_times(read_ns, updated_ns, now_ns())
         self.sink.append(record)
         self._cycles += 1
-        self._valid += record.valid
+        self._valid += record.states.valid
         self.beat()
-
-    def _command(self, cycle: int, time_ns: int) -> None:
-        """Take what clients want, and let the controllers command, as far as their servos answer."""
-        record = self.record
-        if self._lost.look(record.states):
-            self._miss()
-        record.command_count = self.steering.take(time_ns)
-        if self.paused:
-            record.commands.clear()
-        else:
-            self.manager.update(cycle - self._paused_cycles, time_ns)
-        self.steering.answer_late()
-
-    def _controllers_time(self) -> int:
-        """Return the time of this cycle for controllers, which never goes back: a cycle that was late
-        when a pause began may catch up in it."""
-        schedule = self.schedule
-        time_ns = schedule.time_ns(self._woken_ns)
-        if time_ns < self._time_ns:
-            schedule.paused_ns -= self._time_ns - time_ns
-        else:
-            self._time_ns = time_ns
-        return self._time_ns
 
     def _miss(self) -> None:
         """Apply the policies: other servos are lost than in the cycle before."""

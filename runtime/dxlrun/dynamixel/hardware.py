@@ -160,9 +160,9 @@ class DynamixelHardware:
                 for bus, servos in self._lines:
                     if bus.failure is not None:
                         self._settle(servos)
+                        self._report_failures()
                 if answer is Answer.LOOK:
                     self._samples.settle(self._clock.now_ns())
-                self._report_failures()
                 return
             self._interrupt(self._kernel)
         self._parse()
@@ -178,8 +178,9 @@ class DynamixelHardware:
         for index, (bus, servos) in enumerate(self._lines):
             program = servos.reads.plan().program
             if bus.failure is None and kernel is not None:
-                fits = program is not None and kernel.plan(index, program)
-                ready = ready and fits and not bus.pending
+                known = program is not None and program is kernel.programs[index]
+                ready &= known or (program is not None and kernel.plan(index, program))
+                ready &= not bus.receiver.pending
         self._reader = Reader.KERNEL if ready else Reader.PARSER
 
     def _interrupt(self, kernel: Kernel) -> None:
@@ -225,24 +226,25 @@ class DynamixelHardware:
         if self._split:
             self._plan_reads()
         if self._kernel is not None:
-            self._write_by_kernel(self._kernel)
+            answer = self._kernel.write(asks=self._split and self._reader is Reader.KERNEL)
+            if answer is Answer.LOOK:
+                self._reader = Reader.PARSER
+            elif answer is Answer.UNEXPECTED:
+                for index, failure in self._kernel.failures().items():
+                    self._buses[index].fail(failure)
+                self._report_failures()
         else:
-            for bus, servos in self._lines:
-                if bus.failure is None:
-                    with suppress(PortError):  # reported below; the other lines get their goals
-                        for packet in servos.goals.packets(self._goals, servos.torqued, servos.ceiling):
-                            bus.send(packet)
+            self._write_by_parser()
         if self._split and self._reader is Reader.PARSER:
             self._ask_behind()
-        self._report_failures()
 
-    def _write_by_kernel(self, kernel: Kernel) -> None:
-        answer = kernel.write(asks=self._split and self._reader is Reader.KERNEL)
-        if answer is Answer.LOOK:
-            self._reader = Reader.PARSER
-        elif answer is Answer.UNEXPECTED:
-            for index, failure in kernel.failures().items():
-                self._buses[index].fail(failure)
+    def _write_by_parser(self) -> None:
+        for bus, servos in self._lines:
+            if bus.failure is None:
+                with suppress(PortError):  # reported below; the other lines get their goals
+                    for packet in servos.goals.packets(self._goals, servos.torqued, servos.ceiling):
+                        bus.send(packet)
+        self._report_failures()
 
     def _ask_behind(self) -> None:
         """Send the first read of every split bus that was not asked yet."""
@@ -252,6 +254,7 @@ class DynamixelHardware:
                 servos.reads.begin()
                 bus.load(servos.reads)
                 bus.step(self._clock.now_ns())
+        self._report_failures()
 
     def set_modes(self, modes: NDArray[np.uint8]) -> None:
         """Bring joints into modes in the gaps between cycles; UNKNOWN leaves one as it is."""
@@ -281,7 +284,10 @@ class DynamixelHardware:
 
         On a split bus the states come first.
         """
-        self._reopen_lines()
+        for bus in self._buses:
+            if bus.failure is not None:
+                self._reopen_lines()
+                break
         latest = until_ns - IDLE_MARGIN_NS
         late = self._await_states(latest) if self._split else ()
         working: list[Bus] = []

@@ -146,10 +146,12 @@ class Manager:
 
     def stale(self, now_ns: int) -> list[str]:
         """Return the controllers whose stream of commands has run out, each of them once."""
-        stale = [managed for managed in self._managed if 0 < managed.until_ns < now_ns]
-        for managed in stale:
-            managed.until_ns = 0
-        return [managed.plan.name for managed in stale]
+        stale: list[str] = []
+        for managed in self._managed:
+            if 0 < managed.until_ns < now_ns:
+                managed.until_ns = 0
+                stale.append(managed.plan.name)
+        return stale
 
     def hold(self, controller: str) -> None:
         """Withdraw what a controller commands until it gets another command; it stays active."""

@@ -113,7 +113,6 @@ class Bus:
         "_owed",
         "_port",
         "_quiet_ns",
-        "_receiver",
         "_refused",
         "_reply",
         "_sent_ns",
@@ -125,6 +124,7 @@ class Bus:
         "name",
         "noise_bytes",
         "now_ns",
+        "receiver",
         "unrequested",
         "words",
     )
@@ -150,7 +150,8 @@ class Bus:
         self._port = port
         self._sink = packets
         self._dialect: Dialect = dialect_of(plan.protocol)
-        self._receiver = Receiver(self._take_status, self._take_noise, self._dialect)
+        self.receiver = Receiver(self._take_status, self._take_noise, self._dialect)
+        """What it has `pending` is the beginning of a packet, which a new request takes for noise."""
         cyclic = {
             (servo.servo_id, servo.state.length + more)  # as many as late replies are distinguished by
             for servo in plan.servos
@@ -175,11 +176,6 @@ class Bus:
     def busy(self) -> bool:
         """True while a job is under way."""
         return self._job is not None
-
-    @property
-    def pending(self) -> bool:
-        """True while the beginning of a packet has arrived, which a new request takes for noise."""
-        return self._receiver.pending > 0
 
     @property
     def late_ns(self) -> int:
@@ -215,7 +211,7 @@ class Bus:
         self._port = port
         self.retry()
         self.drop()
-        self._receiver.flush()  # the lost line may have brought half a packet
+        self.receiver.flush()  # the lost line may have brought half a packet
 
     def send(self, packet: bytes | bytearray | memoryview) -> None:
         """Send a prepared packet without a reply, between two jobs; does not wait.
@@ -234,8 +230,8 @@ class Bus:
         """Continue with a job in whose transaction the exchange kernel was interrupted."""
         self.load(job)
         if line.state is LineState.AWAITING and self._job is not None:
-            if self.pending:
-                self._receiver.flush()
+            if self.receiver.pending:
+                self.receiver.flush()
             self._awaited = transaction = job.advance(None)
             assert transaction is not None  # noqa: S101  its instruction was sent
             self._last_byte_ns = max(self._last_byte_ns, line.received_ns)
@@ -247,7 +243,7 @@ class Bus:
         """Take what the exchange kernel received beyond the replies that it has kept."""
         for data, at_ns in line.pieces:
             self._last_byte_ns = at_ns
-            self._receiver.feed(data, at_ns)
+            self.receiver.feed(data, at_ns)
             self._skip_headers()
 
     # Time
@@ -277,7 +273,7 @@ class Bus:
     def _receive(self) -> None:
         if self.failure is None:
             try:
-                if self._receiver.read_from(self._port, self.now_ns):
+                if self.receiver.read_from(self._port, self.now_ns):
                     self._last_byte_ns = self.now_ns()
                     self._skip_headers()
             except PortError as error:
@@ -293,8 +289,8 @@ class Bus:
         if transaction is None:
             self._job = None
             return 0
-        if self.pending:
-            self._receiver.flush()
+        if self.receiver.pending:
+            self.receiver.flush()
         packet = transaction.packet
         now_ns = self._write(packet, transaction.servo_id) if packet else self.now_ns()
         self._await(transaction, self._sent_ns if packet else now_ns)
@@ -343,12 +339,12 @@ class Bus:
         elif self._state == _DRAINING and self._quiet_at() > now_ns:
             self._deadline_ns = self._quiet_at()
         elif self._state in (_RESTING, _DRAINING):
-            self._receiver.flush()
+            self.receiver.flush()
             self._state = _READY
 
     def _give_up(self, now_ns: int) -> None:
         """End a transaction of which not every reply came in time."""
-        self._receiver.flush()  # the reply may stand behind a false header
+        self.receiver.flush()  # the reply may stand behind a false header
         if self._state != _AWAITING:
             return
         self._note_owed()
@@ -370,7 +366,7 @@ class Bus:
 
     def _skip_headers(self) -> None:
         # as many bytes as an awaited reply has, and it is not whole: its header is a false one
-        receiver, awaited = self._receiver, self._awaited
+        receiver, awaited = self.receiver, self._awaited
         while awaited is not None and self._state == _AWAITING and receiver.pending >= awaited.widest:
             receiver.skip_header()
 

@@ -364,7 +364,8 @@ class Kernel:
         self._raised: BaseException | None = None
         self._kept: list[object] = [samples, states, goals]
         self._buffers = [ctypes.create_string_buffer(_ROOM) for _ in lines]
-        self._programs: list[Program | None] = [None] * len(lines)
+        self.programs: list[Program | None] = [None] * len(lines)
+        """By which each bus is read."""
         self._writes: list[tuple[SyncWrite, ...]] = [()] * len(lines)
         self._written: list[object] = [None] * len(lines)
         self._kernel = _Kernel(beat_ns=BEAT_NS)
@@ -493,14 +494,13 @@ class Kernel:
         """Read a bus by a program from the next cycle on; False where there is no room for it: the log's
         batch must hold what the lines have at once, a line's buffer the replies to one read.
         """
-        if program is not self._programs[index]:
-            sizes = [read.size for read in program.reads[: program.count]]
-            if program.bytes * len(self._known) > self._room or max(sizes, default=0) > _ROOM // 4:
-                return False
-            line = self._lines[index]
-            self._programs[index] = program
-            line.planned = int(program.count > 0)
-            line.reads, line.read_count = program.reads, program.count
+        sizes = [read.size for read in program.reads[: program.count]]
+        if program.bytes * len(self._known) > self._room or max(sizes, default=0) > _ROOM // 4:
+            return False
+        line = self._lines[index]
+        self.programs[index] = program
+        line.planned = int(program.count > 0)
+        line.reads, line.read_count = program.reads, program.count
         return True
 
     def read(self, until_ns: int = NEVER, *, everything: bool = True) -> Answer:

@@ -30,7 +30,6 @@ class Receiver:
     __slots__ = (
         "_beginnings",
         "_buffer",
-        "_end",
         "_ends",
         "_header",
         "_intact",
@@ -39,6 +38,7 @@ class Receiver:
         "_size_at",
         "_times",
         "_view",
+        "pending",
     )
 
     def __init__(self, packet: Taker, noise: Taker, dialect: Dialect) -> None:
@@ -49,23 +49,19 @@ class Receiver:
         self._intact = dialect.intact
         self._buffer = bytearray(dialect.LONGEST + _GOOD_READ)
         self._view = memoryview(self._buffer)
-        self._end = 0
+        self.pending = 0
+        """Number of bytes that are neither packet nor noise yet."""
         self._ends: list[int] = []  # where each read() ended in the buffer; as many as unfinished reads
         self._times: list[int] = []
         self._packet = packet
         self._noise = noise
-
-    @property
-    def pending(self) -> int:
-        """Number of bytes that are neither packet nor noise yet."""
-        return self._end
 
     def read_from(self, port: Port, now_ns: Callable[[], int]) -> int:
         """Take what the port has, deliver what became whole; return the number of bytes taken.
 
         Raises PortError when the adapter is gone.
         """
-        count = port.read_into(self._view[self._end :] if self._end else self._view)
+        count = port.read_into(self._view[self.pending :] if self.pending else self._view)
         if count:
             self._accept(count, now_ns())
         return count
@@ -74,29 +70,29 @@ class Receiver:
         """Take bytes that arrived at `now_ns`, deliver what became whole."""
         start = 0
         while start < len(data):
-            chunk = data[start : start + min(_GOOD_READ, len(self._view) - self._end)]
-            self._view[self._end : self._end + len(chunk)] = chunk
+            chunk = data[start : start + min(_GOOD_READ, len(self._view) - self.pending)]
+            self._view[self.pending : self.pending + len(chunk)] = chunk
             start += len(chunk)
             self._accept(len(chunk), now_ns)
 
     def skip_header(self) -> None:
         """Give up the header that is being waited for, as false; what follows it gets its chance."""
-        if self._end:
+        if self.pending:
             self._forget(self._scan(1))
 
     def flush(self) -> None:
         """Give up waiting for the rest of an unfinished packet: scan again behind its header."""
-        while self._end:
-            if self._buffer.startswith(self._header, 0, self._end):
+        while self.pending:
+            if self._buffer.startswith(self._header, 0, self.pending):
                 self._forget(self._scan(1))
             else:
-                self._emit(self._noise, 0, self._end)
-                self._forget(self._end)
+                self._emit(self._noise, 0, self.pending)
+                self._forget(self.pending)
 
     def _accept(self, count: int, at_ns: int) -> None:
         """Take bytes that were put behind the pending ones, deliver what became whole."""
-        self._end += count
-        self._ends.append(self._end)
+        self.pending += count
+        self._ends.append(self.pending)
         self._times.append(at_ns)
         self._forget(self._scan(0))
 
@@ -112,7 +108,7 @@ class Receiver:
 
     def _scan(self, search: int) -> int:
         """Deliver what is whole, looking for headers from `search` on; return the start of what is not."""
-        buffer, end = self._buffer, self._end
+        buffer, end = self._buffer, self.pending
         done = 0  # everything before it was delivered
         while True:
             start = buffer.find(self._header, search, end)
@@ -140,21 +136,21 @@ class Receiver:
     def _beginning(self, search: int) -> int:
         """Return where the last bytes may be the beginning of a header; their end when they cannot."""
         for beginning in self._beginnings:
-            if self._buffer.endswith(beginning, search, self._end):
-                return self._end - len(beginning)
-        return self._end
+            if self._buffer.endswith(beginning, search, self.pending):
+                return self.pending - len(beginning)
+        return self.pending
 
     def _forget(self, count: int) -> None:
         """Drop the first `count` bytes."""
-        if count == self._end:
-            self._end = 0
+        if count == self.pending:
+            self.pending = 0
             self._ends.clear()
             self._times.clear()
         elif count:
-            rest = self._end - count
-            self._buffer[:rest] = self._buffer[count : self._end]
+            rest = self.pending - count
+            self._buffer[:rest] = self._buffer[count : self.pending]
             while self._ends[0] <= count:
                 del self._ends[0], self._times[0]
             for i, end in enumerate(self._ends):
                 self._ends[i] = end - count
-            self._end = rest
+            self.pending = rest

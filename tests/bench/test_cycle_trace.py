@@ -1,0 +1,21 @@
+"""The number of functions and files that a steady cycle of the loop goes through is bounded."""
+
+import pytest
+
+import cycle_trace
+from dxlrun.dynamixel.exchange import kernel
+
+MOST_FUNCTIONS = 57
+MOST_FILES = 25
+"""What was reached; a change that needs more says why."""
+
+
+@pytest.mark.skipif(kernel.load() is None, reason="no C compiler: the kernel was not built")
+def test_a_steady_cycle_goes_through_few_functions_and_files():
+    calls = cycle_trace.steady_cycle()
+    files = cycle_trace.by_file(calls)
+    names = {name for functions in files.values() for name in functions}
+    assert {"Loop._one", "Kernel.read", "Kernel.write"} <= names  # it is a cycle of the loop with the kernel
+    assert not any("Bus." in name or "Receiver" in name for name in names)  # and without the parser
+    assert len(calls) <= MOST_FUNCTIONS
+    assert len(files) <= MOST_FILES
