@@ -55,11 +55,9 @@ class Servos:
         "_dialect",
         "_events",
         "_every_fresh",
-        "_hardware_errors",
         "_idle",
         "_life",
         "_line_lost",
-        "_missing",
         "_noise_at_ns",
         "_noise_seen",
         "_offline",
@@ -89,7 +87,7 @@ class Servos:
         self._idle = idle
         self._events = events
         self._samples = samples
-        self._shown = states.hardware_error
+        self._shown = states.hardware_error  # of the robot: Hardware Error Status, or the error byte of 1.0
         self._rows = [servo.row for servo in plan.servos]
         self._dialect = dialect_of(plan.protocol)
         self._every_fresh = b"\1" * count
@@ -104,11 +102,9 @@ class Servos:
         """Whether the Bus Watchdogs receive enough instructions."""
         self._offline = Offline(plan, idle, self._life, self.desired)
         self._slow = SlowReads(plan, idle, self._life, self._offline, states)
-        self._missing = False  # a newest reply is
         self._reported_errors = [0] * count  # error byte of each servo
         self._alerts: list[int] = []  # servos with an alert whose hardware error was not read yet
         self._alert_cycles = 0
-        self._hardware_errors = [0] * count
         self._strained: list[int] = []  # of Protocol 1.0, servos that may have shut down
         self._reading = False  # one of these waits for idle time
         self._read_last = 0
@@ -203,9 +199,8 @@ class Servos:
 
     def settle(self, now_ns: int) -> None:
         """Report what changed with this cycle's replies."""
-        if self._missing or self._samples.fresh.tobytes() != self._every_fresh:
+        if self._samples.fresh.tobytes() != self._every_fresh or any(self.reads.missed):
             self._count_losses(now_ns)
-            self._missing = any(self.reads.missed)
         if self.reads.errors != self._reported_errors:
             self._report_errors()
 
@@ -251,7 +246,7 @@ class Servos:
                 if error & ~before & self._dialect.ALERT and index not in self._alerts:
                     self._alerts.append(index)
                 elif not error & self._dialect.ALERT:
-                    self._hardware_errors[index] = self._shown[self._rows[index]] = 0
+                    self._shown[self._rows[index]] = 0
             else:
                 self._shown[self._rows[index]] = error & FORBIDDEN
                 if error & ~before & _SHUTS_DOWN and index not in self._strained:
@@ -325,7 +320,8 @@ class Servos:
         if enabled == 1:
             self._life.on(index, ServoEvent.TORQUE_ON)
             return
-        if self._hardware_errors[index] or self._reported_errors[index] & self._dialect.ALERT:
+        alert = self._dialect.ALERT
+        if alert and (self._shown[self._rows[index]] or self._reported_errors[index] & alert):
             self._life.on(index, ServoEvent.TORQUE_OFF)  # a shutdown, whose reason was reported
         else:
             self._life.lose(index).limp_reported = True  # it may have started anew
@@ -349,9 +345,9 @@ class Servos:
             return
         self._alerts.remove(index)
         error = reply.parameters[0]
-        if error == self._hardware_errors[index]:
+        if error == self._shown[self._rows[index]]:
             return
-        self._hardware_errors[index] = self._shown[self._rows[index]] = error
+        self._shown[self._rows[index]] = error
         self._life.on(index, ServoEvent.DOUBT)
         address = self._plan.servos[index].hardware_error_address
         text = f"has Hardware Error Status ({address}) = {error}: {describe_hardware_error(error)}"
