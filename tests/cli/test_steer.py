@@ -128,18 +128,20 @@ def test_the_list_has_every_controller_and_what_it_takes(dxlrun, torso: RemoteRo
     assert said.out.split("\n", 1)[1].split() == shown.split("\n", 1)[1].split()
 
 
-def test_the_list_as_json_is_what_the_robot_tells(dxlrun, torso: RemoteRobot) -> None:
+def test_the_list_as_json_is_what_the_robot_returns(dxlrun, torso: RemoteRobot) -> None:
     (told,) = json.loads(dxlrun("list", "--json", "--robot", "bioloid_torso").out)
     assert (told["name"], told["robot"], told["rate"]) == ("bioloid_torso", "bioloid_torso", 50.0)
     assert [one["name"] for one in told["controllers"]] == list(controllers(torso))
 
 
-def test_a_robot_that_went_away_is_said(dxlrun, torso: RemoteRobot, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_robot_that_has_ended_is_an_error(
+    dxlrun, torso: RemoteRobot, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def gone(robot: RemoteRobot) -> None:
-        raise DxlrunError(f"{robot.name} does not answer any more")
+        raise DxlrunError(f"{robot.name} no longer answers")
 
     monkeypatch.setattr(RemoteRobot, "info", gone)
-    assert dxlrun("list") == (1, "", "dxlrun: bioloid_torso does not answer any more\n")
+    assert dxlrun("list") == (1, "", "dxlrun: bioloid_torso no longer answers\n")
 
 
 # Steering
@@ -311,7 +313,7 @@ def test_of_several_robots_one_must_be_chosen(dxlrun, torso: RemoteRobot, stage:
         (sockets / "twin.sock").unlink()
 
 
-def test_the_log_can_say_which_verb_it_was(dxlrun, torso: RemoteRobot) -> None:
+def test_the_log_names_the_command_of_the_terminal(dxlrun, torso: RemoteRobot) -> None:
     last = torso.events()["last"]
     assert dxlrun("rate", "60").code == 0
 
@@ -323,7 +325,7 @@ def test_the_log_can_say_which_verb_it_was(dxlrun, torso: RemoteRobot) -> None:
     assert texts[0].endswith("from dxlrun rate")
 
 
-def test_stop_waits_for_the_end_unless_told(
+def test_stop_waits_for_the_end_by_default(
     dxlrun, torso: RemoteRobot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     waits: list[bool] = []
@@ -374,7 +376,7 @@ def test_the_commands_of_the_page_work_in_their_order(
     assert "bioloid_torso: " in stage.said
 
 
-def test_the_page_says_what_the_client_can() -> None:
+def test_the_page_has_every_method_of_the_client() -> None:
     rows = "".join(line.split("|")[1] for line in PAGE.splitlines() if line.startswith("| `"))
     methods = {name for name in dir(RemoteRobot) if not name.startswith("_")} - {"close", "name"}
     assert methods <= set(re.findall(r"`(\w+)\(", rows))

@@ -1,4 +1,4 @@
-"""What is said of the verbs for a robot that runs when none does, and how their words are read."""
+"""Commands for a running robot when none runs, and how their words are read."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from dxlrun.cli.steering.written import Written
 from dxlrun.errors import InputError, Refused
 from dxlrun.output.terminal import show
 
-NOBODY = "dxlrun: no robot runs that could be steered; `dxlrun ROBOT.yaml` starts one"
+NO_ROBOT = "dxlrun: no robot runs that can be steered; `dxlrun ROBOT.yaml` starts one"
 
 
 @pytest.fixture
-def nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def no_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A computer on which no robot runs."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
 
 
-# Nobody runs
+# No robot runs
 
 
 @pytest.mark.parametrize(
@@ -38,12 +38,14 @@ def nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ("unload", "spare"),
     ],
 )
-def test_without_a_robot_a_verb_says_how_to_start_one(dxlrun, nobody: None, words: tuple[str, ...]) -> None:
-    assert dxlrun(*words) == (1, "", NOBODY + "\n")
+def test_without_a_robot_a_command_names_how_to_start_one(
+    dxlrun, no_robot: None, words: tuple[str, ...]
+) -> None:
+    assert dxlrun(*words) == (1, "", NO_ROBOT + "\n")
 
 
-def test_a_list_of_no_robots_is_no_failure(dxlrun, nobody: None) -> None:
-    assert dxlrun("list") == (0, NOBODY.removeprefix("dxlrun: ") + "\n", "")
+def test_a_list_of_no_robots_is_no_failure(dxlrun, no_robot: None) -> None:
+    assert dxlrun("list") == (0, NO_ROBOT.removeprefix("dxlrun: ") + "\n", "")
     assert dxlrun("list", "--json") == (0, "[]\n", "")
 
 
@@ -63,14 +65,14 @@ def test_a_list_of_no_robots_is_no_failure(dxlrun, nobody: None) -> None:
         (("list", "--robot", "torso"), "no robot torso runs; there is none"),
     ],
 )
-def test_wrong_words_are_said_without_a_robot(dxlrun, nobody: None, words, sentence) -> None:
+def test_wrong_words_are_refused_without_a_robot(dxlrun, no_robot: None, words, sentence) -> None:
     said = dxlrun(*words)
     assert (said.code, said.out) == (2, "")
     assert said.err.startswith("dxlrun: ")
     assert sentence in said.err
 
 
-def test_a_wrong_file_is_said_with_its_places(dxlrun, nobody: None, tmp_path: Path) -> None:
+def test_a_wrong_file_is_refused_with_its_places(dxlrun, no_robot: None, tmp_path: Path) -> None:
     file = tmp_path / "look.yaml"
     file.write_text("positions: [1 deg]\npositions: [2 deg]\n")
     said = dxlrun("send", "head", "posvel", "--file", file)
@@ -92,7 +94,7 @@ WRONG = {
 }
 
 
-def test_a_wrong_quantity_is_told_at_its_place_in_the_file(tmp_path: Path) -> None:
+def test_a_wrong_quantity_is_reported_at_its_place_in_the_file(tmp_path: Path) -> None:
     file = tmp_path / "step.yaml"
     file.write_text("positions:\n  - 30\nvelocities: [true]\n")
     refused = Refused("...", code="wrong_quantity", fields=WRONG, wrong_input=True)
@@ -118,7 +120,7 @@ def test_wrong_quantities_of_the_command_line_are_a_line_each_and_keep_their_cod
 # What is listed
 
 
-def test_a_list_says_how_a_robot_is() -> None:
+def test_a_list_shows_the_state_of_a_robot() -> None:
     info = {"name": "arm", "rate": 320.0, "paused": True, "cycles": 7, "skipped": 1, "log": "logs/arm.mcap"}
     assert headline(info) == "arm: 320 Hz, paused, 7 cycles, 1 period skipped, log logs/arm.mcap"
     info |= {"paused": False, "skipped": 0, "log": None}

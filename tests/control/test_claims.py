@@ -12,7 +12,7 @@ class Wants:
     command: tuple[str, ...] = ("position",)
 
 
-def test_each_pair_that_wants_the_same_joints_is_told_once() -> None:
+def test_each_pair_that_claims_the_same_joints_is_named_once() -> None:
     found = conflicts(
         [Wants("left", ("a", "b", "c")), Wants("right", ("d",)), Wants("whole", tuple("abcde"))]
     )
@@ -22,6 +22,6 @@ def test_each_pair_that_wants_the_same_joints_is_told_once() -> None:
     )
 
 
-def test_who_only_looks_is_in_nobodys_way() -> None:
+def test_a_broadcaster_conflicts_with_no_controller() -> None:
     found = conflicts([Wants("all", ("a",)), Wants("eyes", ("a",), command=())])
     assert (found, conflicts_text(found)) == ((), "")

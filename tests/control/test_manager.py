@@ -283,7 +283,7 @@ def test_the_period_that_a_controller_sees_is_capped(robot):
     assert max(periods) == 5 * PERIOD_NS
 
 
-def test_masks_show_who_is_active_and_who_publishes(robot):
+def test_masks_show_which_controllers_are_active_and_which_publish(robot):
     def act(self, step, time_ns, _):
         if step == "update" and time_ns == PERIOD_NS:
             self.context.publish()
@@ -307,7 +307,7 @@ def test_the_duration_of_each_update_is_recorded(robot):
     np.testing.assert_array_equal(robot.record.controller_ns, [0, 700])
 
 
-def test_a_type_that_nobody_offers_is_named_with_the_broken_plugins(robot):
+def test_a_type_without_a_plugin_is_named_with_the_broken_plugins(robot):
     robot.script("present", idle)
     robot._offers.clear()
     with pytest.raises(PlugInError, match=r"type present of controller present .*broken_one of x 1"):

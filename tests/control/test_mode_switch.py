@@ -1,4 +1,4 @@
-"""Switches between controllers that need other modes: who enters when, who never, where others rest."""
+"""Switches between controllers that need other modes: which enter when, which never, where joints rest."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ def test_a_joint_that_refuses_its_mode_keeps_the_controller_out_at_once(story: S
     assert len(story.robot.hardware.asked) == 1
 
 
-def test_what_waits_can_be_called_off_and_its_joints_go_to_rest(story: Story) -> None:
+def test_a_waiting_controller_can_be_deactivated_and_its_joints_go_to_rest(story: Story) -> None:
     story.at[2] = lambda: story.switch(["press"], ["arm"])
     story.at[4] = lambda: story.switch(["arm"], ["press"])
     story.run(12)
@@ -153,7 +153,7 @@ def test_what_waits_can_be_called_off_and_its_joints_go_to_rest(story: Story) ->
     assert not story.text(EventCode.COMMAND_REFUSED)
 
 
-def test_who_waits_has_its_joints_and_gets_no_commands_yet(story: Story) -> None:
+def test_a_waiting_controller_has_its_joints_and_gets_no_commands_yet(story: Story) -> None:
     story.at[2] = lambda: story.switch(["wheels"], ["arm"])
     story.at[4] = lambda: (
         story.switch(["press"], []),
@@ -184,7 +184,7 @@ def test_a_controller_that_fails_when_its_modes_are_there_is_the_answer_to_its_s
     assert "no way" in fields["problem"]
 
 
-def test_a_joint_that_nobody_claims_any_more_leaves_a_mode_in_which_it_would_not_hold(story: Story) -> None:
+def test_a_joint_without_a_claim_leaves_a_mode_in_which_it_would_not_hold(story: Story) -> None:
     story.at[1] = lambda: story.switch(["press"], ["arm"])
     story.at[8] = lambda: story.switch([], ["press"])
     story.run(16)
@@ -192,7 +192,7 @@ def test_a_joint_that_nobody_claims_any_more_leaves_a_mode_in_which_it_would_not
     assert story.modes[-1] == [POSITION, POSITION]
 
 
-def test_a_wheel_that_nobody_claims_stays_in_velocity_mode_and_stands(story: Story) -> None:
+def test_a_wheel_without_a_claim_stays_in_velocity_mode_at_rest(story: Story) -> None:
     story.at[1] = lambda: story.switch(["wheels"], ["arm"])
     story.at[8] = lambda: story.switch([], ["wheels"])
     story.run(12)

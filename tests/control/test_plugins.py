@@ -116,7 +116,7 @@ def test_a_type_that_two_plugins_offer_is_nobodys(install):
     assert "my-robotics 2.5" in told
 
 
-def test_each_load_is_told_before_the_next_one(install):
+def test_after_each_load_a_hook_is_called_before_the_next_one(install):
     install("a-first", "first_plugin", "import second_plugin_was_not_there")
     install("b-second", "second_plugin", GOOD)
     told = []

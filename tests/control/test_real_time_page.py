@@ -34,7 +34,7 @@ def test_every_policy_for_late_cycles_is_on_the_page():
     assert f"up to {MOST_CAUGHT_UP} late cycles follow at once" in PAGE
 
 
-def test_every_wish_is_on_the_page():
+def test_every_request_is_on_the_page():
     for key in Scheduler.model_fields:
         assert f"`{key}`" in PAGE, key
 

@@ -77,7 +77,7 @@ def refuse(*_):
     raise PermissionError(1, "Operation not permitted")
 
 
-def test_a_refused_policy_says_what_is_lost_and_how_to_allow_it(asked, monkeypatch):
+def test_a_refused_policy_names_the_consequence_and_the_fix(asked, monkeypatch):
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
     grant = realtime.apply(SchedulerPlan("round_robin", 31, False))[-1]
     assert not grant.granted
@@ -122,20 +122,20 @@ def test_cores_none_of_which_there_is_leave_the_loop_where_it_was(asked, monkeyp
     )
 
 
-def test_one_core_is_said_in_the_singular(asked, monkeypatch):
+def test_one_core_is_named_in_the_singular(asked, monkeypatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {2})
     grant = realtime.apply(SchedulerPlan("other", 31, False, cores=(2,)))[2]
     assert (grant.granted, grant.sentence) == (True, "stays on core 2")
 
 
-def test_a_refused_idle_latency_says_the_rule_that_allows_it(asked, monkeypatch):
+def test_a_refused_idle_latency_names_the_rule_that_allows_it(asked, monkeypatch):
     monkeypatch.setattr(os, "open", refuse)
     grant = realtime.apply(SchedulerPlan("other", 31, False, idle_latency=True))[-1]
     assert (grant.request, grant.granted) == ("idle latency", False)
     assert 'KERNEL=="cpu_dma_latency", OWNER="' in grant.fix
 
 
-def test_another_system_is_told_and_not_a_crash(asked, may, monkeypatch):
+def test_another_system_is_a_refusal_and_not_a_crash(asked, may, monkeypatch):
     may(realtime.IPC_LOCK)
     monkeypatch.setattr(sys, "platform", "plan9")
     monkeypatch.delattr(os, "sched_setscheduler")
@@ -146,7 +146,7 @@ def test_another_system_is_told_and_not_a_crash(asked, may, monkeypatch):
         assert "this system does not offer it" in grant.sentence
 
 
-def test_a_c_library_without_mallopt_is_told(asked, monkeypatch):
+def test_a_c_library_without_mallopt_is_a_refusal(asked, monkeypatch):
     monkeypatch.setattr(realtime, "libc", object)
     grant = realtime.apply(SchedulerPlan("other", 31, False))[2]
     assert (grant.request, grant.granted) == ("memory in place", False)
@@ -298,7 +298,7 @@ def test_a_real_process_without_rights_gets_plain_sentences():
     assert sum("/etc/security/limits.d/dxlrun.conf" in told for told in refused) == 4
 
 
-def test_a_real_process_gets_what_its_rights_say():
+def test_a_real_process_gets_what_its_rights_allow():
     """Whoever runs the tests, root or not, in a container or not: what is told is what the kernel did."""
     found = outcome(WISHES.format(before=""))
     granted = dict(found["granted"])

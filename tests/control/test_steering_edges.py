@@ -84,7 +84,7 @@ def plan_of(name, kind, **changes):
 # Claims, when a fault comes into a switch
 
 
-def test_a_fallback_never_takes_a_joint_that_the_same_switch_gives_to_somebody_else(steered):
+def test_a_fallback_never_takes_a_joint_that_the_same_switch_gives_to_another(steered):
     robot = steered.robot
     steered.add("idle", joints=("j0",))
     steered.add("weak", joints=("j0",), active=False, fallback="spare")
@@ -153,7 +153,7 @@ def test_a_controller_that_cannot_even_be_built_is_refused(steered):
     assert "no such calibration" in robot.refusals[2]
 
 
-def test_each_load_has_the_guardians_patience_for_itself(steered):
+def test_each_load_has_the_guardians_timeout_for_itself(steered):
     robot = steered.robot
     steered.add("left", joints=("j0",))
     steered.at[1] = [lambda: robot.ask("pause")]
@@ -182,7 +182,7 @@ def test_a_pause_of_a_slow_loop_leaves_it_its_period(make_robot):
     assert robot.patience == [10**9, 10**9, 10**9]
 
 
-def test_another_rate_in_a_pause_leaves_the_patience_of_the_pause(steered):
+def test_another_rate_in_a_pause_leaves_the_timeout_of_the_pause(steered):
     robot = steered.robot
     steered.add("left", joints=("j0",))
     steered.at = {
@@ -195,7 +195,7 @@ def test_another_rate_in_a_pause_leaves_the_patience_of_the_pause(steered):
 
 
 @pytest.mark.parametrize("rate", [1e-320, 1e-300, 1e-9, 0.1])
-def test_a_rate_at_which_a_wish_to_stop_would_be_seen_too_late_is_refused(steered, rate):
+def test_a_rate_at_which_a_stop_would_be_seen_too_late_is_refused(steered, rate):
     robot = steered.robot
     steered.add("left", joints=("j0",))
     steered.at[1] = [lambda: robot.ask("rate", rate=rate)]
@@ -206,7 +206,7 @@ def test_a_rate_at_which_a_wish_to_stop_would_be_seen_too_late_is_refused(steere
 # Time
 
 
-def test_a_late_cycle_in_a_pause_ends_no_run_and_asks_nobody(steered):
+def test_a_late_cycle_in_a_pause_ends_no_run_and_calls_no_hook(steered):
     robot = steered.robot
     steered.add("left", joints=("j0",))
     steered.at = {1: [lambda: robot.ask("pause")], 4: [lambda: robot.ask("resume")]}
@@ -311,7 +311,7 @@ def test_a_controller_that_starts_a_thread_while_it_is_configured_is_refused(ste
     assert asked == ["of controller x"]
 
 
-def test_a_controller_that_failed_once_says_nothing_about_another_one_of_its_name(steered):
+def test_a_failure_does_not_count_for_a_later_controller_of_the_same_name(steered):
     robot = steered.robot
     steered.add("left", joints=("j0",), fallback="x")
     steered.add("right", joints=("j1",), active=False)

@@ -40,7 +40,7 @@ def test_what_it_claims():
         assert (found.joints, found.command) == (("a", "b"), claims)
 
 
-def test_it_holds_until_it_is_told(stage):
+def test_it_holds_until_its_first_command(stage):
     robot = started(stage, TWO)
     for time in (0.0, 0.02, 5.0):
         np.testing.assert_array_equal(robot.update(time), [0.3, -0.2])
@@ -120,7 +120,7 @@ def test_the_delay_is_the_bridge_and_without_it_the_first_point_is_at_once(stage
     np.testing.assert_allclose(robot.update(3.0), 0.1)
 
 
-def test_at_the_end_it_holds_and_says_so_once(stage):
+def test_at_the_end_it_holds_and_logs_that_once(stage):
     robot = started(stage, ONE | {"command_interface": "posvel"})
     robot.send(0.0, "trajectory", points=points([0.5, 1.0]))
     for time in (0.2, 0.99, 1.0, 1.02, 9.0):
@@ -173,7 +173,7 @@ def test_a_goal_may_be_reached_within_its_time(stage):
 @pytest.mark.parametrize(
     ("answers", "told"), [(True, "joint a is 1.0000 rad off"), (False, "joint a does not answer")]
 )
-def test_a_goal_that_is_missed_is_told(stage, answers, told):
+def test_a_missed_goal_is_logged(stage, answers, told):
     robot = started(stage, GOAL)
     robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3]}])
     robot.context.states.valid[:] = answers

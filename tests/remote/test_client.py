@@ -1,4 +1,4 @@
-"""The client: what it asks, what it never asks twice, and what it says when a robot is gone."""
+"""The client: what it sends, what it never sends twice, and its errors when a robot is gone."""
 
 import socket
 import threading
@@ -134,18 +134,16 @@ def test_a_refusal_is_raised_with_its_sentence(peer):
     [None, b"rubbish\r\n\r\n", answer(b"Service Unavailable", b"503 no"), answer(b"[]"), OK[:-3]],
     ids=["hang up", "rubbish", "no JSON", "a list", "cut off"],
 )
-def test_what_may_have_been_heard_is_never_asked_again(peer, said, monkeypatch):
+def test_what_may_have_been_received_is_never_sent_again(peer, said, monkeypatch):
     monkeypatch.setattr(module, "TIMEOUT_S", 0.2)
     one = peer(said, OK)
-    with pytest.raises(
-        dxlrun.DxlrunError, match=r"pair (does not answer any more|answers in a way)"
-    ) as caught:
+    with pytest.raises(dxlrun.DxlrunError, match=r"pair (no longer answers|answers in a way)") as caught:
         one.robot.send("head", "go", {})
     assert not isinstance(caught.value, dxlrun.Refused)
     assert len(one.heard) == 1
 
 
-def test_a_connection_that_was_closed_while_nobody_asked_is_opened_anew(peer):
+def test_a_connection_that_was_closed_while_idle_is_opened_anew(peer):
     one = peer(OK, OK)
     one.robot.pause()
     one.robot._connection.sock.shutdown(socket.SHUT_RDWR)  # as when the gateway closes it
@@ -161,7 +159,7 @@ def test_a_connection_that_was_idle_for_long_is_not_used_again(peer, monkeypatch
     assert (len(one.heard), one.connections) == (2, 2)
 
 
-def test_who_is_meant_must_be_clear():
+def test_the_choice_of_a_robot_must_be_clear():
     with pytest.raises(dxlrun.DxlrunError, match="no robot runs that can be steered; start one"):
         dxlrun.connect()
     with listen("torso")[0]:
@@ -176,13 +174,13 @@ def test_who_is_meant_must_be_clear():
                 dxlrun.connect()
 
 
-def test_a_stop_whose_answer_was_lost_with_the_robot_is_a_stop(peer):
+def test_a_stop_without_an_answer_of_a_robot_that_ended_is_a_stop(peer):
     one = peer(None)
     one.robot.stop()
     assert one.heard[0].startswith(b"POST /stop ")
 
 
-def test_a_stop_whose_connection_a_living_robot_closed_is_asked_again(peer):
+def test_a_stop_is_sent_again_when_a_running_robot_closed_the_connection(peer):
     one = peer(None, OK)
     one.robot.stop()
     assert [request[:11] for request in one.heard] == [b"POST /stop "] * 2
@@ -201,5 +199,5 @@ def test_a_queue_of_connections_that_stays_full_is_an_error_with_its_reason(plac
     listener.listen(0)
     with listener, socket.socket(socket.AF_UNIX) as waiting:
         waiting.connect(str(path))
-        with pytest.raises(dxlrun.DxlrunError, match=r"pair does not answer any more: .* full for 0\.05 s"):
+        with pytest.raises(dxlrun.DxlrunError, match=r"pair no longer answers: .* full for 0\.05 s"):
             module.RemoteRobot("pair", path, "anna").pause()

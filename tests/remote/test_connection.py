@@ -152,7 +152,7 @@ def test_a_process_has_some_connections_and_leaves_those_of_others_alone(door, m
     door.open(act)
 
 
-def test_a_connection_that_says_nothing_is_closed(door, monkeypatch):
+def test_a_silent_connection_is_closed(door, monkeypatch):
     monkeypatch.setattr(server, "SILENCE_S", 0.02)
 
     async def act():

@@ -1,6 +1,6 @@
 # ruff: noqa: E501 (a request and its answer are read best side by side)
 
-"""The gateway by ASGI: what reaches the loop of what clients ask, and what they are told. No time decides."""
+"""The gateway by ASGI: which requests reach the loop, and how they are answered. No time decides."""
 
 import asyncio
 import json
@@ -36,7 +36,7 @@ def chunk(data, more=True):
     return {"type": "http.request", "body": data, "more_body": more}
 
 
-def test_a_command_reaches_the_loop_prepared_and_with_the_name_of_who_asked(desk):
+def test_a_command_reaches_the_loop_prepared_and_with_its_clients_name(desk):
     name = [("x-dxlrun-client", "anna")]
     headers = [(key, value.encode()) for key, value in name]
     assert desk.ask("POST", GO, {"positions": [0.25]}, headers=headers) == (200, DONE)
@@ -63,7 +63,7 @@ def test_what_reaches_the_log_of_a_clients_name_is_short_and_printable(desk, giv
     assert desk.taken[0].origin == origin
 
 
-def test_what_the_loop_refuses_is_told(desk):
+def test_what_the_loop_refuses_is_refused_with_its_code(desk):
     assert desk.ask("POST", "/pause", refusal=Refusal(Code.PAUSED_ALREADY)) == (
         409, {"refused": "the loop is paused already", "code": "paused_already", "fields": {}},
     )  # fmt: skip
@@ -254,7 +254,7 @@ def test_of_a_body_without_end_a_mebibyte_is_read_and_no_more(desk):
     assert desk.taken == []
 
 
-def test_a_body_that_never_ends_and_never_goes_on_is_given_up(desk, monkeypatch):
+def test_a_body_that_stops_in_the_middle_is_given_up(desk, monkeypatch):
     monkeypatch.setattr(gateway, "BODY_S", 0.01)
     status, content = desk.ask("POST", GO, chunks=[chunk(b'{"posi')])
     assert (status, content["refused"]) == (408, "the request did not arrive within 0.01 s")
@@ -380,7 +380,7 @@ def test_an_answer_that_comes_too_late_is_still_what_the_gateway_knows(desk, mon
 
 
 @pytest.mark.parametrize("phase", [Phase.SETUP, Phase.STOPPING, Phase.DONE])
-def test_a_run_at_its_end_takes_nothing_and_says_so_at_once(desk, phase):
+def test_a_run_at_its_end_refuses_everything_at_once(desk, phase):
     desk.heartbeat.enter(phase)
     for path, body in (("/pause", b""), (SET_POINT, {"positions": [0]})):
         refused = {"refused": "the run is at its end", "code": "run_ending", "fields": {}}
@@ -491,7 +491,7 @@ def test_a_controller_is_loaded_into_the_place_that_the_loop_gives_it(desk):
     assert told == {"left": False, "spare": False, "most": False, "again": True}
 
 
-def test_the_robot_is_told_with_what_its_controllers_take(desk):
+def test_the_robot_is_shown_with_the_commands_of_its_controllers(desk):
     status, told = desk.ask("GET", "/robot")
     assert status == 200
     left = told["controllers"].pop(0)
@@ -534,7 +534,7 @@ def test_states_are_those_of_the_newest_cycle_and_what_is_not_there_is_null(desk
     assert (tilt["mode"], tilt["temperature"], tilt["hardware_error"]) == ("unknown", None, 0x20)
 
 
-def test_events_of_both_processes_are_whole_and_are_told_once_to_who_asks_after_the_last(desk):
+def test_events_of_both_processes_are_returned_whole_and_once(desk):
     long = "ä" * 400
     desk.events.emit(EventCode.SETUP, Severity.INFO, "loop", long)
     desk.guardian_events.emit(EventCode.GUARDIAN, Severity.INFO, "guardian", long)

@@ -41,7 +41,7 @@ def test_a_controller_whose_stream_ended_is_held_until_its_next_command(desk):
         assert held() is expected
 
 
-def test_a_plug_in_that_thinks_for_ever_is_interrupted_and_the_next_client_is_served(desk, monkeypatch):
+def test_a_plug_in_that_never_returns_is_interrupted_and_the_next_client_is_served(desk, monkeypatch):
     monkeypatch.setattr(preparation, "BUDGET_S", 0.05)
     status, content = desk.ask("POST", "/controllers/left/commands/brood", {"count": 1})
     assert (status, content["refused"]) == (

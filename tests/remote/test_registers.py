@@ -48,7 +48,7 @@ def test_the_loop_gets_the_integer_of_the_wire(arm, item, given, raw):
     assert json.loads(taken.data) == {"joint": "pan", "item": item, "value": raw}
 
 
-def test_what_the_servo_says_is_the_answer(arm):
+def test_a_servos_failure_is_the_answer(arm):
     said = "pan (ID 11 on bus main) did not answer"
     refusal = Refusal(Code.REGISTER_NOT_WRITTEN, {"problem": said})
     status, content = arm.ask("POST", GAIN, {"value": 1}, refusal=refusal)

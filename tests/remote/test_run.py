@@ -135,15 +135,15 @@ def steered(tmp_path_factory, place):
     return run
 
 
-def test_a_steered_run_ends_well_when_its_client_says_so(steered, place):
+def test_a_steered_run_ends_well_when_its_client_stops_it(steered, place):
     assert (steered.process.returncode, steered.err) == (0, ""), steered.out + steered.err
     assert steered.stopped.complete
     assert list(place.iterdir()) == []
-    with pytest.raises(dxlrun.DxlrunError, match=r"pair does not answer any more: .*No such file"):
+    with pytest.raises(dxlrun.DxlrunError, match=r"pair no longer answers: .*No such file"):
         steered.robot.info()
 
 
-def test_the_log_has_what_was_asked_and_who_asked_it(steered):
+def test_the_log_has_every_command_and_its_client(steered):
     commands = steered.log.commands
     asked = [(one.controller, one.kind) for one in commands if not one.lease_ns]
     assert asked == [
@@ -166,7 +166,7 @@ def test_the_log_has_what_was_asked_and_who_asked_it(steered):
     assert np.frombuffer(streamed[-1].data) == pytest.approx([0.04])  # the newest of them always arrives
 
 
-def test_refusals_say_why_and_whether_the_wish_itself_was_wrong(steered):
+def test_refusals_have_their_reason_and_whether_the_request_itself_was_wrong(steered):
     assert [code for _, code in steered.refused] == [2, 2, 1, 1]
     sentences = " / ".join(sentence for sentence, _ in steered.refused)
     assert "hold" in sentences
@@ -175,7 +175,7 @@ def test_refusals_say_why_and_whether_the_wish_itself_was_wrong(steered):
     assert "pause the loop first" in sentences
 
 
-def test_the_robot_tells_its_clients_what_became_of_it(steered):
+def test_clients_can_read_what_became_of_their_commands(steered):
     info = steered.info
     told = {one["name"]: (one["active"], one["rate"]) for one in info["controllers"]}
     assert told == {"hold": (False, 100.0), "solo": (True, 100.0), "more": (True, 50.0)}
@@ -192,13 +192,13 @@ def test_clients_that_misbehave_leave_nothing_in_the_log(steered):
     assert not [event for event in steered.log.events if event.code == EventCode.CONTROLLER_FAULT]
 
 
-def test_without_its_gateway_the_robot_goes_on_and_says_so(tmp_path_factory, place):
+def test_without_its_gateway_the_run_continues_with_a_remark(tmp_path_factory, place):
     run = Run(tmp_path_factory.mktemp("killed"))
     pid = gateway_of(run.process.pid)
     before = run.robot.info()["cycles"]
     os.kill(pid, signal.SIGKILL)
     await_truth(lambda: not list(place.iterdir()), "the removal of the dead socket")
-    with pytest.raises(dxlrun.DxlrunError, match="pair does not answer any more"):
+    with pytest.raises(dxlrun.DxlrunError, match="pair no longer answers"):
         run.robot.pause()
     await_truth(lambda: len(read_log(run.log_path).cycles) > before + 25, "more cycles")
     run.process.send_signal(signal.SIGINT)

@@ -11,7 +11,7 @@ import pytest
 
 from dxlrun.errors import DxlrunError
 from dxlrun.remote import sockets
-from dxlrun.remote.sockets import alive, listen, ours, running
+from dxlrun.remote.sockets import alive, listen, owned, running
 
 NOBODY = 65534
 CONNECT = """
@@ -94,7 +94,7 @@ def test_a_gateway_that_is_too_busy_to_listen_is_not_taken_for_dead():
             client.close()
 
 
-def test_nobody_waits_where_nothing_is(place):
+def test_a_probe_of_no_socket_does_not_wait(place):
     assert running() == ()
     assert not place.exists()  # looking makes no directories
     assert not alive(place / "pair.sock")
@@ -131,7 +131,7 @@ def test_without_a_runtime_directory_it_is_one_in_tmp(monkeypatch, value):
 
 def test_with_a_runtime_directory_it_is_the_only_one(place, monkeypatch):
     looked_at = []
-    monkeypatch.setattr(sockets, "ours", lambda directory: looked_at.append(directory) or ours(directory))
+    monkeypatch.setattr(sockets, "owned", lambda directory: looked_at.append(directory) or owned(directory))
     with listen("pair")[0]:
         assert running() == ("pair",)
     assert set(looked_at) == {place}

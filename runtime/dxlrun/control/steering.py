@@ -46,7 +46,7 @@ class Steered(Protocol):
         ...
 
     def expire(self, controller: str) -> str:
-        """Do what the policy for a stale command says; return that in words, for the log."""
+        """Execute the policy for a stale command; return it in words, for the log."""
         ...
 
     @property

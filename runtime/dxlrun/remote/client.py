@@ -29,7 +29,7 @@ from dxlrun.remote.sockets import MOST_BYTES, alive, running, sockets
 __all__ = ["Executed", "RemoteRobot", "Stream", "connect", "running"]
 
 TIMEOUT_S = 10.0
-"""How long an answer may take: two seconds or so whatever the loop does, six more of a switch with modes."""
+"""How long an answer may take: some two seconds, and six more for a switch that waits for modes."""
 LEASE_S = 0.2
 _IDLE_S = 20.0
 """The gateway closes silent connections after 30 s; one that was silent for so long is not used again."""
@@ -43,7 +43,7 @@ class Executed:
     """The answer to a command that the robot executed."""
 
     cycle: int
-    """The loop's cycle that did it; -1 where the robot does not say."""
+    """The loop's cycle that did it; -1: not known."""
 
 
 class _Connection(http.client.HTTPConnection):
@@ -57,7 +57,7 @@ class _Connection(http.client.HTTPConnection):
         """Connect to the socket's path; where its queue of connections is full, wait in the kernel's.
 
         The kernel serves those that wait in order (a socket with a timeout of Python does not wait: unix(7),
-        EAGAIN), so a process that floods the queue delays this one and no more.
+        EAGAIN), so a process that floods the queue only delays this one.
         """
         self.sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         timeval = struct.pack("@2l", int(TIMEOUT_S), int(TIMEOUT_S % 1 * 1e6))
@@ -70,7 +70,7 @@ class _Connection(http.client.HTTPConnection):
 
     @property
     def hung_up(self) -> bool:
-        """True when the other end has closed it; it says nothing unless asked, so any byte means that too."""
+        """True when the other end has closed it; it sends nothing unasked, so any byte means that too."""
         if self.sock is None:
             return False
         look = select.poll()
@@ -121,13 +121,13 @@ class RemoteRobot:
         self.close()
 
     def close(self) -> None:
-        """End the connection; the robot goes on."""
+        """Close the connection; the robot keeps running."""
         self._connection.close()
 
     # Looking
 
     def info(self) -> dict[str, object]:
-        """Return who it is: rate, controllers and what they take, cycles, log."""
+        """Return rate, cycles, log, and the controllers with the commands that they take."""
         return self._ask("GET", "/robot")
 
     def states(self) -> dict[str, object]:
@@ -176,7 +176,7 @@ class RemoteRobot:
         return self._execute("/rate", {"rate": rate})
 
     def pause(self) -> Executed:
-        """Hold the joints; the controllers' time stands still."""
+        """Hold the joints, and stop the controllers' time."""
         return self._execute("/pause")
 
     def resume(self) -> Executed:
@@ -227,7 +227,7 @@ class RemoteRobot:
         return _executed(self._ask("POST", path, content))
 
     def _ask(self, method: str, path: str, content: Mapping[str, object] | None = None) -> dict[str, object]:
-        """Ask once and return the answer: nothing is ever asked twice, the first may have been heard."""
+        """Ask once and return the answer: nothing is sent twice, because the first may have been received."""
         body = None if content is None else _json(content)
         idle = time.monotonic() - self._used > _IDLE_S
         if idle or self._connection.hung_up:
@@ -239,7 +239,7 @@ class RemoteRobot:
         except (http.client.HTTPException, OSError, ValueError) as error:
             self.close()
             why = str(error) or type(error).__name__
-            raise DxlrunError(f"{self.name} does not answer any more: {why}") from error
+            raise DxlrunError(f"{self.name} no longer answers: {why}") from error
         except BaseException:  # Ctrl-C between question and answer: the answer must not meet the next one
             self.close()
             raise
@@ -323,4 +323,4 @@ class Stream:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Nothing is said: the lease runs out, and the joints are held."""
+        """Send nothing: the lease runs out, and the joints are held."""

@@ -173,7 +173,7 @@ class Gateway:
         }
 
     async def states(self, request: Request) -> Response:
-        """The newest cycle; numbers that are not there are null."""
+        """Return the newest cycle; numbers that are not known are null."""
         record = self._link.newest()
         if record is None:
             raise refused(Code.NO_CYCLE, {})
@@ -182,7 +182,7 @@ class Gateway:
         return _json({"cycle": record.cycle, "time": record.woken_ns * 1e-9, "joints": rows})
 
     async def events(self, request: Request) -> Response:
-        """What happened since event `after`, as far as it is kept; `last` is the newest's number."""
+        """Return the events after number `after` that are kept; `last` is the newest's number."""
         after = number(request, "after", 0.0)
         newest = self._link.events[-1][0] if self._link.events else 0
         rows = [
@@ -253,7 +253,7 @@ class Gateway:
         return _done(await self._link.for_loop("rate", rate, origin(request), noted))
 
     async def pause(self, request: Request) -> Response:
-        """Hold the joints where they are sent; the controllers' time stands still."""
+        """Hold the joints at their goals, and stop the controllers' time."""
         noted = partial(self._note, "paused", True)
         return _done(await self._link.for_loop("pause", None, origin(request), noted))
 

@@ -356,7 +356,7 @@ def _plain(value: object, path: tuple[str | int, ...], mistaken: list[tuple[str,
     if quantity is None or value is None:
         return value
     try:
-        return quantity(value)  # type: ignore[arg-type]  # of a number it says that the unit is missing
+        return quantity(value)  # type: ignore[arg-type]  # of a number: ValueError, the unit is missing
     except ValueError as error:
         shown = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in path)
         mistaken.append(("".join(f"/{step}" for step in path), f"{shown.removeprefix('.')}: {error}"))

@@ -1,7 +1,7 @@
-"""Where the sockets of running robots are, and which robots run; both ends of a socket know this.
+"""Sockets of running robots: where they are, and which robots run; used by gateway and client.
 
-A socket is in `$XDG_RUNTIME_DIR/dxlrun` (XDG Base Directory Specification) where that directory is ours, else
-in `/tmp/dxlrun-<user ID>`; never in both. A service and a login shell that differ in the variable do not see
+A socket is in `$XDG_RUNTIME_DIR/dxlrun` (XDG Base Directory Specification) where this user owns that, else
+in `/tmp/dxlrun-<user ID>`; never in both. A service and a login shell that differ in the variable do not find
 each other's runs: set it alike.
 """
 
@@ -28,14 +28,14 @@ def place() -> Path:
     """Return the directory of this user's sockets; it may not exist yet."""
     runtime = Path(os.environ.get("XDG_RUNTIME_DIR", ""))
     with suppress(OSError):
-        # that of another user, left in the environment by su or sudo, is not ours to write into
+        # su and sudo may leave that of another user in the environment
         if runtime.is_absolute() and runtime.stat().st_uid == os.getuid():
             return runtime / "dxlrun"
-    return Path(f"/tmp/dxlrun-{os.getuid()}")  # noqa: S108  entered only when it is ours alone
+    return Path(f"/tmp/dxlrun-{os.getuid()}")  # noqa: S108  entered only if this user owns it
 
 
-def ours(directory: Path) -> bool:
-    """Say whether a directory belongs to this user and nobody else may look into it; no link is followed."""
+def owned(directory: Path) -> bool:
+    """Return whether a directory belongs to this user and no other may enter it; no link is followed."""
     try:
         found = directory.lstat()
     except OSError:
@@ -46,17 +46,17 @@ def ours(directory: Path) -> bool:
 def listen(robot: str) -> tuple[socket.socket, Path]:
     """Return a listening socket of a robot (mode 0600) and its path.
 
-    A second run of the same robot gets its process' number into the name. Raises DxlrunError when there is
+    A second run of the same robot has its process ID in the name. Raises DxlrunError when there is
     no safe place for a socket.
     """
     directory = place()
     with suppress(OSError):
         directory.mkdir(mode=0o700)
-    if not ours(directory):
+    if not owned(directory):
         raise DxlrunError(
             f"{directory} must be a directory that only you may enter: remove it, or set XDG_RUNTIME_DIR"
         )
-    with _alone(directory):
+    with _locked(directory):
         path = directory / f"{robot}{SUFFIX}"
         if alive(path):
             path = directory / f"{robot}-{os.getpid()}{SUFFIX}"
@@ -81,8 +81,8 @@ def _bound(path: Path) -> socket.socket:
 
 
 @contextmanager
-def _alone(directory: Path) -> Iterator[None]:
-    """Keep others from looking between the birth of a socket and its first ear, and from removing it."""
+def _locked(directory: Path) -> Iterator[None]:
+    """Lock the directory: no other process sees a socket before it listens, or removes it then."""
     descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
@@ -92,12 +92,12 @@ def _alone(directory: Path) -> Iterator[None]:
 
 
 def alive(path: Path) -> bool:
-    """Say whether a process listens at a socket, also one that is busy or stopped; never waits."""
+    """Return whether a process listens at a socket, also one that is busy or stopped; never waits."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)
         try:
             probe.connect(str(path))
-        except BlockingIOError:  # so many wait there that there is no room for one more
+        except BlockingIOError:  # its queue of connections is full
             return True
         except OSError:
             return False
@@ -105,17 +105,17 @@ def alive(path: Path) -> bool:
 
 
 def running() -> tuple[str, ...]:
-    """Return the names of the robots that run and can be steered; sockets that nobody serves are removed."""
+    """Return the names of the robots that run and can be steered; sockets without a process are removed."""
     return tuple(sorted(sockets()))
 
 
 def sockets() -> dict[str, Path]:
-    """Return the living sockets by the names of their robots, and remove the dead ones."""
+    """Return the sockets of running robots by name, and remove those without a process."""
     found: dict[str, Path] = {}
     directory = place()
-    if not ours(directory):
+    if not owned(directory):
         return found
-    with _alone(directory):
+    with _locked(directory):
         for path in directory.glob(f"*{SUFFIX}"):
             if alive(path):
                 found[path.stem] = path

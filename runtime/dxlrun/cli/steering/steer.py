@@ -80,7 +80,7 @@ def list_robots(*, robot: str | None = None, as_json: JsonFlag = False, debug: F
     for info in found:
         show(headline(info), controllers(info))
     if not names:
-        show("no robot runs that could be steered; `dxlrun ROBOT.yaml` starts one")
+        show("no robot runs that can be steered; `dxlrun ROBOT.yaml` starts one")
     return code
 
 
@@ -175,7 +175,7 @@ def rate(hz: float, /, *, chosen: Chosen = ONLY_ONE) -> int:
 
 
 def pause(*, chosen: Chosen = ONLY_ONE) -> int:
-    """Pause a running robot: its joints are held, its controllers' time stands still."""
+    """Pause a running robot: its joints are held, its controllers' time stops."""
     with _robot(chosen, "pause") as robot:
         done = robot.pause()
         text = "is paused, its joints are held; `dxlrun resume` ends that"
@@ -226,7 +226,7 @@ def unload(name: str, /, *, chosen: Chosen = ONLY_ONE) -> int:
 
 
 def stop(*, no_wait: Flag = False, chosen: Chosen = ONLY_ONE) -> int:
-    """End a running robot in order, as its policy on_exit says.
+    """End a running robot in order, by its policy on_exit.
 
     Parameters
     ----------
@@ -244,7 +244,7 @@ def _robot(chosen: Chosen, verb: str) -> RemoteRobot:
 
     names = running()
     if not names:
-        raise DxlrunError("no robot runs that could be steered; `dxlrun ROBOT.yaml` starts one")
+        raise DxlrunError("no robot runs that can be steered; `dxlrun ROBOT.yaml` starts one")
     if chosen.robot is None and len(names) > 1:
         raise InputError(f"several robots run; choose one: --robot {', --robot '.join(names)}")
     if chosen.robot is not None and chosen.robot not in names:

@@ -116,7 +116,7 @@ def test_it_is_started_when_the_loop_runs_and_not_before_or_after(make_run, star
     ],
     ids=["no process", "no place", "ends"],
 )
-def test_without_it_the_run_goes_on_with_one_remark(make_run, started, heartbeat, ready, remark):
+def test_without_it_the_run_continues_with_one_remark(make_run, started, heartbeat, ready, remark):
     run = make_run()
     started.ready[0] = ready
     for _ in range(5):
