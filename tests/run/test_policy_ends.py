@@ -15,9 +15,10 @@ from dxlrun.run.channels import process
 from dxlrun.run.channels.events import Severity, decode_event
 from dxlrun.run.channels.heartbeat import Heartbeat, Phase
 from dxlrun.run.channels.packets import PacketBatch, PacketKind, decode_packets
+from dxlrun.run.channels.process import RunMemory
 from dxlrun.run.channels.ring import Handover, Record, RecordKind, RingReader, RingWriter
 from dxlrun.run.guardian import SafeStop
-from dxlrun.run.run_processes import RunMemory, guardian_job
+from dxlrun.run.run_processes import create_memory, guardian_job
 from dxlrun.simulation.virtual_ports import VirtualPorts
 from dxlrun.testing import VirtualRobot, plan_of, simulated_robot
 
@@ -116,7 +117,7 @@ def test_the_guardian_holds_only_a_robot_that_was_running(
     robot = tmp_path / "holding.yaml"
     robot.write_text((tmp_path / "pair.yaml").read_text() + "policies: {on_fault: hold}\n")
     plan = plan_of(robot)
-    memory = RunMemory.create(plan)
+    memory = create_memory(plan)
     Heartbeat(memory.heartbeat).enter(phase)
     limp: list[str] = []
     monkeypatch.setattr(SafeStop, "limp", lambda safe_stop, ports, how, severity: limp.append(how) or [how])
@@ -151,7 +152,7 @@ def safe_stop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[VirtualR
         hardware.read()
         hardware.write()
         hardware.idle(robot.clock.wait_until(robot.clock.now_ns() + 20_000_000))
-    memory = RunMemory.create(robot.plan)
+    memory = create_memory(robot.plan)
     Heartbeat(memory.heartbeat).enter(Phase.RUNNING)
     safe_stop = SafeStop(guardian_job(robot.plan, {}, memory, take_over=False))
     safe_stop._clock = robot.clock  # type: ignore[assignment]  # the time of the simulated servos
@@ -200,7 +201,7 @@ def test_the_last_hand_names_who_did_not_confirm_torque_off(
 
 def test_what_the_loop_had_on_its_desk_when_it_died_comes_into_the_log(start: Start, tmp_path: Path) -> None:
     plan = plan_of(tmp_path / "pair.yaml")
-    memory = RunMemory.create(plan)
+    memory = create_memory(plan)
     desk = PacketBatch(RingWriter(memory.packets), process.shared_memory(memory.desk))
     desk.packet(0, PacketKind.INSTRUCTION, 3, 1, 2, b"half a cycle")
     master, slave = os.openpty()

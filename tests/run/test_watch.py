@@ -40,7 +40,7 @@ from dxlrun.run.guardian import (
     standstill_timeout_ns,
 )
 from dxlrun.run.loop_process import AskedToStop, Pulse
-from dxlrun.run.run_processes import RunMemory, guardian_job
+from dxlrun.run.run_processes import create_memory, guardian_job
 from dxlrun.simulation import Ledger
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.virtual_ports import VirtualPorts
@@ -120,7 +120,7 @@ def test_a_loop_that_never_gets_on_is_ended(  # noqa: PLR0917  fixtures
     """Such as one whose plug-in waits for a server in on_configure, or for a child process at the end."""
     monkeypatch.setattr(guardian, patience, 100 * MS)
     plan = plan_of(tmp_path / "pair.yaml")
-    memory = RunMemory.create(plan)
+    memory = create_memory(plan)
     page = Heartbeat(memory.heartbeat)
     page.name_controller(1, "arm")
     page.enter(phase)
@@ -222,7 +222,7 @@ def test_a_line_whose_other_end_is_gone_still_gives_what_it_said_last() -> None:
 def watcher(start: object, tmp_path: Path) -> Iterator[tuple[Guardian, socket.socket, Heartbeat]]:
     """A guardian of the robot `pair` on virtual time, the terminal's end of its line, and the loop's page."""
     plan = compile_robot(read_robot(tmp_path / "pair.yaml", {}), [], None).plan
-    memory = RunMemory.create(plan)
+    memory = create_memory(plan)
     control, terminal = process.message_channel(Decoder(Stop | Cut))
     made = Guardian(guardian_job(plan, {}, memory, take_over=False), control)
     made._clock = VirtualClock(0)  # type: ignore[assignment]  # so that the test says how time passes

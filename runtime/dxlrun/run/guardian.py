@@ -34,7 +34,7 @@ from dxlrun.run.channels import process
 from dxlrun.run.channels.events import EventCode, EventRing, Severity
 from dxlrun.run.channels.heartbeat import Heartbeat, Phase, Standstill
 from dxlrun.run.channels.packets import PacketBatch, salvage
-from dxlrun.run.channels.process import Cut, Failed, LineLost, LineReturned, MessageChannel, Stop
+from dxlrun.run.channels.process import Cut, Failed, LineLost, LineReturned, MessageChannel, RunMemory, Stop
 from dxlrun.run.channels.ring import RingReader, RingWriter
 
 _NEVER = 1 << 62
@@ -72,19 +72,25 @@ class GuardianJob:
     priority: int
     """Real-time priority of the guardian; 0: none."""
     lock_memory: bool
-    heartbeat: int
-    records: int
-    """The guardian's ring: its packets and its events."""
-    loop_packets: int
-    """The loop's ring of packets: shows whether the batch on the desk is in it."""
-    desk: int
-    """The loop's unfinished batch of packets."""
-    stderr: int
     last: Last
     """How the robot is left when the loop is gone in the middle of a run."""
-    loop: dict[str, object]
-    """The loop's job, but for its port descriptors and its guardian."""
-    loop_descriptors: tuple[int, ...]
+    take_over: bool
+    """The loop accepts servos that are already torqued."""
+    memory: RunMemory
+
+
+@dataclass(frozen=True, slots=True)
+class LoopJob:
+    """What the loop's process works on."""
+
+    memory: RunMemory
+    take_over: bool
+    ports: tuple[int, ...]
+    """Descriptors, in the order of the plan's buses."""
+    channel: int
+    """To the guardian, which opens lines that are gone again."""
+    guardian: int
+    """Process ID."""
 
 
 class Started(msgspec.Struct, frozen=True, tag=True):
@@ -116,8 +122,8 @@ class SafeStop:
     def __init__(self, job: GuardianJob) -> None:
         self._job = job
         self._clock = MonotonicClock()
-        self._heartbeat = Heartbeat(job.heartbeat)
-        self._ring = RingWriter(job.records)
+        self._heartbeat = Heartbeat(job.memory.heartbeat)
+        self._ring = RingWriter(job.memory.guardian)
         self._events = EventRing(self._ring, self._clock)
 
     def end(self, descriptors: Sequence[int], how: str, severity: Severity) -> list[str]:
@@ -155,8 +161,8 @@ class SafeStop:
 
     def _take_over(self, descriptors: Sequence[int]) -> tuple[SerialPorts, PacketBatch]:
         """Bring what the loop had on its desk into the log; return its lines, and where packets go now."""
-        job = self._job
-        salvage(process.shared_memory(job.desk), RingReader(job.loop_packets).head, self._ring)
+        job, memory = self._job, self._job.memory
+        salvage(process.shared_memory(memory.desk), RingReader(memory.packets).head, self._ring)
         ports = SerialPorts(
             [SerialPort(descriptor, path) for descriptor, path in zip(descriptors, job.ports, strict=True)]
         )
@@ -215,7 +221,7 @@ class Guardian:
         self._job = job
         self._control = control
         self._clock = MonotonicClock()
-        self._heartbeat = Heartbeat(job.heartbeat)
+        self._heartbeat = Heartbeat(job.memory.heartbeat)
         self._safe_stop = SafeStop(job)
         self._still = Standstill(LONGEST_LOOK_NS, self._clock.now_ns())
         self._stop_by_ns = _NEVER
@@ -256,12 +262,12 @@ class Guardian:
         self._control.send(Ended(ending, tuple(outcome)))
 
     def _execute(self, descriptors: list[int], channel: int) -> subprocess.Popen[bytes]:
-        job = self._job.loop | {"ports": descriptors, "channel": channel, "guardian": os.getpid()}
+        job = LoopJob(self._job.memory, self._job.take_over, tuple(descriptors), channel, os.getpid())
         return process.start(
             "dxlrun.run.loop_process",
             ["--job", msgspec.json.encode(job).decode()],
-            [*self._job.loop_descriptors, *descriptors, channel],
-            self._job.stderr,
+            [*job.memory.of_loop, *descriptors, channel],
+            job.memory.stderr,
         )
 
     def _watch(self, loop: subprocess.Popen[bytes], returns: LineReturns) -> Ending:

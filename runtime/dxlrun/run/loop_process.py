@@ -14,7 +14,7 @@ import sys
 import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 
 import msgspec
 from msgspec.json import Decoder
@@ -41,39 +41,9 @@ from dxlrun.run.channels.mailbox import Mailbox
 from dxlrun.run.channels.packets import PacketBatch
 from dxlrun.run.channels.process import LineReturned, MessageChannel
 from dxlrun.run.channels.ring import RingWriter
+from dxlrun.run.guardian import LoopJob
 
 _PR_SET_PDEATHSIG = 1
-
-
-@dataclass(frozen=True, slots=True)
-class LoopJob:
-    """The descriptors that the loop's process inherits."""
-
-    plan: int
-    heartbeat: int
-    cycles: int
-    packets: int
-    desk: int
-    """Where the packets of the unfinished cycle lie."""
-    events: int
-    """Also the commands that cycles took."""
-    result: int
-    mailbox: int
-    answers: int
-    grants: int
-    """Where it leaves what the operating system granted."""
-    take_over: bool
-    ports: tuple[int, ...] = ()
-    channel: int = 0
-    """To the guardian, which opens lines that are gone again."""
-    guardian: int = 0
-    """Process ID. Filled in by the guardian, like ports and channel."""
-
-    @property
-    def descriptors(self) -> tuple[int, ...]:
-        """All that was inherited."""
-        fields = (value for name, value in asdict(self).items() if name not in ("take_over", "guardian"))
-        return tuple(one for value in fields for one in (value if isinstance(value, tuple) else (value,)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,7 +160,7 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks) -> LoopOu
         beat=Pulse(heartbeat, stop),
         stop=stop,
         take_over=job.take_over,
-        inbox=Mailbox(job.mailbox, RingWriter(job.answers)),
+        inbox=Mailbox(job.memory.mailbox, RingWriter(job.memory.answers)),
         cycle_limit=heartbeat.may_take,
         pace=pacing,
         activity=Activity(heartbeat, realtime.thread_count),
@@ -238,7 +208,7 @@ def _prepare(  # noqa: PLR0917  what a loop's process has
     if ports.polling:
         ports.polling.margin_ns = pacing.measured_ns
     realtime.log_grants(grants, "loop", sinks.events)
-    os.pwrite(job.grants, msgspec.json.encode(grants), 0)
+    os.pwrite(job.memory.grants, msgspec.json.encode(grants), 0)
     heartbeat.beat()
 
 
@@ -248,17 +218,17 @@ def main() -> None:
     sys.stdout = sys.stderr = process.Printed(sys.stderr.fileno())
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     job = msgspec.json.decode(sys.argv[2], type=LoopJob)
-    _keep_to_this_process(job.descriptors)
+    _keep_to_this_process((*job.memory.of_loop, *job.ports, job.channel))
     clock = MonotonicClock()
-    heartbeat = Heartbeat(job.heartbeat)
-    happened = RingWriter(job.events)
+    heartbeat = Heartbeat(job.memory.heartbeat)
+    happened = RingWriter(job.memory.events)
     events = EventRing(happened, clock)
-    packets = PacketBatch(RingWriter(job.packets), process.shared_memory(job.desk))
-    sinks = Sinks(RingWriter(job.cycles), packets, events, CommandRing(happened), heartbeat.cycle)
+    packets = PacketBatch(RingWriter(job.memory.packets), process.shared_memory(job.memory.desk))
+    sinks = Sinks(RingWriter(job.memory.cycles), packets, events, CommandRing(happened), heartbeat.cycle)
     try:
         if os.getppid() != job.guardian:
             sys.exit(1)  # the guardian was gone before its death could be signalled
-        outcome = _run(from_json(process.whole(job.plan)), job, heartbeat, sinks)
+        outcome = _run(from_json(process.whole(job.memory.plan)), job, heartbeat, sinks)
         outcome = replace(outcome, errors=events.errors.groups)
     except DxlrunError as error:
         outcome = LoopOutcome("start-up", sentences=error.sentences)
@@ -269,7 +239,7 @@ def main() -> None:
         sys.stderr.write(outcome.traceback)
         events.emit(EventCode.LOOP_STOPPED, Severity.FATAL, "loop", outcome.traceback)
     sinks.packets.commit()
-    os.pwrite(job.result, msgspec.json.encode(outcome), 0)
+    os.pwrite(job.memory.result, msgspec.json.encode(outcome), 0)
     if not outcome.traceback:
         heartbeat.enter(Phase.DONE)
     sys.exit(0 if outcome.reason in ("ended", "stopped") and not outcome.sentences else 1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import astuple, dataclass
+from dataclasses import astuple
 from pathlib import Path
 
 import msgspec
@@ -21,9 +21,9 @@ from dxlrun.run.channels.commands import LONGEST_COMMAND, command_capacity
 from dxlrun.run.channels.cycle import MOST_CONTROLLERS, cycle_capacity
 from dxlrun.run.channels.events import LONGEST_EVENT, event_capacity
 from dxlrun.run.channels.packets import DESK_SIZE, LONGEST_BATCH, packet_capacity
-from dxlrun.run.channels.process import Child, Draining, Failed, Listening, Ready
+from dxlrun.run.channels.process import Child, Draining, Failed, Listening, Ready, RunMemory
 from dxlrun.run.guardian import GUARDIAN_MESSAGES, GuardianJob, GuardianMessage
-from dxlrun.run.loop_process import LoopJob, LoopOutcome
+from dxlrun.run.loop_process import LoopOutcome
 from dxlrun.run.simulation_front import FrontOptions, SimulationMessage, first_message, start_simulation
 from dxlrun.simulation import SimulationConfig
 
@@ -38,70 +38,43 @@ _LONGEST_TAKEN = LONGEST_COMMAND + 64
 """Bytes of a command's record when a cycle has taken it."""
 
 
-@dataclass(frozen=True, slots=True)
-class RunMemory:
-    """Descriptors of everything that the processes of a run share; nameless, gone with the last of them."""
+def create_memory(plan: Plan) -> RunMemory:
+    """Create the memory of a run, its rings sized for ten seconds of this robot."""
+    servos = sum(len(bus.servos) for bus in plan.buses)
+    period, cycle = plan.loop.period_ns, cycle_layout(plan).size
+    events = event_capacity(period, servos) + command_capacity(
+        period, len(plan.loop.controllers), mailbox.capacity(MOST_CONTROLLERS)
+    )
+    return RunMemory(
+        plan=process.memory_file("dxlrun-plan", to_json(plan)),
+        heartbeat=heartbeat.create(),
+        cycles=ring.create("cycles", cycle_capacity(period, cycle), cycle),
+        packets=ring.create("packets", packet_capacity(period, servos), LONGEST_BATCH),
+        desk=process.memory_file("dxlrun-desk", bytes(DESK_SIZE)),
+        events=ring.create("events", events, max(_LONGEST_TAKEN, LONGEST_EVENT)),
+        guardian=ring.create("guardian", _GUARDIAN_CAPACITY, max(LONGEST_BATCH, LONGEST_EVENT)),
+        result=process.memory_file("dxlrun-result"),
+        mailbox=mailbox.create(MOST_CONTROLLERS),
+        answers=ring.create("answers", mailbox.ANSWERS_CAPACITY, mailbox.LONGEST_ANSWER),
+        grants=process.memory_file("dxlrun-grants"),
+        stderr=process.memory_file("dxlrun-stderr"),
+    )
 
-    plan: int
-    heartbeat: int
-    cycles: int
-    packets: int
-    desk: int
-    events: int
-    """Of the loop, and the commands that its cycles took."""
-    guardian: int
-    """Packets and events of the guardian."""
-    result: int
-    mailbox: int
-    answers: int
-    grants: int
-    stderr: int
 
-    @classmethod
-    def create(cls, plan: Plan) -> RunMemory:
-        """Create it all, rings sized for ten seconds of this robot."""
-        servos = sum(len(bus.servos) for bus in plan.buses)
-        period, cycle = plan.loop.period_ns, cycle_layout(plan).size
-        events = event_capacity(period, servos) + command_capacity(
-            period, len(plan.loop.controllers), mailbox.capacity(MOST_CONTROLLERS)
-        )
-        return cls(
-            plan=process.memory_file("dxlrun-plan", to_json(plan)),
-            heartbeat=heartbeat.create(),
-            cycles=ring.create("cycles", cycle_capacity(period, cycle), cycle),
-            packets=ring.create("packets", packet_capacity(period, servos), LONGEST_BATCH),
-            desk=process.memory_file("dxlrun-desk", bytes(DESK_SIZE)),
-            events=ring.create("events", events, max(_LONGEST_TAKEN, LONGEST_EVENT)),
-            guardian=ring.create("guardian", _GUARDIAN_CAPACITY, max(LONGEST_BATCH, LONGEST_EVENT)),
-            result=process.memory_file("dxlrun-result"),
-            mailbox=mailbox.create(MOST_CONTROLLERS),
-            answers=ring.create("answers", mailbox.ANSWERS_CAPACITY, mailbox.LONGEST_ANSWER),
-            grants=process.memory_file("dxlrun-grants"),
-            stderr=process.memory_file("dxlrun-stderr"),
-        )
+def loop_outcome(memory: RunMemory) -> LoopOutcome | None:
+    """Return what the loop's process left behind; None when it did not get to it."""
+    try:
+        return msgspec.json.decode(process.whole(memory.result), type=LoopOutcome)
+    except msgspec.MsgspecError:  # nothing, or what was cut short
+        return None
 
-    def outcome(self) -> LoopOutcome | None:
-        """Return what the loop's process left behind; None when it did not get to it."""
-        try:
-            return msgspec.json.decode(process.whole(self.result), type=LoopOutcome)
-        except msgspec.MsgspecError:  # nothing, or what was cut short
-            return None
 
-    def loop_grants(self) -> tuple[Grant, ...]:
-        """Return what the operating system granted to the loop; nothing before it runs."""
-        try:
-            return msgspec.json.decode(process.whole(self.grants), type=tuple[Grant, ...])
-        except msgspec.MsgspecError:
-            return ()
-
-    def rings(self) -> dict[str, int]:
-        """Return the rings that the recorder reads, by the name under which it reports missing records."""
-        return {
-            "loop/cycles": self.cycles,
-            "loop/packets": self.packets,
-            "loop/events": self.events,
-            "guardian": self.guardian,
-        }
+def loop_grants(memory: RunMemory) -> tuple[Grant, ...]:
+    """Return what the operating system granted to the loop; nothing before it runs."""
+    try:
+        return msgspec.json.decode(process.whole(memory.grants), type=tuple[Grant, ...])
+    except msgspec.MsgspecError:
+        return ()
 
 
 def start_simulated_buses(
@@ -129,7 +102,7 @@ def start_simulated_buses(
 
 def start_recorder(log: Path, header: LogHeader, memory: RunMemory) -> Child[RecorderMessage]:
     """Start the recorder and wait until the log is open."""
-    job = RecorderJob(str(log), header, memory.rings())
+    job = RecorderJob(str(log), header, memory.recorded)
     descriptor = process.memory_file("dxlrun-recorder", msgspec.json.encode(job))
     descriptors = [descriptor, *job.rings.values()]
     child = Child(
@@ -179,20 +152,7 @@ def start_gateway(log: Path | None, memory: RunMemory) -> Child[GatewayMessage]:
 
 
 def guardian_job(plan: Plan, ports: Mapping[str, str], memory: RunMemory, *, take_over: bool) -> GuardianJob:
-    """Return what the guardian is to do, and through it the loop."""
-    loop = LoopJob(
-        memory.plan,
-        memory.heartbeat,
-        memory.cycles,
-        memory.packets,
-        memory.desk,
-        memory.events,
-        memory.result,
-        memory.mailbox,
-        memory.answers,
-        memory.grants,
-        take_over,
-    )
+    """Return the job of the guardian, and through it of the loop."""
     scheduler = plan.loop.scheduler
     return GuardianJob(
         buses=plan.buses,
@@ -201,26 +161,9 @@ def guardian_job(plan: Plan, ports: Mapping[str, str], memory: RunMemory, *, tak
         exit_timeout_ns=plan.exit_timeout_ns,
         priority=guardian_priority(scheduler),
         lock_memory=scheduler.lock_memory,
-        heartbeat=memory.heartbeat,
-        records=memory.guardian,
-        loop_packets=memory.packets,
-        desk=memory.desk,
-        stderr=memory.stderr,
         last=plan.loop.policies.on_fault.last,
-        loop=msgspec.to_builtins(loop),
-        loop_descriptors=(
-            memory.plan,
-            memory.heartbeat,
-            memory.cycles,
-            memory.packets,
-            memory.desk,
-            memory.events,
-            memory.result,
-            memory.mailbox,
-            memory.answers,
-            memory.grants,
-            memory.stderr,
-        ),
+        take_over=take_over,
+        memory=memory,
     )
 
 
@@ -231,13 +174,14 @@ def start_guardian(job: GuardianJob, others: Iterable[int]) -> Child[GuardianMes
     they see the end of their channels only after the guardian has made the robot limp.
     """
     descriptor = process.memory_file("dxlrun-guardian", msgspec.json.encode(job))
-    inherited = [descriptor, job.records, *job.loop_descriptors]
+    memory = job.memory
+    inherited = [descriptor, memory.guardian, memory.stderr, *memory.of_loop]
     child = Child(
         "guardian",
         "dxlrun.run.guardian",
         ["--job-fd", str(descriptor)],
         [*inherited, *others],
-        job.stderr,
+        memory.stderr,
         GUARDIAN_MESSAGES,
     )
     os.close(descriptor)

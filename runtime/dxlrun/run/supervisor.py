@@ -34,6 +34,7 @@ from dxlrun.run.channels.process import (
     LineLost,
     LineReturned,
     Listening,
+    RunMemory,
     Stop,
 )
 from dxlrun.run.guardian import Ended, GuardianJob, GuardianMessage, SafeStop, Started
@@ -42,8 +43,10 @@ from dxlrun.run.run_log import discard_log, epoch_offset_ns, incomplete_log, led
 from dxlrun.run.run_processes import (
     GatewayMessage,
     RecorderMessage,
-    RunMemory,
+    create_memory,
     guardian_job,
+    loop_grants,
+    loop_outcome,
     start_gateway,
     start_guardian,
     start_recorder,
@@ -194,7 +197,7 @@ class _Run:
 
     def _look_at_grants(self) -> None:
         """Show what the operating system granted, and record it, once the loop has reported it."""
-        loop = () if self.grants else self.memory.loop_grants()
+        loop = () if self.grants else loop_grants(self.memory)
         if loop:
             self.grants = (
                 *(ProcessGrant("loop", grant) for grant in loop),
@@ -311,7 +314,7 @@ def run_robot(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
     Raises PortError (a port is missing, busy, forbidden) and ProcessFault (a child did not start).
     """
     signals = _Signals()
-    run = _Run(plan, options, RunMemory.create(plan), signals, out)
+    run = _Run(plan, options, create_memory(plan), signals, out)
     began = time.monotonic()
     with signals.caught():
         try:
@@ -342,7 +345,7 @@ def _watching(progress: Progress) -> Callable[[Heartbeat], None]:
 
 def _summary(run: _Run, elapsed_s: float) -> RunSummary:
     """Judge the run: 0 good, 1 failed, 130 interrupted."""
-    outcome = run.memory.outcome()
+    outcome = loop_outcome(run.memory)
     heartbeat = Heartbeat(run.memory.heartbeat)
     sentences: list[str] = []
     if outcome is None and run.ended is not None and run.ended.ending == "done":

@@ -1,4 +1,4 @@
-"""Processes of a run: how one starts another, and the typed messages between them, over a socket pair."""
+"""Processes of a run: how one starts another, the memory they share, and the typed messages between them."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import sys
 from collections import deque
 from collections.abc import Collection, Iterable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import msgspec
@@ -100,6 +101,45 @@ class Printed(io.TextIOBase):
             if data and not self._room:
                 os.write(self._descriptor, b"\n(what was printed after this is left out)\n")
         return len(text)
+
+
+@dataclass(frozen=True, slots=True)
+class RunMemory:
+    """Descriptors of everything that the processes of a run share; nameless, gone with the last of them."""
+
+    plan: int
+    heartbeat: int
+    cycles: int
+    packets: int
+    desk: int
+    """The packets of the unfinished cycle."""
+    events: int
+    """Of the loop, and the commands that its cycles took."""
+    guardian: int
+    """Packets and events of the guardian."""
+    result: int
+    """How the loop ended."""
+    mailbox: int
+    answers: int
+    grants: int
+    """What the operating system granted to the loop."""
+    stderr: int
+
+    @property
+    def of_loop(self) -> tuple[int, ...]:
+        """Those that the loop's process inherits."""
+        rings = (self.cycles, self.packets, self.desk, self.events, self.mailbox, self.answers)
+        return (self.plan, self.heartbeat, *rings, self.result, self.grants)
+
+    @property
+    def recorded(self) -> dict[str, int]:
+        """The rings that the recorder reads, by the name under which it reports missing records."""
+        return {
+            "loop/cycles": self.cycles,
+            "loop/packets": self.packets,
+            "loop/events": self.events,
+            "guardian": self.guardian,
+        }
 
 
 class Failed(msgspec.Struct, frozen=True, tag=True):
