@@ -30,7 +30,7 @@ def loaded_by(*words: str, whole: bool = False) -> tuple[int, set[str]]:
 def test_what_needs_no_robot_imports_neither_numpy_nor_pydantic(words: tuple[str, ...]):
     _, modules = loaded_by(*words)
 
-    assert "cyclopts" in modules
+    assert ("cyclopts" in modules) == (words != ("--version",))
     assert modules.isdisjoint({"numpy", "pydantic", "yaml", "mcap", "serial", "msgspec", "markdown_it"})
 
 
@@ -211,7 +211,7 @@ def test_a_reader_that_goes_away_is_no_traceback(torso):
         (["doctor", "--loud"], 2, "Unknown option"),
         (["list", "--robot", "nobody"], 2, "no robot nobody runs"),
         *(
-            ([verb, *more], 1, "no robot runs that could be steered")
+            ([verb, *more], 1, "no robot runs that can be steered")
             for verb, more in (
                 ("send", ["head", "posvel"]),
                 ("set", ["pan", "led", "1"]),

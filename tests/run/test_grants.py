@@ -33,10 +33,10 @@ def test_a_terminal_gets_a_table_and_each_command_once_and_unbroken() -> None:
     out, text = console(terminal=True)
     show_grants(GRANTS, out)
     lines = text.getvalue().splitlines()
-    assert len(lines) == 1 + len(GRANTS) + 1
-    assert lines[1].split()[:3] == ["timer", "slack", "yes"]
-    assert "guardian: scheduler" in lines[3]
-    assert lines[4].count("allow it with `a long command`") == 1
+    assert len(lines) == 2 + len(GRANTS) + 1  # head, rule, grants, fix
+    assert lines[2].split()[:3] == ["timer", "slack", "yes"]
+    assert "guardian: scheduler" in lines[4]
+    assert lines[5].count("allow it with `a long command`") == 1
     assert refusals(GRANTS, out) == ()
 
 

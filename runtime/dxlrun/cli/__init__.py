@@ -15,13 +15,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     0 good, 1 the robot or the run failed, 2 the input is wrong, 130 interrupted.
     """
     _open_standard_streams()
+    tokens = tuple(sys.argv[1:] if arguments is None else arguments)
     try:
+        if tokens == ("--version",):  # the framework takes longer to import than all that is printed
+            sys.stdout.write(f"{version()}\n")
+            return 0
         from dxlrun.cli.app import run_tokens  # not above: importing the package must cost nothing
 
-        return run_tokens(tuple(sys.argv[1:] if arguments is None else arguments))
+        return run_tokens(tokens)
     except KeyboardInterrupt:  # while that was being imported, or an error reported
         sys.stderr.write("interrupted\n")
         return 130
+
+
+def version() -> str:
+    """Return the version of the installed package."""
+    from importlib import metadata  # not above: only --version needs it
+
+    return metadata.version("dxlrun")
 
 
 def _open_standard_streams() -> None:

@@ -8,10 +8,11 @@ import sys
 import traceback
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from cyclopts import App, CycloptsError
 
+from dxlrun.cli import version
 from dxlrun.cli.inputs import COMMANDS, COMMANDS_WHILE_IT_RUNS
 from dxlrun.cli.run import run
 from dxlrun.errors import DxlrunError, InputError, Problem, Refused
@@ -28,7 +29,7 @@ INTERRUPTED = 130
 _PIPED_HELP = 80
 """Columns."""
 _ROOM = "dxlrun.cli"
-_LISTING = ((), ("--help",), ("-h",), ("--install-completion",))
+_LISTING = ((), ("--help",), ("-h",))
 """How command lines begin that need all commands."""
 RUNNING = "Commands for a robot that runs"
 
@@ -56,7 +57,7 @@ def build(*, listed: bool) -> App:
         help_formatter=_Help(),
         usage=USAGE,
         console=None if sys.stdout.isatty() else out(_PIPED_HELP),
-        version=_version,
+        version=version,
         suppress_keyboard_interrupt=False,  # an interrupt is reported by `run_tokens`, like all else
     )
     app.default(run)
@@ -67,17 +68,21 @@ def build(*, listed: bool) -> App:
     if listed:
         for command in app.resolved_commands().values():
             command.help = command.help.partition("\n\n")[0]  # a list needs no more: the rest takes time
-        app.register_install_completion_command(
-            help="Install tab completion for bash, zsh or fish (--shell), from the next shell on.",
-            version_flags=[],
-        )
+    app.command(install_completion, name="--install-completion", version_flags=[])
     return app
 
 
-def _version() -> str:
-    from importlib import metadata  # not above: only --version needs it
+def install_completion(*, shell: Literal["bash", "zsh", "fish"] | None = None) -> None:
+    """Install tab completion for bash, zsh or fish (--shell), from the next shell on.
 
-    return metadata.version("dxlrun")
+    Parameters
+    ----------
+    shell
+        The shell; without it the one that runs this command.
+    """
+    from cyclopts.completion.install import create_install_completion_command  # not above: it takes long
+
+    create_install_completion_command(build(listed=True).install_completion, add_to_startup=True)(shell=shell)
 
 
 class _Help:

@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dxlrun.errors import counted
+from dxlrun.output.table import Cell, Column, Sentence, Table
+from dxlrun.output.terminal import show
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -116,16 +118,13 @@ def show_grants(grants: Sequence[ProcessGrant], out: Console) -> None:
     """Print a table, and the commands that fix what was refused; only on a terminal."""
     if not out.is_terminal:
         return
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table("real time", "granted", "", box=None, pad_edge=False, header_style="bold")
-    for one in grants:
-        answer = Text("yes", "green") if one.grant.granted else Text("no", "yellow")
-        table.add_row(one.name, answer, Text(one.grant.sentence))
-    out.print(table)
-    for fix in dict.fromkeys(one.grant.fix for one in grants if one.grant.fix):
-        out.print(Text(f"  {fix}", "yellow"), soft_wrap=True)  # unbroken: it is there to be copied
+    columns = [Column("real time", "name"), Column("granted", "name"), Column("", "text")]
+    rows = [
+        (one.name, Cell("yes", "good") if one.grant.granted else Cell("no", "warning"), one.grant.sentence)
+        for one in grants
+    ]
+    fixes = dict.fromkeys(one.grant.fix for one in grants if one.grant.fix)
+    show(Table.of("", columns, rows), *(Sentence(f"  {fix}", "warning") for fix in fixes), console=out)
 
 
 def refusals(grants: Sequence[ProcessGrant], out: Console) -> tuple[str, ...]:
