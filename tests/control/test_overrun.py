@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from dxlrun.control.controllers.plugins import load_plugins
-from dxlrun.control.overrun import OverrunHook
+from dxlrun.control.controllers.plugins import OverrunHook, load_plugins
 from dxlrun.run.channels.answers import Code
 from dxlrun.run.channels.events import EventCode, Severity
 

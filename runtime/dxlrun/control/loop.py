@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from dxlrun.clock import Clock
 from dxlrun.control.controllers.managed import PERIOD_CAP
 from dxlrun.control.controllers.manager import Manager
+from dxlrun.control.controllers.plugins import OverrunHook
 from dxlrun.control.gate import Gate
 from dxlrun.control.loop_plan import ControllerPlan, LoopPlan, OverrunPolicy
-from dxlrun.control.overrun import OverrunHook, Overruns
+from dxlrun.control.overrun import Overruns
 from dxlrun.control.policy_plan import GroupPolicy, Last, PolicyName, PolicyPlan
 from dxlrun.control.safe_motion import SafeMotion
 from dxlrun.control.steering import Steering

@@ -2,24 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TypeAlias, cast, get_args
+from typing import cast, get_args
 
+from dxlrun.control.controllers.plugins import OverrunHook
 from dxlrun.control.loop_plan import OverrunPolicy
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
-
-Decide: TypeAlias = Callable[[int, int, int], object]
-"""What the hook `dxlrun_overrun` of one plug-in says: cycle, scheduled_ns, actual_ns -> policy or None."""
-
-
-@dataclass(frozen=True, slots=True)
-class OverrunHook:
-    """One plug-in's hook."""
-
-    plugin: str
-    """Entry point and distribution."""
-    decide: Decide
 
 
 class Overruns:

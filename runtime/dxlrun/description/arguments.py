@@ -11,10 +11,10 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Annotated
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, Field, ValidationError
 
 from dxlrun.description.document import Filled, KeyPath, Marks, literal, plain_value, text_of
-from dxlrun.description.form import refuse
+from dxlrun.description.form import Form, refuse
 from dxlrun.description.problems import problems_of
 from dxlrun.errors import Mark, Problem
 
@@ -31,10 +31,8 @@ def _scalar(value: object) -> object:
     return value
 
 
-class Argument(BaseModel):
+class Argument(Form):
     """One argument of a robot file."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     default: Annotated[object, AfterValidator(_scalar)] = Field(
         default=None, description="Value when none is given; without one it must be given.", examples=["sim"]

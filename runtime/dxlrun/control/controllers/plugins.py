@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeAlias, cast
 
 import pluggy
 from pydantic import ValidationError
@@ -26,7 +26,6 @@ from dxlrun.control.controllers.controller import (
 )
 from dxlrun.control.controllers.hookspecs import GROUP, HookSpecs
 from dxlrun.control.loop_plan import ControllerPlan
-from dxlrun.control.overrun import Decide, OverrunHook
 from dxlrun.description.modes import COMMAND_INTERFACES, mode_of
 from dxlrun.dynamixel.control_table import add_control_table
 from dxlrun.errors import ControllerFault, PlugInError
@@ -48,6 +47,17 @@ _METHODS = (
 )
 """Called by dxlrun, all by position."""
 _HOOKS = tuple(name for name in vars(HookSpecs) if name.startswith("dxlrun_"))
+Decide: TypeAlias = Callable[[int, int, int], object]
+"""What the hook `dxlrun_overrun` of one plug-in says: cycle, scheduled_ns, actual_ns -> policy or None."""
+
+
+@dataclass(frozen=True, slots=True)
+class OverrunHook:
+    """One plug-in's hook."""
+
+    plugin: str
+    """Entry point and distribution."""
+    decide: Decide
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,8 +158,10 @@ def load_plugins(after_each: Callable[[str], None] = _any_threads) -> PlugIns:
 
 
 def _publisher(entry_point: EntryPoint) -> str:
-    distribution = entry_point.dist
-    return f"{distribution.name} {distribution.version}" if distribution else "an unknown distribution"
+    if entry_point.dist is None:
+        return "an unknown distribution"
+    about = entry_point.dist.metadata  # parsed at each access
+    return f"{about['Name']} {about['Version']}"
 
 
 def _one_line(error: BaseException) -> str:
