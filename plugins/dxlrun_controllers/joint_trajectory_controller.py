@@ -11,7 +11,7 @@ from pydantic import BeforeValidator, Field, TypeAdapter
 
 from dxlrun import Angle, CommandModel, Context, Controller, Duration, Floats, Interfaces, ParametersModel
 from dxlrun_controllers.group import JointNames, check_size, hold
-from dxlrun_controllers.spline import CUBIC, LINEAR, QUINTIC, Sample, Trajectory, flatten
+from dxlrun_controllers.spline import CUBIC, LINEAR, QUINTIC, SplineSample, Trajectory, flatten
 
 CLOSING_SPEED = 0.5
 """rad/s, posvel at the end of a trajectory: with its speed of 0 a servo that lags would creep the rest of its
@@ -107,7 +107,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         """Make room for everything that the loop needs."""
         super().on_configure(context)
         joints = len(context.joints)
-        self._desired = Sample(joints)
+        self._desired = SplineSample(joints)
         self._trajectory = Trajectory(joints)
         self._error = np.zeros(joints)
         self._start_ns = 0

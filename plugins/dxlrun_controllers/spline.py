@@ -19,7 +19,7 @@ LINEAR, CUBIC, QUINTIC = 2, 4, 6
 _HEAD = 4
 
 
-class Sample:
+class SplineSample:
     """The desired state of the joints at one time; shape (joints,) each: rad, rad/s, rad/s^2."""
 
     __slots__ = ("acceleration", "position", "velocity")
@@ -56,7 +56,7 @@ def solve(
     out[5] = (12 * way - 6 * (v1 + v0) * t + (a1 - a0) * t**2) / (2 * t**5)
 
 
-def evaluate(piece: Sequence[Floats] | Floats, t: float, sample: Sample) -> None:
+def evaluate(piece: Sequence[Floats] | Floats, t: float, sample: SplineSample) -> None:
     """Write the piece's value and derivatives at `t` s into `sample` (Horner's scheme)."""
     position, velocity, acceleration = sample.position, sample.velocity, sample.acceleration
     position.fill(0.0)
@@ -119,7 +119,7 @@ class Trajectory:
         self.duration_s = 0.0
         """From `load` to the last point, s."""
 
-    def load(self, data: Floats, now: Sample) -> None:
+    def load(self, data: Floats, now: SplineSample) -> None:
         """Begin a flat trajectory from the sample `now`; time counts from here."""
         count, joints, order = int(data[0]), int(data[1]), int(data[2])
         ends = _HEAD + count
@@ -137,7 +137,7 @@ class Trajectory:
             start = (now.position, now.velocity, now.acceleration)
             solve(order, self._bridge_s, start, self._first, self._bridge[:order])
 
-    def sample(self, t: float, sample: Sample) -> None:
+    def sample(self, t: float, sample: SplineSample) -> None:
         """Write the desired state `t` s after `load`; after the end: the last position, at rest."""
         if t >= self.duration_s:
             np.copyto(sample.position, self._last[0])

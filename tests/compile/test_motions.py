@@ -77,14 +77,14 @@ def test_formulas_for_a_group_controller_become_one_command_a_sample(compile_tex
 def test_formulas_for_a_trajectory_controller_become_one_trajectory(
     compile_text: Compile, trajectory_robot: str
 ):
-    from dxlrun_controllers.spline import Sample, Trajectory
+    from dxlrun_controllers.spline import SplineSample, Trajectory
 
     compiled = compile_text(trajectory_robot, TRAJECTORY)
 
     (command,) = compiled.plan.loop.commands
     assert (command.at_ns, command.kind) == (3_000_000_000, "trajectory")
-    trajectory, sample = Trajectory(2), Sample(2)
-    trajectory.load(np.frombuffer(command.data, dtype="<f8"), Sample(2))
+    trajectory, sample = Trajectory(2), SplineSample(2)
+    trajectory.load(np.frombuffer(command.data, dtype="<f8"), SplineSample(2))
     for t in range(5):
         trajectory.sample(1.0 + t, sample)  # it begins 1 s after it was handed over
         assert sample.position == pytest.approx([0.5 * math.sin(t), t / 10])

@@ -6,7 +6,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import BPoly, CubicHermiteSpline
 
-from dxlrun_controllers.spline import CUBIC, LINEAR, QUINTIC, Sample, Trajectory, evaluate, flatten, solve
+from dxlrun_controllers.spline import (
+    CUBIC,
+    LINEAR,
+    QUINTIC,
+    SplineSample,
+    Trajectory,
+    evaluate,
+    flatten,
+    solve,
+)
 
 values = st.floats(-10, 10)
 boundary = st.tuples(values, values, values)
@@ -19,7 +28,7 @@ def test_a_quintic_piece_is_scipys(start, end, duration, share):
     solve(QUINTIC, duration, np.array(start)[:, None], np.array(end)[:, None], piece)
     theirs = BPoly.from_derivatives([0, duration], [start, end])
     scale = max(1.0, *np.abs(start), *np.abs(end)) * max(1.0, duration**2)
-    found = Sample(1)
+    found = SplineSample(1)
     evaluate(piece, share * duration, found)
     at = share * duration
     assert found.position[0] == pytest.approx(float(theirs(at)), abs=1e-12 * scale)
@@ -34,7 +43,7 @@ def test_a_cubic_piece_is_scipys(start, end, duration, share):
     solve(CUBIC, duration, np.array(start)[:, None], np.array(end)[:, None], piece)
     theirs = CubicHermiteSpline([0, duration], [start[0], end[0]], [start[1], end[1]])
     scale = max(1.0, *np.abs(start), *np.abs(end)) * max(1.0, duration)
-    found = Sample(1)
+    found = SplineSample(1)
     evaluate(piece, share * duration, found)
     at = share * duration
     assert found.position[0] == pytest.approx(float(theirs(at)), abs=1e-12 * scale)
@@ -44,12 +53,12 @@ def test_a_cubic_piece_is_scipys(start, end, duration, share):
 
 def loaded(order, times, points, start_in=0.0, now=None):
     trajectory = Trajectory(points.shape[2])
-    trajectory.load(flatten(order, times, points, start_in), now or Sample(points.shape[2]))
+    trajectory.load(flatten(order, times, points, start_in), now or SplineSample(points.shape[2]))
     return trajectory
 
 
 def sampled(trajectory, times, joints):
-    sample, found = Sample(joints), []
+    sample, found = SplineSample(joints), []
     for time in times:
         trajectory.sample(time, sample)
         found.append((sample.position.copy(), sample.velocity.copy(), sample.acceleration.copy()))
@@ -74,7 +83,7 @@ def test_a_whole_trajectory_is_scipys_between_its_points(order):
 @pytest.mark.parametrize("order", [LINEAR, CUBIC, QUINTIC])
 @pytest.mark.parametrize("start_in", [0.0, 0.7])
 def test_the_bridge_leads_from_now_to_the_first_point(order, start_in):
-    now = Sample(1)
+    now = SplineSample(1)
     now.position[:], now.velocity[:], now.acceleration[:] = 0.4, -0.3, 0.9
     points = np.array([[[1.0], [0.5], [0.2]], [[2.0], [0.1], [0.0]]])
     trajectory = loaded(order, np.array([0.5, 1.5]), points, start_in, now)
@@ -112,7 +121,7 @@ def test_the_position_alone_is_that_of_the_whole_sample_to_the_bit(order, start_
     points = random.uniform(-1, 1, (9, 3, 2))
     trajectory = loaded(order, times, points, start_in)
     at = np.concatenate([times[:-1], np.nextafter(times, 0), random.uniform(-0.1, times[-1], 200)]) + start_in
-    whole, alone = Sample(2), np.empty(2)
+    whole, alone = SplineSample(2), np.empty(2)
     for time in at[at < trajectory.duration_s]:
         trajectory.position(float(time), alone)
         loaded(order, times, points, start_in).sample(float(time), whole)

@@ -14,7 +14,7 @@ import dxlrun
 from dxlrun.compile.plan import Plan
 from dxlrun.control.controllers.plugins import Offer, PlugIns
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan, LoopPlan, SchedulerPlan
-from dxlrun.remote.gateway import Gateway
+from dxlrun.remote.gateway import GatewayApp
 from dxlrun.remote.job import Descriptors
 from dxlrun.remote.link import Link
 from dxlrun.remote.preparation import Preparation
@@ -147,7 +147,7 @@ class Desk:
         self.guardian_events = EventRing(ring.RingWriter(memory.guardian), self.clock)
         self.link = Link(PLAN, memory)
         plugins = PlugIns({"arm": Offer("arm", Arm, "tests 1")}, {})
-        self.gateway = Gateway(
+        self.gateway = GatewayApp(
             self.link,
             Preparation({joint.name: joint for joint in PLAN.loop.joints}, plugins),
             "/logs/pair.mcap",

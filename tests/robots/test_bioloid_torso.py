@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dxlrun.compile import Compiled, compile_files
-from dxlrun_controllers.spline import Sample, Trajectory
+from dxlrun_controllers.spline import SplineSample, Trajectory
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 
@@ -97,8 +97,8 @@ def test_each_arm_follows_its_formula(torso: Compiled):
 
     commands = {c.controller: c for c in torso.plan.loop.commands if c.kind == "trajectory"}
     for name, formula, duration in (("left_arm", left, 30.0), ("right_arm", right, 20.0)):
-        trajectory, sample = Trajectory(3), Sample(3)
-        trajectory.load(np.frombuffer(commands[name].data, dtype="<f8"), Sample(3))
+        trajectory, sample = Trajectory(3), SplineSample(3)
+        trajectory.load(np.frombuffer(commands[name].data, dtype="<f8"), SplineSample(3))
         for i in range(500):
             t = duration * i / 499
             trajectory.sample(1.0 + t, sample)

@@ -12,7 +12,7 @@ import numpy as np
 
 from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.loop_plan import ControllerPlan
-from dxlrun.run.channels.answers import Answer, Code, Done, Outcome, Refusal, Waiting
+from dxlrun.run.channels.answers import Answer, Code, CommandOutcome, Done, Refusal, Waiting
 from dxlrun.run.channels.commands import LOOP, Command, CommandSink, Inbox, TakenCommand
 from dxlrun.run.channels.cycle import CycleRecord
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
@@ -114,7 +114,7 @@ class Steering:
                 self._report_refusal(command, answer)
             elif command.controller == LOOP:
                 text = f"{command.kind} {command.data.decode(errors='replace')}".strip()
-                data = msgspec.json.encode(Outcome(command.kind, command.origin))
+                data = msgspec.json.encode(CommandOutcome(command.kind, command.origin))
                 text = f"{text} from {command.origin}"
                 self.events.emit(EventCode.STEERED, Severity.INFO, "loop", text, data)
             else:
@@ -137,7 +137,7 @@ class Steering:
     def _report_refusal(self, command: Command, refusal: Refusal) -> None:
         source = command.controller or "loop"
         text = f"{command.kind} from {command.origin} refused: {refusal.text}"
-        data = msgspec.json.encode(Outcome(command.kind, command.origin, refusal))
+        data = msgspec.json.encode(CommandOutcome(command.kind, command.origin, refusal))
         self.events.emit(EventCode.COMMAND_REFUSED, Severity.WARNING, source, text, data)
 
     def _log(self, command: Command) -> None:

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 
 from dxlrun.log.reader import UNREADABLE, Log
-from dxlrun.run.channels.answers import Code, Outcome, Refusal
+from dxlrun.run.channels.answers import Code, CommandOutcome, Refusal
 from dxlrun.run.channels.commands import TakenCommand
 from dxlrun.run.channels.events import Event, EventCode
 
@@ -90,14 +90,14 @@ def _refusal(command: TakenCommand, answers: deque[Event]) -> str:
     return ""
 
 
-def _outcome(event: Event, command: TakenCommand) -> Outcome:
+def _outcome(event: Event, command: TakenCommand) -> CommandOutcome:
     try:
-        return msgspec.json.decode(event.data, type=Outcome)
+        return msgspec.json.decode(event.data, type=CommandOutcome)
     except UNREADABLE:  # of the first release, whose events had no data: the text names kind and client
         refused = f"{command.kind} from {command.origin} refused: "
         if event.code == EventCode.STEERED and event.text.startswith(command.kind):
-            return Outcome(command.kind, command.origin)
+            return CommandOutcome(command.kind, command.origin)
         if event.code == EventCode.COMMAND_REFUSED and event.text.startswith(refused):
             problem = event.text.removeprefix(refused)
-            return Outcome(command.kind, command.origin, Refusal(Code.INVALID, {"problem": problem}))
-        return Outcome("", "")
+            return CommandOutcome(command.kind, command.origin, Refusal(Code.INVALID, {"problem": problem}))
+        return CommandOutcome("", "")

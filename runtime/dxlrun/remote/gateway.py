@@ -33,7 +33,7 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 from starlette.routing import Route
 
-from dxlrun.control.steering import Rate, Switch
+from dxlrun.control.steering import Rate, Switch, Unload
 from dxlrun.description.modes import Mode
 from dxlrun.remote.link import Link, Loaded
 from dxlrun.remote.preparation import (
@@ -98,7 +98,7 @@ class Value(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     value: int | str
 
 
-class Gateway:
+class GatewayApp:
     """The routes; every request is checked and prepared here, so that the loop only has to execute it."""
 
     def __init__(
@@ -280,7 +280,7 @@ class Gateway:
         def noted(_: Done) -> None:
             self._link.controllers.pop(name, None)
 
-        return _done(await self._link.for_loop("unload", {"controller": name}, origin(request), noted))
+        return _done(await self._link.for_loop("unload", Unload(name), origin(request), noted))
 
     def _note(self, what: str, value: object, _: Done) -> None:
         setattr(self._link, what, value)

@@ -27,7 +27,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from dxlrun.compile.plan import Plan, from_json
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.errors import DxlrunError
-from dxlrun.remote.gateway import Gateway
+from dxlrun.remote.gateway import GatewayApp
 from dxlrun.remote.job import GatewayJob
 from dxlrun.remote.link import Link
 from dxlrun.remote.preparation import Preparation
@@ -58,7 +58,7 @@ def main() -> None:
     try:
         link = Link(plan, job.memory)
         joints = {joint.name: joint for joint in plan.loop.joints}
-        gateway = Gateway(link, Preparation(joints, load_plugins()), job.log)
+        gateway = GatewayApp(link, Preparation(joints, load_plugins()), job.log)
         listener, path = listen(plan.robot)
     except (DxlrunError, OSError) as error:
         channel.send(Failed(str(error)))
@@ -70,7 +70,7 @@ def main() -> None:
         path.unlink(missing_ok=True)
 
 
-async def serve(link: Link, gateway: Gateway, listener: socket.socket, control: socket.socket) -> None:
+async def serve(link: Link, gateway: GatewayApp, listener: socket.socket, control: socket.socket) -> None:
     """Serve until the other end of `control` is closed, or the link fails, whose error is raised."""
     config = uvicorn.Config(
         gateway.app(),

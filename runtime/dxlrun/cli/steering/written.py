@@ -47,8 +47,14 @@ class Written:
 
     def located(self, refused: Refused) -> DxlrunError:
         """Return a refusal with one line for each wrong quantity, and with their places in the file."""
+        from dxlrun.run.channels.answers import Code
+
         paths, problems = refused.fields.get("paths"), refused.fields.get("problems")
-        if refused.code != "wrong_quantity" or not isinstance(paths, list) or not isinstance(problems, list):
+        if (
+            refused.code != Code.WRONG_QUANTITY
+            or not isinstance(paths, list)
+            or not isinstance(problems, list)
+        ):
             return refused
         if self.in_words:
             return Refused("\n".join(problems), code=refused.code, fields=refused.fields, wrong_input=True)

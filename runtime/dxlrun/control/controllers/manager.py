@@ -17,7 +17,7 @@ from dxlrun.control.controllers.mode_switch import ModeSwitch, SetModes
 from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.loop_plan import ControllerPlan, LoopPlan, ScheduledCommand
 from dxlrun.errors import ControllerFault, PlugInError
-from dxlrun.run.channels.answers import Code, Field, Outcome, Refusal, Waiting
+from dxlrun.run.channels.answers import Code, CommandOutcome, Field, Refusal, Waiting
 from dxlrun.run.channels.commands import CommandSink, NoCommands, TakenCommand
 from dxlrun.run.channels.cycle import MOST_CONTROLLERS, CycleRecord
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
@@ -239,7 +239,7 @@ class Manager:
             for managed in group.entering:
                 name = managed.plan.name
                 text = f"{name} is not activated: {problem}"
-                self._report_refusal(name, text, Outcome("switch", "", refusal))
+                self._report_refusal(name, text, CommandOutcome("switch", "", refusal))
             self.fault = self.fault or group.why or None
 
     def load(self, plan: ControllerPlan) -> int | Refusal:
@@ -358,11 +358,11 @@ class Manager:
             taken += refusal is None
             if refusal is not None:
                 text = f"{command.kind} from {command.origin} refused: {refusal.text}"
-                outcome = Outcome(command.kind, command.origin, refusal)
+                outcome = CommandOutcome(command.kind, command.origin, refusal)
                 self._report_refusal(command.controller, text, outcome)
         return taken
 
-    def _report_refusal(self, controller: str, text: str, outcome: Outcome) -> None:
+    def _report_refusal(self, controller: str, text: str, outcome: CommandOutcome) -> None:
         data = msgspec.json.encode(outcome)
         self._events.emit(EventCode.COMMAND_REFUSED, Severity.WARNING, controller, text, data)
 

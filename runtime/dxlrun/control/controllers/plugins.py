@@ -117,7 +117,7 @@ class PlugIns:
 
 
 @dataclass(frozen=True, slots=True)
-class _Found:
+class _Offered:
     """What one plug-in brings."""
 
     offers: tuple[Offer, ...] = ()
@@ -142,7 +142,7 @@ def load_plugins(after_each: Callable[[str], None] = _any_threads) -> PlugIns:
             found = _load(entry_point, publisher)
         except PlugInError as error:
             broken[_free_key(entry_point.name, publisher, broken)] = str(error)
-            found = _Found()
+            found = _Offered()
         if found.overrun is not None:
             hooks.append(OverrunHook(f"{entry_point.name} ({publisher})", found.overrun))
         after_each(f"{entry_point.name} ({publisher})")
@@ -173,7 +173,7 @@ def _free_key(name: str, publisher: str, taken: Mapping[str, str]) -> str:
     return name if name not in taken else f"{name} ({publisher})"
 
 
-def _load(entry_point: EntryPoint, publisher: str) -> _Found:
+def _load(entry_point: EntryPoint, publisher: str) -> _Offered:
     """Return what one plug-in offers. Raises PlugInError with one sentence that names its distribution."""
 
     def refuse(what: str, fix: str) -> PlugInError:
@@ -216,7 +216,7 @@ def _load(entry_point: EntryPoint, publisher: str) -> _Found:
     )
     for models in servo_models:
         _add_servo_models(models, refuse)
-    return _Found(offers, _overrun(manager))
+    return _Offered(offers, _overrun(manager))
 
 
 def _overrun(manager: pluggy.PluginManager) -> Decide | None:

@@ -132,7 +132,7 @@ class Refusal(msgspec.Struct, frozen=True, tag="refused"):
 Answer: TypeAlias = Done | Waiting | Refusal
 
 
-class Outcome(msgspec.Struct, frozen=True):
+class CommandOutcome(msgspec.Struct, frozen=True):
     """Data of the events STEERED and COMMAND_REFUSED: what became of a command from outside."""
 
     kind: str
