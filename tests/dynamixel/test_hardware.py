@@ -153,7 +153,7 @@ def test_a_servo_whose_torque_fits_no_gap_gets_its_goals_back_all_the_same(make_
     assert sent.count(rig.plans[0].torque_reads[1].packet) == 1
     ((source, text),) = rig.events.of(EventCode.OVERRUN)
     assert source == "main_2_joint"
-    assert "waits for time beside the cycle" in text
+    assert "waits for idle time" in text
 
 
 def test_a_servo_that_was_lost_goes_slowly_to_a_goal_that_went_on(started):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dxlrun.clock import Clock
 from dxlrun.dynamixel.exchange.bus import LATE_NS, NEVER, Bus, LineState, clear, pump, run
 from dxlrun.dynamixel.exchange.cyclic_reads import MOST_BROKEN
-from dxlrun.dynamixel.exchange.gaps import Gaps
+from dxlrun.dynamixel.exchange.idle import IdleScheduler
 from dxlrun.dynamixel.exchange.kernel import Answer, Kernel, KernelLine, Library, holds
 from dxlrun.dynamixel.exchange.samples import Samples
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
@@ -91,14 +91,14 @@ class DynamixelHardware:
             Bus(index, plan, port, clock, packets)
             for index, (plan, port) in enumerate(zip(self._plans, ports.ports, strict=True))
         )
-        self._gaps = tuple(
-            Gaps(plan, events, bus) for plan, bus in zip(self._plans, self._buses, strict=True)
+        self._idle = tuple(
+            IdleScheduler(plan, events, bus) for plan, bus in zip(self._plans, self._buses, strict=True)
         )
         self._samples = Samples(self._plans, states, events)
         self._servos = tuple(
-            Servos(plan, bus, gaps, events, states, arrays)
-            for plan, bus, gaps, arrays in zip(
-                self._plans, self._buses, self._gaps, self._samples.buses, strict=True
+            Servos(plan, bus, idle, events, states, arrays)
+            for plan, bus, idle, arrays in zip(
+                self._plans, self._buses, self._idle, self._samples.buses, strict=True
             )
         )
         self._lines = tuple(zip(self._buses, self._servos, strict=True))
@@ -257,12 +257,12 @@ class DynamixelHardware:
         self._report_failures()
 
     def set_modes(self, modes: NDArray[np.uint8]) -> None:
-        """Bring joints into modes in the gaps between cycles; UNKNOWN leaves one as it is."""
+        """Bring joints into modes in idle time; UNKNOWN leaves one as it is."""
         for servos in self._servos:
             servos.desired.change_modes(modes)
 
     def set_register(self, row: int, item: str, value: int, done: Callable[[str], None]) -> None:
-        """Write a RAM item of a joint's servo in the gaps, and read it back; see `DesiredState`."""
+        """Write a RAM item of a joint's servo in idle time, and read it back; see `DesiredState`."""
         for plan, servos in zip(self._plans, self._servos, strict=True):
             for index, servo in enumerate(plan.servos):
                 if servo.row == row:
@@ -280,7 +280,7 @@ class DynamixelHardware:
                     bus.send(packet)
 
     def idle(self, until_ns: int) -> None:
-        """Do on each line what waits for idle time and fits this one; see `gaps` for what is done even so.
+        """Do on each line what waits for idle time and fits; see `IdleScheduler` for what is done even so.
 
         On a split bus the states come first.
         """
@@ -292,13 +292,13 @@ class DynamixelHardware:
         late = self._await_states(latest) if self._split else ()
         working: list[Bus] = []
         for index, (bus, servos) in enumerate(self._lines):
-            gaps = self._gaps[index]
+            work = self._idle[index]
             if bus.failure is not None:
-                gaps.abandon()
+                work.abandon()
             elif index not in late:
                 servos.look()
-                if gaps.begin(latest):
-                    bus.load(gaps)
+                if work.begin(latest):
+                    bus.load(work)
                     working.append(bus)
         if working:
             clear(self._buses, self._ports)
@@ -340,7 +340,7 @@ class DynamixelHardware:
         return failures
 
     def let_go(self, rows: Sequence[int]) -> None:
-        """Switch the torque of these joints off in the coming gaps; they get no goals in this run."""
+        """Switch the torque of these joints off in idle time; they get no goals in this run."""
         for servos in self._servos:
             servos.let_go(rows)
 
@@ -363,7 +363,7 @@ class DynamixelHardware:
                     bus.send(packet)
 
     def _reopen_lines(self) -> None:
-        """Go on with every line that was gone and is back."""
+        """Open lines again that were lost, and continue on those that are back."""
         for index, (bus, servos) in enumerate(zip(self._buses, self._servos, strict=True)):
             if bus.failure is not None and self._ports.reopen(index):
                 bus.renew(self._ports.ports[index])
@@ -387,7 +387,7 @@ class DynamixelHardware:
                 return outcomes
 
     def _wait_for_lines(self, gone: Sequence[int], until_ns: int) -> bool:
-        """Wait for any line that is gone; say whether one is back."""
+        """Wait for any line that is lost; return whether one is back."""
         while (now_ns := self._clock.now_ns()) < until_ns:
             self._clock.wait_until(now_ns + LINE_STEP_NS)
             self._beat()

@@ -557,7 +557,7 @@ def run(
 ) -> list[Result | None]:
     """Run one program a bus to its end, blocking, side by side; for set-up and tools, never in the loop.
 
-    Returns what each program returned; None where the line is lost, and the bus' `failure` says why.
+    Returns what each program returned; None where the line is lost: see the bus' `failure`.
     """
     jobs = [ProgramJob(program) for program in programs]
     for bus, job in zip(buses, jobs, strict=True):

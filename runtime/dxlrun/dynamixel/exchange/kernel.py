@@ -55,7 +55,7 @@ class Answer(IntEnum):
     FULL = 2
     """The log's batch must be committed first."""
     UNEXPECTED = 3
-    """Something did not come as planned; the parser goes on."""
+    """Something did not come as planned; the parser continues."""
     LOOK = 4
     """All replies came, and a position is further from the last one than is plausible."""
 
@@ -487,7 +487,7 @@ class Kernel:
             raise error
 
     def poll_for_replies(self) -> None:
-        """Begin to poll for replies as the ports say; before real time."""
+        """Begin to poll for replies if the ports are set so; before real time."""
         self._kernel.polling = Polling.of(self._ports.polling)
 
     def plan(self, index: int, program: Program) -> bool:
@@ -619,9 +619,9 @@ def _field(field: Field) -> _Field:
 
 
 def _data(array: NDArray[np.generic]) -> int:
-    """Return the address of an array whose elements lie one behind the other; raises ValueError if not."""
+    """Return the address of a contiguous array; raises ValueError for another."""
     if not array.flags.c_contiguous:
-        raise ValueError("the kernel takes arrays whose elements lie one behind the other")
+        raise ValueError("the kernel takes contiguous arrays only")
     return array.ctypes.data
 
 

@@ -188,7 +188,7 @@ class Budget:
     return_delay_ns: int
     latency_ns: int
     goal_bytes: int = 0
-    """Those of `request_bytes` that are goals, which nobody answers."""
+    """Those of `request_bytes` that are goals, which have no reply."""
 
     @property
     def goals_ns(self) -> int:
@@ -229,11 +229,11 @@ class BusPlan:
     return_delay_ns: int
     servos: tuple[ServoPlan, ...]
     groups: tuple[tuple[int, ...], ...]
-    """Who is read by one instruction: indices into `servos`; a group of one is read by itself."""
+    """Servos that are read by one instruction: indices into `servos`; a group of one is read by itself."""
     reads: tuple[Transaction, ...]
     """The state read of each group, when all its servos answer, in the form that every firmware knows."""
     limp: tuple[Transaction, ...]
-    """Torque off, to be sent at any moment: to everybody first, then servo by servo, acknowledged."""
+    """Torque off, to be sent at any moment: to all servos first, then servo by servo, acknowledged."""
     torque_reads: tuple[Transaction, ...]
     """Read torque enable, in the order of `servos`."""
     budget: Budget

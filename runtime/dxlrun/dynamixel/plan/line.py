@@ -19,7 +19,7 @@ PATIENCE_NS = 10_000_000
 A real servo is never late by more than microseconds, but a simulated one is a process of the same machine: it
 may have to wait for its processor for a slice or two of the scheduler (3 ms each on a stock kernel). Ten
 milliseconds keep that from being taken for a broken cable; only the first silence of a cycle costs them
-(`hardware` is short with everybody after it), and they stay below the 15.6 ms after which a loop of 320 Hz
+(the timeouts behind it are short), and they stay below the 15.6 ms after which a loop of 320 Hz
 would count as hanging.
 """
 SHORT_PATIENCE_NS = 1_000_000
@@ -74,7 +74,7 @@ class Line:
         return Transaction(packet, BROADCAST_ID, awaited, due_ns, timeout_ns, size, fast=True)
 
     def write(self, servo_id: int, address: int, data: bytes) -> Transaction:
-        """Return a write that the servo acknowledges; to everybody: without reply."""
+        """Return a write that the servo acknowledges; to all servos: without reply."""
         packet = self.dialect.write(servo_id, address, data)
         if servo_id == BROADCAST_ID:
             return self.unanswered(packet)

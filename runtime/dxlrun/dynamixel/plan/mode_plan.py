@@ -96,12 +96,12 @@ def model_modes(table: ControlTable, continuous: bool) -> tuple[Mode, ...]:
 
 
 def controls_speed(table: ControlTable) -> bool:
-    """Say whether a model keeps a speed that it is given; in wheel mode only MX do."""
+    """Check whether a model keeps a speed that it is given; in wheel mode only MX do."""
     return "operating_mode" in table.items or "resolution_divider" in table.items
 
 
 def in_mode(wanted: ModePlan, found: Mapping[str, int]) -> bool:
-    """Say whether registers, by name, select a mode; any angle limits in their order are joint mode.
+    """Check whether registers, by name, select a mode; any angle limits in their order are joint mode.
 
     In no order are those of a servo whose mode was half changed: one was written, and the other was not.
     """

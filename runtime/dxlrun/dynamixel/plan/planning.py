@@ -26,7 +26,7 @@ from dxlrun.dynamixel.wire.dialect import Dialect, dialect_of
 from dxlrun.dynamixel.wire.transaction import BROADCAST_ID, Transaction
 
 MOST_SPARE = 2
-"""Two longer forms of a read tell its late replies from the newest (`exchange`)."""
+"""Two longer forms of a read distinguish its late replies from the newest (`cyclic_reads`)."""
 
 Item = TypeVar("Item")
 
@@ -103,7 +103,7 @@ def plan_line(plan: BusPlan) -> Line:
 
 
 def readable(table: ControlTable, start: int, end: int) -> bool:
-    """Say whether the addresses from `start` up to before `end` all belong to items."""
+    """Check whether the addresses from `start` up to before `end` all belong to items."""
     items = table.items.values()
     known = {address for item in items for address in range(item.address, item.address + item.size)}
     return known.issuperset(range(start, end))
@@ -130,9 +130,9 @@ def _empty_goals(line: Line, layout: GoalLayout, servos: Sequence[ServoPlan]) ->
 
 
 def _torque_off(line: Line, servos: Sequence[ServoPlan]) -> list[Transaction]:
-    """Return torque off for everybody at once; nobody answers.
+    """Return torque off for all servos at once, without a reply.
 
-    Where torque enable stands at several addresses nobody may be told to write at another's.
+    Where models differ in the address of torque enable, each gets a sync write of its own.
     """
     addresses = dict.fromkeys(servo.torque_address for servo in servos)
     if len(addresses) == 1:

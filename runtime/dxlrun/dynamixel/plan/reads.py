@@ -30,7 +30,7 @@ FAST = "fast_sync_read"
 
 @dataclass(frozen=True, slots=True)
 class Reads:
-    """Who is read with whom and how: the cheapest way, and what every way costs."""
+    """Which servos are read together and how: the cheapest way, and what every way costs."""
 
     groups: tuple[tuple[int, ...], ...]
     """Indices of servos; a group of one is read by itself."""
@@ -109,21 +109,21 @@ def read_budget(line: Line, reads: Sequence[Transaction], goals: Sequence[bytes]
 def _partitions(
     line: Line, servos: Sequence[ServoPlan], tables: Sequence[ControlTable]
 ) -> list[tuple[tuple[tuple[int, ...], ...], tuple[bool, ...]]]:
-    """Return who could be read with whom, and which groups by a fast form; the simplest first."""
+    """Return which servos could be read together, and which groups by a fast form; the simplest first."""
     chain = CHAIN[line.dialect.PROTOCOL]
     able = [table.capabilities for table in tables]
     alone: list[Hashable] = list(range(len(servos)))
     alike: list[Hashable] = [
         servo.state if chain in able[index] else index for index, servo in enumerate(servos)
     ]
-    everybody: list[Hashable] = [
+    together: list[Hashable] = [
         TOGETHER if TOGETHER in able[index] else key for index, key in enumerate(alike)
     ]
     found = []
-    for keys in (alone, alike, everybody):
+    for keys in (alone, alike, together):
         groups = _grouped(keys)
         found.append((groups, tuple(False for _ in groups)))
-    for keys in (alike, everybody):
+    for keys in (alike, together):
         groups = _grouped([(key, FAST in able[index]) for index, key in enumerate(keys)])
         found.append((groups, tuple(len(group) > 1 and FAST in able[group[0]] for group in groups)))
     return found

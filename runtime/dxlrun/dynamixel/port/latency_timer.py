@@ -60,7 +60,7 @@ def late_replies(bus: str, port: str, extra_ns: float, planned_ns: float) -> str
 
 
 def timer_ms(place: Path) -> int | None:
-    """Return what the kernel shows at a place, ms; None: no number, or nobody may see it."""
+    """Return what the kernel shows at a place, ms; None: no number, or it may not be read."""
     try:
         return int(place.read_text())
     except (OSError, ValueError):
@@ -68,7 +68,7 @@ def timer_ms(place: Path) -> int | None:
 
 
 def latency_timer(path: str, system: Path = SYSTEM) -> LatencyTimer | None:
-    """Return the timer of the adapter whose device is `path`; None: it has none, or nobody may see it."""
+    """Return the timer of the adapter whose device is `path`; None: it has none, or it may not be read."""
     place = system / "bus/usb-serial/devices" / Path(os.path.realpath(path)).name / "latency_timer"
     found = timer_ms(place)
     return None if found is None else LatencyTimer(found, place)

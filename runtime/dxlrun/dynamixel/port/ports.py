@@ -24,7 +24,7 @@ Reopened = Callable[[int], int | None]
 
 
 AUTO_SHARE = 0.1
-"""Share of a core that polling for replies takes at most, if the file does not say how long to poll."""
+"""Share of a core that polling for replies takes at most, if the file does not set how long to poll."""
 MOST_SHARE = 0.5
 """The same where the file does."""
 
@@ -88,7 +88,7 @@ class Ports(Protocol):
         ...
 
     def reopen(self, index: int) -> bool:
-        """Ask for a line that is gone again; say whether it is back, in its place in `ports`. Never waits.
+        """Ask for a line that is lost again; return whether it is back, in its place in `ports`. Never waits.
 
         From the first call on the line that is gone is not waited for any more. What stands behind a line
         that is back was without a host, and maybe without power: all its servos count as rebooted.
@@ -97,7 +97,7 @@ class Ports(Protocol):
 
 
 class SerialPort:
-    """A serial line by its descriptor, made non-blocking; opened, locked and set up by somebody else."""
+    """A serial line by its descriptor, made non-blocking; opened, locked and set up by another process."""
 
     __slots__ = ("_read_into", "announced", "descriptor", "name")
 
@@ -109,7 +109,7 @@ class SerialPort:
         self.name = name
         """Device path, for messages."""
         self.announced = False
-        """True when the line was said to have bytes: to find none then means that it is gone."""
+        """True when a wait reported bytes: to find none then means that the line is lost."""
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
         """Hand one whole packet to the line; raises PortError when the adapter is gone."""
@@ -231,11 +231,11 @@ class SerialPorts:
 
 
 def set_aside(descriptor: int) -> None:
-    """Let go of a line that is gone: its device gets its old name again only when nobody has it open."""
-    put_in_place(os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC), descriptor)  # whoever writes is told
+    """Let go of a line that is gone: its device gets its old name again only when no process has it open."""
+    put_in_place(os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC), descriptor)  # a write then fails
 
 
 def put_in_place(new: int, descriptor: int) -> None:
-    """Let `descriptor` be what `new` is, which is closed: whoever knows the number need not be told."""
+    """Let `descriptor` be what `new` is, which is closed: code that has the number need not know."""
     os.dup2(new, descriptor, inheritable=False)
     os.close(new)

@@ -30,7 +30,7 @@ _LASTING = Path("/dev/serial")
 def lasting_name(path: str, lasting: Path = _LASTING) -> str:
     """Return the name under which the adapter at `path` is there again; empty when it would be another one.
 
-    A link leads to its adapter wherever that is. A device such as /dev/ttyUSB0 may be somebody else's next
+    A link leads to its adapter wherever that is. A device such as /dev/ttyUSB0 may be another adapter's next
     time: udev's link by the adapter's own number is taken instead where there is one. A pseudo-terminal is
     gone for good, and its name goes to the next program that asks for one.
     """
@@ -102,7 +102,7 @@ class KeptLines:
         return self._bell
 
     def lost(self, index: int) -> bool:
-        """Let go of a line that is gone, and open it again; say whether that is tried."""
+        """Let go of a line that is gone, and open it again; return whether that is tried."""
         set_aside(self.descriptors[index])
         if not self._names[index]:
             return False

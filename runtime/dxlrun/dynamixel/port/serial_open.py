@@ -21,9 +21,9 @@ _ROBOT = re.compile(rb'\{"robot":"([^"\\]+)"')
 
 
 class ExclusiveSerial(serial.Serial):
-    """A line that nobody else can open before it is closed.
+    """A line that no other process can open before it is closed.
 
-    The lock belongs to the terminal, and the kernel takes it off when nobody has the terminal open any more.
+    The lock belongs to the terminal, and the Linux kernel takes it off when no process has it open any more.
     Simulated servos keep theirs open for the next program, so closing takes it off.
     """
 
@@ -50,7 +50,7 @@ def open_serial(path: str, baud_rate: int) -> serial.Serial:
     """Open a device at `baud_rate`, 8N1, exclusively (flock and TIOCEXCL); also a pseudo-terminal.
 
     Keep what is returned: closing it lets go of the line. Raises PortError with one sentence: there is no
-    such device, this user may not open it, somebody else has it, or it cannot do the baud rate.
+    such device, this user may not open it, another process has it, or it cannot do the baud rate.
     """
     try:
         # exclusive=True: pyserial takes the lock that other pyserial programs respect
@@ -123,7 +123,7 @@ def _group(path: str) -> str:
 
 
 def _holder(path: str) -> str:
-    """Name the run, or else the processes that have the device open, and say how to stop them.
+    """Name the run, or else the processes that have the device open, and how to stop them.
 
     Only what this user may see is named.
     """

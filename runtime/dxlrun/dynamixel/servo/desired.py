@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import control_table
-from dxlrun.dynamixel.exchange.gaps import Gaps, Urgency
 from dxlrun.dynamixel.exchange.goals import GoalArrays
+from dxlrun.dynamixel.exchange.idle import IdleScheduler, Urgency
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, RegisterValue, ServoPlan
 from dxlrun.dynamixel.plan.line import listen
 from dxlrun.dynamixel.plan.planning import plan_line
@@ -41,7 +41,7 @@ class DesiredState:
     def __init__(  # noqa: PLR0917  what a bus consists of
         self,
         plan: BusPlan,
-        idle: Gaps,
+        idle: IdleScheduler,
         goals: GoalArrays,
         life: Life,
         mode: NDArray[np.uint8],

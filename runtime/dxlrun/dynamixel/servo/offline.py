@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import control_table
-from dxlrun.dynamixel.exchange.gaps import Gaps, Urgency
+from dxlrun.dynamixel.exchange.idle import IdleScheduler, Urgency
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, RegisterValue
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.servo import modes, watchdog
@@ -117,7 +117,7 @@ class Offline:
 
     __slots__ = ("_desired", "_idle", "_life", "_plan", "_reboots", "_tick_reads", "_ticks")
 
-    def __init__(self, plan: BusPlan, idle: Gaps, life: Life, desired: DesiredState) -> None:
+    def __init__(self, plan: BusPlan, idle: IdleScheduler, life: Life, desired: DesiredState) -> None:
         count = len(plan.servos)
         self._plan = plan
         self._idle = idle

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from dxlrun.dynamixel.exchange.bus import Bus
 from dxlrun.dynamixel.exchange.cyclic_reads import CyclicReads
-from dxlrun.dynamixel.exchange.gaps import Gaps, Urgency
 from dxlrun.dynamixel.exchange.goals import GoalArrays
+from dxlrun.dynamixel.exchange.idle import IdleScheduler, Urgency
 from dxlrun.dynamixel.exchange.samples import BusSamples
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.dynamixel.plan.planning import plan_line
@@ -79,7 +79,13 @@ class Servos:
     )
 
     def __init__(  # noqa: PLR0917  what a bus consists of
-        self, plan: BusPlan, bus: Bus, idle: Gaps, events: EventSink, states: States, samples: BusSamples
+        self,
+        plan: BusPlan,
+        bus: Bus,
+        idle: IdleScheduler,
+        events: EventSink,
+        states: States,
+        samples: BusSamples,
     ) -> None:
         count = len(plan.servos)
         self._plan = plan

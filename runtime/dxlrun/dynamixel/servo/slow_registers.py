@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dxlrun.dynamixel.control_table import ControlItem, control_table, side_by_side
-from dxlrun.dynamixel.exchange.gaps import Gaps, Urgency
+from dxlrun.dynamixel.exchange.idle import IdleScheduler, Urgency
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.plan.reads import TEMPERATURES, VOLTAGES
@@ -46,7 +46,9 @@ class SlowReads:
         "_states",
     )
 
-    def __init__(self, plan: BusPlan, idle: Gaps, life: Life, offline: Offline, states: States) -> None:
+    def __init__(
+        self, plan: BusPlan, idle: IdleScheduler, life: Life, offline: Offline, states: States
+    ) -> None:
         self._plan = plan
         self._idle = idle
         self._life = life

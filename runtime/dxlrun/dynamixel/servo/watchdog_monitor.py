@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dxlrun.dynamixel.exchange.gaps import Gaps, Urgency
+from dxlrun.dynamixel.exchange.idle import IdleScheduler, Urgency
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.servo import watchdog
@@ -19,7 +19,7 @@ class WatchdogMonitor:
     __slots__ = ("_desired", "_events", "_idle", "_life", "_longest_ns", "_plan", "_reviving", "_sent_ns")
 
     def __init__(
-        self, plan: BusPlan, idle: Gaps, life: Life, desired: DesiredState, events: EventSink
+        self, plan: BusPlan, idle: IdleScheduler, life: Life, desired: DesiredState, events: EventSink
     ) -> None:
         self._plan = plan
         self._idle = idle

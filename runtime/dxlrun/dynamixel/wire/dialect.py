@@ -34,7 +34,7 @@ class Dialect(Protocol):
         ...
 
     def intact(self, packet: memoryview) -> bool:
-        """Say whether the checksum of a whole packet is right."""
+        """Check whether the checksum of a whole packet is right."""
         ...
 
     def opened(self, packet: memoryview) -> Status | None:
@@ -42,7 +42,7 @@ class Dialect(Protocol):
         ...
 
     def refused(self, error: int, length: int, awaited: int) -> bool:
-        """Say whether a status says that the instruction was not carried out."""
+        """Check whether a status reports that the instruction was not executed."""
         ...
 
     def describe_error(self, error: int) -> str:

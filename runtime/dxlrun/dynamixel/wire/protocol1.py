@@ -1,8 +1,8 @@
-"""Protocol 1.0 packets as bytes: what a host says, what a servo answers; pure functions.
+"""Protocol 1.0 packets as bytes: instructions of a host, replies of a servo; pure functions.
 
 Source: ROBOTIS e-Manual, "DYNAMIXEL Protocol 1.0". Instruction `FF FF ID LEN INST P.. CHK`, status
 `FF FF ID LEN ERR P.. CHK`; LEN = parameters + 2; CHK = ~(ID + LEN + INST or ERR + parameters) & FF.
-A status carries no mark that tells it from an instruction: an echoed instruction parses as a status.
+A status carries no mark that distinguishes it from an instruction: an echoed instruction parses as a status.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ LONGEST = 0xFF + 4
 CHECKSUM = 1
 """Bytes of the checksum, the last one of a packet."""
 ID_AT = 2
-"""Where a packet has the ID of who is addressed, or who answers."""
+"""Where a packet has its ID, of the servo that is addressed or answers."""
 HIGHEST_ID = 0xFD
 PING_LENGTH = 0
 """Parameters of the answer to a ping: the model number must be read."""
 MOST_GOAL_BYTES = 0xFF - 4
 """Parameters of a sync write behind address and length: LEN is one byte."""
 ALERT = 0
-"""No bit of the error byte asks to read more: it says everything itself."""
+"""No bit of the error byte asks to read more: the byte is complete."""
 NO_FAST_FORM = "Protocol 1.0 has no fast sync read and no fast bulk read"
 _MOST_PARAMETERS = 0xFF - 2
 
@@ -64,7 +64,7 @@ class StatusError(IntFlag):
 
 
 REFUSALS = StatusError.RANGE | StatusError.CHECKSUM | StatusError.INSTRUCTION
-"""The bits that say that the servo did not do what the instruction asked."""
+"""The bits of a servo that did not execute the instruction."""
 
 _SENTENCES: Mapping[StatusError, str] = {
     StatusError.INPUT_VOLTAGE: "input voltage error: the voltage is out of the range of the control table",
@@ -86,9 +86,9 @@ def describe_error(error: int) -> str:
 
 
 def refused(error: int, length: int, awaited: int) -> bool:
-    """Say whether a status of `length` parameters, where `awaited` were due, is a refusal.
+    """Check whether a status of `length` parameters, where `awaited` were due, is a refusal.
 
-    The bits are the servo's state and come with good data; without it they tell why there is none.
+    The bits are the servo's state and come with good data; without it they are the reason.
     """
     return length == 0 != awaited and error & REFUSALS != 0
 
@@ -110,7 +110,7 @@ def size_at(buffer: Bytes, start: int, end: int) -> int:
 
 
 def intact(packet: memoryview) -> bool:
-    """Say whether the checksum of a whole packet is right."""
+    """Check whether the checksum of a whole packet is right."""
     return ~sum(packet[2:-1]) & 0xFF == packet[-1]
 
 
@@ -137,7 +137,7 @@ def instruction_packet(servo_id: int, instruction: int, parameters: bytes = b"")
     Raises ValueError when `servo_id` is neither 0..253 nor broadcast, or the parameters do not fit.
     """
     if not (0 <= servo_id <= HIGHEST_ID or servo_id == BROADCAST_ID):
-        raise ValueError(f"{servo_id} is no ID: a servo has 0..{HIGHEST_ID}, everybody is {BROADCAST_ID}")
+        raise ValueError(f"{servo_id} is no ID: a servo has 0..{HIGHEST_ID}, broadcast is {BROADCAST_ID}")
     return _packet(servo_id, instruction, parameters)
 
 

@@ -1,4 +1,4 @@
-"""Protocol 2.0 packets as bytes: what a host says, what a servo answers; pure functions.
+"""Protocol 2.0 packets as bytes: instructions of a host, replies of a servo; pure functions.
 
 Source: ROBOTIS e-Manual, "DYNAMIXEL Protocol 2.0". Instruction `FF FF FD 00 ID LENL LENH INST P.. CRCL CRCH`;
 a status is one with INST 55 and the error byte before its parameters. LEN counts everything behind itself.
@@ -24,13 +24,13 @@ OVERHEAD = 11
 LONGEST = 2048
 """Bytes of the longest packet that a receiver waits for; a header that announces more is a false one.
 
-The protocol allows 65,542. Nobody answers with more than a control table (about 1,000 bytes), or 140 servos'
-states in a fast form, and a false header may not hold the line back for longer.
+The protocol allows 65,542. No servo answers with more than a control table (about 1,000 bytes), or 140
+servos' states in a fast form, and a false header may not hold the line back for longer.
 """
 CHECKSUM = 2
 """Bytes of the CRC, the last ones of a packet."""
 ID_AT = 4
-"""Where a packet has the ID of who is addressed, or who answers."""
+"""Where a packet has its ID, of the servo that is addressed or answers."""
 HIGHEST_ID = 0xFC
 PING_LENGTH = 3
 """Parameters of the answer to a ping: model number (2), firmware version (1)."""
@@ -122,7 +122,7 @@ def describe_error(error: int) -> str:
     """Return the e-Manual's words for an error byte; `no error` for 0."""
     words = []
     if error & ALERT:
-        words.append("alert: the servo has a hardware error, which Hardware Error Status tells")
+        words.append("alert: the servo has a hardware error; see Hardware Error Status")
     if number := error & ~ALERT:
         words.append(_NUMBERS.get(number, f"error number {number}, which Protocol 2.0 does not define"))
     return "; ".join(words) or "no error"
@@ -137,7 +137,7 @@ def describe_hardware_error(status: int) -> str:
 
 
 def refused(error: int, length: int, awaited: int) -> bool:
-    """Say whether a status of `length` parameters, where `awaited` were due, is a refusal.
+    """Check whether a status of `length` parameters, where `awaited` were due, is a refusal.
 
     An error number is one; an error reply to a read has no data. The alert bit alone is not.
     """
@@ -176,7 +176,7 @@ def size_at(buffer: Bytes, start: int, end: int) -> int:
 
 
 def intact(packet: memoryview) -> bool:
-    """Say whether the CRC of a whole packet is right."""
+    """Check whether the CRC of a whole packet is right."""
     return crc16.umts(packet[:-2]) == packet[-2] | packet[-1] << 8
 
 
@@ -257,7 +257,7 @@ def instruction_packet(servo_id: int, instruction: int, parameters: bytes = b"")
     Raises ValueError when `servo_id` is neither 0..252 nor broadcast, or the parameters do not fit.
     """
     if not (0 <= servo_id <= HIGHEST_ID or servo_id == BROADCAST_ID):
-        raise ValueError(f"{servo_id} is no ID: a servo has 0..{HIGHEST_ID}, everybody is {BROADCAST_ID}")
+        raise ValueError(f"{servo_id} is no ID: a servo has 0..{HIGHEST_ID}, broadcast is {BROADCAST_ID}")
     return _packet(servo_id, stuffed(bytes((instruction,)) + parameters))
 
 

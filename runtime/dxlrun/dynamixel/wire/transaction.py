@@ -36,9 +36,9 @@ class Transaction:
 
     packet: bytes
     servo_id: int
-    """Whom the instruction addresses."""
+    """The servo that the instruction addresses."""
     awaited: tuple[Awaited, ...]
-    """Who answers, in the order of their turns; empty: nobody does."""
+    """The replies, in their order; empty: there is none."""
     due_ns: int
     """From the start of the write to the last byte of all replies, by the wire; without: the wire time."""
     timeout_ns: int
@@ -69,7 +69,7 @@ class Outcome(IntEnum):
 class Reply:
     """What came of a transaction; of several statuses it shows the newest.
 
-    A bus reuses one object for all its transactions, so a job takes what it needs before it goes on;
+    A bus reuses one object for all its transactions, so a job takes what it needs before it continues;
     programs get their own.
     """
 
@@ -80,7 +80,7 @@ class Reply:
     last_ns: int
     """Time of the read() that brought the last byte of the status packet."""
     strays: int
-    """Intact packets that nobody awaited, and bytes of noise, since the transaction before."""
+    """Intact packets that were not awaited, and bytes of noise, since the transaction before."""
     echoed: bool
     """True when the instruction itself came back: the adapter echoes."""
     sent_ns: int = 0

@@ -1,7 +1,7 @@
-"""Gaps: what is done on one bus between two cycles, by programs of transactions, the most urgent first.
+"""Idle scheduler: runs programs of transactions on one bus between two cycles, the most urgent first.
 
 Nothing of it makes a cycle late, as long as it is not urgent and starved: a transaction begins only when its
-reply can be there in time, and a program that did not end goes on in the next gap.
+reply can be there in time, and a program that did not end continues in the next idle time.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from dxlrun.run.channels.events import EventCode, EventSink, Severity
 LEAST_PATIENCE_NS = 100_000
 """A reply is awaited at least so long beyond the moment at which it is due; a servo is late by less."""
 STARVED = 50
-"""Cycles after which an urgent program goes on though the gap is too short: a skipped period is better than a
+"""Cycles after which an urgent program continues though time is too short: a skipped period is better than a
 joint that gets no goals for the rest of the run."""
 STARVED_AGAIN = 5
 """Cycles between its transactions from then on."""
@@ -29,7 +29,7 @@ WHOLE_BUS = -1
 
 @unique
 class Urgency(IntEnum):
-    """Whose turn it is: a lower number goes first, between two transactions of others if need be."""
+    """The order of programs: a lower number goes first, between two transactions of others if need be."""
 
     MODE = 0
     """A joint has no goal until its mode is there."""
@@ -38,7 +38,7 @@ class Urgency(IntEnum):
     STEERED = 2
     """A client waits for it."""
     SLOW = 3
-    """Registers of which nobody misses one reading; never done without the time for it."""
+    """Registers of which one reading may be missed; never done without the time for it."""
 
 
 class _Task:
@@ -51,7 +51,7 @@ class _Task:
         "next",
         "paused",
         "pressed",
-        "said",
+        "reported",
         "servo",
         "starved",
         "turn",
@@ -64,7 +64,7 @@ class _Task:
         self.name = name
         self.servo = servo
         self.pressed = turn[0]
-        """The urgency of who waits for it."""
+        """The highest urgency of the programs that wait for it."""
         self.next: Transaction | None = None
         self.begun = False
         """True once anything of it was on the line."""
@@ -72,7 +72,7 @@ class _Task:
         self.wake_ns = 0
         self.starved = 0
         """Cycles in a row without time for its next transaction."""
-        self.said = False
+        self.reported = False
 
     def resume(self, reply: Reply | None) -> bool:
         """Hand over what came of the transaction before, None at the start; return whether one follows."""
@@ -84,8 +84,8 @@ class _Task:
         return True
 
 
-class Gaps:
-    """Programs of one bus that wait for time between cycles; a bus executes it as one job a gap.
+class IdleScheduler:
+    """Programs of one bus that wait for time between cycles; a bus executes it as one job per idle time.
 
     Programs of one servo never mix: one that has begun ends before another one begins. A transaction that
     sends nothing (`line.listen`) is a pause; others use the line meanwhile. Every program comes to its end: a
@@ -120,7 +120,7 @@ class Gaps:
         name: str,
         servo: int = WHOLE_BUS,
     ) -> None:
-        """Let a program be executed in the next gaps; at its end it does itself what follows from it.
+        """Let a program be executed in the next idle times; at its end it does itself what follows from it.
 
         `name`: what a person reads when it has to wait: `torque enable of elbow (ID 4 on bus main)`.
         `servo`: index into the plan's servos. May be called from a program.
@@ -134,7 +134,7 @@ class Gaps:
         return len(self._tasks)
 
     def begin(self, until_ns: int) -> bool:
-        """Prepare for the gap that ends at `until_ns`; return whether there is anything to do in it."""
+        """Prepare for the idle time that ends at `until_ns`; return whether there is anything to do."""
         if not self._tasks:
             return False
         self._until_ns = until_ns
@@ -142,7 +142,7 @@ class Gaps:
         return True
 
     def advance(self, reply: Reply | None) -> Transaction | None:
-        """Give a reply to the program that waits for it, return the next transaction that fits the gap."""
+        """Give a reply to the program that waits for it, return the next transaction that fits."""
         if reply is not None and self._current is not None:
             self._resume(self._current, replace(reply, parameters=bytes(reply.parameters)))
         first = reply is None
@@ -161,9 +161,9 @@ class Gaps:
         """Wait for the end of the transaction: a program awaits one status at a time."""
 
     def abandon(self) -> None:
-        """Bring every program to its end without a line: whatever it asks, nobody answers.
+        """Bring every program to its end without a line: every transaction times out.
 
-        What they add meanwhile waits for the next gap.
+        What they add meanwhile waits for the next idle time.
         """
         tasks, self._tasks, self._current = self._tasks, [], None
         for task in tasks:
@@ -172,7 +172,7 @@ class Gaps:
                 more = task.resume(_nothing())
 
     def _ready(self) -> _Task | None:
-        """Return whose turn it is; of one servo that is who has begun."""
+        """Return the program that is next; of one servo that is the one that has begun."""
         now = self.now_ns()
         for task in self._tasks:
             chosen = task
@@ -195,7 +195,7 @@ class Gaps:
             self._resume(task, _nothing(Outcome.SENT))
 
     def _timed(self, task: _Task, wanted: Transaction, first: bool) -> Transaction | None:
-        """Return the transaction with no more patience than the gap allows; None: it has to wait."""
+        """Return the transaction with a timeout that the idle time allows; None: it has to wait."""
         left_ns = self._until_ns - self.now_ns()
         latest_ns = wanted.due_ns
         if wanted.awaited:
@@ -209,16 +209,16 @@ class Gaps:
         return replace(wanted, timeout_ns=min(wanted.timeout_ns, left_ns))
 
     def _forced(self, task: _Task, need_ns: int, left_ns: int) -> bool:
-        """Count the cycles that a program waits; say whether it is done at the cost of the next cycle."""
+        """Count the cycles that a program waits; return whether it is done at the cost of the next cycle."""
         task.starved += 1
-        if task.pressed is Urgency.SLOW or task.starved <= (STARVED_AGAIN if task.said else STARVED):
+        if task.pressed is Urgency.SLOW or task.starved <= (STARVED_AGAIN if task.reported else STARVED):
             return False
-        if not task.said:
-            task.said = True
+        if not task.reported:
+            task.reported = True
             servos = self._plan.servos
             source = self._plan.name if task.servo == WHOLE_BUS else servos[task.servo].joint
             need, left = need_ns * 1e-6, max(left_ns, 0) * 1e-6
-            text = f"{task.name} waits for time beside the cycle: it may take {need:.1f} ms, the gap has"
+            text = f"{task.name} waits for idle time: it may take {need:.1f} ms, of which the cycle leaves"
             text = f"{text} {left:.1f} ms; periods may be skipped"
             self._events.emit(EventCode.OVERRUN, Severity.WARNING, source, text)
         return True

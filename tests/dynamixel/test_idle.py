@@ -4,7 +4,7 @@ from dataclasses import dataclass
 import pytest
 
 from dxlrun.dynamixel.exchange.bus import Bus, pump
-from dxlrun.dynamixel.exchange.gaps import STARVED, STARVED_AGAIN, Gaps, Urgency
+from dxlrun.dynamixel.exchange.idle import STARVED, STARVED_AGAIN, IdleScheduler, Urgency
 from dxlrun.dynamixel.plan.line import listen
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.wire import protocol2
@@ -17,17 +17,17 @@ READ_NS = 270_000
 
 @dataclass
 class Rounds:
-    """One bus whose gaps are given one after the other, each a millisecond after the one before."""
+    """One bus whose idle times come one after the other, each a millisecond after the one before."""
 
     rig: object
     bus: Bus
-    gaps: Gaps
+    idle: IdleScheduler
 
     def gap(self, length_ns):
         until = self.rig.clock.now_ns() + length_ns
         count = len(self.rig.into_bus())
-        if self.gaps.begin(until):
-            self.bus.load(self.gaps)
+        if self.idle.begin(until):
+            self.bus.load(self.idle)
             pump([self.bus], self.rig.ports, self.rig.clock, lambda: None)
         self.over_ns = self.rig.clock.now_ns() - until
         self.rig.clock.wait_until(until + 1_000_000)
@@ -37,7 +37,7 @@ class Rounds:
         def ended():
             done((yield from program))
 
-        self.gaps.add(ended(), *others, **more)
+        self.idle.add(ended(), *others, **more)
 
     def read(self, servo_id, address, size=1):
         return plan_line(self.rig.plans[0]).read(servo_id, address, size)
@@ -56,7 +56,7 @@ def rounds(make_rig, make_plan):
     )
     rig = make_rig(plan)
     bus = Bus(0, plan, rig.ports.ports[0], rig.clock, rig.packets)
-    return Rounds(rig, bus, Gaps(plan, rig.events, bus))
+    return Rounds(rig, bus, IdleScheduler(plan, rig.events, bus))
 
 
 def reading(rounds, servo_id, *addresses):
@@ -73,7 +73,7 @@ def test_a_program_goes_on_from_gap_to_gap(rounds):
     sent = [rounds.gap(READ_NS + 150_000) for _ in range(4)]
     assert sent == [[protocol2.read(11, address, 1)] for address in (7, 11, 64)] + [[]]
     assert found == [[11, 3, 0]]
-    assert rounds.gaps.waiting == 0
+    assert rounds.idle.waiting == 0
 
 
 def test_a_gap_takes_as_many_transactions_as_fit_and_ends_in_time(rounds):
@@ -141,7 +141,7 @@ def test_what_is_urgent_is_done_at_last_in_a_gap_too_short_and_what_is_slow_neve
         ((source, text),) = told
         assert source == rounds.rig.plans[0].servos[0].joint
         assert text.startswith(
-            f"{name} waits for time beside the cycle: it may take 0.4 ms, the gap has 0.3 ms"
+            f"{name} waits for idle time: it may take 0.4 ms, of which the cycle leaves 0.3 ms"
         )
 
 
@@ -155,16 +155,16 @@ def test_every_program_of_a_line_that_is_gone_ends_with_time_outs(rounds):
         rounds.add(reading(rounds, 12, 7), found.append, Urgency.SLOW, "added")
 
     rounds.add(reading(rounds, 12, 7), adding, Urgency.SLOW, "not begun")
-    rounds.gaps.abandon()
+    rounds.idle.abandon()
     assert found == [[11, Outcome.TIMEOUT], [Outcome.TIMEOUT]]
-    assert rounds.gaps.waiting == 1
+    assert rounds.idle.waiting == 1
 
 
 def test_a_transaction_that_a_cycle_cut_off_is_asked_again(rounds):
     found = []
     rounds.add(reading(rounds, 11, 7), found.append, Urgency.MODE, "one")
-    assert rounds.gaps.begin(rounds.rig.clock.now_ns() + 5_000_000)
-    rounds.bus.load(rounds.gaps)
+    assert rounds.idle.begin(rounds.rig.clock.now_ns() + 5_000_000)
+    rounds.bus.load(rounds.idle)
     rounds.bus.step(rounds.rig.clock.now_ns())  # sent, and nobody waits for the reply
     rounds.rig.clock.wait_until(rounds.rig.clock.now_ns() + 5_000_000)
     assert rounds.gap(1_000_000) == [protocol2.read(11, 7, 1)]
@@ -184,7 +184,7 @@ def test_a_gap_begins_nothing_on_a_line_that_was_late_until_that_is_forgotten(ro
     assert found == [[11]]
 
 
-def test_one_reply_that_came_a_second_late_does_not_close_the_gaps_of_the_next_seconds(rounds):
+def test_one_reply_that_came_a_second_late_does_not_close_the_idle_time_of_the_next_seconds(rounds):
     found = []
     rounds.bus._note_lateness(1_000_000_000)  # the process was not running
     rounds.add(reading(rounds, 11, 7), found.append, Urgency.MODE, "the mode of a servo")
