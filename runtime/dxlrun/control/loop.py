@@ -347,7 +347,8 @@ class Loop:
                 record.commands.clear()
             else:
                 self.manager.update(cycle - self._paused_cycles, self._time_ns)
-            self.steering.answer_late()
+            if self.manager.ended_switches:
+                self.steering.answer_late()
         self.gate.apply(record.commands, record.goals, dt_ns)
         updated_ns = now_ns()
         self.hardware.write()

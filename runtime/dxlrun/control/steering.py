@@ -121,7 +121,9 @@ class Steering:
                 count += 1
             if answer is not None:
                 self.inbox.answer(command.number, answer)
-        self._expire()
+        for name in self.manager.stale(self.record.woken_ns):
+            text = f"the stream of commands ended; {self.loop.expire(name)}"
+            self.events.emit(EventCode.STALE_COMMAND, Severity.WARNING, name, text)
         return count
 
     def refuse(self) -> None:
@@ -131,8 +133,10 @@ class Steering:
 
     def answer_late(self) -> None:
         """Answer the switches that waited for modes and have come to an end."""
-        for number, refusal in self.manager.ended_switches():
+        ended = self.manager.ended_switches
+        for number, refusal in ended:
             self.inbox.answer(number, refusal or Done(self.record.cycle))
+        ended.clear()
 
     def _report_refusal(self, command: Command, refusal: Refusal) -> None:
         source = command.controller or "loop"
@@ -163,11 +167,6 @@ class Steering:
         until_ns = self.record.woken_ns + command.lease_ns if command.lease_ns else 0
         name, kind, origin = command.controller, command.kind, command.origin
         return self.manager.hand(name, kind, data, origin, time_ns, until_ns) or Done(self.record.cycle)
-
-    def _expire(self) -> None:
-        for name in self.manager.stale(self.record.woken_ns):
-            text = f"the stream of commands ended; {self.loop.expire(name)}"
-            self.events.emit(EventCode.STALE_COMMAND, Severity.WARNING, name, text)
 
     def _for_loop(self, command: Command, time_ns: int) -> Answer | None:
         """Execute a command for the loop itself; None: it is answered later."""

@@ -208,11 +208,15 @@ class Managed:
         period_ns = self._nominal_ns if self._last_ns < 0 else time_ns - self._last_ns
         self._last_ns = time_ns
         self._due_cycle = (cycle // self._divider + 1) * self._divider
-        self._gathering.gather()
+        if self._gathering.pairs:
+            self._gathering.gather()
         capped_ns = min(period_ns, PERIOD_CAP * self._nominal_ns)
         self._call(ControllerMethod.UPDATE, "", self._controller.update, time_ns, capped_ns)
-        changed = [claim for claim in self._claimed if not claim.unchanged()]
-        for claim in changed:
+        changed: list[_Claim] = []
+        for claim in self._claimed:
+            if claim.unchanged():
+                continue
+            changed.append(claim)
             np.isfinite(claim.own, self._finite)
             if np.count_nonzero(self._finite) < self._finite.size:  # a tenth of the time of all()
                 self._check(claim)
@@ -291,18 +295,19 @@ class _Gathering:
     Rows that are equally far apart are shown as they are; others are copied by `gather`.
     """
 
-    __slots__ = ("_pairs", "goals", "states")
+    __slots__ = ("goals", "pairs", "states")
 
     def __init__(self, record: CycleRecord, rows: NDArray[np.intp]) -> None:
         place = _columns(rows)
-        self._pairs: list[tuple[NDArray[np.generic], NDArray[np.generic], NDArray[np.intp]]] = []
+        self.pairs: list[tuple[NDArray[np.generic], NDArray[np.generic], NDArray[np.intp]]] = []
+        """What is copied: the robot's array, the controller's, and the rows."""
         sources = [getattr(record.states, field.name) for field in fields(States) if field.init]
         self.states = States(*(self._shown(source, place) for source in sources))
         self.goals = Commands(self._shown(record.goals.values, place))
 
     def gather(self) -> None:
         """Copy what must be copied."""
-        for source, own, rows in self._pairs:
+        for source, own, rows in self.pairs:
             source.take(rows, axis=-1, out=own, mode="clip")
 
     def _shown(self, source: NDArray[_Element], place: Columns) -> NDArray[_Element]:
@@ -310,7 +315,7 @@ class _Gathering:
             shown = source[..., place]
         else:
             own = source[..., place]
-            self._pairs.append((source, own, place))
+            self.pairs.append((source, own, place))
             shown = own.view()
         shown.flags.writeable = False
         return shown

@@ -62,7 +62,8 @@ class Manager:
         self._next = 0
         self._lost: Collection[int] = ()
         self._modes = ModeSwitch(plan.joints, record.states.mode, set_modes)
-        self._ended: list[tuple[int, Refusal | None]] = []
+        self.ended_switches: list[tuple[int, Refusal | None]] = []
+        """Switches that waited and have ended: the command's number, and why not; for the loop to answer."""
 
     def configure(self) -> None:
         """Build and configure every controller, decode every command; allocates, before real time.
@@ -87,7 +88,8 @@ class Manager:
 
     def begin(self) -> None:
         """Begin a cycle, before its states are read: request modes."""
-        self._modes.ask(self._managed)
+        if not self._modes.requested:
+            self._modes.request(self._managed)
         self._record.renew()
 
     def update(self, cycle: int, time_ns: int) -> str | None:
@@ -98,7 +100,7 @@ class Manager:
         held by the gate; the others are updated all the same. Returns `fault`.
         """
         now_ns, took_ns = self._clock.now_ns, self._record.controller_ns
-        if self._modes.awaited:
+        if self._modes.groups:
             self._admit(time_ns)
         if self._next < len(self._commands):
             self._record.command_count += self._hand_over(time_ns)
@@ -197,16 +199,9 @@ class Manager:
                 self._end_switch(self._modes.drop(managed), refusal)
         return self._enter([self._named[name] for name in activate], time_ns, number, "")
 
-    def ended_switches(self) -> Sequence[tuple[int, Refusal | None]]:
-        """Return the switches that waited and have ended since the last call: the number, and why not."""
-        if not self._ended:
-            return ()
-        ended, self._ended = self._ended, []
-        return ended
-
     def _end_switch(self, number: int | None, refusal: Refusal | None) -> None:
         if number is not None:
-            self._ended.append((number, refusal))
+            self.ended_switches.append((number, refusal))
 
     def _refuse(self, activate: Sequence[str], deactivate: Sequence[str]) -> Refusal | None:
         active = [managed for managed in self._managed if managed.active]

@@ -49,7 +49,7 @@ class ModeSwitch:
     stays in position or velocity mode, where it holds still, and is brought from others into its rest mode.
     """
 
-    __slots__ = ("_groups", "_joints", "_modes", "_requested", "_rows", "_set_modes")
+    __slots__ = ("_joints", "_modes", "_rows", "_set_modes", "groups", "requested")
 
     def __init__(
         self, joints: Sequence[JointPlan], modes: NDArray[np.uint8], set_modes: SetModes | None
@@ -59,27 +59,24 @@ class ModeSwitch:
         self._rows = {joint.name: row for row, joint in enumerate(joints)}
         self._modes = modes
         self._set_modes = set_modes
-        self._groups: list[Group] = []
-        self._requested = True
-
-    @property
-    def awaited(self) -> bool:
-        """True while a controller waits."""
-        return bool(self._groups)
+        self.groups: list[Group] = []
+        """Controllers that wait."""
+        self.requested = True
+        """False when claims have changed since modes were requested."""
 
     @property
     def entering(self) -> tuple[Managed, ...]:
         """The controllers that wait."""
-        return tuple(managed for group in self._groups for managed in group.entering)
+        return tuple(managed for group in self.groups for managed in group.entering)
 
     def changed(self) -> None:
         """Claims have changed: request modes anew."""
-        self._requested = False
+        self.requested = False
 
     def await_modes(self, entering: Iterable[Managed], time_ns: int, number: int | None, why: str) -> None:
         """Let controllers wait, together, until all their joints are in their modes."""
-        self._groups.append(Group(tuple(entering), time_ns + MODE_TIMEOUT_NS, number, why))
-        self._requested = False
+        self.groups.append(Group(tuple(entering), time_ns + MODE_TIMEOUT_NS, number, why))
+        self.requested = False
 
     def ready(self, entering: Iterable[Managed]) -> bool:
         """Return whether all joints of these controllers are in the modes that they need."""
@@ -92,16 +89,16 @@ class ModeSwitch:
         a joint that changes its mode is in none.
         """
         ready, late = [], []
-        for group in self._groups:
+        for group in self.groups:
             missing = self._missing(group.entering)
-            refused = self._requested and any(now != Mode.UNKNOWN for _, now in missing.values())
+            refused = self.requested and any(now != Mode.UNKNOWN for _, now in missing.values())
             if not missing:
                 ready.append(group)
             elif refused or time_ns >= group.until_ns:
                 late.append(group)
-        self._groups = [group for group in self._groups if group not in ready and group not in late]
+        self.groups = [group for group in self.groups if group not in ready and group not in late]
         if late:
-            self._requested = False
+            self.requested = False
         return ready, late
 
     def problem(self, group: Group) -> str:
@@ -122,27 +119,25 @@ class ModeSwitch:
     def drop(self, managed: Managed) -> int | None:
         """Let a controller wait no more; return the number of the command whose last one it was."""
         ended = None
-        for index, group in enumerate(self._groups):
+        for index, group in enumerate(self.groups):
             if managed in group.entering:
                 left = tuple(one for one in group.entering if one is not managed)
-                self._groups[index] = replace(group, entering=left)
+                self.groups[index] = replace(group, entering=left)
                 ended = None if left else group.number
-        self._groups = [group for group in self._groups if group.entering]
-        self._requested = False
+        self.groups = [group for group in self.groups if group.entering]
+        self.requested = False
         return ended
 
     def end(self) -> list[int | None]:
         """End all waiting, and ask for no modes any more; return the numbers of the commands that waited."""
-        numbers = [group.number for group in self._groups]
-        self._groups = []
-        self._requested = True
+        numbers = [group.number for group in self.groups]
+        self.groups = []
+        self.requested = True
         return numbers
 
-    def ask(self, managed: Iterable[Managed]) -> None:
-        """Request modes from the hardware, once for each change of the active controllers' claims."""
-        if self._requested:
-            return
-        self._requested = True
+    def request(self, managed: Iterable[Managed]) -> None:
+        """Request modes from the hardware, by the claims of these controllers that are active or wait."""
+        self.requested = True
         active = (one for one in managed if one.active)
         claimed = claimed_modes(one.plan for one in (*active, *self.entering))
         modes = np.zeros(len(self._joints), dtype=np.uint8)
