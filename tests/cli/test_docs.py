@@ -53,7 +53,7 @@ TESTS = {
     "controllers.md": ("tests/plugins/test_docs.py",),
     "models.md": ("tests/cli/test_models.py",),
     "real-time.md": ("tests/cli/test_docs.py",),
-    "replay.md": ("tests/replay/test_command_line.py",),
+    "replay.md": ("tests/log/replay/test_command_line.py",),
     "simulation.md": ("tests/cli/test_sim_page.py", "tests/cli/test_docs.py"),
     "steering.md": ("tests/cli/test_steer.py",),
     "tools.md": ("tests/cli/test_docs.py",),

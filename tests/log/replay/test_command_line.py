@@ -15,7 +15,7 @@ import pytest
 
 from dxlrun.cli import main
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 TEXT = (ROOT / "docs/replay.md").read_text()
 COMMANDS = [line.strip() for line in TEXT.splitlines() if line.startswith("    dxlrun ")]
 OUTPUTS = re.findall(r"```\n(.*?)```", TEXT, re.DOTALL)

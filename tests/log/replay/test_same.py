@@ -19,7 +19,7 @@ from dxlrun.log.reader import read_log
 from dxlrun.log.replay import replay_log
 from dxlrun.testing import VirtualRobot, plan_of, simulated_robot
 
-ROBOTS = Path(__file__).parents[2] / "robots"
+ROBOTS = Path(__file__).parents[3] / "robots"
 DXLRUN = Path(sys.executable).with_name("dxlrun")
 
 

@@ -13,7 +13,7 @@ from dxlrun.errors import InputError
 from dxlrun.log.replay import replay_log
 from dxlrun.testing import simulated_robot
 
-ROBOTS = Path(__file__).parents[2] / "robots"
+ROBOTS = Path(__file__).parents[3] / "robots"
 Change = Callable[..., Path]
 
 
