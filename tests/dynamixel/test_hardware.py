@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from dxlrun.dynamixel.plan.units import joint_position
 from dxlrun.dynamixel.wire import protocol1
 from dxlrun.errors import StartUpError
 from dxlrun.run.channels.events import EventCode
@@ -65,7 +64,7 @@ def test_a_cycle_is_eight_reads_and_one_sync_write(started, ticks):
     }
     assert started.into_bus()[count:] == [*expected, protocol1.sync_write(30, 4, goals)]
     sent = position_replies(started, start)
-    shown = [joint_position(servo, sent[servo.servo_id]) for servo in started.plans[0].servos]
+    shown = [servo.joint_position(sent[servo.servo_id]) for servo in started.plans[0].servos]
     assert started.states.position == pytest.approx(shown, abs=1e-12)
 
 
@@ -239,7 +238,7 @@ def test_a_late_reply_is_never_taken_as_current(started, late_ms):
                     and len(entry.data) == 6 + length
                     and "collision" not in entry.note
                 ]
-                newest = joint_position(servo, int.from_bytes(replies[-1][5:7], "little"))
+                newest = servo.joint_position(int.from_bytes(replies[-1][5:7], "little"))
                 assert started.states.position[servo.row] == newest
                 assert start <= asked
     assert late >= 1

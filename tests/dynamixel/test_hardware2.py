@@ -7,7 +7,6 @@ import pytest
 
 from dxlrun.dynamixel.control_table import all_tables
 from dxlrun.dynamixel.plan.bus_plan import RegisterValue
-from dxlrun.dynamixel.plan.units import joint_position
 from dxlrun.dynamixel.servo.torque_off import limp
 from dxlrun.dynamixel.wire import protocol2
 from dxlrun.dynamixel.wire.receiver import Receiver
@@ -312,7 +311,7 @@ def test_two_buses_of_different_protocols_are_read_side_by_side(make_rig, make_p
 
 def test_joint_position_of_an_x(make_x):
     servo = make_x((11,)).servos[0]
-    assert joint_position(servo, 2048) == pytest.approx(0.0, abs=0.002)
+    assert servo.joint_position(2048) == pytest.approx(0.0, abs=0.002)
 
 
 def test_an_alert_is_read_once_and_reported_in_the_manuals_words(started):
@@ -350,7 +349,7 @@ def test_a_late_reply_is_never_taken_as_current(started, late_ms):
         mine = [packet for packet in sent if packet[4] == 11 and len(packet) == 11 + length]
         if started.states.valid[0]:
             newest = int.from_bytes(mine[-1][15:19], "little", signed=True)
-            assert started.states.position[0] == joint_position(started.plans[0].servos[0], newest)
+            assert started.states.position[0] == started.plans[0].servos[0].joint_position(newest)
     assert missed >= 1
     assert started.packets.received() == started.out_of_bus()
 

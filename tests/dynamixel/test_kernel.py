@@ -1,6 +1,7 @@
 """The compiled kernel does what the parser does, whatever arrives; and what it promises by itself."""
 
 import importlib.util
+import math
 import os
 import shutil
 import sys
@@ -12,6 +13,8 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from dxlrun.clock import MonotonicClock
 from dxlrun.dynamixel.exchange import kernel
@@ -359,3 +362,29 @@ def test_goals_beyond_one_sync_write_are_split(fuzz, make_plan, compiled, case):
             assert (sum(packet[2:]) & 0xFF) == 0xFF
         else:
             assert int.from_bytes(packet[5:7], "little") == len(packet) - 7
+
+
+ODD = st.floats(-4, 4) | st.sampled_from([math.nan, math.inf, -math.inf, 0.0, -0.0, 1e300, 5e-324])
+
+
+@pytest.mark.parametrize("name", ["single reads", "sync read", "two layouts"])
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_goals_become_the_same_packets_in_kernel_and_parser(fuzz, name, data):
+    plans, _ = fuzz.robot(name, 1, False)
+    sides = [fuzz.Side(plans, kernel.load()), fuzz.Side(plans, None)]
+    count = len(plans[0].servos)
+    modes = [data.draw(st.sampled_from([one.mode for one in servo.modes])) for servo in plans[0].servos]
+    ceiling = data.draw(st.lists(st.just(math.nan) | st.floats(0, 5), min_size=count, max_size=count))
+    for side in sides:
+        (servos,) = side.hardware._servos
+        servos.ceiling[:] = ceiling
+        for index, mode in enumerate(modes):
+            servos.goals.set_mode(index, mode)
+    for _ in range(4):
+        goals = data.draw(st.lists(st.lists(ODD, min_size=count, max_size=count), min_size=4, max_size=4))
+        repeats = data.draw(st.sampled_from([1, 2, 51]))
+        for _ in range(repeats):
+            for side in sides:
+                side.write(np.array(goals), 0)
+            assert sides[0].lines.ports[0].sent == sides[1].lines.ports[0].sent

@@ -4,7 +4,6 @@ import pytest
 from dxlrun.dynamixel.control_table import control_table, model_names
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.dynamixel.plan.line import LONGEST_RETURN_DELAY_NS, PATIENCE_NS
-from dxlrun.dynamixel.plan.units import joint_position
 
 
 def test_the_budget_of_protocol_md_at_one_millisecond_of_latency(make_plan):
@@ -69,7 +68,7 @@ def test_limp_is_a_broadcast_and_then_every_servo_acknowledged(make_plan):
 def test_limits_become_ticks_inside_them(make_plan):
     plan = make_plan((1, 2), lower=-1.0, upper=0.5)
     for servo in plan.servos:
-        ends = sorted((joint_position(servo, servo.lower_tick), joint_position(servo, servo.upper_tick)))
+        ends = sorted((servo.joint_position(servo.lower_tick), servo.joint_position(servo.upper_tick)))
         assert ends[0] >= -1.0
         assert ends[1] <= 0.5
         assert ends[1] - ends[0] > 1.5 - 2 * servo.rad_per_tick
@@ -93,4 +92,4 @@ def test_goals_beyond_one_sync_write_are_counted_as_two(make_plan, model, protoc
 
 def test_the_middle_of_an_ax_is_exact(make_plan):
     servo = make_plan((1,)).servos[0]
-    assert joint_position(servo, 1023) == pytest.approx(-2.6179938779914944)
+    assert servo.joint_position(1023) == pytest.approx(-2.6179938779914944)

@@ -9,7 +9,6 @@ import pytest
 
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.exchange.samples import MARGIN_NS, MARGIN_RAD, REPORT_AGAIN_NS, Jumps, Samples
-from dxlrun.dynamixel.plan.units import joint_position
 from dxlrun.run.channels.cycle import States
 from dxlrun.run.channels.events import EventCode
 
@@ -83,7 +82,7 @@ def test_signs_follow_the_joints_direction(make_robot, make_plan):
     robot.all_said(512, 100, 1024 + 200, age_ns=30)  # counter-clockwise 100; clockwise 200
     servo = robot.servos[0]
     direction = np.array([one.direction for one in robot.servos])
-    assert robot.states.position == pytest.approx([joint_position(one, 512) for one in robot.servos])
+    assert robot.states.position == pytest.approx([one.joint_position(512) for one in robot.servos])
     assert robot.states.velocity == pytest.approx(direction * 100 * servo.rad_s_per_tick)
     assert robot.states.effort == pytest.approx(direction * -200 / 1023)
     assert robot.states.age_ns.tolist() == [30] * 8
@@ -139,7 +138,7 @@ class OneServo:
         if self.servo.state.velocity.encoding == "sign_magnitude":
             velocity, effort = (value % 0x400 * (-1 if value & 0x400 else 1) for value in (velocity, effort))
         found = (
-            joint_position(self.servo, position),
+            self.servo.joint_position(position),
             self.servo.direction * velocity * self.servo.rad_s_per_tick,
             self.servo.direction * effort * self.servo.effort_per_tick,
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Literal, Protocol
+from typing import Literal, Protocol, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,6 @@ from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.controllers.plugins import OverrunHook
 from dxlrun.control.gate import Gate
 from dxlrun.control.loop_plan import ControllerPlan, LoopPlan, OverrunPolicy
-from dxlrun.control.overrun import Overruns
 from dxlrun.control.policy_plan import GroupPolicy, Last, PolicyName, PolicyPlan
 from dxlrun.control.safe_motion import SafeMotion
 from dxlrun.control.steering import Steering
@@ -507,6 +506,44 @@ class Schedule:
         if policy == "catch_up":
             first -= MOST_CAUGHT_UP
         return max(cycle + 1, first)
+
+
+class Overruns:
+    """Decides what becomes of deadlines that passed in a late cycle: the plug-ins in turn, then the file.
+
+    A hook that raises, or answers with something else, is reported in an event and not called again.
+    """
+
+    __slots__ = ("_events", "_hooks", "_policy")
+
+    def __init__(self, policy: OverrunPolicy, hooks: tuple[OverrunHook, ...], events: EventSink) -> None:
+        self._policy = policy
+        self._hooks = list(hooks)
+        self._events = events
+
+    def decide(self, cycle: int, scheduled_ns: int, actual_ns: int) -> OverrunPolicy:
+        """Return the policy for a cycle that was due at `scheduled_ns` and can begin at `actual_ns`."""
+        for hook in tuple(self._hooks):
+            try:
+                answer = hook.decide(cycle, scheduled_ns, actual_ns)
+            except (Exception, SystemExit) as error:  # foreign code: it must not take the loop along
+                self._dismiss(hook, f"raised {type(error).__name__}: {error}")
+                continue
+            if answer is None:
+                continue
+            if isinstance(answer, str) and answer in get_args(OverrunPolicy):
+                return cast("OverrunPolicy", answer)
+            self._dismiss(hook, f"returned {answer!r}, which is none of {', '.join(get_args(OverrunPolicy))}")
+        return self._policy
+
+    def _dismiss(self, hook: OverrunHook, why: str) -> None:
+        self._hooks.remove(hook)
+        self._events.emit(
+            EventCode.OVERRUN,
+            Severity.ERROR,
+            hook.plugin,
+            f"dxlrun_overrun {why}; it is not asked again in this run",
+        )
 
 
 class LostServos:

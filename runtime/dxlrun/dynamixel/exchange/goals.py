@@ -10,16 +10,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.description.modes import COMMAND_INTERFACES, CommandName, Mode
-from dxlrun.dynamixel.plan.bus_plan import BusPlan, Field, GoalLayout, ModePlan, OwnLimit, Scale, ServoPlan
+from dxlrun.dynamixel.plan.bus_plan import (
+    SIGN,
+    BusPlan,
+    Field,
+    GoalLayout,
+    ModePlan,
+    OwnLimit,
+    Scale,
+    ServoPlan,
+)
 from dxlrun.dynamixel.plan.planning import goal_parts
 from dxlrun.dynamixel.wire.dialect import Dialect, dialect_of
 from dxlrun.run.channels.cycle import Commands, Floats
 
 REPEATED = 50
 """Cycles after which an unchanged goal is sent again: a sync write has no acknowledgement."""
-
-CLOCKWISE = 0x400
-"""Direction bit of sign-magnitude goals: bit 10 (e-Manual AX-12A, Moving Speed (32))."""
 
 LEADS: Mapping[Mode, CommandName] = {Mode.VELOCITY: "velocity", Mode.EFFORT: "effort", Mode.PWM: "pwm"}
 """The goal that a mode follows, where it is not the position; without it a servo is sent none."""
@@ -61,7 +67,7 @@ class Cell:
                 else self.high
             )
             mirrored = self.place.encoding == "sign_magnitude" and tick < 0
-            return CLOCKWISE - tick if mirrored else tick
+            return SIGN - tick if mirrored else tick
         if self.interface == _VELOCITY and not (math.isnan(ceiling) or abs(goal) <= ceiling):
             goal = ceiling
         exact = abs(goal) / self.unit

@@ -10,13 +10,11 @@ from numpy.typing import NDArray
 
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import control_table
-from dxlrun.dynamixel.plan.bus_plan import BusPlan, Field, ServoPlan
+from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.run.channels.cycle import Floats, States
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
 
 _WHEEL_MODES = (Mode.VELOCITY, Mode.PWM)
-_CLOCKWISE = 0x400
-"""Sign of sign-magnitude items, bit 10 (e-Manual AX-12A, Present Speed (38), Present Load (40))."""
 
 MARGIN_RAD = 0.035
 """rad, two degrees: noise of a potentiometer, and what a hand adds [i]."""
@@ -129,7 +127,7 @@ class BusSamples:
         samples, column = self._samples, self._first + servo
         values, scale = samples.values, samples.scale
         for number, field in enumerate(self._fields[servo]):
-            values[number, column] = _tick(field, data) * scale[number, column]
+            values[number, column] = field.tick(data) * scale[number, column]
         values[0, column] -= samples.reference[column]
         self.fresh[servo] = True
         self.at_ns[servo] = at_ns
@@ -172,20 +170,6 @@ class Jumps:
             text = f"{name} jumped by {jump:.0f} deg in {time:.0f} ms, faster than it can turn: not believed"
             self._events.emit(EventCode.IMPLAUSIBLE, Severity.WARNING, name, text)
         return False
-
-
-def _tick(field: Field, data: bytes | memoryview) -> int:
-    """Return an item of a reply as the servo counts.
-
-    Velocity and effort are sign-magnitude in Protocol 1.0 and of XL-320 (e-Manual AX-12A, Present Speed
-    (38); XL-320, Present Speed (39)), bits above the sign are ignored; else two's complement (e-Manual
-    XM430-W350, Present Velocity (128)).
-    """
-    raw = data[field.offset : field.offset + field.size]
-    if field.encoding == "sign_magnitude":
-        value = int.from_bytes(raw, "little")
-        return -(value & (_CLOCKWISE - 1)) if value & _CLOCKWISE else value & (_CLOCKWISE - 1)
-    return int.from_bytes(raw, "little", signed=field.encoding == "twos_complement")
 
 
 def _units(servo: ServoPlan) -> tuple[float, float, float]:

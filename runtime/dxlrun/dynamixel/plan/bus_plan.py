@@ -8,6 +8,10 @@ from typing import Literal
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.wire.transaction import Transaction
 
+SIGN = 0x400
+"""Of sign-magnitude items, bit 10: clockwise (e-Manual AX-12A, Moving Speed (32), Present Speed (38), Present
+Load (40))."""
+
 
 @dataclass(frozen=True, slots=True)
 class Field:
@@ -17,6 +21,19 @@ class Field:
     size: int
     """1, 2 or 4"""
     encoding: Literal["unsigned", "sign_magnitude", "twos_complement"]
+
+    def tick(self, block: bytes | memoryview) -> int:
+        """Return the item as the servo counts, out of the bytes of its block.
+
+        Velocity and effort are sign-magnitude in Protocol 1.0 and of XL-320 (e-Manual AX-12A, Present Speed
+        (38); XL-320, Present Speed (39)), bits above the sign are ignored; else two's complement (e-Manual
+        XM430-W350, Present Velocity (128)).
+        """
+        raw = block[self.offset : self.offset + self.size]
+        if self.encoding == "sign_magnitude":
+            value = int.from_bytes(raw, "little")
+            return -(value & (SIGN - 1)) if value & SIGN else value & (SIGN - 1)
+        return int.from_bytes(raw, "little", signed=self.encoding == "twos_complement")
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,6 +186,14 @@ class ServoPlan:
     """Torque is given back after a reboot (policy `on_returned_servo: hold`)."""
     continuous: bool = False
     """The joint is a wheel, or one of many turns."""
+
+    def joint_position(self, raw: int) -> float:
+        """Return the joint's angle, rad, of a present or goal position in ticks.
+
+        theta = raw * rad_per_tick, counter-clockwise positive (thesis of M. Amarante Araujo, 2017, JointID;
+        e-Manual AX-12A, Goal Position (30): 300/1023 deg a tick).
+        """
+        return self.direction * (raw * self.rad_per_tick - self.reference)
 
     def mode_plan(self, mode: int) -> ModePlan:
         """Return one of its modes; raises LookupError when the servo does not have it."""

@@ -18,7 +18,6 @@ from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.plan.line import Line, listen
 from dxlrun.dynamixel.plan.mode_plan import mode_in
 from dxlrun.dynamixel.plan.reads import state_read
-from dxlrun.dynamixel.plan.units import joint_position, ticks_in
 from dxlrun.dynamixel.servo.retry import retry, setup_line
 from dxlrun.dynamixel.servo.watchdog import shown, tripped
 from dxlrun.dynamixel.wire.protocol1 import StatusError, describe_error
@@ -147,7 +146,7 @@ def _limits(low: str, high: str, names: str) -> Check:
 
     def sentence(found: Inspected, lowest: int) -> str:
         servo, highest = found.servo, found.values[high]
-        ends = sorted(math.degrees(joint_position(servo, raw)) for raw in (lowest, highest))
+        ends = sorted(math.degrees(servo.joint_position(raw)) for raw in (lowest, highest))
         return (
             f"has {names} {lowest}..{highest}, narrower than the joint's "
             f"{servo.lower_tick}..{servo.upper_tick}, and would refuse goals: write "
@@ -356,7 +355,7 @@ def inspect_states(plan: BusPlan, servos: list[ServoPlan], line: Line, found: Bu
                 if reply.outcome is Outcome.TIMEOUT:
                     problem = "does not answer any more: check cable and power"
             else:
-                raw = ticks_in(servo.state.position, reply.parameters)
+                raw = servo.state.position.tick(reply.parameters)
                 if again and servo.servo_id in before:
                     problem = _jump(servo, before[servo.servo_id], (raw, reply.last_ns))
                 elif not again:
@@ -420,9 +419,9 @@ def _misplaced(servo: ServoPlan, raw: int, found: BusSurvey) -> str:
         return f"reports position {raw}, beyond its {servo.max_tick} ticks"
     if servo.lower_tick - 1 <= raw <= servo.upper_tick + 1:
         return ""
-    ends = sorted(math.degrees(joint_position(servo, end)) for end in (servo.lower_tick, servo.upper_tick))
+    ends = sorted(math.degrees(servo.joint_position(end)) for end in (servo.lower_tick, servo.upper_tick))
     return (
-        f"stands at {math.degrees(joint_position(servo, raw)):.1f} deg, outside its limits "
+        f"stands at {math.degrees(servo.joint_position(raw)):.1f} deg, outside its limits "
         f"{ends[0]:.1f}..{ends[1]:.1f} deg: move the joint inside by hand"
     )
 

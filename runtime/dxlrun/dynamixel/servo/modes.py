@@ -17,7 +17,6 @@ from dxlrun.dynamixel.control_table import ControlItem, control_table, side_by_s
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, GoalLayout, ModePlan, OwnLimit, ServoPlan
 from dxlrun.dynamixel.plan.mode_plan import in_mode, mode_in
 from dxlrun.dynamixel.plan.planning import plan_line, readable
-from dxlrun.dynamixel.plan.units import ticks_in
 from dxlrun.dynamixel.servo import watchdog
 from dxlrun.dynamixel.servo.retry import retry
 from dxlrun.dynamixel.wire.transaction import Outcome, Program, Reply
@@ -147,7 +146,7 @@ def hold(plan: BusPlan, servo: ServoPlan, mode: ModePlan, *, inward: bool = Fals
         state = yield from retry(line.read(servo.servo_id, block.address, block.length))
         if not state.answered:
             return Held("did not answer when torque was to be switched on")
-        present = ticks_in(servo.state.position, state.parameters)
+        present = servo.state.position.tick(state.parameters)
         position = min(max(present, mode.lower_tick), mode.upper_tick)
         beyond = abs(position - present)
         unwound = servo.continuous and beyond * servo.rad_per_tick > FARTHEST_INWARD

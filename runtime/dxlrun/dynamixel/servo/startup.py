@@ -20,7 +20,6 @@ from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.plan.line import PATIENCE_NS, listen
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.plan.reads import state_read
-from dxlrun.dynamixel.plan.units import joint_position
 from dxlrun.dynamixel.port.latency_timer import late_replies
 from dxlrun.dynamixel.port.ports import Ports
 from dxlrun.dynamixel.servo import modes, watchdog
@@ -344,7 +343,7 @@ def _refuse(problems: Iterable[str]) -> None:
 def _first_goals(goals: Commands, servo: ServoPlan, raw: int | None) -> None:
     """Let the goals be what the servo was given: where it stands, without a speed, or 0."""
     row, mode = servo.row, servo.start_mode
-    goals.position[row] = float("nan") if raw is None else joint_position(servo, raw)
+    goals.position[row] = float("nan") if raw is None else servo.joint_position(raw)
     goals.velocity[row] = 0.0 if mode is Mode.VELOCITY else float("nan")
     goals.effort[row] = 0.0 if mode is Mode.EFFORT else float("nan")
     goals.pwm[row] = 0.0 if mode is Mode.PWM else float("nan")
