@@ -62,7 +62,7 @@ def printed(words: tuple[str, ...], directory: Path) -> list[str]:
     ours, theirs = pty.openpty()
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", ROWS, COLUMNS, 0, 0))
     environment = os.environ | {"TERM": "xterm-256color", "COLUMNS": str(COLUMNS)}
-    command = [sys.executable, "-c", "from dxlrun.cli import main; main()", *words]
+    command = [sys.executable, "-c", "import sys; from dxlrun.cli import main; sys.exit(main())", *words]
     process = subprocess.Popen(
         command, cwd=directory, env=environment, stdin=theirs, stdout=theirs, stderr=theirs
     )
