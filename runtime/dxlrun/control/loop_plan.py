@@ -1,4 +1,4 @@
-"""What the loop executes: period, scheduler wishes, controllers, commands by time; JSON in the log."""
+"""What the loop executes: period, scheduler requests, controllers, commands by time; JSON in the log."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MOST_SHARE = 2
 
 @dataclass(frozen=True, slots=True)
 class SchedulerPlan:
-    """Wishes to the operating system; what was granted is said by `realtime`."""
+    """Requests to the operating system; `realtime` reports what was granted."""
 
     policy: Policy
     priority: int
@@ -72,7 +72,7 @@ class JointPlan:
 
     @property
     def rest(self) -> Mode:
-        """The mode into which a joint is brought that nobody commands and that would not hold still."""
+        """The mode into which a joint without a command is brought where it would not hold still."""
         return Mode.VELOCITY if self.continuous else Mode.POSITION
 
 
@@ -87,7 +87,7 @@ class ControllerPlan:
     name: str
     type: str
     distribution: str
-    """Who published the plug-in: `name version`."""
+    """Publisher of the plug-in: `name version`."""
     parameters: str
     """JSON that `Parameters` accepts"""
     joints: tuple[str, ...]
@@ -114,7 +114,7 @@ class ScheduledCommand:
     data: bytes
     """Little-endian float64"""
     origin: str
-    """Who asked: `three_parts.yaml:7:5`."""
+    """Its source: `three_parts.yaml:7:5`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +128,7 @@ class LoopPlan:
     commands: tuple[ScheduledCommand, ...]
     """Sorted by time."""
     end_ns: int | None
-    """Stop by itself at this time since the first deadline; None: run until told."""
+    """Stop by itself at this time since the first deadline; None: run until a stop."""
     overrun: OverrunPolicy = "skip"
     tolerated_skips: float = TOLERATED_SKIPS
     """Share of its periods that a run may skip and still be good."""

@@ -13,7 +13,7 @@ TORQUE_STAYS = (
     "torque stays on, as the policy says: the robot holds until its power is off; "
     "the next run needs --take-over"
 )
-"""What a person is told of a run that ends with `hold`."""
+"""The remark of a run that ends with `hold`."""
 
 SLOW_SPEED = 1.5
 """rad/s; a goal moves no faster in the first second after torque was switched on. A quarter of an AX-12's

@@ -21,7 +21,7 @@ ARRIVED = 0.05
 MODES_NS = 500_000_000
 """How long a policy waits for modes: its own time runs on. Some twenty transactions a servo. [i]"""
 STAND_NS = 100_000_000
-"""How long at least a pose, and goals of 0 rad/s to who is left with torque on, are sent: a write may be
+"""How long at least a pose, and goals of 0 rad/s to joints that keep their torque, are sent: a write may be
 lost, and a servo that missed a reply gets its goal a cycle later."""
 
 
