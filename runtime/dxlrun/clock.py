@@ -21,7 +21,7 @@ class Clock(Protocol):
 class MonotonicClock:
     """CLOCK_MONOTONIC: sleeps until shortly before the deadline, then polls the clock.
 
-    `spin_ns` is the margin that is polled away. A sleep alone wakes some 50-100 us late on a stock kernel;
+    `spin_ns` is the margin that is polled away. A sleep alone wakes some 50-100 us late on a stock Linux;
     polling the last of it costs `spin_ns / period` of one core.
     """
 

@@ -14,7 +14,7 @@ from dxlrun.log.reader import Log
 from dxlrun.run.channels.ring import RING_SECONDS
 
 ROUGH_NS = 150_000
-"""A wake-up later than this does not happen on a real-time kernel (M. A. Araujo, UFU 2017)."""
+"""A wake-up later than this does not happen on a real-time Linux kernel (M. A. Araujo, UFU 2017)."""
 
 DISORDER_NS = RING_SECONDS * 1_000_000_000
 """A log has the records of several rings in the order in which the recorder got them: no further apart."""

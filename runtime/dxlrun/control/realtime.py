@@ -156,13 +156,13 @@ def _set_policy(policy: Policy, priority: int, limit: int) -> Grant:
 
 
 def _timer_slack() -> Grant:
-    """Ask the kernel to wake an ordinary thread within 1 ns of the timer instead of 50 us (prctl(2))."""
+    """Ask Linux to wake an ordinary thread within 1 ns of the timer instead of 50 us (prctl(2))."""
     succeed(libc().prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(1), 0, 0, 0))
     return Grant("timer slack", True, "timer slack 1 ns")
 
 
 def _stay_on(cores: Sequence[int]) -> Grant:
-    """Bind the calling thread to cores; the kernel drops those that there are not (sched_setaffinity(2))."""
+    """Bind the calling thread to cores; Linux drops those that there are not (sched_setaffinity(2))."""
     before = os.sched_getaffinity(0)
     try:
         os.sched_setaffinity(0, cores)
@@ -266,7 +266,7 @@ def _lock_all() -> None:
 
 
 def keep_freed() -> bool:
-    """Have malloc give nothing back to the kernel: the next allocation finds it touched (mallopt(3)).
+    """Have malloc give nothing back to the Linux kernel: the next allocation finds it touched (mallopt(3)).
 
     Returns False where the C library has no mallopt (musl): the pages then come and go.
     """

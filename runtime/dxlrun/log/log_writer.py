@@ -369,7 +369,7 @@ class LogFile:
         self._size = 0
 
     def write(self, data: bytes | bytearray | memoryview) -> int:
-        """Write all of `data`; the kernel may take it in pieces, and the last piece shows a full disk."""
+        """Write all of `data`; Linux may take it in pieces, and the last piece shows a full disk."""
         if os.fstat(self._descriptor).st_size < self._size:
             raise OSError(errno.EIO, "the file was cut by another program")
         rest = memoryview(data)

@@ -54,9 +54,9 @@ class _Connection(http.client.HTTPConnection):
         self._path = path
 
     def connect(self) -> None:
-        """Connect to the socket's path; where its queue of connections is full, wait in the kernel's.
+        """Connect to the socket's path; where its queue of connections is full, wait in the Linux kernel's.
 
-        The kernel serves those that wait in order (a socket with a timeout of Python does not wait: unix(7),
+        Linux serves those that wait in order (a socket with a timeout of Python does not wait: unix(7),
         EAGAIN), so a process that floods the queue only delays this one.
         """
         self.sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)

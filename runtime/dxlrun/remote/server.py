@@ -2,7 +2,7 @@
 
 A client may hang in the middle of a request, never read its answer, or open connections without end. A
 process above its limit loses the connection of its own that was silent longest, so a flood closes none of
-another process, whose `stop` is served. The process ID comes from the kernel (SO_PEERCRED, unix(7)).
+another process, whose `stop` is served. The process ID comes from the Linux kernel (SO_PEERCRED, unix(7)).
 """
 
 from __future__ import annotations

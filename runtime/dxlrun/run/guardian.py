@@ -41,7 +41,7 @@ _NEVER = 1 << 62
 SILENT_PERIODS = 5
 """A running loop whose counter stands still this long hangs."""
 LEAST_TIMEOUT_NS = 80_000_000
-"""At high rates a few periods are less than a stock kernel's worst wake-up (thesis: 17 ms), and than a host
+"""At high rates a few periods are less than a stock Linux's worst wake-up (thesis: 17 ms), and than a host
 of virtual machines takes a processor away [i]: a robot that falls for that was made safe for nothing."""
 SETUP_TIMEOUT_NS = 1_000_000_000
 """Set-up and shutdown beat while they await replies; each wait ends within milliseconds."""

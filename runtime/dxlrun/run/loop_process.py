@@ -1,7 +1,7 @@
 """The loop's process: plug-ins, set-up on the bus, real time, the loop, torque off.
 
 One thread, executed afresh (no fork), on descriptors that the guardian opened. It is asked to stop
-by SIGTERM, which the guardian sends, or the kernel when the guardian is gone.
+by SIGTERM, which the guardian sends, or the Linux kernel when the guardian is gone.
 """
 
 from __future__ import annotations

@@ -166,7 +166,7 @@ class Served:
 class TypedLines:
     """Lines of a descriptor without waiting for them; a terminal is read only in the foreground.
 
-    A job in the background that reads its terminal would be stopped by the kernel.
+    A job in the background that reads its terminal would be stopped by the Linux kernel.
     """
 
     def __init__(self, descriptor: int) -> None:

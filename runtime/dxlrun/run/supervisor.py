@@ -241,7 +241,7 @@ class _Run:
                 self.socket.unlink(missing_ok=True)
 
     def _without_guardian(self, loop: int, guardian: Child[GuardianMessage], job: GuardianJob) -> None:
-        """The guardian is gone, and the kernel has signalled the loop: see that it stops, or cut torque."""
+        """The guardian is gone, and Linux has signalled the loop: see that it stops, or cut torque."""
         give_up = time.monotonic() + self.plan.exit_timeout_ns * 1e-9
         while not (gone := bool(select.select([loop], [], [], _POLL_S)[0])):
             # the second request may have gone to a guardian that did not read it any more

@@ -17,7 +17,7 @@ PATIENCE_NS = 10_000_000
 """How long a servo that answered last time is awaited beyond the latest moment of its reply by the wire.
 
 A real servo is never late by more than microseconds, but a simulated one is a process of the same machine: it
-may have to wait for its processor for a slice or two of the scheduler (3 ms each on a stock kernel). Ten
+may have to wait for its processor for a slice or two of the scheduler (3 ms each on a stock Linux). Ten
 milliseconds keep that from being taken for a broken cable; only the first silence of a cycle costs them
 (the timeouts behind it are short), and they stay below the 15.6 ms after which a loop of 320 Hz
 would count as hanging.

@@ -28,7 +28,7 @@ class LatencyTimer:
 
     found_ms: int
     place: Path
-    """Where the kernel shows it."""
+    """Where the Linux kernel shows it."""
 
     @property
     def mend(self) -> str:
@@ -60,7 +60,7 @@ def late_replies(bus: str, port: str, extra_ns: float, planned_ns: float) -> str
 
 
 def timer_ms(place: Path) -> int | None:
-    """Return what the kernel shows at a place, ms; None: no number, or it may not be read."""
+    """Return what the Linux kernel shows at a place, ms; None: no number, or it may not be read."""
     try:
         return int(place.read_text())
     except (OSError, ValueError):

@@ -33,9 +33,9 @@ MOST_SHARE = 0.5
 class ReplyPolling:
     """How replies are polled for: asleep until shortly before they are due by the plan, then looked for.
 
-    Waking a process that blocks costs some 50 us on a stock kernel, of each reply. What is polled is credit:
+    Waking a process that blocks costs some 50 us on a stock Linux, of each reply. What is polled is credit:
     a share of the time that passes, so that no more than that share of a core is ever spent on it. Only the
-    compiled kernel polls.
+    exchange kernel polls.
     """
 
     longest_ns: int = 1_000_000

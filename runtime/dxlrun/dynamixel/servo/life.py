@@ -207,7 +207,7 @@ class Life:
         self.losses: list[Loss | None] = [None] * count
         """Of each servo that is OFFLINE."""
         self.torqued: NDArray[np.bool_] = np.zeros(count, dtype=np.bool_)
-        """Shape (servos,): the servos that get goals; the memory of the kernel, too."""
+        """Shape (servos,): the servos that get goals; memory that the exchange kernel shares."""
         self.ceiling: Floats = np.full(count, np.nan)
         """Shape (servos,): the highest speeds toward positions, rad/s; NaN: no limit but that of the goal."""
 

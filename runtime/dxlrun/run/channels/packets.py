@@ -78,7 +78,7 @@ class PacketLog(PacketSink, Protocol):
 
     @property
     def desk(self) -> Desk | None:
-        """Where the exchange's kernel appends records by itself; None: what it exchanges is not recorded."""
+        """Where the exchange kernel appends records by itself; None: what it exchanges is not recorded."""
         ...
 
     def commit(self) -> None:
