@@ -43,7 +43,7 @@ def asked_and_answered(wire: Make, at: int, error: int = 0) -> list[Any]:
     ]
 
 
-def test_a_good_run_is_said_to_be_good(write: Make, cycle: Make, wire: Make) -> None:
+def test_a_good_run_is_good(write: Make, cycle: Make, wire: Make) -> None:
     packets = [packet for at in (0, 20_000) for packet in asked_and_answered(wire, at)]
     report = analyze_log(
         write([cycle(number, late=83 if number == 7 else 60) for number in range(50)], packets)
@@ -71,7 +71,7 @@ def test_the_wake_up_latency_is_that_of_the_records(write: Make, cycle: Make) ->
     )
 
 
-def test_the_steps_take_what_the_records_say(write: Make, cycle: Make) -> None:
+def test_the_steps_take_the_times_of_the_records(write: Make, cycle: Make) -> None:
     cycles = [
         cycle(number, late=50, read=5000 + number, update=100, write=300 - number) for number in range(101)
     ]
@@ -102,7 +102,7 @@ def test_periods_that_were_skipped_are_accounted_for(write: Make, cycle: Make) -
     [[(0, 0), (1, 0), (4, 0)], [(0, 0), (3, 1)], [(0, 0), (3, 0), (4, 2)], [(2, 0)]],
     ids=["undeclared", "half declared", "declared late", "no beginning"],
 )
-def test_periods_that_vanished_are_told(write: Make, cycle: Make, numbers: list[tuple[int, int]]) -> None:
+def test_periods_that_vanished_are_reported(write: Make, cycle: Make, numbers: list[tuple[int, int]]) -> None:
     report = analyze_log(write([cycle(number, skipped=skipped) for number, skipped in numbers]))
     assert not report.periods.agree
     assert not report.verdict.good
@@ -193,19 +193,19 @@ def test_without_known_limits_tracking_compares_with_the_goal_of_the_cycle_befor
     assert (head.rms_rad, head.invalid) == (None, 0)
 
 
-def test_a_cycle_longer_than_its_period_is_said_with_the_step_that_made_it(write: Make, cycle: Make) -> None:
+def test_a_cycle_longer_than_its_period_is_reported_with_its_longest_step(write: Make, cycle: Make) -> None:
     sentences = analyze_log(write([cycle(0), cycle(1, read=23_000)])).verdict.sentences
     assert sentences[1] == (
         "A cycle took up to 23.40 ms, longer than its period of 20.00 ms; its read took 23.00 ms."
     )
 
 
-def test_rough_wake_ups_are_said(write: Make, cycle: Make) -> None:
+def test_rough_wake_ups_are_reported(write: Make, cycle: Make) -> None:
     report = analyze_log(write([cycle(number, late=200 if number < 3 else 10) for number in range(100)]))
     assert "3.0% came later than 150 us" in report.verdict.sentences[1]
 
 
-def test_errors_gaps_and_a_log_without_end_are_said(write: Make, cycle: Make, said: Make) -> None:
+def test_errors_gaps_and_a_log_without_end_are_reported(write: Make, cycle: Make, said: Make) -> None:
     events = [
         said(EventCode.LOOP_STARTED, Severity.INFO, "50 Hz"),
         said(EventCode.CONTROLLER_FAULT, Severity.ERROR, "Traceback\nValueError: no"),
@@ -229,14 +229,14 @@ def test_a_finished_log_with_gaps_counts_them(write: Make, cycle: Make) -> None:
     assert (report.gaps, report.complete) == (4, True)
 
 
-def test_a_run_without_a_cycle_is_said_to_be_one(write: Make) -> None:
+def test_a_run_without_a_cycle_is_reported(write: Make) -> None:
     report = analyze_log(write())
     assert report.verdict == Verdict(False, ("The loop never ran a cycle.",))
     assert (report.latency, report.steps) == (None, ())
     assert "torso" in shown(report)
 
 
-def test_the_terminal_says_the_verdict_first_and_every_number_after(
+def test_the_terminal_shows_the_verdict_first_and_every_number_after(
     write: Make, cycle: Make, wire: Make
 ) -> None:
     report = analyze_log(
@@ -271,5 +271,5 @@ def test_what_is_no_log_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("value", "text"), [(83.4, "83 us"), (16_949.0, "16.95 ms"), (2.5e6, "2.50 s")])
-def test_times_are_written_as_a_person_writes_them(value: float, text: str) -> None:
+def test_times_are_written_in_fitting_units(value: float, text: str) -> None:
     assert microseconds(value) == text

@@ -252,9 +252,7 @@ def test_a_log_without_packets_has_nothing_to_compare(judge: Callable, entries):
         judge([], entries)
 
 
-def test_injected_faults_of_the_run_are_listed_with_what_the_log_says_of_them(
-    judge: Callable, wires: list, entries
-):
+def test_injected_faults_of_the_run_are_listed_with_their_events(judge: Callable, wires: list, entries):
     noise = LedgerEntry(FIRST_US * US + 5, "main", "note", b"", "fault: noise bytes=4")
     lost = LedgerEntry(FIRST_US * US + 10**8, "main", "note", b"", "fault: lose servo=5")
     long_before = noise._replace(t_ns=0)

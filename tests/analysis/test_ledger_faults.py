@@ -144,10 +144,10 @@ def test_a_fault_of_a_kind_that_is_not_known_has_no_answer():
 )
 def test_what_lasts_must_be_noticed(text: str, who: tuple[str, ...]):
     assert unanswered(fault(1000, text)) == who
-    told = [
+    shown = [
         event(1010, EventCode.PORT_LOST if one == "main" else EventCode.READ_LOST, one) for one in who[:-1]
     ]
-    assert unanswered(fault(1000, text), *told) == who[-1:]
+    assert unanswered(fault(1000, text), *shown) == who[-1:]
 
 
 @pytest.mark.parametrize(
@@ -163,7 +163,7 @@ def test_only_faults_of_the_running_loop_must_be_noticed(t_ms: int):
     assert unanswered(fault(t_ms, "silence servo=3")) == ()
 
 
-def test_who_is_silent_already_has_nothing_to_lose():
+def test_a_servo_that_is_silent_already_has_nothing_to_lose():
     lost = event(900, EventCode.READ_LOST, "elbow")
     one = fault(1000, "silence servo=3")
     assert unanswered(one, lost) == ()
@@ -188,7 +188,7 @@ def test_of_two_servos_with_one_id_the_other_one_answers():
 
 
 @pytest.mark.parametrize(
-    ("entries", "told"),
+    ("entries", "shown"),
     [
         ([], event(1000, EventCode.READ_LOST, "elbow")),
         ([], event(1000, EventCode.PORT_LOST, "main")),
@@ -214,12 +214,12 @@ def test_of_two_servos_with_one_id_the_other_one_answers():
         "the plug of another bus",
     ],
 )
-def test_an_event_without_a_cause_is_found(entries: list[LedgerEntry], told: Event):
-    assert causeless(entries, told) == [(told.name, told.source)]
+def test_an_event_without_a_cause_is_found(entries: list[LedgerEntry], shown: Event):
+    assert causeless(entries, shown) == [(shown.name, shown.source)]
 
 
 @pytest.mark.parametrize(
-    ("entries", "told"),
+    ("entries", "shown"),
     [
         ([fault(1000, "lose servo=3")], event(1001, EventCode.READ_LOST, "elbow")),
         ([fault(1000, "lose servo=3")], event(1001, EventCode.READ_LOST, "wrist")),
@@ -237,7 +237,7 @@ def test_an_event_without_a_cause_is_found(entries: list[LedgerEntry], told: Eve
     ],
     ids=[
         "its own fault",
-        "who was asked before it",
+        "of the request before it",
         "the request",
         "still silent",
         "shut down",
@@ -245,11 +245,11 @@ def test_an_event_without_a_cause_is_found(entries: list[LedgerEntry], told: Eve
         "its own shutdown",
     ],
 )
-def test_an_event_with_a_cause_is_none_of_them(entries: list[LedgerEntry], told: Event):
-    assert causeless(entries, told) == []
+def test_an_event_with_a_cause_is_none_of_them(entries: list[LedgerEntry], shown: Event):
+    assert causeless(entries, shown) == []
 
 
-def test_what_was_silent_since_a_fault_may_tell_late_what_happened_to_it():
+def test_a_servo_silent_since_a_fault_may_report_it_late():
     entries = [fault(1000, "reboot servo=3 for=100ms"), fault(1050, "silence servo=3 for=8s")]
     lost, back = event(1010, EventCode.READ_LOST, "elbow"), event(1020, EventCode.READ_BACK, "elbow")
     rebooted = event(9800, EventCode.SERVO_REBOOTED, "elbow")
@@ -258,5 +258,5 @@ def test_what_was_silent_since_a_fault_may_tell_late_what_happened_to_it():
 
 
 def test_good_news_needs_no_cause():
-    told = Event(MS, EventCode.SERVO_ERROR, Severity.INFO, "elbow", "reports no error")
-    assert causeless([], told) == []
+    shown = Event(MS, EventCode.SERVO_ERROR, Severity.INFO, "elbow", "reports no error")
+    assert causeless([], shown) == []

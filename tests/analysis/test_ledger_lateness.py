@@ -48,7 +48,7 @@ def test_of_answers_that_came_together_the_last_one_counts(write: Callable[..., 
     assert (found.deliveries, found.max_us, found.median_us) == (2, 30, 20)
 
 
-def test_an_overrun_with_a_late_reply_in_its_time_is_told_from_one_without(
+def test_an_overrun_with_a_late_reply_in_its_time_is_distinguished_from_one_without(
     write: Callable[..., Path], cycle: type, entries
 ):
     cycles = [cycle(n) for n in range(31)] + [cycle(33, skipped=2)] + [cycle(n) for n in range(34, 80)]
@@ -60,11 +60,11 @@ def test_an_overrun_with_a_late_reply_in_its_time_is_told_from_one_without(
     assert (found.overruns, found.overruns_beside) == (2, 1)
 
 
-def test_without_a_delivery_there_is_nothing_to_say(write: Callable[..., Path], cycle: type):
+def test_without_a_delivery_there_is_no_lateness(write: Callable[..., Path], cycle: type):
     assert lateness(read_log(write([cycle(0)])), []) is None
 
 
-def test_a_person_reads_it_in_a_table_and_a_sentence(
+def test_the_terminal_shows_it_in_a_table_and_a_sentence(
     write: Callable[..., Path], cycle: type, wire: type, entries
 ):
     cycles = [cycle(n) for n in range(31)] + [cycle(33, skipped=2)]

@@ -121,7 +121,7 @@ def test_a_late_reply_of_another_cycle_is_no_excuse(causes_of: Callable[..., Any
 @pytest.mark.parametrize(
     ("late", "update", "expected"), [(16_000, 100, (0, 1, 0)), (2_000, 16_000, (0, 0, 1))]
 )
-def test_a_late_wake_up_is_told_from_work(
+def test_a_late_wake_up_is_distinguished_from_work(
     causes_of: Callable[..., Any], late: int, update: int, expected: tuple[int, int, int]
 ) -> None:
     assert counts(causes_of(ledger(woke_us=late), late=late, update=update)) == expected
@@ -182,7 +182,7 @@ def test_bytes_that_wait_for_the_line_are_not_late() -> None:
     assert one.late_ns == 7_000
 
 
-def test_a_person_reads_the_causes_and_the_worst_of_them(
+def test_the_terminal_shows_the_causes_and_the_worst_overruns(
     write: Callable[..., Path], cycle: type, wire: type
 ) -> None:
     entries = ledger(handed_late_us=17_000)

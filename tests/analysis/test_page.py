@@ -161,7 +161,7 @@ def test_the_numbers_are_those_of_the_report(run: Path, whole: Made) -> None:
         assert sentence.replace("\x1b", "\N{REPLACEMENT CHARACTER}") in reader.words("p")
 
 
-def test_what_was_asked_of_the_system_and_granted_is_told(whole: Made) -> None:
+def test_what_was_asked_of_the_system_and_granted_is_reported(whole: Made) -> None:
     _, reader = whole
     cells = reader.words("th", "td")
     assert cells.count("granted") == 1

@@ -87,7 +87,7 @@ def test_errors_of_protocol_2_are_numbers_and_the_alert_a_bit(write: Make, wire:
     assert (second.errors, second.error_names) == (0, ())
 
 
-def test_a_broadcast_ping_asks_nobody_in_particular(write: Make, wire: Make) -> None:
+def test_a_broadcast_ping_requests_no_certain_reply(write: Make, wire: Make) -> None:
     (servo,) = analyze_log(write([], [asks(wire, 0, PING_ALL), answers(wire, 500, 1, status(1))])).servos
     assert (servo.asked, servo.lost, servo.replies) == (0, 0, 1)
 

@@ -1,4 +1,4 @@
-"""Analysis of steered runs: periods are counted through other rates and pauses, and told to people."""
+"""Analysis of steered runs: periods are counted through other rates and pauses, and printed to people."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_the_periods_are_those_of_each_cycle(log: Log, report: Report) -> None:
     assert account.rates_hz == (50.0, 100.0)
 
 
-def test_the_verdict_says_it(report: Report) -> None:
+def test_the_verdict_has_it(report: Report) -> None:
     loop, steered, *_ = report.verdict.sentences
     assert loop == "The loop kept 50 Hz and 100 Hz: 0 of 56 periods skipped, on virtual time."
     assert steered == (
@@ -104,7 +104,7 @@ def test_the_verdict_says_it(report: Report) -> None:
     )
 
 
-def test_the_table_tells_who_asked_for_what(report: Report) -> None:
+def test_the_table_has_each_request_with_its_origin(report: Report) -> None:
     rows = [[cell.text for cell in row[1:]] for row in steering_table(report.steering).rows]
     assert rows == [
         ["5", "rate 100 Hz", "anna", "done"],
@@ -167,7 +167,7 @@ def test_the_page_shows_it(log: Log, report: Report) -> None:
     assert "The dashed lines are the periods, 10 ms to 20 ms" in text
 
 
-def test_a_run_that_nobody_steered_says_nothing_of_it(tmp_path: Path) -> None:
+def test_a_run_without_commands_has_no_steering(tmp_path: Path) -> None:
     log = run(tmp_path, {20: []})
     report = analyze(log)
     assert (report.steering, report.pauses) == ((), ())

@@ -38,7 +38,7 @@ def report(write: Make, cycle: Make, wire: Make, said: Make) -> Report:
 
 
 @pytest.mark.parametrize("width", [80, 100, 200])
-def test_no_line_is_longer_than_the_terminal_or_than_a_person_reads(report: Report, width: int) -> None:
+def test_no_line_is_longer_than_the_terminal_or_than_reads_well(report: Report, width: int) -> None:
     assert max(len(line) for line in lines(report, width)) <= min(width, 120)
 
 
@@ -52,7 +52,7 @@ def test_a_wide_terminal_shows_the_details(report: Report) -> None:
     assert not any("instructions" in line and "slowest" in line for line in lines(report, 60))
 
 
-def test_an_event_says_its_source_once(report: Report) -> None:
+def test_an_event_has_its_source_once(report: Report) -> None:
     text = "\n".join(lines(report, 120))
     assert "head (ID 21) did not answer" in text
     assert "head: head (ID 21)" not in text

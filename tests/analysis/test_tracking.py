@@ -1,4 +1,4 @@
-"""Tracking against the trajectory that a servo could reach, of joints whose way is known exactly."""
+"""Tracking against the trajectory that a servo could reach, of joints with a known way."""
 
 from __future__ import annotations
 
@@ -189,12 +189,12 @@ def test_a_first_goal_is_approached_from_where_the_joint_stands(make: Make) -> N
     assert way[1:] == pytest.approx(np.minimum(np.arange(1, 100) * DT * 0.5, 1.0), abs=DT)
 
 
-def test_terminal_report_and_json_say_the_same(make: Make) -> None:
+def test_terminal_report_and_json_have_the_same_numbers(make: Make) -> None:
     log = make(stepped(200, 10, 1.0), ramp(200, 10, 1.0, 0.5, delay=3), speed=0.5)
     report = analyze(log)
     (row,) = joints_table(report).rows
-    told = dict(zip((column.name for column in joints_table(report).columns), row, strict=True))
-    assert [told[name].text for name in ("worst", "lag", "at rest")] == ["0.0300", "59 ms", "0.0000"]
+    shown = dict(zip((column.name for column in joints_table(report).columns), row, strict=True))
+    assert [shown[name].text for name in ("worst", "lag", "at rest")] == ["0.0300", "59 ms", "0.0000"]
     (as_json,) = json.loads(json_text(report))["joints"]
     assert as_json["lag_ms"] == pytest.approx(60.0, rel=0.02)
     assert as_json["worst_rad"] == pytest.approx(0.03)

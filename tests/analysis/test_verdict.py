@@ -1,4 +1,4 @@
-"""The verdict: what a run may not have to be good, what hurts most, and that nobody says it otherwise."""
+"""The verdict: what a run may not have to be good, the order of findings, and one verdict everywhere."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_no_run_with_a_loss_or_an_error_is_good(  # noqa: PLR0917  what is writt
     assert verdict.sentences[0].startswith(sentence)
 
 
-def test_what_happened_to_one_servo_is_said_of_it_at_once(write: Make, cycle: Make, said: Make) -> None:
+def test_all_that_happened_to_one_servo_is_one_sentence(write: Make, cycle: Make, said: Make) -> None:
     codes = [EventCode.SERVO_LOST, EventCode.SERVO_REBOOTED, EventCode.SERVO_LOST, EventCode.SERVO_LIMP]
     events = [said(EventCode.SERVO_LOST, Severity.ERROR, "away", "wrist")]
     events += [said(code, Severity.ERROR, "", "elbow") for code in codes]
@@ -147,15 +147,15 @@ def test_what_hurt_most_comes_first(write: Make, cycle: Make, said: Make) -> Non
     lost = said(EventCode.SERVO_LOST, Severity.ERROR, "", "elbow")
     gone = said(EventCode.PORT_LOST, Severity.ERROR, "unplugged", "main")
 
-    def told(cycles: list[Any], *events: Any) -> list[str]:
+    def shown(cycles: list[Any], *events: Any) -> list[str]:
         path = write(cycles, events=events)
         sentences = analyze_log(path).verdict.sentences
         path.unlink()
         return [sentence.split(maxsplit=2)[1] for sentence in sentences]
 
-    assert told(half) == ["were", "loop"]  # 50 % of the states, 16 % of the periods
-    assert told(tenth) == ["loop", "were"]
-    assert told(half, lost, gone) == ["main", "failed:", "were", "loop"]
+    assert shown(half) == ["were", "loop"]  # 50 % of the states, 16 % of the periods
+    assert shown(tenth) == ["loop", "were"]
+    assert shown(half, lost, gone) == ["main", "failed:", "were", "loop"]
 
 
 # What helps
@@ -207,7 +207,7 @@ def exchanges(wire: Make, took_us: int, count: int = 5) -> list[Any]:
 
 
 @pytest.mark.parametrize(
-    ("extra_us", "latency_ms", "told"),
+    ("extra_us", "latency_ms", "shown"),
     [
         (300, 1, ""),
         (2900, 1, ""),
@@ -217,7 +217,7 @@ def exchanges(wire: Make, took_us: int, count: int = 5) -> list[Any]:
     ],
 )
 def test_replies_are_compared_with_the_plan(  # noqa: PLR0917  what is written, and fixtures
-    write: Make, cycle: Make, wire: Make, extra_us: int, latency_ms: int, told: str
+    write: Make, cycle: Make, wire: Make, extra_us: int, latency_ms: int, shown: str
 ) -> None:
     wire_us = 10 * (len(ASK) + len(ANSWER)) + 500
     plan = {"buses": [PLANNED | {"latency_ns": latency_ms * MS}]}
@@ -225,7 +225,7 @@ def test_replies_are_compared_with_the_plan(  # noqa: PLR0917  what is written, 
     assert report.buses[0].extra_us == pytest.approx(extra_us)
     assert report.verdict.good
     (late,) = [one for one in report.verdict.sentences if one.startswith("Replies on")] or [""]
-    assert told in late
+    assert shown in late
     assert ("latency timer" in late) is (extra_us > 12_000 and latency_ms == 1)
     assert "cable" not in late
 
@@ -322,20 +322,20 @@ def analyze_totals(path: Path) -> RunTotals:
     return tally.totals(log)
 
 
-def test_page_and_json_and_run_say_the_same(storm: Path) -> None:
+def test_page_and_json_and_run_have_the_same_verdict(storm: Path) -> None:
     log = read_log(storm)
     report = analyze(log)
     said = judge(totals_of(storm))
     assert not said.good
     assert report.verdict == said
-    told = json.loads(json_text(report))["verdict"]
-    assert (told["good"], tuple(told["sentences"])) == (said.good, said.sentences)
+    shown = json.loads(json_text(report))["verdict"]
+    assert (shown["good"], tuple(shown["sentences"])) == (said.good, said.sentences)
     text = page(log, report)
     assert "Verdict: not good" in text
     assert all(f"<p>{sentence}</p>" in text for sentence in said.sentences)
 
 
-def test_what_is_not_read_whole_is_told_of_a_scanned_log_too(storm: Path, tmp_path: Path) -> None:
+def test_damage_is_reported_of_a_scanned_log_too(storm: Path, tmp_path: Path) -> None:
     cut = tmp_path / "cut.mcap"
     data = storm.read_bytes()
     cut.write_bytes(data[: len(data) * 2 // 3])

@@ -20,7 +20,7 @@ def log(dxlrun: Callable, torso: Path, tmp_path: Path, monkeypatch: pytest.Monke
     return path
 
 
-def test_a_report_is_written_beside_what_is_said(dxlrun: Callable, log: Path, tmp_path: Path):
+def test_a_report_is_written_beside_the_output(dxlrun: Callable, log: Path, tmp_path: Path):
     target = tmp_path / "report.html"
 
     said = dxlrun("analyze", log, "--report", target)
@@ -53,7 +53,7 @@ def test_a_report_never_goes_where_it_does_harm(dxlrun: Callable, tmp_path: Path
     assert log.read_bytes() == b"a log"
 
 
-def test_without_matplotlib_one_sentence_says_how_to_get_it(
+def test_without_matplotlib_one_sentence_has_the_command_that_installs_it(
     dxlrun: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     log = tmp_path / "run.mcap"
@@ -90,7 +90,7 @@ def test_without_an_argument_the_newest_log_of_the_directory_is_analyzed(dxlrun:
     assert json.loads(dxlrun("analyze", "--json").out)["log"] == str(newest.relative_to(Path.cwd()))
 
 
-def test_without_a_log_in_the_directory_one_sentence_says_where_it_was_looked_for(
+def test_without_a_log_in_the_directory_one_sentence_names_the_directory(
     dxlrun: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.chdir(tmp_path)

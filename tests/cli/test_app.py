@@ -209,7 +209,7 @@ def test_a_reader_that_goes_away_is_no_traceback(torso):
         (["bench", "rate", "missing.yaml"], 2, "there is no robot file missing.yaml"),
         (["bench", "rate", "missing.yaml", "--seconds", "soon"], 2, "Invalid value"),
         (["doctor", "--loud"], 2, "Unknown option"),
-        (["list", "--robot", "nobody"], 2, "no robot nobody runs"),
+        (["list", "--robot", "ghost"], 2, "no robot ghost runs"),
         *(
             ([verb, *more], 1, "no robot runs that can be steered")
             for verb, more in (
@@ -251,7 +251,7 @@ def test_an_interrupt_under_json_is_json(dxlrun, monkeypatch: pytest.MonkeyPatch
     assert (said.code, json.loads(said.out)["errors"]) == (130, [{"what": "interrupted"}])
 
 
-def test_the_usage_says_that_a_robot_and_a_command_are_alternatives(dxlrun):
+def test_the_usage_shows_that_a_robot_and_a_command_are_alternatives(dxlrun):
     assert dxlrun("--help").out.splitlines()[:2] == [
         "Usage: dxlrun ROBOT.yaml [ARG:=VALUE ...] [OPTIONS]",
         "       dxlrun COMMAND ...",
@@ -277,7 +277,7 @@ def test_tab_completion_is_installed_where_it_is_asked_for_and_completes(tmp_pat
         f"COMP_WORDS=(dxlrun {words}); COMP_CWORD={number}; _dxlrun; echo ${{COMPREPLY[@]}}"
         for words, number in (("ana", 1), ("check --on", 2), ("--vir", 1))
     )
-    told = subprocess.run(
+    shown = subprocess.run(
         ["/bin/bash", "-c", f". {script}; {asked}"], check=True, capture_output=True, text=True, cwd=tmp_path
     )
-    assert told.stdout.splitlines() == ["analyze", "--online", "--virtual"]
+    assert shown.stdout.splitlines() == ["analyze", "--online", "--virtual"]

@@ -17,7 +17,7 @@ from dxlrun.run.virtual_run import VirtualRobot
 ROBOT = Path(__file__).parents[2] / "robots" / "single_joint.yaml"
 
 
-def test_a_robot_file_that_is_not_there_is_told(dxlrun: Callable[..., Any], tmp_path: Path) -> None:
+def test_a_robot_file_that_is_not_there_is_reported(dxlrun: Callable[..., Any], tmp_path: Path) -> None:
     said = dxlrun("bench", "rate", tmp_path / "none.yaml")
     assert said.code == 2
     assert "there is no robot file" in said.err
@@ -28,11 +28,11 @@ def test_a_robot_is_run_to_see_whether_a_rate_is_kept(
 ) -> None:
     monkeypatch.setattr(highest_rate, "MOST_TRIES", 1)  # each takes seconds
     said = dxlrun("bench", "rate", ROBOT, "--seconds", "0.3", "--json")
-    told = json.loads(said.out)
-    assert said.code == (0 if told["kept_hz"] else 1)
-    assert told["robot"] == "single_joint"
-    assert told["tries"][0]["rate_hz"] <= told["computed_hz"]
-    assert told["kept_hz"] in (None, told["tries"][-1]["rate_hz"])
+    shown = json.loads(said.out)
+    assert said.code == (0 if shown["kept_hz"] else 1)
+    assert shown["robot"] == "single_joint"
+    assert shown["tries"][0]["rate_hz"] <= shown["computed_hz"]
+    assert shown["kept_hz"] in (None, shown["tries"][-1]["rate_hz"])
 
 
 def test_the_runs_are_shown_in_a_table_and_the_rate_in_a_sentence(

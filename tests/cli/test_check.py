@@ -124,7 +124,7 @@ def test_errors_as_json(dxlrun, tmp_path):
 
 
 def test_an_error_without_a_place_as_json(dxlrun):
-    said = dxlrun("check", "nobody", "--json")
+    said = dxlrun("check", "ghost", "--json")
 
     assert said.code == 2
     assert "neither a command nor a robot file" in json.loads(said.out)["errors"][0]["what"]

@@ -118,7 +118,7 @@ def test_commands_inside_sentences_exist_with_their_options(dxlrun: Dxlrun, page
             assert option in helped, span
 
 
-def test_bus_md_its_checks_say_what_the_page_says(dxlrun: Dxlrun, clone: Path) -> None:
+def test_bus_md_its_checks_print_what_the_page_has(dxlrun: Dxlrun, clone: Path) -> None:
     split, ftdi = [line for line in commands("bus.md") if " check " in line]
     assert "read:=split" in split
     result = dxlrun(*shlex.split(split)[1:])
@@ -152,7 +152,7 @@ def test_bus_md_the_simulation_and_the_robot_meet_at_the_link(
     assert str(parse_fault(fault)) == fault
 
 
-def test_tools_md_its_commands_do_what_they_say(
+def test_tools_md_its_commands_do_what_the_page_has(
     dxlrun: Dxlrun, clone: Path, simulated_line: Callable[..., Any]
 ) -> None:
     path, finish = simulated_line(BusConfig("main", 1_000_000, (ServoConfig(1, "XM430-W350", 2.0),), 2.0))
@@ -185,7 +185,7 @@ def test_simulations_inside_sentences_are_understood(
 
 
 @pytest.mark.parametrize("page", ["real-time.md", "bench.md", "simulation.md", "analyze.md"])
-def test_a_log_is_compared_with_its_ledger_as_the_page_says(dxlrun: Dxlrun, clone: Path, page: str) -> None:
+def test_a_log_is_compared_with_its_ledger_as_on_the_page(dxlrun: Dxlrun, clone: Path, page: str) -> None:
     analyze = next(line for line in commands(page) if " analyze " in line and "--ledger" in line)
     runs = [line for line in commands(page) if line.startswith("dxlrun robots/")]
     run = runs[0] if runs else "dxlrun robots/single_joint.yaml --duration 60 --ledger logs/of.ledger.jsonl"

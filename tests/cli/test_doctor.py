@@ -46,7 +46,7 @@ def look(tmp_path: Path) -> Look:
     return look
 
 
-def test_a_good_machine_has_nothing_to_mend(look: Look) -> None:
+def test_a_good_machine_has_nothing_to_fix(look: Look) -> None:
     found = look()
     assert {one.state for one in found.values()} == {"good"}
     assert not any(one.mend for one in found.values())
@@ -151,7 +151,7 @@ CONTAINER = "--cap-add SYS_NICE --ulimit rtprio=98 --ulimit memlock=-1"
         ),
     ],
 )
-def test_one_thing_that_could_be_better_is_told_with_the_command_that_mends_it(
+def test_what_could_be_better_is_listed_with_the_command_that_fixes_it(
     *, look: Look, files: dict[str, str], rights: dict[str, Any], what: str, found: str, mend: str
 ) -> None:
     by_name = look(files, **rights)
@@ -217,7 +217,7 @@ def test_what_a_machine_hides_is_not_called_bad(tmp_path: Path) -> None:
         (("CAP_SYS_NICE", "CAP_IPC_LOCK"), "up to 99, by CAP_SYS_NICE", "all of it, by CAP_IPC_LOCK"),
     ],
 )
-def test_a_right_says_where_it_comes_from(
+def test_a_right_names_its_source(
     look: Look, capabilities: tuple[str, ...], priority: str, memory: str
 ) -> None:
     found = look(capabilities=capabilities)
@@ -236,7 +236,7 @@ def test_isolated_cores_are_offered_to_the_loop(look: Look) -> None:
         ({"missing_calls": ("pidfd_open",)}, "this Python has no pidfd_open"),
     ],
 )
-def test_another_system_is_told_in_one_sentence(look: Look, other: dict[str, Any], found: str) -> None:
+def test_another_system_is_reported_in_one_sentence(look: Look, other: dict[str, Any], found: str) -> None:
     (one,) = look(**other).values()
     assert (one.what, one.state) == ("system", "missing")
     assert found in one.found
@@ -254,16 +254,16 @@ def test_trying_a_policy_leaves_none_behind() -> None:
 
 def test_the_doctor_looks_at_this_machine(dxlrun: Callable[..., Any]) -> None:
     said = dxlrun("doctor", "--json")
-    told = json.loads(said.out)
-    states = {check["state"] for check in told["checks"]}
+    shown = json.loads(said.out)
+    states = {check["state"] for check in shown["checks"]}
     assert said.code == (1 if "missing" in states else 0)
-    assert told["ok"] == ("missing" not in states)
+    assert shown["ok"] == ("missing" not in states)
     assert states <= {"good", "worse", "missing"}
-    assert all(set(check) == {"what", "state", "found", "why", "mend"} for check in told["checks"])
-    assert all(check["mend"] for check in told["checks"] if check["state"] != "good")
+    assert all(set(check) == {"what", "state", "found", "why", "mend"} for check in shown["checks"])
+    assert all(check["mend"] for check in shown["checks"] if check["state"] != "good")
 
 
-def test_a_person_gets_a_table_the_commands_and_a_verdict(
+def test_the_terminal_gets_a_table_the_commands_and_a_verdict(
     dxlrun: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     other = Machine(platform="linux", root=tmp_path, user="anna", may_schedule=lambda: False)
@@ -277,7 +277,7 @@ def test_a_person_gets_a_table_the_commands_and_a_verdict(
     assert lines[-1] == "robots run here: 0 missing, 4 could be better"
 
 
-def test_on_another_system_the_exit_code_says_so(
+def test_on_another_system_the_exit_code_is_one(
     dxlrun: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Machine, "this", lambda: Machine(platform="darwin"))

@@ -62,11 +62,11 @@ def test_it_goes_into_robots_and_may_be_copied_again(
     assert dxlrun("check", "robots/bioloid_torso.yaml").code == 0
 
 
-def test_a_copy_is_told_in_json_too(dxlrun: Callable, tmp_path: Path):
-    told = json.loads(dxlrun("examples", "diff_drive", tmp_path, "--json").out)
+def test_a_copy_is_reported_in_json_too(dxlrun: Callable, tmp_path: Path):
+    shown = json.loads(dxlrun("examples", "diff_drive", tmp_path, "--json").out)
 
-    assert told["robot"] == told["files"][0] == f"{tmp_path}/diff_drive.yaml"
-    assert all(Path(file).is_file() for file in told["files"])
+    assert shown["robot"] == shown["files"][0] == f"{tmp_path}/diff_drive.yaml"
+    assert all(Path(file).is_file() for file in shown["files"])
 
 
 def test_what_was_changed_is_not_overwritten(dxlrun: Callable, tmp_path: Path):

@@ -34,7 +34,7 @@ def test_the_log_of_a_run_is_what_its_buses_saw(dxlrun: Callable, run: tuple[Pat
     assert "differences" in said.out
 
 
-def test_one_changed_byte_ends_with_1_and_says_where(dxlrun: Callable, run: tuple[Path, Path]):
+def test_one_changed_byte_ends_with_1_and_its_place(dxlrun: Callable, run: tuple[Path, Path]):
     log, ledger = run
     lines = ledger.read_text().splitlines()
     index = next(i for i, line in enumerate(lines) if i > 40 and json.loads(line)["direction"] == "out")
@@ -55,7 +55,7 @@ def test_one_changed_byte_ends_with_1_and_says_where(dxlrun: Callable, run: tupl
     assert "only in the ledger" in said.out
 
 
-def test_a_run_in_real_time_writes_the_ledger_where_it_is_told(
+def test_a_run_in_real_time_writes_the_ledger_to_its_option(
     dxlrun: Callable, torso: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.chdir(tmp_path)
@@ -98,7 +98,7 @@ def test_a_report_and_a_comparison_are_made_one_at_a_time(dxlrun: Callable, run:
     ("words", "sentence"),
     [
         (("port:=/dev/ttyUSB9", "--ledger", "seen.jsonl"), "what simulated buses saw"),
-        (("--ledger", "missing/seen.jsonl"), "there is no directory missing"),
+        (("--ledger", "missing/seen.jsonl"), "--ledger missing/seen.jsonl cannot be written"),
         (("--ledger", "."), "cannot be written"),
     ],
 )

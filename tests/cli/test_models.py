@@ -68,7 +68,7 @@ def test_a_name_prints_its_motor_as_far_as_the_manual_gives_it(dxlrun, model, li
     assert dxlrun("models", model).out.splitlines()[2] == f"motor       {line}"
 
 
-def test_the_motor_that_is_simulated_is_told_with_its_source(dxlrun):
+def test_the_motor_that_is_simulated_is_reported_with_its_source(dxlrun):
     known = dxlrun("models", "MX-64", "--protocol", "1").out.splitlines()[3:7]
     assert known == [
         "simulated   no-load speed 68.76 rpm, time constant 15.1 ms, friction 0.1 Nm and 8% of the torque, "
@@ -83,8 +83,8 @@ def test_the_motor_that_is_simulated_is_told_with_its_source(dxlrun):
         "1.78 Nm/A",
         "  source    [i] scaled from the MX-64: Rhoban BAM, bam/params/mx64/m3.json",
     ]
-    (told,) = json.loads(dxlrun("models", "XL330-M077", "--json").out)
-    motor = told["simulated_motor"]
+    (shown,) = json.loads(dxlrun("models", "XL330-M077", "--json").out)
+    motor = shown["simulated_motor"]
     assert (motor["time_constant"], motor["p_gain_duty"]) == pytest.approx((0.0448, 0.0028774), rel=1e-2)
     assert motor["source"].startswith("[i] scaled from the XL330-M288: ")
     assert motor["gain_source"].startswith("[i] as XL330-M288; ")
@@ -111,15 +111,15 @@ def test_items_that_repeat_themselves_share_a_line(dxlrun):
 
 
 def test_json_of_one_model_holds_all_that_the_table_knows(dxlrun):
-    (told,) = json.loads(dxlrun("models", "XM430-W350", "--json").out)
+    (shown,) = json.loads(dxlrun("models", "XM430-W350", "--json").out)
 
     table = control_table("XM430-W350")
-    assert told["rad_per_tick"] == table.rad_per_tick
-    motor = {name: told[name] for name in ("stall_torque", "stall_current", "nominal_voltage", "gear_ratio")}
+    assert shown["rad_per_tick"] == table.rad_per_tick
+    motor = {name: shown[name] for name in ("stall_torque", "stall_current", "nominal_voltage", "gear_ratio")}
     assert motor == {"stall_torque": 4.1, "stall_current": 2.3, "nominal_voltage": 12.0, "gear_ratio": 353.5}
-    assert told["capabilities"] == sorted(table.capabilities)
-    assert told["baud_rates"]["3"] == 1_000_000
-    items = {item["name"]: item for item in told["items"]}
+    assert shown["capabilities"] == sorted(table.capabilities)
+    assert shown["baud_rates"]["3"] == 1_000_000
+    items = {item["name"]: item for item in shown["items"]}
     assert list(items) == list(table.items)
     assert items["id"] == {
         "name": "id", "address": 7, "size": 1, "access": "RW", "area": "EEPROM", "minimum": 0, "maximum": 252,
@@ -129,12 +129,12 @@ def test_json_of_one_model_holds_all_that_the_table_knows(dxlrun):
 
 
 def test_json_of_all_models_has_no_items(dxlrun):
-    told = json.loads(dxlrun("models", "--json").out)
+    shown = json.loads(dxlrun("models", "--json").out)
 
-    assert [(each["model"], each["protocol"]) for each in told] == [
+    assert [(each["model"], each["protocol"]) for each in shown] == [
         (table.model, table.protocol) for table in all_tables()
     ]
-    assert all("items" not in each for each in told)
+    assert all("items" not in each for each in shown)
 
 
 @pytest.mark.parametrize(

@@ -60,7 +60,7 @@ def logged(torso: Path, tmp_path: Path) -> Path:
     return log
 
 
-def test_a_good_run_says_where_its_log_is(dxlrun: Callable, runs: Runs, torso: Path, logged: Path):
+def test_a_good_run_names_its_log(dxlrun: Callable, runs: Runs, torso: Path, logged: Path):
     runs.answer = RunSummary(0, "ended", 10, 0, 2.03, (), log=str(logged), messages=10**9)
 
     said = dxlrun(torso)
@@ -108,9 +108,9 @@ def test_a_run_with_a_loss_in_its_log_has_failed_for_the_terminal_and_for_analyz
     assert first.startswith("bioloid_torso: failed. ")
     assert sentences[0].startswith("  Servos failed: left_shoulder_swing_joint lost its torque")
     path = log.split()[1]
-    told = dxlrun("analyze", path, "--json")
-    verdict = json.loads(told.out)["verdict"]
-    assert (told.code, verdict["good"]) == (1, False)
+    printed = dxlrun("analyze", path, "--json")
+    verdict = json.loads(printed.out)["verdict"]
+    assert (printed.code, verdict["good"]) == (1, False)
     assert [f"  {sentence}" for sentence in verdict["sentences"]] == sentences
     shown = dxlrun("analyze", path, "--report", "run.html")
     assert shown.code == 1
@@ -119,7 +119,9 @@ def test_a_run_with_a_loss_in_its_log_has_failed_for_the_terminal_and_for_analyz
 
 
 @pytest.mark.parametrize(("code", "word"), [(1, "failed"), (130, "interrupted")])
-def test_a_bad_run_says_why_on_stderr(dxlrun: Callable, runs: Runs, torso: Path, code: int, word: str):
+def test_a_bad_run_prints_the_reason_on_stderr(
+    dxlrun: Callable, runs: Runs, torso: Path, code: int, word: str
+):
     runs.answer = RunSummary(
         code, "fault", 5, 0, 0.1, ("servo 3 does not answer",), remarks=("no real-time priority",)
     )
@@ -171,7 +173,7 @@ def test_virtual_time_runs_in_this_process(
     assert dxlrun("analyze", log, "--json").out.startswith("{")
 
 
-def test_a_run_says_the_verdict_of_its_log(
+def test_a_run_prints_the_verdict_of_its_log(
     dxlrun: Callable, torso: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.chdir(tmp_path)
@@ -226,7 +228,7 @@ def test_an_interrupt_while_the_log_is_read_leaves_the_summary_and_its_name(
     ]
 
 
-def test_a_loss_without_a_log_is_told_and_fails_the_run(
+def test_a_loss_without_a_log_is_reported_and_fails_the_run(
     dxlrun: Callable, tmp_path: Path, torso: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.chdir(tmp_path)
@@ -238,14 +240,14 @@ def test_a_loss_without_a_log_is_told_and_fails_the_run(
     born = VirtualRobot.__init__
     monkeypatch.setattr(VirtualRobot, "__init__", silent)
 
-    told = [dxlrun(torso, "--virtual", "--duration", "2", *words) for words in ((), ("--no-record",))]
+    printed = [dxlrun(torso, "--virtual", "--duration", "2", *words) for words in ((), ("--no-record",))]
 
-    assert [said.code for said in told] == [1, 1]
-    for said in told:
+    assert [said.code for said in printed] == [1, 1]
+    for said in printed:
         _, lost, invalid, *_ = said.out.splitlines()
         assert lost == "  Servos failed: left_shoulder_lateral_joint was lost."
         assert invalid.startswith("  States were invalid: left_shoulder_lateral_joint in 60.0%")
-    assert told[0].out.splitlines()[1:3] == told[1].out.splitlines()[1:3]
+    assert printed[0].out.splitlines()[1:3] == printed[1].out.splitlines()[1:3]
 
 
 def test_virtual_time_refuses_a_real_port(dxlrun: Callable, torso: Path):
@@ -400,7 +402,7 @@ def test_progress_counts_skipped_periods(
     assert line.shown == [shown]
 
 
-def test_without_a_terminal_a_line_tells_every_five_seconds_that_the_run_goes_on(
+def test_without_a_terminal_a_line_every_five_seconds_shows_progress(
     torso: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """Timed by a clock of the test: from 100 s on, one cycle every 20 ms."""

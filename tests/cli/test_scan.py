@@ -21,7 +21,7 @@ from dxlrun.simulation import BusConfig, ServoConfig
         (("--write", "robot.txt"), "robot.txt is no name for a robot file; end it in .yaml"),
     ],
 )
-def test_a_wrong_word_is_told_before_the_port_is_opened(dxlrun, words, sentence):
+def test_a_wrong_word_is_reported_before_the_port_is_opened(dxlrun, words, sentence):
     said = dxlrun("scan", "/dev/ttyNowhere", *words)
     assert said.code == 2
     assert sentence in said.err
@@ -72,7 +72,7 @@ def test_both_protocols_are_looked_at_and_told_as_json(dxlrun, simulated_line):
     assert sum(data[0] == 0xFD for data in packets) >= 4
 
 
-def test_nobody_is_an_answer_too(dxlrun, simulated_line):
+def test_no_servo_at_all_is_exit_code_one(dxlrun, simulated_line):
     path, _ = simulated_line(BusConfig("main", 1_000_000, (), 2.0))
     said = dxlrun("scan", path, *NARROW)
     assert said.code == 1
@@ -88,7 +88,7 @@ sys.stdin.read()
 """
 
 
-def test_a_port_that_somebody_has_is_not_touched_and_who_has_it_is_named(dxlrun, simulated_line):
+def test_a_port_in_use_is_not_touched_and_its_process_is_named(dxlrun, simulated_line):
     path, finish = simulated_line(BusConfig("main", 1_000_000, servos("XM430-W350"), 2.0))
     command = [sys.executable, "-c", HOLD, path]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:

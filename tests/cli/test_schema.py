@@ -1,4 +1,4 @@
-"""`dxlrun schema`: what an editor is told agrees with what dxlrun reads."""
+"""`dxlrun schema`: what an editor is shown agrees with what dxlrun reads."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_every_motion_is_right(path: Path) -> None:
 def test_the_schemas_beside_the_robots_are_those_of_the_code(
     kind: Literal["robot", "motion"], name: str
 ) -> None:
-    # the standard controllers only: who has others installed writes a schema of his own, by
+    # the standard controllers only: with others installed a schema is written by
     # `dxlrun schema --output robots/robot.schema.json`
     assert json.loads((ROBOTS / name).read_text()) == json.loads(schema_text(kind, only="dxlrun "))
 
@@ -132,7 +132,7 @@ def test_each_mistake_is_found_at_its_place(right: str, mistake: str, place: str
     assert set(wrong("robot", ROBOT.replace(right, mistake))) == {place}
 
 
-def test_who_includes_others_need_not_have_everything() -> None:
+def test_a_file_with_includes_need_not_have_everything() -> None:
     part = "joints: {pan: {id: 5}}\ncontrollers: {head: {active: false}}\n"
 
     assert wrong("robot", f"include: [pair.yaml]\n{part}") == []

@@ -34,7 +34,7 @@ OLD = ("--protocol", "1.0", "--baud", "1000000")
         (("1", "get", "--protocol", "3"), "there is no Protocol 3"),
     ],
 )
-def test_a_wrong_word_is_told_before_the_port_is_opened(dxlrun, words, sentence):
+def test_a_wrong_word_is_reported_before_the_port_is_opened(dxlrun, words, sentence):
     said = dxlrun("servo", "/dev/ttyNowhere", *words)
     assert said.code == 2
     assert sentence in said.err
@@ -124,7 +124,7 @@ REFUSED = [
 ]
 
 
-def test_what_the_model_does_not_have_is_told(one):
+def test_what_the_model_does_not_have_is_reported(one):
     servo, finish = one()
     for words, sentence in REFUSED:
         said = servo(1, *words, *NEW)
@@ -147,7 +147,7 @@ def test_a_servo_moves_to_another_id_and_rate_and_is_started_anew_and_reset(one)
     assert len(writes(finish())) == 2
 
 
-def test_a_servo_is_found_without_being_told_where(one):
+def test_a_servo_is_found_without_its_address(one):
     servo, _ = one("AX-12A", 1.0, 1_000_000)
     said = servo(1, "get", "model_number", "--json")
     assert json.loads(said.out)["servo"] == {
@@ -229,13 +229,13 @@ def test_a_servo_keeps_a_backup_of_its_own(one):
 
 
 class Terminal(io.StringIO):
-    """A terminal at which somebody answers."""
+    """A terminal with an answer typed."""
 
     def isatty(self):
         return True
 
 
-def test_a_person_is_asked_and_only_yes_is_yes(one, monkeypatch):
+def test_only_yes_confirms(one, monkeypatch):
     servo, finish = one()
     for answer in ("n\n", "", "\n", "y\n"):
         monkeypatch.setattr(sys, "stdin", Terminal(answer))

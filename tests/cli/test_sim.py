@@ -160,7 +160,7 @@ def test_servos_without_a_robot_file_answer_and_take_faults_that_are_typed(start
     sim.type("help")
     assert any(line.startswith("lose ") for line in json.loads(sim.line())["faults"])
 
-    sim.input.close()  # nobody types any more: that ends nothing
+    sim.input.close()  # no more input: that ends nothing
     sim.process.stdin = None
     assert hear(ports["main"], PING_2, 14)[:5] == PING_2[:5]
     assert sim.stop(signal.SIGTERM) == (0, "", "")
@@ -200,27 +200,27 @@ def test_every_bus_is_simulated_and_has_a_link_that_follows_its_adapter(
 ):
     (tmp_path / "robot.yaml").write_text(TWO)
     sim = start("robot.yaml", "--link", "robot", "--json")
-    told = json.loads(sim.line())
+    printed = json.loads(sim.line())
 
-    assert told["ports"] == {name: str(tmp_path / f"robot.{name}") for name in ("left", "right")}
-    assert {name: os.readlink(port) for name, port in told["ports"].items()} == told["devices"]
-    assert hear(told["ports"]["left"], PING_1, 14)[:12] == PONG_1
+    assert printed["ports"] == {name: str(tmp_path / f"robot.{name}") for name in ("left", "right")}
+    assert {name: os.readlink(port) for name, port in printed["ports"].items()} == printed["devices"]
+    assert hear(printed["ports"]["left"], PING_1, 14)[:12] == PONG_1
     sim.type("unplug bus=left for=1ms")
     line = "unplug bus=left for=1ms"
     for expected in ({"understood": line}, {"fault": line}, {"devices": {"left": ""}}):
         assert json.loads(sim.line()) == expected
     (back,) = json.loads(sim.line())["devices"].values()
-    assert back != told["devices"]["left"]
-    assert os.readlink(told["ports"]["left"]) == back
-    assert hear(told["ports"]["left"], PING_1, 14)[:12] == PONG_1
-    assert hear(told["ports"]["right"], bytes.fromhex("ff ff 01 02 01 fb"), 6) == bytes.fromhex(
+    assert back != printed["devices"]["left"]
+    assert os.readlink(printed["ports"]["left"]) == back
+    assert hear(printed["ports"]["left"], PING_1, 14)[:12] == PONG_1
+    assert hear(printed["ports"]["right"], bytes.fromhex("ff ff 01 02 01 fb"), 6) == bytes.fromhex(
         "ff ff 01 02 00 fc"
     )
     assert sim.stop()[0] == 0
     assert not list(tmp_path.glob("robot.*t"))
 
 
-def test_a_planned_fault_is_told_when_it_happens_and_stands_in_the_ledger(
+def test_a_planned_fault_is_printed_when_it_happens_and_is_in_the_ledger(
     start: Callable[..., Sim], tmp_path: Path
 ):
     sim = start("--servo", "XL430-W250:1", "--fault", "lose servo=1", "--fault", "overload servo=1 packet=2",
@@ -239,7 +239,7 @@ def test_a_planned_fault_is_told_when_it_happens_and_stands_in_the_ledger(
     ]
 
 
-def test_a_simulation_whose_process_dies_fails_and_says_so(start: Callable[..., Sim], tmp_path: Path):
+def test_a_simulation_whose_process_dies_fails_with_a_sentence(start: Callable[..., Sim], tmp_path: Path):
     sim = start("--servo", "AX-12A:1", "--json", "--link", "robot")
     sim.line()
     children = Path(f"/proc/{sim.process.pid}/task/{sim.process.pid}/children").read_text().split()

@@ -41,7 +41,7 @@ def drawn(shown: Look, typed: str = "", height: int = 24, *, several: bool = Fal
     return [line.rstrip() for line in file.getvalue().splitlines()]
 
 
-def test_a_line_a_servo_says_what_it_does():
+def test_a_row_has_the_state_of_a_servo():
     head, _, first, second, *_ = drawn(look(2))
 
     assert head.split() == [
@@ -79,7 +79,7 @@ def test_a_low_window_keeps_the_prompt():
     assert lines[-1].startswith("fault> lose")
 
 
-def test_the_table_is_drawn_again_below_whatever_is_said():
+def test_the_table_is_drawn_again_below_each_printed_line():
     file = StringIO()
     console = Console(file=file, force_terminal=True, width=80, height=20)
     view = TableView(Shown("torso", (), {}), console)
@@ -95,7 +95,7 @@ def test_the_table_is_drawn_again_below_whatever_is_said():
         file.seek(0)
         file.truncate()
     assert "XL430-W250" in file.getvalue()
-    assert "fault> " not in file.getvalue()  # nobody can type any more
+    assert "fault> " not in file.getvalue()  # no more input is taken
 
 
 @pytest.fixture

@@ -98,9 +98,9 @@ def test_wrong_words_are_sentences_and_exit_code_two(
     said = dxlrun("sim", *(word.format(torso=torso) for word in words))
 
     assert (said.code, said.out) == (2, "")
-    told = [line for line in said.errors if ": warning: " not in line]
-    assert len(told) == len(sentences), told
-    for line, sentence in zip(told, sentences, strict=True):
+    shown = [line for line in said.errors if ": warning: " not in line]
+    assert len(shown) == len(sentences), shown
+    for line, sentence in zip(shown, sentences, strict=True):
         assert sentence in line
 
 
@@ -115,7 +115,7 @@ def test_faults_come_from_the_line_and_from_a_file(tmp_path: Path):
     assert [str(fault).split()[0] for fault in read] == ["lose", "silence", "overload"]
 
 
-def test_every_wrong_fault_is_told_with_its_place(dxlrun, tmp_path: Path):
+def test_every_wrong_fault_is_reported_with_its_place(dxlrun, tmp_path: Path):
     file = tmp_path / "faults.txt"
     file.write_text("lose servo=1\n  lose servo=one\nexplode\n")
 
@@ -127,7 +127,7 @@ def test_every_wrong_fault_is_told_with_its_place(dxlrun, tmp_path: Path):
     assert len(both.errors) == 3
 
 
-def test_options_replace_what_the_robot_file_says_of_the_adapter():
+def test_options_replace_the_robot_files_adapter():
     options = AdapterOptions(4_000_000, "random", echo=True, absent="slot")
     bus = with_adapter(BUS, options, 7)
 
@@ -156,7 +156,7 @@ def test_what_is_no_link_is_never_replaced(tmp_path: Path):
     assert link_of_each([BUS], tmp_path / "dangling") == {"main": tmp_path / "dangling"}
 
 
-def test_the_ports_are_said_once(capsys: pytest.CaptureFixture[str]):
+def test_the_ports_are_printed_once(capsys: pytest.CaptureFixture[str]):
     servos = tuple(ServoConfig(each, "AX-12A", 0.0) for each in (1, 2, 3, 7))
     bus = BusConfig("main", 1_000_000, servos)
     view = PlainView(Shown("torso", (bus,), {"main": Path("/tmp/robot")}, "dxlrun torso.yaml"))  # noqa: S108
@@ -177,7 +177,7 @@ def test_the_ports_are_said_once(capsys: pytest.CaptureFixture[str]):
     ]
 
 
-def test_the_last_line_says_what_passed():
+def test_the_last_line_has_the_counts():
     servo = ServoLook("main", 1, "AX-12A", True, None, 0.0, 25.0, 12.0, 0, heard=1, answered=0)
     look = Look((servo,), {"median": 12.3, "p99": 80.0})
 

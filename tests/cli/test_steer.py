@@ -101,9 +101,9 @@ def settle(robot: RemoteRobot) -> None:
 
 
 def controllers(robot: RemoteRobot) -> dict[str, dict[str, object]]:
-    told = robot.info()["controllers"]
-    assert isinstance(told, list)
-    return {one["name"]: one for one in told}
+    printed = robot.info()["controllers"]
+    assert isinstance(printed, list)
+    return {one["name"]: one for one in printed}
 
 
 def until(robot: RemoteRobot, joint: str, goal: float) -> None:
@@ -129,9 +129,9 @@ def test_the_list_has_every_controller_and_what_it_takes(dxlrun, torso: RemoteRo
 
 
 def test_the_list_as_json_is_what_the_robot_returns(dxlrun, torso: RemoteRobot) -> None:
-    (told,) = json.loads(dxlrun("list", "--json", "--robot", "bioloid_torso").out)
-    assert (told["name"], told["robot"], told["rate"]) == ("bioloid_torso", "bioloid_torso", 50.0)
-    assert [one["name"] for one in told["controllers"]] == list(controllers(torso))
+    (printed,) = json.loads(dxlrun("list", "--json", "--robot", "bioloid_torso").out)
+    assert (printed["name"], printed["robot"], printed["rate"]) == ("bioloid_torso", "bioloid_torso", 50.0)
+    assert [one["name"] for one in printed["controllers"]] == list(controllers(torso))
 
 
 def test_a_robot_that_has_ended_is_an_error(
@@ -158,8 +158,8 @@ def test_a_register_is_set_while_the_robot_runs(dxlrun, torso: RemoteRobot) -> N
     last = torso.events()["last"]
     said = dxlrun("set", "head_yaw_joint", "ccw_compliance_slope", "64", "--debug")
     assert said == (0, "bioloid_torso: ccw_compliance_slope of head_yaw_joint is 64\n", "")
-    told = [event["text"] for event in torso.events(last)["events"] if event["name"] == "register_written"]
-    assert told == ["CCW Compliance Slope (29) was 32 and is 64"]
+    printed = [event["text"] for event in torso.events(last)["events"] if event["name"] == "register_written"]
+    assert printed == ["CCW Compliance Slope (29) was 32 and is 64"]
     assert dxlrun("set", "head_yaw_joint", "ccw_compliance_slope", "64").code == 0
     said = dxlrun("set", "head_yaw_joint", "temperature_limit", "70 degC")
     assert said.code == 2
@@ -341,20 +341,20 @@ def test_stop_waits_for_the_end_by_default(
 def test_the_script_of_the_page_steers_a_torso(torso: RemoteRobot, tmp_path: Path) -> None:
     (script,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
     assert len(script.splitlines()) <= 30
-    told = subprocess.run(
+    printed = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, check=False, cwd=tmp_path
     )
-    assert (told.returncode, told.stderr) == (0, "")
+    assert (printed.returncode, printed.stderr) == (0, "")
     (shown,) = re.findall(r"It prints:\n\n```\n(.*?)```", PAGE, re.DOTALL)
-    assert told.stdout == shown
+    assert printed.stdout == shown
     assert torso.info()["rate"] == 40
 
 
 @pytest.mark.skipif(shutil.which("curl") is None, reason="needs curl, which the page uses")
 def test_another_program_reads_the_robot_by_the_page(torso: RemoteRobot) -> None:
     (line,) = re.findall(r"^    (curl .+)$", PAGE, re.MULTILINE)
-    told = subprocess.run(["/bin/bash", "-c", f"{line} --silent"], capture_output=True, check=True)
-    assert json.loads(told.stdout)["robot"] == torso.name
+    printed = subprocess.run(["/bin/bash", "-c", f"{line} --silent"], capture_output=True, check=True)
+    assert json.loads(printed.stdout)["robot"] == torso.name
 
 
 def test_the_commands_of_the_page_work_in_their_order(

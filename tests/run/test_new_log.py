@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from dxlrun.cli import main
-from dxlrun.cli.sim import _check_ledger
+from dxlrun.cli.inputs import check_ledger
 from dxlrun.errors import InputError
 from dxlrun.log.log_writer import LogFile
 from dxlrun.run.run_log import discard_log, ledger_of, new_log
@@ -54,7 +54,7 @@ def _virtual_run(directory: Path) -> None:
         lambda directory: new_log(directory, "pair"),
         lambda directory: LogFile(directory / "log.mcap").close(),
         lambda directory: Ledger(directory / "bus.jsonl").close(),
-        lambda directory: _check_ledger(directory / "sim.jsonl"),
+        lambda directory: check_ledger(directory / "sim.jsonl"),
         _virtual_run,
     ],
     ids=["name", "log", "ledger", "sim", "run"],

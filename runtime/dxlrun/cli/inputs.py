@@ -93,6 +93,17 @@ def parse_assignments(assignments: Sequence[str]) -> dict[str, str]:
     return arguments
 
 
+def check_ledger(ledger: Path) -> None:
+    """Raise InputError where no ledger can be written, before anything starts."""
+    from dxlrun.simulation.bus.ledger import for_group
+
+    try:
+        open(ledger, "a", opener=for_group).close()
+    except OSError as error:
+        reason = error.strerror or error
+        raise InputError(f"--ledger {ledger} cannot be written ({reason}); choose another file") from None
+
+
 def _known_file(robot: Path) -> None:
     """Refuse a word that is neither a command nor a file with one sentence that helps."""
     if robot.is_file():

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dxlrun.cli.inputs import Assignment, Flag, Motions, compiled
+from dxlrun.cli.inputs import Assignment, Flag, Motions, check_ledger, compiled
 from dxlrun.errors import InputError, LogError, counted
 from dxlrun.output.terminal import out, print_error, print_warning, show
 
@@ -71,7 +71,12 @@ def run(
     for warning in result.warnings:
         print_warning(str(warning))
     if ledger is not None:
-        _check_ledger(ledger, result.plan)
+        if not result.plan.simulated:
+            raise InputError(
+                f"a ledger records what simulated buses saw, and {result.plan.robot} has none: give the "
+                "argument port:=sim, or leave out --ledger"
+            )
+        check_ledger(ledger)
     from dxlrun.run.run_summary import RunOptions
 
     options = RunOptions(
@@ -87,23 +92,6 @@ def run(
 
         summary = run_robot(result.plan, options, console)
     return show_summary(summary, result.plan, console)
-
-
-def _check_ledger(ledger: Path, plan: Plan) -> None:
-    """Raise InputError where no ledger can be written, before anything starts."""
-    from dxlrun.simulation.bus.ledger import for_group
-
-    if not plan.simulated:
-        raise InputError(
-            f"a ledger records what simulated buses saw, and {plan.robot} has none: give the argument "
-            "port:=sim, or leave out --ledger"
-        )
-    if not ledger.parent.is_dir():
-        raise InputError(f"there is no directory {ledger.parent} for the ledger; make it first")
-    try:
-        open(ledger, "w", opener=for_group).close()
-    except OSError as error:
-        raise InputError(f"the ledger {ledger} cannot be written: {error.strerror or error}") from error
 
 
 def _read_models(buses: Sequence[BusPlan], joints: Sequence[str]) -> Mapping[str, str]:

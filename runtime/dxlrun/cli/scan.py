@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from dxlrun.output.table import Table
 
 Rates = Annotated[tuple[int, ...], Parameter(negative=(), show_default=False)]
-_HIGHEST_ID = 253
+HIGHEST_ID = 253
 _FASTEST = 10_500_000
 _SLOW = 30
 """deg/s, the velocity limit of each drafted joint: slow enough to step back from."""
@@ -119,8 +119,8 @@ def read_ids(text: str) -> tuple[int, ...]:
         if not first.strip().isdecimal() or (dash and not last.strip().isdecimal()):
             raise InputError(f"--ids {text}: {part!r} is no ID; give for example 1-20 or 1,4,7")
         span = range(int(first), int(last if dash else first) + 1)
-        if not span or span[-1] > _HIGHEST_ID:
-            raise InputError(f"--ids {text}: {part} is no ID of a servo; they are 0..{_HIGHEST_ID}")
+        if not span or span[-1] > HIGHEST_ID:
+            raise InputError(f"--ids {text}: {part} is no ID of a servo; they are 0..{HIGHEST_ID}")
         found.update(span)
     return tuple(sorted(found))
 

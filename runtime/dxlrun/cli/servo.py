@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from dxlrun.cli.inputs import Flag, JsonFlag
-from dxlrun.cli.scan import load_models, read_search
+from dxlrun.cli.scan import HIGHEST_ID, load_models, read_search
 from dxlrun.errors import InputError, ServoFault
 from dxlrun.output.terminal import print_warning, show, show_json
 
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from dxlrun.dynamixel.tools.tool_line import ToolLine
     from dxlrun.output.table import Table
 
-_HIGHEST_ID = 253
 Keep = Literal["nothing", "id", "id-and-baud"]
 _TORQUE_OFF = "its torque goes off, and what it holds falls"
 _ELSEWHERE: Mapping[str, str] = MappingProxyType(
@@ -99,8 +98,8 @@ def servo(
 
 def _check(servo_id: int, verb: str, asked: Asked) -> None:
     """Refuse words that mean nothing before the port is opened; raises InputError."""
-    if not 0 <= servo_id <= _HIGHEST_ID:
-        raise InputError(f"{servo_id} is no ID of a servo; they are 0..{_HIGHEST_ID}")
+    if not 0 <= servo_id <= HIGHEST_ID:
+        raise InputError(f"{servo_id} is no ID of a servo; they are 0..{HIGHEST_ID}")
     found = VERBS.get(verb)
     if found is None:
         from dxlrun.errors import suggestion

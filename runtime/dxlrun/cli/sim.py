@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import Assignment, Flag, JsonFlag, compiled
+from dxlrun.cli.inputs import Assignment, Flag, JsonFlag, check_ledger, compiled
 from dxlrun.cli.sim_inputs import (
     Absent,
     AdapterOptions,
@@ -105,7 +105,8 @@ def sim(
     with mistakes.collected():
         planned = read_faults(fault, faults)
     with mistakes.collected():
-        _check_ledger(ledger)
+        if ledger is not None:
+            check_ledger(ledger)
     with mistakes.collected():
         latency_ns = read_latency(latency_timer)
     with mistakes.collected():
@@ -233,20 +234,6 @@ def link_of_each(buses: Sequence[BusConfig], link: Path | None) -> dict[str, Pat
     if wrong:
         raise InputError("\n".join(wrong))
     return {name: path.absolute() for name, path in links.items()}
-
-
-def _check_ledger(ledger: Path | None) -> None:
-    """Raise InputError for a ledger that cannot be written, before anything starts."""
-    if ledger is None:
-        return
-    from dxlrun.simulation.bus.ledger import for_group
-
-    try:
-        open(ledger, "a", opener=for_group).close()
-    except OSError as error:
-        raise InputError(
-            f"--ledger {ledger} cannot be written ({error.strerror}); choose another file"
-        ) from None
 
 
 def _serve(config: SimulationConfig, options: FrontOptions, shown: Shown, *, as_json: bool) -> Served:
