@@ -13,7 +13,7 @@ from pathlib import Path
 import msgspec
 
 from dxlrun.errors import InputError
-from dxlrun.simulation.bus.ledger import SOME_ENTRIES, Ledger
+from dxlrun.simulation.bus.ledger import FAULT, SOME_ENTRIES, Ledger
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.configuration import SimulationConfig
 from dxlrun.simulation.faults.fault import parse_fault
@@ -24,7 +24,6 @@ from dxlrun.simulation.realtime import PollBudget
 from dxlrun.simulation.servo.memory import Memory
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 
-_HAPPENED = "fault: "
 MOST_BACKLOG_NS = 20_000_000
 """A host that hands over bytes faster than they pass the wire is not read while so much of them waits.
 
@@ -121,12 +120,8 @@ class Server:
         self._buses = tuple(SimulatedBus(bus, ledger, self.start_ns, self._mechanics) for bus in config.buses)
         self._faults = FaultScript([parse_fault(text) for text in config.faults], config.seed)
         self._faults.attach(self._buses, start_ns=self.start_ns)
-        self._terminals = tuple(
-            PseudoTerminal(
-                bus, DeviceLink(Path(config.links[bus.name])) if bus.name in config.links else None
-            )
-            for bus in self._buses
-        )
+        links = {name: DeviceLink(Path(path)) for name, path in config.links.items()}
+        self._terminals = tuple(PseudoTerminal(bus, links.get(bus.name)) for bus in self._buses)
         self._polling = PollBudget(self.start_ns)
         self._stopped = False
         self._waiting = select.epoll()
@@ -253,8 +248,8 @@ class Server:
         return {terminal.bus.name: terminal.path for terminal in self._terminals}
 
     def _report_fault(self, note: str) -> None:
-        if note.startswith(_HAPPENED):
-            self._line.send({"happened": note.removeprefix(_HAPPENED)})
+        if note.startswith(FAULT):
+            self._line.send({"happened": note.removeprefix(FAULT)})
 
     def _answer_requests(self, now_ns: int) -> None:
         """Answer the lines of the process that started the simulation."""

@@ -13,11 +13,9 @@ from dataclasses import dataclass, replace
 from dxlrun.errors import InputError
 from dxlrun.run.channels.events import Event, EventCode, Severity
 from dxlrun.simulation import LedgerEntry
-from dxlrun.simulation.bus.ledger import OTHER_HOST
+from dxlrun.simulation.bus.ledger import FAULT, OTHER_HOST
 from dxlrun.simulation.faults.fault import BABBLE_NS, BOOT_NS, BROWNOUT_NS, TURN_NS, Fault, parse_fault
 
-MARK = "fault: "
-"""How the note of an injected fault begins in the ledger."""
 WINDOW_NS = 2_000_000_000
 """An event that comes later answers something else [i]."""
 LATE_NS = 1_000_000
@@ -140,7 +138,7 @@ class _Cause:
 
 def faults_in(entries: Iterable[LedgerEntry]) -> list[LedgerEntry]:
     """Return the notes of injected faults, in order of time."""
-    faults = [entry for entry in entries if entry.direction == "note" and entry.note.startswith(MARK)]
+    faults = [entry for entry in entries if entry.direction == "note" and entry.note.startswith(FAULT)]
     return sorted(faults, key=lambda entry: entry.t_ns)
 
 
@@ -160,7 +158,7 @@ def answered(
         FaultAnswers(
             seconds=(entry.t_ns - begin_ns) / 1e9,
             bus=entry.bus,
-            text=entry.note.removeprefix(MARK),
+            text=entry.note.removeprefix(FAULT),
             answers=tuple(
                 EventAnswer(event.name, event.source, event.text, (event.t_ns - entry.t_ns) / 1e6)
                 for event in events
@@ -200,7 +198,7 @@ def uncaused(
 def _fault(entry: LedgerEntry) -> Fault | None:
     """Return the fault of a note; None where this version knows none of that kind."""
     try:
-        return parse_fault(entry.note.removeprefix(MARK))
+        return parse_fault(entry.note.removeprefix(FAULT))
     except InputError:
         return None
 
@@ -294,7 +292,7 @@ def _causes(entries: Iterable[LedgerEntry]) -> list[_Cause]:
             found.append(_Cause(entry.t_ns, entry.t_ns + entry.late_ns, entry.bus, None, _GARBLED))
         elif entry.direction != "note":
             continue
-        elif entry.note.startswith(MARK):
+        elif entry.note.startswith(FAULT):
             found += _causes_of(entry)
         elif entry.note.startswith("collision: "):
             found.append(_Cause(entry.t_ns, entry.t_ns, entry.bus, None, _GARBLED))

@@ -29,6 +29,9 @@ FLUSH_NS = 500_000_000
 """A ledger file is never further behind than this."""
 
 
+FAULT = "fault: "
+"""How the note of a fault that happens begins; its text follows."""
+
 OTHER_HOST = "another host sends"
 """How the note of an instruction of another host begins."""
 

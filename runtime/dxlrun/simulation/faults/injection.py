@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from random import Random
 
+from dxlrun.simulation.bus.ledger import FAULT
 from dxlrun.simulation.bus.line import flipped
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.configuration import ServoConfig
@@ -62,7 +63,7 @@ class Injection:
         """Enter the fault into the ledger, when this is called first."""
         if not self.happened:
             self.happened = True
-            self.bus.note(f"fault: {self.fault}")
+            self.bus.note(f"{FAULT}{self.fault}")
 
     def servos(self) -> Sequence[SimulatedServo]:
         """Return the servo that the fault names, or all of the bus, at the bus' time; it happens to them.
