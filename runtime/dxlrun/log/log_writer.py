@@ -8,7 +8,7 @@ import struct
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import IO, cast
+from typing import IO, TypeVar, cast
 
 import msgspec
 import numpy as np
@@ -26,6 +26,7 @@ from dxlrun.run.channels.events import Event, EventCode, LostRecords, Severity, 
 from dxlrun.run.channels.packets import split_packets
 from dxlrun.run.channels.ring import Payload, RecordKind
 
+Written = TypeVar("Written")
 CHUNK_BYTES = 256 * 1024
 _PACKET = struct.Struct("<4sqqBBxxI")
 """What precedes the bytes of a BUS_PACKET, as Codec packs it: nine of ten messages are packets."""
@@ -153,12 +154,13 @@ class LogWriter:
     def _mark_whole(self) -> None:
         self._whole_bytes, self._whole_messages = self._file.tell(), self._messages
 
-    def _guarded(self, write: Callable[[], None]) -> None:
+    def _guarded(self, write: Callable[[Written], None], what: Written) -> None:
+        """Write something, or count it when nothing can be written any more."""
         if self.error is not None:
             self._unwritten += 1
             return
         try:
-            write()
+            write(what)
         except OSError as error:
             self._give_up(error)
 
@@ -175,7 +177,7 @@ class LogWriter:
         """Write one record of a ring. Raises ValueError when it is none that the log can hold."""
         if kind not in self._takers:
             raise ValueError(f"a record of kind {kind} does not belong into a log")
-        self._guarded(lambda: self._takers[kind](payload))
+        self._guarded(self._takers[kind], payload)
 
     def _cycle(self, payload: Payload) -> None:
         """Write a cycle: /cycle, the goals, and the states that controllers marked; before the first one
@@ -268,7 +270,7 @@ class LogWriter:
         text = f"{what} overwritten or damaged before the recorder read {them}"
         data = msgspec.json.encode(LostRecords(source, lost))
         event = Event(self._last_ns, EventCode.RECORDER_GAP, Severity.ERROR, "recorder", text, data=data)
-        self._guarded(lambda: self._write_event(event))
+        self._guarded(self._write_event, event)
 
     def flush(self, *, sync: bool = False) -> None:
         """Finish the chunk in progress, so that a reader finds it; with `sync`, wait for the disk."""
