@@ -31,7 +31,7 @@ def said(data: bytes | None) -> Any:
     return Codec(schemas.DIAGNOSTICS).unpack(data)
 
 
-def test_each_joint_says_how_its_servo_is() -> None:
+def test_each_joint_has_the_status_of_its_servo() -> None:
     record = record_of()
     row = np.frombuffer(bytes(record.raw), dtype=record.layout.dtype)[0]
     message = said(Diagnostics(JOINTS).of(row, 5, (7, 8)))
@@ -50,7 +50,7 @@ def test_each_joint_says_how_its_servo_is() -> None:
     ]
 
 
-def test_it_is_said_once_a_second() -> None:
+def test_it_is_published_once_a_second() -> None:
     record = record_of()
     row = np.frombuffer(bytes(record.raw), dtype=record.layout.dtype)[0]
     diagnostics = Diagnostics(JOINTS)

@@ -79,7 +79,7 @@ def test_what_was_no_json_is_none_in_the_log(log: LogWriter, tmp_path: Path) -> 
     assert read.complete
 
 
-def test_a_log_without_them_says_so(log: LogWriter, tmp_path: Path, cycle: Callable[[int], bytes]) -> None:
+def test_a_log_without_them_has_none(log: LogWriter, tmp_path: Path, cycle: Callable[[int], bytes]) -> None:
     log.take(RecordKind.CYCLE, cycle(0))
     log.close()
     read = read_log(tmp_path / "run.mcap")

@@ -210,7 +210,7 @@ def test_a_log_is_readable_up_to_the_last_flush(log: LogWriter, tmp_path: Path, 
 
 
 @pytest.mark.parametrize("missing", [1, 8, 30, 500])
-def test_a_cut_log_is_readable_and_says_so(
+def test_a_cut_log_is_readable_and_reported_as_cut(
     log: LogWriter, tmp_path: Path, cycle: Cycle, missing: int
 ) -> None:
     log.take(RecordKind.CYCLE, cycle(0))
@@ -224,7 +224,7 @@ def test_a_cut_log_is_readable_and_says_so(
     assert len(read.cycles) == 12
 
 
-def test_a_damaged_chunk_is_left_out_and_said(log: LogWriter, tmp_path: Path, cycle: Cycle) -> None:
+def test_a_damaged_chunk_is_left_out_and_reported(log: LogWriter, tmp_path: Path, cycle: Cycle) -> None:
     path = tmp_path / "run.mcap"
     log.take(RecordKind.CYCLE, cycle(0))
     log.flush()
@@ -333,7 +333,7 @@ def test_a_chunk_that_would_fill_the_memory_is_left_out(rewritten: Rewritten, si
 
 
 @pytest.mark.parametrize("compress", [zstandard.compress, lz4.frame.compress])
-def test_a_chunk_that_is_longer_than_it_says_is_not_decompressed_further(
+def test_a_chunk_that_is_longer_than_its_header_has_it_is_not_decompressed_further(
     rewritten: Rewritten, compress: Callable[[bytes], bytes]
 ) -> None:
     def change(chunk: Chunk) -> None:
@@ -378,7 +378,7 @@ def test_a_log_that_another_tool_compressed_anew_is_read(rewritten: Rewritten, c
     assert (log.cycles["cycle"].tolist(), log.complete) == ([0, 1, 2, 3], True)
 
 
-def test_an_unknown_compression_is_said(rewritten: Rewritten) -> None:
+def test_an_unknown_compression_is_reported(rewritten: Rewritten) -> None:
     def change(chunk: Chunk) -> None:
         chunk.compression = "rar"
 
@@ -387,7 +387,7 @@ def test_an_unknown_compression_is_said(rewritten: Rewritten) -> None:
     )
 
 
-def test_a_mode_that_is_none_is_said(
+def test_a_mode_that_is_none_is_reported(
     log: LogWriter, tmp_path: Path, cycle: Cycle, layout: CycleLayout
 ) -> None:
     record = np.frombuffer(bytearray(cycle(7)), dtype=layout.dtype)
@@ -439,7 +439,7 @@ def test_a_full_disk_stops_the_writing_and_leaves_a_readable_log(
     assert not read.complete
 
 
-def test_a_disk_that_is_full_at_the_end_is_said(log: LogWriter, tmp_path: Path, cycle: Cycle) -> None:
+def test_a_disk_that_is_full_at_the_end_is_reported(log: LogWriter, tmp_path: Path, cycle: Cycle) -> None:
     log.take(RecordKind.CYCLE, cycle(0))
     with files_of_at_most((tmp_path / "run.mcap").stat().st_size):
         summary = log.close()
@@ -448,7 +448,7 @@ def test_a_disk_that_is_full_at_the_end_is_said(log: LogWriter, tmp_path: Path, 
 
 
 @pytest.mark.parametrize("what", ["deleted", "moved", "replaced"])
-def test_a_file_that_is_gone_is_said(log: LogWriter, tmp_path: Path, cycle: Cycle, what: str) -> None:
+def test_a_file_that_is_gone_is_reported(log: LogWriter, tmp_path: Path, cycle: Cycle, what: str) -> None:
     path, elsewhere = tmp_path / "run.mcap", tmp_path / "elsewhere.mcap"
     log.take(RecordKind.CYCLE, cycle(0))
     log.flush()
@@ -460,7 +460,9 @@ def test_a_file_that_is_gone_is_said(log: LogWriter, tmp_path: Path, cycle: Cycl
     assert log.close().error == "its file was deleted or moved by another program during the run"
 
 
-def test_a_file_that_was_cut_is_said_and_gets_no_hole(log: LogWriter, tmp_path: Path, cycle: Cycle) -> None:
+def test_a_file_that_was_cut_is_reported_and_gets_no_hole(
+    log: LogWriter, tmp_path: Path, cycle: Cycle
+) -> None:
     path = tmp_path / "run.mcap"
     log.take(RecordKind.CYCLE, cycle(0))
     log.flush()

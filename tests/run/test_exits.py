@@ -84,7 +84,7 @@ def test_a_second_interrupt_cuts_torque_at_once(
     assert run.log().complete
 
 
-def test_a_plug_in_that_hides_the_wish_to_stop_is_ended_after_exit_timeout(
+def test_a_plug_in_that_hides_the_request_to_stop_is_ended_after_exit_timeout(
     odd: Callable[..., Running], all_limp: Limp
 ) -> None:
     run = odd(configure="signal.signal(signal.SIGTERM, signal.SIG_IGN)")
@@ -187,7 +187,7 @@ def test_a_guardian_that_stands_still_ends_the_run(start: Start, all_limp: Limp)
     assert run.log().complete
 
 
-def test_a_recorder_that_stands_still_does_not_stop_the_robot_and_is_said(
+def test_a_recorder_that_is_stopped_does_not_stop_the_robot_and_is_reported(
     start: Start, all_limp: Limp
 ) -> None:
     run = start("--duration", "1")

@@ -66,7 +66,7 @@ loop:
   scheduler: {policy: fifo, priority: 30, lock_memory: true, cores: [0], idle_latency: true}
 joints: {j: {bus: m, id: 3, model: AX-12A, reference: 150 deg, direction: 1}}
 """
-WISHES = [
+REQUESTS = [
     "collector",
     "cores",
     "idle latency",
@@ -89,7 +89,7 @@ os.execv(sys.argv[1], sys.argv[1:])
 
 
 @pytest.mark.parametrize("before", [(), (sys.executable, "-c", WITHOUT_RIGHTS)], ids=["as is", "no rights"])
-def test_a_run_says_what_it_was_granted(
+def test_a_run_reports_what_it_was_granted(
     start: Callable[..., Any], tmp_path: Path, before: tuple[str, ...]
 ) -> None:
     """Once with the rights of whoever runs the tests, once without capabilities and limits."""
@@ -101,7 +101,7 @@ def test_a_run_says_what_it_was_granted(
     log = run.log()
     granted = log.metadata["granted"]
     loops = [name for name in granted if not name.startswith("guardian")]
-    assert sorted(loops) == WISHES
+    assert sorted(loops) == REQUESTS
     assert sorted(set(granted) - set(loops)) == ["guardian: locked memory", "guardian: scheduler"]
     told = [event for event in log.events if event.code == EventCode.SCHEDULER]
     assert [event.source for event in told].count("guardian") == 2

@@ -135,7 +135,7 @@ def test_a_controller_goes_on_slowly_when_its_servo_answers_again(
     assert max(abs(b - a) for a, b in itertools.pairwise(eased)) > 1.5 * 0.02 + TICK, "nobody slowed yaw down"
 
 
-def test_two_missed_replies_hold_nobody(
+def test_two_missed_replies_hold_no_joint(
     built: Callable[..., VirtualRobot], acts: dict[str, Act], tmp_path: Path
 ) -> None:
     acts |= {"pair": sway}
@@ -198,7 +198,7 @@ def test_two_that_fall_back_on_each_other_end_the_run_when_both_have_failed(
     assert "calm gave up" in result.detail
 
 
-def test_nobody_takes_over_from_a_controller_that_fails_while_it_leaves(
+def test_no_controller_takes_over_from_one_that_fails_while_it_leaves(
     built: Callable[..., VirtualRobot], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def leave(controller: Any, time_ns: int) -> None:

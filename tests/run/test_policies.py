@@ -262,7 +262,7 @@ def test_controllers_are_deactivated_before_a_policy_moves(
     assert all(mask == 0b11 for mask, _ in seen[: len(active)])
 
 
-def test_who_asks_for_something_during_a_policy_is_told_that_the_run_ends(
+def test_a_request_during_a_policy_is_refused_because_the_run_ends(
     built: Callable[..., VirtualRobot], acts: dict[str, Act]
 ) -> None:
     robot = built(on_exit=STEPS["pose"])

@@ -95,7 +95,7 @@ def test_an_interrupt_takes_the_robot_to_its_pose_and_holds_it_there(
     assert not all_limp(run)
 
 
-def test_the_guardian_holds_a_robot_whose_loop_is_gone_when_the_policy_says_so(
+def test_the_guardian_holds_a_robot_whose_loop_is_gone_when_the_policy_is_hold(
     holding: Callable[..., Any], all_limp: Limp
 ) -> None:
     run = holding("180 deg/s", "limp", "4 s")
@@ -182,7 +182,7 @@ def test_a_guardian_that_leaves_torque_on_stops_what_is_led_by_a_velocity(
 
 
 @pytest.mark.parametrize("silent", [False, True])
-def test_the_last_hand_names_who_did_not_confirm_torque_off(
+def test_a_safe_stop_names_the_servos_that_did_not_confirm_torque_off(
     safe_stop: tuple[VirtualRobot, SafeStop, RunMemory], silent: bool
 ) -> None:
     robot, safe_stop, memory = safe_stop

@@ -54,7 +54,7 @@ def test_two_runs_with_one_seed_are_the_same_to_the_bit_and_another_seed_is_anot
 
 
 @pytest.mark.parametrize("seed", [1, 3])
-def test_the_log_tells_a_storm_as_the_bus_saw_it(plan: Plan, tmp_path: Path, seed: int) -> None:
+def test_the_log_has_a_storm_as_the_bus_saw_it(plan: Plan, tmp_path: Path, seed: int) -> None:
     log, ledger = run(plan, tmp_path / "run", seed)
 
     report = compare(read_log(log), read_ledger(ledger), ledger)

@@ -112,7 +112,7 @@ def test_the_log_is_the_wire(tmp_path: Path) -> None:
         assert b"".join(packet.data for packet in packets if packet.kind in kinds) == wire
 
 
-def test_a_silent_servo_is_invalid_with_an_age_and_nobody_else_is(tmp_path: Path) -> None:
+def test_a_silent_servo_is_invalid_with_an_age_and_no_other_is(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     robot = simulated_robot(TORSO, duration_s=2.0, log=path)
     robot.buses[0].at(1_000_000_000, lambda: robot.buses[0].servo(5).silence(True))

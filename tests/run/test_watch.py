@@ -152,7 +152,7 @@ def test_only_a_set_up_is_given_up_and_only_once(page: Heartbeat) -> None:
     assert page.beats == 5
 
 
-def test_a_stop_anywhere_in_the_set_up_leaves_nobody_with_torque(
+def test_a_stop_anywhere_in_the_set_up_leaves_no_servo_with_torque(
     start: object, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Ask to stop at the first transaction, at the second ...: until one set-up is through without us."""
@@ -203,7 +203,7 @@ def set_up(tmp_path: Path, transactions: int) -> bool | None:
     return None
 
 
-def test_a_line_whose_other_end_is_gone_still_gives_what_it_said_last() -> None:
+def test_a_channel_whose_other_end_is_gone_still_gives_its_last_messages() -> None:
     ours, theirs = process.message_channel(GUARDIAN_MESSAGES)
     theirs.sendall(b'{"type": "Ended", "ending": "done"}\n')
     theirs.close()
@@ -249,7 +249,7 @@ def watcher(start: object, tmp_path: Path) -> Iterator[tuple[Guardian, socket.so
         (Phase.STOPPING, -9, "late", "late"),
     ],
 )
-def test_a_loop_is_done_only_when_it_says_so_and_ends_well(
+def test_a_loop_is_done_only_when_it_reports_it_and_ends_well(
     watcher: tuple[Guardian, socket.socket, Heartbeat], phase: Phase, code: int, killed: Any, ending: str
 ) -> None:
     made, _, page = watcher

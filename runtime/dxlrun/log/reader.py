@@ -74,7 +74,7 @@ class _Found:
 
 @dataclass(frozen=True)
 class Log:
-    """One run, as its log tells it. Times: ns of the run's clock; wall time = that + `epoch_offset_ns`."""
+    """One run, as its log has it. Times: ns of the run's clock; wall time = that + `epoch_offset_ns`."""
 
     path: Path
     header: LogHeader

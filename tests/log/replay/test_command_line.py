@@ -25,7 +25,7 @@ def words(text: str) -> list[str]:
     return text.split()
 
 
-def test_the_document_says_what_comes_out(tmp_path: Path) -> None:
+def test_the_document_shows_the_output(tmp_path: Path) -> None:
     (tmp_path / "robots").symlink_to(ROOT / "robots")
     environment = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
     told = [

@@ -103,7 +103,7 @@ def test_what_the_controllers_began_with_is_an_input(pair_log: Path, changed: Ch
     assert (report.first.cycle, report.first.joint) == (0, "nod")
 
 
-def test_who_was_active_counts(pair_log: Path, changed: Change) -> None:
+def test_active_controllers_are_compared(pair_log: Path, changed: Change) -> None:
     def change(content: Any) -> None:
         content.cycles["active"][9] = 0b110
 
@@ -178,7 +178,7 @@ def test_a_setting_that_does_not_fit_is_one_sentence(pair_log: Path, setting: st
     assert "\n" not in str(error.value)
 
 
-def test_a_setting_that_claims_somebody_elses_joint(pair_log: Path) -> None:
+def test_a_setting_that_claims_a_joint_of_another_controller(pair_log: Path) -> None:
     with pytest.raises(ControllerFault, match="pan"):
         changed_by(pair_log, "all_inputs.joints=[pan, nod]")
 

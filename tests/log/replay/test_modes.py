@@ -115,7 +115,7 @@ def test_wheels_that_are_held_at_the_end_stand(told: tuple[Log, dict[int, Answer
     assert told[0].cycles["velocity"][-1, :2] == pytest.approx([0.0, 0.0], abs=0.05)
 
 
-def test_the_log_tells_what_was_waited_for(told: tuple[Log, dict[int, Answer]]) -> None:
+def test_the_log_has_what_was_waited_for(told: tuple[Log, dict[int, Answer]]) -> None:
     waits = [
         event.source
         for event in told[0].events

@@ -348,7 +348,7 @@ def test_nothing_is_compared_behind_a_lost_command_for_the_loop(
     )
 
 
-def test_what_is_refused_only_in_the_replay_is_said(tell: Callable[[str], Path], changed: Change) -> None:
+def test_what_is_refused_only_in_the_replay_is_reported(tell: Callable[[str], Path], changed: Change) -> None:
     gone = replace(LOADED, type="gone")
     change = with_command("load", data=msgspec.json.encode(gone))
     report = replay_log(changed(tell("a controller that is loaded"), change))

@@ -65,7 +65,7 @@ def test_a_lease_below_zero_is_refused() -> None:
         decode_command(encode_command(Command(1, "arm", "position", b"", "process 12", -1)))
 
 
-def test_a_name_that_is_longer_than_its_length_can_say_is_cut() -> None:
+def test_a_name_that_is_longer_than_its_length_field_allows_is_cut() -> None:
     long = Command(1, "c" * 70_000, "k", b"data", "o")
     assert decode_command(encode_command(long)) == Command(1, "c" * 65_535, "k", b"data", "o")
 

@@ -131,7 +131,7 @@ def test_a_damaged_byte_is_one_gap_and_the_neighbours_stay(make: Make, at: int) 
     assert all_of(reader) == [event(b"one"), middle, event(b"three")]
 
 
-def test_damage_at_the_end_is_declared_at_once_and_counted_when_the_next_record_tells_how_much(
+def test_damage_at_the_end_is_declared_at_once_and_counted_with_the_next_record(
     make: Make,
 ) -> None:
     descriptor = make(512, 64)

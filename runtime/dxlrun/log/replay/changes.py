@@ -105,8 +105,8 @@ def with_arguments(plan: RecordedPlan, loop: LoopPlan, arguments: Mapping[str, s
     same = _compiled(plan, plan.arguments)
     if (same.joints, same.controllers) != (plan.loop.joints, plan.loop.controllers):
         raise InputError(
-            "the robot file in the log no longer gives the plan that was run (other versions, or servos that "
-            "only told their models when they were asked): its arguments cannot be changed; --set can"
+            "the robot file in the log no longer gives the plan that was run (other versions, or servos "
+            "whose models are known only at a start): its arguments cannot be changed; --set can"
         )
     other = _compiled(plan, {**plan.arguments, **arguments})
     if other.period_ns != loop.period_ns:
