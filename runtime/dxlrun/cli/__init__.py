@@ -18,7 +18,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     tokens = tuple(sys.argv[1:] if arguments is None else arguments)
     try:
         if tokens == ("--version",):  # the framework takes longer to import than all that is printed
-            sys.stdout.write(f"{version()}\n")
+            from importlib import metadata
+
+            sys.stdout.write(f"{metadata.version('dxlrun')}\n")
             return 0
         from dxlrun.cli.app import run_tokens  # not above: importing the package must cost nothing
 
@@ -26,13 +28,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:  # while that was being imported, or an error reported
         sys.stderr.write("interrupted\n")
         return 130
-
-
-def version() -> str:
-    """Return the version of the installed package."""
-    from importlib import metadata  # not above: only --version needs it
-
-    return metadata.version("dxlrun")
 
 
 def _open_standard_streams() -> None:

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Literal
 
 from cyclopts import App, CycloptsError
 
-from dxlrun.cli import version
 from dxlrun.cli.inputs import COMMANDS, COMMANDS_WHILE_IT_RUNS
 from dxlrun.cli.run import run
 from dxlrun.errors import DxlrunError, InputError, Problem, Refused
@@ -57,7 +56,7 @@ def build(*, listed: bool) -> App:
         help_formatter=_Help(),
         usage=USAGE,
         console=None if sys.stdout.isatty() else out(_PIPED_HELP),
-        version=version,
+        version=_version,
         suppress_keyboard_interrupt=False,  # an interrupt is reported by `run_tokens`, like all else
     )
     app.default(run)
@@ -112,6 +111,12 @@ def _filled(text: object) -> str:
     """Return a text of a docstring without the line breaks inside its paragraphs."""
     plain = str(getattr(text, "primary_renderable", text) or "").strip()
     return re.sub(r"(?<!\n)\n(?!\n)", " ", plain)
+
+
+def _version() -> str:
+    from importlib import metadata  # not above: only --version needs it
+
+    return metadata.version("dxlrun")
 
 
 def run_tokens(tokens: Sequence[str]) -> int:
