@@ -153,7 +153,8 @@ class DynamixelHardware:
         now_ns = self._clock.now_ns()
         for servos in self._servos:
             servos.watchdogs.sent(now_ns)
-        self._samples.follow_modes()
+        if self._states.mode.tobytes() != self._samples.modes:
+            self._samples.follow_modes()
         if self._kernel is not None and reader is Reader.KERNEL:
             answer = self._kernel.read()
             if answer is not Answer.UNEXPECTED:
@@ -176,7 +177,8 @@ class DynamixelHardware:
             return
         kernel, ready = self._kernel, self._kernel is not None
         for index, (bus, servos) in enumerate(self._lines):
-            program = servos.reads.plan().program
+            cycle = servos.reads.plan() if servos.reads.stale else servos.reads.cycle
+            program = cycle.program
             if bus.failure is None and kernel is not None:
                 known = program is not None and program is kernel.programs[index]
                 ready &= known or (program is not None and kernel.plan(index, program))
@@ -297,7 +299,7 @@ class DynamixelHardware:
                 work.abandon()
             elif index not in late:
                 servos.look()
-                if work.begin(latest):
+                if work.tasks and work.begin(latest):
                     bus.load(work)
                     working.append(bus)
         if working:

@@ -63,7 +63,6 @@ class CyclicReads:
     __slots__ = (
         "_broken",
         "_calm",
-        "_cycle",
         "_line",
         "_lossy",
         "_made",
@@ -73,14 +72,15 @@ class CyclicReads:
         "_programs",
         "_samples",
         "_shape",
-        "_stale",
         "away",
         "begun",
+        "cycle",
         "errors",
         "fast",
         "garbled",
         "given_up",
         "missed",
+        "stale",
     )
 
     def __init__(self, plan: BusPlan, samples: BusSamples) -> None:
@@ -106,8 +106,8 @@ class CyclicReads:
         self._lossy = [False] * groups  # a reply was lost in this cycle
         self._broken = [0] * groups  # incomplete fast reads since the last complete one
         self._calm = 0  # cycles of the parser in a row without a loss
-        self._cycle = Cycle((), (), None)
-        self._stale = True  # the next cycle is another one
+        self.cycle = Cycle((), (), None)
+        self.stale = True  # the next cycle is another one
         self._position = 0  # in its queue
         self._patient = True
         self._made: dict[tuple[int, ...], Request] = {}
@@ -117,8 +117,8 @@ class CyclicReads:
 
     def plan(self) -> Cycle:
         """Plan the next cycle, before anything of it is asked: as the one before if nothing happened."""
-        if self._stale:
-            self._stale = False
+        if self.stale:
+            self.stale = False
             silent = tuple(map(bool, self.missed))
             queue = tuple(
                 self._request(number, indices)
@@ -126,14 +126,14 @@ class CyclicReads:
                 for indices in _reads([index for index in group if not self.away[index]], silent)
             )
             program = self._program(queue) if self._calm >= CALM_CYCLES else None
-            self._cycle = Cycle(silent, queue, program)
-        return self._cycle
+            self.cycle = Cycle(silent, queue, program)
+        return self.cycle
 
     def end(self) -> None:
         """End a cycle in which the parser read, or the line was lost: plan the next by what came of it."""
         self.begun = False
-        self._stale = True
-        silent = self._cycle.silent
+        self.stale = True
+        silent = self.cycle.silent
         for number, members in enumerate(self._plan.groups):
             if self._lossy[number]:
                 # once a cycle: if each loss counted, three silent servos of a group would ask alike for ever
@@ -148,18 +148,18 @@ class CyclicReads:
 
     def asks(self, servo: int) -> bool:
         """Check whether a servo is asked in this cycle: not if it joined after a split bus was asked."""
-        return any(servo in request.indices for request in self._cycle.queue)
+        return any(servo in request.indices for request in self.cycle.queue)
 
     def leave(self, servo: int) -> None:
         """Ask a servo no more: it is lost, and its silence would cost the others their time."""
         self.away[servo] = True
-        self._stale = True
+        self.stale = True
 
     def join(self, servo: int) -> None:
         """Ask a servo again from the next cycle on, with the others: it was found in order."""
         self.away[servo] = False
         self.missed[servo] = 0
-        self._stale = True
+        self.stale = True
 
     def learn(self, return_delays: Mapping[int, int]) -> None:
         """Await replies when they are due by the servos' measured return delays, ns by ID."""
@@ -174,7 +174,7 @@ class CyclicReads:
     def _forget(self) -> None:
         self._made.clear()
         self._programs.clear()
-        self._stale = True
+        self.stale = True
 
     def _request(self, group: int, indices: tuple[int, ...]) -> Request:
         request = self._made.get(indices)
@@ -226,7 +226,7 @@ class CyclicReads:
 
     def advance(self, reply: Reply | None) -> Transaction | None:
         """Take what came of a read, return the next one."""
-        queue = self._cycle.queue
+        queue = self.cycle.queue
         if reply is not None:
             if reply.outcome is not Outcome.OK:
                 self._count_loss(queue[self._position], reply.outcome)
@@ -240,7 +240,7 @@ class CyclicReads:
 
     def status(self, index: int, reply: Reply) -> None:
         """Keep the state of one servo of the current read."""
-        servo = self._cycle.queue[self._position].indices[index]
+        servo = self.cycle.queue[self._position].indices[index]
         self._samples.take(servo, reply.parameters, reply.last_ns)
         self.errors[servo] = reply.error
 

@@ -98,9 +98,9 @@ class IdleScheduler:
         "_current",
         "_events",
         "_plan",
-        "_tasks",
         "_until_ns",
         "now_ns",
+        "tasks",
     )
 
     def __init__(self, plan: BusPlan, events: EventSink, bus: Bus) -> None:
@@ -108,7 +108,7 @@ class IdleScheduler:
         self._events = events
         self._bus = bus
         self.now_ns = bus.now_ns
-        self._tasks: list[_Task] = []  # in the order of their turns
+        self.tasks: list[_Task] = []  # in the order of their turns
         self._current: _Task | None = None
         self._until_ns = 0
         self._count = 0
@@ -126,16 +126,16 @@ class IdleScheduler:
         `servo`: index into the plan's servos. May be called from a program.
         """
         self._count += 1
-        insort(self._tasks, _Task(program, (urgency, self._count), name, servo), key=_turn)
+        insort(self.tasks, _Task(program, (urgency, self._count), name, servo), key=_turn)
 
     @property
     def waiting(self) -> int:
         """How many programs have not come to their end."""
-        return len(self._tasks)
+        return len(self.tasks)
 
     def begin(self, until_ns: int) -> bool:
         """Prepare for the idle time that ends at `until_ns`; return whether there is anything to do."""
-        if not self._tasks:
+        if not self.tasks:
             return False
         self._until_ns = until_ns
         self._current = None
@@ -165,7 +165,7 @@ class IdleScheduler:
 
         What they add meanwhile waits for the next idle time.
         """
-        tasks, self._tasks, self._current = self._tasks, [], None
+        tasks, self.tasks, self._current = self.tasks, [], None
         for task in tasks:
             more = task.next is not None or task.resume(None)
             while more:
@@ -174,10 +174,10 @@ class IdleScheduler:
     def _ready(self) -> _Task | None:
         """Return the program that is next; of one servo that is the one that has begun."""
         now = self.now_ns()
-        for task in self._tasks:
+        for task in self.tasks:
             chosen = task
             if task.servo != WHOLE_BUS and not task.begun:
-                chosen = next((one for one in self._tasks if one.begun and one.servo == task.servo), task)
+                chosen = next((one for one in self.tasks if one.begun and one.servo == task.servo), task)
                 chosen.pressed = min(chosen.pressed, task.pressed)
             if not chosen.paused or chosen.wake_ns <= now:
                 return chosen
@@ -185,7 +185,7 @@ class IdleScheduler:
 
     def _resume(self, task: _Task, reply: Reply | None) -> None:
         if not task.resume(reply):
-            self._tasks.remove(task)
+            self.tasks.remove(task)
 
     def _pause(self, task: _Task, pause: Transaction) -> None:
         if not task.paused:

@@ -34,13 +34,13 @@ class Samples:
 
     __slots__ = (
         "_joint_speed",
-        "_modes_seen",
         "_states",
         "_wheel_speed",
         "at_ns",
         "buses",
         "fresh",
         "jumps",
+        "modes",
         "reference",
         "rows",
         "scale",
@@ -68,7 +68,8 @@ class Samples:
         self.jumps = Jumps(plans, events)
         self._joint_speed = self.scale[1].copy()
         self._wheel_speed = np.array([servo.direction * _in_wheel_mode(servo) for servo in servos])
-        self._modes_seen = b""
+        self.modes = b""
+        """The robot's modes, as of the last `follow_modes`."""
         counts = [len(plan.servos) for plan in plans]
         self.buses = tuple(
             BusSamples(plan, self, end - count)
@@ -78,11 +79,9 @@ class Samples:
 
     def follow_modes(self) -> None:
         """Use the unit of velocity that belongs to each servo's mode; before replies are taken."""
-        modes = self._states.mode.tobytes()
-        if modes != self._modes_seen:
-            self._modes_seen = modes
-            turning = np.isin(self._states.mode[self.rows], _WHEEL_MODES)
-            self.scale[1] = np.where(turning, self._wheel_speed, self._joint_speed)
+        self.modes = self._states.mode.tobytes()
+        turning = np.isin(self._states.mode[self.rows], _WHEEL_MODES)
+        self.scale[1] = np.where(turning, self._wheel_speed, self._joint_speed)
 
     def settle(self, now_ns: int) -> None:
         """Fill the states from the replies of this cycle.
