@@ -160,7 +160,12 @@ def test_what_waits_for_a_gap_is_done_behind_the_states(started):
     assert started.states.valid.all()
 
 
-def test_a_line_that_is_gone_between_request_and_reply_is_asked_anew(started):
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_line_that_is_gone_between_request_and_reply_is_asked_anew(make_rig, make_plan, compiled):
+    started = make_rig(make_plan(IDS, **X), compiled=compiled)
+    started.hardware.start()
+    for _ in range(10):
+        started.cycle()
     started.hardware.read()
     started.hardware.write()
     started.buses[0].unplug()
@@ -170,9 +175,49 @@ def test_a_line_that_is_gone_between_request_and_reply_is_asked_anew(started):
     started.buses[0].plug_in()
     for _ in range(150):
         started.cycle()
-        if started.states.valid.all():
+        if len(started.events.of(EventCode.SERVO_BACK)) == len(IDS):
             break
+        back = {source for source, _ in started.events.of(EventCode.SERVO_BACK)}
+        valid = {
+            servo.joint
+            for servo, one in zip(started.plans[0].servos, started.states.valid, strict=True)
+            if one
+        }
+        assert valid <= back  # the plan from before the loss is not read any more
+    assert len(started.events.of(EventCode.SERVO_BACK)) == len(IDS)
+    for _ in range(2):
+        started.cycle()
     assert started.states.valid.all()
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_line_that_is_back_leaves_the_requests_on_another_line_alone(make_rig, make_plan, compiled):
+    second = make_plan((21, 22), **{**X, "name": "leg"}, first_row=8)
+    started = make_rig(make_plan(IDS, **X), second, compiled=compiled)
+    started.hardware.start()
+    for _ in range(10):
+        started.cycle()
+    started.hardware.read()
+    started.buses[0].unplug()
+    started.goals.position[:] += 0.01
+    started.hardware.write()
+    started.buses[0].plug_in()
+    deadline = started.clock.now_ns() + started.period_ns
+    started.hardware.idle(deadline)
+    started.clock.wait_until(deadline)
+    started.hardware.read()
+    assert started.states.valid.tolist() == [False] * 8 + [True] * 2
+    for _ in range(150):
+        started.hardware.write()
+        started.hardware.idle(started.clock.now_ns() + started.period_ns)
+        started.clock.wait_until(started.clock.now_ns() + started.period_ns)
+        started.hardware.read()
+        assert started.states.valid[8:].all()
+    assert started.states.valid.all()
+    assert {source for source, _ in started.events.of(EventCode.READ_LOST)} <= {
+        servo.joint for servo in started.plans[0].servos
+    }
+    assert started.packets.sent(1) == started.into_bus(1)
 
 
 def test_what_came_before_a_read_is_asked_behind_the_goals_is_none_of_its_replies(started):

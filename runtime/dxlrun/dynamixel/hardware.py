@@ -366,11 +366,17 @@ class DynamixelHardware:
 
     def _reopen_lines(self) -> None:
         """Open lines again that were lost, and continue on those that are back."""
-        for index, (bus, servos) in enumerate(zip(self._buses, self._servos, strict=True)):
+        for index, (bus, servos) in enumerate(self._lines):
             if bus.failure is not None and self._ports.reopen(index):
+                if self._kernel is not None and self._reader is Reader.KERNEL:
+                    # the states may have been requested already, on the other lines: the kernel would now
+                    # read this one, too, by its plan from before the loss
+                    self._reader = Reader.PARSER
+                    self._interrupt(self._kernel)
                 bus.renew(self._ports.ports[index])
                 servos.goals.renew()
                 servos.found()
+                servos.reads.plan()  # without its servos: none is read before it was found in order
 
     def _limp(self) -> tuple[LimpOutcome, ...]:
         """Torque off at once wherever there is a line, and once more when one that was gone is back soon."""
