@@ -451,6 +451,23 @@ def test_no_servo_is_stopped_because_the_adapter_is_slow_while_they_are_armed(ma
     assert rig.events.of(EventCode.WATCHDOG) == []
 
 
+def test_no_watchdog_is_taken_for_tripped_before_it_was_armed(make_rig, make_x):
+    """The first states are read once more after a pause that is longer than the watchdogs."""
+    rig = make_rig(make_x(watchdog=2))
+    read = rig.hardware.read
+
+    def spoilt():
+        rig.buses[0].truncate_next(rig.plans[0].servos[0].servo_id, 4)
+        rig.hardware.read = read
+        read()
+
+    rig.hardware.read = spoilt
+    rig.hardware.start()
+    assert rig.events.of(EventCode.READ_LOST)
+    assert rig.events.of(EventCode.WATCHDOG) == []
+    assert all(map(math.isnan, rig.hardware._servos[0].ceiling))  # goals are followed as fast as they say
+
+
 def test_a_servo_that_was_stopped_while_others_were_armed_is_revived(make_rig, make_x):
     rig = make_rig(make_x(watchdog=10))
     _once_armed(rig, 14, lambda one: [rig.buses[0].truncate_next(one, 0) for _ in range(3)])

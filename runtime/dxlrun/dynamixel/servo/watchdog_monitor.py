@@ -28,7 +28,7 @@ class WatchdogMonitor:
         self._events = events
         self._longest_ns = plan.watchdog_ticks * watchdog.UNIT_NS
         self._sent_ns = 0
-        """When the servos were sent something, ns; 0: not yet."""
+        """When the servos were sent something, ns; 0: they are not armed yet."""
         self._reviving = [False] * len(plan.servos)
         """A revival waits for idle time already: a loop that is late repeatedly requests no second one."""
 
@@ -38,6 +38,7 @@ class WatchdogMonitor:
         All of them at once, and once more before each is read: none is stopped because the others take long.
         """
         plan, line, problems = self._plan, plan_line(self._plan), []
+        self._sent_ns = self._idle.now_ns()
         packets = watchdog.to_all(plan, plan.servos, plan.watchdog_ticks)
         for servo in plan.servos:
             if not plan.watchdog_ticks or (item := watchdog.item_of(plan, servo)) is None:
@@ -52,7 +53,9 @@ class WatchdogMonitor:
 
     def sent(self, now_ns: int) -> None:
         """Record that the servos are sent something now; revive them if they were silent for too long."""
-        if self._longest_ns and self._sent_ns and now_ns - self._sent_ns > self._longest_ns:
+        if not (self._longest_ns and self._sent_ns):
+            return
+        if now_ns - self._sent_ns > self._longest_ns:
             self._revive_all((now_ns - self._sent_ns) // 1_000_000)
         self._sent_ns = now_ns
 
