@@ -3,7 +3,7 @@ import pytest
 
 from dxlrun.dynamixel.control_table import control_table, model_names
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
-from dxlrun.dynamixel.plan.line import LONGEST_RETURN_DELAY_NS, PATIENCE_NS
+from dxlrun.dynamixel.plan.line import LONGEST_RETURN_DELAY_NS, TIMEOUT_MARGIN_NS
 
 
 def test_the_budget_of_protocol_md_at_one_millisecond_of_latency(make_plan):
@@ -52,7 +52,7 @@ def test_reads_are_six_bytes_from_present_position_on(make_plan):
 
 def test_patience_covers_return_delay_and_latency(make_plan):
     plan = make_plan(latency_ns=16_000_000, return_delay_ns=LONGEST_RETURN_DELAY_NS)
-    assert {read.timeout_ns for read in plan.reads} == {200_000 + 508_000 + 16_000_000 + PATIENCE_NS}
+    assert {read.timeout_ns for read in plan.reads} == {200_000 + 508_000 + 16_000_000 + TIMEOUT_MARGIN_NS}
 
 
 def test_limp_is_a_broadcast_and_then_every_servo_acknowledged(make_plan):

@@ -69,7 +69,7 @@ _OPERATORS: Mapping[type[ast.AST], Callable[..., float]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Target:
+class SampledTarget:
     """Position, rad, velocity, rad/s, and acceleration, rad/s^2, of a joint; None = not given."""
 
     position: float | None
@@ -89,7 +89,7 @@ class Sample:
 
     t_ns: int
     """Since the part's start."""
-    targets: dict[str, Target]
+    targets: dict[str, SampledTarget]
     mark: Mark
 
 
@@ -108,7 +108,7 @@ def listed_samples(
                 "sort the points by time",
             )
         targets = {
-            joint: Target(
+            joint: SampledTarget(
                 target.position,
                 target.velocity,
                 target.acceleration,
@@ -154,9 +154,9 @@ def formula_samples(
     )
 
 
-def _target(column: Mapping[Quantity, Sequence[float]], row: int, mark: Mark) -> Target:
+def _target(column: Mapping[Quantity, Sequence[float]], row: int, mark: Mark) -> SampledTarget:
     values = {quantity: column[quantity][row] for quantity in column}
-    return Target(values.get("position"), values.get("velocity"), values.get("acceleration"), mark)
+    return SampledTarget(values.get("position"), values.get("velocity"), values.get("acceleration"), mark)
 
 
 def _text(formula: Formula, quantity: Quantity) -> str | None:

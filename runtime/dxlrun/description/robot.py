@@ -97,7 +97,7 @@ class Loop(Form):
 
     rate: float = Field(gt=0, le=100_000, description="Cycles per second, Hz.", examples=["50"])
     scheduler: Scheduler = Field(
-        default=Scheduler(), description="Real-time wishes.", examples=["{policy: round_robin}"]
+        default=Scheduler(), description="Real-time settings of the loop.", examples=["{policy: round_robin}"]
     )
     overrun: Literal["skip", "catch_up", "stop"] = Field(
         default="skip",

@@ -29,7 +29,7 @@ from dxlrun.run.channels.packets import PacketLog
 
 STOP_LIMIT_NS = 1_000_000_000
 """Retries of torque off end here; half of the default exit timeout."""
-LINE_PATIENCE_NS = 300_000_000
+LINE_TIMEOUT_NS = 300_000_000
 """An adapter that is pulled in the last moment may be back by then."""
 LINE_STEP_NS = 10_000_000
 TAKEN_BACK = "torque was switched off again on every servo"
@@ -216,7 +216,7 @@ class DynamixelHardware:
         servos.settle(self._clock.now_ns())
         servos.reads.end()
         if servos.reads.given_up:
-            self._tell_plain_reads()
+            self._report_plain_reads()
 
     def write(self) -> None:
         """Send the goals, one sync write a line and layout, on every line that is there.
@@ -381,7 +381,7 @@ class DynamixelHardware:
     def _limp(self) -> tuple[LimpOutcome, ...]:
         """Torque off at once wherever there is a line, and once more when one that was gone is back soon."""
         now_ns = self._clock.now_ns()
-        deadline_ns, patience_ns = now_ns + STOP_LIMIT_NS, now_ns + LINE_PATIENCE_NS
+        deadline_ns, timeout_ns = now_ns + STOP_LIMIT_NS, now_ns + LINE_TIMEOUT_NS
         while True:
             self._reopen_lines()
             for bus, servos in zip(self._buses, self._servos, strict=True):
@@ -391,7 +391,7 @@ class DynamixelHardware:
                 self._plans, self._buses, self._ports, self._clock, deadline_ns=deadline_ns, beat=self._beat
             )
             gone = [index for index, bus in enumerate(self._buses) if bus.failure is not None]
-            if not gone or not self._wait_for_lines(gone, patience_ns):
+            if not gone or not self._wait_for_lines(gone, timeout_ns):
                 return outcomes
 
     def _wait_for_lines(self, gone: Sequence[int], until_ns: int) -> bool:
@@ -411,7 +411,7 @@ class DynamixelHardware:
                 report_failures(self._plans, self._buses, self._servos)
                 return
 
-    def _tell_plain_reads(self) -> None:
+    def _report_plain_reads(self) -> None:
         for plan, servos in zip(self._plans, self._servos, strict=True):
             for group in servos.reads.given_up:
                 names = ", ".join(plan.servos[index].joint for index in plan.groups[group])

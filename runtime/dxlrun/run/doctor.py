@@ -22,7 +22,7 @@ from dxlrun.control.realtime import (
     user,
 )
 from dxlrun.dynamixel.exchange import kernel as compiled_exchange
-from dxlrun.dynamixel.port.latency_timer import mend, timer_ms
+from dxlrun.dynamixel.port.latency_timer import fix, timer_ms
 
 NEEDED = ("memfd_create", "pidfd_open", "sched_setscheduler")
 """Calls of `os` without which no run starts; Linux has them all since 5.3."""
@@ -249,7 +249,7 @@ def _timer(machine: Machine, path: Path) -> Finding:
         return check.worse("it cannot be read", f"cat {shown}")
     if found <= FAST_MS:
         return check.good(f"{found} ms")
-    return check.worse(f"{found} ms where 1 ms is possible", mend(shown))
+    return check.worse(f"{found} ms where 1 ms is possible", fix(shown))
 
 
 def _priority(machine: Machine) -> Finding:

@@ -124,10 +124,10 @@ class Pulse:
             raise AskedToStop
 
 
-def _reply_polling(wish_ns: int | None) -> ReplyPolling | None:
-    if wish_ns is None:
+def _reply_polling(longest_ns: int | None) -> ReplyPolling | None:
+    if longest_ns is None:
         return ReplyPolling()
-    return ReplyPolling(wish_ns, MOST_SHARE) if wish_ns else None
+    return ReplyPolling(longest_ns, MOST_SHARE) if longest_ns else None
 
 
 def beside_simulation(plan: Plan) -> SchedulerPlan:

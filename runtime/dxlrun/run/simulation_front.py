@@ -276,7 +276,7 @@ class _Front:
             if self._audience.look_every_s is not None and time.monotonic() >= look_s:
                 self._child.channel.send({"look": True})
                 look_s = time.monotonic() + self._audience.look_every_s
-            ready = select.select(self._sources(), [], [], self._patience(look_s))[0]
+            ready = select.select(self._sources(), [], [], self._timeout_s(look_s))[0]
             if self._stop in ready and _STOPS.intersection(self._stop.recv(64)):
                 self._last_look()
                 return
@@ -291,7 +291,7 @@ class _Front:
             sources.append(self._typed)
         return sources
 
-    def _patience(self, look_s: float) -> float | None:
+    def _timeout_s(self, look_s: float) -> float | None:
         """Return for how long nothing must be done, s; a job that waits in the background looks up."""
         if self._audience.look_every_s is not None:
             return max(0.0, look_s - time.monotonic())

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from dxlrun.dynamixel.exchange.kernel import PlannedRead, Program
 from dxlrun.dynamixel.exchange.samples import BusSamples
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
-from dxlrun.dynamixel.plan.line import PATIENCE_NS, SHORT_PATIENCE_NS
+from dxlrun.dynamixel.plan.line import SHORT_TIMEOUT_MARGIN_NS, TIMEOUT_MARGIN_NS
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.plan.reads import state_read
 from dxlrun.dynamixel.wire.transaction import Outcome, Reply, Transaction
@@ -186,7 +186,7 @@ class CyclicReads:
             fast = self.fast[group] and len(indices) > 1
             patient = tuple(state_read(self._line, servos, more, fast=fast) for more in range(1 + spare))
             short = tuple(
-                replace(read, timeout_ns=read.timeout_ns - PATIENCE_NS + SHORT_PATIENCE_NS)
+                replace(read, timeout_ns=read.timeout_ns - TIMEOUT_MARGIN_NS + SHORT_TIMEOUT_MARGIN_NS)
                 for read in patient
             )
             request = self._made[indices] = Request(group, indices, patient, short)

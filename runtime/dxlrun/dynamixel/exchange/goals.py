@@ -36,7 +36,7 @@ Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
-class Cell:
+class GoalCell:
     """One goal item of one servo: how a goal in SI units becomes the integer in its packet.
 
     With its sign: tick = (sign * goal + offset) / unit, to the nearest, from `low` to `high`. A magnitude:
@@ -186,7 +186,7 @@ class SyncWrite:
         lead: CommandName,
         members: Sequence[int],
         servos: Sequence[ServoPlan],
-        cells: Sequence[Sequence[Cell]],
+        cells: Sequence[Sequence[GoalCell]],
     ) -> None:
         self._dialect = dialect
         self.layout = layout
@@ -236,7 +236,7 @@ class SyncWrite:
 
 def _cells(
     servo: ServoPlan, mode: Mode, layout: GoalLayout, limits: Mapping[str, int], fraction: float
-) -> list[Cell]:
+) -> list[GoalCell]:
     """Return the goals that stand in a block, in the order of the wire.
 
     `limits`: the servo's own, ticks, by what they limit; `fraction`: the part of an effort's or a PWM's limit
@@ -244,17 +244,17 @@ def _cells(
     """
     plan = servo.mode_plan(mode)
 
-    def signed(place: Field, scale: Scale | None, of: str) -> Cell:
+    def signed(place: Field, scale: Scale | None, of: str) -> GoalCell:
         unit, most = _reach(scale, of, limits, fraction)
         row = COMMAND_INTERFACES.index(LEADS.get(mode, "position"))
-        return Cell(place, row, False, float(servo.direction), 0.0, unit, -most, most)
+        return GoalCell(place, row, False, float(servo.direction), 0.0, unit, -most, most)
 
-    found: list[Cell] = []
+    found: list[GoalCell] = []
     if layout.position is not None:
         found.append(_position(layout.position, servo, plan))
         if layout.speed is not None:
             unit, most = _reach(plan.speed, "speed", limits, fraction)
-            found.append(Cell(layout.speed, _VELOCITY, True, 1.0, 0.0, unit, 1, max(most, 1)))
+            found.append(GoalCell(layout.speed, _VELOCITY, True, 1.0, 0.0, unit, 1, max(most, 1)))
     elif layout.speed is not None:
         found.append(signed(layout.speed, plan.speed, "speed"))
     elif layout.pwm is not None:
@@ -264,13 +264,13 @@ def _cells(
     elif layout.effort is not None:
         unit, most = _reach(plan.effort, "effort", limits, fraction)
         effort = COMMAND_INTERFACES.index("effort")
-        found.append(Cell(layout.effort, effort, True, 1.0, 0.0, unit, 0, most, most))
+        found.append(GoalCell(layout.effort, effort, True, 1.0, 0.0, unit, 0, most, most))
     return sorted(found, key=lambda cell: cell.place.offset)
 
 
-def _position(place: Field, servo: ServoPlan, plan: ModePlan) -> Cell:
+def _position(place: Field, servo: ServoPlan, plan: ModePlan) -> GoalCell:
     """Counted from the servo's raw 0, to the nearest tick, inside the joint's limits."""
-    return Cell(
+    return GoalCell(
         place,
         COMMAND_INTERFACES.index("position"),
         False,

@@ -12,11 +12,11 @@ from enum import IntEnum, unique
 
 from dxlrun.dynamixel.exchange.bus import Bus
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
-from dxlrun.dynamixel.plan.line import SHORT_PATIENCE_NS
+from dxlrun.dynamixel.plan.line import SHORT_TIMEOUT_MARGIN_NS
 from dxlrun.dynamixel.wire.transaction import Outcome, Program, Reply, Transaction
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
 
-LEAST_PATIENCE_NS = 100_000
+LEAST_MARGIN_NS = 100_000
 """A reply is awaited at least so long beyond the moment at which it is due; a servo is late by less."""
 STARVED = 50
 """Cycles after which an urgent program continues though time is too short: a skipped period is better than a
@@ -200,11 +200,11 @@ class IdleScheduler:
         latest_ns = wanted.due_ns
         if wanted.awaited:
             # a reply behind the end would disturb the next cyclic read, which costs far more than this brings
-            latest_ns += self._plan.latency_ns + max(self._bus.late_ns, LEAST_PATIENCE_NS)
+            latest_ns += self._plan.latency_ns + max(self._bus.late_ns, LEAST_MARGIN_NS)
         if latest_ns > left_ns:
             if not first or not self._forced(task, latest_ns, left_ns):
                 return None
-            left_ns = latest_ns + SHORT_PATIENCE_NS
+            left_ns = latest_ns + SHORT_TIMEOUT_MARGIN_NS
         task.starved = 0
         return replace(wanted, timeout_ns=min(wanted.timeout_ns, left_ns))
 

@@ -13,7 +13,7 @@ BITS_PER_BYTE = 10
 """8N1: start bit, eight bits, stop bit (protocol.md, Line)."""
 LONGEST_RETURN_DELAY_NS = 508_000
 """254 steps of 2 us (e-Manual, Return Delay Time (5)); what a servo may be set to before it was asked."""
-PATIENCE_NS = 10_000_000
+TIMEOUT_MARGIN_NS = 10_000_000
 """How long a servo that answered last time is awaited beyond the latest moment of its reply by the wire.
 
 A real servo is never late by more than microseconds, but a simulated one is a process of the same machine: it
@@ -22,7 +22,7 @@ milliseconds keep that from being taken for a broken cable; only the first silen
 (the timeouts behind it are short), and they stay below the 15.6 ms after which a loop of 320 Hz
 would count as hanging.
 """
-SHORT_PATIENCE_NS = 1_000_000
+SHORT_TIMEOUT_MARGIN_NS = 1_000_000
 """The same for a servo that is silent already: it must not take the time of the others."""
 
 
@@ -70,7 +70,7 @@ class Line:
         size = self.dialect.fast_size(sum(one.length for one in awaited), len(awaited))
         # only the first one waits before it speaks: the others add their parts at once (protocol.md, Time)
         due_ns = self.wire_ns(len(packet) + size) + self.delay_ns(awaited[0].servo_id)
-        timeout_ns = due_ns + self.latency_ns + PATIENCE_NS
+        timeout_ns = due_ns + self.latency_ns + TIMEOUT_MARGIN_NS
         return Transaction(packet, BROADCAST_ID, awaited, due_ns, timeout_ns, size, fast=True)
 
     def write(self, servo_id: int, address: int, data: bytes) -> Transaction:
@@ -93,7 +93,9 @@ class Line:
         replies = sum(self.dialect.OVERHEAD + one.length for one in awaited)
         due_ns = self.wire_ns(len(packet) + replies) + sum(self.delay_ns(one.servo_id) for one in awaited)
         widest = self.dialect.widest(max(one.length for one in awaited))
-        return Transaction(packet, servo_id, awaited, due_ns, due_ns + self.latency_ns + PATIENCE_NS, widest)
+        return Transaction(
+            packet, servo_id, awaited, due_ns, due_ns + self.latency_ns + TIMEOUT_MARGIN_NS, widest
+        )
 
 
 def listen(duration_ns: int) -> Transaction:

@@ -31,12 +31,12 @@ class LatencyTimer:
     """Where the Linux kernel shows it."""
 
     @property
-    def mend(self) -> str:
+    def fix(self) -> str:
         """The command that shortens it until the adapter is unplugged."""
-        return mend(str(self.place))
+        return fix(str(self.place))
 
 
-def mend(place: str) -> str:
+def fix(place: str) -> str:
     """Return the command that makes a timer as short as it can be, 1 ms, until the adapter is unplugged."""
     return f"echo 1 | sudo tee {place}"
 
@@ -55,7 +55,7 @@ def late_replies(bus: str, port: str, extra_ns: float, planned_ns: float) -> str
         return told
     name = Path(port).name
     device = name if name.startswith("ttyUSB") else f"$(basename $(readlink -f {port}))"
-    command = mend(f"/sys/bus/usb-serial/devices/{device}/latency_timer")
+    command = fix(f"/sys/bus/usb-serial/devices/{device}/latency_timer")
     return f"{told}: that is a latency timer of 16 ms; `{command}` shortens it"
 
 
@@ -92,6 +92,6 @@ def shorten(line: serial.Serial, path: str, most_ns: int, system: Path = SYSTEM)
     if now.found_ms * 1_000_000 > most_ns:
         return "", (
             f"{path} keeps replies back for {now.found_ms} ms, and the robot file says adapter: {{latency: "
-            f"{most_ns * 1e-6:g} ms}}: `{now.mend}` shortens that, or write what is true"
+            f"{most_ns * 1e-6:g} ms}}: `{now.fix}` shortens that, or write what is true"
         )
     return f"{path}: latency timer set from {before.found_ms} ms to {now.found_ms} ms", ""

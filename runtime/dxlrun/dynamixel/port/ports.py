@@ -16,7 +16,7 @@ from dxlrun.errors import PortError
 # found at once, some dozen times a cycle
 _write, _now_ns = os.write, time.monotonic_ns
 
-_WRITE_PATIENCE_NS = 20_000_000
+_WRITE_TIMEOUT_NS = 20_000_000
 """A goal packet for 50 servos takes 2.6 ms at 1 Mbit/s; a line that does not take it in 20 ms is stuck."""
 
 Reopened = Callable[[int], int | None]
@@ -124,7 +124,7 @@ class SerialPort:
 
     def _write_rest(self, data: memoryview) -> None:
         """Wait for room in the output queue; packets are short, so a full queue is stuck."""
-        deadline = time.monotonic_ns() + _WRITE_PATIENCE_NS
+        deadline = time.monotonic_ns() + _WRITE_TIMEOUT_NS
         while data:
             left = deadline - time.monotonic_ns()
             if left <= 0:

@@ -17,7 +17,7 @@ from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.exchange.bus import Bus, run
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
-from dxlrun.dynamixel.plan.line import PATIENCE_NS, listen
+from dxlrun.dynamixel.plan.line import TIMEOUT_MARGIN_NS, listen
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.plan.reads import state_read
 from dxlrun.dynamixel.port.latency_timer import late_replies
@@ -218,7 +218,7 @@ class StartUp:
         """Name the buses whose replies usually come when the cyclic reads have given them up."""
         for plan, late_ns in zip(self._plans, self._late_ns, strict=True):
             usual_ns = median(late_ns) if len(late_ns) >= _SOME else 0.0
-            if usual_ns > plan.latency_ns + PATIENCE_NS:
+            if usual_ns > plan.latency_ns + TIMEOUT_MARGIN_NS:
                 how = late_replies(plan.name, plan.port, usual_ns, plan.latency_ns)
                 yield f"every servo answers too late: {how}"
 
