@@ -17,7 +17,15 @@ from dxlrun.analysis.steering import Act, Pause, SteeringHistory
 from dxlrun.control.loop_plan import TOLERATED_SKIPS
 from dxlrun.log.reader import UNREADABLE, Log, scan_log
 from dxlrun.log.schemas import FAILURES_NAME, SUMMARY_NAME
-from dxlrun.run.channels.events import EventCode, EventCounts, EventGroup, Granted, LostRecords
+from dxlrun.run.channels.events import (
+    Event,
+    EventCode,
+    EventCounts,
+    EventGroup,
+    Granted,
+    LostRecords,
+    Severity,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +92,7 @@ class Tally:
             self._events.add(event)
             with suppress(*UNREADABLE):
                 if event.code == EventCode.SCHEDULER and event.source == "loop":
-                    granted = msgspec.json.decode(event.data, type=Granted)
+                    granted = _granted(event)
                     if granted.request == "scheduler":
                         self._granted = granted.granted
                 elif event.code == EventCode.RECORDER_GAP:
@@ -122,6 +130,13 @@ def totals_of(path: str | Path) -> RunTotals:
     """Count the log at a path, slice by slice. Raises LogError when it cannot be read."""
     tally = Tally()
     return tally.totals(scan_log(path, tally.take))
+
+
+def _granted(event: Event) -> Granted:
+    """Return the data of an event; those of the first release had none, but a text with the request first."""
+    if event.data:
+        return msgspec.json.decode(event.data, type=Granted)
+    return Granted(event.text.partition(" ")[0], event.severity < Severity.WARNING)
 
 
 def _real_time(log: Log, *, granted: bool) -> RealTime:
