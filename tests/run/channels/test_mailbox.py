@@ -197,6 +197,19 @@ def test_answers_come_back_by_their_numbers_and_long_ones_are_cut(both):
     assert both.answers.new() == []
 
 
+def test_an_answer_that_names_many_controllers_is_cut(both):
+    both.reader.answer(1, Waiting(tuple(f"controller_{index:060}" for index in range(63))))
+    ((number, answer),) = both.answers.new()
+    assert number == 1
+    assert isinstance(answer, Waiting)
+
+
+def test_a_refusal_with_a_text_that_is_no_utf_8_is_answered(both):
+    both.reader.answer(1, Refusal(Code.CONTROLLER_FAULT, {"problem": "no file a\udcff"}))
+    ((_, answer),) = both.answers.new()
+    assert answer.text == "no file a\\udcff"
+
+
 def test_a_descriptor_of_something_else_is_refused():
     descriptor = os.memfd_create("other")
     os.ftruncate(descriptor, 4096)

@@ -117,6 +117,11 @@ class Refusal(msgspec.Struct, frozen=True, tag="refused"):
     code: Code
     fields: Mapping[str, Field] = {}
 
+    def __post_init__(self) -> None:
+        """Escape what no UTF-8 has: a plug-in's error may name a file whose name is none."""
+        shown = {name: _writable(value) for name, value in self.fields.items()}
+        msgspec.structs.force_setattr(self, "fields", shown)
+
     @property
     def text(self) -> str:
         """The reason in one sentence."""
@@ -140,9 +145,16 @@ class CommandOutcome(msgspec.Struct, frozen=True):
     refusal: Refusal | None = None
 
 
+def _writable(value: Field) -> Field:
+    return value.encode(errors="backslashreplace").decode() if isinstance(value, str) else value
+
+
 def encode_answer(answer: Answer, most: int) -> bytes:
-    """Return an answer as JSON of at most so many bytes; of a refusal's long texts as much as fits."""
+    """Return an answer as JSON of at most so many bytes; of long texts and lists as much as fits."""
     data = msgspec.json.encode(answer)
+    while len(data) > most and isinstance(answer, Waiting):
+        answer = Waiting(answer.controllers[: len(answer.controllers) // 2])
+        data = msgspec.json.encode(answer)
     while len(data) > most and isinstance(answer, Refusal):
         fields = dict(answer.fields)
         longest = max(fields, key=lambda name: len(str(fields[name])))
