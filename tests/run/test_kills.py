@@ -23,7 +23,7 @@ from typing import Any
 
 import pytest
 
-VICTIMS = ("loop_process", "guardian", "recording", "dxlrun")
+VICTIMS = ("run.loop_process", "run.guardian", "log.recorder", "dxlrun")
 """The terminal's own process is "dxlrun"."""
 LATEST_S = {"process": 1.8, "wire": 0.5}
 """Half of the moments are counted from the start of the victim's process: loading, set-up, running and the
