@@ -313,7 +313,7 @@ class Loop:
         return "fault", self.manager.fault
 
     def _one(self, cycle: int) -> None:
-        """Wait for a deadline, then take commands, read, update, gate and write."""
+        """Wait for a deadline, then read, take commands, update, gate and write."""
         record, now_ns, schedule = self.record, self.clock.now_ns, self.schedule
         deadline_ns = schedule.deadline_ns(cycle)
         self.hardware.idle(deadline_ns)

@@ -1,4 +1,4 @@
-"""Steering: take commands from outside at the start of a cycle, a bounded number, and answer each of them."""
+"""Steering: after a cycle's read, take commands from outside, a bounded number, and answer each of them."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Commands to a robot while it runs: `dxlrun list`, `send`, `switch`, `set`, `rate`, `pause`, `stop` ...
 
-Each is one request to the gateway of the run: executed at the start of a cycle, or refused with the reason.
+Each is one request to the gateway of the run: executed after the read of a cycle, or refused with the reason.
 """
 
 from __future__ import annotations
