@@ -9,13 +9,15 @@ from dxlrun.simulation import BusConfig, ServoConfig
 
 ROBOT = """\
 name: pair
+arguments:
+  wrist_led: {default: 1}
 buses:
   main: {port: PORT, protocol: 2.0, baud_rate: 1_000_000, adapter: {latency: 0 ms}, return_delay_time: 0 us}
 loop: {rate: 50}
 joints:
   elbow:
     {bus: main, id: 1, model: XM430-W350, reference: 180 deg, direction: 1, registers: {REGISTERS}}
-  wrist: {bus: main, id: 2, model: auto, reference: 180 deg, direction: 1, registers: {led: 1}}
+  wrist: {bus: main, id: 2, model: auto, reference: 180 deg, direction: 1, registers: {led: "${wrist_led}"}}
 """
 
 
@@ -46,8 +48,21 @@ def test_the_difference_is_a_table_and_nothing_is_written(check):
     assert ["elbow", "return_delay_time", "EEPROM", "9", "0", "0", "leave", "it"] in table
     assert ["elbow", "position_p_gain", "RAM", "84", "900", "800", "write", "it"] in table
     assert ["wrist", "led", "RAM", "65", "1", "0", "write", "it"] in table
+    assert "2 servos compared with the file, 2 differences\n" in out
     assert (code, err) == (1, "")
     assert asked(sent) == {1, 2}
+
+
+def test_servos_that_are_as_declared_are_counted(check):
+    code, out, err, _ = check("position_p_gain: 800", "wrist_led:=0")
+    assert "2 servos compared with the file, no differences\n" in out
+    assert (code, err) == (0, "")
+
+
+def test_a_servo_that_is_missing_is_not_counted(check):
+    code, out, _, _ = check("position_p_gain: 800", ids=(2,))
+    assert "1 servo compared with the file, 1 difference; a run would not start\n" in out
+    assert code == 1
 
 
 def test_a_servo_that_is_missing_is_named_and_the_table_is_there_all_the_same(check):
@@ -60,6 +75,7 @@ def test_a_servo_that_is_missing_is_named_and_the_table_is_there_all_the_same(ch
     ]
     assert online["problems"][0].startswith("elbow (ID 1 on bus main) does not answer")
     assert not online["as_declared"]
+    assert online["compared"] == 1
     assert asked(sent) == {1, 2}
 
 

@@ -66,7 +66,7 @@ def check(
         return 0 if found is None or found.as_declared else 1
     show(_verdict(result), *_tables(result.report))
     if found is not None:
-        show(_registers(found.registers))
+        show(_registers(found.registers), _compared(found))
     for warning in result.warnings:
         print_warning(str(warning))
     if found is None:
@@ -262,6 +262,15 @@ def _motions(motions: Sequence[MotionRow], duration: float | None) -> Table:
     ]
     rows = [(row.file, row.controller, row.start, row.end, row.points, row.commands) for row in motions]
     return Table.of(f"Motions{ending}", columns, rows)
+
+
+def _compared(found: Found) -> str:
+    """Return in one line that servos were read, and how many differences there are."""
+    differing = sum(row.found not in (None, row.declared) for row in found.registers)
+    count = differing + len(found.remarks)
+    differences = counted(count, "difference", "differences") if count else "no differences"
+    start = "; a run would not start" if found.problems else ""
+    return f"{counted(found.compared, 'servo', 'servos')} compared with the file, {differences}{start}"
 
 
 def _registers(registers: Sequence[RegisterRow]) -> Table:

@@ -56,6 +56,8 @@ class RegisterRow:
 class Found:
     """What was read of the servos, in the order of the plans."""
 
+    compared: int = 0
+    """How many servos were read and compared with the file."""
     registers: list[RegisterRow] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
     """Why a run would not start, one sentence each."""
@@ -92,6 +94,7 @@ def look(buses: Sequence[BusPlan]) -> Found:
         found = _run([_look(plan) for plan in buses], buses, ports, MonotonicClock())
     together = Found()
     for one in found:
+        together.compared += one.compared
         together.registers += one.registers
         together.problems += one.problems
         together.remarks += one.remarks
@@ -130,8 +133,8 @@ def _run(
 def _look(plan: BusPlan) -> Program[Found]:
     surveyed = yield from survey(plan, take_over=False)
     remarks = [f"{joint}: {difference}" for joint, difference in surveyed.differences]
-    found = Found(problems=surveyed.problems, remarks=remarks)
     answered = {joint for joint, _ in surveyed.servos}
+    found = Found(len(answered), problems=surveyed.problems, remarks=remarks)
     for servo in plan.servos:
         differences = [RegisterDifference(register, None) for register in servo.registers]
         if servo.joint in answered:
