@@ -12,11 +12,14 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from dxlrun.control.controllers.controller import (
         CONTRACT_VERSION,
+        LIVE,
         CommandModel,
         Context,
         Controller,
+        Goal,
         Interfaces,
         JointLimits,
+        Outcome,
         ParametersModel,
     )
     from dxlrun.control.controllers.hookspecs import hookimpl
@@ -37,6 +40,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CONTRACT_VERSION",
+    "LIVE",
     "Angle",
     "AngularAcceleration",
     "AngularVelocity",
@@ -48,10 +52,12 @@ __all__ = [
     "Duration",
     "DxlrunError",
     "Floats",
+    "Goal",
     "InputError",
     "Interfaces",
     "JointLimits",
     "LogError",
+    "Outcome",
     "ParametersModel",
     "PlugInError",
     "PortError",
@@ -69,11 +75,14 @@ __all__ = [
 _ROOMS = {
     "dxlrun.control.controllers.controller": (
         "CONTRACT_VERSION",
+        "LIVE",
         "CommandModel",
         "Context",
         "Controller",
+        "Goal",
         "Interfaces",
         "JointLimits",
+        "Outcome",
         "ParametersModel",
     ),
     "dxlrun.control.controllers.hookspecs": ("hookimpl",),

@@ -68,6 +68,9 @@ def compile_controllers(
             every=every,
             rate=entry.rate,
             fallback=entry.fallback or "",
+            into=entry.into,
+            reference=interfaces.reference,
+            reads=interfaces.reads,
         )
         compiled[name] = CompiledController(plan, offer, parameters)
     _exclusive_claims(description, compiled, problems)

@@ -101,6 +101,12 @@ class ControllerPlan:
     """Updates per second that the file asks for, Hz; None: the loop's."""
     fallback: str = ""
     """Name of the controller that takes over when this one breaks its contract; empty: none."""
+    into: tuple[str, ...] = ()
+    """Controllers whose references it commands; empty: it commands the servos."""
+    reference: tuple[str, ...] = ()
+    """Interfaces that it exports on each of its joints, for controllers that are `into` it."""
+    reads: tuple[str, ...] = ()
+    """Interfaces that it reads without a claim: `JOINT/position`, `CONTROLLER/JOINT/position`."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -291,11 +291,11 @@ class Policies(Form):
     )
 
 
-_COMMON_KEYS = ("type", "active", "rate", "fallback")
+_COMMON_KEYS = ("type", "active", "rate", "fallback", "into")
 
 
 class ControllerEntry(Form):
-    """One controller; the keys beside type, active, rate and fallback are its own parameters."""
+    """One controller; the keys beside type, active, rate, fallback and into are its own parameters."""
 
     type: str = Field(
         min_length=1, description="Type that a plug-in offers.", examples=["joint_group_position_controller"]
@@ -310,6 +310,11 @@ class ControllerEntry(Form):
         description="Controller that takes over when this one breaks its contract.",
         examples=["stand_still"],
     )
+    into: tuple[str, ...] = Field(
+        default=(),
+        description="Controllers whose references this one commands, instead of the servos.",
+        examples=["arm_pid"],
+    )
     parameters: dict[str, object] = Field(
         default={}, description="All other keys of the entry; the controller's type says which there are."
     )
@@ -320,6 +325,8 @@ class ControllerEntry(Form):
         if not isinstance(entry, dict):
             return entry
         own = {key: value for key, value in entry.items() if key in _COMMON_KEYS}
+        if isinstance(into := own.get("into"), str):
+            own["into"] = (into,)
         return {**own, "parameters": {key: value for key, value in entry.items() if key not in own}}
 
 

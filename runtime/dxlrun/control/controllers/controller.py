@@ -5,7 +5,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Generic, TypeVar
+from enum import StrEnum, unique
+from typing import ClassVar, Final, Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,17 +35,33 @@ P = TypeVar("P", bound=ParametersModel)
 
 
 @dataclass(frozen=True, slots=True)
+class Live:
+    """Mark of a parameter that may be changed in a run: `p: Annotated[float, LIVE]`; a number or a bool."""
+
+
+LIVE: Final = Live()
+
+
+@dataclass(frozen=True, slots=True)
 class Interfaces:
-    """What a controller asks of the robot, decided by its parameters.
+    """What a controller asks of the robot and offers to other controllers, decided by its parameters.
 
     `command` interfaces are claimed on every joint of `joints`: no other active controller may have one of
     the same joint. They determine the mode in which the joints are driven (`interfaces.mode_of`): `position`
     alone or with `velocity` (the speed toward it); `velocity`, `effort` or `pwm` alone; or `position` with
-    `effort` (the most that the servo may exert). States are read without a claim.
+    `effort` (the most that the servo may exert). A controller that the robot file puts `into` others claims
+    their reference interfaces of these joints instead.
+
+    `reference` interfaces are exported on every joint of `joints`, as `NAME/JOINT/position`: controllers that
+    are `into` this one command them, each of them at most one. `reads` are interfaces that it reads without a
+    claim, in the order of `Context.reads`: `JOINT/position`, `NAME/JOINT/position` (a reference of another
+    controller). The states of its own joints need no such name.
     """
 
     joints: tuple[str, ...]
     command: tuple[CommandName, ...] = ()
+    reference: tuple[CommandName, ...] = ()
+    reads: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +72,53 @@ class JointLimits:
     upper: Floats
     velocity: Floats
     effort: Floats
+
+
+@unique
+class Outcome(StrEnum):
+    """How a goal ended."""
+
+    REACHED = "reached"
+    MISSED = "missed"
+    """Not reached within its tolerance or time."""
+    ABORTED = "aborted"
+    """The controller gave it up, was deactivated, or broke its contract."""
+    CANCELLED = "cancelled"
+    PREEMPTED = "preempted"
+    """Another goal took its place."""
+
+
+class Goal(Protocol):
+    """A goal that a controller works on, one at a time, until it calls `end`."""
+
+    @property
+    def number(self) -> int:
+        """Its identity in this run, from 1."""
+        ...
+
+    @property
+    def kind(self) -> str:
+        """Name of the command that it came with."""
+        ...
+
+    def feedback(self, progress: float, error: float = float("nan")) -> None:
+        """Report progress, 0..1, and the largest distance from the desired state; the runtime thins it."""
+        ...
+
+    def end(self, outcome: Outcome, text: str = "", joint: str = "", error: float = float("nan")) -> None:
+        """Report the result, once; `joint` is the worst one, `error` its distance from the goal, SI units."""
+        ...
+
+
+class Publish(Protocol):
+    """Publishes a message on one of the controller's own topics."""
+
+    def __call__(self, topic: str = "", message: object = None) -> None:
+        """Publish `message`, of the type declared in `Topics`, as `/CONTROLLER/topic`, at this cycle.
+
+        Without a topic: mark this cycle for the topics of `publishes`.
+        """
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,22 +146,35 @@ class Context:
     """
     say: Callable[[str], None]
     """Leave a sentence in the log (event CONTROLLER_SAYS); for rare things."""
-    publish: Callable[[], None]
-    """Mark this cycle for the topics of `publishes`."""
+    publish: Publish
+    references: Commands
+    """What the controllers that are `into` this one command, in the order of its joints; NaN = not commanded.
+
+    Only the exported interfaces are ever commanded. As fresh as this cycle: those above are updated before.
+    """
+    reads: Floats
+    """Values of `Interfaces.reads`, shape (reads,), gathered before each update and before on_activate; NaN
+    where there is none yet."""
+    into: tuple[str, ...] = ()
+    """Controllers whose references this one commands; empty: it commands the servos."""
 
 
 class Controller(ABC, Generic[P]):
     """A law of motion: states in, commands out, once a period.
 
     Life: `on_configure` (before real time: may allocate and do I/O) -> `on_activate` -> `update` ... ->
-    `on_deactivate`. `update`, `on_activate`, `on_command` and `on_deactivate` are in the loop: bounded, no
-    I/O, no lock, no growing allocation. What they raise ends the controller, not the process.
+    `on_deactivate`. All but `on_configure` are in the loop: bounded, no I/O, no lock,
+    no growing allocation. What they raise ends the controller, not the process.
     """
 
     Parameters: ClassVar[type[ParametersModel]] = ParametersModel
     """The model of the controller's keys in the robot file (all but type, active, rate and fallback)."""
     Commands: ClassVar[Mapping[str, type[CommandModel]]] = {}
     """The typed commands it takes, by name."""
+    Goals: ClassVar[frozenset[str]] = frozenset()
+    """Names of those commands that are goals: they come to `on_goal`, can be cancelled, and have a result."""
+    Topics: ClassVar[Mapping[str, type]] = {}
+    """Its own topics, by name, with the type of their messages: a dataclass, see dxlrun.messages."""
     publishes: ClassVar[tuple[str, ...]] = ()
     """Topics of the log that are written in the cycles it marks: `/joint_states`."""
 
@@ -129,6 +206,16 @@ class Controller(ABC, Generic[P]):
 
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
         """Take a prepared command at the start of a cycle; `data` stays as it is until the run ends."""
+
+    def on_goal(self, goal: Goal, data: NDArray[np.float64], time_ns: int) -> None:
+        """Take a prepared command that is a goal (`goal.kind`); the one before has ended as preempted."""
+
+    def on_cancel(self, goal: Goal, time_ns: int) -> None:
+        """Bring the joints to rest; call `goal.end` when they are, in this call or in a later update."""
+        goal.end(Outcome.CANCELLED)
+
+    def on_parameters(self, time_ns: int) -> None:
+        """Take changed live parameters: `self.parameters` has them already, all of one request together."""
 
     @abstractmethod
     def update(self, time_ns: int, period_ns: int) -> None:

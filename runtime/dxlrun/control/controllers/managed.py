@@ -108,6 +108,9 @@ class Managed:
             # neither knows this object: a circle would stay when the controller is unloaded
             say=partial(events.emit, EventCode.CONTROLLER_SAYS, Severity.INFO, self.plan.name),
             publish=partial(_publish, self._record, self.bit),
+            references=Commands.empty(len(joints)),
+            reads=np.full(len(self.plan.reads), np.nan),
+            into=self.plan.into,
         )
 
     # Life
@@ -321,7 +324,7 @@ class _Gathering:
         return shown
 
 
-def _publish(record: CycleRecord, bit: int) -> None:
+def _publish(record: CycleRecord, bit: int, topic: str = "", message: object = None) -> None:
     record.published |= bit
 
 
