@@ -75,6 +75,21 @@ class Unload(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     controller: str
 
 
+class Cancel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Data of `cancel`: a goal by its number, or the one that a controller has."""
+
+    goal: int = 0
+    controller: str = ""
+
+
+class Parameters(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Data of `parameters`: live parameters of a controller, checked against its model before."""
+
+    controller: str
+    values: dict[str, bool | int | float]
+    """By dotted name, in SI units."""
+
+
 class Register(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Data of `register`; whether the item may be written was checked before."""
 
@@ -84,7 +99,18 @@ class Register(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The integer on the wire, signed where the item is."""
 
 
-KINDS = ("switch", "rate", "pause", "resume", "load", "unload", "register", "stop")
+KINDS = (
+    "switch",
+    "cancel",
+    "parameters",
+    "rate",
+    "pause",
+    "resume",
+    "load",
+    "unload",
+    "register",
+    "stop",
+)
 """Commands for the loop itself; `load` carries a ControllerPlan, `pause`, `resume` and `stop` nothing."""
 
 
@@ -166,7 +192,10 @@ class Steering:
         data = np.frombuffer(command.data, dtype="<f8")
         until_ns = self.record.woken_ns + command.lease_ns if command.lease_ns else 0
         name, kind, origin = command.controller, command.kind, command.origin
-        return self.manager.hand(name, kind, data, origin, time_ns, until_ns) or Done(self.record.cycle)
+        found = self.manager.hand(name, kind, data, origin, time_ns, until_ns)
+        if isinstance(found, Refusal):
+            return found
+        return Done(self.record.cycle, goals=(found,) if found else ())
 
     def _for_loop(self, command: Command, time_ns: int) -> Answer | None:
         """Execute a command for the loop itself; None: it is answered later."""
@@ -182,6 +211,12 @@ class Steering:
             case "switch":
                 switch = msgspec.json.decode(data, type=Switch)
                 answer = manager.switch(switch.activate, switch.deactivate, time_ns, command.number)
+            case "cancel":
+                cancel = msgspec.json.decode(data, type=Cancel)
+                answer = manager.cancel(cancel.goal, cancel.controller, time_ns)
+            case "parameters":
+                changed = msgspec.json.decode(data, type=Parameters)
+                answer = manager.change_parameters(changed.controller, changed.values, time_ns)
             case "rate":
                 answer = loop.change_rate(msgspec.json.decode(data, type=Rate).rate)
             case "pause":

@@ -39,6 +39,7 @@ _LOOK_S = 0.002
 _HELD = {
     EventCode.STALE_COMMAND: True,
     EventCode.COMMAND: False,
+    EventCode.GOAL_ACCEPTED: False,
     EventCode.CONTROLLER_ACTIVATED: False,
     EventCode.CONTROLLER_DEACTIVATED: False,
 }

@@ -14,7 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.control.controllers.activity import Activity
-from dxlrun.control.controllers.controller import Context, Controller, JointLimits
+from dxlrun.control.controllers.controller import Context, Controller, JointLimits, Outcome
+from dxlrun.control.controllers.goals import RunningGoal
+from dxlrun.control.controllers.live_parameters import LiveValues, with_values
 from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan
 from dxlrun.errors import ControllerFault
@@ -70,6 +72,7 @@ class Managed:
         """When its stream of commands runs out, ns of the clock; 0: there is none."""
         self.waiting = False
         """True while one of the joints that it claims is lost."""
+        self._goal: RunningGoal | None = None
         rows = {joint.name: row for row, joint in enumerate(joints)}
         self.rows: NDArray[np.intp] = np.array([rows[joint] for joint in plan.joints], dtype=np.intp)
         """Rows of its joints in the robot's arrays."""
@@ -153,11 +156,16 @@ class Managed:
 
     def deactivate(self, time_ns: int) -> None:
         """Let the controller leave its joints. Raises ControllerFault; they are released all the same."""
-        self.release()
+        self.release(f"{self.plan.name} was deactivated")
         self._call(ControllerMethod.ON_DEACTIVATE, "", self._controller.on_deactivate, time_ns)
 
-    def release(self) -> None:
-        """Take its commands out of the robot's: the gate holds what it last let through."""
+    def release(self, why: str) -> None:
+        """Take its commands out of the robot's: the gate holds what it last let through.
+
+        Its goal is aborted for this reason.
+        """
+        if (goal := self.goal) is not None:
+            goal.end(Outcome.ABORTED, why)
         self.active = False
         self._record.active &= ~self.bit
         self.until_ns = 0
@@ -178,6 +186,38 @@ class Managed:
         self._call(
             ControllerMethod.ON_COMMAND, f" ({kind})", self._controller.on_command, kind, data, time_ns
         )
+
+    @property
+    def goal(self) -> RunningGoal | None:
+        """The goal that it works on."""
+        if self._goal is not None and self._goal.outcome is not None:
+            self._goal = None
+        return self._goal
+
+    def takes_goal(self, kind: str) -> bool:
+        """Return whether a command of this name is a goal."""
+        return kind in self._controller.Goals
+
+    def begin_goal(self, goal: RunningGoal, data: NDArray[np.float64], time_ns: int) -> None:
+        """Hand over a prepared command that is a goal; the one before has ended. Raises ControllerFault."""
+        self._held = False
+        self.until_ns = 0
+        self._goal = goal
+        self._gathering.gather()
+        on_goal = self._controller.on_goal
+        self._call(ControllerMethod.ON_GOAL, f" ({goal.kind})", on_goal, goal, data, time_ns)
+
+    def cancel(self, goal: RunningGoal, time_ns: int) -> None:
+        """Let the controller bring its goal to an end. Raises ControllerFault."""
+        goal.cancelling = True
+        self._gathering.gather()
+        self._call(ControllerMethod.ON_CANCEL, "", self._controller.on_cancel, goal, time_ns)
+
+    def change_parameters(self, values: LiveValues, time_ns: int) -> None:
+        """Replace live parameters, all of them together. Raises ControllerFault, and ValueError for a name
+        that is none of a live one: then nothing is changed."""
+        self._controller.parameters = with_values(self._controller.parameters, values)
+        self._call(ControllerMethod.ON_PARAMETERS, "", self._controller.on_parameters, time_ns)
 
     def hold(self) -> None:
         """Take its commands out of the robot's, and update it no more, until the next command."""

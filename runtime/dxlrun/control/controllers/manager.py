@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 from dxlrun.clock import Clock
 from dxlrun.control.controllers.activity import Activity
 from dxlrun.control.controllers.claims import conflicts
+from dxlrun.control.controllers.controller import Outcome
+from dxlrun.control.controllers.goals import Goals, RunningGoal
+from dxlrun.control.controllers.live_parameters import LiveValues
 from dxlrun.control.controllers.managed import Managed, rate_divider, rate_fits
 from dxlrun.control.controllers.mode_switch import ModeSwitch, SetModes
 from dxlrun.control.controllers.plugins import PlugIns
@@ -61,6 +64,7 @@ class Manager:
         self._commands: tuple[tuple[ScheduledCommand, NDArray[np.float64]], ...] = ()
         self._next = 0
         self._lost: Collection[int] = ()
+        self._goals = Goals(record, events)
         self._modes = ModeSwitch(plan.joints, record.states.mode, set_modes)
         self.ended_switches: list[tuple[int, Refusal | None]] = []
         """Switches that waited and have ended: the command's number, and why not; for the loop to answer."""
@@ -123,8 +127,8 @@ class Manager:
         origin: str,
         time_ns: int,
         until_ns: int = 0,
-    ) -> Refusal | None:
-        """Hand a prepared command to a controller.
+    ) -> int | Refusal:
+        """Hand a prepared command to a controller; return the number of the goal that it is, else 0.
 
         `until_ns` is when it runs out, ns of the clock, unless another one follows (see `stale`); 0: never.
         Of a stream, only the first one has an event.
@@ -136,6 +140,10 @@ class Manager:
             entering = managed in self._modes.entering
             code = Code.NOT_ACTIVE_YET if entering else Code.NOT_ACTIVE
             return Refusal(code, {"controller": controller})
+        if managed.takes_goal(kind):
+            if until_ns:
+                return Refusal(Code.GOAL_STREAMED, {"controller": controller, "kind": kind})
+            return self._begin_goal(managed, kind, data, origin, time_ns)
         streaming = until_ns and managed.until_ns
         try:
             managed.command(kind, data, time_ns, until_ns)
@@ -144,6 +152,59 @@ class Manager:
             return _refused_by(managed, str(fault))
         if not streaming:
             self._log(EventCode.COMMAND, managed, f"{kind} from {origin}")
+        return 0
+
+    def _begin_goal(
+        self, managed: Managed, kind: str, data: NDArray[np.float64], origin: str, time_ns: int
+    ) -> int | Refusal:
+        if (before := managed.goal) is not None:
+            before.end(Outcome.PREEMPTED, f"goal {self._goals.last + 1} took its place")
+        goal = self._goals.accept(managed.plan.name, kind, origin)
+        try:
+            managed.begin_goal(goal, data, time_ns)
+        except ControllerFault as fault:
+            self._end(managed, fault, time_ns)
+            return _refused_by(managed, str(fault))
+        return goal.number
+
+    def cancel(self, number: int, controller: str, time_ns: int) -> Refusal | None:
+        """Let a controller end a goal, by the goal's number, or the one that a controller has."""
+        goal = self._goal_of(controller) if controller else self._goals.found(number)
+        if isinstance(goal, Refusal):
+            return goal
+        if goal.cancelling:
+            return Refusal(Code.CANCELLED_ALREADY, {"goal": goal.number, "controller": goal.controller})
+        managed = self._named[goal.controller]
+        try:
+            managed.cancel(goal, time_ns)
+        except ControllerFault as fault:
+            self._end(managed, fault, time_ns)
+            return _refused_by(managed, str(fault))
+        return None
+
+    def _goal_of(self, controller: str) -> RunningGoal | Refusal:
+        managed = self._named.get(controller)
+        if managed is None:
+            return Refusal(Code.UNKNOWN_CONTROLLER, {"controller": controller})
+        return managed.goal or Refusal(Code.NO_GOAL, {"controller": controller})
+
+    def change_parameters(self, controller: str, values: LiveValues, time_ns: int) -> Refusal | None:
+        """Replace live parameters of a controller, active or not, all of them together."""
+        managed = self._named.get(controller)
+        if managed is None:
+            return Refusal(Code.UNKNOWN_CONTROLLER, {"controller": controller})
+        try:
+            managed.change_parameters(values, time_ns)
+        except ValueError as error:
+            return Refusal(Code.INVALID, {"problem": f"{controller}: {error}"})
+        except ControllerFault as fault:
+            if managed.active:
+                self._end(managed, fault, time_ns)
+            else:
+                self._take_out(managed, fault)  # it has no joints that a fallback would take over
+            return _refused_by(managed, str(fault))
+        shown = ", ".join(f"{name} = {value:g}" for name, value in values.items())
+        self._log(EventCode.PARAMETERS, managed, shown)
         return None
 
     def stale(self, now_ns: int) -> list[str]:
@@ -349,12 +410,13 @@ class Manager:
             command, data = self._commands[self._next]
             self._log_taken(self._next, command)
             self._next += 1
-            refusal = self.hand(command.controller, command.kind, data, command.origin, time_ns)
-            taken += refusal is None
-            if refusal is not None:
-                text = f"{command.kind} from {command.origin} refused: {refusal.text}"
-                outcome = CommandOutcome(command.kind, command.origin, refusal)
+            answer = self.hand(command.controller, command.kind, data, command.origin, time_ns)
+            if isinstance(answer, Refusal):
+                text = f"{command.kind} from {command.origin} refused: {answer.text}"
+                outcome = CommandOutcome(command.kind, command.origin, answer)
                 self._report_refusal(command.controller, text, outcome)
+            else:
+                taken += 1
         return taken
 
     def _report_refusal(self, controller: str, text: str, outcome: CommandOutcome) -> None:
@@ -375,7 +437,7 @@ class Manager:
         self._fall_back(managed, str(fault), time_ns)
 
     def _take_out(self, managed: Managed, fault: ControllerFault) -> None:
-        managed.release()
+        managed.release(str(fault))
         self._modes.changed()
         text = "\n".join([str(fault), *getattr(fault, "__notes__", ())])
         self._events.emit(EventCode.CONTROLLER_FAULT, Severity.ERROR, managed.plan.name, text)

@@ -25,6 +25,7 @@ from dxlrun.control.controllers.controller import (
     ParametersModel,
 )
 from dxlrun.control.controllers.hookspecs import GROUP, HookSpecs
+from dxlrun.control.controllers.live_parameters import live_mistake
 from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.description.modes import COMMAND_INTERFACES, mode_of
 from dxlrun.dynamixel.control_table import add_control_table
@@ -42,6 +43,9 @@ _METHODS = (
     "on_configure",
     "on_activate",
     "on_command",
+    "on_goal",
+    "on_cancel",
+    "on_parameters",
     "update",
     "on_deactivate",
 )
@@ -337,14 +341,35 @@ def interfaces_breach(interfaces: object) -> Breach | None:
 def _declaration_breach(controller: ControllerClass) -> Breach | None:
     if not _is_model(controller.Parameters, ParametersModel):
         return "whose Parameters is no model of parameters", "derive it from dxlrun.ParametersModel"
+    if mistaken := live_mistake(controller.Parameters):
+        return (
+            f"whose parameter {mistaken} is LIVE and is neither a number nor a bool",
+            "mark only parameters of type float, int and bool",
+        )
     commands: object = controller.Commands
     if not isinstance(commands, Mapping) or not all(
         isinstance(kind, str) and _is_model(model, CommandModel) for kind, model in commands.items()
     ):
         return "whose Commands is no mapping of names to models", "write {name: class of dxlrun.CommandModel}"
+    if breach := _goals_breach(controller, commands):
+        return breach
     publishes: object = controller.publishes
     if not isinstance(publishes, tuple) or not all(isinstance(topic, str) for topic in publishes):
         return "whose publishes is no tuple of topics", 'write publishes = ("/joint_states",)'
+    return None
+
+
+def _goals_breach(controller: ControllerClass, commands: Mapping[str, object]) -> Breach | None:
+    goals: object = controller.Goals
+    if not isinstance(goals, frozenset | set) or not all(isinstance(kind, str) for kind in goals):
+        return "whose Goals is no set of names", "write frozenset({name})"
+    if unknown := sorted(goals - set(commands)):
+        return (
+            f"whose goal {', '.join(unknown)} is none of its Commands",
+            f"name some of {', '.join(commands) or 'them: it has no Commands'}",
+        )
+    if goals and controller.on_goal is Controller.on_goal:
+        return "which has Goals and no method on_goal", "write it"
     return None
 
 

@@ -55,6 +55,14 @@ class Code(StrEnum):
     TOO_MANY_CONTROLLERS = "too_many_controllers", "there are {most} controllers, which is the most"
     NOT_IN_PAUSE = "not_in_pause", "pause the loop first: it stands still meanwhile"
     UNLOADED = "unloaded", "{controller} was unloaded meanwhile"
+    # goals and parameters
+    UNKNOWN_GOAL = "unknown_goal", "there is no goal {goal}; the newest is {last}"
+    GOAL_ENDED = "goal_ended", "goal {goal} has ended already: {outcome}"
+    CANCELLED_ALREADY = "cancelled_already", "goal {goal} is being cancelled already"
+    NO_GOAL = "no_goal", "{controller} has no goal"
+    GOAL_STREAMED = "goal_streamed", "{kind} of {controller} is a goal; send it once, not in a stream"
+    NOT_LIVE = "not_live", "{parameter} of {controller} cannot be changed in a run; {known}"
+    UNKNOWN_PARAMETER = "unknown_parameter", "{controller} has no parameter {parameter}"
     # the loop
     PAUSED_ALREADY = "paused_already", "the loop is paused already"
     NOT_PAUSED = "not_paused", "the loop is not paused"
@@ -103,6 +111,8 @@ class Done(msgspec.Struct, frozen=True, tag="done"):
     """The loop's cycle that did it."""
     place: int | None = None
     """Of a controller that was loaded: its bit in the masks of the cycles."""
+    goals: tuple[int, ...] = ()
+    """Numbers of the goals that the command began; none where it is no goal."""
 
 
 class Waiting(msgspec.Struct, frozen=True, tag="waiting"):

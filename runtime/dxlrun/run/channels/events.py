@@ -82,6 +82,12 @@ class EventCode(IntEnum):
     """The Bus Watchdog of servos was armed, disarmed, or has stopped them."""
     UNREQUESTED = 46
     """Packets came that answer no request of this run: another host writes on the line."""
+    GOAL_ACCEPTED = 47
+    """A controller has a new goal; the data are a GoalReport."""
+    GOAL_ENDED = 48
+    """A goal was reached, missed, aborted, cancelled or preempted; the data are a GoalReport."""
+    PARAMETERS = 49
+    """Live parameters of a controller were changed, all of one request in one cycle."""
     GUARDIAN = 50
     RECORDER = 60
     RECORDER_GAP = 61
@@ -100,6 +106,26 @@ class Granted(msgspec.Struct, frozen=True):
 
     request: str
     granted: bool
+
+
+class GoalReport(msgspec.Struct, frozen=True):
+    """Data of GOAL_ACCEPTED and GOAL_ENDED."""
+
+    goal: int
+    """Its number in the run, from 1."""
+    controller: str
+    kind: str
+    """The command that it came with."""
+    origin: str
+    """The client, or the place in a motion file."""
+    status: str
+    """`accepted`, or how it ended: `reached`, `missed`, `aborted`, `cancelled`, `preempted`."""
+    text: str = ""
+    """What its controller reported at the end, for people."""
+    joint: str = ""
+    """The worst one at the end; empty: none was named."""
+    error: float | None = None
+    """How far that joint was from the goal, SI units; None: not known."""
 
 
 class EventSink(Protocol):

@@ -44,6 +44,9 @@ class ControllerMethod(IntEnum):
     UPDATE = 4
     ON_COMMAND = 5
     ON_DEACTIVATE = 6
+    ON_GOAL = 7
+    ON_CANCEL = 8
+    ON_PARAMETERS = 9
 
     def __str__(self) -> str:
         return "__init__" if self is ControllerMethod.INIT else self.name.lower()

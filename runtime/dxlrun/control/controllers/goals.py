@@ -1,0 +1,144 @@
+"""Goals: what controllers work on, one at a time each; numbered from 1, reported when accepted and ended."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+
+from dxlrun.control.controllers.controller import Outcome
+from dxlrun.run.channels.answers import Code, Refusal
+from dxlrun.run.channels.cycle import CycleRecord
+from dxlrun.run.channels.events import EventCode, EventSink, GoalReport, Severity
+
+FEEDBACK_NS = 100_000_000
+"""Between two reports of one goal's progress, ns of the run's clock: 10 Hz."""
+KEPT = 256
+"""Of so many goals that ended it is known how."""
+_LONGEST_TEXT = 500
+_WARNED = (Outcome.MISSED, Outcome.ABORTED)
+
+
+class RunningGoal:
+    """One goal, as its controller sees it (see `controller.Goal`); after its end nothing changes it."""
+
+    __slots__ = (
+        "_goals",
+        "_reported_ns",
+        "cancelling",
+        "controller",
+        "error",
+        "kind",
+        "number",
+        "origin",
+        "outcome",
+        "progress",
+    )
+
+    def __init__(self, goals: Goals, number: int, controller: str, kind: str, origin: str) -> None:
+        self.number = number
+        self.controller = controller
+        self.kind = kind
+        self.origin = origin
+        self.cancelling = False
+        """True when its controller was told to bring it to an end."""
+        self.outcome: Outcome | None = None
+        """None while it runs."""
+        self.progress = 0.0
+        self.error = math.nan
+        self._goals = goals
+        self._reported_ns = -FEEDBACK_NS
+
+    def feedback(self, progress: float, error: float = math.nan) -> None:
+        """Report progress, 0..1, and the largest distance from the desired state, SI units."""
+        if self.outcome is not None:
+            return
+        self.progress, self.error = float(progress), float(error)
+        now_ns = self._goals.now_ns
+        if now_ns - self._reported_ns >= FEEDBACK_NS:
+            self._reported_ns = now_ns
+            self._goals.report_feedback(self)
+
+    def end(self, outcome: Outcome, text: str = "", joint: str = "", error: float = math.nan) -> None:
+        """Report the result; that of a goal that has ended already is ignored."""
+        if self.outcome is None:
+            self.outcome = Outcome(outcome)
+            self._goals.report_end(self, text, joint, float(error))
+
+
+class Goals:
+    """All goals of a run. Numbers follow from the commands alone, so a replay gives the same ones."""
+
+    __slots__ = ("_ended", "_events", "_record", "last", "running")
+
+    def __init__(self, record: CycleRecord, events: EventSink) -> None:
+        self.last = 0
+        """Number of the newest one."""
+        self.running: dict[int, RunningGoal] = {}
+        """By number; at most one of each controller."""
+        self._record = record
+        self._events = events
+        self._ended: list[tuple[int, str, Outcome] | None] = [None] * KEPT
+
+    @property
+    def now_ns(self) -> int:
+        """When this cycle woke, ns of the run's clock."""
+        return self._record.woken_ns
+
+    def accept(self, controller: str, kind: str, origin: str) -> RunningGoal:
+        """Return a new goal, and report it; the one before of its controller has ended."""
+        self.last += 1
+        goal = self.running[self.last] = RunningGoal(self, self.last, controller, kind, origin)
+        text = f"goal {goal.number}: {kind} from {origin}"
+        self._emit(EventCode.GOAL_ACCEPTED, Severity.INFO, goal, "accepted", text)
+        return goal
+
+    def found(self, number: int) -> RunningGoal | Refusal:
+        """Return a goal that runs, or why there is none of this number."""
+        goal = self.running.get(number)
+        if goal is not None:
+            return goal
+        if not 0 < number <= self.last:
+            return Refusal(Code.UNKNOWN_GOAL, {"goal": number, "last": self.last})
+        ended = self._ended[number % KEPT]
+        if ended is None or ended[0] != number:
+            return Refusal(Code.GOAL_ENDED, {"goal": number, "outcome": "long ago"})
+        return Refusal(Code.GOAL_ENDED, {"goal": number, "controller": ended[1], "outcome": ended[2].value})
+
+    def report_feedback(self, goal: RunningGoal) -> None:
+        """Report the progress of a goal."""
+
+    def report_end(self, goal: RunningGoal, text: str, joint: str, error: float) -> None:
+        """Report the result of a goal, and forget it but for how it ended."""
+        outcome = goal.outcome or Outcome.ABORTED
+        del self.running[goal.number]
+        self._ended[goal.number % KEPT] = (goal.number, goal.controller, outcome)
+        why = text
+        if not text and joint and math.isfinite(error):
+            why = f"{joint} is {error:.4g} off"
+        sentence = f"goal {goal.number} {outcome}{f': {why}' if why else ''}"
+        severity = Severity.WARNING if outcome in _WARNED else Severity.INFO
+        self._emit(EventCode.GOAL_ENDED, severity, goal, outcome.value, sentence, why, joint, error)
+
+    def _emit(  # noqa: PLR0917  a report's parts, as they come
+        self,
+        code: EventCode,
+        severity: Severity,
+        goal: RunningGoal,
+        status: str,
+        sentence: str,
+        text: str = "",
+        joint: str = "",
+        error: float = math.nan,
+    ) -> None:
+        report = GoalReport(
+            goal=goal.number,
+            controller=goal.controller,
+            kind=goal.kind,
+            origin=goal.origin,
+            status=status,
+            text=text[:_LONGEST_TEXT],
+            joint=joint,
+            error=error if math.isfinite(error) else None,
+        )
+        self._events.emit(code, severity, goal.controller, sentence, msgspec.json.encode(report))

@@ -1,0 +1,428 @@
+"""Goals: numbers, results, preemption, cancel, and what ends a goal that its controller does not end."""
+
+import gc
+import sys
+from typing import Annotated, ClassVar
+
+import msgspec
+import numpy as np
+import pytest
+from pydantic import Field
+
+from dxlrun.control.controllers.controller import (
+    LIVE,
+    CommandModel,
+    Controller,
+    Interfaces,
+    Outcome,
+    ParametersModel,
+)
+from dxlrun.control.controllers.goals import KEPT, Goals
+from dxlrun.control.controllers.plugins import controller_breach
+from dxlrun.run.channels.answers import Code, Done
+from dxlrun.run.channels.events import EventCode, GoalReport
+
+PERIOD_NS = 20_000_000
+
+
+class Move(CommandModel):
+    seconds: float
+
+
+class Gains(ParametersModel):
+    p: Annotated[float, LIVE, Field(ge=0, le=10)] = 1.0
+    d: float = 0.0
+
+
+class Speeds(ParametersModel):
+    speed: Annotated[float, LIVE] = 1.0
+    careful: Annotated[bool, LIVE] = False
+    size: int = 3
+    gains: Gains = Gains()
+
+
+class Mover(Controller[Speeds]):
+    """Reaches a goal after as many updates as it says; comes to rest two updates after a cancel."""
+
+    Parameters = Speeds
+    Commands: ClassVar = {"move": Move, "nudge": Move}
+    Goals: ClassVar = frozenset({"move"})
+    steps: ClassVar[list] = []
+    fail_in: ClassVar[set[str]] = set()
+
+    @classmethod
+    def interfaces(cls, parameters, joints):
+        return Interfaces(joints, ("position", "velocity"))
+
+    def _step(self, name, *values):
+        self.steps.append((name, *values))
+        if name in self.fail_in:
+            raise RuntimeError("no way")
+
+    def on_activate(self, time_ns):
+        self.goal, self.left, self.resting = None, 0, 0
+
+    def on_goal(self, goal, data, time_ns):
+        self._step("goal", goal.number, goal.kind, data.tolist())
+        self.goal, self.left, self.resting = goal, int(data[0]), 0
+
+    def on_command(self, kind, data, time_ns):
+        self._step("command", kind)
+
+    def on_cancel(self, goal, time_ns):
+        self._step("cancel", goal.number)
+        self.resting = 2
+
+    def on_parameters(self, time_ns):
+        self._step("parameters", self.parameters)
+
+    def update(self, time_ns, period_ns):
+        self._step("update")
+        if self.goal is None:
+            return
+        self.left -= 1
+        self.goal.feedback(1 - self.left / 100, 0.5)
+        if self.resting:
+            self.resting -= 1
+            if not self.resting:
+                self.goal.end(Outcome.CANCELLED)
+                self.goal = None
+        elif self.left == 0:
+            self.goal.end(Outcome.REACHED, joint="j0", error=0.001)
+            self.goal = None
+
+
+class Steered:
+    """A robot with an arm that takes goals; `at` maps a cycle to what is requested just before it."""
+
+    def __init__(self, make_robot, **options):
+        self.robot = make_robot(joints=2)
+        self.mover = type("OneMover", (Mover,), {"steps": [], "fail_in": set()})
+        self.robot.add("arm", self.mover, joints=("j0",), **options)
+        self.at = {}
+        self.reports = []
+        self.emit = self.robot.events.emit
+        self.robot.events.emit = self._emit
+
+    def _emit(self, code, severity, source, text, data=b""):
+        self.emit(code, severity, source, text, data)
+        if code in (EventCode.GOAL_ACCEPTED, EventCode.GOAL_ENDED):
+            self.reports.append((self.robot.loop.record.cycle, msgspec.json.decode(data, type=GoalReport)))
+
+    def run(self, cycles):
+        robot = self.robot
+        robot.build()
+        robot.hardware.keep = False
+
+        def idle(deadline_ns):
+            number = len(robot.sink.cycles)
+            for act in self.at.get(number, ()):
+                act()
+            if number == cycles - 1:
+                robot.stop.request()
+
+        robot.hardware.idle = idle
+        return robot.loop.run()
+
+    def move(self, updates):
+        return lambda: self.robot.post("arm", "move", np.array([updates], dtype="<f8").tobytes())
+
+    def ask(self, kind, **data):
+        return lambda: self.robot.ask(kind, **data)
+
+    @property
+    def statuses(self):
+        return [(report.goal, report.status) for _, report in self.reports]
+
+    def steps(self, name):
+        return [step[1:] for step in self.mover.steps if step[0] == name]
+
+
+@pytest.fixture
+def steered(make_robot):
+    return Steered(make_robot)
+
+
+def test_a_goal_has_a_number_and_a_result(steered):
+    steered.at = {2: [steered.move(3)], 7: [steered.move(1)]}
+    steered.run(10)
+    assert steered.statuses == [(1, "accepted"), (1, "reached"), (2, "accepted"), (2, "reached")]
+    assert [cycle for cycle, _ in steered.reports] == [2, 4, 7, 7]
+    assert steered.reports[1][1] == GoalReport(
+        1, "arm", "move", "anna", "reached", "j0 is 0.001 off", "j0", 0.001
+    )
+    assert steered.robot.answer(1) == Done(2, goals=(1,))
+    assert steered.steps("goal") == [(1, "move", [3.0]), (2, "move", [1.0])]
+    assert not steered.robot.events.of(EventCode.COMMAND)
+
+
+def test_a_command_that_is_no_goal_goes_on_command_and_has_no_number(steered):
+    steered.at = {2: [lambda: steered.robot.post("arm", "nudge")]}
+    steered.run(4)
+    assert steered.robot.answer(1) == Done(2)
+    assert (steered.steps("command"), steered.statuses) == ([("nudge",)], [])
+
+
+def test_planned_commands_are_goals(steered):
+    steered.robot.send(2 * PERIOD_NS, "arm", "move", 2.0)
+    steered.run(6)
+    assert [(cycle, one.status, one.origin) for cycle, one in steered.reports] == [
+        (2, "accepted", "motion.yaml:7:5"),
+        (3, "reached", "motion.yaml:7:5"),
+    ]
+
+
+def test_each_goal_takes_the_place_of_the_one_before(steered):
+    steered.at = {cycle: [steered.move(50)] for cycle in (1, 2, 3)}
+    steered.at[3] *= 2
+    steered.run(5)
+    assert steered.statuses == [
+        (1, "accepted"),
+        (1, "preempted"),
+        (2, "accepted"),
+        (2, "preempted"),
+        (3, "accepted"),
+        (3, "preempted"),
+        (4, "accepted"),
+        (4, "aborted"),
+    ]
+    assert steered.reports[1][1].text == "goal 2 took its place"
+
+
+def test_a_cancelled_goal_ends_when_its_controller_is_at_rest(steered):
+    steered.at = {1: [steered.move(50)], 3: [steered.ask("cancel", goal=1)]}
+    steered.run(8)
+    assert steered.statuses == [(1, "accepted"), (1, "cancelled")]
+    assert steered.reports[-1][0] == 4
+    assert steered.robot.answer(2) == Done(3)
+
+
+def test_a_goal_is_cancelled_by_the_name_of_its_controller(steered):
+    steered.at = {1: [steered.move(50)], 3: [steered.ask("cancel", controller="arm")]}
+    steered.run(8)
+    assert steered.statuses[-1] == (1, "cancelled")
+
+
+def refused(steered, number):
+    code, _ = steered.robot.answer(number)
+    return code, steered.robot.refusals[number]
+
+
+def test_a_cancel_that_comes_twice_is_refused_with_one_sentence(steered):
+    cancel = steered.ask("cancel", goal=1)
+    steered.at = {1: [steered.move(50)], 3: [cancel, cancel], 6: [cancel]}
+    steered.run(8)
+    assert refused(steered, 3) == (Code.CANCELLED_ALREADY, "goal 1 is being cancelled already")
+    assert refused(steered, 4) == (Code.GOAL_ENDED, "goal 1 has ended already: cancelled")
+    assert steered.steps("cancel") == [(1,)]
+
+
+def test_a_goal_that_ends_in_the_cycle_of_its_cancel_has_one_result(steered):
+    steered.at = {
+        1: [steered.move(3)],
+        3: [steered.ask("cancel", goal=1)],
+        4: [steered.ask("cancel", goal=1)],
+    }
+
+    def on_cancel(self, goal, time_ns):
+        """Go on to the goal, which is reached in this cycle."""
+
+    steered.mover.on_cancel = on_cancel
+    steered.run(8)
+    assert steered.statuses == [(1, "accepted"), (1, "reached")]
+    assert steered.reports[-1][0] == 3
+    assert refused(steered, 3) == (Code.GOAL_ENDED, "goal 1 has ended already: reached")
+
+
+@pytest.mark.parametrize(
+    ("request_", "code", "text"),
+    [
+        ({"goal": 7}, Code.UNKNOWN_GOAL, "there is no goal 7; the newest is 1"),
+        ({"goal": -1}, Code.UNKNOWN_GOAL, "there is no goal -1; the newest is 1"),
+        ({"controller": "leg"}, Code.UNKNOWN_CONTROLLER, "there is no controller leg"),
+        ({"controller": "arm"}, Code.NO_GOAL, "arm has no goal"),
+        ({"goal": 0}, Code.UNKNOWN_GOAL, "there is no goal 0; the newest is 1"),
+    ],
+)
+def test_a_cancel_of_what_there_is_not_is_refused(steered, request_, code, text):
+    steered.at = {1: [steered.move(1)], 3: [steered.ask("cancel", **request_)]}
+    steered.run(5)
+    assert refused(steered, 2) == (code, text)
+
+
+def test_deactivation_aborts_the_goal_and_a_result_that_comes_later_counts_no_more(steered):
+    def on_deactivate(self, time_ns):
+        self.goal.end(Outcome.REACHED)
+
+    steered.mover.on_deactivate = on_deactivate
+    steered.at = {1: [steered.move(50)], 3: [steered.ask("switch", deactivate=["arm"])]}
+    steered.run(5)
+    assert [(cycle, one.status, one.text) for cycle, one in steered.reports[1:]] == [
+        (3, "aborted", "arm was deactivated")
+    ]
+
+
+@pytest.mark.parametrize("step", ["goal", "cancel", "update"])
+def test_a_fault_aborts_the_goal_and_the_fallback_takes_over(make_robot, step):
+    steered = Steered(make_robot, fallback="careful")
+    steered.robot.script("careful", lambda *_: None, joints=("j0",), active=False)
+    steered.at = {1: [steered.move(50)], 3: [steered.ask("cancel", goal=1)]}
+    steered.mover.fail_in = {step} if step != "update" else set()
+    if step == "update":
+        steered.at[2] = [lambda: steered.mover.fail_in.add("update")]
+    steered.run(6)
+    assert steered.statuses == [(1, "accepted"), (1, "aborted")]
+    where = {"goal": "on_goal (move)", "cancel": "on_cancel", "update": "update"}[step]
+    assert f"raised in {where}: RuntimeError: no way" in steered.reports[-1][1].text
+    assert steered.robot.manager.active == ()
+    assert [cycle["active"] for cycle in steered.robot.sink.cycles][-1] == 0b10
+
+
+@pytest.mark.parametrize("outcome", ["arrived", None, 3])
+def test_an_outcome_that_is_none_is_the_controllers_fault(steered, outcome):
+    def update(self, time_ns, period_ns):
+        if self.goal:
+            self.goal.end(outcome)
+
+    steered.mover.update = update
+    steered.at = {1: [steered.move(5)]}
+    assert steered.run(5).reason == "fault"
+    assert steered.statuses == [(1, "accepted"), (1, "aborted")]
+
+
+def test_a_goal_is_not_streamed(steered):
+    data = np.array([5.0]).tobytes()
+    steered.at = {1: [lambda: steered.robot.post("arm", "move", data, PERIOD_NS)]}
+    steered.run(3)
+    assert refused(steered, 1) == (Code.GOAL_STREAMED, "move of arm is a goal; send it once, not in a stream")
+
+
+def test_feedback_is_reported_ten_times_a_second(steered, monkeypatch):
+    seen = []
+
+    def report_feedback(self, goal):
+        seen.append((steered.robot.loop.record.cycle, goal.progress, goal.error))
+
+    monkeypatch.setattr(Goals, "report_feedback", report_feedback)
+    steered.at = {1: [steered.move(50)]}
+    steered.run(52)
+    assert [cycle for cycle, *_ in seen] == list(range(1, 51, 5))
+    assert seen[2][1:] == (1 - 39 / 100, 0.5)
+
+
+def test_only_the_last_results_are_kept_and_memory_stays_flat(steered):
+    goals, robot = 3 * KEPT + 20, steered.robot  # numbers up to 256 are Python's own objects
+    marks = []
+    for cycle in range(1, goals + 1):
+        steered.at[cycle] = [steered.move(1)]
+    steered.emit = lambda *_: None
+
+    def mark():
+        steered.reports.clear()
+        robot.inbox.answers.clear()
+        steered.mover.steps.clear()
+        robot.sink.cycles[:] = [None] * len(robot.sink.cycles)
+        robot.taken.clear()
+        gc.collect()
+        marks.append(sys.getallocatedblocks())
+
+    steered.at[2 * KEPT].append(mark)
+    steered.at[3 * KEPT].append(mark)
+    steered.at[goals + 2] = [steered.ask("cancel", goal=1), steered.ask("cancel", goal=goals)]
+    steered.run(goals + 4)
+    assert refused(steered, goals + 1)[1] == "goal 1 has ended already: long ago"
+    assert refused(steered, goals + 2)[1] == f"goal {goals} has ended already: reached"
+    assert not robot.manager._goals.running
+    assert abs(marks[1] - marks[0]) < 60
+
+
+def test_live_parameters_change_together_at_one_cycle(steered):
+    values = {"speed": 0.5, "careful": True, "gains.p": 4.0}
+    steered.at = {3: [steered.ask("parameters", controller="arm", values=values)]}
+    steered.run(5)
+    changed = Speeds(speed=0.5, careful=True, gains=Gains(p=4.0))
+    assert steered.steps("parameters") == [(changed,)]
+    assert steered.robot.answer(1) == Done(3)
+    ((source, text),) = steered.robot.events.of(EventCode.PARAMETERS)
+    assert (source, text) == ("arm", "speed = 0.5, careful = 1, gains.p = 4")
+    assert steered.robot.taken[0].kind == "parameters"
+
+
+def test_changed_parameters_survive_a_switch_in_the_same_cycle_and_later_ones(steered):
+    steered.at = {
+        2: [
+            steered.ask("switch", deactivate=["arm"]),
+            steered.ask("parameters", controller="arm", values={"speed": 0.25}),
+        ],
+        4: [steered.ask("switch", activate=["arm"])],
+    }
+    steered.run(6)
+    assert set(steered.robot.refusals.values()) == {""}
+    assert steered.robot.manager._named["arm"]._controller.parameters.speed == 0.25
+
+
+@pytest.mark.parametrize(
+    ("values", "code", "text"),
+    [
+        ({"size": 4}, Code.INVALID, "arm: size is no live parameter"),
+        ({"speed": 2.0, "gains.q": 1.0}, Code.INVALID, "arm: gains.q is no live parameter"),
+        ({"gains": 1.0}, Code.INVALID, "arm: gains is no live parameter"),
+        ({"speed": "fast"}, Code.INVALID, "the data of parameters do not fit"),
+    ],
+)
+def test_parameters_that_are_not_live_are_refused_whole(steered, values, code, text):
+    steered.at = {2: [steered.ask("parameters", controller="arm", values=values)]}
+    steered.run(4)
+    found = refused(steered, 1)
+    assert found[0] is code
+    assert text in found[1]
+    assert steered.steps("parameters") == []
+    assert steered.robot.manager._named["arm"]._controller.parameters == Speeds()
+
+
+@pytest.mark.parametrize("active", [True, False])
+def test_a_controller_that_raises_in_on_parameters_breaks_its_contract(make_robot, active):
+    steered = Steered(make_robot, fallback="careful", active=active)
+    steered.robot.script("careful", lambda *_: None, joints=("j0",), active=False)
+    steered.mover.fail_in = {"parameters"}
+    steered.at = {2: [steered.ask("parameters", controller="arm", values={"speed": 2.0})]}
+    result = steered.run(5)
+    assert result.reason == "stopped"
+    assert refused(steered, 1) == (
+        Code.CONTROLLER_FAULT,
+        "controller arm raised in on_parameters: RuntimeError: no way",
+    )
+    assert [cycle["active"] for cycle in steered.robot.sink.cycles][-1] == (0b10 if active else 0)
+
+
+class TextLive(ParametersModel):
+    word: Annotated[str, LIVE] = "a"
+
+
+class Inner(ParametersModel):
+    most: Annotated[float | None, LIVE] = None
+
+
+class Outer(ParametersModel):
+    inner: Inner = Inner()
+
+
+@pytest.mark.parametrize(
+    ("changed", "what"),
+    [
+        ({"Parameters": TextLive}, "whose parameter word is LIVE and is neither a number nor a bool"),
+        ({"Parameters": Outer}, "whose parameter inner.most is LIVE"),
+        ({"Goals": frozenset({"jump"})}, "whose goal jump is none of its Commands"),
+        ({"Goals": ("move",)}, "whose Goals is no set of names"),
+        ({"Goals": frozenset({3})}, "whose Goals is no set of names"),
+        ({"on_goal": Controller.on_goal}, "which has Goals and no method on_goal"),
+        ({"on_goal": lambda self, goal: None}, "whose on_goal(goal) cannot be called as"),
+        ({"on_cancel": lambda self: None}, "whose on_cancel() cannot be called as"),
+        ({"on_parameters": lambda self: None}, "whose on_parameters() cannot be called as"),
+    ],
+)
+def test_a_wrong_declaration_is_refused_when_the_plug_in_is_loaded(changed, what):
+    assert controller_breach(Mover) is None
+    breach = controller_breach(type("Wrong", (Mover,), changed))
+    assert breach is not None
+    assert what in breach[0]
