@@ -9,16 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from dxlrun import CommandModel, Context, Controller, Floats, Interfaces, ParametersModel
+from dxlrun import CommandModel, Controller, Floats, Interfaces
+from dxlrun_controllers.joints import JointsParameters, check_size, hold
 
-JointNames = Annotated[tuple[str, ...], Field(min_length=1)]
 
-
-class GroupParameters(ParametersModel):
+class GroupParameters(JointsParameters):
     """Keys of a group controller in the robot file."""
-
-    joints: JointNames
-    """The joints, in the order in which commands name them."""
 
 
 class PositionsCommand(CommandModel):
@@ -65,20 +61,6 @@ class PwmCommand(CommandModel):
 
     pwm: tuple[Annotated[float, Field(ge=-1, le=1)], ...]
     """Fraction of the full voltage, -1..1, shape (joints,): 20 for 20 % is refused"""
-
-
-def check_size(what: str, found: int, joints: tuple[str, ...]) -> None:
-    """Raise ValueError when a command does not have one value a joint."""
-    if found != len(joints):
-        raise ValueError(f"{found} {what} for {len(joints)} joints ({', '.join(joints)})")
-
-
-def hold(context: Context) -> None:
-    """Command what was last sent, or the position that was read where nothing was sent: nothing moves."""
-    commands, goals = context.commands, context.goals
-    np.copyto(commands.position, goals.position)
-    np.copyto(commands.position, context.states.position, where=np.isnan(goals.position))
-    np.copyto(commands.velocity, goals.velocity)
 
 
 class _GroupController(Controller[GroupParameters]):

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, TypeAdapter
 
 from dxlrun import Angle, CommandModel, Context, Controller, Duration, Floats, Interfaces, ParametersModel
-from dxlrun_controllers.group import JointNames, check_size, hold
+from dxlrun_controllers.joints import JointNames, check_size, hold
 from dxlrun_controllers.spline import CUBIC, LINEAR, QUINTIC, SplineSample, Trajectory, flatten
 
 CLOSING_SPEED = 0.5

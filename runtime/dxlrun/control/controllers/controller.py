@@ -36,7 +36,8 @@ P = TypeVar("P", bound=ParametersModel)
 
 @dataclass(frozen=True, slots=True)
 class Live:
-    """Mark of a parameter that may be changed in a run: `p: Annotated[float, LIVE]`; a number or a bool."""
+    """Mark of a parameter that may be changed in a run: `p: Annotated[float, LIVE]`; a number or a bool, or a
+    mapping of names to them, each of which can be changed."""
 
 
 LIVE: Final = Live()

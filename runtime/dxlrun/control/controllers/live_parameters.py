@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import TypeAlias, TypeVar
+from types import UnionType
+from typing import Annotated, TypeAlias, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel
 
 from dxlrun.control.controllers.controller import Live
 
 LiveValues: TypeAlias = Mapping[str, bool | int | float]
-"""Values in SI units by dotted name, such as `gains.p`."""
+"""Values in SI units by dotted name, such as `gains.p`, or `gains.p.elbow` of a mapping."""
 _Model = TypeVar("_Model", bound=BaseModel)
 
 
 def live_names(model: BaseModel) -> Iterator[str]:
-    """Return the dotted names of the live parameters, those of nested models too."""
+    """Return the dotted names of the live parameters, those of nested models and of mappings too."""
     for name, field in type(model).model_fields.items():
         value = getattr(model, name)
         if any(isinstance(mark, Live) for mark in field.metadata):
-            yield name
+            yield from (f"{name}.{key}" for key in value) if isinstance(value, Mapping) else (name,)
         elif isinstance(value, BaseModel):
             yield from (f"{name}.{inner}" for inner in live_names(value))
 
@@ -28,8 +29,12 @@ def value_of(model: BaseModel, name: str) -> object:
     """Return a parameter's value by its dotted name."""
     value: object = model
     for key in name.split("."):
-        value = getattr(value, key)
+        value = _inner(value, key)
     return value
+
+
+def _inner(value: object, key: str) -> object:
+    return value[key] if isinstance(value, Mapping) else getattr(value, key)
 
 
 def with_values(model: _Model, values: LiveValues) -> _Model:
@@ -41,14 +46,20 @@ def with_values(model: _Model, values: LiveValues) -> _Model:
     if unknown := [name for name in values if name not in known]:
         raise ValueError(f"{unknown[0]} is no live parameter")
     for name, value in values.items():
-        model = _changed(model, name.split("."), value)
+        first, *rest = name.split(".")
+        model = model.model_copy(update={first: _changed(getattr(model, first), rest, value)})
     return model
 
 
-def _changed(model: _Model, path: list[str], value: object) -> _Model:
+def _changed(inner: object, path: list[str], value: object) -> object:
+    """Return what stands at a place with the value at a path below it."""
+    if not path:
+        return value
     first, *rest = path
-    inner = getattr(model, first)
-    return model.model_copy(update={first: _changed(inner, rest, value) if rest else value})
+    found = _changed(_inner(inner, first), rest, value)
+    if isinstance(inner, BaseModel):
+        return inner.model_copy(update={first: found})
+    return {**inner, first: found} if isinstance(inner, Mapping) else inner
 
 
 def live_mistake(model: type[BaseModel], seen: tuple[type, ...] = ()) -> str:
@@ -56,7 +67,7 @@ def live_mistake(model: type[BaseModel], seen: tuple[type, ...] = ()) -> str:
     for name, field in model.model_fields.items():
         kind = field.annotation
         if any(isinstance(mark, Live) for mark in field.metadata):
-            if kind not in (bool, int, float):
+            if not _of_numbers(kind):
                 return name
             continue
         if isinstance(kind, type) and issubclass(kind, BaseModel) and kind not in seen:
@@ -64,3 +75,15 @@ def live_mistake(model: type[BaseModel], seen: tuple[type, ...] = ()) -> str:
             if mistake:
                 return f"{name}.{mistake}"
     return ""
+
+
+def _of_numbers(kind: object) -> bool:
+    """Return whether a type is a number or a bool, or a mapping of names to them, or either."""
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        return _of_numbers(inner[0])
+    if origin in (Union, UnionType):
+        return all(map(_of_numbers, inner))
+    if origin is dict:
+        return inner[0] is str and _of_numbers(inner[1])
+    return kind in (bool, int, float)

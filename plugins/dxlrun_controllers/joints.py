@@ -1,0 +1,91 @@
+"""Joints: the names of a controller's joints, parameters with one value for all of them or one for each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Self, TypeVar
+
+import numpy as np
+from pydantic import BaseModel, Discriminator, Field, Tag, model_validator
+
+from dxlrun import Context, Floats, ParametersModel
+
+JointNames = Annotated[tuple[str, ...], Field(min_length=1)]
+NotNegative = Annotated[float, Field(ge=0)]
+Positive = Annotated[float, Field(gt=0)]
+
+T = TypeVar("T")
+
+
+def _kind(value: object) -> str:
+    return "<by joint>" if isinstance(value, Mapping) else "<all>"
+
+
+PerJoint = Annotated[
+    Annotated[T, Tag("<all>")] | Annotated[dict[str, T], Tag("<by joint>")], Discriminator(_kind)
+]
+"""One value for all joints, or a mapping of joints to values: `3.0` or `{shoulder: 3.0, elbow: 1.5}`."""
+
+
+class JointsParameters(ParametersModel):
+    """Base of parameters with `joints`; mappings by joint name only these joints."""
+
+    joints: JointNames
+    """The joints, in the order in which commands name them."""
+
+    @model_validator(mode="after")
+    def _known_joints(self) -> Self:
+        for name, values in _mappings(self, ""):
+            for joint in values:
+                if joint not in self.joints:
+                    raise ValueError(
+                        f"{name} names {joint}, which is not one of its joints ({', '.join(self.joints)})"
+                    )
+        return self
+
+
+def _mappings(model: BaseModel, prefix: str) -> Iterator[tuple[str, Mapping[str, object]]]:
+    for name, value in model:
+        if isinstance(value, BaseModel):
+            yield from _mappings(value, f"{prefix}{name}.")
+        elif isinstance(value, Mapping):
+            yield f"{prefix}{name}", value
+
+
+def fill(
+    row: Floats, value: float | Mapping[str, float] | None, joints: tuple[str, ...], default: float
+) -> None:
+    """Write a PerJoint parameter into `row`, shape (joints,); `default` where it is left out."""
+    if isinstance(value, Mapping):
+        for index, joint in enumerate(joints):
+            row[index] = value.get(joint, default)
+    else:
+        row.fill(default if value is None else value)
+
+
+def row_of(
+    value: float | Mapping[str, float] | None, joints: tuple[str, ...], default: float = np.inf
+) -> Floats:
+    """Return a PerJoint parameter as an array, shape (joints,); `default` where it is left out."""
+    row = np.empty(len(joints))
+    fill(row, value, joints, default)
+    return row
+
+
+def finite_or(values: Floats, default: float) -> Floats:
+    """Return a copy with `default` in place of NaN: a limit that there is not."""
+    return np.where(np.isnan(values), default, values)
+
+
+def check_size(what: str, found: int, joints: tuple[str, ...]) -> None:
+    """Raise ValueError when a command does not have one value a joint."""
+    if found != len(joints):
+        raise ValueError(f"{found} {what} for {len(joints)} joints ({', '.join(joints)})")
+
+
+def hold(context: Context) -> None:
+    """Command what was last sent, or the position that was read where nothing was sent: nothing moves."""
+    commands, goals = context.commands, context.goals
+    np.copyto(commands.position, goals.position)
+    np.copyto(commands.position, context.states.position, where=np.isnan(goals.position))
+    np.copyto(commands.velocity, goals.velocity)

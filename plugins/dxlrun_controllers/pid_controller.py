@@ -1,0 +1,253 @@
+"""pid_controller: leads joints to positions or velocities by a PID law, alone or below another controller."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, ClassVar, Final, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import model_validator
+
+from dxlrun import LIVE, CommandModel, Context, Controller, Duration, Floats, Interfaces, ParametersModel
+from dxlrun_controllers.group import PositionsCommand, VelocitiesCommand
+from dxlrun_controllers.joints import (
+    JointsParameters,
+    NotNegative,
+    PerJoint,
+    Positive,
+    check_size,
+    fill,
+    finite_or,
+    row_of,
+)
+from dxlrun_controllers.pid import Pid, Slope
+
+_NO_LIMIT: Final = np.inf
+
+
+class Gains(ParametersModel):
+    """Gains of a PID law, each one number for all joints or a mapping by joint; they can be changed in a run.
+
+    u is the unit of the command (Nm, A or fraction of maximum; rad/s; fraction of the full voltage; rad), e
+    that of the reference (rad or rad/s).
+    """
+
+    p: Annotated[PerJoint[NotNegative], LIVE] = 0.0
+    """u/e"""
+    i: Annotated[PerJoint[NotNegative], LIVE] = 0.0
+    """u/(e s)"""
+    d: Annotated[PerJoint[NotNegative], LIVE] = 0.0
+    """u s/e"""
+    feed_forward: Annotated[PerJoint[NotNegative], LIVE] = 0.0
+    """u s/rad, times the reference's velocity; left out, it is 1 where velocities are commanded."""
+
+
+class PidParameters(JointsParameters):
+    """Keys of a pid_controller in the robot file."""
+
+    reference: Literal["position", "velocity"] = "position"
+    """What the joints are led to."""
+    command_interface: Literal["effort", "velocity", "pwm", "position"] = "effort"
+    """What is commanded. `position` adds the law to the reference: it removes what a servo's own control
+    leaves."""
+    gains: Gains
+    output_limit: PerJoint[Positive] | None = None
+    """Largest magnitude of the command, beside the joint's own limits; with `position` of the correction."""
+    integral_limit: PerJoint[NotNegative] | None = None
+    """Largest magnitude of the integral term, in units of the command."""
+    derivative_filter: Duration = 0
+    """Time constant of the filter on the error's rate."""
+    wrap: tuple[str, ...] = ()
+    """Joints whose position error is taken the shorter way round, -pi..pi: continuous joints that shall face
+    a direction. Without it one turn more is one turn more."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _velocities_are_fed_forward(cls, data: object) -> object:
+        if not isinstance(data, dict) or data.get("command_interface") != "velocity":
+            return data
+        gains = data.get("gains")
+        return {**data, "gains": {"feed_forward": 1.0, **gains}} if isinstance(gains, dict) else data
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.reference == "velocity" and self.command_interface == "position":
+            raise ValueError(
+                "a velocity reference cannot be commanded as positions; command effort, velocity or pwm"
+            )
+        if self.reference == "velocity" and self.wrap:
+            raise ValueError("velocities do not wrap; take wrap out, or take the reference position")
+        for joint in self.wrap:
+            if joint not in self.joints:
+                raise ValueError(
+                    f"wrap names {joint}, which is not one of its joints ({', '.join(self.joints)})"
+                )
+        return self
+
+
+_KIND: Final = {"position": "positions", "velocity": "velocities"}
+
+
+class PidController(Controller[PidParameters]):
+    """Commands by a PID law on the error of a reference (`pid.Pid`), once each period, with its true length.
+
+    - References: what controllers that are `into` this one command (`position` with `velocity` as its rate,
+      or `velocity`; `effort` is added to a commanded effort), else the newest `positions` or `velocities`
+      command, else the positions at which the joints were when it became active or the last reference ended,
+      or the velocity 0.
+    - The derivative is that of the error: reference velocity minus measured velocity. A position reference
+      without a velocity counts as one at rest, so a step in it makes no kick. Of a velocity reference only
+      the measured rate counts: the difference of the measured velocities.
+    - The output stays inside the joint's own limit of what is commanded (effort, velocity, position, full
+      voltage), so the law knows when the last gate would cut it, and its integral does not wind up.
+    - A joint without a new measurement keeps its last command, see `Pid`; one that was never measured gets
+      none of its own (0; no position).
+
+    Behaves like pid_controller of ros2_controllers (control.ros.org, pid_controller) where that has the
+    same; it is also the joint_position_controller.
+    """
+
+    Parameters = PidParameters
+    Commands: ClassVar[Mapping[str, type[CommandModel]]] = {
+        "positions": PositionsCommand,
+        "velocities": VelocitiesCommand,
+    }
+
+    @classmethod
+    def interfaces(cls, parameters: PidParameters, joints: tuple[str, ...]) -> Interfaces:
+        """Command one interface; export the reference, its rate, and an effort to add."""
+        position = ("position", "velocity") if parameters.reference == "position" else ("velocity",)
+        effort = ("effort",) if parameters.command_interface == "effort" else ()
+        return Interfaces(parameters.joints, (parameters.command_interface,), reference=(*position, *effort))
+
+    @classmethod
+    def prepare(cls, kind: str, command: CommandModel, parameters: PidParameters) -> NDArray[np.float64]:
+        """Return the set-points, shape (joints,). Raises ValueError for the other kind or a wrong size."""
+        if kind not in cls.Commands:
+            return super().prepare(kind, command, parameters)
+        if kind != (own := _KIND[parameters.reference]):
+            raise ValueError(f"its reference is the {parameters.reference}, so it takes {own}, not {kind}")
+        values = command.model_dump()[kind]
+        check_size(kind, len(values), parameters.joints)
+        return np.array(values, dtype=np.float64)
+
+    def on_configure(self, context: Context) -> None:
+        """Make room for everything that the loop needs."""
+        super().on_configure(context)
+        count, limits, parameters = len(context.joints), context.limits, self.parameters
+        self._pid = Pid(count)
+        self._slope = Slope(count)
+        self._feed_forward = np.zeros(count)
+        self._pid.filter_s = parameters.derivative_filter * 1e-9
+        self._pid.limit_integral(row_of(parameters.integral_limit, context.joints))
+        most = row_of(parameters.output_limit, context.joints)
+        own = {"effort": limits.effort, "velocity": limits.velocity, "pwm": np.ones(count)}
+        if parameters.command_interface in own:
+            most = np.minimum(most, finite_or(own[parameters.command_interface], _NO_LIMIT))
+        self._most, self._least = most, -most
+        np.copyto(self._pid.upper, most)
+        np.copyto(self._pid.lower, self._least)
+        self._lower, self._upper = finite_or(limits.lower, -_NO_LIMIT), finite_or(limits.upper, _NO_LIMIT)
+        self._wrap = np.array([joint in parameters.wrap for joint in context.joints])
+        self._wraps = bool(parameters.wrap)
+        states, references, commands = context.states, context.references, context.commands
+        self._by_position = parameters.reference == "position"
+        self._measurement: Floats = states.position if self._by_position else states.velocity
+        self._commanded: Floats = references.position if self._by_position else references.velocity
+        self._output: Floats = getattr(commands, parameters.command_interface)
+        self._setpoint, self._reference, self._error, self._rate, self._bias, self._turns = np.zeros(
+            (6, count)
+        )
+        self._free, self._chained, self._ended, self._measured = np.zeros((4, count), dtype=np.bool_)
+        self.on_parameters(0)
+
+    def on_parameters(self, time_ns: int) -> None:
+        """Take the gains."""
+        gains, joints = self.parameters.gains, self.context.joints
+        fill(self._pid.p, gains.p, joints, 0.0)
+        fill(self._pid.i, gains.i, joints, 0.0)
+        fill(self._pid.d, gains.d, joints, 0.0)
+        fill(self._feed_forward, gains.feed_forward, joints, 0.0)
+        self._pid.integral[self._pid.i == 0.0] = 0.0  # nothing would ever remove it
+
+    def on_activate(self, time_ns: int) -> None:
+        """Hold the joints where they are; what was commanded before stays the output, but for the mode."""
+        goals, pid = self.context.goals, self._pid
+        self._setpoint.fill(np.nan if self._by_position else 0.0)
+        self._chained.fill(False)
+        self._slope.reset()
+        self._refer()
+        if self.parameters.command_interface == "position":
+            # the servo's goal is above where its load lets it be: that much is the correction
+            before = goals.position - self._reference
+            before[np.isnan(before)] = 0.0
+            self._output.fill(np.nan)
+        else:
+            before = getattr(goals, self.parameters.command_interface).copy()
+            before[np.isnan(before)] = 0.0
+            self._output.fill(0.0)
+        pid.reset(before, self._error, self._bias)
+
+    def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
+        """Take new set-points."""
+        np.copyto(self._setpoint, data)
+
+    def update(self, time_ns: int, period_ns: int) -> None:
+        """Command by the law."""
+        period_s = period_ns * 1e-9
+        self._refer()
+        if not self._by_position:
+            measured_rate = self._slope.update(self._measurement, self._measured, period_s)
+            np.negative(measured_rate, out=self._rate)
+        if self.parameters.command_interface == "position":
+            self._correct(period_s)
+        else:
+            output = self._pid.update(self._error, self._rate, self._bias, self._measured, period_s)
+            np.copyto(self._output, output)
+
+    def _correct(self, period_s: float) -> None:
+        """Command the reference and its correction, which ends where the position limits do."""
+        pid, reference = self._pid, self._reference
+        np.subtract(self._upper, reference, out=pid.upper)
+        np.minimum(pid.upper, self._most, out=pid.upper)
+        np.subtract(self._lower, reference, out=pid.lower)
+        np.maximum(pid.lower, self._least, out=pid.lower)
+        correction = pid.update(self._error, self._rate, self._bias, self._measured, period_s)
+        np.add(reference, correction, out=self._output, where=self._measured)
+
+    def _refer(self) -> None:
+        """Set the reference, its error, the error's rate, and the feed-forward."""
+        free, measured, error, bias = self._free, self._measured, self._error, self._bias
+        states, references = self.context.states, self.context.references
+        np.isnan(self._commanded, out=free)
+        np.logical_and(free, self._chained, out=self._ended)
+        np.copyto(self._setpoint, np.nan if self._by_position else 0.0, where=self._ended)
+        np.logical_not(free, out=self._chained)
+        if self._by_position:
+            np.isnan(self._setpoint, out=self._ended)
+            self._ended &= states.valid
+            np.copyto(self._setpoint, self._measurement, where=self._ended)
+        np.copyto(self._reference, self._commanded)
+        np.copyto(self._reference, self._setpoint, where=free)
+        np.subtract(self._reference, self._measurement, out=error)
+        np.isfinite(error, out=measured)
+        measured &= states.valid
+        if self._wraps:
+            np.divide(error, 2 * np.pi, out=self._turns)
+            np.rint(self._turns, out=self._turns)
+            self._turns *= -2 * np.pi
+            np.add(error, self._turns, out=error, where=self._wrap)
+        if self._by_position:
+            np.copyto(bias, references.velocity)
+            np.isnan(bias, out=free)
+            np.copyto(bias, 0.0, where=free)
+            np.subtract(bias, states.velocity, out=self._rate)
+            bias *= self._feed_forward
+        else:
+            np.multiply(self._reference, self._feed_forward, out=bias)
+        if self.parameters.command_interface == "effort":
+            np.isnan(references.effort, out=free)
+            np.copyto(self._turns, references.effort)
+            np.copyto(self._turns, 0.0, where=free)
+            bias += self._turns

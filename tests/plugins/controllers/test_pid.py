@@ -1,0 +1,188 @@
+"""The PID law against closed forms, scipy's filters and its own promises."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import signal
+
+from dxlrun_controllers.pid import Pid, Slope
+
+ALL = np.ones(1, dtype=bool)
+NONE = np.zeros(1)
+
+
+def law(p=0.0, i=0.0, d=0.0, *, filter_s=0.0, limit=np.inf, integral_limit=np.inf):
+    pid = Pid(1)
+    pid.p[:], pid.i[:], pid.d[:], pid.filter_s = p, i, d, filter_s
+    pid.upper[:], pid.lower[:] = limit, -limit
+    pid.limit_integral(np.array([integral_limit]))
+    return pid
+
+
+def stepped(pid, error, period_s=0.01, *, rate=0.0, bias=0.0, measured=ALL):
+    rows = (np.array([value], dtype=float) for value in (error, rate, bias))
+    return float(pid.update(*rows, measured, period_s)[0])
+
+
+@pytest.mark.parametrize("filter_s", [0.0, 0.001, 0.05, 3.0])
+def test_the_filtered_derivative_is_scipys_backward_difference_of_its_transfer_function(filter_s):
+    h, d = 0.01, 0.7
+    errors = np.random.default_rng(1).normal(size=300)
+    if filter_s:
+        numerator, denominator, _ = signal.cont2discrete(
+            ([d, 0.0], [filter_s, 1.0]), h, method="backward_diff"
+        )
+        numerator = numerator.ravel()
+    else:
+        numerator, denominator = np.array([d, -d]) / h, [1.0]
+    theirs = signal.lfilter(numerator, denominator, errors - errors[0])  # it begins at rest
+    pid, slope = law(d=d, filter_s=filter_s), Slope(1)
+    ours = [stepped(pid, e, h, rate=slope.update(np.array([e]), ALL, h)[0]) for e in errors]
+    np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-9)
+
+
+def test_the_integral_is_scipys_backward_difference():
+    h, i = 0.02, 1.3
+    errors = np.random.default_rng(2).normal(size=300)
+    numerator, denominator, _ = signal.cont2discrete(([i], [1.0, 0.0]), h, method="backward_diff")
+    theirs = signal.lfilter(numerator.ravel(), denominator, errors)
+    pid = law(i=i)
+    np.testing.assert_allclose([stepped(pid, e, h) for e in errors], theirs, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("p", [0.5, 4.0, 30.0])
+def test_a_first_order_plant_under_p_follows_its_closed_form(p):
+    """y' = (K u - y) / T, held between samples: y[n] = K p / (1 + K p) (1 - (a - K p (1 - a))**n)."""
+    gain, constant, h = 2.0, 0.5, 0.01
+    a = np.exp(-h / constant)
+    pid, y, path = law(p=p), 0.0, []
+    for _ in range(400):
+        path.append(y)
+        y = a * y + gain * (1 - a) * stepped(pid, 1.0 - y, h)
+    n = np.arange(400)
+    closed = gain * p / (1 + gain * p) * (1 - (a - gain * p * (1 - a)) ** n)
+    np.testing.assert_allclose(path, closed, rtol=1e-10, atol=1e-12)
+
+
+def test_a_first_order_plant_under_pi_follows_its_discrete_solution_and_the_continuous_one():
+    """State (y, I) of the sampled loop; and for short periods the step response of the continuous loop."""
+    gain, constant, p, i = 2.0, 0.5, 1.5, 4.0
+    for h in (0.02, 0.0005):
+        a, steps = np.exp(-h / constant), round(3 / h)
+        b = gain * (1 - a)
+        matrix = np.array([[a - b * (p + i * h), b], [-i * h, 1.0]])
+        drive = np.array([b * (p + i * h), i * h])
+        rest = np.linalg.solve(np.eye(2) - matrix, drive)
+        values, vectors = np.linalg.eig(matrix)
+        start = np.linalg.solve(vectors, -rest)
+        n = np.arange(steps)[:, None]
+        closed = rest[0] + (values**n * start * vectors[0]).sum(axis=1).real
+        pid, y, path = law(p=p, i=i), 0.0, []
+        for _ in range(steps):
+            path.append(y)
+            y = a * y + b * stepped(pid, 1.0 - y, h)
+        np.testing.assert_allclose(path, closed, rtol=1e-9, atol=1e-9)
+        assert rest[0] == pytest.approx(1.0)
+    loop = signal.TransferFunction([gain * p, gain * i], [constant, 1 + gain * p, gain * i])
+    _, continuous = signal.step(loop, T=np.arange(steps) * h)
+    np.testing.assert_allclose(path, continuous, atol=2e-3)
+
+
+@settings(max_examples=50, deadline=None)
+@given(periods=st.lists(st.floats(1e-4, 0.1), min_size=1, max_size=50))
+def test_the_integral_goes_by_true_time_however_irregular_the_periods(periods):
+    pid = law(i=3.0)
+    for period in periods:
+        output = stepped(pid, 0.25, period)
+    assert output == pytest.approx(3.0 * 0.25 * sum(periods))
+
+
+def test_all_terms_and_the_feed_forward_add_up():
+    pid = law(p=2.0, i=10.0, d=0.5)
+    assert stepped(pid, 0.3, 0.1, rate=-1.0, bias=7.0) == pytest.approx(0.6 + 0.3 - 0.5 + 7.0)
+    found = pid.proportional[0], pid.integral[0], pid.derivative[0]
+    assert found == pytest.approx((0.6, 0.3, -0.5))
+
+
+def test_at_its_limit_it_does_not_wind_up_and_leaves_with_the_first_error_of_the_other_sign():
+    pid = law(p=1.0, i=5.0, limit=2.0)
+    for _ in range(1000):
+        assert stepped(pid, 1.0) <= 2.0
+    assert pid.output[0] == 2.0
+    assert pid.integral[0] == pytest.approx(1.0)  # what p leaves of the limit; without it, 50
+    assert stepped(pid, -0.1) == pytest.approx(1.0 - 0.1 - 5.0 * 0.1 * 0.01)
+
+
+def test_where_p_alone_is_beyond_the_limit_the_integral_rests_and_may_come_back():
+    pid = law(p=10.0, i=5.0, limit=2.0)
+    for _ in range(10):
+        stepped(pid, 1.0)
+    assert pid.integral[0] == 0.0
+    pid.integral[:] = 0.5
+    stepped(pid, 1.0, bias=-20.0)  # below the lower limit: a step up is allowed
+    assert pid.integral[0] == pytest.approx(0.55)
+
+
+def test_the_integral_has_a_limit_of_its_own():
+    pid = law(i=100.0, integral_limit=0.3)
+    assert [stepped(pid, error) for error in (1.0, 1.0, -1.0)] == pytest.approx([0.3, 0.3, -0.3])
+
+
+numbers = st.floats(-100, 100)
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    gains=st.tuples(*[st.floats(0, 50)] * 3),
+    limit=st.floats(0.01, 20),
+    steps=st.lists(st.tuples(numbers, numbers, numbers, st.booleans()), min_size=1, max_size=30),
+)
+def test_whatever_comes_the_output_is_inside_and_the_integral_never_pushes_further_out(gains, limit, steps):
+    pid = law(*gains, limit=limit, integral_limit=5.0, filter_s=0.02)
+    for error, rate, bias, measured in steps:
+        before = pid.output[0], pid.integral[0]
+        output = stepped(pid, error, rate=rate, bias=bias, measured=np.array([measured]))
+        assert -limit <= output <= limit
+        assert abs(pid.integral[0]) <= 5.0
+        if not measured:
+            assert (output, pid.integral[0]) == before
+            continue
+        free = pid.proportional[0] + pid.derivative[0] + bias + pid.integral[0]
+        assert np.clip(free, -limit, limit) == pytest.approx(output, abs=1e-9)
+        growth = pid.integral[0] - before[1]
+        beyond = max(0.0, abs(free) - limit) if free * growth > 0 else 0.0
+        assert beyond == pytest.approx(0.0, abs=1e-9) or growth == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("silent", [1, 3])
+def test_without_a_measurement_the_output_stays_and_the_time_counts_when_the_next_one_comes(silent):
+    pid = law(p=1.0, i=2.0)
+    first = stepped(pid, 0.5)
+    for _ in range(silent):
+        assert stepped(pid, np.nan, measured=~ALL, rate=np.nan) == first
+    assert stepped(pid, 0.5) == pytest.approx(0.5 + 2.0 * 0.5 * (0.02 + silent * 0.01))
+
+
+def test_a_slope_spans_the_silence_and_begins_with_nothing():
+    slope = Slope(1)
+    found = [
+        float(slope.update(np.array([value]), np.array([measured]), 0.1)[0])
+        for value, measured in ((5.0, True), (5.1, True), (np.nan, False), (5.5, True))
+    ]
+    assert found == pytest.approx([0.0, 1.0, 1.0, 2.0])
+    slope.reset()
+    assert slope.update(np.array([9.0]), ALL, 0.1)[0] == 0.0
+
+
+def test_a_reset_goes_on_with_the_output_that_there_is():
+    pid = law(p=2.0, i=1.0, integral_limit=3.0)
+    pid.reset(np.array([1.0]), np.array([0.25]), np.array([0.1]))
+    assert stepped(pid, 0.25, 1e-9, bias=0.1) == pytest.approx(1.0)
+    pid.reset(np.array([np.nan]), np.array([0.25]), NONE)
+    assert pid.integral[0] == 0.0
+    pid.reset(np.array([99.0]), np.array([0.25]), NONE)
+    assert pid.integral[0] == 3.0
+    pid.i[:] = 0.0
+    pid.reset(np.array([1.0]), np.array([0.25]), NONE)
+    assert stepped(pid, 0.25) == pytest.approx(0.5)  # no integral: no bias that nothing removes
