@@ -122,6 +122,7 @@ class Sink:
                 "position": record.commands.position,
                 "velocity": record.commands.velocity,
                 "clamped": record.clamped,
+                "reference": record.reference,
                 "controller_ns": record.controller_ns,
             }
             self.cycles.append(cycle | {name: array.copy() for name, array in arrays.items()})
@@ -158,6 +159,9 @@ class Robot:
         rate: float | None = None,
         fallback: str = "",
         parameters: str = "{}",
+        into: tuple[str, ...] = (),
+        reference: tuple[str, ...] = (),
+        reads: tuple[str, ...] = (),
     ) -> None:
         plan = ControllerPlan(
             name=name,
@@ -171,6 +175,9 @@ class Robot:
             every=every,
             rate=rate,
             fallback=fallback,
+            into=into,
+            reference=reference,
+            reads=reads,
         )
         self._controllers.append(plan)
         self._offers[name] = Offer(name, controller, "tests 1")
@@ -220,7 +227,7 @@ class Robot:
             end_ns=end_ns,
             **plan,
         )
-        layout = CycleLayout(self.names, tuple(plan.name for plan in self._controllers))
+        layout = CycleLayout(self.names, tuple(plan.name for plan in self._controllers), self.plan.references)
         self.record = CycleRecord(layout)
         self.hardware = Hardware(self.record, self.clock)
         plugins = PlugIns(self._offers, {"broken_one": "plug-in broken_one of x 1 cannot be imported"})

@@ -2,7 +2,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from dxlrun.control.controllers.claims import conflicts, conflicts_text
+from dxlrun.control.controllers.claims import claimed_modes, conflicts, conflicts_text
+from dxlrun.description.modes import Mode
 
 
 @dataclass(frozen=True)
@@ -10,6 +11,7 @@ class Wants:
     name: str
     joints: tuple[str, ...]
     command: tuple[str, ...] = ("position",)
+    into: tuple[str, ...] = ()
 
 
 def test_each_pair_that_claims_the_same_joints_is_named_once() -> None:
@@ -20,6 +22,25 @@ def test_each_pair_that_claims_the_same_joints_is_named_once() -> None:
         "controllers left and whole both command joint a and 2 more; "
         "controllers right and whole both command joint d"
     )
+
+
+def test_a_reference_is_claimed_by_joint_and_interface() -> None:
+    found = conflicts(
+        [
+            Wants("pid", ("a", "b")),
+            Wants("arm", ("a", "b"), into=("pid",)),
+            Wants("gravity", ("a", "b"), command=("effort",), into=("pid",)),
+            Wants("whole", ("b", "c"), into=("other", "pid")),
+        ]
+    )
+    assert [str(conflict) for conflict in found] == ["controllers arm and whole both command pid/b/position"]
+
+
+def test_a_chained_controller_leaves_the_servo_to_the_one_below() -> None:
+    assert not conflicts([Wants("pid", ("a",)), Wants("arm", ("a",), into=("pid",))])
+    assert claimed_modes(
+        [Wants("pid", ("a",), command=("effort",)), Wants("arm", ("a",), into=("pid",))]
+    ) == {"a": Mode.EFFORT}
 
 
 def test_a_broadcaster_conflicts_with_no_controller() -> None:

@@ -232,6 +232,7 @@ def test_modes_follow_from_claims_and_the_rest_of_the_joints_rests() -> None:
             self, name: str, joints: tuple[str, ...], command: tuple[str, ...], active: bool
         ) -> None:
             self.name, self.joints, self.command, self.active = name, joints, command, active
+            self.into = ()
 
     claims: Any = [
         Claim("x", ("a",), ("effort",), True),

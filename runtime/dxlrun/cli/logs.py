@@ -222,8 +222,11 @@ def _replayed(report: ReplayReport) -> tuple[Part, ...]:
 
     if report.first is None:
         return (report.sentence,)
-    columns = [Column("cycles that differ", "name"), *numbers("commands", "goals")]
-    rows = [(joint.joint, joint.commands, joint.goals) for joint in report.joints]
+    counts = ["commands", "goals"]
+    if any(joint.references for joint in report.joints):
+        counts.insert(0, "references")
+    columns = [Column("cycles that differ", "name"), *numbers(*counts)]
+    rows = [(joint.joint, *(getattr(joint, count) for count in counts)) for joint in report.joints]
     return report.sentence, _first(report.first), Table.of("", columns, rows)
 
 

@@ -187,7 +187,7 @@ class Gate:
     def _owner(self, joint: str) -> str:
         active = self._record.active
         for index, controller in enumerate(self._plan.controllers):
-            if active >> index & 1 and controller.command and joint in controller.joints:
+            if active >> index & 1 and controller.commands_servos and joint in controller.joints:
                 return f"controller {controller.name}"
         return "no controller"
 

@@ -108,6 +108,18 @@ class ControllerPlan:
     reads: tuple[str, ...] = ()
     """Interfaces that it reads without a claim: `JOINT/position`, `CONTROLLER/JOINT/position`."""
 
+    @property
+    def commands_servos(self) -> bool:
+        """True when its claims are the servos' and not references of other controllers."""
+        return bool(self.command) and not self.into
+
+    @property
+    def references(self) -> tuple[str, ...]:
+        """Names of the reference interfaces that it exports: `arm_pid/shoulder/position`."""
+        return tuple(
+            f"{self.name}/{joint}/{interface}" for interface in self.reference for joint in self.joints
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class ScheduledCommand:
@@ -143,3 +155,8 @@ class LoopPlan:
     slowest_period_ns: int = 0
     """The longest period in which no Bus Watchdog stops its servos; 0: any."""
     policies: PolicyPlan = field(default_factory=PolicyPlan)
+
+    @property
+    def references(self) -> tuple[str, ...]:
+        """Names of all reference interfaces, in the order of the cycle's record."""
+        return tuple(name for controller in self.controllers for name in controller.references)

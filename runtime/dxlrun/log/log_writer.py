@@ -52,7 +52,7 @@ class LogWriter:
         self.error: str | None = None
         self.late_metadata: dict[str, dict[str, str]] = {}
         """Written at the end, beside the header's: what became known in the run."""
-        self._layout = CycleLayout(header.joints, [c.name for c in header.controllers])
+        self._layout = CycleLayout(header.joints, [c.name for c in header.controllers], header.references)
         self._file = LogFile(path)
         self._messages = self._lost = self._unwritten = self._last_ns = 0
         self._whole_bytes = self._whole_messages = 0

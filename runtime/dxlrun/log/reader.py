@@ -178,7 +178,8 @@ def _log(path: Path, header: LogHeader, found: _Found) -> Log:
     by_topic: dict[str, list[bytes]] = {topic: [] for topic in found.channels.values()}
     for channel, topic in found.channels.items():
         by_topic[topic] += found.messages.get(channel, [])
-    layout = CycleLayout(header.joints, [controller.name for controller in header.controllers])
+    names = [controller.name for controller in header.controllers]
+    layout = CycleLayout(header.joints, names, header.references)
     packets = tuple(
         (index, tuple(by_topic.get(schemas.bus_topic(bus), ()))) for index, bus in enumerate(header.buses)
     )
@@ -202,6 +203,10 @@ def _log(path: Path, header: LogHeader, found: _Found) -> Log:
 
 def _cycles(layout: CycleLayout, messages: list[bytes]) -> NDArray[np.void]:
     size = len(ENCAPSULATION) + layout.size
+    old = len(ENCAPSULATION) + layout.places["mode"].stop
+    if not layout.references and all(len(message) == old for message in messages):
+        # a log from before cycles had references: the length of none is missing
+        messages = [message + bytes(size - old) for message in messages]
     if any(len(message) != size for message in messages):
         raise ValueError("the messages of /cycle are not as long as joints and controllers ask")
     bodies = b"".join(message[len(ENCAPSULATION) :] for message in messages)

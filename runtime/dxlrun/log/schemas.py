@@ -36,8 +36,10 @@ SUMMARY_NAME = "dxlrun_summary"
 FAILURES_NAME = "failures"
 """The metadata record with what failed in the run outside of the loop, one sentence each."""
 HEADER_ATTACHMENT = "header.json"
-FORMAT = "3"
+FORMAT = "4"
 """Grows when a reader of the version before would misread a log."""
+_READABLE = ("3", FORMAT)
+"""Before 4 a cycle had no references."""
 
 LOG_MODE = 0o640
 """Of a new log: commands and the names of clients are for its user and group."""
@@ -154,7 +156,7 @@ def _cycle_text() -> str:
         "# 1 lower, 2 upper, 4 step, 8 velocity, 16 not finite, 32 effort, 64 pwm, 128 outward.",
         "# hardware_error: bits of Hardware Error Status, or states of Protocol 1.0's ERR. mode: 0 not",
         "# known, 1 position, 2 velocity, 3 effort, 4 pwm, 5 position with an effort limit.",
-        "# Records + skipped = elapsed periods.",
+        "# reference: in the order of the metadata's references. Records + skipped = elapsed periods.",
     ]
     lines += [f"{kind} {name}" for name, kind in SCALARS]
     lines += [f"{kind}[] {name}" for name, kind, _ in SEQUENCES]
@@ -164,7 +166,7 @@ def _cycle_text() -> str:
 CYCLE = MessageType(
     "dxlrun_msgs/msg/Cycle",
     _cycle_text(),
-    "RIHS01_10c0e4036b7ed80a34c95410e76aefc8bbdff6fb7693d76c4c1107fc25373d6c",
+    "RIHS01_a2b592761ca04f639e0a6499349d25451b9ad3be8c9a8c0b7a3792ef0155b07b",
 )
 
 BUS_PACKET = MessageType(
@@ -237,6 +239,8 @@ class LogHeader:
     period_ns: int
     epoch_offset_ns: int
     """Wall time (ns since 1970) = time of the run's clock + this."""
+    references: tuple[str, ...] = ()
+    """Names of the cycles' references: `arm_pid/shoulder/position`."""
     attachments: dict[str, bytes] = field(default_factory=dict)
     """Robot file, plan: by name."""
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
@@ -286,12 +290,13 @@ def to_metadata(header: LogHeader) -> dict[str, str]:
         "controllers": msgspec.json.encode(header.controllers).decode(),
         "period_ns": str(header.period_ns),
         "epoch_offset_ns": str(header.epoch_offset_ns),
+        "references": msgspec.json.encode(header.references).decode(),
     }
 
 
 def from_metadata(text: dict[str, str]) -> LogHeader:
     """Return the header that `to_metadata` wrote. Raises ValueError when something is missing or wrong."""
-    if text.get("format") != FORMAT:
+    if text.get("format") not in _READABLE:
         raise ValueError(
             f"it has format {text.get('format', 'none')}, this version reads format {FORMAT}; "
             "read it with the dxlrun that made it"
@@ -304,6 +309,7 @@ def from_metadata(text: dict[str, str]) -> LogHeader:
             controllers=msgspec.json.decode(text["controllers"], type=tuple[LoggedController, ...]),
             period_ns=int(text["period_ns"]),
             epoch_offset_ns=int(text["epoch_offset_ns"]),
+            references=msgspec.json.decode(text.get("references", "[]"), type=tuple[str, ...]),
         )
     except (KeyError, ValueError, msgspec.MsgspecError) as error:
         raise ValueError(f"the metadata {error} is missing or wrong") from error

@@ -64,6 +64,7 @@ def cycle_layout(plan: Plan) -> CycleLayout:
     return CycleLayout(
         joints=tuple(joint.name for joint in plan.loop.joints),
         controllers=tuple(controller.name for controller in plan.loop.controllers),
+        references=plan.loop.references,
     )
 
 

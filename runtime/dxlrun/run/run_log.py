@@ -34,6 +34,7 @@ def log_header(plan: Plan, epoch_offset_ns: int, *, virtual: bool) -> LogHeader:
         ),
         period_ns=plan.loop.period_ns,
         epoch_offset_ns=epoch_offset_ns,
+        references=plan.loop.references,
         attachments={
             "robot.yaml": plan.source_text.encode(),
             "plan.json": to_json(plan),

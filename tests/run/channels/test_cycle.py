@@ -11,8 +11,12 @@ from dxlrun.run.channels.ring import record_size
 SHAPES = [(0, 0), (1, 0), (3, 1), (8, 2), (18, 5)]
 
 
-def layout_of(joints: int, controllers: int) -> CycleLayout:
-    return CycleLayout([f"j{i}" for i in range(joints)], [f"c{i}" for i in range(controllers)])
+def layout_of(joints: int, controllers: int, references: int = 0) -> CycleLayout:
+    return CycleLayout(
+        [f"j{i}" for i in range(joints)],
+        [f"c{i}" for i in range(controllers)],
+        [f"c{i}/j0/position" for i in range(references)],
+    )
 
 
 @pytest.mark.parametrize(("joints", "controllers"), SHAPES)
@@ -50,9 +54,12 @@ def test_what_is_written_to_the_arrays_is_in_the_bytes(joints: int, controllers:
     np.testing.assert_array_equal(read["controller_ns"], np.full(controllers, 7))
 
 
+@pytest.mark.parametrize("references", [0, 1, 7])
 @pytest.mark.parametrize(("joints", "controllers"), SHAPES)
-def test_no_two_fields_share_a_byte_and_lengths_are_set(joints: int, controllers: int) -> None:
-    layout = layout_of(joints, controllers)
+def test_no_two_fields_share_a_byte_and_lengths_are_set(
+    joints: int, controllers: int, references: int
+) -> None:
+    layout = layout_of(joints, controllers, references)
     used = np.zeros(layout.size, dtype=int)
     fields = layout.dtype.fields
     assert fields is not None
@@ -61,7 +68,8 @@ def test_no_two_fields_share_a_byte_and_lengths_are_set(joints: int, controllers
     assert used.max() == 1
     record = np.frombuffer(bytes(CycleRecord(layout).raw), dtype=layout.dtype)[0]
     for name, _, per in SEQUENCES:
-        assert record[f"{name}_length"] == {"joints": joints, "controllers": controllers}[per]
+        counts = {"joints": joints, "controllers": controllers, "references": references}
+        assert record[f"{name}_length"] == counts[per]
         assert len(record[name]) == record[f"{name}_length"]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -28,35 +28,57 @@ class Claimant(Protocol):
         """The command interfaces that it claims on each of them; empty: it only reads."""
         ...
 
+    @property
+    def into(self) -> tuple[str, ...]:
+        """The controllers whose references it claims; empty: it claims the servos."""
+        ...
+
 
 @dataclass(frozen=True, slots=True)
 class Conflict:
-    """Two controllers that claim the same joint."""
+    """Two controllers that claim the same joint, or the same reference of it."""
 
     joint: str
     holder: str
     other: str
+    reference: str = ""
+    """`arm_pid/shoulder/position`; empty: they claim its servo."""
 
     def __str__(self) -> str:
-        return f"controllers {self.holder} and {self.other} both command joint {self.joint}"
+        what = self.reference or f"joint {self.joint}"
+        return f"controllers {self.holder} and {self.other} both command {what}"
 
 
 def conflicts(claimants: Iterable[Claimant]) -> tuple[Conflict, ...]:
-    """Return every joint that a later controller claims although an earlier one has it.
+    """Return every joint, and every reference, that a later controller claims although an earlier one has it.
 
-    A claim of one interface of a joint keeps all others of the joint away too: position and speed of a servo
-    belong together, and a stale speed of another controller would move the robot in an unexpected way.
+    A claim of one interface of a servo keeps all others of the joint away too: position and speed of a servo
+    belong together, and a stale speed of another controller would move the robot in an unexpected way. The
+    interfaces of a reference are claimed one by one: the lower controller makes one command of them.
     """
-    holders: dict[str, str] = {}
+    holders: dict[tuple[str, str], str] = {}
     found: list[Conflict] = []
     for claimant in claimants:
-        if not claimant.command:
-            continue
-        for joint in claimant.joints:
-            holder = holders.setdefault(joint, claimant.name)
+        for joint, reference in _claims(claimant):
+            holder = holders.setdefault((joint, reference), claimant.name)
             if holder != claimant.name:
-                found.append(Conflict(joint, holder, claimant.name))
+                found.append(Conflict(joint, holder, claimant.name, reference))
     return tuple(found)
+
+
+def _claims(claimant: Claimant) -> Iterator[tuple[str, str]]:
+    """Yield joints with the claimed reference; with none where the servo is claimed.
+
+    A joint is exported by one of the controllers that it is `into`; at the others it has no reference.
+    """
+    if not claimant.command:
+        return
+    for joint in claimant.joints:
+        if not claimant.into:
+            yield joint, ""
+        for lower in claimant.into:
+            for interface in claimant.command:
+                yield joint, f"{lower}/{joint}/{interface}"
 
 
 def conflicts_text(found: Iterable[Conflict]) -> str:
@@ -77,7 +99,7 @@ def claimed_modes(claimants: Iterable[Claimant]) -> dict[str, Mode]:
     return {
         joint: mode_of(claimant.command)
         for claimant in claimants
-        if claimant.command
+        if claimant.command and not claimant.into
         for joint in claimant.joints
     }
 

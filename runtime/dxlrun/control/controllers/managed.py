@@ -6,9 +6,8 @@ import math
 import traceback
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import fields
 from functools import partial
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +17,10 @@ from dxlrun.control.controllers.controller import Context, Controller, JointLimi
 from dxlrun.control.controllers.goals import RunningGoal
 from dxlrun.control.controllers.live_parameters import LiveValues, with_values
 from dxlrun.control.controllers.plugins import PlugIns
+from dxlrun.control.controllers.wiring import Claim, Inputs, claims
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan
 from dxlrun.errors import ControllerFault
-from dxlrun.run.channels.cycle import Clamp, Commands, CycleRecord, Floats, States
+from dxlrun.run.channels.cycle import Clamp, Commands, CycleRecord, Floats
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
 from dxlrun.run.channels.heartbeat import ControllerMethod
 
@@ -62,7 +62,10 @@ class Managed:
         activity: Activity,
         period_ns: int,
     ) -> None:
-        """`joints` are all joints of the robot; `period_ns` is the loop's."""
+        """`joints` are all joints of the robot; `period_ns` is the loop's.
+
+        Raises ControllerFault for a reference, or something that it reads, which is not there.
+        """
         self.plan = plan
         self.bit = 1 << place
         self.active = False
@@ -80,7 +83,7 @@ class Managed:
         self._record = record
         self._activity = activity
         self._controller: Controller[Any]
-        self._gathering = _Gathering(record, self.rows)
+        self._inputs = Inputs(plan, record, self.rows)
         self._divider = plan.every
         self._nominal_ns = plan.every * period_ns
         self._context = self._new_context([joints[row] for row in self.rows], events)
@@ -88,11 +91,7 @@ class Managed:
         self._last_ns = -1
         self._due_cycle = 0
         self._finite = np.zeros(len(self.rows), dtype=np.bool_)
-        columns = _columns(self.rows)
-        self._claimed = tuple(
-            _Claim(name, _array(self._context.commands, name), _array(record.commands, name), columns)
-            for name in plan.command
-        )
+        self._claimed = claims(plan, self._context.commands, record, self.rows)
 
     def _new_context(self, joints: Sequence[JointPlan], events: EventSink) -> Context:
         return Context(
@@ -105,14 +104,14 @@ class Managed:
                 velocity=_row([joint.velocity for joint in joints]),
                 effort=_row([joint.effort for joint in joints]),
             ),
-            states=self._gathering.states,
-            goals=self._gathering.goals,
+            states=self._inputs.states,
+            goals=self._inputs.goals,
             commands=Commands.empty(len(joints)),
             # neither knows this object: a circle would stay when the controller is unloaded
             say=partial(events.emit, EventCode.CONTROLLER_SAYS, Severity.INFO, self.plan.name),
             publish=partial(_publish, self._record, self.bit),
-            references=Commands.empty(len(joints)),
-            reads=np.full(len(self.plan.reads), np.nan),
+            references=self._inputs.references,
+            reads=self._inputs.reads,
             into=self.plan.into,
         )
 
@@ -145,7 +144,7 @@ class Managed:
         """Let the controller take over its joints. Raises ControllerFault."""
         for claim in self._claimed:
             claim.forget()
-        self._gathering.gather()
+        self._inputs.gather()
         self._call(ControllerMethod.ON_ACTIVATE, "", self._controller.on_activate, time_ns)
         self._last_ns = -1
         self._due_cycle = 0
@@ -182,7 +181,7 @@ class Managed:
         ControllerFault."""
         self._held = False
         self.until_ns = until_ns
-        self._gathering.gather()
+        self._inputs.gather()
         self._call(
             ControllerMethod.ON_COMMAND, f" ({kind})", self._controller.on_command, kind, data, time_ns
         )
@@ -203,14 +202,14 @@ class Managed:
         self._held = False
         self.until_ns = 0
         self._goal = goal
-        self._gathering.gather()
+        self._inputs.gather()
         on_goal = self._controller.on_goal
         self._call(ControllerMethod.ON_GOAL, f" ({goal.kind})", on_goal, goal, data, time_ns)
 
     def cancel(self, goal: RunningGoal, time_ns: int) -> None:
         """Let the controller bring its goal to an end. Raises ControllerFault."""
         goal.cancelling = True
-        self._gathering.gather()
+        self._inputs.gather()
         self._call(ControllerMethod.ON_CANCEL, "", self._controller.on_cancel, goal, time_ns)
 
     def change_parameters(self, values: LiveValues, time_ns: int) -> None:
@@ -251,11 +250,11 @@ class Managed:
         period_ns = self._nominal_ns if self._last_ns < 0 else time_ns - self._last_ns
         self._last_ns = time_ns
         self._due_cycle = (cycle // self._divider + 1) * self._divider
-        if self._gathering.pairs:
-            self._gathering.gather()
+        if self._inputs.gathered:
+            self._inputs.gather()
         capped_ns = min(period_ns, PERIOD_CAP * self._nominal_ns)
         self._call(ControllerMethod.UPDATE, "", self._controller.update, time_ns, capped_ns)
-        changed: list[_Claim] = []
+        changed: list[Claim] = []
         for claim in self._claimed:
             if claim.unchanged():
                 continue
@@ -269,16 +268,16 @@ class Managed:
         for claim in changed:
             claim.merge()
 
-    def _check(self, claim: _Claim) -> None:
+    def _check(self, claim: Claim) -> None:
         """Accept NaN where nothing was commanded yet. Raises ControllerFault for everything else."""
         wrong = ~self._finite & (claim.seen | np.isinf(claim.own))
         if wrong.any():
-            self._record.clamped[self.rows[wrong]] |= np.uint8(Clamp.NOT_FINITE)
+            if not self.plan.into:
+                self._record.clamped[self.rows[wrong]] |= np.uint8(Clamp.NOT_FINITE)
             first = int(np.flatnonzero(wrong)[0])
             after = " after a finite value" if claim.seen[first] else ""
             raise ControllerFault(
-                f"controller {self.plan.name} commanded {self.plan.joints[first]}/{claim.interface} = "
-                f"{claim.own[first]}{after}"
+                f"controller {self.plan.name} commanded {claim.names[first]} = {claim.own[first]}{after}"
             )
         claim.seen |= self._finite
 
@@ -316,101 +315,8 @@ class Managed:
         return fault
 
 
-_Element = TypeVar("_Element", bound=np.generic)
-Columns = slice | NDArray[np.intp]
-"""Rows of some joints: a slice where they are equally far apart, which numpy takes in a tenth of the time."""
-
-
-def _columns(rows: NDArray[np.intp]) -> Columns:
-    """Return the rows as a slice if they are equally far apart, in either direction: any two are."""
-    if not rows.size:
-        return rows
-    first, last = int(rows[0]), int(rows[-1])
-    step = int(rows[1]) - first if rows.size > 1 else 1
-    if not step or not np.array_equal(rows, first + step * np.arange(rows.size)):
-        return rows
-    return slice(first, last + step if last + step >= 0 else None, step)
-
-
-class _Gathering:
-    """States and goals of some rows, read-only for their controller.
-
-    Rows that are equally far apart are shown as they are; others are copied by `gather`.
-    """
-
-    __slots__ = ("goals", "pairs", "states")
-
-    def __init__(self, record: CycleRecord, rows: NDArray[np.intp]) -> None:
-        place = _columns(rows)
-        self.pairs: list[tuple[NDArray[np.generic], NDArray[np.generic], NDArray[np.intp]]] = []
-        """What is copied: the robot's array, the controller's, and the rows."""
-        sources = [getattr(record.states, field.name) for field in fields(States) if field.init]
-        self.states = States(*(self._shown(source, place) for source in sources))
-        self.goals = Commands(self._shown(record.goals.values, place))
-
-    def gather(self) -> None:
-        """Copy what must be copied."""
-        for source, own, rows in self.pairs:
-            source.take(rows, axis=-1, out=own, mode="clip")
-
-    def _shown(self, source: NDArray[_Element], place: Columns) -> NDArray[_Element]:
-        if isinstance(place, slice):
-            shown = source[..., place]
-        else:
-            own = source[..., place]
-            self.pairs.append((source, own, place))
-            shown = own.view()
-        shown.flags.writeable = False
-        return shown
-
-
 def _publish(record: CycleRecord, bit: int, topic: str = "", message: object = None) -> None:
     record.published |= bit
-
-
-class _Claim:
-    """A claimed interface: the controller's own array, the robot's, and where it was ever finite."""
-
-    __slots__ = ("_merged", "_place", "_shown", "_taken", "all_seen", "interface", "own", "seen")
-
-    def __init__(self, interface: str, own: Floats, merged: Floats, place: Columns) -> None:
-        self.interface = interface
-        self.own = own
-        self.seen = np.zeros(len(own), dtype=np.bool_)
-        self.all_seen = False
-        self._merged = merged
-        self._place = place
-        self._shown = merged[place] if isinstance(place, slice) else None
-        self._taken = b""
-
-    def forget(self) -> None:
-        """Begin anew: nothing was commanded yet."""
-        self.own.fill(np.nan)
-        self.seen.fill(False)
-        self.all_seen = False
-        self._taken = b""
-
-    def unchanged(self) -> bool:
-        """Return whether the commands are those that were checked and merged before, and still merged."""
-        own = self.own.tobytes()
-        return own == self._taken and self._shown is not None and self._shown.tobytes() == own
-
-    def merge(self) -> None:
-        """Put what was checked into the robot's commands."""
-        self._taken = self.own.tobytes()
-        if self._shown is None:
-            self._merged[self._place] = self.own
-        else:
-            self._shown[:] = self.own
-
-    def withdraw(self) -> None:
-        """Take it out of the robot's commands."""
-        self._merged[self._place] = np.nan
-
-
-def _array(commands: Commands, interface: str) -> Floats:
-    array: Floats = getattr(commands, interface)
-    return array
 
 
 def _row(values: Sequence[float | None]) -> Floats:

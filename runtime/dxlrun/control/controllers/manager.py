@@ -14,6 +14,7 @@ from dxlrun.control.controllers.activity import Activity
 from dxlrun.control.controllers.claims import conflicts
 from dxlrun.control.controllers.controller import Outcome
 from dxlrun.control.controllers.goals import Goals, RunningGoal
+from dxlrun.control.controllers.graph import update_order
 from dxlrun.control.controllers.live_parameters import LiveValues
 from dxlrun.control.controllers.managed import Managed, rate_divider, rate_fits
 from dxlrun.control.controllers.mode_switch import ModeSwitch, SetModes
@@ -59,6 +60,8 @@ class Manager:
         self._period_ns = plan.period_ns
         self._managed: tuple[Managed, ...] = ()
         """By their places; those that were unloaded keep theirs until another one gets it."""
+        self._order: tuple[tuple[int, Managed], ...] = ()
+        """Places and controllers in the order of updates: those above in a chain before those below."""
         self._named: dict[str, Managed] = {}
         """Those that are loaded."""
         self._commands: tuple[tuple[ScheduledCommand, NDArray[np.float64]], ...] = ()
@@ -82,6 +85,7 @@ class Manager:
             self._configured(place, controller) for place, controller in enumerate(self._plan.controllers)
         )
         self._named = {managed.plan.name: managed for managed in self._managed}
+        self._sort()
         self._commands = tuple(
             (command, np.frombuffer(command.data, dtype="<f8")) for command in self._plan.commands
         )
@@ -108,15 +112,15 @@ class Manager:
             self._admit(time_ns)
         if self._next < len(self._commands):
             self._record.command_count += self._hand_over(time_ns)
-        for index, managed in enumerate(self._managed):
+        for place, managed in self._order:
             if managed.active and managed.due(cycle):
                 begin_ns = now_ns()
                 try:
                     managed.update(cycle, time_ns)
                 except ControllerFault as fault:
                     self._end(managed, fault, time_ns)
-                if index < len(took_ns):
-                    took_ns[index] = now_ns() - begin_ns
+                if place < len(took_ns):
+                    took_ns[place] = now_ns() - begin_ns
         return self.fault
 
     def hand(  # noqa: PLR0917  a command's parts, as they come
@@ -319,8 +323,19 @@ class Manager:
         managed.wait_for(self._lost)
         self._managed = (*self._managed[:place], managed, *self._managed[place + 1 :])
         self._named[plan.name] = managed
+        self._sort()
         self._log_loaded(managed, "loaded", begin_ns)
         return place
+
+    def _sort(self) -> None:
+        """Put the loaded controllers into the order of updates."""
+        places = {
+            managed.plan.name: place
+            for place, managed in enumerate(self._managed)
+            if self._named.get(managed.plan.name) is managed
+        }
+        order = update_order([self._managed[place].plan for place in places.values()])
+        self._order = tuple((places[name], self._managed[places[name]]) for name in order)
 
     def _free_place(self) -> int:
         """Return a place for a controller; those of the plan keep theirs, also when they were unloaded.
@@ -342,6 +357,7 @@ class Manager:
             return Refusal(Code.STILL_ACTIVE, {"controller": name})
         begin_ns = self._clock.now_ns()
         del self._named[name]
+        self._sort()
         self._log_loaded(managed, "unloaded", begin_ns)
         return None
 
@@ -358,7 +374,7 @@ class Manager:
     @property
     def active(self) -> tuple[str, ...]:
         """Names of the active controllers, in the order of their updates."""
-        return tuple(managed.plan.name for managed in self._managed if managed.active)
+        return tuple(managed.plan.name for _, managed in self._order if managed.active)
 
     @property
     def plans(self) -> tuple[ControllerPlan, ...]:

@@ -91,7 +91,18 @@ def _asked(plan: ControllerPlan, joints: tuple[str, ...], plugins: PlugIns) -> C
     if unknown or len(set(interfaces.joints)) != len(interfaces.joints):
         what = f"joint {unknown[0]}, which the log does not have" if unknown else "a joint twice"
         raise InputError(f"--set {plan.name}: the controller would want {what}")
-    return replace(plan, joints=interfaces.joints, command=interfaces.command)
+    changed = replace(
+        plan,
+        joints=interfaces.joints,
+        command=interfaces.command,
+        reference=interfaces.reference,
+        reads=interfaces.reads,
+    )
+    if changed.references != plan.references:
+        raise InputError(
+            f"--set {plan.name}: the controller would export other references than those of the log"
+        )
+    return changed
 
 
 def with_arguments(plan: RecordedPlan, loop: LoopPlan, arguments: Mapping[str, str]) -> LoopPlan:
@@ -120,6 +131,8 @@ def with_arguments(plan: RecordedPlan, loop: LoopPlan, arguments: Mapping[str, s
         raise InputError(
             "the arguments change which joints or controllers there are; the log has the old ones"
         )
+    if other.references != loop.references:
+        raise InputError("the arguments change which references there are; the log has the old ones")
     return replace(loop, joints=other.joints, controllers=other.controllers)
 
 

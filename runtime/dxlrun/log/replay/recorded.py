@@ -133,7 +133,7 @@ def version_remarks(log: Log, loop: LoopPlan, plugins: PlugIns) -> tuple[str, ..
 
 def _plan(log: Log) -> RecordedPlan:
     contract = log.metadata.get("versions", {}).get("contract", str(CONTRACT_VERSION))
-    if contract != str(CONTRACT_VERSION):
+    if contract not in map(str, range(1, CONTRACT_VERSION + 1)):
         raise LogError(
             f"{log.path}: the run's controllers were made for contract {contract}, this dxlrun has contract "
             f"{CONTRACT_VERSION}: replay it with the dxlrun that made it, {_version(log)}"
@@ -154,6 +154,8 @@ def _plan(log: Log) -> RecordedPlan:
         controller.name for controller in log.controllers
     ):
         raise LogError(f"{log.path}: the plan in the log has other controllers than its cycles")
+    if plan.loop.references != log.header.references:
+        raise LogError(f"{log.path}: the plan in the log has other references than its cycles")
     _check_controllers(log, plan.loop)
     return plan
 

@@ -25,7 +25,7 @@ from dxlrun.run.channels.events import EventCode, Severity
 
 _COMMANDS = tuple(f"command_{interface}" for interface in COMMAND_INTERFACES)
 _GOALS = tuple(f"goal_{interface}" for interface in COMMAND_INTERFACES)
-_COMPARED = (*_COMMANDS, *_GOALS)
+_COMPARED = ("reference", *_COMMANDS, *_GOALS)
 """In the order in which they are computed: what differs first is the cause of the rest."""
 _WHAT = {
     **{f"command_{interface}": f"command of the {interface}" for interface in COMMAND_INTERFACES},
@@ -45,11 +45,11 @@ class ReplayDifference:
     time_s: float
     """Of the cycle's wake-up, since the loop's first deadline."""
     what: str
-    """`command of the position`, `goal of the velocity ...`, `active`."""
+    """`command of the position`, `goal of the velocity ...`, `reference arm_pid/j0/position`, `active`."""
     joint: str | None
     """None: a controller was active in one of the two and not in the other."""
     controller: str | None
-    """The one that claims the joint; None when none does."""
+    """The one that claims the joint, or commands the reference; None when none does."""
     recorded: str
     """The shortest number with these bits, and the bits where they are not a finite number's."""
     replayed: str
@@ -62,6 +62,7 @@ class JointDifferences:
     joint: str
     commands: int
     goals: int
+    references: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,7 +145,8 @@ def _run(
 ) -> tuple[Comparison, LoopResult, tuple[str, ...]]:
     """Put recorded hardware, clock and clients into the loop that runs robots, and run it."""
     names = tuple(joint.name for joint in plan.joints)
-    record = CycleRecord(CycleLayout(names, tuple(controller.name for controller in plan.controllers)))
+    controllers = tuple(controller.name for controller in plan.controllers)
+    record = CycleRecord(CycleLayout(names, controllers, plan.references))
     stop, events = StopFlag(), _Silence()
     clock = RecordedClock(inputs.start_ns - plan.period_ns)
     hardware = RecordedHardware(inputs.cycles, inputs.activation, record, clock, stop, ends=inputs.ends)
@@ -213,11 +215,16 @@ class Comparison:
             np.logical_or.reduce([differs[name] for name in names]).sum(axis=0)
             for names in (_COMMANDS, _GOALS)
         )
-        return tuple(
-            JointDifferences(joint.name, int(command), int(goal))
+        found = (
+            JointDifferences(joint.name, int(command), int(goal), self._references(joint.name))
             for joint, command, goal in zip(self._plan.joints, commands, goals, strict=True)
-            if command or goal
         )
+        return tuple(one for one in found if one.commands or one.goals or one.references)
+
+    def _references(self, joint: str) -> int:
+        """Return in how many cycles references of this joint differ."""
+        places = [at for at, name in enumerate(self._plan.references) if name.split("/")[1] == joint]
+        return int(np.count_nonzero(self._differs["reference"][:, places].any(axis=1)))
 
     def begin(self, record: CycleRecord) -> None:
         """Nothing was commanded yet."""
@@ -246,7 +253,11 @@ class Comparison:
             bits: _Words = values.view(np.uint64)
             np.not_equal(bits, self._recorded[name][index], out=self._differs[name][index])
             if self.first is None and self._differs[name][index].any():
-                self.first = self._of_joint(index, name, bits, active)
+                self.first = (
+                    self._of_reference(index, bits, active)
+                    if name == "reference"
+                    else self._of_joint(index, name, bits, active)
+                )
         self._index += 1
 
     def _since_start(self, time_ns: int) -> str:
@@ -272,19 +283,33 @@ class Comparison:
         values = [_shortest(int(words[row])) for words in (self._recorded[name][index], bits)]
         return ReplayDifference(cycle, time_s, _WHAT[name], joint, owner, *values)
 
+    def _of_reference(self, index: int, bits: _Words, active: int) -> ReplayDifference:
+        place = int(np.argmax(self._differs["reference"][index]))
+        name = self._plan.references[place]
+        lower, joint, interface = name.split("/")
+        cycle, time_s = self._when(index)
+        both = active | int(self._cycles["active"][index])
+        uppers = (
+            one.name
+            for bit, one in enumerate(self._manager.plans)
+            if both >> bit & 1 and lower in one.into and joint in one.joints and interface in one.command
+        )
+        values = [_shortest(int(words[place])) for words in (self._recorded["reference"][index], bits)]
+        return ReplayDifference(cycle, time_s, f"reference {name}", joint, next(uppers, None), *values)
+
     def _when(self, index: int) -> tuple[int, float]:
         row = self._cycles[index]
         return int(row["cycle"]), (int(row["woken_ns"]) - self._start_ns) * 1e-9
 
     def _owner(self, joint: str, active: int) -> str | None:
         for bit, controller in enumerate(self._manager.plans):
-            if active >> bit & 1 and controller.command and joint in controller.joints:
+            if active >> bit & 1 and controller.commands_servos and joint in controller.joints:
                 return controller.name
         return None
 
 
 def _values(record: CycleRecord) -> tuple[Floats, ...]:
-    return *record.commands.values, *record.goals.values
+    return record.reference, *record.commands.values, *record.goals.values
 
 
 def _shortest(bits: int) -> str:

@@ -64,6 +64,7 @@ SEQUENCES: tuple[tuple[str, str, str], ...] = (
     ("clamped", "uint8", "joints"),
     ("hardware_error", "uint8", "joints"),
     ("mode", "uint8", "joints"),
+    ("reference", "float64", "references"),
 )
 """Name, element type and what it has one element of."""
 
@@ -167,17 +168,25 @@ class Clamp(IntFlag):
 class CycleLayout:
     """The numpy dtype of a robot's cycle record; rows are in the order of the plan's joints and controllers.
 
-    Raises ValueError for more than 63 controllers (they are bits of a mask).
+    `references` are the names of the controllers' reference interfaces: `arm_pid/shoulder/position`. Raises
+    ValueError for more than 63 controllers (they are bits of a mask).
     """
 
-    __slots__ = ("controllers", "dtype", "joints", "lengths", "places")
+    __slots__ = ("controllers", "dtype", "joints", "lengths", "places", "references")
 
-    def __init__(self, joints: Sequence[str], controllers: Sequence[str]) -> None:
+    def __init__(
+        self, joints: Sequence[str], controllers: Sequence[str], references: Sequence[str] = ()
+    ) -> None:
         if len(controllers) > MOST_CONTROLLERS:
             raise ValueError(f"at most {MOST_CONTROLLERS} controllers, not {len(controllers)}")
         self.joints = tuple(joints)
         self.controllers = tuple(controllers)
-        counts = {"joints": len(self.joints), "controllers": len(self.controllers)}
+        self.references = tuple(references)
+        counts = {
+            "joints": len(self.joints),
+            "controllers": len(self.controllers),
+            "references": len(self.references),
+        }
         names = [name for name, _ in SCALARS]
         formats: list[Any] = [np.dtype(kind).newbyteorder("<") for _, kind in SCALARS]
         offsets = [8 * index for index in range(len(SCALARS))]
@@ -206,6 +215,11 @@ class CycleLayout:
         """Bytes of one record."""
         return self.dtype.itemsize
 
+    def place(self, name: str) -> int:
+        """Return where the elements of a sequence of 64 bits begin in `CycleRecord.floats`."""
+        first: int = self.places[name].start
+        return first // 8
+
 
 class _Word:
     """A scalar field of 64 bits, by its index in the record."""
@@ -233,9 +247,11 @@ class CycleRecord:
         "clamped",
         "commands",
         "controller_ns",
+        "floats",
         "goals",
         "layout",
         "raw",
+        "reference",
         "states",
         "words",
     )
@@ -289,8 +305,13 @@ class CycleRecord:
         """How long each controller's update took; 0 where it was not updated in this cycle."""
         self.clamped: NDArray[np.uint8] = array["clamped"][0]
         """Bits of Clamp, one element a joint."""
-        for name, kind, per in SEQUENCES:
-            if kind == "float64" and per == "joints":
+        self.reference: Floats = _row(array, "reference")
+        """What controllers command of each other's references, one element a name of the layout's references;
+        NaN = not commanded."""
+        self.floats: Floats = np.frombuffer(self.raw[: layout.size - layout.size % 8], dtype="<f8")
+        """The record as float64: the element at `layout.place(name)` is the first of a sequence of them."""
+        for name, kind, _ in SEQUENCES:
+            if kind == "float64":
                 array[name] = np.nan
         self.states.age_ns[:] = -1
         self._renewed = tuple(

@@ -1,0 +1,206 @@
+"""Wiring: a controller's views of the robot's arrays: what it sees, and where its commands go.
+
+What lies in equal distances is shown as it is; everything else is copied before each call. A controller that
+is `into` others writes into their references instead of the servos' commands.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.control.loop_plan import ControllerPlan
+from dxlrun.description.modes import COMMAND_INTERFACES
+from dxlrun.errors import ControllerFault
+from dxlrun.run.channels.cycle import Commands, CycleLayout, CycleRecord, Floats, States
+
+READABLE = ("position", "velocity", "effort", "temperature", "voltage", "age")
+"""States of a joint that any controller may read as `JOINT/position`; the age in s."""
+
+_Element = TypeVar("_Element", bound=np.generic)
+Columns = slice | NDArray[np.intp]
+"""Rows of some joints: a slice where they are equally far apart, which numpy takes in a tenth of the time."""
+
+
+def _columns(rows: NDArray[np.intp]) -> Columns:
+    """Return the rows as a slice if they are equally far apart, in either direction: any two are."""
+    if not rows.size:
+        return rows
+    first, last = int(rows[0]), int(rows[-1])
+    step = int(rows[1]) - first if rows.size > 1 else 1
+    if not step or not np.array_equal(rows, first + step * np.arange(rows.size)):
+        return rows
+    return slice(first, last + step if last + step >= 0 else None, step)
+
+
+class Inputs:
+    """What a controller sees, read-only for it: states and goals of its joints, its references, its reads.
+
+    Raises ControllerFault for something that it reads which is not there.
+    """
+
+    __slots__ = ("_ages", "_pairs", "gathered", "goals", "reads", "references", "states")
+
+    def __init__(self, plan: ControllerPlan, record: CycleRecord, rows: NDArray[np.intp]) -> None:
+        """`rows` are those of its joints."""
+        place = _columns(rows)
+        self._pairs: list[tuple[NDArray[np.generic], NDArray[np.generic], NDArray[np.intp]]] = []
+        """What is copied: the robot's array, the controller's, and the rows."""
+        sources = [getattr(record.states, field.name) for field in fields(States) if field.init]
+        self.states = States(*(self._shown(source, place) for source in sources))
+        self.goals = Commands(self._shown(record.goals.values, place))
+        self.references = self._references(plan, record)
+        self._ages: tuple[Floats, list[int], NDArray[np.int64], list[int]] | None = None
+        """The reads, where in them an age is, the robot's ages, and their rows."""
+        self.reads = self._reads(plan, record)
+        self.gathered = bool(self._pairs or self._ages)
+        """True when something must be copied."""
+
+    def gather(self) -> None:
+        """Copy what must be copied."""
+        for source, own, place in self._pairs:
+            source.take(place, axis=-1, out=own, mode="clip")
+        if self._ages is not None:
+            reads, slots, age_ns, rows = self._ages
+            ages = age_ns[rows]
+            reads[slots] = np.where(ages < 0, np.nan, ages * 1e-9)
+
+    def _shown(self, source: NDArray[_Element], place: Columns) -> NDArray[_Element]:
+        if isinstance(place, slice):
+            shown = source[..., place]
+        else:
+            own = source[..., place]
+            self._pairs.append((source, own, place))
+            shown = own.view()
+        shown.flags.writeable = False
+        return shown
+
+    def _references(self, plan: ControllerPlan, record: CycleRecord) -> Commands:
+        values = np.full((len(COMMAND_INTERFACES), len(plan.joints)), np.nan)
+        if plan.joints and not set(plan.references) <= set(record.layout.references):
+            raise ControllerFault(f"the record has no references of controller {plan.name}")
+        for interface in plan.reference if plan.joints else ():
+            names = [f"{plan.name}/{joint}/{interface}" for joint in plan.joints]
+            at = np.array([record.layout.references.index(name) for name in names], dtype=np.intp)
+            self._pairs.append((record.reference, values[COMMAND_INTERFACES.index(interface)], at))
+        return Commands(_read_only(values))
+
+    def _reads(self, plan: ControllerPlan, record: CycleRecord) -> Floats:
+        values = np.full(len(plan.reads), np.nan)
+        if plan.reads:
+            at = np.array([_place(plan, name, record.layout) for name in plan.reads], dtype=np.intp)
+            self._pairs.append((record.floats, values, at))
+            aged = [slot for slot, name in enumerate(plan.reads) if _state(name, record.layout) == "age"]
+            if aged:
+                joints = [plan.reads[slot].rpartition("/")[0] for slot in aged]
+                rows = [record.layout.joints.index(joint) for joint in joints]
+                self._ages = values, aged, record.states.age_ns, rows
+        return _read_only(values)
+
+
+def _read_only(values: Floats) -> Floats:
+    shown = values.view()
+    shown.flags.writeable = False
+    return shown
+
+
+def _state(name: str, layout: CycleLayout) -> str:
+    """Return which state of a joint this names; empty: none."""
+    joint, _, state = name.rpartition("/")
+    return state if joint in layout.joints and state in READABLE else ""
+
+
+def _place(plan: ControllerPlan, name: str, layout: CycleLayout) -> int:
+    """Return where a readable interface is in `CycleRecord.floats`; an age's is read by itself."""
+    if name in layout.references:
+        return layout.place("reference") + layout.references.index(name)
+    state = _state(name, layout)
+    if not state:
+        raise ControllerFault(f"controller {plan.name} reads {name}, which is not there")
+    return layout.place("age_ns" if state == "age" else state) + layout.joints.index(name.rpartition("/")[0])
+
+
+def claims(
+    plan: ControllerPlan, own: Commands, record: CycleRecord, rows: NDArray[np.intp]
+) -> tuple[Claim, ...]:
+    """Return what a controller commands: the servos of its joints, or references of those that it is `into`.
+
+    Raises ControllerFault for a reference that is not there.
+    """
+    if plan.into:
+        return tuple(_reference_claim(plan, interface, own, record) for interface in plan.command)
+    columns = _columns(rows)
+    return tuple(
+        Claim(
+            tuple(f"{joint}/{name}" for joint in plan.joints),
+            _array(own, name),
+            _array(record.commands, name),
+            columns,
+        )
+        for name in plan.command
+    )
+
+
+def _reference_claim(plan: ControllerPlan, interface: str, own: Commands, record: CycleRecord) -> Claim:
+    known = record.layout.references
+    names: list[str] = []
+    for joint in plan.joints:
+        found = [name for lower in plan.into if (name := f"{lower}/{joint}/{interface}") in known]
+        if len(found) != 1:
+            many = "more than one" if found else "none"
+            raise ControllerFault(
+                f"controller {plan.name} commands {joint}/{interface}, which {many} of "
+                f"{', '.join(plan.into)} exports"
+            )
+        names += found
+    at = np.array([known.index(name) for name in names], dtype=np.intp)
+    return Claim(tuple(names), _array(own, interface), record.reference, _columns(at))
+
+
+class Claim:
+    """A claimed interface: the controller's array, the one it goes into, and where it was ever finite."""
+
+    __slots__ = ("_merged", "_place", "_shown", "_taken", "all_seen", "names", "own", "seen")
+
+    def __init__(self, names: tuple[str, ...], own: Floats, merged: Floats, place: Columns) -> None:
+        self.names = names
+        """What its elements command, `shoulder/position` or `arm_pid/shoulder/position`."""
+        self.own = own
+        self.seen = np.zeros(len(own), dtype=np.bool_)
+        self.all_seen = False
+        self._merged = merged
+        self._place = place
+        self._shown = merged[place] if isinstance(place, slice) else None
+        self._taken = b""
+
+    def forget(self) -> None:
+        """Begin anew: nothing was commanded yet."""
+        self.own.fill(np.nan)
+        self.seen.fill(False)
+        self.all_seen = False
+        self._taken = b""
+
+    def unchanged(self) -> bool:
+        """Return whether the commands are those that were checked and merged before, and still merged."""
+        own = self.own.tobytes()
+        return own == self._taken and self._shown is not None and self._shown.tobytes() == own
+
+    def merge(self) -> None:
+        """Put what was checked into the robot's commands."""
+        self._taken = self.own.tobytes()
+        if self._shown is None:
+            self._merged[self._place] = self.own
+        else:
+            self._shown[:] = self.own
+
+    def withdraw(self) -> None:
+        """Take it out of the robot's commands."""
+        self._merged[self._place] = np.nan
+
+
+def _array(commands: Commands, interface: str) -> Floats:
+    array: Floats = getattr(commands, interface)
+    return array
