@@ -23,7 +23,17 @@ if TYPE_CHECKING:
         ParametersModel,
     )
     from dxlrun.control.controllers.hookspecs import hookimpl
-    from dxlrun.description.units import Angle, AngularAcceleration, AngularVelocity, Duration
+    from dxlrun.description.units import (
+        Angle,
+        AngularAcceleration,
+        AngularJerk,
+        AngularVelocity,
+        Duration,
+        Length,
+        LinearAcceleration,
+        LinearJerk,
+        LinearVelocity,
+    )
     from dxlrun.errors import (
         ControllerFault,
         DxlrunError,
@@ -43,6 +53,7 @@ __all__ = [
     "LIVE",
     "Angle",
     "AngularAcceleration",
+    "AngularJerk",
     "AngularVelocity",
     "CommandModel",
     "Commands",
@@ -56,6 +67,10 @@ __all__ = [
     "InputError",
     "Interfaces",
     "JointLimits",
+    "Length",
+    "LinearAcceleration",
+    "LinearJerk",
+    "LinearVelocity",
     "LogError",
     "Outcome",
     "ParametersModel",
@@ -86,7 +101,17 @@ _ROOMS = {
         "ParametersModel",
     ),
     "dxlrun.control.controllers.hookspecs": ("hookimpl",),
-    "dxlrun.description.units": ("Angle", "AngularAcceleration", "AngularVelocity", "Duration"),
+    "dxlrun.description.units": (
+        "Angle",
+        "AngularAcceleration",
+        "AngularJerk",
+        "AngularVelocity",
+        "Duration",
+        "Length",
+        "LinearAcceleration",
+        "LinearJerk",
+        "LinearVelocity",
+    ),
     "dxlrun.errors": (
         "ControllerFault",
         "DxlrunError",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 
 import pytest
 from hypothesis import given, settings
@@ -14,15 +15,25 @@ from dxlrun.description.units import (
     Angle,
     Angles,
     AngularAcceleration,
+    AngularJerk,
     AngularVelocity,
     Duration,
     Inertia,
+    Length,
+    LinearAcceleration,
+    LinearJerk,
+    LinearVelocity,
     Torque,
     angle,
     angular_acceleration,
+    angular_jerk,
     angular_velocity,
     duration,
     inertia,
+    length,
+    linear_acceleration,
+    linear_jerk,
+    linear_velocity,
     torque,
 )
 
@@ -108,6 +119,35 @@ def test_acceleration_is_in_rad_per_square_second() -> None:
 
 
 @pytest.mark.parametrize(
+    ("read", "text", "expected"),
+    [
+        (length, "0.2 m", 0.2),
+        (length, "20 cm", 0.2),
+        (length, "200 mm", 0.2),
+        (linear_velocity, "-300 mm/s", -0.3),
+        (linear_acceleration, "50 cm/s^2", 0.5),
+        (linear_jerk, "5 m/s^3", 5.0),
+        (angular_jerk, "180 deg/s^3", math.pi),
+    ],
+)
+def test_ways_of_wheels_are_in_metres(read: Callable[[str], float], text: str, expected: float) -> None:
+    assert read(text) == pytest.approx(expected, rel=1e-15)
+
+
+def test_a_base_in_json_is_read_to_the_same_values() -> None:
+    class Base(BaseModel):
+        separation: Length
+        speed: LinearVelocity
+        acceleration: LinearAcceleration
+        jerk: LinearJerk
+        turn: AngularJerk
+
+    written = {"separation": "16 cm", "speed": "30 cm/s", "acceleration": "1 m/s^2", "jerk": "3 mm/s^3"}
+    base = Base.model_validate(written | {"turn": "7 deg/s^3"})
+    assert Base.model_validate_json(base.model_dump_json()) == base
+
+
+@pytest.mark.parametrize(
     ("text", "expected"),
     [
         ("500 us", 500_000),
@@ -125,7 +165,9 @@ def test_duration_is_in_exact_nanoseconds(text: str, expected: int) -> None:
     assert duration(text) == expected
 
 
-@pytest.mark.parametrize("read", [angle, angular_velocity, angular_acceleration, duration])
+@pytest.mark.parametrize(
+    "read", [angle, angular_velocity, angular_acceleration, duration, length, linear_velocity, linear_jerk]
+)
 @pytest.mark.parametrize(
     "text",
     ["", "deg", "60", "sixty deg", "6 0 deg", "1,5 rad", ". rad", "e5 rad", "1e rad", "nan rad", "inf s", "60 grad",

@@ -1,8 +1,9 @@
 """Units: angles, speeds and times as a person writes them, `60 deg` or `500 us`, held in SI.
 
-Use `Angle`, `AngularVelocity`, `AngularAcceleration`, `Torque`, `Effort`, `Inertia` and `Duration` as types
-of a model's fields. They take text with a unit; a bare number is an error, because `60`
-could be deg or rad. In JSON they are written back as text that they read to the same value.
+Use `Angle`, `AngularVelocity`, `AngularAcceleration`, `Length`, `LinearVelocity`, `LinearAcceleration`,
+`Torque`, `Effort`, `Inertia` and `Duration` as types of a model's fields. They take text with a unit; a bare
+number is an error, because `60` could be deg or rad. In JSON they are written back as text that they read to
+the same value.
 """
 
 from __future__ import annotations
@@ -32,6 +33,11 @@ _REV = 2 * math.pi
 _ANGLE: Mapping[str, float] = {"deg": math.pi / 180, "rad": 1.0}
 _ANGULAR_VELOCITY: Mapping[str, float] = {"rad/s": 1.0, "deg/s": math.pi / 180, "rpm": _REV / 60}
 _ANGULAR_ACCELERATION: Mapping[str, float] = {"rad/s^2": 1.0, "deg/s^2": math.pi / 180}
+_ANGULAR_JERK: Mapping[str, float] = {"rad/s^3": 1.0, "deg/s^3": math.pi / 180}
+_LENGTH: Mapping[str, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+_LINEAR_VELOCITY: Mapping[str, float] = {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3}
+_LINEAR_ACCELERATION: Mapping[str, float] = {"m/s^2": 1.0, "cm/s^2": 1e-2, "mm/s^2": 1e-3}
+_LINEAR_JERK: Mapping[str, float] = {"m/s^3": 1.0, "cm/s^3": 1e-2, "mm/s^3": 1e-3}
 _TORQUE: Mapping[str, float] = {"Nm": 1.0, "mNm": 1e-3}
 _EFFORT: Mapping[str, tuple[float, EffortUnit]] = {
     "Nm": (1.0, "Nm"),
@@ -76,6 +82,31 @@ def angular_velocity(text: str) -> float:
 def angular_acceleration(text: str) -> float:
     """Return an acceleration, rad/s^2, from `10 rad/s^2` or `90 deg/s^2`; raises ValueError."""
     return _si(text, "an angular acceleration", _ANGULAR_ACCELERATION, "10 rad/s^2 or 90 deg/s^2")
+
+
+def angular_jerk(text: str) -> float:
+    """Return a jerk, rad/s^3, from `100 rad/s^3` or `900 deg/s^3`; raises ValueError with an example."""
+    return _si(text, "an angular jerk", _ANGULAR_JERK, "100 rad/s^3 or 900 deg/s^3")
+
+
+def length(text: str) -> float:
+    """Return a length, m, from `0.2 m`, `20 cm` or `200 mm`; raises ValueError with an example."""
+    return _si(text, "a length", _LENGTH, "0.2 m, 20 cm or 200 mm")
+
+
+def linear_velocity(text: str) -> float:
+    """Return a speed, m/s, from `0.2 m/s` or `200 mm/s`; raises ValueError with an example."""
+    return _si(text, "a linear velocity", _LINEAR_VELOCITY, "0.2 m/s or 200 mm/s")
+
+
+def linear_acceleration(text: str) -> float:
+    """Return an acceleration, m/s^2, from `1 m/s^2` or `500 mm/s^2`; raises ValueError with an example."""
+    return _si(text, "a linear acceleration", _LINEAR_ACCELERATION, "1 m/s^2 or 500 mm/s^2")
+
+
+def linear_jerk(text: str) -> float:
+    """Return a jerk, m/s^3, from `5 m/s^3` or `500 mm/s^3`; raises ValueError with an example."""
+    return _si(text, "a linear jerk", _LINEAR_JERK, "5 m/s^3 or 500 mm/s^3")
 
 
 def torque(text: str) -> float:
@@ -208,6 +239,46 @@ AngularAcceleration = Annotated[
     _text_schema("10 rad/s^2", _ANGULAR_ACCELERATION),
 ]
 """rad/s^2, from `10 rad/s^2` or `90 deg/s^2`."""
+
+AngularJerk = Annotated[
+    float,
+    BeforeValidator(angular_jerk),
+    PlainSerializer(lambda value: f"{value!r} rad/s^3", return_type=str, when_used="json"),
+    _text_schema("100 rad/s^3", _ANGULAR_JERK),
+]
+"""rad/s^3, from `100 rad/s^3` or `900 deg/s^3`."""
+
+Length = Annotated[
+    float,
+    BeforeValidator(length),
+    PlainSerializer(lambda value: f"{value!r} m", return_type=str, when_used="json"),
+    _text_schema("200 mm", _LENGTH),
+]
+"""m, from `0.2 m`, `20 cm` or `200 mm`."""
+
+LinearVelocity = Annotated[
+    float,
+    BeforeValidator(linear_velocity),
+    PlainSerializer(lambda value: f"{value!r} m/s", return_type=str, when_used="json"),
+    _text_schema("0.2 m/s", _LINEAR_VELOCITY),
+]
+"""m/s, from `0.2 m/s` or `200 mm/s`."""
+
+LinearAcceleration = Annotated[
+    float,
+    BeforeValidator(linear_acceleration),
+    PlainSerializer(lambda value: f"{value!r} m/s^2", return_type=str, when_used="json"),
+    _text_schema("1 m/s^2", _LINEAR_ACCELERATION),
+]
+"""m/s^2, from `1 m/s^2` or `500 mm/s^2`."""
+
+LinearJerk = Annotated[
+    float,
+    BeforeValidator(linear_jerk),
+    PlainSerializer(lambda value: f"{value!r} m/s^3", return_type=str, when_used="json"),
+    _text_schema("5 m/s^3", _LINEAR_JERK),
+]
+"""m/s^3, from `5 m/s^3` or `500 mm/s^3`."""
 
 Torque = Annotated[
     float,

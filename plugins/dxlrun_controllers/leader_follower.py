@@ -1,0 +1,205 @@
+"""leader_follower: joints follow other joints' states, or positions of another program, with a soft start."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, ClassVar, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from dxlrun import (
+    LIVE,
+    Angle,
+    AngularVelocity,
+    CommandModel,
+    Context,
+    Controller,
+    Duration,
+    Interfaces,
+    ParametersModel,
+)
+from dxlrun_controllers.group import PositionsCommand, check_size, hold
+
+CLOSING_SPEED = 0.5
+"""rad/s, posvel: the least speed toward a position, for the rest of the way of a servo that lags."""
+
+
+class Pair(ParametersModel):
+    """A joint and the joint that it follows: to scale * (leader's position) + offset."""
+
+    joint: str
+    """The follower."""
+    leader: str = ""
+    """The joint whose position is followed; all pairs have one, or none: then `positions` are followed."""
+    scale: float = 1.0
+    """Negative: the follower turns the other way."""
+    offset: Angle = 0.0
+    """rad, added to the scaled position"""
+
+
+class LeaderFollowerParameters(ParametersModel):
+    """Keys of a leader_follower in the robot file."""
+
+    pairs: Annotated[tuple[Pair, ...], Field(min_length=1)]
+    """In the order of the commands `positions`."""
+    command_interface: Literal["position", "posvel"] = "position"
+    """`posvel` commands the speed of the leader beside the position."""
+    speed: Annotated[AngularVelocity, Field(gt=0), LIVE] = 1.0
+    """rad/s, of a follower on its way to where its leader is, until it is in step"""
+    timeout: Annotated[Duration, Field(gt=0)] = 100_000_000
+    """ns; a leader's state, or a command, that is older is not followed: the joints hold"""
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Self:
+        led = [pair for pair in self.pairs if pair.leader]
+        if led and len(led) < len(self.pairs):
+            alone = next(pair.joint for pair in self.pairs if not pair.leader)
+            raise ValueError(f"{alone} has no leader, other joints have one; give it one, or none to all")
+        if not led and self.command_interface == "posvel":
+            raise ValueError("posvel commands the speed of leaders; name them, or take `position`")
+        if not led and any(pair.scale != 1.0 or pair.offset for pair in self.pairs):
+            raise ValueError("scale and offset are for a leader; name it, or take them out")
+        if any(pair.scale == 0.0 for pair in self.pairs):
+            raise ValueError("a scale of 0 follows nothing; write another number, -1 for the other way")
+        own, led_joints = {pair.joint for pair in self.pairs}, {pair.leader for pair in led}
+        if both := sorted(own.intersection(led_joints)):
+            raise ValueError(f"{both[0]} is leader and follower; a joint is one of the two")
+        return self
+
+
+class LeaderFollower(Controller[LeaderFollowerParameters]):
+    """Moves each joint to where its leader is: at first at a limited speed, then, in step, at once.
+
+    In step, a follower's command of a cycle is made of its leader's state of that cycle. All joints hold,
+    where they were last sent, as long as one leader's state, or the last command, is too old; then they start
+    softly again. Leaders may be joints without torque, moved by hand, or joints of any other controller.
+    """
+
+    Parameters = LeaderFollowerParameters
+    Commands: ClassVar[Mapping[str, type[CommandModel]]] = {"positions": PositionsCommand}
+
+    @classmethod
+    def interfaces(cls, parameters: LeaderFollowerParameters, joints: tuple[str, ...]) -> Interfaces:
+        """Claim the followers, and read position, velocity and age of their leaders."""
+        followers = tuple(pair.joint for pair in parameters.pairs)
+        leaders = [pair.leader for pair in parameters.pairs if pair.leader]
+        reads = [f"{leader}/{state}" for state in ("position", "velocity", "age") for leader in leaders]
+        posvel = parameters.command_interface == "posvel"
+        return Interfaces(
+            followers, ("position", "velocity") if posvel else ("position",), reads=tuple(reads)
+        )
+
+    @classmethod
+    def prepare(
+        cls, kind: str, command: CommandModel, parameters: LeaderFollowerParameters
+    ) -> NDArray[np.float64]:
+        """Return the positions, rad, shape (pairs,). Raises ValueError for a wrong number of them."""
+        if not isinstance(command, PositionsCommand):
+            return super().prepare(kind, command, parameters)
+        if parameters.pairs[0].leader:
+            raise ValueError("its joints follow leaders, so it takes no positions")
+        check_size("positions", len(command.positions), tuple(pair.joint for pair in parameters.pairs))
+        return np.array(command.positions)
+
+    def on_configure(self, context: Context) -> None:
+        """Make room for everything that the loop needs."""
+        super().on_configure(context)
+        pairs, count = self.parameters.pairs, len(context.joints)
+        self._led = bool(pairs[0].leader)
+        self._scale = np.array([pair.scale for pair in pairs])
+        self._offset = np.array([pair.offset for pair in pairs])
+        # a joint without limits has none that clips
+        self._lower = np.where(np.isnan(context.limits.lower), -np.inf, context.limits.lower)
+        self._upper = np.where(np.isnan(context.limits.upper), np.inf, context.limits.upper)
+        # no rows where positions are commanded
+        self._leader_position, self._leader_velocity, self._leader_age = context.reads.reshape(3, -1)
+        self._wanted, self._reachable, self._step, self._size = np.zeros((4, count))
+        self._in_step = np.zeros(count, dtype=np.bool_)
+        self._near = np.zeros(count, dtype=np.bool_)
+        self._posvel = self.parameters.command_interface == "posvel"
+        self._commanded_ns = -1
+        self._updated_ns = 0
+        self._following = self._reported = False
+
+    def on_activate(self, time_ns: int) -> None:
+        """Hold where the joints are."""
+        hold(self.context)
+        self._in_step.fill(False)
+        self._commanded_ns = -1
+        self._updated_ns = time_ns
+        self._following = self._reported = False
+
+    def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
+        """Take new positions to follow."""
+        np.copyto(self._wanted, data)
+        self._commanded_ns = time_ns
+
+    def update(self, time_ns: int, period_ns: int) -> None:
+        """Command where the leaders are: of a joint that is not in step, a step on the way there."""
+        if time_ns - self._updated_ns > period_ns:  # a true period is shorter: it was held meanwhile
+            hold(self.context)
+            self._in_step.fill(False)
+        self._updated_ns = time_ns
+        age_s = self._age_s(time_ns)
+        if not age_s <= self.parameters.timeout * 1e-9:
+            self._rest(age_s)
+            return
+        self._following, self._reported = True, False
+        if self._led:
+            np.multiply(self._leader_position, self._scale, out=self._wanted)
+            self._wanted += self._offset
+        np.clip(self._wanted, self._lower, self._upper, out=self._reachable)
+        position, step, reach = (
+            self.context.commands.position,
+            self._step,
+            self.parameters.speed * period_ns * 1e-9,
+        )
+        np.subtract(self._reachable, position, out=step)
+        np.less_equal(np.abs(step, out=self._size), reach, out=self._near)
+        np.logical_or(self._in_step, self._near, out=self._in_step)
+        np.clip(step, -reach, reach, out=step)
+        position += step
+        np.copyto(position, self._reachable, where=self._in_step)
+        if self._posvel:
+            self._command_speed()
+
+    def _age_s(self, time_ns: int) -> float:
+        """Return the age of what is followed, s; NaN when there is none yet."""
+        if self._led:
+            return float(np.maximum.reduce(self._leader_age))  # of NaN: NaN
+        return (time_ns - self._commanded_ns) * 1e-9 if self._commanded_ns >= 0 else np.nan
+
+    def _rest(self, age_s: float) -> None:
+        """Hold, and report why, once; before the first command there is nothing to report."""
+        if self._following:
+            self._in_step.fill(False)
+            if self._posvel:
+                self._close_in()
+        self._following = False
+        if self._reported or (not self._led and self._commanded_ns < 0):
+            return
+        self._reported = True
+        if not self._led:
+            self.context.say(f"no positions for {age_s:.2f} s, holding")
+            return
+        worst = int(np.argmax(np.where(np.isnan(self._leader_age), np.inf, self._leader_age)))
+        leader = self.parameters.pairs[worst].leader
+        since = "yet" if np.isnan(age_s) else f"for {age_s:.2f} s"
+        self.context.say(f"no reply of leader {leader} {since}, holding")
+
+    def _command_speed(self) -> None:
+        """Command the leaders' speed to what is in step, the approach's to the others."""
+        velocity, approach = self.context.commands.velocity, self.parameters.speed
+        np.multiply(self._leader_velocity, self._scale, out=velocity)
+        if self.context.into:  # a reference, with its sign
+            np.copyto(velocity, np.copysign(approach, self._step, out=self._size), where=~self._in_step)
+            return
+        np.abs(velocity, out=velocity)
+        np.maximum(velocity, CLOSING_SPEED, out=velocity)
+        np.copyto(velocity, approach, where=~self._in_step)
+
+    def _close_in(self) -> None:
+        """Give followers that lag a speed for the rest of their way; a reference is at rest."""
+        self.context.commands.velocity.fill(0.0 if self.context.into else CLOSING_SPEED)

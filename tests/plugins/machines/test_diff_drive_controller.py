@@ -1,0 +1,349 @@
+"""diff_drive_controller: its kinematics, its ramps, its odometry, each against a closed form."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dxlrun_controllers.diff_drive_controller import AngularLimits, DiffDriveController, LinearLimits, Ramp
+from dxlrun_controllers.odometry import Pose, WheelAngles
+
+SEPARATION, RADIUS = 0.16, 0.033
+BASE = {"left": ["l"], "right": ["r"], "separation": "160 mm", "radius": "33 mm"}
+FOUR = BASE | {"left": ["l1", "l2"], "right": ["r1", "r2"]}
+SMOOTH = {
+    "linear": {"velocity": "0.3 m/s", "acceleration": "0.5 m/s^2"},
+    "angular": {"velocity": "2 rad/s", "acceleration": "4 rad/s^2"},
+}
+
+
+def twist(robot, parameters=BASE):
+    """The twist that was commanded, by the textbook's inverse of the kinematics."""
+    left, right = np.split(robot.commands.velocity, 2)
+    left, right = left.mean() * RADIUS, right.mean() * RADIUS
+    return (left + right) / 2, (right - left) / SEPARATION
+
+
+def on_arc(way, angle):
+    """Closed form: a point that moves `way` along a circle and turns by `angle`, from the origin along x."""
+    if abs(angle) < 1e-12:
+        return way, way * angle / 2
+    r = way / angle
+    return r * math.sin(angle), r * 2.0 * math.sin(angle / 2) ** 2
+
+
+# Kinematics
+
+
+@pytest.mark.parametrize("parameters", [BASE, FOUR])
+@pytest.mark.parametrize(("linear", "angular"), [(0.2, 0.0), (0.0, 1.0), (0.15, -0.7), (-0.1, 2.0)])
+def test_wheels_have_the_speeds_of_their_rims(mounted, parameters, linear, angular):
+    robot = mounted(DiffDriveController, parameters)
+    robot.activate()
+    robot.send("velocity", linear=linear, angular=angular)
+    robot.step()
+    count = len(parameters["left"])
+    across = angular * SEPARATION / 2
+    np.testing.assert_allclose(robot.commands.velocity[:count], (linear - across) / RADIUS)
+    np.testing.assert_allclose(robot.commands.velocity[count:], (linear + across) / RADIUS)
+
+
+def test_it_claims_the_velocity_of_all_wheels_and_begins_at_rest(mounted):
+    robot = mounted(DiffDriveController, FOUR)
+    assert robot.interfaces.joints == ("l1", "l2", "r1", "r2")
+    assert robot.interfaces.command == ("velocity",)
+    robot.activate()
+    assert robot.commands.velocity.tolist() == [0.0] * 4
+    robot.step()
+    assert robot.commands.velocity.tolist() == [0.0] * 4
+
+
+def test_commands_may_have_units_and_must_be_finite(mounted):
+    robot = mounted(DiffDriveController, BASE)
+    written = robot.prepare("velocity", linear="20 cm/s", angular="90 deg/s")
+    np.testing.assert_allclose(written, [0.2, math.pi / 2])
+    assert robot.prepare("velocity", linear=0.2).tolist() == [0.2, 0.0]
+    for wrong in ({"linear": float("nan")}, {"linear": "20 deg"}, {"sideways": 1.0}):
+        with pytest.raises(ValueError, match="validation error"):
+            robot.prepare("velocity", **wrong)
+
+
+def test_calibration_changes_the_wheels_apart(mounted):
+    robot = mounted(
+        DiffDriveController, BASE | {"left_radius_multiplier": 1.02, "separation_multiplier": 1.1}
+    )
+    robot.activate()
+    robot.send("velocity", linear=0.1, angular=0.5)
+    robot.step()
+    across = 0.5 * SEPARATION * 1.1 / 2
+    np.testing.assert_allclose(
+        robot.commands.velocity, [(0.1 - across) / (RADIUS * 1.02), (0.1 + across) / RADIUS]
+    )
+
+
+def test_a_calibration_in_a_run_counts_from_the_next_update(mounted):
+    robot = mounted(DiffDriveController, BASE)
+    robot.activate()
+    robot.send("velocity", linear=0.1)
+    robot.step()
+    robot.controller.parameters = robot.model.model_copy(update={"right_radius_multiplier": 2.0})
+    robot.controller.on_parameters(robot.time_ns)
+    robot.step()
+    np.testing.assert_allclose(robot.commands.velocity[1], 0.1 / (2 * RADIUS))
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    asked=st.lists(
+        st.tuples(st.floats(-1, 1), st.floats(-10, 10), st.integers(1, 40)), min_size=1, max_size=6
+    )
+)
+def test_at_the_wheels_limit_it_keeps_its_curve_and_its_ramps(mounted, asked):
+    robot = mounted(DiffDriveController, BASE | SMOOTH, limits={"velocity": 6.0})
+    robot.activate()
+    before = (0.0, 0.0)
+    for linear, angular, steps in asked:
+        robot.send("velocity", linear=linear, angular=angular)
+        for _ in range(steps):
+            robot.step()
+            assert np.abs(robot.commands.velocity).max() <= 6.0 * (1 + 1e-9)
+            now = twist(robot)
+            assert abs(now[0] - before[0]) <= 0.5 * 0.02 * (1 + 1e-6)
+            assert abs(now[1] - before[1]) <= 4.0 * 0.02 * (1 + 1e-6)
+            before = now
+    robot.send("velocity", linear=0.3, angular=2.0)  # 10.3 and ... rad/s: more than the wheels may
+    for _ in range(300):
+        robot.controller.on_command("velocity", np.array([0.3, 2.0]), robot.time_ns)
+        robot.step()
+    now = twist(robot)
+    np.testing.assert_allclose(np.abs(robot.commands.velocity).max(), 6.0)
+    np.testing.assert_allclose(now[0] / now[1], 0.3 / 2.0)
+
+
+# Time-out
+
+
+def test_without_a_new_command_it_decelerates_within_its_limit(mounted):
+    robot = mounted(DiffDriveController, BASE | SMOOTH | {"timeout": "200 ms"})
+    robot.activate()
+    robot.send("velocity", linear=0.3)
+    for _ in range(50):
+        robot.send("velocity", linear=0.3)
+        robot.step()
+    last_ns, speeds = robot.time_ns - 20_000_000, []
+    while robot.time_ns - last_ns < 1_000_000_000:
+        robot.step()
+        speeds.append((robot.time_ns - last_ns, twist(robot)[0]))
+    since = np.array([since for since, _ in speeds]) * 1e-9
+    # from 0.3 m/s at 0.5 m/s^2: 0.6 s from the first update after the time-out on
+    wanted = np.clip(0.3 - 0.5 * (since - 0.2), 0.0, 0.3)
+    np.testing.assert_allclose([speed for _, speed in speeds], wanted, atol=1e-12)
+
+
+def test_it_goes_on_from_what_the_gate_let_through(mounted):
+    robot = mounted(DiffDriveController, BASE | SMOOTH)
+    robot.activate()
+    robot.send("velocity", linear=0.3)
+    for _ in range(20):
+        robot.step()
+    robot.sent.velocity[:] = 0.0  # held meanwhile
+    robot.send("velocity", linear=0.3)
+    robot.step()
+    np.testing.assert_allclose(twist(robot)[0], 0.5 * 0.02)
+
+
+# Ramps
+
+
+LIMITS = st.one_of(st.none(), st.floats(0.1, 10))
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    acceleration=st.floats(0.1, 10),
+    deceleration=LIMITS,
+    jerk=st.one_of(st.none(), st.floats(0.5, 100)),
+    targets=st.lists(st.tuples(st.floats(-2, 2), st.integers(1, 60)), min_size=1, max_size=5),
+    dt=st.sampled_from([0.001, 0.01, 0.02]),
+)
+def test_a_ramp_keeps_its_limits_and_arrives(acceleration, deceleration, jerk, targets, dt):
+    ramp = Ramp(LinearLimits.model_construct(acceleration=acceleration, deceleration=deceleration, jerk=jerk))
+    sink = deceleration or acceleration
+    velocity, slope = 0.0, 0.0
+    for target, steps in [*targets, (0.7, round(60 / dt))]:
+        for _ in range(steps):
+            ramp.set(ramp.next(target, dt), dt)
+            now = (ramp.velocity - velocity) / dt
+            tolerance = 1e-7 + (
+                0 if jerk is None else jerk * dt
+            )  # it comes back from the other limit by jerk
+            limit = max(acceleration, sink)
+            assert abs(now) <= limit + tolerance
+            if jerk is not None:
+                assert abs(now - slope) <= jerk * dt + 1e-6
+            velocity, slope = ramp.velocity, now
+            if steps > 100 and abs(velocity - 0.7) < 1e-12 and abs(slope) < 1e-9:
+                break
+    assert velocity == pytest.approx(0.7, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("target", "acceleration", "jerk"), [(1.0, 0.5, 2.0), (0.2, 2.0, 3.0), (1.0, 0.7, None)]
+)
+def test_a_ramp_takes_the_time_of_the_closed_form_and_does_not_overshoot(target, acceleration, jerk):
+    """Biagiotti and Melchiorri (2008), section 3.4: v/a + a/j, or 2 sqrt(v/j) where a is not reached."""
+    if jerk is None:
+        wanted = target / acceleration
+    elif target >= acceleration**2 / jerk:
+        wanted = target / acceleration + acceleration / jerk
+    else:
+        wanted = 2 * math.sqrt(target / jerk)
+    ramp = Ramp(LinearLimits.model_construct(acceleration=acceleration, jerk=jerk))
+    dt, speeds = 0.01, []
+    while not speeds or speeds[-1] < target - 1e-12:
+        ramp.set(ramp.next(target, dt), dt)
+        speeds.append(ramp.velocity)
+    assert max(speeds) <= target * (1 + 1e-12)
+    assert len(speeds) * dt == pytest.approx(wanted, abs=2.01 * dt)
+
+
+def test_through_zero_a_ramp_brakes_with_one_limit_and_accelerates_with_the_other():
+    ramp = Ramp(AngularLimits.model_construct(acceleration=1.0, deceleration=4.0))
+    ramp.velocity = 0.2
+    speeds = []
+    for _ in range(30):
+        ramp.set(ramp.next(-0.2, 0.02), 0.02)
+        speeds.append(ramp.velocity)
+    expected = [max(-0.2, 0.2 - 4 * t if t < 0.05 else -(t - 0.05)) for t in 0.02 * np.arange(1, 31)]
+    np.testing.assert_allclose(speeds, expected, atol=1e-12)
+
+
+# Odometry
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    arcs=st.lists(
+        st.tuples(
+            st.floats(-0.5, 0.5),
+            st.one_of(st.just(0.0), st.floats(-1e-3, 1e-3), st.floats(-3, 3)),
+            st.integers(1, 40),
+        ),
+        min_size=1,
+        max_size=8,
+    )
+)
+def test_odometry_is_the_exact_arc_of_exact_wheel_angles(mounted, arcs):
+    """Each arc is one closed form, however many cycles it takes."""
+    robot = mounted(DiffDriveController, BASE, limits={"velocity": 50.0})
+    robot.activate()
+    robot.step()
+    position, pose = np.zeros(2), np.zeros(3)
+    for way, angle, cycles in arcs:
+        across = angle * SEPARATION / 2
+        wheels = np.array([way - across, way + across]) / RADIUS
+        steps = max(cycles, math.ceil(np.abs(wheels).max() / 2.5))  # less than half a turn in a cycle
+        for n in range(1, steps + 1):
+            robot.states.position[:] = position + wheels * n / steps
+            robot.step()
+        position += wheels
+        x, y = on_arc(way, angle)
+        cos, sin = math.cos(pose[2]), math.sin(pose[2])
+        pose += [cos * x - sin * y, sin * x + cos * y, angle]
+    found = robot.controller._pose
+    np.testing.assert_allclose([found.x, found.y, found.heading], pose, rtol=0, atol=1e-9)
+
+
+def test_small_and_large_angles_meet():
+    for angle in (9.9e-5, 1.01e-4, -1.01e-4, 2e-4, 1e-9):
+        pose = Pose()
+        pose.move(1.0, angle)
+        exact = on_arc(1.0, angle) if abs(angle) > 1e-6 else (1.0, angle / 2)
+        np.testing.assert_allclose([pose.x, pose.y], exact, rtol=0, atol=1e-12)
+
+
+def test_a_position_that_begins_anew_after_a_turn_is_followed(mounted):
+    robot = mounted(DiffDriveController, BASE, limits={"velocity": 6.0})
+    robot.activate()
+    angle = 0.0
+    for _ in range(400):
+        angle += 5.0 * 0.02
+        robot.states.position[:] = [angle % math.tau, -math.tau + angle % math.tau]
+        robot.step()
+    np.testing.assert_allclose(robot.controller._pose.x, 399 * 5.0 * 0.02 * RADIUS)
+    np.testing.assert_allclose([robot.controller._pose.y, robot.controller._pose.heading], 0.0, atol=1e-9)
+
+
+def test_a_lost_reply_is_made_up_for_and_a_lost_servo_is_reported(mounted):
+    robot = mounted(DiffDriveController, BASE, limits={"velocity": 6.0})
+    robot.activate()
+    robot.step()
+    for turn, valid in ((0.1, True), (0.2, False), (0.3, True)):
+        robot.states.position[:] = turn
+        robot.states.valid[0] = valid
+        robot.step()
+    assert robot.controller._pose.x == pytest.approx(0.3 * RADIUS)
+    assert robot.said == []
+    robot.states.valid[0] = False
+    for _ in range(20):
+        robot.states.position[1] += 0.1
+        robot.step()
+    assert robot.said == ["odometry holds: no reply of l"]
+    assert robot.controller._pose.x == pytest.approx(0.3 * RADIUS)
+    robot.states.valid[0] = True
+    robot.states.position[0] -= 12.0  # it has rebooted and counts from another turn
+    robot.step()
+    assert robot.said[1] == "odometry goes on without the way of 0.42 s without all replies"
+    robot.states.position[:] += 0.1
+    robot.step()
+    assert robot.controller._pose.x == pytest.approx(0.4 * RADIUS)
+    assert robot.controller._pose.heading == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize("source", ["velocity", "command"])
+def test_odometry_of_velocities_is_the_arc_too(mounted, source):
+    robot = mounted(DiffDriveController, BASE | {"odometry": source})
+    robot.activate()
+    if source == "velocity":
+        robot.states.position[:] = np.nan  # an AX-12 in wheel mode has none between 300 and 360 deg
+    robot.send("velocity", linear=0.2, angular=0.5)
+    for _ in range(100):
+        robot.send("velocity", linear=0.2, angular=0.5)
+        robot.step()
+        robot.states.velocity[:] = robot.commands.velocity
+    x, y = on_arc(0.2 * 99 * 0.02, 0.5 * 99 * 0.02)
+    found = robot.controller._pose
+    np.testing.assert_allclose([found.x, found.y, found.heading], [x, y, 0.99], atol=1e-9)
+
+
+def test_messages_come_at_their_own_rate(mounted):
+    robot = mounted(DiffDriveController, BASE | {"odometry_rate": 20.0}, period_s=0.01)
+    robot.activate()
+    for _ in range(200):
+        robot.step()
+    assert len(robot.messages) == pytest.approx(40, abs=1)
+    assert {topic for topic, _ in robot.messages} == {"odometry"}
+
+
+def test_after_a_long_time_turns_are_not_guessed():
+    angles = WheelAngles(1, fastest=6.0, period_ns=20_000_000)
+    assert angles.longest_ns == round(math.pi / 12 * 1e9)
+    assert WheelAngles(1, fastest=math.nan, period_ns=20_000_000).longest_ns == 40_000_000
+
+
+@pytest.mark.parametrize(
+    ("wrong", "where"),
+    [
+        ({"separation": "0 m"}, "separation"),
+        ({"radius": "33 deg"}, "radius"),
+        ({"left": []}, "left"),
+        ({"linear": {"velocity": "-1 m/s"}}, "linear"),
+        ({"odometry": "gps"}, "odometry"),
+        ({"timeout": "0 s"}, "timeout"),
+    ],
+)
+def test_wrong_parameters_are_refused(wrong, where):
+    with pytest.raises(ValueError, match=where):
+        DiffDriveController.Parameters.model_validate(BASE | wrong)

@@ -1,0 +1,176 @@
+"""leader_follower: softly into step, then at once; holds when its leader falls silent."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dxlrun_controllers.leader_follower import LeaderFollower
+
+PAIR = {"pairs": [{"joint": "f", "leader": "l"}], "speed": "1 rad/s"}
+TWO = {
+    "pairs": [
+        {"joint": "f", "leader": "l", "scale": -0.5, "offset": "0.2 rad"},
+        {"joint": "g", "leader": "m"},
+    ]
+}
+STREAM = {"pairs": [{"joint": "f"}, {"joint": "g"}], "speed": "1 rad/s"}
+
+
+def lead(robot, *positions, velocity=0.0, age=0.0):
+    count = len(positions)
+    robot.context.reads[:] = [*positions, *[velocity] * count, *[age] * count]
+
+
+def test_it_reads_the_leaders_and_claims_the_followers(mounted):
+    robot = mounted(LeaderFollower, TWO)
+    assert robot.interfaces.joints == ("f", "g")
+    assert robot.interfaces.command == ("position",)
+    assert robot.interfaces.reads == (
+        "l/position", "m/position", "l/velocity", "m/velocity", "l/age", "m/age",
+    )  # fmt: skip
+    assert mounted(LeaderFollower, STREAM).interfaces.reads == ()
+    assert mounted(LeaderFollower, PAIR | {"command_interface": "posvel"}).interfaces.command == (
+        "position", "velocity",
+    )  # fmt: skip
+
+
+def test_it_starts_at_its_speed_and_is_then_in_step_at_once(mounted):
+    robot = mounted(LeaderFollower, PAIR)
+    robot.activate()
+    lead(robot, 0.5)
+    path = []
+    for _ in range(40):
+        robot.step()
+        path.append(robot.commands.position[0])
+    np.testing.assert_allclose(path, np.minimum(0.02 * np.arange(1, 41), 0.5))
+    lead(robot, 1.4)  # 45 rad/s: in step it follows, and the last gate limits
+    robot.step()
+    assert robot.commands.position[0] == 1.4
+
+
+@settings(max_examples=50, deadline=None)
+@given(path=st.lists(st.floats(-3, 3), min_size=2, max_size=60))
+def test_in_step_a_command_is_made_of_the_state_of_its_own_cycle(mounted, path):
+    robot = mounted(LeaderFollower, TWO)
+    robot.activate()
+    lead(robot, 0.4, 0.0)
+    robot.step()
+    for position in path:
+        lead(robot, position, 0.1)
+        robot.step()
+        if robot.controller._in_step.all():
+            np.testing.assert_allclose(robot.commands.position, [-0.5 * position + 0.2, 0.1])
+
+
+def test_limits_of_the_followers_hold(mounted):
+    robot = mounted(LeaderFollower, PAIR, limits={"lower": -0.1, "upper": 0.1})
+    robot.activate()
+    for leader, follower in ((3.0, 0.1), (-3.0, -0.1)):
+        lead(robot, leader)
+        for _ in range(20):
+            robot.step()
+        assert robot.commands.position[0] == follower
+
+
+@pytest.mark.parametrize("silence", [0.11, np.nan, np.inf])
+def test_a_silent_leader_is_reported_once_and_all_hold_until_it_is_back(mounted, silence):
+    robot = mounted(LeaderFollower, TWO | {"speed": "1 rad/s"})
+    robot.activate()
+    lead(robot, 0.4, 0.0)
+    robot.step()
+    held = robot.commands.position.copy()
+    lead(robot, 2.0, 1.0)
+    robot.context.reads[5] = silence
+    for _ in range(10):
+        robot.step()
+        np.testing.assert_array_equal(robot.commands.position, held)
+    (sentence,) = robot.said
+    assert sentence.startswith("no reply of leader m")
+    assert sentence.endswith("holding")
+    lead(robot, 0.4, 1.0)
+    robot.step()  # softly again
+    np.testing.assert_allclose(robot.commands.position, [0.0, held[1] + 0.02], atol=1e-12)
+    robot.context.reads[4] = 0.3
+    robot.step()
+    assert robot.said[1] == "no reply of leader l for 0.30 s, holding"
+
+
+def test_after_it_was_held_by_the_manager_it_starts_softly_from_what_was_sent(mounted):
+    robot = mounted(LeaderFollower, PAIR)
+    robot.activate()
+    lead(robot, 0.0)
+    robot.step()
+    robot.sent.position[:] = 0.3  # a returned servo was brought elsewhere
+    lead(robot, 1.0)
+    robot.step(periods=50)
+    assert robot.commands.position[0] == pytest.approx(0.3 + 5 * 0.02)
+
+
+def test_positions_are_followed_as_long_as_they_come(mounted):
+    robot = mounted(LeaderFollower, STREAM)
+    robot.activate()
+    robot.step()
+    assert robot.commands.position.tolist() == [0.0, 0.0]
+    assert robot.said == []
+    for _ in range(10):
+        robot.send("positions", positions=[0.1, -0.1])
+        robot.step()
+    np.testing.assert_allclose(robot.commands.position, [0.1, -0.1])
+    for _ in range(10):
+        robot.step()
+    assert robot.said == ["no positions for 0.12 s, holding"]
+    robot.send("positions", positions=[0.2, -0.2])
+    robot.step()
+    np.testing.assert_allclose(robot.commands.position, [0.12, -0.12])
+
+
+def test_posvel_commands_the_leaders_speed_as_a_magnitude_or_as_a_reference(mounted):
+    for into, expected in (((), 0.8), (("pid",), -0.8)):
+        robot = mounted(LeaderFollower, PAIR | {"command_interface": "posvel"}, into=into)
+        robot.activate()
+        lead(robot, -0.5, velocity=-0.8)
+        robot.step()
+        assert robot.commands.velocity[0] == (-1.0 if into else 1.0)  # on the way there
+        for _ in range(30):
+            robot.step()
+        assert robot.commands.velocity[0] == expected
+        lead(robot, -0.5, age=1.0)
+        robot.step()
+        assert robot.commands.velocity[0] == (0.0 if into else 0.5)
+
+
+def test_a_live_speed_counts_at_once(mounted):
+    robot = mounted(LeaderFollower, PAIR)
+    robot.activate()
+    lead(robot, 2.0)
+    robot.step()
+    robot.controller.parameters = robot.model.model_copy(update={"speed": 2.0})
+    robot.step()
+    assert robot.commands.position[0] == pytest.approx(0.06)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "sentence"),
+    [
+        ({"pairs": []}, "at least 1 item"),
+        ({"pairs": [{"joint": "f", "leader": "l"}, {"joint": "g"}]}, "g has no leader"),
+        ({"pairs": [{"joint": "f", "scale": 2.0}]}, "scale and offset are for a leader"),
+        ({"pairs": [{"joint": "f", "leader": "l", "scale": 0.0}]}, "a scale of 0"),
+        (
+            {"pairs": [{"joint": "f", "leader": "l"}, {"joint": "g", "leader": "f"}]},
+            "f is leader and follower",
+        ),
+        ({"pairs": [{"joint": "f"}], "command_interface": "posvel"}, "posvel commands the speed of leaders"),
+    ],
+)
+def test_pairs_that_make_no_sense_are_refused_in_words(wrong, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        LeaderFollower.Parameters.model_validate(wrong)
+
+
+def test_commands_that_do_not_fit_are_refused_in_words(mounted):
+    with pytest.raises(ValueError, match="its joints follow leaders"):
+        mounted(LeaderFollower, PAIR).prepare("positions", positions=[0.1])
+    with pytest.raises(ValueError, match=r"1 positions for 2 joints \(f, g\)"):
+        mounted(LeaderFollower, STREAM).prepare("positions", positions=[0.1])
