@@ -33,7 +33,7 @@ from dxlrun import (
     LinearVelocity,
     ParametersModel,
 )
-from dxlrun_controllers.group import JointNames
+from dxlrun_controllers.joints import JointNames
 from dxlrun_controllers.odometry import Pose, WheelAngles
 
 

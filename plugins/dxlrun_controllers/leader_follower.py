@@ -20,7 +20,8 @@ from dxlrun import (
     Interfaces,
     ParametersModel,
 )
-from dxlrun_controllers.group import PositionsCommand, check_size, hold
+from dxlrun_controllers.group import PositionsCommand
+from dxlrun_controllers.joints import check_size, finite_or, hold
 
 CLOSING_SPEED = 0.5
 """rad/s, posvel: the least speed toward a position, for the rest of the way of a servo that lags."""
@@ -110,9 +111,8 @@ class LeaderFollower(Controller[LeaderFollowerParameters]):
         self._led = bool(pairs[0].leader)
         self._scale = np.array([pair.scale for pair in pairs])
         self._offset = np.array([pair.offset for pair in pairs])
-        # a joint without limits has none that clips
-        self._lower = np.where(np.isnan(context.limits.lower), -np.inf, context.limits.lower)
-        self._upper = np.where(np.isnan(context.limits.upper), np.inf, context.limits.upper)
+        self._lower = finite_or(context.limits.lower, -np.inf)
+        self._upper = finite_or(context.limits.upper, np.inf)
         # no rows where positions are commanded
         self._leader_position, self._leader_velocity, self._leader_age = context.reads.reshape(3, -1)
         self._wanted, self._reachable, self._step, self._size = np.zeros((4, count))

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from dxlrun import CONTRACT_VERSION, Controller, hookimpl
+from dxlrun_controllers.diff_drive_controller import DiffDriveController
 from dxlrun_controllers.group import (
     JointGroupEffortController,
     JointGroupPosEffortController,
@@ -16,6 +17,7 @@ from dxlrun_controllers.group import (
 )
 from dxlrun_controllers.joint_state_broadcaster import JointStateBroadcaster
 from dxlrun_controllers.joint_trajectory_controller import JointTrajectoryController
+from dxlrun_controllers.leader_follower import LeaderFollower
 from dxlrun_controllers.pid_controller import PidController
 
 
@@ -29,6 +31,7 @@ def dxlrun_contract() -> int:
 def dxlrun_controllers() -> Mapping[str, type[Controller[Any]]]:
     """Return the standard controllers by their type in the robot file."""
     return {
+        "diff_drive_controller": DiffDriveController,
         "joint_group_effort_controller": JointGroupEffortController,
         "joint_group_poseffort_controller": JointGroupPosEffortController,
         "joint_group_position_controller": JointGroupPositionController,
@@ -38,5 +41,6 @@ def dxlrun_controllers() -> Mapping[str, type[Controller[Any]]]:
         "joint_position_controller": PidController,
         "joint_state_broadcaster": JointStateBroadcaster,
         "joint_trajectory_controller": JointTrajectoryController,
+        "leader_follower": LeaderFollower,
         "pid_controller": PidController,
     }
