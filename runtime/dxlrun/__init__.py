@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from dxlrun.errors import (
         ControllerFault,
         DxlrunError,
-        GoalTimeout,
         InputError,
         LogError,
         PlugInError,
@@ -46,7 +45,7 @@ if TYPE_CHECKING:
         Refused,
         StartUpError,
     )
-    from dxlrun.remote.client import GoalState, RemoteGoal, RemoteRobot, Stream, connect, running
+    from dxlrun.remote.client import RemoteRobot, Stream, connect, running
     from dxlrun.run.channels.cycle import Commands, Floats, States
 
 __all__ = [
@@ -65,8 +64,6 @@ __all__ = [
     "DxlrunError",
     "Floats",
     "Goal",
-    "GoalState",
-    "GoalTimeout",
     "InputError",
     "Interfaces",
     "JointLimits",
@@ -81,7 +78,6 @@ __all__ = [
     "PortError",
     "ProcessFault",
     "Refused",
-    "RemoteGoal",
     "RemoteRobot",
     "StartUpError",
     "States",
@@ -119,7 +115,6 @@ _ROOMS = {
     "dxlrun.errors": (
         "ControllerFault",
         "DxlrunError",
-        "GoalTimeout",
         "InputError",
         "LogError",
         "PlugInError",
@@ -129,7 +124,7 @@ _ROOMS = {
         "StartUpError",
     ),
     "dxlrun.run.channels.cycle": ("Commands", "Floats", "States"),
-    "dxlrun.remote.client": ("GoalState", "RemoteGoal", "RemoteRobot", "Stream", "connect", "running"),
+    "dxlrun.remote.client": ("RemoteRobot", "Stream", "connect", "running"),
 }
 _HOME = {name: room for room, names in _ROOMS.items() for name in names}
 

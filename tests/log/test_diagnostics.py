@@ -8,8 +8,8 @@ import numpy as np
 
 from dxlrun.description.modes import Mode
 from dxlrun.log import schemas
-from dxlrun.log.cdr import Codec
 from dxlrun.log.log_writer import DIAGNOSTICS_NS, Diagnostics
+from dxlrun.messages.cdr import Codec
 from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
 
 JOINTS = ("elbow", "wheel", "head")

@@ -25,10 +25,10 @@ from rosbags.typesys.store import Typestore
 from dxlrun.clock import VirtualClock
 from dxlrun.errors import LogError
 from dxlrun.log import reader, schemas
-from dxlrun.log.cdr import Codec
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import read_log
 from dxlrun.log.schemas import LogHeader, LogSummary, MessageType, to_metadata
+from dxlrun.messages.cdr import Codec
 from dxlrun.run.channels.cycle import CycleLayout
 from dxlrun.run.channels.events import Event, EventCode, EventCounts, EventRing, Severity
 from dxlrun.run.channels.packets import LoggedPacket, PacketBatch, PacketKind

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from dxlrun.log import schemas
-from dxlrun.log.cdr import Codec
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import read_log
 from dxlrun.log.schemas import LogHeader
+from dxlrun.messages.cdr import Codec
 from dxlrun.run.channels.packets import PacketBatch, PacketKind, decode_packets
 from dxlrun.run.channels.ring import Handover
 

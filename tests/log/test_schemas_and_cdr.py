@@ -12,8 +12,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from dxlrun.log import schemas
-from dxlrun.log.cdr import ENCAPSULATION, Codec, parse
-from dxlrun.log.schemas import MessageType
+from dxlrun.messages.cdr import ENCAPSULATION, Codec
+from dxlrun.messages.definition import MessageType, parse
 from dxlrun.run.channels.cycle import SCALARS, SEQUENCES, CycleLayout, CycleRecord
 
 MESSAGES = [
@@ -146,4 +146,4 @@ def test_a_cut_message_is_refused(cut: int) -> None:
 
 def test_a_definition_that_is_not_laid_out_is_refused() -> None:
     with pytest.raises(ValueError, match="cannot lay out"):
-        parse(MessageType("a/msg/B", "float64[3] fixed\n", ""))
+        parse(MessageType("a/msg/B", "float64[<=3] bounded\n", ""))

@@ -24,6 +24,7 @@ from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
 from dxlrun.run.channels.events import LONGEST_EVENT, EventRing
 from dxlrun.run.channels.heartbeat import Heartbeat, Phase
 from dxlrun.run.channels.mailbox import Mailbox
+from dxlrun.run.channels.messages import LONGEST_RECORD
 
 PERIOD_NS = 20_000_000
 
@@ -134,6 +135,7 @@ class Desk:
             guardian=ring.create("guardian", 1 << 16, LONGEST_EVENT),
             mailbox=mailbox.create(8),
             answers=ring.create("answers", mailbox.ANSWERS_CAPACITY, mailbox.LONGEST_ANSWER),
+            messages=ring.create("messages", 1 << 20, LONGEST_RECORD),
         )
         self.heartbeat = Heartbeat(memory.heartbeat)
         self.heartbeat.enter(Phase.RUNNING)

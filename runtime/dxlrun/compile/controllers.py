@@ -71,7 +71,12 @@ def compile_controllers(
             into=entry.into,
             reference=interfaces.reference,
             reads=interfaces.reads,
+            topics=tuple(f"/{name}/{topic}" for topic in offer.controller.Topics),
         )
+        buses = (f"/bus/{bus}" for bus in description.robot.buses)
+        if taken := set(plan.topics).intersection(buses):
+            mark = description.marks.key("controllers", name)
+            problems.error(mark, f"{min(taken)} is the topic of a bus", f"call {name} otherwise")
         compiled[name] = CompiledController(plan, offer, parameters)
     _exclusive_claims(description, compiled, problems)
     _fallbacks(description, compiled, problems)

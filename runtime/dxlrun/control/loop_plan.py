@@ -107,6 +107,8 @@ class ControllerPlan:
     """Interfaces that it exports on each of its joints, for controllers that are `into` it."""
     reads: tuple[str, ...] = ()
     """Interfaces that it reads without a claim: `JOINT/position`, `CONTROLLER/JOINT/position`."""
+    topics: tuple[str, ...] = ()
+    """Its own topics: `/arm/state`."""
 
     @property
     def commands_servos(self) -> bool:

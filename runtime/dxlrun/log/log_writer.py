@@ -18,11 +18,13 @@ from numpy.typing import NDArray
 from dxlrun.description.modes import Mode
 from dxlrun.errors import counted
 from dxlrun.log import schemas
-from dxlrun.log.cdr import ENCAPSULATION, Codec
-from dxlrun.log.schemas import LOG_MODE, LogHeader, LogSummary, MessageType, to_metadata
+from dxlrun.log.schemas import LOG_MODE, LogHeader, LogSummary, to_metadata
+from dxlrun.messages.cdr import ENCAPSULATION, Codec
+from dxlrun.messages.definition import MessageType
 from dxlrun.run.channels.commands import decode_taken_command
 from dxlrun.run.channels.cycle import CycleLayout
 from dxlrun.run.channels.events import Event, EventCode, LostRecords, Severity, decode_event
+from dxlrun.run.channels.messages import decode_message, decode_topic
 from dxlrun.run.channels.packets import split_packets
 from dxlrun.run.channels.ring import Payload, RecordKind
 
@@ -62,11 +64,16 @@ class LogWriter:
             cast("IO[bytes]", self._file), chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD
         )
         self._sequences: dict[int, int] = {}
+        self._known: dict[str, int] = {}
+        """Schemas by the names of their messages."""
+        self._topic_channels: list[int] = []
         self._takers: dict[int, Callable[[Payload], None]] = {
             RecordKind.CYCLE: self._cycle,
             RecordKind.PACKETS: self._packets,
             RecordKind.EVENT: self._event_record,
             RecordKind.TAKEN_COMMAND: self._taken_command,
+            RecordKind.TOPIC: self._topic,
+            RecordKind.MESSAGE: self._message,
         }
         self._diagnostics = Diagnostics(header.joints)
         self._event, self._ros_log, self._joint_state, self._command = (
@@ -95,7 +102,7 @@ class LogWriter:
             media = _MEDIA_TYPES.get(Path(name).suffix, "application/octet-stream")
             at_ns = max(0, header.epoch_offset_ns)
             self._writer.add_attachment(at_ns, at_ns, name, media, data)
-        known: dict[str, int] = {}
+        known = self._known
         self._cycle_channel = self._channel(known, schemas.CYCLE_TOPIC, schemas.CYCLE)
         self._activation_channel = self._channel(known, schemas.ACTIVATION_TOPIC, schemas.CYCLE)
         self._taken_channel = self._channel(known, schemas.COMMANDS_TOPIC, schemas.COMMAND)
@@ -240,6 +247,16 @@ class LogWriter:
             command.numbers,
         )
         self._add(self._taken_channel, command.t_ns, data)
+
+    def _topic(self, payload: Payload) -> None:
+        """Open the channel of a topic that has messages from now on."""
+        topic = decode_topic(payload)
+        self._topic_channels.append(self._channel(self._known, topic.name, topic.type))
+
+    def _message(self, payload: Payload) -> None:
+        """Write one message of a topic, as it is."""
+        message = decode_message(payload)
+        self._add(self._topic_channels[message.topic], message.t_ns, message.data)
 
     def _event_record(self, payload: Payload) -> None:
         self._write_event(decode_event(payload))

@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from dxlrun.description.modes import Mode
 from dxlrun.errors import LogError
 from dxlrun.log import schemas
-from dxlrun.log.cdr import ENCAPSULATION, Codec
 from dxlrun.log.schemas import LoggedController, LogHeader, from_metadata
+from dxlrun.messages.cdr import ENCAPSULATION, Codec
 from dxlrun.run.channels.commands import TakenCommand, data_of
 from dxlrun.run.channels.cycle import CycleLayout
 from dxlrun.run.channels.events import Event

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import msgspec
 
+from dxlrun.messages.definition import RULE, MessageType
 from dxlrun.run.channels.cycle import SCALARS, SEQUENCES
 
 PROFILE = "ros2"
@@ -44,17 +45,6 @@ _READABLE = ("3", FORMAT)
 LOG_MODE = 0o640
 """Of a new log: commands and the names of clients are for its user and group."""
 
-_RULE = "=" * 80
-
-
-@dataclass(frozen=True, slots=True)
-class MessageType:
-    """A message: its full name, its definition with all it depends on, its RIHS01 hash."""
-
-    name: str
-    text: str
-    type_hash: str
-
 
 def bus_topic(bus: str) -> str:
     """Return the topic of a bus' packets."""
@@ -62,7 +52,7 @@ def bus_topic(bus: str) -> str:
 
 
 _TIME = f"""
-{_RULE}
+{RULE}
 MSG: builtin_interfaces/Time
 int32 sec
 uint32 nanosec
@@ -75,7 +65,7 @@ string[] name
 float64[] position
 float64[] velocity
 float64[] effort
-{_RULE}
+{RULE}
 MSG: std_msgs/Header
 builtin_interfaces/Time stamp
 string frame_id
@@ -103,12 +93,12 @@ DIAGNOSTICS = MessageType(
     "diagnostic_msgs/msg/DiagnosticArray",
     f"""std_msgs/Header header
 diagnostic_msgs/DiagnosticStatus[] status
-{_RULE}
+{RULE}
 MSG: std_msgs/Header
 builtin_interfaces/Time stamp
 string frame_id
 {_TIME.strip()}
-{_RULE}
+{RULE}
 MSG: diagnostic_msgs/DiagnosticStatus
 # 0 OK, 1 warning, 2 error, 3 stale
 byte level
@@ -116,7 +106,7 @@ string name
 string message
 string hardware_id
 diagnostic_msgs/KeyValue[] values
-{_RULE}
+{RULE}
 MSG: diagnostic_msgs/KeyValue
 string key
 string value

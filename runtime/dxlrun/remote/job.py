@@ -15,6 +15,7 @@ class Descriptors:
     guardian: int
     mailbox: int
     answers: int
+    messages: int
 
 
 @dataclass(frozen=True, slots=True)

@@ -65,7 +65,7 @@ class _TooLong(BaseException):
 
 
 @contextmanager
-def bounded(controller: str) -> Iterator[None]:
+def _bounded(controller: str) -> Iterator[None]:
     """Interrupt a plug-in's Python code after BUDGET_S, in the main thread; raises RefusedRequest then.
 
     A call into C that never returns is not interrupted: then Ctrl-C in the robot's terminal is what is left.
@@ -145,15 +145,6 @@ class Preparation:
             self._schemas[plan.type] = found
         return self._schemas[plan.type]
 
-    def goals(self, plan: ControllerPlan) -> list[str]:
-        """Return the names of the commands of a controller that are goals."""
-        offer = self.plugins.controllers.get(plan.type)
-        return sorted(offer.controller.Goals) if offer else []
-
-    def parameters(self, plan: ControllerPlan) -> ParametersModel:
-        """Return the parameters of a controller as they are now; raises RefusedRequest."""
-        return self._controller(plan).parameters
-
     def command(self, plan: ControllerPlan, kind: str, body: bytes, *, units: bool = False) -> Prepared:
         """Return a typed command that came as JSON (`true` and "1" are no numbers there).
 
@@ -171,7 +162,7 @@ class Preparation:
         if units and _of_motions(kind, model):
             body = in_si(body, what)
         try:
-            with bounded(plan.name):
+            with _bounded(plan.name):
                 command = model.model_validate_json(body, strict=True)
                 prepared = controller.prepare(kind, command, known.parameters)
                 data = np.ascontiguousarray(prepared, dtype="<f8").tobytes()
@@ -195,7 +186,7 @@ class Preparation:
         if offer is None:
             raise invalid(f"no plug-in offers the type {plan.type} of {plan.name} any more")
         try:
-            with bounded(plan.name):
+            with _bounded(plan.name):
                 parameters = offer.controller.Parameters.model_validate_json(plan.parameters)
         except RefusedRequest:
             raise
@@ -242,12 +233,13 @@ class Preparation:
             every=1,  # the loop knows its own rate
             rate=written.rate,
             fallback=written.fallback or "",
+            topics=tuple(f"/{name}/{topic}" for topic in offer.controller.Topics),
         )
 
     def _interfaces(self, name: str, offer: Offer, own: Mapping[str, object]) -> Interfaces:
         """Return the interfaces that a controller's class asks for with these parameters."""
         try:
-            with bounded(name):
+            with _bounded(name):
                 parameters = offer.controller.Parameters.model_validate(own)
                 interfaces = offer.controller.interfaces(parameters, tuple(self.joints))
         except RefusedRequest:

@@ -10,6 +10,7 @@ from dxlrun.compile.plan import Plan
 from dxlrun.control.controllers.activity import Activity
 from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.controllers.plugins import PlugIns
+from dxlrun.control.controllers.topics import TopicLog
 from dxlrun.control.gate import Gate
 from dxlrun.control.loop import Loop, StopFlag
 from dxlrun.dynamixel.exchange import kernel
@@ -18,6 +19,7 @@ from dxlrun.dynamixel.port.ports import Ports
 from dxlrun.run.channels.commands import CommandSink, Inbox, NoInbox
 from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
 from dxlrun.run.channels.events import EventSink
+from dxlrun.run.channels.messages import MessageSink, NoMessages
 from dxlrun.run.channels.packets import PacketLog
 from dxlrun.run.channels.ring import Appender, RecordKind
 
@@ -33,6 +35,9 @@ class Sinks:
     commands: CommandSink
     progress: Callable[[int, int], None] = lambda cycles, skipped: None
     """Called after each cycle with how many ran and how many periods were skipped."""
+    messages: MessageSink = field(default_factory=NoMessages)
+    epoch_offset_ns: int = 0
+    """Wall time = time of the run's clock + this, for the stamps of messages."""
     ran: int = field(default=0, init=False)
     skipped: int = field(default=0, init=False)
 
@@ -107,6 +112,7 @@ def assemble(
         commands=sinks.commands,
         set_modes=hardware.set_modes,
         activity=activity,
+        topics=TopicLog(record, sinks.messages, sinks.epoch_offset_ns),
     )
     gate = Gate(plan.loop, record, sinks.events)
     loop = Loop(

@@ -77,6 +77,8 @@ class GuardianJob:
     take_over: bool
     """The loop accepts servos that are already torqued."""
     memory: RunMemory
+    epoch_offset_ns: int = 0
+    """Wall time = time of the run's clock + this."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +93,7 @@ class LoopJob:
     """To the guardian, which opens lines that are gone again."""
     guardian: int
     """Process ID."""
+    epoch_offset_ns: int = 0
 
 
 class Started(msgspec.Struct, frozen=True, tag=True):
@@ -262,7 +265,10 @@ class Guardian:
         self._control.send(Ended(ending, tuple(outcome)))
 
     def _execute(self, descriptors: list[int], channel: int) -> subprocess.Popen[bytes]:
-        job = LoopJob(self._job.memory, self._job.take_over, tuple(descriptors), channel, os.getpid())
+        given = self._job
+        job = LoopJob(
+            given.memory, given.take_over, tuple(descriptors), channel, os.getpid(), given.epoch_offset_ns
+        )
         return process.start(
             "dxlrun.run.loop_process",
             ["--job", msgspec.json.encode(job).decode()],

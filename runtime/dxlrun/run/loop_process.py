@@ -38,6 +38,7 @@ from dxlrun.run.channels.commands import CommandRing
 from dxlrun.run.channels.events import EventCode, EventGroup, EventRing, Severity
 from dxlrun.run.channels.heartbeat import Heartbeat, Phase
 from dxlrun.run.channels.mailbox import Mailbox
+from dxlrun.run.channels.messages import MessageRing
 from dxlrun.run.channels.packets import PacketBatch
 from dxlrun.run.channels.process import LineReturned, MessageChannel
 from dxlrun.run.channels.ring import RingWriter
@@ -224,7 +225,15 @@ def main() -> None:
     happened = RingWriter(job.memory.events)
     events = EventRing(happened, clock)
     packets = PacketBatch(RingWriter(job.memory.packets), process.shared_memory(job.memory.desk))
-    sinks = Sinks(RingWriter(job.memory.cycles), packets, events, CommandRing(happened), heartbeat.cycle)
+    sinks = Sinks(
+        RingWriter(job.memory.cycles),
+        packets,
+        events,
+        CommandRing(happened),
+        heartbeat.cycle,
+        MessageRing(RingWriter(job.memory.messages)),
+        job.epoch_offset_ns,
+    )
     try:
         if os.getppid() != job.guardian:
             sys.exit(1)  # the guardian was gone before its death could be signalled

@@ -20,6 +20,7 @@ from dxlrun.run.channels import heartbeat, mailbox, process, ring
 from dxlrun.run.channels.commands import LONGEST_COMMAND, command_capacity
 from dxlrun.run.channels.cycle import MOST_CONTROLLERS, cycle_capacity
 from dxlrun.run.channels.events import LONGEST_EVENT, event_capacity
+from dxlrun.run.channels.messages import LONGEST_RECORD, message_capacity, usual_message
 from dxlrun.run.channels.packets import DESK_SIZE, LONGEST_BATCH, packet_capacity
 from dxlrun.run.channels.process import Child, Draining, Failed, Listening, Ready, RunMemory
 from dxlrun.run.guardian import GUARDIAN_MESSAGES, GuardianJob, GuardianMessage
@@ -52,12 +53,21 @@ def create_memory(plan: Plan) -> RunMemory:
         packets=ring.create("packets", packet_capacity(period, servos), LONGEST_BATCH),
         desk=process.memory_file("dxlrun-desk", bytes(DESK_SIZE)),
         events=ring.create("events", events, max(_LONGEST_TAKEN, LONGEST_EVENT)),
+        messages=ring.create("messages", message_capacity(_published(plan)), LONGEST_RECORD),
         guardian=ring.create("guardian", _GUARDIAN_CAPACITY, max(LONGEST_BATCH, LONGEST_EVENT)),
         result=process.memory_file("dxlrun-result"),
         mailbox=mailbox.create(MOST_CONTROLLERS),
         answers=ring.create("answers", mailbox.ANSWERS_CAPACITY, mailbox.LONGEST_ANSWER),
         grants=process.memory_file("dxlrun-grants"),
         stderr=process.memory_file("dxlrun-stderr"),
+    )
+
+
+def _published(plan: Plan) -> float:
+    """Return how many bytes a second the plan's controllers publish, one message a topic and update."""
+    return sum(
+        len(one.topics) * usual_message(len(one.joints)) * 1e9 / (plan.loop.period_ns * one.every)
+        for one in plan.loop.controllers
     )
 
 
@@ -134,6 +144,7 @@ def start_gateway(log: Path | None, memory: RunMemory) -> Child[GatewayMessage]:
         memory.guardian,
         memory.mailbox,
         memory.answers,
+        memory.messages,
     )
     job = GatewayJob(memory.plan, shared, str(log.absolute()) if log else None)
     descriptor = process.memory_file("dxlrun-gateway", msgspec.json.encode(job))
@@ -151,7 +162,9 @@ def start_gateway(log: Path | None, memory: RunMemory) -> Child[GatewayMessage]:
         os.close(descriptor)
 
 
-def guardian_job(plan: Plan, ports: Mapping[str, str], memory: RunMemory, *, take_over: bool) -> GuardianJob:
+def guardian_job(
+    plan: Plan, ports: Mapping[str, str], memory: RunMemory, *, take_over: bool, epoch_offset_ns: int = 0
+) -> GuardianJob:
     """Return the job of the guardian, and through it of the loop."""
     scheduler = plan.loop.scheduler
     return GuardianJob(
@@ -164,6 +177,7 @@ def guardian_job(plan: Plan, ports: Mapping[str, str], memory: RunMemory, *, tak
         last=plan.loop.policies.on_fault.last,
         take_over=take_over,
         memory=memory,
+        epoch_offset_ns=epoch_offset_ns,
     )
 
 

@@ -132,11 +132,14 @@ class _Run:
         ports: dict[str, str] = {}
         if self.plan.simulated:
             self.simulation, ports = start_simulated_buses(self.plan, ledger, self.memory)
+        offset_ns = epoch_offset_ns()
         if self.log:
-            header = log_header(self.plan, epoch_offset_ns(), virtual=False)
+            header = log_header(self.plan, offset_ns, virtual=False)
             self.recorder = start_recorder(self.log, header, self.memory)
         others = [child.channel.fileno() for child in (self.simulation, self.recorder) if child]
-        self.job = guardian_job(self.plan, ports, self.memory, take_over=self.options.take_over)
+        self.job = guardian_job(
+            self.plan, ports, self.memory, take_over=self.options.take_over, epoch_offset_ns=offset_ns
+        )
         self.guardian = start_guardian(self.job, others)
         started = self.guardian.ready()
         if isinstance(started, Started):

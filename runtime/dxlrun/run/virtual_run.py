@@ -24,6 +24,7 @@ from dxlrun.run.assembly import Sinks, assemble
 from dxlrun.run.channels.commands import CommandRing, NoCommands, QueueInbox
 from dxlrun.run.channels.cycle import CycleRecord
 from dxlrun.run.channels.events import EventCode, EventGroup, EventRing, Severity
+from dxlrun.run.channels.messages import MessageRing, NoMessages
 from dxlrun.run.channels.packets import NoPackets, PacketBatch
 from dxlrun.run.channels.ring import Handover
 from dxlrun.run.run_log import discard_log, incomplete_log, log_header, new_log
@@ -78,6 +79,7 @@ class VirtualRobot:
             PacketBatch(to_log) if log else NoPackets(),
             self._events,
             CommandRing(to_log) if log else NoCommands(),
+            messages=MessageRing(to_log) if log else NoMessages(),
         )
         self.robot = assemble(
             plan,

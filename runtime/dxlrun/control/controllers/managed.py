@@ -17,6 +17,7 @@ from dxlrun.control.controllers.controller import Context, Controller, JointLimi
 from dxlrun.control.controllers.goals import RunningGoal
 from dxlrun.control.controllers.live_parameters import LiveValues, with_values
 from dxlrun.control.controllers.plugins import PlugIns
+from dxlrun.control.controllers.topics import TopicLog
 from dxlrun.control.controllers.wiring import Claim, Inputs, claims
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan
 from dxlrun.errors import ControllerFault
@@ -61,6 +62,7 @@ class Managed:
         events: EventSink,
         activity: Activity,
         period_ns: int,
+        topics: TopicLog,
     ) -> None:
         """`joints` are all joints of the robot; `period_ns` is the loop's.
 
@@ -84,6 +86,7 @@ class Managed:
         self._activity = activity
         self._controller: Controller[Any]
         self._inputs = Inputs(plan, record, self.rows)
+        self._topics = topics.of_controller(plan.name, self.bit)
         self._divider = plan.every
         self._nominal_ns = plan.every * period_ns
         self._context = self._new_context([joints[row] for row in self.rows], events)
@@ -107,9 +110,9 @@ class Managed:
             states=self._inputs.states,
             goals=self._inputs.goals,
             commands=Commands.empty(len(joints)),
-            # neither knows this object: a circle would stay when the controller is unloaded
+            # none of them knows this object: a circle would stay when the controller is unloaded
             say=partial(events.emit, EventCode.CONTROLLER_SAYS, Severity.INFO, self.plan.name),
-            publish=partial(_publish, self._record, self.bit),
+            publish=self._topics.publish,
             references=self._inputs.references,
             reads=self._inputs.reads,
             into=self.plan.into,
@@ -123,6 +126,7 @@ class Managed:
         self._activity.name_controller(self._place, name)
         with self._shown(ControllerMethod.INIT):
             self._controller = plugins.built(self.plan)
+        self._topics.open(type(self._controller).Topics, self.plan.distribution, self.plan.joints)
         with self._shown(ControllerMethod.ON_CONFIGURE):
             try:
                 self._controller.on_configure(self._context)
@@ -153,12 +157,9 @@ class Managed:
         self.active = True
         self._record.active |= self.bit
 
-    def deactivate(self, time_ns: int, why: str = "") -> None:
-        """Let the controller leave its joints. Raises ControllerFault; they are released all the same.
-
-        `why` its goal is aborted; empty: because it is deactivated.
-        """
-        self.release(why or f"{self.plan.name} was deactivated")
+    def deactivate(self, time_ns: int) -> None:
+        """Let the controller leave its joints. Raises ControllerFault; they are released all the same."""
+        self.release(f"{self.plan.name} was deactivated")
         self._call(ControllerMethod.ON_DEACTIVATE, "", self._controller.on_deactivate, time_ns)
 
     def release(self, why: str) -> None:
@@ -307,6 +308,8 @@ class Managed:
                 "start a process in on_configure instead",
                 raised,
             ) from raised
+        if isinstance(raised, ControllerFault):  # the context refused something, in a sentence of its own
+            raise self._fault(str(raised), raised) from raised
         if raised is not None:
             shown = " ".join(f"{type(raised).__name__}: {raised}".split())
             raise self._fault(f"raised in {method}{what}: {shown}", raised) from raised
@@ -316,10 +319,6 @@ class Managed:
         if raised is not None:
             fault.add_note("".join(traceback.format_exception(raised))[-_TRACEBACK:])
         return fault
-
-
-def _publish(record: CycleRecord, bit: int, topic: str = "", message: object = None) -> None:
-    record.published |= bit
 
 
 def _row(values: Sequence[float | None]) -> Floats:

@@ -19,6 +19,7 @@ from dxlrun.control.controllers.live_parameters import LiveValues
 from dxlrun.control.controllers.managed import Managed, rate_divider, rate_fits
 from dxlrun.control.controllers.mode_switch import ModeSwitch, SetModes
 from dxlrun.control.controllers.plugins import PlugIns
+from dxlrun.control.controllers.topics import TopicLog
 from dxlrun.control.loop_plan import ControllerPlan, LoopPlan, ScheduledCommand
 from dxlrun.errors import ControllerFault, PlugInError
 from dxlrun.run.channels.answers import Code, CommandOutcome, Field, Refusal, Waiting
@@ -44,10 +45,11 @@ class Manager:
         commands: CommandSink | None = None,
         set_modes: SetModes | None = None,
         activity: Activity | None = None,
+        topics: TopicLog | None = None,
     ) -> None:
         """`set_modes` requests other modes of joints from the hardware; without it they stay as they are.
 
-        `activity` shows which controller's code runs.
+        `activity` shows which controller's code runs, `topics` takes what they publish.
         """
         self.fault: str | None = None
         self._plan = plan
@@ -57,6 +59,7 @@ class Manager:
         self._clock = clock
         self._taken = commands or NoCommands()
         self._activity = activity or Activity()
+        self._topics = topics or TopicLog(record)
         self._period_ns = plan.period_ns
         self._managed: tuple[Managed, ...] = ()
         """By their places; those that were unloaded keep theirs until another one gets it."""
@@ -385,7 +388,7 @@ class Manager:
         """Deactivate all controllers, the last one first; raises nothing, a fault is in `fault`."""
         for managed in reversed(self._managed):
             if managed.active:
-                self._deactivate(managed, time_ns, "the run ended")
+                self._deactivate(managed, time_ns)
         for number in self._modes.end():
             self._end_switch(number, Refusal(Code.RUN_ENDING))
 
@@ -409,10 +412,10 @@ class Manager:
             self._fall_back(managed, why, time_ns)
         return _refused_by(*failed[0]) if failed else None
 
-    def _deactivate(self, managed: Managed, time_ns: int, why: str = "") -> None:
+    def _deactivate(self, managed: Managed, time_ns: int) -> None:
         self._modes.changed()
         try:
-            managed.deactivate(time_ns, why)
+            managed.deactivate(time_ns)
         except ControllerFault as fault:
             self._take_out(managed, fault)  # without a fallback: it was leaving anyway
             self.fault = self.fault or str(fault)
@@ -484,6 +487,7 @@ class Manager:
             events=self._events,
             activity=self._activity,
             period_ns=self._period_ns,
+            topics=self._topics,
         )
         managed.configure(self._plugins)
         return managed

@@ -7,6 +7,7 @@ a traceback; a plug-in that is broken leaves the others usable.
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -30,8 +31,13 @@ from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.description.modes import COMMAND_INTERFACES, mode_of
 from dxlrun.dynamixel.control_table import add_control_table
 from dxlrun.errors import ControllerFault, PlugInError
+from dxlrun.messages.declared import WrongMessage, declared_message, package_of
 
 _MOST_MISTAKES = 5
+DERIVED_TOPICS = ("/joint_states",)
+"""What the recorder makes of the cycles that a controller marks."""
+_TOPIC = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
+"""Part of a topic's name, by the page "Topic and Service names to DDS" of ROS 2's design."""
 ControllerClass = type[Controller[Any]]
 Breach = tuple[str, str]
 """What is wrong, and how to fix it."""
@@ -218,6 +224,8 @@ def _load(entry_point: EntryPoint, publisher: str) -> _Offered:
         for mapping in mappings
         for name, controller in _items(mapping, refuse)
     )
+    if twofold := _twofold_message(offers):
+        raise refuse(f"has two messages {twofold}", "give one of the two classes another name")
     for models in servo_models:
         _add_servo_models(models, refuse)
     return _Offered(offers, _overrun(manager))
@@ -353,9 +361,46 @@ def _declaration_breach(controller: ControllerClass) -> Breach | None:
         return "whose Commands is no mapping of names to models", "write {name: class of dxlrun.CommandModel}"
     if breach := _goals_breach(controller, commands):
         return breach
+    return _publishes_breach(controller) or _topics_breach(controller)
+
+
+def _publishes_breach(controller: ControllerClass) -> Breach | None:
     publishes: object = controller.publishes
     if not isinstance(publishes, tuple) or not all(isinstance(topic, str) for topic in publishes):
         return "whose publishes is no tuple of topics", 'write publishes = ("/joint_states",)'
+    if unknown := [topic for topic in publishes if topic not in DERIVED_TOPICS]:
+        return (
+            f"whose publishes has {unknown[0]}, which is not made of the robot's cycles",
+            f"declare it in Topics with the class of its messages; publishes has {', '.join(DERIVED_TOPICS)}",
+        )
+    return None
+
+
+def _topics_breach(controller: ControllerClass) -> Breach | None:
+    topics: object = controller.Topics
+    if not isinstance(topics, Mapping):
+        return "whose Topics is no mapping of names to messages", 'write Topics = {"state": WaveState}'
+    for topic, message in topics.items():
+        if not isinstance(topic, str) or not _TOPIC.fullmatch(topic):
+            return (
+                f"whose Topics has {topic!r}, which is no name of a topic",
+                "use letters, digits and _, a letter first; it becomes /CONTROLLER/TOPIC",
+            )
+        try:
+            declared_message(message, "any")
+        except WrongMessage as wrong:
+            return f"whose topic {topic} has no message of ROS 2: {wrong.what}", wrong.fix
+    return None
+
+
+def _twofold_message(offers: Sequence[Offer]) -> str | None:
+    """Return the name of a message that the topics of these offers define in two ways."""
+    known: dict[str, str] = {}
+    for offer in offers:
+        for message in offer.controller.Topics.values():
+            found = declared_message(message, package_of(offer.distribution)).type
+            if known.setdefault(found.name, found.type_hash) != found.type_hash:
+                return found.name
     return None
 
 

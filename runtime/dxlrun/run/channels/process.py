@@ -115,6 +115,8 @@ class RunMemory:
     """The packets of the unfinished cycle."""
     events: int
     """Of the loop, and the commands that its cycles took."""
+    messages: int
+    """Topics of the loop."""
     guardian: int
     """Packets and events of the guardian."""
     result: int
@@ -128,7 +130,7 @@ class RunMemory:
     @property
     def of_loop(self) -> tuple[int, ...]:
         """Those that the loop's process inherits."""
-        rings = (self.cycles, self.packets, self.desk, self.events, self.mailbox, self.answers)
+        rings = (self.cycles, self.packets, self.desk, self.events, self.messages, self.mailbox, self.answers)
         return (self.plan, self.heartbeat, *rings, self.result, self.grants)
 
     @property
@@ -138,6 +140,7 @@ class RunMemory:
             "loop/cycles": self.cycles,
             "loop/packets": self.packets,
             "loop/events": self.events,
+            "loop/messages": self.messages,
             "guardian": self.guardian,
         }
 

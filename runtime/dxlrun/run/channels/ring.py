@@ -67,6 +67,10 @@ class RecordKind(IntEnum):
     """commands.py: a command on its way to the loop"""
     ANSWER = 6
     """mailbox.py"""
+    TOPIC = 7
+    """messages.py: a topic that has messages from here on"""
+    MESSAGE = 8
+    """messages.py"""
 
 
 class Record(NamedTuple):

@@ -9,17 +9,15 @@ both decode what comes out of here in the tests.
 
 from __future__ import annotations
 
-import re
 import struct
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.log.schemas import MessageType
+from dxlrun.messages.definition import PRIMITIVES, Definitions, MessageField, MessageType, parse, short_name
 
 ENCAPSULATION = b"\x00\x01\x00\x00"
 """CDR, little-endian, no options."""
@@ -27,58 +25,11 @@ ENCAPSULATION = b"\x00\x01\x00\x00"
 Numbers: TypeAlias = "NDArray[np.generic] | bytes | bytearray | memoryview"
 Value: TypeAlias = "int | float | str | Numbers | Sequence[Value] | Mapping[str, Value]"
 
-_PRIMITIVES = {
-    "bool": "?",
-    "byte": "B",
-    "char": "B",
-    "int8": "b",
-    "uint8": "B",
-    "int16": "h",
-    "uint16": "H",
-    "int32": "i",
-    "uint32": "I",
-    "int64": "q",
-    "uint64": "Q",
-    "float32": "f",
-    "float64": "d",
-}
-_FIELD = re.compile(r"^([A-Za-z0-9_/]+)(\[\])? +([a-z][a-z0-9_]*)$")
 _HEAD = len(ENCAPSULATION)
 _LENGTH = struct.Struct("<I")
 
 Write: TypeAlias = "Callable[[bytearray, Value], None]"
 Read: TypeAlias = "Callable[[memoryview, int], tuple[Value, int]]"
-
-
-@dataclass(frozen=True, slots=True)
-class MessageField:
-    """One field of a definition."""
-
-    name: str
-    kind: str
-    sequence: bool
-
-
-def parse(message: MessageType) -> dict[str, tuple[MessageField, ...]]:
-    """Return the fields of a message and of all it depends on, by type name without `msg/`.
-
-    Raises ValueError for what our messages do not use: constants, defaults, fixed arrays, bounds.
-    """
-    definitions: dict[str, tuple[MessageField, ...]] = {}
-    name = message.name
-    for block in re.split(r"^=+$", message.text, flags=re.MULTILINE):
-        fields = []
-        for line in block.strip().splitlines():
-            text = line.split("#", 1)[0].strip()
-            if text.startswith("MSG: "):
-                name = text.removeprefix("MSG: ")
-            elif text:
-                match = _FIELD.match(text)
-                if match is None:
-                    raise ValueError(f"{message.name}: cannot lay out {line!r}")
-                fields.append(MessageField(match[3], match[1], match[2] is not None))
-        definitions[name.replace("/msg/", "/")] = tuple(fields)
-    return definitions
 
 
 class Codec:
@@ -87,16 +38,17 @@ class Codec:
     The numbers that a message begins with lie at fixed places: they are packed in one go.
     """
 
-    __slots__ = ("_lead", "_lead_count", "_read", "_rest", "fields", "message")
+    __slots__ = ("_definitions", "_lead", "_lead_count", "_read", "_rest", "fields", "message")
 
     def __init__(self, message: MessageType) -> None:
         self.message = message
         definitions = parse(message)
-        top = message.name.replace("/msg/", "/")
+        top = short_name(message.name)
         self.fields: tuple[str, ...] = tuple(field.name for field in definitions[top])
         self._lead, self._lead_count = _lead(definitions[top])
         rest = definitions[top][self._lead_count :]
         self._rest: list[Write] = [_field(field, definitions)[0] for field in rest]
+        self._definitions = definitions
         _, self._read = _nested(top, definitions)
 
     def pack(self, *values: Value) -> bytes:
@@ -112,6 +64,13 @@ class Codec:
         buffer += self._lead.pack(*values[:count])
         for write, value in zip(self._rest, values[count:], strict=True):
             write(buffer, value)
+        return bytes(buffer)
+
+    def pack_field(self, name: str, value: Value) -> bytes:
+        """Return one field alone, as if its message began with it: shows which one does not fit."""
+        fields = self._definitions[short_name(self.message.name)]
+        buffer = bytearray(ENCAPSULATION)
+        _field(fields[self.fields.index(name)], self._definitions)[0](buffer, value)
         return bytes(buffer)
 
     def unpack(self, data: bytes | memoryview) -> Mapping[str, Value]:
@@ -134,9 +93,9 @@ def _lead(fields: Sequence[MessageField]) -> tuple[struct.Struct, int]:
     """Return the layout of the numbers that a message begins with, padding included, and their count."""
     form, at, count = "<", 0, 0
     for field in fields:
-        if field.sequence or field.kind not in _PRIMITIVES:
+        if field.sequence or field.length or field.kind not in PRIMITIVES:
             break
-        code = _PRIMITIVES[field.kind]
+        code = PRIMITIVES[field.kind]
         size = struct.calcsize("<" + code)
         form += f"{-at % size}x{code}"
         at += -at % size + size
@@ -155,7 +114,7 @@ def _aligned(at: int, size: int) -> int:
 
 
 def _number(kind: str) -> tuple[Write, Read]:
-    form = struct.Struct("<" + _PRIMITIVES[kind])
+    form = struct.Struct("<" + PRIMITIVES[kind])
 
     def write(buffer: bytearray, value: Value) -> None:
         _align(buffer, form.size)
@@ -168,26 +127,41 @@ def _number(kind: str) -> tuple[Write, Read]:
     return write, read
 
 
-def _numbers(kind: str) -> tuple[Write, Read]:
-    element = np.dtype(_PRIMITIVES[kind]).newbyteorder("<")
+def _row(value: Value, element: np.dtype[np.generic]) -> bytes | bytearray | memoryview:
+    """Return the bytes of one row of numbers."""
+    if isinstance(value, np.ndarray):
+        if value.dtype != element:
+            raise ValueError(f"{value.dtype} is given where {element} is asked")
+        if value.ndim != 1:
+            raise ValueError(f"an array of shape {value.shape} is given where one row is asked")
+        return value.tobytes()
+    if not isinstance(value, bytes | bytearray | memoryview) or element.itemsize != 1:
+        raise ValueError(f"numbers come as an array of {element}, not as {type(value).__name__}")
+    return value
+
+
+def _numbers(kind: str, fixed: int) -> tuple[Write, Read]:
+    """Sequences, or arrays of a `fixed` length, which is then not written."""
+    element = np.dtype(PRIMITIVES[kind]).newbyteorder("<")
 
     def write(buffer: bytearray, value: Value) -> None:
-        if isinstance(value, np.ndarray):
-            if value.dtype != element:
-                raise ValueError(f"{value.dtype} is given where {element} is asked")
-            value = value.tobytes()
-        elif not isinstance(value, bytes | bytearray | memoryview) or element.itemsize != 1:
-            raise ValueError(f"numbers come as an array of {element}, not as {type(value).__name__}")
-        _align(buffer, 4)
-        buffer += _LENGTH.pack(len(value) // element.itemsize)
-        if value:
+        row = _row(value, element)
+        count = len(row) // element.itemsize
+        if not fixed:
+            _align(buffer, 4)
+            buffer += _LENGTH.pack(count)
+        elif count != fixed:
+            raise ValueError(f"{count} numbers are given where {fixed} are asked")
+        if row:
             _align(buffer, element.itemsize)
-            buffer += value
+            buffer += row
 
     def read(data: memoryview, at: int) -> tuple[Value, int]:
-        at = _aligned(at, 4)
-        (count,) = _LENGTH.unpack_from(data, at)
-        at += 4
+        count = fixed
+        if not fixed:
+            at = _aligned(at, 4)
+            (count,) = _LENGTH.unpack_from(data, at)
+            at += 4
         if count:
             at = _aligned(at, element.itemsize)
         end = at + count * element.itemsize
@@ -261,7 +235,7 @@ def _texts() -> tuple[Write, Read]:
     return write, read
 
 
-def _nested(name: str, definitions: Mapping[str, tuple[MessageField, ...]]) -> tuple[Write, Read]:
+def _nested(name: str, definitions: Definitions) -> tuple[Write, Read]:
     fields = definitions[name]
     steps = [_field(field, definitions) for field in fields]
     names = [field.name for field in fields]
@@ -281,9 +255,12 @@ def _nested(name: str, definitions: Mapping[str, tuple[MessageField, ...]]) -> t
     return write, read
 
 
-def _field(field: MessageField, definitions: Mapping[str, tuple[MessageField, ...]]) -> tuple[Write, Read]:
-    if field.kind in _PRIMITIVES:
-        return _numbers(field.kind) if field.sequence else _number(field.kind)
+def _field(field: MessageField, definitions: Definitions) -> tuple[Write, Read]:
+    if field.kind in PRIMITIVES:
+        many = field.sequence or field.length
+        return _numbers(field.kind, field.length) if many else _number(field.kind)
+    if field.length:
+        raise ValueError(f"{field.name}: only numbers come in arrays of fixed length")
     if field.kind == "string":
         return _texts() if field.sequence else _text()
     one = _nested(field.kind, definitions)

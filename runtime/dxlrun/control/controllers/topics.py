@@ -1,0 +1,124 @@
+"""Topics of the loop: messages of controllers, and of the runtime itself, on their way to log and clients.
+
+A message is checked and encoded where it is published, in the loop's process; nothing of it is kept there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from dxlrun.errors import ControllerFault
+from dxlrun.messages.declared import DeclaredMessage, WrongMessage, declared_message, package_of
+from dxlrun.run.channels.cycle import CycleRecord
+from dxlrun.run.channels.messages import LONGEST_MESSAGE, MessageSink, NoMessages, Topic
+
+MOST_PER_CYCLE = 16
+"""Messages that one controller may publish in a cycle; it is a limit for what is out of control."""
+OWN_PACKAGE = "dxlrun_msgs"
+"""Of the runtime's own messages."""
+
+
+class Publisher:
+    """One topic: takes its messages, at the time of the cycle."""
+
+    __slots__ = ("_epoch_offset_ns", "_message", "_number", "_record", "_sink", "topic")
+
+    def __init__(
+        self,
+        topic: Topic,
+        message: DeclaredMessage,
+        sink: MessageSink,
+        record: CycleRecord,
+        epoch_offset_ns: int,
+    ) -> None:
+        self.topic = topic
+        self._message = message
+        self._sink = sink
+        self._number = sink.announce(topic)
+        self._record = record
+        self._epoch_offset_ns = epoch_offset_ns
+
+    def publish(self, message: object) -> None:
+        """Publish a message. Raises WrongMessage, with one sentence, when it does not fit its topic."""
+        t_ns = self._record.woken_ns
+        data = self._message.pack(message, divmod(max(0, t_ns + self._epoch_offset_ns), 1_000_000_000))
+        if len(data) > LONGEST_MESSAGE:
+            raise WrongMessage(f"takes {LONGEST_MESSAGE} bytes at most, not {len(data)}")
+        self._sink.message(self._number, t_ns, data)
+
+
+class TopicLog:
+    """Where the loop's topics are opened; `record` has the cycle's time."""
+
+    __slots__ = ("_epoch_offset_ns", "_record", "_sink")
+
+    def __init__(
+        self, record: CycleRecord, sink: MessageSink | None = None, epoch_offset_ns: int = 0
+    ) -> None:
+        """`epoch_offset_ns` + time of the run's clock is wall time, for stamps."""
+        self._record = record
+        self._sink = sink or NoMessages()
+        self._epoch_offset_ns = epoch_offset_ns
+
+    def open(
+        self, name: str, message: type, package: str = OWN_PACKAGE, joints: tuple[str, ...] = ()
+    ) -> Publisher:
+        """Announce a topic of messages of a dataclass; allocates. Raises WrongMessage when it is none."""
+        declared = declared_message(message, package)
+        topic = Topic(name, declared.type, joints)
+        return Publisher(topic, declared, self._sink, self._record, self._epoch_offset_ns)
+
+    def of_controller(self, name: str, bit: int) -> ControllerTopics:
+        """Return what a controller publishes with; its topics are opened later."""
+        return ControllerTopics(self, self._record, name, bit)
+
+
+class ControllerTopics:
+    """What `Context.publish` calls: the topics of one controller."""
+
+    __slots__ = ("_bit", "_cycle", "_left", "_log", "_name", "_publishers", "_record")
+
+    def __init__(self, log: TopicLog, record: CycleRecord, name: str, bit: int) -> None:
+        self._log = log
+        self._record = record
+        self._name = name
+        self._bit = bit
+        self._publishers: dict[str, Publisher] = {}
+        self._cycle = -2
+        self._left = 0
+
+    def open(self, topics: Mapping[str, type], distribution: str, joints: tuple[str, ...]) -> None:
+        """Open its topics; messages are of the package of the distribution that offers the controller."""
+        package = package_of(distribution)
+        for topic, message in topics.items():
+            try:
+                name = f"/{self._name}/{topic}"
+                self._publishers[topic] = self._log.open(name, message, package, joints)
+            except WrongMessage as error:
+                raise ControllerFault(f"controller {self._name}: topic {topic}: {error}") from None
+
+    def publish(self, topic: str = "", message: object = None) -> None:
+        """Publish a message on a topic; without one, mark this cycle for the topics of `publishes`.
+
+        Raises ControllerFault for what its declaration does not allow, and for more than MOST_PER_CYCLE.
+        """
+        record = self._record
+        if not topic:
+            record.published |= self._bit
+            return
+        publisher = self._publishers.get(topic)
+        if publisher is None:
+            known = ", ".join(self._publishers) or "none"
+            raise ControllerFault(f"published on {topic}, which is none of its Topics ({known})")
+        if not record.woken_ns:
+            raise ControllerFault(f"published on {topic} before it was activated")
+        cycle = record.cycle
+        if cycle != self._cycle:
+            self._cycle, self._left = cycle, MOST_PER_CYCLE
+        self._left -= 1
+        if self._left < 0:
+            raise ControllerFault(f"published more than {MOST_PER_CYCLE} messages in a cycle")
+        try:
+            publisher.publish(message)
+        except WrongMessage as error:
+            raise ControllerFault(f"published what its topic {topic} does not take: it {error}") from None

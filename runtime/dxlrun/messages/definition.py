@@ -1,0 +1,148 @@
+"""Definitions of messages: their text as ROS 2 writes it (`ros2msg`), its fields, and its RIHS01 hash.
+
+Sources: ROS 2's documentation "Interfaces" for the text, REP 2011 and REP 2016 for the hash: SHA-256 of the
+type description as JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from hashlib import sha256
+
+RULE = "=" * 80
+
+PRIMITIVES: Mapping[str, str] = {
+    "bool": "?",
+    "byte": "B",
+    "char": "B",
+    "int8": "b",
+    "uint8": "B",
+    "int16": "h",
+    "uint16": "H",
+    "int32": "i",
+    "uint32": "I",
+    "int64": "q",
+    "uint64": "Q",
+    "float32": "f",
+    "float64": "d",
+}
+"""Numbers of a definition, and their codes in `struct`."""
+
+_FIELD = re.compile(r"^([A-Za-z0-9_/]+)(?:\[(\d*)\])? +([a-z][a-z0-9_]*)$")
+_NUMBERS = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64")
+_TYPE_IDS = {name: number for number, name in enumerate(_NUMBERS, 2)} | {
+    "char": 13,
+    "bool": 15,
+    "byte": 16,
+    "string": 17,
+}
+"""type_description_interfaces/msg/FieldType: FIELD_TYPE_INT8 and so on; a nested type is 1."""
+_ARRAY, _SEQUENCE = 48, 144
+
+
+@dataclass(frozen=True, slots=True)
+class MessageType:
+    """A message: its full name, its definition with all it depends on, its RIHS01 hash."""
+
+    name: str
+    text: str
+    type_hash: str
+
+
+@dataclass(frozen=True, slots=True)
+class MessageField:
+    """One field of a definition."""
+
+    name: str
+    kind: str
+    """A number, `string`, or the name of another message, without `msg/`."""
+    sequence: bool = False
+    length: int = 0
+    """Of an array of fixed length; 0: it is none."""
+
+    @property
+    def text(self) -> str:
+        """Its line in the definition."""
+        many = f"[{self.length}]" if self.length else "[]" if self.sequence else ""
+        return f"{self.kind}{many} {self.name}"
+
+
+Definitions = Mapping[str, tuple[MessageField, ...]]
+"""The fields of a message and of all it depends on, by names without `msg/`; its own come first."""
+
+
+def short_name(name: str) -> str:
+    """Return `std_msgs/Header` of `std_msgs/msg/Header`."""
+    return name.replace("/msg/", "/")
+
+
+def parse(message: MessageType) -> dict[str, tuple[MessageField, ...]]:
+    """Return the definitions of a message.
+
+    Raises ValueError for what our messages do not use: constants, defaults, bounds.
+    """
+    definitions: dict[str, tuple[MessageField, ...]] = {}
+    name = message.name
+    for block in re.split(r"^=+$", message.text, flags=re.MULTILINE):
+        fields = []
+        for line in block.strip().splitlines():
+            text = line.split("#", 1)[0].strip()
+            if text.startswith("MSG: "):
+                name = text.removeprefix("MSG: ")
+            elif text:
+                match = _FIELD.match(text)
+                if match is None:
+                    raise ValueError(f"{message.name}: cannot lay out {line!r}")
+                length = int(match[2] or 0)
+                fields.append(MessageField(match[3], match[1], match[2] == "", length))
+        definitions[short_name(name)] = tuple(fields)
+    return definitions
+
+
+def message_type(name: str, definitions: Definitions) -> MessageType:
+    """Return the message of this full name: its text and its hash."""
+    top = short_name(name)
+    blocks = ["".join(f"{field.text}\n" for field in definitions[top])]
+    for other, fields in definitions.items():
+        if other != top:
+            lines = "".join(f"{field.text}\n" for field in fields)
+            blocks.append(f"{RULE}\nMSG: {other}\n{lines}")
+    return MessageType(name, "".join(blocks), type_hash(name, definitions))
+
+
+def type_hash(name: str, definitions: Definitions) -> str:
+    """Return the RIHS01 hash of the message of this full name."""
+    top = short_name(name)
+    others = sorted(_full_name(other) for other in definitions if other != top)
+    description = {
+        "type_description": _described(name, definitions[top]),
+        "referenced_type_descriptions": [
+            _described(other, definitions[short_name(other)]) for other in others
+        ],
+    }
+    return f"RIHS01_{sha256(json.dumps(description).encode()).hexdigest()}"
+
+
+def _full_name(name: str) -> str:
+    return name.replace("/", "/msg/", 1)
+
+
+def _described(name: str, fields: tuple[MessageField, ...]) -> dict[str, object]:
+    return {
+        "type_name": name,
+        "fields": [{"name": field.name, "type": _field_type(field)} for field in fields],
+    }
+
+
+def _field_type(field: MessageField) -> dict[str, object]:
+    nested = field.kind not in _TYPE_IDS
+    many = _ARRAY if field.length else _SEQUENCE if field.sequence else 0
+    return {
+        "type_id": many + (1 if nested else _TYPE_IDS[field.kind]),
+        "capacity": field.length,
+        "string_capacity": 0,
+        "nested_type_name": _full_name(field.kind) if nested else "",
+    }

@@ -1,0 +1,141 @@
+"""Topics of controllers: what they publish reaches the sink as it is, or is their fault in one sentence."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dxlrun import ControllerFault, Floats
+from dxlrun.control.controllers.topics import MOST_PER_CYCLE, TopicLog
+from dxlrun.messages import Header
+from dxlrun.messages.cdr import Codec
+from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
+from dxlrun.run.channels.messages import LONGEST_MESSAGE, Topic
+
+EPOCH_NS = 1_700_000_000_000_000_000
+
+
+@dataclass
+class State:
+    header: Header
+    error: Floats
+    text: str = ""
+
+
+class Sink:
+    def __init__(self) -> None:
+        self.topics: list[Topic] = []
+        self.messages: list[tuple[int, int, bytes]] = []
+
+    def announce(self, topic: Topic) -> int:
+        self.topics.append(topic)
+        return len(self.topics) - 1
+
+    def message(self, topic: int, t_ns: int, data: bytes) -> None:
+        self.messages.append((topic, t_ns, data))
+
+
+class Stage:
+    """One controller's topics, in cycle 3."""
+
+    def __init__(self) -> None:
+        self.sink = Sink()
+        self.record = CycleRecord(CycleLayout(["a", "b"], ["wave"]))
+        self.record.wake(3, 0, 5_000_000_007, 1)
+        log = TopicLog(self.record, self.sink, EPOCH_NS)
+        self.goals = log.open("/goals", State)
+        self.topics = log.of_controller("wave", 1)
+        self.topics.open({"state": State, "other": Header}, "My-Robotics 1.0", ("a", "b"))
+
+    def read(self, index: int) -> Any:
+        number, _, data = self.sink.messages[index]
+        return Codec(self.sink.topics[number].type).unpack(data)
+
+
+def state(rows: int = 2, text: str = "") -> State:
+    return State(Header(frame_id="base"), np.full(rows, np.nan), text)
+
+
+def test_topics_are_announced_before_their_messages() -> None:
+    stage = Stage()
+    assert [(topic.name, topic.type.name, topic.joints) for topic in stage.sink.topics] == [
+        ("/goals", "dxlrun_msgs/msg/State", ()),
+        ("/wave/state", "my_robotics/msg/State", ("a", "b")),
+        ("/wave/other", "std_msgs/msg/Header", ("a", "b")),
+    ]
+
+
+def test_a_message_has_the_time_of_the_cycle_and_nan_is_a_number() -> None:
+    stage = Stage()
+    stage.topics.publish("state", state(text="well"))
+    ((number, t_ns, _),) = stage.sink.messages
+    assert (number, t_ns) == (1, 5_000_000_007)
+    found = stage.read(0)
+    assert found["header"] == {"stamp": {"sec": 1_700_000_005, "nanosec": 7}, "frame_id": "base"}
+    assert np.isnan(found["error"]).tolist() == [True, True]
+    assert found["text"] == "well"
+
+
+def test_the_runtime_publishes_its_own_messages_the_same_way() -> None:
+    stage = Stage()
+    stage.goals.publish(state(1))
+    assert stage.read(0)["header"]["stamp"] == {"sec": 1_700_000_005, "nanosec": 7}
+
+
+def test_publishing_nothing_marks_the_cycle() -> None:
+    stage = Stage()
+    stage.topics.publish()
+    assert stage.record.published == 1
+    assert stage.sink.messages == []
+
+
+@pytest.mark.parametrize(
+    ("topic", "message", "reason"),
+    [
+        ("states", state(), r"published on states, which is none of its Topics \(state, other\)"),
+        ("state", {"a": 1}, "published what its topic state does not take: it takes State, not dict"),
+        ("state", None, "it takes State, not NoneType"),
+        ("state", State(Header(), [1.0]), "takes no such State.error: numbers come as an array"),  # type: ignore[arg-type]
+        ("state", state(text="x" * LONGEST_MESSAGE), f"takes {LONGEST_MESSAGE} bytes at most, not 65"),
+    ],
+)
+def test_what_a_topic_does_not_take_is_a_fault_and_reaches_nothing(
+    topic: str, message: object, reason: str
+) -> None:
+    stage = Stage()
+    with pytest.raises(ControllerFault, match=reason):
+        stage.topics.publish(topic, message)
+    assert stage.sink.messages == []
+
+
+def test_a_flood_in_one_cycle_is_a_fault_and_the_next_cycle_begins_anew() -> None:
+    stage = Stage()
+    for _ in range(MOST_PER_CYCLE):
+        stage.topics.publish("state", state())
+    with pytest.raises(ControllerFault, match=f"more than {MOST_PER_CYCLE} messages in a cycle"):
+        stage.topics.publish("other", Header())
+    stage.record.wake(4, 0, 6_000_000_000, 1)
+    stage.topics.publish("other", Header())
+    assert len(stage.sink.messages) == MOST_PER_CYCLE + 1
+
+
+def test_nothing_is_published_before_the_activation() -> None:
+    stage = Stage()
+    stage.record.woken_ns = 0
+    with pytest.raises(ControllerFault, match="published on state before it was activated"):
+        stage.topics.publish("state", state())
+
+
+def test_a_controller_that_publishes_wrongly_is_ended_with_one_sentence(robot: Any) -> None:
+    def act(controller: Any, step: str, time_ns: int, data: Any) -> None:
+        if step == "update" and time_ns >= 40_000_000:
+            controller.context.publish("state", None)
+
+    robot.script("wave", act)
+    robot.build()
+    result = robot.loop.run()
+    assert result.reason == "fault"
+    assert result.detail == "controller wave published on state, which is none of its Topics (none)"

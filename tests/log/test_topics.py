@@ -1,0 +1,150 @@
+"""Topics of controllers in the log: other programs decode them without a line of ours."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from dxlrun.testing import simulated_robot
+
+ROBOT = """\
+name: pair
+buses:
+  main:
+    port: sim
+    protocol: 1.0
+    baud_rate: 1_000_000
+    return_delay_time: 100 us
+    adapter: {latency: 1 ms}
+loop: {rate: 50}
+joints:
+  pan: {bus: main, id: 3, model: AX-12A, reference: 150 deg, direction: 1}
+  tilt: {bus: main, id: 7, model: AX-12A, reference: 150 deg, direction: 1}
+controllers:
+  wave: {type: publishing, joints: [pan, tilt]}
+  slow: {type: publishing, joints: [], rate: 10}
+"""
+PLUGIN = '''\
+"""A controller with topics: one of its own message, one of ROS 2."""
+from dataclasses import dataclass
+
+import numpy as np
+from dxlrun import CONTRACT_VERSION, Controller, Floats, Interfaces, ParametersModel, hookimpl
+from dxlrun.messages import Header, Odometry
+
+
+class PublishingParameters(ParametersModel):
+    joints: tuple[str, ...]
+
+
+@dataclass
+class WaveState:
+    header: Header
+    time_s: float
+    error: Floats
+    names: tuple[str, ...]
+
+
+class Publishing(Controller[PublishingParameters]):
+    Parameters = PublishingParameters
+    Topics = {"state": WaveState, "odometry": Odometry}
+
+    @classmethod
+    def interfaces(cls, parameters, joints):
+        return Interfaces(parameters.joints, ("position",))
+
+    def on_activate(self, time_ns):
+        self.context.publish("state", WaveState(Header(frame_id="begin"), 0.0, np.zeros(0), ()))
+
+    def update(self, time_ns, period_ns):
+        names = self.context.joints
+        error = np.full(len(names), np.nan)
+        error[:1] = time_ns * 1e-9
+        self.context.publish("state", WaveState(Header(), time_ns * 1e-9, error, names))
+        odometry = Odometry(child_frame_id="base")
+        odometry.pose.pose.position.x = time_ns * 1e-9
+        odometry.pose.covariance[35] = 0.5
+        self.context.publish("odometry", odometry)
+
+
+@hookimpl
+def dxlrun_contract():
+    return CONTRACT_VERSION
+
+
+@hookimpl
+def dxlrun_controllers():
+    return {"publishing": Publishing}
+'''
+
+
+@pytest.fixture(scope="module")
+def plugin(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A directory with the plug-in, as pip would install it."""
+    directory = tmp_path_factory.mktemp("plugin")
+    (directory / "publishing.py").write_text(PLUGIN)
+    info = directory / "publishing-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my-robotics\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[dxlrun]\npublishing = publishing\n")
+    return directory
+
+
+@pytest.fixture
+def log(plugin: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A second of the robot."""
+    monkeypatch.syspath_prepend(plugin)
+    (tmp_path / "pair.yaml").write_text(ROBOT)
+    robot = simulated_robot(tmp_path / "pair.yaml", duration_s=1.0, log=tmp_path / "run.mcap")
+    assert robot.run().detail == ""
+    return tmp_path / "run.mcap"
+
+
+def test_mcap_ros2_decodes_every_message(log: Path) -> None:
+    with log.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        found = [
+            (channel.topic, schema.name, message.log_time, decoded)
+            for schema, channel, message, decoded in reader.iter_decoded_messages(
+                topics=["/wave/state", "/slow/state", "/wave/odometry"]
+            )
+            if schema is not None
+        ]
+    of: dict[str, list[Any]] = {}
+    for topic, _, _, decoded in found:
+        of.setdefault(topic, []).append(decoded)
+    assert {topic: len(messages) for topic, messages in of.items()} == {
+        "/wave/state": 51,
+        "/slow/state": 11,
+        "/wave/odometry": 50,
+    }
+    assert {name for _, name, _, _ in found} == {"my_robotics/msg/WaveState", "nav_msgs/msg/Odometry"}
+    for _, _, log_ns, decoded in found:
+        assert log_ns == decoded.header.stamp.sec * 10**9 + decoded.header.stamp.nanosec
+    begin, first, second = of["/wave/state"][:3]
+    assert (begin.header.frame_id, list(begin.error), begin.names) == ("begin", [], [])
+    assert first.time_s == 0.0
+    assert second.time_s == pytest.approx(0.02)
+    assert second.names == ["pan", "tilt"]
+    assert second.error[0] == second.time_s
+    assert np.isnan(second.error[1])
+    last = of["/wave/odometry"][-1]
+    assert last.pose.pose.position.x == pytest.approx(0.98)
+    assert last.pose.covariance[35] == 0.5
+
+
+def test_rosbags_decodes_with_the_definition_and_the_hash_of_the_log(log: Path) -> None:
+    with log.open("rb") as stream:
+        for schema, channel, message in make_reader(stream).iter_messages(topics=["/wave/state"]):
+            assert schema is not None
+            store = get_typestore(Stores.EMPTY)
+            store.register(get_types_from_msg(schema.data.decode(), schema.name))
+            assert store.hash_rihs01(schema.name) == channel.metadata["topic_type_hash"]
+            found: Any = store.deserialize_cdr(message.data, schema.name)
+            assert bytes(store.serialize_cdr(found, schema.name)) == message.data
