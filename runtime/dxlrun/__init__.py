@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from dxlrun.errors import (
         ControllerFault,
         DxlrunError,
+        GoalTimeout,
         InputError,
         LogError,
         PlugInError,
@@ -45,7 +46,7 @@ if TYPE_CHECKING:
         Refused,
         StartUpError,
     )
-    from dxlrun.remote.client import RemoteRobot, Stream, connect, running
+    from dxlrun.remote.client import GoalState, RemoteGoal, RemoteRobot, Stream, connect, running
     from dxlrun.run.channels.cycle import Commands, Floats, States
 
 __all__ = [
@@ -64,6 +65,8 @@ __all__ = [
     "DxlrunError",
     "Floats",
     "Goal",
+    "GoalState",
+    "GoalTimeout",
     "InputError",
     "Interfaces",
     "JointLimits",
@@ -78,6 +81,7 @@ __all__ = [
     "PortError",
     "ProcessFault",
     "Refused",
+    "RemoteGoal",
     "RemoteRobot",
     "StartUpError",
     "States",
@@ -115,6 +119,7 @@ _ROOMS = {
     "dxlrun.errors": (
         "ControllerFault",
         "DxlrunError",
+        "GoalTimeout",
         "InputError",
         "LogError",
         "PlugInError",
@@ -124,7 +129,7 @@ _ROOMS = {
         "StartUpError",
     ),
     "dxlrun.run.channels.cycle": ("Commands", "Floats", "States"),
-    "dxlrun.remote.client": ("RemoteRobot", "Stream", "connect", "running"),
+    "dxlrun.remote.client": ("GoalState", "RemoteGoal", "RemoteRobot", "Stream", "connect", "running"),
 }
 _HOME = {name: room for room, names in _ROOMS.items() for name in names}
 

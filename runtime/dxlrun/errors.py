@@ -11,6 +11,7 @@ Exception
     ├── ControllerFault            a controller raised, or broke its contract
     ├── ProcessFault               a process of the run ended or hung
     ├── Refused                    a running robot refused a request; exit code 2: the request was wrong
+    ├── GoalTimeout (TimeoutError) a goal has not ended in the time that was given
     └── LogError (ValueError)      a log or a ledger cannot be read; exit code 2
 ```
 """
@@ -97,6 +98,10 @@ class Refused(DxlrunError):
         self.code = code
         self.fields = fields
         self.exit_code = InputError.exit_code if wrong_input else DxlrunError.exit_code
+
+
+class GoalTimeout(DxlrunError, TimeoutError):
+    """A goal has not ended in the time that was given; it goes on."""
 
 
 class StartUpError(DxlrunError, RuntimeError):

@@ -497,6 +497,7 @@ def test_the_robot_is_shown_with_the_commands_of_its_controllers(desk):
     left = told["controllers"].pop(0)
     assert left.pop("takes")["go"]["properties"]["positions"]["type"] == "array"
     assert left == {
+        "goals": [],
         "name": "left",
         "type": "arm",
         "active": True,

@@ -17,16 +17,16 @@ import select
 import socket
 import struct
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from urllib.parse import quote
 
-from dxlrun.errors import DxlrunError, Refused
+from dxlrun.errors import DxlrunError, GoalTimeout, Refused
 from dxlrun.remote.sockets import MOST_BYTES, alive, running, sockets
 
-__all__ = ["Executed", "RemoteRobot", "Stream", "connect", "running"]
+__all__ = ["Executed", "GoalState", "RemoteGoal", "RemoteRobot", "Stream", "connect", "running"]
 
 TIMEOUT_S = 10.0
 """How long an answer may take: some two seconds, and six more for a switch that waits for modes."""
@@ -34,6 +34,9 @@ LEASE_S = 0.2
 _IDLE_S = 20.0
 """The gateway closes silent connections after 30 s; one that was silent for so long is not used again."""
 _STOP_S = 30.0
+_POLL_S = 2.0
+_FEEDBACK_S = 0.1
+"""How long one request waits for the end of a goal, without and with progress to report."""
 _WRONG_INPUT = (404, 413, 422)
 """Statuses of requests that would be refused at any time: no such thing, too long, not as they must be."""
 
@@ -44,6 +47,61 @@ class Executed:
 
     cycle: int
     """The loop's cycle that did it; -1: not known."""
+    goal: RemoteGoal | None = None
+    """The goal that the command is; None: it is none."""
+
+
+@dataclass(frozen=True, slots=True)
+class GoalState:
+    """A goal as the robot reports it."""
+
+    number: int
+    controller: str
+    kind: str
+    origin: str
+    """The client that sent it, or the place in a motion file."""
+    status: str
+    """`running`, or how it ended: `reached`, `missed`, `aborted`, `cancelled`, `preempted`."""
+    progress: float
+    """0..1"""
+    error: float | None
+    """Largest distance from the desired state, at the end the worst joint's from the goal; SI units."""
+    joint: str
+    """The worst one at the end; empty: none was named."""
+    text: str
+    """What the controller reported at the end."""
+    seconds: float | None
+    """From its beginning to its end; None while it runs."""
+
+    @property
+    def reached(self) -> bool:
+        """True when it ended well."""
+        return self.status == "reached"
+
+
+@dataclass(frozen=True, slots=True)
+class RemoteGoal:
+    """A goal of a running robot, by its number."""
+
+    robot: RemoteRobot
+    number: int
+
+    def state(self) -> GoalState:
+        """Return how far it is, or how it ended."""
+        return self.robot.goal_state(self.number)
+
+    def wait(
+        self, timeout: float | None = None, feedback: Callable[[GoalState], object] | None = None
+    ) -> GoalState:
+        """Return the result when it has ended; `feedback` gets its state some ten times a second meanwhile.
+
+        Raises GoalTimeout after `timeout` s; the goal goes on.
+        """
+        return self.robot.wait(self.number, timeout, feedback)
+
+    def cancel(self) -> Executed:
+        """Let its controller bring the joints to rest; the goal ends when they are."""
+        return self.robot.cancel(self.number)
 
 
 class _Connection(http.client.HTTPConnection):
@@ -139,13 +197,83 @@ class RemoteRobot:
         """Return what happened since event number `after`, as far as it is kept, and the last number."""
         return self._ask("GET", f"/events?after={after}")
 
+    # Goals
+
+    def goals(self) -> list[GoalState]:
+        """Return the goals that run, and the last 100 that ended."""
+        answer = self._ask("GET", "/goals")
+        rows = [answer.get("running"), answer.get("ended")]
+        found = [_goal_state(row) for each in rows if isinstance(each, list) for row in each]
+        return sorted(found, key=lambda goal: goal.number)
+
+    def goal_state(self, number: int, wait: float = 0.0) -> GoalState:
+        """Return one goal; with `wait`, at most 5 s, when it has ended or after that time."""
+        query = f"?wait={wait:g}" if wait else ""
+        return _goal_state(self._ask("GET", f"/goals/{number}{query}"))
+
+    def wait(
+        self,
+        goal: RemoteGoal | int,
+        timeout: float | None = None,
+        feedback: Callable[[GoalState], object] | None = None,
+    ) -> GoalState:
+        """Return the result of a goal when it has ended, see RemoteGoal.wait.
+
+        Raises GoalTimeout, and DxlrunError when the robot is gone before.
+        """
+        number = goal.number if isinstance(goal, RemoteGoal) else goal
+        until = None if timeout is None else time.monotonic() + timeout
+        while True:
+            longest = _POLL_S if feedback is None else _FEEDBACK_S
+            left = longest if until is None else max(0.0, until - time.monotonic())
+            state = self.goal_state(number, min(longest, left))
+            if state.status != "running":
+                return state
+            if feedback is not None:
+                feedback(state)
+            if left <= 0.0:
+                raise GoalTimeout(f"goal {number} of {state.controller} has not ended within {timeout:g} s")
+
+    def cancel(self, goal: RemoteGoal | int | str) -> Executed:
+        """Cancel a goal, by its number or by the name of its controller; it ends when the joints rest.
+
+        Raises Refused when it has ended already, and when it is being cancelled already.
+        """
+        if isinstance(goal, str):
+            return self._execute(f"/controllers/{_quoted(goal)}/cancel")
+        number = goal.number if isinstance(goal, RemoteGoal) else goal
+        return self._execute(f"/goals/{number}/cancel")
+
+    # Parameters
+
+    def parameters(self, controller: str) -> dict[str, object]:
+        """Return the parameters of a controller by dotted name, as in the robot file."""
+        return {str(row["name"]): row["value"] for row in self.parameter_table(controller)}
+
+    def parameter_table(self, controller: str) -> list[dict[str, object]]:
+        """Return name, value, live, range and description of each parameter of a controller."""
+        rows = self._ask("GET", f"/controllers/{_quoted(controller)}/parameters").get("parameters")
+        return [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
+
+    def set_parameters(
+        self, controller: str, values: Mapping[str, bool | float | str]
+    ) -> dict[str, tuple[object, object]]:
+        """Change live parameters of a controller in one cycle, or none; return the old and the new values.
+
+        Values are written as in the robot file: `{"gains.p": 4.0, "speed": "20 deg/s"}`.
+        """
+        path = f"/controllers/{_quoted(controller)}/parameters"
+        rows = self._ask("POST", path, {"values": dict(values)}).get("changed")
+        found = [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
+        return {str(row["name"]): (row["old"], row["new"]) for row in found}
+
     # Steering
 
     def send(
         self, controller: str, kind: str, command: Mapping[str, object], *, units: bool = False
     ) -> Executed:
         """Send a controller a typed command; returns when the loop has taken it. Raises Refused for values
-        beyond their joints' limits too.
+        beyond their joints' limits too. Where the command is a goal, the answer has it, to wait for its end.
 
         Numbers are in SI. With `units`, quantities are written as in a motion file, such as `"30 deg"`.
         """
@@ -189,7 +317,7 @@ class RemoteRobot:
 
     def unload(self, name: str) -> Executed:
         """Take a controller that is not active out of the paused loop."""
-        return _executed(self._ask("DELETE", f"/controllers/{_quoted(name)}"))
+        return self._executed(self._ask("DELETE", f"/controllers/{_quoted(name)}"))
 
     def stop(self, wait: bool = True) -> None:
         """End the run in order; with `wait`, return when it has ended and its log is closed.
@@ -224,7 +352,13 @@ class RemoteRobot:
         return True
 
     def _execute(self, path: str, content: Mapping[str, object] | None = None) -> Executed:
-        return _executed(self._ask("POST", path, content))
+        return self._executed(self._ask("POST", path, content))
+
+    def _executed(self, answer: Mapping[str, object]) -> Executed:
+        cycle, goal = answer.get("cycle"), answer.get("goal")
+        return Executed(
+            cycle if isinstance(cycle, int) else -1, RemoteGoal(self, goal) if isinstance(goal, int) else None
+        )
 
     def _ask(self, method: str, path: str, content: Mapping[str, object] | None = None) -> dict[str, object]:
         """Ask once and return the answer: nothing is sent twice, because the first may have been received."""
@@ -257,9 +391,24 @@ class RemoteRobot:
         return answer
 
 
-def _executed(answer: Mapping[str, object]) -> Executed:
-    cycle = answer.get("cycle")
-    return Executed(cycle if isinstance(cycle, int) else -1)
+def _goal_state(row: Mapping[str, object]) -> GoalState:
+    def number(name: str) -> float | None:
+        value = row.get(name)
+        return float(value) if isinstance(value, int | float) else None
+
+    accepted, ended = number("accepted"), number("ended")
+    return GoalState(
+        number=int(number("goal") or 0),
+        controller=str(row.get("controller", "")),
+        kind=str(row.get("kind", "")),
+        origin=str(row.get("origin", "")),
+        status=str(row.get("status", "")),
+        progress=number("progress") or 0.0,
+        error=number("error"),
+        joint=str(row.get("joint", "")),
+        text=str(row.get("text", "")),
+        seconds=None if ended is None or accepted is None else ended - accepted,
+    )
 
 
 def _quoted(name: str) -> str:

@@ -5,14 +5,18 @@
     GET  /events?after=N                        what happened since event N
     POST /controllers/NAME/commands/KIND        a typed command; ?units=true: quantities with their units
     POST /controllers/NAME/set-points/KIND      one of a stream; the newest wins; ?lease=0.2 (seconds)
+    GET  /goals, GET /goals/N?wait=2            those that run and the last that ended; wait for an end, s
+    POST /goals/N/cancel, /controllers/NAME/cancel       a goal, by its number or its controller
+    GET, POST /controllers/NAME/parameters {values}      all of them; change live ones in one cycle
     POST /switch {activate, deactivate}         controllers, in one cycle or not at all
     POST /joints/NAME/registers/ITEM {value}    a RAM item of a joint's servo; answered when it is there
     POST /rate {rate}, /pause, /resume, /stop
     POST /controllers {name, type, ...}         load one, DELETE /controllers/NAME unload it; in a pause only
 
-`{"done": true, "cycle": N}`, of a set-point instead `"clamped"`, the number of values beyond their joints'
-limits, and `"clamped_joints"`; or `{"refused": "...", "code": "...", "fields": {...}}` with a status of 4xx
-or 5xx: a sentence for a person, and for a program the code of the reason with its data.
+`{"done": true, "cycle": N}`, of a goal with its number in `"goal"`, of a set-point instead `"clamped"`, the
+number of values beyond their joints' limits, and `"clamped_joints"`; or `{"refused": "...", "code": "...",
+"fields": {...}}` with a status of 4xx or 5xx: a sentence for a person, and for a program the code of the
+reason with its data.
 """
 
 from __future__ import annotations
@@ -33,12 +37,15 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 from starlette.routing import Route
 
-from dxlrun.control.steering import Rate, Switch, Unload
+from dxlrun.control.steering import Cancel, Rate, Switch, Unload
 from dxlrun.description.modes import Mode
+from dxlrun.remote.goals import GoalStatus
 from dxlrun.remote.link import Link, Loaded
+from dxlrun.remote.parameters import Change, Written, changed, parameters_of
 from dxlrun.remote.preparation import (
     Preparation,
     RefusedRequest,
+    bounded,
     invalid,
     prepared_register,
     refused,
@@ -47,6 +54,7 @@ from dxlrun.remote.preparation import (
 from dxlrun.remote.sockets import MOST_BYTES
 from dxlrun.run.channels.answers import Code, Done, Refusal
 from dxlrun.run.channels.cycle import CycleRecord
+from dxlrun.run.channels.heartbeat import Phase
 
 MOST_OPERATIONS = 200.0
 MOST_SET_POINTS = 4000.0
@@ -60,6 +68,10 @@ BODY_S = 10.0
 """How long a body may take to arrive."""
 LEASE_S = (0.01, 0.2, 60.0)
 """Shortest, default and longest time that a set-point of a stream counts."""
+LONGEST_WAIT_S = 5.0
+"""For the end of a goal; a client that waits longer asks again."""
+_ENDING_S = 0.5
+"""How long the results of goals may take when the run ends."""
 LONGEST_ORIGIN = 64
 LONGEST_SENTENCE = 2000
 _STATUS = {
@@ -69,6 +81,8 @@ _STATUS = {
     Code.UNKNOWN_REGISTER: 404,
     Code.UNKNOWN_PAGE: 404,
     Code.UNLOADED: 404,
+    Code.UNKNOWN_GOAL: 404,
+    Code.UNKNOWN_PARAMETER: 404,
     Code.WRONG_METHOD: 405,
     Code.BODY_TIMEOUT: 408,
     Code.TOO_LONG: 413,
@@ -77,6 +91,8 @@ _STATUS = {
     Code.WRONG_QUANTITY: 422,
     Code.BEYOND_LIMITS: 422,
     Code.NAMED_TWICE: 422,
+    Code.NOT_LIVE: 422,
+    Code.GOAL_STREAMED: 422,
     Code.TOO_SLOW: 422,
     Code.TOO_OFTEN: 429,
     Code.QUEUE_FULL: 429,
@@ -98,6 +114,12 @@ class Value(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     value: int | str
 
 
+class NewValues(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Body of a change of live parameters: values as in the robot file, by dotted name."""
+
+    values: dict[str, Written]
+
+
 class GatewayApp:
     """The routes; every request is checked and prepared here, so that the loop only has to execute it."""
 
@@ -114,6 +136,7 @@ class GatewayApp:
         self._operations = Allowance(MOST_OPERATIONS, now)
         self._set_points = Allowance(MOST_SET_POINTS, now)
         self._looks = Allowance(MOST_LOOKS, now)
+        self._changing = asyncio.Lock()
 
     def app(self) -> Starlette:
         """Return the ASGI application."""
@@ -126,6 +149,15 @@ class GatewayApp:
             route("/robot", self.robot, "GET", looks),
             route("/states", self.states, "GET", looks),
             route("/events", self.events, "GET", looks),
+            route("/goals", self.goals, "GET", looks),
+            route("/goals/{number}", self.goal, "GET", looks),
+            route("/goals/{number}/cancel", self.cancel, "POST", operations),
+            route("/controllers/{name}/cancel", self.cancel, "POST", operations),
+            Route(
+                "/controllers/{name}/parameters",
+                _answered(self.parameters, operations),
+                methods=["GET", "POST"],
+            ),
             route("/controllers/{name}/commands/{kind}", self.command, "POST", operations),
             route("/controllers/{name}/set-points/{kind}", self.set_point, "POST", self._set_points),
             route("/controllers/{name}", self.unload, "DELETE", operations),
@@ -170,6 +202,7 @@ class GatewayApp:
             "joints": plan.joints,
             "command": plan.command,
             "takes": self._preparation.takes(plan),
+            "goals": self._preparation.goals(plan),
         }
 
     async def states(self, request: Request) -> Response:
@@ -199,7 +232,62 @@ class GatewayApp:
         ]
         return _json({"events": rows, "last": newest})
 
+    async def goals(self, request: Request) -> Response:
+        """Return the goals that run, and the last that ended."""
+        book = self._link.goals
+        return _json({"running": list(book.running.values()), "ended": list(book.ended.values())})
+
+    async def goal(self, request: Request) -> Response:
+        """Return one goal; with `wait`, s, when it has ended or after that time."""
+        wanted = number(request, "wait", 0.0)
+        if not 0 <= wanted <= LONGEST_WAIT_S:
+            raise invalid(f"wait is 0 to {LONGEST_WAIT_S:g} s, not {wanted:g}")
+        chosen, link = _goal_number(request), self._link
+        status = self._goal_status(chosen)
+        if status.ended is None and link.heartbeat.phase is not Phase.RUNNING:
+            await link.goals.wait(chosen, _ENDING_S)
+            if status.ended is None:
+                raise refused(Code.RUN_ENDING, {})
+        if wanted:
+            await link.goals.wait(chosen, wanted)
+        return _json(status)
+
+    def _goal_status(self, chosen: int) -> GoalStatus:
+        found = self._link.goals.status(chosen)
+        if isinstance(found, Refusal):
+            raise RefusedRequest(found)
+        return found
+
     # Steering
+
+    async def cancel(self, request: Request) -> Response:
+        """Cancel a goal by its number, or the one that a controller has; answer with its number."""
+        if "number" in request.path_params:
+            wanted = Cancel(goal=_goal_number(request))
+            goals = [wanted.goal]
+        else:
+            name = self._known(request).plan.name
+            wanted = Cancel(controller=name)
+            goals = [goal.goal for goal in self._link.goals.running.values() if goal.controller == name]
+        done = await self._link.for_loop("cancel", wanted, origin(request))
+        return _json({"done": True, "cycle": done.cycle, "goal": goals[0] if goals else None})
+
+    async def parameters(self, request: Request) -> Response:
+        """Return a controller's parameters, or change live ones, all of them in one cycle."""
+        if request.method == "GET":
+            now = self._preparation.parameters(self._known(request).plan)
+            return _json({"parameters": list(parameters_of(now))})
+        given = await typed(request, NewValues, '{"values": {"speed": "20 deg/s"}}')
+        async with self._changing:  # what is checked against the values of now must meet them in the loop
+            loaded = self._known(request)
+            now = self._preparation.parameters(loaded.plan)
+            change = changed(loaded.plan, now, given.values, bounded)
+            noted = partial(self._note_parameters, loaded, change)
+            done = await self._link.for_loop("parameters", change.request, origin(request), noted)
+        return _json({"done": True, "cycle": done.cycle, "changed": change.shown})
+
+    def _note_parameters(self, loaded: Loaded, change: Change, _: Done) -> None:
+        loaded.plan = change.plan
 
     async def command(self, request: Request) -> Response:
         """Check and prepare a typed command, within the limits, and let the loop hand it over."""
@@ -220,6 +308,8 @@ class GatewayApp:
             raise invalid(f"a lease is {shortest:g} to {longest:g} s, not {lease:g}")
         loaded, kind = self._known(request), request.path_params["kind"]
         name = loaded.plan.name
+        if kind in self._preparation.goals(loaded.plan):
+            raise refused(Code.GOAL_STREAMED, {"controller": name, "kind": kind})
         prepared = self._preparation.command(loaded.plan, kind, await body(request))
         if self._link.controllers.get(name) is not loaded:
             raise refused(Code.UNLOADED, {"controller": name})
@@ -343,7 +433,15 @@ def _json(content: object, status: int = 200) -> Response:
 
 
 def _done(done: Done) -> Response:
-    return _json({"done": True, "cycle": done.cycle})
+    goal = {"goal": done.goals[0]} if done.goals else {}
+    return _json({"done": True, "cycle": done.cycle} | goal)
+
+
+def _goal_number(request: Request) -> int:
+    text = request.path_params["number"]
+    if not (text.isdecimal() and text.isascii() and len(text) < 16):
+        raise invalid(f"{text[:40]!r} is no number of a goal")
+    return int(text)
 
 
 def _refused(refusal: Refusal) -> Response:

@@ -13,6 +13,7 @@ import msgspec
 
 from dxlrun.compile.plan import Plan
 from dxlrun.control.loop_plan import ControllerPlan
+from dxlrun.remote.goals import GoalBook
 from dxlrun.remote.job import Descriptors
 from dxlrun.remote.preparation import RefusedRequest
 from dxlrun.run.channels.answers import Answer, Code, Done, Refusal, Waiting
@@ -75,6 +76,7 @@ class Link:
         self.heartbeat = Heartbeat(memory.heartbeat)
         self.controllers = {one.name: Loaded(one, place) for place, one in enumerate(plan.loop.controllers)}
         self.events: deque[tuple[int, Event]] = deque()
+        self.goals = GoalBook()
         self._cycles = RingReader(memory.cycles)
         joints = tuple(joint.name for joint in plan.loop.joints)
         controllers = tuple(one.name for one in plan.loop.controllers)
@@ -215,6 +217,7 @@ class Link:
         while self.events and (self._text > KEPT_TEXT or len(self.events) >= KEPT_EVENTS):
             self._text -= len(self.events.popleft()[1].text)
         self.events.append((next(self._event_numbers), event))
+        self.goals.take(event)
         loaded = self.controllers.get(event.source)
         if loaded is not None and event.code in _HELD:
             loaded.held = _HELD[EventCode(event.code)]

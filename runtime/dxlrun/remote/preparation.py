@@ -65,7 +65,7 @@ class _TooLong(BaseException):
 
 
 @contextmanager
-def _bounded(controller: str) -> Iterator[None]:
+def bounded(controller: str) -> Iterator[None]:
     """Interrupt a plug-in's Python code after BUDGET_S, in the main thread; raises RefusedRequest then.
 
     A call into C that never returns is not interrupted: then Ctrl-C in the robot's terminal is what is left.
@@ -145,6 +145,15 @@ class Preparation:
             self._schemas[plan.type] = found
         return self._schemas[plan.type]
 
+    def goals(self, plan: ControllerPlan) -> list[str]:
+        """Return the names of the commands of a controller that are goals."""
+        offer = self.plugins.controllers.get(plan.type)
+        return sorted(offer.controller.Goals) if offer else []
+
+    def parameters(self, plan: ControllerPlan) -> ParametersModel:
+        """Return the parameters of a controller as they are now; raises RefusedRequest."""
+        return self._controller(plan).parameters
+
     def command(self, plan: ControllerPlan, kind: str, body: bytes, *, units: bool = False) -> Prepared:
         """Return a typed command that came as JSON (`true` and "1" are no numbers there).
 
@@ -162,7 +171,7 @@ class Preparation:
         if units and _of_motions(kind, model):
             body = in_si(body, what)
         try:
-            with _bounded(plan.name):
+            with bounded(plan.name):
                 command = model.model_validate_json(body, strict=True)
                 prepared = controller.prepare(kind, command, known.parameters)
                 data = np.ascontiguousarray(prepared, dtype="<f8").tobytes()
@@ -186,7 +195,7 @@ class Preparation:
         if offer is None:
             raise invalid(f"no plug-in offers the type {plan.type} of {plan.name} any more")
         try:
-            with _bounded(plan.name):
+            with bounded(plan.name):
                 parameters = offer.controller.Parameters.model_validate_json(plan.parameters)
         except RefusedRequest:
             raise
@@ -239,7 +248,7 @@ class Preparation:
     def _interfaces(self, name: str, offer: Offer, own: Mapping[str, object]) -> Interfaces:
         """Return the interfaces that a controller's class asks for with these parameters."""
         try:
-            with _bounded(name):
+            with bounded(name):
                 parameters = offer.controller.Parameters.model_validate(own)
                 interfaces = offer.controller.interfaces(parameters, tuple(self.joints))
         except RefusedRequest:

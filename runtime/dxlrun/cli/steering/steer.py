@@ -96,7 +96,7 @@ def switch(*, activate: Names = (), deactivate: Names = (), chosen: Chosen = ONL
     """
     if not activate and not deactivate:
         raise InputError("nothing to switch; write --activate NAME, --deactivate NAME, or both")
-    with _robot(chosen, "switch") as robot:
+    with robot_of(chosen, "switch") as robot:
         done = robot.switch(activate, deactivate)
         groups = {
             "activated": [name for name in activate if name not in deactivate],
@@ -104,7 +104,7 @@ def switch(*, activate: Names = (), deactivate: Names = (), chosen: Chosen = ONL
             "restarted": [name for name in activate if name in deactivate],
         }
         parts = [f"{', '.join(names)} {state}" for state, names in groups.items() if names]
-        return _done(robot, chosen, done, f"{robot.name}: {'; '.join(parts)}")
+        return report_done(robot, chosen, done, f"{robot.name}: {'; '.join(parts)}")
 
 
 def send(
@@ -128,12 +128,12 @@ def send(
     from dxlrun.cli.steering.written import Written
 
     written = Written.read(words, file)
-    with _robot(chosen, "send") as robot:
+    with robot_of(chosen, "send") as robot:
         try:
             done = robot.send(controller, kind, written.data, units=True)
         except Refused as refused:
             raise written.located(refused) from None
-        return _done(robot, chosen, done, f"{robot.name}: {controller} accepted {kind}")
+        return report_done(robot, chosen, done, f"{robot.name}: {controller} accepted {kind}")
 
 
 def set_register(joint: str, item: str, value: str, /, *, chosen: Chosen = ONLY_ONE) -> int:
@@ -154,9 +154,9 @@ def set_register(joint: str, item: str, value: str, /, *, chosen: Chosen = ONLY_
 
     number = plain_value(value)
     given = number if isinstance(number, int) and not isinstance(number, bool) else value
-    with _robot(chosen, "set") as robot:
+    with robot_of(chosen, "set") as robot:
         done = robot.set_register(joint, item, given)
-        return _done(robot, chosen, done, f"{robot.name}: {item} of {joint} is {given}")
+        return report_done(robot, chosen, done, f"{robot.name}: {item} of {joint} is {given}")
 
 
 def rate(hz: float, /, *, chosen: Chosen = ONLY_ONE) -> int:
@@ -169,24 +169,24 @@ def rate(hz: float, /, *, chosen: Chosen = ONLY_ONE) -> int:
     """
     if not 0 < hz < float("inf"):  # false for nan too
         raise InputError(f"{hz:g} is no rate; give a number of Hz above 0")
-    with _robot(chosen, "rate") as robot:
+    with robot_of(chosen, "rate") as robot:
         done = robot.rate(hz)
-        return _done(robot, chosen, done, f"{robot.name} runs at {hz:g} Hz")
+        return report_done(robot, chosen, done, f"{robot.name} runs at {hz:g} Hz")
 
 
 def pause(*, chosen: Chosen = ONLY_ONE) -> int:
     """Pause a running robot: its joints are held, its controllers' time stops."""
-    with _robot(chosen, "pause") as robot:
+    with robot_of(chosen, "pause") as robot:
         done = robot.pause()
         text = "is paused, its joints are held; `dxlrun resume` ends that"
-        return _done(robot, chosen, done, f"{robot.name} {text}")
+        return report_done(robot, chosen, done, f"{robot.name} {text}")
 
 
 def resume(*, chosen: Chosen = ONLY_ONE) -> int:
     """Resume the controllers of a paused robot where they were."""
-    with _robot(chosen, "resume") as robot:
+    with robot_of(chosen, "resume") as robot:
         done = robot.resume()
-        return _done(robot, chosen, done, f"{robot.name} runs again")
+        return report_done(robot, chosen, done, f"{robot.name} runs again")
 
 
 def load(name: str, /, *words: Words, file: Path | None = None, chosen: Chosen = ONLY_ONE) -> int:
@@ -206,10 +206,10 @@ def load(name: str, /, *words: Words, file: Path | None = None, chosen: Chosen =
     entry = Written.read(words, file).data
     if "type" not in entry:
         raise InputError(f"{name} has no type; give it one, such as type=joint_group_position_controller")
-    with _robot(chosen, "load") as robot:
+    with robot_of(chosen, "load") as robot:
         done = robot.load(name, entry)
         text = f"{name} is loaded; `dxlrun switch --activate {name}` starts it"
-        return _done(robot, chosen, done, f"{robot.name}: {text}")
+        return report_done(robot, chosen, done, f"{robot.name}: {text}")
 
 
 def unload(name: str, /, *, chosen: Chosen = ONLY_ONE) -> int:
@@ -220,9 +220,9 @@ def unload(name: str, /, *, chosen: Chosen = ONLY_ONE) -> int:
     name
         Name of the controller.
     """
-    with _robot(chosen, "unload") as robot:
+    with robot_of(chosen, "unload") as robot:
         done = robot.unload(name)
-        return _done(robot, chosen, done, f"{robot.name}: {name} is unloaded")
+        return report_done(robot, chosen, done, f"{robot.name}: {name} is unloaded")
 
 
 def stop(*, no_wait: Flag = False, chosen: Chosen = ONLY_ONE) -> int:
@@ -233,12 +233,12 @@ def stop(*, no_wait: Flag = False, chosen: Chosen = ONLY_ONE) -> int:
     no_wait
         Return as soon as the loop has accepted it.
     """
-    with _robot(chosen, "stop") as robot:
+    with robot_of(chosen, "stop") as robot:
         robot.stop(wait=not no_wait)
-        return _done(robot, chosen, None, f"{robot.name} {'is ending' if no_wait else 'has ended'}")
+        return report_done(robot, chosen, None, f"{robot.name} {'is ending' if no_wait else 'has ended'}")
 
 
-def _robot(chosen: Chosen, verb: str) -> RemoteRobot:
+def robot_of(chosen: Chosen, verb: str) -> RemoteRobot:
     """Return the chosen robot; raises InputError when the choice is open, DxlrunError when none runs."""
     from dxlrun.remote.client import connect, running
 
@@ -252,7 +252,8 @@ def _robot(chosen: Chosen, verb: str) -> RemoteRobot:
     return connect(chosen.robot or names[0], f"dxlrun {verb}")
 
 
-def _done(robot: RemoteRobot, chosen: Chosen, done: Executed | None, sentence: str) -> int:
+def report_done(robot: RemoteRobot, chosen: Chosen, done: Executed | None, sentence: str) -> int:
+    """Print that a request was executed; return the exit code."""
     if chosen.as_json:
         cycle = {} if done is None else {"cycle": done.cycle}
         show_json_line({"robot": robot.name, "done": True} | cycle)

@@ -157,9 +157,12 @@ class Managed:
         self.active = True
         self._record.active |= self.bit
 
-    def deactivate(self, time_ns: int) -> None:
-        """Let the controller leave its joints. Raises ControllerFault; they are released all the same."""
-        self.release(f"{self.plan.name} was deactivated")
+    def deactivate(self, time_ns: int, why: str = "") -> None:
+        """Let the controller leave its joints. Raises ControllerFault; they are released all the same.
+
+        `why` its goal is aborted; empty: because it is deactivated.
+        """
+        self.release(why or f"{self.plan.name} was deactivated")
         self._call(ControllerMethod.ON_DEACTIVATE, "", self._controller.on_deactivate, time_ns)
 
     def release(self, why: str) -> None:

@@ -388,7 +388,7 @@ class Manager:
         """Deactivate all controllers, the last one first; raises nothing, a fault is in `fault`."""
         for managed in reversed(self._managed):
             if managed.active:
-                self._deactivate(managed, time_ns)
+                self._deactivate(managed, time_ns, "the run ended")
         for number in self._modes.end():
             self._end_switch(number, Refusal(Code.RUN_ENDING))
 
@@ -412,10 +412,10 @@ class Manager:
             self._fall_back(managed, why, time_ns)
         return _refused_by(*failed[0]) if failed else None
 
-    def _deactivate(self, managed: Managed, time_ns: int) -> None:
+    def _deactivate(self, managed: Managed, time_ns: int, why: str = "") -> None:
         self._modes.changed()
         try:
-            managed.deactivate(time_ns)
+            managed.deactivate(time_ns, why)
         except ControllerFault as fault:
             self._take_out(managed, fault)  # without a fallback: it was leaving anyway
             self.fault = self.fault or str(fault)

@@ -1,0 +1,142 @@
+"""Parameters of a controller in a run: all of them shown, live ones changed, checked whole by the model."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
+
+import msgspec
+from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
+
+from dxlrun.control.controllers.controller import ParametersModel
+from dxlrun.control.controllers.live_parameters import live_names, value_of
+from dxlrun.control.loop_plan import ControllerPlan
+from dxlrun.control.steering import Parameters
+from dxlrun.errors import suggestion
+from dxlrun.remote.preparation import RefusedRequest, invalid, mistakes, refused
+from dxlrun.run.channels.answers import Code, Field
+
+_BOUNDS = (("ge", "at least"), ("gt", "above"), ("le", "at most"), ("lt", "below"))
+Written = bool | int | float | str
+"""A value as in the robot file: `4.0`, `true`, `20 deg/s`."""
+
+
+class Parameter(msgspec.Struct, frozen=True):
+    """One parameter, for a client."""
+
+    name: str
+    value: object
+    """As in the robot file; quantities with their units."""
+    live: bool
+    """True where it can be changed in a run."""
+    range: str = ""
+    description: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """Live parameters with other values, ready for the loop."""
+
+    request: Parameters
+    plan: ControllerPlan
+    """The controller's, with the new values."""
+    shown: tuple[dict[str, object], ...]
+    """Name, old and new value of each."""
+
+
+def parameters_of(model: BaseModel, prefix: str = "") -> Iterator[Parameter]:
+    """Return all parameters of a controller; those of nested models have dotted names."""
+    live = frozenset(live_names(model))
+    values = model.model_dump(mode="json")
+    for name, field in type(model).model_fields.items():
+        value, range_, about = getattr(model, name), _range(field), field.description or ""
+        if isinstance(value, BaseModel):
+            yield from parameters_of(value, f"{prefix}{name}.")
+        elif isinstance(value, Mapping) and any(one.startswith(f"{name}.") for one in live):
+            for key, inner in values[name].items():
+                yield Parameter(f"{prefix}{name}.{key}", inner, True, range_, about)
+        else:
+            yield Parameter(f"{prefix}{name}", values[name], name in live, range_, about)
+
+
+def _range(field: FieldInfo) -> str:
+    bounds = (
+        (words, getattr(mark, key)) for mark in field.metadata for key, words in _BOUNDS if hasattr(mark, key)
+    )
+    return ", ".join(f"{words} {value:g}" for words, value in bounds if isinstance(value, int | float))
+
+
+def changed(
+    plan: ControllerPlan,
+    now: ParametersModel,
+    values: Mapping[str, Written],
+    bounded: Callable[[str], AbstractContextManager[None]],
+) -> Change:
+    """Return a change of live parameters; raises RefusedRequest with the reason.
+
+    `now` are the values of the plan; `bounded` limits how long the model's own code may compute.
+    """
+    if not values:
+        raise invalid('nothing to change; write for example {"values": {"speed": "20 deg/s"}}')
+    known = {parameter.name: parameter for parameter in parameters_of(now)}
+    for name in values:
+        _require_live(plan.name, name[:80], known)
+    model = type(now)
+    written = json.loads(plan.parameters)
+    for name, value in values.items():
+        _put(written, name.split("."), value, now)
+    try:
+        with bounded(plan.name):
+            new = model.model_validate(written)
+    except RefusedRequest:
+        raise
+    except ValidationError as error:
+        problem = mistakes(error, plan.name, model)
+        wrong = {".".join(map(str, details["loc"])) for details in error.errors(include_url=False)}
+        ranges = [f"{name}: {known[name].range}" for name in values if name in wrong and known[name].range]
+        raise invalid(problem + (f" ({'; '.join(ranges)})" if ranges else "")) from error
+    except (Exception, SystemExit) as error:  # a plug-in's code
+        raise invalid(f"the parameters of {plan.name}: {type(error).__name__}: {error}") from error
+    flat = {name: _number(value_of(new, name)) for name in live_names(new)}
+    before = {parameter.name: parameter.value for parameter in known.values()}
+    after = {parameter.name: parameter.value for parameter in parameters_of(new)}
+    # one that a validator of the model derives from another changes with it
+    differing = [name for name in flat if name in values or before[name] != after[name]]
+    return Change(
+        Parameters(plan.name, {name: flat[name] for name in differing}),
+        replace(plan, parameters=json.dumps(written)),
+        tuple({"name": name, "old": before[name], "new": after[name]} for name in differing),
+    )
+
+
+def _require_live(controller: str, name: str, known: Mapping[str, Parameter]) -> None:
+    fields: dict[str, Field] = {"controller": controller, "parameter": name}
+    if name not in known:
+        inner = [one for one in known if one.startswith(f"{name}.")]
+        hint = f"name its parts: {', '.join(inner)}" if inner else suggestion(name, tuple(known))
+        raise refused(Code.UNKNOWN_PARAMETER, fields | {"hint": hint})
+    if not known[name].live:
+        live = [one.name for one in known.values() if one.live]
+        shown = f"live are {', '.join(live)}" if live else "it has no live parameters"
+        raise refused(Code.NOT_LIVE, fields | {"known": shown})
+
+
+def _put(written: dict[str, object], path: list[str], value: Written, now: object) -> None:
+    """Put a value into what the robot file has; what stands there in another form is written out."""
+    for key in path[:-1]:
+        now = now[key] if isinstance(now, Mapping) else getattr(now, key)
+        inner = written.get(key)
+        if not isinstance(inner, dict):
+            inner = now.model_dump(mode="json") if key in written and isinstance(now, BaseModel) else {}
+            written[key] = inner
+        written = inner
+    written[path[-1]] = value
+
+
+def _number(value: object) -> bool | int | float:
+    if not isinstance(value, bool | int | float):  # LIVE is checked when the plug-in is loaded
+        raise invalid(f"{value!r} is neither a number nor a bool")
+    return value
