@@ -43,12 +43,12 @@ def test_it_is_answered_when_it_is_there_and_not_before(steered):
         ((row, item, value, done),) = robot.written
         assert (row, item, value) == (1, "p_gain", 40)
         look(robot)
-        done("")
+        done("", 32)
         look(robot)
 
     robot = steered(6, {1: change, 2: look, 4: settled})
     assert answers == [{}, {}, {robot.number: ""}]
-    assert robot.answer(robot.number) == Done(3)  # it was there before cycle 4
+    assert robot.answer(robot.number) == Done(3, value=32)  # it was there before cycle 4
     ((source, text),) = robot.events.of(EventCode.STEERED)
     assert (source, text) == ("loop", 'register {"joint":"j1","item":"p_gain","value":40} from anna')
     (taken,) = [one for one in robot.taken if one.kind == "register"]
@@ -56,7 +56,7 @@ def test_it_is_answered_when_it_is_there_and_not_before(steered):
 
 
 def test_what_went_wrong_is_the_answer(steered):
-    robot = steered(4, {1: change, 2: lambda robot: robot.written[0][3]("j1 did not answer")})
+    robot = steered(4, {1: change, 2: lambda robot: robot.written[0][3]("j1 did not answer", None)})
     assert robot.answer(robot.number) == (Code.REGISTER_NOT_WRITTEN, {"problem": "j1 did not answer"})
 
 

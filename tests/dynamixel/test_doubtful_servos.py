@@ -221,7 +221,7 @@ def test_a_joint_that_is_let_go_is_limp_though_noise_hit_every_attempt_to_switch
         write(data)
 
     rig.ports.ports[0].write = lose_torque_off
-    rig.hardware.let_go([0])
+    rig.hardware.switch_torque(0, False)
     for _ in range(10):
         rig.cycle()
     assert rig.torque() == [True, True]

@@ -9,7 +9,7 @@ import pytest
 
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.plan.bus_plan import RegisterValue
-from dxlrun.dynamixel.servo.offline import RealtimeTicks, RebootCount
+from dxlrun.dynamixel.servo.reboots import RealtimeTicks, RebootCount
 from dxlrun.dynamixel.servo.watchdog import RETURN_SPEED
 from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.dynamixel.wire.transaction import Outcome, Reply
@@ -263,7 +263,7 @@ def test_a_servo_of_a_group_that_was_let_go_gets_no_torque_when_it_is_back(
     servo = rig.buses[0].servos[1]
     servo.silence()
     cycles(rig, 20)
-    rig.hardware.let_go([1])
+    rig.hardware.switch_torque(1, False)
     servo.reset()
     servo.silence(False)
     given = []
@@ -740,7 +740,7 @@ def test_a_servo_of_protocol_1_that_was_let_go_gets_no_goal_which_would_switch_i
     rig = start(make_plan((1, 3, 5)))
     rig.restless = 0.02
     cycles(rig, 3)
-    rig.hardware.let_go([1])
+    rig.hardware.switch_torque(1, False)
     since = len(rig.into_bus())
     cycles(rig, 30)
     assert rig.torque() == [True, False, True]

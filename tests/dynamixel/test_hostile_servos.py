@@ -85,7 +85,7 @@ def act(rig, chance, name):
         rig.hardware.set_modes(wanted)
     if chance.random() < 0.1:
         value = chance.choice((8, 16, 32))
-        rig.hardware.set_register(chance.randrange(3), item, value, lambda _: None)
+        rig.hardware.set_register(chance.randrange(3), item, value, lambda *_: None)
 
 
 def cycle(rig):

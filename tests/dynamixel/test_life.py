@@ -71,13 +71,18 @@ def test_no_state_gets_goals_but_by_torque_that_was_read():
             assert state in life.IN_DOUBT
 
 
-def test_a_latched_servo_gets_no_goals_on_any_way_but_a_return():
-    reached, new = {ServoState.LATCHED}, {ServoState.LATCHED}
+def test_a_released_servo_gets_no_goals_on_any_way_but_a_return_or_a_request():
+    reached, new = {ServoState.RELEASED}, {ServoState.RELEASED}
     while new:
-        found = {TRANSITIONS[state][event] for state in new for event in TRANSITIONS[state]}
+        found = {
+            TRANSITIONS[state][event]
+            for state in new
+            for event in TRANSITIONS[state]
+            if event is not ServoEvent.REQUESTED
+        }
         new = {state for state in found - reached if state is not ServoState.OFFLINE}
         reached |= found
-    assert reached == {ServoState.LATCHED, ServoState.OFFLINE}
+    assert reached == {ServoState.RELEASED, ServoState.OFFLINE}
 
 
 @pytest.fixture
@@ -129,8 +134,8 @@ class Story:
             self.lose()
             self.servo.reset()
             self.servo.silence(False)
-        elif state is ServoState.LATCHED:
-            self.rig.hardware.let_go([1])
+        elif state is ServoState.RELEASED:
+            self.rig.hardware.switch_torque(1, False)
             for _ in range(5):
                 self.rig.cycle()
         elif state is ServoState.OFFLINE:
@@ -197,6 +202,8 @@ class Story:
         self.rig.hardware.idle(self.rig.clock.now_ns() + 10_000_000)
 
     def returned(self):
+        if self.state is ServoState.LIMP:
+            self.requested()
         self.servo.silence(False)
         self.until(ServoState.RETURNING)
 
@@ -205,8 +212,17 @@ class Story:
         self.servo.silence(False)
         self.until(ServoState.LIMP)
 
-    def latch(self):
-        self.rig.hardware.let_go([1])
+    def release(self):
+        self.rig.hardware.switch_torque(1, False)
+
+    def requested(self):
+        if self.state is ServoState.LIMP:
+            self.rig.hardware.start()
+            self.lose()
+            self.servo.reset()
+            self.servo.silence(False)
+            self.until(ServoState.LIMP)
+        self.rig.hardware.switch_torque(1, True)
 
 
 @pytest.mark.parametrize(("state", "event"), sorted(LEGAL, key=str))
@@ -218,13 +234,13 @@ def test_each_legal_transition_is_reached_by_what_a_servo_does(make_plan, make_r
     assert (state, event) in recorded
 
 
-def test_a_servo_that_is_lost_after_it_was_let_go_is_latched_again_when_it_is_back(make_plan, make_rig):
+def test_a_servo_that_is_lost_after_it_was_let_go_is_released_again_when_it_is_back(make_plan, make_rig):
     story = Story(make_plan, make_rig)
-    story.come_to(ServoState.LATCHED)
+    story.come_to(ServoState.RELEASED)
     story.lose()
     story.servo.silence(False)
-    story.until(ServoState.LATCHED, ServoState.LIMP, ServoState.RETURNING)
-    assert story.state is ServoState.LATCHED
+    story.until(ServoState.RELEASED, ServoState.LIMP, ServoState.RETURNING)
+    assert story.state is ServoState.RELEASED
     assert story.rig.torque() == [True, False, True]
 
 
@@ -237,11 +253,11 @@ def test_torque_that_was_read_before_a_servo_was_let_go_gives_it_no_goals(make_p
     story.servo.silence(False)
     rig.cycle(idle=False)
     rig.hardware._servos[0].look()  # the read is due, and waits for idle time
-    rig.hardware.let_go([1])
+    rig.hardware.switch_torque(1, False)
     since = len(rig.into_bus())
     for _ in range(20):
         rig.cycle()
-    assert story.state is ServoState.LATCHED
+    assert story.state is ServoState.RELEASED
     goals = [packet for packet in rig.into_bus()[since:] if packet[4] == 0x83]
     assert goals
     assert not any(12 in packet[7:-1:5] for packet in goals)
@@ -272,7 +288,8 @@ def test_whatever_happens_in_whatever_order_only_legal_transitions_follow(
 
     def let_one_go():
         let_go.add(chance.randrange(3))
-        rig.hardware.let_go(let_go)
+        for row in let_go:
+            rig.hardware.switch_torque(row, False)
 
     happenings = (
         lambda: chance.choice(line.servos).silence(chance.random() < 0.5),
@@ -300,7 +317,7 @@ def test_whatever_happens_in_whatever_order_only_legal_transitions_follow(
             rig.hardware.idle(rig.clock.now_ns() + 15_000_000)
             rig.clock.wait_until(rig.clock.now_ns() + 5_000_000)
             for index in let_go:
-                assert story.life.states[index] in (ServoState.LATCHED, ServoState.OFFLINE)
+                assert story.life.states[index] in (ServoState.RELEASED, ServoState.OFFLINE)
 
 
 def goals_in(packet, protocol):

@@ -53,7 +53,7 @@ class Wishes:
         self.answers.append([])
         self.possible.setdefault((row, name), {0}).add(value)
 
-        def done(problem):
+        def done(problem, _found):
             self.answers[number].append(problem)
             if not problem:
                 self.possible[row, name] = {value}

@@ -33,6 +33,11 @@ def started(make_rig, make_x):
     return rig
 
 
+def keep(answers):
+    """Keep what went wrong with each register."""
+    return lambda problem, found: answers.append(problem)
+
+
 def gain_of(rig, index):
     registers = rig.buses[0].servos[index].registers
     return registers.table.items["position_p_gain"].decode(registers.read(84, 2))
@@ -46,7 +51,7 @@ def writes(rig, since=0):
 
 def test_a_gain_is_changed_between_cycles_read_back_and_reported(started):
     answers, before = [], len(started.into_bus())
-    started.hardware.set_register(1, "position_p_gain", 900, answers.append)
+    started.hardware.set_register(1, "position_p_gain", 900, keep(answers))
     assert answers == []
     for _ in range(3):
         started.cycle()
@@ -62,7 +67,7 @@ def test_a_gain_is_changed_between_cycles_read_back_and_reported(started):
 
 def test_what_a_servo_has_already_is_not_written(started):
     answers, before = [], len(started.into_bus())
-    started.hardware.set_register(0, "position_p_gain", 800, answers.append)
+    started.hardware.set_register(0, "position_p_gain", 800, keep(answers))
     started.cycle()
     assert answers == [""]
     assert writes(started, before) == []
@@ -70,7 +75,7 @@ def test_what_a_servo_has_already_is_not_written(started):
 
 def test_a_servo_that_refuses_is_reported_and_keeps_what_it_had(started):
     answers = []
-    started.hardware.set_register(0, "velocity_p_gain", 20_000, answers.append)
+    started.hardware.set_register(0, "velocity_p_gain", 20_000, keep(answers))
     for _ in range(3):
         started.cycle()
     (answer,) = answers
@@ -81,7 +86,7 @@ def test_a_servo_that_refuses_is_reported_and_keeps_what_it_had(started):
 def test_a_servo_that_is_silent_is_reported(started):
     answers = []
     started.buses[0].servo(11).silence()
-    started.hardware.set_register(0, "position_p_gain", 900, answers.append)
+    started.hardware.set_register(0, "position_p_gain", 900, keep(answers))
     for _ in range(20):
         started.cycle()
     assert answers == ["arm_11_joint (ID 11 on bus arm) did not answer when Position P Gain (84) was read"]
@@ -92,7 +97,7 @@ def test_a_servo_that_is_silent_for_a_moment_gets_its_register(started):
     servo = started.buses[0].servo(11)
     servo.silence()
     started.buses[0].at(started.clock.now_ns() + 130_000_000, lambda: servo.silence(False))
-    started.hardware.set_register(0, "position_p_gain", 900, answers.append)
+    started.hardware.set_register(0, "position_p_gain", 900, keep(answers))
     for _ in range(40):
         started.cycle()
     assert answers == [""]
@@ -102,7 +107,7 @@ def test_a_servo_that_is_silent_for_a_moment_gets_its_register(started):
 @pytest.mark.parametrize("item", ["temperature_limit", "present_position", "nonsense"])
 def test_nothing_else_than_ram_is_written_whatever_comes_out_of_the_mailbox(started, item):
     answers = []
-    started.hardware.set_register(0, item, 60, answers.append)
+    started.hardware.set_register(0, item, 60, keep(answers))
     assert answers == [f"arm_11_joint has no register {item} that could be written now"]
 
 
@@ -111,7 +116,7 @@ def test_many_requests_are_done_in_their_order_and_no_cycle_is_late(started):
     for value in (500, 600, 700):
         for row in (0, 1):
             started.hardware.set_register(
-                row, "position_p_gain", value, lambda why, at=(row, value): answers.append((*at, why))
+                row, "position_p_gain", value, lambda why, _, at=(row, value): answers.append((*at, why))
             )
     for _ in range(6):
         started.cycle()  # asserts that it ends in its period
@@ -129,7 +134,7 @@ def until_back(rig, most=200):
 
 def test_what_was_set_in_the_run_is_set_again_after_a_reset(started):
     servo, answers = started.buses[0].servo(12), []
-    started.hardware.set_register(1, "position_p_gain", 900, answers.append)
+    started.hardware.set_register(1, "position_p_gain", 900, keep(answers))
     for _ in range(3):
         started.cycle()
     servo.silence()

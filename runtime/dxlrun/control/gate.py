@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from dxlrun.control.loop_plan import JointPlan, LoopPlan
 from dxlrun.control.policy_plan import SLOW_SPEED, SLOW_START_NS
 from dxlrun.description.modes import Mode
-from dxlrun.run.channels.cycle import Clamp, Commands, CycleRecord, Floats, States
+from dxlrun.run.channels.cycle import LIMP, Clamp, Commands, CycleRecord, Floats, States
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
 
 BRAKING_S = 0.1
@@ -50,6 +50,7 @@ class Gate:
       the first second after `ease_in` at most SLOW_SPEED * dt.
     - The commanded speed is taken as a magnitude and clamped to `limits.velocity` and the servo's top speed;
       NaN stays NaN: as fast as the servo can. No speed outlives the command that it came with.
+    - A joint without torque that is not commanded has the position where it stands.
 
     `record.clamped` has what was done, bits of Clamp; an event reports when it begins. `counts`, shape
     (joints, 8), counts cycles by joint and bit.
@@ -74,6 +75,10 @@ class Gate:
         self._led = np.ones(count, dtype=np.bool_)
         """Joints that are led to positions."""
         self._any_led = True
+        self._torque = b""
+        """The joints' torque, as the states had it last."""
+        self._limp = np.zeros(count, dtype=np.bool_)
+        self._any_limp = False
         self._before = np.zeros(count, dtype=np.uint8)
         # positions in the first row, the speeds toward them in the second
         self._commanded, self._least, self._most, self._inside = (np.empty((2, count)) for _ in range(4))
@@ -122,6 +127,8 @@ class Gate:
     def apply(self, commands: Commands, goals: Commands, dt_ns: int) -> None:
         """Move `goals` toward `commands` in place; `dt_ns` is the time since the cycle before."""
         clamped, speed = self._record.clamped, self._speed
+        if self._any_limp or self._record.states.torque.tobytes() != self._torque:
+            self._follow(commands, goals)
         np.bitwise_and(clamped, _NOT_FINITE, clamped)  # what the manager found
         if self._longest_slow_ns > 0:
             speed = np.where(self._slow_ns > 0, self._slow, self._speed)
@@ -134,6 +141,22 @@ class Gate:
         if np.count_nonzero(clamped):  # a tenth of the time of any()
             self._report(clamped & ~self._before)
         np.copyto(self._before, clamped)
+
+    def _follow(self, commands: Commands, goals: Commands) -> None:
+        """Let the goals of limp joints that no controller commands be where these stand.
+
+        So a joint that gets torque again holds where it is, and follows its next commands slowly.
+        """
+        states, limp = self._record.states, self._limp
+        if (torque := states.torque.tobytes()) != self._torque:
+            self._torque, before = torque, limp
+            self._limp = np.isin(states.torque, LIMP)
+            self._any_limp = bool(self._limp.any())
+            self.ease_in(np.flatnonzero(before & ~self._limp).tolist())
+            limp = before | self._limp  # those that have it again too, as they moved until now
+        limp = limp & self._led & np.isnan(commands.position) & np.isfinite(states.position)
+        np.copyto(goals.position, states.position, where=limp)
+        goals.velocity[limp] = np.nan
 
     def _lead(self, commands: Commands, goals: Commands, speed: Floats, dt_ns: int) -> None:
         """Fill position and speed of the joints that are led to positions.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal, Protocol, cast, get_args
 
@@ -14,12 +14,13 @@ from dxlrun.control.controllers.managed import PERIOD_CAP
 from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.controllers.plugins import OverrunHook
 from dxlrun.control.gate import Gate
+from dxlrun.control.joint_requests import JointRequests
 from dxlrun.control.loop_plan import ControllerPlan, LoopPlan, OverrunPolicy
 from dxlrun.control.policy_plan import GroupPolicy, Last, PolicyName, PolicyPlan
 from dxlrun.control.safe_motion import SafeMotion
 from dxlrun.control.steering import Steering
 from dxlrun.errors import PortError, counted
-from dxlrun.run.channels.answers import Code, Refusal
+from dxlrun.run.channels.answers import Answer, Code, Refusal
 from dxlrun.run.channels.commands import LOOP, CommandSink, Inbox, NoCommands, NoInbox, TakenCommand
 from dxlrun.run.channels.cycle import LOST_AGE_NS, LOST_CYCLES, CycleRecord, States
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
@@ -75,13 +76,31 @@ class Hardware(Protocol):
         """
         ...
 
-    def set_register(self, row: int, item: str, value: int, done: Callable[[str], None]) -> None:
+    def set_register(self, row: int, item: str, value: int, done: Callable[[str, int | None], None]) -> None:
         """Write a RAM item of a joint's servo in idle time and read it back.
 
         Returns at once. `done` is called once, here or later: with an empty text when the servo has
-        it, else with what went wrong. `item` and `value` (the integer on the wire) were checked against the
-        control table. A servo that is reset gets it again, with what the robot file declares.
+        it, else with what went wrong, and with what it had before. `item` and `value` (the integer on the
+        wire) were checked against the control table. A servo that is reset gets it again, with what the robot
+        file declares.
         """
+        ...
+
+    def read_register(self, row: int, item: str, done: Callable[[str, int | None], None]) -> None:
+        """Read an item of a joint's servo in idle time; `done` takes what went wrong, and what it has."""
+        ...
+
+    def switch_torque(self, row: int, on: bool, done: Callable[[str], None]) -> None:
+        """Switch the torque of a joint off in the coming idle time, or on where it stands.
+
+        Returns at once. `done` is called once, here or later, with what went wrong, or an empty text. A joint
+        that was switched off gets no goals and no torque until it is switched on; `states.torque` shows it
+        from the next read on.
+        """
+        ...
+
+    def reboot(self, row: int, done: Callable[[str], None]) -> None:
+        """Reboot a joint's servo in idle time; `done` is called when it is in order again, or is given up."""
         ...
 
     def limit_torque(self, fraction: float) -> None:
@@ -94,10 +113,6 @@ class Hardware(Protocol):
 
     def stop(self) -> tuple[str, ...]:
         """Switch torque off on every servo, read it back, raise nothing; return a sentence per failure."""
-        ...
-
-    def let_go(self, rows: Sequence[int]) -> None:
-        """Switch the torque of these joints off in the coming idle time, for the rest of the run."""
         ...
 
     def release(self) -> None:
@@ -163,6 +178,7 @@ class Loop:
     """Plug-ins that decide what becomes of a late cycle."""
     schedule: Schedule = field(init=False)
     steering: Steering = field(init=False)
+    joints: JointRequests = field(init=False)
     _overruns: Overruns = field(init=False)
     paused: bool = field(default=False, init=False)
     _cycle: int = field(default=0, init=False)
@@ -185,8 +201,11 @@ class Loop:
         self.schedule = Schedule(self.plan.period_ns)
         self._overruns = Overruns(self.plan.overrun, self.overrun_hooks, self.events)
         self._valid = np.zeros(len(self.plan.joints), np.int64)
-        self._lost = LostServos(len(self.plan.joints))
-        self.steering = Steering(self.inbox, self, self.manager, self.record, self.events, self.commands)
+        self.joints = JointRequests(self.plan.joints, self.hardware, self.manager, self.record, self._answer)
+        self._lost = LostServos(len(self.plan.joints), self.joints.expected)
+        self.steering = Steering(
+            self.inbox, self, self.manager, self.joints, self.record, self.events, self.commands
+        )
 
     def run(self) -> LoopResult:
         """Activate the controllers, run until the plan's end, a stop or a fault, deactivate them; then go
@@ -211,7 +230,7 @@ class Loop:
         finally:
             # behind the last cycle of a pause, the period until the next one is left out already
             self.manager.deactivate(max(self._time_ns, self.schedule.time_ns(self.clock.now_ns())))
-            self.steering.answer_late()
+            self.steering.end()
         if reason != "fault" and self.manager.fault is not None:
             reason, detail = "fault", self.manager.fault
         policy: PolicyName = "on_fault" if reason == "fault" else "on_exit"
@@ -268,14 +287,6 @@ class Loop:
         self.beat()
         return found
 
-    def set_register(self, joint: str, item: str, value: int, done: Callable[[str], None]) -> Refusal | None:
-        """Have a RAM item of a joint's servo written in idle time; `done` gets what went wrong, or ''."""
-        for row, one in enumerate(self.plan.joints):
-            if one.name == joint:
-                self.hardware.set_register(row, item, value, done)
-                return None
-        return Refusal(Code.UNKNOWN_JOINT, {"joint": joint})
-
     def finish(self) -> None:
         """End the run in order after this cycle."""
         self.stop.request()
@@ -290,6 +301,9 @@ class Loop:
         return f"the run ends: {policy.text}"
 
     # Inside
+
+    def _answer(self, number: int, answer: Answer) -> None:
+        self.steering.inbox.answer(number, answer)
 
     def _set_cycle_limit(self) -> None:
         """Set how long a cycle may take; what this one took until now does not count."""
@@ -332,7 +346,7 @@ class Loop:
             self.steering.refuse()
             self._motion.command()
         else:
-            if self._lost.look(record.states):
+            if self._lost.look(record.states, woken_ns):
                 self._miss()
             time_ns = schedule.time_ns(woken_ns)
             if (
@@ -361,8 +375,9 @@ class Loop:
         """Apply the policies: other servos are lost than in the cycle before."""
         ending, limp = self._lost.judge(self.plan.policies)
         for group in limp:
-            self.hardware.let_go(sorted(group.rows))
-            text = f"group {group.name} lost a servo: it gets no torque any more"
+            for row in sorted(group.rows):
+                self.hardware.switch_torque(row, False, _unanswered)
+            text = f"group {group.name} lost a servo: it gets no torque until a client requests it"
             self.events.emit(EventCode.POLICY, Severity.ERROR, "loop", text)
         for policy, rows in ending.items():
             names = ", ".join(self.plan.joints[row].name for row in rows)
@@ -546,27 +561,36 @@ class Overruns:
         )
 
 
+def _unanswered(problem: str) -> None:
+    """Take what came of a policy's request for a servo: no client waits for it, events report it."""
+
+
 class LostServos:
     """Counts the replies that each joint missed in a row."""
 
-    __slots__ = ("_all", "_limp", "_missed", "rows")
+    __slots__ = ("_all", "_expected", "_limp", "_missed", "rows")
 
-    def __init__(self, joints: int) -> None:
+    def __init__(self, joints: int, expected: dict[int, int]) -> None:
+        """`expected`: rows of servos that reboot by request, until when, ns; those that are back leave it."""
+        self._expected = expected
         self.rows: frozenset[int] = frozenset()
         """Rows of the joints that are lost now."""
         self._limp: set[str] = set()  # names of groups that a lost servo has left without torque
         self._missed = np.zeros(joints, dtype=np.int64)
         self._all = bytes([True]) * joints
 
-    def look(self, states: States) -> bool:
-        """Take the states of a cycle; return whether `rows` is another one now."""
+    def look(self, states: States, now_ns: int) -> bool:
+        """Take the states of a cycle that began at `now_ns`; return whether `rows` is another one now."""
         valid, age_ns = states.valid, states.age_ns
         if valid.tobytes() == self._all and not np.count_nonzero(self._missed):
             return False
+        for row, until_ns in tuple(self._expected.items()):
+            if now_ns >= until_ns or (valid[row] and self._missed[row]):
+                del self._expected[row]
         self._missed += 1
         self._missed[valid] = 0
         lost = (self._missed >= LOST_CYCLES) & ((age_ns >= LOST_AGE_NS) | (age_ns < 0))
-        rows = frozenset(np.flatnonzero(lost).tolist())
+        rows = frozenset(np.flatnonzero(lost).tolist()) - self._expected.keys()
         changed = rows != self.rows
         self.rows = rows
         return changed

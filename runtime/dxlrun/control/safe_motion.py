@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from dxlrun.control.loop_plan import JointPlan
 from dxlrun.control.policy_plan import SETTLE_NS, Policy, Step
 from dxlrun.description.modes import Mode
-from dxlrun.run.channels.cycle import CycleRecord, Floats
+from dxlrun.run.channels.cycle import LIMP, CycleRecord, Floats
 
 ARRIVED = 0.05
 """rad; so near to its pose a joint counts as there. Ten ticks of an AX-12: friction holds it off by some."""
@@ -135,7 +135,11 @@ class SafeMotion:
         if not np.any(named & (np.abs(target - goal) > 1e-9)):
             self._there_ns = now_ns if self._there_ns < 0 else self._there_ns
             states = record.states
-            away = named & ~(states.valid & (np.abs(target - states.position) <= ARRIVED))
+            away = (
+                named
+                & ~np.isin(states.torque, LIMP)
+                & ~(states.valid & (np.abs(target - states.position) <= ARRIVED))
+            )
             lasted_ns = now_ns - self._there_ns
             return lasted_ns >= SETTLE_NS or (lasted_ns >= STAND_NS and not away.any())
         reach = step.speed * max(record.period_ns, 1) * 1e-9

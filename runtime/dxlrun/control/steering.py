@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Protocol
 
 import msgspec
 import numpy as np
 
 from dxlrun.control.controllers.manager import Manager
+from dxlrun.control.joint_requests import JOINT_KINDS, JointRequests
 from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.run.channels.answers import Answer, Code, CommandOutcome, Done, Refusal, Waiting
 from dxlrun.run.channels.commands import LOOP, Command, CommandSink, Inbox, TakenCommand
@@ -35,10 +34,6 @@ class Steered(Protocol):
 
     def load(self, plan: ControllerPlan) -> int | Refusal:
         """Configure one more controller; return its place."""
-        ...
-
-    def set_register(self, joint: str, item: str, value: int, done: Callable[[str], None]) -> Refusal | None:
-        """Have a RAM item of a joint's servo written; `done` gets what went wrong, or an empty text."""
         ...
 
     def finish(self) -> None:
@@ -90,15 +85,6 @@ class Parameters(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """By dotted name, in SI units."""
 
 
-class Register(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Data of `register`; whether the item may be written was checked before."""
-
-    joint: str
-    item: str
-    value: int
-    """The integer on the wire, signed where the item is."""
-
-
 KINDS = (
     "switch",
     "cancel",
@@ -108,7 +94,7 @@ KINDS = (
     "resume",
     "load",
     "unload",
-    "register",
+    *JOINT_KINDS,
     "stop",
 )
 """Commands for the loop itself; `load` carries a ControllerPlan, `pause`, `resume` and `stop` nothing."""
@@ -119,12 +105,14 @@ class Steering:
     """Executes the commands of an inbox, logs them, and answers them.
 
     Most are answered in the cycle that takes them. A switch that waits for modes is answered by `Waiting`
-    first, and again when its controllers are active or given up; a register when the servo has it.
+    first, and again when its controllers are active or given up; so are torque and reboots. A register is
+    answered when the servo has it.
     """
 
     inbox: Inbox
     loop: Steered
     manager: Manager
+    joints: JointRequests
     record: CycleRecord
     events: EventSink
     taken: CommandSink
@@ -156,6 +144,11 @@ class Steering:
         """Refuse what has come, because the run is ending; it is not in the log, as it changes nothing."""
         for command in self.inbox.take():
             self.inbox.answer(command.number, Refusal(Code.RUN_ENDING))
+
+    def end(self) -> None:
+        """Answer what waits still: the controllers are inactive."""
+        self.answer_late()
+        self.joints.end()
 
     def answer_late(self) -> None:
         """Answer the switches that waited for modes and have come to an end."""
@@ -232,16 +225,9 @@ class Steering:
                 return found if isinstance(found, Refusal) else Done(self.record.cycle, found)
             case "unload":
                 answer = manager.unload(msgspec.json.decode(data, type=Unload).controller)
-            case "register":
-                register = msgspec.json.decode(data, type=Register)
-                done = partial(self._written, command.number)
-                return loop.set_register(register.joint, register.item, register.value, done)
+            case kind if kind in JOINT_KINDS:
+                return self.joints.execute(command, time_ns)
             case _:
                 problem = f"the loop has no command {command.kind}; known: {', '.join(KINDS)}"
                 answer = Refusal(Code.INVALID, {"problem": problem})
         return answer or Done(self.record.cycle)
-
-    def _written(self, number: int, problem: str) -> None:
-        """Answer a register when the servo has it, or when that failed."""
-        refusal = Refusal(Code.REGISTER_NOT_WRITTEN, {"problem": problem}) if problem else None
-        self.inbox.answer(number, refusal or Done(self.record.cycle))

@@ -18,6 +18,9 @@ from dxlrun.dynamixel.exchange.samples import Samples
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.dynamixel.port.ports import Ports
 from dxlrun.dynamixel.servo import watchdog
+from dxlrun.dynamixel.servo.desired import RegisterDone
+from dxlrun.dynamixel.servo.life import Done
+from dxlrun.dynamixel.servo.offline import ignore
 from dxlrun.dynamixel.servo.registers import reduced_torque_limits
 from dxlrun.dynamixel.servo.servos import Servos
 from dxlrun.dynamixel.servo.startup import StartUp, report_failures
@@ -102,6 +105,12 @@ class DynamixelHardware:
             )
         )
         self._lines = tuple(zip(self._buses, self._servos, strict=True))
+        self._places = {
+            servo.row: (servos, index)
+            for plan, servos in zip(self._plans, self._servos, strict=True)
+            for index, servo in enumerate(plan.servos)
+        }
+        """Row of a joint -> where its servo is."""
         self._kernel: Kernel | None = None
         if library is not None and holds(self._plans, packets):
             self._kernel = Kernel(
@@ -153,6 +162,8 @@ class DynamixelHardware:
         now_ns = self._clock.now_ns()
         for servos in self._servos:
             servos.watchdogs.sent(now_ns)
+            if servos.torque_changed:
+                servos.show_torque(self._states.torque)
         if self._states.mode.tobytes() != self._samples.modes:
             self._samples.follow_modes()
         if self._kernel is not None and reader is Reader.KERNEL:
@@ -263,12 +274,25 @@ class DynamixelHardware:
         for servos in self._servos:
             servos.desired.change_modes(modes)
 
-    def set_register(self, row: int, item: str, value: int, done: Callable[[str], None]) -> None:
+    def set_register(self, row: int, item: str, value: int, done: RegisterDone) -> None:
         """Write a RAM item of a joint's servo in idle time, and read it back; see `DesiredState`."""
-        for plan, servos in zip(self._plans, self._servos, strict=True):
-            for index, servo in enumerate(plan.servos):
-                if servo.row == row:
-                    servos.desired.write_register(index, item, value, done)
+        servos, index = self._places[row]
+        servos.desired.write_register(index, item, value, done)
+
+    def read_register(self, row: int, item: str, done: RegisterDone) -> None:
+        """Read an item of a joint's servo in idle time."""
+        servos, index = self._places[row]
+        servos.desired.read_register(index, item, done)
+
+    def switch_torque(self, row: int, on: bool, done: Done = ignore) -> None:
+        """Switch the torque of a joint's servo in idle time; see `Requests`."""
+        servos, index = self._places[row]
+        (servos.requests.torque_on if on else servos.requests.torque_off)(index, done)
+
+    def reboot(self, row: int, done: Done) -> None:
+        """Reboot a joint's servo in idle time; see `Requests`."""
+        servos, index = self._places[row]
+        servos.requests.reboot(index, done)
 
     def limit_torque(self, fraction: float) -> None:
         """Let no servo exert more than a fraction of its own limit; `restore_torque` takes that back."""
@@ -297,6 +321,7 @@ class DynamixelHardware:
             work = self._idle[index]
             if bus.failure is not None:
                 work.abandon()
+                servos.abandon()
             elif index not in late:
                 servos.look()
                 if work.tasks and work.begin(latest):
@@ -340,11 +365,6 @@ class DynamixelHardware:
                 f"torque is off on {'the servo' if count == 1 else f'all {count} servos'}",
             )
         return failures
-
-    def let_go(self, rows: Sequence[int]) -> None:
-        """Switch the torque of these joints off in idle time; they get no goals in this run."""
-        for servos in self._servos:
-            servos.let_go(rows)
 
     def release(self) -> None:
         """Leave the robot with its torque on: nothing is sent any more, and no servo may stop for that.

@@ -146,7 +146,8 @@ def _cycle_text() -> str:
         "# 1 lower, 2 upper, 4 step, 8 velocity, 16 not finite, 32 effort, 64 pwm, 128 outward.",
         "# hardware_error: bits of Hardware Error Status, or states of Protocol 1.0's ERR. mode: 0 not",
         "# known, 1 position, 2 velocity, 3 effort, 4 pwm, 5 position with an effort limit.",
-        "# reference: in the order of the metadata's references. Records + skipped = elapsed periods.",
+        "# reference: in the order of the metadata's references. torque: 0 not known, 1 on, 2 in doubt,",
+        "# 3 off, 4 switched off on request, 5 lost. Records + skipped = elapsed periods.",
     ]
     lines += [f"{kind} {name}" for name, kind in SCALARS]
     lines += [f"{kind}[] {name}" for name, kind, _ in SEQUENCES]
@@ -156,7 +157,7 @@ def _cycle_text() -> str:
 CYCLE = MessageType(
     "dxlrun_msgs/msg/Cycle",
     _cycle_text(),
-    "RIHS01_a2b592761ca04f639e0a6499349d25451b9ad3be8c9a8c0b7a3792ef0155b07b",
+    "RIHS01_ca3b43183332b5c6e423b3daf0dc4b21cf46dd25a9b88bdca2f8cbb597634840",
 )
 
 BUS_PACKET = MessageType(

@@ -24,7 +24,7 @@ from dxlrun.control.loop_plan import ControllerPlan, LoopPlan, ScheduledCommand
 from dxlrun.errors import ControllerFault, PlugInError
 from dxlrun.run.channels.answers import Code, CommandOutcome, Field, Refusal, Waiting
 from dxlrun.run.channels.commands import CommandSink, NoCommands, TakenCommand
-from dxlrun.run.channels.cycle import MOST_CONTROLLERS, CycleRecord
+from dxlrun.run.channels.cycle import LIMP, MOST_CONTROLLERS, CycleRecord
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
 
 
@@ -72,6 +72,8 @@ class Manager:
         self._lost: Collection[int] = ()
         self._goals = Goals(record, events)
         self._modes = ModeSwitch(plan.joints, record.states.mode, set_modes)
+        self.released: set[int] = set()
+        """Rows of joints whose torque clients switched off; the states show it a cycle later."""
         self.ended_switches: list[tuple[int, Refusal | None]] = []
         """Switches that waited and have ended: the command's number, and why not; for the loop to answer."""
 
@@ -257,7 +259,7 @@ class Manager:
         in the first cycle in which all joints have (see ModeSwitch). How that ends is in `ended_switches`,
         under `number`, the command's; None: no command asked for it.
         """
-        if refusal := self._refuse(activate, deactivate):
+        if refusal := self._refuse(activate, deactivate) or self._refuse_limp(activate):
             return refusal
         for managed in (self._named[name] for name in deactivate):
             if managed.active:
@@ -266,6 +268,40 @@ class Manager:
                 refusal = Refusal(Code.SWITCHED_AGAIN, {"controller": managed.plan.name})
                 self._end_switch(self._modes.drop(managed), refusal)
         return self._enter([self._named[name] for name in activate], time_ns, number, "")
+
+    def commanding(self, joints: Collection[str]) -> tuple[str, ...]:
+        """Return the controllers that command one of these joints, directly or through a chain.
+
+        Active ones, and those that wait for modes; upper ends of chains first.
+        """
+        engaged = [one for one in self._managed if one.active or one in self._modes.entering]
+        found = [
+            one.plan.name
+            for one in engaged
+            if one.plan.command and not one.plan.into and not set(joints).isdisjoint(one.plan.joints)
+        ]
+        for lower in found:  # grows meanwhile
+            found += [
+                one.plan.name for one in engaged if lower in one.plan.into and one.plan.name not in found
+            ]
+        return tuple(reversed(found))
+
+    def _refuse_limp(self, activate: Sequence[str]) -> Refusal | None:
+        """Refuse controllers for joints without torque: they would command what cannot move."""
+        torque = self._record.states.torque
+        limp = tuple(
+            dict.fromkeys(
+                self._plan.joints[row].name
+                for managed in (self._named[name] for name in activate)
+                if managed.plan.command and not managed.plan.into
+                for row in managed.rows.tolist()
+                if row in self.released or torque[row] in LIMP
+            )
+        )
+        if not limp:
+            return None
+        hint = f"`dxlrun torque on {' '.join(limp)}` gives it"
+        return Refusal(Code.JOINT_LIMP, {"joint": limp, "hint": hint})
 
     def _end_switch(self, number: int | None, refusal: Refusal | None) -> None:
         if number is not None:

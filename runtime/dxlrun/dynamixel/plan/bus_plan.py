@@ -186,6 +186,8 @@ class ServoPlan:
     """Torque is given back after a reboot (policy `on_returned_servo: hold`)."""
     continuous: bool = False
     """The joint is a wheel, or one of many turns."""
+    torque_at_start: bool = True
+    """The start gives it torque; False: it stays limp until a client requests torque."""
 
     def joint_position(self, raw: int) -> float:
         """Return the joint's angle, rad, of a present or goal position in ticks.

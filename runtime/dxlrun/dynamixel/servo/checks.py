@@ -14,11 +14,11 @@ from typing import NamedTuple
 
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import ControlItem, control_table
+from dxlrun.dynamixel.exchange.retry import retry, setup_line
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.plan.line import Line, listen
 from dxlrun.dynamixel.plan.mode_plan import mode_in
 from dxlrun.dynamixel.plan.reads import state_read
-from dxlrun.dynamixel.servo.retry import retry, setup_line
 from dxlrun.dynamixel.servo.watchdog import shown, tripped
 from dxlrun.dynamixel.wire.protocol1 import StatusError, describe_error
 from dxlrun.dynamixel.wire.protocol2 import describe_hardware_error
@@ -415,6 +415,8 @@ def _misplaced(servo: ServoPlan, raw: int, found: BusSurvey) -> str:
     """Return what is wrong with a servo's position, or nothing."""
     if found.modes.get(servo.servo_id) != servo.start_mode:
         return ""  # its position counts in another mode; it is looked at again before it gets torque
+    if not servo.torque_at_start:
+        return ""  # a person moves it as far as it goes; `hold` looks at it before it gets torque
     if raw > servo.max_tick and not servo.continuous:
         return f"reports position {raw}, beyond its {servo.max_tick} ticks"
     if servo.lower_tick - 1 <= raw <= servo.upper_tick + 1:

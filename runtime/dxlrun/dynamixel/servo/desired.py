@@ -7,6 +7,7 @@ was offline is brought to the newest of it again.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,18 +16,21 @@ from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.exchange.goals import GoalArrays
 from dxlrun.dynamixel.exchange.idle import IdleScheduler, Urgency
+from dxlrun.dynamixel.exchange.retry import retry
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, RegisterValue, ServoPlan
 from dxlrun.dynamixel.plan.line import listen
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.servo import modes
 from dxlrun.dynamixel.servo.life import Life, ServoEvent
-from dxlrun.dynamixel.servo.registers import Settled, merged, settle
-from dxlrun.dynamixel.servo.retry import retry
+from dxlrun.dynamixel.servo.reboots import Reboots
+from dxlrun.dynamixel.servo.registers import Settled, compare, merged, settle
 from dxlrun.dynamixel.wire.transaction import Program
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
 
 PAUSES_NS = (50_000_000, 150_000_000)
 """Between attempts to write a register: a stalled machine or adapter is no reason to fail a request."""
+RegisterDone = Callable[[str, int | None], None]
+"""Takes what went wrong with a register, or an empty text, and what the servo had there; None: not known."""
 
 
 class DesiredState:
@@ -36,7 +40,18 @@ class DesiredState:
     not answer, its mode is read again; one that cannot be read stays UNKNOWN until the servo is taken back.
     """
 
-    __slots__ = ("_changing", "_events", "_goals", "_idle", "_life", "_mode", "_modes", "_plan", "_registers")
+    __slots__ = (
+        "_changing",
+        "_events",
+        "_goals",
+        "_idle",
+        "_life",
+        "_mode",
+        "_modes",
+        "_plan",
+        "_reboots",
+        "_registers",
+    )
 
     def __init__(  # noqa: PLR0917  what a bus consists of
         self,
@@ -44,6 +59,7 @@ class DesiredState:
         idle: IdleScheduler,
         goals: GoalArrays,
         life: Life,
+        reboots: Reboots,
         mode: NDArray[np.uint8],
         events: EventSink,
     ) -> None:
@@ -52,6 +68,7 @@ class DesiredState:
         self._idle = idle
         self._goals = goals
         self._life = life
+        self._reboots = reboots
         self._mode = mode
         self._events = events
         self._modes = [servo.start_mode for servo in plan.servos]
@@ -102,12 +119,25 @@ class DesiredState:
         self._idle.add(self._change_mode(index), Urgency.MODE, name, index)
 
     def _change_mode(self, index: int) -> Program[None]:
-        """Change into the newest mode that is requested, and report what came of it."""
+        """Change into the newest mode that is requested, and report what came of it.
+
+        A servo that reboots meanwhile gets no torque back by that: it is lost, and returns by the policy.
+        """
         plan, servo, mode = self._plan, self._plan.servos[index], self._modes[index]
-        try:
-            problem = yield from modes.enter(plan, servo, mode, inward=True)
-        except LookupError as error:
-            problem = f"cannot follow: {error}"
+        rebooted = yield from self._reboots.tick(index)
+        problem = modes.STARTED_ANEW if rebooted else ""
+        if not rebooted:
+            try:
+                problem = yield from modes.enter(
+                    plan, servo, mode, inward=True, rebooted=partial(self._reboots.tick, index)
+                )
+            except LookupError as error:
+                problem = f"cannot follow: {error}"
+        if problem == modes.STARTED_ANEW:
+            self._changing[index] = False
+            if not self._life.offline(index):
+                self._life.lose(index).rebooted = True
+            return
         if problem:
             mode = yield from modes.mode_now(plan, servo)
             self._life.on(index, ServoEvent.DOUBT)
@@ -129,18 +159,44 @@ class DesiredState:
     def _report_mode(self, index: int, severity: Severity, text: str) -> None:
         self._life.report(EventCode.MODE, severity, index, text)
 
-    def write_register(self, index: int, item: str, value: int, done: Callable[[str], None]) -> None:
-        """Write a RAM item in idle time, if the servo has something else; `done` takes what went wrong."""
+    def read_register(self, index: int, item: str, done: RegisterDone) -> None:
+        """Read an item in idle time; `done` takes what went wrong, and what the servo has."""
+        servo = self._plan.servos[index]
+        entry = control_table(servo.model, self._plan.protocol).items.get(item)
+        if entry is None:
+            done(f"{servo.joint} has no register {item}", None)
+            return
+        register = RegisterValue(entry.address, entry.size, 0, item)
+        name = f"{entry.title} of {self._plan.label(servo)}"
+        self._idle.add(self._read(servo, register, done), Urgency.STEERED, name, index)
+
+    def _read(self, servo: ServoPlan, register: RegisterValue, done: RegisterDone) -> Program[None]:
+        found: int | None = None
+        for pause_ns in (*PAUSES_NS, 0):
+            (difference,) = yield from compare(self._plan, servo, (register,), plan_line(self._plan))
+            found = difference.found
+            if found is not None or not pause_ns:
+                break
+            yield listen(pause_ns)
+        item = control_table(servo.model, self._plan.protocol).items[register.name]
+        problem = f"{self._plan.label(servo)} did not answer when {item.title} was read"
+        done(problem if found is None else "", found)
+
+    def write_register(self, index: int, item: str, value: int, done: RegisterDone) -> None:
+        """Write a RAM item in idle time, if the servo has something else.
+
+        `done` takes what went wrong, and what the servo had before.
+        """
         servo = self._plan.servos[index]
         entry = control_table(servo.model, self._plan.protocol).items.get(item)
         if entry is None or entry.area != "RAM" or entry.access != "RW":
-            done(f"{servo.joint} has no register {item} that could be written now")
+            done(f"{servo.joint} has no register {item} that could be written now", None)
             return
         register = RegisterValue(entry.address, entry.size, value, item)
         name = f"{entry.title} of {self._plan.label(servo)}"
         self._idle.add(self._write(index, register, done), Urgency.STEERED, name, index)
 
-    def _write(self, index: int, register: RegisterValue, done: Callable[[str], None]) -> Program[None]:
+    def _write(self, index: int, register: RegisterValue, done: RegisterDone) -> Program[None]:
         servo = self._plan.servos[index]
         settled = yield from self._settle(servo, register)
         problem = "; ".join(settled.problems)
@@ -149,7 +205,7 @@ class DesiredState:
         else:
             self._registers[index] = merged(self._registers[index], register)
         self.report_written(settled.written)
-        done(problem)
+        done(problem, settled.found.get(register.name))
 
     def _settle(self, servo: ServoPlan, register: RegisterValue) -> Program[Settled]:
         """Write one register, and try again later while the servo is silent."""

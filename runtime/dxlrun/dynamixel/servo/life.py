@@ -7,8 +7,8 @@
                     STOPPED <-------------'             |
                      ^    '-- torque on --> RETURNING --'     doubt, watchdog: back to STOPPED
                      | returned
-      lost --> OFFLINE -- returned limp --> LIMP
-      latch -> LATCHED
+      lost ---> OFFLINE -- returned limp --> LIMP
+      release -> RELEASED -- requested --> LIMP -- returned --> STOPPED
 
 What drives it are programs, generators that yield transactions to a bus and end in an event:
 
@@ -18,7 +18,9 @@ What drives it are programs, generators that yield transactions to a bus and end
 | read torque enable, hardware error, torque limit | `servos.py` | TORQUE_ON, TORQUE_OFF, DOUBT, LOST |
 | probe an offline servo, and take it back | `offline.py` | RETURNED (then TORQUE_ON) or RETURNED_LIMP |
 | read Realtime Tick, which shows a reboot | `offline.py`, `slow_registers.py` | LOST |
-| switch torque off for the rest of the run | `offline.py` | LATCH, then LOST where it fails |
+| switch torque off, until it is requested | `requests.py` | RELEASE, then LOST where it fails |
+| switch torque on at a client's request | `requests.py` | REQUESTED; RETURNED (then TORQUE_ON) or RELEASE |
+| reboot at a client's request | `requests.py` | LOST; its return is that of an offline servo |
 | change a mode | `desired.py`, `modes.py` | DOUBT where torque was not confirmed |
 | revive a servo its watchdog stopped | `watchdog_monitor.py` | WATCHDOG, then LOST where it fails |
 
@@ -40,7 +42,7 @@ from numpy.typing import NDArray
 from dxlrun.dynamixel.exchange.cyclic_reads import CyclicReads
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.dynamixel.servo.watchdog import RETURN_SPEED
-from dxlrun.run.channels.cycle import Floats
+from dxlrun.run.channels.cycle import Floats, Torque
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
 
 
@@ -60,8 +62,9 @@ class ServoState(Enum):
     """Has torque for certain, and goes to its goal at RETURN_SPEED at most, until it has caught up."""
     OFFLINE = "offline"
     """Out of the cyclic reads; probed now and then, and taken back when it is in order."""
-    LATCHED = "latched"
-    """Read in every cycle; its torque is off for the rest of the run."""
+    RELEASED = "released"
+    """Read in every cycle; its torque was switched off by a client, a policy or the robot file, and stays off
+    whatever policies say, until a client requests it."""
 
 
 @unique
@@ -86,17 +89,21 @@ class ServoEvent(Enum):
     """It is in order again, and its torque is on."""
     RETURNED_LIMP = "returned limp"
     """It is in order again, without torque."""
-    LATCH = "latch"
-    """A policy switches its torque off for the rest of the run."""
+    REQUESTED = "requested"
+    """A client requests torque: RETURNED follows when it is there, RELEASE when the servo is not in order."""
+    RELEASE = "release"
+    """A client, a policy or the robot file switches its torque off."""
 
 
-_ONLINE = {ServoEvent.LOST: ServoState.OFFLINE, ServoEvent.LATCH: ServoState.LATCHED}
+_ONLINE = {ServoEvent.LOST: ServoState.OFFLINE, ServoEvent.RELEASE: ServoState.RELEASED}
 """From every state in which a servo is read."""
 
 TRANSITIONS: Mapping[ServoState, Mapping[ServoEvent, ServoState]] = MappingProxyType(
     {
         ServoState.LIMP: {
             ServoEvent.ENGAGED: ServoState.HOLDING,
+            ServoEvent.REQUESTED: ServoState.LIMP,
+            ServoEvent.RETURNED: ServoState.STOPPED,
             ServoEvent.TORQUE_OFF: ServoState.LIMP,
             ServoEvent.DOUBT: ServoState.LIMP,
             ServoEvent.WATCHDOG: ServoState.LIMP,
@@ -134,12 +141,13 @@ TRANSITIONS: Mapping[ServoState, Mapping[ServoEvent, ServoState]] = MappingProxy
             ServoEvent.RETURNED_LIMP: ServoState.LIMP,
             ServoEvent.DOUBT: ServoState.OFFLINE,
             ServoEvent.LOST: ServoState.OFFLINE,
-            ServoEvent.LATCH: ServoState.OFFLINE,  # `Loss.latched` keeps it until the servo is back
+            ServoEvent.RELEASE: ServoState.OFFLINE,  # `Loss.released` keeps it until the servo is back
         },
-        ServoState.LATCHED: {
-            ServoEvent.TORQUE_OFF: ServoState.LATCHED,
-            ServoEvent.DOUBT: ServoState.LATCHED,
-            ServoEvent.WATCHDOG: ServoState.LATCHED,
+        ServoState.RELEASED: {
+            ServoEvent.REQUESTED: ServoState.LIMP,
+            ServoEvent.TORQUE_OFF: ServoState.RELEASED,
+            ServoEvent.DOUBT: ServoState.RELEASED,
+            ServoEvent.WATCHDOG: ServoState.RELEASED,
             **_ONLINE,
         },
     }
@@ -149,12 +157,41 @@ TRANSITIONS: Mapping[ServoState, Mapping[ServoEvent, ServoState]] = MappingProxy
 GETS_GOALS = frozenset((ServoState.TORQUED, ServoState.RETURNING))
 IN_DOUBT = frozenset((ServoState.HOLDING, ServoState.STOPPED))
 """Their torque enable is read as soon as there is time for it."""
-POWERLESS = frozenset((ServoState.LIMP, ServoState.LATCHED))
+POWERLESS = frozenset((ServoState.LIMP, ServoState.RELEASED))
 _SLOW = frozenset((ServoState.STOPPED, ServoState.RETURNING, ServoState.OFFLINE))
+
+
+_SHOWN: Mapping[ServoState, Torque] = MappingProxyType(
+    {
+        ServoState.LIMP: Torque.OFF,
+        ServoState.HOLDING: Torque.DOUBT,
+        ServoState.TORQUED: Torque.ON,
+        ServoState.STOPPED: Torque.DOUBT,
+        ServoState.RETURNING: Torque.ON,
+        ServoState.OFFLINE: Torque.LOST,
+        ServoState.RELEASED: Torque.RELEASED,
+    }
+)
+"""What the robot's states have of a servo's state."""
+
+Done = Callable[[str], None]
+"""Takes what came of a request for a servo: what went wrong, or an empty text."""
 
 
 class IllegalTransition(LookupError):
     """An event in a state that does not have it."""
+
+
+@dataclass(slots=True)
+class RequestedReboot:
+    """A reboot that a client requested, until the servo is back or the time for that is over."""
+
+    had_torque: bool
+    """It had torque before, and gets it back."""
+    until_ns: int
+    """When the client gets its answer at the latest."""
+    done: Done
+    """Takes what went wrong, or an empty text."""
 
 
 @dataclass(slots=True)
@@ -165,8 +202,8 @@ class Loss:
     """It had torque when it was lost: torque that is off now shows a reboot, where no clock does."""
     limp_reported: bool
     """That it has no torque was reported already."""
-    latched: bool
-    """It is to be LATCHED when it is back."""
+    released: bool
+    """It is to be RELEASED when it is back."""
     rebooted: bool
     """A reboot was counted since it took part."""
     probe_at_ns: int
@@ -175,6 +212,8 @@ class Loss:
     """A probe is under way, or waits for idle time."""
     problem: str = ""
     """Why it could not be taken back, as reported last."""
+    reboot: RequestedReboot | None = None
+    """The client's request that it is offline for."""
 
 
 class Life:
@@ -189,6 +228,8 @@ class Life:
         "losses",
         "reads",
         "states",
+        "torque",
+        "torque_changed",
         "torqued",
     )
 
@@ -208,6 +249,10 @@ class Life:
         """Of each servo that is OFFLINE."""
         self.torqued: NDArray[np.bool_] = np.zeros(count, dtype=np.bool_)
         """Shape (servos,): the servos that get goals; memory that the exchange kernel shares."""
+        self.torque: NDArray[np.uint8] = np.full(count, Torque.OFF, dtype=np.uint8)
+        """Shape (servos,), a Torque: what the robot's states have of each servo from the next read on."""
+        self.torque_changed = True
+        """It is another one than the robot's states show."""
         self.ceiling: Floats = np.full(count, np.nan)
         """Shape (servos,): the highest speeds toward positions, rad/s; NaN: no limit but that of the goal."""
 
@@ -220,13 +265,16 @@ class Life:
             raise IllegalTransition(f"{name} is {before.value}, where {event.value} cannot happen")
         self.states[index] = after
         self.torqued[index] = after in GETS_GOALS
+        if after is not before:
+            self.torque[index] = _SHOWN[after]
+            self.torque_changed = True
         self.ceiling[index] = RETURN_SPEED if after in _SLOW else np.nan
         loss = self.losses[index]
         if event is ServoEvent.LOST:
             self.losses[index] = self._loss(before, loss)
             self.reads.leave(index)
-        elif loss is not None and event is ServoEvent.LATCH:
-            loss.latched = True
+        elif loss is not None and event is ServoEvent.RELEASE:
+            loss.released = True
         elif loss is not None and after is not ServoState.OFFLINE:
             self.losses[index] = None
             self.reads.join(index)
@@ -246,9 +294,10 @@ class Life:
         return Loss(
             had_torque=not powerless,
             limp_reported=powerless,
-            latched=before is ServoState.LATCHED if earlier is None else earlier.latched,
+            released=before is ServoState.RELEASED if earlier is None else earlier.released,
             rebooted=earlier is not None and earlier.rebooted,
             probe_at_ns=self._now_ns(),
+            reboot=None if earlier is None else earlier.reboot,
         )
 
     @property

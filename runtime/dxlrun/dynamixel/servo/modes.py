@@ -9,16 +9,16 @@ Angle Limit (6, 8) and Torque Control Mode Enable (70).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import ControlItem, control_table, side_by_side
+from dxlrun.dynamixel.exchange.retry import retry
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, GoalLayout, ModePlan, OwnLimit, ServoPlan
 from dxlrun.dynamixel.plan.mode_plan import in_mode, mode_in
 from dxlrun.dynamixel.plan.planning import plan_line, readable
 from dxlrun.dynamixel.servo import watchdog
-from dxlrun.dynamixel.servo.retry import retry
 from dxlrun.dynamixel.wire.transaction import Outcome, Program, Reply
 
 ENGAGE_SPEED = 0.5
@@ -28,6 +28,7 @@ FARTHEST_INWARD = 1.0
 them up."""
 LONGEST_BACK = 64
 """Bytes; items farther apart are read back one by one."""
+STARTED_ANEW = "started anew while its mode was changed"
 _RESET = (
     "velocity_i_gain",
     "velocity_p_gain",
@@ -52,12 +53,19 @@ class Held:
 
 
 def enter(
-    plan: BusPlan, servo: ServoPlan, mode: Mode, *, again: bool = True, inward: bool = False
+    plan: BusPlan,
+    servo: ServoPlan,
+    mode: Mode,
+    *,
+    again: bool = True,
+    inward: bool = False,
+    rebooted: Callable[[], Program[bool]] | None = None,
 ) -> Program[str]:
     """Bring one servo into a mode in which it then stands still; return what went wrong, or nothing.
 
     `again`: also one that has torque in this mode is held anew; without, it is left alone. `inward`: as in
-    `hold`. Raises LookupError when the model does not have the mode.
+    `hold`. `rebooted` finds out whether the servo rebooted meanwhile: then it gets no torque, and what is
+    returned is STARTED_ANEW. Raises LookupError when the model does not have the mode.
     """
     desired, line = servo.mode_plan(mode), plan_line(plan)
     torque = yield from retry(line.read(servo.servo_id, servo.torque_address, 1))
@@ -71,6 +79,8 @@ def enter(
         problem = yield from _change(plan, servo, desired, found, enabled=enabled)
     elif not again:
         return ""
+    if enabled and rebooted is not None and (yield from rebooted()):
+        return STARTED_ANEW
     if problem and enabled:
         # a joint that does not change shall not fall for that
         now = yield from mode_now(plan, servo)

@@ -16,9 +16,9 @@ from dataclasses import dataclass, field
 
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import ControlItem, control_table
+from dxlrun.dynamixel.exchange.retry import ATTEMPTS, retry, setup_line
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, RegisterValue, ServoPlan, TorqueLimit
 from dxlrun.dynamixel.plan.line import Line
-from dxlrun.dynamixel.servo.retry import ATTEMPTS, retry, setup_line
 from dxlrun.dynamixel.servo.watchdog import shown
 from dxlrun.dynamixel.wire.dialect import dialect_of
 from dxlrun.dynamixel.wire.transaction import Outcome, Program, Reply
@@ -32,6 +32,8 @@ class Settled:
     """Why it does not have them, one sentence each."""
     written: list[tuple[str, str]] = field(default_factory=list)
     """Joint, and what was written: `Position P Gain (84) was 640 and is 800`."""
+    found: dict[str, int] = field(default_factory=dict)
+    """What the servo had before, by item."""
     silent: bool = False
     """True when the servo answered nothing, so that nothing was written."""
 
@@ -82,6 +84,7 @@ def settle(
     """
     settled = Settled()
     differences = yield from compare(plan, servo, registers, line)
+    settled.found = {one.register.name: one.found for one in differences if one.found is not None}
     silent = [one.register for one in differences if one.found is None]
     if silent:
         settled.silent = len(silent) == len(differences)

@@ -5,7 +5,7 @@ Each becomes an event of the state machine in `life.py`, and an event of the log
 
 from __future__ import annotations
 
-from collections.abc import Collection, Generator
+from collections.abc import Generator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,8 @@ from dxlrun.dynamixel.servo.checks import FORBIDDEN
 from dxlrun.dynamixel.servo.desired import DesiredState
 from dxlrun.dynamixel.servo.life import IN_DOUBT, Life, ServoEvent, ServoState
 from dxlrun.dynamixel.servo.offline import FIRST_PROBE_NS, Offline
+from dxlrun.dynamixel.servo.reboots import Reboots
+from dxlrun.dynamixel.servo.requests import Requests
 from dxlrun.dynamixel.servo.slow_registers import SlowReads
 from dxlrun.dynamixel.servo.watchdog_monitor import WatchdogMonitor
 from dxlrun.dynamixel.wire.dialect import dialect_of
@@ -64,6 +66,7 @@ class Servos:
         "_plan",
         "_read_last",
         "_reading",
+        "_reboots",
         "_reported_errors",
         "_rows",
         "_samples",
@@ -75,6 +78,7 @@ class Servos:
         "desired",
         "goals",
         "reads",
+        "requests",
         "watchdogs",
     )
 
@@ -102,12 +106,15 @@ class Servos:
         self.reads = CyclicReads(plan, samples)
         """The job that reads every servo once."""
         self._life = Life(plan, self.reads, events, idle.now_ns)
-        self.desired = DesiredState(plan, idle, self.goals, self._life, states.mode, events)
+        self._reboots = Reboots(plan, idle, self._life)
+        self.desired = DesiredState(plan, idle, self.goals, self._life, self._reboots, states.mode, events)
         """Modes and registers that the servos shall have."""
         self.watchdogs = WatchdogMonitor(plan, idle, self._life, self.desired, events)
         """Whether the Bus Watchdogs receive enough instructions."""
-        self._offline = Offline(plan, idle, self._life, self.desired)
-        self._slow = SlowReads(plan, idle, self._life, self._offline, states)
+        self._offline = Offline(plan, idle, self._life, self._reboots, self.desired)
+        self.requests = Requests(plan, idle, self._life, self._reboots, self.desired, self._offline)
+        """Torque and reboots that clients request."""
+        self._slow = SlowReads(plan, idle, self._life, self._reboots, states)
         self._reported_errors = [0] * count  # error byte of each servo
         self._alerts: list[int] = []  # servos with an alert whose hardware error was not read yet
         self._alert_cycles = 0
@@ -139,14 +146,15 @@ class Servos:
     # Start and end
 
     def engaged(self) -> None:
-        """Take every servo for one that holds where it stands, as the start-up has read back."""
-        for index in range(len(self._rows)):
-            self._life.on(index, ServoEvent.ENGAGED)
+        """Take every servo for one that holds where it stands, or is limp, as the start-up has read back."""
+        for index, servo in enumerate(self._plan.servos):
+            self._life.on(index, ServoEvent.ENGAGED if servo.torque_at_start else ServoEvent.RELEASE)
 
     def confirmed(self) -> None:
-        """Let every servo get goals: its torque was read again behind the first states."""
+        """Let every servo with torque get goals: it was read again behind the first states."""
         for index, servo in enumerate(self._plan.servos):
-            self._life.on(index, ServoEvent.TORQUE_ON)
+            if servo.torque_at_start:
+                self._life.on(index, ServoEvent.TORQUE_ON)
             self.desired.entered(index, servo.start_mode)
 
     def watch(self) -> Program[list[str]]:
@@ -155,7 +163,7 @@ class Servos:
         The last step of the start: from now on the exchange must not stop.
         """
         for index in range(len(self._rows)):
-            yield from self._offline.tick(index)
+            yield from self._reboots.tick(index)
         return (yield from self.watchdogs.arm())
 
     def withhold_goals(self) -> None:
@@ -163,11 +171,15 @@ class Servos:
         for index in range(len(self._rows)):
             self._life.on(index, ServoEvent.DOUBT)
 
-    def let_go(self, rows: Collection[int]) -> None:
-        """Switch the torque of joints off for the rest of the run, of an offline servo when it is back."""
-        for index, row in enumerate(self._rows):
-            if row in rows and self._life.on(index, ServoEvent.LATCH) is ServoState.LATCHED:
-                self._offline.switch_off(index)
+    @property
+    def torque_changed(self) -> bool:
+        """True when `show_torque` would show something else than before."""
+        return self._life.torque_changed
+
+    def show_torque(self, torque: NDArray[np.uint8]) -> None:
+        """Fill the rows of these servos with whether they have torque, shape (joints,), a Torque each."""
+        torque[self._rows] = self._life.torque
+        self._life.torque_changed = False
 
     # The line
 
@@ -263,6 +275,11 @@ class Servos:
             self._life.report(EventCode.SERVO_ERROR, severity, index, text)
 
     # Idle time
+
+    def abandon(self) -> None:
+        """Answer what clients requested and waits for too long, while the line is gone."""
+        if not self._life.calm:
+            self._offline.expire()
 
     def look(self) -> None:
         """Let the coming idle time read what is due beside the cyclic reads, one servo at a time.

@@ -8,7 +8,7 @@ from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.plan.reads import TEMPERATURES, VOLTAGES
 from dxlrun.dynamixel.servo.life import Life
-from dxlrun.dynamixel.servo.offline import Offline
+from dxlrun.dynamixel.servo.reboots import Reboots
 from dxlrun.dynamixel.wire.transaction import Program
 from dxlrun.run.channels.cycle import Floats, States
 from dxlrun.run.channels.events import EventCode, Severity
@@ -39,20 +39,20 @@ class SlowReads:
         "_life",
         "_limits",
         "_next",
-        "_offline",
         "_plan",
         "_reading",
+        "_reboots",
         "_round",
         "_states",
     )
 
     def __init__(
-        self, plan: BusPlan, idle: IdleScheduler, life: Life, offline: Offline, states: States
+        self, plan: BusPlan, idle: IdleScheduler, life: Life, reboots: Reboots, states: States
     ) -> None:
         self._plan = plan
         self._idle = idle
         self._life = life
-        self._offline = offline
+        self._reboots = reboots
         self._states = states
         self._round: list[tuple[int, _Block | None]] = _round(plan)  # None: the tick
         self._next = 0
@@ -83,7 +83,7 @@ class SlowReads:
         self._idle.add(program, Urgency.SLOW, name, index)
 
     def _read_tick(self, index: int) -> Program[None]:
-        rebooted = yield from self._offline.tick(index)
+        rebooted = yield from self._reboots.tick(index)
         self._reading = False
         if rebooted and not self._life.offline(index):
             self._life.lose(index).rebooted = True

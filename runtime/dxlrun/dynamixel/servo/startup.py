@@ -16,6 +16,7 @@ from dxlrun.clock import Clock
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.exchange.bus import Bus, run
+from dxlrun.dynamixel.exchange.retry import LONGER_NS, extend_timeouts, retry, setup_line
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.plan.line import TIMEOUT_MARGIN_NS, listen
 from dxlrun.dynamixel.plan.planning import plan_line
@@ -25,7 +26,6 @@ from dxlrun.dynamixel.port.ports import Ports
 from dxlrun.dynamixel.servo import modes, watchdog
 from dxlrun.dynamixel.servo.checks import survey
 from dxlrun.dynamixel.servo.registers import restore_torque_limits, settle_bus
-from dxlrun.dynamixel.servo.retry import LONGER_NS, extend_timeouts, retry, setup_line
 from dxlrun.dynamixel.servo.servos import Servos
 from dxlrun.dynamixel.wire.transaction import Program, Result
 from dxlrun.errors import PortError, StartUpError
@@ -60,6 +60,8 @@ class Engagement:
     problems: list[str] = field(default_factory=list)
     goals: list[int | None] = field(default_factory=list)
     """Goal position in ticks as it was written, in the order of the plan's servos; None: there is none."""
+    limp: list[str] = field(default_factory=list)
+    """Joints that the robot file wants without torque."""
 
 
 @dataclass(slots=True)
@@ -119,8 +121,12 @@ class StartUp:
             servos.engaged()
             for servo, raw in zip(plan.servos, one.goals, strict=True):
                 _first_goals(goals, servo, raw)
-            names = ", ".join(servo.joint for servo in plan.servos)
-            self._events.emit(EventCode.TORQUE_ON, Severity.INFO, plan.name, f"torque is on: {names}")
+            names = ", ".join(servo.joint for servo in plan.servos if servo.torque_at_start)
+            if names:
+                self._events.emit(EventCode.TORQUE_ON, Severity.INFO, plan.name, f"torque is on: {names}")
+            if one.limp:
+                text = f"limp, as the robot file says: {', '.join(one.limp)}"
+                self._events.emit(EventCode.TORQUE_OFF, Severity.INFO, plan.name, text)
 
     def restore_limits(self) -> list[list[int]]:
         """Give the servos the torque again that a policy of an earlier run may have left them without.
@@ -243,11 +249,20 @@ def report_failures(
 def _engage(plan: BusPlan) -> Program[Engagement]:
     """Hold every servo where it stands: goal := present, torque on, both read back, group by group.
 
-    Ends at the first problem; the caller takes back the torque.
+    Those that the robot file wants limp get none, and lose what they have. Ends at the first problem; the
+    caller takes back the torque.
     """
     result = Engagement()
     for index, servo in enumerate(plan.servos):
-        if index and index % GROUP == 0:
+        if not servo.torque_at_start:
+            if problem := (yield from _let_go(plan, index)):
+                result.problems.append(f"{plan.label(servo)} {problem}")
+                break
+            result.limp.append(servo.joint)
+            result.goals.append(None)
+            continue
+        given = index - len(result.limp)
+        if given and given % GROUP == 0:
             yield listen(GROUP_PAUSE_NS)
         held = yield from modes.hold(plan, servo, servo.mode_plan(servo.start_mode))
         if held.problem:
@@ -257,10 +272,24 @@ def _engage(plan: BusPlan) -> Program[Engagement]:
     return result
 
 
+def _let_go(plan: BusPlan, index: int) -> Program[str]:
+    """Make sure that a servo has no torque; return what went wrong, or nothing."""
+    servo = plan.servos[index]
+    back = yield from retry(plan.torque_reads[index])
+    if back.answered and back.parameters[0]:
+        yield from retry(setup_line(plan).write(servo.servo_id, servo.torque_address, b"\0"))
+        back = yield from retry(plan.torque_reads[index])
+    if back.answered and not back.parameters[0]:
+        return ""
+    return "did not confirm that its torque is off"
+
+
 def _confirm(plan: BusPlan) -> Program[list[str]]:
     """Read torque enable of every servo again, after the last one got torque; return what is wrong."""
     problems: list[str] = []
     for servo, read in zip(plan.servos, plan.torque_reads, strict=True):
+        if not servo.torque_at_start:
+            continue
         reply = yield from retry(read)
         if not reply.answered:
             problems.append(f"{plan.label(servo)} did not answer after torque was switched on")

@@ -109,8 +109,17 @@ class RecordedHardware:
     def set_modes(self, modes: NDArray[np.uint8]) -> None:
         """Switch nothing: the states have the mode of each servo."""
 
-    def set_register(self, row: int, item: str, value: int, done: Callable[[str], None]) -> None:
+    def set_register(self, row: int, item: str, value: int, done: Callable[[str, int | None], None]) -> None:
         """Write nothing and report nothing: the states have the result."""
+
+    def read_register(self, row: int, item: str, done: Callable[[str, int | None], None]) -> None:
+        """Read nothing and report nothing."""
+
+    def switch_torque(self, row: int, on: bool, done: Callable[[str], None]) -> None:
+        """Switch nothing and report nothing: the states have the result."""
+
+    def reboot(self, row: int, done: Callable[[str], None]) -> None:
+        """Reboot nothing and report nothing: the states have the result."""
 
     def limit_torque(self, fraction: float) -> None:
         """Limit nothing: the states have the result."""
@@ -118,9 +127,6 @@ class RecordedHardware:
     def stop(self) -> tuple[str, ...]:
         """Do nothing: no servo has torque."""
         return ()
-
-    def let_go(self, rows: Sequence[int]) -> None:
-        """Do nothing: the states have the result."""
 
     def release(self) -> None:
         """Do nothing: no servo holds."""

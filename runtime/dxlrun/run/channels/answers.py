@@ -85,6 +85,16 @@ class Code(StrEnum):
     UNKNOWN_REGISTER = "unknown_register", "{joint}: {problem}"
     INVALID_REGISTER = "invalid_register", "{joint}: {problem}"
     REGISTER_NOT_WRITTEN = "register_not_written", "{problem}"
+    REGISTER_NOT_READ = "register_not_read", "{problem}"
+    JOINT_COMMANDED = (
+        "joint_commanded",
+        "{joint} is commanded by {controller}; deactivate that first, or add --release",
+    )
+    JOINT_LIMP = "joint_limp", "{joint} has no torque"
+    JOINT_LOST = "joint_lost", "{joint} does not answer: check cable and power"
+    HARDWARE_ERROR = "hardware_error", "{joint} has a hardware error, and cannot get torque"
+    TORQUE_NOT_SWITCHED = "torque_not_switched", "{problem}"
+    NOT_REBOOTED = "not_rebooted", "{problem}"
     # commands
     UNKNOWN_COMMAND = "unknown_command", "{controller} takes no command {kind}"
     INVALID = "invalid", "{problem}"
@@ -113,10 +123,15 @@ class Done(msgspec.Struct, frozen=True, tag="done"):
     """Of a controller that was loaded: its bit in the masks of the cycles."""
     goals: tuple[int, ...] = ()
     """Numbers of the goals that the command began; none where it is no goal."""
+    value: int | None = None
+    """Of a register: what the servo has, or had before it was written; None: it is not known."""
 
 
 class Waiting(msgspec.Struct, frozen=True, tag="waiting"):
-    """The command was accepted; controllers enter when their joints are in the modes that they need."""
+    """The command was accepted; another answer follows.
+
+    Controllers enter when their joints are in the modes that they need; torque and reboots take idle time.
+    """
 
     controllers: tuple[str, ...]
 

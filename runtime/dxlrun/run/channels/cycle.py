@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from enum import IntFlag, unique
+from enum import IntEnum, IntFlag, unique
 from typing import Any
 
 import numpy as np
@@ -65,8 +65,31 @@ SEQUENCES: tuple[tuple[str, str, str], ...] = (
     ("hardware_error", "uint8", "joints"),
     ("mode", "uint8", "joints"),
     ("reference", "float64", "references"),
+    ("torque", "uint8", "joints"),
 )
 """Name, element type and what it has one element of."""
+
+
+@unique
+class Torque(IntEnum):
+    """Whether a joint's servo holds torque; the numbers are in the log."""
+
+    UNKNOWN = 0
+    """In logs of versions that did not record it."""
+    ON = 1
+    """It holds torque for certain, and gets goals."""
+    DOUBT = 2
+    """It gets no goals until its torque enable was read: a reply was lost, or torque was just given."""
+    OFF = 3
+    """It has none: it was reset, its torque was cut, or it shut itself down."""
+    RELEASED = 4
+    """It has none, because a client, a policy or the robot file switched it off."""
+    LOST = 5
+    """It is not known: the servo is lost, or reboots."""
+
+
+LIMP = (Torque.OFF, Torque.RELEASED)
+"""Joints that move freely."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +113,8 @@ class States:
     """Bits of the e-Manual's Hardware Error Status; Protocol 1.0: those of ERR that are states; 0: none."""
     mode: NDArray[np.uint8]
     """A Mode: in which the servo is known to be; UNKNOWN while that changes."""
+    torque: NDArray[np.uint8]
+    """A Torque: whether the servo holds torque, as known before this cycle's read."""
 
     def __post_init__(self) -> None:
         for name, row in zip(("position", "velocity", "effort"), self.motion, strict=True):
@@ -106,6 +131,7 @@ class States:
             voltage=np.full(joints, np.nan),
             hardware_error=np.zeros(joints, dtype=np.uint8),
             mode=np.zeros(joints, dtype=np.uint8),
+            torque=np.zeros(joints, dtype=np.uint8),
         )
 
 
@@ -295,6 +321,7 @@ class CycleRecord:
             voltage=_row(array, "voltage"),
             hardware_error=array["hardware_error"][0],
             mode=array["mode"][0],
+            torque=array["torque"][0],
         )
         """The servos' states."""
         self.commands = Commands(_rows(array, "command_position", len(COMMAND_INTERFACES)))

@@ -1,0 +1,242 @@
+"""Joint requests: torque, reboots and registers of single joints, as clients request them of a running loop.
+
+Decided by the record of the cycle that takes them, so that a replay decides alike; carried out by the
+hardware in idle time, and answered when that has come to an end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Protocol
+
+import msgspec
+
+from dxlrun.control.controllers.manager import Manager
+from dxlrun.control.loop_plan import JointPlan
+from dxlrun.run.channels.answers import Answer, Code, Done, Refusal, Waiting
+from dxlrun.run.channels.commands import Command
+from dxlrun.run.channels.cycle import LIMP, CycleRecord, Torque
+
+REBOOT_NS = 4_000_000_000
+"""So long a servo that reboots at a client's request does not count as lost [i]: the hardware gives up after
+three seconds."""
+
+
+class JointHardware(Protocol):
+    """What these requests ask of the hardware; each method returns at once and calls `done` once, later."""
+
+    def set_register(self, row: int, item: str, value: int, done: Callable[[str, int | None], None]) -> None:
+        """Write a RAM item of a joint's servo and read it back."""
+        ...
+
+    def read_register(self, row: int, item: str, done: Callable[[str, int | None], None]) -> None:
+        """Read an item of a joint's servo."""
+        ...
+
+    def switch_torque(self, row: int, on: bool, done: Callable[[str], None]) -> None:
+        """Switch a joint's torque on where it stands, or off until it is requested."""
+        ...
+
+    def reboot(self, row: int, done: Callable[[str], None]) -> None:
+        """Reboot a joint's servo, and take it back with the torque that it had."""
+        ...
+
+
+class TorqueRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Data of `torque`."""
+
+    joints: tuple[str, ...]
+    on: bool
+    release: bool = False
+    """Deactivate the controllers that command the joints, in the same cycle."""
+
+
+class RebootRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Data of `reboot`."""
+
+    joints: tuple[str, ...]
+    release: bool = False
+
+
+class RegisterReading(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Data of `get`."""
+
+    joint: str
+    item: str
+
+
+class Register(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Data of `register`; whether the item may be written was checked before."""
+
+    joint: str
+    item: str
+    value: int
+    """The integer on the wire, signed where the item is."""
+
+
+JOINT_KINDS = ("register", "get", "torque", "reboot")
+"""Commands for the loop that are about joints."""
+
+
+@dataclass(slots=True)
+class _Pending:
+    """A request for several joints that is not answered yet."""
+
+    code: Code
+    """Of the refusal, where a servo did not do it."""
+    left: int
+    """Joints that are not answered."""
+    joints: list[str] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
+
+
+class JointRequests:
+    """Decides on requests for joints, hands them to the hardware, and answers them."""
+
+    __slots__ = ("_answer", "_hardware", "_manager", "_pending", "_record", "_rows", "expected")
+
+    def __init__(
+        self,
+        joints: Sequence[JointPlan],
+        hardware: JointHardware,
+        manager: Manager,
+        record: CycleRecord,
+        answer: Callable[[int, Answer], None],
+    ) -> None:
+        """`answer` sends a client an answer, by the number of its command."""
+        self._rows = {joint.name: row for row, joint in enumerate(joints)}
+        self._hardware = hardware
+        self._manager = manager
+        self._record = record
+        self._answer = answer
+        self._pending: dict[int, _Pending] = {}
+        self.expected: dict[int, int] = {}
+        """Rows of servos that reboot by request -> until when that is no loss, ns of the clock."""
+
+    def execute(self, command: Command, time_ns: int) -> Answer | None:
+        """Execute a command of JOINT_KINDS; None: it is answered later. Raises what msgspec does."""
+        number, data = command.number, command.data
+        match command.kind:
+            case "register":
+                return self.register(number, msgspec.json.decode(data, type=Register))
+            case "get":
+                return self.read(number, msgspec.json.decode(data, type=RegisterReading))
+            case "torque":
+                return self.torque(number, msgspec.json.decode(data, type=TorqueRequest), time_ns)
+            case _:
+                return self.reboot(number, msgspec.json.decode(data, type=RebootRequest), time_ns)
+
+    def torque(self, number: int, request: TorqueRequest, time_ns: int) -> Answer:
+        """Switch the torque of joints on or off, of all of them or of none."""
+        rows = self._known(request.joints)
+        if isinstance(rows, Refusal):
+            return rows
+        if request.on:
+            if refusal := self._refuse_lost(rows) or self._refuse_broken(rows):
+                return refusal
+            self._manager.released.difference_update(rows.values())
+        else:
+            if refusal := self._release(rows, request.release, time_ns):
+                return refusal
+            self._manager.released.update(rows.values())
+        pending = self._pending[number] = _Pending(Code.TORQUE_NOT_SWITCHED, len(rows))
+        for joint, row in rows.items():
+            self._hardware.switch_torque(row, request.on, partial(self._done, number, pending, joint))
+        return Waiting(())
+
+    def reboot(self, number: int, request: RebootRequest, time_ns: int) -> Answer:
+        """Reboot the servos of joints, of all of them or of none."""
+        rows = self._known(request.joints)
+        if isinstance(rows, Refusal):
+            return rows
+        if refusal := self._refuse_lost(rows) or self._release(rows, request.release, time_ns):
+            return refusal
+        pending = self._pending[number] = _Pending(Code.NOT_REBOOTED, len(rows))
+        for joint, row in rows.items():
+            self.expected[row] = self._record.woken_ns + REBOOT_NS
+            self._hardware.reboot(row, partial(self._done, number, pending, joint))
+        return Waiting(())
+
+    def register(self, number: int, request: Register) -> Refusal | None:
+        """Have a RAM item of a joint's servo written; None: it is answered later."""
+        rows = self._known((request.joint,))
+        if isinstance(rows, Refusal):
+            return rows
+        done = partial(self._answer_register, number, Code.REGISTER_NOT_WRITTEN)
+        self._hardware.set_register(rows[request.joint], request.item, request.value, done)
+        return None
+
+    def read(self, number: int, request: RegisterReading) -> Refusal | None:
+        """Have an item of a joint's servo read; None: it is answered later."""
+        rows = self._known((request.joint,))
+        if isinstance(rows, Refusal):
+            return rows
+        done = partial(self._answer_register, number, Code.REGISTER_NOT_READ)
+        self._hardware.read_register(rows[request.joint], request.item, done)
+        return None
+
+    def end(self) -> None:
+        """Answer what the run's end interrupts."""
+        for number in self._pending:
+            self._answer(number, Refusal(Code.RUN_ENDING))
+        self._pending.clear()
+
+    # Inside
+
+    def _known(self, joints: Sequence[str]) -> dict[str, int] | Refusal:
+        unknown = tuple(joint for joint in joints if joint not in self._rows)
+        if unknown or not joints:
+            return Refusal(Code.UNKNOWN_JOINT, {"joint": unknown})
+        return {joint: self._rows[joint] for joint in joints}
+
+    def _refuse_lost(self, rows: dict[str, int]) -> Refusal | None:
+        torque = self._record.states.torque
+        lost = tuple(joint for joint, row in rows.items() if torque[row] == Torque.LOST)
+        return Refusal(Code.JOINT_LOST, {"joint": lost}) if lost else None
+
+    def _refuse_broken(self, rows: dict[str, int]) -> Refusal | None:
+        """Refuse torque for joints whose servos cut it after a hardware error."""
+        states = self._record.states
+        broken = tuple(
+            joint for joint, row in rows.items() if states.hardware_error[row] and states.torque[row] in LIMP
+        )
+        if not broken:
+            return None
+        hint = f"find the cause, then `dxlrun reboot {' '.join(broken)}` (Protocol 1.0: power off and on)"
+        return Refusal(Code.HARDWARE_ERROR, {"joint": broken, "hint": hint})
+
+    def _release(self, rows: dict[str, int], release: bool, time_ns: int) -> Refusal | None:
+        """Deactivate the controllers that command joints, or refuse because of them."""
+        names = self._manager.commanding(rows)
+        if not names:
+            return None
+        if release:
+            answer = self._manager.switch((), names, time_ns)
+            return answer if isinstance(answer, Refusal) else None
+        joints = tuple(joint for joint in rows if self._manager.commanding((joint,)))
+        return Refusal(Code.JOINT_COMMANDED, {"joint": joints, "controller": names})
+
+    def _done(self, number: int, pending: _Pending, joint: str, problem: str) -> None:
+        """Take what came of one joint's request; the last one answers, until then the client waits on."""
+        pending.left -= 1
+        if problem:
+            pending.joints.append(joint)
+            pending.problems.append(problem)
+        if self._pending.get(number) is not pending:
+            return  # the run's end has answered it
+        if pending.left:
+            self._answer(number, Waiting(()))
+            return
+        del self._pending[number]
+        answer: Answer = Done(self._record.cycle)
+        if pending.problems:
+            problems = "; ".join(pending.problems)
+            answer = Refusal(pending.code, {"joint": tuple(pending.joints), "problem": problems})
+        self._answer(number, answer)
+
+    def _answer_register(self, number: int, code: Code, problem: str, found: int | None) -> None:
+        """Answer when the servo has a register, or what it has was read, or when that failed."""
+        refusal = Refusal(code, {"problem": problem}) if problem else None
+        self._answer(number, refusal or Done(self._record.cycle, value=found))

@@ -1,0 +1,135 @@
+"""Reboots: found by a servo's clock, reported, and counted."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+from dxlrun.dynamixel.control_table import control_table
+from dxlrun.dynamixel.exchange.idle import IdleScheduler
+from dxlrun.dynamixel.exchange.retry import retry
+from dxlrun.dynamixel.plan.bus_plan import BusPlan
+from dxlrun.dynamixel.plan.planning import plan_line
+from dxlrun.dynamixel.servo.life import Life
+from dxlrun.dynamixel.wire.transaction import Program, Reply, Transaction
+from dxlrun.run.channels.events import EventCode, Severity
+
+TICK_MODULUS_MS = 32_768
+"""Realtime Tick counts milliseconds modulo this (e-Manual XM430-W350, Realtime Tick (120))."""
+BLIND_NS = 16_000_000_000
+"""After half a turn of the counter nothing shows whether it was less or more (protocol.md)."""
+DRIFT = 0.02
+"""The servo's clock may go so much faster or slower than the host's [i] (protocol.md)."""
+SLACK_MS = 20.0
+"""And a reading may be so far off, beside the time from request to reply [i] (protocol.md)."""
+WITHIN_NS = 60_000_000_000
+TOO_MANY_REBOOTS = 2
+"""So many within a minute, and a servo gets no torque back in this run (failures.md)."""
+
+
+class _Reading(NamedTuple):
+    tick: int
+    middle_ns: int
+    half_ms: float
+    """The tick was read within this time around the middle."""
+
+
+class RealtimeTicks:
+    """Compares a servo's millisecond counter with the host's clock: a reboot sets it back to 0."""
+
+    __slots__ = ("_last",)
+
+    def __init__(self, servos: int) -> None:
+        self._last: list[_Reading | None] = [None] * servos
+
+    def rebooted(self, servo: int, reply: Reply) -> bool | None:
+        """Take a reading of Realtime Tick; return whether the servo rebooted since the one before.
+
+        None: there was none before, or it is too long ago to know.
+        """
+        half_ns = (reply.last_ns - reply.sent_ns) // 2
+        now = _Reading(reply.word(), reply.sent_ns + half_ns, half_ns * 1e-6)
+        before, self._last[servo] = self._last[servo], now
+        if before is None or now.middle_ns - before.middle_ns > BLIND_NS:
+            return None
+        elapsed_ms = (now.middle_ns - before.middle_ns) * 1e-6
+        half = TICK_MODULUS_MS / 2
+        off = (now.tick - before.tick - elapsed_ms + half) % TICK_MODULUS_MS - half
+        return abs(off) > DRIFT * elapsed_ms + SLACK_MS + now.half_ms + before.half_ms
+
+
+class RebootCount:
+    """Counts the reboots of each servo; after two within a minute it gets no torque back."""
+
+    __slots__ = ("_times", "exhausted")
+
+    def __init__(self, servos: int) -> None:
+        self._times: list[deque[int]] = [deque(maxlen=TOO_MANY_REBOOTS) for _ in range(servos)]
+        self.exhausted = [False] * servos
+        """True for a servo that rebooted TOO_MANY_REBOOTS times within a minute, ever."""
+
+    def add(self, servo: int, now_ns: int) -> bool:
+        """Count a reboot; return whether it is the one too many."""
+        times = self._times[servo]
+        times.append(now_ns)
+        if self.exhausted[servo] or len(times) < TOO_MANY_REBOOTS or now_ns - times[0] > WITHIN_NS:
+            return False
+        self.exhausted[servo] = True
+        return True
+
+
+class Reboots:
+    """The reboots of the servos of one bus; of Protocol 1.0 none has a clock that shows them."""
+
+    __slots__ = ("_count", "_idle", "_life", "_reads", "_ticks")
+
+    def __init__(self, plan: BusPlan, idle: IdleScheduler, life: Life) -> None:
+        count = len(plan.servos)
+        self._idle = idle
+        self._life = life
+        self._ticks = RealtimeTicks(count)
+        self._count = RebootCount(count)
+        self._reads = [_tick_read(plan, index) for index in range(count)]
+
+    def read(self, index: int) -> Transaction | None:
+        """Return the read of a servo's Realtime Tick; None where it has none."""
+        return self._reads[index]
+
+    def tick(self, index: int) -> Program[bool]:
+        """Read a servo's Realtime Tick, if it has one; return whether it shows a reboot, which is counted."""
+        read = self._reads[index]
+        return False if read is None else bool(self.judge(index, (yield from retry(read))))
+
+    def judge(self, index: int, reply: Reply) -> bool | None:
+        """Judge a reply with Realtime Tick; None: it has none, or the one before is too long ago."""
+        if self._reads[index] is None or not reply.answered:
+            return None
+        rebooted = self._ticks.rebooted(index, reply)
+        if rebooted:
+            self.count(index)
+        return rebooted
+
+    def count(self, index: int) -> None:
+        """Report a reboot, and count it unless a client requested it."""
+        loss = self._life.losses[index]
+        if loss is not None:
+            loss.rebooted, loss.had_torque = True, False
+            if loss.reboot is not None:
+                text = "started anew, as requested"
+                self._life.report(EventCode.SERVO_REBOOTED, Severity.INFO, index, text)
+                return
+        text = "started anew: it was without power, or something rebooted it"
+        self._life.report(EventCode.SERVO_REBOOTED, Severity.ERROR, index, text)
+        if self._count.add(index, self._idle.now_ns()):
+            text = "rebooted twice within a minute: it gets no torque again by itself; check its supply"
+            self._life.report(EventCode.SERVO_REBOOTED, Severity.ERROR, index, text)
+
+    def exhausted(self, index: int) -> bool:
+        """Return whether a servo rebooted so often that no policy gives it torque any more."""
+        return self._count.exhausted[index]
+
+
+def _tick_read(plan: BusPlan, index: int) -> Transaction | None:
+    servo = plan.servos[index]
+    item = control_table(servo.model, plan.protocol).items.get("realtime_tick")
+    return None if item is None else plan_line(plan).read(servo.servo_id, item.address, item.size)

@@ -1,0 +1,435 @@
+"""Torque and reboots that clients request, judged by the simulated bus: its ledger, its servos' memory."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dxlrun.description.modes import Mode
+from dxlrun.dynamixel.servo.life import ServoState
+from dxlrun.errors import StartUpError
+from dxlrun.run.channels.cycle import Torque
+from dxlrun.run.channels.events import EventCode, Severity
+
+PROTOCOLS = (1.0, 2.0)
+IDS = (11, 12, 13)
+
+
+class Arm:
+    """Three servos that hold, and what was answered."""
+
+    def __init__(self, make_plan, make_rig, protocol=2.0, *, watchdog=0, **change):
+        model = {} if protocol == 1.0 else {"protocol": 2.0, "model": "XM430-W350", "reference": math.pi}
+        limits = {"lower": -2.5, "upper": 2.5}
+        returning = change.pop("returning", False)
+        limp = change.pop("limp", ())
+        plan = make_plan(IDS, name="arm", return_delay_ns=0, **(model | limits | change))
+        servos = tuple(
+            replace(servo, torque_on_return=returning, torque_at_start=servo.servo_id not in limp)
+            for servo in plan.servos
+        )
+        self.plan = replace(plan, servos=servos, watchdog_ticks=watchdog)
+        self.protocol = protocol
+        self.rig = make_rig(self.plan)
+        self.answers = {}
+        self.asked = 0
+
+    def start(self):
+        self.rig.hardware.start()
+        return self
+
+    @property
+    def servo(self):
+        return self.rig.buses[0].servo(12)
+
+    @property
+    def state(self):
+        return self.rig.hardware._servos[0]._life.states[1]
+
+    @property
+    def shown(self):
+        return [Torque(one) for one in self.rig.states.torque.tolist()]
+
+    def cycles(self, count):
+        for _ in range(count):
+            self.rig.cycle()
+
+    def follow(self, count):
+        """Run cycles in which the goal of a limp joint is where it stands, as the gate has it."""
+        for _ in range(count):
+            limp = np.isin(self.rig.states.torque, (Torque.OFF, Torque.RELEASED))
+            np.copyto(self.rig.goals.position, self.rig.states.position, where=limp)
+            self.rig.cycle()
+
+    def _answer(self):
+        self.asked += 1
+        return lambda problem, number=self.asked: self.answers.setdefault(number, []).append(problem)
+
+    def switch(self, on, row=1):
+        self.rig.hardware.switch_torque(row, on, self._answer())
+        return self.asked
+
+    def reboot(self, row=1):
+        self.rig.hardware.reboot(row, self._answer())
+        return self.asked
+
+    def told(self, number, most=300):
+        """Run cycles until a request is answered; return what went wrong."""
+        for _ in range(most):
+            if number in self.answers:
+                (answer,) = self.answers[number]
+                return answer
+            self.follow(1)
+        raise AssertionError("it was not answered")
+
+    def writes(self, since=0):
+        """Return what single servos were told to write: ID, address and data."""
+        found = []
+        for packet in self.rig.into_bus()[since:]:
+            if self.protocol == 1.0 and packet[4] == 3:
+                found.append((packet[2], packet[5], bytes(packet[6:-1])))
+            elif self.protocol == 2.0 and packet[7] == 3:
+                found.append((packet[4], int.from_bytes(packet[8:10], "little"), bytes(packet[10:-2])))
+        return found
+
+    def torque_bytes(self, since=0):
+        address = self.plan.servos[0].torque_address
+        return [(servo, data[0]) for servo, at, data in self.writes(since) if at == address]
+
+
+@pytest.fixture
+def make(make_plan, make_rig):
+    return lambda *given, **change: Arm(make_plan, make_rig, *given, **change)
+
+
+def goals_to(arm, since):
+    """Return the IDs that sync writes of goals named."""
+    found = set()
+    for packet in arm.rig.into_bus()[since:]:
+        if arm.protocol == 1.0 and packet[4] == 0x83:
+            found |= set(packet[7 : -1 : packet[6] + 1])
+        elif arm.protocol == 2.0 and packet[7] == 0x83 and packet[8:10] != b"\x62\x00":
+            found |= set(packet[12 : -2 : packet[10] + 1])
+    return found
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+@pytest.mark.parametrize("split", [False, True])
+def test_one_joint_is_limp_while_the_others_hold(make, protocol, split):
+    arm = make(protocol, split=split).start()
+    arm.rig.restless = 0.02
+    begun = len(arm.rig.into_bus())
+    number = arm.switch(False)
+    assert arm.told(number) == ""
+    assert arm.torque_bytes(begun) == [(12, 0)]
+    arm.cycles(2)
+    assert arm.shown == [Torque.ON, Torque.RELEASED, Torque.ON]
+    since = len(arm.rig.into_bus())
+    arm.cycles(60)
+    assert goals_to(arm, since) == {11, 13}
+    assert arm.rig.torque() == [True, False, True]
+    assert arm.rig.states.valid.all()
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+@pytest.mark.parametrize("split", [False, True])
+def test_torque_on_holds_a_joint_where_a_person_has_put_it(make, protocol, split):
+    arm = make(protocol, split=split).start()
+    assert arm.told(arm.switch(False)) == ""
+    arm.servo.turn_by_hand(2.4)
+    arm.follow(5)
+    begun = len(arm.rig.into_bus())
+    assert arm.told(arm.switch(True)) == ""
+    arm.follow(3)
+    place = arm.rig.states.position[1]
+    assert arm.torque_bytes(begun) == [(12, 1)]
+    arm.follow(40)
+    assert abs(arm.rig.states.position[1] - place) < 0.02
+    assert arm.rig.torque() == [True, True, True]
+    assert arm.shown == [Torque.ON] * 3
+    assert arm.state is ServoState.TORQUED
+    written = [address for servo, address, _ in arm.writes(begun) if servo == 12]
+    assert written[-1] == arm.plan.servos[1].torque_address, "its goal came behind its torque"
+
+
+def test_off_and_on_twice_is_off_and_on(make):
+    arm = make().start()
+    assert [arm.told(arm.switch(on)) for on in (False, False, True, True)] == [""] * 4
+    assert arm.rig.torque() == [True] * 3
+
+
+def test_requests_that_follow_each_other_at_once_end_in_the_last_one(make):
+    arm = make().start()
+    for orders in ([False, True], [False, True, False], [False, True, False, True]):
+        numbers = [arm.switch(on) for on in orders]
+        arm.follow(30)
+        assert all(len(arm.answers[number]) == 1 for number in numbers)
+        assert arm.answers[numbers[-1]] == [""]
+        assert arm.rig.torque() == [True, orders[-1], True]
+
+
+@pytest.mark.parametrize("returning", [False, True])
+def test_a_joint_that_was_let_go_stays_limp_when_it_reboots(make, returning):
+    arm = make(returning=returning).start()
+    assert arm.told(arm.switch(False)) == ""
+    given = []
+    arm.servo.registers.watch(("torque_enable",), lambda: given.append(arm.servo.registers["torque_enable"]))
+    arm.servo.reboot()
+    arm.follow(150)
+    assert not any(given)
+    assert arm.shown[1] is Torque.RELEASED
+    assert arm.rig.states.valid.all()
+
+
+def test_a_joint_that_was_let_go_stays_limp_when_its_mode_changes_or_the_line_is_pulled(make):
+    arm = make(returning=True).start()
+    assert arm.told(arm.switch(False)) == ""
+    given = []
+    arm.servo.registers.watch(("torque_enable",), lambda: given.append(arm.servo.registers["torque_enable"]))
+    arm.rig.hardware.set_modes(np.array([0, Mode.VELOCITY, 0], np.uint8))
+    arm.follow(20)
+    assert arm.rig.states.mode[1] == Mode.VELOCITY
+    arm.rig.buses[0].unplug()
+    arm.cycles(5)
+    arm.rig.buses[0].plug_in()
+    arm.follow(150)
+    assert not any(given)
+    assert arm.shown == [Torque.ON, Torque.RELEASED, Torque.ON]
+
+
+def test_torque_off_while_the_mode_changes_wins(make):
+    arm = make().start()
+    arm.rig.hardware.set_modes(np.array([0, Mode.VELOCITY, 0], np.uint8))
+    number = arm.switch(False)
+    assert arm.told(number) == ""
+    arm.follow(20)
+    assert arm.rig.torque() == [True, False, True]
+    assert arm.rig.states.mode[1] == Mode.VELOCITY
+    assert arm.told(arm.switch(True)) == ""
+    arm.follow(5)
+    assert arm.rig.torque() == [True] * 3
+
+
+def test_torque_on_that_waits_behind_a_mode_is_done_in_the_new_one(make):
+    arm = make().start()
+    assert arm.told(arm.switch(False)) == ""
+    arm.rig.hardware.set_modes(np.array([0, Mode.VELOCITY, 0], np.uint8))
+    assert arm.told(arm.switch(True)) == ""
+    assert arm.servo.registers["operating_mode"] == 1
+    assert arm.servo.registers["goal_velocity"] == 0
+    assert arm.rig.torque() == [True] * 3
+
+
+def _shut_down(arm):
+    arm.servo.trigger_overload()
+    arm.follow(10)
+
+
+def test_torque_on_a_servo_with_a_hardware_error_is_refused_and_a_reboot_clears_it(make):
+    arm = make().start()
+    _shut_down(arm)
+    assert arm.shown[1] is Torque.OFF
+    problem = arm.told(arm.switch(True))
+    assert "arm_12_joint (ID 12 on bus arm) reports in Hardware Error Status (70)" in problem
+    assert "then reboot it" in problem
+    assert arm.rig.torque() == [True, False, True]
+    assert arm.told(arm.reboot()) == ""
+    arm.follow(2)
+    assert arm.rig.states.hardware_error[1] == 0
+    assert arm.rig.torque() == [True, False, True]  # it had none before
+    assert arm.told(arm.switch(True)) == ""
+    assert arm.rig.torque() == [True] * 3
+
+
+def test_torque_on_a_servo_of_protocol_1_that_shut_down_says_what_helps(make):
+    arm = make(1.0).start()
+    _shut_down(arm)
+    problem = arm.told(arm.switch(True))
+    assert "(ID 12 on bus arm)" in problem
+    assert "switch its power off and on" in problem
+    assert "reboot" not in problem
+    assert "knows no reboot instruction: switch its power off and on" in arm.told(arm.reboot())
+
+
+@pytest.mark.parametrize("watchdog", [0, 10])
+def test_a_servo_that_held_holds_again_after_its_reboot(make, watchdog):
+    arm = make(watchdog=watchdog).start()
+    place, begun = arm.rig.states.position[1], len(arm.rig.into_bus())
+    assert arm.told(arm.reboot()) == ""
+    packets = [packet for packet in arm.rig.into_bus()[begun:] if packet[7] == 8]
+    assert [packet[4] for packet in packets] == [12]
+    arm.follow(30)
+    assert arm.rig.torque() == [True] * 3
+    assert arm.shown == [Torque.ON] * 3
+    assert abs(arm.rig.states.position[1] - place) < 0.02
+    assert arm.servo.registers["bus_watchdog"] == watchdog
+    rebooted = [(s, t) for code, s, _, t in arm.rig.events.list if code == EventCode.SERVO_REBOOTED]
+    assert rebooted == [(Severity.INFO, "arm_12_joint (ID 12 on bus arm) started anew, as requested")] or [
+        s for s, _ in rebooted
+    ] == [Severity.INFO]
+    assert not arm.rig.events.of(EventCode.SERVO_LOST)
+
+
+def test_reboots_by_request_do_not_exhaust_the_policy(make):
+    arm = make(returning=True).start()
+    for _ in range(3):
+        assert arm.told(arm.reboot()) == ""
+    arm.servo.reboot()
+    arm.follow(150)
+    assert arm.rig.torque() == [True] * 3
+
+
+def test_a_servo_that_was_let_go_is_limp_after_its_reboot(make):
+    arm = make(returning=True).start()
+    assert arm.told(arm.switch(False)) == ""
+    assert arm.told(arm.reboot()) == ""
+    arm.follow(5)
+    assert arm.shown[1] is Torque.RELEASED
+    assert arm.rig.torque() == [True, False, True]
+
+
+def test_a_servo_that_does_not_come_back_is_named_after_three_seconds(make):
+    arm = make().start()
+    number = arm.reboot()
+    arm.follow(2)
+    arm.servo.silence()
+    problem = arm.told(number)
+    assert problem.startswith("arm_12_joint (ID 12 on bus arm) did not come back within 3 s after its reboot")
+    arm.servo.silence(False)
+    arm.follow(120)
+    assert arm.rig.states.valid.all()
+    assert arm.rig.torque() == [True, False, True]  # by the policy for returned servos, which is limp
+
+
+@pytest.mark.parametrize("what", ["on", "reboot"])
+def test_a_servo_that_is_lost_is_named(make, what):
+    arm = make().start()
+    arm.servo.silence()
+    arm.cycles(30)
+    assert arm.shown[1] is Torque.LOST
+    number = arm.switch(True) if what == "on" else arm.reboot()
+    assert arm.told(number) == "arm_12_joint (ID 12 on bus arm) does not answer"
+
+
+def test_a_servo_that_is_lost_is_limp_when_it_is_back_after_torque_off(make):
+    arm = make(returning=True).start()
+    arm.servo.silence()
+    arm.cycles(30)
+    assert arm.told(arm.switch(False)).endswith("does not answer: its torque stays off when it is back")
+    arm.servo.silence(False)
+    arm.follow(120)
+    assert arm.rig.torque() == [True, False, True]
+    assert arm.shown[1] is Torque.RELEASED
+
+
+def test_requests_on_a_line_that_is_gone_are_answered(make):
+    arm = make().start()
+    assert arm.told(arm.switch(False, row=0)) == ""
+    arm.rig.buses[0].unplug()
+    numbers = [arm.switch(False), arm.switch(True, row=0), arm.reboot(row=2)]
+    assert all(arm.told(number) for number in numbers)
+    arm.rig.buses[0].plug_in()
+    arm.follow(200)
+    assert not arm.rig.torque()[1]
+
+
+def test_a_servo_out_of_its_limits_gets_no_torque(make):
+    arm = make().start()
+    assert arm.told(arm.switch(False)) == ""
+    plan = arm.plan.servos[1]
+    arm.servo.turn_by_hand((plan.upper_tick + 40) * plan.rad_per_tick)
+    arm.follow(10)
+    problem = arm.told(arm.switch(True))
+    assert "outside its limits" in problem
+    assert arm.rig.torque() == [True, False, True]
+    arm.follow(1)
+    assert arm.shown[1] is Torque.RELEASED
+
+
+def test_a_servo_that_reboots_while_it_is_checked_gets_no_torque(make):
+    arm = make(returning=True).start()
+    assert arm.told(arm.switch(False)) == ""
+    given = []
+    arm.servo.registers.watch(("torque_enable",), lambda: given.append(arm.servo.registers["torque_enable"]))
+    begun = len(arm.rig.into_bus())
+    number = arm.switch(True)
+    arm.rig.buses[0].after(12, arm.servo.reset)
+    assert "started anew while it was checked" in arm.told(number)
+    assert arm.torque_bytes(begun)[-1:] != [(12, 1)]
+    arm.follow(100)
+    assert not any(given)
+
+
+@pytest.mark.parametrize("returning", [False, True])
+@pytest.mark.parametrize("after", range(1, 14))
+def test_a_servo_that_reboots_while_its_mode_changes_gets_torque_by_the_policy_alone(make, returning, after):
+    arm = make(returning=returning).start()
+    arm.rig.hardware.set_modes(np.array([0, Mode.VELOCITY, 0], np.uint8))
+    arm.rig.buses[0].after(after + 2, arm.servo.reset)
+    arm.follow(150)
+    assert arm.rig.torque() == [True, returning, True]
+    assert arm.rig.states.mode[1] == Mode.VELOCITY
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+@pytest.mark.parametrize("limp", [(12,), IDS])
+def test_joints_that_the_file_wants_limp_get_no_torque_at_the_start(make, protocol, limp):
+    arm = make(protocol, limp=limp)
+    arm.servo.turn_by_hand(3.0)
+    arm.start()
+    assert not any(on for servo, on in arm.torque_bytes() if servo in limp)
+    arm.follow(30)
+    assert arm.rig.torque() == [servo not in limp for servo in IDS]
+    assert arm.rig.states.valid.all()
+    assert arm.shown[1] is Torque.RELEASED
+    assert arm.told(arm.switch(True)) == ""
+    arm.follow(3)
+    assert arm.rig.torque()[1]
+    assert arm.rig.hardware.stop() == ()
+    assert arm.rig.torque() == [False] * 3
+
+
+def test_a_limp_joint_may_stand_outside_its_limits_at_the_start(make):
+    arm = make(limp=(12,))
+    plan = arm.plan.servos[1]
+    arm.servo.turn_by_hand((plan.upper_tick + 40) * plan.rad_per_tick)
+    arm.start()
+    assert arm.rig.torque() == [True, False, True]
+    other = make()
+    other.servo.turn_by_hand((plan.upper_tick + 40) * plan.rad_per_tick)
+    with pytest.raises(StartUpError, match="outside its limits"):
+        other.start()
+
+
+def test_twenty_joints_at_once(make_plan, make_rig):
+    ids = tuple(range(1, 21))
+    plan = make_plan(
+        ids, name="all", protocol=2.0, model="XM430-W350", reference=math.pi, lower=-2.5, upper=2.5,
+        return_delay_ns=0,
+    )  # fmt: skip
+    rig = make_rig(plan)
+    rig.hardware.start()
+    answers = []
+    for on in (False, True):
+        for row in range(20):
+            rig.hardware.switch_torque(row, on, answers.append)
+        for _ in range(200):
+            limp = np.isin(rig.states.torque, (Torque.OFF, Torque.RELEASED))
+            np.copyto(rig.goals.position, rig.states.position, where=limp)
+            rig.cycle()
+            if len(answers) == 20:
+                break
+        assert answers == [""] * 20
+        assert rig.torque() == [on] * 20
+        answers.clear()
+
+
+def test_a_servo_that_refuses_torque_is_limp_and_named(make):
+    arm = make().start()
+    assert arm.told(arm.switch(False)) == ""
+    arm.servo.registers.watch(("torque_enable",), lambda: arm.servo.poke("torque_enable", 0))
+    problem = arm.told(arm.switch(True))
+    assert problem.startswith("arm_12_joint (ID 12 on bus arm) was given goal")
+    arm.follow(1)
+    assert arm.shown[1] is Torque.RELEASED
