@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from pathlib import Path
+from textwrap import dedent
 from typing import Any
 
 import pytest
@@ -31,10 +32,14 @@ def package(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_the_page_has_these_files_and_one_excerpt() -> None:
+def test_the_page_has_these_files_an_excerpt_and_sketches() -> None:
     assert list(FILES) == ["pyproject.toml", "my_robotics.py", "robot.yaml", "test_wave.py"]
-    (excerpt,) = (block for block in BLOCKS if block not in FILES.values())
-    assert excerpt in (ROOT / "plugins/example/src/dxlrun_easing/controller.py").read_text()
+    others = [block for block in BLOCKS if block not in FILES.values()]
+    example = (ROOT / "plugins/example/src/dxlrun_easing/controller.py").read_text()
+    (excerpt,) = (block for block in others if block in example)
+    for sketch in others:
+        if sketch != excerpt:
+            compile(dedent(sketch), "controllers.md", "exec")
 
 
 def test_its_commands_end_well_in_their_order(fresh: Shell, package: Path) -> None:

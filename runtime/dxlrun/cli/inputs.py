@@ -32,6 +32,8 @@ COMMANDS_WHILE_IT_RUNS = {
     "set": "steering.steer:set_register",
     "switch": "steering.steer:switch",
     "send": "steering.steer:send",
+    "cancel": "steering.goals:cancel",
+    "parameters": "steering.parameters:parameters",
     "rate": "steering.steer:rate",
     "pause": "steering.steer:pause",
     "resume": "steering.steer:resume",

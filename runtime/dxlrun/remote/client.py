@@ -270,15 +270,25 @@ class RemoteRobot:
     # Steering
 
     def send(
-        self, controller: str, kind: str, command: Mapping[str, object], *, units: bool = False
+        self,
+        controller: str,
+        kind: str,
+        command: Mapping[str, object],
+        *,
+        units: bool = False,
+        seconds: float | None = None,
     ) -> Executed:
         """Send a controller a typed command; returns when the loop has taken it. Raises Refused for values
         beyond their joints' limits too. Where the command is a goal, the answer has it, to wait for its end.
 
         Numbers are in SI. With `units`, quantities are written as in a motion file, such as `"30 deg"`.
+
+        Some joints by name: `send("arm", "position", {"elbow": 0.35})`, or `velocity`, `effort`, `pwm`; the
+        others keep their newest goals. A trajectory controller leads them there in `seconds`.
         """
         path = f"/controllers/{_quoted(controller)}/commands/{_quoted(kind)}"
-        return self._execute(f"{path}?units=true" if units else path, command)
+        query = [*(["units=true"] if units else []), *([] if seconds is None else [f"in={seconds!r}"])]
+        return self._execute(f"{path}?{'&'.join(query)}" if query else path, command)
 
     def stream(self, controller: str, kind: str, lease: float = LEASE_S) -> Stream:
         """Return a stream of set-points for a controller, of which the newest counts, for `lease` seconds."""

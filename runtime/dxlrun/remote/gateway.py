@@ -4,6 +4,7 @@
     GET  /states                                the newest cycle
     GET  /events?after=N                        what happened since event N
     POST /controllers/NAME/commands/KIND        a typed command; ?units=true: quantities with their units
+    POST /controllers/NAME/commands/position?in=2 {JOINT: ...}   some joints by name; in: s, of a trajectory
     POST /controllers/NAME/set-points/KIND      one of a stream; the newest wins; ?lease=0.2 (seconds)
     GET  /goals, GET /goals/N?wait=2            those that run and the last that ended; wait for an end, s
     POST /goals/N/cancel, /controllers/NAME/cancel       a goal, by its number or its controller
@@ -40,6 +41,7 @@ from starlette.routing import Route
 from dxlrun.control.steering import Cancel, Rate, Switch, Unload
 from dxlrun.description.modes import Mode
 from dxlrun.remote.goals import GoalStatus
+from dxlrun.remote.joint_commands import joint_command
 from dxlrun.remote.link import Link, Loaded
 from dxlrun.remote.parameters import Change, Written, changed, parameters_of
 from dxlrun.remote.preparation import (
@@ -72,6 +74,8 @@ LONGEST_WAIT_S = 5.0
 """For the end of a goal; a client that waits longer asks again."""
 _ENDING_S = 0.5
 """How long the results of goals may take when the run ends."""
+LONGEST_WAY_S = 3600.0
+"""To a point that is named by its joints."""
 LONGEST_ORIGIN = 64
 LONGEST_SENTENCE = 2000
 _STATUS = {
@@ -293,7 +297,18 @@ class GatewayApp:
         """Check and prepare a typed command, within the limits, and let the loop hand it over."""
         loaded, kind = self._known(request), request.path_params["kind"]
         units = request.query_params.get("units") == "true"
-        prepared = self._preparation.command(loaded.plan, kind, await body(request), units=units)
+        seconds = None if "in" not in request.query_params else number(request, "in", 0.0)
+        if seconds is not None and not 0 < seconds <= LONGEST_WAY_S:
+            raise invalid(f"in is a time above 0 s, at most {LONGEST_WAY_S:g} s, not {seconds:g}")
+        content = await body(request)
+        if loaded.plan.joints and (newest := self._link.newest()) is not None:
+            known = self._preparation.known(loaded.plan)
+            found = joint_command(known, kind, content, newest, units=units, seconds=seconds)
+            if found is not None:
+                kind, content, units, seconds = found.kind, found.content, False, None
+        if seconds is not None:
+            raise invalid(f"in is for joints by name; {kind} of {loaded.plan.name} has its own times")
+        prepared = self._preparation.command(loaded.plan, kind, content, units=units)
         prepared.require_within_limits()
         return _done(await self._link.command(loaded.plan.name, kind, prepared.data, origin(request)))
 

@@ -112,7 +112,7 @@ class Prepared:
 
 
 @dataclass(frozen=True, slots=True)
-class _Known:
+class Known:
     """What is looked up once for a controller, and used for each of its commands."""
 
     plan: ControllerPlan
@@ -128,7 +128,7 @@ class Preparation:
     joints: Mapping[str, JointPlan]
     """The robot's, by name, in its order."""
     plugins: PlugIns
-    _known: dict[str, _Known] = field(default_factory=dict, init=False)
+    _known: dict[str, Known] = field(default_factory=dict, init=False)
     """By the controller's name; one that is loaded later under the same name has another plan."""
     _schemas: dict[str, dict[str, object]] = field(default_factory=dict, init=False)
     """Controller type -> schema of each command."""
@@ -152,7 +152,7 @@ class Preparation:
 
     def parameters(self, plan: ControllerPlan) -> ParametersModel:
         """Return the parameters of a controller as they are now; raises RefusedRequest."""
-        return self._controller(plan).parameters
+        return self.known(plan).parameters
 
     def command(self, plan: ControllerPlan, kind: str, body: bytes, *, units: bool = False) -> Prepared:
         """Return a typed command that came as JSON (`true` and "1" are no numbers there).
@@ -160,7 +160,7 @@ class Preparation:
         `units`: where the command is one of those that motions are made of, its quantities are texts with
         their units. Raises RefusedRequest.
         """
-        known = self._controller(plan)
+        known = self.known(plan)
         controller = known.controller
         model = controller.Commands.get(kind)
         if model is None:
@@ -186,7 +186,7 @@ class Preparation:
             raise invalid(f"{what}: {_raised(error)}") from error
         return Prepared(plan.name, kind, data, beyond)
 
-    def _controller(self, plan: ControllerPlan) -> _Known:
+    def known(self, plan: ControllerPlan) -> Known:
         """Return a controller's class and parameters, parsed once; raises RefusedRequest."""
         known = self._known.get(plan.name)
         if known is not None and known.plan is plan:
@@ -202,7 +202,7 @@ class Preparation:
         except (Exception, SystemExit) as error:  # a plug-in's code
             raise invalid(f"the parameters of {plan.name}: {_raised(error)}") from error
         joints = tuple(self.joints[joint] for joint in plan.joints)
-        known = self._known[plan.name] = _Known(plan, offer.controller, parameters, joints)
+        known = self._known[plan.name] = Known(plan, offer.controller, parameters, joints)
         return known
 
     def controller(self, entry: Mapping[str, object], others: Collection[str]) -> ControllerPlan:
@@ -354,6 +354,27 @@ def in_si(body: bytes, what: str) -> bytes:
             Code.WRONG_QUANTITY, {"problem": "; ".join(problems), "paths": paths, "problems": problems}
         )
     return msgspec.json.encode(plain)
+
+
+def plain_quantities(values: Mapping[str, object], field: str) -> dict[str, object]:
+    """Return values by joint, whose quantities have the units of a command's field, as plain numbers.
+
+    Raises RefusedRequest as `in_si`.
+    """
+    plain: dict[str, object] = {}
+    mistaken: dict[str, str] = {}
+    for joint, value in values.items():
+        try:
+            plain[joint] = QUANTITIES[field](value)  # type: ignore[arg-type]  # of a number: ValueError
+        except ValueError as error:
+            mistaken[joint] = f"{joint}: {error}"
+    if mistaken:
+        problems = tuple(mistaken.values())
+        paths = tuple(f"/{joint}" for joint in mistaken)
+        raise refused(
+            Code.WRONG_QUANTITY, {"problem": "; ".join(problems), "paths": paths, "problems": problems}
+        )
+    return plain
 
 
 def _plain(value: object, path: tuple[str | int, ...], mistaken: list[tuple[str, str]]) -> object:

@@ -1,0 +1,135 @@
+"""Goals at the terminal: follow them to their end, and `dxlrun cancel`."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import TYPE_CHECKING
+
+from dxlrun.cli.inputs import Flag
+from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, robot_of
+from dxlrun.errors import DxlrunError, Refused
+from dxlrun.output.terminal import print_error, print_warning, progress_bar, show, show_json_line
+
+if TYPE_CHECKING:
+    from dxlrun.remote.client import Executed, GoalState, RemoteRobot
+
+REST_S = 10.0
+"""How long a cancelled goal may take until its joints are at rest."""
+_PROGRESS_S = 0.1
+
+
+def cancel(goal: str = "", /, *, wait: Flag = False, chosen: Chosen = ONLY_ONE) -> int:
+    """Cancel goals of a running robot: their controllers bring the joints to rest.
+
+    Parameters
+    ----------
+    goal
+        Number of a goal, or the name of a controller; without it all goals that run.
+    wait
+        Return when the joints are at rest.
+    """
+    from dxlrun.run.channels.answers import Code
+
+    with robot_of(chosen, "cancel") as robot:
+        states = robot.goals()
+        if not goal:
+            wanted = [state.number for state in states if state.status == "running"]
+        elif goal.isdecimal():
+            wanted = [int(goal)]
+        else:
+            wanted = [one.number for one in states if (one.controller, one.status) == (goal, "running")]
+        if goal and not wanted:
+            robot.cancel(goal)  # refused, with the reason
+        cancelled = []
+        for number in wanted:
+            try:
+                robot.cancel(number)
+            except Refused as refused:
+                if goal or refused.code not in (Code.GOAL_ENDED, Code.CANCELLED_ALREADY):
+                    raise
+                continue  # of all goals, one that has ended meanwhile is as it is to be
+            cancelled.append(number)
+        if wait:
+            for number in cancelled:
+                robot.wait(number, REST_S)
+        if chosen.as_json:
+            show_json_line({"robot": robot.name, "done": True, "goals": cancelled})
+        elif not cancelled:
+            show(f"{robot.name}: no goal runs")
+        else:
+            shown = ", ".join(map(str, cancelled))
+            show(f"{robot.name}: goal{'s' if len(cancelled) > 1 else ''} {shown} cancelled")
+    return 0
+
+
+def follow(robot: RemoteRobot, chosen: Chosen, done: Executed, numbers: Sequence[int]) -> int:
+    """Show the progress of goals until all have ended, print their results, and return the exit code.
+
+    Ctrl-C cancels them, waits until their joints are at rest, and is raised again.
+    """
+    try:
+        states = _ended(robot, numbers, hidden=chosen.as_json)
+    except KeyboardInterrupt:
+        states = cancelled(robot, numbers)
+        if not chosen.as_json:
+            for state in states:
+                print_warning(f"dxlrun: {sentence(state)}")
+        raise
+    reached = all(state.reached for state in states)
+    if chosen.as_json:
+        goals = [{"goal": state.number, **_without_number(state)} for state in states]
+        result: dict[str, object] = {"robot": robot.name, "done": reached, "cycle": done.cycle}
+        show_json_line(result | (goals[0] if len(goals) == 1 else {"goals": goals}))
+        return 0 if reached else 1
+    for state in states:
+        if state.reached:
+            show(f"{robot.name}: {sentence(state)}")
+        else:
+            print_error(f"dxlrun: {sentence(state)}")
+    return 0 if reached else 1
+
+
+def _ended(robot: RemoteRobot, numbers: Sequence[int], *, hidden: bool) -> list[GoalState]:
+    """Wait until all goals have ended, with a bar on a terminal."""
+    states = {number: robot.goal_state(number) for number in numbers}
+    with progress_bar(hidden=hidden) as draw:
+        while running := [state for state in states.values() if state.status == "running"]:
+            slowest = min(running, key=lambda state: state.progress)
+            draw(f"{slowest.controller} {slowest.kind}", slowest.progress)
+            states[slowest.number] = robot.goal_state(slowest.number, _PROGRESS_S)
+            for state in running[:-1]:
+                states[state.number] = robot.goal_state(state.number)
+    return list(states.values())
+
+
+def cancelled(robot: RemoteRobot, numbers: Sequence[int]) -> list[GoalState]:
+    """Cancel goals and return them when their joints are at rest; those that ended before are as they are."""
+    for number in numbers:
+        try:
+            robot.cancel(number)
+        except Refused:  # it has ended meanwhile, or is being cancelled
+            continue
+        except DxlrunError as error:
+            print_error(f"dxlrun: {error}")
+            return []
+    until = time.monotonic() + REST_S
+    states = []
+    for number in numbers:
+        try:
+            states.append(robot.wait(number, max(0.0, until - time.monotonic())))
+        except DxlrunError as error:
+            print_error(f"dxlrun: {error}")
+    return states
+
+
+def sentence(state: GoalState) -> str:
+    """Return how a goal ended: `goal 3 of left_arm reached after 1.02 s`."""
+    after = "" if state.seconds is None else f" after {state.seconds:.2f} s"
+    why = f": {state.text}" if state.text else ""
+    return f"goal {state.number} of {state.controller} {state.status}{after}{why}"
+
+
+def _without_number(state: GoalState) -> dict[str, object]:
+    return {name: value for name, value in asdict(state).items() if name != "number"}

@@ -1,0 +1,90 @@
+"""`dxlrun parameters`: the parameters of a controller in a run, shown and changed."""
+
+from __future__ import annotations
+
+from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, Words, robot_of
+from dxlrun.errors import InputError
+from dxlrun.output.table import Column, Table
+from dxlrun.output.terminal import show, show_json_line
+
+
+def parameters(controller: str, /, *words: Words, chosen: Chosen = ONLY_ONE) -> int:
+    """Show the parameters of a controller, or change live ones: `dxlrun parameters arm gains.p=4.0`.
+
+    All that are given change in one cycle, or none does.
+
+    Parameters
+    ----------
+    controller
+        Name of the controller.
+    words
+        New values of live parameters, as in the robot file; quantities with their units: 'speed=20 deg/s'.
+    """
+    values = dict(_pair(word) for word in words)
+    if len(values) < len(words):
+        raise InputError("a parameter is given twice; give each once")
+    with robot_of(chosen, "parameters") as robot:
+        if not values:
+            rows = robot.parameter_table(controller)
+            if chosen.as_json:
+                show_json_line({"robot": robot.name, "controller": controller, "parameters": rows})
+            else:
+                show(_table(rows))
+            return 0
+        changed = robot.set_parameters(controller, values)
+        if chosen.as_json:
+            shown = [{"name": name, "old": old, "new": new} for name, (old, new) in changed.items()]
+            show_json_line({"robot": robot.name, "controller": controller, "done": True, "changed": shown})
+        else:
+            for name, (old, new) in changed.items():
+                show(f"{robot.name}: {controller} {name}: {written(old)} -> {written(new)}")
+    return 0
+
+
+def _pair(word: str) -> tuple[str, bool | float | str]:
+    from dxlrun.description.document import plain_value
+
+    name, sign, text = word.partition("=")
+    if not sign or not name or not text:
+        raise InputError(f"{word!r} changes nothing; write NAME=VALUE, such as gains.p=4.0")
+    value = plain_value(text.strip())
+    return name.strip(), value if isinstance(value, bool | int | float) else text.strip()
+
+
+def _table(rows: list[dict[str, object]]) -> Table:
+    columns = [
+        Column("parameter", "name"),
+        Column("value", "text"),
+        Column("in a run", "name"),
+        Column("range", "text"),
+        Column("description", "text", detail=True),
+    ]
+    cells = [
+        (
+            str(row["name"]),
+            written(row["value"]),
+            "live" if row["live"] else "fixed",
+            str(row["range"]),
+            str(row["description"]),
+        )
+        for row in rows
+    ]
+    used = [index for index in range(len(columns)) if index < 3 or any(row[index] for row in cells)]
+    return Table.of(
+        "", [columns[index] for index in used], [tuple(row[index] for index in used) for row in cells]
+    )
+
+
+def written(value: object) -> str:
+    """Return a value as a person writes it: numbers with six digits, quantities with their units."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, list):
+        return f"[{', '.join(map(written, value))}]"
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{key}: {written(inner)}' for key, inner in value.items())}}}"
+    number, _, unit = str(value).partition(" ")
+    try:
+        return f"{float(number):.6g} {unit}".strip()
+    except ValueError:
+        return str(value)

@@ -1,0 +1,163 @@
+"""Commands for some joints by name: the controller's own command is made of them and of the present goals.
+
+Each command of the standard controllers has one number a joint and interface (`positions`, `velocities`,
+`efforts`, `pwm`), or is a trajectory. A trajectory that may be one of some `joints` names only these. In all
+other commands the joints that are not named get their newest goals, as the gateway reads them when the
+request arrives; what another client sends in the same few milliseconds may be replaced.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import msgspec
+
+from dxlrun.compile.motions import TRAJECTORY
+from dxlrun.control.loop_plan import ControllerPlan, JointPlan
+from dxlrun.errors import suggestion
+from dxlrun.remote.preparation import Known, invalid, plain_quantities, refused
+from dxlrun.run.channels.answers import Code, Field
+from dxlrun.run.channels.cycle import CycleRecord
+
+POINT_SPEED = 0.5
+"""rad/s of the joint that has the longest way, where a trajectory gets no time; or its limit, if lower."""
+_SHORTEST_S = 0.1
+_FIELDS = {"position": "positions", "velocity": "velocities", "effort": "efforts", "pwm": "pwm"}
+_INTERFACES = {**{name: name for name in _FIELDS}, **{field: name for name, field in _FIELDS.items()}}
+"""Singular and plural -> interface."""
+
+
+@dataclass(frozen=True, slots=True)
+class JointCommand:
+    """A command of a controller, made of values for some of its joints."""
+
+    kind: str
+    content: bytes
+    """JSON, in SI units"""
+
+
+def joint_command(
+    known: Known, kind: str, body: bytes, record: CycleRecord, *, units: bool, seconds: float | None
+) -> JointCommand | None:
+    """Return the command of a controller for joints by name; None where the body names no joints.
+
+    `kind` is an interface (`position` or `positions`), `body` JSON with a value for each joint, `record` the
+    newest cycle; a trajectory gets there in `seconds`. Raises RefusedRequest.
+    """
+    plan, commands = known.plan, known.controller.Commands
+    interface = _INTERFACES.get(kind)
+    if interface is None:
+        return None
+    try:
+        given = msgspec.json.decode(body)
+    except (msgspec.MsgspecError, RecursionError):
+        return None  # refused as any other command
+    named = given if isinstance(given, dict) and given else {}
+    strangers = [name for name in named if name not in plan.joints]
+    if kind in commands and (strangers or not named):
+        return None
+    if not named:
+        raise invalid(f"{kind} of {plan.name} names no joint; write for example {plan.joints[0]}=20deg")
+    if strangers:
+        fields: dict[str, Field] = {"joint": strangers[0][:80], "controller": plan.name}
+        raise refused(Code.UNKNOWN_JOINT, fields | {"hint": suggestion(strangers[0][:80], plan.joints)})
+    field = _FIELDS[interface]
+    values = _numbers(plan, kind, field, named, units)
+    chosen, fields_of = _command_for(known, interface)
+    if fields_of is None:
+        partial = "joints" in commands[chosen].model_fields
+        joints = [joint for joint in known.joints if joint.name in values or not partial]
+        positions = _filled(joints, field, values, record)
+        point = {"time": seconds or _duration(joints, positions, record), "positions": positions}
+        named_too = {"joints": [joint.name for joint in joints]} if partial else {}
+        return JointCommand(chosen, msgspec.json.encode({"points": [point], "start_in": 0.0} | named_too))
+    if seconds is not None:
+        raise invalid(f"{plan.name} takes no time, it goes there at once; leave it out")
+    still = "positions" not in fields_of  # a speed or an effort beside a position is the most there may be
+    content = {
+        each: _filled(known.joints, each, values if each == field else {}, record, still=still)
+        for each in fields_of
+    }
+    return JointCommand(chosen, msgspec.json.encode(content))
+
+
+def _numbers(
+    plan: ControllerPlan, kind: str, field: str, named: Mapping[str, object], units: bool
+) -> dict[str, float]:
+    """Return the values in SI units; raises RefusedRequest."""
+    si = plain_quantities(named, field) if units else named
+    for joint, value in si.items():
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            raise invalid(
+                f"{kind} of {plan.name}: {joint} is {str(value)[:40]!r}, but must be a finite number"
+            )
+    return {joint: float(value) for joint, value in si.items() if isinstance(value, int | float)}
+
+
+def _command_for(known: Known, interface: str) -> tuple[str, tuple[str, ...] | None]:
+    """Return the command by which an interface is commanded, with its fields; None: a trajectory."""
+    field, commands = _FIELDS[interface], known.controller.Commands
+    found: dict[str, tuple[str, ...]] = {}
+    for kind, model in commands.items():
+        fields = tuple(model.model_fields)
+        if field in fields and set(fields) <= set(_FIELDS.values()):
+            found[kind] = fields
+    if found:  # the one with the fewest fields: nothing else needs to be filled in
+        kind = min(found, key=lambda one: len(found[one]))
+        return kind, found[kind]
+    if interface == "position" and TRAJECTORY in commands:
+        return TRAJECTORY, None
+    offered = [
+        name
+        for name, each in _FIELDS.items()
+        if any(each in model.model_fields for model in commands.values())
+        or (name == "position" and TRAJECTORY in commands)
+    ]
+    hint = f"joints of {known.plan.name} take {', '.join(offered) or 'nothing by name'}"
+    fields_of: dict[str, Field] = {"controller": known.plan.name, "kind": interface, "known": tuple(commands)}
+    raise refused(Code.UNKNOWN_COMMAND, fields_of | {"hint": hint})
+
+
+def _filled(
+    joints: Sequence[JointPlan],
+    field: str,
+    values: Mapping[str, float],
+    record: CycleRecord,
+    *,
+    still: bool = True,
+) -> list[float]:
+    """Return one value a joint: the given ones, the newest goals for the others."""
+    return [
+        values[joint.name] if joint.name in values else _present(joint, field, record, still=still)
+        for joint in joints
+    ]
+
+
+def _present(joint: JointPlan, field: str, record: CycleRecord, *, still: bool = True) -> float:
+    """Return what a joint is commanded now; where that is nothing, what keeps it as it is: its position, no
+    velocity and no effort, or unless it is to be `still`, the most of them."""
+    row = record.layout.joints.index(joint.name)
+    goals, states = record.goals, record.states
+    now, otherwise = {
+        "positions": (goals.position, float(states.position[row])),
+        "velocities": (goals.velocity, 0.0 if still else min(joint.highest_speed, POINT_SPEED)),
+        "efforts": (goals.effort, 0.0 if still else joint.highest_effort),
+        "pwm": (goals.pwm, 0.0),
+    }[field]
+    value = float(now[row])
+    if not math.isfinite(value):
+        value = otherwise
+    if not math.isfinite(value):
+        raise invalid(f"the {field} of {joint.name} are not known yet; name it in the command too")
+    return value
+
+
+def _duration(joints: Sequence[JointPlan], positions: Sequence[float], record: CycleRecord) -> float:
+    """Return how long the way to these positions takes, s."""
+    ways = (
+        abs(position - _present(joint, "positions", record)) / min(joint.highest_speed, POINT_SPEED)
+        for joint, position in zip(joints, positions, strict=True)
+    )
+    return max(_SHORTEST_S, *ways)

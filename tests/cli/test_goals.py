@@ -1,0 +1,229 @@
+"""Goals and live parameters at the terminal, on a robot of which only the client's side is there."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from dxlrun.cli.steering import goals, parameters, steer
+from dxlrun.errors import DxlrunError, GoalTimeout, Refused
+from dxlrun.remote.client import Executed, GoalState, RemoteGoal
+
+Dxlrun = Callable[..., Any]
+RUNNING = GoalState(3, "arm", "trajectory", "anna", "running", 0.5, 0.01, "", "", None)
+REACHED = replace(RUNNING, status="reached", progress=1.0, seconds=1.5)
+MISSED = replace(RUNNING, status="missed", text="elbow is 0.1 off", joint="elbow", error=0.1, seconds=2.0)
+
+
+class Robot:
+    """A robot whose goals go through the states of a script; `requests` is what was sent."""
+
+    name = "torso"
+
+    def __init__(self) -> None:
+        self.script: dict[int, list[GoalState | BaseException]] = {}
+        self.requests: list[tuple[Any, ...]] = []
+        self.refusals: dict[int, Refused] = {}
+        self.goal: int | None = 3
+
+    def __enter__(self) -> Robot:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def send(
+        self, controller: str, kind: str, command: Any, *, units: bool, seconds: float | None
+    ) -> Executed:
+        self.requests.append(("send", controller, kind, command, seconds))
+        goal = None if self.goal is None else RemoteGoal(self, self.goal)  # type: ignore[arg-type]
+        return Executed(7, goal)
+
+    def goals(self) -> list[GoalState]:
+        return [
+            state for states in self.script.values() for state in states[:1] if isinstance(state, GoalState)
+        ]
+
+    def goal_state(self, number: int, wait: float = 0.0) -> GoalState:
+        states = self.script[number]
+        state = states.pop(0) if len(states) > 1 else states[0]
+        if isinstance(state, BaseException):
+            raise state
+        return state
+
+    def wait(self, number: int, timeout: float) -> GoalState:
+        self.requests.append(("wait", number))
+        for _ in range(10):
+            if (state := self.goal_state(number)).status != "running":
+                return state
+        raise GoalTimeout(f"goal {number} of arm has not ended within 10 s")
+
+    def cancel(self, goal: int | str) -> Executed:
+        self.requests.append(("cancel", goal))
+        if goal in self.refusals:
+            raise self.refusals[goal]  # type: ignore[index]
+        return Executed(8)
+
+    def parameter_table(self, controller: str) -> list[dict[str, object]]:
+        return [
+            {"name": "gains.p", "value": 1.0, "live": True, "range": "at least 0", "description": ""},
+            {
+                "name": "speed",
+                "value": "0.3490658503988659 rad/s",
+                "live": True,
+                "range": "",
+                "description": "",
+            },
+            {"name": "joints", "value": ["a", "b"], "live": False, "range": "", "description": ""},
+            {"name": "careful", "value": False, "live": True, "range": "", "description": ""},
+        ]
+
+    def set_parameters(self, controller: str, values: Any) -> dict[str, tuple[object, object]]:
+        self.requests.append(("parameters", controller, values))
+        return {name: (1.0, value) for name, value in values.items()}
+
+
+@pytest.fixture
+def robot(monkeypatch: pytest.MonkeyPatch) -> Robot:
+    one = Robot()
+    for room in (goals, parameters, steer):
+        monkeypatch.setattr(room, "robot_of", lambda chosen, verb: one)
+    return one
+
+
+SEND = ("send", "arm", "trajectory", "points=[]")
+
+
+def test_send_reports_the_number_of_the_goal(dxlrun: Dxlrun, robot: Robot) -> None:
+    assert dxlrun(*SEND) == (0, "torso: arm accepted trajectory as goal 3\n", "")
+    assert json.loads(dxlrun(*SEND, "--json").out) == {"robot": "torso", "done": True, "cycle": 7, "goal": 3}
+
+
+def test_send_waits_for_the_result(dxlrun: Dxlrun, robot: Robot) -> None:
+    robot.script = {3: [RUNNING, RUNNING, REACHED]}
+    assert dxlrun(*SEND, "--wait") == (0, "torso: goal 3 of arm reached after 1.50 s\n", "")
+    robot.script = {3: [RUNNING, MISSED]}
+    said = dxlrun(*SEND, "--wait")
+    assert said == (1, "", "dxlrun: goal 3 of arm missed after 2.00 s: elbow is 0.1 off\n")
+
+
+def test_the_result_is_json_for_programs(dxlrun: Dxlrun, robot: Robot) -> None:
+    robot.script = {3: [RUNNING, MISSED]}
+    said = dxlrun(*SEND, "--wait", "--json")
+    found = json.loads(said.out)
+    assert (said.code, said.err) == (1, "")
+    assert (found["done"], found["goal"], found["status"], found["joint"]) == (False, 3, "missed", "elbow")
+
+
+@pytest.mark.parametrize("status", ["aborted", "cancelled", "preempted"])
+def test_all_other_results_are_failures(dxlrun: Dxlrun, robot: Robot, status: str) -> None:
+    robot.script = {3: [replace(MISSED, status=status, text="")]}
+    assert dxlrun(*SEND, "--wait") == (1, "", f"dxlrun: goal 3 of arm {status} after 2.00 s\n")
+
+
+def test_ctrl_c_cancels_the_goal_and_waits_until_the_joints_rest(dxlrun: Dxlrun, robot: Robot) -> None:
+    robot.script = {3: [RUNNING, KeyboardInterrupt(), RUNNING, replace(REACHED, status="cancelled")]}
+    said = dxlrun(*SEND, "--wait")
+    assert said.code == 130
+    assert said.errors == ["dxlrun: goal 3 of arm cancelled after 1.50 s", "interrupted"]
+    assert robot.requests[1:] == [("cancel", 3), ("wait", 3)]
+
+
+def test_ctrl_c_of_a_goal_that_has_ended_meanwhile_has_its_result(dxlrun: Dxlrun, robot: Robot) -> None:
+    robot.script = {3: [RUNNING, KeyboardInterrupt(), REACHED]}
+    robot.refusals = {3: Refused("goal 3 has ended already: reached", code="goal_ended")}
+    said = dxlrun(*SEND, "--wait")
+    assert (said.code, said.errors) == (130, ["dxlrun: goal 3 of arm reached after 1.50 s", "interrupted"])
+
+
+def test_joints_that_do_not_come_to_rest_are_reported(dxlrun: Dxlrun, robot: Robot) -> None:
+    robot.script = {3: [RUNNING, KeyboardInterrupt(), RUNNING]}
+    said = dxlrun(*SEND, "--wait")
+    assert (said.code, said.errors[0]) == (130, "dxlrun: goal 3 of arm has not ended within 10 s")
+
+
+def test_a_run_that_ends_meanwhile_is_one_sentence(dxlrun: Dxlrun, robot: Robot) -> None:
+    robot.script = {3: [RUNNING, DxlrunError("torso no longer answers: closed")]}
+    assert dxlrun(*SEND, "--wait") == (1, "", "dxlrun: torso no longer answers: closed\n")
+
+
+def test_what_is_no_goal_cannot_be_waited_for(dxlrun: Dxlrun, robot: Robot) -> None:
+    robot.goal = None
+    said = dxlrun(*SEND, "--wait")
+    assert (said.code, said.errors) == (
+        1,
+        ["dxlrun: arm accepted trajectory, which is no goal that could be waited for"],
+    )
+
+
+def test_a_time_is_sent_for_joints_by_name(dxlrun: Dxlrun, robot: Robot) -> None:
+    assert dxlrun("send", "arm", "position", "elbow=20deg", "--in", "500ms").code == 0
+    assert robot.requests == [("send", "arm", "position", {"elbow": "20deg"}, 0.5)]
+    said = dxlrun("send", "arm", "position", "elbow=20deg", "--in", "2")
+    assert (said.code, said.err.startswith("dxlrun: --in: '2' has no unit")) == (2, True), said
+
+
+def test_cancel_takes_a_number_a_controller_or_all(dxlrun: Dxlrun, robot: Robot) -> None:
+    robot.script = {3: [RUNNING], 4: [replace(RUNNING, number=4, controller="leg")], 2: [REACHED]}
+    assert dxlrun("cancel") == (0, "torso: goals 3, 4 cancelled\n", "")
+    assert dxlrun("cancel", "leg") == (0, "torso: goal 4 cancelled\n", "")
+    assert dxlrun("cancel", "3").out == "torso: goal 3 cancelled\n"
+    assert json.loads(dxlrun("cancel", "--json").out)["goals"] == [3, 4]
+    robot.script = {2: [REACHED]}
+    assert dxlrun("cancel").out == "torso: no goal runs\n"
+    robot.refusals = {2: Refused("goal 2 has ended already: reached", code="goal_ended")}
+    assert dxlrun("cancel", "2") == (1, "", "dxlrun: goal 2 has ended already: reached\n")
+
+
+def test_cancel_waits_for_rest(dxlrun: Dxlrun, robot: Robot) -> None:
+    robot.script = {3: [RUNNING, RUNNING, REACHED]}
+    assert dxlrun("cancel", "arm", "--wait").code == 0
+    assert robot.requests == [("cancel", 3), ("wait", 3)]
+
+
+def test_of_all_goals_one_that_has_ended_meanwhile_is_no_error(dxlrun: Dxlrun, robot: Robot) -> None:
+    robot.script = {3: [RUNNING], 4: [replace(RUNNING, number=4, controller="leg")]}
+    robot.refusals = {3: Refused("ended", code="goal_ended")}
+    assert dxlrun("cancel") == (0, "torso: goal 4 cancelled\n", "")
+
+
+def test_parameters_are_a_table(dxlrun: Dxlrun, robot: Robot) -> None:
+    said = dxlrun("parameters", "arm")
+    assert [line.split() for line in said.out.splitlines()[2:]] == [
+        ["gains.p", "1", "live", "at", "least", "0"],
+        ["speed", "0.349066", "rad/s", "live"],
+        ["joints", "[a,", "b]", "fixed"],
+        ["careful", "false", "live"],
+    ]
+    assert json.loads(dxlrun("parameters", "arm", "--json").out)["parameters"][0]["name"] == "gains.p"
+
+
+def test_parameters_are_changed_together(dxlrun: Dxlrun, robot: Robot) -> None:
+    said = dxlrun("parameters", "arm", "gains.p=4.0", "speed=20 deg/s", "careful=true")
+    assert said.out.splitlines() == [
+        "torso: arm gains.p: 1 -> 4",
+        "torso: arm speed: 1 -> 20 deg/s",
+        "torso: arm careful: 1 -> true",
+    ]
+    assert robot.requests == [("parameters", "arm", {"gains.p": 4.0, "speed": "20 deg/s", "careful": True})]
+
+
+@pytest.mark.parametrize(
+    ("words", "what"),
+    [
+        (("gains.p",), "'gains.p' changes nothing; write NAME=VALUE"),
+        (("=4",), "'=4' changes nothing"),
+        (("gains.p=",), "'gains.p=' changes nothing"),
+        (("gains.p=1", "gains.p=2"), "a parameter is given twice"),
+    ],
+)
+def test_words_that_change_nothing_are_refused(
+    dxlrun: Dxlrun, robot: Robot, words: tuple[str, ...], what: str
+) -> None:
+    said = dxlrun("parameters", "arm", *words)
+    assert (said.code, what in said.err) == (2, True), said
+    assert robot.requests == []
