@@ -24,7 +24,7 @@ import dxlrun
 import dxlrun_controllers
 from dxlrun.clock import MonotonicClock
 from dxlrun.compile.plan import Plan
-from dxlrun.compile.simulated import simulated_buses
+from dxlrun.compile.simulation import simulated_buses
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.control.loop import StopFlag
 from dxlrun.dynamixel.port.ports import SerialPort, SerialPorts

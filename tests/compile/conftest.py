@@ -2,10 +2,14 @@ from collections.abc import Callable
 from pathlib import Path
 from textwrap import dedent
 
+import numpy as np
 import pytest
 
-from dxlrun.compile import Compiled, compile_files
+from dxlrun import Controller, Interfaces, ParametersModel
+from dxlrun.compile import Compiled, compile_files, robot
+from dxlrun.control.controllers.plugins import Offer, PlugIns, load_plugins
 from dxlrun.errors import InputError, Problem
+from dxlrun.run import virtual_run
 
 ROBOT = """\
 name: pair
@@ -72,3 +76,40 @@ def problems_in(compile_text: Callable[..., Compiled]) -> Callable[..., tuple[Pr
             return error.problems
 
     return problems_in
+
+
+class PartParameters(ParametersModel):
+    joints: tuple[str, ...] = ()
+    command: tuple[str, ...] = ()
+    exports: tuple[str, ...] = ()
+    reads: tuple[str, ...] = ()
+    step: float = 0.0
+
+
+class Part(Controller[PartParameters]):
+    """A controller of any place in the graph: forwards its references, plus what it counts by itself."""
+
+    Parameters = PartParameters
+
+    @classmethod
+    def interfaces(cls, parameters, joints):
+        return Interfaces(parameters.joints, parameters.command, parameters.exports, parameters.reads)
+
+    def on_activate(self, time_ns):
+        self.count = 0
+
+    def update(self, time_ns, period_ns):
+        self.count += 1
+        references, commands = self.context.references, self.context.commands
+        for interface in self.parameters.command:
+            above = getattr(references, interface)
+            own = np.full(len(above), self.count * self.parameters.step)
+            getattr(commands, interface)[:] = own + np.where(np.isfinite(above), above, 0.0)
+
+
+@pytest.fixture
+def part_plugins(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Offer the type `part`, to the compiler and to runs on virtual time."""
+    offers = {**load_plugins().controllers, "part": Offer("part", Part, "elsewhere 2.1")}
+    for room in (robot, virtual_run):
+        monkeypatch.setattr(room, "load_plugins", lambda: PlugIns(offers, {}))

@@ -104,7 +104,7 @@ def test_what_its_interfaces_raise_is_an_error_of_the_file(problems_in: Find, te
 
 @pytest.mark.usefixtures("foreign_plugins")
 def test_an_unknown_type_names_the_broken_plug_ins(problems_in: Find, text: str):
-    (problem,) = problems_in(text.replace("foreign", "sad_controller"))
+    (problem,) = problems_in(text.replace("foreign", "sad"))
 
     assert problem.fix == "plug-in sad of sad-robots 0.3 cannot be imported; reinstall it"
 

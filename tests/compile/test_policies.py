@@ -32,7 +32,7 @@ MISTAKES = [
     ("joint: -20 deg", "joint: §-91 deg", "pose home puts right_arm_joint at -91 deg; it can go to -90..+60 deg"),
     ("[hold]", "[§hold, limp]", "on_fault has steps after hold; write hold as the last step"),
     ("exit_timeout: 6 s\n", "exit_timeout: 3 s\n", "on_exit may take"),
-    ("active: false\n", "active: false\n    fallback: §spar\n", "the fallback spar of spare is no controller of the file"),
+    ("active: false\n", "active: false\n    fallback: §spar\n", "the fallback spar of spare is no controller of the robot"),
     ("active: false\n", "active: false\n    fallback: §spare\n", "spare is its own fallback"),
     ("rate: 25}", "rate: 25, fallback: §arms}", "the fallback arms of states is active from the start"),
     ("rate: 25}", "rate: 25, fallback: §spare}", "fallback spare of states claims joints of arms, which stays active"),

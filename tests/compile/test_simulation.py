@@ -11,7 +11,7 @@ import pytest
 
 from dxlrun.compile import Compiled
 from dxlrun.compile.plan import AdapterPlan, LoadPlan, SimulationPlan, from_json, to_json
-from dxlrun.compile.simulated import simulated_bodies, simulated_buses
+from dxlrun.compile.simulation import simulated_bodies, simulated_buses
 from dxlrun.errors import InputError, Problem
 from dxlrun.simulation import AdapterConfig, Load, UrdfBodies, UrdfJoint
 

@@ -12,6 +12,7 @@ class Wants:
     joints: tuple[str, ...]
     command: tuple[str, ...] = ("position",)
     into: tuple[str, ...] = ()
+    reference: tuple[str, ...] = ("position", "effort")
 
 
 def test_each_pair_that_claims_the_same_joints_is_named_once() -> None:
@@ -34,6 +35,14 @@ def test_a_reference_is_claimed_by_joint_and_interface() -> None:
         ]
     )
     assert [str(conflict) for conflict in found] == ["controllers arm and whole both command pid/b/position"]
+
+
+def test_a_joint_is_claimed_at_the_one_that_exports_it() -> None:
+    lower = [Wants("left", ("a",)), Wants("spare", ("a",), command=()), Wants("right", ("b", "c"))]
+    first = Wants("first", ("a", "b"), into=("left", "right"))
+    assert not conflicts([*lower, first, Wants("second", ("a", "c"), into=("spare", "right"))])
+    (found,) = conflicts([*lower, first, Wants("second", ("a", "b"), into=("spare", "right"))])
+    assert found.reference == "right/b/position"
 
 
 def test_a_chained_controller_leaves_the_servo_to_the_one_below() -> None:

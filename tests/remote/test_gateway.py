@@ -120,7 +120,12 @@ WRONG = [
     ("POST", "/controllers", LOAD | {"joints": 3}, 422, "invalid", "more.joints is 3"),
     ("POST", "/controllers", LOAD | {"rate": "x"}, 422, "invalid", "must be a number"),
     ("POST", "/controllers", LOAD | {"active": True}, 422, "invalid", "load it, then switch to it"),
-    ("POST", "/controllers", LOAD | {"fallback": "nun"}, 422, "invalid", "there is no fallback nun"),
+    ("POST", "/controllers", LOAD | {"fallback": "nun"}, 422, "invalid", "the fallback nun of more is no controller"),
+    ("POST", "/controllers", LOAD | {"fallback": "more"}, 422, "invalid", "more is its own fallback; name another"),
+    ("POST", "/controllers", LOAD | {"into": "lefty"}, 422, "invalid", "more is into lefty, which is no controller of the robot; did you mean left?"),
+    ("POST", "/controllers", LOAD | {"into": ["left", "more"]}, 422, "invalid", "left, which exports no reference; no controller of the robot exports any"),
+    ("POST", "/controllers", LOAD | {"into": ["left", "more"]}, 422, "invalid", "more is into itself"),
+    ("POST", "/controllers", LOAD | {"into": 3}, 422, "invalid", "names no controller"),
     ("POST", "/controllers", b"[]", 422, "invalid", "Expected `object`"),
 ]  # fmt: skip
 
@@ -505,6 +510,9 @@ def test_the_robot_is_shown_with_the_commands_of_its_controllers(desk):
         "rate": 50.0,
         "joints": ["pan"],
         "command": ["position"],
+        "into": [],
+        "reference": [],
+        "reads": [],
     }
     del told["controllers"]
     assert told == {

@@ -15,7 +15,7 @@ from msgspec.json import Decoder
 
 from dxlrun.clock import VirtualClock
 from dxlrun.compile import compile_robot
-from dxlrun.compile.simulated import simulated_buses
+from dxlrun.compile.simulation import simulated_buses
 from dxlrun.control.loop import StopFlag
 from dxlrun.description import read_robot
 from dxlrun.dynamixel.exchange import bus

@@ -180,7 +180,7 @@ def _simulated(
     result = compiled(robot, assignments, (), None)
     for warning in result.warnings:
         print_warning(str(warning))
-    from dxlrun.compile.simulated import simulated_bodies, simulated_buses
+    from dxlrun.compile.simulation import simulated_bodies, simulated_buses
 
     plan = result.plan
     everywhere = replace(plan, buses=tuple(replace(bus, port="sim") for bus in plan.buses))

@@ -1,23 +1,24 @@
-"""Controllers of the robot file against plug-ins, joints, claims, modes and the loop's rate."""
+"""Controllers of the robot file against plug-ins, joints, each other, modes and the loop's rate."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 from pydantic import ValidationError
 
+from dxlrun.compile.graph import ControllerGraph, mistakes_of
 from dxlrun.compile.joints import CompiledJoint
-from dxlrun.compile.problems import Problems, joint_mark
-from dxlrun.control.controllers.claims import conflicts, start_modes
+from dxlrun.compile.problems import Problems, into_mark, joint_mark
+from dxlrun.control.controllers.claims import start_modes
 from dxlrun.control.controllers.controller import Interfaces, ParametersModel
 from dxlrun.control.controllers.plugins import Offer, PlugIns, interfaces_breach
 from dxlrun.control.loop_plan import ControllerPlan
-from dxlrun.description import Description, problems_of
+from dxlrun.description import Description, KeyPath, problems_of
 from dxlrun.description.modes import Mode, mode_of
 from dxlrun.dynamixel.plan.mode_plan import LACKS, controls_speed, model_modes
-from dxlrun.errors import suggestion
+from dxlrun.errors import Mark, suggestion
 from dxlrun.run.channels.cycle import MOST_CONTROLLERS
 
 _RATE_TOLERANCE = 1e-6
@@ -45,41 +46,28 @@ def compile_controllers(
 ) -> dict[str, CompiledController]:
     """Return the controllers that could be compiled, by name, in the order of the file."""
     compiled: dict[str, CompiledController] = {}
+    plans: list[ControllerPlan] = []
     for name, entry in description.robot.controllers.items():
         every = _every(description, name, entry.rate, problems)
-        offer = _offer(description, name, entry.type, plugins, problems)
-        if offer is None:
-            continue
-        parameters = _parameters(description, name, offer, problems)
-        if parameters is None:
-            continue
-        interfaces = _interfaces(description, name, offer, parameters, problems)
-        if interfaces is None:
-            continue
         plan = ControllerPlan(
             name=name,
             type=entry.type,
-            distribution=offer.distribution,
+            distribution="",
             parameters=json.dumps(entry.parameters),  # as written: `60 deg` is what the model accepts
-            joints=interfaces.joints,
-            command=interfaces.command,
-            publishes=offer.controller.publishes,
+            joints=(),
+            command=(),
+            publishes=(),
             active=entry.active,
             every=every,
             rate=entry.rate,
             fallback=entry.fallback or "",
             into=entry.into,
-            reference=interfaces.reference,
-            reads=interfaces.reads,
-            topics=tuple(f"/{name}/{topic}" for topic in offer.controller.Topics),
         )
-        buses = (f"/bus/{bus}" for bus in description.robot.buses)
-        if taken := set(plan.topics).intersection(buses):
-            mark = description.marks.key("controllers", name)
-            problems.error(mark, f"{min(taken)} is the topic of a bus", f"call {name} otherwise")
-        compiled[name] = CompiledController(plan, offer, parameters)
-    _exclusive_claims(description, compiled, problems)
-    _fallbacks(description, compiled, problems)
+        one = _compiled(description, plan, plugins, problems)
+        if one is not None:
+            compiled[name] = one
+        plans.append(plan if one is None else one.plan)
+    _check_graph(description, plans, compiled, problems)
     if len(description.robot.controllers) > MOST_CONTROLLERS:
         problems.error(
             description.marks.key("controllers"),
@@ -89,8 +77,67 @@ def compile_controllers(
     return compiled
 
 
+def _compiled(
+    description: Description, plan: ControllerPlan, plugins: PlugIns, problems: Problems
+) -> CompiledController | None:
+    """Return a controller with what its class asks for; None where a mistake keeps that from being known."""
+    name = plan.name
+    offer = _offer(description, name, plan.type, plugins, problems)
+    parameters = None if offer is None else _parameters(description, name, offer, problems)
+    if offer is None or parameters is None:
+        return None
+    interfaces = _interfaces(description, name, offer, parameters, problems)
+    if interfaces is None:
+        return None
+    whole = replace(
+        plan,
+        distribution=offer.distribution,
+        joints=interfaces.joints,
+        command=interfaces.command,
+        publishes=offer.controller.publishes,
+        reference=interfaces.reference,
+        reads=interfaces.reads,
+        topics=tuple(f"/{name}/{topic}" for topic in offer.controller.Topics),
+    )
+    buses = (f"/bus/{bus}" for bus in description.robot.buses)
+    if taken := set(whole.topics).intersection(buses):
+        mark = description.marks.key("controllers", name)
+        problems.error(mark, f"{min(taken)} is the topic of a bus", f"call {name} otherwise")
+    return CompiledController(whole, offer, parameters)
+
+
+def _check_graph(
+    description: Description, plans: Sequence[ControllerPlan], compiled: Collection[str], problems: Problems
+) -> None:
+    """Check the controllers against each other."""
+    incomplete = frozenset(plan.name for plan in plans if plan.name not in compiled)
+    joints = tuple(description.robot.joints)
+    try:
+        ControllerGraph(joints=joints, controllers=tuple(plans), incomplete=incomplete)
+    except ValidationError as error:
+        named = {plan.name: plan for plan in plans}
+        for mistake in mistakes_of(error):
+            problems.error(_graph_mark(description, named, mistake.at), mistake.what, mistake.fix)
+
+
+def _graph_mark(description: Description, plans: Mapping[str, ControllerPlan], at: KeyPath) -> Mark:
+    """Return the place of a part of a controller: what only its class names is where its parameters do."""
+    marks, plan = description.marks, plans[str(at[1])]
+    match at[2:]:
+        case ("joints", int(index)):
+            return joint_mark(description, plan.name, plan.joints[index])
+        case ("reads", int(index)):
+            interface = plan.reads[index]
+            places = (joint_mark(description, plan.name, text) for text in (interface, *interface.split("/")))
+            own = marks.key("controllers", plan.name)
+            return next((place for place in places if place != own), own)
+        case ("into", int(index)):
+            return into_mark(description, plan.name, index)
+    return marks.value(*at) if at[2:] else marks.key(*at)
+
+
 def _every(description: Description, name: str, rate: float | None, problems: Problems) -> int:
-    """Return of how many cycles the controller is updated in one."""
+    """Return of how many cycles the controller is updated in one; 0 where its rate is wrong."""
     loop = description.robot.loop.rate
     if rate is None:
         return 1
@@ -101,7 +148,7 @@ def _every(description: Description, name: str, rate: float | None, problems: Pr
             f"rate {rate:g} Hz of {name} is above the loop's {loop:g} Hz",
             f"the nearest possible is {loop:g}",
         )
-        return 1
+        return 0
     every = max(1, round(loop / rate))
     if abs(every * rate - loop) > _RATE_TOLERANCE * loop:
         problems.error(
@@ -109,6 +156,7 @@ def _every(description: Description, name: str, rate: float | None, problems: Pr
             f"rate {rate:g} Hz of {name} does not divide the loop's {loop:g} Hz",
             f"the nearest possible is {loop / every:.6g}",
         )
+        return 0
     return every
 
 
@@ -176,7 +224,8 @@ def _interfaces(
     except Exception as error:
         _at_fault(description, name, offer, _raised("name its interfaces", error), problems)
         return None
-    breach = interfaces_breach(interfaces)
+    chained = bool(description.robot.controllers[name].into)
+    breach = interfaces_breach(interfaces, chained=chained)
     if breach is not None:
         what, fix = breach
         _at_fault(description, name, offer, (what, f"report it to its author: {fix}"), problems)
@@ -195,46 +244,6 @@ def _interfaces(
             good = False
         seen.add(joint)
     return interfaces if good else None
-
-
-def _fallbacks(description: Description, compiled: dict[str, CompiledController], problems: Problems) -> None:
-    """Check that each fallback can take over when it is needed."""
-    robot = description.robot
-    for name, entry in robot.controllers.items():
-        if entry.fallback is None:
-            continue
-        mark = description.marks.value("controllers", name, "fallback")
-        other = robot.controllers.get(entry.fallback)
-        if other is None:
-            what = f"the fallback {entry.fallback} of {name} is no controller of the file"
-            problems.error(mark, what, suggestion(entry.fallback, tuple(robot.controllers)))
-        elif entry.fallback == name:
-            problems.error(mark, f"{name} is its own fallback", "name another controller, or take it out")
-        elif not entry.active:
-            continue  # which are active when it fails depends on what is switched
-        elif other.active:
-            what = f"the fallback {entry.fallback} of {name} is active from the start"
-            problems.error(mark, what, f"write active: false in {entry.fallback}: it takes over later")
-        elif name in compiled and entry.fallback in compiled:
-            staying = [one.plan for one in compiled.values() if one.plan.active and one.plan.name != name]
-            after = [*staying, compiled[entry.fallback].plan]
-            for holder in sorted({c.holder for c in conflicts(after) if entry.fallback == c.other}):
-                what = f"fallback {entry.fallback} of {name} claims joints of {holder}, which stays active"
-                problems.error(mark, what, "take these joints out of it, or name another controller")
-
-
-def _exclusive_claims(
-    description: Description, compiled: dict[str, CompiledController], problems: Problems
-) -> None:
-    taken: dict[tuple[str, str], list[str]] = {}
-    for conflict in conflicts(c.plan for c in compiled.values() if c.plan.active):
-        taken.setdefault((conflict.holder, conflict.other), []).append(conflict.joint)
-    for (holder, other), joints in taken.items():
-        problems.error(
-            joint_mark(description, other, joints[0]),
-            f"{other} and {holder} are both active and both claim {', '.join(joints)}",
-            f"write active: false in one of the two, or take the joint{'s' * (len(joints) > 1)} out",
-        )
 
 
 def compile_modes(
@@ -275,7 +284,7 @@ def _check(  # noqa: PLR0917  one controller against everything that was compile
     able: Mapping[str, Collection[Mode]],
     problems: Problems,
 ) -> None:
-    if not controller.plan.command:
+    if not controller.plan.command or controller.plan.into:
         return
     mode = mode_of(controller.plan.command)
     for joint in controller.plan.joints:

@@ -57,6 +57,16 @@ def joint_mark(description: Description, controller: str, joint: str) -> Mark:
     return description.marks.value(*named[-1]) if named else description.marks.key(*start)
 
 
+def into_mark(description: Description, controller: str, index: int) -> Mark:
+    """Return where a controller names one of those that it is into: a list, or one name without it."""
+    at: KeyPath = ("controllers", controller, "into")
+    return (
+        description.marks.value(*at, index)
+        if description.marks.has((*at, index))
+        else description.marks.value(*at)
+    )
+
+
 def _texts(value: object, path: KeyPath) -> Iterator[tuple[KeyPath, str]]:
     """Yield every text of a tree with its path."""
     if isinstance(value, str):
@@ -97,12 +107,19 @@ def _following(description: Description) -> Iterator[Mark]:
                 yield marks.value("policies", name, index)
                 if poses:
                     yield marks.value("policies", name, index, "pose")
-    yield from (
-        marks.value("controllers", name, "fallback")
-        for name, controller in robot.controllers.items()
-        if controller.fallback in left_out_names(description, "controllers")
-    )
+    yield from _following_controllers(description)
     for name, controller in robot.controllers.items():
         for path, text in _texts(controller.parameters, ("controllers", name)):
             if text in joints:
                 yield marks.value(*path)
+
+
+def _following_controllers(description: Description) -> Iterator[Mark]:
+    """Yield the places that name controllers which were left out."""
+    marks, controllers = description.marks, left_out_names(description, "controllers")
+    for name, controller in description.robot.controllers.items():
+        if controller.fallback in controllers:
+            yield marks.value("controllers", name, "fallback")
+        for index, lower in enumerate(controller.into):
+            if lower in controllers:
+                yield into_mark(description, name, index)

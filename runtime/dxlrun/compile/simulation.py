@@ -1,4 +1,4 @@
-"""Simulation: the `simulation` keys of the robot file, checked and put into the plan.
+"""Simulation: the `simulation` keys of the robot file, checked and put into the plan; what simulates a plan.
 
 On a real port none of these keys is used, so one that could not be simulated is then a warning at most.
 """
@@ -7,13 +7,20 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 from dxlrun.compile.buses import SIMULATED
 from dxlrun.compile.joints import CompiledJoint
-from dxlrun.compile.plan import AdapterPlan, LoadPlan, SimulationPlan
+from dxlrun.compile.plan import AdapterPlan, LoadPlan, Plan, SimulationPlan
 from dxlrun.compile.problems import Problems
 from dxlrun.description import Description
 from dxlrun.description.bus import Bus
+from dxlrun.dynamixel.control_table import added_control_tables
+from dxlrun.dynamixel.plan.bus_plan import BusPlan
+from dxlrun.errors import InputError
+
+if TYPE_CHECKING:
+    from dxlrun.simulation import BusConfig, UrdfBodies
 
 NEEDS_URDF = "physics: mujoco moves the bodies of a URDF, and the file names none"
 NAME_URDF = "write `model: {urdf: ...}`, or take physics: independent"
@@ -114,3 +121,64 @@ def _check_physics(description: Description, problems: Problems) -> None:
         from dxlrun.simulation.motion.mujoco_plant import INSTALL_MUJOCO, NEEDS_MUJOCO
 
         add(mark, NEEDS_MUJOCO, INSTALL_MUJOCO)
+
+
+# What simulates a plan
+
+
+def simulated_buses(plan: Plan) -> tuple[BusConfig, ...]:
+    """Return the simulated lines of a plan: the servos that it expects, each at its reference (q = 0)."""
+    return tuple(_simulated_bus(plan, bus) for bus in plan.buses if bus.port == SIMULATED)
+
+
+def simulated_bodies(plan: Plan) -> UrdfBodies | None:
+    """Return the bodies that the servos of `simulated_buses` move together; None: each joint by itself.
+
+    Raises InputError when the robot file asks for bodies that cannot be moved: here, where the
+    user sees it, and not in the process of the simulated buses.
+    """
+    if plan.simulation.physics == "independent":
+        return None
+    if plan.urdf is None:
+        raise InputError(f"{NEEDS_URDF}; {NAME_URDF}")
+    from dxlrun.simulation import UrdfBodies, UrdfJoint
+
+    joints = (
+        UrdfJoint(servo.joint, servo.reference, servo.direction)
+        for bus in plan.buses
+        if bus.port == SIMULATED
+        for servo in bus.servos
+    )
+    bodies = UrdfBodies(plan.urdf, tuple(joints))
+    from dxlrun.simulation.motion.mujoco_plant import mujoco_plant  # MuJoCo is optional, and slow to import
+
+    mujoco_plant(bodies)
+    return bodies
+
+
+def _simulated_bus(plan: Plan, bus: BusPlan) -> BusConfig:
+    from dxlrun.simulation import AdapterConfig, BusConfig, Load, ServoConfig  # not above: no check needs it
+
+    adapter = plan.simulation.adapters.get(bus.name, AdapterPlan())
+    loads = plan.simulation.loads
+    return BusConfig(
+        name=bus.name,
+        baud_rate=bus.baud_rate,
+        servos=tuple(
+            ServoConfig(
+                servo.servo_id,
+                servo.model,
+                servo.reference,
+                bus.return_delay_ns,
+                load=Load(load.inertia, load.friction, load.gravity, load.gravity_angle),
+            )
+            for servo in bus.servos
+            for load in (loads.get(servo.joint, LoadPlan()),)
+        ),
+        protocol=bus.protocol,
+        control_tables=added_control_tables(servo.model for servo in bus.servos),
+        adapter=AdapterConfig(
+            latency_timer_ns=adapter.latency_timer_ns, split=adapter.split, echo=adapter.echo
+        ),
+        absent=adapter.absent,
+    )

@@ -57,6 +57,14 @@ def _cores(value: tuple[int, ...]) -> tuple[int, ...]:
     return value
 
 
+def _one_or_more(value: object) -> object:
+    if isinstance(value, str):
+        return (value,)
+    if not isinstance(value, list) or not value:
+        raise refuse("this names no controller", "write one name, or several: [a, b]")
+    return tuple(value)
+
+
 class Scheduler(Form):
     """What the loop asks of the operating system."""
 
@@ -291,6 +299,7 @@ class Policies(Form):
     )
 
 
+_ONE_OR_MORE = {"anyOf": [{"type": "string"}, {"type": "array", "minItems": 1, "items": {"type": "string"}}]}
 _COMMON_KEYS = ("type", "active", "rate", "fallback", "into")
 
 
@@ -310,9 +319,9 @@ class ControllerEntry(Form):
         description="Controller that takes over when this one breaks its contract.",
         examples=["stand_still"],
     )
-    into: tuple[str, ...] = Field(
+    into: Annotated[tuple[str, ...], BeforeValidator(_one_or_more), WithJsonSchema(_ONE_OR_MORE)] = Field(
         default=(),
-        description="Controllers whose references this one commands, instead of the servos.",
+        description="Controllers whose references this one commands, instead of the servos: one, or a list.",
         examples=["arm_pid"],
     )
     parameters: dict[str, object] = Field(
@@ -325,8 +334,6 @@ class ControllerEntry(Form):
         if not isinstance(entry, dict):
             return entry
         own = {key: value for key, value in entry.items() if key in _COMMON_KEYS}
-        if isinstance(into := own.get("into"), str):
-            own["into"] = (into,)
         return {**own, "parameters": {key: value for key, value in entry.items() if key not in own}}
 
 

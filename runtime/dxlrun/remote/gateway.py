@@ -205,6 +205,9 @@ class GatewayApp:
             "rate": plan.rate or self._link.rate,
             "joints": plan.joints,
             "command": plan.command,
+            "into": plan.into,
+            "reference": plan.reference,
+            "reads": plan.reads,
             "takes": self._preparation.takes(plan),
             "goals": self._preparation.goals(plan),
         }
@@ -374,7 +377,8 @@ class GatewayApp:
     async def load(self, request: Request) -> Response:
         """Load a controller into a paused loop."""
         entry = await typed(request, dict[str, object], '{"name": "arm", "type": "..."}')
-        plan = self._preparation.controller(entry, self._link.controllers)
+        others = {name: loaded.plan for name, loaded in self._link.controllers.items()}
+        plan = self._preparation.controller(entry, others, self._link.rate)
         noted = partial(self._link.loaded, plan)
         return _done(await self._link.for_loop("load", plan, origin(request), noted))
 

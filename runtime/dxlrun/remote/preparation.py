@@ -7,19 +7,21 @@ from __future__ import annotations
 
 import json
 import signal
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import msgspec
 import numpy as np
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
+from dxlrun.compile.graph import ControllerGraph, Mistake, mistakes_of
 from dxlrun.compile.limits import BeyondLimit, beyond_limits
 from dxlrun.compile.motions import TRAJECTORY
 from dxlrun.compile.plan import Plan
 from dxlrun.compile.registers import UnfitRegister, steered_value
 from dxlrun.control.controllers.controller import Interfaces, ParametersModel
+from dxlrun.control.controllers.managed import rate_divider, rate_fits
 from dxlrun.control.controllers.plugins import ControllerClass, Offer, PlugIns, interfaces_breach
 from dxlrun.control.joint_requests import Register
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan
@@ -205,10 +207,12 @@ class Preparation:
         known = self._known[plan.name] = Known(plan, offer.controller, parameters, joints)
         return known
 
-    def controller(self, entry: Mapping[str, object], others: Collection[str]) -> ControllerPlan:
+    def controller(
+        self, entry: Mapping[str, object], others: Mapping[str, ControllerPlan], rate: float
+    ) -> ControllerPlan:
         """Return the plan of a controller that is to be loaded beside `others`; raises RefusedRequest.
 
-        `entry` is one of the robot file, with its name.
+        `entry` is one of the robot file, with its name; `rate` is the loop's, Hz.
         """
         try:
             name = _NAME.validate_python(entry.get("name", ""))
@@ -222,15 +226,12 @@ class Preparation:
             raise refused(Code.NAME_TAKEN, {"controller": name, "hint": hint})
         if entry.get("active"):
             raise invalid(f"{name} cannot be active at once; load it, then switch to it")
-        if written.fallback is not None and written.fallback not in others:
-            hint = suggestion(written.fallback, tuple(others))
-            raise invalid(f"there is no fallback {written.fallback}; {hint}")
         offer = self.plugins.controllers.get(written.type)
         if offer is None:
             hint = suggestion(written.type, tuple(self.plugins.controllers))
             raise invalid(f"no plug-in offers the controller type {written.type}; {hint}")
-        interfaces = self._interfaces(name, offer, written.parameters)
-        return ControllerPlan(
+        interfaces = self._interfaces(name, offer, written)
+        plan = ControllerPlan(
             name=name,
             type=written.type,
             distribution=offer.distribution,
@@ -242,14 +243,35 @@ class Preparation:
             every=1,  # the loop knows its own rate
             rate=written.rate,
             fallback=written.fallback or "",
+            into=written.into,
+            reference=interfaces.reference,
+            reads=interfaces.reads,
             topics=tuple(f"/{name}/{topic}" for topic in offer.controller.Topics),
         )
+        known = self._mistakes(tuple(others.values()), rate)  # such as of one whose lower end was unloaded
+        if found := [one for one in self._mistakes((*others.values(), plan), rate) if one not in known]:
+            raise invalid("; ".join(f"{one.what}; {one.fix}" for one in found[:_MOST_MISTAKES]))
+        return plan
 
-    def _interfaces(self, name: str, offer: Offer, own: Mapping[str, object]) -> Interfaces:
+    def _mistakes(self, plans: Sequence[ControllerPlan], rate: float) -> list[Mistake]:
+        """Return what is wrong with the controllers of a run as a graph, at this rate of the loop."""
+        period_ns = round(1e9 / rate)
+        now = (
+            # 0: one whose own rate does not divide the loop's, which the loop refuses
+            replace(plan, every=rate_divider(plan.rate, period_ns) if rate_fits(plan.rate, period_ns) else 0)
+            for plan in plans
+        )
+        try:
+            ControllerGraph(joints=tuple(self.joints), controllers=tuple(now))
+        except ValidationError as error:
+            return mistakes_of(error)
+        return []
+
+    def _interfaces(self, name: str, offer: Offer, written: ControllerEntry) -> Interfaces:
         """Return the interfaces that a controller's class asks for with these parameters."""
         try:
             with bounded(name):
-                parameters = offer.controller.Parameters.model_validate(own)
+                parameters = offer.controller.Parameters.model_validate(written.parameters)
                 interfaces = offer.controller.interfaces(parameters, tuple(self.joints))
         except RefusedRequest:
             raise
@@ -257,7 +279,7 @@ class Preparation:
             raise invalid(mistakes(error, name, offer.controller.Parameters)) from error
         except (Exception, SystemExit) as error:  # a plug-in's code
             raise invalid(f"the interfaces of {name} are not known: {_raised(error)}") from error
-        if breach := interfaces_breach(interfaces):
+        if breach := interfaces_breach(interfaces, chained=bool(written.into)):
             raise invalid(f"{name} ({offer.distribution}) {breach[0]}; report it to its author: {breach[1]}")
         if unknown := [joint for joint in interfaces.joints if joint not in self.joints]:
             hint = suggestion(unknown[0], tuple(self.joints))

@@ -11,7 +11,7 @@ import msgspec
 from msgspec.json import Decoder
 
 from dxlrun.compile.plan import Plan, to_json
-from dxlrun.compile.simulated import simulated_bodies, simulated_buses
+from dxlrun.compile.simulation import simulated_bodies, simulated_buses
 from dxlrun.control.realtime import Grant, guardian_priority
 from dxlrun.log.schemas import LogClosed, LogHeader, RecorderJob
 from dxlrun.remote.job import Descriptors, GatewayJob

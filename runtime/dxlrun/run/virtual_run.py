@@ -14,7 +14,7 @@ from rich.console import Console
 
 from dxlrun.clock import VirtualClock
 from dxlrun.compile.plan import Plan
-from dxlrun.compile.simulated import simulated_bodies, simulated_buses
+from dxlrun.compile.simulation import simulated_bodies, simulated_buses
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.control.loop import LoopResult, StopFlag
 from dxlrun.control.policy_plan import TORQUE_STAYS, Last

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from dxlrun.compile import compile_robot
 from dxlrun.compile.plan import Plan
-from dxlrun.compile.simulated import simulated_buses
+from dxlrun.compile.simulation import simulated_buses
 from dxlrun.description import Description, read_robot
 from dxlrun.simulation import BusConfig
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -33,6 +33,11 @@ class Claimant(Protocol):
         """The controllers whose references it claims; empty: it claims the servos."""
         ...
 
+    @property
+    def reference(self) -> tuple[str, ...]:
+        """The interfaces that it exports on each of its joints."""
+        ...
+
 
 @dataclass(frozen=True, slots=True)
 class Conflict:
@@ -58,27 +63,32 @@ def conflicts(claimants: Iterable[Claimant]) -> tuple[Conflict, ...]:
     """
     holders: dict[tuple[str, str], str] = {}
     found: list[Conflict] = []
+    claimants = list(claimants)
+    named = {claimant.name: claimant for claimant in claimants}
     for claimant in claimants:
-        for joint, reference in _claims(claimant):
+        for joint, reference in _claims(claimant, named):
             holder = holders.setdefault((joint, reference), claimant.name)
             if holder != claimant.name:
                 found.append(Conflict(joint, holder, claimant.name, reference))
     return tuple(found)
 
 
-def _claims(claimant: Claimant) -> Iterator[tuple[str, str]]:
+def _claims(claimant: Claimant, named: Mapping[str, Claimant]) -> Iterator[tuple[str, str]]:
     """Yield joints with the claimed reference; with none where the servo is claimed.
 
-    A joint is exported by one of the controllers that it is `into`; at the others it has no reference.
+    Of controllers that are into several ones each joint is claimed where it is exported, as far as these are
+    among `named`.
     """
     if not claimant.command:
         return
     for joint in claimant.joints:
         if not claimant.into:
             yield joint, ""
-        for lower in claimant.into:
-            for interface in claimant.command:
-                yield joint, f"{lower}/{joint}/{interface}"
+        for name in claimant.into:
+            lower = named.get(name)
+            if lower is None or (joint in lower.joints and set(claimant.command) <= set(lower.reference)):
+                for interface in claimant.command:
+                    yield joint, f"{name}/{joint}/{interface}"
 
 
 def conflicts_text(found: Iterable[Conflict]) -> str:

@@ -323,19 +323,17 @@ def controller_breach(controller: object) -> Breach | None:
     return _declaration_breach(controller)
 
 
-def interfaces_breach(interfaces: object) -> Breach | None:
-    """Check what a controller's `interfaces` returned."""
+def interfaces_breach(interfaces: object, *, chained: bool = False) -> Breach | None:
+    """Check what a controller's `interfaces` returned.
+
+    `chained`: it commands references of other controllers, of which any may go together; servos have modes.
+    """
     if not isinstance(interfaces, Interfaces):
         return f"returns {interfaces!r} from interfaces", "return dxlrun.Interfaces(joints, command)"
-    for what, names in (("joints", interfaces.joints), ("command", interfaces.command)):
-        if not isinstance(names, tuple) or not all(isinstance(name, str) for name in names):
-            return f"asks for {what} {names!r}", f"{what} of dxlrun.Interfaces is a tuple of names"
-    unknown = [name for name in interfaces.command if name not in COMMAND_INTERFACES]
-    if unknown:
-        return (
-            f"asks for the command interface {', '.join(unknown)}",
-            f"command interfaces are {', '.join(COMMAND_INTERFACES)}",
-        )
+    if breach := _names_breach(interfaces):
+        return breach
+    if chained:
+        return None
     try:
         mode_of(interfaces.command or ("position",))
     except ValueError as error:
@@ -343,6 +341,28 @@ def interfaces_breach(interfaces: object) -> Breach | None:
             f"asks for command interfaces that do not go together: {error}",
             "ask for position (with velocity or effort beside it), or for velocity, effort or pwm alone",
         )
+    return None
+
+
+def _names_breach(interfaces: Interfaces) -> Breach | None:
+    """Check that names are names, and those of interfaces known."""
+    found: Mapping[str, object] = {
+        what: getattr(interfaces, what) for what in ("joints", "command", "reference", "reads")
+    }
+    for what, names in found.items():
+        if not isinstance(names, tuple) or not all(isinstance(name, str) for name in names):
+            return f"asks for {what} {names!r}", f"{what} of dxlrun.Interfaces is a tuple of names"
+    for what, verb, chosen in (
+        ("command", "asks for", interfaces.command),
+        ("reference", "exports", interfaces.reference),
+    ):
+        if unknown := [name for name in chosen if name not in COMMAND_INTERFACES]:
+            return (
+                f"{verb} the {what} interface {', '.join(unknown)}",
+                f"{what} interfaces are {', '.join(COMMAND_INTERFACES)}",
+            )
+        if len(set(chosen)) < len(chosen):
+            return f"{verb} a {what} interface twice: {', '.join(chosen)}", "name each once"
     return None
 
 

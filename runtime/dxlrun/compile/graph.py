@@ -1,0 +1,469 @@
+"""The controller graph: controllers, what they read, claim and command; valid as a whole, or every mistake.
+
+A pydantic model of its own, for the controllers of a robot file and for one that is loaded into a run. Each
+mistake is one error of the ValidationError, at the path in the file that it is about.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, TypeAlias
+
+from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+from pydantic_core import InitErrorDetails
+
+from dxlrun.control.controllers.claims import Conflict, conflicts
+from dxlrun.control.controllers.graph import above, below, circles, drawn, update_order
+from dxlrun.control.loop_plan import ControllerPlan
+from dxlrun.description import KeyPath
+from dxlrun.description.form import refuse
+from dxlrun.errors import suggestion
+
+STATES = ("position", "velocity", "effort", "temperature", "voltage", "age")
+"""Interfaces of every joint that may be read without a claim; `age` is that of the state, s."""
+_LONGEST = 6
+"""Names of joints in one message."""
+
+
+@dataclass(frozen=True, slots=True)
+class GraphEdge:
+    """What passes from one node to another: commands toward the servos, values toward a reader."""
+
+    kind: Literal["command", "reference", "read"]
+    """To the servo of a joint; to another controller; without a claim."""
+    source: str
+    target: str
+    joint: str
+    interfaces: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Mistake:
+    """What is wrong with the graph, and the path in the file."""
+
+    at: KeyPath
+    what: str
+    fix: str
+
+
+class ControllerGraph(BaseModel):
+    """Controllers of a robot and the joints that they work on.
+
+    Raises ValidationError with every mistake; `mistakes_of` returns them.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    joints: tuple[str, ...]
+    controllers: tuple[ControllerPlan, ...]
+    incomplete: frozenset[str] = frozenset()
+    """Those that have mistakes of their own, so that their joints and interfaces are not known."""
+
+    @model_validator(mode="after")
+    def _valid(self) -> ControllerGraph:
+        if mistakes := list(_Checks(self.joints, self.controllers, self.incomplete).all()):
+            details = [
+                InitErrorDetails(type=refuse(one.what, one.fix), loc=one.at, input=None) for one in mistakes
+            ]
+            raise ValidationError.from_exception_data(type(self).__name__, details)
+        return self
+
+    @property
+    def order(self) -> tuple[str, ...]:
+        """Names in the order of updates."""
+        return update_order(self.controllers)
+
+    @property
+    def edges(self) -> tuple[GraphEdge, ...]:
+        """All edges: those of each controller together, in the order of the file."""
+        found = _Checks(self.joints, self.controllers, self.incomplete)
+        return tuple(edge for plan in self.controllers for edge in found.edges_of(plan))
+
+
+def mistakes_of(error: ValidationError) -> list[Mistake]:
+    """Return what a graph's ValidationError holds."""
+    return [
+        Mistake(details["loc"], str(details["ctx"]["what"]), str(details["ctx"]["fix"]))
+        for details in error.errors(include_url=False)
+    ]
+
+
+Check: TypeAlias = Callable[[ControllerPlan], Iterable[Mistake]]
+
+
+class _Checks:
+    """The rules of the graph; each yields the mistakes of one controller."""
+
+    def __init__(
+        self, joints: Sequence[str], controllers: Sequence[ControllerPlan], incomplete: frozenset[str]
+    ) -> None:
+        self._joints = joints
+        self._plans = controllers
+        self._named = {plan.name: plan for plan in controllers}
+        self._incomplete = incomplete
+
+    def all(self) -> Iterator[Mistake]:
+        """Yield every mistake of the graph."""
+        checks: Sequence[Check] = (
+            self._targets,
+            self._exports,
+            self._activity,
+            self._rates,
+            self._reads,
+            self._needed_together,
+            self._fallback,
+        )
+        for plan in self._plans:
+            for check in checks:
+                yield from check(plan)
+        yield from self._circles()
+        yield from self._active_claims()
+
+    # Edges
+
+    @cached_property
+    def sources(self) -> Mapping[str, tuple[str, ...]]:
+        """What can be read without a claim: interfaces of `JOINT` and of `CONTROLLER/JOINT`.
+
+        A robot's sensors belong here too, by name.
+        """
+        states = dict.fromkeys(self._joints, STATES)
+        references = {
+            f"{plan.name}/{joint}": plan.reference
+            for plan in self._plans
+            if plan.reference
+            for joint in plan.joints
+        }
+        return {**states, **references}
+
+    def edges_of(self, plan: ControllerPlan) -> Iterator[GraphEdge]:
+        """Yield the edges that one controller has in a valid graph: what it reads, then what it commands."""
+        for interface in plan.reads:
+            source, _, name = interface.rpartition("/")
+            owner, _, joint = source.rpartition("/")
+            yield GraphEdge("read", owner or joint, plan.name, joint, (name,))
+        for joint in plan.joints if plan.command else ():
+            if not plan.into:
+                yield GraphEdge("command", plan.name, joint, joint, plan.command)
+            for lower in self._exporters(plan, joint):
+                yield GraphEdge("reference", plan.name, lower.name, joint, plan.command)
+
+    def _lowers(self, plan: ControllerPlan) -> list[ControllerPlan]:
+        """Return the controllers that it is into, without itself and without unknown ones."""
+        return [
+            self._named[name]
+            for name in dict.fromkeys(plan.into)
+            if name in self._named and name != plan.name
+        ]
+
+    def _exporters(self, plan: ControllerPlan, joint: str) -> list[ControllerPlan]:
+        """Return the controllers that it is into and that export all that it commands of a joint."""
+        return [
+            lower
+            for lower in self._lowers(plan)
+            if joint in lower.joints and set(plan.command) <= set(lower.reference)
+        ]
+
+    # Rules
+
+    def _targets(self, plan: ControllerPlan) -> Iterator[Mistake]:
+        """Each name of `into` is another controller of the file, once."""
+        name = plan.name
+        for index, target in enumerate(plan.into):
+            at = (*_path(name), "into", index)
+            if target == name:
+                yield Mistake(
+                    at, f"{name} is into itself", "name the controller whose references it commands"
+                )
+            elif target not in self._named:
+                known = tuple(one.name for one in self._plans if one.reference and one.name != name)
+                what = f"{name} is into {target}, which is no controller of the robot"
+                yield Mistake(at, what, suggestion(target, known or tuple(self._named)))
+            elif target in plan.into[:index]:
+                yield Mistake(at, f"{name} is into {target} twice", "name it once")
+
+    def _exports(self, plan: ControllerPlan) -> Iterator[Mistake]:
+        """Each joint is exported, with all that is commanded of it, by exactly one of `into`."""
+        name, lowers = plan.name, self._lowers(plan)
+        if not plan.into or name in self._incomplete:
+            return
+        if not plan.command:
+            what = f"{name} is into {_listed(plan.into)}, but commands nothing"
+            yield Mistake((*_path(name), "into"), what, "take `into` out, or use a controller that commands")
+            return
+        mute = [
+            one for one in lowers if not (one.reference and one.joints) and one.name not in self._incomplete
+        ]
+        for lower in mute:
+            what = f"{name} is into {lower.name}, which exports no reference"
+            yield Mistake(self._at_into(plan, lower), what, self._exporting(plan))
+        known = all(target in self._named and target not in self._incomplete for target in plan.into)
+        useful = [one for one in lowers if one not in mute]
+        if known and useful:
+            yield from self._each_joint(plan, useful)
+
+    def _each_joint(self, plan: ControllerPlan, lowers: Sequence[ControllerPlan]) -> Iterator[Mistake]:
+        name = plan.name
+        used: set[str] = set()
+        missing: list[tuple[int, str]] = []
+        partial: dict[str, list[tuple[int, str]]] = {}
+        double: dict[tuple[str, ...], list[tuple[int, str]]] = {}
+        for index, joint in enumerate(plan.joints):
+            found = tuple(one.name for one in self._exporters(plan, joint))
+            near = [one.name for one in lowers if joint in one.joints]
+            used.update(near)
+            if len(found) > 1:
+                double.setdefault(found, []).append((index, joint))
+            elif not found and near:
+                partial.setdefault(near[0], []).append((index, joint))
+            elif not found:
+                missing.append((index, joint))
+        if missing:
+            exported = dict.fromkeys(joint for one in lowers for joint in one.joints)
+            what = f"{name} commands {_names(missing)}, which {_listed(one.name for one in lowers)} "
+            what += "does not export" if len(lowers) == 1 else "do not export"
+            fix = f"take {_it(missing)} out; exported: {_listed(exported)}"
+            yield Mistake(_joint(name, missing[0][0]), what, fix)
+        for lower, joints in partial.items():
+            exported_interfaces = self._named[lower].reference
+            lacking = [each for each in plan.command if each not in exported_interfaces]
+            what = (
+                f"{name} commands {' and '.join(lacking)} of {_names(joints)}, which {lower} does not export"
+            )
+            fix = f"{lower} exports {' and '.join(exported_interfaces)}: let the two have the same interfaces"
+            yield Mistake((*_path(name), "into", plan.into.index(lower)), what, fix)
+        for pair, joints in double.items():
+            what = f"{_names(joints)} of {name} is exported by {' and '.join(pair)}"
+            yield Mistake(
+                _joint(name, joints[0][0]), what, "let one of them export it, or take one out of `into`"
+            )
+        idle_ones = [one for one in lowers if one.name not in used and not missing]
+        for idle in idle_ones:
+            what = f"{name} is into {idle.name}, which exports none of its joints"
+            yield Mistake(self._at_into(plan, idle), what, f"take {idle.name} out of `into`")
+
+    def _activity(self, plan: ControllerPlan) -> Iterator[Mistake]:
+        """What is active from the start has its lower end active too."""
+        for lower in self._lowers(plan):
+            if plan.active and not lower.active:
+                what = f"{plan.name} is active from the start, but {lower.name}, which it commands, is not"
+                fix = f"write active: true in {lower.name}, or active: false in {plan.name}"
+                yield Mistake(self._at_into(plan, lower), what, fix)
+
+    def _rates(self, plan: ControllerPlan) -> Iterator[Mistake]:
+        """The upper end's rate divides that of the lower one: no command of it is missed."""
+        for lower in self._lowers(plan):
+            if plan.every and lower.every and plan.every % lower.every:
+                what = (
+                    f"{plan.name} is updated every {_cycles(plan.every)}, {lower.name}, which it commands, "
+                )
+                what += f"every {_cycles(lower.every)}: its rate does not divide that of {lower.name}"
+                key = "rate" if plan.rate is not None else "into"
+                yield Mistake(
+                    (*_path(plan.name), key),
+                    what,
+                    f"give {plan.name} the rate of {lower.name} or a whole fraction of it"
+                    + (f": {lower.rate:g}" if lower.rate is not None else ""),
+                )
+
+    def _reads(self, plan: ControllerPlan) -> Iterator[Mistake]:
+        """Each of `reads` is an interface that there is."""
+        for index, interface in enumerate(plan.reads):
+            source, _, name = interface.rpartition("/")
+            owner = source.partition("/")[0]
+            if owner in self._incomplete or name in self.sources.get(source, ()):
+                continue
+            what, fix = self._unreadable(interface, source, name)
+            yield Mistake(
+                (*_path(plan.name), "reads", index), f"{plan.name} reads {interface}, but {what}", fix
+            )
+
+    def _unreadable(self, interface: str, source: str, name: str) -> tuple[str, str]:
+        """Return why there is no such interface, and what to write."""
+        owner, _, joint = source.partition("/")
+        plan = self._named.get(owner)
+        if interface.count("/") not in {1, 2} or "" in interface.split("/"):
+            return (
+                "that is no interface",
+                "write JOINT/position, or CONTROLLER/JOINT/position for a reference",
+            )
+        if source in self.sources:
+            return f"{source} has no interface {name}", f"it has {', '.join(self.sources[source])}"
+        if plan is None:
+            kind, known = ("controller", tuple(self._named)) if joint else ("joint", tuple(self._joints))
+            return f"there is no {kind} {owner}", suggestion(owner, known)
+        return _unexported(plan, joint)
+
+    def _needed_together(self, plan: ControllerPlan) -> Iterator[Mistake]:
+        """The controllers below one another can be active together."""
+        found = self._clashes_below(plan)
+        for lower in self._lowers(plan):
+            found = {pair: clash for pair, clash in found.items() if pair not in self._clashes_below(lower)}
+        for (holder, other), clashes in found.items():
+            what = f"{plan.name} needs {self._way(plan, holder)} and {self._way(plan, other)} together, "
+            what += f"and both command {_claimed(clashes)}"
+            fix = "take these joints out of one of the two, or let one end in the other"
+            yield Mistake((*_path(plan.name), "into"), what, fix)
+
+    def _clashes_below(self, plan: ControllerPlan) -> dict[tuple[str, str], list[Conflict]]:
+        """Return which controllers claim the same among one and all below it."""
+        names = {plan.name, *below(self._plans, plan.name)} - self._incomplete if plan.into else set()
+        return _by_pairs(conflicts(one for one in self._plans if one.name in names))
+
+    def _way(self, plan: ControllerPlan, end: str) -> str:
+        """Return the chain from a controller down to another: `arm -> limiter -> pid`."""
+        ways: list[tuple[str, ...]] = [(plan.name,)]
+        seen = {plan.name}
+        for way in ways:
+            if way[-1] == end:
+                return " -> ".join(way)
+            further = [one.name for one in self._lowers(self._named[way[-1]]) if one.name not in seen]
+            seen.update(further)
+            ways += [(*way, name) for name in further]
+        return end
+
+    def _circles(self) -> Iterator[Mistake]:
+        for circle in circles(self._plans):
+            if len(circle) == 1:
+                continue  # into itself: said before
+            following = dict(zip(circle, (*circle[1:], circle[0]), strict=True))
+            begin = next((one for one in circle if following[one] in self._named[one].into), circle[0])
+            into = self._named[begin].into
+            at = (
+                (*_path(begin), "into", into.index(following[begin]))
+                if following[begin] in into
+                else _path(begin)
+            )
+            what = f"controllers command each other in a circle: {drawn(circle)}"
+            if not all(after in self._named[one].into for one, after in following.items()):
+                what = f"controllers wait for each other, by `into` and by `reads`: {drawn(circle)}"
+            yield Mistake(at, what, "take one of these steps out")
+
+    def _active_claims(self) -> Iterator[Mistake]:
+        """What is active from the start claims each servo, and each reference, once."""
+        active = [plan for plan in self._plans if plan.active and plan.name not in self._incomplete]
+        reported = {pair for plan in self._plans for pair in self._clashes_below(plan)}
+        for (holder, other), clashes in _by_pairs(conflicts(active)).items():
+            if (holder, other) in reported:
+                continue
+            verb = "command" if clashes[0].reference else "claim"
+            what = f"{other} and {holder} are both active and both {verb} {_claimed(clashes)}"
+            ways = [way for name in (other, holder) if "->" in (way := self._from_above(name))]
+            if ways:
+                what += f" (chain{'s' * (len(ways) > 1)} {' and '.join(ways)})"
+            index = self._named[other].joints.index(clashes[0].joint)
+            joints = dict.fromkeys(clash.joint for clash in clashes)
+            fix = f"write active: false in one of the two, or take the joint{'s' * (len(joints) > 1)} out"
+            yield Mistake(_joint(other, index), what, fix)
+
+    def _from_above(self, name: str) -> str:
+        """Return the chain that ends in a controller, from its upper end."""
+        way = [name]
+        while upper := next(
+            (p for p in self._plans if way[0] in p.into and p.name not in way and p.active), None
+        ):
+            way.insert(0, upper.name)
+        return " -> ".join(way)
+
+    def _fallback(self, plan: ControllerPlan) -> Iterator[Mistake]:
+        """A fallback can take over when it is needed."""
+        name, at = plan.name, (*_path(plan.name), "fallback")
+        if not plan.fallback:
+            return
+        other = self._named.get(plan.fallback)
+        if other is None:
+            what = f"the fallback {plan.fallback} of {name} is no controller of the robot"
+            yield Mistake(at, what, suggestion(plan.fallback, tuple(self._named)))
+        elif other is plan:
+            yield Mistake(at, f"{name} is its own fallback", "name another controller, or take it out")
+        elif name in below(self._plans, other.name):
+            what = f"the fallback {other.name} of {name} commands {name} ({self._way(other, name)})"
+            yield Mistake(at, f"{what}, which has failed then", "name a controller that is not above it")
+        elif plan.active and other.active:
+            what = f"the fallback {other.name} of {name} is active from the start"
+            fix = f"write active: false in {other.name}: it takes over later"
+            yield Mistake(at, what, fix)
+        elif plan.active and not {name, other.name} & self._incomplete:
+            yield from self._taking_over(plan, other, at)
+
+    def _taking_over(self, plan: ControllerPlan, fallback: ControllerPlan, at: KeyPath) -> Iterator[Mistake]:
+        """Compare the claims of a fallback, and of all below it, with those that stay active beside them."""
+        plans = self._plans
+        entering = {fallback.name, *below(plans, fallback.name)}
+        leaving = {plan.name, *above(plans, plan.name)}
+        staying = {one.name for one in plans if one.active} - leaving - self._incomplete
+        free = {
+            lower
+            for lower in below(plans, plan.name)
+            if not staying & set(above(plans, lower)) and lower not in entering
+        }
+        after = [one for one in plans if one.name in staying - free - entering]
+        after += [one for one in plans if one.name in entering]
+        clashes = [one for one in conflicts(after) if one.other in entering and one.holder not in entering]
+        for holder, other in dict.fromkeys((one.holder, one.other) for one in clashes):
+            through = "" if other == fallback.name else f" through {other}"
+            what = f"fallback {fallback.name} of {plan.name} claims joints of {holder}{through}"
+            fix = "take these joints out of it, or name another controller"
+            yield Mistake(at, f"{what}, which stays active", fix)
+
+    # Words
+
+    def _at_into(self, plan: ControllerPlan, lower: ControllerPlan) -> KeyPath:
+        return (*_path(plan.name), "into", plan.into.index(lower.name))
+
+    def _exporting(self, plan: ControllerPlan) -> str:
+        names = [one.name for one in self._plans if one.reference and one.name != plan.name]
+        return (
+            f"controllers that export: {_listed(names)}"
+            if names
+            else "no controller of the robot exports any"
+        )
+
+
+def _unexported(plan: ControllerPlan, joint: str) -> tuple[str, str]:
+    """Return why a controller has no such reference, and what to write."""
+    if not (plan.reference and plan.joints):
+        return f"{plan.name} exports no reference", "read a joint: JOINT/position"
+    if not joint:
+        example = f"{plan.name}/{plan.joints[0]}/{plan.reference[0]}"
+        return f"{plan.name} is a controller", f"name a joint too: {example}"
+    return f"{plan.name} does not export {joint}", f"exported: {_listed(plan.joints)}"
+
+
+def _path(controller: str) -> KeyPath:
+    return ("controllers", controller)
+
+
+def _joint(controller: str, index: int) -> KeyPath:
+    return (*_path(controller), "joints", index)
+
+
+def _listed(names: Iterable[str]) -> str:
+    names = list(names)
+    more = f" and {len(names) - _LONGEST} more" if len(names) > _LONGEST else ""
+    return ", ".join(names[:_LONGEST]) + more
+
+
+def _names(joints: Sequence[tuple[int, str]]) -> str:
+    return _listed(joint for _, joint in joints)
+
+
+def _it(joints: Sequence[object]) -> str:
+    return "it" if len(joints) == 1 else "them"
+
+
+def _by_pairs(clashes: Iterable[Conflict]) -> dict[tuple[str, str], list[Conflict]]:
+    found: dict[tuple[str, str], list[Conflict]] = {}
+    for clash in clashes:
+        found.setdefault((clash.holder, clash.other), []).append(clash)
+    return found
+
+
+def _claimed(clashes: Iterable[Conflict]) -> str:
+    return _listed(dict.fromkeys(clash.reference or clash.joint for clash in clashes))
+
+
+def _cycles(every: int) -> str:
+    return "cycle" if every == 1 else f"{every} cycles"
