@@ -2,6 +2,7 @@
 
 import gc
 import sys
+from dataclasses import replace
 from typing import Annotated, ClassVar
 
 import msgspec
@@ -17,8 +18,10 @@ from dxlrun.control.controllers.controller import (
     Outcome,
     ParametersModel,
 )
-from dxlrun.control.controllers.goals import KEPT, Goals
+from dxlrun.control.controllers.goals import KEPT, GoalStatus
 from dxlrun.control.controllers.plugins import controller_breach
+from dxlrun.control.controllers.topics import TopicLog
+from dxlrun.messages.declared import declared_message
 from dxlrun.run.channels.answers import Code, Done
 from dxlrun.run.channels.events import EventCode, GoalReport
 
@@ -297,17 +300,46 @@ def test_a_goal_is_not_streamed(steered):
     assert refused(steered, 1) == (Code.GOAL_STREAMED, "move of arm is a goal; send it once, not in a stream")
 
 
-def test_feedback_is_reported_ten_times_a_second(steered, monkeypatch):
+@pytest.fixture
+def messages(steered, monkeypatch):
+    """What is published on /goals, with the cycle."""
     seen = []
 
-    def report_feedback(self, goal):
-        seen.append((steered.robot.loop.record.cycle, goal.progress, goal.error))
+    class Published:
+        def publish(self, message):
+            seen.append((steered.robot.loop.record.cycle, replace(message)))
 
-    monkeypatch.setattr(Goals, "report_feedback", report_feedback)
+    monkeypatch.setattr(TopicLog, "open", lambda self, name, cls: Published())
+    return seen
+
+
+def test_the_topic_has_feedback_ten_times_a_second_between_acceptance_and_result(steered, messages):
     steered.at = {1: [steered.move(50)]}
     steered.run(52)
-    assert [cycle for cycle, *_ in seen] == list(range(1, 51, 5))
-    assert seen[2][1:] == (1 - 39 / 100, 0.5)
+    assert [cycle for cycle, one in messages if one.status == "running"] == list(range(1, 51, 5))
+    assert [one.status for _, one in messages if one.status != "running"] == ["accepted", "reached"]
+    third, last = messages[3][1], messages[-1][1]
+    assert (third.goal, third.controller, third.progress, third.error) == (1, "arm", 1 - 39 / 100, 0.5)
+    assert (last.progress, last.joint, last.error, last.text) == (1.0, "j0", 0.001, "j0 is 0.001 off")
+
+
+def test_the_topic_of_goals_is_a_message_of_ros():
+    found = declared_message(GoalStatus, "dxlrun_msgs")
+    assert found.type.name == "dxlrun_msgs/msg/GoalStatus"
+    assert found.stamped
+    assert found.pack(GoalStatus(goal=3, text="Ü"), (1, 2))
+
+
+def test_a_text_that_no_utf8_has_is_reported_with_escapes(steered):
+    def update(self, time_ns, period_ns):
+        if self.goal:
+            self.goal.end(Outcome.ABORTED, "no \udcff" + 1000 * "a", "\udcfe")
+
+    steered.mover.update = update
+    steered.at = {1: [steered.move(5)]}
+    assert steered.run(4).reason == "stopped"
+    text = steered.reports[-1][1].text
+    assert (text.startswith("no \\udcff"), len(text) < 600) == (True, True)
 
 
 def test_only_the_last_results_are_kept_and_memory_stays_flat(steered):

@@ -1,12 +1,18 @@
-"""Goals: what controllers work on, one at a time each; numbered from 1, reported when accepted and ended."""
+"""Goals: what controllers work on, one at a time each; numbered from 1.
+
+Events report when a goal is accepted and how it ends; the topic /goals has its progress beside them.
+"""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 
 import msgspec
 
 from dxlrun.control.controllers.controller import Outcome
+from dxlrun.control.controllers.topics import Publisher, TopicLog
+from dxlrun.messages import Header
 from dxlrun.run.channels.answers import Code, Refusal
 from dxlrun.run.channels.cycle import CycleRecord
 from dxlrun.run.channels.events import EventCode, EventSink, GoalReport, Severity
@@ -17,6 +23,25 @@ KEPT = 256
 """Of so many goals that ended it is known how."""
 _LONGEST_TEXT = 500
 _WARNED = (Outcome.MISSED, Outcome.ABORTED)
+
+
+@dataclass(slots=True)
+class GoalStatus:
+    """Message of the topic /goals: a goal is accepted, goes on, or has ended."""
+
+    header: Header = field(default_factory=Header)
+    goal: int = 0
+    controller: str = ""
+    kind: str = ""
+    origin: str = ""
+    status: str = ""
+    """`accepted`, `running`, or how it ended: `reached`, `missed`, `aborted`, `cancelled`, `preempted`."""
+    progress: float = 0.0
+    """0..1"""
+    error: float = math.nan
+    """Largest distance from the desired state, at the end the worst joint's from the goal; SI units."""
+    joint: str = ""
+    text: str = ""
 
 
 class RunningGoal:
@@ -69,7 +94,7 @@ class RunningGoal:
 class Goals:
     """All goals of a run. Numbers follow from the commands alone, so a replay gives the same ones."""
 
-    __slots__ = ("_ended", "_events", "_record", "last", "running")
+    __slots__ = ("_ended", "_events", "_publisher", "_record", "_status", "last", "running")
 
     def __init__(self, record: CycleRecord, events: EventSink) -> None:
         self.last = 0
@@ -79,6 +104,13 @@ class Goals:
         self._record = record
         self._events = events
         self._ended: list[tuple[int, str, Outcome] | None] = [None] * KEPT
+        self._publisher: Publisher | None = None
+        self._status = GoalStatus()
+
+    def open(self, topics: TopicLog) -> None:
+        """Announce the topic /goals, once: the first controller that takes goals is there. Allocates."""
+        if self._publisher is None:
+            self._publisher = topics.open("/goals", GoalStatus)
 
     @property
     def now_ns(self) -> int:
@@ -107,10 +139,12 @@ class Goals:
 
     def report_feedback(self, goal: RunningGoal) -> None:
         """Report the progress of a goal."""
+        self._publish(goal, "running", goal.progress, goal.error)
 
     def report_end(self, goal: RunningGoal, text: str, joint: str, error: float) -> None:
         """Report the result of a goal, and forget it but for how it ended."""
         outcome = goal.outcome or Outcome.ABORTED
+        text, joint = _writable(text), _writable(joint)
         del self.running[goal.number]
         self._ended[goal.number % KEPT] = (goal.number, goal.controller, outcome)
         why = text
@@ -137,8 +171,26 @@ class Goals:
             kind=goal.kind,
             origin=goal.origin,
             status=status,
-            text=text[:_LONGEST_TEXT],
+            text=text,
             joint=joint,
             error=error if math.isfinite(error) else None,
         )
         self._events.emit(code, severity, goal.controller, sentence, msgspec.json.encode(report))
+        progress = 1.0 if status == Outcome.REACHED else goal.progress
+        self._publish(goal, status, progress, error, joint, text)
+
+    def _publish(  # noqa: PLR0917  a report's parts, as they come
+        self, goal: RunningGoal, status: str, progress: float, error: float, joint: str = "", text: str = ""
+    ) -> None:
+        if self._publisher is None:
+            return
+        message = self._status
+        message.goal, message.controller, message.kind = goal.number, goal.controller, goal.kind
+        message.origin, message.status, message.progress = goal.origin, status, progress
+        message.error, message.joint, message.text = error, joint, text
+        self._publisher.publish(message)
+
+
+def _writable(text: object) -> str:
+    """Return a controller's text with escapes for what no UTF-8 has, as long as reports may have it."""
+    return str(text)[:_LONGEST_TEXT].encode(errors="backslashreplace").decode()

@@ -200,6 +200,11 @@ class Managed:
             self._goal = None
         return self._goal
 
+    @property
+    def has_goals(self) -> bool:
+        """True when some of its commands are goals."""
+        return bool(self._controller.Goals)
+
     def takes_goal(self, kind: str) -> bool:
         """Return whether a command of this name is a goal."""
         return kind in self._controller.Goals

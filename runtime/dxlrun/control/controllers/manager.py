@@ -526,6 +526,8 @@ class Manager:
             topics=self._topics,
         )
         managed.configure(self._plugins)
+        if managed.has_goals:
+            self._goals.open(self._topics)
         return managed
 
 
