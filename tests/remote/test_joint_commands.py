@@ -1,0 +1,154 @@
+"""Joints by name: what is made of them and of the newest goals, for each kind of controller."""
+
+import json
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+import dxlrun
+from dxlrun.control.controllers.plugins import Offer, PlugIns
+from dxlrun.control.loop_plan import ControllerPlan, JointPlan
+from dxlrun.remote.preparation import Preparation
+from dxlrun_controllers import group
+from dxlrun_controllers.joint_trajectory_controller import JointTrajectoryController
+
+JOINTS = (
+    JointPlan("pan", -1.0, 1.0, 2.0, effort=0.5),
+    JointPlan("tilt", -1.0, 1.0, 0.25, effort=0.5),
+)
+
+
+class Points(dxlrun.CommandModel):
+    points: list[dict[str, float | list[float]]]
+    start_in: float
+
+
+class Whole(dxlrun.Controller[dxlrun.ParametersModel]):
+    """Takes trajectories of all its joints."""
+
+    Commands: ClassVar = {"trajectory": Points}
+
+    @classmethod
+    def interfaces(cls, parameters, joints):
+        return dxlrun.Interfaces(joints, ("position",))
+
+    @classmethod
+    def prepare(cls, kind, command, parameters):
+        (point,) = command.points
+        return np.array([command.start_in, point["time"], *point["positions"]])
+
+    def update(self, time_ns, period_ns):
+        pass
+
+
+TYPES = {
+    "positions": group.JointGroupPositionController,
+    "posvel": group.JointGroupPosVelController,
+    "poseffort": group.JointGroupPosEffortController,
+    "velocities": group.JointGroupVelocityController,
+    "efforts": group.JointGroupEffortController,
+    "pwm": group.JointGroupPwmController,
+    "trajectory": JointTrajectoryController,
+    "whole": Whole,
+}
+
+
+def plan_of(kind):
+    parameters = {} if kind == "whole" else {"joints": ["pan", "tilt"]}
+    names = ("pan", "tilt")
+    return ControllerPlan(kind, kind, "tests 1", json.dumps(parameters), names, (), (), True, 1)
+
+
+@pytest.fixture
+def head(desk):
+    """The desk with one controller of each type, of both joints; pan is sent to 0.25 rad, tilt to -0.5."""
+    plugins = PlugIns({kind: Offer(kind, cls, "tests 1") for kind, cls in TYPES.items()}, {})
+    desk.gateway._preparation = Preparation({joint.name: joint for joint in JOINTS}, plugins)
+    desk.app = desk.gateway.app()
+    loaded = type(next(iter(desk.link.controllers.values())))
+    desk.link.controllers = {kind: loaded(plan_of(kind), 0) for kind in TYPES}
+    for array in (*desk.record.goals.values, desk.record.states.position):
+        array.fill(np.nan)
+    desk.record.goals.position[:] = [0.25, -0.5]
+    desk.finish_cycle()
+    return desk
+
+
+def send(head, controller, interface, values, query="?units=true"):
+    status, answer = head.ask("POST", f"/controllers/{controller}/commands/{interface}{query}", values)
+    return status, answer, head.taken[-1] if head.taken else None
+
+
+@pytest.mark.parametrize(
+    ("controller", "interface", "values", "data"),
+    [
+        ("positions", "position", {"pan": "0.5rad"}, [0.5, -0.5]),
+        ("positions", "positions", {"tilt": "0 deg", "pan": "0 deg"}, [0.0, 0.0]),
+        ("posvel", "position", {"pan": "0.5 rad"}, [0.5, -0.5, 0.5, 0.25]),
+        ("posvel", "velocity", {"pan": "1 rad/s"}, [0.25, -0.5, 1.0, 0.25]),
+        ("poseffort", "position", {"pan": "0.5 rad"}, [0.5, -0.5, 0.5, 0.5]),
+        ("velocities", "velocity", {"pan": "1 rad/s"}, [1.0, 0.0]),
+        ("efforts", "effort", {"tilt": 0.25}, [0.0, 0.25]),
+        ("pwm", "pwm", {"tilt": 0.25}, [0.0, 0.25]),
+        ("whole", "position", {"pan": "0.5 rad"}, [0.0, 0.5, 0.5, -0.5]),
+        ("whole", "position", {"tilt": "0 rad"}, [0.0, 2.0, 0.25, 0.0]),
+    ],
+)
+def test_joints_that_are_not_named_keep_their_goals(head, controller, interface, values, data):
+    status, answer, taken = send(head, controller, interface, values)
+    assert status == 200, answer
+    assert taken.controller == controller
+    np.testing.assert_allclose(np.frombuffer(taken.data), data)
+
+
+def test_a_goal_that_is_not_known_is_the_position_that_was_read(head):
+    head.record.goals.position[1] = np.nan
+    head.record.states.position[1] = 0.125
+    head.finish_cycle()
+    assert np.frombuffer(send(head, "positions", "position", {"pan": "0 deg"})[2].data).tolist() == [0, 0.125]
+    head.record.states.position[1] = np.nan
+    head.finish_cycle()
+    status, answer, _ = send(head, "positions", "position", {"pan": "0 deg"})
+    assert (status, "the positions of tilt are not known yet" in answer["refused"]) == (422, True)
+
+
+def test_a_trajectory_gets_there_in_its_time(head):
+    _, _, taken = send(head, "whole", "position", {"pan": 0.5}, "?in=3")
+    np.testing.assert_allclose(np.frombuffer(taken.data), [0.0, 3.0, 0.5, -0.5])
+    status, answer, taken = send(head, "trajectory", "position", {"pan": "0.5 rad"}, "?units=true&in=3")
+    assert (status, taken.kind) == (200, "trajectory"), answer
+
+
+WRONG = [
+    ("positions", "position", {"pam": "0 deg"}, "", 404, "there is no joint pam; did you mean pan?"),
+    (
+        "positions",
+        "position",
+        {},
+        "",
+        422,
+        "position of positions names no joint; write for example pan=20deg",
+    ),
+    ("positions", "position", {"pan": 0.5}, "", 422, "pan: 0.5 has no unit"),
+    ("positions", "position", {"pan": "soon"}, "", 422, "pan: 'soon' is not an angle"),
+    ("positions", "velocity", {"pan": "1 rad/s"}, "", 404, "joints of positions take position"),
+    ("whole", "velocity", {"pan": "1 rad/s"}, "", 404, "joints of whole take position"),
+    ("positions", "position", {"pan": "80 deg"}, "", 422, "pan is sent to 80 deg, outside its limits"),
+    ("posvel", "velocity", {"tilt": "1 rad/s"}, "", 422, "tilt is asked for 1 rad/s, more than 0.25 rad/s"),
+    ("positions", "position", {"pan": "0 deg"}, "&in=2", 422, "positions takes no time"),
+    ("whole", "position", {"pan": "0 deg"}, "&in=0", 422, "in is a time above 0 s"),
+    ("positions", "positions", {"positions": ["0 deg", "0 deg"]}, "&in=2", 422, "in is for joints by name"),
+    ("positions", "positions", {"positions": ["0 deg"]}, "", 422, "1 positions for 2 joints"),
+    ("positions", "posvel", {"pan": "0 deg"}, "", 404, "positions takes no command posvel"),
+    ("pwm", "pwm", {"pan": 1.5}, "", 422, "pwm"),
+    ("pwm", "pwm", {"pan": True}, "", 422, "pan is 'True', but must be a finite number"),
+]
+
+
+@pytest.mark.parametrize("wrong", WRONG, ids=[f"{one[0]} {one[1]} {one[2]}" for one in WRONG])
+def test_what_does_not_fit_is_refused_with_one_sentence(head, wrong):
+    controller, interface, values, query, status, sentence = wrong
+    found, answer, taken = send(head, controller, interface, values, f"?units=true{query}")
+    assert (found, sentence in answer["refused"]) == (status, True), answer
+    assert taken is None
