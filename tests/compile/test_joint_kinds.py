@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+import msgspec
 import pytest
 
 from dxlrun.compile import Compiled
 from dxlrun.compile.plan import from_json, to_json
+from dxlrun.control.loop_plan import JointPlan
 from dxlrun.description.modes import Mode
 from dxlrun.errors import Problem
 
@@ -79,3 +81,48 @@ def test_an_effort_limit_in_another_unit_than_the_model_measures(
 def test_what_is_no_effort(problems_in: ProblemsIn, limit: str) -> None:
     (problem,) = problems_in(TEXT.replace("800 mA", limit))
     assert "0.3 Nm, 800 mA or 40 %" in str(problem)
+
+
+ACCELERATED = TEXT.replace("limits: {effort: 800 mA}", "limits: {velocity: 4 rad/s, acceleration: A}")
+
+
+def test_a_speed_that_the_file_does_not_give_is_the_servos_own(compile_text: Compile) -> None:
+    wheel, arm = compile_text(ACCELERATED.replace("A}", "20 rad/s^2}")).plan.loop.joints
+    assert wheel.velocity == wheel.top_speed > 6.0
+    assert (wheel.acceleration, arm.velocity, arm.acceleration) == (None, 4.0, 20.0)
+
+
+def test_a_plan_of_the_time_before_acceleration_limits_has_neither_limit() -> None:
+    old = msgspec.json.decode(
+        b'{"name":"j","lower":-1,"upper":1,"velocity":null,"top_speed":8.0}', type=JointPlan
+    )
+    assert (old.velocity, old.acceleration) == (None, None)
+
+
+@pytest.mark.parametrize(
+    ("acceleration", "says", "column"),
+    [
+        ("0 rad/s^2", "greater than 0", 121),
+        ("-20 rad/s^2", "greater than 0", 121),
+        ("20 rad/s", "rad/s^2", 121),
+        ("0.3 rad/s^2", "arm would need 13.3 s to reach 4 rad/s, and as long to stop", 121),
+        ("1e300 rad/s^2", "limits nothing: arm may reach its highest speed, 4 rad/s, within one cycle", 121),
+        ("20 rad/s^2, jerk: 100 rad/s^3", "jerk", 121),
+    ],
+)
+def test_accelerations_that_limit_nothing_or_everything(
+    problems_in: ProblemsIn, acceleration: str, says: str, column: int
+) -> None:
+    found = problems_in(ACCELERATED.replace("A}", f"{acceleration}}}"))
+    (problem,) = [one for one in found if "arm" in str(one) or one.mark.line == 7]
+    assert says in str(problem)
+    assert problem.mark.line == 7
+    assert problem.mark.column >= column - 20
+
+
+def test_a_joint_that_brakes_longer_than_the_end_of_a_run_lasts(problems_in: ProblemsIn) -> None:
+    text = ACCELERATED.replace("A}", "1 rad/s^2}") + "policies: {on_exit: hold}\n"
+    (problem,) = problems_in(text)
+    assert str(problem).startswith("robot.yaml:7:") or problem.mark.line == 7
+    assert "arm may take 4 s to stop before on_exit holds it" in str(problem)
+    assert problems_in(text.replace("on_exit: hold", "on_exit: hold, exit_timeout: 6 s")) == ()

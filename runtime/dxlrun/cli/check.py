@@ -136,17 +136,27 @@ def _joints(joints: Sequence[JointRow]) -> Table:
     def interval(lower: float, upper: float) -> str:
         return f"{degrees(lower, signed=True)}..{degrees(upper, signed=True)}"
 
-    efforts = any(row.effort is not None for row in joints)
+    def own(text: str, source: str) -> str:
+        return f"{text} (servo)" if source == "servo" else text
+
+    def effort(row: JointRow) -> str:
+        if row.effort is None:
+            return "none"
+        return own(f"{row.effort:g} {row.effort_unit}".rstrip(), row.effort_source)
+
+    accelerations = any(row.acceleration is not None for row in joints)
+    efforts = any(row.effort_source == "file" for row in joints)
     columns = [
         *(Column(name, "name") for name in ("joint", "bus", "model", "mode")),
         Column("ID"),
         Column("reference"),
         Column("direction", form="{:+d}"),
         *numbers("limits", "reach"),
-        Column("velocity limit", form="{}/s", missing="none"),
+        *numbers("velocity"),
+        *numbers(*["acceleration"] * accelerations),
         *numbers(*["effort limit"] * efforts),
     ]
-    rows = [
+    rows: list[tuple[Value, ...]] = [
         (
             row.name,
             row.bus,
@@ -155,10 +165,11 @@ def _joints(joints: Sequence[JointRow]) -> Table:
             row.id,
             degrees(row.reference),
             row.direction,
-            interval(row.lower, row.upper) if row.bounded else "none",
+            own(interval(row.lower, row.upper), row.position_source) if row.bounded else "none",
             interval(row.reach_lower, row.reach_upper) if row.bounded else "continuous",
-            None if row.velocity is None else degrees(row.velocity),
-            *["none" if row.effort is None else f"{row.effort:g} {row.effort_unit}".rstrip()] * efforts,
+            "none" if row.velocity is None else own(f"{degrees(row.velocity)}/s", row.velocity_source),
+            *["none" if row.acceleration is None else f"{degrees(row.acceleration)}/s^2"] * accelerations,
+            *[effort(row)] * efforts,
         )
         for row in joints
     ]

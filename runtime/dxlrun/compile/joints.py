@@ -36,6 +36,8 @@ MANY_TURNS = {1.0: 7, 2.0: 256}
 """Turns that a goal position can be away from raw 0, by protocol: Multi-turn Mode of MX (e-Manual MX-64, Goal
 Position (30): -28,672..28,672), Extended Position Control Mode (e-Manual XM430-W350, Goal Position (116):
 -1,048,575..1,048,575)."""
+MOST_STARTING_S = 10.0
+"""A joint that needs longer to its highest speed, and to stop from it, is one with a mistaken unit. [i]"""
 _SAME = math.radians(1.0)
 """References nearer than this are taken as equal: a horn has teeth, a trim has not."""
 _TURNING = ("revolute", "continuous")
@@ -88,13 +90,16 @@ def compile_joints(
                 name,
                 allowed.lower,
                 allowed.upper,
-                joint.limits.velocity,
+                # the servo cannot go faster: a goal that does not run ahead of it is one that can be stopped
+                joint.limits.velocity or table.top_speed or None,
                 effort,
                 joint.continuous,
                 bounded=not joint.continuous or joint.limits.position is not None,
                 top_speed=table.top_speed or None,
                 top_effort=_top_effort(table, continuous=joint.continuous),
+                acceleration=joint.limits.acceleration,
             )
+            _check_acceleration(description, plan, problems)
             compiled[name] = CompiledJoint(plan, joint, table, reach, registers)
     return compiled
 
@@ -192,6 +197,28 @@ def _effort(
             f"write it in {_UNITS[table.effort_unit]}, such as {_EXAMPLES[table.effort_unit]}",
         )
     return value
+
+
+def _check_acceleration(description: Description, plan: JointPlan, problems: Problems) -> None:
+    """Compare an acceleration limit with the highest speed of its joint, and with the cycle."""
+    speed, acceleration, rate = plan.highest_speed, plan.acceleration, description.robot.loop.rate
+    if acceleration is None or not math.isfinite(speed):
+        return
+    mark = description.marks.value("joints", plan.name, "limits", "acceleration")
+    seconds = speed / acceleration
+    if seconds > MOST_STARTING_S:
+        problems.error(
+            mark,
+            f"{plan.name} would need {seconds:.3g} s to reach {speed:.3g} rad/s, and as long to stop",
+            f"allow at least {speed / MOST_STARTING_S:.2g} rad/s^2",
+        )
+    elif seconds * rate <= 1:
+        problems.warning(
+            mark,
+            f"{acceleration:.4g} rad/s^2 limits nothing: {plan.name} may reach its highest speed, "
+            f"{speed:.3g} rad/s, within one cycle of {1e3 / rate:.3g} ms",
+            f"write less than {speed * rate:.3g} rad/s^2, or take it out",
+        )
 
 
 def _top_effort(table: ControlTable, *, continuous: bool) -> float | None:

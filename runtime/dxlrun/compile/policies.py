@@ -45,6 +45,8 @@ def compile_policies(
             _check_torque(description, name, buses, problems)
         if found[name].steps and found[name].longest_ns > limit_ns:
             _too_long(description, found[name], name, limit_ns, problems)
+        if found[name].last == "hold" and (name in ("on_exit", "on_fault") or not found[name].goes_on):
+            _check_stopping(description, name, joints, limit_ns - found[name].longest_ns, problems)
     return PolicyPlan(
         on_exit=found["on_exit"],
         on_fault=found["on_fault"],
@@ -107,7 +109,9 @@ def _pose(step: PoseStep, angles: Mapping[str, float], joints: Mapping[str, Comp
         if name in joints:
             plan = joints[name].plan
             speed = step.speed if plan.velocity is None else min(step.speed, plan.velocity)
-            longest = max(longest, longest_pose_ns(max(plan.upper - angle, angle - plan.lower), speed))
+            way = max(plan.upper - angle, angle - plan.lower)
+            ramps = () if plan.acceleration is None else (plan.acceleration, plan.highest_speed)
+            longest = max(longest, longest_pose_ns(way, speed, *ramps))
     return Step(
         text=f"pose {step.pose} at {degrees(step.speed)} deg/s",
         longest_ns=longest,
@@ -130,6 +134,25 @@ def _check_torque(
                 description.marks.value("policies", name),
                 f"{name} reduces torque, but the {servo.model} of {servo.joint} has no torque limit in RAM",
                 "take reduce_torque out",
+            )
+
+
+def _check_stopping(
+    description: Description,
+    name: PolicyName,
+    joints: Mapping[str, CompiledJoint],
+    left_ns: int,
+    problems: Problems,
+) -> None:
+    """Refuse joints that brake longer than a policy lasts that leaves them holding."""
+    for joint in (joint.plan for joint in joints.values()):
+        stop_s = 0.0 if joint.acceleration is None else joint.highest_speed / joint.acceleration
+        if stop_s * 1e9 > left_ns:
+            problems.error(
+                description.marks.value("joints", joint.name, "limits", "acceleration"),
+                f"{joint.name} may take {stop_s:.2g} s to stop before {name} holds it, but of "
+                f"exit_timeout {max(left_ns, 0) * 1e-9:.2g} s are left",
+                "raise exit_timeout, or allow more acceleration",
             )
 
 

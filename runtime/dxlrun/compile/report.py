@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -12,6 +13,9 @@ from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.control.policy_plan import POLICIES, PolicyPlan
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, ReadWay
+
+Source = Literal["file", "servo", "none"]
+"""Where a limit is from."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,10 +31,18 @@ class JointRow:
     lower: float
     """The limit that the gate keeps: the file's, cut to the reach."""
     upper: float
+    position_source: Source
+    """`servo`: the reach of the servo; `none`: a wheel."""
     velocity: float | None
-    """rad/s; None: no limit in the file."""
+    """rad/s; None: not known."""
+    velocity_source: Source
+    """`servo`: its top speed, as the control table's data have it."""
+    acceleration: float | None
+    """rad/s^2; None: no limit in the file."""
     effort: float | None
-    """In `effort_unit`; None: no limit in the file."""
+    """In `effort_unit`; None: the servo follows none."""
+    effort_source: Source
+    """`servo`: its highest goal."""
     effort_unit: str
     """As the model measures effort: Nm, A, or empty for the fraction of its maximum."""
     reach_lower: float
@@ -168,14 +180,22 @@ def _joint_row(joint: CompiledJoint, mode: Mode) -> JointRow:
         direction=described.direction,
         lower=joint.plan.lower,
         upper=joint.plan.upper,
+        position_source=_source(described.limits.position, joint.plan.bounded),
         velocity=joint.plan.velocity,
-        effort=joint.plan.effort,
+        velocity_source=_source(described.limits.velocity, joint.plan.velocity is not None),
+        acceleration=joint.plan.acceleration,
+        effort=None if math.isinf(joint.plan.highest_effort) else joint.plan.highest_effort,
+        effort_source=_source(described.limits.effort, joint.plan.top_effort is not None),
         effort_unit=joint.table.effort_unit.replace("1", ""),
         reach_lower=joint.reach.lower,
         reach_upper=joint.reach.upper,
         bounded=joint.plan.bounded,
         mode=mode.name.lower().replace("_", " "),
     )
+
+
+def _source(written: object, servo: bool) -> Source:
+    return "file" if written is not None else "servo" if servo else "none"
 
 
 def _controller_row(plan: ControllerPlan, rate: float) -> ControllerRow:

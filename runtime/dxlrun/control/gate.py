@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.control.acceleration import Ramps, braking_speed
 from dxlrun.control.loop_plan import JointPlan, LoopPlan
 from dxlrun.control.policy_plan import SLOW_SPEED, SLOW_START_NS
 from dxlrun.description.modes import Mode
@@ -15,13 +16,16 @@ from dxlrun.run.channels.events import EventCode, EventSink, Severity
 
 BRAKING_S = 0.1
 """A joint in velocity mode may come nearer to a position limit by as much of the way that is left in this
-time, so it comes to rest there; [i] several times what a servo takes to follow (XM430: some 20 ms)."""
+time, so it comes to rest there, and with an acceleration limit this is how long a velocity counts to act
+until the next one; [i] several times what a servo takes to follow (XM430: some 20 ms)."""
 FULL_PWM = 1.0
+_SEEN = 1e-9
+"""rad; a goal that is less behind its command was not held back: what a sum of steps is off by rounding."""
 
 _WHAT = {
     Clamp.LOWER: "raised to the lower position limit",
     Clamp.UPPER: "lowered to the upper position limit",
-    Clamp.STEP: "held to the step limit",
+    Clamp.STEP: "held to the step or acceleration limit",
     Clamp.VELOCITY: "held to the velocity limit",
     Clamp.NOT_FINITE: "was not finite, the last goal is kept",
     Clamp.EFFORT: "held to the effort limit",
@@ -46,8 +50,10 @@ class Gate:
       flagged.
     - Positions are clamped to the joint's limits. A goal that starts outside of them (the present position of
       a joint that hangs there) may stay or move toward them, never further out.
-    - The step from the last goal is at most `limits.velocity * dt` where the file gives a velocity, and in
-      the first second after `ease_in` at most SLOW_SPEED * dt.
+    - The step from the last goal is at most `limits.velocity * dt`, which is the servo's top speed where the
+      file gives none, and in the first second after `ease_in` at most SLOW_SPEED * dt.
+    - With `limits.acceleration` the step changes by at most `acceleration * dt^2` from cycle to cycle, also
+      when commands are withdrawn: see Ramps. It is never so long that the goal could not stop at the limit.
     - The commanded speed is taken as a magnitude and clamped to `limits.velocity` and the servo's top speed;
       NaN stays NaN: as fast as the servo can. No speed outlives the command that it came with.
     - A joint without torque that is not commanded has the position where it stands.
@@ -64,13 +70,15 @@ class Gate:
         self._events = events
         self._lower = _finite(joint.lower for joint in joints)  # so that infinity is beyond every limit
         self._upper = _finite(joint.upper for joint in joints)
-        speeds = [np.inf if joint.velocity is None else joint.velocity for joint in joints]
-        self._speed = np.array(speeds, dtype=np.float64)
+        self._speed = np.array([_or_inf(joint.velocity) for joint in joints])
         self._slow = np.minimum(self._speed, SLOW_SPEED)
         self._slow_ns = np.full(count, SLOW_START_NS, dtype=np.int64)
         """For how long each joint is slow."""
         self._longest_slow_ns = SLOW_START_NS
         self._drive = DriveGate(joints, self._flag)
+        self._ramps = Ramps(joints)
+        self._own_speed = np.array([_or_inf(joint.top_speed) for joint in joints])
+        """Steps at the servos' own top speed hold nothing back, so nothing is flagged."""
         self._modes = np.zeros(count, dtype=np.uint8)
         self._led = np.ones(count, dtype=np.bool_)
         """Joints that are led to positions."""
@@ -88,10 +96,15 @@ class Gate:
         self._low, self._high = self._least[0], self._most[0]
         self._speeds, self._position_given = self._commanded[1], self._given[0]
         self._step, self._reach = np.empty(count), np.empty(count)
-        self.begin()
+        self._wanted = np.empty(count)
+        self._take_modes()
 
     def begin(self) -> None:
-        """Take the joints' modes as they are: their goals belong to them already."""
+        """Take the joints' modes and goals as they are: they belong together, and the goals are at rest."""
+        self._take_modes()
+        self._ramps.rest(np.ones(len(self._modes), dtype=np.bool_), self._record.goals.position)
+
+    def _take_modes(self) -> None:
         np.copyto(self._modes, self._record.states.mode)
         np.logical_or(self._modes == Mode.POSITION, self._modes == Mode.EFFORT_POSITION, out=self._led)
         self._any_led = bool(self._led.any())
@@ -106,13 +119,14 @@ class Gate:
         if modes.tobytes() == self._modes.tobytes():
             return
         changed = modes != self._modes
-        self.begin()
+        self._take_modes()
         record, goals = self._record, self._record.goals
         goals.values[:, changed] = np.nan
         np.copyto(goals.position, record.states.position, where=changed & self._led)
         for mode, interface in _NEUTRAL.items():
             values = getattr(goals, interface)
             values[changed & (modes == mode)] = 0.0
+        self._ramps.rest(changed, goals.position)
         self.ease_in(np.flatnonzero(changed).tolist())
 
     def ease_in(self, rows: Sequence[int] | None = None) -> None:
@@ -178,12 +192,36 @@ class Gate:
         np.logical_and(np.not_equal(inside, commanded, cut), given, cut)
         moved = self._position_given
         if np.count_nonzero(cut):
-            self._flag_cut(goal)
+            self._flag_cut(goal, speed)
             moved = moved & np.isfinite(commanded[0])  # infinity keeps the last goal
+        if self._ramps.any:
+            moved = self._ramp(goal, moved, speed, max(dt_ns, 1) * 1e-9)
         np.copyto(goals.values[:2], inside, where=moved)
 
-    def _flag_cut(self, goal: Floats) -> None:
-        """Flag why commands were cut; an infinite speed becomes NaN, as if none was commanded."""
+    def _ramp(self, goal: Floats, moved: NDArray[np.bool_], speed: Floats, dt: float) -> NDArray[np.bool_]:
+        """Let the goals change their velocity within the acceleration limits; return which move."""
+        wanted, inside, ramps = self._wanted, self._inside, self._ramps
+        np.copyto(wanted, goal)
+        np.copyto(wanted, inside[0], where=moved)
+        if ramps.passes(goal, wanted, dt):
+            return moved
+        # not held to the step limit yet: the goal must know how far it is to go to begin to brake in time
+        given = np.clip(self._commanded[0], np.fmin(self._lower, goal), np.fmax(self._upper, goal))
+        np.copyto(wanted, given, where=moved)
+        toward = np.where(moved, inside[1], np.nan)
+        stepped = ramps.steer(goal, wanted, np.minimum(speed, self._own_speed), toward, dt)
+        rows = ramps.limited & self._led
+        held = rows & moved & (np.abs(stepped - wanted) > _SEEN)
+        self._flag(held, Clamp.STEP)
+        np.copyto(inside[0], stepped, where=rows)
+        np.copyto(inside[1], self._record.goals.velocity, where=rows & ~moved)
+        return moved | rows
+
+    def _flag_cut(self, goal: Floats, highest: Floats) -> None:
+        """Flag why commands were cut; an infinite speed becomes NaN, as if none was commanded.
+
+        `highest`, rad/s: of each joint in this cycle.
+        """
         position, speed = self._commanded
         infinite = self._position_given & np.isinf(position)
         finite = self._position_given & ~infinite
@@ -194,7 +232,8 @@ class Gate:
         lower, upper = np.fmin(self._lower, goal), np.fmax(self._upper, goal)
         self._flag(finite & (position < lower), Clamp.LOWER)
         self._flag(finite & (position > upper), Clamp.UPPER)
-        self._flag(finite & (self._inside[0] != np.clip(position, lower, upper)), Clamp.STEP)
+        held = finite & (highest < self._own_speed) & ~self._ramps.limited
+        self._flag(held & (self._inside[0] != np.clip(position, lower, upper)), Clamp.STEP)
 
     def _flag(self, rows: NDArray[np.bool_] | _Rows, bit: Clamp) -> None:
         self._record.clamped[rows] |= np.uint8(bit)
@@ -215,6 +254,10 @@ class Gate:
         return "no controller"
 
 
+def _or_inf(limit: float | None) -> float:
+    return np.inf if limit is None else limit
+
+
 def _finite(limits: Iterable[float]) -> Floats:
     most = np.finfo(np.float64).max
     return np.clip(np.array(list(limits), dtype=np.float64), -most, most)
@@ -227,13 +270,29 @@ class DriveGate:
       goes nowhere by itself when it is not commanded any more.
     - Velocities are cut to the speed that the gate gives, efforts to `limits.effort`, PWM to full voltage;
       all of them to what the servo has.
-    - Within position limits: a velocity that leads outward becomes smaller toward the limit and is 0 there;
+    - With `limits.acceleration` a velocity changes by at most `acceleration * dt` a cycle, also when it is
+      not commanded any more; faster only at a position limit, for a joint that did not follow its goals.
+    - Within position limits: a velocity that leads outward becomes smaller toward the limit and is 0 there,
+    in
+      proportion to what is left, and with an acceleration limit so that it can brake (`braking_speed`);
       an effort or a PWM that leads outward is 0 from the limit on. Where the position is not known, each of
       them is 0. A wheel (a joint that is not `bounded`) has none of this.
     - In mode EFFORT_POSITION the effort is a limit: its magnitude counts, NaN keeps the last one.
     """
 
-    __slots__ = ("_effort", "_flag", "_free", "_limiting", "_lower", "_rows", "_speed", "_upper", "any")
+    __slots__ = (
+        "_accelerates",
+        "_acceleration",
+        "_effort",
+        "_flag",
+        "_free",
+        "_limiting",
+        "_lower",
+        "_rows",
+        "_speed",
+        "_upper",
+        "any",
+    )
 
     def __init__(self, joints: Sequence[JointPlan], flag: Callable[[_Rows, Clamp], None]) -> None:
         """`flag` notes what was done to the commands of some rows."""
@@ -245,6 +304,8 @@ class DriveGate:
         self._effort = np.array([joint.highest_effort for joint in joints])
         self._speed = np.array([joint.highest_speed for joint in joints])
         self._free = np.array([not joint.bounded for joint in joints], dtype=np.bool_)
+        self._acceleration = np.array([_or_inf(joint.acceleration) for joint in joints])
+        self._accelerates = bool(np.isfinite(self._acceleration).any())
         none = np.empty(0, dtype=np.intp)
         self._rows: dict[Mode, _Rows] = dict.fromkeys(_DRIVEN, none)
         self._limiting = none
@@ -271,6 +332,8 @@ class DriveGate:
             rows = self._rows[mode]
             if rows.size:
                 values = self._bounded(rows, commanded[rows], most[rows], clamp)
+                if mode == Mode.VELOCITY and self._accelerates:
+                    values = self._ramped(rows, commanded[rows], values, goal[rows], dt_ns)
                 goal[rows] = self._inward(rows, values, states.position[rows], mode, dt_ns)
         if self._limiting.size:
             self._limit(commands.effort, goals.effort)
@@ -287,12 +350,27 @@ class DriveGate:
         self._flag(rows[beyond], clamp)
         return np.clip(values, -most, most)
 
+    def _ramped(self, rows: _Rows, commanded: Floats, values: Floats, last: Floats, dt_ns: int) -> Floats:
+        """Return the velocities that the acceleration allows from the last ones on."""
+        before, change = (
+            np.where(np.isnan(last), 0.0, last),
+            self._acceleration[rows] * (max(dt_ns, 1) * 1e-9),
+        )
+        ramped: Floats = np.minimum(np.maximum(values, before - change), before + change)
+        self._flag(rows[(ramped != values) & np.isfinite(commanded)], Clamp.STEP)
+        return ramped
+
     def _inward(self, rows: _Rows, values: Floats, position: Floats, mode: Mode, dt_ns: int) -> Floats:
         """Return the values without what leads out of the position limits."""
         above, below = self._upper[rows] - position, position - self._lower[rows]  # NaN where not known
         if mode == Mode.VELOCITY:
             seconds = max(BRAKING_S, 2e-9 * dt_ns)  # a slow loop sees late how near it came
-            up, down = np.fmax(above, 0.0) / seconds, np.fmax(below, 0.0) / seconds
+            up, down = np.fmax(above, 0.0), np.fmax(below, 0.0)
+            if self._accelerates:
+                limit = self._acceleration[rows]
+                up, down = braking_speed(up, seconds, limit), braking_speed(down, seconds, limit)
+            else:
+                up, down = up / seconds, down / seconds
         else:
             up, down = np.where(above > 0, np.inf, 0.0), np.where(below > 0, np.inf, 0.0)
         up[self._free[rows]] = down[self._free[rows]] = np.inf

@@ -47,7 +47,8 @@ class JointPlan:
     """rad; the tighter one of the file's limit and the servo's reach"""
     upper: float
     velocity: float | None
-    """rad/s; None: no limit in the file"""
+    """rad/s; the servo's top speed where the file gives none; None: not known either, or a log of the time
+    before acceleration limits, which replays without one"""
     effort: float | None = None
     """Nm, A or the fraction of maximum, as the model measures it; None: no limit in the file"""
     continuous: bool = False
@@ -59,6 +60,8 @@ class JointPlan:
     """The servo's own, rad/s; None: not known."""
     top_effort: float | None = None
     """The highest goal that the servo has, in the unit of `effort`; None: it has none, or it is not known."""
+    acceleration: float | None = None
+    """rad/s^2, by which goals may become faster and slower; None: no limit in the file"""
 
     @property
     def highest_speed(self) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -24,15 +25,20 @@ SETTLE_NS = 300_000_000
 """A joint that has had its pose as goal for so long and is not there is blocked, too weak, or lost."""
 
 
-def longest_pose_ns(distance: float, speed: float) -> int:
+def longest_pose_ns(
+    distance: float, speed: float, acceleration: float = math.inf, highest_speed: float = 0.0
+) -> int:
     """Return how long a pose takes at the most from `distance` rad away at `speed` rad/s, ns.
 
-    The gate lets nothing go faster than SLOW_SPEED in the first second, and a run may be stopped in it.
+    The gate lets nothing go faster than SLOW_SPEED in the first second, and a run may be stopped in it. With
+    a finite acceleration, rad/s^2, a goal of `highest_speed` comes to rest first, which takes v / a; its way
+    then takes at most distance / v + v / a, whether it reaches its speed or not.
     """
     slow_s = SLOW_START_NS * 1e-9
     slow = min(speed, SLOW_SPEED)
     left = max(0.0, distance - slow * slow_s)
-    return round((min(distance, slow * slow_s) / slow + left / speed) * 1e9) + SETTLE_NS
+    ramps_s = (highest_speed + speed) / acceleration if math.isfinite(acceleration) else 0.0
+    return round((min(distance, slow * slow_s) / slow + left / speed + ramps_s) * 1e9) + SETTLE_NS
 
 
 @dataclass(frozen=True, slots=True)

@@ -42,8 +42,9 @@ class SafeMotion:
     """A policy under way; `over` when its last step has ended, or its time has.
 
     Joints that would not hold still, and those that a pose moves, are brought into other modes first; joints
-    in velocity mode stand from the first cycle on.
-    A pose: goals move toward it at the step's speed, from where they are, and it is reached STAND_NS later if
+    in velocity mode stand from the first cycle on, those with an acceleration limit as soon as it lets them.
+    A pose: goals move toward it at the step's speed, from where they are (the gate lets those with an
+    acceleration limit begin and end within it), and it is reached STAND_NS later if
     the joints are there, or SETTLE_NS later. Less torque: so many times within the step's time a smaller
     limit, from the servos' own one down to `fraction` of it.
     """
@@ -64,15 +65,24 @@ class SafeMotion:
     _modes: NDArray[np.uint8] = field(init=False)
     """That joints need first; UNKNOWN: any will do."""
     _wait_ns: int = field(default=0, init=False)
-    """How long the steps wait for modes, and for joints in velocity mode to stand."""
+    """How long the steps wait for modes, and for joints to stand."""
+    _stand_ns: int = field(init=False)
+    """How long joints are given to stand before the robot holds."""
+    _reach: Floats = field(init=False)
+    """How far ahead of a goal its command may be, as a part of the step's way in a cycle."""
 
     def __post_init__(self) -> None:
         now = self.record.states.mode.tolist()
         self._modes = np.array(
             [self._needed(row, Mode(mode)) for row, mode in enumerate(now)], dtype=np.uint8
         )
-        turning = self.policy.last == "hold" and Mode.VELOCITY in now
-        self._wait_ns = MODES_NS if self._modes.any() else STAND_NS if turning else 0
+        stops_s = [0.0 if j.acceleration is None else j.highest_speed / j.acceleration for j in self.joints]
+        holds = self.policy.last == "hold"
+        self._stand_ns = STAND_NS + round(min(max(stops_s) * 1e9, self.limit_ns) if holds else 0)
+        standing_ns = self._stand_ns if holds and (Mode.VELOCITY in now or max(stops_s) > 0) else 0
+        self._wait_ns = max(MODES_NS if self._modes.any() else 0, standing_ns)
+        # one that brakes within its limit must know its target, not only the next step to it
+        self._reach = np.array([1.0 if joint.acceleration is None else np.inf for joint in self.joints])
         self.over = not self.policy.steps and not self._wait_ns
 
     def begin(self) -> None:
@@ -116,7 +126,7 @@ class SafeMotion:
         if not self._wait_ns:
             return False
         away = (self._modes != Mode.UNKNOWN) & (self._modes != self.record.states.mode)
-        if now_ns - self._began_ns < (self._wait_ns if away.any() else STAND_NS):
+        if now_ns - self._began_ns < (self._wait_ns if away.any() else self._stand_ns):
             return True
         self._wait_ns = 0
         self._step_ns = now_ns
@@ -142,7 +152,7 @@ class SafeMotion:
             )
             lasted_ns = now_ns - self._there_ns
             return lasted_ns >= SETTLE_NS or (lasted_ns >= STAND_NS and not away.any())
-        reach = step.speed * max(record.period_ns, 1) * 1e-9
+        reach = self._reach * (step.speed * max(record.period_ns, 1) * 1e-9)
         np.copyto(commands.position, goal + np.clip(target - goal, -reach, reach), where=named)
         commands.velocity[named] = step.speed
         return False

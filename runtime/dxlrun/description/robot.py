@@ -19,6 +19,7 @@ from dxlrun.description.bus import Bus
 from dxlrun.description.form import Form, Name, refuse
 from dxlrun.description.units import (
     Angle,
+    AngularAcceleration,
     AngularVelocity,
     AutoDuration,
     Duration,
@@ -128,7 +129,12 @@ class Limits(Form):
         examples=["[-90 deg, 90 deg]"],
     )
     velocity: Annotated[AngularVelocity, Field(gt=0)] | None = Field(
-        default=None, description="Highest speed.", examples=["2 rad/s"]
+        default=None, description="Highest speed; none: the servo's own.", examples=["2 rad/s"]
+    )
+    acceleration: Annotated[AngularAcceleration, Field(gt=0)] | None = Field(
+        default=None,
+        description="By how much goals may become faster or slower; none: as much as commanded.",
+        examples=["20 rad/s^2"],
     )
     effort: Effort | None = Field(
         default=None,

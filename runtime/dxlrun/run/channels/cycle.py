@@ -178,7 +178,7 @@ class Clamp(IntFlag):
     UPPER = 2
     """Lowered to the upper position limit."""
     STEP = 4
-    """The change since the last goal was cut to the step limit."""
+    """The change since the last goal was cut to the step limit, or to what the acceleration limit allows."""
     VELOCITY = 8
     """The velocity was cut to the velocity limit."""
     NOT_FINITE = 16

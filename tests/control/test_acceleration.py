@@ -1,0 +1,285 @@
+"""Acceleration limits of the gate: goals in every mode, by exact simulation, with times that are not even."""
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from dxlrun.control.gate import BRAKING_S, Gate
+from dxlrun.control.loop_plan import ControllerPlan, JointPlan, LoopPlan, SchedulerPlan
+from dxlrun.control.policy_plan import SLOW_START_NS
+from dxlrun.description.modes import Mode
+from dxlrun.run.channels.cycle import Clamp, CycleLayout, CycleRecord
+
+DT_NS = 10_000_000
+DT = DT_NS * 1e-9
+LED = (Mode.POSITION, Mode.EFFORT_POSITION)
+
+
+class Rig:
+    """One joint of -1..1 rad with an acceleration limit, followed cycle by cycle."""
+
+    def __init__(self, mode=Mode.POSITION, *, acceleration=10.0, start=0.0, eased=True, **joint):
+        limits = {"lower": -1.0, "upper": 1.0, "velocity": 6.0, "top_speed": 8.0} | joint
+        self.joint = JointPlan("j", **limits, acceleration=acceleration)
+        controller = ControllerPlan("a", "t", "d 1", "{}", ("j",), ("position",), (), True, 1)
+        plan = LoopPlan(DT_NS, SchedulerPlan("other", 31, False), (self.joint,), (controller,), (), None)
+        self.record = CycleRecord(CycleLayout(("j",), ("a",)))
+        self.record.active = 1
+        self.record.states.mode[:] = mode
+        self.record.states.position[:] = start
+        self.record.goals.position[:] = start
+        self.texts = []
+        self.gate = Gate(plan, self.record, self)
+        self.gate.begin()
+        self.velocity = 0.0
+        if eased:
+            self.apply(dt_ns=SLOW_START_NS)
+
+    def emit(self, code, severity, source, text, data=b""):
+        self.texts.append(text)
+
+    def apply(self, dt_ns=DT_NS, **commands):
+        """Command for a cycle; return position and velocity of the goal."""
+        self.record.commands.clear()
+        for name, value in commands.items():
+            getattr(self.record.commands, name)[:] = value
+        before = float(self.record.goals.position[0])
+        self.gate.enter_modes()
+        self.gate.apply(self.record.commands, self.record.goals, dt_ns)
+        goal = float(self.record.goals.position[0])
+        self.velocity = (goal - before) / (dt_ns * 1e-9)
+        return goal, self.velocity
+
+    @property
+    def clamped(self):
+        return Clamp(int(self.record.clamped[0]))
+
+
+any_command = st.floats(-3, 3) | st.just(np.nan) | st.just(np.inf)
+uneven = st.integers(DT_NS // 4, 4 * DT_NS)
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    mode=st.sampled_from(LED),
+    acceleration=st.floats(1, 500),
+    velocity=st.floats(0.5, 8),
+    start=st.floats(-1, 1),
+    cycles=st.lists(st.tuples(any_command, st.integers(1, 15), uneven), min_size=1, max_size=12),
+)
+@example(Mode.POSITION, 10.0, 6.0, 0.0, [(3.0, 15, DT_NS), (3.0, 15, 4 * DT_NS), (-3.0, 15, DT_NS)])
+def test_goals_change_their_speed_within_the_limit_and_never_leave_the_position_limits(
+    mode, acceleration, velocity, start, cycles
+):
+    rig = Rig(mode, acceleration=acceleration, velocity=velocity, start=start)
+    before = 0.0
+    for position, count, dt_ns in cycles:
+        for number in range(count):
+            dt = dt_ns * (1 + number % 3) * 1e-9
+            goal, now = rig.apply(dt_ns * (1 + number % 3), position=position, velocity=np.nan)
+            assert -1.0 <= goal <= 1.0
+            assert abs(now - before) <= acceleration * dt * (1 + 1e-6) + 1e-9
+            assert abs(now) <= velocity * (1 + 1e-6) + 1e-9
+            before = now
+
+
+@pytest.mark.parametrize("dt_ns", [1_000_000, 7_000_000, 20_000_000])
+@pytest.mark.parametrize("target", [0.9, 1.0, -0.5, 0.0003])
+def test_a_step_ends_at_its_target_without_overshoot_in_the_time_that_it_needs(dt_ns, target):
+    rig = Rig()
+    goals = []
+    while len(goals) < 3 or goals[-1] != goals[-3]:
+        goals.append(rig.apply(dt_ns, position=target)[0])
+        assert len(goals) * dt_ns < 3e9
+    assert goals[-1] == pytest.approx(target, abs=1e-9)
+    assert max(np.abs(goals)) <= abs(target) + 1e-9
+    arrived_s = int(np.argmax(np.abs(np.array(goals) - target) < 1e-3)) * dt_ns * 1e-9
+    assert arrived_s <= 2 * np.sqrt(abs(target) / 10.0) + 5 * dt_ns * 1e-9  # bang-bang
+
+
+def test_a_motion_within_the_limit_passes_as_it_is():
+    rig = Rig()
+    times = np.arange(300) * DT
+    wanted = 0.9 * np.sin(times * 2.0 - np.pi / 2) + 0.9 * 1.0 - 0.9  # at most 3.6 rad/s^2
+    rig = Rig(start=wanted[0])
+    for one in wanted:
+        assert rig.apply(position=one)[0] == one
+        assert rig.clamped == 0
+    assert rig.texts == []
+
+
+def test_withdrawn_commands_let_the_goal_come_to_rest_and_hold():
+    rig = Rig(lower=-9.0, upper=9.0)
+    for _ in range(30):
+        moving = rig.apply(position=8.0)
+    speeds = [rig.apply()[1] for _ in range(60)]
+    assert moving[1] == pytest.approx(10.0 * 30 * DT)
+    assert np.diff([moving[1], *speeds[:29]]) == pytest.approx(-10.0 * DT)
+    assert speeds[31:] == [0.0] * 29
+    assert rig.clamped == 0
+
+
+def test_another_command_on_the_way_turns_the_goal_round_within_the_limit():
+    rig = Rig(lower=-9.0, upper=9.0)
+    speeds = [rig.apply(position=8.0)[1] for _ in range(40)] + [
+        rig.apply(position=-8.0)[1] for _ in range(60)
+    ]
+    assert np.abs(np.diff(speeds)).max() == pytest.approx(10.0 * DT)
+    assert speeds[-1] < -1
+
+
+def test_a_speed_toward_the_position_holds_for_the_goal_too():
+    rig = Rig()
+    speeds = [rig.apply(position=1.0, velocity=0.5)[1] for _ in range(100)]
+    assert max(speeds) == pytest.approx(0.5)
+    assert rig.record.goals.velocity[0] == 0.5
+    rig.apply()
+    assert rig.record.goals.velocity[0] == 0.5, "no command: the speed stays, too"
+
+
+def test_what_is_held_back_is_flagged_once():
+    rig = Rig()
+    rig.apply(position=0.5)
+    rig.apply(position=0.5)
+    assert rig.clamped == Clamp.STEP
+    assert rig.texts == ["j, controller a: held to the step or acceleration limit"]
+
+
+def test_a_goal_outside_of_the_limits_may_go_in_and_never_further_out():
+    rig = Rig(start=1.3)
+    assert rig.apply(position=2.0)[0] == 1.3
+    goals = [rig.apply(position=0.9)[0] for _ in range(100)]
+    assert max(goals) <= 1.3
+    assert goals[-1] == pytest.approx(0.9)
+
+
+def test_goals_that_were_set_anew_begin_at_rest():
+    rig = Rig(lower=-9.0, upper=9.0)
+    for _ in range(30):
+        rig.apply(position=8.0)
+    rig.record.goals.position[:] = -1.0  # torque was off, the joint was moved by hand
+    goal, velocity = rig.apply(position=8.0)
+    assert velocity == pytest.approx(10.0 * DT)
+    assert goal == pytest.approx(-1.0 + 10.0 * DT * DT)
+
+
+def test_a_change_of_mode_begins_at_rest():
+    rig = Rig(Mode.VELOCITY, bounded=False)
+    rig.apply(velocity=1.0)
+    rig.record.states.mode[:] = Mode.POSITION
+    rig.record.states.position[:] = 0.2
+    assert rig.apply()[0] == 0.2
+    goal, velocity = rig.apply(position=0.9)
+    assert (goal, velocity) == (pytest.approx(0.201), pytest.approx(0.1))
+
+
+def test_a_joint_without_the_limit_beside_one_with_it_is_as_before():
+    joints = (JointPlan("slow", -1, 1, 6.0, acceleration=10.0), JointPlan("fast", -1, 1, None, top_speed=8.0))
+    controller = ControllerPlan("a", "t", "d 1", "{}", ("slow", "fast"), ("position",), (), True, 1)
+    plan = LoopPlan(DT_NS, SchedulerPlan("other", 31, False), joints, (controller,), (), None)
+    record = CycleRecord(CycleLayout(("slow", "fast"), ("a",)))
+    record.states.mode[:] = Mode.POSITION
+    record.goals.position[:] = 0.0
+    rig = Rig()
+    gate = Gate(plan, record, rig)
+    gate.apply(record.commands, record.goals, SLOW_START_NS)
+    record.commands.position[:] = 0.7
+    record.commands.velocity[:] = 0.3
+    gate.apply(record.commands, record.goals, DT_NS)
+    assert record.goals.position.tolist() == [pytest.approx(10.0 * DT * DT), 0.7]
+    assert record.goals.velocity.tolist() == [0.3, 0.3]
+    record.commands.clear()
+    gate.apply(record.commands, record.goals, DT_NS)
+    assert record.goals.position[1] == 0.7
+    assert record.clamped.tolist() == [0, 0]
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    acceleration=st.floats(1, 500),
+    start=st.floats(-1, 1),
+    cycles=st.lists(
+        st.tuples(st.floats(-9, 9) | st.just(np.nan), st.integers(1, 20)), min_size=1, max_size=12
+    ),
+    uneven=st.lists(st.integers(1, round(BRAKING_S * 1e9)), min_size=1, max_size=7),
+)
+def test_a_joint_that_follows_its_velocity_never_passes_a_limit_nor_brakes_harder_than_the_limit(
+    acceleration, start, cycles, uneven
+):
+    rig = Rig(Mode.VELOCITY, acceleration=acceleration, start=start)
+    place, before, number = start, 0.0, 0
+    for velocity, count in cycles:
+        for _ in range(count):
+            dt_ns = uneven[number % len(uneven)]
+            number += 1
+            place += before * dt_ns * 1e-9  # what was sent acts until this cycle
+            assert -1 - 1e-9 <= place <= 1 + 1e-9
+            rig.record.states.position[:] = place
+            rig.apply(dt_ns, velocity=velocity)
+            now = float(rig.record.goals.velocity[0])
+            assert abs(now) <= 6.0
+            assert abs(now - before) <= acceleration * dt_ns * 1e-9 * (1 + 1e-6) + 1e-9
+            before = now
+
+
+def test_a_velocity_that_is_withdrawn_becomes_zero_within_the_limit():
+    rig = Rig(Mode.VELOCITY, bounded=False)
+    for _ in range(40):
+        rig.apply(velocity=2.0)
+    speeds = []
+    for _ in range(40):
+        rig.apply()
+        speeds.append(float(rig.record.goals.velocity[0]))
+    assert np.diff([2.0, *speeds[:20]]) == pytest.approx(-0.1)
+    assert speeds[20:] == [0.0] * 20
+    assert rig.clamped == 0
+
+
+def test_an_unfollowing_joint_is_stopped_at_its_limit_at_once():
+    rig = Rig(Mode.VELOCITY)
+    for _ in range(40):
+        rig.apply(velocity=3.0)
+    rig.record.states.position[:] = 1.0
+    rig.apply(velocity=3.0)
+    assert rig.record.goals.velocity[0] == 0.0
+    assert rig.clamped == Clamp.OUTWARD
+
+
+@pytest.mark.parametrize("mode", [Mode.EFFORT, Mode.PWM])
+def test_effort_and_pwm_know_no_acceleration(mode):
+    rig = Rig(mode)
+    rig.apply(effort=0.4, pwm=0.4)
+    assert getattr(rig.record.goals, "effort" if mode == Mode.EFFORT else "pwm")[0] == 0.4
+
+
+def test_a_joint_that_is_driven_toward_its_limit_brakes_within_the_acceleration():
+    rig = Rig(Mode.VELOCITY, acceleration=5.0)
+    place, speeds = 0.0, [0.0]
+    for _ in range(400):
+        place += speeds[-1] * DT
+        rig.record.states.position[:] = place
+        rig.apply(velocity=9.0)
+        speeds.append(float(rig.record.goals.velocity[0]))
+    assert np.abs(np.diff(speeds)).max() == pytest.approx(5.0 * DT)
+    assert place == pytest.approx(1.0, abs=1e-6)
+    assert max(speeds) > 1.5
+
+
+def test_commands_that_move_are_caught_up_with_and_followed_without_a_lag():
+    rig = Rig(lower=-9.0, upper=9.0)
+    for number in range(1, 150):
+        command = 2.0 * number * DT
+        goal, _ = rig.apply(position=command)
+    assert goal == command
+
+
+def test_a_mode_that_comes_back_where_the_goal_was_begins_at_rest():
+    rig = Rig(lower=-9.0, upper=9.0)
+    for _ in range(20):
+        goal, _ = rig.apply(position=8.0)
+    rig.record.states.position[:] = goal
+    for mode in (Mode.UNKNOWN, Mode.POSITION):
+        rig.record.states.mode[:] = mode
+        assert rig.apply()[0] == goal or mode == Mode.UNKNOWN
+    assert rig.apply() == (goal, 0.0)
