@@ -46,7 +46,16 @@ if TYPE_CHECKING:
         Refused,
         StartUpError,
     )
-    from dxlrun.remote.client import GoalState, RemoteGoal, RemoteRobot, Stream, connect, running
+    from dxlrun.remote.client import (
+        GoalState,
+        RemoteGoal,
+        RemoteRobot,
+        Stream,
+        TopicMessage,
+        TopicState,
+        connect,
+        running,
+    )
     from dxlrun.run.channels.cycle import Commands, Floats, States
 
 __all__ = [
@@ -86,6 +95,8 @@ __all__ = [
     "StartUpError",
     "States",
     "Stream",
+    "TopicMessage",
+    "TopicState",
     "connect",
     "hookimpl",
     "running",
@@ -129,7 +140,16 @@ _ROOMS = {
         "StartUpError",
     ),
     "dxlrun.run.channels.cycle": ("Commands", "Floats", "States"),
-    "dxlrun.remote.client": ("GoalState", "RemoteGoal", "RemoteRobot", "Stream", "connect", "running"),
+    "dxlrun.remote.client": (
+        "GoalState",
+        "RemoteGoal",
+        "RemoteRobot",
+        "Stream",
+        "TopicMessage",
+        "TopicState",
+        "connect",
+        "running",
+    ),
 }
 _HOME = {name: room for room, names in _ROOMS.items() for name in names}
 

@@ -12,7 +12,20 @@ import pytest
 PAGE = (Path(__file__).parents[2] / "docs" / "commands.md").read_text()
 SECTIONS: dict[str, str] = dict(re.findall(r"^## ([^\n]+)\n(.*?)(?=^## |\Z)", PAGE, re.M | re.S))
 RUN = "dxlrun ROBOT.yaml"
-STEER = {"send", "cancel", "parameters", "switch", "set", "rate", "pause", "resume", "load", "unload", "stop"}
+STEER = {
+    "send",
+    "echo",
+    "cancel",
+    "parameters",
+    "switch",
+    "set",
+    "rate",
+    "pause",
+    "resume",
+    "load",
+    "unload",
+    "stop",
+}
 EVERYWHERE = {"--debug", "--json", "--robot"}
 """Options that the page describes once."""
 Dxlrun = Callable[..., Any]

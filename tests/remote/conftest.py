@@ -24,7 +24,7 @@ from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
 from dxlrun.run.channels.events import LONGEST_EVENT, EventRing
 from dxlrun.run.channels.heartbeat import Heartbeat, Phase
 from dxlrun.run.channels.mailbox import Mailbox
-from dxlrun.run.channels.messages import LONGEST_RECORD
+from dxlrun.run.channels.messages import LONGEST_RECORD, MessageRing
 
 PERIOD_NS = 20_000_000
 
@@ -147,6 +147,8 @@ class Desk:
         self.clock = SimpleNamespace(now_ns=lambda: 7_000_000_000)
         self.events = EventRing(ring.RingWriter(memory.events), self.clock)
         self.guardian_events = EventRing(ring.RingWriter(memory.guardian), self.clock)
+        self.message_ring = ring.RingWriter(memory.messages)
+        self.messages = MessageRing(self.message_ring)
         self.link = Link(PLAN, memory)
         plugins = PlugIns({"arm": Offer("arm", Arm, "tests 1")}, {})
         self.gateway = GatewayApp(

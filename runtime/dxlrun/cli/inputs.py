@@ -34,6 +34,7 @@ COMMANDS_WHILE_IT_RUNS = {
     "send": "steering.steer:send",
     "cancel": "steering.goals:cancel",
     "parameters": "steering.parameters:parameters",
+    "echo": "steering.echo:echo",
     "rate": "steering.steer:rate",
     "pause": "steering.steer:pause",
     "resume": "steering.steer:resume",

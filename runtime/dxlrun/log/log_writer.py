@@ -66,7 +66,8 @@ class LogWriter:
         self._sequences: dict[int, int] = {}
         self._known: dict[str, int] = {}
         """Schemas by the names of their messages."""
-        self._topic_channels: list[int] = []
+        self._topic_channels: dict[int, int] = {}
+        """Channels of topics by their numbers."""
         self._takers: dict[int, Callable[[Payload], None]] = {
             RecordKind.CYCLE: self._cycle,
             RecordKind.PACKETS: self._packets,
@@ -250,13 +251,16 @@ class LogWriter:
 
     def _topic(self, payload: Payload) -> None:
         """Open the channel of a topic that has messages from now on."""
-        topic = decode_topic(payload)
-        self._topic_channels.append(self._channel(self._known, topic.name, topic.type))
+        number, topic = decode_topic(payload)
+        self._topic_channels[number] = self._channel(self._known, topic.name, topic.type)
 
     def _message(self, payload: Payload) -> None:
         """Write one message of a topic, as it is."""
         message = decode_message(payload)
-        self._add(self._topic_channels[message.topic], message.t_ns, message.data)
+        channel = self._topic_channels.get(message.topic)
+        if channel is None:
+            raise ValueError(f"a message is of topic number {message.topic}, which was not announced")
+        self._add(channel, message.t_ns, message.data)
 
     def _event_record(self, payload: Payload) -> None:
         self._write_event(decode_event(payload))

@@ -17,7 +17,7 @@ import select
 import socket
 import struct
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -26,7 +26,17 @@ from urllib.parse import quote
 from dxlrun.errors import DxlrunError, GoalTimeout, Refused
 from dxlrun.remote.sockets import MOST_BYTES, alive, running, sockets
 
-__all__ = ["Executed", "GoalState", "RemoteGoal", "RemoteRobot", "Stream", "connect", "running"]
+__all__ = [
+    "Executed",
+    "GoalState",
+    "RemoteGoal",
+    "RemoteRobot",
+    "Stream",
+    "TopicMessage",
+    "TopicState",
+    "connect",
+    "running",
+]
 
 TIMEOUT_S = 10.0
 """How long an answer may take: some two seconds, and six more for a switch that waits for modes."""
@@ -102,6 +112,39 @@ class RemoteGoal:
     def cancel(self) -> Executed:
         """Let its controller bring the joints to rest; the goal ends when they are."""
         return self.robot.cancel(self.number)
+
+
+@dataclass(frozen=True, slots=True)
+class TopicState:
+    """A topic of a running robot."""
+
+    name: str
+    """`/CONTROLLER/TOPIC`, `/goals`, `/events`, `/joint_states`."""
+    type: str
+    """As ROS 2 writes it: `nav_msgs/msg/Odometry`."""
+    joints: tuple[str, ...]
+    """Whose rows its arrays have; empty: of none."""
+    count: int
+    """Messages so far."""
+    rate: float | None
+    """Hz; None: not known yet."""
+
+
+@dataclass(frozen=True, slots=True)
+class TopicMessage:
+    """A message of a topic, as it was received."""
+
+    topic: str
+    number: int
+    """Counted from 1 by the robot."""
+    time: float
+    """s of the run's clock"""
+    message: dict[str, object]
+    """Its fields; numbers that are none (NaN, infinite) are None."""
+    lost: int
+    """Messages that were not received between this one and the one before, because this end was too slow."""
+    joints: tuple[str, ...] = ()
+    """Whose rows its arrays have; empty: of none."""
 
 
 class _Connection(http.client.HTTPConnection):
@@ -196,6 +239,61 @@ class RemoteRobot:
     def events(self, after: int = 0) -> dict[str, object]:
         """Return what happened since event number `after`, as far as it is kept, and the last number."""
         return self._ask("GET", f"/events?after={after}")
+
+    # Topics
+
+    def topics(self) -> list[TopicState]:
+        """Return what there is to listen to."""
+        rows = self._ask("GET", "/topics").get("topics")
+        return [_topic_state(row) for row in rows] if isinstance(rows, list) else []
+
+    def newest(self, topic: str) -> TopicMessage | None:
+        """Return the newest message of a topic; None when it had none yet."""
+        found = self._messages(topic, "")
+        return found[-1] if found else None
+
+    def listen(self, topic: str, rate: float | None = None) -> Iterator[TopicMessage]:
+        """Return the messages of a topic as they come, from the newest on, until the run ends.
+
+        Every message comes, unless this end is slower than the topic: `lost` counts what is missing then.
+        With `rate` (Hz) at most so many a second come, the newest each time. Raises Refused for an unknown
+        topic.
+        """
+        last, query = 0, ""
+        while True:
+            began = time.monotonic()
+            try:
+                found = self._messages(topic, query)
+            except Refused:
+                raise
+            except DxlrunError:
+                if alive(self._path):
+                    raise
+                return
+            new = [message for message in found if message.number > last]
+            for message in new if rate is None else new[-1:]:
+                last = message.number
+                yield message
+            query = f"?after={last}&wait={_POLL_S:g}"
+            if rate is not None and new:
+                time.sleep(max(0.0, began + 1 / rate - time.monotonic()))
+                query = ""
+
+    def _messages(self, topic: str, query: str) -> list[TopicMessage]:
+        answer = self._ask("GET", f"/topics/{quote(topic.lstrip('/'))}{query}")
+        rows, joints, lost = answer.get("messages"), answer.get("joints"), answer.get("lost")
+        names = tuple(map(str, joints)) if isinstance(joints, list) else ()
+        return [
+            TopicMessage(
+                topic=str(answer.get("topic")),
+                number=int(row["number"]),
+                time=float(row["time"]),
+                message=row["message"],
+                lost=lost if index == 0 and isinstance(lost, int) else 0,
+                joints=names,
+            )
+            for index, row in enumerate(rows if isinstance(rows, list) else [])
+        ]
 
     # Goals
 
@@ -399,6 +497,17 @@ class RemoteRobot:
                 wrong_input=response.status in _WRONG_INPUT,
             )
         return answer
+
+
+def _topic_state(row: Mapping[str, object]) -> TopicState:
+    joints, count, rate = row.get("joints"), row.get("count"), row.get("rate")
+    return TopicState(
+        name=str(row.get("name", "")),
+        type=str(row.get("type", "")),
+        joints=tuple(map(str, joints)) if isinstance(joints, list) else (),
+        count=count if isinstance(count, int) else 0,
+        rate=float(rate) if isinstance(rate, int | float) else None,
+    )
 
 
 def _goal_state(row: Mapping[str, object]) -> GoalState:

@@ -3,6 +3,7 @@
     GET  /robot                                 the run, its controllers and the commands that they take
     GET  /states                                the newest cycle
     GET  /events?after=N                        what happened since event N
+    GET  /topics, GET /topics/NAME?after=N&wait=2        all of them; messages behind number N, or the newest
     POST /controllers/NAME/commands/KIND        a typed command; ?units=true: quantities with their units
     POST /controllers/NAME/commands/position?in=2 {JOINT: ...}   some joints by name; in: s, of a trajectory
     POST /controllers/NAME/set-points/KIND      one of a stream; the newest wins; ?lease=0.2 (seconds)
@@ -71,7 +72,8 @@ BODY_S = 10.0
 LEASE_S = (0.01, 0.2, 60.0)
 """Shortest, default and longest time that a set-point of a stream counts."""
 LONGEST_WAIT_S = 5.0
-"""For the end of a goal; a client that waits longer asks again."""
+"""For the end of a goal, or a message; a client that waits longer asks again."""
+_LOOK_S = 0.01
 _ENDING_S = 0.5
 """How long the results of goals may take when the run ends."""
 LONGEST_WAY_S = 3600.0
@@ -86,6 +88,7 @@ _STATUS = {
     Code.UNKNOWN_PAGE: 404,
     Code.UNLOADED: 404,
     Code.UNKNOWN_GOAL: 404,
+    Code.UNKNOWN_TOPIC: 404,
     Code.UNKNOWN_PARAMETER: 404,
     Code.WRONG_METHOD: 405,
     Code.BODY_TIMEOUT: 408,
@@ -153,6 +156,8 @@ class GatewayApp:
             route("/robot", self.robot, "GET", looks),
             route("/states", self.states, "GET", looks),
             route("/events", self.events, "GET", looks),
+            route("/topics", self.topics, "GET", looks),
+            route("/topics/{name:path}", self.topic, "GET", looks),
             route("/goals", self.goals, "GET", looks),
             route("/goals/{number}", self.goal, "GET", looks),
             route("/goals/{number}/cancel", self.cancel, "POST", operations),
@@ -239,6 +244,19 @@ class GatewayApp:
         ]
         return _json({"events": rows, "last": newest})
 
+    async def topics(self, request: Request) -> Response:
+        """Return all topics, with their types and rates."""
+        return _json({"topics": self._link.topic_states()})
+
+    async def topic(self, request: Request) -> Response:
+        """Return the messages behind number `after`, without it the newest; `wait` so long for one, s."""
+        wait = waiting(request)
+        after = int(number(request, "after", 0.0)) if "after" in request.query_params else None
+        topic, until = f"/{request.path_params['name']}", time.monotonic() + wait
+        while not (found := self._link.messages(topic, after)).messages and time.monotonic() < until:
+            await asyncio.sleep(_LOOK_S)
+        return _json(found)
+
     async def goals(self, request: Request) -> Response:
         """Return the goals that run, and the last that ended."""
         book = self._link.goals
@@ -246,9 +264,7 @@ class GatewayApp:
 
     async def goal(self, request: Request) -> Response:
         """Return one goal; with `wait`, s, when it has ended or after that time."""
-        wanted = number(request, "wait", 0.0)
-        if not 0 <= wanted <= LONGEST_WAIT_S:
-            raise invalid(f"wait is 0 to {LONGEST_WAIT_S:g} s, not {wanted:g}")
+        wanted = waiting(request)
         chosen, link = _goal_number(request), self._link
         status = self._goal_status(chosen)
         if status.ended is None and link.heartbeat.phase is not Phase.RUNNING:
@@ -552,6 +568,14 @@ def number(request: Request, name: str, default: float) -> float:
     if not math.isfinite(value):
         raise invalid(f"{name}={str(text)[:40]} is no number")
     return value
+
+
+def waiting(request: Request) -> float:
+    """Return how long a client waits, s; raises RefusedRequest."""
+    wait = number(request, "wait", 0.0)
+    if not 0 <= wait <= LONGEST_WAIT_S:
+        raise invalid(f"wait is 0 to {LONGEST_WAIT_S:g} s, not {wait:g}")
+    return wait
 
 
 def peer(request: Request) -> str:

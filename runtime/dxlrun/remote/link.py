@@ -13,9 +13,11 @@ import msgspec
 
 from dxlrun.compile.plan import Plan
 from dxlrun.control.loop_plan import ControllerPlan
+from dxlrun.log.schemas import EVENT_TOPIC, JOINT_STATES_TOPIC
 from dxlrun.remote.goals import GoalBook
 from dxlrun.remote.job import Descriptors
 from dxlrun.remote.preparation import RefusedRequest
+from dxlrun.remote.topics import LiveTopics, Messages, TopicState, events_after, joint_states
 from dxlrun.run.channels.answers import Answer, Code, Done, Refusal, Waiting
 from dxlrun.run.channels.commands import LONGEST_COMMAND, LOOP, Command
 from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
@@ -76,6 +78,7 @@ class Link:
         self.heartbeat = Heartbeat(memory.heartbeat)
         self.controllers = {one.name: Loaded(one, place) for place, one in enumerate(plan.loop.controllers)}
         self.events: deque[tuple[int, Event]] = deque()
+        self.topics = LiveTopics(memory.messages)
         self.goals = GoalBook()
         self._cycles = RingReader(memory.cycles)
         joints = tuple(joint.name for joint in plan.loop.joints)
@@ -103,6 +106,28 @@ class Link:
         """Return whether a controller is active in the newest cycle."""
         record = self.newest()
         return record is not None and bool(record.active >> loaded.place & 1)
+
+    def topic_states(self) -> list[TopicState]:
+        """Return what there is to listen to: the loop's topics, its events, and the states of the joints."""
+        derived = (self._derived(name, None) for name in (EVENT_TOPIC, JOINT_STATES_TOPIC))
+        states = [TopicState(one.topic, one.type, one.joints, one.last, None) for one in derived if one]
+        return [*(one.state() for one in self.topics.topics.values()), *states]
+
+    def messages(self, topic: str, after: int | None) -> Messages:
+        """Return the messages of a topic behind this number; None: the newest. Raises RefusedRequest."""
+        if (live := self.topics.topics.get(topic)) is not None:
+            return live.after(after)
+        if (found := self._derived(topic, after)) is not None:
+            return found
+        known = ", ".join(one.name for one in self.topic_states())
+        raise RefusedRequest(Refusal(Code.UNKNOWN_TOPIC, {"topic": topic, "topics": known}))
+
+    def _derived(self, topic: str, after: int | None) -> Messages | None:
+        if topic == EVENT_TOPIC:
+            return events_after(self.events, after)
+        if topic == JOINT_STATES_TOPIC:
+            return joint_states(self.newest(), self._record.layout.joints, after)
+        return None
 
     # Commands
 
@@ -192,6 +217,7 @@ class Link:
         for number, answer in self._answers.new():
             if number in self._pending:  # else it answers a set-point of a stream
                 self._resolve(number, answer)
+        self.topics.collect()
         for ring in self._event_rings:
             while (record := ring.read()) is not None:
                 # the log reports gaps; packets and commands are for it alone

@@ -56,6 +56,7 @@ class Code(StrEnum):
     NOT_IN_PAUSE = "not_in_pause", "pause the loop first: it stands still meanwhile"
     UNLOADED = "unloaded", "{controller} was unloaded meanwhile"
     # goals and parameters
+    UNKNOWN_TOPIC = "unknown_topic", "there is no topic {topic}; there are {topics}"
     UNKNOWN_GOAL = "unknown_goal", "there is no goal {goal}; the newest is {last}"
     GOAL_ENDED = "goal_ended", "goal {goal} has ended already: {outcome}"
     CANCELLED_ALREADY = "cancelled_already", "goal {goal} is being cancelled already"

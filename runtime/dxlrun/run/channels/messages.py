@@ -22,7 +22,7 @@ LEAST_CAPACITY = 1 << 20
 MOST_CAPACITY = 64 << 20
 
 _HEADER = struct.Struct("<qIxxxx")
-"""Time, number of the topic; the message follows."""
+"""Time, number of the topic; the message follows, or of a topic what it is, as JSON."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +72,7 @@ class MessageRing:
         """Append a topic; return its number."""
         number = self._announced
         self._announced += 1
-        self._writer.append(RecordKind.TOPIC, msgspec.json.encode(topic))
+        self._writer.append(RecordKind.TOPIC, _HEADER.pack(0, number) + msgspec.json.encode(topic))
         return number
 
     def message(self, topic: int, t_ns: int, data: bytes) -> None:
@@ -91,9 +91,10 @@ class NoMessages:
         """Forget it."""
 
 
-def decode_topic(payload: Payload) -> Topic:
-    """Return the topic of a record. Raises ValueError when it is none."""
-    return msgspec.json.decode(bytes(payload), type=Topic)
+def decode_topic(payload: Payload) -> tuple[int, Topic]:
+    """Return number and topic of a record. Raises ValueError when it is none."""
+    record = decode_message(payload)
+    return record.topic, msgspec.json.decode(record.data, type=Topic)
 
 
 def decode_message(payload: Payload) -> TopicMessage:

@@ -1,0 +1,141 @@
+"""`dxlrun echo`: messages of a topic of a running robot, as they come."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, robot_of
+from dxlrun.errors import InputError
+from dxlrun.output.table import Column, Table
+from dxlrun.output.terminal import show, show_json, show_json_line
+
+if TYPE_CHECKING:
+    from dxlrun.remote.client import TopicMessage, TopicState
+
+_NAMES = ("name", "joint_names")
+"""Fields in which messages of ROS 2 name their joints."""
+
+
+def echo(
+    topic: str | None = None,
+    /,
+    *,
+    count: int | None = None,
+    rate: float | None = None,
+    chosen: Chosen = ONLY_ONE,
+) -> int:
+    """Print the messages of a topic of a running robot as they come: `dxlrun echo /arm/state`.
+
+    Without a topic, list those that there are. Ctrl-C ends it, and so does the end of the run.
+
+    Parameters
+    ----------
+    topic
+        Name of the topic; the first / may be left out.
+    count
+        End after so many messages.
+    rate
+        Print at most so many messages a second, the newest each time, Hz.
+    """
+    if count is not None and count < 1:
+        raise InputError(f"--count {count} is no number of messages; give 1 or more")
+    if rate is not None and not 0 < rate < math.inf:  # false for nan too
+        raise InputError(f"--rate {rate:g} is no rate; give a number of Hz above 0")
+    with robot_of(chosen, "echo") as robot:
+        if topic is None:
+            states = robot.topics()
+            if chosen.as_json:
+                show_json([_plain(state) for state in states])
+            else:
+                show(topics(states))
+            return 0
+        try:
+            for number, message in enumerate(robot.listen(topic, rate), 1):
+                print_message(message, as_json=chosen.as_json)
+                if number == count:
+                    break
+        except KeyboardInterrupt:
+            return 0  # how one ends it
+    return 0
+
+
+def topics(states: Sequence[TopicState]) -> Table:
+    """Return a row for each topic."""
+    columns = [
+        Column("topic", "name"),
+        Column("type", "text"),
+        Column("messages"),
+        Column("rate", form="{:.4g} Hz"),
+    ]
+    return Table.of("", columns, [(one.name, one.type, one.count, one.rate) for one in states])
+
+
+def _plain(state: TopicState) -> dict[str, object]:
+    return {
+        "name": state.name,
+        "type": state.type,
+        "joints": state.joints,
+        "count": state.count,
+        "rate": state.rate,
+    }
+
+
+def print_message(message: TopicMessage, *, as_json: bool) -> None:
+    """Print one message: JSON in one line, or its fields in lines of their own behind `---`."""
+    if as_json:
+        show_json_line(
+            {
+                "topic": message.topic,
+                "number": message.number,
+                "time": message.time,
+                "lost": message.lost,
+                "message": message.message,
+            }
+        )
+        return
+    lost = f", {message.lost} missed before it" if message.lost else ""
+    head = f"--- {message.topic} {message.number}, {message.time:.3f} s{lost}"
+    show("\n".join([head, *fields(message.message, message.joints)]))
+
+
+def fields(message: Mapping[str, object], joints: Sequence[str]) -> list[str]:
+    """Return the lines of a message; arrays with a row a joint have the joints' names in front."""
+    for name in _NAMES:
+        named = message.get(name)
+        if isinstance(named, list) and named and all(isinstance(one, str) for one in named):
+            joints = named
+    return list(_lines(message, joints, ""))
+
+
+def _lines(message: Mapping[str, object], joints: Sequence[str], indent: str) -> Iterator[str]:
+    for name, value in message.items():
+        if isinstance(value, Mapping):
+            yield f"{indent}{name}:"
+            yield from _lines(value, joints, f"{indent}  ")
+        elif not isinstance(value, list):
+            yield f"{indent}{name}: {_scalar(value)}"
+        elif any(isinstance(one, Mapping) for one in value):
+            yield f"{indent}{name}:"
+            for one in value:
+                first, *rest = _lines(one, joints, "") if isinstance(one, Mapping) else [_scalar(one)]
+                yield f"{indent}- {first}"
+                yield from (f"{indent}  {line}" for line in rest)
+        elif joints and len(value) == len(joints) and not any(isinstance(one, str) for one in value):
+            yield f"{indent}{name}:"
+            yield from (
+                f"{indent}  {joint}: {_scalar(one)}" for joint, one in zip(joints, value, strict=True)
+            )
+        else:
+            yield f"{indent}{name}: [{', '.join(map(_scalar, value))}]"
+
+
+def _scalar(value: object) -> str:
+    if value is None:
+        return "nan"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return str(value) if isinstance(value, int) else f'"{value}"' if value == "" else str(value)

@@ -1,0 +1,189 @@
+"""Live topics: the newest messages of the loop's topics, for clients that listen at their own pace.
+
+The last messages of each topic are kept, bounded, for all clients together: one that is slower than its topic
+misses some and is told how many, and the loop does not notice either.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from contextlib import suppress
+
+import msgspec
+import numpy as np
+
+from dxlrun.log.schemas import EVENT, EVENT_TOPIC, JOINT_STATE, JOINT_STATES_TOPIC
+from dxlrun.messages.cdr import Codec
+from dxlrun.run.channels.cycle import CycleRecord
+from dxlrun.run.channels.events import Event
+from dxlrun.run.channels.messages import Topic, TopicMessage, decode_message, decode_topic
+from dxlrun.run.channels.ring import Record, RecordKind, RingReader
+
+KEPT_MESSAGES = 512
+KEPT_BYTES = 1 << 20
+"""Of one topic: so many of its newest messages are kept, and so many bytes."""
+MOST_PER_ANSWER = 128
+"""Messages; a client asks again for what comes behind them."""
+ANSWER_BYTES = 256 * 1024
+"""Bytes of messages in one answer, before they become JSON."""
+
+
+class Message(msgspec.Struct, frozen=True):
+    """One message, for a client."""
+
+    number: int
+    """Counted from 1; what is missing was not kept long enough."""
+    time: float
+    """s of the run's clock"""
+    message: object
+
+
+class Messages(msgspec.Struct, frozen=True):
+    """What a client gets that listens to a topic."""
+
+    topic: str
+    type: str
+    joints: tuple[str, ...]
+    messages: list[Message]
+    last: int
+    """Where the client goes on."""
+    lost: int
+    """Messages between those it has and these that are not kept any more."""
+
+
+class TopicState(msgspec.Struct, frozen=True):
+    """A topic in the list of all."""
+
+    name: str
+    type: str
+    joints: tuple[str, ...]
+    count: int
+    """Messages so far."""
+    rate: float | None
+    """Of the kept messages, Hz; null: fewer than two."""
+
+
+class LiveTopic:
+    """The newest messages of one topic."""
+
+    __slots__ = ("_bytes", "_codec", "_kept", "count", "topic")
+
+    def __init__(self, topic: Topic, count: int = 0) -> None:
+        self.topic = topic
+        self.count = count
+        self._codec = Codec(topic.type)
+        self._kept: deque[TopicMessage] = deque()
+        self._bytes = 0
+
+    def keep(self, message: TopicMessage) -> None:
+        """Keep a message, and let go of the oldest."""
+        self.count += 1
+        self._kept.append(message)
+        self._bytes += len(message.data)
+        while len(self._kept) > KEPT_MESSAGES or (self._bytes > KEPT_BYTES and len(self._kept) > 1):
+            self._bytes -= len(self._kept.popleft().data)
+
+    def state(self) -> TopicState:
+        """Return what the list of topics has."""
+        rate = None
+        if len(self._kept) > 1 and (span_ns := self._kept[-1].t_ns - self._kept[0].t_ns) > 0:
+            rate = (len(self._kept) - 1) * 1e9 / span_ns
+        return TopicState(self.topic.name, self.topic.type.name, self.topic.joints, self.count, rate)
+
+    def after(self, number: int | None) -> Messages:
+        """Return the messages behind this number that are kept, at most as many as an answer has.
+
+        None: the newest one alone.
+        """
+        first = self.count - len(self._kept) + 1
+        begin = self.count if number is None else max(number + 1, first)
+        lost = 0 if number is None or number > self.count else max(0, begin - number - 1)
+        found: list[Message] = []
+        size, index = 0, max(begin, first)
+        while index <= self.count and len(found) < MOST_PER_ANSWER and size < ANSWER_BYTES:
+            message = self._kept[index - first]
+            size += len(message.data)
+            with suppress(ValueError):  # none of ours: the loop encodes them
+                found.append(Message(index, message.t_ns * 1e-9, plain(self._codec.unpack(message.data))))
+            index += 1
+        return Messages(
+            self.topic.name, self.topic.type.name, self.topic.joints, found, max(index - 1, 0), lost
+        )
+
+
+class LiveTopics:
+    """All topics of the loop; reads their ring."""
+
+    def __init__(self, memory: int) -> None:
+        self.topics: dict[str, LiveTopic] = {}
+        self._by_number: dict[int, LiveTopic] = {}
+        self._ring = RingReader(memory)
+
+    def collect(self) -> None:
+        """Take what has come; the log declares what was lost on the way."""
+        while (record := self._ring.read()) is not None:
+            if isinstance(record, Record):
+                with suppress(ValueError):
+                    self._take(record)
+
+    def _take(self, record: Record) -> None:
+        if record.kind == RecordKind.TOPIC:
+            number, topic = decode_topic(record.payload)
+            before = self.topics.get(topic.name)  # of a controller that was unloaded: numbers go on
+            opened = LiveTopic(topic, before.count if before else 0)
+            self.topics[topic.name] = self._by_number[number] = opened
+        elif record.kind == RecordKind.MESSAGE:
+            message = decode_message(record.payload)
+            if (live := self._by_number.get(message.topic)) is not None:
+                live.keep(message)
+
+
+def events_after(events: deque[tuple[int, Event]], number: int | None) -> Messages:
+    """Return events as messages of their topic."""
+    last = events[-1][0] if events else 0
+    begin = last if number is None else number + 1
+    first = events[0][0] if events else 1
+    chosen = [(n, event) for n, event in events if n >= begin][:MOST_PER_ANSWER]
+    found = [Message(n, event.t_ns * 1e-9, _event(event)) for n, event in chosen]
+    lost = 0 if number is None else max(0, first - number - 1)
+    return Messages(EVENT_TOPIC, EVENT.name, (), found, found[-1].number if found else last, lost)
+
+
+def _event(event: Event) -> Mapping[str, object]:
+    return {
+        "t_ns": event.t_ns,
+        "code": int(event.code),
+        "severity": int(event.severity),
+        "name": event.name,
+        "source": event.source,
+        "text": event.text,
+        "data": event.data.decode(errors="replace"),
+    }
+
+
+def joint_states(record: CycleRecord | None, joints: tuple[str, ...], number: int | None) -> Messages:
+    """Return the states of the newest cycle, as a message whose number is the cycle's, from 1."""
+    found: list[Message] = []
+    count = 0 if record is None else record.cycle + 1
+    if record is not None and (number is None or count > number):
+        states = record.states
+        message = {
+            "name": joints,
+            "position": plain(states.position),
+            "velocity": plain(states.velocity),
+            "effort": plain(states.effort),
+        }
+        found.append(Message(count, record.woken_ns * 1e-9, message))
+    return Messages(JOINT_STATES_TOPIC, JOINT_STATE.name, joints, found, max(count, number or 0), 0)
+
+
+def plain(value: object) -> object:
+    """Return a value of a message as JSON has it; numbers that are none (NaN, infinite) become null."""
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, Mapping):
+        return {name: plain(one) for name, one in value.items()}
+    if isinstance(value, list):
+        return [plain(one) for one in value]
+    return value
