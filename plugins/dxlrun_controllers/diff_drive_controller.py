@@ -10,12 +10,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field, TypeAdapter
+from pydantic import Field, TypeAdapter
 
 from dxlrun import (
     LIVE,
@@ -33,7 +32,8 @@ from dxlrun import (
     LinearVelocity,
     ParametersModel,
 )
-from dxlrun_controllers.joints import JointNames
+from dxlrun.messages import Header, Odometry
+from dxlrun_controllers.joints import JointNames, or_number
 from dxlrun_controllers.odometry import Pose, WheelAngles
 
 
@@ -92,34 +92,13 @@ class DiffDriveParameters(ParametersModel):
     """Name of the frame of the base, in which the twist is."""
 
 
-def _or_number(adapter: TypeAdapter[float]) -> BeforeValidator:
-    """Accept text with a unit beside a bare number, which is in SI units."""
-    return BeforeValidator(lambda value: adapter.validate_python(value) if isinstance(value, str) else value)
-
-
 class VelocityCommand(CommandModel):
     """A twist of the base in the plane, until the next one, at most for the time-out."""
 
-    linear: Annotated[float, _or_number(TypeAdapter(LinearVelocity))] = 0.0
+    linear: Annotated[float, or_number(TypeAdapter(LinearVelocity))] = 0.0
     """m/s, forward"""
-    angular: Annotated[float, _or_number(TypeAdapter(AngularVelocity))] = 0.0
+    angular: Annotated[float, or_number(TypeAdapter(AngularVelocity))] = 0.0
     """rad/s, to the left"""
-
-
-@dataclass(frozen=True, slots=True)
-class Odometry:
-    """Where the base is, and how fast."""
-
-    x: float
-    """m"""
-    y: float
-    """m"""
-    heading: float
-    """rad"""
-    linear: float
-    """m/s"""
-    angular: float
-    """rad/s"""
 
 
 class Ramp:
@@ -212,6 +191,9 @@ class DiffDriveController(Controller[DiffDriveParameters]):
         self._sides = slice(None, left), slice(left, None)
         self._linear, self._angular = Ramp(parameters.linear), Ramp(parameters.angular)
         self._pose = Pose()
+        self._message = Odometry(
+            header=Header(frame_id=parameters.frame), child_frame_id=parameters.child_frame
+        )
         self._twist = (0.0, 0.0)
         self._command = self._target = (0.0, 0.0)
         self._interval_ns = round(1e9 / parameters.odometry_rate)
@@ -340,5 +322,9 @@ class DiffDriveController(Controller[DiffDriveParameters]):
         self.context.say(f"odometry holds: no reply of {', '.join(silent)}")
 
     def _publish(self) -> None:
-        pose, (linear, angular) = self._pose, self._twist
-        self.context.publish("odometry", Odometry(pose.x, pose.y, pose.heading, linear, angular))
+        pose, (linear, angular), message = self._pose, self._twist, self._message
+        place, speed = message.pose.pose, message.twist.twist
+        place.position.x, place.position.y = pose.x, pose.y
+        place.orientation.z, place.orientation.w = math.sin(pose.heading / 2), math.cos(pose.heading / 2)
+        speed.linear.x, speed.angular.z = linear, angular
+        self.context.publish("odometry", message)

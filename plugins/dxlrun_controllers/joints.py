@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import Annotated, Self, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, Discriminator, Field, Tag, model_validator
+from pydantic import BaseModel, BeforeValidator, Discriminator, Field, Tag, TypeAdapter, model_validator
 
 from dxlrun import Context, Floats, ParametersModel
 
@@ -15,6 +15,11 @@ NotNegative = Annotated[float, Field(ge=0)]
 Positive = Annotated[float, Field(gt=0)]
 
 T = TypeVar("T")
+
+
+def or_number(adapter: TypeAdapter[float]) -> BeforeValidator:
+    """Let a field of a command accept text with a unit beside a bare number, which is in SI units."""
+    return BeforeValidator(lambda value: adapter.validate_python(value) if isinstance(value, str) else value)
 
 
 def _kind(value: object) -> str:

@@ -7,6 +7,7 @@ from typing import Any
 
 from dxlrun import CONTRACT_VERSION, Controller, hookimpl
 from dxlrun_controllers.diff_drive_controller import DiffDriveController
+from dxlrun_controllers.gripper_controller import GripperController
 from dxlrun_controllers.group import (
     JointGroupEffortController,
     JointGroupPosEffortController,
@@ -17,6 +18,7 @@ from dxlrun_controllers.group import (
 )
 from dxlrun_controllers.joint_state_broadcaster import JointStateBroadcaster
 from dxlrun_controllers.joint_trajectory_controller import JointTrajectoryController
+from dxlrun_controllers.keyframe_player import KeyframePlayer
 from dxlrun_controllers.leader_follower import LeaderFollower
 from dxlrun_controllers.pid_controller import PidController
 
@@ -32,6 +34,7 @@ def dxlrun_controllers() -> Mapping[str, type[Controller[Any]]]:
     """Return the standard controllers by their type in the robot file."""
     return {
         "diff_drive_controller": DiffDriveController,
+        "gripper_controller": GripperController,
         "joint_group_effort_controller": JointGroupEffortController,
         "joint_group_poseffort_controller": JointGroupPosEffortController,
         "joint_group_position_controller": JointGroupPositionController,
@@ -41,6 +44,7 @@ def dxlrun_controllers() -> Mapping[str, type[Controller[Any]]]:
         "joint_position_controller": PidController,
         "joint_state_broadcaster": JointStateBroadcaster,
         "joint_trajectory_controller": JointTrajectoryController,
+        "keyframe_player": KeyframePlayer,
         "leader_follower": LeaderFollower,
         "pid_controller": PidController,
     }

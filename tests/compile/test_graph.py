@@ -3,7 +3,9 @@
 # ruff: noqa: E501  lines of robot files
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 from pydantic import ValidationError
@@ -286,6 +288,12 @@ RIGHT = {
 @pytest.mark.parametrize("controllers", RIGHT.values(), ids=RIGHT)
 def test_what_is_right_is_accepted(problems_in: Find, controllers: str):
     assert problems_in(ROBOT + controllers) == ()
+
+
+def test_the_chain_of_the_page_is_right(problems_in: Find):
+    page = (Path(__file__).parents[2] / "docs" / "robot-file.md").read_text()
+    (chain,) = [text for text in re.findall(r"```yaml\n(.*?)```", page, re.DOTALL) if "into:" in text]
+    assert problems_in(ROBOT.replace("controllers:\n", "") + chain) == ()
 
 
 def test_all_mistakes_are_listed_at_once(problems_in: Find):

@@ -43,13 +43,15 @@ ROWS = {
 
 
 def test_the_examples_of_the_page_are_read(desk: Any) -> None:
-    robot, variant, motion = EXAMPLES
+    robot, variant, chain, motion = EXAMPLES
     assert set(desk.robot(robot, {"port": "/dev/ttyUSB0"}).robot.joints) == {
         "head_pitch_joint",
         "head_yaw_joint",
     }
     desk.write(robot, "two_joints.yaml")
     assert (desk.robot(variant).robot.name, desk.robot(variant).robot.loop.rate) == ("two_joints_slow", 10)
+    without = robot[: robot.index("controllers:")]
+    assert desk.robot(without + chain).robot.controllers["arm"].into == ("arm_pid",)
     assert len(desk.motion(motion).motion.motions) == 2
 
 

@@ -327,6 +327,24 @@ def test_messages_come_at_their_own_rate(mounted):
     assert {topic for topic, _ in robot.messages} == {"odometry"}
 
 
+def test_a_message_has_pose_and_twist_in_their_frames(mounted):
+    robot = mounted(
+        DiffDriveController, BASE | {"frame": "map", "child_frame": "base", "odometry": "command"}
+    )
+    robot.activate()
+    for _ in range(100):
+        robot.send("velocity", linear=0.2, angular=0.5)
+        robot.step()
+    (topic, message), pose = robot.messages[-1], robot.controller._pose
+    assert (topic, message.header.frame_id, message.child_frame_id) == ("odometry", "map", "base")
+    place, speed = message.pose.pose, message.twist.twist
+    assert (place.position.x, place.position.y, place.position.z) == (pose.x, pose.y, 0.0)
+    turned = place.orientation
+    assert 2 * math.atan2(turned.z, turned.w) == pytest.approx(pose.heading)
+    assert (turned.x, turned.y) == (0.0, 0.0)
+    assert (speed.linear.x, speed.angular.z) == (pytest.approx(0.2), pytest.approx(0.5))
+
+
 def test_after_a_long_time_turns_are_not_guessed():
     angles = WheelAngles(1, fastest=6.0, period_ns=20_000_000)
     assert angles.longest_ns == round(math.pi / 12 * 1e9)

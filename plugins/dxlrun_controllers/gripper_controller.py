@@ -1,0 +1,269 @@
+"""gripper_controller: closes and opens a gripper by goals, with a limited effort, and reports what it holds.
+
+A gripper that stands still short of its goal holds something: as in ROS 2's gripper controllers
+(control.ros.org, gripper_controllers: stall_velocity_threshold, stall_timeout, allow_stalling).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, TypeAdapter, model_validator
+
+from dxlrun import (
+    LIVE,
+    Angle,
+    AngularVelocity,
+    CommandModel,
+    Context,
+    Controller,
+    Duration,
+    Floats,
+    Goal,
+    Interfaces,
+    Length,
+    Outcome,
+    ParametersModel,
+)
+from dxlrun_controllers.joints import finite_or, hold, or_number
+
+STATE_NS = 50_000_000
+"""Between two messages of the topic, ns."""
+REST_NS = 1_000_000_000
+"""After a cancel, how long the gripper may take to come to rest, ns."""
+
+
+class Width(ParametersModel):
+    """How far the gripper is open at an angle of its joint."""
+
+    angle: Angle
+    width: Length
+
+
+class GripperParameters(ParametersModel):
+    """Keys of a gripper_controller in the robot file."""
+
+    joint: str
+    effort: Annotated[float, Field(gt=0)] | None = None
+    """The most that the servo may exert, in the unit that the model measures (Nm, A or the fraction of its
+    maximum), unless a goal has its own. Left out: the servo is in position mode, without such a limit."""
+    speed: Annotated[AngularVelocity, Field(gt=0), LIVE] = 2.0
+    """rad/s, at which it closes and opens"""
+    tolerance: Annotated[Angle, Field(gt=0)] = 0.02
+    """rad; nearer to its goal it has reached it"""
+    stall_speed: Annotated[AngularVelocity, Field(gt=0)] = 0.05
+    """rad/s; slower ..."""
+    stall_time: Annotated[Duration, Field(gt=0)] = 200_000_000
+    """... for so long, ns, and short of its goal, it is stalled"""
+    timeout: Annotated[Duration, Field(gt=0)] = 5_000_000_000
+    """ns; a goal that has neither been reached nor stalled then is missed"""
+    widths: tuple[Width, ...] = ()
+    """At least two, in between linear; without them goals and results are angles."""
+
+    @model_validator(mode="after")
+    def _one_to_one(self) -> Self:
+        if len(self.widths) == 1:
+            raise ValueError("one width makes no line; write at least two, such as open and closed")
+        ordered = sorted(self.widths, key=lambda point: point.angle)
+        steps = (
+            np.diff([[point.angle, point.width] for point in ordered], axis=0) if ordered else np.ones((1, 2))
+        )
+        if (steps[:, 0] == 0).any() or not ((steps[:, 1] > 0).all() or (steps[:, 1] < 0).all()):
+            raise ValueError("widths must all grow, or all shrink, with the angle; each angle stands once")
+        return self
+
+
+class GripCommand(CommandModel):
+    """A goal: an angle of the joint or a width, and perhaps the most effort on the way and at it."""
+
+    position: Annotated[float, or_number(TypeAdapter(Angle))] | None = None
+    """rad"""
+    width: Annotated[float, or_number(TypeAdapter(Length))] | None = None
+    """m"""
+    effort: Annotated[float, Field(gt=0)] | None = None
+    """In the unit that the model measures"""
+
+    @model_validator(mode="after")
+    def _one_goal(self) -> Self:
+        if (self.position is None) == (self.width is None):
+            raise ValueError("give either position or width")
+        return self
+
+
+@dataclass(frozen=True, slots=True)
+class GripperState:
+    """What the gripper does."""
+
+    position: float
+    """rad"""
+    width: float
+    """m; NaN without a table of widths"""
+    effort: float
+    """In the unit that the model measures"""
+    moving: bool
+    """True while it works on a goal"""
+    stalled: bool
+    """True from a stall until the next goal: it holds something"""
+
+
+class GripperController(Controller[GripperParameters]):
+    """Moves one joint to goals; a stall ends a goal as reached, and the gripper keeps its grip.
+
+    With a limit of effort it goes on pressing with it; without one, it holds the angle at which it stalled.
+    """
+
+    Parameters = GripperParameters
+    Commands: ClassVar[Mapping[str, type[CommandModel]]] = {"grip": GripCommand}
+    Goals: ClassVar[frozenset[str]] = frozenset({"grip"})
+    Topics: ClassVar[Mapping[str, type]] = {"state": GripperState}
+
+    @classmethod
+    def interfaces(cls, parameters: GripperParameters, joints: tuple[str, ...]) -> Interfaces:
+        """Claim position and velocity of the joint, and its effort where that is limited."""
+        limited = parameters.effort is not None
+        return Interfaces(
+            (parameters.joint,), ("position", "velocity", "effort") if limited else ("position", "velocity")
+        )
+
+    @classmethod
+    def prepare(cls, kind: str, command: CommandModel, parameters: GripperParameters) -> NDArray[np.float64]:
+        """Return angle, rad, and effort. Raises ValueError for a width, or an effort, that it cannot have."""
+        if not isinstance(command, GripCommand):
+            return super().prepare(kind, command, parameters)
+        if command.effort is not None and parameters.effort is None:
+            raise ValueError("its joint has no limit of effort; write one as `effort` in the robot file")
+        effort = command.effort or parameters.effort or np.nan
+        if command.width is None:
+            return np.array([command.position, effort])
+        if not parameters.widths:
+            raise ValueError("it has no widths; give a position, or write `widths` in the robot file")
+        angles, widths = _table(parameters)
+        if not widths.min() <= command.width <= widths.max():
+            raise ValueError(
+                f"width {command.width:g} m is not between {widths.min():g} m and {widths.max():g} m"
+            )
+        order = np.argsort(widths)
+        return np.array([np.interp(command.width, widths[order], angles[order]), effort])
+
+    def on_configure(self, context: Context) -> None:
+        """Make room for everything that the loop needs."""
+        super().on_configure(context)
+        self._angles, self._widths = _table(self.parameters)
+        self._lower = float(finite_or(context.limits.lower, -np.inf)[0])
+        self._upper = float(finite_or(context.limits.upper, np.inf)[0])
+        self._goal: Goal | None = None
+        self._target = self._way = 0.0
+        self._began_ns = self._published_ns = 0
+        self._still_ns = -1
+        self._cancelled = self._stalled = False
+
+    def on_activate(self, time_ns: int) -> None:
+        """Hold where the gripper is."""
+        hold(self.context)
+        commands = self.context.commands
+        self.on_parameters(time_ns)
+        if self.parameters.effort is not None:
+            commands.effort.fill(self.parameters.effort)
+        self._goal, self._stalled = None, False
+        self._published_ns = time_ns - STATE_NS
+
+    def on_parameters(self, time_ns: int) -> None:
+        """Take another speed; beside a reference of another controller it would be a velocity, so 0."""
+        self.context.commands.velocity.fill(0.0 if self.context.into else self.parameters.speed)
+
+    def on_goal(self, goal: Goal, data: NDArray[np.float64], time_ns: int) -> None:
+        """Begin to close or open; an angle beyond the joint's limits is refused."""
+        self._goal, self._cancelled, self._stalled = None, False, False
+        angle, effort = float(data[0]), float(data[1])
+        if not self._lower <= angle <= self._upper:
+            limits = f"{self._lower:.4g}..{self._upper:.4g} rad"
+            goal.end(
+                Outcome.ABORTED, f"{angle:.4g} rad is outside its limits {limits}", self.parameters.joint
+            )
+            return
+        commands = self.context.commands
+        commands.position.fill(angle)
+        if not np.isnan(effort):
+            commands.effort.fill(effort)
+        self._goal, self._target, self._began_ns, self._still_ns = goal, angle, time_ns, -1
+        self._way = abs(angle - float(self.context.states.position[0]))
+
+    def on_cancel(self, goal: Goal, time_ns: int) -> None:
+        """Hold where the gripper is now; the goal has ended when it is at rest."""
+        self._cancelled, self._began_ns = True, time_ns
+        self._stay()
+
+    def on_deactivate(self, time_ns: int) -> None:
+        """Leave the goal: the runtime ends it."""
+        self._goal = None
+
+    def update(self, time_ns: int, period_ns: int) -> None:
+        """Watch the gripper until it has reached its goal, stands still short of it, or takes too long."""
+        states = self.context.states
+        if self._goal is not None:
+            still = bool(states.valid[0]) and abs(states.velocity[0]) <= self.parameters.stall_speed
+            if self._cancelled:
+                if still or time_ns - self._began_ns >= REST_NS:
+                    self._end(Outcome.CANCELLED, "stopped")
+            else:
+                self._watch(self._goal, time_ns, still)
+        if time_ns - self._published_ns >= STATE_NS:
+            self._published_ns = max(self._published_ns + STATE_NS, time_ns - STATE_NS)
+            moving = self._goal is not None
+            position, effort = float(states.position[0]), float(states.effort[0])
+            message = GripperState(position, self._width(position), effort, moving, self._stalled)
+            self.context.publish("state", message)
+
+    def _watch(self, goal: Goal, time_ns: int, still: bool) -> None:
+        """Look at a goal that is pursued; without a reply nothing is known but the time."""
+        if not self.context.states.valid[0]:
+            self._still_ns = -1
+            if time_ns - self._began_ns >= self.parameters.timeout:
+                self._end(Outcome.MISSED, "no reply of its servo")
+            return
+        error = abs(self._target - float(self.context.states.position[0]))
+        if error <= self.parameters.tolerance:
+            self._end(Outcome.REACHED, "reached")
+            return
+        if not still:
+            self._still_ns = -1
+        elif self._still_ns < 0:
+            self._still_ns = time_ns
+        elif time_ns - self._still_ns >= self.parameters.stall_time:
+            self._stalled = True
+            if self.parameters.effort is None:
+                self._stay()
+            self._end(Outcome.REACHED, "stalled, holds something")
+            return
+        if time_ns - self._began_ns >= self.parameters.timeout:
+            self._end(Outcome.MISSED, f"not there after {self.parameters.timeout * 1e-9:g} s")
+            return
+        goal.feedback(max(0.0, 1.0 - error / self._way) if self._way else 0.0, error)
+
+    def _stay(self) -> None:
+        """Command the angle that was measured, within the limits; without one, the goal of before counts."""
+        position = float(self.context.states.position[0])
+        if not np.isnan(position):
+            self.context.commands.position.fill(min(max(position, self._lower), self._upper))
+
+    def _end(self, outcome: Outcome, text: str) -> None:
+        goal, self._goal = self._goal, None
+        if goal is None:
+            return
+        position = float(self.context.states.position[0])
+        width = self._width(position)
+        at = f"{position:.4g} rad" if np.isnan(width) else f"{position:.4g} rad, {width * 1e3:.4g} mm"
+        goal.end(outcome, f"{text} at {at}", self.parameters.joint, abs(self._target - position))
+
+    def _width(self, angle: float) -> float:
+        return float(np.interp(angle, self._angles, self._widths)) if self._angles.size else float("nan")
+
+
+def _table(parameters: GripperParameters) -> tuple[Floats, Floats]:
+    """Return angles, rad, growing, and their widths, m."""
+    ordered = sorted(parameters.widths, key=lambda point: point.angle)
+    return np.array([point.angle for point in ordered]), np.array([point.width for point in ordered])

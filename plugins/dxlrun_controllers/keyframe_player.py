@@ -1,0 +1,402 @@
+"""keyframe_player: plays motions of poses, each with its time, a pause and torques, by their names.
+
+The parts of a motion are those of ROBOTIS' motion pages (e-Manual, RoboPlus Motion): steps with a pose, a
+play time and a pause; of a page its repetitions, its speed and the next page. The way between two poses is a
+cubic here: Biagiotti and Melchiorri, Trajectory Planning for Automatic Machines and Robots (2008), section
+2.1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from dxlrun import (
+    LIVE,
+    Angle,
+    AngularAcceleration,
+    AngularVelocity,
+    CommandModel,
+    Context,
+    Controller,
+    Duration,
+    Floats,
+    Goal,
+    Interfaces,
+    Outcome,
+    ParametersModel,
+)
+from dxlrun_controllers.joints import JointNames, finite_or, hold
+from dxlrun_controllers.spline import CUBIC, LINEAR, SplineSample, evaluate, solve
+
+CLOSING_SPEED = 0.5
+"""rad/s, posvel: the least speed toward a pose, for the rest of the way of a servo that lags."""
+HIGHEST_RATE = 10.0
+"""Of a motion's own time over the loop's: so few steps at most are passed in a period."""
+PEAK = 1.5
+"""Highest speed of a cubic from rest to rest, over its mean speed."""
+
+
+class Step(ParametersModel):
+    """A pose, how the joints go there, and how long they stay."""
+
+    time: Annotated[Duration, Field(ge=10_000_000)]
+    """ns, of the way to the pose"""
+    pose: dict[str, Angle]
+    """Joints that it does not name stay where they were sent last."""
+    pause: Duration = 0
+    """ns, at the pose"""
+    torque: dict[str, Annotated[float, Field(gt=0)]] = Field(default_factory=dict)
+    """The most that a joint's servo may exert from this step on, in the unit that the model measures (Nm, A
+    or the fraction of its maximum)."""
+    interpolation: Literal["smooth", "linear"] = "smooth"
+    """`smooth` begins and ends at rest; `linear` has one speed all the way."""
+
+
+class Motion(ParametersModel):
+    """A motion: its steps, one after the other, and perhaps another motion after it."""
+
+    steps: Annotated[tuple[Step, ...], Field(min_length=1)]
+    repeat: Annotated[int, Field(ge=1, le=10_000)] = 1
+    """How often the steps are played."""
+    speed: Annotated[float, Field(gt=0, le=10)] = 1.0
+    """What all times and pauses are divided by."""
+    next: str | None = None
+    """The motion that is played after it."""
+
+
+class KeyframeParameters(ParametersModel):
+    """Keys of a keyframe_player in the robot file."""
+
+    joints: JointNames
+    motions: Annotated[dict[str, Motion], Field(min_length=1)]
+    command_interface: Literal["position", "posvel"] = "position"
+    """`posvel` commands the speed beside the position; where a step names torques, efforts are too."""
+    approach: Annotated[AngularVelocity, Field(gt=0)] = 1.0
+    """rad/s; on the way to the first pose of a goal no joint is faster, the way takes longer instead"""
+    deceleration: Annotated[AngularAcceleration, Field(gt=0)] = 20.0
+    """rad/s^2, of each joint after a cancel"""
+    tolerance: Annotated[Angle, Field(gt=0)] | None = None
+    """How far a joint may be off at the end; left out: a goal is reached when its time is over."""
+    settle: Duration = 500_000_000
+    """ns after the end in which the tolerance may still be reached"""
+    speed: Annotated[float, Field(gt=0, le=10), LIVE] = 1.0
+    """What all motions are sped up by."""
+
+    @model_validator(mode="after")
+    def _known_names(self) -> Self:
+        for name, motion in self.motions.items():
+            for number, step in enumerate(motion.steps, 1):
+                if unknown := [joint for joint in (*step.pose, *step.torque) if joint not in self.joints]:
+                    of = f"step {number} of motion {name}"
+                    raise ValueError(
+                        f"{of} names {unknown[0]}, not one of its joints ({', '.join(self.joints)})"
+                    )
+            seen, after = [name], motion.next
+            while after is not None:
+                if after not in self.motions:
+                    raise ValueError(
+                        f"motion {seen[-1]} is followed by {after}, which is none of its motions"
+                    )
+                if after in seen:
+                    raise ValueError(f"motions follow each other in a circle: {' -> '.join([*seen, after])}")
+                seen.append(after)
+                after = self.motions[after].next
+        return self
+
+    def has_torques(self) -> bool:
+        """Check whether any step limits a torque."""
+        return any(step.torque for motion in self.motions.values() for step in motion.steps)
+
+
+class PlayCommand(CommandModel):
+    """A goal: a motion, by its name, and how."""
+
+    motion: str
+    speed: Annotated[float, Field(gt=0, le=10)] = 1.0
+    """What all times and pauses are divided by, beside the motion's own speed."""
+    repeat: Annotated[int, Field(ge=1, le=10_000)] | None = None
+    """In place of the motion's own number; not of the motions that follow it."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Frame:
+    """A step as the loop needs it; NaN where a joint is not named."""
+
+    time_s: float
+    pause_s: float
+    linear: bool
+    pose: Floats
+    torque: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class _Page:
+    """A motion as the loop needs it."""
+
+    name: str
+    frames: tuple[_Frame, ...]
+    repeat: int
+    speed: float
+
+    def duration_s(self, repeat: int) -> float:
+        """Return how long it takes at speed 1 of the goal."""
+        return repeat * sum(frame.time_s + frame.pause_s for frame in self.frames) / self.speed
+
+
+class KeyframePlayer(Controller[KeyframeParameters]):
+    """Plays one motion at a time; the last pose is held.
+
+    A motion begins where the joints were sent last, with their speed of then; a new goal takes over like
+    that, too. After a cancel each joint decelerates to a stop.
+    """
+
+    Parameters = KeyframeParameters
+    Commands: ClassVar[Mapping[str, type[CommandModel]]] = {"play": PlayCommand}
+    Goals: ClassVar[frozenset[str]] = frozenset({"play"})
+
+    @classmethod
+    def interfaces(cls, parameters: KeyframeParameters, joints: tuple[str, ...]) -> Interfaces:
+        """Claim position, perhaps velocity, and effort where a step limits a torque."""
+        posvel, limited = parameters.command_interface == "posvel", parameters.has_torques()
+        if posvel:
+            return Interfaces(
+                parameters.joints, ("position", "velocity", "effort") if limited else ("position", "velocity")
+            )
+        return Interfaces(parameters.joints, ("position", "effort") if limited else ("position",))
+
+    @classmethod
+    def prepare(cls, kind: str, command: CommandModel, parameters: KeyframeParameters) -> NDArray[np.float64]:
+        """Return the motion's number, speed, and repetitions. Raises ValueError for an unknown motion."""
+        if not isinstance(command, PlayCommand):
+            return super().prepare(kind, command, parameters)
+        names = list(parameters.motions)
+        if command.motion not in names:
+            raise ValueError(f"there is no motion {command.motion!r}; there are {', '.join(names)}")
+        repeat = command.repeat or parameters.motions[command.motion].repeat
+        return np.array([names.index(command.motion), command.speed, repeat])
+
+    def on_configure(self, context: Context) -> None:
+        """Make room for everything that the loop needs."""
+        super().on_configure(context)
+        parameters, count = self.parameters, len(context.joints)
+        self._pages = [tuple(_pages(parameters, name)) for name in parameters.motions]
+        self._lower = finite_or(context.limits.lower, -np.inf)
+        self._upper = finite_or(context.limits.upper, np.inf)
+        speeds = finite_or(context.limits.velocity, np.inf)
+        self._closing = np.minimum(speeds, CLOSING_SPEED)
+        self._posvel = parameters.command_interface == "posvel"
+        self._now = SplineSample(count)
+        """Where the joints are sent, rad, and how fast, in rad a second of the motion's own time."""
+        self._piece = np.zeros((CUBIC, count))
+        self._ends = np.zeros((2, 2, count))
+        """Position and velocity at the beginning and at the end of a step."""
+        self._stop, self._stop_s = np.zeros((2, count)), np.zeros(count)
+        self._scratch = np.zeros(count)
+        self._order = CUBIC
+        self._goal: Goal | None = None
+        self._playing = self._stopping = False
+        self._rate = 1.0
+        self._settle_ns = -1
+
+    def on_activate(self, time_ns: int) -> None:
+        """Hold where the joints are."""
+        hold(self.context)
+        np.copyto(self._now.position, self.context.commands.position)
+        self._now.velocity.fill(0.0)
+        self._goal, self._playing, self._stopping, self._settle_ns = None, False, False, -1
+
+    def on_deactivate(self, time_ns: int) -> None:
+        """Leave the goal: the runtime ends it."""
+        self._goal = None
+
+    def on_goal(self, goal: Goal, data: NDArray[np.float64], time_ns: int) -> None:
+        """Begin a motion where the joints are sent, with their speed."""
+        self._now.velocity *= self._rate if self._playing or self._stopping else 0.0
+        self._goal, self._playing, self._stopping, self._settle_ns = goal, True, False, -1
+        self._todo, self._goal_speed = self._pages[int(data[0])], float(data[1])
+        self._page, self._frame, self._left = 0, -1, int(data[2])
+        first, *others = self._todo
+        self._total_s = first.duration_s(self._left) + sum(page.duration_s(page.repeat) for page in others)
+        self._done_s = self._time_s = self._step_s = self._pause_s = 0.0
+        self._rate = self._rate_of(first)
+        self._now.velocity /= self._rate
+        self._next_frame(softly=True)
+
+    def on_cancel(self, goal: Goal, time_ns: int) -> None:
+        """Bring each joint to rest by its deceleration."""
+        if self._stopping:
+            return
+        if not self._playing:  # at the end, waiting for its servos
+            self._finish(Outcome.CANCELLED, "stopped at the end")
+            return
+        velocity = self._now.velocity
+        velocity *= self._rate
+        self._rate = 1.0
+        np.copyto(self._stop[0], self._now.position)
+        np.copyto(self._stop[1], velocity)
+        np.divide(np.abs(velocity), self.parameters.deceleration, out=self._stop_s)
+        self._playing, self._stopping, self._time_s = False, True, 0.0
+
+    def update(self, time_ns: int, period_ns: int) -> None:
+        """Command the pose of this moment; the last one is held."""
+        dt = period_ns * 1e-9
+        if self._playing:
+            self._play(dt, time_ns)
+        elif self._stopping:
+            self._decelerate(dt)
+        elif self._settle_ns >= 0:
+            self._settle(time_ns)
+
+    # Playing
+
+    def _rate_of(self, page: _Page) -> float:
+        return min(self._goal_speed * page.speed * self.parameters.speed, HIGHEST_RATE)
+
+    def _play(self, dt: float, time_ns: int) -> None:
+        self._rate = self._rate_of(self._todo[self._page])
+        self._time_s += dt * self._rate
+        self._done_s += dt * self._rate / self._todo[self._page].speed
+        while self._time_s >= self._step_s + self._pause_s:
+            self._time_s -= self._step_s + self._pause_s
+            self._reach()
+            if not self._next_frame():
+                self._playing = False
+                self._command()
+                self._settle_ns = time_ns
+                self._settle(time_ns)
+                return
+        if self._time_s < self._step_s:
+            evaluate(self._piece[: self._order], self._time_s, self._now)
+        else:
+            self._reach()
+        self._command()
+        if self._goal is not None:
+            self._goal.feedback(min(self._done_s / self._total_s, 1.0), self._worst())
+
+    def _reach(self) -> None:
+        """Be at the end of the step, at rest."""
+        np.copyto(self._now.position, self._ends[1, 0])
+        self._now.velocity.fill(0.0)
+
+    def _next_frame(self, softly: bool = False) -> bool:
+        """Begin the next step from here; false: there is none. `softly`: not faster than the approach."""
+        if not self._advance():
+            return False
+        page = self._todo[self._page]
+        frame = page.frames[self._frame]
+        start, end = self._ends
+        np.copyto(start[0], self._now.position)
+        np.copyto(start[1], self._now.velocity)
+        np.copyto(end[0], start[0])
+        np.copyto(end[0], frame.pose, where=np.isfinite(frame.pose))
+        np.clip(end[0], self._lower, self._upper, out=end[0])
+        self._step_s, self._pause_s = frame.time_s, frame.pause_s
+        if softly:
+            farthest = float(
+                np.abs(np.subtract(end[0], start[0], out=self._scratch), out=self._scratch).max()
+            )
+            needed = PEAK * farthest / self.parameters.approach * self._rate
+            if needed > self._step_s:  # NaN: a joint that has never answered is not there to be approached
+                self._total_s += (needed - self._step_s) / page.speed
+                self._step_s = needed
+        self._order = LINEAR if frame.linear and not softly else CUBIC
+        solve(self._order, self._step_s, start, end, self._piece[: self._order])
+        efforts = self.context.commands.effort
+        np.copyto(efforts, frame.torque, where=np.isfinite(frame.torque))
+        return True
+
+    def _advance(self) -> bool:
+        """Go to the next step: of this round, of the next round, or of the next motion."""
+        self._frame += 1
+        if self._frame < len(self._todo[self._page].frames):
+            return True
+        self._frame = 0
+        self._left -= 1
+        if self._left > 0:
+            return True
+        self._page += 1
+        if self._page == len(self._todo):
+            return False
+        page = self._todo[self._page]
+        self._left = page.repeat
+        self._time_s *= self._rate_of(page) / self._rate  # what is left of the period
+        self._rate = self._rate_of(page)
+        return True
+
+    def _decelerate(self, dt: float) -> None:
+        self._time_s += dt
+        (start, velocity), now, elapsed = self._stop, self._now, self._scratch
+        np.minimum(self._stop_s, self._time_s, out=elapsed)
+        change = np.copysign(self.parameters.deceleration, velocity)
+        np.clip(
+            start + (velocity - change * elapsed / 2) * elapsed, self._lower, self._upper, out=now.position
+        )
+        np.subtract(velocity, change * elapsed, out=now.velocity)
+        self._command()
+        if self._time_s >= self._stop_s.max():
+            self._stopping = False
+            now.velocity.fill(0.0)
+            self._finish(Outcome.CANCELLED, f"stopped in step {self._frame + 1} of {self._name()}")
+
+    def _command(self) -> None:
+        commands, now = self.context.commands, self._now
+        np.copyto(commands.position, now.position)
+        if not self._posvel:
+            return
+        np.multiply(now.velocity, self._rate, out=commands.velocity)
+        if not self.context.into:  # of a reference with its sign, of a servo the magnitude
+            np.abs(commands.velocity, out=commands.velocity)
+            np.maximum(commands.velocity, self._closing, out=commands.velocity)
+
+    # The end
+
+    def _settle(self, time_ns: int) -> None:
+        """End the goal when every joint is near enough, or has had its time."""
+        parameters, worst = self.parameters, self._worst()
+        if parameters.tolerance is None or worst <= parameters.tolerance:
+            self._finish(Outcome.REACHED, f"played {self._name()}")
+        elif time_ns - self._settle_ns >= parameters.settle:
+            self._finish(
+                Outcome.MISSED, f"{self.context.joints[int(self._scratch.argmax())]} is off at its end"
+            )
+
+    def _worst(self) -> float:
+        """Return the largest distance from what is commanded, rad; infinite where a servo does not answer."""
+        states, error = self.context.states, self._scratch
+        np.abs(np.subtract(states.position, self.context.commands.position, out=error), out=error)
+        np.copyto(error, np.inf, where=~states.valid)
+        return float(error.max())
+
+    def _finish(self, outcome: Outcome, text: str) -> None:
+        self._settle_ns = -1
+        goal, self._goal = self._goal, None
+        if goal is not None:
+            worst = self._worst()
+            goal.end(outcome, text, self.context.joints[int(self._scratch.argmax())], worst)
+
+    def _name(self) -> str:
+        return self._todo[min(self._page, len(self._todo) - 1)].name
+
+
+def _pages(parameters: KeyframeParameters, name: str | None) -> Iterator[_Page]:
+    """Yield a motion and those that follow it."""
+    while name is not None:
+        motion = parameters.motions[name]
+        frames = tuple(
+            _Frame(
+                time_s=step.time * 1e-9,
+                pause_s=step.pause * 1e-9,
+                linear=step.interpolation == "linear",
+                pose=np.array([step.pose.get(joint, np.nan) for joint in parameters.joints]),
+                torque=np.array([step.torque.get(joint, np.nan) for joint in parameters.joints]),
+            )
+            for step in motion.steps
+        )
+        yield _Page(name, frames, motion.repeat, motion.speed)
+        name = motion.next

@@ -1,0 +1,205 @@
+"""gripper_controller: reached, stalled at an object, missed, cancelled; widths by a table."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dxlrun import Outcome
+from dxlrun_controllers.gripper_controller import GripperController
+
+WIDTHS = [{"angle": "-1.26 rad", "width": "78 mm"}, {"angle": "0.66 rad", "width": "20 mm"}]
+GRIPPER = {"joint": "gripper", "effort": 0.4, "speed": "2 rad/s", "widths": WIDTHS}
+PLAIN = {"joint": "gripper", "speed": "2 rad/s"}
+LIMITS = {"lower": -1.26, "upper": 0.66}
+
+
+def run(robot, seconds, *, blocked_at=None):
+    """Let a servo go to its goal at the commanded speed; something that it cannot pass is at `blocked_at`."""
+    states, sent = robot.states, robot.sent
+    for _ in range(round(seconds / robot.period_s)):
+        robot.step()
+        step = robot.commands.velocity[0] * robot.period_s
+        before = states.position[0]
+        now = before + np.clip(sent.position[0] - before, -step, step)
+        if blocked_at is not None and before <= blocked_at:
+            now = min(now, blocked_at)
+        states.position[0] = now
+        states.velocity[0] = (now - before) / robot.period_s
+        if robot.goals and robot.goals[-1].outcome is not None:
+            break
+
+
+def begun(mounted, parameters=GRIPPER, **options):
+    robot = mounted(GripperController, parameters, limits=LIMITS, **options)
+    robot.activate()
+    return robot
+
+
+def test_it_claims_the_effort_where_it_limits_it(mounted):
+    assert begun(mounted).interfaces.command == ("position", "velocity", "effort")
+    assert begun(mounted, PLAIN).interfaces.command == ("position", "velocity")
+
+
+def test_it_holds_until_its_first_goal(mounted):
+    robot = begun(mounted)
+    robot.sent.position[:] = np.nan
+    robot.step()
+    assert robot.commands.position[0] == 0.0
+    assert robot.commands.effort[0] == 0.4
+
+
+def test_a_goal_is_reached_with_its_width(mounted):
+    robot = begun(mounted)
+    goal = robot.ask("grip", width="60 mm", effort=0.2)
+    assert robot.commands.effort[0] == 0.2
+    assert robot.commands.position[0] == pytest.approx(-1.26 + 1.92 * (78 - 60) / 58)
+    run(robot, 3.0)
+    assert goal.outcome is Outcome.REACHED
+    assert goal.text.startswith("reached at -0.6")
+    assert "60" in goal.text or "59" in goal.text
+    assert goal.error <= 0.02
+    assert goal.joint == "gripper"
+    assert goal.progress == sorted(goal.progress)
+
+
+@pytest.mark.parametrize("parameters", [GRIPPER, PLAIN])
+def test_an_object_stalls_it_and_is_held(mounted, parameters):
+    robot = begun(mounted, parameters)
+    goal = robot.ask("grip", position=0.6)
+    run(robot, 3.0, blocked_at=0.3)
+    assert goal.outcome is Outcome.REACHED
+    assert goal.text.startswith("stalled, holds something at 0.3 rad")
+    assert ("30.88 mm" in goal.text) == ("widths" in parameters)
+    assert goal.error == pytest.approx(0.3)
+    # 0.15 s for the way, then 0.2 s of standing still
+    assert 0.33 <= robot.time_ns * 1e-9 <= 0.42
+    # with a limit of effort it goes on pressing, without one the angle is held
+    assert robot.commands.position[0] == (0.6 if "effort" in parameters else 0.3)
+    robot.step(periods=10)
+    assert robot.messages[-1][1].stalled
+    robot.ask("grip", position=0.0)
+    robot.step(periods=10)
+    assert not robot.messages[-1][1].stalled
+
+
+def test_a_pause_on_the_way_is_no_stall(mounted):
+    robot = begun(mounted)
+    goal = robot.ask("grip", position=0.6)
+    for n in range(60):
+        robot.states.velocity[0] = 0.0 if n % 9 else 1.0  # 0.16 s of rest at most
+        robot.step()
+    assert goal.outcome is None
+
+
+def test_what_neither_arrives_nor_stalls_is_missed(mounted):
+    robot = begun(mounted, GRIPPER | {"timeout": "1 s"})
+    goal = robot.ask("grip", position=0.6)
+    robot.states.velocity[0] = 0.3
+    for _ in range(60):
+        robot.step()
+    assert goal.outcome is Outcome.MISSED
+    assert goal.text == "not there after 1 s at 0 rad, 39.94 mm"
+    assert goal.error == pytest.approx(0.6)
+
+
+def test_a_silent_servo_is_no_stall_but_missed(mounted):
+    robot = begun(mounted, GRIPPER | {"timeout": "1 s"})
+    goal = robot.ask("grip", position=0.6)
+    robot.states.valid[:] = False
+    for _ in range(49):
+        robot.step()
+    assert goal.outcome is None
+    for _ in range(2):
+        robot.step()
+    assert (goal.outcome, goal.text[:22]) == (Outcome.MISSED, "no reply of its servo ")
+
+
+def test_a_cancel_holds_and_ends_at_rest(mounted):
+    robot = begun(mounted)
+    goal = robot.ask("grip", position=0.6)
+    run(robot, 0.1)
+    moving = robot.states.position[0]
+    robot.cancel()
+    assert robot.commands.position[0] == moving
+    assert goal.outcome is None
+    run(robot, 1.0)
+    assert goal.outcome is Outcome.CANCELLED
+    robot = begun(mounted)
+    goal = robot.ask("grip", position=0.6)
+    robot.cancel()
+    robot.states.velocity[0] = 1.0  # something turns it
+    for _ in range(55):
+        robot.step()
+    assert goal.outcome is Outcome.CANCELLED
+
+
+def test_a_new_goal_takes_over(mounted):
+    robot = begun(mounted)
+    first = robot.ask("grip", position=0.6)
+    run(robot, 0.1)
+    second = robot.ask("grip", position=-0.5)
+    run(robot, 3.0)
+    assert (first.outcome, second.outcome) == (Outcome.PREEMPTED, Outcome.REACHED)
+
+
+def test_an_angle_beyond_the_limits_is_refused_and_nothing_moves(mounted):
+    robot = begun(mounted)
+    goal = robot.ask("grip", position=0.7)
+    assert goal.outcome is Outcome.ABORTED
+    assert goal.text == "0.7 rad is outside its limits -1.26..0.66 rad"
+    robot.step()
+    assert robot.commands.position[0] == 0.0
+
+
+def test_a_live_speed_counts_at_once(mounted):
+    robot = begun(mounted)
+    robot.controller.parameters = robot.model.model_copy(update={"speed": 0.5})
+    robot.controller.on_parameters(0)
+    assert robot.commands.velocity[0] == 0.5
+
+
+@settings(max_examples=100, deadline=None)
+@given(width=st.floats(0.02, 0.078), shrinking=st.booleans())
+def test_a_width_is_the_inverse_of_its_angle(mounted, width, shrinking):
+    sign = -1 if shrinking else 1
+    points = ((-1.0, 0.02), (0.1, 0.03), (0.4, 0.078))
+    table = [{"angle": f"{sign * angle} rad", "width": f"{wide} m"} for angle, wide in points]
+    robot = mounted(GripperController, GRIPPER | {"widths": table})
+    angle, effort = robot.prepare("grip", width=width)
+    assert robot.controller._width(angle) == pytest.approx(width, abs=1e-12)
+    assert effort == 0.4
+
+
+@pytest.mark.parametrize(
+    ("parameters", "command", "sentence"),
+    [
+        (GRIPPER, {"width": 0.09}, r"width 0.09 m is not between 0.02 m and 0.078 m"),
+        (PLAIN, {"width": 0.03}, "it has no widths"),
+        (PLAIN, {"position": 0.3, "effort": 0.1}, "no limit of effort"),
+        (GRIPPER, {}, "give either position or width"),
+        (GRIPPER, {"position": 0.1, "width": 0.03}, "give either position or width"),
+        (GRIPPER, {"position": math.nan}, "finite"),
+        (GRIPPER, {"position": 0.1, "effort": -0.1}, "greater than 0"),
+        (GRIPPER, {"position": "30 mm"}, "unit mm"),
+    ],
+)
+def test_a_goal_that_makes_no_sense_is_refused_in_words(mounted, parameters, command, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        mounted(GripperController, parameters).prepare("grip", **command)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "sentence"),
+    [
+        ({"widths": WIDTHS[:1]}, "one width makes no line"),
+        ({"widths": [*WIDTHS, {"angle": "1 rad", "width": "50 mm"}]}, "must all grow, or all shrink"),
+        ({"widths": [WIDTHS[0], WIDTHS[0]]}, "each angle stands once"),
+        ({"effort": 0.0}, "greater than 0"),
+    ],
+)
+def test_wrong_parameters_are_refused(wrong, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        GripperController.Parameters.model_validate(GRIPPER | wrong)

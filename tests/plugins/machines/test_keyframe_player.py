@@ -1,0 +1,264 @@
+"""keyframe_player: poses at their times, smoothly, at a speed, again and after one another."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dxlrun import Outcome
+from dxlrun_controllers.keyframe_player import KeyframePlayer
+
+
+def step(time="500 ms", pause="0 s", **more):
+    pose = {joint: f"{angle} rad" for joint, angle in more.pop("pose", {"a": 0.5}).items()}
+    return {"time": time, "pause": pause, "pose": pose, **more}
+
+
+WAVE = {"steps": [step(pose={"a": 0.5}), step(pose={"a": -0.5, "b": 0.2}, pause="200 ms")]}
+PLAYER = {"joints": ["a", "b"], "approach": "10 rad/s", "motions": {"wave": WAVE}}
+
+
+def player(**motions):
+    return PLAYER | {"motions": motions}
+
+
+def play(robot, seconds, *, follow=True):
+    """Return time since now and positions, after each period."""
+    begun_ns, found = robot.time_ns, []
+    for _ in range(round(seconds / robot.period_s)):
+        robot.step()
+        if follow:
+            robot.states.position[:] = robot.commands.position
+        found.append(((robot.time_ns - begun_ns) * 1e-9, *robot.commands.position))
+    return np.array(found)
+
+
+def begun(mounted, parameters=PLAYER, **options):
+    robot = mounted(KeyframePlayer, parameters, **options)
+    robot.activate()
+    return robot
+
+
+def cubic(t, time, start, end):
+    s = np.clip(t / time, 0, 1)
+    return start + (end - start) * (3 * s**2 - 2 * s**3)
+
+
+def test_what_it_claims_depends_on_speeds_and_torques(mounted):
+    torque = player(wave={"steps": [step(torque={"a": 0.3})]})
+    for parameters, claims in (
+        (PLAYER, ("position",)),
+        (PLAYER | {"command_interface": "posvel"}, ("position", "velocity")),
+        (torque, ("position", "effort")),
+        (torque | {"command_interface": "posvel"}, ("position", "velocity", "effort")),
+    ):
+        assert mounted(KeyframePlayer, parameters).interfaces.command == claims
+
+
+def test_poses_are_reached_at_their_times_on_cubics(mounted):
+    robot = begun(mounted)
+    goal = robot.ask("play", motion="wave")
+    t, a, b = play(robot, 2.0).T
+    wanted = np.where(t <= 0.5, cubic(t, 0.5, 0.0, 0.5), cubic(t - 0.5, 0.5, 0.5, -0.5))
+    np.testing.assert_allclose(a, wanted, atol=1e-12)
+    np.testing.assert_allclose(b, cubic(t - 0.5, 0.5, 0.0, 0.2), atol=1e-12)
+    assert (goal.outcome, goal.text) == (Outcome.REACHED, "played wave")
+    assert goal.progress == sorted(goal.progress)
+    assert goal.progress[0] == pytest.approx(0.02 / 1.2)
+    assert goal.progress[-1] == pytest.approx(1.0, abs=0.02)
+    assert len(goal.progress) * 0.02 == pytest.approx(1.2, abs=0.03)
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    speed=st.floats(0.2, 3),
+    page_speed=st.floats(0.5, 2),
+    periods=st.lists(st.floats(0.2, 4), min_size=5, max_size=150),
+)
+def test_time_decides_whatever_the_periods_and_the_speed(mounted, speed, page_speed, periods):
+    robot = begun(mounted, player(wave=WAVE | {"speed": page_speed}) | {"approach": "1000 rad/s"})
+    robot.ask("play", motion="wave", speed=speed)
+    for gap in periods:
+        robot.step(periods=gap)
+        t = robot.time_ns * 1e-9 * speed * page_speed
+        wanted = cubic(t, 0.5, 0.0, 0.5) if t <= 0.5 else cubic(t - 0.5, 0.5, 0.5, -0.5)
+        np.testing.assert_allclose(robot.commands.position[0], wanted, atol=1e-6)
+
+
+def test_linear_steps_have_one_speed_and_pauses_stand_still(mounted):
+    steps = [
+        step(pose={"a": 0.0}),
+        step(pose={"a": 1.0}, interpolation="linear", pause="1 s"),
+        step(pose={"a": 0}),
+    ]
+    robot = begun(mounted, player(ramp={"steps": steps}))
+    robot.ask("play", motion="ramp")
+    t, a, _ = play(robot, 2.0).T
+    np.testing.assert_allclose(a, np.clip((t - 0.5) * 2, 0, 1), atol=1e-12)
+
+
+def test_repeated_and_followed_by_others(mounted):
+    robot = begun(
+        mounted,
+        player(
+            nod={"steps": [step(pose={"b": 0.4}), step(pose={"b": 0.0})], "repeat": 2, "next": "rest"},
+            rest={"steps": [step(time="1 s", pose={"a": 0.1, "b": 0.3})], "speed": 2.0},
+        ),
+    )
+    goal = robot.ask("play", motion="nod", repeat=3)
+    t, _, b = play(robot, 4.0).T
+    peaks = [0.5, 1.5, 2.5]
+    for peak in peaks:
+        assert b[np.searchsorted(t, peak - 1e-9)] == pytest.approx(0.4)
+        assert b[np.searchsorted(t, peak + 0.5 - 1e-9)] == pytest.approx(0.0, abs=1e-9)
+    assert goal.text == "played rest"
+    assert len(goal.progress) * 0.02 == pytest.approx(3.5, abs=0.03)
+    np.testing.assert_allclose(robot.commands.position, [0.1, 0.3])
+
+
+def test_the_first_pose_is_approached_softly(mounted):
+    robot = begun(
+        mounted, player(far={"steps": [step(time="10 ms", pose={"a": 2.0})]}) | {"approach": "1 rad/s"}
+    )
+    robot.ask("play", motion="far", speed=3.0)
+    t, a, _ = play(robot, 5.0).T
+    speeds = np.diff(a) / 0.02
+    assert speeds.max() == pytest.approx(1.0, abs=1e-3)
+    assert t[np.searchsorted(a, 2.0 - 1e-9)] == pytest.approx(3.0, abs=0.03)
+
+
+def test_a_new_goal_takes_over_with_the_speed_of_before(mounted):
+    robot = begun(mounted)
+    first = robot.ask("play", motion="wave", speed=0.5)
+    before = play(robot, 0.4)
+    second = robot.ask("play", motion="wave", speed=2.0)
+    after = play(robot, 1.0)
+    assert (first.outcome, second.outcome) == (Outcome.PREEMPTED, Outcome.REACHED)
+    speeds = np.diff(np.concatenate([before, after])[:, 1]) / 0.02
+    seam = len(before) - 1
+    assert abs(speeds[seam] - speeds[seam - 1]) < 0.3  # rad/s; 1.4 without the speed of before
+
+
+@settings(max_examples=50, deadline=None)
+@given(at=st.integers(1, 48), deceleration=st.floats(1, 50), speed=st.floats(0.3, 3))
+def test_a_cancel_decelerates_each_joint_within_its_limit(mounted, at, deceleration, speed):
+    robot = begun(mounted, PLAYER | {"deceleration": f"{deceleration} rad/s^2", "approach": "1000 rad/s"})
+    goal = robot.ask("play", motion="wave", speed=speed)
+    path = [play(robot, at * 0.02)]
+    if goal.outcome is not None:
+        return
+    robot.cancel()
+    robot.cancel()  # twice is once
+    moving = not robot.controller._now.velocity.any()
+    path.append(play(robot, 8.0))
+    assert goal.outcome is Outcome.CANCELLED
+    assert goal.text.startswith("stopped in step") or moving
+    positions = np.concatenate(path)[at - 1 :, 1:]
+    speeds = np.diff(positions, axis=0) / 0.02
+    changes = np.abs(np.diff(speeds, axis=0)) / 0.02
+    assert changes.max() <= deceleration * (1 + 1e-6) + 1e-6
+    assert np.abs(speeds[-1]).max() < 1e-12
+
+
+def test_torques_count_from_their_step_on(mounted):
+    steps = [step(torque={"a": 0.3}), step(torque={"b": 0.2}), step(torque={"a": 0.1})]
+    robot = begun(mounted, player(push={"steps": steps}))
+    robot.ask("play", motion="push")
+    for wanted in ([0.3, np.nan], [0.3, 0.2], [0.1, 0.2]):
+        play(robot, 0.48)
+        np.testing.assert_array_equal(robot.commands.effort, wanted)
+        play(robot, 0.02)
+
+
+def test_posvel_has_magnitudes_for_servos_and_signs_for_references(mounted):
+    for into in ((), ("pid",)):
+        robot = begun(mounted, PLAYER | {"command_interface": "posvel"}, into=into)
+        robot.ask("play", motion="wave", speed=2.0)
+        speeds = []
+        for _ in range(50):
+            robot.step()
+            speeds.append(robot.commands.velocity[0])
+        wanted = -1.5 * 1.0 / 0.25  # the peak between 0.5 and -0.5 rad, in half of 500 ms
+        if into:
+            assert min(speeds) == pytest.approx(wanted, rel=0.03)
+            assert speeds[-1] == 0.0
+        else:
+            assert max(speeds) == pytest.approx(-wanted, rel=0.03)
+            assert min(speeds) == 0.5
+
+
+def test_servos_that_stay_behind_miss(mounted):
+    robot = begun(mounted, PLAYER | {"tolerance": "0.05 rad", "settle": "300 ms"})
+    goal = robot.ask("play", motion="wave")
+    play(robot, 1.3, follow=False)
+    assert goal.outcome is None
+    play(robot, 0.3, follow=False)
+    assert (goal.outcome, goal.text, goal.joint) == (Outcome.MISSED, "a is off at its end", "a")
+    assert goal.error == pytest.approx(0.5)
+    goal = robot.ask("play", motion="wave")
+    play(robot, 1.3, follow=False)
+    robot.states.position[:] = robot.commands.position + 0.04
+    play(robot, 0.02, follow=False)
+    assert (goal.outcome, goal.error) == (Outcome.REACHED, pytest.approx(0.04))
+
+
+def test_a_cancel_while_it_settles_ends_at_once(mounted):
+    robot = begun(mounted, PLAYER | {"tolerance": "0.05 rad"})
+    goal = robot.ask("play", motion="wave")
+    play(robot, 1.3, follow=False)
+    robot.cancel()
+    assert goal.outcome is Outcome.CANCELLED
+
+
+def test_poses_stay_within_the_limits(mounted):
+    robot = begun(mounted, limits={"lower": -0.2, "upper": 0.3})
+    robot.ask("play", motion="wave")
+    _, a, _ = play(robot, 2.0).T
+    assert (a.min(), a.max()) == (-0.2, 0.3)
+
+
+def test_a_live_speed_counts_in_the_middle_of_a_motion(mounted):
+    robot = begun(mounted)
+    robot.ask("play", motion="wave")
+    play(robot, 0.26)
+    robot.controller.parameters = robot.model.model_copy(update={"speed": 2.0})
+    robot.controller.on_parameters(robot.time_ns)
+    play(robot, 0.12)
+    assert robot.commands.position[0] == pytest.approx(0.5)
+
+
+def test_an_unknown_motion_is_refused_with_those_that_exist(mounted):
+    robot = begun(mounted, player(wave=WAVE, bow=WAVE))
+    with pytest.raises(ValueError, match=r"there is no motion 'wav'; there are wave, bow"):
+        robot.prepare("play", motion="wav")
+    for wrong in (
+        {"motion": "wave", "speed": 0.0},
+        {"motion": "wave", "repeat": 0},
+        {"motion": "wave", "speed": 11},
+    ):
+        with pytest.raises(ValueError, match="validation error"):
+            robot.prepare("play", **wrong)
+
+
+@pytest.mark.parametrize(
+    ("motions", "sentence"),
+    [
+        ({}, "at least 1 item"),
+        ({"w": {"steps": []}}, "at least 1 item"),
+        (
+            {"w": {"steps": [step(pose={"c": 1.0})]}},
+            r"step 1 of motion w names c, not one of its joints \(a, b\)",
+        ),
+        ({"w": {"steps": [step(torque={"c": 1.0})]}}, "names c"),
+        ({"w": {"steps": [step()], "next": "x"}}, "motion w is followed by x, which is none of its motions"),
+        (
+            {"w": {"steps": [step()], "next": "x"}, "x": {"steps": [step()], "next": "w"}},
+            "in a circle: w -> x -> w",
+        ),
+        ({"w": {"steps": [step(time="1 ms")]}}, "greater than or equal"),
+        ({"w": {"steps": [step(interpolation="bezier")]}}, "smooth"),
+    ],
+)
+def test_motions_that_make_no_sense_are_refused_in_words(motions, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        KeyframePlayer.Parameters.model_validate(PLAYER | {"motions": motions})
