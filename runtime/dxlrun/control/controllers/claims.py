@@ -1,13 +1,19 @@
-"""Claims: which controller may command which joint; one active controller a joint."""
+"""Claims: which controllers may be active together; one commander a servo, and one a reference.
+
+A controller that is `into` others commands their references: it is above them. It is never active without
+them, so it enters after and leaves before them, in the same step.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+from dxlrun.control.controllers.graph import below, commander, lowers_first, uppers_first
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan
 from dxlrun.description.modes import Mode, mode_of
+from dxlrun.run.channels.answers import Code, Field, Refusal
 
 
 class Claimant(Protocol):
@@ -119,3 +125,110 @@ def start_modes(joints: Iterable[JointPlan], controllers: Iterable[ControllerPla
     active from the start, else its rest mode."""
     claimed = claimed_modes(controller for controller in controllers if controller.active)
     return {joint.name: claimed.get(joint.name, joint.rest) for joint in joints}
+
+
+Plans = Mapping[str, ControllerPlan]
+"""Controllers by their names."""
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """Controllers that leave and enter together, each list in the order in which they do."""
+
+    leave: tuple[str, ...]
+    enter: tuple[str, ...]
+
+
+def switch_step(  # noqa: PLR0911  one return a reason
+    activate: Sequence[str], deactivate: Sequence[str], known: Plans, active: Plans, waiting: Plans
+) -> Step | Refusal:
+    """Return what a switch does: those below that are not active enter too; or why it is refused.
+
+    `waiting` are those that will be active when their joints are in their modes.
+    """
+    if unknown := tuple(name for name in (*activate, *deactivate) if name not in known):
+        return Refusal(Code.UNKNOWN_CONTROLLER, {"controller": unknown})
+    for names in (activate, deactivate):
+        if twice := tuple({name for name in names if names.count(name) > 1}):
+            return Refusal(Code.NAMED_TWICE, {"controller": twice})
+    engaged = {**active, **waiting}
+    if idle := tuple(name for name in deactivate if name not in engaged):
+        return Refusal(Code.INACTIVE_ALREADY, {"controller": idle})
+    if busy := tuple(name for name in activate if name in engaged and name not in deactivate):
+        return Refusal(Code.ACTIVE_ALREADY, {"controller": busy})
+    staying = {name: plan for name, plan in engaged.items() if name not in deactivate}
+    enter = lowers_first(activate, known, staying)
+    if refusal := _refuse_ends(enter, activate, deactivate, known, staying, waiting):
+        return refusal
+    found = conflicts([*staying.values(), *(known[name] for name in enter)])
+    if found:
+        fields: dict[str, Field] = {
+            "conflict": conflicts_text(found),
+            "joints": tuple(conflict.joint for conflict in found),
+            "holders": tuple(conflict.holder for conflict in found),
+            "others": tuple(conflict.other for conflict in found),
+        }
+        return Refusal(Code.JOINTS_CLAIMED, fields)
+    return Step(uppers_first(deactivate, known), enter)
+
+
+def _refuse_ends(  # noqa: PLR0917  the parts of a switch
+    enter: Sequence[str],
+    activate: Sequence[str],
+    deactivate: Sequence[str],
+    known: Plans,
+    staying: Plans,
+    waiting: Plans,
+) -> Refusal | None:
+    """Refuse to leave one above without those below it."""
+    after = [*staying.values(), *(known[name] for name in enter)]
+    for name in deactivate:
+        upper = commander(name, staying.values() if name in activate else after)
+        if upper:
+            hint = f"deactivate {upper} in the same switch"
+            return Refusal(Code.COMMANDED, {"controller": name, "upper": upper, "hint": hint})
+    for name in enter:
+        for lower in known[name].into:
+            if lower not in known:
+                return Refusal(Code.UNKNOWN_CONTROLLER, {"controller": lower})
+            if lower in staying and lower in waiting:
+                return Refusal(Code.NOT_ACTIVE_YET, {"controller": lower})
+    return None
+
+
+def takeover_step(  # noqa: PLR0917  the states in which controllers are
+    fallback: str, taken: Sequence[str], known: Plans, active: Plans, waiting: Plans, failed: Collection[str]
+) -> Step | None:
+    """Return how a fallback takes over for controllers that were taken out; None: it cannot.
+
+    Those below them leave too where they hold what the fallback claims, unless one that goes on uses them.
+    `failed` have broken their contract: none of them comes back by a fault of another.
+    """
+    engaged = {**active, **waiting}
+    if fallback in engaged:
+        return None
+    free = _only_under(taken, known, engaged)
+    enter = lowers_first([fallback], known, engaged)
+    found = conflicts([*engaged.values(), *(known[name] for name in enter)])
+    leave = {conflict.holder for conflict in found}
+    while more := {upper for name in leave if (upper := commander(name, _without(engaged, leave)))}:
+        leave |= more
+    needed = {lower for name in enter for lower in known[name].into}
+    if not leave <= free or needed & leave or not needed <= known.keys():
+        return None
+    if any(name in failed for name in enter) or needed & waiting.keys():
+        return None
+    return Step(uppers_first([name for name in engaged if name in leave], known), enter)
+
+
+def _only_under(taken: Sequence[str], known: Plans, engaged: Plans) -> set[str]:
+    """Return the controllers below these that no other one which goes on uses."""
+    plans = tuple(known.values())
+    free = {lower for name in taken for lower in below(plans, name)} & engaged.keys()
+    while kept := {name for name in free if commander(name, _without(engaged, free))}:
+        free -= kept
+    return free
+
+
+def _without(plans: Plans, names: Collection[str]) -> list[ControllerPlan]:
+    return [plan for name, plan in plans.items() if name not in names]

@@ -6,7 +6,7 @@ An edge goes from the controller that is updated first. `into`: the upper end of
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from graphlib import CycleError, TopologicalSorter
 from heapq import heapify, heappop, heappush
@@ -138,6 +138,55 @@ def _reached(nodes: Sequence[Node], start: str, steps: Sequence[tuple[str, str]]
         newest = {end for begin, end in steps if begin in newest} - reached
         reached |= newest
     return tuple(node.name for node in nodes if node.name in reached)
+
+
+def lowers_first(
+    names: Iterable[str], known: Mapping[str, Node], without: Collection[str] = ()
+) -> tuple[str, ...]:
+    """Return controllers with all below them, each behind those below it, else in the order given.
+
+    Those of `without` are left out, with what is below them.
+    """
+    found: list[str] = []
+    for name in names:
+        _add_lowers_first(name, known, without, found)
+    return tuple(found)
+
+
+def _add_lowers_first(
+    name: str, known: Mapping[str, Node], without: Collection[str], found: list[str]
+) -> None:
+    # no closure: one that calls itself is a circle, and the loop collects no garbage
+    if name in known and name not in found and name not in without:
+        for lower in known[name].into:
+            _add_lowers_first(lower, known, without, found)
+        found.append(name)
+
+
+def uppers_first(names: Collection[str], known: Mapping[str, Node]) -> tuple[str, ...]:
+    """Return these controllers, each behind those above it, else in the order given."""
+    order = [name for name in lowers_first(reversed(tuple(names)), known) if name in names]
+    order.reverse()
+    return tuple(order)
+
+
+def commander(name: str, engaged: Iterable[Node]) -> str:
+    """Return the first controller that commands references of this one; empty: none does."""
+    return next((plan.name for plan in engaged if name in plan.into), "")
+
+
+def nearest_above(name: str, engaged: Sequence[Node]) -> tuple[str, ...]:
+    """Return the controllers above one, through others too, the nearest first."""
+    found: list[str] = []
+    newest: list[str] = [name]
+    while newest:
+        newest = [
+            plan.name
+            for plan in engaged
+            if plan.name not in found and any(one in plan.into for one in newest)
+        ]
+        found += newest
+    return tuple(found)
 
 
 def _sorter(nodes: Sequence[Node], found: Iterable[Edge]) -> TopologicalSorter[str]:

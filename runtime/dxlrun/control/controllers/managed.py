@@ -172,10 +172,11 @@ class Managed:
         """
         if (goal := self.goal) is not None:
             goal.end(Outcome.ABORTED, why)
+        if self.active:  # else the arrays that it claims may be another's
+            self._withdraw()
         self.active = False
         self._record.active &= ~self.bit
         self.until_ns = 0
-        self._withdraw()
 
     def _withdraw(self) -> None:
         for claim in self._claimed:
@@ -235,12 +236,19 @@ class Managed:
         self._held = True
         self._withdraw()
 
-    def wait_for(self, lost: Collection[int]) -> bool:
-        """Hold its joints as long as one that it claims is lost, of these rows.
+    def follow(self, time_ns: int) -> None:
+        """End what clients had it do: one above commands its references now. Raises ControllerFault."""
+        self._held = False
+        self.until_ns = 0
+        if (goal := self.goal) is not None and not goal.cancelling:
+            self.cancel(goal, time_ns)
+
+    def wait_for(self, lost: Collection[int], below: bool = False) -> bool:
+        """Hold its joints as long as one that it claims is lost, of these rows, or one below it waits.
 
         Returns whether that changed anything for the robot.
         """
-        waiting = bool(self._claimed) and any(row in lost for row in self.rows.tolist())
+        waiting = bool(self._claimed) and (below or any(row in lost for row in self.rows.tolist()))
         changed = waiting != self.waiting
         self.waiting = waiting
         if waiting and self.active:

@@ -5,20 +5,20 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.clock import Clock
 from dxlrun.control.controllers.activity import Activity
-from dxlrun.control.controllers.claims import conflicts
+from dxlrun.control.controllers.claims import Plans, conflicts
 from dxlrun.control.controllers.controller import Outcome
 from dxlrun.control.controllers.goals import Goals, RunningGoal
-from dxlrun.control.controllers.graph import update_order
+from dxlrun.control.controllers.graph import commander, update_order
 from dxlrun.control.controllers.live_parameters import LiveValues
 from dxlrun.control.controllers.managed import Managed, rate_divider, rate_fits
 from dxlrun.control.controllers.mode_switch import ModeSwitch, SetModes
 from dxlrun.control.controllers.plugins import PlugIns
+from dxlrun.control.controllers.switching import Switching, refused_by
 from dxlrun.control.controllers.topics import TopicLog
 from dxlrun.control.loop_plan import ControllerPlan, LoopPlan, ScheduledCommand
 from dxlrun.errors import ControllerFault, PlugInError
@@ -29,10 +29,7 @@ from dxlrun.run.channels.events import EventCode, EventSink, Severity
 
 
 class Manager:
-    """The controllers of a robot; `record` holds the arrays that all of them share.
-
-    `fault` is None, or the sentence of the first controller that broke its contract.
-    """
+    """The controllers of a robot; `record` holds the arrays that all of them share."""
 
     def __init__(
         self,
@@ -51,7 +48,6 @@ class Manager:
 
         `activity` shows which controller's code runs, `topics` takes what they publish.
         """
-        self.fault: str | None = None
         self._plan = plan
         self._plugins = plugins
         self._record = record
@@ -65,8 +61,6 @@ class Manager:
         """By their places; those that were unloaded keep theirs until another one gets it."""
         self._order: tuple[tuple[int, Managed], ...] = ()
         """Places and controllers in the order of updates: those above in a chain before those below."""
-        self._named: dict[str, Managed] = {}
-        """Those that are loaded."""
         self._commands: tuple[tuple[ScheduledCommand, NDArray[np.float64]], ...] = ()
         self._next = 0
         self._lost: Collection[int] = ()
@@ -74,8 +68,18 @@ class Manager:
         self._modes = ModeSwitch(plan.joints, record.states.mode, set_modes)
         self.released: set[int] = set()
         """Rows of joints whose torque clients switched off; the states show it a cycle later."""
-        self.ended_switches: list[tuple[int, Refusal | None]] = []
+        self._switching = Switching(self._modes, events)
+        self._named = self._switching.named
+
+    @property
+    def fault(self) -> str | None:
+        """The sentence of the first controller that broke its contract without a fallback; None: none did."""
+        return self._switching.fault
+
+    @property
+    def ended_switches(self) -> list[tuple[int, Refusal | None]]:
         """Switches that waited and have ended: the command's number, and why not; for the loop to answer."""
+        return self._switching.ended
 
     def configure(self) -> None:
         """Build and configure every controller, decode every command; allocates, before real time.
@@ -89,7 +93,7 @@ class Manager:
         self._managed = tuple(
             self._configured(place, controller) for place, controller in enumerate(self._plan.controllers)
         )
-        self._named = {managed.plan.name: managed for managed in self._managed}
+        self._named.update((managed.plan.name, managed) for managed in self._managed)
         self._sort()
         self._commands = tuple(
             (command, np.frombuffer(command.data, dtype="<f8")) for command in self._plan.commands
@@ -97,7 +101,7 @@ class Manager:
 
     def activate(self, time_ns: int) -> None:
         """Activate the controllers that start active; states and goals are fresh. A fault is in `fault`."""
-        self._enter([one for one in self._managed if one.plan.active and not one.active], time_ns, None, "")
+        self._switching.start(time_ns)
 
     def begin(self) -> None:
         """Begin a cycle, before its states are read: request modes."""
@@ -114,7 +118,7 @@ class Manager:
         """
         now_ns, took_ns = self._clock.now_ns, self._record.controller_ns
         if self._modes.groups:
-            self._admit(time_ns)
+            self._switching.admit(time_ns)
         if self._next < len(self._commands):
             self._record.command_count += self._hand_over(time_ns)
         for place, managed in self._order:
@@ -123,12 +127,12 @@ class Manager:
                 try:
                     managed.update(cycle, time_ns)
                 except ControllerFault as fault:
-                    self._end(managed, fault, time_ns)
+                    self._switching.end(managed, fault, time_ns)
                 if place < len(took_ns):
                     took_ns[place] = now_ns() - begin_ns
         return self.fault
 
-    def hand(  # noqa: PLR0917  a command's parts, as they come
+    def hand(  # noqa: PLR0911, PLR0917  a command's parts, as they come; one return a reason
         self,
         controller: str,
         kind: str,
@@ -149,6 +153,9 @@ class Manager:
             entering = managed in self._modes.entering
             code = Code.NOT_ACTIVE_YET if entering else Code.NOT_ACTIVE
             return Refusal(code, {"controller": controller})
+        if upper := commander(controller, self._switching.active.values()):
+            hint = f"command {upper}, or deactivate it"
+            return Refusal(Code.COMMANDED, {"controller": controller, "upper": upper, "hint": hint})
         if managed.takes_goal(kind):
             if until_ns:
                 return Refusal(Code.GOAL_STREAMED, {"controller": controller, "kind": kind})
@@ -157,8 +164,8 @@ class Manager:
         try:
             managed.command(kind, data, time_ns, until_ns)
         except ControllerFault as fault:
-            self._end(managed, fault, time_ns)
-            return _refused_by(managed, str(fault))
+            self._switching.end(managed, fault, time_ns)
+            return refused_by(managed, str(fault))
         if not streaming:
             self._log(EventCode.COMMAND, managed, f"{kind} from {origin}")
         return 0
@@ -172,8 +179,8 @@ class Manager:
         try:
             managed.begin_goal(goal, data, time_ns)
         except ControllerFault as fault:
-            self._end(managed, fault, time_ns)
-            return _refused_by(managed, str(fault))
+            self._switching.end(managed, fault, time_ns)
+            return refused_by(managed, str(fault))
         return goal.number
 
     def cancel(self, number: int, controller: str, time_ns: int) -> Refusal | None:
@@ -187,8 +194,8 @@ class Manager:
         try:
             managed.cancel(goal, time_ns)
         except ControllerFault as fault:
-            self._end(managed, fault, time_ns)
-            return _refused_by(managed, str(fault))
+            self._switching.end(managed, fault, time_ns)
+            return refused_by(managed, str(fault))
         return None
 
     def _goal_of(self, controller: str) -> RunningGoal | Refusal:
@@ -208,10 +215,10 @@ class Manager:
             return Refusal(Code.INVALID, {"problem": f"{controller}: {error}"})
         except ControllerFault as fault:
             if managed.active:
-                self._end(managed, fault, time_ns)
+                self._switching.end(managed, fault, time_ns)
             else:
-                self._take_out(managed, fault)  # it has no joints that a fallback would take over
-            return _refused_by(managed, str(fault))
+                self._switching.take_out(managed, fault)  # it has no joints that a fallback would take over
+            return refused_by(managed, str(fault))
         shown = ", ".join(f"{name} = {value:g}" for name, value in values.items())
         self._log(EventCode.PARAMETERS, managed, shown)
         return None
@@ -232,14 +239,15 @@ class Manager:
             managed.hold()
 
     def wait_for(self, lost: Collection[int]) -> tuple[int, ...]:
-        """Hold every controller that claims a lost joint, of these rows, as long as it is lost.
+        """Hold every controller that claims a lost joint, of these rows, as long as it is lost, and those
+        above it.
 
         Returns the rows of those that are commanded again. One that is activated meanwhile waits too.
         """
         self._lost = lost
         resumed: list[int] = []
-        for managed in self._managed:
-            if not managed.wait_for(lost):
+        for managed in (managed for _, managed in reversed(self._order)):  # those below first
+            if not managed.wait_for(lost, self._waits_below(managed)):
                 continue
             text, severity = "resumes: all its joints answer again", Severity.INFO
             if managed.waiting:
@@ -259,15 +267,10 @@ class Manager:
         in the first cycle in which all joints have (see ModeSwitch). How that ends is in `ended_switches`,
         under `number`, the command's; None: no command asked for it.
         """
-        if refusal := self._refuse(activate, deactivate) or self._refuse_limp(activate):
-            return refusal
-        for managed in (self._named[name] for name in deactivate):
-            if managed.active:
-                self._deactivate(managed, time_ns)
-            else:
-                refusal = Refusal(Code.SWITCHED_AGAIN, {"controller": managed.plan.name})
-                self._end_switch(self._modes.drop(managed), refusal)
-        return self._enter([self._named[name] for name in activate], time_ns, number, "")
+        step = self._switching.planned(activate, deactivate)
+        if isinstance(step, Refusal):
+            return step
+        return self._refuse_limp(step.enter) or self._switching.take(step, time_ns, number)
 
     def commanding(self, joints: Collection[str]) -> tuple[str, ...]:
         """Return the controllers that command one of these joints, directly or through a chain.
@@ -286,13 +289,13 @@ class Manager:
             ]
         return tuple(reversed(found))
 
-    def _refuse_limp(self, activate: Sequence[str]) -> Refusal | None:
+    def _refuse_limp(self, entering: Sequence[str]) -> Refusal | None:
         """Refuse controllers for joints without torque: they would command what cannot move."""
         torque = self._record.states.torque
         limp = tuple(
             dict.fromkeys(
                 self._plan.joints[row].name
-                for managed in (self._named[name] for name in activate)
+                for managed in (self._named[name] for name in entering)
                 if managed.plan.command and not managed.plan.into
                 for row in managed.rows.tolist()
                 if row in self.released or torque[row] in LIMP
@@ -303,45 +306,9 @@ class Manager:
         hint = f"`dxlrun torque on {' '.join(limp)}` gives it"
         return Refusal(Code.JOINT_LIMP, {"joint": limp, "hint": hint})
 
-    def _end_switch(self, number: int | None, refusal: Refusal | None) -> None:
-        if number is not None:
-            self.ended_switches.append((number, refusal))
-
-    def _refuse(self, activate: Sequence[str], deactivate: Sequence[str]) -> Refusal | None:
-        active = [managed for managed in self._managed if managed.active]
-        return self._modes.refuse(activate, deactivate, self._named, active)
-
-    def _enter(
-        self, entering: Sequence[Managed], time_ns: int, number: int | None, why: str
-    ) -> Refusal | Waiting | None:
-        """Activate controllers whose claims were checked together, at once or when their modes are there.
-
-        `why`: the fault of the controller that these stand in for; empty: they were asked for.
-        """
-        self._modes.changed()
-        if self._modes.ready(entering):
-            return self._activate_all(entering, time_ns)
-        self._modes.await_modes(entering, time_ns, number, why)
-        for managed in entering:
-            self._log(EventCode.MODE, managed, "waits until its joints are in their modes")
-        return Waiting(tuple(managed.plan.name for managed in entering))
-
-    def _admit(self, time_ns: int) -> None:
-        """Activate controllers whose modes are there now; give up those that waited too long."""
-        ready, late = self._modes.due(time_ns)
-        for group in ready:
-            self._end_switch(group.number, self._activate_all(group.entering, time_ns))
-        for group in late:
-            problem = self._modes.problem(group)
-            refusal = Refusal(Code.MODE_NOT_ENTERED, {"controller": group.names, "problem": problem})
-            self._end_switch(group.number, refusal)
-            for managed in group.entering:
-                name = managed.plan.name
-                text = f"{name} is not activated: {problem}"
-                self._report_refusal(name, text, CommandOutcome("switch", "", refusal))
-            self.fault = self.fault or group.why or None
-
-    def load(self, plan: ControllerPlan) -> int | Refusal:
+    def load(  # noqa: PLR0911  one return a reason
+        self, plan: ControllerPlan
+    ) -> int | Refusal:
         """Configure one more controller, inactive; return its place. Only while the loop is paused."""
         if plan.name in self._named:
             return Refusal(Code.NAME_TAKEN, {"controller": plan.name})
@@ -353,18 +320,25 @@ class Manager:
         known = {joint.name for joint in self._plan.joints}
         if unknown := tuple(joint for joint in plan.joints if joint not in known):
             return Refusal(Code.UNKNOWN_JOINT, {"joint": unknown})
+        divider = rate_divider(plan.rate, self._period_ns)
+        plan = replace(plan, active=False, every=divider)
+        if refusal := self._refuse_graph(plan):
+            return refusal
         begin_ns = self._clock.now_ns()
         try:
-            divider = rate_divider(plan.rate, self._period_ns)
-            managed = self._configured(place, replace(plan, active=False, every=divider))
+            managed = self._configured(place, plan)
         except (ControllerFault, PlugInError) as error:
             return Refusal(Code.CONTROLLER_FAULT, {"controller": plan.name, "problem": str(error)})
-        managed.wait_for(self._lost)
+        managed.wait_for(self._lost, self._waits_below(managed))
         self._managed = (*self._managed[:place], managed, *self._managed[place + 1 :])
         self._named[plan.name] = managed
         self._sort()
         self._log_loaded(managed, "loaded", begin_ns)
         return place
+
+    def _waits_below(self, managed: Managed) -> bool:
+        """Return whether a controller whose references this one commands waits for a lost joint."""
+        return any(self._named[lower].waiting for lower in managed.plan.into)
 
     def _sort(self) -> None:
         """Put the loaded controllers into the order of updates."""
@@ -375,6 +349,19 @@ class Manager:
         }
         order = update_order([self._managed[place].plan for place in places.values()])
         self._order = tuple((places[name], self._managed[places[name]]) for name in order)
+
+    def _refuse_graph(self, plan: ControllerPlan) -> Refusal | None:
+        """Refuse a controller that is not to be had in the graph of those that are loaded."""
+        known = self._switching.known
+        if unknown := tuple(lower for lower in plan.into if lower not in known):
+            return Refusal(Code.UNKNOWN_CONTROLLER, {"controller": unknown})
+        if not set(plan.references) <= set(self._record.layout.references):
+            return Refusal(Code.NO_NEW_REFERENCES, {"controller": plan.name})
+        try:
+            update_order([*known.values(), plan])
+        except ValueError as error:
+            return Refusal(Code.INVALID, {"problem": str(error)})
+        return _refuse_rates({**known, plan.name: plan}, self._period_ns)
 
     def _free_place(self) -> int:
         """Return a place for a controller; those of the plan keep theirs, also when they were unloaded.
@@ -394,6 +381,9 @@ class Manager:
             return Refusal(Code.UNKNOWN_CONTROLLER, {"controller": name})
         if managed.active or managed in self._modes.entering:
             return Refusal(Code.STILL_ACTIVE, {"controller": name})
+        if upper := commander(name, self._switching.known.values()):
+            hint = f"unload {upper} first"
+            return Refusal(Code.COMMANDED, {"controller": name, "upper": upper, "hint": hint})
         begin_ns = self._clock.now_ns()
         del self._named[name]
         self._sort()
@@ -405,6 +395,8 @@ class Manager:
         for managed in self._named.values():
             if not rate_fits(managed.plan.rate, period_ns):
                 return _not_divided(managed.plan, period_ns)
+        if refusal := _refuse_rates(self._switching.known, period_ns):
+            return refusal
         self._period_ns = period_ns
         for managed in self._named.values():
             managed.change_period(period_ns)
@@ -422,41 +414,7 @@ class Manager:
 
     def deactivate(self, time_ns: int) -> None:
         """Deactivate all controllers, the last one first; raises nothing, a fault is in `fault`."""
-        for managed in reversed(self._managed):
-            if managed.active:
-                self._deactivate(managed, time_ns, "the run ended")
-        for number in self._modes.end():
-            self._end_switch(number, Refusal(Code.RUN_ENDING))
-
-    def _activate_all(self, entering: Sequence[Managed], time_ns: int) -> Refusal | None:
-        """Activate controllers whose claims were checked together, then the fallbacks of those that failed:
-        a fallback that came first could have a joint that belongs to one of the others.
-
-        Returns the first fault; the other controllers are active all the same.
-        """
-        # no faults in it, which hold this frame: the collector is off, so such a circle would stay
-        failed: list[tuple[Managed, str]] = []
-        for managed in entering:
-            try:
-                managed.activate(time_ns)
-            except ControllerFault as fault:
-                self._take_out(managed, fault)
-                failed.append((managed, str(fault)))
-            else:
-                self._log(EventCode.CONTROLLER_ACTIVATED, managed, "active")
-        for managed, why in failed:
-            self._fall_back(managed, why, time_ns)
-        return _refused_by(*failed[0]) if failed else None
-
-    def _deactivate(self, managed: Managed, time_ns: int, why: str = "") -> None:
-        self._modes.changed()
-        try:
-            managed.deactivate(time_ns, why)
-        except ControllerFault as fault:
-            self._take_out(managed, fault)  # without a fallback: it was leaving anyway
-            self.fault = self.fault or str(fault)
-        else:
-            self._log(EventCode.CONTROLLER_DEACTIVATED, managed, "inactive")
+        self._switching.deactivate_all(time_ns)
 
     def _hand_over(self, time_ns: int) -> int:
         """Give each command whose time has come to its controller; return how many were taken."""
@@ -469,14 +427,10 @@ class Manager:
             if isinstance(answer, Refusal):
                 text = f"{command.kind} from {command.origin} refused: {answer.text}"
                 outcome = CommandOutcome(command.kind, command.origin, answer)
-                self._report_refusal(command.controller, text, outcome)
+                self._switching.report_refusal(command.controller, text, outcome)
             else:
                 taken += 1
         return taken
-
-    def _report_refusal(self, controller: str, text: str, outcome: CommandOutcome) -> None:
-        data = msgspec.json.encode(outcome)
-        self._events.emit(EventCode.COMMAND_REFUSED, Severity.WARNING, controller, text, data)
 
     def _log_taken(self, planned: int, command: ScheduledCommand) -> None:
         record = self._record
@@ -485,27 +439,6 @@ class Manager:
                 record.woken_ns, record.cycle, planned, command.controller, command.kind, command.origin, b""
             )
         )
-
-    def _end(self, managed: Managed, fault: ControllerFault, time_ns: int) -> None:
-        """Take a controller that broke its contract out of the robot, and let its fallback take over."""
-        self._take_out(managed, fault)
-        self._fall_back(managed, str(fault), time_ns)
-
-    def _take_out(self, managed: Managed, fault: ControllerFault) -> None:
-        managed.release(str(fault))
-        self._modes.changed()
-        text = "\n".join([str(fault), *getattr(fault, "__notes__", ())])
-        self._events.emit(EventCode.CONTROLLER_FAULT, Severity.ERROR, managed.plan.name, text)
-        managed.failed = True
-
-    def _fall_back(self, managed: Managed, why: str, time_ns: int) -> None:
-        """Let a fallback take over, but for one that broke its own contract before: two that fall back on
-        each other would do so for ever."""
-        fallback = self._named.get(managed.plan.fallback)
-        if fallback is None or fallback.failed or self._refuse((fallback.plan.name,), ()):
-            self.fault = self.fault or why
-        else:
-            self._enter([fallback], time_ns, None, why)
 
     def _log_loaded(self, managed: Managed, what: str, begin_ns: int) -> None:
         text = f"{what} in {(self._clock.now_ns() - begin_ns) / 1e6:.1f} ms, while the loop stood still"
@@ -531,8 +464,14 @@ class Manager:
         return managed
 
 
-def _refused_by(managed: Managed, problem: str) -> Refusal:
-    return Refusal(Code.CONTROLLER_FAULT, {"controller": managed.plan.name, "problem": problem})
+def _refuse_rates(plans: Plans, period_ns: int) -> Refusal | None:
+    """Refuse a period in which a controller is not updated whenever one above it is."""
+    for upper in plans.values():
+        for lower in (plans[name] for name in upper.into):
+            if rate_divider(upper.rate, period_ns) % rate_divider(lower.rate, period_ns):
+                fields: dict[str, Field] = {"controller": lower.name, "upper": upper.name}
+                return Refusal(Code.RATE_BELOW_UPPER, fields | {"rate": 1e9 / period_ns})
+    return None
 
 
 def _not_divided(plan: ControllerPlan, period_ns: int) -> Refusal:

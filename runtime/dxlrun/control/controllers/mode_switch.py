@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.control.controllers.claims import claimed_modes, conflicts, conflicts_text
+from dxlrun.control.controllers.claims import claimed_modes
 from dxlrun.control.controllers.managed import Managed
 from dxlrun.control.loop_plan import JointPlan
 from dxlrun.description.modes import Mode
-from dxlrun.run.channels.answers import Code, Field, Refusal
 
 MODE_TIMEOUT_NS = 5_000_000_000
 """How long controllers wait for modes: twenty servos, one after the other in short idle times, need less than
@@ -116,6 +115,11 @@ class ModeSwitch:
         ]
         return (stays or late)[0] + (f", nor did {len(missing) - 1} more" if len(missing) > 1 else "")
 
+    def give_up(self, group: Group) -> None:
+        """Let a group wait no more."""
+        self.groups = [one for one in self.groups if one is not group]
+        self.requested = False
+
     def drop(self, managed: Managed) -> int | None:
         """Let a controller wait no more; return the number of the command whose last one it was."""
         ended = None
@@ -150,36 +154,6 @@ class ModeSwitch:
                 modes[row] = mode
         if self._set_modes is not None and modes.any():
             self._set_modes(modes)
-
-    def refuse(
-        self,
-        activate: Sequence[str],
-        deactivate: Sequence[str],
-        named: Mapping[str, Managed],
-        active: Iterable[Managed],
-    ) -> Refusal | None:
-        """Return why controllers cannot be switched so, None when they can."""
-        if unknown := tuple(name for name in (*activate, *deactivate) if name not in named):
-            return Refusal(Code.UNKNOWN_CONTROLLER, {"controller": unknown})
-        for names in (activate, deactivate):
-            if twice := tuple({name for name in names if names.count(name) > 1}):
-                return Refusal(Code.NAMED_TWICE, {"controller": twice})
-        engaged = {managed.plan.name: managed.plan for managed in (*active, *self.entering)}
-        if idle := tuple(name for name in deactivate if name not in engaged):
-            return Refusal(Code.INACTIVE_ALREADY, {"controller": idle})
-        if busy := tuple(name for name in activate if name in engaged and name not in deactivate):
-            return Refusal(Code.ACTIVE_ALREADY, {"controller": busy})
-        staying = [plan for name, plan in engaged.items() if name not in deactivate]
-        found = conflicts([*staying, *(named[name].plan for name in activate)])
-        if not found:
-            return None
-        fields: dict[str, Field] = {
-            "conflict": conflicts_text(found),
-            "joints": tuple(conflict.joint for conflict in found),
-            "holders": tuple(conflict.holder for conflict in found),
-            "others": tuple(conflict.other for conflict in found),
-        }
-        return Refusal(Code.JOINTS_CLAIMED, fields)
 
     def _missing(self, entering: Iterable[Managed]) -> dict[str, tuple[Mode, Mode]]:
         """Return the joints that are not in their modes, with the mode that they need and theirs."""

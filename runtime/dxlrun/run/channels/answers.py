@@ -48,6 +48,11 @@ class Code(StrEnum):
     ACTIVE_ALREADY = "active_already", "{controller} is active already"
     STILL_ACTIVE = "still_active", "{controller} is active; deactivate it first"
     JOINTS_CLAIMED = "joints_claimed", "{conflict}; deactivate the other one in the same switch"
+    COMMANDED = "commanded", "{controller} is commanded by {upper}"
+    NO_NEW_REFERENCES = (
+        "no_new_references",
+        "{controller} exports references that the robot file does not have; write it there and start anew",
+    )
     MODE_NOT_ENTERED = "mode_not_entered", "{controller} is not activated: {problem}"
     SWITCHED_AGAIN = "switched_again", "another switch deactivated {controller} before it was active"
     CONTROLLER_FAULT = "controller_fault", "{problem}"
@@ -80,6 +85,10 @@ class Code(StrEnum):
     RATE_NOT_DIVIDED = (
         "rate_not_divided",
         "{rate:g} Hz is no multiple of {controller_rate:g} Hz, the rate of controller {controller}",
+    )
+    RATE_BELOW_UPPER = (
+        "rate_below_upper",
+        "at {rate:g} Hz {controller} would not be updated whenever {upper} is, which commands it",
     )
     # joints
     UNKNOWN_JOINT = "unknown_joint", "there is no joint {joint}"
