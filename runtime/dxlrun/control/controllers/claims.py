@@ -181,9 +181,9 @@ def _refuse_ends(  # noqa: PLR0917  the parts of a switch
     waiting: Plans,
 ) -> Refusal | None:
     """Refuse to leave one above without those below it."""
-    after = [*staying.values(), *(known[name] for name in enter)]
+    fresh = [known[name] for name in enter if name not in deactivate]
     for name in deactivate:
-        upper = commander(name, staying.values() if name in activate else after)
+        upper = commander(name, [*staying.values(), *(() if name in activate else fresh)])
         if upper:
             hint = f"deactivate {upper} in the same switch"
             return Refusal(Code.COMMANDED, {"controller": name, "upper": upper, "hint": hint})

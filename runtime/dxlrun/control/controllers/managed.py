@@ -276,8 +276,9 @@ class Managed:
         self._call(ControllerMethod.UPDATE, "", self._controller.update, time_ns, capped_ns)
         changed: list[Claim] = []
         for claim in self._claimed:
-            if claim.unchanged():
-                continue
+            own, shown = claim.own.tobytes(), claim.shown
+            if own == claim.taken and shown is not None and shown.tobytes() == own:
+                continue  # checked and merged before, and still there
             changed.append(claim)
             np.isfinite(claim.own, self._finite)
             if np.count_nonzero(self._finite) < self._finite.size:  # a tenth of the time of all()

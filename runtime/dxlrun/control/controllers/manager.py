@@ -70,16 +70,13 @@ class Manager:
         """Rows of joints whose torque clients switched off; the states show it a cycle later."""
         self._switching = Switching(self._modes, events)
         self._named = self._switching.named
+        self.ended_switches = self._switching.ended
+        """Switches that waited and have ended: the command's number, and why not; for the loop to answer."""
 
     @property
     def fault(self) -> str | None:
         """The sentence of the first controller that broke its contract without a fallback; None: none did."""
         return self._switching.fault
-
-    @property
-    def ended_switches(self) -> list[tuple[int, Refusal | None]]:
-        """Switches that waited and have ended: the command's number, and why not; for the loop to answer."""
-        return self._switching.ended
 
     def configure(self) -> None:
         """Build and configure every controller, decode every command; allocates, before real time.
@@ -130,7 +127,7 @@ class Manager:
                     self._switching.end(managed, fault, time_ns)
                 if place < len(took_ns):
                     took_ns[place] = now_ns() - begin_ns
-        return self.fault
+        return self._switching.fault
 
     def hand(  # noqa: PLR0911, PLR0917  a command's parts, as they come; one return a reason
         self,

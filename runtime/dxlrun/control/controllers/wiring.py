@@ -163,7 +163,7 @@ def _reference_claim(plan: ControllerPlan, interface: str, own: Commands, record
 class Claim:
     """A claimed interface: the controller's array, the one it goes into, and where it was ever finite."""
 
-    __slots__ = ("_merged", "_place", "_shown", "_taken", "all_seen", "names", "own", "seen")
+    __slots__ = ("_merged", "_place", "all_seen", "names", "own", "seen", "shown", "taken")
 
     def __init__(self, names: tuple[str, ...], own: Floats, merged: Floats, place: Columns) -> None:
         self.names = names
@@ -173,28 +173,25 @@ class Claim:
         self.all_seen = False
         self._merged = merged
         self._place = place
-        self._shown = merged[place] if isinstance(place, slice) else None
-        self._taken = b""
+        self.shown = merged[place] if isinstance(place, slice) else None
+        """Where it goes, as a view; None: its elements are in no equal distances."""
+        self.taken = b""
+        """The bytes of `own` that were checked and merged last."""
 
     def forget(self) -> None:
         """Begin anew: nothing was commanded yet."""
         self.own.fill(np.nan)
         self.seen.fill(False)
         self.all_seen = False
-        self._taken = b""
-
-    def unchanged(self) -> bool:
-        """Return whether the commands are those that were checked and merged before, and still merged."""
-        own = self.own.tobytes()
-        return own == self._taken and self._shown is not None and self._shown.tobytes() == own
+        self.taken = b""
 
     def merge(self) -> None:
         """Put what was checked into the robot's commands."""
-        self._taken = self.own.tobytes()
-        if self._shown is None:
+        self.taken = self.own.tobytes()
+        if self.shown is None:
             self._merged[self._place] = self.own
         else:
-            self._shown[:] = self.own
+            self.shown[:] = self.own
 
     def withdraw(self) -> None:
         """Take it out of the robot's commands."""
