@@ -2,102 +2,123 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from typing import Annotated, ClassVar, Literal
+from enum import Enum, auto, unique
+from typing import Annotated, ClassVar, Final, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field, TypeAdapter
+from pydantic import Field, model_validator
 
-from dxlrun import Angle, CommandModel, Context, Controller, Duration, Floats, Interfaces, ParametersModel
-from dxlrun_controllers.joints import JointNames, check_size, hold
-from dxlrun_controllers.spline import CUBIC, LINEAR, QUINTIC, SplineSample, Trajectory, flatten
+from dxlrun import (
+    LIVE,
+    Angle,
+    AngularAcceleration,
+    CommandModel,
+    Context,
+    Controller,
+    Duration,
+    Floats,
+    Goal,
+    Interfaces,
+    Outcome,
+    ParametersModel,
+)
+from dxlrun_controllers.joints import JointsParameters, PerJoint, finite_or, hold, row_of
+from dxlrun_controllers.laws.pid import feed_velocities_forward
+from dxlrun_controllers.laws.spline import SplineSample, Stop, Trajectory
+from dxlrun_controllers.laws.tracking import Tracking, TrackingGains
+from dxlrun_controllers.trajectory_command import TrajectoryCommand, flat_trajectory
 
-CLOSING_SPEED = 0.5
+CLOSING_SPEED: Final = 0.5
 """rad/s, posvel at the end of a trajectory: with its speed of 0 a servo that lags would creep the rest of its
 way at one tick (0.012 rad/s)."""
+DECELERATION: Final = 20.0
+"""rad/s^2, of joints that have no limit of their own: an XM430 is at rest from its top speed in 0.25 s."""
+SPEED_SLOPE: Final = 2.0
+"""1/s, how fast the speed of a trajectory changes: from 1 to 0 in 0.5 s, so no velocity ever jumps."""
+FEEDBACK_NS: Final = 100_000_000
+_STILL: Final = 1e-3
+"""A speed of the trajectory so near to 0 is none: its time stands still."""
 
 
 class Tolerances(ParametersModel):
-    """How far a joint may be off; a tolerance that is left out is not checked."""
+    """How far a joint may be off, each one angle for all joints or a mapping by joint.
 
-    path: Angle | None = None
-    """On the way: beyond it the trajectory is aborted and the joints hold the desired position of then."""
-    goal: Angle | None = None
+    A tolerance that is left out is not checked.
+    """
+
+    path: PerJoint[Angle] | None = None
+    """On the way: beyond it the goal is aborted, and the joints come to rest."""
+    goal: PerJoint[Angle] | None = None
     """At the end: the goal counts as reached when every joint is nearer than this."""
     goal_time: Duration = 0
     """How long after the end the goal may still be reached."""
 
 
-class TrajectoryParameters(ParametersModel):
+class TrajectoryParameters(JointsParameters):
     """Keys of a joint_trajectory_controller in the robot file."""
 
-    joints: JointNames
-    """The joints, in the order in which points name them."""
-    command_interface: Literal["position", "posvel"] = "position"
-    """`posvel` commands the magnitude of the desired velocity beside the position."""
+    command_interface: Literal["position", "posvel", "velocity", "effort"] = "position"
+    """`posvel` commands the desired velocity beside the position: its magnitude to servos, with its sign to
+    another controller. `velocity` and `effort` follow it by a PID law with feed-forward."""
     tolerances: Tolerances = Tolerances()
+    gains: TrackingGains | None = None
+    """Of `velocity` and `effort`."""
+    derivative_filter: Duration = 0
+    """Time constant of the filter on the error's rate."""
+    deceleration: PerJoint[Annotated[AngularAcceleration, Field(gt=0)]] | None = None
+    """With which joints come to rest after a cancel or an abort; the joint's own limit if that is lower."""
+    speed: Annotated[float, LIVE, Field(ge=0, le=10)] = 1.0
+    """Factor of the trajectories' time: 0.5 is half as fast, 0 waits."""
+
+    _own_velocity = model_validator(mode="before")(feed_velocities_forward)
+
+    @model_validator(mode="after")
+    def _gains_where_they_count(self) -> Self:
+        tracks = self.command_interface in ("velocity", "effort")
+        if tracks and self.gains is None:
+            raise ValueError(f"{self.command_interface} needs gains: add gains: {{p: ..., d: ...}}")
+        if self.gains is not None and not tracks:
+            raise ValueError("gains count only for velocity and effort; take them out")
+        return self
 
 
-_DURATION: TypeAdapter[int] = TypeAdapter(Duration)
-
-
-def _seconds(value: object) -> object:
-    """Accept `500 ms` beside a bare number, which counts seconds."""
-    return _DURATION.validate_python(value) * 1e-9 if isinstance(value, str) else value
-
-
-Seconds = Annotated[float, BeforeValidator(_seconds), Field(ge=0)]
-
-
-class TrajectoryPoint(CommandModel):
-    """Where the joints are to be at a time."""
-
-    time: Seconds
-    """s since the trajectory's start"""
-    positions: tuple[float, ...]
-    """rad, shape (joints,)"""
-    velocities: tuple[float, ...] | None = None
-    """rad/s, shape (joints,)"""
-    accelerations: tuple[float, ...] | None = None
-    """rad/s^2, shape (joints,)"""
-
-
-class TrajectoryCommand(CommandModel):
-    """A trajectory: linear when only positions are given, cubic with velocities, quintic with accelerations.
-
-    What only some points give is not used. The joints go from where they are to the first point in
-    `start_in` and the first point's time; when both are 0, at once, as the last gate lets them.
-    """
-
-    points: Annotated[tuple[TrajectoryPoint, ...], Field(min_length=1)]
-    start_in: Seconds = 0.0
-    """s until the trajectory's start, from the moment at which the command is taken"""
+@unique
+class _Phase(Enum):
+    RESTING = auto()
+    MOVING = auto()
+    SETTLING = auto()
+    """The trajectory has ended, the goal not yet."""
+    STOPPING = auto()
 
 
 class JointTrajectoryController(Controller[TrajectoryParameters]):
     """Plays one trajectory at a time; a new one begins at the desired state of then, without a jump.
 
-    Time decides the desired state, never the number of updates: a late cycle shortens nothing.
+    Time decides the desired state, never the number of updates: a late cycle shortens nothing. Goals,
+    tolerances and partial joints as in joint_trajectory_controller of ros2_controllers (control.ros.org).
     """
 
     Parameters = TrajectoryParameters
     Commands: ClassVar[Mapping[str, type[CommandModel]]] = {"trajectory": TrajectoryCommand}
+    Goals = frozenset({"trajectory"})
 
     @classmethod
     def interfaces(cls, parameters: TrajectoryParameters, joints: tuple[str, ...]) -> Interfaces:
-        """Claim position, or position and velocity, of the parameters' joints."""
-        if parameters.command_interface == "position":
-            return Interfaces(parameters.joints, ("position",))
-        return Interfaces(parameters.joints, ("position", "velocity"))
+        """Claim position, position and velocity, velocity, or effort of the parameters' joints."""
+        if parameters.command_interface == "posvel":
+            return Interfaces(parameters.joints, ("position", "velocity"))
+        return Interfaces(parameters.joints, (parameters.command_interface,))
 
     @classmethod
     def prepare(
         cls, kind: str, command: CommandModel, parameters: TrajectoryParameters
     ) -> NDArray[np.float64]:
-        """Return the trajectory's splines as one flat array (spline.flatten).
+        """Return the trajectory's splines as one flat array (spline.flatten), its joints and its time-out.
 
-        Raises ValueError for a wrong size or times that do not grow.
+        Raises ValueError for a wrong size, unknown joints, or times that do not grow.
         """
         if not isinstance(command, TrajectoryCommand):
             return super().prepare(kind, command, parameters)
@@ -106,72 +127,264 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
     def on_configure(self, context: Context) -> None:
         """Make room for everything that the loop needs."""
         super().on_configure(context)
-        joints = len(context.joints)
-        self._desired = SplineSample(joints)
-        self._trajectory = Trajectory(joints)
-        self._error = np.zeros(joints)
-        self._start_ns = 0
-        self._moving = False
-        self._settling = False
-        speed = context.limits.velocity
-        self._closing = np.where(np.isfinite(speed), np.minimum(speed, CLOSING_SPEED), CLOSING_SPEED)
+        joints, limits, parameters = context.joints, context.limits, self.parameters
+        count = len(joints)
+        self._desired, self._path, self._others = (SplineSample(count) for _ in range(3))
+        self._trajectory = Trajectory(count)
+        self._stop = Stop(count)
+        self._error, self._part = np.zeros((2, count))
+        self._moved, self._resting = np.ones(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
+        """Joints of the goal, and all others: these come to rest by `_stop`."""
+        self._some_rest = self._rest_still = False
+        self._silent = np.zeros(count, dtype=np.bool_)
+        self._unknown = False
+        self._phase = _Phase.RESTING
+        self._goal: Goal | None = None
+        self._cancelling = False
+        self._start_ns = self._base_ns = self._stop_ns = self._end_ns = self._feedback_ns = 0
+        self._timeout_ns = np.inf
+        self._base_s = 0.0
+        self._speed = self._rate = parameters.speed
+        self._slope = 0.0
+        """The speed that is wanted; that of now, and how fast it changes, 1/s."""
+        self._path_tolerance = row_of(parameters.tolerances.path, joints)
+        self._goal_tolerance = row_of(parameters.tolerances.goal, joints)
+        self._checks_path = parameters.tolerances.path is not None
+        self._lower, self._upper = finite_or(limits.lower, -np.inf), finite_or(limits.upper, np.inf)
+        own = row_of(parameters.deceleration, joints, DECELERATION)
+        self._deceleration = np.fmin(own, getattr(limits, "acceleration", own))
+        speed = finite_or(limits.velocity, np.inf)
+        self._speed_limit = speed
+        self._closing = np.minimum(speed, CLOSING_SPEED)
+        self._interface = parameters.command_interface
+        self._tracking: Tracking | None = None
+        if parameters.gains is not None:
+            tracked: Literal["velocity", "effort"] = "velocity" if self._interface == "velocity" else "effort"
+            self._tracking = Tracking(context, tracked, parameters.derivative_filter * 1e-9)
+            self._tracking.take(parameters.gains, joints)
+        self._to_servos = not context.into
+
+    def on_parameters(self, time_ns: int) -> None:
+        """Take the gains; the speed is reached with SPEED_SLOPE."""
+        if self._phase is _Phase.MOVING:
+            self._base_s, self._base_ns = self._warped(time_ns), time_ns
+        self._speed = self.parameters.speed
+        if self._tracking is not None and self.parameters.gains is not None:
+            self._tracking.take(self.parameters.gains, self.context.joints)
 
     def on_activate(self, time_ns: int) -> None:
         """Hold where the joints are."""
-        hold(self.context)
-        self._moving = self._settling = False
-        self._rest(self.context.commands.position)
+        commands, states = self.context.commands, self.context.states
+        self._phase, self._goal, self._some_rest = _Phase.RESTING, None, False
+        if self._tracking is None:
+            hold(self.context)
+            self._rest(commands.position)
+            if not self._to_servos:
+                commands.velocity.fill(0.0)
+        else:
+            self._rest(states.position)
+            self._tracking.begin(self._desired)
+        self._unknown = True
 
-    def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
+    def on_deactivate(self, time_ns: int) -> None:
+        """Forget the goal: the runtime has ended it."""
+        self._goal = None
+
+    # Goals
+
+    def on_goal(self, goal: Goal, data: NDArray[np.float64], time_ns: int) -> None:
         """Begin a trajectory from the desired state."""
-        if self._moving:
-            self._trajectory.sample(self._elapsed(time_ns), self._desired)
-            self.context.say(f"trajectory preempted after {self._elapsed(time_ns):.3f} s")
-        self._trajectory.load(data, self._desired)
-        self._start_ns = time_ns
-        self._moving, self._settling = True, False
+        self._goal = None
+        if self._phase is not _Phase.MOVING:
+            still = self._phase is not _Phase.STOPPING
+            self._rate, self._slope = self._speed if still or self._speed > _STILL else 1.0, 0.0
+        self._know_where(time_ns)
+        if np.isnan(self._desired.position).any():
+            row = int(np.isnan(self._desired.position).argmax())
+            joint = self.context.joints[row]
+            goal.end(Outcome.ABORTED, f"joint {joint} has not answered yet", joint)
+            return
+        self._stop.load(self._desired, self._deceleration, self._lower, self._upper)
+        more = self._trajectory.load(data, self._path)
+        self._moved.fill(True)
+        self._timeout_ns = np.inf
+        if len(more):  # logs of the first release have trajectories of all joints, without a time-out
+            np.copyto(self._moved, more[1:] != 0)
+            self._timeout_ns = float(more[0]) * 1e9
+        np.logical_not(self._moved, out=self._resting)
+        self._some_rest, self._rest_still = bool(self._resting.any()), False
+        self._goal, self._cancelling = goal, False
+        self._start_ns = self._base_ns = self._stop_ns = time_ns
+        self._feedback_ns = time_ns + FEEDBACK_NS
+        self._base_s = 0.0
+        self._phase = _Phase.MOVING
+        self._report_haste()
+
+    def on_cancel(self, goal: Goal, time_ns: int) -> None:
+        """Bring the joints to rest from their desired velocity; the goal ends when they are."""
+        self._cancelling = True
+        self._stop_from(time_ns)
+
+    def _know_where(self, time_ns: int) -> None:
+        """Set the desired state of now, and in `_path` the same with the derivatives of the path."""
+        desired, path = self._desired, self._path
+        if self._unknown:
+            self._hold_where_heard()
+        if self._phase is _Phase.MOVING:
+            self._sample(time_ns, derivatives=True)
+        elif self._phase is _Phase.STOPPING:
+            self._stop.sample((time_ns - self._stop_ns) * 1e-9, desired)
+        self._bring_others_to_rest(time_ns)
+        np.copyto(path.position, desired.position)
+        if self._rate > _STILL:
+            np.divide(desired.velocity, self._rate, out=path.velocity)
+            np.multiply(path.velocity, -self._slope, out=path.acceleration)
+            path.acceleration += desired.acceleration
+            path.acceleration /= self._rate**2
+        else:
+            path.velocity.fill(0.0)
+            path.acceleration.fill(0.0)
+
+    def _report_haste(self) -> None:
+        """Report a way to the first point that is too long for its time: only now it is known."""
+        speed = np.abs(self._trajectory.first_way(self._path)) * self._moved * self._speed
+        fast = speed > self._speed_limit * (1 + 1e-9)
+        if fast.any():
+            row = int(fast.argmax())
+            self.context.say(
+                f"joint {self.context.joints[row]} has to go to the first point at {speed[row]:.4g} rad/s, "
+                f"more than its limit of {self._speed_limit[row]:.4g} rad/s, so it comes late"
+            )
+
+    def _end(self, outcome: Outcome, time_ns: int, text: str = "", row: int = -1) -> None:
+        """End the goal with the joint of `row`, or the one that is farthest off."""
+        goal, self._goal = self._goal, None
+        if goal is None:
+            return
+        if row < 0:
+            self._measure(silent=0.0)
+            row = int(self._error.argmax())
+        after = f"after {(time_ns - self._start_ns) * 1e-9:.3f} s{', ' * bool(text)}{text}"
+        goal.end(outcome, after, self.context.joints[row], float(self._error[row]))
+
+    # In a cycle
 
     def update(self, time_ns: int, period_ns: int) -> None:
         """Command the trajectory's state at `time_ns`; hold when there is none."""
-        if self._moving:
-            self._follow(self._elapsed(time_ns))
-        elif self._settling:
-            self._settle(self._elapsed(time_ns))
+        if self._phase is _Phase.MOVING:
+            self._move(time_ns)
+        elif self._phase is _Phase.STOPPING:
+            self._come_to_rest(time_ns)
+        elif self._phase is _Phase.SETTLING:
+            self._settle(time_ns)
+        elif self._unknown:
+            self._hold_where_heard()
+        self._bring_others_to_rest(time_ns)
+        self._command(period_ns)
 
-    def _elapsed(self, time_ns: int) -> float:
-        return (time_ns - self._start_ns) * 1e-9
-
-    def _follow(self, elapsed: float) -> None:
-        commands, desired, trajectory = self.context.commands, self._desired, self._trajectory
-        if elapsed >= trajectory.duration_s:
-            trajectory.sample(elapsed, desired)
-            np.copyto(commands.position, desired.position)
-            self._moving, self._settling = False, True
+    def _move(self, time_ns: int) -> None:
+        elapsed = self._sample(time_ns, derivatives=self._interface != "position")
+        if elapsed >= self._trajectory.duration_s:
+            self._phase, self._end_ns = _Phase.SETTLING, time_ns
             self._close_in()
-            self._settle(elapsed)
-            return
-        if self.parameters.command_interface == "posvel":
-            trajectory.sample(elapsed, desired)
-            np.copyto(commands.position, desired.position)
-            np.abs(desired.velocity, out=commands.velocity)
-        else:
-            trajectory.position(elapsed, commands.position)
-        path = self.parameters.tolerances.path
-        if path is not None and self._worst(silent=0.0) > path:
-            self._moving = False
-            self._rest(commands.position)
-            self._close_in()
-            self.context.say(f"trajectory aborted after {elapsed:.3f} s: {self._off()}, holding")
+            self._settle(time_ns)
+        elif self._checks_path and (row := self._worst(self._path_tolerance, silent=0.0)) >= 0:
+            self._end(Outcome.ABORTED, time_ns, f"{self._off(row)}, stopping", row)
+            self._stop_from(time_ns)
+        elif time_ns - self._start_ns > self._timeout_ns:
+            self._time_out(time_ns)
+            self._stop_from(time_ns)
+        elif time_ns >= self._feedback_ns and self._goal is not None:
+            self._feedback_ns = time_ns + FEEDBACK_NS
+            self._measure(silent=0.0)
+            self._goal.feedback(elapsed / self._trajectory.duration_s, float(self._error.max()))
 
-    def _settle(self, elapsed: float) -> None:
-        """Log whether the goal was reached, once."""
+    def _sample(self, time_ns: int, *, derivatives: bool) -> float:
+        """Set the desired state by the trajectory; return how far it is, s."""
+        desired, trajectory = self._desired, self._trajectory
+        elapsed = self._warped(time_ns)
+        if not derivatives and elapsed < trajectory.duration_s:
+            trajectory.position(elapsed, desired.position)
+            return elapsed
+        trajectory.sample(elapsed, desired)
+        if self._rate != 1.0 or self._slope != 0.0:
+            desired.acceleration *= self._rate**2
+            np.multiply(desired.velocity, self._slope, out=self._part)
+            desired.acceleration += self._part
+            desired.velocity *= self._rate
+        return elapsed
+
+    def _warped(self, time_ns: int) -> float:
+        """Return the trajectory's time, s: it goes at `speed`, toward which it changes with SPEED_SLOPE."""
+        since_s, wanted = (time_ns - self._base_ns) * 1e-9, self._speed
+        if self._rate == wanted:
+            self._slope = 0.0
+            return self._base_s + self._rate * since_s
+        self._slope = math.copysign(SPEED_SLOPE, wanted - self._rate)
+        changing_s = min(since_s, (wanted - self._rate) / self._slope)
+        reached = self._rate + self._slope * changing_s
+        self._base_s += (self._rate + reached) / 2 * changing_s
+        if changing_s < since_s:
+            self._base_s += wanted * (since_s - changing_s)
+            reached, self._slope = wanted, 0.0
+        self._base_ns, self._rate = time_ns, reached
+        return self._base_s
+
+    def _settle(self, time_ns: int) -> None:
+        """End the goal when it is reached, or too late."""
         tolerances = self.parameters.tolerances
-        if tolerances.goal is None or self._worst(silent=np.inf) <= tolerances.goal:
-            self._settling = False
-            self.context.say(f"trajectory reached its goal after {elapsed:.3f} s")
-        elif elapsed >= self._trajectory.duration_s + tolerances.goal_time * 1e-9:
-            self._settling = False
-            self.context.say(f"trajectory missed its goal after {elapsed:.3f} s: {self._off()}, holding")
+        row = self._worst(self._goal_tolerance, silent=np.inf)
+        if row < 0:
+            self._phase = _Phase.RESTING
+            self._end(Outcome.REACHED, time_ns)
+        elif time_ns - self._end_ns >= tolerances.goal_time:
+            self._phase = _Phase.RESTING
+            self._end(Outcome.MISSED, time_ns, f"{self._off(row)}, holding", row)
+        elif time_ns - self._start_ns > self._timeout_ns:
+            self._phase = _Phase.RESTING
+            self._time_out(time_ns)
+
+    def _time_out(self, time_ns: int) -> None:
+        self._measure(silent=np.inf)
+        row = int(self._error.argmax())
+        self._end(Outcome.MISSED, time_ns, f"its time-out: {self._off(row)}", row)
+
+    def _stop_from(self, time_ns: int) -> None:
+        """Let all joints come to rest from their desired velocity."""
+        self._know_where(time_ns)
+        self._some_rest = False
+        self._stop.load(self._desired, self._deceleration, self._lower, self._upper)
+        self._phase, self._stop_ns = _Phase.STOPPING, time_ns
+        self._come_to_rest(time_ns)
+
+    def _come_to_rest(self, time_ns: int) -> None:
+        elapsed = (time_ns - self._stop_ns) * 1e-9
+        self._stop.sample(elapsed, self._desired)
+        if elapsed >= self._stop.duration_s:
+            self._phase = _Phase.RESTING
+            self._close_in()
+            if self._cancelling:
+                self._end(Outcome.CANCELLED, time_ns)
+
+    def _bring_others_to_rest(self, time_ns: int) -> None:
+        """Set the desired state of the joints that the goal does not move."""
+        if not self._some_rest:
+            return
+        others, elapsed = self._others, (time_ns - self._stop_ns) * 1e-9
+        if not self._rest_still:
+            self._stop.sample(elapsed, others)
+            self._rest_still = elapsed >= self._stop.duration_s
+        for row, other in zip(self._desired.arrays, others.arrays, strict=True):
+            np.copyto(row, other, where=self._resting)
+        if self._rest_still and self._phase is _Phase.RESTING:
+            self._some_rest = False
+
+    def _hold_where_heard(self) -> None:
+        """Take positions that were not known at the activation, as soon as they are."""
+        silent, position = self._silent, self._desired.position
+        np.isnan(position, out=silent)
+        np.copyto(position, self.context.states.position, where=silent)
+        self._unknown = bool(np.isnan(position).any())
 
     def _rest(self, position: Floats) -> None:
         """Make `position`, at rest, the desired state."""
@@ -179,49 +392,52 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._desired.velocity.fill(0.0)
         self._desired.acceleration.fill(0.0)
 
+    # Commands
+
+    def _command(self, period_ns: int) -> None:
+        commands, desired = self.context.commands, self._desired
+        if self._tracking is not None:
+            self._tracking.update(desired, period_ns * 1e-9)
+            return
+        np.copyto(commands.position, desired.position)
+        if self._interface != "posvel":
+            return
+        if not self._to_servos:
+            np.copyto(commands.velocity, desired.velocity)
+        elif self._phase in (_Phase.MOVING, _Phase.STOPPING):
+            np.abs(desired.velocity, out=commands.velocity)
+            if self._some_rest and self._rest_still:
+                np.copyto(commands.velocity, self._closing, where=self._resting)
+
     def _close_in(self) -> None:
         """Give servos that lag a speed for the rest of their way."""
-        if self.parameters.command_interface == "posvel":
+        if self._interface == "posvel" and self._to_servos:
             np.copyto(self.context.commands.velocity, self._closing)
 
-    def _worst(self, silent: float) -> float:
-        """Return the largest distance from the commands, rad; `silent` for a joint without a reply."""
+    # How far off
+
+    def _measure(self, silent: float) -> None:
+        """Set how far each joint of the goal is off, rad; `silent` for one without a reply."""
         states, error = self.context.states, self._error
-        np.subtract(states.position, self.context.commands.position, out=error)
+        np.subtract(states.position, self._desired.position, out=error)
         np.abs(error, out=error)
-        np.copyto(error, silent, where=~states.valid)
-        return float(error.max())
+        np.logical_not(states.valid, out=self._silent)
+        np.copyto(error, silent, where=self._silent)
+        if self._some_rest:
+            np.copyto(error, 0.0, where=self._resting)
 
-    def _off(self) -> str:
-        row = int(self._error.argmax())
+    def _worst(self, tolerance: Floats, silent: float) -> int:
+        """Return the row of the joint that is farthest off of those beyond their tolerance; -1: none is."""
+        self._measure(silent)
+        np.greater(self._error, tolerance, out=self._silent)
+        if not np.count_nonzero(self._silent):
+            return -1
+        np.copyto(self._part, -1.0)
+        np.copyto(self._part, self._error, where=self._silent)
+        return int(self._part.argmax())
+
+    def _off(self, row: int) -> str:
+        joint = self.context.joints[row]
         if np.isinf(self._error[row]):
-            return f"joint {self.context.joints[row]} does not answer"
-        return f"joint {self.context.joints[row]} is {self._error[row]:.4f} rad off"
-
-
-def flat_trajectory(command: TrajectoryCommand, joints: tuple[str, ...]) -> Floats:
-    """Return the command as a flat array. Raises ValueError for a wrong size or times that do not grow."""
-    times = np.array([point.time for point in command.points])
-    stalled = np.flatnonzero(np.diff(times) <= 0)
-    if len(stalled):
-        index = int(stalled[0]) + 1
-        raise ValueError(
-            f"the times of a trajectory must grow: point {index + 1} is at {times[index]:g} s, "
-            f"the one before at {times[index - 1]:g} s"
-        )
-    points = np.zeros((len(times), 3, len(joints)))
-    given = [True, True]
-    for index, point in enumerate(command.points):
-        check_size(f"positions in point {index + 1}", len(point.positions), joints)
-        points[index, 0] = point.positions
-        for derivative, (what, values) in enumerate(
-            (("velocities", point.velocities), ("accelerations", point.accelerations))
-        ):
-            if values is None:
-                given[derivative] = False
-                continue
-            check_size(f"{what} in point {index + 1}", len(values), joints)
-            points[index, derivative + 1] = values
-    velocities, accelerations = given
-    order = LINEAR if not velocities else QUINTIC if accelerations else CUBIC
-    return flatten(order, times, points, command.start_in)
+            return f"joint {joint} does not answer"
+        return f"joint {joint} is {self._error[row]:.4f} rad off"

@@ -32,7 +32,7 @@ from dxlrun import (
     ParametersModel,
 )
 from dxlrun_controllers.joints import JointNames, finite_or, hold
-from dxlrun_controllers.spline import CUBIC, LINEAR, SplineSample, evaluate, solve
+from dxlrun_controllers.laws.spline import CUBIC, LINEAR, SplineSample, evaluate, solve
 
 CLOSING_SPEED = 0.5
 """rad/s, posvel: the least speed toward a pose, for the rest of the way of a servo that lags."""

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, ClassVar, Final, Literal, Self
+from typing import ClassVar, Final, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import model_validator
 
-from dxlrun import LIVE, CommandModel, Context, Controller, Duration, Floats, Interfaces, ParametersModel
+from dxlrun import CommandModel, Context, Controller, Duration, Floats, Interfaces
 from dxlrun_controllers.group import PositionsCommand, VelocitiesCommand
 from dxlrun_controllers.joints import (
     JointsParameters,
@@ -21,26 +21,9 @@ from dxlrun_controllers.joints import (
     finite_or,
     row_of,
 )
-from dxlrun_controllers.pid import Pid, Slope
+from dxlrun_controllers.laws.pid import Gains, Pid, Slope, feed_velocities_forward
 
 _NO_LIMIT: Final = np.inf
-
-
-class Gains(ParametersModel):
-    """Gains of a PID law, each one number for all joints or a mapping by joint; they can be changed in a run.
-
-    u is the unit of the command (Nm, A or fraction of maximum; rad/s; fraction of the full voltage; rad), e
-    that of the reference (rad or rad/s).
-    """
-
-    p: Annotated[PerJoint[NotNegative], LIVE] = 0.0
-    """u/e"""
-    i: Annotated[PerJoint[NotNegative], LIVE] = 0.0
-    """u/(e s)"""
-    d: Annotated[PerJoint[NotNegative], LIVE] = 0.0
-    """u s/e"""
-    feed_forward: Annotated[PerJoint[NotNegative], LIVE] = 0.0
-    """u s/rad, times the reference's velocity; left out, it is 1 where velocities are commanded."""
 
 
 class PidParameters(JointsParameters):
@@ -62,13 +45,7 @@ class PidParameters(JointsParameters):
     """Joints whose position error is taken the shorter way round, -pi..pi: continuous joints that shall face
     a direction. Without it one turn more is one turn more."""
 
-    @model_validator(mode="before")
-    @classmethod
-    def _velocities_are_fed_forward(cls, data: object) -> object:
-        if not isinstance(data, dict) or data.get("command_interface") != "velocity":
-            return data
-        gains = data.get("gains")
-        return {**data, "gains": {"feed_forward": 1.0, **gains}} if isinstance(gains, dict) else data
+    _own_velocity = model_validator(mode="before")(feed_velocities_forward)
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -165,11 +142,8 @@ class PidController(Controller[PidParameters]):
     def on_parameters(self, time_ns: int) -> None:
         """Take the gains."""
         gains, joints = self.parameters.gains, self.context.joints
-        fill(self._pid.p, gains.p, joints, 0.0)
-        fill(self._pid.i, gains.i, joints, 0.0)
-        fill(self._pid.d, gains.d, joints, 0.0)
+        self._pid.take(gains, joints)
         fill(self._feed_forward, gains.feed_forward, joints, 0.0)
-        self._pid.integral[self._pid.i == 0.0] = 0.0  # nothing would ever remove it
 
     def on_activate(self, time_ns: int) -> None:
         """Hold the joints where they are; what was commanded before stays the output, but for the mode."""

@@ -18,7 +18,7 @@ from dxlrun_controllers.group import (
     PosVelCommand,
     VelocitiesCommand,
 )
-from dxlrun_controllers.joint_trajectory_controller import TrajectoryCommand
+from dxlrun_controllers.trajectory_command import TrajectoryCommand
 
 FREE = JointPlan("free", -2.0, 2.0, None, top_speed=8.0, top_effort=3.0)
 BOUND = JointPlan("bound", -1.0, 1.0, 2.0, 0.5, top_speed=8.0, top_effort=3.0)
@@ -69,6 +69,12 @@ def trajectory(*points: tuple[float, tuple[float, float]], **more: object) -> Tr
                 f"free is asked for 10 rad/s from point 1 to 2, {FREE_SPEED}",
                 f"bound is asked for 3 rad/s from point 2 to 3, {BOUND_SPEED}",
             ],
+        ),
+        (
+            TrajectoryCommand.model_validate(
+                {"joints": ["bound"], "points": [{"time": 1, "positions": [1.5]}]}
+            ),
+            ["bound is sent to 85.9437 deg in point 1, outside its limits -57.3..+57.3 deg"],
         ),
         (
             trajectory((1.0, (0.0, 5.0)), velocities=(0.0, 3.0)),

@@ -77,7 +77,7 @@ def test_formulas_for_a_group_controller_become_one_command_a_sample(compile_tex
 def test_formulas_for_a_trajectory_controller_become_one_trajectory(
     compile_text: Compile, trajectory_robot: str
 ):
-    from dxlrun_controllers.spline import SplineSample, Trajectory
+    from dxlrun_controllers.laws.spline import SplineSample, Trajectory
 
     compiled = compile_text(trajectory_robot, TRAJECTORY)
 

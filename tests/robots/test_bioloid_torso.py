@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dxlrun.compile import Compiled, compile_files
-from dxlrun_controllers.spline import SplineSample, Trajectory
+from dxlrun_controllers.laws.spline import SplineSample, Trajectory
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 

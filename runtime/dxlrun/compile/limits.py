@@ -134,10 +134,15 @@ def beyond_limits(joints: Sequence[JointPlan], command: CommandModel) -> list[Be
 
     `joints`: those of the controller, in its order. Positions (rad) are compared with the position limits,
     velocities (rad/s) and efforts with the lower one of the file's limit and the servo's own; between two
-    points of a trajectory the mean speed, which every path through both reaches. A field that has not one
-    number a joint is for the controller's `prepare` to judge.
+    points of a trajectory the mean speed, which every path through both reaches. Of a command that names its
+    `joints`, the values are theirs. A field that has not one number a joint is for the controller's `prepare`
+    to judge.
     """
     values = command.model_dump()
+    named = values.get("joints")
+    if isinstance(named, list | tuple):
+        known = {joint.name: joint for joint in joints}
+        joints = [known[name] for name in named if name in known]
     points = values.get("points")
     if isinstance(points, Sequence) and all(isinstance(point, Mapping) for point in points):
         return list(_beyond_in_points(joints, points))

@@ -6,7 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from dxlrun_controllers.joint_trajectory_controller import CLOSING_SPEED, JointTrajectoryController
+from dxlrun import Outcome
+from dxlrun_controllers.joint_trajectory_controller import (
+    CLOSING_SPEED,
+    DECELERATION,
+    SPEED_SLOPE,
+    JointTrajectoryController,
+)
 
 ONE = {"joints": ["a"]}
 TWO = {"joints": ["a", "b"]}
@@ -32,9 +38,15 @@ def started(stage, parameters=ONE, **options):
 
 
 def test_what_it_claims():
-    for interface, claims in (("position", ("position",)), ("posvel", ("position", "velocity"))):
+    for interface, claims in (
+        ("position", ("position",)),
+        ("posvel", ("position", "velocity")),
+        ("velocity", ("velocity",)),
+        ("effort", ("effort",)),
+    ):
+        gains = {"gains": {"p": 1.0}} if interface in ("velocity", "effort") else {}
         parameters = JointTrajectoryController.Parameters.model_validate(
-            TWO | {"command_interface": interface}
+            TWO | {"command_interface": interface} | gains
         )
         found = JointTrajectoryController.interfaces(parameters, ("a", "b", "c"))
         assert (found.joints, found.command) == (("a", "b"), claims)
@@ -96,7 +108,7 @@ def test_a_new_trajectory_takes_over_without_a_jump(stage, at):
     np.testing.assert_allclose(path[-1], -0.9)
     if at < 6:
         np.testing.assert_allclose(path[1] - path[0], path[0] - before, atol=4e-3)  # the speed goes on, too
-        assert robot.said[0] == f"trajectory preempted after {at:.3f} s"
+        assert [ended[0] for ended in robot.goals[0].ended] == [Outcome.PREEMPTED]
 
 
 def test_a_command_between_two_updates_starts_from_what_is_wanted_then(stage):
@@ -120,14 +132,14 @@ def test_the_delay_is_the_bridge_and_without_it_the_first_point_is_at_once(stage
     np.testing.assert_allclose(robot.update(3.0), 0.1)
 
 
-def test_at_the_end_it_holds_and_logs_that_once(stage):
+def test_at_the_end_it_holds_and_the_goal_is_reached_once(stage):
     robot = started(stage, ONE | {"command_interface": "posvel"})
     robot.send(0.0, "trajectory", points=points([0.5, 1.0]))
     for time in (0.2, 0.99, 1.0, 1.02, 9.0):
         robot.update(time)
     np.testing.assert_allclose(robot.context.commands.position, thesis(1.0)[0])
     np.testing.assert_array_equal(robot.context.commands.velocity, CLOSING_SPEED)
-    assert robot.said == ["trajectory reached its goal after 1.000 s"]
+    assert robot.goal.ended == [(Outcome.REACHED, "after 1.000 s", "a", pytest.approx(0, abs=0.01))]
 
 
 def test_closing_in_respects_a_slower_limit(stage):
@@ -142,8 +154,9 @@ def test_off_the_path_it_aborts_and_holds(stage):
     robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3, -0.2]}])
     for time in (0.05, 0.09, 0.15, 0.5, 2.0):
         position = robot.update(time, follow=False)
-    np.testing.assert_allclose(position, [0.45, -0.2])
-    assert robot.said == ["trajectory aborted after 0.150 s: joint a is 0.1500 rad off, holding"]
+    np.testing.assert_allclose(position, [0.45 + 1.0 / 2 / DECELERATION, -0.2])
+    told = "after 0.150 s, joint a is 0.1500 rad off, stopping"
+    assert robot.goal.ended == [(Outcome.ABORTED, told, "a", pytest.approx(0.15))]
 
 
 def test_a_silent_servo_does_not_abort_a_path(stage):
@@ -163,23 +176,25 @@ def test_a_goal_may_be_reached_within_its_time(stage):
     robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3]}])
     for time in (0.5, 1.0, 1.3):
         robot.update(time, follow=False)
-    assert robot.said == []
+    assert robot.goal.ended == []
     robot.context.states.position[:] = 1.28
     robot.update(1.4, follow=False)
     robot.update(2.4, follow=False)
-    assert robot.said == ["trajectory reached its goal after 1.400 s"]
+    assert robot.goal.ended == [(Outcome.REACHED, "after 1.400 s", "a", pytest.approx(0.02))]
 
 
 @pytest.mark.parametrize(
-    ("answers", "told"), [(True, "joint a is 1.0000 rad off"), (False, "joint a does not answer")]
+    ("answers", "told", "error"),
+    [(True, "joint a is 1.0000 rad off", 1.0), (False, "joint a does not answer", np.inf)],
 )
-def test_a_missed_goal_is_logged(stage, answers, told):
+def test_a_missed_goal_says_by_how_much(stage, answers, told, error):
     robot = started(stage, GOAL)
     robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3]}])
     robot.context.states.valid[:] = answers
     for time in (0.5, 1.0, 1.4, 1.6, 3.0):
         position = robot.update(time, follow=False)
-    assert robot.said == [f"trajectory missed its goal after 1.600 s: {told}, holding"]
+    expected = (Outcome.MISSED, f"after 1.600 s, {told}, holding", "a", pytest.approx(error))
+    assert robot.goal.ended == [expected]
     np.testing.assert_allclose(position, 1.3)
 
 
@@ -237,3 +252,339 @@ def test_parameters_survive_the_plan(stage):
     model = JointTrajectoryController.Parameters.model_validate(written)
     assert model.tolerances.goal_time == 500_000_000
     assert JointTrajectoryController.Parameters.model_validate_json(model.model_dump_json()) == model
+
+
+# Interfaces with a law of their own
+
+
+@pytest.mark.parametrize("interface", ["velocity", "effort"])
+def test_velocity_and_effort_follow_by_pid_and_feed_forward(stage, interface):
+    gains = {"p": 3.0, "d": 0.5, "acceleration": 0.2, "friction": 0.1}
+    robot = started(stage, ONE | {"command_interface": interface, "gains": gains})
+    robot.context.states.velocity[:] = 0.0
+    command = getattr(robot.context.commands, interface)
+    robot.controller.update(0, 20_000_000)
+    assert command[0] == 0.0
+    cubic = [{"time": t, "positions": [p], "velocities": [0.0]} for t, p in ((1, 0.3), (2, 1.3))]
+    robot.send(0.0, "trajectory", points=cubic)
+    robot.context.states.position[:], robot.context.states.velocity[:] = 0.4, 0.9
+    robot.controller.update(1_250_000_000, 20_000_000)
+    t = 0.25
+    desired = 0.3 + 3 * t**2 - 2 * t**3, 6 * t - 6 * t**2, 6 - 12 * t
+    forward = desired[1] * (interface == "velocity") + 0.2 * desired[2] + 0.1
+    assert command[0] == pytest.approx(3.0 * (desired[0] - 0.4) + 0.5 * (desired[1] - 0.9) + forward)
+    assert np.isnan(robot.context.commands.position).all()
+
+
+def test_at_rest_an_effort_holds_the_joint_against_its_load(stage):
+    robot = started(stage, ONE | {"command_interface": "effort", "gains": {"p": 2.0}})
+    robot.context.states.velocity[:] = 0.0
+    robot.context.states.position[:] = 0.25
+    robot.controller.update(0, 20_000_000)
+    assert robot.context.commands.effort[0] == pytest.approx(0.1)
+    robot.change(0.0, gains={"p": 4.0})
+    robot.controller.update(20_000_000, 20_000_000)
+    assert robot.context.commands.effort[0] == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "sentence"),
+    [
+        ({"command_interface": "effort"}, "effort needs gains"),
+        ({"gains": {"p": 1.0}}, "gains count only for velocity and effort"),
+        ({"tolerances": {"path": {"c": "1 deg"}}}, "tolerances.path names c"),
+        ({"deceleration": "0 rad/s^2"}, "greater than 0"),
+        ({"speed": -0.1}, "greater than or equal to 0"),
+    ],
+)
+def test_wrong_parameters_are_refused_in_words(wrong, sentence):
+    with pytest.raises(ValidationError, match=sentence):
+        JointTrajectoryController.Parameters.model_validate(TWO | wrong)
+
+
+def test_into_another_controller_the_velocity_has_its_sign_and_is_zero_at_rest(stage):
+    robot = started(stage, ONE | {"command_interface": "posvel"}, into=("lower",))
+    robot.update(0.0)
+    assert robot.context.commands.velocity[0] == 0.0
+    robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [-0.7]}])
+    robot.update(0.5)
+    assert robot.context.commands.velocity[0] == pytest.approx(-1.0)
+    robot.update(1.5)
+    assert robot.context.commands.velocity[0] == 0.0
+
+
+# Some joints
+
+
+def test_joints_that_a_goal_does_not_name_hold(stage):
+    robot = started(stage, TWO)
+    robot.send(0.0, "trajectory", joints=["b"], points=[{"time": 1, "positions": [0.8]}])
+    for time in (0.25, 0.5, 1.0, 2.0):
+        np.testing.assert_allclose(robot.update(time), [0.3, -0.2 + min(time, 1.0)])
+    assert robot.goal.ended == [(Outcome.REACHED, "after 1.000 s", "b", pytest.approx(0.5))]  # of before
+
+
+def test_joints_that_moved_when_a_goal_of_others_came_decelerate_within_their_limit(stage):
+    robot = started(stage, TWO | {"deceleration": {"a": "2 rad/s^2"}}, into=("lower",))
+    robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3, 0.8]}])
+    robot.update(0.5)
+    robot.send(0.5, "trajectory", joints=["b"], points=[{"time": 0.2, "positions": [0.8]}])
+    path = {step: robot.update(0.5 + step * 1e-3)[0] for step in range(1000)}
+    for step, position in path.items():
+        t = min(step * 1e-3, 0.5)
+        assert position == pytest.approx(0.8 + t - t**2)
+    np.testing.assert_allclose(robot.update(3.0), [1.05, 0.8])
+
+
+def test_only_joints_of_the_goal_are_judged(stage):
+    robot = started(stage, TWO | {"tolerances": {"path": "0.1 rad", "goal": "0.1 rad"}})
+    robot.context.states.position[0] = 9.0
+    robot.context.states.position[1] = -0.15
+    robot.send(0.0, "trajectory", joints=["b"], points=[{"time": 1, "positions": [-0.2]}])
+    for time in (0.5, 1.0):
+        robot.update(time, follow=False)
+    assert [ended[0] for ended in robot.goal.ended] == [Outcome.REACHED]
+
+
+@pytest.mark.parametrize(
+    ("joints", "sentence"),
+    [
+        (["c"], r"c is not one of its joints \(a, b\)"),
+        (["b", "b"], "joints names b twice"),
+        (["b", "a"], r"1 positions in point 1 for 2 joints \(b, a\)"),
+    ],
+)
+def test_wrong_joints_of_a_goal_are_refused_in_words(stage, joints, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        started(stage, TWO).prepare("trajectory", joints=joints, points=[{"time": 1, "positions": [1]}])
+
+
+# Results
+
+
+def test_a_tolerance_is_for_each_joint_and_the_worst_one_is_named(stage):
+    robot = started(stage, TWO | {"tolerances": {"path": {"b": "0.1 rad"}, "goal": {"a": "0.2 rad"}}})
+    robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3, -0.2]}])
+    robot.context.states.position[:] = 0.3, -0.15
+    robot.update(0.9, follow=False)
+    assert robot.goal.ended == []
+    robot.update(1.0, follow=False)
+    told = "after 1.000 s, joint a is 1.0000 rad off, holding"
+    assert robot.goal.ended == [(Outcome.MISSED, told, "a", pytest.approx(1.0))]
+    robot.context.states.position[1] = -0.31
+    robot.send(2.0, "trajectory", points=[{"time": 1, "positions": [1.3, -0.2]}])
+    robot.update(2.1, follow=False)
+    assert robot.goal.ended[0][2:] == ("b", pytest.approx(0.11))
+
+
+def test_feedback_comes_ten_times_a_second_with_progress_and_distance(stage):
+    robot = started(stage, ONE)
+    robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3]}])
+    for step in range(1, 100):
+        robot.context.states.position[:] = 0.3 + step * 0.01 - 0.05
+        robot.update(step * 0.01, follow=False)
+    progress = [entry[0] for entry in robot.goal.progress]
+    np.testing.assert_allclose(progress, np.arange(0.1, 0.95, 0.1))
+    np.testing.assert_allclose([entry[1] for entry in robot.goal.progress], 0.05)
+
+
+@pytest.mark.parametrize("speed", [0.0, 1.0])
+def test_a_goal_that_takes_longer_than_its_time_out_is_missed_and_the_joints_stop(stage, speed):
+    robot = started(stage, ONE | {"speed": speed})
+    robot.send(0.0, "trajectory", timeout=0.5, points=[{"time": 1, "positions": [1.3]}])
+    for time in (0.4, 0.5, 0.52, 2.0):
+        position = robot.update(time)
+    outcome, told, joint, _ = robot.goal.ended[0]
+    assert (outcome, joint) == (Outcome.MISSED, "a")
+    assert told.startswith("after 0.520 s, its time-out: joint a is ")
+    assert position == pytest.approx(0.3 if not speed else 0.82 + 1 / 2 / DECELERATION)
+
+
+def test_the_time_out_ends_a_goal_that_is_waited_for_too(stage):
+    robot = started(stage, ONE | {"tolerances": {"goal": "2 deg", "goal_time": "5 s"}})
+    robot.send(0.0, "trajectory", timeout=2, points=[{"time": 1, "positions": [1.3]}])
+    for time in (1.0, 1.9, 2.1, 9.0):
+        robot.update(time, follow=False)
+    told = "after 2.100 s, its time-out: joint a is 1.0000 rad off"
+    assert robot.goal.ended == [(Outcome.MISSED, told, "a", pytest.approx(1.0))]
+
+
+def test_a_joint_that_never_answered_aborts_the_goal_at_once(stage):
+    robot = stage(JointTrajectoryController, TWO)
+    robot.context.goals.position[1] = robot.context.states.position[1] = np.nan
+    robot.controller.on_activate(0)
+    robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3, 0.0]}])
+    assert robot.goal.ended[0][:3] == (Outcome.ABORTED, "joint b has not answered yet", "b")
+    assert np.isnan(robot.update(0.02, follow=False)[1])
+    robot.context.states.position[1] = 0.6
+    np.testing.assert_array_equal(robot.update(0.04, follow=False), [0.3, 0.6])
+
+
+def test_a_way_to_the_first_point_that_is_too_fast_for_the_joint_is_reported(stage):
+    robot = started(stage, TWO, limits={"velocity": 2.0})
+    robot.send(0.0, "trajectory", points=[{"time": 0.5, "positions": [0.3, 1.0]}])
+    told = (
+        "joint b has to go to the first point at 2.4 rad/s, more than its limit of 2 rad/s, so it comes late"
+    )
+    assert robot.said == [told]
+    robot.send(0.0, "trajectory", points=[{"time": 0.7, "positions": [0.3, 1.0]}])
+    assert robot.said == [told]
+
+
+# Stops
+
+
+def observed(robot, begin_s, duration_s, step_s=1e-3):
+    """Return positions and velocities of a controller that is `into` another one, shape (steps, joints)."""
+    positions, velocities = [], []
+    for index in range(round(duration_s / step_s) + 1):
+        positions.append(robot.update(begin_s + index * step_s))
+        velocities.append(robot.context.commands.velocity.copy())
+    return np.array(positions), np.array(velocities)
+
+
+def test_a_cancelled_goal_ends_when_its_joints_are_at_rest(stage):
+    robot = started(stage, ONE | {"command_interface": "posvel", "deceleration": "4 rad/s^2"})
+    robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [2.3]}])
+    robot.update(0.5)
+    robot.cancel(0.5)
+    for time in (0.5, 0.75, 0.99):
+        assert robot.update(time)[0] == pytest.approx(1.3 + 2 * (time - 0.5) - 2 * (time - 0.5) ** 2)
+        assert robot.context.commands.velocity[0] == pytest.approx(2 - 4 * (time - 0.5))
+        assert robot.goal.ended == []
+    assert robot.update(1.0)[0] == pytest.approx(1.3 + 0.5)
+    assert robot.goal.ended == [(Outcome.CANCELLED, "after 1.000 s", "a", pytest.approx(0, abs=0.05))]
+    assert robot.context.commands.velocity[0] == CLOSING_SPEED
+    assert robot.update(9.0)[0] == pytest.approx(1.8)
+
+
+def test_a_cancel_at_rest_ends_the_goal_at_once(stage):
+    robot = started(stage, GOAL)
+    robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3]}])
+    robot.update(1.2, follow=False)
+    robot.cancel(1.3)
+    assert [ended[0] for ended in robot.goal.ended] == [Outcome.CANCELLED]
+    np.testing.assert_allclose(robot.update(2.0), 1.3)
+
+
+values = st.floats(-1.0, 1.0)
+point = st.tuples(st.floats(0.1, 0.6), st.tuples(values, values), st.tuples(values, values))
+FIELDS = st.sampled_from([(), ("velocities",), ("velocities", "accelerations")])
+
+
+def timed(drawn, fields):
+    points, time = [], 0.0
+    for gap, positions, others in drawn:
+        time += gap
+        full = {"time": time, "positions": positions, "velocities": others, "accelerations": others[::-1]}
+        points.append({key: full[key] for key in ("time", "positions", *fields)})
+    return points
+
+
+@settings(max_examples=40, deadline=None)
+@given(first=st.lists(point, min_size=1, max_size=4), fields=FIELDS, share=st.floats(0.02, 1.1))
+def test_however_it_is_cancelled_it_stops_within_its_deceleration_and_its_limits(stage, first, fields, share):
+    step, most = 1e-3, np.array([6.0, 25.0])
+    limits = {"lower": -1.5, "upper": 1.5}
+    parameters = {"command_interface": "posvel", "deceleration": {"a": "6 rad/s^2", "b": "25 rad/s^2"}}
+    robot = started(stage, TWO | parameters, into=("lower",), limits=limits)
+    points = timed(first, fields)
+    robot.send(0.0, "trajectory", points=points)
+    at = round(share * points[-1]["time"], 3)
+    before, before_speed = observed(robot, at - 2 * step, 2 * step)
+    if robot.goal.ended:
+        return
+    robot.cancel(at)
+    after, speed = observed(robot, at, 4.0)
+    np.testing.assert_allclose(after[0], before[-1], atol=1e-9)
+    way = np.where(before_speed[-1] > 0, 1.5 - before[-1], 1.5 + before[-1])
+    inside = before_speed[-1] ** 2 / 2 / most <= way
+    np.testing.assert_allclose(speed[0][way > 0], before_speed[-1][way > 0], atol=1e-9)
+    deceleration = np.abs(np.diff(speed, axis=0)).max(axis=0) / step
+    assert (deceleration[inside] <= most[inside] * (1 + 1e-6)).all()
+    gone = np.abs(after[-1] - after[0])
+    np.testing.assert_allclose(gone[inside], (before_speed[-1] ** 2 / 2 / most)[inside], atol=1e-9)
+    bound = np.maximum(1.5, np.abs(before[-1]))
+    assert (np.abs(after) <= bound + 1e-9).all()
+    np.testing.assert_array_equal(speed[-1], 0.0)
+    assert [ended[0] for ended in robot.goal.ended] == [Outcome.CANCELLED]
+
+
+@settings(max_examples=80, deadline=None)
+@given(
+    first=st.lists(point, min_size=1, max_size=4),
+    second=st.lists(point, min_size=1, max_size=3),
+    fields=st.tuples(FIELDS, FIELDS),
+    share=st.floats(0.02, 1.1),
+    speed=st.sampled_from([1.0, 0.4, 1.7]),
+    cancelled=st.booleans(),
+)
+def test_whenever_a_goal_takes_over_position_velocity_and_acceleration_go_on(  # noqa: PLR0917
+    stage, first, second, fields, share, speed, cancelled
+):
+    robot = started(stage, TWO | {"command_interface": "posvel", "speed": speed}, into=("lower",))
+    points = timed(first, fields[0])
+    robot.send(0.0, "trajectory", points=points)
+    at = share * points[-1]["time"] / speed
+    if cancelled:
+        robot.update(at - 0.02)
+        if not robot.goal.ended:
+            robot.cancel(at - 0.01)
+    robot.update(at)
+    before = [row.copy() for row in robot.controller._desired.arrays]
+    robot.send(at, "trajectory", points=timed(second, fields[1]))
+    robot.update(at)
+    after = [row.copy() for row in robot.controller._desired.arrays]
+    np.testing.assert_allclose(after[0], before[0], atol=1e-9)
+    if before[1].any():  # from rest, a linear piece begins with its speed: that is what linear means
+        np.testing.assert_allclose(after[1], before[1], atol=1e-9)
+        np.testing.assert_allclose(after[2], before[2], atol=1e-8)
+
+
+def test_a_linear_trajectory_is_joined_without_a_jump_of_its_velocity_at_both_ends(stage):
+    robot = started(stage, ONE | {"command_interface": "posvel"}, into=("lower",))
+    robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3]}])
+    robot.update(0.5)
+    linear = [{"time": 1, "positions": [1.0]}, {"time": 2, "positions": [0.4]}]
+    robot.send(0.5, "trajectory", points=linear)
+    _, speed = observed(robot, 0.5, 1.9)
+    np.testing.assert_allclose(speed[[0, 1000, -1], 0], [1.0, -0.6, -0.6], atol=1e-9)
+    assert np.abs(np.diff(speed, axis=0)).max() < 0.02
+
+
+# The speed
+
+
+def test_a_slower_speed_stretches_the_time_of_a_trajectory(stage):
+    robot = started(stage, ONE | {"command_interface": "posvel", "speed": 0.5}, into=("lower",))
+    robot.send(0.0, "trajectory", points=points(np.linspace(0, 5, 200)), start_in=1.0)
+    for time in (2.5, 4.0, 7.3):
+        position = robot.update(time)
+        np.testing.assert_allclose(position, thesis(time / 2 - 1.0)[0], atol=1e-4)
+        expected = 0.5 * thesis(time / 2 - 1.0)[1]
+        np.testing.assert_allclose(robot.context.commands.velocity, expected, atol=2e-3)
+
+
+@pytest.mark.parametrize("period", [0.02, 0.001, 0.25])
+def test_a_speed_that_changes_in_a_run_bends_the_time_smoothly_whatever_the_periods(stage, period):
+    robot = started(stage, ONE | {"command_interface": "posvel"}, into=("lower",))
+    robot.send(0.0, "trajectory", points=points(np.linspace(0, 10, 400)))
+    robot.update(2.0)
+    robot.change(2.0, speed=0.0)
+    seen = [robot.context.commands.velocity[0]]
+    for time in 2.0 + period * np.arange(1, round(2 / period)):
+        since = min(time - 2.0, 1 / SPEED_SLOPE)
+        gone = 2.0 + since - SPEED_SLOPE * since**2 / 2
+        np.testing.assert_allclose(robot.update(time), thesis(gone)[0], atol=1e-4)
+        seen.append(robot.context.commands.velocity[0])
+    assert seen[-1] == 0.0
+    if period == 0.001:
+        assert np.abs(np.diff(seen)).max() < (SPEED_SLOPE * 3 + 10) * period
+    robot.change(4.0, speed=2.0)
+    gone = 2 + 1 / (2 * SPEED_SLOPE) + 2 * 2.0 - 2**2 / (2 * SPEED_SLOPE)
+    np.testing.assert_allclose(robot.update(6.0), thesis(gone)[0], atol=1e-3)
+    assert robot.goal.ended == []
+    robot.change(6.0, speed=10.0)
+    robot.update(8.0)
+    robot.update(9.0)
+    assert [ended[0] for ended in robot.goal.ended] == [Outcome.REACHED]

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import signal
 
-from dxlrun_controllers.pid import Pid, Slope
+from dxlrun_controllers.laws.pid import Pid, Slope
 
 ALL = np.ones(1, dtype=bool)
 NONE = np.zeros(1)

@@ -6,11 +6,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import BPoly, CubicHermiteSpline
 
-from dxlrun_controllers.spline import (
+from dxlrun_controllers.laws.spline import (
     CUBIC,
     LINEAR,
     QUINTIC,
     SplineSample,
+    Stop,
     Trajectory,
     evaluate,
     flatten,
@@ -126,3 +127,25 @@ def test_the_position_alone_is_that_of_the_whole_sample_to_the_bit(order, start_
         trajectory.position(float(time), alone)
         loaded(order, times, points, start_in).sample(float(time), whole)
         np.testing.assert_array_equal(alone, whole.position)
+
+
+@settings(max_examples=80, deadline=None)
+@given(state=boundary, most=st.floats(0.1, 50), share=st.floats(0, 1.2), room=st.floats(0, 30))
+def test_a_stop_is_a_constant_deceleration_that_ends_before_the_limit(state, most, share, room):
+    now, found, stop = SplineSample(1), SplineSample(1), Stop(1)
+    position, velocity, _ = state
+    now.position[:], now.velocity[:] = position, velocity
+    lower, upper = (-np.inf, position + room) if velocity > 0 else (position - room, np.inf)
+    stop.load(now, np.array([most]), np.array([lower]), np.array([upper]))
+    room = upper - position if velocity > 0 else position - lower  # as it was rounded
+    way = velocity**2 / (2 * most)
+    used = most if way <= room else velocity**2 / (2 * room) if room else np.inf
+    assert stop.duration_s == pytest.approx(abs(velocity) / used)
+    t = min(share, 1.0) * stop.duration_s
+    stop.sample(share * stop.duration_s, found)
+    pull = np.sign(velocity) * used if stop.duration_s else 0.0
+    assert found.position[0] == pytest.approx(position + velocity * t - pull * t**2 / 2, abs=1e-9)
+    assert found.velocity[0] == pytest.approx(velocity - pull * t if stop.duration_s else 0.0, abs=1e-9)
+    if share < 0.99:
+        assert found.acceleration[0] == pytest.approx(-pull)
+    assert lower - 1e-9 <= found.position[0] <= upper + 1e-9

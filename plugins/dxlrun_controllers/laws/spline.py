@@ -1,4 +1,4 @@
-"""Splines through the points of a trajectory: linear, cubic or quintic pieces, sampled by time.
+"""Splines through the points of a trajectory: linear, cubic or quintic pieces, sampled by time; and stops.
 
 A piece is sum(c[k] * t**k), t from its start. Coefficients as in Biagiotti and Melchiorri, Trajectory
 Planning for Automatic Machines and Robots (2008), section 2.1. They are our own because the loop needs them
@@ -22,12 +22,13 @@ _HEAD = 4
 class SplineSample:
     """The desired state of the joints at one time; shape (joints,) each: rad, rad/s, rad/s^2."""
 
-    __slots__ = ("acceleration", "position", "velocity")
+    __slots__ = ("acceleration", "arrays", "position", "velocity")
 
     def __init__(self, joints: int) -> None:
         self.position = np.zeros(joints)
         self.velocity = np.zeros(joints)
         self.acceleration = np.zeros(joints)
+        self.arrays = (self.position, self.velocity, self.acceleration)
 
 
 def solve(
@@ -95,7 +96,6 @@ class Trajectory:
     __slots__ = (
         "_begin_s",
         "_bridge",
-        "_bridge_s",
         "_end_s",
         "_first",
         "_last",
@@ -103,12 +103,14 @@ class Trajectory:
         "_pieces",
         "_start_in",
         "_times",
+        "bridge_s",
         "duration_s",
     )
 
     def __init__(self, joints: int) -> None:
         self._bridge = np.zeros((QUINTIC, joints))
-        self._bridge_s = 0.0
+        self.bridge_s = 0.0
+        """From `load` to the first point, s."""
         self._start_in = 0.0
         self._times = np.zeros(1)
         self._first = self._last = np.zeros((3, joints))
@@ -119,23 +121,46 @@ class Trajectory:
         self.duration_s = 0.0
         """From `load` to the last point, s."""
 
-    def load(self, data: Floats, now: SplineSample) -> None:
-        """Begin a flat trajectory from the sample `now`; time counts from here."""
+    def load(self, data: Floats, now: SplineSample) -> Floats:
+        """Begin a flat trajectory from the sample `now`; time counts from here.
+
+        From rest, the bridge is a piece as the others. From a motion it is quintic, whatever they are: it
+        keeps velocity and acceleration at both its ends. Returns what `data` has beyond the trajectory.
+        """
         count, joints, order = int(data[0]), int(data[1]), int(data[2])
         ends = _HEAD + count
         body = ends + 6 * joints
+        end = body + (count - 1) * order * joints
         self._start_in = float(data[3])
         self._times = data[_HEAD:ends]
         self._first = data[ends : ends + 3 * joints].reshape(3, joints)
         self._last = data[ends + 3 * joints : body].reshape(3, joints)
-        self._pieces = data[body:].reshape(count - 1, order, joints)
+        self._pieces = data[body:end].reshape(count - 1, order, joints)
         self._begin_s = self._end_s = 0.0
-        self._bridge_s = self._start_in + float(self._times[0])
+        self.bridge_s = self._start_in + float(self._times[0])
         self.duration_s = self._start_in + float(self._times[-1])
         self._bridge.fill(0.0)
-        if self._bridge_s > 0:
+        if self.bridge_s > 0:
             start = (now.position, now.velocity, now.acceleration)
-            solve(order, self._bridge_s, start, self._first, self._bridge[:order])
+            if now.velocity.any() or now.acceleration.any():
+                solve(QUINTIC, self.bridge_s, start, self._beginning(order), self._bridge)
+            else:
+                solve(order, self.bridge_s, start, self._first, self._bridge[:order])
+        return data[end:]
+
+    def _beginning(self, order: int) -> tuple[Floats, Floats, Floats]:
+        """Return position, velocity and acceleration with which the first piece begins, or what it has."""
+        if len(self._pieces):
+            first = self._pieces[0]
+            return first[0], first[1], first[2] * 2.0 if order > LINEAR else np.zeros_like(first[0])
+        velocity, acceleration = self._first[1] * (order > LINEAR), self._first[2] * (order > CUBIC)
+        return self._first[0], velocity, acceleration
+
+    def first_way(self, now: SplineSample) -> Floats:
+        """Return the mean velocity on the way from `now` to the first point, rad/s; 0 if it is a jump."""
+        way: Floats = self._first[0] - now.position
+        way /= self.bridge_s if self.bridge_s > 0 else np.inf
+        return way
 
     def sample(self, t: float, sample: SplineSample) -> None:
         """Write the desired state `t` s after `load`; after the end: the last position, at rest."""
@@ -157,7 +182,7 @@ class Trajectory:
 
     def _piece(self, t: float) -> tuple[Sequence[Floats] | Floats, float]:
         """Return the piece that is played `t` s after `load`, and the time in it."""
-        if t < self._bridge_s:
+        if t < self.bridge_s:
             return self._bridge, max(t, 0.0)
         t -= self._start_in
         if not self._begin_s <= t < self._end_s:
@@ -165,3 +190,45 @@ class Trajectory:
             self._begin_s, self._end_s = float(self._times[index]), float(self._times[index + 1])
             self._now = tuple(self._pieces[index])
         return self._now, t - self._begin_s
+
+
+class Stop:
+    """Joints that come to rest, each with a constant deceleration from its own velocity.
+
+    t_stop = |v| / a, and the way is |v| t_stop / 2, as joint_trajectory_controller of ros2_controllers does
+    on cancel (docs.ros.org, joint_trajectory_controller, "Decelerate on cancel"). Where a position limit is
+    nearer than that way, the deceleration is v**2 / (2 way to the limit): the limit goes before it.
+    """
+
+    __slots__ = ("_duration", "_end", "_left", "_pull", "duration_s")
+
+    def __init__(self, joints: int) -> None:
+        self._duration, self._end, self._pull, self._left = np.zeros((4, joints))
+        self.duration_s = 0.0
+        """From `load` until all are at rest, s."""
+
+    def load(self, now: SplineSample, deceleration: Floats, lower: Floats, upper: Floats) -> None:
+        """Begin to stop from position and velocity of `now`; limits shape (joints,), rad/s^2 and rad."""
+        speed = np.abs(now.velocity)
+        room = np.where(now.velocity > 0, upper - now.position, now.position - lower)
+        np.maximum(room, 0.0, out=room)
+        needed = np.divide(speed * speed, 2.0 * room, out=np.full_like(room, np.inf), where=room > 0)
+        np.maximum(needed, deceleration, out=needed)
+        np.divide(speed, needed, out=self._duration)
+        self._pull[:] = 0.0  # a joint that stops at once has none
+        np.copyto(self._pull, np.copysign(needed, now.velocity), where=self._duration > 0)
+        np.add(now.position, now.velocity * self._duration / 2.0, out=self._end)
+        self.duration_s = float(self._duration.max(initial=0.0))
+
+    def sample(self, t: float, sample: SplineSample) -> None:
+        """Write the state `t` s after `load` into `sample`."""
+        left, position = self._left, sample.position
+        np.subtract(self._duration, t, out=left)
+        np.maximum(left, 0.0, out=left)
+        np.multiply(self._pull, left, out=sample.velocity)
+        np.multiply(sample.velocity, left, out=position)
+        position *= -0.5
+        position += self._end
+        np.sign(left, out=left)
+        np.multiply(self._pull, left, out=sample.acceleration)
+        np.negative(sample.acceleration, out=sample.acceleration)

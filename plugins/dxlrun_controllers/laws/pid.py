@@ -11,10 +11,38 @@ B. Wittenmark, Computer-Controlled Systems (1997), section 8.
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun import Floats
+from dxlrun import LIVE, Floats, ParametersModel
+from dxlrun_controllers.joints import NotNegative, PerJoint, fill
+
+
+class Gains(ParametersModel):
+    """Gains of a PID law, each one number for all joints or a mapping by joint; they can be changed in a run.
+
+    u is the unit of the command (Nm, A or fraction of maximum; rad/s; fraction of the full voltage; rad), e
+    that of the reference (rad or rad/s).
+    """
+
+    p: Annotated[PerJoint[NotNegative], LIVE] = 0.0
+    """u/e"""
+    i: Annotated[PerJoint[NotNegative], LIVE] = 0.0
+    """u/(e s)"""
+    d: Annotated[PerJoint[NotNegative], LIVE] = 0.0
+    """u s/e"""
+    feed_forward: Annotated[PerJoint[NotNegative], LIVE] = 0.0
+    """u s/rad, times the reference's velocity; left out, it is 1 where velocities are commanded."""
+
+
+def feed_velocities_forward(data: object) -> object:
+    """Return parameters as written, with a feed_forward of 1 where velocities are commanded and it is not."""
+    if not isinstance(data, dict) or data.get("command_interface") != "velocity":
+        return data
+    gains = data.get("gains")
+    return {**data, "gains": {"feed_forward": 1.0, **gains}} if isinstance(gains, dict) else data
 
 
 class Pid:
@@ -68,6 +96,13 @@ class Pid:
         self._new = np.zeros((5, joints))
         self._elapsed_s = np.zeros(joints)
         self._room, self._share = np.zeros((2, joints))
+
+    def take(self, gains: Gains, joints: tuple[str, ...]) -> None:
+        """Take other gains; an integral that nothing would ever remove begins anew."""
+        fill(self.p, gains.p, joints, 0.0)
+        fill(self.i, gains.i, joints, 0.0)
+        fill(self.d, gains.d, joints, 0.0)
+        self.integral[self.i == 0.0] = 0.0
 
     def limit_integral(self, limit: Floats) -> None:
         """Limit the magnitude of the integral term, in units of the command."""

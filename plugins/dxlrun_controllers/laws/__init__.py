@@ -1,0 +1,1 @@
+"""Laws: what controllers compute, on arrays of joints, without a robot."""
