@@ -243,9 +243,12 @@ def _nested(cls: type, known: Mapping[str, tuple[tuple[str, Plain | None], ...]]
     def plain(value: object) -> Value:
         if not isinstance(value, cls):
             raise ValueError(f"{type(value).__name__} is given where {cls.__name__} is asked")
+        # of a list: a tuple that grows with a generator ends in CPython's free list, which then fills
         return tuple(
-            getattr(value, one) if convert is None else convert(getattr(value, one))
-            for one, convert in fields
+            [
+                getattr(value, one) if convert is None else convert(getattr(value, one))
+                for one, convert in fields
+            ]
         )
 
     return plain
