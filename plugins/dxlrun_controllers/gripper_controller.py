@@ -29,7 +29,8 @@ from dxlrun import (
     Outcome,
     ParametersModel,
 )
-from dxlrun_controllers.joints import finite_or, hold, or_number
+from dxlrun_controllers.group import PositionsCommand
+from dxlrun_controllers.joints import check_size, finite_or, hold, or_number
 
 STATE_NS = 50_000_000
 """Between two messages of the topic, ns."""
@@ -114,10 +115,14 @@ class GripperController(Controller[GripperParameters]):
     """Moves one joint to goals; a stall ends a goal as reached, and the gripper keeps its grip.
 
     With a limit of effort it goes on pressing with it; without one, it holds the angle at which it stalled.
+    The command `positions`, of streams and motion files, moves it without a result.
     """
 
     Parameters = GripperParameters
-    Commands: ClassVar[Mapping[str, type[CommandModel]]] = {"grip": GripCommand}
+    Commands: ClassVar[Mapping[str, type[CommandModel]]] = {
+        "grip": GripCommand,
+        "positions": PositionsCommand,
+    }
     Goals: ClassVar[frozenset[str]] = frozenset({"grip"})
     Topics: ClassVar[Mapping[str, type]] = {"state": GripperState}
 
@@ -132,6 +137,9 @@ class GripperController(Controller[GripperParameters]):
     @classmethod
     def prepare(cls, kind: str, command: CommandModel, parameters: GripperParameters) -> NDArray[np.float64]:
         """Return angle, rad, and effort. Raises ValueError for a width, or an effort, that it cannot have."""
+        if isinstance(command, PositionsCommand):
+            check_size("positions", len(command.positions), (parameters.joint,))
+            return np.array(command.positions)
         if not isinstance(command, GripCommand):
             return super().prepare(kind, command, parameters)
         if command.effort is not None and parameters.effort is None:
@@ -191,6 +199,13 @@ class GripperController(Controller[GripperParameters]):
             commands.effort.fill(effort)
         self._goal, self._target, self._began_ns, self._still_ns = goal, angle, time_ns, -1
         self._way = abs(angle - float(self.context.states.position[0]))
+
+    def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
+        """Go to another angle; a goal that is pursued ends."""
+        self._end(Outcome.PREEMPTED, "positions came")
+        self._cancelled, self._stalled = False, False
+        self.on_parameters(time_ns)
+        np.copyto(self.context.commands.position, data)
 
     def on_cancel(self, goal: Goal, time_ns: int) -> None:
         """Hold where the gripper is now; the goal has ended when it is at rest."""

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import json
 import shlex
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
+from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.log.reader import Log, read_log
+from dxlrun.log.replay import replay_log
+from dxlrun.remote.preparation import Preparation
+from dxlrun.run.channels.answers import Done
+from dxlrun.run.channels.commands import Command, QueueInbox
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import simulated_robot
 
@@ -17,7 +24,7 @@ ROOT = Path(__file__).parents[2]
 
 
 @dataclass(frozen=True)
-class Command:
+class TypedCommand:
     """`dxlrun ROBOT name:=value ... --play MOTION`, as a person would type it in the clone."""
 
     robot: Path
@@ -34,15 +41,15 @@ class Run:
 
 
 @pytest.fixture(scope="session")
-def command_of() -> Callable[[Path], Command]:
+def command_of() -> Callable[[Path], TypedCommand]:
     """Return the command that a motion file tells its reader to type; there is exactly one."""
 
-    def command_of(motion: Path) -> Command:
+    def command_of(motion: Path) -> TypedCommand:
         (line,) = [line for line in motion.read_text().splitlines() if line.startswith("#   dxlrun ")]
         _, _, robot, *words = shlex.split(line)
         *assignments, option, played = words
         assert option == "--play"
-        return Command(ROOT / robot, dict(word.split(":=") for word in assignments), ROOT / played)
+        return TypedCommand(ROOT / robot, dict(word.split(":=") for word in assignments), ROOT / played)
 
     return command_of
 
@@ -51,7 +58,7 @@ def command_of() -> Callable[[Path], Command]:
 def played(tmp_path: Path) -> Callable[..., Run]:
     """Run a command on virtual time, not longer than `duration_s`."""
 
-    def played(command: Command, duration_s: float | None = None) -> Run:
+    def played(command: TypedCommand, duration_s: float | None = None) -> Run:
         log = tmp_path / "run.mcap"
         robot = simulated_robot(
             command.robot,
@@ -64,3 +71,83 @@ def played(tmp_path: Path) -> Callable[..., Run]:
         return Run(robot, read_log(log))
 
     return played
+
+
+@dataclass(frozen=True)
+class Ask:
+    """A command or a goal of a client, as it would send it; taken by the first cycle at or after `at_s`."""
+
+    at_s: float
+    controller: str
+    kind: str
+    command: dict[str, object]
+
+
+class Client(QueueInbox):
+    """Asks what it asks when its time has come; commands go through the gateway's checks."""
+
+    def __init__(self, robot: VirtualRobot, asks: Sequence[Ask]) -> None:
+        super().__init__()
+        loop = robot.plan.loop
+        preparation = Preparation({joint.name: joint for joint in loop.joints}, load_plugins())
+        plans = {plan.name: plan for plan in loop.controllers}
+        self._record, self._period_ns = robot.record, loop.period_ns
+        self._asks = deque(
+            (
+                round(ask.at_s * 1e9),
+                Command(
+                    number,
+                    ask.controller,
+                    ask.kind,
+                    preparation.command(
+                        plans[ask.controller], ask.kind, json.dumps(ask.command).encode()
+                    ).data
+                    if ask.controller
+                    else json.dumps(ask.command).encode(),
+                    "test",
+                ),
+            )
+            for number, ask in enumerate(sorted(asks, key=lambda ask: ask.at_s), 1)
+        )
+
+    def take(self) -> Sequence[Command]:
+        while self._asks and self._asks[0][0] <= self._record.cycle * self._period_ns:
+            self.waiting.append(self._asks.popleft()[1])
+        return super().take()
+
+
+@pytest.fixture
+def steered(tmp_path: Path) -> Callable[..., Run]:
+    """Run a robot file on virtual time while a client asks, and compare the run with its replay."""
+
+    def steered(
+        robot: Path,
+        duration_s: float,
+        asks: Sequence[Ask] = (),
+        *,
+        arguments: dict[str, str] | None = None,
+        before: Callable[[VirtualRobot], None] | None = None,
+        play: Sequence[Path] = (),
+    ) -> Run:
+        log = tmp_path / "steered.mcap"
+        virtual = simulated_robot(robot, arguments=arguments or {}, duration_s=duration_s, play=play, log=log)
+        client = Client(virtual, asks)
+        virtual.robot.loop.steering.inbox = client
+        (before or (lambda _: None))(virtual)
+        result = virtual.run()
+        assert (result.reason, result.detail, virtual.failures) == ("ended", "", ())
+        refused = {
+            number: answer for number, answer in client.answers.items() if not isinstance(answer, Done)
+        }
+        assert not refused
+        report = replay_log(log)
+        assert (report.different, report.compared) == (0, report.cycles)
+        return Run(virtual, read_log(log))
+
+    return steered
+
+
+@pytest.fixture(scope="session")
+def asking() -> type[Ask]:
+    """What a client asks."""
+    return Ask

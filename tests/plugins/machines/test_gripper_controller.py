@@ -145,6 +145,20 @@ def test_a_new_goal_takes_over(mounted):
     assert (first.outcome, second.outcome) == (Outcome.PREEMPTED, Outcome.REACHED)
 
 
+def test_positions_move_it_without_a_result_and_end_a_goal(mounted):
+    robot = begun(mounted)
+    goal = robot.ask("grip", position=0.6)
+    run(robot, 0.1)
+    robot.send("positions", positions=[-0.5])
+    assert goal.outcome is Outcome.PREEMPTED
+    run(robot, 1.0)
+    for _ in range(50):
+        robot.step()
+    assert robot.commands.position[0] == -0.5
+    with pytest.raises(ValueError, match=r"2 positions for 1 joints \(gripper\)"):
+        robot.prepare("positions", positions=[0.1, 0.2])
+
+
 def test_an_angle_beyond_the_limits_is_refused_and_nothing_moves(mounted):
     robot = begun(mounted)
     goal = robot.ask("grip", position=0.7)

@@ -1,0 +1,112 @@
+"""The examples that are steered: what they do on virtual time, by their logs, and by their replays."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+
+from dxlrun.run.channels.events import EventCode
+
+ROBOTS = Path(__file__).parents[2] / "robots"
+
+
+def messages(path: Path, topic: str) -> list[Any]:
+    """Messages of a topic of a log, as a ROS 2 tool decodes them."""
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        return [decoded.decoded_message for decoded in reader.iter_decoded_messages(topics=[topic])]
+
+
+def results(run: Any) -> list[tuple[str, str]]:
+    """Outcomes and texts of the goals that ended."""
+    ended = [json.loads(event.data) for event in run.log.events if event.code == EventCode.GOAL_ENDED]
+    return [(report["status"], report["text"]) for report in ended]
+
+
+def test_a_base_drives_a_circle_and_knows_it(steered: Callable[..., Any], asking: Any) -> None:
+    asks = [asking(0.1 + 0.1 * n, "base", "velocity", {"linear": 0.1, "angular": 1.0}) for n in range(60)]
+    run = steered(ROBOTS / "diff_drive.yaml", 8.0, asks)
+
+    odometry = messages(run.log.path, "/base/odometry")
+    assert len(odometry) == pytest.approx(8.0 * 50, abs=3)
+    assert odometry[0].header.frame_id == "odom"
+    places = np.array([(m.pose.pose.position.x, m.pose.pose.position.y) for m in odometry])
+    # a circle with a radius of 0.1 m on the left, but for the ramp at the beginning and the end
+    distance = np.hypot(places[50:-80, 0], places[50:-80, 1] - 0.1)
+    assert distance == pytest.approx(0.1, abs=0.01)
+    last = odometry[-1]
+    assert last.twist.twist.linear.x == pytest.approx(0.0, abs=0.001)  # it has timed out
+    row = run.log.cycles["position"]
+    left, right = (row[-1] - row[0]) * 0.033
+    heading = 2 * math.atan2(last.pose.pose.orientation.z, last.pose.pose.orientation.w)
+    assert math.remainder(heading - (right - left) / 0.16, math.tau) == pytest.approx(0.0, abs=1e-6)
+    assert abs((right - left) / 0.16) > 5.5  # about a turn
+
+
+def test_a_gripper_reaches_a_width(steered: Callable[..., Any], asking: Any) -> None:
+    asks = [
+        asking(0.5, "gripper", "grip", {"width": "30 mm"}),
+        asking(3.0, "gripper", "grip", {"width": 0.06}),
+    ]
+    run = steered(ROBOTS / "open_manipulator_x.yaml", 6.0, asks)
+
+    assert [outcome for outcome, _ in results(run)] == ["reached", "reached"]
+    widths = [message.width for message in messages(run.log.path, "/gripper/state")]
+    assert max(widths) == pytest.approx(0.06, abs=0.002)
+    assert min(widths[:50]) == pytest.approx(0.03, abs=0.002)
+
+
+def test_a_gripper_that_is_held_back_stalls_with_its_effort(
+    steered: Callable[..., Any], asking: Any, tmp_path: Path
+) -> None:
+    """A weight that its effort cannot lift is what an object is to a gripper."""
+    text = (ROBOTS / "open_manipulator_x.yaml").read_text()
+    held = tmp_path / "held.yaml"
+    joint = "limits: {position: [-1.26 rad, 0.66 rad], velocity: 4.8 rad/s}"
+    assert text.count(joint) == 1
+    held.write_text(text.replace(joint, f"{joint}, simulation: {{gravity: 2.0 Nm}}"))
+    run = steered(held, 4.0, [asking(0.5, "gripper", "grip", {"position": 0.6})])
+
+    ((outcome, reason),) = results(run)
+    assert outcome == "reached"
+    assert reason.startswith("stalled, holds something at 0.")
+    effort = run.log.cycles["effort"][-50:, run.log.joints.index("gripper")]
+    assert effort == pytest.approx(0.3, abs=0.01)
+
+
+def test_followers_are_where_their_leaders_are_within_two_periods(steered: Callable[..., Any]) -> None:
+    run = steered(
+        ROBOTS / "leader_follower.yaml", 7.0, play=[ROBOTS / "motions" / "leader_follower_wave.yaml"]
+    )
+
+    cycles, joints = run.log.cycles, run.log.joints
+    for side in ("shoulder", "elbow"):
+        leader = cycles["position"][:, joints.index(f"left_{side}")]
+        sent = cycles["goal_position"][:, joints.index(f"right_{side}")]
+        begun = 200  # in step long before
+        errors = [np.abs(sent[begun:] - np.roll(leader, lag)[begun:]).max() for lag in range(4)]
+        assert np.ptp(leader) > 0.7
+        assert min(errors) == pytest.approx(0.0, abs=2e-3)  # a tick
+        assert int(np.argmin(errors)) <= 2
+
+
+def test_a_trajectory_leads_a_pid_that_commands_currents(steered: Callable[..., Any]) -> None:
+    run = steered(ROBOTS / "effort_arm.yaml", 6.0, play=[ROBOTS / "motions" / "effort_arm_lift.yaml"])
+
+    cycles = run.log.cycles
+    assert np.isnan(cycles["command_position"]).all()
+    assert np.isfinite(cycles["command_effort"][10:]).all()
+    for row, top in ((0, 1.0), (1, 0.8)):
+        position = cycles["position"][:, row]
+        assert position.max() == pytest.approx(top, abs=0.06)
+        t = np.arange(len(position)) / 400
+        rest = (t > 3.0) & (t < 3.05)
+        assert position[rest] == pytest.approx(top, abs=0.08)
