@@ -20,6 +20,7 @@ STEER = {
     "switch",
     "set",
     "rate",
+    "halt",
     "pause",
     "resume",
     "load",

@@ -280,6 +280,21 @@ def test_a_rate_holds_at_once(dxlrun, torso: RemoteRobot) -> None:
     assert dxlrun("list").out.startswith("bioloid_torso: 80 Hz, ")
 
 
+def test_a_halted_robot_holds_until_a_controller_is_activated(dxlrun, torso: RemoteRobot) -> None:
+    said = dxlrun("halt")
+    assert (said.code, said.err) == (0, "")
+    assert re.fullmatch(
+        r"bioloid_torso stands still after \d\.\d\d s \(\w+: [\d.e-]+ rad/s\); "
+        r"`dxlrun switch --activate NAME` lets it go on\n",
+        said.out,
+    )
+    active = [name for name, one in controllers(torso).items() if one["active"]]
+    assert active == ["joint_state_broadcaster"]
+    printed = json.loads(dxlrun("halt", "--json").out)
+    assert set(printed) == {"robot", "done", "cycle", "seconds", "joint", "velocity"}
+    assert torso.switch(["head"]).cycle > printed["cycle"]
+
+
 def test_a_pause_is_when_controllers_are_loaded_and_unloaded(dxlrun, torso: RemoteRobot) -> None:
     assert dxlrun("pause").out == (
         "bioloid_torso is paused, its joints are held; `dxlrun resume` ends that\n"

@@ -42,6 +42,7 @@ _MOST_NAMED = 3
 _KINDS = {
     "switch": "switch",
     "rate": "change of the rate",
+    "halt": "halt",
     "pause": "pause",
     "load": "controller loaded",
     "unload": "controller unloaded",

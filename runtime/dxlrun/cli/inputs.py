@@ -36,6 +36,7 @@ COMMANDS_WHILE_IT_RUNS = {
     "parameters": "steering.parameters:parameters",
     "echo": "steering.echo:echo",
     "rate": "steering.steer:rate",
+    "halt": "steering.steer:halt",
     "pause": "steering.steer:pause",
     "resume": "steering.steer:resume",
     "load": "steering.steer:load",

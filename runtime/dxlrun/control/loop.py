@@ -14,6 +14,7 @@ from dxlrun.control.controllers.managed import PERIOD_CAP
 from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.controllers.plugins import OverrunHook
 from dxlrun.control.gate import Gate
+from dxlrun.control.halt import Halt
 from dxlrun.control.joint_requests import JointRequests
 from dxlrun.control.loop_plan import ControllerPlan, LoopPlan, OverrunPolicy
 from dxlrun.control.policy_plan import GroupPolicy, Last, PolicyName, PolicyPlan
@@ -203,8 +204,9 @@ class Loop:
         self._valid = np.zeros(len(self.plan.joints), np.int64)
         self.joints = JointRequests(self.plan.joints, self.hardware, self.manager, self.record, self._answer)
         self._lost = LostServos(len(self.plan.joints), self.joints.expected)
+        halt = Halt(self.plan.joints, self.manager, self.record, self._answer)
         self.steering = Steering(
-            self.inbox, self, self.manager, self.joints, self.record, self.events, self.commands
+            self.inbox, self, self.manager, self.joints, halt, self.record, self.events, self.commands
         )
 
     def run(self) -> LoopResult:

@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 
 from dxlrun.control.controllers.manager import Manager
+from dxlrun.control.halt import Halt
 from dxlrun.control.joint_requests import JOINT_KINDS, JointRequests
 from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.run.channels.answers import Answer, Code, CommandOutcome, Done, Refusal, Waiting
@@ -87,6 +88,7 @@ class Parameters(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 KINDS = (
     "switch",
+    "halt",
     "cancel",
     "parameters",
     "rate",
@@ -97,7 +99,7 @@ KINDS = (
     *JOINT_KINDS,
     "stop",
 )
-"""Commands for the loop itself; `load` carries a ControllerPlan, `pause`, `resume` and `stop` nothing."""
+"""Commands for the loop; `load` carries a ControllerPlan, `halt`, `pause`, `resume` and `stop` nothing."""
 
 
 @dataclass(slots=True)
@@ -105,7 +107,8 @@ class Steering:
     """Executes the commands of an inbox, logs them, and answers them.
 
     Most are answered in the cycle that takes them. A switch that waits for modes is answered by `Waiting`
-    first, and again when its controllers are active or given up; so are torque and reboots. A register is
+    first, and again when its controllers are active or given up; so are torque, reboots, and a halt when the
+    joints stand still. A register is
     answered when the servo has it.
     """
 
@@ -113,6 +116,7 @@ class Steering:
     loop: Steered
     manager: Manager
     joints: JointRequests
+    halt: Halt
     record: CycleRecord
     events: EventSink
     taken: CommandSink
@@ -120,6 +124,7 @@ class Steering:
     def take(self, time_ns: int) -> int:
         """Execute what has come, and end streams whose lease ran out; return the commands for controllers."""
         count = 0
+        self.halt.watch()
         for command in self.inbox.take():
             self._log(command)
             execute = self._for_loop if command.controller == LOOP else self._for_controller
@@ -149,6 +154,7 @@ class Steering:
         """Answer what waits still: the controllers are inactive."""
         self.answer_late()
         self.joints.end()
+        self.halt.end()
 
     def answer_late(self) -> None:
         """Answer the switches that waited for modes and have come to an end."""
@@ -192,6 +198,8 @@ class Steering:
 
     def _for_loop(self, command: Command, time_ns: int) -> Answer | None:
         """Execute a command for the loop itself; None: it is answered later."""
+        if command.kind == "halt":
+            return self.halt.begin(command.number, time_ns)
         try:
             return self._execute(command, time_ns)
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:

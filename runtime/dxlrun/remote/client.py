@@ -62,6 +62,20 @@ class Executed:
 
 
 @dataclass(frozen=True, slots=True)
+class Halted:
+    """A robot that stands still."""
+
+    cycle: int
+    """The loop's cycle that found it."""
+    seconds: float
+    """Since the loop took the command."""
+    joint: str
+    """The fastest one then."""
+    velocity: float
+    """Its speed, rad/s"""
+
+
+@dataclass(frozen=True, slots=True)
 class GoalState:
     """A goal as the robot reports it."""
 
@@ -410,6 +424,21 @@ class RemoteRobot:
     def rate(self, rate: float) -> Executed:
         """Let the loop run at another rate, Hz."""
         return self._execute("/rate", {"rate": rate})
+
+    def halt(self) -> Halted:
+        """Deactivate all controllers that command joints; returns when every joint stands still and holds.
+
+        Raises Refused with the code `still_moving` when one does not after five seconds.
+        """
+        answer = self._ask("POST", "/halt")
+        measured = answer.get("halted")
+        found = measured if isinstance(measured, dict) else {}
+        return Halted(
+            self._executed(answer).cycle,
+            float(found["seconds"]),
+            str(found["joint"]),
+            float(found["velocity"]),
+        )
 
     def pause(self) -> Executed:
         """Hold the joints, and stop the controllers' time."""

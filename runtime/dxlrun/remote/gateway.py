@@ -12,7 +12,7 @@
     GET, POST /controllers/NAME/parameters {values}      all of them; change live ones in one cycle
     POST /switch {activate, deactivate}         controllers, in one cycle or not at all
     POST /joints/NAME/registers/ITEM {value}    a RAM item of a joint's servo; answered when it is there
-    POST /rate {rate}, /pause, /resume, /stop
+    POST /rate {rate}, /halt, /pause, /resume, /stop
     POST /controllers {name, type, ...}         load one, DELETE /controllers/NAME unload it; in a pause only
 
 `{"done": true, "cycle": N}`, of a goal with its number in `"goal"`, of a set-point instead `"clamped"`, the
@@ -174,6 +174,7 @@ class GatewayApp:
             route("/switch", self.switch, "POST", operations),
             route("/joints/{name}/registers/{item}", self.register, "POST", operations),
             route("/rate", self.rate, "POST", operations),
+            route("/halt", self.halt, "POST", None),  # always taken, as far as there is room
             route("/pause", self.pause, "POST", operations),
             route("/resume", self.resume, "POST", operations),
             route("/stop", self.stop, "POST", None),  # always taken
@@ -375,6 +376,11 @@ class GatewayApp:
         rate = await typed(request, Rate, '{"rate": 100}')
         noted = partial(self._note, "rate", rate.rate)
         return _done(await self._link.for_loop("rate", rate, origin(request), noted))
+
+    async def halt(self, request: Request) -> Response:
+        """Let every joint come to a stop and hold; answered when they stand still."""
+        done = await self._link.for_loop("halt", None, origin(request))
+        return _json({"done": True, "cycle": done.cycle, "halted": msgspec.to_builtins(done.halted)})
 
     async def pause(self, request: Request) -> Response:
         """Hold the joints at their goals, and stop the controllers' time."""

@@ -6,7 +6,7 @@ Each is one request to the gateway of the run: executed after the read of a cycl
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -195,6 +195,21 @@ def rate(hz: float, /, *, chosen: Chosen = ONLY_ONE) -> int:
     with robot_of(chosen, "rate") as robot:
         done = robot.rate(hz)
         return report_done(robot, chosen, done, f"{robot.name} runs at {hz:g} Hz")
+
+
+def halt(*, chosen: Chosen = ONLY_ONE) -> int:
+    """Let every joint of a running robot come to a stop within its limits and hold; the run goes on."""
+    with robot_of(chosen, "halt") as robot:
+        done = robot.halt()
+        if chosen.as_json:
+            show_json_line({"robot": robot.name, "done": True, **asdict(done)})
+            return 0
+        fastest = f"{done.joint}: {done.velocity:.2g} rad/s"
+        show(
+            f"{robot.name} stands still after {done.seconds:.2f} s ({fastest}); "
+            "`dxlrun switch --activate NAME` lets it go on"
+        )
+        return 0
 
 
 def pause(*, chosen: Chosen = ONLY_ONE) -> int:

@@ -103,6 +103,11 @@ class Code(StrEnum):
     JOINT_LIMP = "joint_limp", "{joint} has no torque"
     JOINT_LOST = "joint_lost", "{joint} does not answer: check cable and power"
     HARDWARE_ERROR = "hardware_error", "{joint} has a hardware error, and cannot get torque"
+    STILL_MOVING = (
+        "still_moving",
+        "no controller commands any more, but {joint} does not stand still after {seconds:.1f} s: "
+        "at most {velocity:.2g} rad/s",
+    )
     TORQUE_NOT_SWITCHED = "torque_not_switched", "{problem}"
     NOT_REBOOTED = "not_rebooted", "{problem}"
     # commands
@@ -124,6 +129,17 @@ class Code(StrEnum):
     GATEWAY_FAILED = "gateway_failed", "the gateway failed: {problem}; --debug shows where"
 
 
+class Halted(msgspec.Struct, frozen=True):
+    """What was measured when a halted robot stood still."""
+
+    seconds: float
+    """Since the loop took the command."""
+    joint: str
+    """The fastest one then."""
+    velocity: float
+    """Its speed, rad/s"""
+
+
 class Done(msgspec.Struct, frozen=True, tag="done"):
     """The command was executed."""
 
@@ -135,6 +151,8 @@ class Done(msgspec.Struct, frozen=True, tag="done"):
     """Numbers of the goals that the command began; none where it is no goal."""
     value: int | None = None
     """Of a register: what the servo has, or had before it was written; None: it is not known."""
+    halted: Halted | None = None
+    """Of a halt; None: it was none."""
 
 
 class Waiting(msgspec.Struct, frozen=True, tag="waiting"):

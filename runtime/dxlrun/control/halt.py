@@ -1,0 +1,119 @@
+"""Halt: every joint comes to a stop within its limits and holds, while the run goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from dxlrun.control.controllers.manager import Manager
+from dxlrun.control.loop_plan import JointPlan
+from dxlrun.description.modes import Mode
+from dxlrun.run.channels.answers import Answer, Code, Done, Halted, Refusal, Waiting
+from dxlrun.run.channels.cycle import LIMP, CycleRecord, Torque
+
+STILL = 0.1
+"""rad/s; a slower joint stands still: servos report what they turn in steps of 0.024 rad/s (XM430) or less,
+with noise of some steps. [i]"""
+STILL_NS = 100_000_000
+"""For how long all joints must be that slow, with goals at rest."""
+HALT_NS = 5_000_000_000
+"""A halt is answered after this time at the latest, as joints may change their modes for so long."""
+_HOLDING = (Mode.POSITION, Mode.VELOCITY)
+_FREE = (*LIMP, Torque.LOST)
+"""Joints that do not count: what moves them is not the run, or not known."""
+
+
+class Halt:
+    """Deactivates all controllers that command joints, and watches the joints until they stand still.
+
+    Without a command the gate lets goals come to rest within `limits.acceleration`, and brings velocities to
+    0; joints in other modes are brought into their rest modes as after any deactivation. The goal of a joint
+    without an acceleration limit may be far ahead of it, where its servo goes there at a lower speed: while
+    such a joint moves toward its goal, the goal becomes where the joint is.
+    """
+
+    __slots__ = (
+        "_answer",
+        "_before",
+        "_began_ns",
+        "_joints",
+        "_manager",
+        "_numbers",
+        "_record",
+        "_still_ns",
+        "_stops",
+    )
+
+    def __init__(
+        self,
+        joints: Sequence[JointPlan],
+        manager: Manager,
+        record: CycleRecord,
+        answer: Callable[[int, Answer], None],
+    ) -> None:
+        """`answer` sends a client an answer, by the number of its command."""
+        self._joints = tuple(joint.name for joint in joints)
+        self._stops = np.array([joint.acceleration is None for joint in joints], dtype=np.bool_)
+        self._manager = manager
+        self._record = record
+        self._answer = answer
+        self._numbers: list[int] = []
+        """Commands that wait for the joints to stand still."""
+        self._began_ns = self._still_ns = 0
+        self._before = b""
+
+    def begin(self, number: int, time_ns: int) -> Refusal | Waiting:
+        """Deactivate the controllers, upper ends of chains first; the joints are watched from now on."""
+        refusal = self._manager.switch((), self._manager.commanding(self._joints), time_ns)
+        if isinstance(refusal, Refusal):
+            return refusal
+        self._numbers.append(number)
+        self._began_ns = self._still_ns = self._record.woken_ns
+        self._before = b""
+        self.watch()
+        return Waiting(())
+
+    def watch(self) -> None:
+        """Look at the joints after a read; answer when they have stood still for a while, or time is over."""
+        if not self._numbers:
+            return
+        record, now_ns = self._record, self._record.woken_ns
+        states, goals = record.states, record.goals
+        count = ~np.isin(states.torque, _FREE)
+        speed = np.where(count & states.valid, np.abs(states.velocity), 0.0)
+        speed = np.nan_to_num(speed)  # a servo that reports no speed is judged by its goals alone
+        position = states.mode == Mode.POSITION
+        ahead = position & self._stops & (speed > STILL)
+        ahead &= (goals.position - states.position) * states.velocity > 0
+        np.copyto(goals.position, states.position, where=ahead)
+        goal = goals.values[:2, count].tobytes()
+        ready = np.isin(states.mode, _HOLDING) & states.valid & (speed <= STILL)
+        if goal != self._before or not np.all(ready | ~count):
+            self._still_ns = now_ns
+        self._before = goal
+        row = int(np.argmax(speed))
+        measured = Halted((now_ns - self._began_ns) * 1e-9, self._joints[row], float(speed[row]))
+        if now_ns - self._still_ns >= STILL_NS:
+            self._end(Done(record.cycle, halted=measured))
+        elif now_ns - self._began_ns >= HALT_NS:
+            late = tuple(self._joints[index] for index in np.flatnonzero(count & ~ready).tolist())
+            self._end(
+                Refusal(
+                    Code.STILL_MOVING,
+                    {
+                        "joint": late or self._joints[row],
+                        "seconds": measured.seconds,
+                        "velocity": measured.velocity,
+                    },
+                )
+            )
+
+    def end(self) -> None:
+        """Answer what the run's end interrupts."""
+        self._end(Refusal(Code.RUN_ENDING))
+
+    def _end(self, answer: Answer) -> None:
+        for number in self._numbers:
+            self._answer(number, answer)
+        self._numbers.clear()

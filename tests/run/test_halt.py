@@ -1,0 +1,207 @@
+"""Halt on virtual time: joints in every mode come to a stop within their limits, by the ledger."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dxlrun.control.halt import HALT_NS, STILL, STILL_NS
+from dxlrun.log.reader import Log, read_log
+from dxlrun.log.replay import replay_log
+from dxlrun.run.channels.answers import Code, Done, Refusal
+from dxlrun.run.channels.commands import LOOP, Command
+from dxlrun.run.channels.events import EventCode
+from dxlrun.run.virtual_run import VirtualRobot
+from dxlrun.testing import simulated_robot
+
+ROBOT = """\
+name: halting
+buses:
+  main: {port: sim, protocol: 2.0, baud_rate: 1_000_000}
+loop: {rate: 100}
+joints:
+  ramped: {bus: main, id: 1, model: XM430-W350, reference: 180 deg, direction: 1,
+           limits: {acceleration: 10 rad/s^2}}
+  slow: {bus: main, id: 2, model: XM430-W350, reference: 180 deg, direction: -1}
+  wheel: {bus: main, id: 3, model: XL430-W250, reference: 0 deg, direction: 1, continuous: true,
+          limits: {acceleration: 8 rad/s^2}}
+  grip: {bus: main, id: 4, model: XM430-W350, reference: 180 deg, direction: 1}
+controllers:
+  joint_state_broadcaster: {type: joint_state_broadcaster}
+  a: {type: joint_group_position_controller, joints: [ramped]}
+  b: {type: joint_group_posvel_controller, joints: [slow]}
+  c: {type: joint_group_velocity_controller, joints: [wheel]}
+  d: {type: joint_group_effort_controller, joints: [grip]}
+"""
+RAMPED, SLOW, WHEEL, GRIP = range(4)
+SYNC_WRITE, GOAL_POSITION, GOAL_VELOCITY = 0x83, 116, 104
+RAD_PER_TICK, RAD_S_PER_TICK = 2 * np.pi / 4096, 0.229 * 2 * np.pi / 60
+DT = 0.01
+HALTED_S = 1.56
+NUMBERS = itertools.count(1)
+Steer = Callable[[VirtualRobot], None]
+
+
+def send(controller: str, kind: str, *values: float) -> Command:
+    return Command(next(NUMBERS), controller, kind, np.array(values).tobytes(), "anna")
+
+
+def loop(kind: str, data: bytes = b"") -> Command:
+    return Command(next(NUMBERS), LOOP, kind, data, "anna")
+
+
+def ran(
+    folder: Path, steps: dict[float, list[Command]], *, seconds: float = 3.0, text: str = ROBOT
+) -> tuple[VirtualRobot, Log]:
+    (folder / "robot.yaml").write_text(text)
+    robot = simulated_robot(folder / "robot.yaml", duration_s=seconds, log=folder / "run.mcap")
+
+    def steer(commands: list[Command]) -> Callable[[], None]:
+        return lambda: robot.inbox.waiting.extend(commands)
+
+    for at, commands in steps.items():
+        robot.buses[0].at(round(at * 1e9), steer(commands))
+    result = robot.run()
+    assert (result.reason, result.detail) == ("ended", "")
+    return robot, read_log(folder / "run.mcap")
+
+
+def written(robot: VirtualRobot, servo_id: int, address: int) -> list[tuple[float, int]]:
+    """Return times, s, and signed values of the last four bytes that sync writes had for a servo."""
+    found = []
+    for entry in robot.ledger.entries:
+        data = entry.data
+        if entry.direction != "in" or data[7] != SYNC_WRITE:
+            continue
+        first, size = int.from_bytes(data[8:10], "little"), int.from_bytes(data[10:12], "little")
+        if not first <= address <= first + size - 4:
+            continue
+        for at in range(12, len(data) - 2, size + 1):
+            if data[at] == servo_id:
+                value = data[at + 1 + address - first : at + 5 + address - first]
+                found.append((entry.t_ns * 1e-9, int.from_bytes(value, "little", signed=True)))
+    return found
+
+
+GO = [
+    send("a", "positions", 1.9),
+    send("b", "posvel", 1.2, 0.8),
+    send("c", "velocities", 4.0),
+    send("d", "efforts", 0.15),
+]
+
+
+def at(log: Log, seconds: float) -> int:
+    """Return the row of the cycle that began at this time of the buses' clock."""
+    return int(np.searchsorted(log.cycles["woken_ns"], seconds * 1e9))
+
+
+@pytest.fixture(scope="module")
+def halted(tmp_path_factory: pytest.TempPathFactory) -> tuple[VirtualRobot, Log, Command]:
+    command = loop("halt")
+    return *ran(tmp_path_factory.mktemp("halt"), {1.2: GO, HALTED_S: [command]}), command
+
+
+def test_joints_in_every_mode_come_to_rest_and_hold(halted: tuple[VirtualRobot, Log, Command]) -> None:
+    robot, log, command = halted
+    cycles = log.cycles
+    during = cycles["velocity"][at(log, HALTED_S) - 2]
+    assert (np.abs(during) > 2 * STILL).tolist() == [True, True, True, True], during
+    answer = robot.inbox.answers[command.number]
+    assert isinstance(answer, Done)
+    assert answer.halted is not None
+    assert STILL_NS * 1e-9 < answer.halted.seconds < 2.0
+    assert answer.halted.velocity <= STILL
+    after = cycles[at(log, HALTED_S + answer.halted.seconds) + 2 :]
+    assert np.abs(after["velocity"]).max() <= STILL
+    assert np.ptp(after["position"], axis=0).max() < 0.03
+    assert not np.any(after["active"] & 0b11110)
+    assert np.all(after["active"] & 1), "the broadcaster goes on"
+
+
+def test_goal_ticks_decelerate_within_the_limit_and_then_stand(
+    halted: tuple[VirtualRobot, Log, Command],
+) -> None:
+    robot, log, _ = halted
+    ticks = np.array([value for at, value in written(robot, 1, GOAL_POSITION) if at > 1.2], dtype=float)
+    speeds = np.diff(ticks) * RAD_PER_TICK / DT
+    assert speeds.max() > 3.0
+    assert np.abs(np.diff(speeds)).max() <= 10.0 * DT + 2.1 * RAD_PER_TICK / DT  # and two roundings
+    assert ticks[-1] * RAD_PER_TICK - np.pi < 1.6, "it came to rest on its way"
+    goals = log.cycles["goal_position"][:, RAMPED]
+    assert np.abs(np.diff(goals, 2)).max() <= 10.0 * DT * DT * (1 + 1e-6)
+
+
+def test_the_velocity_of_a_wheel_becomes_zero_within_the_limit(
+    halted: tuple[VirtualRobot, Log, Command],
+) -> None:
+    speeds = [value * RAD_S_PER_TICK for at, value in written(halted[0], 3, GOAL_VELOCITY) if at > 1.2]
+    assert max(speeds) == pytest.approx(8.0 * (HALTED_S - 1.2), abs=0.15)
+    assert np.abs(np.diff(speeds)).max() <= 8.0 * DT + 1.1 * RAD_S_PER_TICK
+    assert speeds[-1] == 0.0
+
+
+def test_a_goal_far_ahead_of_a_slow_joint_comes_back_to_it(halted: tuple[VirtualRobot, Log, Command]) -> None:
+    goals, states = (halted[1].cycles[name][:, SLOW] for name in ("goal_position", "position"))
+    row = at(halted[1], HALTED_S)
+    assert goals[row - 2] - states[row - 2] > 0.5
+    assert goals[-1] == pytest.approx(states[row], abs=0.05)
+
+
+def test_a_halted_robot_goes_on_when_a_controller_is_activated(tmp_path: Path) -> None:
+    steps = {
+        1.2: GO,
+        1.6: [loop("halt")],
+        2.4: [loop("switch", b'{"activate":["a"]}'), send("a", "positions", -0.5)],
+    }
+    robot, log = ran(tmp_path, steps, seconds=4.0)
+    assert all(isinstance(one, Done) for one in robot.inbox.answers.values())
+    assert log.cycles["position"][-1, RAMPED] == pytest.approx(-0.5, abs=0.05)
+    assert "halt from anna" in [event.text for event in log.events if event.code == EventCode.STEERED]
+
+
+def test_a_halt_is_replayed_without_a_difference(
+    halted: tuple[VirtualRobot, Log, Command], tmp_path: Path
+) -> None:
+    report = replay_log(Path(halted[1].path))
+    assert report.sentence.endswith("0 differences"), report
+
+
+def test_two_halts_are_answered_and_one_of_a_standing_robot_at_once(tmp_path: Path) -> None:
+    both = [loop("halt"), loop("halt")]
+    robot, _ = ran(tmp_path, {1.5: both})
+    for command in both:
+        answer = robot.inbox.answers[command.number]
+        assert isinstance(answer, Done)
+        assert answer.halted is not None
+
+
+def test_a_joint_that_cannot_stop_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dxlrun.control.halt.STILL", -1.0)
+    command = loop("halt")
+    robot, _ = ran(tmp_path, {1.2: [*GO, command]}, seconds=1.4 + HALT_NS * 1e-9)
+    answer = robot.inbox.answers[command.number]
+    assert isinstance(answer, Refusal)
+    assert answer.code == Code.STILL_MOVING
+    assert "ramped, slow, wheel, grip does not stand still after 5.0 s" in answer.text
+
+
+def test_a_halt_that_the_end_of_the_run_interrupts_is_refused(tmp_path: Path) -> None:
+    command = loop("halt")
+    robot, _ = ran(tmp_path, {1.2: GO, 1.48: [command]}, seconds=1.5)
+    assert robot.inbox.answers[command.number] == Refusal(Code.RUN_ENDING)
+
+
+def test_goals_that_still_decelerate_are_waited_for_also_where_the_joint_is_slow(tmp_path: Path) -> None:
+    text = ROBOT.replace("{acceleration: 10 rad/s^2}", "{velocity: 1 rad/s, acceleration: 0.2 rad/s^2}")
+    command = loop("halt")
+    robot, log = ran(tmp_path, {1.2: [send("a", "positions", 1.0)], 1.6: [command]}, text=text)
+    answer = robot.inbox.answers[command.number]
+    assert isinstance(answer, Done)
+    assert answer.halted is not None
+    assert answer.halted.seconds == pytest.approx(0.4 + STILL_NS * 1e-9, abs=0.05)
+    assert np.ptp(log.cycles["goal_position"][at(log, 1.6 + answer.halted.seconds) :, RAMPED]) == 0
