@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,9 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from dxlrun import LogError
+from dxlrun.analysis.report import analyze_log, tables
+from dxlrun.log.reader import Log, read_log, scan_log
 from dxlrun.testing import simulated_robot
 
 ROBOT = """\
@@ -148,3 +152,54 @@ def test_rosbags_decodes_with_the_definition_and_the_hash_of_the_log(log: Path) 
             assert store.hash_rihs01(schema.name) == channel.metadata["topic_type_hash"]
             found: Any = store.deserialize_cdr(message.data, schema.name)
             assert bytes(store.serialize_cdr(found, schema.name)) == message.data
+
+
+def test_our_reader_has_messages_times_and_columns(log: Path) -> None:
+    read = read_log(log)
+    assert {"/wave/state", "/wave/odometry", "/slow/state", "/slow/odometry"} <= set(read.topics)
+    states = read.messages("/wave/state")
+    assert states[0]["names"] == []
+    assert states[2]["names"] == ["pan", "tilt"]
+    topic = read.topics["/slow/odometry"]
+    assert (topic.type.name, len(topic.data), topic.rate) == (
+        "nav_msgs/msg/Odometry",
+        10,
+        pytest.approx(10.0),
+    )
+    np.testing.assert_allclose(topic.column("pose.pose.position.x"), np.arange(10) * 0.1, atol=1e-9)
+    assert topic.column("pose.covariance").shape == (10, 36)
+    woken = dict(zip(read.cycles["cycle"].tolist(), read.cycles["woken_ns"].tolist(), strict=True))
+    assert topic.t_ns.tolist() == [woken[cycle] for cycle in range(0, 50, 5)]
+
+
+@pytest.mark.parametrize(
+    ("topic", "field", "reason"),
+    [
+        ("/wave/state", "header.stamp.year", "messages of /wave/state have no field header.stamp.year"),
+        ("/wave/state", "error", "error of /wave/state is not always of the same length"),
+        ("/wave/states", "", "no topic /wave/states; did you mean /wave/state?"),
+    ],
+)
+def test_what_a_log_does_not_have_is_one_sentence(log: Path, topic: str, field: str, reason: str) -> None:
+    read = read_log(log)
+    with pytest.raises(LogError, match=re.escape(reason)):
+        read.topics[topic].column(field) if field else read.messages(topic)
+
+
+def test_the_report_counts_the_messages(log: Path) -> None:
+    (table,) = [table for table in tables(analyze_log(log)) if table.title == "Topics"]
+    counted = {tuple(cell.text for cell in row[:3]) for row in table.rows}
+    assert ("/wave/state", "my_robotics/msg/WaveState", "51") in counted
+    assert ("/wave/odometry", "nav_msgs/msg/Odometry", "50") in counted
+
+
+def test_a_log_is_read_slice_by_slice_with_its_topics(log: Path) -> None:
+    counts: dict[str, int] = {}
+
+    def take(part: Log) -> None:
+        for name, topic in part.topics.items():
+            if topic.data:
+                counts[name] = counts.get(name, 0) + len(topic.data)
+
+    assert scan_log(log, take).topics["/wave/state"].data == ()
+    assert counts == {"/wave/state": 51, "/wave/odometry": 50, "/slow/state": 11, "/slow/odometry": 10}

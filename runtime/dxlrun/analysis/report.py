@@ -53,6 +53,17 @@ class EventCount:
 
 
 @dataclass(frozen=True, slots=True)
+class TopicCount:
+    """How many messages of one topic of a controller are in the log."""
+
+    name: str
+    type: str
+    messages: int
+    rate: float | None
+    """Hz; None for fewer than two."""
+
+
+@dataclass(frozen=True, slots=True)
 class Report:
     """All results of `dxlrun analyze` on a log."""
 
@@ -71,6 +82,7 @@ class Report:
     steering: tuple[Act, ...]
     """Commands from outside, a stream as one."""
     pauses: tuple[Pause, ...]
+    topics: tuple[TopicCount, ...]
     gaps: int
     """Records that the recorder did not get."""
     complete: bool
@@ -101,6 +113,11 @@ def analyze(log: Log) -> Report:
         events=_events(totals.events),
         steering=totals.acts,
         pauses=totals.pauses,
+        topics=tuple(
+            TopicCount(one.name, one.type.name, len(one.data), one.rate)
+            for one in log.topics.values()
+            if one.data
+        ),
         gaps=totals.gaps,
         complete=log.complete,
         damage=log.damage,
@@ -137,6 +154,7 @@ def tables(report: Report) -> tuple[Table, ...]:
         servos_table(report),
         buses_table(report),
         joints_table(report),
+        topics_table(report.topics),
         steering_table(report.steering),
         events_table(report.events),
     )
@@ -270,6 +288,18 @@ def joints_table(report: Report) -> Table:
         for joint in report.joints
     ]
     return Table.of("Joints (errors in rad, of position minus what was reachable)", columns, rows)
+
+
+def topics_table(topics: Sequence[TopicCount]) -> Table:
+    """Return the topics of the controllers and of the runtime, with what is in the log of them."""
+    columns = [
+        Column("topic", "name"),
+        Column("type", "text"),
+        Column("messages"),
+        Column("rate", form="{:.4g} Hz", missing="-"),
+    ]
+    rows = [(one.name, one.type, one.messages, one.rate) for one in topics]
+    return Table.of("Topics", columns, rows)
 
 
 def steering_table(acts: Sequence[Act]) -> Table:

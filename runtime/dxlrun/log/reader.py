@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import struct
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,15 +17,17 @@ import numpy as np
 import zstandard
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, McapRecord, Metadata
+from mcap.records import Attachment, Channel, Chunk, McapRecord, Metadata, Schema
 from mcap.stream_reader import StreamReader
 from numpy.typing import NDArray
 
 from dxlrun.description.modes import Mode
-from dxlrun.errors import LogError
+from dxlrun.errors import LogError, suggestion
 from dxlrun.log import schemas
 from dxlrun.log.schemas import LoggedController, LogHeader, from_metadata
-from dxlrun.messages.cdr import ENCAPSULATION, Codec
+from dxlrun.log.topics import LoggedTopic
+from dxlrun.messages.cdr import ENCAPSULATION, Codec, Value
+from dxlrun.messages.definition import MessageType
 from dxlrun.run.channels.commands import TakenCommand, data_of
 from dxlrun.run.channels.cycle import CycleLayout
 from dxlrun.run.channels.events import Event
@@ -34,6 +36,10 @@ from dxlrun.run.channels.packets import LoggedPacket, PacketKind
 _MAGIC = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
+_TIMED_AT = 6
+"""Bytes of a message before its times: channel and sequence."""
+_TIMES = struct.Struct("<QQ")
+"""Log time and publish time of a message."""
 _PACKET = struct.Struct("<qqBBxxI")
 _FOR_OTHERS = frozenset(
     (
@@ -45,6 +51,15 @@ _FOR_OTHERS = frozenset(
     )
 )
 """What other tools read; the same is in the other topics."""
+_OWN = frozenset(
+    (
+        schemas.CYCLE_TOPIC,
+        schemas.ACTIVATION_TOPIC,
+        schemas.COMMANDS_TOPIC,
+        schemas.EVENT_TOPIC,
+    )
+)
+"""What this module reads by itself."""
 _DAMAGE = (McapError, zstandard.ZstdError, struct.error, UnicodeDecodeError, EOFError)
 UNREADABLE = (msgspec.MsgspecError, ValueError, RecursionError)
 """What msgspec raises for JSON in a log (the plan, data of a command) that is damaged or too deep."""
@@ -61,6 +76,10 @@ class _Found:
     channels: dict[int, str] = field(default_factory=dict)
     needless: set[int] = field(default_factory=set)
     """Channels whose messages are left where they are."""
+    schemas: dict[int, MessageType] = field(default_factory=dict)
+    published: dict[int, int] = field(default_factory=dict)
+    """Channels of topics of controllers and of the runtime -> their schemas. Their messages have log time and
+    publish time in front."""
     messages: dict[int, list[bytes]] = field(default_factory=dict)
     attachments: dict[str, bytes] = field(default_factory=dict)
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
@@ -93,6 +112,17 @@ class Log:
     """Shape (1,), as `cycles`: states and goals when the controllers were activated; None: not in the log."""
     commands: tuple[TakenCommand, ...] = ()
     """What cycles took for controllers and for the loop, in order."""
+    topics: Mapping[str, LoggedTopic] = field(default_factory=dict)
+    """Own topics of controllers, and `/goals` of the runtime, by name."""
+
+    def messages(self, topic: str) -> list[Mapping[str, Value]]:
+        """Return the messages of a controller's own topic by their fields; `topics` has times and columns.
+
+        Raises LogError when the log does not have it.
+        """
+        if topic not in self.topics:
+            raise LogError(f"{self.path}: no topic {topic}; {suggestion(topic, tuple(self.topics))}")
+        return self.topics[topic].messages()
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -198,7 +228,28 @@ def _log(path: Path, header: LogHeader, found: _Found) -> Log:
         packet_messages=packets,
         activation=_cycles(layout, activation) if activation else None,
         commands=_commands(by_topic.get(schemas.COMMANDS_TOPIC, [])),
+        topics=_topics(header, found),
     )
+
+
+def _topics(header: LogHeader, found: _Found) -> dict[str, LoggedTopic]:
+    topics: dict[str, LoggedTopic] = {}
+    for channel, schema in found.published.items():
+        kind = found.schemas.get(schema)
+        if kind is None:
+            raise ValueError(f"the topic {found.channels[channel]} has no definition")
+        messages = found.messages.get(channel, [])
+        name = found.channels[channel]
+        before = topics.get(name)  # of a controller that was unloaded and loaded again
+        if before is not None and before.type != kind:
+            name, before = f"{name} ({kind.name})", None
+        t_ns = np.array([_TIMES.unpack_from(message)[0] for message in messages], dtype=np.int64)
+        t_ns -= header.epoch_offset_ns
+        data = tuple(message[_TIMES.size :] for message in messages)
+        if before is not None:
+            t_ns, data = np.concatenate((before.t_ns, t_ns)), (*before.data, *data)
+        topics[name] = LoggedTopic(name, kind, t_ns, data)
+    return topics
 
 
 def _cycles(layout: CycleLayout, messages: list[bytes]) -> NDArray[np.void]:
@@ -306,14 +357,28 @@ def _take(record: McapRecord, found: _Found) -> None:
         found.attachments[record.name] = record.data
     elif isinstance(record, Metadata):
         found.metadata[record.name] = record.metadata
+    elif isinstance(record, Schema):
+        _open_schema(record.id, record.name, record.data, found)
     elif isinstance(record, Channel):
-        _open_channel(record.id, record.topic, found)
+        _open_channel(record.id, record.schema_id, record.topic, found)
 
 
-def _open_channel(identifier: int, topic: str, found: _Found) -> None:
+def _open_schema(identifier: int, name: str, data: bytes, found: _Found) -> None:
+    found.schemas[identifier] = MessageType(name, data.decode(errors="replace"), "")
+
+
+def _open_channel(identifier: int, schema: int, topic: str, found: _Found) -> None:
     found.channels[identifier] = topic
     if topic in _FOR_OTHERS:
         found.needless.add(identifier)
+    elif topic not in _OWN and not topic.startswith(schemas.BUS_PREFIX):
+        found.published[identifier] = schema
+
+
+def _counted(data: bytes, at: int) -> tuple[bytes, int]:
+    """Return bytes that have their length in front, and where they end."""
+    (length,) = struct.unpack_from("<I", data, at)
+    return data[at + 4 : at + 4 + length], at + 4 + length
 
 
 def _decompressed(chunk: Chunk, found: _Found) -> bytes:
@@ -346,7 +411,7 @@ def _decompressed(chunk: Chunk, found: _Found) -> bytes:
 def _split(data: bytes, found: _Found) -> None:
     """Cut a chunk into its messages; several times faster than the library's objects."""
     start, end = 0, len(data)
-    messages, needless, head = found.messages, found.needless, _RECORD.size + _MESSAGE.size
+    messages, needless, published = found.messages, found.needless, found.published
     while start < end:
         opcode, length = _RECORD.unpack_from(data, start)
         body = start + _RECORD.size
@@ -356,11 +421,17 @@ def _split(data: bytes, found: _Found) -> None:
         if opcode == Opcode.MESSAGE:
             (channel,) = struct.unpack_from("<H", data, body)
             if channel not in needless:
-                messages.setdefault(channel, []).append(data[body - _RECORD.size + head : start])
+                begin = body + (_TIMED_AT if channel in published else _MESSAGE.size)
+                messages.setdefault(channel, []).append(data[begin:start])
         elif opcode == Opcode.CHANNEL:
-            identifier, _ = struct.unpack_from("<HH", data, body)
+            identifier, schema = struct.unpack_from("<HH", data, body)
             (text_length,) = struct.unpack_from("<I", data, body + 4)
-            _open_channel(identifier, data[body + 8 : body + 8 + text_length].decode(), found)
+            _open_channel(identifier, schema, data[body + 8 : body + 8 + text_length].decode(), found)
+        elif opcode == Opcode.SCHEMA:
+            (identifier,) = struct.unpack_from("<H", data, body)
+            name, at = _counted(data, body + 2)
+            _, at = _counted(data, at)  # its encoding: ros2msg
+            _open_schema(identifier, name.decode(), _counted(data, at)[0], found)
 
 
 def _said(error: Exception) -> str:

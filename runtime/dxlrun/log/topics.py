@@ -1,0 +1,56 @@
+"""Topics in a log: messages of controllers and of the runtime, decoded by the definitions that it has."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.errors import LogError
+from dxlrun.messages.cdr import Codec, Value
+from dxlrun.messages.definition import MessageType
+
+
+@dataclass(frozen=True, slots=True)
+class LoggedTopic:
+    """One topic: its messages, in order."""
+
+    name: str
+    """`/CONTROLLER/TOPIC`, or `/goals`."""
+    type: MessageType
+    """Name and text as in the log, without the hash."""
+    t_ns: NDArray[np.int64]
+    """When each was published, ns of the run's clock: the wake-up of its cycle."""
+    data: tuple[bytes, ...]
+    """CDR, as it was published."""
+
+    @property
+    def rate(self) -> float | None:
+        """Messages a second; None for fewer than two, or all at one time."""
+        span_ns = int(self.t_ns[-1] - self.t_ns[0]) if len(self.t_ns) else 0
+        return (len(self.t_ns) - 1) * 1e9 / span_ns if span_ns > 0 else None
+
+    def messages(self) -> list[Mapping[str, Value]]:
+        """Return the fields of each message; nested ones as mappings. Raises LogError."""
+        try:
+            codec = Codec(self.type)
+            return [codec.unpack(data) for data in self.data]
+        except ValueError as error:
+            raise LogError(f"a message of {self.name} cannot be read: {error}") from error
+
+    def column(self, field: str) -> NDArray[np.generic]:
+        """Return a field of all messages, one row each: `error`, `pose.pose.position.x`. Raises LogError.
+
+        Raises it also where the field is an array whose length is not always the same.
+        """
+        values: list[Value] = list(self.messages())
+        for name in field.split("."):
+            if not all(isinstance(value, Mapping) and name in value for value in values):
+                raise LogError(f"messages of {self.name} have no field {field}")
+            values = [value[name] for value in values if isinstance(value, Mapping)]
+        try:
+            return np.array(values)
+        except ValueError:
+            raise LogError(f"{field} of {self.name} is not always of the same length") from None
