@@ -7,8 +7,8 @@ import pytest
 from dxlrun.compile.registers import UnfitRegister, declarable, register_value
 from dxlrun.dynamixel.control_table import all_tables, control_table
 from dxlrun.dynamixel.exchange.bus import Bus, run
-from dxlrun.dynamixel.exchange.retry import setup_line
 from dxlrun.dynamixel.plan.bus_plan import RegisterValue
+from dxlrun.dynamixel.plan.retry import setup_line
 from dxlrun.dynamixel.servo.offline import rejoin
 from dxlrun.dynamixel.servo.registers import compare, settle
 from dxlrun.errors import StartUpError

@@ -2,6 +2,7 @@
 
 """What a client may change in a servo's memory, by ASGI: what reaches the loop, and what is refused before."""
 
+import asyncio
 import json
 from dataclasses import replace
 
@@ -9,7 +10,8 @@ import pytest
 
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
-from dxlrun.run.channels.answers import Code, Refusal
+from dxlrun.run.channels.answers import Code, Done, Refusal, Waiting
+from dxlrun.run.channels.cycle import Torque
 
 GAIN = "/joints/pan/registers/position_p_gain"
 
@@ -41,7 +43,7 @@ def arm(desk):
 def test_the_loop_gets_the_integer_of_the_wire(arm, item, given, raw):
     assert arm.ask("POST", f"/joints/pan/registers/{item}", {"value": given}) == (
         200,
-        {"done": True, "cycle": 0},
+        {"done": True, "cycle": 0, "old": None, "value": raw},
     )
     (taken,) = arm.taken
     assert (taken.controller, taken.kind) == ("", "register")
@@ -77,3 +79,121 @@ def test_what_cannot_be_written_does_not_reach_the_loop(arm, path, body, status,
     found, content = arm.ask("POST", path, body)
     assert (found, said in content["refused"]) == (status, True), content
     assert arm.taken == []
+
+
+def test_an_item_is_read_with_its_meaning(arm):
+    status, content = arm.ask("GET", "/joints/pan/registers/return_delay_time", refusal=Done(7, value=250))
+    assert status == 200
+    assert content == {
+        "done": True,
+        "cycle": 7,
+        "joint": "pan",
+        "item": "return_delay_time",
+        "title": "Return Delay Time (9)",
+        "area": "EEPROM",
+        "value": 250,
+        "is": "500 us",
+    }
+    (taken,) = arm.taken
+    assert (taken.kind, json.loads(taken.data)) == ("get", {"joint": "pan", "item": "return_delay_time"})
+
+
+def test_the_old_value_is_answered(arm):
+    status, content = arm.ask("POST", GAIN, {"value": 900}, refusal=Done(7, value=800))
+    assert (status, content) == (200, {"done": True, "cycle": 7, "old": 800, "value": 900})
+
+
+def test_a_joints_state_is_answered(arm):
+    arm.record.states.position[:] = 0.25
+    arm.record.states.torque[:] = Torque.RELEASED
+    arm.finish_cycle()
+    status, content = arm.ask("GET", "/joints/tilt")
+    assert status == 200
+    assert (content["joint"], content["position"], content["torque"]) == ("tilt", 0.25, "released")
+    assert (content["effort_unit"], content["velocity"]) == ("A", None)
+
+
+@pytest.mark.parametrize(
+    ("names", "joints"),
+    [
+        (["tilt"], ["tilt"]),
+        (["left"], ["pan"]),
+        (["all"], ["pan", "tilt"]),
+        (["tilt", "right", "pan"], ["tilt", "pan"]),
+    ],
+)
+@pytest.mark.parametrize("kind", ["torque", "reboot"])
+def test_joints_and_groups_are_named(arm, kind, names, joints):
+    data = {"on": False} if kind == "torque" else {}
+    status, content = arm.ask("POST", f"/{kind}", {"joints": names, **data}, refusal=Done(-1))
+    assert (status, content["joints"]) == (200, joints)
+    (taken,) = arm.taken
+    assert (taken.kind, json.loads(taken.data)) == (kind, {"joints": joints, **data, "release": False})
+
+
+@pytest.mark.parametrize(
+    ("path", "body", "status", "said"),
+    [
+        ("/torque", {"joints": ["pen"], "on": True}, 404, "there is no joint pen; did you mean pan?"),
+        ("/torque", {"joints": [], "on": True}, 404, "name one, a controller, or all"),
+        ("/torque", {"joints": ["pan"]}, 422, "missing required field `on`"),
+        ("/torque", {"joints": "pan", "on": True}, 422, "Expected `array`, got `str`"),
+        ("/reboot", {"joints": ["pan"], "on": True}, 422, "unknown field `on`"),
+    ],
+)
+def test_what_cannot_be_switched_does_not_reach_the_loop(arm, path, body, status, said):
+    found, content = arm.ask("POST", path, body)
+    assert (found, said in content["refused"]) == (status, True), content
+    assert arm.taken == []
+
+
+@pytest.mark.parametrize(
+    ("path", "said"),
+    [
+        ("/joints/pen", "there is no joint pen; did you mean pan?"),
+        ("/joints/pen/registers/led", "there is no joint pen; did you mean pan?"),
+        ("/joints/pan/registers/lad", "pan: an XM430-W350 has no register lad; did you mean led?"),
+        ("/joints/pan/registers/nonsense", "`dxlrun models XM430-W350` lists them"),
+    ],
+)
+def test_what_there_is_not_cannot_be_read(arm, path, said):
+    found, content = arm.ask("GET", path)
+    assert (found, said in content["refused"]) == (404, True), content
+    assert arm.taken == []
+
+
+def test_a_servo_of_protocol_1_is_not_rebooted(desk):
+    table = control_table("AX-12A", 1.0)
+    bus = bus_plan(
+        name="main", port="sim", baud_rate=1_000_000, latency_ns=0, return_delay_ns=0,
+        joints=[Wiring("pan", 0, 3, table, 2.6, 1, -1.0, 1.0)], protocol=1.0,
+    )  # fmt: skip
+    desk.link.plan = replace(desk.link.plan, buses=(bus,))
+    status, content = desk.ask("POST", "/reboot", {"joints": ["pan"]})
+    assert (status, content["code"]) == (409, "not_rebooted")
+    assert content["refused"] == (
+        "pan (ID 3 on bus main) knows no reboot instruction: switch the torque off and on, or the power"
+    )
+    assert desk.taken == []
+
+
+def test_waiting_answers_keep_the_client_waiting(arm):
+    """A joint after the other is done; the last answer counts."""
+    answers = [Waiting(()), Waiting(()), Done(9)]
+
+    async def story():
+        asked = asyncio.ensure_future(arm.request("POST", "/torque", {"joints": ["all"], "on": False}))
+        commands = []
+        while not commands:
+            commands = list(arm.mailbox.take())
+            await asyncio.sleep(0)
+        for answer in answers:
+            assert not asked.done()
+            arm.mailbox.answer(commands[0].number, answer)
+            arm.link.collect()
+            await asyncio.sleep(0.001)
+        for _ in range(12):
+            arm.finish_cycle()
+        return await asked
+
+    assert asyncio.run(story()) == (200, {"done": True, "cycle": 9, "joints": ["pan", "tilt"]})

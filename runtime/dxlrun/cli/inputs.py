@@ -29,7 +29,11 @@ COMMANDS = {
 """Where each command is, in this room; it is imported when it is used."""
 COMMANDS_WHILE_IT_RUNS = {
     "list": "steering.steer:list_robots",
-    "set": "steering.steer:set_register",
+    "watch": "steering.watch:watch",
+    "get": "steering.joints:get",
+    "set": "steering.joints:set_register",
+    "torque": "steering.joints:torque",
+    "reboot": "steering.joints:reboot",
     "switch": "steering.steer:switch",
     "send": "steering.steer:send",
     "cancel": "steering.goals:cancel",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -151,6 +150,7 @@ def _show(one: OneServo, verb: str, asked: Asked, *, as_json: bool) -> None:
 
 
 def _registers(values: Mapping[str, int], items: Mapping[str, ControlItem]) -> Table:
+    from dxlrun.dynamixel.servo.registers import meaning
     from dxlrun.output.table import Column, Table
 
     columns = [
@@ -162,26 +162,10 @@ def _registers(values: Mapping[str, int], items: Mapping[str, ControlItem]) -> T
         Column("is", "name"),
     ]
     rows = [
-        (name, items[name].address, items[name].area, items[name].access, value, _meaning(items[name], value))
+        (name, items[name].address, items[name].area, items[name].access, value, meaning(items[name], value))
         for name, value in values.items()
     ]
     return Table.of("", columns, rows)
-
-
-def _meaning(item: ControlItem, value: int) -> str:
-    """Return a value with its unit; empty for what has none."""
-    from dxlrun.dynamixel.servo.watchdog import tripped
-
-    if tripped(item, value):
-        return "tripped"
-    if not item.unit:
-        return ""
-    quantity = item.decode(value.to_bytes(item.size, "little", signed=item.signed)) * item.scale
-    if item.unit == "s" and abs(quantity) < 1:
-        return f"{quantity * 1e3:.6g} ms" if abs(quantity) >= 1e-3 else f"{quantity * 1e6:.6g} us"
-    if item.unit.startswith("rad"):
-        return f"{math.degrees(quantity):.6g} {item.unit.replace('rad', 'deg')}"
-    return f"{quantity * 100:.6g} %" if item.unit == "1" else f"{quantity:.6g} {item.unit}"
 
 
 # The verbs: each reads its words, asks for confirmation where it must, and reports what was done

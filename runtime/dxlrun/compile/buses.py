@@ -176,6 +176,7 @@ def _with_monitoring(description: Description, plan: BusPlan, problems: Problems
                 servo,
                 slow=slow_items(control_table(servo.model, plan.protocol)) if items is None else items,
                 torque_on_return=_on_returned_servo(description, servo.joint) == "hold",
+                torque_at_start=description.robot.joints[servo.joint].torque,
             )
             for servo in plan.servos
         ),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from dxlrun.compile.limits import Interval, degrees
 from dxlrun.compile.problems import Problems
 from dxlrun.compile.registers import compile_registers
-from dxlrun.control.loop_plan import JointPlan
+from dxlrun.control.loop_plan import ControllerPlan, JointPlan
 from dxlrun.description import Description
 from dxlrun.description.document import read_text
 from dxlrun.description.robot import Joint
@@ -102,6 +102,23 @@ def compile_joints(
             _check_acceleration(description, plan, problems)
             compiled[name] = CompiledJoint(plan, joint, table, reach, registers)
     return compiled
+
+
+def check_limp_joints(
+    description: Description, controllers: Iterable[ControllerPlan], problems: Problems
+) -> None:
+    """Refuse controllers that are active from the start and command joints without torque."""
+    joints = description.robot.joints
+    for plan in controllers:
+        limp = [name for name in plan.joints if name in joints and not joints[name].torque]
+        if limp and plan.active and plan.command and not plan.into:
+            problems.error(
+                description.marks.key("controllers", plan.name),
+                f"controller {plan.name} is active from the start and commands {', '.join(limp)}, which has "
+                "torque: off",
+                f"write active: false, and `dxlrun torque on {' '.join(limp)}` before it is activated, or "
+                "take torque: off out",
+            )
 
 
 def _unique_ids(description: Description, problems: Problems) -> None:

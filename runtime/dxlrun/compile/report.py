@@ -50,7 +50,7 @@ class JointRow:
     bounded: bool
     """False: a wheel, which turns for ever."""
     mode: str
-    """In which the run begins."""
+    """In which the run begins; `, limp`: without torque."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,7 +190,7 @@ def _joint_row(joint: CompiledJoint, mode: Mode) -> JointRow:
         reach_lower=joint.reach.lower,
         reach_upper=joint.reach.upper,
         bounded=joint.plan.bounded,
-        mode=mode.name.lower().replace("_", " "),
+        mode=mode.name.lower().replace("_", " ") + ("" if described.torque else ", limp"),
     )
 
 

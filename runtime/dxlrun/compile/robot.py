@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, TypeAlias
 
 from dxlrun.compile.buses import SIMULATED, compile_buses, slowest_period_ns
 from dxlrun.compile.controllers import compile_controllers, compile_modes
-from dxlrun.compile.joints import AUTO, CompiledJoint, check_twins, compile_joints, compile_urdf
+from dxlrun.compile.joints import (
+    AUTO,
+    CompiledJoint,
+    check_limp_joints,
+    check_twins,
+    compile_joints,
+    compile_urdf,
+)
 from dxlrun.compile.plan import MotionPart, Plan, SimulationPlan
 from dxlrun.compile.policies import compile_policies
 from dxlrun.compile.problems import Problems, independent_errors, left_out_names
@@ -142,6 +149,7 @@ def compile_robot(
     urdf = compile_urdf(description, joints, problems)
     simulation = compile_simulation(description, joints, problems)
     controllers = compile_controllers(description, plugins, problems)
+    check_limp_joints(description, (one.plan for one in controllers.values()), problems)
     modes = compile_modes(description, joints, controllers, problems)
     buses = compile_buses(description, joints, modes, problems)
     policies = compile_policies(description, joints, buses, problems)

@@ -44,6 +44,15 @@ def _ordered(value: tuple[float, float]) -> tuple[float, float]:
     return value
 
 
+def _on_or_off(value: object) -> object:
+    """Return true or false for the words on and off, which YAML 1.2 takes for texts."""
+    if isinstance(value, bool):
+        return value
+    if value not in ("on", "off"):
+        raise refuse("torque is on or off", "write `torque: off` for a joint that is to be limp")
+    return value == "on"
+
+
 def _register(value: object) -> object:
     if isinstance(value, bool) or not isinstance(value, int | str):
         raise refuse(
@@ -162,6 +171,8 @@ class JointSimulation(Form):
     )
 
 
+OnOff = Annotated[bool, BeforeValidator(_on_or_off), WithJsonSchema({"enum": ["on", "off", True, False]})]
+
 Register = Annotated[int | str, BeforeValidator(_register), WithJsonSchema({"type": ["integer", "string"]})]
 """A raw integer, or a quantity with its unit as text: its item's unit is in the control table."""
 
@@ -184,6 +195,11 @@ class Joint(Form):
         default=False,
         description="A wheel, or a joint of many turns; it needs no position limits.",
         examples=["true"],
+    )
+    torque: OnOff = Field(
+        default=True,
+        description="off: it is limp from the start, until `dxlrun torque on`.",
+        examples=["off"],
     )
     limits: Limits = Field(
         default=Limits(),

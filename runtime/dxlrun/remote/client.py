@@ -59,6 +59,8 @@ class Executed:
     """The loop's cycle that did it; -1: not known."""
     goal: RemoteGoal | None = None
     """The goal that the command is; None: it is none."""
+    old: int | None = None
+    """What a register had before; None: it is no register, or not known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -413,6 +415,30 @@ class RemoteRobot:
         """
         return self._execute("/switch", {"activate": list(activate), "deactivate": list(deactivate)})
 
+    def get(self, joint: str, item: str = "") -> dict[str, object]:
+        """Return a joint's newest state, SI units, or an item of its servo's memory, read in idle time.
+
+        Of an item: `value`, the integer of the e-Manual, and `is`, the same with its unit.
+        """
+        path = f"/joints/{_quoted(joint)}"
+        return self._ask("GET", f"{path}/registers/{_quoted(item)}" if item else path)
+
+    def torque(self, joints: str | Sequence[str], on: bool, *, release: bool = False) -> Executed:
+        """Switch the torque of joints on or off; returns when it was read back.
+
+        `joints`: names of joints, of controllers (their joints), or "all". On: each is checked as at the
+        start, and holds where it stands. Off: it is limp until its torque is switched on, whatever policies
+        say. Refused while a controller commands one of them, unless `release` deactivates that.
+        """
+        return self._execute("/torque", {"joints": _listed(joints), "on": on, "release": release})
+
+    def reboot(self, joints: str | Sequence[str], *, release: bool = False) -> Executed:
+        """Reboot the servos of joints (Protocol 2.0); returns when they are in order again.
+
+        That clears a hardware error. They have torque afterwards if they had it before.
+        """
+        return self._execute("/reboot", {"joints": _listed(joints), "release": release})
+
     def set_register(self, joint: str, item: str, value: int | str) -> Executed:
         """Write a RAM item of a joint's servo, such as a gain; returns when it was read back.
 
@@ -492,9 +518,11 @@ class RemoteRobot:
         return self._executed(self._ask("POST", path, content))
 
     def _executed(self, answer: Mapping[str, object]) -> Executed:
-        cycle, goal = answer.get("cycle"), answer.get("goal")
+        cycle, goal, old = answer.get("cycle"), answer.get("goal"), answer.get("old")
         return Executed(
-            cycle if isinstance(cycle, int) else -1, RemoteGoal(self, goal) if isinstance(goal, int) else None
+            cycle if isinstance(cycle, int) else -1,
+            RemoteGoal(self, goal) if isinstance(goal, int) else None,
+            old if isinstance(old, int) else None,
         )
 
     def _ask(self, method: str, path: str, content: Mapping[str, object] | None = None) -> dict[str, object]:
@@ -557,6 +585,10 @@ def _goal_state(row: Mapping[str, object]) -> GoalState:
         text=str(row.get("text", "")),
         seconds=None if ended is None or accepted is None else ended - accepted,
     )
+
+
+def _listed(names: str | Sequence[str]) -> list[str]:
+    return [names] if isinstance(names, str) else list(names)
 
 
 def _quoted(name: str) -> str:

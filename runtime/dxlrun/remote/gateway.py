@@ -11,7 +11,11 @@
     POST /goals/N/cancel, /controllers/NAME/cancel       a goal, by its number or its controller
     GET, POST /controllers/NAME/parameters {values}      all of them; change live ones in one cycle
     POST /switch {activate, deactivate}         controllers, in one cycle or not at all
-    POST /joints/NAME/registers/ITEM {value}    a RAM item of a joint's servo; answered when it is there
+    GET  /joints/NAME                           its newest state
+    GET  /joints/NAME/registers/ITEM            an item of its servo, read in idle time
+    POST /joints/NAME/registers/ITEM {value}    a RAM item of it; answered when it is there, with the old one
+    POST /torque {joints, on, release}          of joints, of a controller's joints, of all
+    POST /reboot {joints, release}              their servos (Protocol 2.0)
     POST /rate {rate}, /halt, /pause, /resume, /stop
     POST /controllers {name, type, ...}         load one, DELETE /controllers/NAME unload it; in a pause only
 
@@ -39,10 +43,20 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 from starlette.routing import Route
 
+from dxlrun.control.joint_requests import RebootRequest, TorqueRequest
 from dxlrun.control.steering import Cancel, Rate, Switch, Unload
-from dxlrun.description.modes import Mode
 from dxlrun.remote.goals import GoalStatus
 from dxlrun.remote.joint_commands import joint_command
+from dxlrun.remote.joints import (
+    effort_units,
+    joint_row,
+    joint_state,
+    prepared_reading,
+    prepared_reboot,
+    prepared_register,
+    prepared_torque,
+    read_register,
+)
 from dxlrun.remote.link import Link, Loaded
 from dxlrun.remote.parameters import Change, Written, changed, parameters_of
 from dxlrun.remote.preparation import (
@@ -50,13 +64,11 @@ from dxlrun.remote.preparation import (
     RefusedRequest,
     bounded,
     invalid,
-    prepared_register,
     refused,
     unknown_controllers,
 )
 from dxlrun.remote.sockets import MOST_BYTES
 from dxlrun.run.channels.answers import Code, Done, Refusal
-from dxlrun.run.channels.cycle import CycleRecord
 from dxlrun.run.channels.heartbeat import Phase
 
 MOST_OPERATIONS = 200.0
@@ -127,6 +139,21 @@ class NewValues(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     values: dict[str, Written]
 
 
+class TorqueBody(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Body of a request for torque; `joints` may name controllers, or be `["all"]`."""
+
+    joints: tuple[str, ...]
+    on: bool
+    release: bool = False
+
+
+class RebootBody(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Body of a request for reboots."""
+
+    joints: tuple[str, ...]
+    release: bool = False
+
+
 class GatewayApp:
     """The routes; every request is checked and prepared here, so that the loop only has to execute it."""
 
@@ -172,7 +199,11 @@ class GatewayApp:
             route("/controllers/{name}", self.unload, "DELETE", operations),
             route("/controllers", self.load, "POST", operations),
             route("/switch", self.switch, "POST", operations),
+            route("/joints/{name}", self.joint, "GET", looks),
             route("/joints/{name}/registers/{item}", self.register, "POST", operations),
+            route("/joints/{name}/registers/{item}", self.read_register, "GET", operations),
+            route("/torque", self.torque, "POST", operations),
+            route("/reboot", self.reboot, "POST", operations),
             route("/rate", self.rate, "POST", operations),
             route("/halt", self.halt, "POST", None),  # always taken, as far as there is room
             route("/pause", self.pause, "POST", operations),
@@ -196,6 +227,7 @@ class GatewayApp:
                 "cycles": link.heartbeat.cycles,
                 "skipped": link.heartbeat.skipped,
                 "joints": [joint.name for joint in link.plan.loop.joints],
+                "effort_units": effort_units(link.plan),
                 "controllers": [self._shown(one) for one in link.controllers.values()],
                 "log": self._log,
             }
@@ -224,8 +256,15 @@ class GatewayApp:
         if record is None:
             raise refused(Code.NO_CYCLE, {})
         joints = self._link.plan.loop.joints
-        rows = {joint.name: _state(record, row) for row, joint in enumerate(joints)}
-        return _json({"cycle": record.cycle, "time": record.woken_ns * 1e-9, "joints": rows})
+        rows = {joint.name: joint_state(record, row) for row, joint in enumerate(joints)}
+        updates = {
+            one.plan.name: int(record.controller_ns[one.place]) * 1e-9
+            for one in self._link.controllers.values()
+            if one.place < len(record.controller_ns)
+        }
+        late = (record.woken_ns - record.scheduled_ns) * 1e-9
+        times = {"time": record.woken_ns * 1e-9, "late": late, "updates": updates}
+        return _json({"cycle": record.cycle, **times, "joints": rows})
 
     async def events(self, request: Request) -> Response:
         """Return the events after number `after` that are kept; `last` is the newest's number."""
@@ -369,7 +408,47 @@ class GatewayApp:
         given = await typed(request, Value, '{"value": 800}')
         joint, item = request.path_params["name"], request.path_params["item"]
         register = prepared_register(self._link.plan, joint, item, given.value)
-        return _done(await self._link.for_loop("register", register, origin(request)))
+        done = await self._link.for_loop("register", register, origin(request))
+        return _json({"done": True, "cycle": done.cycle, "old": done.value, "value": register.value})
+
+    async def read_register(self, request: Request) -> Response:
+        """Have an item of a joint's servo read, and return what it has."""
+        plan, joint, item = self._link.plan, request.path_params["name"], request.path_params["item"]
+        reading = prepared_reading(plan, joint, item)
+        done = await self._link.for_loop("get", reading, origin(request))
+        return _json({"done": True, "cycle": done.cycle, **read_register(plan, joint, item, done.value)})
+
+    async def joint(self, request: Request) -> Response:
+        """Return the newest state of one joint."""
+        plan, joint = self._link.plan, request.path_params["name"]
+        row, record = joint_row(plan, joint), self._link.newest()
+        if record is None:
+            raise refused(Code.NO_CYCLE, {})
+        state = joint_state(record, row)
+        return _json(
+            {"joint": joint, "cycle": record.cycle, **state, "effort_unit": effort_units(plan).get(joint, "")}
+        )
+
+    async def torque(self, request: Request) -> Response:
+        """Switch the torque of joints on or off, and answer when it was read back."""
+        given = await typed(request, TorqueBody, '{"joints": ["elbow"], "on": false}')
+        plans = [one.plan for one in self._link.controllers.values()]
+        wanted = prepared_torque(self._link.plan, plans, given.joints, given.on, given.release)
+        return await self._joints_done("torque", wanted, request)
+
+    async def reboot(self, request: Request) -> Response:
+        """Reboot the servos of joints, and answer when they are in order again."""
+        given = await typed(request, RebootBody, '{"joints": ["elbow"]}')
+        plans = [one.plan for one in self._link.controllers.values()]
+        wanted = prepared_reboot(self._link.plan, plans, given.joints, given.release)
+        return await self._joints_done("reboot", wanted, request)
+
+    async def _joints_done(
+        self, kind: str, wanted: TorqueRequest | RebootRequest, request: Request
+    ) -> Response:
+        done = await self._link.for_loop(kind, wanted, origin(request))
+        await self._link.recorded(done.cycle + 1)  # so that the states that follow show it
+        return _json({"done": True, "cycle": done.cycle, "joints": wanted.joints})
 
     async def rate(self, request: Request) -> Response:
         """Run the loop at another rate."""
@@ -444,29 +523,6 @@ def _answered(handler: Handler, allowance: Allowance | None) -> Handler:
                 allowance.charge(peer(request), getattr(request.state, "received", 0))
 
     return answer
-
-
-def _state(record: CycleRecord, row: int) -> dict[str, object]:
-    states, goals = record.states, record.goals
-    return {
-        "position": _number(states.position[row]),
-        "velocity": _number(states.velocity[row]),
-        "effort": _number(states.effort[row]),
-        "valid": bool(states.valid[row]),
-        "age": int(states.age_ns[row]) * 1e-9,
-        "goal_position": _number(goals.position[row]),
-        "goal_velocity": _number(goals.velocity[row]),
-        "goal_effort": _number(goals.effort[row]),
-        "goal_pwm": _number(goals.pwm[row]),
-        "temperature": _number(states.temperature[row]),
-        "voltage": _number(states.voltage[row]),
-        "hardware_error": int(states.hardware_error[row]),
-        "mode": Mode(int(states.mode[row])).name.lower(),
-    }
-
-
-def _number(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
 
 
 def _json(content: object, status: int = 200) -> Response:

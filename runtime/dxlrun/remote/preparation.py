@@ -18,18 +18,14 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 from dxlrun.compile.graph import ControllerGraph, Mistake, mistakes_of
 from dxlrun.compile.limits import BeyondLimit, beyond_limits
 from dxlrun.compile.motions import TRAJECTORY
-from dxlrun.compile.plan import Plan
-from dxlrun.compile.registers import UnfitRegister, steered_value
 from dxlrun.control.controllers.controller import Interfaces, ParametersModel
 from dxlrun.control.controllers.managed import rate_divider, rate_fits
 from dxlrun.control.controllers.plugins import ControllerClass, Offer, PlugIns, interfaces_breach
-from dxlrun.control.joint_requests import Register
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan
 from dxlrun.description.form import Name
 from dxlrun.description.problems import sentences_of
 from dxlrun.description.robot import ControllerEntry
 from dxlrun.description.units import angle, angular_acceleration, angular_velocity, duration
-from dxlrun.dynamixel.control_table import ControlTable, control_table
 from dxlrun.errors import suggestion
 from dxlrun.run.channels.answers import Code, Field, Refusal
 
@@ -287,36 +283,6 @@ class Preparation:
         if len(set(interfaces.joints)) != len(interfaces.joints):
             raise invalid(f"{name} names a joint twice; name it once")
         return interfaces
-
-
-# Registers
-
-
-def prepared_register(plan: Plan, joint: str, item: str, value: int | str) -> Register:
-    """Return the data of the loop's command for a RAM item; raises RefusedRequest where it cannot be written.
-
-    `value`: the integer on the wire, or a quantity with its unit.
-    """
-    tables = _tables(plan)
-    fields: dict[str, Field] = {"joint": joint[:80], "item": item[:80]}
-    table = tables.get(joint)
-    if table is None:
-        raise refused(Code.UNKNOWN_JOINT, fields | {"hint": suggestion(joint[:80], tuple(tables))})
-    try:
-        register = steered_value(table, item[:80], value)
-    except UnfitRegister as error:
-        code = Code.INVALID_REGISTER if item in table.items else Code.UNKNOWN_REGISTER
-        raise refused(code, fields | {"problem": str(error)}) from error
-    except ValueError as error:  # a quantity that is none
-        problem = f"{item} of {joint}: {error}"
-        raise refused(Code.WRONG_QUANTITY, fields | {"problem": problem}) from error
-    return Register(joint, item, register.value)
-
-
-def _tables(plan: Plan) -> dict[str, ControlTable]:
-    return {
-        servo.joint: control_table(servo.model, bus.protocol) for bus in plan.buses for servo in bus.servos
-    }
 
 
 # Quantities with units

@@ -57,6 +57,10 @@ def register(joint: str, item: str, value: int) -> Command:
     return ask("register", {"joint": joint, "item": item, "value": value})
 
 
+def torque(joints: Sequence[str], *, on: bool, release: bool = False) -> Command:
+    return ask("torque", {"joints": joints, "on": on, "release": release})
+
+
 def send(controller: str, kind: str, *numbers: float, lease_ns: int = 0) -> Command:
     """Return a command for a controller."""
     return Command(0, controller, kind, np.array(numbers).tobytes(), "anna", lease_ns)
@@ -90,6 +94,19 @@ STORIES: dict[str, Asked] = {
     "registers": {
         4: [register("nod", "cw_compliance_slope", 64), register("nod", "ccw_compliance_slope", 16)],
         9: [register("nobody", "punch", 40), register("tilt", "temperature_limit", 60)],
+    },
+    "torque off and on": {
+        4: [torque(["nod"], on=False), torque(["tilt"], on=False, release=True)],
+        7: [switch(["all_inputs"]), torque(["nod", "tilt"], on=False)],
+        12: [torque(["tilt", "nobody"], on=True), ask("pause")],
+        14: [torque(["tilt", "nod"], on=True)],
+        22: [ask("resume"), switch(["all_inputs"])],
+        30: [torque(["pan"], on=False, release=True), switch(["head"])],
+        38: [torque(["pan"], on=True)],
+    },
+    "reboots that cannot be": {
+        5: [ask("reboot", {"joints": ["nod"]}), ask("reboot", {"joints": ["nod"], "release": True})],
+        9: [ask("get", {"joint": "nod", "item": "punch"}), ask("get", {"joint": "nobody", "item": "punch"})],
     },
     "a stop in a pause": {10: [ask("pause")], 20: [ask("stop")]},
     "rubbish": {4: [Command(0, "", "switch", b'{"activate": ["\xff"]}', "mallory"), ask("policy")]},
@@ -184,6 +201,11 @@ def test_the_stories_do_what_they_are_there_for(tell: Callable[[str], Path]) -> 
         ("nod", "CW Compliance Slope (28) was 32 and is 64"),
         ("nod", "CCW Compliance Slope (29) was 32 and is 16"),
     ]
+    log = read_log(tell("torque off and on"))
+    shown = log.cycles["torque"]
+    assert [set(shown[:, row].tolist()) for row in range(3)] == [{1, 4}] * 3
+    assert (shown[-1] == 1).all()
+    assert not log.cycles["active"][13] & 0b100
     log = read_log(tell("a fallback"))
     assert {int(mask) for mask in log.cycles["active"]} == {0b0111, 0b1011}
     log = read_log(tell("a controller that is loaded"))
@@ -265,6 +287,13 @@ COMMANDS = st.one_of(
         st.sampled_from([0, 30 * MS, 100 * MS]),
     ),
     st.just(ask("load", LOADED)),
+    st.builds(
+        lambda joints, on, release: torque(joints, on=on, release=release),
+        st.lists(st.sampled_from(["pan", "tilt", "nod"]), min_size=1, max_size=3, unique=True),
+        st.booleans(),
+        st.booleans(),
+    ),
+    st.just(ask("reboot", {"joints": ["nod"], "release": True})),
     st.just(ask("unload", {"controller": "guest"})),
 )
 

@@ -159,29 +159,6 @@ def send(
         return follow(robot, chosen, done, [done.goal.number])
 
 
-def set_register(joint: str, item: str, value: str, /, *, chosen: Chosen = ONLY_ONE) -> int:
-    """Change a register of a servo while the robot runs: `dxlrun set elbow_joint position_p_gain 900`.
-
-    Items of the RAM that no controller commands; returns when the servo has it. `dxlrun models` lists them.
-
-    Parameters
-    ----------
-    joint
-        Name of the joint.
-    item
-        Item of its servo's control table.
-    value
-        Whole number as in the e-Manual, or a quantity with its unit, such as '10 rad/s^2'.
-    """
-    from dxlrun.description.document import plain_value
-
-    number = plain_value(value)
-    given = number if isinstance(number, int) and not isinstance(number, bool) else value
-    with robot_of(chosen, "set") as robot:
-        done = robot.set_register(joint, item, given)
-        return report_done(robot, chosen, done, f"{robot.name}: {item} of {joint} is {given}")
-
-
 def rate(hz: float, /, *, chosen: Chosen = ONLY_ONE) -> int:
     """Change the rate of a running robot's loop.
 

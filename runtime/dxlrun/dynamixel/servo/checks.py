@@ -14,11 +14,11 @@ from typing import NamedTuple
 
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import ControlItem, control_table
-from dxlrun.dynamixel.exchange.retry import retry, setup_line
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.plan.line import Line, listen
 from dxlrun.dynamixel.plan.mode_plan import mode_in
 from dxlrun.dynamixel.plan.reads import state_read
+from dxlrun.dynamixel.plan.retry import retry, setup_line
 from dxlrun.dynamixel.servo.watchdog import shown, tripped
 from dxlrun.dynamixel.wire.protocol1 import StatusError, describe_error
 from dxlrun.dynamixel.wire.protocol2 import describe_hardware_error

@@ -16,10 +16,10 @@ from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.exchange.goals import GoalArrays
 from dxlrun.dynamixel.exchange.idle import IdleScheduler, Urgency
-from dxlrun.dynamixel.exchange.retry import retry
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, RegisterValue, ServoPlan
 from dxlrun.dynamixel.plan.line import listen
 from dxlrun.dynamixel.plan.planning import plan_line
+from dxlrun.dynamixel.plan.retry import retry
 from dxlrun.dynamixel.servo import modes
 from dxlrun.dynamixel.servo.life import Life, ServoEvent
 from dxlrun.dynamixel.servo.reboots import Reboots

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.exchange.idle import IdleScheduler, Urgency
-from dxlrun.dynamixel.exchange.retry import retry
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, RegisterValue
 from dxlrun.dynamixel.plan.planning import plan_line
+from dxlrun.dynamixel.plan.retry import retry
 from dxlrun.dynamixel.servo import modes, watchdog
 from dxlrun.dynamixel.servo.checks import BusSurvey, inspect, inspect_states
 from dxlrun.dynamixel.servo.desired import DesiredState

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.exchange.idle import IdleScheduler
-from dxlrun.dynamixel.exchange.retry import retry
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.dynamixel.plan.planning import plan_line
+from dxlrun.dynamixel.plan.retry import retry
 from dxlrun.dynamixel.servo.life import Life
 from dxlrun.dynamixel.wire.transaction import Program, Reply, Transaction
 from dxlrun.run.channels.events import EventCode, Severity

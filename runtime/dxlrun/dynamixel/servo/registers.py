@@ -11,15 +11,16 @@ written again.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import ControlItem, control_table
-from dxlrun.dynamixel.exchange.retry import ATTEMPTS, retry, setup_line
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, RegisterValue, ServoPlan, TorqueLimit
 from dxlrun.dynamixel.plan.line import Line
-from dxlrun.dynamixel.servo.watchdog import shown
+from dxlrun.dynamixel.plan.retry import ATTEMPTS, retry, setup_line
+from dxlrun.dynamixel.servo.watchdog import shown, tripped
 from dxlrun.dynamixel.wire.dialect import dialect_of
 from dxlrun.dynamixel.wire.transaction import Outcome, Program, Reply
 
@@ -145,6 +146,20 @@ def write_register(plan: BusPlan, servo: ServoPlan, register: RegisterValue, lin
         if found is None:
             problem = f"did not answer when {item.title} was read back"
     return problem
+
+
+def meaning(item: ControlItem, value: int) -> str:
+    """Return a value of an item with its unit; empty for what has none."""
+    if tripped(item, value):
+        return "tripped"
+    if not item.unit:
+        return ""
+    quantity = item.decode(value.to_bytes(item.size, "little", signed=item.signed)) * item.scale
+    if item.unit == "s" and abs(quantity) < 1:
+        return f"{quantity * 1e3:.6g} ms" if abs(quantity) >= 1e-3 else f"{quantity * 1e6:.6g} us"
+    if item.unit.startswith("rad"):
+        return f"{math.degrees(quantity):.6g} {item.unit.replace('rad', 'deg')}"
+    return f"{quantity * 100:.6g} %" if item.unit == "1" else f"{quantity:.6g} {item.unit}"
 
 
 def restore_torque_limits(plan: BusPlan) -> Program[TorqueLimits]:

@@ -16,11 +16,11 @@ from dxlrun.clock import Clock
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.exchange.bus import Bus, run
-from dxlrun.dynamixel.exchange.retry import LONGER_NS, extend_timeouts, retry, setup_line
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.plan.line import TIMEOUT_MARGIN_NS, listen
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.plan.reads import state_read
+from dxlrun.dynamixel.plan.retry import LONGER_NS, extend_timeouts, retry, setup_line
 from dxlrun.dynamixel.port.latency_timer import late_replies
 from dxlrun.dynamixel.port.ports import Ports
 from dxlrun.dynamixel.servo import modes, watchdog

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 from dxlrun.clock import Clock
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.exchange.bus import Bus, run
-from dxlrun.dynamixel.exchange.retry import retry
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.plan.line import listen
+from dxlrun.dynamixel.plan.retry import retry
 from dxlrun.dynamixel.port.ports import Ports
 from dxlrun.dynamixel.servo import modes
 from dxlrun.dynamixel.wire.transaction import Outcome, Program, Reply, Transaction

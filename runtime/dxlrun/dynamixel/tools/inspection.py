@@ -9,9 +9,9 @@ from dataclasses import dataclass, field, replace
 from dxlrun.clock import Clock, MonotonicClock
 from dxlrun.dynamixel.control_table import control_table, models_by_number
 from dxlrun.dynamixel.exchange.bus import Bus, run
-from dxlrun.dynamixel.exchange.retry import extend_timeouts, retry, setup_line
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.plan.line import listen
+from dxlrun.dynamixel.plan.retry import extend_timeouts, retry, setup_line
 from dxlrun.dynamixel.port.ports import Ports, SerialPort, SerialPorts
 from dxlrun.dynamixel.port.serial_open import open_serial
 from dxlrun.dynamixel.servo.checks import LISTEN_NS, survey

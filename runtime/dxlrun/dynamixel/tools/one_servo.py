@@ -13,10 +13,10 @@ from collections.abc import Mapping, Sequence
 
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import ControlItem, ControlTable, control_table, side_by_side
-from dxlrun.dynamixel.exchange.retry import extend_timeouts, retry
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, RegisterValue, ServoPlan
 from dxlrun.dynamixel.plan.line import LONGEST_RETURN_DELAY_NS, listen
 from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
+from dxlrun.dynamixel.plan.retry import extend_timeouts, retry
 from dxlrun.dynamixel.servo import modes, watchdog
 from dxlrun.dynamixel.servo.registers import RegisterDifference, Settled, compare, settle
 from dxlrun.dynamixel.servo.watchdog import shown, tripped

@@ -11,8 +11,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from dxlrun.dynamixel.control_table import ControlTable, all_tables, models_by_number
-from dxlrun.dynamixel.exchange.retry import extend_timeouts, retry
 from dxlrun.dynamixel.plan.line import Line, listen
+from dxlrun.dynamixel.plan.retry import extend_timeouts, retry
 from dxlrun.dynamixel.tools.tool_line import ToolLine, refuse_echo
 from dxlrun.dynamixel.wire.dialect import dialect_of
 from dxlrun.dynamixel.wire.transaction import BROADCAST_ID, Outcome, Program, Reply, Transaction

@@ -98,7 +98,7 @@ class Code(StrEnum):
     REGISTER_NOT_READ = "register_not_read", "{problem}"
     JOINT_COMMANDED = (
         "joint_commanded",
-        "{joint} is commanded by {controller}; deactivate that first, or add --release",
+        "{controller} commands {joint}; deactivate it first, or add --release",
     )
     JOINT_LIMP = "joint_limp", "{joint} has no torque"
     JOINT_LOST = "joint_lost", "{joint} does not answer: check cable and power"

@@ -1,0 +1,155 @@
+"""Joints of a running robot at the terminal: `dxlrun torque`, `reboot`, `get`, `set`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from dxlrun.cli.inputs import Flag
+from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, report_done, robot_of
+from dxlrun.errors import InputError
+from dxlrun.output.table import Table
+from dxlrun.output.terminal import show, show_json_line
+
+Joints = Annotated[str, Parameter(name="joint", show_default=False)]
+"""Names of joints, of controllers, or `all`."""
+DEGREES = 180 / math.pi
+_WRITTEN: Mapping[str, tuple[float, int, str]] = MappingProxyType(
+    {
+        "deg": (DEGREES, 1, "deg"),
+        "deg/s": (DEGREES, 1, "deg/s"),
+        "ms": (1e3, 1, "ms"),
+        "deg C": (1.0, 0, "deg C"),
+        "V": (1.0, 1, "V"),
+        "": (100.0, 0, "%"),
+    }
+)
+"""Unit -> factor from SI, digits, and how it is written; others as they are."""
+
+
+def torque(
+    state: Literal["on", "off"], /, *joints: Joints, release: Flag = False, chosen: Chosen = ONLY_ONE
+) -> int:
+    """Switch the torque of joints on or off while the robot runs: `dxlrun torque off elbow_joint`.
+
+    Off: the joint is limp, and stays so whatever policies say. On: its servo is checked as at the start, and
+    holds where it stands. Returns when that was read back.
+
+    Parameters
+    ----------
+    state
+        on or off.
+    joints
+        Joints; the name of a controller means its joints, `all` every joint.
+    release
+        Deactivate the controllers that command the joints; without it they are a reason to refuse.
+    """
+    names = _named(joints)
+    with robot_of(chosen, f"torque {state}") as robot:
+        done = robot.torque(names, state == "on", release=release)
+        verb = "has torque" if state == "on" else "is limp"
+        return report_done(robot, chosen, done, f"{robot.name}: {', '.join(names)} {verb}")
+
+
+def reboot(*joints: Joints, release: Flag = False, chosen: Chosen = ONLY_ONE) -> int:
+    """Reboot servos of a running robot, which clears a hardware error: `dxlrun reboot elbow_joint`.
+
+    Only servos of Protocol 2.0 know that. Returns when they are in order again; they have torque if they had
+    it before.
+
+    Parameters
+    ----------
+    joints
+        Joints; the name of a controller means its joints, `all` every joint.
+    release
+        Deactivate the controllers that command the joints; without it they are a reason to refuse.
+    """
+    names = _named(joints)
+    with robot_of(chosen, "reboot") as robot:
+        done = robot.reboot(names, release=release)
+        return report_done(robot, chosen, done, f"{robot.name}: {', '.join(names)} rebooted, in order again")
+
+
+def get(joint: str, item: str = "", /, *, chosen: Chosen = ONLY_ONE) -> int:
+    """Print the state of a joint of a running robot, or an item of its servo's control table.
+
+    Parameters
+    ----------
+    joint
+        Name of the joint.
+    item
+        Item of its servo's control table, RAM or EEPROM, such as position_p_gain; `dxlrun models` lists them.
+    """
+    with robot_of(chosen, "get") as robot:
+        found = robot.get(joint, item)
+        if chosen.as_json:
+            show_json_line({"robot": robot.name, **found})
+        elif item:
+            meaning = f" ({found['is']})" if found["is"] else ""
+            show(f"{robot.name}: {found['title']} of {joint} is {found['value']}{meaning}")
+        else:
+            show(f"{robot.name}: {joint}", Table.facts("", facts(found)))
+    return 0
+
+
+def set_register(joint: str, item: str, value: str, /, *, chosen: Chosen = ONLY_ONE) -> int:
+    """Change a register of a servo while the robot runs: `dxlrun set elbow_joint position_p_gain 900`.
+
+    Items of the RAM that no controller commands; returns when the servo has it. `dxlrun models` lists them.
+
+    Parameters
+    ----------
+    joint
+        Name of the joint.
+    item
+        Item of its servo's control table.
+    value
+        Whole number as in the e-Manual, or a quantity with its unit, such as '10 rad/s^2'.
+    """
+    from dxlrun.description.document import plain_value
+
+    number = plain_value(value)
+    given = number if isinstance(number, int) and not isinstance(number, bool) else value
+    with robot_of(chosen, "set") as robot:
+        done = robot.set_register(joint, item, given)
+        before = "" if done.old is None else f"{done.old} -> "
+        return report_done(robot, chosen, done, f"{robot.name}: {item} of {joint} is {before}{given}")
+
+
+def facts(state: Mapping[str, object]) -> list[tuple[str, str]]:
+    """Return the state of a joint in words, with its units."""
+    unit = state["effort_unit"]
+    found = [
+        ("position", written(state["position"], "deg")),
+        ("velocity", written(state["velocity"], "deg/s")),
+        ("effort", written(state["effort"], unit)),
+        ("goal position", written(state["goal_position"], "deg")),
+        ("goal velocity", written(state["goal_velocity"], "deg/s")),
+        ("goal effort", written(state["goal_effort"], unit)),
+        ("goal pwm", written(state["goal_pwm"], "")),
+        ("temperature", written(state["temperature"], "deg C")),
+        ("voltage", written(state["voltage"], "V")),
+        ("torque", str(state["torque"])),
+        ("mode", str(state["mode"]).replace("_", " ")),
+        ("hardware error", f"{state['hardware_error']:#04x}" if state["hardware_error"] else ""),
+        ("age", written(state["age"], "ms")),
+    ]
+    return [(name, text) for name, text in found if text]
+
+
+def written(value: object, unit: object) -> str:
+    """Return a number in SI with a unit that people read; empty: it is not known. Without one it is in %."""
+    if not isinstance(value, int | float):
+        return ""
+    factor, digits, shown = _WRITTEN.get(str(unit), (1.0, 3, str(unit)))
+    return f"{value * factor:.{digits}f} {shown}"
+
+
+def _named(joints: Sequence[str]) -> Sequence[str]:
+    if not joints:
+        raise InputError("no joint is named; name joints, a controller for its joints, or all")
+    return joints

@@ -1,0 +1,328 @@
+"""`dxlrun watch`: a live view of a running robot in the terminal, or one snapshot of it into a pipe."""
+
+from __future__ import annotations
+
+import select
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, cast
+
+from dxlrun.cli.inputs import Flag
+from dxlrun.cli.steering.joints import DEGREES
+from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, robot_of, state
+from dxlrun.errors import DxlrunError, Refused
+from dxlrun.output.table import Cell, Column, Sentence, Table, Tone
+from dxlrun.output.terminal import STYLES, out, show, show_json_line
+
+if TYPE_CHECKING:
+    from rich.console import Group
+
+    from dxlrun.remote.client import RemoteRobot
+
+REFRESH_S = 0.2
+_RATE_S = 1.0
+"""The rate is measured over this time."""
+_LONGEST_EVENTS = 200
+_TONES: Mapping[str, Tone] = {"on": "good", "doubt": "warning", "lost": "error", "off": "warning"}
+_FIELDS = Mapping[str, object]
+
+
+@dataclass(slots=True)
+class Watched:
+    """What is known of a running robot: newest states, controllers and events."""
+
+    robot: RemoteRobot
+    info: _FIELDS = field(default_factory=dict)
+    states: _FIELDS = field(default_factory=dict)
+    events: list[_FIELDS] = field(default_factory=list)
+    rate: float | None = None
+    """Cycles per second, measured."""
+    latest: float = 0.0
+    """The latest wake-up that was seen, s."""
+    _last: int = 0
+    _cycle: tuple[int, float] = (0, 0.0)
+
+    def look(self) -> None:
+        """Ask the robot; raises DxlrunError when it is gone."""
+        self.info, self.states = self.robot.info(), self.robot.states()
+        found = self.robot.events(self._last)
+        self._last = cast("int", found["last"])
+        self.events = (self.events + cast("list[_FIELDS]", found["events"]))[-_LONGEST_EVENTS:]
+        cycle, now = cast("int", self.states["cycle"]), cast("float", self.states["time"])
+        self.latest = max(self.latest, cast("float", self.states["late"]))
+        if not self._cycle[1]:
+            self._cycle = cycle, now
+        elif now - self._cycle[1] >= _RATE_S:
+            self.rate = (cycle - self._cycle[0]) / (now - self._cycle[1])
+            self._cycle = cycle, now
+
+    def json(self) -> _FIELDS:
+        """Return what one line of JSON has."""
+        kept = ("name", "active", "held", "rate", "joints")
+        rows = cast("list[_FIELDS]", self.info["controllers"])
+        controllers = [{key: row[key] for key in kept if key in row} for row in rows]
+        events, self.events = self.events, []
+        known = {key: self.info[key] for key in ("rate", "paused", "cycles", "skipped")}
+        return {
+            "robot": self.robot.name,
+            **known,
+            "measured_rate": self.rate,
+            **self.states,
+            "controllers": controllers,
+            "events": events,
+        }
+
+
+def watch(*, once: Flag = False, chosen: Chosen = ONLY_ONE) -> int:
+    """Watch a running robot: its joints, controllers, rate and events, live; q or Ctrl-C ends it.
+
+    Into a pipe, one snapshot as tables; with --json one object a line, until the run ends.
+
+    Parameters
+    ----------
+    once
+        Print one snapshot.
+    """
+    with robot_of(chosen, "watch") as robot:
+        watched = Watched(robot)
+        _first_look(watched)
+        try:
+            if chosen.as_json:
+                _print_lines(watched, once=once)
+            elif once or not sys.stdout.isatty():
+                show(*snapshot(watched))
+            else:
+                _show_live(watched)
+        except KeyboardInterrupt:
+            return 0
+        except DxlrunError as error:
+            if not _ended(robot):
+                raise
+            if not chosen.as_json:
+                show(
+                    f"{robot.name} has ended" if not isinstance(error, Refused) else f"{robot.name} is ending"
+                )
+    return 0
+
+
+def _first_look(watched: Watched) -> None:
+    """Look once; a run that begins has no cycle yet."""
+    from dxlrun.run.channels.answers import Code
+
+    for _ in range(50):
+        try:
+            watched.look()
+        except Refused as refused:
+            if refused.code != Code.NO_CYCLE:
+                raise
+            time.sleep(REFRESH_S / 4)
+        else:
+            return
+    watched.look()
+
+
+def _ended(robot: RemoteRobot) -> bool:
+    from dxlrun.remote.client import running
+
+    return robot.name not in running()
+
+
+def _print_lines(watched: Watched, *, once: bool) -> None:
+    show_json_line(watched.json())
+    while not once:
+        time.sleep(REFRESH_S)
+        watched.look()
+        show_json_line(watched.json())
+
+
+def _show_live(watched: Watched) -> None:
+    """Draw the view until a key ends it; raises DxlrunError when the robot is gone."""
+    from rich.live import Live
+
+    console = out()
+    with _keys() as pressed, Live(console=console, screen=True, auto_refresh=False) as live:
+        while True:
+            live.update(view(watched, *console.size), refresh=True)
+            if pressed(REFRESH_S):
+                return
+            watched.look()
+
+
+@contextmanager
+def _keys() -> Iterator[_Pressed]:
+    """Give what waits for the key q; without a terminal on stdin it only waits."""
+    if not sys.stdin.isatty():
+        yield _Pressed(None)
+        return
+    import termios
+    import tty
+
+    keyboard = sys.stdin.fileno()
+    before = termios.tcgetattr(keyboard)
+    try:
+        tty.setcbreak(keyboard)
+        yield _Pressed(keyboard)
+    finally:
+        termios.tcsetattr(keyboard, termios.TCSADRAIN, before)
+
+
+@dataclass(frozen=True, slots=True)
+class _Pressed:
+    keyboard: int | None
+
+    def __call__(self, seconds: float) -> bool:
+        """Wait so long; return True as soon as q was pressed, or the terminal is gone."""
+        if self.keyboard is None:
+            time.sleep(seconds)
+            return False
+        if not select.select([self.keyboard], [], [], seconds)[0]:
+            return False
+        import os
+
+        typed = os.read(self.keyboard, 64)
+        return not typed or b"q" in typed
+
+
+# What is shown
+
+
+def headline(watched: Watched) -> Sentence:
+    """Return the state of the run in one line."""
+    info, late = watched.info, cast("float", watched.states["late"])
+    rate = "" if watched.rate is None else f" ({watched.rate:.1f})"
+    paused = ", paused" if info["paused"] else ""
+    skipped = cast("int", info["skipped"])
+    text = (
+        f"{watched.robot.name}: {info['rate']:g} Hz{rate}{paused}, cycle {watched.states['cycle']}, "
+        f"late {late * 1e3:.2f} ms (max {watched.latest * 1e3:.2f}), {skipped} skipped"
+    )
+    return Sentence(text, "warning" if skipped or paused else "plain")
+
+
+def joints(watched: Watched) -> Table:
+    """Return a row for each joint: goal, position, velocity, effort, temperature, voltage, what is wrong."""
+    names = (("joint", "name"), ("goal", "number"), ("deg", "number"), ("deg/s", "number"))
+    more = (("effort", "number"), ("deg C", "number"), ("V", "number"), ("torque", "name"))
+    columns = [Column(name, kind) for name, kind in (*names, *more)]  # type: ignore[arg-type]  # two of its words
+    units = cast("Mapping[str, str]", watched.info.get("effort_units", {}))
+    rows = cast("Mapping[str, _FIELDS]", watched.states["joints"])
+    return Table.of("", columns, (_joint(name, row, units.get(name, "")) for name, row in rows.items()))
+
+
+def _joint(name: str, row: _FIELDS, unit: str) -> list[Cell | str]:
+    torque = str(row["torque"])
+    tone = _TONES.get(torque, "plain")
+    if error := row["hardware_error"]:
+        torque, tone = f"{torque} error {error:#04x}", "error"
+    elif not row["valid"] and torque != "lost":
+        torque, tone = f"{torque} silent", "warning"
+    goal = row["goal_position"]
+    return [
+        name,
+        _number(goal, DEGREES, 1) if goal is not None else _number(row["goal_velocity"], DEGREES, 1, "/s"),
+        _number(row["position"], DEGREES, 1),
+        _number(row["velocity"], DEGREES, 1),
+        _number(row["effort"], 1.0, 2, f" {unit}") if unit else _number(row["effort"], 100.0, 0, " %"),
+        _number(row["temperature"], 1.0, 0),
+        _number(row["voltage"], 1.0, 1),
+        Cell(torque, tone),
+    ]
+
+
+def _number(value: object, factor: float, digits: int, unit: str = "") -> str:
+    if not isinstance(value, int | float):
+        return ""
+    text = f"{value * factor:.{digits}f}"
+    return f"{'0' if float(text) == 0 and not digits else text}{unit}"
+
+
+def controllers(watched: Watched) -> Table:
+    """Return a row for each controller: what it does, its rate, and how long its update took."""
+    columns = [
+        Column("controller", "name"),
+        Column("state", "name"),
+        Column("rate", form="{:g} Hz"),
+        Column("update", form="{:.0f} us"),
+        Column("into", "text"),
+    ]
+    updates = cast("Mapping[str, float]", watched.states["updates"])
+    return Table.of(
+        "",
+        columns,
+        (
+            (
+                str(one["name"]),
+                Cell(state(one), "good" if one["active"] else "plain"),
+                cast("float", one["rate"]),
+                took * 1e6 if (took := updates.get(str(one["name"]), 0.0)) else None,
+                ", ".join(cast("Sequence[str]", one.get("into", ()))),
+            )
+            for one in cast("list[_FIELDS]", watched.info["controllers"])
+        ),
+    )
+
+
+def event_lines(watched: Watched, most: int) -> list[Sentence]:
+    """Return the newest events, the newest one last."""
+    lines = []
+    for event in watched.events[-most:] if most > 0 else []:
+        severity = cast("int", event["severity"])
+        tone: Tone = "error" if severity >= 40 else "warning" if severity >= 30 else "plain"
+        text = " ".join(str(event["text"]).split())
+        ago = cast("float", watched.states["time"]) - cast("float", event["time"])
+        lines.append(Sentence(f"{ago:5.1f} s ago, {event['source']}: {text}", tone))
+    return lines
+
+
+def snapshot(watched: Watched) -> tuple[Table | Sentence, ...]:
+    """Return everything once, for a pipe."""
+    return (headline(watched), joints(watched), controllers(watched), *event_lines(watched, 10))
+
+
+def view(watched: Watched, width: int, height: int) -> Group:
+    """Return the view for a terminal: the joints first, then as much of the rest as there is room for."""
+    from rich.console import Group
+
+    head, rows, other = headline(watched), joints(watched), controllers(watched)
+    left = height - 2 - len(rows.rows)
+    parts: list[object] = [_line(head, width), _compact(rows)]
+    if left >= len(other.rows) + 2:
+        parts.append(_compact(other))
+        left -= len(other.rows) + 1
+    elif left > 0:
+        active = [row[0].text for row in other.rows if row[1].text != "inactive"]
+        parts.append(_line(Sentence(f"active: {', '.join(active)}"), width))
+        left -= 1
+    parts += [_line(one, width) for one in event_lines(watched, left)]
+    return Group(*parts)  # type: ignore[arg-type]  # texts and tables
+
+
+def _line(sentence: Sentence, width: int) -> object:
+    from rich.text import Text
+
+    text = Text(sentence.text, style=STYLES[sentence.tone], no_wrap=True, overflow="ellipsis")
+    text.truncate(width, overflow="ellipsis")
+    return text
+
+
+def _compact(table: Table) -> object:
+    """Return a table without rules, cut at the right where there is no room."""
+    from rich.table import Table as RichTable
+    from rich.text import Text
+
+    shown = RichTable(box=None, padding=(0, 1, 0, 0), pad_edge=False, header_style="dim")
+    for column in table.columns:
+        right = column.kind == "number"
+        shown.add_column(
+            column.name,
+            justify="right" if right else "left",
+            no_wrap=True,
+            overflow="ellipsis",
+            min_width=5 if right else None,
+        )
+    for row in table.rows:
+        shown.add_row(*(Text(cell.text, style=STYLES[cell.tone], no_wrap=True) for cell in row))
+    return shown

@@ -1,0 +1,182 @@
+"""Joints of a running robot, as clients name them: groups, registers, and what their states are."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TypedDict
+
+from dxlrun.compile.plan import Plan
+from dxlrun.compile.registers import UnfitRegister, steered_value
+from dxlrun.control.joint_requests import RebootRequest, Register, RegisterReading, TorqueRequest
+from dxlrun.control.loop_plan import ControllerPlan
+from dxlrun.description.modes import Mode
+from dxlrun.dynamixel.control_table import ControlTable, control_table
+from dxlrun.dynamixel.servo.registers import meaning
+from dxlrun.errors import suggestion
+from dxlrun.remote.preparation import refused
+from dxlrun.run.channels.answers import Code, Field
+from dxlrun.run.channels.cycle import CycleRecord, Torque
+
+ALL = "all"
+"""Every joint of the robot."""
+_LONGEST = 80
+"""Characters of a name in a refusal."""
+
+
+class JointState(TypedDict):
+    """A joint in the newest cycle, SI units; None: not known."""
+
+    position: float | None
+    velocity: float | None
+    effort: float | None
+    valid: bool
+    age: float
+    goal_position: float | None
+    goal_velocity: float | None
+    goal_effort: float | None
+    goal_pwm: float | None
+    temperature: float | None
+    voltage: float | None
+    hardware_error: int
+    mode: str
+    torque: str
+
+
+def joint_state(record: CycleRecord, row: int) -> JointState:
+    """Return a joint's state in a cycle."""
+    states, goals = record.states, record.goals
+    return {
+        "position": finite(states.position[row]),
+        "velocity": finite(states.velocity[row]),
+        "effort": finite(states.effort[row]),
+        "valid": bool(states.valid[row]),
+        "age": int(states.age_ns[row]) * 1e-9,
+        "goal_position": finite(goals.position[row]),
+        "goal_velocity": finite(goals.velocity[row]),
+        "goal_effort": finite(goals.effort[row]),
+        "goal_pwm": finite(goals.pwm[row]),
+        "temperature": finite(states.temperature[row]),
+        "voltage": finite(states.voltage[row]),
+        "hardware_error": int(states.hardware_error[row]),
+        "mode": Mode(int(states.mode[row])).name.lower(),
+        "torque": Torque(int(states.torque[row])).name.lower(),
+    }
+
+
+def finite(value: float) -> float | None:
+    """Return a number of JSON: NaN is none."""
+    return float(value) if math.isfinite(value) else None
+
+
+def joint_row(plan: Plan, joint: str) -> int:
+    """Return the row of a joint; raises RefusedRequest."""
+    names = [one.name for one in plan.loop.joints]
+    if joint not in names:
+        hint = suggestion(joint[:_LONGEST], tuple(names))
+        raise refused(Code.UNKNOWN_JOINT, {"joint": joint[:_LONGEST], "hint": hint})
+    return names.index(joint)
+
+
+def effort_units(plan: Plan) -> dict[str, str]:
+    """Return the unit in which each joint's servo measures effort; empty: the fraction of its maximum."""
+    return {joint: table.effort_unit.replace("1", "") for joint, table in _tables(plan).items()}
+
+
+def named_joints(plan: Plan, controllers: Iterable[ControllerPlan], names: Sequence[str]) -> tuple[str, ...]:
+    """Return the joints meant by names of joints, of controllers (their joints), or `all`; once each.
+
+    Raises RefusedRequest.
+    """
+    joints = tuple(one.name for one in plan.loop.joints)
+    groups = {one.name: one.joints for one in controllers if one.command} | {ALL: joints}
+    unknown = tuple(name[:_LONGEST] for name in names if name not in joints and name not in groups)
+    if unknown or not names:
+        hint = suggestion(unknown[0], (*joints, *groups)) if unknown else "name one, a controller, or all"
+        raise refused(Code.UNKNOWN_JOINT, {"joint": unknown or "without a name", "hint": hint})
+    return tuple(
+        dict.fromkeys(joint for name in names for joint in ((name,) if name in joints else groups[name]))
+    )
+
+
+def prepared_torque(
+    plan: Plan, controllers: Iterable[ControllerPlan], names: Sequence[str], on: bool, release: bool
+) -> TorqueRequest:
+    """Return the data of the loop's command for torque; raises RefusedRequest."""
+    return TorqueRequest(named_joints(plan, controllers, names), on, release)
+
+
+def prepared_reboot(
+    plan: Plan, controllers: Iterable[ControllerPlan], names: Sequence[str], release: bool
+) -> RebootRequest:
+    """Return the data of the loop's command for reboots; raises RefusedRequest where a servo knows none."""
+    joints = named_joints(plan, controllers, names)
+    servos = {servo.joint: (bus, servo) for bus in plan.buses for servo in bus.servos}
+    cannot = [
+        bus.label(servo)
+        for bus, servo in (servos[joint] for joint in joints if joint in servos)
+        if "reboot" not in control_table(servo.model, bus.protocol).capabilities
+    ]
+    if cannot:
+        verb = "knows" if len(cannot) == 1 else "know"
+        what = f"{', '.join(cannot)} {verb} no reboot instruction: switch the torque off and on, or the power"
+        raise refused(Code.NOT_REBOOTED, {"joint": joints, "problem": what})
+    return RebootRequest(joints, release)
+
+
+# Registers
+
+
+def prepared_register(plan: Plan, joint: str, item: str, value: int | str) -> Register:
+    """Return the data of the loop's command for a RAM item; raises RefusedRequest where it cannot be written.
+
+    `value`: the integer on the wire, or a quantity with its unit.
+    """
+    table, fields = _table(plan, joint, item)
+    try:
+        register = steered_value(table, item[:_LONGEST], value)
+    except UnfitRegister as error:
+        code = Code.INVALID_REGISTER if item in table.items else Code.UNKNOWN_REGISTER
+        raise refused(code, fields | {"problem": str(error)}) from error
+    except ValueError as error:  # a quantity that is none
+        problem = f"{item} of {joint}: {error}"
+        raise refused(Code.WRONG_QUANTITY, fields | {"problem": problem}) from error
+    return Register(joint, item, register.value)
+
+
+def prepared_reading(plan: Plan, joint: str, item: str) -> RegisterReading:
+    """Return the data of the loop's command for reading an item; raises RefusedRequest."""
+    table, fields = _table(plan, joint, item)
+    if item not in table.items:
+        close = difflib.get_close_matches(item[:_LONGEST], table.items, n=1)
+        hint = f"did you mean {close[0]}?" if close else f"`dxlrun models {table.model}` lists them"
+        problem = f"an {table.model} has no register {item[:_LONGEST]}"
+        raise refused(Code.UNKNOWN_REGISTER, fields | {"problem": problem, "hint": hint})
+    return RegisterReading(joint, item)
+
+
+def read_register(plan: Plan, joint: str, item: str, value: int | None) -> Mapping[str, object]:
+    """Return an item with its value as clients get it: the integer on the wire, and what it means."""
+    entry = _tables(plan)[joint].items[item]
+    shown = "" if value is None else meaning(entry, value)
+    return {"joint": joint, "item": item, "title": entry.title, "area": entry.area} | {
+        "value": value,
+        "is": shown,
+    }
+
+
+def _table(plan: Plan, joint: str, item: str) -> tuple[ControlTable, dict[str, Field]]:
+    """Return the control table of a joint's servo, and the fields of a refusal; raises RefusedRequest."""
+    tables = _tables(plan)
+    fields: dict[str, Field] = {"joint": joint[:_LONGEST], "item": item[:_LONGEST]}
+    if joint not in tables:
+        hint = suggestion(joint[:_LONGEST], tuple(tables))
+        raise refused(Code.UNKNOWN_JOINT, fields | {"hint": hint})
+    return tables[joint], fields
+
+
+def _tables(plan: Plan) -> dict[str, ControlTable]:
+    return {
+        servo.joint: control_table(servo.model, bus.protocol) for bus in plan.buses for servo in bus.servos
+    }
