@@ -121,6 +121,7 @@ class Sink:
             arrays = {
                 "position": record.commands.position,
                 "velocity": record.commands.velocity,
+                "effort": record.commands.effort,
                 "clamped": record.clamped,
                 "reference": record.reference,
                 "controller_ns": record.controller_ns,

@@ -449,6 +449,16 @@ def test_two_fallbacks_that_fail_in_turn_end_the_run(story):
     assert story.result.reason == "fault"
 
 
+def test_the_gate_names_the_chain_whose_command_it_cuts(story):
+    chain(story)
+    story.commands["upper"] = 3.0
+    story.run(60)
+    assert (
+        "j0",
+        "j0, controller lower, commanded by upper: lowered to the upper position limit",
+    ) in story.events(EventCode.GATE)
+
+
 # Modes
 
 

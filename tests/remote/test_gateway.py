@@ -22,6 +22,7 @@ from dxlrun.remote.preparation import Prepared, RefusedRequest, _of_motions, in_
 from dxlrun.remote.sockets import MOST_BYTES
 from dxlrun.run.channels.answers import Code, Done, Refusal, Waiting
 from dxlrun.run.channels.commands import MOST_PER_CYCLE
+from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
 from dxlrun.run.channels.events import EventCode, Severity
 from dxlrun.run.channels.heartbeat import Phase
 
@@ -542,6 +543,16 @@ def test_states_are_those_of_the_newest_cycle_and_what_is_not_there_is_null(desk
     assert (tilt["position"], tilt["valid"], tilt["age"]) == (None, False, 0.04)
     assert (pan["mode"], pan["temperature"], pan["hardware_error"]) == ("effort", 41.0, 0)
     assert (tilt["mode"], tilt["temperature"], tilt["hardware_error"]) == ("unknown", None, 0x20)
+
+
+def test_states_show_the_references_by_their_names(desk):
+    names = ("spare/pan/position", "spare/pan/effort")
+    layout = CycleLayout(("pan", "tilt"), ("left", "right", "spare"), names)
+    desk.record, desk.link._record = CycleRecord(layout), CycleRecord(layout)
+    desk.record.reference[:] = (0.25, np.nan)
+    desk.finish_cycle()
+    references = desk.ask("GET", "/states")[1]["references"]
+    assert references == {"spare/pan/position": 0.25, "spare/pan/effort": None}
 
 
 def test_events_of_both_processes_are_returned_whole_and_once(desk):

@@ -247,10 +247,14 @@ class Gate:
                 self._events.emit(EventCode.GATE, Severity.WARNING, name, text)
 
     def _owner(self, joint: str) -> str:
+        """Return the controller that commands a servo, with those above it that command its references."""
         active = self._record.active
-        for index, controller in enumerate(self._plan.controllers):
-            if active >> index & 1 and controller.commands_servos and joint in controller.joints:
-                return f"controller {controller.name}"
+        plans = [plan for index, plan in enumerate(self._plan.controllers) if active >> index & 1]
+        for plan in plans:
+            if plan.commands_servos and joint in plan.joints:
+                uppers = [one.name for one in plans if plan.name in one.into and joint in one.joints]
+                by = f", commanded by {' and '.join(uppers)}" if uppers else ""
+                return f"controller {plan.name}{by}"
         return "no controller"
 
 

@@ -264,7 +264,9 @@ class GatewayApp:
         }
         late = (record.woken_ns - record.scheduled_ns) * 1e-9
         times = {"time": record.woken_ns * 1e-9, "late": late, "updates": updates}
-        return _json({"cycle": record.cycle, **times, "joints": rows})
+        values = [value if math.isfinite(value) else None for value in record.reference.tolist()]
+        references = dict(zip(record.layout.references, values, strict=True))
+        return _json({"cycle": record.cycle, **times, "joints": rows, "references": references})
 
     async def events(self, request: Request) -> Response:
         """Return the events after number `after` that are kept; `last` is the newest's number."""
