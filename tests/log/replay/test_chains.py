@@ -1,0 +1,289 @@
+"""A replay of chains has no difference, and names the reference that differs where there is one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from dxlrun.errors import InputError, LogError
+from dxlrun.log.reader import read_log
+from dxlrun.log.replay import Setting, replay_log
+from dxlrun.run.channels.commands import Command, QueueInbox
+from dxlrun.run.channels.events import EventCode
+from dxlrun.testing import VirtualRobot, simulated_robot
+
+ROBOT = """\
+name: chained
+buses:
+  main: {port: sim, protocol: 1.0, baud_rate: 1_000_000, return_delay_time: 100 us, adapter: {latency: 1 ms}}
+loop: {rate: 50}
+joints:
+  pan: {bus: main, id: 3, model: AX-12A, reference: 150 deg, direction: 1}
+  tilt: {bus: main, id: 7, model: AX-12A, reference: 150 deg, direction: -1}
+  nod: {bus: main, id: 8, model: AX-12A, reference: 150 deg, direction: -1}
+controllers:
+  top: {type: law, joints: [nod, pan], into: middle, gain: 0.3, rate: 25, fallback: spare}
+  base: {type: law, joints: [pan, tilt, nod], exports: [position, velocity], drives: true}
+  beside: {type: law, joints: [tilt], into: base, gain: 0.2}
+  middle: {type: law, joints: [pan, nod], into: base, exports: [position]}
+  eye: {type: eye, reads: [base/pan/position, middle/nod/position, tilt/age, pan/position]}
+  spare: {type: law, joints: [pan, nod], into: middle, gain: -0.1, active: false}
+  alone: {type: law, joints: [pan, tilt, nod], drives: true, active: false}
+"""
+PLUGIN = '''\
+"""A law that follows its references, and one whose topic depends on what it reads."""
+import numpy as np
+from dxlrun import Controller, Interfaces, ParametersModel, hookimpl
+
+
+class LawParameters(ParametersModel):
+    joints: tuple[str, ...]
+    exports: tuple[str, ...] = ()
+    drives: bool = False
+    gain: float = 0.0
+
+
+class Law(Controller[LawParameters]):
+    Parameters = LawParameters
+    Commands = {}
+
+    @classmethod
+    def interfaces(cls, parameters, joints):
+        command = ("position", "velocity") if parameters.drives else ("position",)
+        return Interfaces(parameters.joints, command, parameters.exports)
+
+    def on_activate(self, time_ns):
+        self.held = self.context.states.position.copy()
+        self.held[np.isnan(self.held)] = 0.0
+
+    def update(self, time_ns, period_ns):
+        if time_ns > 700_000_000 and self.parameters.gain == 0.3:
+            raise RuntimeError("out of ideas")
+        references, commands = self.context.references, self.context.commands
+        self.held = self.held * 0.9 + 0.1 * self.parameters.gain * np.sin(time_ns * 1e-8)
+        given = references.position * 0.99 + self.context.states.position * 0.01
+        np.copyto(commands.position, np.where(np.isnan(references.position), self.held, given))
+        if self.parameters.drives:
+            commands.velocity[:] = 1.0 + abs(np.nan_to_num(references.position))
+
+
+class EyeParameters(ParametersModel):
+    reads: tuple[str, ...]
+
+
+class Eye(Controller[EyeParameters]):
+    Parameters = EyeParameters
+
+    @classmethod
+    def interfaces(cls, parameters, joints):
+        return Interfaces((), (), (), parameters.reads)
+
+    def update(self, time_ns, period_ns):
+        if time_ns < 200_000_000:
+            self.context.say(" ".join(map(float.hex, self.context.reads.tolist())))
+
+
+@hookimpl
+def dxlrun_contract():
+    return 1
+
+
+@hookimpl
+def dxlrun_controllers():
+    return {"law": Law, "eye": Eye}
+'''
+
+
+@pytest.fixture(scope="module")
+def law(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A directory with the plug-in, as pip would install it."""
+    directory = tmp_path_factory.mktemp("law")
+    (directory / "law_plugin.py").write_text(PLUGIN)
+    info = directory / "law-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: law\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[dxlrun]\nlaw_plugin = law_plugin\n")
+    return directory
+
+
+@pytest.fixture(autouse=True)
+def _installed(law: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(law)
+
+
+def switch(activate: Sequence[str] = (), deactivate: Sequence[str] = ()) -> Command:
+    data = msgspec.json.encode({"activate": activate, "deactivate": deactivate})
+    return Command(0, "", "switch", data, "anna")
+
+
+STORIES: Mapping[str, Mapping[int, Sequence[Command]]] = {
+    "a fallback": {},
+    "switches": {
+        5: [switch(["alone"], ["top", "middle", "beside", "base"])],
+        9: [switch(["top"], ["alone"]), switch([], ["middle"])],
+        15: [switch(["spare"], ["top"])],
+        20: [switch(["beside"])],
+        30: [switch(["top"], ["spare", "top"])],
+    },
+    "a restart": {10: [switch(["top"], ["top", "middle"])]},
+}
+
+
+class Clients(QueueInbox):
+    """Ask what they ask in the cycle that the story says."""
+
+    def __init__(self, robot: VirtualRobot, asked: Mapping[int, Sequence[Command]]) -> None:
+        super().__init__()
+        self.record, self.asked = robot.record, asked
+
+    def take(self) -> Sequence[Command]:
+        self.waiting.extend(self.asked.get(self.record.cycle, ()))
+        return super().take()
+
+
+@pytest.fixture(scope="module")
+def logs() -> dict[str, Path]:
+    """The logs of the stories that were told already."""
+    return {}
+
+
+@pytest.fixture
+def story(
+    law: Path, logs: dict[str, Path], tmp_path_factory: pytest.TempPathFactory
+) -> Callable[[str], Path]:
+    """Return the log of a story, which is run once."""
+
+    def told(name: str) -> Path:
+        if name not in logs:
+            directory = tmp_path_factory.mktemp("chained")
+            file, log = directory / "chained.yaml", directory / "run.mcap"
+            file.write_text(ROBOT)
+            robot = simulated_robot(file, duration_s=1.0, log=log)
+            robot.robot.loop.steering.inbox = Clients(robot, STORIES[name])
+            robot.run()
+            logs[name] = log
+        return logs[name]
+
+    return told
+
+
+def active(cycles: NDArray[np.void], row: int) -> set[str]:
+    names = ("top", "base", "beside", "middle", "eye", "spare", "alone")
+    return {name for bit, name in enumerate(names) if int(cycles["active"][row]) >> bit & 1}
+
+
+@pytest.mark.parametrize("name", STORIES)
+def test_a_run_of_chains(story: Callable[[str], Path], name: str) -> None:
+    path = story(name)
+    report = replay_log(path)
+    log = read_log(path)
+    assert (report.compared, report.different, report.first) == (len(log.cycles), 0, None)
+    assert (report.fault, report.stopped, report.remarks) == ("", "", ())
+    assert np.isfinite(log.cycles["reference"]).any()
+
+
+def test_the_stories_do_what_they_are_there_for(story: Callable[[str], Path]) -> None:
+    log = read_log(story("switches"))
+    assert log.header.references == (
+        "base/pan/position",
+        "base/tilt/position",
+        "base/nod/position",
+        "base/pan/velocity",
+        "base/tilt/velocity",
+        "base/nod/velocity",
+        "middle/pan/position",
+        "middle/nod/position",
+    )
+    chain = {"top", "base", "middle", "eye"}
+    assert [active(log.cycles, row) for row in (4, 5, 9, 15, 20)] == [
+        chain | {"beside"},
+        {"alone", "eye"},
+        chain,
+        chain - {"top"} | {"spare"},
+        chain - {"top"} | {"spare", "beside"},
+    ]
+    assert "middle is commanded by top" in str(
+        [event.text for event in log.events if event.code == EventCode.COMMAND_REFUSED]
+    )
+    log = read_log(story("a fallback"))
+    assert active(log.cycles, -1) == {"base", "beside", "middle", "eye", "spare"}
+
+
+def test_what_was_read_without_a_claim_is_what_the_log_has(story: Callable[[str], Path]) -> None:
+    log = read_log(story("a fallback"))
+    said = [event.text for event in log.events if event.source == "eye" and " " in event.text]
+    for row in range(1, 9):
+        cycle = log.cycles[row]
+        expected = [
+            cycle["reference"][0],
+            cycle["reference"][7],
+            cycle["age_ns"][1] * 1e-9,
+            cycle["position"][0],
+        ]
+        texts = [text for text in said if text.count("0x") == 4]
+        assert [float.fromhex(word) for word in texts[row].split()] == pytest.approx(expected, rel=0, abs=0)
+
+
+FLIPPED = [
+    (7, 12, "top", "nod", "middle/nod/position"),
+    (0, 30, "middle", "pan", "base/pan/position"),
+    (1, 3, "beside", "tilt", "base/tilt/position"),
+    (4, 8, None, "tilt", "base/tilt/velocity"),
+]
+
+
+@pytest.mark.parametrize("flipped", FLIPPED, ids=[one[-1] for one in FLIPPED])
+def test_a_flipped_bit_of_a_reference_is_found_and_named(
+    story: Callable[[str], Path],
+    changed: Callable[..., Path],
+    flipped: tuple[int, int, str | None, str, str],
+) -> None:
+    place, cycle, controller, joint, name = flipped
+
+    def flip(content: Any) -> None:
+        content.cycles["reference"].view(np.uint64)[cycle, place] ^= 1
+
+    report = replay_log(changed(story("a fallback"), flip))
+    assert report.different == 1
+    first = report.first
+    assert first is not None
+    assert (first.cycle, first.controller, first.joint, first.what) == (
+        cycle,
+        controller,
+        joint,
+        f"reference {name}",
+    )
+    assert [(one.joint, one.references, one.commands, one.goals) for one in report.joints] == [
+        (joint, 1, 0, 0)
+    ]
+
+
+def test_another_parameter_above_differs_first_in_its_references(story: Callable[[str], Path]) -> None:
+    report = replay_log(story("a restart"), [Setting.parse("beside.gain=0.25")])
+    assert report.first is not None
+    assert (report.first.what, report.first.controller) == ("reference base/tilt/position", "beside")
+    assert [one.joint for one in report.joints] == ["tilt"]
+    assert report.joints[0].references >= report.joints[0].commands > 0
+
+
+def test_a_parameter_that_changes_what_is_exported_is_refused(story: Callable[[str], Path]) -> None:
+    with pytest.raises(InputError, match="base: the controller would export other references"):
+        replay_log(story("a restart"), [Setting.parse("base.exports=[position]")])
+
+
+def test_a_log_whose_plan_has_other_references_is_damaged(
+    story: Callable[[str], Path], changed: Callable[..., Path]
+) -> None:
+    def other(content: Any) -> None:
+        plan = msgspec.json.decode(content.attachments["plan.json"])
+        plan["loop"]["controllers"][1]["reference"] = ["position"]
+        content.attachments["plan.json"] = msgspec.json.encode(plan)
+
+    with pytest.raises(LogError, match="the plan in the log has other references than its cycles"):
+        replay_log(changed(story("a restart"), other))
