@@ -1,6 +1,6 @@
 """Random graphs of controllers, switched at random while some of them fail: the invariants of every cycle.
 
-CI tries 120 graphs; `DXLRUN_GRAPHS=10000 pytest tests/control/test_chain_storms.py` tries more.
+CI tries 120 graphs; `DXLRUN_CHAIN_STORMS=10000 pytest tests/control/test_chain_storms.py` tries more.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from dxlrun.description.modes import Mode
 from dxlrun.run.channels.answers import Code, Done
 from dxlrun.run.channels.events import EventCode
 
-GRAPHS = int(os.environ.get("DXLRUN_GRAPHS", "120"))
+GRAPHS = int(os.environ.get("DXLRUN_CHAIN_STORMS", "120"))
 CYCLES = 40
 PERIOD_NS = 20_000_000
 LATE = (Code.RUN_ENDING, Code.MODE_NOT_ENTERED, Code.SWITCHED_AGAIN, Code.CONTROLLER_FAULT)
