@@ -1,0 +1,211 @@
+"""A replay of a steered controller graph has no difference: chains, goals, torque, reboots, parameters.
+
+CI tries 5 random runs; `DXLRUN_STEERED_GRAPHS=500 pytest tests/log/replay/test_steered_graphs.py` tries more.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from dxlrun.control.controllers.plugins import load_plugins
+from dxlrun.log.client_commands import client_commands
+from dxlrun.log.reader import Log, read_log
+from dxlrun.log.replay import replay_log
+from dxlrun.run.channels.commands import Command, QueueInbox
+from dxlrun.testing import VirtualRobot, simulated_robot
+
+MS = 1_000_000
+CYCLES = 70
+ROBOT = """\
+name: graph
+buses:
+  main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, return_delay_time: 20 us}
+loop: {rate: 50}
+joints:
+  shoulder:
+    {bus: main, id: 1, model: XM430-W350, reference: 180 deg, direction: 1, limits: {velocity: 3 rad/s}}
+  elbow: {bus: main, id: 2, model: XM430-W350, reference: 180 deg, direction: -1}
+  wrist: {bus: main, id: 3, model: XM430-W350, reference: 180 deg, direction: 1}
+  mirror: {bus: main, id: 4, model: XM430-W350, reference: 180 deg, direction: 1}
+controllers:
+  states: {type: joint_state_broadcaster}
+  arm_pid:
+    {type: pid_controller, joints: [shoulder, elbow], gains: {p: 3.0, i: 1.0, d: 0.1}, fallback: standby}
+  arm: {type: joint_trajectory_controller, joints: [shoulder, elbow], rate: 25, into: arm_pid}
+  standby: {type: joint_group_position_controller, joints: [shoulder, elbow], active: false}
+  turn: {type: pid_controller, joints: [wrist], command_interface: velocity, gains: {p: 4.0}}
+  hand: {type: joint_group_position_controller, joints: [wrist], into: [turn]}
+  follow: {type: leader_follower, pairs: [{joint: mirror, leader: elbow, scale: 0.5}], speed: 1 rad/s}
+"""
+JOINTS = ("shoulder", "elbow", "wrist", "mirror")
+CONTROLLERS = ("arm_pid", "arm", "standby", "turn", "hand", "follow")
+_OFFERS = load_plugins().controllers
+
+
+def ask(kind: str, data: object = None) -> Command:
+    return Command(0, "", kind, b"" if data is None else msgspec.json.encode(data), "anna")
+
+
+def send(controller: str, kind: str, data: Any, lease_ns: int = 0) -> Command:
+    return Command(0, controller, kind, np.asarray(data, dtype="<f8").tobytes(), "anna", lease_ns)
+
+
+def trajectory(shoulder: float, elbow: float, seconds: float) -> Command:
+    """Return a goal for `arm`, prepared as the gateway does."""
+    offered = _OFFERS["joint_trajectory_controller"].controller
+    parameters = offered.Parameters.model_validate({"joints": ("shoulder", "elbow")})
+    command = offered.Commands["trajectory"].model_validate(
+        {"points": [{"time": seconds, "positions": [shoulder, elbow]}]}
+    )
+    return send("arm", "trajectory", offered.prepare("trajectory", command, parameters))
+
+
+def switch(activate: Sequence[str] = (), deactivate: Sequence[str] = ()) -> Command:
+    return ask("switch", {"activate": activate, "deactivate": deactivate})
+
+
+def torque(on: bool, joints: Sequence[str], release: bool) -> Command:
+    return ask("torque", {"on": on, "joints": joints, "release": release})
+
+
+ANGLES = st.floats(-1, 1)
+NAMES = st.lists(st.sampled_from(JOINTS), min_size=1, max_size=2, unique=True)
+COMMANDS = st.one_of(
+    st.builds(trajectory, ANGLES, ANGLES, st.sampled_from([0.1, 0.3, 0.8])),
+    st.builds(lambda goal: ask("cancel", {"goal": goal}), st.integers(0, 4)),
+    st.builds(lambda name: ask("cancel", {"controller": name}), st.sampled_from(["arm", "arm", "hand"])),
+    st.builds(switch, *[st.lists(st.sampled_from(CONTROLLERS), max_size=3)] * 2),
+    st.sampled_from([
+        switch(["standby"], ["arm", "arm_pid"]),
+        switch(["arm"], ["standby"]),
+        switch([], ["hand", "turn"]),
+        switch(["hand"]),
+    ]),
+    st.builds(lambda a, lease: send("hand", "positions", [a], lease), ANGLES, st.sampled_from([0, 60 * MS])),
+    st.builds(lambda a: send("turn", "positions", [a]), ANGLES),
+    st.builds(
+        lambda p, i: ask("parameters", {"controller": "arm_pid", "values": {"gains.p": p, "gains.i": i}}),
+        st.floats(0, 6),
+        st.floats(0, 3),
+    ),
+    st.builds(
+        lambda speed: ask("parameters", {"controller": "follow", "values": {"speed": speed}}),
+        st.floats(0.1, 3),
+    ),
+    st.builds(torque, st.booleans(), NAMES, st.booleans()),
+    st.builds(
+        lambda joints, release: ask("reboot", {"joints": joints, "release": release}), NAMES, st.booleans()
+    ),
+    st.just(ask("halt")),
+    st.sampled_from([25.0, 50.0, 100.0]).map(lambda hz: ask("rate", {"rate": hz})),
+    st.sampled_from(["pause", "resume", "resume"]).map(ask),
+)  # fmt: skip
+
+
+class Clients(QueueInbox):
+    """Request what is requested in its cycle."""
+
+    def __init__(self, robot: VirtualRobot, asked: Mapping[int, Sequence[Command]]) -> None:
+        super().__init__()
+        self.record, self.asked = robot.record, asked
+
+    def take(self) -> Sequence[Command]:
+        self.waiting.extend(self.asked.get(self.record.cycle, ()))
+        return super().take()
+
+
+@pytest.fixture(scope="module")
+def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("graphs")
+    (directory / "graph.yaml").write_text(ROBOT)
+    return directory
+
+
+@pytest.fixture(scope="module")
+def steer(directory: Path) -> Callable[..., Path]:
+    """Run the robot while clients request these commands in these cycles; return the log."""
+
+    def run(asked: Mapping[int, Sequence[Command]], silent: Sequence[tuple[int, int, int]] = ()) -> Path:
+        log = directory / "run.mcap"
+        log.unlink(missing_ok=True)
+        robot = simulated_robot(directory / "graph.yaml", duration_s=CYCLES / 50, log=log)
+        robot.robot.loop.steering.inbox = Clients(robot, {**asked, CYCLES + 10: [ask("stop")]})
+        for servo, begin_ms, length_ms in silent:
+            robot.buses[0].at(begin_ms * MS, lambda s=servo: robot.buses[0].servo(s).silence(True))
+            end = (begin_ms + length_ms) * MS
+            robot.buses[0].at(end, lambda s=servo: robot.buses[0].servo(s).silence(False))
+        robot.run()
+        return log
+
+    return run
+
+
+def whole(path: Path) -> Log:
+    """Assert that a replay compares everything and finds no difference; return the log."""
+    log = read_log(path)
+    report = replay_log(path)
+    assert (report.compared, report.different, report.first) == (len(log.cycles), 0, None)
+    assert (report.fault, report.stopped, report.remarks) == ("", "", ())
+    assert log.complete
+    return log
+
+
+def chains_whole(log: Log) -> None:
+    """Assert that no controller was active without the one below it, and no joint had two commanders."""
+    names = ("states", *CONTROLLERS)
+    for mask in {int(mask) for mask in log.cycles["active"]}:
+        active = {name for bit, name in enumerate(names) if mask >> bit & 1}
+        assert {"arm", "arm_pid"} & active != {"arm"}, active
+        assert {"hand", "turn"} & active != {"hand"}, active
+        assert not {"arm_pid", "standby"} <= active, active
+
+
+STORY: dict[int, list[Command]] = {
+    3: [trajectory(0.5, -0.3, 0.3)],
+    6: [ask("parameters", {"controller": "arm_pid", "values": {"gains.p": 5.0}})],
+    8: [send("hand", "positions", [0.4])],
+    12: [ask("cancel", {"goal": 1}), ask("cancel", {"goal": 1})],
+    20: [trajectory(-0.2, 0.2, 0.5), ask("cancel", {"controller": "arm"})],
+    26: [torque(False, ["mirror"], True), torque(False, ["wrist"], False)],
+    34: [torque(True, ["mirror"], False)],
+    40: [switch(["standby"], ["arm", "arm_pid"])],
+    50: [switch(["arm"], ["standby"])],
+    52: [switch([], ["arm_pid"])],
+}
+
+
+def test_chains_goals_torque_and_parameters(steer: Callable[..., Path]) -> None:
+    log = whole(steer(STORY))
+    chains_whole(log)
+    refused = [one.refusal for one in client_commands(log) if one.refusal]
+    assert len(refused) == 3, refused  # cancelled twice, torque of a commanded joint, a lower end
+    names = [event.name for event in log.events]
+    assert names.count("goal_accepted") == names.count("goal_ended") == 2
+    active = log.cycles["active"].astype(int)
+    assert {tuple(pair) for pair in pairwise((active >> 1 & 0b111).tolist())} >= {(0b011, 0b000), (0b100, 0)}
+
+
+@pytest.mark.campaign
+@settings(
+    max_examples=int(os.environ.get("DXLRUN_STEERED_GRAPHS", "5")),
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(
+    st.dictionaries(st.integers(0, CYCLES - 5), st.lists(COMMANDS, min_size=1, max_size=4), max_size=15),
+    st.lists(st.tuples(st.integers(1, 4), st.integers(100, 900), st.sampled_from([20, 60, 300])), max_size=2),
+)
+def test_any_steered_graph(
+    steer: Callable[..., Path], asked: dict[int, list[Command]], silent: list[tuple[int, int, int]]
+) -> None:
+    chains_whole(whole(steer(asked, silent)))
