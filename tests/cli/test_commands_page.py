@@ -15,6 +15,7 @@ RUN = "dxlrun ROBOT.yaml"
 STEER = {
     "send",
     "echo",
+    "play",
     "cancel",
     "parameters",
     "switch",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -40,8 +41,14 @@ class Robot:
         self, controller: str, kind: str, command: Any, *, units: bool, seconds: float | None
     ) -> Executed:
         self.requests.append(("send", controller, kind, command, seconds))
-        goal = None if self.goal is None else RemoteGoal(self, self.goal)  # type: ignore[arg-type]
-        return Executed(7, goal)
+        goals = () if self.goal is None else (RemoteGoal(self, self.goal),)  # type: ignore[arg-type]
+        return Executed(7, goals)
+
+    def play(self, motion: Path, speed: float) -> Executed:
+        self.requests.append(("play", str(motion), speed))
+        if 0 in self.refusals:
+            raise self.refusals[0]
+        return Executed(7, (RemoteGoal(self, 3), RemoteGoal(self, 4)))  # type: ignore[arg-type]
 
     def goals(self) -> list[GoalState]:
         return [
@@ -227,3 +234,59 @@ def test_words_that_change_nothing_are_refused(
     said = dxlrun("parameters", "arm", *words)
     assert (said.code, what in said.err) == (2, True), said
     assert robot.requests == []
+
+
+# Motions
+
+
+@pytest.fixture
+def wave(tmp_path: Path) -> Path:
+    file = tmp_path / "wave.yaml"
+    file.write_text("name: wave\n")
+    return file
+
+
+def test_play_follows_all_goals(dxlrun: Dxlrun, robot: Robot, wave: Path) -> None:
+    leg = replace(REACHED, number=4, controller="leg")
+    robot.script = {3: [RUNNING, RUNNING, REACHED], 4: [replace(leg, status="running"), leg]}
+    assert dxlrun("play", wave, "--speed", "0.5") == (
+        0,
+        "torso: goal 3 of arm reached after 1.50 s\ntorso: goal 4 of leg reached after 1.50 s\n",
+        "",
+    )
+    assert robot.requests == [("play", str(wave), 0.5)]
+
+
+def test_play_fails_when_one_of_its_goals_does(dxlrun: Dxlrun, robot: Robot, wave: Path) -> None:
+    robot.script = {3: [REACHED], 4: [replace(MISSED, number=4, controller="leg")]}
+    said = dxlrun("play", wave, "--json")
+    found = json.loads(said.out)
+    assert (said.code, found["done"]) == (1, False)
+    assert [(goal["goal"], goal["status"]) for goal in found["goals"]] == [(3, "reached"), (4, "missed")]
+
+
+def test_play_without_waiting_reports_the_numbers(dxlrun: Dxlrun, robot: Robot, wave: Path) -> None:
+    assert dxlrun("play", wave, "--no-wait").out == f"torso: plays {wave} as goals 3, 4\n"
+    assert json.loads(dxlrun("play", wave, "--no-wait", "--json").out)["goals"] == [3, 4]
+
+
+def test_ctrl_c_cancels_all_goals_of_a_motion(dxlrun: Dxlrun, robot: Robot, wave: Path) -> None:
+    stopped = replace(REACHED, status="cancelled")
+    robot.script = {
+        3: [RUNNING, KeyboardInterrupt(), stopped],
+        4: [replace(RUNNING, number=4), replace(stopped, number=4)],
+    }
+    assert dxlrun("play", wave).code == 130
+    assert robot.requests[1:3] == [("cancel", 3), ("cancel", 4)]
+
+
+def test_mistakes_of_a_motion_have_their_places(dxlrun: Dxlrun, robot: Robot, wave: Path) -> None:
+    fields = {"places": ["3:17", "4:1"], "problems": ["no leg", "no arm"], "fixes": ["known: arm", "add one"]}
+    robot.refusals = {0: Refused("all", code="wrong_motion", fields=fields, wrong_input=True)}
+    said = dxlrun("play", wave)
+    assert (said.code, said.errors) == (
+        2,
+        [f"{wave}:3:17: no leg; known: arm", f"{wave}:4:1: no arm; add one"],
+    )
+    said = dxlrun("play", wave.parent / "wive.yaml")
+    assert (said.code, "there is no motion file" in said.err) == (2, True)

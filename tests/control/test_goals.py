@@ -23,6 +23,7 @@ from dxlrun.control.controllers.plugins import controller_breach
 from dxlrun.control.controllers.topics import TopicLog
 from dxlrun.messages.declared import declared_message
 from dxlrun.run.channels.answers import Code, Done
+from dxlrun.run.channels.commands import data_of
 from dxlrun.run.channels.events import EventCode, GoalReport
 
 PERIOD_NS = 20_000_000
@@ -458,3 +459,133 @@ def test_a_wrong_declaration_is_refused_when_the_plug_in_is_loaded(changed, what
     breach = controller_breach(type("Wrong", (Mover,), changed))
     assert breach is not None
     assert what in breach[0]
+
+
+# Motions
+
+
+def motion(*parts, numbers=None):
+    """Return the data of `play`: each part is a controller, a command, its times (cycles) and its arrays."""
+    heads = [
+        {
+            "controller": controller,
+            "kind": kind,
+            "at_ns": [round(cycle * PERIOD_NS) for cycle in times],
+            "sizes": [len(array) for array in arrays],
+            "end_ns": end * PERIOD_NS,
+        }
+        for controller, kind, times, arrays, end in parts
+    ]
+    values = [value for *_, arrays, _ in parts for array in arrays for value in array]
+    return msgspec.json.encode({"parts": heads}) + b"\n" + np.array(numbers or values, dtype="<f8").tobytes()
+
+
+@pytest.fixture
+def played(make_robot):
+    """A robot with an arm that takes goals, and a leg that writes down its plain commands."""
+    steered = Steered(make_robot)
+    steered.given = []
+
+    def act(controller, step, time_ns, value):
+        if step == "command":
+            steered.given.append((steered.robot.loop.record.cycle, value.tolist()))
+            if steered.given[-1][1] == [13.0]:
+                raise RuntimeError("no way")
+
+    steered.robot.script("leg", act, joints=("j1",))
+    steered.play = lambda *parts, **more: lambda: steered.robot.post("", "play", motion(*parts, **more))
+    return steered
+
+
+LEG = ("leg", "go", (0, 1, 4), ([1.0], [2.0], [3.0]), 6)
+ARM = ("arm", "move", (0,), ([4.0],), 0)
+
+
+def test_the_parts_of_a_motion_begin_in_one_cycle_and_are_goals(played):
+    played.at = {2: [played.play(LEG, ARM)]}
+    played.run(12)
+    assert played.robot.answer(1) == Done(2, goals=(1, 2))
+    assert played.given == [(2, [1.0]), (3, [2.0]), (6, [3.0])]
+    assert played.steps("goal") == [(2, "move", [4.0])]
+    assert [(cycle, one.goal, one.status) for cycle, one in played.reports] == [
+        (2, 1, "accepted"),
+        (2, 2, "accepted"),
+        (5, 2, "reached"),
+        (8, 1, "reached"),
+    ]
+    assert played.robot.manager._motions == {}
+    (taken,) = played.robot.taken
+    assert (taken.kind, taken.numbers.tolist()) == ("play", [1.0, 2.0, 3.0, 4.0])
+    assert data_of("", taken.text, taken.numbers) == taken.data
+    assert len(played.robot.events.of(EventCode.STEERED)[0][1]) < 400
+
+
+def test_a_played_motion_is_cancelled(played):
+    played.at = {2: [played.play(LEG)], 4: [played.ask("cancel", controller="leg")]}
+    played.run(9)
+    assert played.given == [(2, [1.0]), (3, [2.0])]
+    assert (played.reports[-1][0], played.reports[-1][1].status) == (4, "cancelled")
+
+
+@pytest.mark.parametrize("other", ["command", "motion"])
+def test_what_comes_later_takes_the_place_of_a_motion(played, other):
+    data = np.array([7.0]).tobytes()
+    later = {
+        "command": lambda: played.robot.post("leg", "go", data),
+        "motion": played.play(("leg", "go", (0,), ([7.0],), 1)),
+    }[other]
+    played.at = {2: [played.play(LEG)], 4: [later]}
+    played.run(9)
+    assert played.given == [(2, [1.0]), (3, [2.0]), (4, [7.0])]
+    assert played.reports[1][1].status == "preempted"
+
+
+def test_a_deactivated_controller_gets_nothing_more_of_a_motion(played):
+    played.at = {
+        2: [played.play(LEG)],
+        3: [played.ask("switch", deactivate=["leg"])],
+        4: [played.ask("switch", activate=["leg"])],
+    }
+    played.run(9)
+    assert played.given == [(2, [1.0])]
+    assert played.statuses == [(1, "accepted"), (1, "aborted")]
+
+
+def test_a_controller_that_fails_in_a_motion_is_taken_out(played):
+    played.at = {2: [played.play(("leg", "go", (0, 1, 2), ([1.0], [13.0], [3.0]), 3), ARM)]}
+    assert played.run(9).reason == "fault"
+    assert played.given == [(2, [1.0]), (3, [13.0])]
+    assert (1, "aborted") in played.statuses
+
+
+def test_a_goal_that_fails_cancels_the_others_of_the_motion(played):
+    played.mover.fail_in = {"goal"}
+    played.at = {2: [played.play(LEG, ARM)]}
+    played.run(9)
+    assert refused(played, 1)[0] is Code.CONTROLLER_FAULT
+    assert played.statuses == [(1, "accepted"), (2, "accepted"), (2, "aborted"), (1, "cancelled")]
+
+
+@pytest.mark.parametrize(
+    ("parts", "numbers", "code"),
+    [
+        ([LEG, ("head", "go", (0,), ([1.0],), 0)], None, Code.UNKNOWN_CONTROLLER),
+        ([LEG, ("arm", "move", (1,), ([1.0],), 0)], None, Code.INVALID),
+        ([LEG, ("arm", "move", (0, 1), ([1.0], [1.0]), 0)], None, Code.INVALID),
+        ([LEG, ("arm", "move", (), (), 0)], None, Code.INVALID),
+        ([LEG], [1.0, 2.0], Code.INVALID),
+        ([LEG], [1.0, 2.0, 3.0, 4.0], Code.INVALID),
+    ],
+)
+def test_a_motion_that_does_not_fit_is_refused_whole(played, parts, numbers, code):
+    played.at = {2: [played.play(*parts, numbers=numbers)]}
+    played.run(6)
+    assert refused(played, 1)[0] is code
+    assert (played.given, played.statuses) == ([], [])
+
+
+def test_a_motion_of_a_controller_that_is_not_active_is_refused_whole(played):
+    played.at = {1: [played.ask("switch", deactivate=["arm"])], 2: [played.play(LEG, ARM)]}
+    played.run(6)
+    assert refused(played, 2) == (Code.NOT_ACTIVE, "arm is not active; switch to it first")
+    assert played.given == []

@@ -69,12 +69,12 @@ def compile_motion(
     limits = {name: Interval(joint.plan.lower, joint.plan.upper) for name, joint in joints.items()}
     plans = {name: joint.plan for name, joint in joints.items()}
     parts: list[MotionPart] = []
-    if not _affordable(motion, problems):
+    if not affordable(motion, problems):
         return parts
     for index, part in enumerate(motion.motion.motions):
-        samples = _samples(motion, index, problems)
+        samples = samples_of(motion, index, problems)
         controller = _controller(motion, index, controllers, names, problems)
-        if controller is None or not _own_joints(motion, index, controller, problems) or not samples:
+        if controller is None or not names_own_joints(motion, index, controller, problems) or not samples:
             continue
         kind = command_kind(controller.offer.controller)
         if kind is None:
@@ -99,7 +99,7 @@ def compile_motion(
     return parts
 
 
-def _affordable(motion: MotionDescription, problems: Problems) -> bool:
+def affordable(motion: MotionDescription, problems: Problems) -> bool:
     """Return whether the formulas of a motion file can be sampled in a few seconds and some 100 MB."""
     values: dict[int, int] = {}
     characters: dict[int, int] = {}
@@ -126,7 +126,8 @@ def _affordable(motion: MotionDescription, problems: Problems) -> bool:
     return good
 
 
-def _samples(motion: MotionDescription, index: int, problems: Problems) -> tuple[Sample, ...]:
+def samples_of(motion: MotionDescription, index: int, problems: Problems) -> tuple[Sample, ...]:
+    """Return the samples of a part, listed or computed."""
     part = motion.motion.motions[index]
     if isinstance(part, PointsPart):
         return listed_samples(motion, index, part, problems)
@@ -157,7 +158,7 @@ def _controller(
     return controller
 
 
-def _own_joints(
+def names_own_joints(
     motion: MotionDescription, index: int, controller: CompiledController, problems: Problems
 ) -> bool:
     """Return whether every joint that the part names belongs to its controller."""
@@ -197,17 +198,17 @@ def _commands(
     joints = controller.plan.joints
     if kind == TRAJECTORY:
         payload = trajectory_command(joints, samples, lead_ns)
-        return (_prepared(controller, kind, payload, start_ns, samples[0].mark),)
+        return (prepared(controller, kind, payload, start_ns, samples[0].mark),)
     commands: list[ScheduledCommand] = []
     held = samples[0]
     for sample in samples:
         held = Sample(sample.t_ns, {**held.targets, **sample.targets}, sample.mark)
         payload = group_command(controller.offer.controller, kind, joints, held)
-        commands.append(_prepared(controller, kind, payload, start_ns + sample.t_ns, sample.mark))
+        commands.append(prepared(controller, kind, payload, start_ns + sample.t_ns, sample.mark))
     return tuple(commands)
 
 
-def _prepared(
+def prepared(
     controller: CompiledController, kind: str, payload: dict[str, object], at_ns: int, mark: Mark
 ) -> ScheduledCommand:
     """Validate and prepare a command by the controller's own code, which may raise anything."""

@@ -8,6 +8,7 @@ from typing import Protocol
 import msgspec
 import numpy as np
 
+from dxlrun.control.controllers.goals import PlayedPart
 from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.halt import Halt
 from dxlrun.control.joint_requests import JOINT_KINDS, JointRequests
@@ -78,6 +79,12 @@ class Cancel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     controller: str = ""
 
 
+class Play(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Data of `play`: what controllers are given from this cycle on; the array has all commands in a row."""
+
+    parts: tuple[PlayedPart, ...]
+
+
 class Parameters(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Data of `parameters`: live parameters of a controller, checked against its model before."""
 
@@ -90,6 +97,7 @@ KINDS = (
     "switch",
     "halt",
     "cancel",
+    "play",
     "parameters",
     "rate",
     "pause",
@@ -132,7 +140,8 @@ class Steering:
             if isinstance(answer, Refusal):
                 self._report_refusal(command, answer)
             elif command.controller == LOOP:
-                text = f"{command.kind} {command.data.decode(errors='replace')}".strip()
+                shown = command.data.partition(b"\n")[0].decode(errors="replace")
+                text = f"{command.kind} {shown}".strip()
                 data = msgspec.json.encode(CommandOutcome(command.kind, command.origin))
                 text = f"{text} from {command.origin}"
                 self.events.emit(EventCode.STEERED, Severity.INFO, "loop", text, data)
@@ -205,6 +214,22 @@ class Steering:
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
             return Refusal(Code.INVALID, {"problem": f"the data of {command.kind} do not fit: {error}"})
 
+    def _to_controllers(self, command: Command, time_ns: int) -> Answer:
+        """Execute what the loop does with the goals and the parameters of controllers."""
+        manager, data, refusal = self.manager, command.data, None
+        if command.kind == "play":
+            head, _, numbers = data.partition(b"\n")
+            parts = msgspec.json.decode(head, type=Play).parts
+            goals = manager.play(parts, numbers, command.origin, time_ns)
+            return goals if isinstance(goals, Refusal) else Done(self.record.cycle, goals=goals)
+        if command.kind == "cancel":
+            cancel = msgspec.json.decode(data, type=Cancel)
+            refusal = manager.cancel(cancel.goal, cancel.controller, time_ns)
+        else:
+            changed = msgspec.json.decode(data, type=Parameters)
+            refusal = manager.change_parameters(changed.controller, changed.values, time_ns)
+        return refusal or Done(self.record.cycle)
+
     def _execute(self, command: Command, time_ns: int) -> Answer | None:
         loop, manager, data = self.loop, self.manager, command.data
         answer: Refusal | Waiting | None = None
@@ -212,12 +237,8 @@ class Steering:
             case "switch":
                 switch = msgspec.json.decode(data, type=Switch)
                 answer = manager.switch(switch.activate, switch.deactivate, time_ns, command.number)
-            case "cancel":
-                cancel = msgspec.json.decode(data, type=Cancel)
-                answer = manager.cancel(cancel.goal, cancel.controller, time_ns)
-            case "parameters":
-                changed = msgspec.json.decode(data, type=Parameters)
-                answer = manager.change_parameters(changed.controller, changed.values, time_ns)
+            case "cancel" | "play" | "parameters":
+                return self._to_controllers(command, time_ns)
             case "rate":
                 answer = loop.change_rate(msgspec.json.decode(data, type=Rate).rate)
             case "pause":

@@ -126,7 +126,12 @@ class MotionDescription:
 
 def read_motion(path: Path) -> MotionDescription:
     """Read a motion file; raises InputError with all problems of its form."""
-    text, file = read_text(path), str(path)
+    return motion_of(read_text(path), path)
+
+
+def motion_of(text: str, path: Path) -> MotionDescription:
+    """Return the motion of a file's text; raises InputError with all problems of its form."""
+    file = str(path)
     grown = grow(parse(text, file), file, refuse_arguments)
     problems = [*grown.problems]
     try:

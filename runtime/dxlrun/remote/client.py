@@ -57,10 +57,15 @@ class Executed:
 
     cycle: int
     """The loop's cycle that did it; -1: not known."""
-    goal: RemoteGoal | None = None
-    """The goal that the command is; None: it is none."""
+    goals: tuple[RemoteGoal, ...] = ()
+    """The goals that the command began."""
     old: int | None = None
     """What a register had before; None: it is no register, or not known."""
+
+    @property
+    def goal(self) -> RemoteGoal | None:
+        """The goal that the command is; None: it is none."""
+        return self.goals[0] if self.goals else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -404,6 +409,15 @@ class RemoteRobot:
         query = [*(["units=true"] if units else []), *([] if seconds is None else [f"in={seconds!r}"])]
         return self._execute(f"{path}?{'&'.join(query)}" if query else path, command)
 
+    def play(self, motion: Path | str, speed: float = 1.0) -> Executed:
+        """Play a motion file, `speed` times as fast; returns when its controllers have begun, all in one
+        cycle, with a goal for each. They lead the joints to their first poses slowly.
+
+        Raises Refused with all that is wrong with the file, or with the robot for it.
+        """
+        text = Path(motion).read_text(encoding="utf-8")
+        return self._execute("/play", {"file": str(motion), "text": text, "speed": speed})
+
     def stream(self, controller: str, kind: str, lease: float = LEASE_S) -> Stream:
         """Return a stream of set-points for a controller, of which the newest counts, for `lease` seconds."""
         return Stream(self, controller, kind, lease)
@@ -518,10 +532,12 @@ class RemoteRobot:
         return self._executed(self._ask("POST", path, content))
 
     def _executed(self, answer: Mapping[str, object]) -> Executed:
-        cycle, goal, old = answer.get("cycle"), answer.get("goal"), answer.get("old")
+        cycle, old = answer.get("cycle"), answer.get("old")
+        goals = answer.get("goals", [answer.get("goal")])
+        numbers = [one for one in goals if isinstance(one, int)] if isinstance(goals, list) else []
         return Executed(
             cycle if isinstance(cycle, int) else -1,
-            RemoteGoal(self, goal) if isinstance(goal, int) else None,
+            tuple(RemoteGoal(self, number) for number in numbers),
             old if isinstance(old, int) else None,
         )
 

@@ -10,6 +10,7 @@
     GET  /goals, GET /goals/N?wait=2            those that run and the last that ended; wait for an end, s
     POST /goals/N/cancel, /controllers/NAME/cancel       a goal, by its number or its controller
     GET, POST /controllers/NAME/parameters {values}      all of them; change live ones in one cycle
+    POST /play {text, file, speed}              a motion file, begun softly, all its controllers in one cycle
     POST /switch {activate, deactivate}         controllers, in one cycle or not at all
     GET  /joints/NAME                           its newest state
     GET  /joints/NAME/registers/ITEM            an item of its servo, read in idle time
@@ -32,8 +33,9 @@ import math
 import time
 import traceback
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from typing import TypeAlias, TypeVar
 
 import msgspec
@@ -45,6 +47,8 @@ from starlette.routing import Route
 
 from dxlrun.control.joint_requests import RebootRequest, TorqueRequest
 from dxlrun.control.steering import Cancel, Rate, Switch, Unload
+from dxlrun.description.motion import motion_of
+from dxlrun.errors import InputError
 from dxlrun.remote.goals import GoalStatus
 from dxlrun.remote.joint_commands import joint_command
 from dxlrun.remote.joints import (
@@ -58,6 +62,7 @@ from dxlrun.remote.joints import (
     read_register,
 )
 from dxlrun.remote.link import Link, Loaded
+from dxlrun.remote.motions import MOST_SPEED, Running, play
 from dxlrun.remote.parameters import Change, Written, changed, parameters_of
 from dxlrun.remote.preparation import (
     Preparation,
@@ -68,7 +73,8 @@ from dxlrun.remote.preparation import (
     unknown_controllers,
 )
 from dxlrun.remote.sockets import MOST_BYTES
-from dxlrun.run.channels.answers import Code, Done, Refusal
+from dxlrun.run.channels.answers import Code, Done, Field, Refusal
+from dxlrun.run.channels.commands import LOOP
 from dxlrun.run.channels.heartbeat import Phase
 
 MOST_OPERATIONS = 200.0
@@ -90,6 +96,9 @@ _ENDING_S = 0.5
 """How long the results of goals may take when the run ends."""
 LONGEST_WAY_S = 3600.0
 """To a point that is named by its joints."""
+LONGEST_FILE = 200
+MOST_MISTAKES = 20
+"""Of a motion, in an answer."""
 LONGEST_ORIGIN = 64
 LONGEST_SENTENCE = 2000
 _STATUS = {
@@ -110,6 +119,7 @@ _STATUS = {
     Code.WRONG_QUANTITY: 422,
     Code.BEYOND_LIMITS: 422,
     Code.NAMED_TWICE: 422,
+    Code.WRONG_MOTION: 422,
     Code.NOT_LIVE: 422,
     Code.GOAL_STREAMED: 422,
     Code.TOO_SLOW: 422,
@@ -152,6 +162,16 @@ class RebootBody(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     joints: tuple[str, ...]
     release: bool = False
+
+
+class NewMotion(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Body of a motion that is to be played."""
+
+    text: str
+    """Of the motion file."""
+    file: str = "motion"
+    """Its name, for the places of mistakes and the log."""
+    speed: float = 1.0
 
 
 class GatewayApp:
@@ -198,6 +218,7 @@ class GatewayApp:
             route("/controllers/{name}/set-points/{kind}", self.set_point, "POST", self._set_points),
             route("/controllers/{name}", self.unload, "DELETE", operations),
             route("/controllers", self.load, "POST", operations),
+            route("/play", self.play, "POST", operations),
             route("/switch", self.switch, "POST", operations),
             route("/joints/{name}", self.joint, "GET", looks),
             route("/joints/{name}/registers/{item}", self.register, "POST", operations),
@@ -336,6 +357,29 @@ class GatewayApp:
             goals = [goal.goal for goal in self._link.goals.running.values() if goal.controller == name]
         done = await self._link.for_loop("cancel", wanted, origin(request))
         return _json({"done": True, "cycle": done.cycle, "goal": goals[0] if goals else None})
+
+    async def play(self, request: Request) -> Response:
+        """Play a motion file: all its controllers begin in one cycle; answer with their goals."""
+        given = await typed(request, NewMotion, '{"text": "name: wave ...", "speed": 0.5}')
+        if not 0 < given.speed <= MOST_SPEED:
+            raise invalid(f"speed is a factor above 0, at most {MOST_SPEED:g}, not {given.speed:g}")
+        record = self._link.newest()
+        if record is None:
+            raise refused(Code.NO_CYCLE, {})
+        controllers = {
+            name: self._preparation.compiled(replace(one.plan, active=self._link.active(one)))
+            for name, one in self._link.controllers.items()
+        }
+        file = given.file[:LONGEST_FILE]
+        running = Running(controllers, self._preparation.joints, record)
+        try:
+            with bounded(file):
+                played = play(motion_of(given.text, Path(file)), running, given.speed)
+        except InputError as error:
+            raise refused(Code.WRONG_MOTION, _mistaken(error)) from error
+        done = await self._link.command(LOOP, "play", played.data, f"{origin(request)}: {file}")
+        answer = {"done": True, "cycle": done.cycle, "goals": done.goals, "seconds": played.seconds}
+        return _json(answer)
 
     async def parameters(self, request: Request) -> Response:
         """Return a controller's parameters, or change live ones, all of them in one cycle."""
@@ -534,6 +578,19 @@ def _json(content: object, status: int = 200) -> Response:
 def _done(done: Done) -> Response:
     goal = {"goal": done.goals[0]} if done.goals else {}
     return _json({"done": True, "cycle": done.cycle} | goal)
+
+
+def _mistaken(error: InputError) -> dict[str, Field]:
+    """Return the mistakes of a motion: what, where and how to fix it, each a tuple; and all as one text."""
+    found = error.problems[:MOST_MISTAKES]
+    if not found:
+        return {"problem": str(error)}
+    return {
+        "problem": "; ".join(map(str, found)),
+        "places": tuple(f"{one.mark.line}:{one.mark.column}" for one in found),
+        "problems": tuple(one.what for one in found),
+        "fixes": tuple(one.fix for one in found),
+    }
 
 
 def _goal_number(request: Request) -> int:

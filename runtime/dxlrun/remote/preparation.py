@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
+from dxlrun.compile.controllers import CompiledController
 from dxlrun.compile.graph import ControllerGraph, Mistake, mistakes_of
 from dxlrun.compile.limits import BeyondLimit, beyond_limits
 from dxlrun.compile.motions import TRAJECTORY
@@ -142,6 +143,13 @@ class Preparation:
                 found = {kind: {} for kind in commands}
             self._schemas[plan.type] = found
         return self._schemas[plan.type]
+
+    def compiled(self, plan: ControllerPlan) -> CompiledController:
+        """Return a controller with its class and parameters; raises RefusedRequest."""
+        known = self._known.get(plan.name)
+        same = known is not None and known.plan.parameters == plan.parameters and known.plan.type == plan.type
+        parameters = known.parameters if known is not None and same else self.known(plan).parameters
+        return CompiledController(plan, self.plugins.controllers[plan.type], parameters)
 
     def goals(self, plan: ControllerPlan) -> list[str]:
         """Return the names of the commands of a controller that are goals."""

@@ -1,15 +1,18 @@
-"""Goals at the terminal: follow them to their end, and `dxlrun cancel`."""
+"""What a running robot is given to do: `dxlrun send`, `play`, `cancel`, and goals until their end."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
 
 from dxlrun.cli.inputs import Flag
-from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, robot_of
-from dxlrun.errors import DxlrunError, Refused
+from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, Words, report_done, robot_of
+from dxlrun.errors import DxlrunError, InputError, Mark, Problem, Refused
 from dxlrun.output.terminal import print_error, print_warning, progress_bar, show, show_json_line
 
 if TYPE_CHECKING:
@@ -18,6 +21,57 @@ if TYPE_CHECKING:
 REST_S = 10.0
 """How long a cancelled goal may take until its joints are at rest."""
 _PROGRESS_S = 0.1
+
+
+def send(
+    controller: str,
+    kind: str,
+    /,
+    *words: Words,
+    file: Path | None = None,
+    in_: Annotated[str | None, Parameter(name="--in")] = None,
+    wait: Flag = False,
+    chosen: Chosen = ONLY_ONE,
+) -> int:
+    """Send a controller of a running robot a command: `dxlrun send neck positions 'positions=[30 deg]'`.
+
+    `dxlrun list` shows which commands a controller takes, and what is in them. Some joints by name, while the
+    others keep their goals: `dxlrun send arm position elbow=20deg`.
+
+    Parameters
+    ----------
+    controller
+        Name of the controller.
+    kind
+        The command; or position, velocity, effort, pwm of joints by name.
+    words
+        Its keys, or joints; values are YAML, quantities have their units.
+    file
+        A YAML file with its keys, instead of the words.
+    in_
+        Time for joints by name to get there, such as 2s; of controllers that take trajectories.
+    wait
+        Show the progress of a goal, and return with its result. Ctrl-C cancels it.
+    """
+    from dxlrun.cli.steering.written import Written
+    from dxlrun.description.units import duration
+
+    written = Written.read(words, file)
+    try:
+        seconds = None if in_ is None else duration(in_) * 1e-9
+    except ValueError as error:
+        raise InputError(f"--in: {error}") from None
+    with robot_of(chosen, "send") as robot:
+        try:
+            done = robot.send(controller, kind, written.data, units=True, seconds=seconds)
+        except Refused as refused:
+            raise written.located(refused) from None
+        if not wait:
+            as_goal = "" if done.goal is None else f" as goal {done.goal.number}"
+            return report_done(robot, chosen, done, f"{robot.name}: {controller} accepted {kind}{as_goal}")
+        if done.goal is None:
+            raise DxlrunError(f"{controller} accepted {kind}, which is no goal that could be waited for")
+        return follow(robot, chosen, done, [done.goal.number])
 
 
 def cancel(goal: str = "", /, *, wait: Flag = False, chosen: Chosen = ONLY_ONE) -> int:
@@ -62,6 +116,46 @@ def cancel(goal: str = "", /, *, wait: Flag = False, chosen: Chosen = ONLY_ONE) 
             shown = ", ".join(map(str, cancelled))
             show(f"{robot.name}: goal{'s' if len(cancelled) > 1 else ''} {shown} cancelled")
     return 0
+
+
+def play(motion: Path, /, *, speed: float = 1.0, no_wait: Flag = False, chosen: Chosen = ONLY_ONE) -> int:
+    """Play a motion file on a running robot, begun softly from where its joints are.
+
+    All its controllers begin in one cycle. Ctrl-C cancels them, and returns when the joints are at rest.
+
+    Parameters
+    ----------
+    motion
+        Motion file; its controllers must be active.
+    speed
+        How fast, as a factor: 0.5 takes twice as long.
+    no_wait
+        Return when the motion has begun.
+    """
+    if not motion.is_file():
+        raise InputError(f"there is no motion file {motion}; check the path")
+    with robot_of(chosen, "play") as robot:
+        try:
+            done = robot.play(motion, speed)
+        except Refused as refused:
+            raise _located(refused, motion) from None
+        numbers = [goal.number for goal in done.goals]
+        if no_wait:
+            shown = ", ".join(map(str, numbers))
+            return report_done(robot, chosen, done, f"{robot.name}: plays {motion} as goals {shown}")
+        return follow(robot, chosen, done, numbers)
+
+
+def _located(refused: Refused, motion: Path) -> DxlrunError:
+    """Return a refusal with the places of the mistakes in the motion file."""
+    places, problems, fixes = (refused.fields.get(name) for name in ("places", "problems", "fixes"))
+    if not (isinstance(places, list) and isinstance(problems, list) and isinstance(fixes, list)):
+        return refused
+    found = []
+    for place, problem, fix in zip(places, problems, fixes, strict=True):
+        line, column = map(int, place.split(":"))
+        found.append(Problem(Mark(str(motion), line, column), problem, fix))
+    return InputError(found)
 
 
 def follow(robot: RemoteRobot, chosen: Chosen, done: Executed, numbers: Sequence[int]) -> int:

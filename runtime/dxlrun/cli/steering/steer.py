@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from dxlrun.cli.inputs import Flag, JsonFlag
-from dxlrun.errors import DxlrunError, InputError, Refused, suggestion
+from dxlrun.errors import DxlrunError, InputError, suggestion
 from dxlrun.output.table import Column, Table
 from dxlrun.output.terminal import print_error, show, show_json, show_json_line
 
@@ -105,58 +105,6 @@ def switch(*, activate: Names = (), deactivate: Names = (), chosen: Chosen = ONL
         }
         parts = [f"{', '.join(names)} {state}" for state, names in groups.items() if names]
         return report_done(robot, chosen, done, f"{robot.name}: {'; '.join(parts)}")
-
-
-def send(
-    controller: str,
-    kind: str,
-    /,
-    *words: Words,
-    file: Path | None = None,
-    in_: Annotated[str | None, Parameter(name="--in")] = None,
-    wait: Flag = False,
-    chosen: Chosen = ONLY_ONE,
-) -> int:
-    """Send a controller of a running robot a command: `dxlrun send neck positions 'positions=[30 deg]'`.
-
-    `dxlrun list` shows which commands a controller takes, and what is in them. Some joints by name, while the
-    others keep their goals: `dxlrun send arm position elbow=20deg`.
-
-    Parameters
-    ----------
-    controller
-        Name of the controller.
-    kind
-        The command; or position, velocity, effort, pwm of joints by name.
-    words
-        Its keys, or joints; values are YAML, quantities have their units.
-    file
-        A YAML file with its keys, instead of the words.
-    in_
-        Time for joints by name to get there, such as 2s; of controllers that take trajectories.
-    wait
-        Show the progress of a goal, and return with its result. Ctrl-C cancels it.
-    """
-    from dxlrun.cli.steering.goals import follow
-    from dxlrun.cli.steering.written import Written
-    from dxlrun.description.units import duration
-
-    written = Written.read(words, file)
-    try:
-        seconds = None if in_ is None else duration(in_) * 1e-9
-    except ValueError as error:
-        raise InputError(f"--in: {error}") from None
-    with robot_of(chosen, "send") as robot:
-        try:
-            done = robot.send(controller, kind, written.data, units=True, seconds=seconds)
-        except Refused as refused:
-            raise written.located(refused) from None
-        if not wait:
-            as_goal = "" if done.goal is None else f" as goal {done.goal.number}"
-            return report_done(robot, chosen, done, f"{robot.name}: {controller} accepted {kind}{as_goal}")
-        if done.goal is None:
-            raise DxlrunError(f"{controller} accepted {kind}, which is no goal that could be waited for")
-        return follow(robot, chosen, done, [done.goal.number])
 
 
 def rate(hz: float, /, *, chosen: Chosen = ONLY_ONE) -> int:
@@ -271,8 +219,9 @@ def report_done(robot: RemoteRobot, chosen: Chosen, done: Executed | None, sente
     """Print that a request was executed; return the exit code."""
     if chosen.as_json:
         cycle = {} if done is None else {"cycle": done.cycle}
-        goal = {} if done is None or done.goal is None else {"goal": done.goal.number}
-        show_json_line({"robot": robot.name, "done": True} | cycle | goal)
+        numbers = [] if done is None else [goal.number for goal in done.goals]
+        goals = {"goals": numbers} if len(numbers) > 1 else dict(zip(("goal",), numbers, strict=False))
+        show_json_line({"robot": robot.name, "done": True} | cycle | goals)
     else:
         show(sentence)
     return 0

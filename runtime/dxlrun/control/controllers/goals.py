@@ -9,6 +9,8 @@ import math
 from dataclasses import dataclass, field
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from dxlrun.control.controllers.controller import Outcome
 from dxlrun.control.controllers.topics import Publisher, TopicLog
@@ -42,6 +44,46 @@ class GoalStatus:
     """Largest distance from the desired state, at the end the worst joint's from the goal; SI units."""
     joint: str = ""
     text: str = ""
+
+
+class PlayedPart(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What one controller is given of a motion: commands by time; one that is a goal stands alone."""
+
+    controller: str
+    kind: str
+    at_ns: tuple[int, ...]
+    """When each command is handed over, since the motion was taken; they do not decrease."""
+    sizes: tuple[int, ...]
+    """How many numbers each command has."""
+    end_ns: int = 0
+    """When the part is over."""
+
+
+@dataclass(slots=True)
+class PlayedMotion:
+    """Commands that the runtime hands to a controller by time: a goal that no controller sees."""
+
+    goal: RunningGoal
+    part: PlayedPart
+    commands: tuple[NDArray[np.float64], ...]
+    begun_ns: int
+    """Time of the controllers."""
+    next: int = 0
+
+    def due(self, time_ns: int) -> NDArray[np.float64] | None:
+        """Return the next command whose time has come."""
+        if self.next < len(self.commands) and self.begun_ns + self.part.at_ns[self.next] <= time_ns:
+            self.next += 1
+            return self.commands[self.next - 1]
+        return None
+
+    def report(self, time_ns: int) -> None:
+        """Report its progress, and its end."""
+        passed_ns, end_ns = time_ns - self.begun_ns, self.part.end_ns
+        if self.next == len(self.commands) and passed_ns >= end_ns:
+            self.goal.end(Outcome.REACHED, "all commands were given")
+        else:
+            self.goal.feedback(min(1.0, passed_ns / end_ns) if end_ns > 0 else 0.0)
 
 
 class RunningGoal:

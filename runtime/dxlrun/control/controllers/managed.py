@@ -210,6 +210,10 @@ class Managed:
         """Return whether a command of this name is a goal."""
         return kind in self._controller.Goals
 
+    def adopt(self, goal: RunningGoal) -> None:
+        """Have a goal that the runtime leads for it, by plain commands."""
+        self._goal = goal
+
     def begin_goal(self, goal: RunningGoal, data: NDArray[np.float64], time_ns: int) -> None:
         """Hand over a prepared command that is a goal; the one before has ended. Raises ControllerFault."""
         self._held = False

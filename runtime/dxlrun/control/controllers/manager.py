@@ -12,7 +12,7 @@ from dxlrun.clock import Clock
 from dxlrun.control.controllers.activity import Activity
 from dxlrun.control.controllers.claims import Plans, conflicts
 from dxlrun.control.controllers.controller import Outcome
-from dxlrun.control.controllers.goals import Goals, RunningGoal
+from dxlrun.control.controllers.goals import Goals, PlayedMotion, PlayedPart, RunningGoal
 from dxlrun.control.controllers.graph import commander, update_order
 from dxlrun.control.controllers.live_parameters import LiveValues
 from dxlrun.control.controllers.managed import Managed, rate_divider, rate_fits
@@ -65,6 +65,8 @@ class Manager:
         self._next = 0
         self._lost: Collection[int] = ()
         self._goals = Goals(record, events)
+        self._motions: dict[str, PlayedMotion] = {}
+        """What is played by commands, by controller."""
         self._modes = ModeSwitch(plan.joints, record.states.mode, set_modes)
         self.released: set[int] = set()
         """Rows of joints whose torque clients switched off; the states show it a cycle later."""
@@ -118,6 +120,8 @@ class Manager:
             self._switching.admit(time_ns)
         if self._next < len(self._commands):
             self._record.command_count += self._hand_over(time_ns)
+        if self._motions:
+            self._play_on(time_ns)
         for place, managed in self._order:
             if managed.active and managed.due(cycle):
                 begin_ns = now_ns()
@@ -129,7 +133,7 @@ class Manager:
                     took_ns[place] = now_ns() - begin_ns
         return self._switching.fault
 
-    def hand(  # noqa: PLR0911, PLR0917  a command's parts, as they come; one return a reason
+    def hand(  # noqa: PLR0917  a command's parts, as they come
         self,
         controller: str,
         kind: str,
@@ -143,20 +147,15 @@ class Manager:
         `until_ns` is when it runs out, ns of the clock, unless another one follows (see `stale`); 0: never.
         Of a stream, only the first one has an event.
         """
-        managed = self._named.get(controller)
-        if managed is None:
-            return Refusal(Code.UNKNOWN_CONTROLLER, {"controller": controller})
-        if not managed.active:
-            entering = managed in self._modes.entering
-            code = Code.NOT_ACTIVE_YET if entering else Code.NOT_ACTIVE
-            return Refusal(code, {"controller": controller})
-        if upper := commander(controller, self._switching.active.values()):
-            hint = f"command {upper}, or deactivate it"
-            return Refusal(Code.COMMANDED, {"controller": controller, "upper": upper, "hint": hint})
+        managed = self._commandable(controller)
+        if isinstance(managed, Refusal):
+            return managed
         if managed.takes_goal(kind):
             if until_ns:
                 return Refusal(Code.GOAL_STREAMED, {"controller": controller, "kind": kind})
             return self._begin_goal(managed, kind, data, origin, time_ns)
+        if (motion := self._motions.get(controller)) is not None:
+            motion.goal.end(Outcome.PREEMPTED, "another command took its place")
         streaming = until_ns and managed.until_ns
         try:
             managed.command(kind, data, time_ns, until_ns)
@@ -167,12 +166,89 @@ class Manager:
             self._log(EventCode.COMMAND, managed, f"{kind} from {origin}")
         return 0
 
+    def _commandable(self, controller: str) -> Managed | Refusal:
+        """Return a controller that takes commands now."""
+        managed = self._named.get(controller)
+        if managed is None:
+            return Refusal(Code.UNKNOWN_CONTROLLER, {"controller": controller})
+        if not managed.active:
+            entering = managed in self._modes.entering
+            code = Code.NOT_ACTIVE_YET if entering else Code.NOT_ACTIVE
+            return Refusal(code, {"controller": controller})
+        if upper := commander(controller, self._switching.active.values()):
+            hint = f"command {upper}, or deactivate it"
+            return Refusal(Code.COMMANDED, {"controller": controller, "upper": upper, "hint": hint})
+        return managed
+
+    def play(
+        self, parts: Sequence[PlayedPart], numbers: bytes, origin: str, time_ns: int
+    ) -> tuple[int, ...] | Refusal:
+        """Begin the parts of a motion in this cycle, or none; return the numbers of their goals.
+
+        `numbers` has the commands of all parts in a row, little-endian float64.
+        """
+        sizes = [size for part in parts for size in part.sizes]
+        fits = all(size >= 0 for size in sizes) and 8 * sum(sizes) == len(numbers)
+        if not fits or any(len(part.at_ns) != len(part.sizes) for part in parts):
+            return Refusal(
+                Code.INVALID, {"problem": "the motion's array does not have the sizes of its parts"}
+            )
+        for part in parts:
+            managed = self._commandable(part.controller)
+            if isinstance(managed, Refusal):
+                return managed
+            if not part.sizes or (managed.takes_goal(part.kind) and part.at_ns != (0,)):
+                return Refusal(Code.INVALID, {"problem": f"the part of {part.controller} has no single goal"})
+        values = np.frombuffer(numbers, dtype="<f8")
+        commands = np.split(values, np.cumsum(sizes)[:-1])
+        begun: list[int] = []
+        for part in parts:
+            own, commands = commands[: len(part.sizes)], commands[len(part.sizes) :]
+            found = self._begin_part(part, tuple(own), origin, time_ns)
+            if isinstance(found, Refusal):
+                for number in begun:
+                    self.cancel(number, "", time_ns)
+                return found
+            begun.append(found)
+        return tuple(begun)
+
+    def _begin_part(
+        self, part: PlayedPart, commands: tuple[NDArray[np.float64], ...], origin: str, time_ns: int
+    ) -> int | Refusal:
+        managed = self._commandable(part.controller)
+        if isinstance(managed, Refusal):  # a fault of another one took it out
+            return managed
+        if managed.takes_goal(part.kind):
+            return self._begin_goal(managed, part.kind, commands[0], origin, time_ns)
+        goal = self._accept(managed, part.kind, origin)
+        managed.adopt(goal)
+        self._motions[part.controller] = PlayedMotion(goal, part, commands, time_ns)
+        return goal.number
+
+    def _play_on(self, time_ns: int) -> None:
+        """Hand over what is due of each motion, and forget those that have ended."""
+        for name, motion in tuple(self._motions.items()):
+            while motion.goal.outcome is None and (data := motion.due(time_ns)) is not None:
+                managed = self._named[name]  # active: else its goal has ended
+                try:
+                    managed.command(motion.part.kind, data, time_ns)
+                except ControllerFault as fault:
+                    self._switching.end(managed, fault, time_ns)
+            if motion.goal.outcome is None:
+                motion.report(time_ns)
+            if motion.goal.outcome is not None:
+                del self._motions[name]
+
+    def _accept(self, managed: Managed, kind: str, origin: str) -> RunningGoal:
+        """Return a new goal in place of the one that a controller has."""
+        if (before := managed.goal) is not None:
+            before.end(Outcome.PREEMPTED, f"goal {self._goals.last + 1} took its place")
+        return self._goals.accept(managed.plan.name, kind, origin)
+
     def _begin_goal(
         self, managed: Managed, kind: str, data: NDArray[np.float64], origin: str, time_ns: int
     ) -> int | Refusal:
-        if (before := managed.goal) is not None:
-            before.end(Outcome.PREEMPTED, f"goal {self._goals.last + 1} took its place")
-        goal = self._goals.accept(managed.plan.name, kind, origin)
+        goal = self._accept(managed, kind, origin)
         try:
             managed.begin_goal(goal, data, time_ns)
         except ControllerFault as fault:
@@ -187,6 +263,10 @@ class Manager:
             return goal
         if goal.cancelling:
             return Refusal(Code.CANCELLED_ALREADY, {"goal": goal.number, "controller": goal.controller})
+        motion = self._motions.get(goal.controller)
+        if motion is not None and motion.goal is goal:
+            goal.end(Outcome.CANCELLED)  # its controller keeps what it was given last
+            return None
         managed = self._named[goal.controller]
         try:
             managed.cancel(goal, time_ns)

@@ -114,6 +114,7 @@ class Code(StrEnum):
     UNKNOWN_COMMAND = "unknown_command", "{controller} takes no command {kind}"
     INVALID = "invalid", "{problem}"
     WRONG_QUANTITY = "wrong_quantity", "{problem}"
+    WRONG_MOTION = "wrong_motion", "{problem}"
     BEYOND_LIMITS = "beyond_limits", "{kind} of {controller}: {problem}"
     TOO_SLOW = (
         "too_slow",

@@ -47,7 +47,8 @@ class Command:
     controller: str
     kind: str
     data: bytes
-    """For a controller what its `prepare` made, little-endian float64; for the loop JSON (UTF-8)."""
+    """For a controller what its `prepare` made, little-endian float64; for the loop JSON (UTF-8), for `play`
+    with a line break and such an array behind it."""
     origin: str
     """The client, for the log."""
     lease_ns: int = 0
@@ -69,7 +70,7 @@ class TakenCommand:
     origin: str
     """The client, or the place in a motion file."""
     data: bytes
-    """Little-endian float64, for the loop JSON; empty for a planned command."""
+    """As in Command; empty for a planned command."""
     lease_ns: int = 0
     """For how long a set-point of a stream counts; 0: for ever."""
 
@@ -83,21 +84,23 @@ class TakenCommand:
         """The data as the log's text: JSON for the loop, hexadecimal for what is no array of numbers, else
         empty. Bytes that are no UTF-8 become escapes that no JSON has: what was refused stays refused."""
         if self.for_loop:
-            return self.data.decode(errors="backslashreplace")
+            return self.data.partition(b"\n")[0].decode(errors="backslashreplace")
         return self.data.hex() if len(self.data) % _NUMBER else ""
 
     @property
     def numbers(self) -> NDArray[np.float64]:
         """The data as the log's array; empty where it is the text."""
-        whole = not self.for_loop and len(self.data) % _NUMBER == 0
-        return np.frombuffer(self.data if whole else b"", dtype="<f8")
+        data = self.data.partition(b"\n")[2] if self.for_loop else self.data
+        return np.frombuffer(data if len(data) % _NUMBER == 0 else b"", dtype="<f8")
 
 
 def data_of(controller: str, text: str, numbers: NDArray[np.float64]) -> bytes:
     """Return a command's data from its text and its array in the log. Raises ValueError when neither fits."""
     if controller and text:
         return bytes.fromhex(text)
-    return numbers.tobytes() if controller else text.encode()
+    if controller:
+        return numbers.tobytes()
+    return text.encode() + (b"\n" + numbers.tobytes() if len(numbers) else b"")
 
 
 class Inbox(Protocol):

@@ -1,0 +1,272 @@
+"""Motions for a robot that runs: checked as before a start, begun softly from where the joints are."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+
+from dxlrun.compile.controllers import CompiledController
+from dxlrun.compile.limits import Interval, check_limits, check_speeds
+from dxlrun.compile.motions import (
+    SETTLE_NS,
+    TRAJECTORY,
+    UnfitError,
+    affordable,
+    command_kind,
+    group_command,
+    names_own_joints,
+    prepared,
+    samples_of,
+    trajectory_command,
+)
+from dxlrun.compile.problems import Problems
+from dxlrun.compile.samples import Sample, SampledTarget
+from dxlrun.control.controllers.goals import PlayedPart
+from dxlrun.control.loop_plan import JointPlan
+from dxlrun.control.steering import Play
+from dxlrun.description import MotionDescription
+from dxlrun.errors import InputError, Problem, suggestion
+from dxlrun.run.channels.cycle import CycleRecord
+
+SOFT_SPEED = 0.5
+"""rad/s on the way to the first pose; or the joint's limit, if that is lower."""
+MOST_SPEED = 10.0
+"""Largest factor on a motion's speed."""
+_STILL = 0.005
+"""rad; a joint that is nearer to its first position is there."""
+_LEAST_NS = 200_000_000
+"""Of a way to a first pose."""
+_SLOWEST = 0.05
+"""rad/s on that way, of joints that have almost none: a servo at 0 rad/s would not come to rest there."""
+_RAMP_NS = 20_000_000
+_MOST_STEPS = 500
+"""Between two commands of positions on that way; so many at most."""
+
+
+@dataclass(frozen=True, slots=True)
+class Running:
+    """The robot as it is now, for a motion that is to be played."""
+
+    controllers: Mapping[str, CompiledController]
+    """All that are loaded; `plan.active` as it is now."""
+    joints: Mapping[str, JointPlan]
+    record: CycleRecord
+    """The newest cycle."""
+
+    def position(self, joint: str) -> float:
+        """Return where a joint is sent, or where it is; NaN when neither is known, rad."""
+        row = self.record.layout.joints.index(joint)
+        goal = float(self.record.goals.position[row])
+        return goal if math.isfinite(goal) else float(self.record.states.position[row])
+
+
+@dataclass(frozen=True, slots=True)
+class Played:
+    """A motion, ready for the loop."""
+
+    data: bytes
+    """Of the loop's command `play`."""
+    seconds: float
+    """Until all parts have ended."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """What one controller shall do, by the time of the motion, at its final speed."""
+
+    controller: CompiledController
+    kind: str
+    samples: tuple[Sample, ...]
+
+
+def play(motion: MotionDescription, running: Running, speed: float) -> Played:
+    """Return a motion as it is played now, `speed` times as fast; raises InputError with all that is wrong.
+
+    What is beyond the limits of a joint is refused, as in a command. All controllers begin in one cycle, and
+    lead their joints to their first poses; the motion itself begins when the slowest is there.
+    """
+    problems = Problems()
+    parts = _parts(motion, running, speed, problems) if affordable(motion, problems) else []
+    for part in parts:
+        _check(part, running, problems)
+    wrong = [*problems.errors, *(_refused(warning) for warning in problems.warnings)]
+    if wrong:
+        raise InputError(sorted(wrong, key=lambda problem: problem.mark))
+    lead_ns = max((_way_ns(part, running) - part.samples[0].t_ns for part in parts), default=0)
+    lead_ns = max(0, lead_ns)
+    played: list[PlayedPart] = []
+    arrays: list[bytes] = []
+    for part in parts:
+        try:
+            commands = _commands(part, running, lead_ns)
+        except UnfitError as error:
+            problems.error(error.mark, error.what, error.fix)
+            continue
+        times, contents = zip(*commands, strict=True)
+        sizes = tuple(len(content) // 8 for content in contents)
+        end_ns = lead_ns + part.samples[-1].t_ns + SETTLE_NS
+        played.append(PlayedPart(part.controller.plan.name, part.kind, times, sizes, end_ns))
+        arrays += contents
+    problems.refuse()
+    data = msgspec.json.encode(Play(tuple(played))) + b"\n" + b"".join(arrays)
+    return Played(data, max(part.end_ns for part in played) * 1e-9)
+
+
+def _parts(motion: MotionDescription, running: Running, speed: float, problems: Problems) -> list[_Part]:
+    """Return one part for each controller, which has all parts of the file for it."""
+    by_name: dict[str, list[tuple[int, Sequence[Sample]]]] = {}
+    for index, part in enumerate(motion.motion.motions):
+        samples = samples_of(motion, index, problems)
+        controller = _controller(motion, index, running, problems)
+        if controller is None or not names_own_joints(motion, index, controller, problems) or not samples:
+            continue
+        if command_kind(controller.offer.controller) is None:
+            problems.error(
+                motion.marks.value("motions", index, "controller"),
+                f"{part.controller} ({controller.plan.type}) takes no commands that a motion could give",
+                "choose a group controller or a trajectory controller",
+            )
+            continue
+        by_name.setdefault(part.controller, []).append((part.start, samples))
+    found = []
+    for name, pieces in by_name.items():
+        controller = running.controllers[name]
+        kind = command_kind(controller.offer.controller)
+        samples = _joined(sorted(pieces, key=lambda piece: piece[0]), speed, problems)
+        if kind is not None and samples:
+            found.append(_Part(controller, kind, samples))
+    return found
+
+
+def _controller(
+    motion: MotionDescription, index: int, running: Running, problems: Problems
+) -> CompiledController | None:
+    name = motion.motion.motions[index].controller
+    mark = motion.marks.value("motions", index, "controller")
+    controller = running.controllers.get(name)
+    if controller is None:
+        problems.error(
+            mark, f"the robot has no controller {name}", suggestion(name, tuple(running.controllers))
+        )
+        return None
+    if not controller.plan.active:
+        problems.error(mark, f"controller {name} is not active", _switch(name, running))
+        return None
+    return controller
+
+
+def _switch(name: str, running: Running) -> str:
+    """Return the command that activates a controller, and deactivates those that have its joints."""
+    own = running.controllers[name].plan
+    others = [
+        plan.name
+        for plan in (one.plan for one in running.controllers.values())
+        if plan.active and plan.command and not set(plan.joints).isdisjoint(own.joints)
+    ]
+    leaving = f" --deactivate {' '.join(others)}" if others else ""
+    return f"`dxlrun switch --activate {name}{leaving}` activates it"
+
+
+def _joined(
+    pieces: Iterable[tuple[int, Sequence[Sample]]], speed: float, problems: Problems
+) -> tuple[Sample, ...]:
+    """Return the samples of several parts on the time of the motion, `speed` times as fast."""
+    joined: list[Sample] = []
+    for start_ns, samples in pieces:
+        for sample in samples:
+            t_ns = round((start_ns + sample.t_ns) / speed)
+            if joined and t_ns <= joined[-1].t_ns:
+                if sample is samples[0]:
+                    problems.error(
+                        sample.mark,
+                        "this part begins before the one before of its controller has ended",
+                        "start it later; one controller plays one part at a time",
+                    )
+                return ()
+            targets = {joint: _faster(target, speed) for joint, target in sample.targets.items()}
+            joined.append(Sample(t_ns, targets, sample.mark))
+    return tuple(joined)
+
+
+def _faster(target: SampledTarget, speed: float) -> SampledTarget:
+    velocity, acceleration = target.velocity, target.acceleration
+    return replace(
+        target,
+        velocity=None if velocity is None else velocity * speed,
+        acceleration=None if acceleration is None else acceleration * speed**2,
+    )
+
+
+def _check(part: _Part, running: Running, problems: Problems) -> None:
+    limits = {name: Interval(joint.lower, joint.upper) for name, joint in running.joints.items()}
+    check_limits(part.samples, 0, limits, problems)
+    check_speeds(part.samples, 0, running.joints, problems, interpolated=part.kind == TRAJECTORY)
+    for joint, target in part.samples[0].targets.items():
+        if target.position is not None and not math.isfinite(running.position(joint)):
+            problems.error(target.mark, f"{joint} has not answered yet", "play the motion when it has")
+
+
+def _refused(warning: Problem) -> Problem:
+    """Return the error for what a start of a robot only warns of; there the gate would hold the joint."""
+    return replace(warning, severity="error", fix=warning.fix.rpartition("; ")[2])
+
+
+def _way_ns(part: _Part, running: Running) -> int:
+    """Return how long the way to the first pose takes."""
+    ways = (
+        (abs(target.position - running.position(joint)), running.joints[joint].highest_speed)
+        for joint, target in part.samples[0].targets.items()
+        if target.position is not None
+    )
+    longest = max((way / min(speed, SOFT_SPEED) for way, speed in ways if way > _STILL), default=0.0)
+    return max(_LEAST_NS, round(longest * 1e9)) if longest else 0
+
+
+def _commands(part: _Part, running: Running, lead_ns: int) -> list[tuple[int, bytes]]:
+    """Return the commands of a part and when each is given; raises UnfitError."""
+    plan, samples = part.controller.plan, part.samples
+    first_ns = lead_ns + samples[0].t_ns
+    if part.kind == TRAJECTORY:
+        begun = [Sample(sample.t_ns - samples[0].t_ns, sample.targets, sample.mark) for sample in samples]
+        payload = trajectory_command(plan.joints, begun, first_ns)
+        return [(0, prepared(part.controller, part.kind, payload, 0, samples[0].mark).data)]
+    held = samples[0]
+    steps = list(_ramp(part, running, first_ns))
+    for sample in samples:
+        held = Sample(sample.t_ns, {**held.targets, **sample.targets}, sample.mark)
+        steps.append((lead_ns + sample.t_ns, held))
+    commands = []
+    for at_ns, sample in steps:
+        payload = group_command(part.controller.offer.controller, part.kind, plan.joints, sample)
+        commands.append((at_ns, prepared(part.controller, part.kind, payload, 0, sample.mark).data))
+    return commands
+
+
+def _ramp(part: _Part, running: Running, first_ns: int) -> Iterable[tuple[int, Sample]]:
+    """Yield what leads the joints to the first pose until that time: positions in small steps, or one
+    position with the speed to get there."""
+    first = part.samples[0]
+    known = {joint: target for joint, target in first.targets.items() if target.position is not None}
+    if not known or first_ns <= 0:
+        return
+    fields = part.controller.offer.controller.Commands[part.kind].model_fields
+    ways = {joint: (target.position or 0.0) - running.position(joint) for joint, target in known.items()}
+    if "velocities" in fields:
+        seconds = first_ns * 1e-9
+        targets = {
+            joint: replace(target, velocity=max(_SLOWEST, abs(ways[joint]) / seconds))
+            for joint, target in known.items()
+        }
+        yield 0, Sample(0, targets, first.mark)
+        return
+    for at_ns in np.arange(0, first_ns, max(_RAMP_NS, first_ns // _MOST_STEPS)).tolist():
+        share = at_ns / first_ns
+        targets = {
+            joint: replace(target, position=running.position(joint) + share * ways[joint], velocity=None)
+            for joint, target in known.items()
+        }
+        yield at_ns, Sample(at_ns, targets, first.mark)

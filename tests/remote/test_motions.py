@@ -1,0 +1,210 @@
+# ruff: noqa: E501 (motions and their mistakes are read best side by side)
+
+"""Motions for a robot that runs: what is refused and where, the way to the first poses, and the speed."""
+
+import json
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from dxlrun.control.controllers.plugins import Offer, PlugIns
+from dxlrun.control.loop_plan import ControllerPlan, JointPlan
+from dxlrun.remote.preparation import Preparation
+from dxlrun.run.channels.answers import Done
+from dxlrun_controllers import group
+from dxlrun_controllers.joint_trajectory_controller import JointTrajectoryController
+
+JOINTS = (JointPlan("pan", -1.0, 1.0, 2.0), JointPlan("tilt", -1.0, 1.0, 2.0))
+TYPES = {
+    "positions": (group.JointGroupPositionController, ("pan",)),
+    "posvel": (group.JointGroupPosVelController, ("tilt",)),
+    "arm": (JointTrajectoryController, ("tilt",)),
+    "wheel": (group.JointGroupVelocityController, ("tilt",)),
+}
+
+
+@pytest.fixture
+def head(desk):
+    """The desk with a controller of each type; the last two are not active. Both joints are at 0.2 rad."""
+    offers = {name: Offer(name, cls, "tests 1") for name, (cls, _) in TYPES.items()}
+    desk.gateway._preparation = Preparation({joint.name: joint for joint in JOINTS}, PlugIns(offers, {}))
+    desk.app = desk.gateway.app()
+    loaded = type(next(iter(desk.link.controllers.values())))
+    desk.link.controllers = {}
+    for place, (name, (_, joints)) in enumerate(TYPES.items()):
+        plan = ControllerPlan(
+            name, name, "tests 1", json.dumps({"joints": joints}), joints, ("position",), (), True, 1
+        )
+        desk.link.controllers[name] = loaded(plan, place)
+    activate(desk, "positions", "posvel")
+    for array in desk.record.goals.values:
+        array.fill(np.nan)
+    desk.record.states.position[:] = 0.2
+    desk.finish_cycle()
+    return desk
+
+
+def activate(desk, *names):
+    desk.record.active = sum(1 << list(TYPES).index(name) for name in names)
+    desk.finish_cycle()
+
+
+def play(desk, text, speed=1.0, file="wave.yaml"):
+    """Return status, answer, and what the loop got: (controller, kind, times in s, arrays, end in s)."""
+    before = len(desk.taken)
+    status, answer = desk.ask("POST", "/play", {"text": text, "speed": speed, "file": file})
+    if len(desk.taken) == before:
+        return status, answer, []
+    head, _, numbers = desk.taken[-1].data.partition(b"\n")
+    values, found = np.frombuffer(numbers), []
+    for part in json.loads(head)["parts"]:
+        arrays = np.split(values[: sum(part["sizes"])], np.cumsum(part["sizes"])[:-1])
+        values = values[sum(part["sizes"]) :]
+        times = np.array(part["at_ns"]) * 1e-9
+        found.append((part["controller"], part["kind"], times, arrays, part["end_ns"] * 1e-9))
+    assert not len(values)
+    return status, answer, found
+
+
+NOD = """name: nod
+motions:
+  - controller: positions
+    points:
+      - {time: 0 s, joints: {pan: {position: 0.7 rad}}}
+      - {time: 1 s, joints: {pan: {position: 0.1 rad}}}
+  - controller: posvel
+    start: 1 s
+    points:
+      - {time: 0 s, joints: {tilt: {position: 0.1 rad, velocity: 1 rad/s}}}
+      - {time: 1 s, joints: {tilt: {position: 0.5 rad, velocity: 1 rad/s}}}
+"""
+
+
+def test_a_motion_begins_softly_when_the_slowest_joint_is_there(head):
+    real = head.mailbox.answer
+    head.mailbox.answer = lambda number, _: real(number, Done(7, goals=(4, 5)))
+    status, answer, (positions, posvel) = play(head, NOD)
+    assert (status, answer) == (200, {"done": True, "cycle": 7, "goals": [4, 5], "seconds": 4.0})
+    name, kind, times, arrays, end = positions
+    assert (name, kind, end) == ("positions", "positions", 3.0)
+    ramp = [array[0] for array in arrays]
+    assert ramp[0] == 0.2
+    assert max(np.diff(ramp[:-1])) <= 0.5 * 0.02 + 1e-9
+    assert times[-2:].tolist() == [1.0, 2.0]  # 0.5 rad at 0.5 rad/s
+    assert ramp[-2:] == [0.7, 0.1]
+    assert all(later > before for before, later in pairwise(times))
+    name, kind, times, arrays, end = posvel
+    assert (name, kind, end) == ("posvel", "posvel", 4.0)
+    assert times.tolist() == [0.0, 2.0, 3.0]
+    np.testing.assert_allclose(arrays[0], [0.1, 0.05])
+    np.testing.assert_allclose(arrays[1:], [[0.1, 1.0], [0.5, 1.0]])
+    assert head.taken[-1].origin.endswith(": wave.yaml")
+
+
+def test_joints_that_are_there_already_begin_at_once(head):
+    head.record.states.position[:] = [0.7, 0.1]
+    head.finish_cycle()
+    _, _, (positions, posvel) = play(head, NOD)
+    assert positions[2].tolist() == [0.0, 1.0]
+    assert posvel[2].tolist() == [0.0, 1.0, 2.0]
+
+
+@pytest.mark.parametrize("speed", [0.5, 2.0])
+def test_the_speed_scales_times_and_velocities(head, speed):
+    _, answer, (positions, posvel) = play(head, NOD, speed)
+    lead = 1.0
+    np.testing.assert_allclose(positions[2][-2:], [lead, lead + 1 / speed])
+    np.testing.assert_allclose(posvel[2][-2:], [lead + 1 / speed, lead + 2 / speed])
+    np.testing.assert_allclose(posvel[3][1:], [[0.1, speed], [0.5, speed]])
+    assert answer["seconds"] == pytest.approx(lead + 2 / speed + 1)
+
+
+def test_a_trajectory_is_one_goal_with_its_parts_in_a_row(head):
+    activate(head, "positions", "arm")
+    text = """name: two
+motions:
+  - controller: arm
+    start: 2 s
+    points: [{time: 500 ms, joints: {tilt: {position: 0.4 rad}}}]
+  - controller: arm
+    points: [{time: 0 s, joints: {tilt: {position: 0.3 rad}}}, {time: 1 s, joints: {tilt: {position: 0.2 rad}}}]
+"""
+    status, answer, (arm,) = play(head, text, 0.5)
+    assert status == 200, answer
+    assert arm[:2] == ("arm", "trajectory")
+    assert arm[2].tolist() == [0.0]
+    points = [{"time": time, "positions": [at]} for time, at in ((0.0, 0.3), (2.0, 0.2), (5.0, 0.4))]
+    command = JointTrajectoryController.Commands["trajectory"](points=points, start_in=0.2)
+    parameters = JointTrajectoryController.Parameters(joints=("tilt",))
+    np.testing.assert_allclose(
+        arm[3][0], JointTrajectoryController.prepare("trajectory", command, parameters), atol=1e-12
+    )
+
+
+def test_wheels_have_no_way_to_a_first_pose(head):
+    activate(head, "wheel")
+    text = "name: roll\nmotions:\n  - controller: wheel\n    points: [{time: 0 s, joints: {tilt: {velocity: 1 rad/s}}}]\n"
+    _, answer, (wheel,) = play(head, text)
+    assert (wheel[2].tolist(), wheel[3][0].tolist(), answer["seconds"]) == ([0.0], [1.0], 1.0)
+
+
+POINT = "    points: [{time: 0 s, joints: {%s}}]\n"
+HEAD = "name: nod\nmotions:\n  - controller: %s\n"
+WRONG = [
+    (HEAD % "leg" + POINT % "pan: {position: 0 rad}", "3:17", "the robot has no controller leg", "known: arm"),
+    (HEAD % "arm" + POINT % "tilt: {position: 0 rad}", "3:17", "controller arm is not active", "`dxlrun switch --activate arm --deactivate posvel` activates it"),
+    (HEAD % "positions" + POINT % "pan: {position: 2 rad}", "4:35", "pan is sent to 114.59 deg", "change the motion or the limits"),
+    (HEAD % "posvel" + POINT % "tilt: {position: 0 rad, velocity: 9 rad/s}", "4:35", "tilt is asked for 9 rad/s", "give it more time"),
+    (HEAD % "positions" + POINT % "tilt: {position: 0 rad}", "4:35", "positions does not move tilt", "known: pan"),
+    (HEAD % "posvel" + POINT % "tilt: {position: 0 rad}", "4:35", "tilt has no target velocity at", "give it one"),
+    (HEAD % "positions" + POINT % "pan: {position: 0}", "4:51", "0 has no unit", "60 deg"),
+    ("name: nod\n", "1:1", "motions", ""),
+    ("name: [\n", "2:1", "", ""),
+    (NOD + NOD.split("motions:\n")[1].split("  - controller: posvel", maxsplit=1)[0], "14:9", "this part begins before the one before", "start it later"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("wrong", WRONG, ids=[f"{one[2]}" for one in WRONG])
+def test_a_motion_that_cannot_be_played_is_refused_with_its_places(head, wrong):
+    text, place, what, fix = wrong
+    status, answer, taken = play(head, text)
+    assert (status, answer["code"], taken) == (422, "wrong_motion", []), answer
+    fields = answer["fields"]
+    assert (fields["places"][0], what in fields["problems"][0], fix in fields["fixes"][0]) == (
+        place,
+        True,
+        True,
+    ), fields
+    assert f"wave.yaml:{place}: " in answer["refused"]
+
+
+def test_all_mistakes_come_together(head):
+    text = (
+        HEAD % "leg"
+        + POINT % "pan: {position: 0 rad}"
+        + "  - controller: positions\n"
+        + POINT % "pan: {position: 2 rad}"
+    )
+    assert len(play(head, text)[1]["fields"]["places"]) == 2
+
+
+@pytest.mark.parametrize("speed", [0, -1, 11, 1e-400])
+def test_a_speed_that_is_none_is_refused(head, speed):
+    status, answer, taken = play(head, NOD, speed)
+    assert (status, taken) == (422, [])
+    assert "speed is a factor above 0, at most 10" in answer["refused"]
+
+
+def test_a_joint_that_has_not_answered_yet_is_named(head):
+    head.record.states.position[0] = np.nan
+    head.finish_cycle()
+    _, answer, taken = play(head, NOD)
+    assert taken == []
+    assert "pan has not answered yet" in answer["refused"]
+
+
+def test_a_motion_that_is_too_long_is_refused(head):
+    text = HEAD % "positions" + "    duration: 9 s\n    samples: 20000\n    joints: {pan: {position: 0.2}}\n"
+    status, answer, taken = play(head, text)
+    assert (status, answer["code"], taken) == (413, "too_long", [])
