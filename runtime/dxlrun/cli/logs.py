@@ -233,6 +233,8 @@ def _replayed(report: ReplayReport) -> tuple[Part, ...]:
 def _first(first: ReplayDifference) -> str:
     place = f"first: cycle {first.cycle}, {first.time_s:.3f} s, "
     values = f"recorded {first.recorded}, replayed {first.replayed}"
+    if first.joint is None and first.controller is None:
+        return f"{place}{first.what}: {values}"
     if first.joint is None:
         return f"{place}controller {first.controller}: {values}"
     owner = f"controller {first.controller}" if first.controller else "no controller"

@@ -465,7 +465,8 @@ class Loop:
         record = self.record
         record.cycle = -1
         record.scheduled_ns = self.schedule.start_ns
-        record.woken_ns = record.read_ns = record.updated_ns = record.written_ns = self.clock.now_ns()
+        record.read_ns = record.updated_ns = record.written_ns = self.clock.now_ns()
+        record.woken_ns = self._woken_ns  # from which the first deadline is: a replay knows it
         self.sink.begin(record)
 
     def _log_end(self, reason: str, detail: str) -> None:

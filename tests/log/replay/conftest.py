@@ -14,6 +14,7 @@ from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import Log, read_log
 from dxlrun.run.channels.commands import CommandRing, TakenCommand
 from dxlrun.run.channels.events import Event, EventCode, EventRing, Severity
+from dxlrun.run.channels.messages import MessageRing, Topic
 from dxlrun.run.channels.ring import Handover, RecordKind
 from dxlrun.testing import VirtualRobot, simulated_robot
 
@@ -52,8 +53,18 @@ motions:
 """
 PLUGIN = '''\
 """A controller whose command depends on every input that it ever had."""
+from dataclasses import dataclass
+
 import numpy as np
-from dxlrun import CONTRACT_VERSION, Controller, Interfaces, ParametersModel, hookimpl
+from dxlrun import CONTRACT_VERSION, Controller, Floats, Interfaces, ParametersModel, hookimpl
+from dxlrun.messages import Header
+
+
+@dataclass
+class State:
+    header: Header
+    number: int
+    sum: Floats
 
 
 class AllInputsParameters(ParametersModel):
@@ -64,6 +75,8 @@ class AllInputsParameters(ParametersModel):
 
 class AllInputs(Controller[AllInputsParameters]):
     Parameters = AllInputsParameters
+    Topics = {"state": State}
+    number = 0
 
     @classmethod
     def interfaces(cls, parameters, joints):
@@ -72,6 +85,10 @@ class AllInputs(Controller[AllInputsParameters]):
     def on_activate(self, time_ns):
         self.sum = np.zeros(len(self.context.joints))
         self.take(time_ns, 0)
+        self.context.publish("state", State(Header(), 0, self.sum))
+
+    def on_deactivate(self, time_ns):
+        self.context.publish("state", State(Header(), -1, self.sum))
 
     def take(self, time_ns, period_ns):
         states, goals = self.context.states, self.context.goals
@@ -83,6 +100,8 @@ class AllInputs(Controller[AllInputsParameters]):
         if self.parameters.give_up_after is not None and time_ns * 1e-9 > self.parameters.give_up_after:
             raise RuntimeError("out of ideas")
         self.take(time_ns, period_ns)
+        self.number += 1
+        self.context.publish("state", State(Header(), self.number, self.sum))
         self.context.commands.position[:] = np.sin(self.sum) * 0.1 + self.parameters.gain
         self.context.commands.velocity[1] = 1.0 + np.cos(self.sum[1])
 
@@ -164,6 +183,8 @@ class Changed:
     metadata: dict[str, dict[str, str]]
     activation: NDArray[np.void] | None
     events: list[Event]
+    messages: dict[str, list[tuple[int, bytes]]]
+    """Of each topic, with their times."""
     gaps: list[tuple[str, int]] = field(default_factory=list)
 
 
@@ -177,7 +198,16 @@ def changed(tmp_path: Path) -> Callable[[Path, Callable[[Changed], None]], Path]
         attachments = {k: v for k, v in log.attachments.items() if k != "header.json"}
         activation = None if log.activation is None else log.activation.copy()
         content = Changed(
-            log.cycles.copy(), list(log.commands), attachments, metadata, activation, list(log.events)
+            log.cycles.copy(),
+            list(log.commands),
+            attachments,
+            metadata,
+            activation,
+            list(log.events),
+            {
+                name: list(zip(topic.t_ns.tolist(), topic.data, strict=True))
+                for name, topic in log.topics.items()
+            },
         )
         change(content)
         new = tmp_path / "changed.mcap"
@@ -196,6 +226,11 @@ def changed(tmp_path: Path) -> Callable[[Path, Callable[[Changed], None]], Path]
         for event in content.events:
             then.t_ns = event.t_ns
             events.emit(EventCode(event.code), Severity(event.severity), event.source, event.text)
+        published = MessageRing(Handover(writer.take))
+        for name, messages in content.messages.items():
+            number = published.announce(Topic(name, log.topics[name].type))
+            for t_ns, data in messages:
+                published.message(number, t_ns, data)
         for source, lost in content.gaps:
             writer.gap(source, lost)
         writer.close()

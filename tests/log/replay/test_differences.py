@@ -100,7 +100,9 @@ def test_what_the_controllers_began_with_is_an_input(pair_log: Path, changed: Ch
 
     report = replay_log(changed(pair_log, change))
     assert report.first is not None
-    assert (report.first.cycle, report.first.joint) == (0, "nod")
+    # what the controller published when it was activated
+    assert (report.first.cycle, report.first.what) == (-1, "message of /all_inputs/state: sum[1]")
+    assert [joint.joint for joint in report.joints] == ["nod"]
 
 
 def test_active_controllers_are_compared(pair_log: Path, changed: Change) -> None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.controllers.plugins import PlugIns, load_plugins
+from dxlrun.control.controllers.topics import TopicLog
 from dxlrun.control.gate import Gate
 from dxlrun.control.loop import Loop, LoopResult, StopFlag
 from dxlrun.control.loop_plan import LoopPlan
@@ -19,6 +20,7 @@ from dxlrun.errors import LogError, counted
 from dxlrun.log.reader import read_log
 from dxlrun.log.replay.changes import Setting, with_arguments, with_settings
 from dxlrun.log.replay.inputs import PlannedCommands, RecordedClock, RecordedHardware, RecordedInbox
+from dxlrun.log.replay.published import MessageComparison, MessageDifference
 from dxlrun.log.replay.recorded import RecordedInputs, recorded, version_remarks
 from dxlrun.run.channels.cycle import CycleLayout, CycleRecord, Floats
 from dxlrun.run.channels.events import EventCode, Severity
@@ -47,7 +49,7 @@ class ReplayDifference:
     what: str
     """`command of the position`, `goal of the velocity ...`, `reference arm_pid/j0/position`, `active`."""
     joint: str | None
-    """None: a controller was active in one of the two and not in the other."""
+    """None: a controller was active in one of the two and not in the other, or a message differs."""
     controller: str | None
     """The one that claims the joint, or commands the reference; None when none does."""
     recorded: str
@@ -85,11 +87,14 @@ class ReplayReport:
     """Why not all cycles were compared; empty when they were, or when `fault` is the reason."""
     remarks: tuple[str, ...]
     """Other versions, damage of the log."""
+    messages: int = 0
+    """Messages of topics that were compared, or are in one of the two only."""
+    different_messages: int = 0
 
     @property
     def same(self) -> bool:
         """True when every cycle that can be compared was, and none differs."""
-        return not self.different and not self.fault
+        return not self.different and not self.different_messages and not self.fault
 
     @property
     def sentence(self) -> str:
@@ -97,9 +102,13 @@ class ReplayReport:
         cycles = counted(self.compared, "cycle", "cycles")
         if self.same:
             return f"{self.robot}: {cycles} replayed, 0 differences"
+        ended = f"; then {self.fault}" if self.fault else ""
+        if not self.different and self.different_messages:
+            differ = "differs" if self.different_messages == 1 else "differ"
+            of = f"{self.different_messages} of {counted(self.messages, 'message', 'messages')}"
+            return f"{self.robot}: {cycles} replayed, {of} {differ}{ended}"
         if not self.different:
             return f"{self.robot}: {cycles} replayed without a difference, then {self.fault}"
-        ended = f"; then {self.fault}" if self.fault else ""
         differ = "differs" if self.different == 1 else "differ"
         return f"{self.robot}: {self.different} of {self.compared} replayed cycles {differ}{ended}"
 
@@ -124,24 +133,51 @@ def replay_log(
     plugins = load_plugins()
     loop = with_arguments(inputs.plan, inputs.loop, arguments or {})
     loop = with_settings(loop, settings, plugins)
-    comparison, result, refused = _run(inputs, loop, plugins)
+    ended = any(event.code == EventCode.LOOP_STOPPED for event in read.events)
+    last_ns = int(inputs.cycles["woken_ns"][-1])
+    messages = MessageComparison(read, last_ns, whole=ended and not inputs.stopped)
+    comparison, result, refused = _run(inputs, loop, plugins, messages, read.header.epoch_offset_ns)
     early = comparison.compared < len(inputs.cycles)
+    messages.finish(int(inputs.cycles["woken_ns"][max(0, comparison.compared - 1)]) - early)
     return ReplayReport(
         log=str(log),
         robot=inputs.plan.robot,
         cycles=inputs.in_log,
         compared=comparison.compared,
         different=comparison.different,
-        first=comparison.first,
+        first=_first(comparison, messages.first),
         joints=comparison.joints(),
         fault=f"the replay ended: {result.detail or 'its policy was done'}" if early else "",
         stopped="" if early else inputs.stopped,
-        remarks=(*inputs.remarks, *version_remarks(read, inputs.plan.loop, plugins), *refused),
+        remarks=(
+            *inputs.remarks,
+            *version_remarks(read, inputs.plan.loop, plugins),
+            *refused,
+            *messages.remarks,
+        ),
+        messages=messages.compared,
+        different_messages=messages.different,
     )
 
 
+def _first(comparison: Comparison, message: MessageDifference | None) -> ReplayDifference | None:
+    """Return what differs first: of one cycle the command, which the message is about."""
+    first = comparison.first
+    if message is None:
+        return first
+    cycle, time_s = comparison.cycle_at(message.t_ns)
+    if first is not None and first.cycle <= cycle:
+        return first
+    what = f"message of {message.topic}" + (f": {message.field}" if message.field else "")
+    return ReplayDifference(cycle, time_s, what, None, None, message.recorded, message.replayed)
+
+
 def _run(
-    inputs: RecordedInputs, plan: LoopPlan, plugins: PlugIns
+    inputs: RecordedInputs,
+    plan: LoopPlan,
+    plugins: PlugIns,
+    messages: MessageComparison,
+    epoch_offset_ns: int,
 ) -> tuple[Comparison, LoopResult, tuple[str, ...]]:
     """Put recorded hardware, clock and clients into the loop that runs robots, and run it."""
     names = tuple(joint.name for joint in plan.joints)
@@ -151,7 +187,8 @@ def _run(
     clock = RecordedClock(inputs.start_ns - plan.period_ns)
     hardware = RecordedHardware(inputs.cycles, inputs.activation, record, clock, stop, ends=inputs.ends)
     taken = PlannedCommands(inputs.commands, str(inputs.log))
-    manager = Manager(plan, plugins, record, events, clock, commands=taken)
+    topics = TopicLog(record, messages, epoch_offset_ns)
+    manager = Manager(plan, plugins, record, events, clock, commands=taken, topics=topics)
     inbox = RecordedInbox(inputs.steered, record)
     comparison = Comparison(plan, inputs.cycles, inputs.start_ns, manager)
     loop = Loop(
@@ -296,6 +333,11 @@ class Comparison:
         )
         values = [_shortest(int(words[place])) for words in (self._recorded["reference"][index], bits)]
         return ReplayDifference(cycle, time_s, f"reference {name}", joint, next(uppers, None), *values)
+
+    def cycle_at(self, t_ns: int) -> tuple[int, float]:
+        """Return the cycle that woke at this time, -1: before the first one, and its time since the start."""
+        index = int(np.searchsorted(self._cycles["woken_ns"], t_ns, side="right")) - 1
+        return (int(self._cycles["cycle"][index]) if index >= 0 else -1), (t_ns - self._start_ns) * 1e-9
 
     def _when(self, index: int) -> tuple[int, float]:
         row = self._cycles[index]
