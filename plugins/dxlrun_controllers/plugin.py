@@ -16,6 +16,7 @@ from dxlrun_controllers.group import (
     JointGroupPwmController,
     JointGroupVelocityController,
 )
+from dxlrun_controllers.joint_limiter import JointLimiter
 from dxlrun_controllers.joint_state_broadcaster import JointStateBroadcaster
 from dxlrun_controllers.joint_trajectory_controller import JointTrajectoryController
 from dxlrun_controllers.keyframe_player import KeyframePlayer
@@ -41,6 +42,7 @@ def dxlrun_controllers() -> Mapping[str, type[Controller[Any]]]:
         "joint_group_posvel_controller": JointGroupPosVelController,
         "joint_group_pwm_controller": JointGroupPwmController,
         "joint_group_velocity_controller": JointGroupVelocityController,
+        "joint_limiter": JointLimiter,
         "joint_position_controller": PidController,
         "joint_state_broadcaster": JointStateBroadcaster,
         "joint_trajectory_controller": JointTrajectoryController,

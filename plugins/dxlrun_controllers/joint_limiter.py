@@ -1,0 +1,142 @@
+"""joint_limiter: passes positions on within limits of position, velocity and acceleration."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from dxlrun import (
+    Angle,
+    AngularAcceleration,
+    AngularVelocity,
+    CommandModel,
+    Context,
+    Controller,
+    Interfaces,
+    ParametersModel,
+)
+from dxlrun_controllers.group import PositionsCommand
+from dxlrun_controllers.joints import JointsParameters, PerJoint, check_size, finite_or, row_of
+from dxlrun_controllers.laws.limiting import Limiter
+
+
+class LimiterLimits(ParametersModel):
+    """Limits of the joints, each one value for all or a mapping by joint."""
+
+    acceleration: PerJoint[Annotated[AngularAcceleration, Field(gt=0)]]
+    """Of a mapping, every joint has to be in it."""
+    velocity: PerJoint[Annotated[AngularVelocity, Field(gt=0)]] | None = None
+    """The joint's own limit if that is lower, or none is given."""
+    lower: PerJoint[Angle] | None = None
+    upper: PerJoint[Angle] | None = None
+    """Positions; the joint's own limits where they are narrower, or none are given."""
+
+
+class LimiterParameters(JointsParameters):
+    """Keys of a joint_limiter in the robot file."""
+
+    command_interface: Literal["position", "posvel"] = "position"
+    """`posvel` commands the velocity too: its magnitude to servos, with its sign to another controller."""
+    limits: LimiterLimits
+
+
+class JointLimiter(Controller[LimiterParameters]):
+    """Leads joints to positions in the least time that limits allow (`limiting.Limiter`).
+
+    References: what controllers that are `into` this one command, else the newest `positions` command, else
+    where the joints come to rest. A reference without a velocity is one at rest: joints follow a moving one
+    by v**2 / (2 a) later, so those that move smoothly should command the velocity too.
+    """
+
+    Parameters = LimiterParameters
+    Commands: ClassVar[Mapping[str, type[CommandModel]]] = {"positions": PositionsCommand}
+
+    @classmethod
+    def interfaces(cls, parameters: LimiterParameters, joints: tuple[str, ...]) -> Interfaces:
+        """Command positions, perhaps with velocities; export both."""
+        if parameters.command_interface == "posvel":
+            return Interfaces(parameters.joints, ("position", "velocity"), reference=("position", "velocity"))
+        return Interfaces(parameters.joints, ("position",), reference=("position", "velocity"))
+
+    @classmethod
+    def prepare(cls, kind: str, command: CommandModel, parameters: LimiterParameters) -> NDArray[np.float64]:
+        """Return the positions, shape (joints,). Raises ValueError for a wrong size."""
+        if not isinstance(command, PositionsCommand):
+            return super().prepare(kind, command, parameters)
+        check_size("positions", len(command.positions), parameters.joints)
+        return np.array(command.positions, dtype=np.float64)
+
+    def on_configure(self, context: Context) -> None:
+        """Make room for everything that the loop needs."""
+        super().on_configure(context)
+        joints, own, limits = context.joints, context.limits, self.parameters.limits
+        if isinstance(limits.acceleration, Mapping) and len(limits.acceleration) < len(joints):
+            missing = [joint for joint in joints if joint not in limits.acceleration]
+            raise ValueError(f"limits.acceleration has no {', '.join(missing)}")
+        self._limiter = limiter = Limiter(len(joints))
+        np.copyto(limiter.acceleration, row_of(limits.acceleration, joints))
+        np.fmin(limiter.acceleration, getattr(own, "acceleration", np.inf), out=limiter.acceleration)
+        np.minimum(row_of(limits.velocity, joints), finite_or(own.velocity, np.inf), out=limiter.speed)
+        np.maximum(row_of(limits.lower, joints, -np.inf), finite_or(own.lower, -np.inf), out=limiter.lower)
+        np.minimum(row_of(limits.upper, joints), finite_or(own.upper, np.inf), out=limiter.upper)
+        self._setpoint, self._reference, self._rate = np.zeros((3, len(joints)))
+        self._free, self._chained, self._ended, self._unknown = np.zeros((4, len(joints)), dtype=np.bool_)
+        self._some_unknown = True
+        self._posvel = self.parameters.command_interface == "posvel"
+
+    def on_activate(self, time_ns: int) -> None:
+        """Hold what was last sent, or the positions that were read where nothing was sent."""
+        goals, states = self.context.goals, self.context.states
+        position = np.where(np.isnan(goals.position), states.position, goals.position)
+        self._limiter.begin(position)
+        np.copyto(self._setpoint, position)
+        self._chained.fill(False)
+        self._some_unknown = True
+
+    def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
+        """Take new positions."""
+        np.copyto(self._setpoint, data)
+
+    def update(self, time_ns: int, period_ns: int) -> None:
+        """Go on towards the reference."""
+        limiter, references, commands = self._limiter, self.context.references, self.context.commands
+        if self._some_unknown:
+            self._hold_where_heard()
+        free, ended = self._free, self._ended
+        np.isnan(references.position, out=free)
+        np.logical_and(free, self._chained, out=ended)
+        if np.count_nonzero(ended):
+            limiter.stopping_point(self._reference)
+            np.copyto(self._setpoint, self._reference, where=ended)
+        np.logical_not(free, out=self._chained)
+        np.copyto(self._reference, references.position)
+        np.copyto(self._reference, self._setpoint, where=free)
+        np.isnan(references.velocity, out=ended)
+        ended |= free
+        np.copyto(self._rate, references.velocity)
+        np.copyto(self._rate, 0.0, where=ended)
+        limiter.update(self._reference, self._rate, period_ns * 1e-9)
+        np.copyto(commands.position, limiter.position)
+        if not self._posvel:
+            return
+        if self.context.into:
+            np.copyto(commands.velocity, limiter.velocity)
+        else:
+            np.abs(limiter.velocity, out=commands.velocity)
+            # a servo that lags when the joint is to rest goes the rest of its way at the highest speed
+            np.equal(limiter.velocity, 0.0, out=ended)
+            np.copyto(commands.velocity, limiter.speed, where=ended)
+
+    def _hold_where_heard(self) -> None:
+        """Begin with joints that were not known at the activation where they are heard first."""
+        unknown, limiter, states = self._unknown, self._limiter, self.context.states
+        np.isnan(limiter.position, out=unknown)
+        np.copyto(limiter.position, states.position, where=unknown)
+        np.copyto(limiter.velocity, 0.0, where=unknown)
+        np.isnan(self._setpoint, out=unknown)
+        np.copyto(self._setpoint, limiter.position, where=unknown)
+        self._some_unknown = bool(np.isnan(limiter.position).any())
