@@ -10,13 +10,17 @@ import pytest
 from pydantic import Field, model_validator
 
 import dxlrun
+from dxlrun.control.controllers.goals import GoalStatus as LoopStatus
 from dxlrun.control.controllers.plugins import Offer, PlugIns
+from dxlrun.control.controllers.topics import TopicLog
+from dxlrun.messages.declared import declared_message
 from dxlrun.remote import gateway
 from dxlrun.remote.goals import KEPT_GOALS
 from dxlrun.remote.preparation import Preparation
 from dxlrun.run.channels.answers import Code, Done, Refusal
 from dxlrun.run.channels.events import EventCode, GoalReport, Severity
 from dxlrun.run.channels.heartbeat import Phase
+from dxlrun.run.channels.messages import Topic
 
 GO = "/controllers/left/commands/go"
 PARAMETERS = "/controllers/left/parameters"
@@ -102,7 +106,9 @@ def test_the_answer_to_a_goal_has_its_number_and_the_goal_is_known_at_once(arm):
 
 def test_a_result_is_kept_and_listed(arm):
     report(arm, 1, "accepted")
-    arm.link.goals.feedback(1, 0.25, 0.01)
+    arm.link.goals.take_feedback({"goal": 1, "status": "running", "progress": 0.25, "error": 0.01})
+    arm.link.goals.take_feedback({"goal": 1, "status": "running", "progress": "half"})
+    arm.link.goals.take_feedback({"goal": 7, "status": "running", "progress": 0.5})
     assert arm.ask("GET", "/goals")[1]["running"][0]["progress"] == 0.25
     report(arm, 1, "missed", text="too slow", joint="pan", error=0.02)
     report(arm, 2, "accepted")
@@ -116,6 +122,22 @@ def test_a_result_is_kept_and_listed(arm):
         0.02,
     )
     assert ended["ended"] >= ended["accepted"]
+
+
+def test_progress_is_that_of_the_topic(arm):
+    topic = Topic("/goals", declared_message(LoopStatus, "dxlrun_msgs").type)
+    publisher = TopicLog(arm.record, arm.messages).open("/goals", LoopStatus)
+    assert publisher.topic == topic
+    report(arm, 1, "accepted")
+    for progress in (0.1, 0.2, 0.3):
+        publisher.publish(LoopStatus(goal=1, status="running", progress=progress))
+    arm.link.collect()
+    goal = arm.ask("GET", "/goals/1")[1]
+    assert (goal["progress"], goal["error"]) == (0.3, None)
+    publisher.publish(LoopStatus(goal=1, status="running", progress=0.4, error=0.02))
+    arm.link.collect()
+    (goal,) = arm.ask("GET", "/goals")[1]["running"]
+    assert (goal["progress"], goal["error"]) == (0.4, 0.02)
 
 
 def test_as_many_results_are_kept_as_there_is_room_for(arm):

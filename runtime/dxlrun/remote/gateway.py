@@ -322,6 +322,7 @@ class GatewayApp:
 
     async def goals(self, request: Request) -> Response:
         """Return the goals that run, and the last that ended."""
+        self._link.take_feedback()
         book = self._link.goals
         return _json({"running": list(book.running.values()), "ended": list(book.ended.values())})
 
@@ -336,6 +337,7 @@ class GatewayApp:
                 raise refused(Code.RUN_ENDING, {})
         if wanted:
             await link.goals.wait(chosen, wanted)
+        link.take_feedback()
         return _json(status)
 
     def _goal_status(self, chosen: int) -> GoalStatus:

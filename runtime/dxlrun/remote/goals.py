@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import msgspec
@@ -33,6 +34,13 @@ class GoalStatus(msgspec.Struct):
     accepted: float = 0.0
     """s of the run's clock"""
     ended: float | None = None
+
+
+class _Feedback(msgspec.Struct):
+    goal: int
+    status: str
+    progress: float = 0.0
+    error: float | None = None
 
 
 @dataclass(slots=True)
@@ -66,10 +74,13 @@ class GoalBook:
         if (waiting := self._waiting.pop(number, None)) is not None:
             waiting.set()
 
-    def feedback(self, number: int, progress: float, error: float | None) -> None:
-        """Note the progress of a goal that runs."""
-        if (status := self.running.get(number)) is not None:
-            status.progress, status.error = progress, error
+    def take_feedback(self, message: object) -> None:
+        """Note the progress of a goal that runs, from a message of the topic /goals, as JSON has it."""
+        with suppress(msgspec.ValidationError):
+            found = msgspec.convert(message, _Feedback)
+            status = self.running.get(found.goal)
+            if status is not None and found.status == "running":
+                status.progress, status.error = found.progress, found.error
 
     def status(self, number: int) -> GoalStatus | Refusal:
         """Return a goal, or why there is none of this number."""

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import msgspec
 
 from dxlrun.compile.plan import Plan
+from dxlrun.control.controllers.goals import GOALS_TOPIC
 from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.log.schemas import EVENT_TOPIC, JOINT_STATES_TOPIC
 from dxlrun.remote.goals import GoalBook
@@ -80,6 +81,7 @@ class Link:
         self.events: deque[tuple[int, Event]] = deque()
         self.topics = LiveTopics(memory.messages)
         self.goals = GoalBook()
+        self._feedback = 0
         self._cycles = RingReader(memory.cycles)
         joints = tuple(joint.name for joint in plan.loop.joints)
         controllers = tuple(one.name for one in plan.loop.controllers)
@@ -224,6 +226,15 @@ class Link:
                 if isinstance(record, Record) and record.kind == RecordKind.EVENT:
                     with suppress(ValueError):
                         self._keep(decode_event(record.payload))
+
+    def take_feedback(self) -> None:
+        """Note the progress of goals that has been published since the last call."""
+        topic = self.topics.topics.get(GOALS_TOPIC)
+        while topic is not None and self._feedback < topic.count:
+            found = topic.after(self._feedback)
+            self._feedback = max(found.last, self._feedback + 1)
+            for message in found.messages:
+                self.goals.take_feedback(message.message)
 
     def _resolve(self, number: int, answer: Answer) -> None:
         pending = self._pending[number]

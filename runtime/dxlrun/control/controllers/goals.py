@@ -21,6 +21,7 @@ from dxlrun.run.channels.events import EventCode, EventSink, GoalReport, Severit
 
 FEEDBACK_NS = 100_000_000
 """Between two reports of one goal's progress, ns of the run's clock: 10 Hz."""
+GOALS_TOPIC = "/goals"
 KEPT = 256
 """Of so many goals that ended it is known how."""
 _LONGEST_TEXT = 500
@@ -152,7 +153,7 @@ class Goals:
     def open(self, topics: TopicLog) -> None:
         """Announce the topic /goals, once: the first controller that takes goals is there. Allocates."""
         if self._publisher is None:
-            self._publisher = topics.open("/goals", GoalStatus)
+            self._publisher = topics.open(GOALS_TOPIC, GoalStatus)
 
     @property
     def now_ns(self) -> int:
