@@ -17,11 +17,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from dxlrun.control.controllers.goals import Goals
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.log.client_commands import client_commands
 from dxlrun.log.reader import Log, read_log
 from dxlrun.log.replay import replay_log
 from dxlrun.run.channels.commands import Command, QueueInbox
+from dxlrun.run.channels.events import GoalReport
 from dxlrun.testing import VirtualRobot, simulated_robot
 
 MS = 1_000_000
@@ -78,10 +80,24 @@ def torque(on: bool, joints: Sequence[str], release: bool) -> Command:
     return ask("torque", {"on": on, "joints": joints, "release": release})
 
 
+def play(angle: float, seconds: float) -> Command:
+    """Return a motion: three positions for `hand` by time, and a trajectory for `arm`, in one cycle."""
+    arm, steps = trajectory(angle, -angle, seconds).data, [0.0, angle / 2, angle]
+    parts = [
+        {"controller": "hand", "kind": "positions", "at_ns": [0, 60 * MS, round(seconds * 1e9)]}
+        | {"sizes": [1, 1, 1], "end_ns": round(seconds * 1e9)},
+        {"controller": "arm", "kind": "trajectory", "at_ns": [0], "sizes": [len(arm) // 8], "end_ns": 0},
+    ]
+    head = msgspec.json.encode({"parts": parts})
+    data = head + b"\n" + np.array(steps, dtype="<f8").tobytes() + arm
+    return Command(0, "", "play", data, "anna")
+
+
 ANGLES = st.floats(-1, 1)
 NAMES = st.lists(st.sampled_from(JOINTS), min_size=1, max_size=2, unique=True)
 COMMANDS = st.one_of(
     st.builds(trajectory, ANGLES, ANGLES, st.sampled_from([0.1, 0.3, 0.8])),
+    st.builds(play, ANGLES, st.sampled_from([0.1, 0.3, 0.8])),
     st.builds(lambda goal: ask("cancel", {"goal": goal}), st.integers(0, 4)),
     st.builds(lambda name: ask("cancel", {"controller": name}), st.sampled_from(["arm", "arm", "hand"])),
     st.builds(switch, *[st.lists(st.sampled_from(CONTROLLERS), max_size=3)] * 2),
@@ -193,6 +209,49 @@ def test_chains_goals_torque_and_parameters(steer: Callable[..., Path]) -> None:
     assert names.count("goal_accepted") == names.count("goal_ended") == 2
     active = log.cycles["active"].astype(int)
     assert {tuple(pair) for pair in pairwise((active >> 1 & 0b111).tolist())} >= {(0b011, 0b000), (0b100, 0)}
+
+
+MOTIONS: dict[int, list[Command]] = {
+    3: [play(0.5, 0.3)],
+    9: [
+        ask("parameters", {"controller": "arm_pid", "values": {"gains.p": 5.0}}),
+        ask("cancel", {"controller": "hand"}),
+    ],
+    30: [play(-0.2, 0.5)],
+    36: [send("hand", "positions", [0.1])],
+}
+
+
+def test_motions_are_played_again_with_the_same_numbers(
+    steer: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = steer(MOTIONS)
+    log = whole(path)
+    reports = [
+        msgspec.json.decode(event.data, type=GoalReport)
+        for event in log.events
+        if event.name in ("goal_accepted", "goal_ended")
+    ]
+    assert [(one.goal, one.controller, one.status) for one in reports] == [
+        (1, "hand", "accepted"),
+        (2, "arm", "accepted"),
+        (1, "hand", "cancelled"),
+        (2, "arm", "reached"),
+        (3, "hand", "accepted"),
+        (4, "arm", "accepted"),
+        (3, "hand", "preempted"),
+        (4, "arm", "reached"),
+    ]
+    begin = Goals.__init__
+
+    def begin_one_later(goals: Goals, *arguments: Any) -> None:
+        begin(goals, *arguments)
+        goals.last = 1
+
+    monkeypatch.setattr(Goals, "__init__", begin_one_later)
+    report = replay_log(path)
+    assert not report.same
+    assert "/goals" in str(report.first), report
 
 
 @pytest.mark.campaign

@@ -220,8 +220,9 @@ def cancelled(robot: RemoteRobot, numbers: Sequence[int]) -> list[GoalState]:
 
 def sentence(state: GoalState) -> str:
     """Return how a goal ended: `goal 3 of left_arm reached after 1.02 s`."""
-    after = "" if state.seconds is None else f" after {state.seconds:.2f} s"
-    why = f": {state.text}" if state.text else ""
+    timed = state.seconds is None or state.text.startswith("after ")  # by its controller
+    after = "" if timed else f" after {state.seconds:.2f} s"
+    why = f"{' ' if timed and state.seconds is not None else ': '}{state.text}" if state.text else ""
     return f"goal {state.number} of {state.controller} {state.status}{after}{why}"
 
 

@@ -83,6 +83,8 @@ def written(value: object) -> str:
         return f"[{', '.join(map(written, value))}]"
     if isinstance(value, dict):
         return f"{{{', '.join(f'{key}: {written(inner)}' for key, inner in value.items())}}}"
+    if value is None:
+        return ""
     number, _, unit = str(value).partition(" ")
     try:
         return f"{float(number):.6g} {unit}".strip()
