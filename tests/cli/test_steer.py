@@ -6,6 +6,7 @@ import json
 import re
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 import threading
@@ -15,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun import DxlrunError, RemoteRobot, connect, running
+from dxlrun import DxlrunError, GoalState, GoalTimeout, RemoteRobot, connect, running
 from dxlrun.cli.inputs import COMMANDS_WHILE_IT_RUNS
 
 ROOT = Path(__file__).parents[2]
@@ -164,6 +165,81 @@ def test_a_register_is_set_while_the_robot_runs(dxlrun, torso: RemoteRobot) -> N
     said = dxlrun("set", "head_yaw_joint", "temperature_limit", "70 degC")
     assert said.code == 2
     assert "Temperature Limit (11) is in the EEPROM, which no servo writes while it holds torque" in said.err
+
+
+def test_a_goal_is_waited_for_and_reached(dxlrun, torso: RemoteRobot) -> None:
+    words = ("send", "left_arm", "position", "left_elbow_joint=20deg", "--in", "200ms")
+    said = dxlrun(*words, "--wait", "--json")
+    result = json.loads(said.out)
+    assert (said.code, result["status"], result["progress"]) == (0, "reached", 1.0)
+    assert torso.goal_state(result["goal"]).reached
+    assert torso.states()["joints"]["left_elbow_joint"]["goal_position"] == pytest.approx(0.349, abs=0.003)
+
+
+def test_python_follows_and_cancels_a_goal(torso: RemoteRobot) -> None:
+    goal = torso.send("left_arm", "position", {"left_elbow_joint": -0.3}, seconds=20.0).goal
+    assert goal is not None
+    with pytest.raises(GoalTimeout, match=f"goal {goal.number} of left_arm has not ended within 0.1 s"):
+        goal.wait(0.1)
+    seen: list[GoalState] = []
+
+    def feedback(state: GoalState) -> None:
+        if state.progress > 0.01 and not seen:
+            seen.append(state)
+            goal.cancel()
+
+    assert goal.wait(20.0, feedback).status == "cancelled"
+    assert 0.01 < seen[-1].progress < 0.5
+    assert torso.goals()[-1].number == goal.number
+
+
+def test_ctrl_c_at_a_terminal_that_waits_cancels_the_goal(torso: RemoteRobot, stage: Stage) -> None:
+    words = ("send", "left_arm", "position", "left_elbow_joint=-20deg", "--in", "60s", "--wait")
+    before = len(torso.goals())
+    waiting = subprocess.Popen(
+        [sys.executable, "-P", "-c", CODE, *words], stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    tick, give_up = threading.Event(), time.monotonic() + DEADLINE_S
+    while len(torso.goals()) == before:
+        assert time.monotonic() < give_up
+        tick.wait(0.02)
+    goal = torso.goals()[-1]
+    assert (goal.status, goal.controller) == ("running", "left_arm")
+    waiting.send_signal(signal.SIGINT)
+    out, err = waiting.communicate(timeout=DEADLINE_S)
+    assert (waiting.returncode, out) == (130, ""), err
+    assert f"goal {goal.number} of left_arm cancelled" in err
+    assert err.endswith("interrupted\n")
+    assert torso.goal_state(goal.number).status == "cancelled"
+
+
+def test_live_parameters_change_on_a_robot_that_runs(dxlrun, torso: RemoteRobot) -> None:
+    assert dxlrun("parameters", "left_arm", "speed=0.5").out == "bioloid_torso: left_arm speed: 1 -> 0.5\n"
+    assert torso.parameters("left_arm")["speed"] == 0.5
+    assert torso.set_parameters("left_arm", {"speed": 1}) == {"speed": (0.5, 1.0)}
+    said = dxlrun("parameters", "left_arm", "speed=50")
+    assert (said.code, "must be at most 10" in said.err) == (2, True), said
+
+
+def test_a_motion_is_played_into_a_robot_that_runs(dxlrun, torso: RemoteRobot, tmp_path: Path) -> None:
+    file = tmp_path / "nod.yaml"
+    file.write_text(
+        "name: nod\nmotions:\n"
+        "  - controller: head\n    points:\n"
+        "      - time: 100 ms\n        joints:\n"
+        "          head_pitch_joint: {position: 0 deg, velocity: 1 rad/s}\n"
+        "          head_yaw_joint: {position: 10 deg, velocity: 1 rad/s}\n"
+    )
+    said = dxlrun("play", file, "--json")
+    result = json.loads(said.out)
+    assert (said.code, result["status"], result["controller"]) == (0, "reached", "head")
+    until(torso, "head_yaw_joint", 0.1745)
+    torso.switch(deactivate=["head"])
+    said = dxlrun("play", file)
+    assert (said.code, said.errors) == (
+        2,
+        [f"{file}:3:17: controller head is not active; `dxlrun switch --activate head` activates it"],
+    )
 
 
 def test_send_takes_a_file(dxlrun, torso: RemoteRobot, tmp_path: Path) -> None:
@@ -379,6 +455,7 @@ def test_the_commands_of_the_page_work_in_their_order(
     (file,) = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
     (tmp_path / name).write_text(file)
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "robots").symlink_to(ROOT / "robots")
     started, *lines = re.findall(r"^    dxlrun (.+)$", PAGE, re.MULTILINE)
     assert started == "robots/bioloid_torso.yaml"
     assert {line.split()[0] for line in lines} == set(COMMANDS_WHILE_IT_RUNS)
