@@ -1,4 +1,5 @@
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 import numpy as np
@@ -34,6 +35,15 @@ class Foreign(Controller[ParametersModel]):
         pass
 
 
+@dataclass
+class State:
+    amount: float
+
+
+class Publishing(Foreign):
+    Topics: ClassVar = {"main": State}
+
+
 class Raising(Foreign):
     @classmethod
     def interfaces(cls, parameters, joints):
@@ -44,6 +54,7 @@ class Raising(Foreign):
 def foreign_plugins(monkeypatch: pytest.MonkeyPatch):
     offers = dict(load_plugins().controllers)
     offers["foreign"] = Offer("foreign", Foreign, "elsewhere 2.1")
+    offers["publishing"] = Offer("publishing", Publishing, "elsewhere 2.1")
     offers["raising"] = Offer("raising", Raising, "elsewhere 2.1")
     plugins = PlugIns(offers, {"sad": "plug-in sad of sad-robots 0.3 cannot be imported; reinstall it"})
     monkeypatch.setattr(robot, "load_plugins", lambda: plugins)
@@ -53,6 +64,17 @@ def foreign_plugins(monkeypatch: pytest.MonkeyPatch):
 def text(robot_text: str) -> str:
     head = robot_text.partition("controllers:")[0]
     return head + "controllers:\n  mine: {type: foreign}\n"
+
+
+@pytest.mark.usefixtures("foreign_plugins")
+def test_its_topics_are_in_the_plan_and_none_is_that_of_a_bus(
+    compile_text: Callable[..., Compiled], problems_in: Find, text: str
+):
+    text = text.replace("foreign", "publishing")
+    (controller,) = compile_text(text).plan.loop.controllers
+    assert controller.topics == ("/mine/main",)
+    (problem,) = problems_in(text.replace("mine:", "bus:"))
+    assert (problem.what, problem.fix) == ("/bus/main is the topic of a bus", "call bus otherwise")
 
 
 MOTION = """\

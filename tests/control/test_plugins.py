@@ -73,7 +73,38 @@ def test_a_foreign_plugin_is_offered_with_its_publisher(install):
     )
 
 
+TOPICS = (
+    """
+from dataclasses import dataclass, make_dataclass
+
+@dataclass
+class State:
+    amount: float
+"""
+    + GOOD
+)
+
+
+def with_topics(topics):
+    return TOPICS.replace("    def update", f"    Topics = {topics}\n    def update")
+
+
 BROKEN = {
+    "offers Mine as TYPE, whose Topics is no mapping of names to messages": with_topics("('state',)"),
+    "whose Topics has 'my state', which is no name of a topic": with_topics("{'my state': State}"),
+    "whose Topics has '/state', which is no name of a topic": with_topics("{'/state': State}"),
+    "whose topic state has no message of ROS 2: dict is no dataclass; put @dataclass above": with_topics(
+        "{'state': dict}"
+    ),
+    "whose topic state has no message of ROS 2: Odd.amount is complex, for which ROS 2 has": with_topics(
+        "{'state': make_dataclass('Odd', [('amount', complex)])}"
+    ),
+    "has two messages broken_one/msg/State; give one of the two classes another name": with_topics(
+        "{'state': State, 'other': make_dataclass('State', [('amount', int)])}"
+    ),
+    "whose publishes has /state, which is not made of the robot's cycles; declare it in Topics": GOOD.replace(
+        "    def update", "    publishes = ('/state',)\n    def update"
+    ),
     "cannot be imported (ModuleNotFoundError: No module named 'no_such_thing')": "import no_such_thing",
     "cannot be imported (SyntaxError": "def",
     "cannot be imported (SystemExit: 3)": "import sys; sys.exit(3)",
@@ -104,6 +135,12 @@ def test_a_broken_plugin_is_named_and_the_others_work(install, sentence, source)
     assert sentence in told
     assert "\n" not in told
     assert set(found.controllers) >= {"my_type", *STANDARD}
+
+
+def test_good_topics_are_offered(install):
+    install("my-robotics", "my_plugin", with_topics("{'state': State, 'arm/State2': State}"))
+    assert not load_plugins().broken
+    assert set(load_plugins().controllers["TYPE"].controller.Topics) == {"state", "arm/State2"}
 
 
 def test_a_type_that_two_plugins_offer_is_nobodys(install):

@@ -44,6 +44,8 @@ LEASE_S = 0.2
 _IDLE_S = 20.0
 """The gateway closes silent connections after 30 s; one that was silent for so long is not used again."""
 _STOP_S = 30.0
+_ENDING_S = 1.0
+"""How long a gateway that closed a connection may take to be gone, when the run has ended."""
 _POLL_S = 2.0
 _FEEDBACK_S = 0.1
 """How long one request waits for the end of a goal, without and with progress to report."""
@@ -288,7 +290,7 @@ class RemoteRobot:
             except Refused:
                 raise
             except DxlrunError:
-                if alive(self._path):
+                if not self._ends():
                     raise
                 return
             new = [message for message in found if message.number > last]
@@ -514,6 +516,15 @@ class RemoteRobot:
             time.sleep(0.05)
 
     # Inside
+
+    def _ends(self) -> bool:
+        """Return whether the gateway is gone, or goes within a second: it ends with the run."""
+        until = time.monotonic() + _ENDING_S
+        while alive(self._path):
+            if time.monotonic() > until:
+                return False
+            time.sleep(0.02)
+        return True
 
     def _stopping(self) -> bool:
         """Ask once to stop; False when the connection was closed by a gateway that is alive."""
