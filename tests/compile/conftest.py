@@ -78,16 +78,30 @@ def problems_in(compile_text: Callable[..., Compiled]) -> Callable[..., tuple[Pr
     return problems_in
 
 
+UNITS = {
+    "position": 2 * np.pi / 4096,
+    "velocity": 0.229 * 2 * np.pi / 60,
+    "effort": 2.69e-3,
+    "pwm": 1 / 885,
+}
+"""One step of a goal on the wire, of an XM430."""
+READ: dict[str, list[np.ndarray]] = {}
+"""What each part found in `reads`, update by update; the newest run's."""
+
+
 class PartParameters(ParametersModel):
     joints: tuple[str, ...] = ()
     command: tuple[str, ...] = ()
     exports: tuple[str, ...] = ()
     reads: tuple[str, ...] = ()
-    step: float = 0.0
+    steps: float = 0.0
 
 
 class Part(Controller[PartParameters]):
-    """A controller of any place in the graph: forwards its references, plus what it counts by itself."""
+    """A controller of any place in the graph: adds its own steps to what is commanded of it.
+
+    A hundred-millionth more of them with each update shows which update a value is from.
+    """
 
     Parameters = PartParameters
 
@@ -96,20 +110,23 @@ class Part(Controller[PartParameters]):
         return Interfaces(parameters.joints, parameters.command, parameters.exports, parameters.reads)
 
     def on_activate(self, time_ns):
-        self.count = 0
+        self.updates = 0
+        READ[self.context.name] = []
 
     def update(self, time_ns, period_ns):
-        self.count += 1
+        self.updates += 1
+        READ[self.context.name].append(self.context.reads.copy())
         references, commands = self.context.references, self.context.commands
         for interface in self.parameters.command:
             above = getattr(references, interface)
-            own = np.full(len(above), self.count * self.parameters.step)
+            own = self.parameters.steps * (1 + self.updates * 1e-8) * UNITS[interface]
             getattr(commands, interface)[:] = own + np.where(np.isfinite(above), above, 0.0)
 
 
 @pytest.fixture
-def part_plugins(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Offer the type `part`, to the compiler and to runs on virtual time."""
+def part_plugins(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[np.ndarray]]:
+    """Offer the type `part`, to the compiler and to runs on virtual time; return what parts read."""
     offers = {**load_plugins().controllers, "part": Offer("part", Part, "elsewhere 2.1")}
     for room in (robot, virtual_run):
         monkeypatch.setattr(room, "load_plugins", lambda: PlugIns(offers, {}))
+    return READ

@@ -92,6 +92,8 @@ def _claims(claimant: Claimant, named: Mapping[str, Claimant]) -> Iterator[tuple
             yield joint, ""
         for name in claimant.into:
             lower = named.get(name)
+            if lower is claimant:
+                continue  # a mistake that is refused
             if lower is None or (joint in lower.joints and set(claimant.command) <= set(lower.reference)):
                 for interface in claimant.command:
                     yield joint, f"{name}/{joint}/{interface}"
