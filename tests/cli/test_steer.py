@@ -135,6 +135,13 @@ def test_the_list_as_json_is_what_the_robot_returns(dxlrun, torso: RemoteRobot) 
     assert [one["name"] for one in printed["controllers"]] == list(controllers(torso))
 
 
+def test_the_list_draws_the_controllers_with_those_that_are_inactive(dxlrun, torso: RemoteRobot) -> None:
+    said = dxlrun("list", "--graph")
+    assert (said.code, said.err) == (0, "")
+    assert "whole_body_position (inactive)" in said.out
+    assert re.search(r"│ left_arm +│", said.out)
+
+
 def test_a_robot_that_has_ended_is_an_error(
     dxlrun, torso: RemoteRobot, monkeypatch: pytest.MonkeyPatch
 ) -> None:

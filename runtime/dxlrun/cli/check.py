@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
 
 from dxlrun.cli.inputs import Assignment, Flag, JsonFlag, Motions, compiled
 from dxlrun.errors import InputError, counted
@@ -26,6 +28,9 @@ if TYPE_CHECKING:
     from dxlrun.dynamixel.plan.bus_plan import BusPlan
     from dxlrun.dynamixel.tools.inspection import Found, RegisterRow
 
+_OPTIONAL = Parameter(negative=(), show_default=False, consume_multiple=(0, 1))
+"""An option with a value or without one."""
+
 
 def check(
     robot: Path,
@@ -34,6 +39,7 @@ def check(
     play: Motions = (),
     duration: float | None = None,
     online: Flag = False,
+    graph: Annotated[tuple[Path, ...] | None, _OPTIONAL] = None,
     as_json: JsonFlag = False,
     debug: Flag = False,
 ) -> int:
@@ -54,17 +60,28 @@ def check(
         As for a run: stop after this many seconds.
     online
         Read the servos too, and compare their registers with those of the file; nothing is written.
+    graph
+        Draw the controllers, what they read and what they command: here, or into a file, .svg or .dot.
     as_json
         Print the result as JSON.
     debug
         Print the traceback of an error.
     """
+    for file in graph or ():
+        _require_picture(file)
     result = compiled(robot, assignments, play, duration, _read_models if online else None)
     found = _look(result) if online else None
+    for file in graph or ():
+        _write(result, file)
     if as_json:
         show_json(_as_json(result, found))
         return 0 if found is None or found.as_declared else 1
-    show(_verdict(result), *_tables(result.report))
+    if graph is None:
+        show(_verdict(result), *_tables(result.report))
+    else:
+        show(_verdict(result), *(f"the controller graph is in {file}" for file in graph))
+        if not graph:
+            show(result.drawing)
     if found is not None:
         show(_registers(found.registers), _compared(found))
     for warning in result.warnings:
@@ -76,6 +93,18 @@ def check(
     for problem in found.problems:
         print_error(problem)
     return 0 if found.as_declared else 1
+
+
+def _require_picture(file: Path) -> None:
+    from dxlrun.output.graph_picture import kind_of  # not above: most checks draw nothing
+
+    kind_of(file)
+
+
+def _write(result: Compiled, file: Path) -> None:
+    from dxlrun.output.graph_picture import write_picture  # as above
+
+    write_picture(result.drawing, file)
 
 
 def _read_models(buses: Sequence[BusPlan], joints: Sequence[str]) -> Mapping[str, str]:
@@ -189,7 +218,7 @@ def _controllers(controllers: Sequence[ControllerRow], joints: int) -> Table:
             row.name,
             row.type,
             row.distribution,
-            " + ".join(row.command) or "nothing",
+            " + ".join(row.command) + (f" into {', '.join(row.into)}" if row.into else "") or "nothing",
             (every if len(row.joints) == joints else ", ".join(row.joints)) if row.command else "",
             "yes" if row.active else "no",
             row.rate,

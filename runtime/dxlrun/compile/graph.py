@@ -20,6 +20,7 @@ from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.description import KeyPath
 from dxlrun.description.form import refuse
 from dxlrun.errors import suggestion
+from dxlrun.output.graph import Edge, Graph, Node, listed
 
 STATES = ("position", "velocity", "effort", "temperature", "voltage", "age")
 """Interfaces of every joint that may be read without a claim; `age` is that of the state, s."""
@@ -80,6 +81,52 @@ class ControllerGraph(BaseModel):
         """All edges: those of each controller together, in the order of the file."""
         found = _Checks(self.joints, self.controllers, self.incomplete)
         return tuple(edge for plan in self.controllers for edge in found.edges_of(plan))
+
+    def drawing(self, title: str, rate: float) -> Graph:
+        """Return what is drawn of it, for a loop at this rate, Hz.
+
+        Joints of the same controllers are one node. That controllers read the states of their own joints is
+        drawn only for those that command nothing.
+        """
+        commanding: dict[str, list[str]] = {}
+        sources: dict[tuple[str, str], dict[str, list[str]]] = {}
+        for edge in self.edges:
+            if edge.kind == "command":
+                commanding.setdefault(edge.joint, []).append(edge.source)
+            elif edge.kind == "read":
+                owner = "" if edge.source == edge.joint else f"{edge.source}/"
+                sources.setdefault((owner, edge.interfaces[0]), {}).setdefault(edge.target, []).append(
+                    edge.joint
+                )
+        for plan in self.controllers:
+            if plan.joints and not (plan.command or plan.reference):
+                sources.setdefault(("", "states"), {})[plan.name] = list(plan.joints)
+        nodes: dict[str, Node] = {}
+        edges: dict[Edge, None] = {}
+        for (owner, interface), readers in sources.items():
+            for reader, joints in readers.items():
+                name = f"{interface} of {owner}{' '.join(joints)}"
+                lines = tuple(owner + line for line in listed(self._together(joints)))
+                nodes[name] = Node(name, "source", lines, interface)
+                edges[Edge(name, reader)] = None
+        for plan in self.controllers:
+            about = f"{plan.type}, {rate / max(plan.every, 1):g} Hz"
+            out = " + ".join(plan.command)
+            nodes[plan.name] = Node(plan.name, "controller", (plan.name,), out, about, plan.active)
+        groups: dict[tuple[str, ...], list[str]] = {}
+        for joint in self.joints:
+            if joint in commanding:
+                groups.setdefault(tuple(commanding[joint]), []).append(joint)
+        for controllers, joints in groups.items():
+            name = f"joints {' '.join(joints)}"
+            nodes[name] = Node(name, "joints", listed(self._together(joints)))
+            edges |= dict.fromkeys(Edge(controller, name) for controller in controllers)
+        edges |= dict.fromkeys(Edge(one.source, one.target) for one in self.edges if one.kind == "reference")
+        return Graph(title, tuple(nodes.values()), tuple(edges))
+
+    def _together(self, joints: Sequence[str]) -> Sequence[str]:
+        """Return names of joints, or that they are all."""
+        return [f"all {len(joints)} joints"] if 2 < len(joints) == len(self.joints) else joints
 
 
 def mistakes_of(error: ValidationError) -> list[Mistake]:

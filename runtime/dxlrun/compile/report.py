@@ -7,9 +7,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from dxlrun.compile.graph import ControllerGraph, GraphEdge
 from dxlrun.compile.joints import CompiledJoint
 from dxlrun.compile.plan import MotionPart, Plan
-from dxlrun.control.loop_plan import ControllerPlan
+from dxlrun.control.loop_plan import ControllerPlan, LoopPlan
 from dxlrun.control.policy_plan import POLICIES, PolicyPlan
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, ReadWay
@@ -64,6 +65,10 @@ class ControllerRow:
     command: tuple[str, ...]
     active: bool
     rate: float
+    into: tuple[str, ...] = ()
+    """The controllers whose references it commands; empty: it commands the servos."""
+    reference: tuple[str, ...] = ()
+    reads: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,6 +139,24 @@ class MotionRow:
 
 
 @dataclass(frozen=True, slots=True)
+class GraphNode:
+    """A joint or a controller; the rows of both have more of it."""
+
+    name: str
+    kind: Literal["joint", "controller"]
+
+
+@dataclass(frozen=True, slots=True)
+class GraphRows:
+    """The controller graph."""
+
+    order: tuple[str, ...]
+    """Controllers in the order of their updates."""
+    nodes: tuple[GraphNode, ...]
+    edges: tuple[GraphEdge, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class CheckReport:
     """Everything that was decided for a robot before a port opens."""
 
@@ -146,6 +169,7 @@ class CheckReport:
     ways: tuple[WayRow, ...]
     policies: tuple[PolicyRow, ...]
     motions: tuple[MotionRow, ...]
+    graph: GraphRows
     duration: float | None
     """s; None: the run continues until it is stopped."""
 
@@ -155,6 +179,7 @@ def check_report(
 ) -> CheckReport:
     """Return what was decided for a robot whose loop has a `rate`, Hz, in rows."""
     loop, buses = plan.loop, plan.buses
+    graph = graph_of(loop)
     modes = {servo.joint: servo.start_mode for bus in buses for servo in bus.servos}
     return CheckReport(
         robot=plan.robot,
@@ -165,7 +190,25 @@ def check_report(
         ways=tuple(row for bus in buses for row in _way_rows(bus, rate)),
         policies=_policy_rows(loop.policies, buses),
         motions=tuple(_motion_row(part) for part in parts),
+        graph=_graph_rows(graph),
         duration=None if loop.end_ns is None else loop.end_ns * 1e-9,
+    )
+
+
+def graph_of(loop: LoopPlan) -> ControllerGraph:
+    """Return the controller graph of a plan, which was found valid when the plan was made."""
+    joints = tuple(joint.name for joint in loop.joints)
+    return ControllerGraph.model_construct(joints=joints, controllers=loop.controllers)
+
+
+def _graph_rows(graph: ControllerGraph) -> GraphRows:
+    return GraphRows(
+        order=graph.order,
+        nodes=(
+            *(GraphNode(name, "joint") for name in graph.joints),
+            *(GraphNode(plan.name, "controller") for plan in graph.controllers),
+        ),
+        edges=graph.edges,
     )
 
 
@@ -207,6 +250,9 @@ def _controller_row(plan: ControllerPlan, rate: float) -> ControllerRow:
         command=plan.command,
         active=plan.active,
         rate=rate / plan.every,
+        into=plan.into,
+        reference=plan.reference,
+        reads=plan.reads,
     )
 
 

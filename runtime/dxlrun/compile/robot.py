@@ -32,6 +32,7 @@ from dxlrun.errors import InputError, Problem
 if TYPE_CHECKING:
     from dxlrun.compile.report import CheckReport
     from dxlrun.description import MotionDescription
+    from dxlrun.output.graph import Graph
 
 Ask: TypeAlias = Callable[[Sequence[BusPlan], Sequence[str]], Mapping[str, str]]
 """Read the models of the servos of joints: takes the buses and the joints, returns models by joint."""
@@ -56,6 +57,13 @@ class Compiled:
         from dxlrun.compile.report import check_report  # not above: only `dxlrun check` shows it
 
         return check_report(self.plan, self.rate, self.joints, self.parts)
+
+    @property
+    def drawing(self) -> Graph:
+        """The controller graph, as it is drawn."""
+        from dxlrun.compile.report import graph_of  # as above
+
+        return graph_of(self.plan.loop).drawing(f"{self.plan.robot}: controllers", self.rate)
 
 
 def compile_files(

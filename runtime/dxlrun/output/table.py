@@ -6,6 +6,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
+from dxlrun.output.graph import Graph
+
 Tone = Literal["plain", "good", "warning", "error"]
 
 
@@ -78,7 +80,7 @@ class Sentence:
     tone: Tone = "plain"
 
 
-Part = Table | Sentence | str
+Part = Table | Graph | Sentence | str
 """What is shown; a string is a plain line."""
 
 

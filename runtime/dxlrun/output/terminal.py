@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from typing import IO, TYPE_CHECKING, cast
 
+from dxlrun.output.graph import Graph
 from dxlrun.output.json import json_text, problems_json
 from dxlrun.output.table import Part, Sentence, Table, Tone
 
@@ -53,6 +54,8 @@ def show(*parts: Part, console: Console | None = None, folded: bool = False) -> 
         if isinstance(part, Table):
             if part.rows:
                 _show_table(part, console)
+        elif isinstance(part, Graph):
+            _show_graph(part, console)
         else:
             line = Sentence(part) if isinstance(part, str) else part
             console.print(Text(line.text, style=STYLES[line.tone]), soft_wrap=not folded)
@@ -148,6 +151,16 @@ def _show_table(table: Table, console: Console) -> None:
         console.print(Text(f"\n{table.title}", style="bold"))
     shown = fitted(table, console.width)
     console.print(shown, soft_wrap=isinstance(shown, Text))
+
+
+def _show_graph(graph: Graph, console: Console) -> None:
+    from rich.text import Text
+
+    from dxlrun.output.graph_text import graph_text
+
+    ascii_only = console.options.ascii_only
+    console.print(Text(f"\n{graph.title}", style="bold"), soft_wrap=True)
+    console.print(Text(graph_text(graph, console.width, ascii_only=ascii_only)), soft_wrap=True)
 
 
 def _width(table: Table, chosen: Sequence[int], *, tight: bool) -> int:

@@ -18,6 +18,7 @@ from dxlrun.output.table import Column, Table
 from dxlrun.output.terminal import print_error, show, show_json, show_json_line
 
 if TYPE_CHECKING:
+    from dxlrun.output.graph import Graph
     from dxlrun.remote.client import Executed, RemoteRobot
 
 Names = Annotated[tuple[str, ...], Parameter(negative=(), show_default=False, consume_multiple=True)]
@@ -49,13 +50,17 @@ ONLY_ONE = Chosen()
 """The one robot that runs."""
 
 
-def list_robots(*, robot: str | None = None, as_json: JsonFlag = False, debug: Flag = False) -> int:
+def list_robots(
+    *, robot: str | None = None, graph: Flag = False, as_json: JsonFlag = False, debug: Flag = False
+) -> int:
     """List the robots that run and can be steered, with their controllers and the commands these take.
 
     Parameters
     ----------
     robot
         Only the robot of this name.
+    graph
+        Draw the controllers, what they read and what they command, with those that are active now.
     as_json
         Print the result as JSON.
     debug
@@ -78,7 +83,7 @@ def list_robots(*, robot: str | None = None, as_json: JsonFlag = False, debug: F
         show_json(found)
         return code
     for info in found:
-        show(headline(info), controllers(info))
+        show(headline(info), drawing(info) if graph else controllers(info))
     if not names:
         show("no robot runs that can be steered; `dxlrun ROBOT.yaml` starts one")
     return code
@@ -256,6 +261,34 @@ def controllers(info: Mapping[str, object]) -> Table:
         for one in (listed if isinstance(listed, list) else [])
     ]
     return Table.of("", columns, rows)
+
+
+def drawing(info: Mapping[str, object]) -> Graph:
+    """Return the controller graph of a running robot as it is drawn."""
+    from dxlrun.compile.graph import ControllerGraph  # not above: only a graph needs pydantic
+    from dxlrun.control.loop_plan import ControllerPlan
+
+    rate, listed = float(str(info["rate"])), info["controllers"]
+    plans = (
+        ControllerPlan(
+            name=one["name"],
+            type=one["type"],
+            distribution="",
+            parameters="{}",
+            joints=tuple(one["joints"]),
+            command=tuple(one["command"]),
+            publishes=(),
+            active=one["active"],
+            every=max(1, round(rate / one["rate"])),
+            into=tuple(one["into"]),
+            reference=tuple(one["reference"]),
+            reads=tuple(one["reads"]),
+        )
+        for one in (listed if isinstance(listed, list) else [])
+    )
+    joints = info["joints"] if isinstance(info["joints"], list) else []
+    graph = ControllerGraph.model_construct(joints=tuple(joints), controllers=tuple(plans))
+    return graph.drawing("controllers", rate)
 
 
 def state(controller: Mapping[str, object]) -> str:

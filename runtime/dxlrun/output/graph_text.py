@@ -1,0 +1,147 @@
+"""A graph in characters: boxes in columns with lines between them, or as a list where there is no room."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from dxlrun.output.graph import Graph, Node, Placed, placed
+
+_UP, _DOWN, _LEFT, _RIGHT = 1, 2, 4, 8
+_LINES = " ╵╷│╴┘┐┤╶└┌├─┴┬┼"
+"""By the sum of the directions into which a line goes."""
+_INACTIVE_LINES = str.maketrans("│─", "┊┄")
+_ASCII = str.maketrans("╵╷│╴┘┐┤╶└┌├─┴┬┼┊┄▶", "|||-+++-+++-+++:.>")
+_EDGE = 2
+"""Columns beside a text in its box, together with the line."""
+
+
+def graph_text(graph: Graph, width: int, *, ascii_only: bool = False) -> str:
+    """Return the lines of a graph that fit into a width: a drawing, else a list of what leads where."""
+    lines = _Drawing(placed(graph)).lines() if graph.nodes else []
+    if any(len(line) > width for line in lines):
+        lines = list(_list(graph))
+    text = "\n".join(line.rstrip() for line in lines)
+    return text.translate(_ASCII) if ascii_only else text
+
+
+def shown_lines(node: Node) -> tuple[str, ...]:
+    """Return the lines of a node's box: what comes in is at the first one, what leaves at the last one."""
+    first, *more = node.lines
+    return (first if node.active else f"{first} (inactive)", *more)
+
+
+class _Drawing:
+    """Characters on a grid.
+
+    Boxes begin at even rows; lines come in at odd ones and leave at even ones, so no two of different nodes
+    share a row. Lines leave each node through a column of its own.
+    """
+
+    def __init__(self, graph: Placed) -> None:
+        self._graph = graph
+        self._lines: dict[tuple[int, int], int] = {}
+        """By row and column, the directions of lines."""
+        self._texts: dict[tuple[int, int], str] = {}
+        self._dashed: set[tuple[int, int]] = set()
+        self._row: dict[str, int] = {}
+        for layer in graph.layers:
+            row = 0
+            for name in layer:
+                self._row[name] = row
+                row += self._height(name)
+        left = 0
+        for layer in graph.layers:
+            width = max(self._width(name) for name in layer)
+            for name in layer:
+                self._place(name, left, width)
+            left = self._join(layer, left + width)
+
+    def lines(self) -> list[str]:
+        """Return the rows of the drawing."""
+        cells = {at: _LINES[bits] for at, bits in self._lines.items()}
+        for at in self._dashed:
+            cells[at] = cells[at].translate(_INACTIVE_LINES)
+        cells |= self._texts
+        height = 1 + max(row for row, _ in cells)
+        width = 1 + max(column for _, column in cells)
+        return ["".join(cells.get((row, column), " ") for column in range(width)) for row in range(height)]
+
+    def _width(self, name: str) -> int:
+        node = self._graph.nodes.get(name)
+        return 1 if node is None else max(map(len, (*shown_lines(node), node.out))) + 2 * _EDGE
+
+    def _height(self, name: str) -> int:
+        """Return how many rows a node takes, with the free ones below it."""
+        node = self._graph.nodes.get(name)
+        return 4 if node is None else _even(len(shown_lines(node)) + bool(node.out)) + 2
+
+    def _out_row(self, name: str) -> int:
+        return self._row[name] + self._height(name) - 2
+
+    def _place(self, name: str, left: int, width: int) -> None:
+        """Draw a box, or what passes."""
+        node, row = self._graph.nodes.get(name), self._row[name]
+        right, bottom = left + width - 1, self._out_row(name) + 1
+        if node is None:
+            self._line((row + 1, left), (row + 1, right))
+            self._line((row + 1, right), (row + 2, right))
+            return
+        corners = (row, left), (row, right), (bottom, right), (bottom, left)
+        for begin, end in zip(corners, (*corners[1:], corners[0]), strict=True):
+            self._line(begin, end)
+        if not node.active:
+            frame = {(each, column) for each in (row, bottom) for column in range(left, right + 1)}
+            self._dashed |= frame | {
+                (each, column) for each in range(row, bottom) for column in (left, right)
+            }
+        for number, text in enumerate(shown_lines(node), row + 1):
+            self._text(text, number, left + _EDGE)
+        self._text(node.out, bottom - 1, right + 1 - _EDGE - len(node.out))
+
+    def _join(self, layer: Sequence[str], left: int) -> int:
+        """Draw what leads from a layer into the next one; return where that one begins."""
+        ends = {name: [step.target for step in self._graph.steps if step.source == name] for name in layer}
+        leading = [name for name in layer if ends[name]]
+        right = left + 2 * len(leading) + 3
+        for number, name in enumerate(leading):
+            column, out = left + 1 + 2 * number, self._out_row(name)
+            self._line((out, left - 1), (out, column))
+            for end in ends[name]:
+                row = self._row[end] + 1
+                self._line((out, column), (row, column))
+                is_node = end in self._graph.nodes
+                self._line((row, column), (row, right - is_node))
+                if is_node:
+                    self._texts[row, right - 1] = "▶"
+        return right
+
+    def _line(self, begin: tuple[int, int], end: tuple[int, int]) -> None:
+        (row, column), (last_row, last_column) = sorted((begin, end))
+        for each in range(row, last_row):
+            self._add((each, column), _DOWN)
+            self._add((each + 1, column), _UP)
+        for each in range(min(column, last_column), max(column, last_column)):
+            self._add((last_row, each), _RIGHT)
+            self._add((last_row, each + 1), _LEFT)
+
+    def _add(self, at: tuple[int, int], direction: int) -> None:
+        self._lines[at] = self._lines.get(at, 0) | direction
+
+    def _text(self, text: str, row: int, column: int) -> None:
+        for number, character in enumerate(text):
+            self._texts[row, column + number] = character
+
+
+def _even(number: int) -> int:
+    return number + number % 2
+
+
+def _list(graph: Graph) -> Iterator[str]:
+    """Yield what leads from each node where, line by line."""
+    named = {node.name: node for node in graph.nodes}
+    for node in graph.nodes:
+        ends = [named[edge.target] for edge in graph.edges if edge.source == node.name]
+        if ends or node.kind == "controller":
+            yield " ".join(shown_lines(node))
+        for end in ends:
+            yield f"  {node.out} ─▶ {' '.join(end.lines)}"
