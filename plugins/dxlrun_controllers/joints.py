@@ -93,4 +93,5 @@ def hold(context: Context) -> None:
     commands, goals = context.commands, context.goals
     np.copyto(commands.position, goals.position)
     np.copyto(commands.position, context.states.position, where=np.isnan(goals.position))
-    np.copyto(commands.velocity, goals.velocity)
+    if not context.into:  # for another controller it would be a velocity with its sign
+        np.copyto(commands.velocity, goals.velocity)

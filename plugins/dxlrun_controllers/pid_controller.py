@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import ClassVar, Final, Literal, Self
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from pydantic import model_validator
 
 from dxlrun import CommandModel, Context, Controller, Duration, Floats, Interfaces
+from dxlrun.messages import Header
 from dxlrun_controllers.group import PositionsCommand, VelocitiesCommand
 from dxlrun_controllers.joints import (
     JointsParameters,
@@ -66,6 +68,30 @@ class PidParameters(JointsParameters):
 _KIND: Final = {"position": "positions", "velocity": "velocities"}
 
 
+STATE_NS: Final = 20_000_000
+"""Between two messages of the state, ns."""
+
+
+@dataclass(slots=True)
+class PidState:
+    """What the law sees and does; rows in the order of the controller's joints."""
+
+    header: Header
+    reference: Floats
+    """rad or rad/s, as the measurement and the error"""
+    measurement: Floats
+    error: Floats
+    error_rate: Floats
+    """Filtered: rad/s or rad/s^2"""
+    proportional: Floats
+    """In units of the command, as all that follow"""
+    integral: Floats
+    derivative: Floats
+    feed_forward: Floats
+    output: Floats
+    """What is commanded"""
+
+
 class PidController(Controller[PidParameters]):
     """Commands by a PID law on the error of a reference (`pid.Pid`), once each period, with its true length.
 
@@ -90,6 +116,7 @@ class PidController(Controller[PidParameters]):
         "positions": PositionsCommand,
         "velocities": VelocitiesCommand,
     }
+    Topics: ClassVar[Mapping[str, type]] = {"state": PidState}
 
     @classmethod
     def interfaces(cls, parameters: PidParameters, joints: tuple[str, ...]) -> Interfaces:
@@ -137,6 +164,20 @@ class PidController(Controller[PidParameters]):
             (6, count)
         )
         self._free, self._chained, self._ended, self._measured = np.zeros((4, count), dtype=np.bool_)
+        law = self._pid
+        self._state = PidState(
+            Header(),
+            self._reference,
+            self._measurement,
+            self._error,
+            law.rate,
+            law.proportional,
+            law.integral,
+            law.derivative,
+            self._bias,
+            self._output,
+        )
+        self._state_ns = 0
         self.on_parameters(0)
 
     def on_parameters(self, time_ns: int) -> None:
@@ -150,6 +191,7 @@ class PidController(Controller[PidParameters]):
         goals, pid = self.context.goals, self._pid
         self._setpoint.fill(np.nan if self._by_position else 0.0)
         self._chained.fill(False)
+        self._state_ns = time_ns
         self._slope.reset()
         self._refer()
         if self.parameters.command_interface == "position":
@@ -179,6 +221,9 @@ class PidController(Controller[PidParameters]):
         else:
             output = self._pid.update(self._error, self._rate, self._bias, self._measured, period_s)
             np.copyto(self._output, output)
+        if time_ns >= self._state_ns:
+            self._state_ns = time_ns + STATE_NS
+            self.context.publish("state", self._state)
 
     def _correct(self, period_s: float) -> None:
         """Command the reference and its correction, which ends where the position limits do."""

@@ -25,6 +25,7 @@ class Limiter:
 
     __slots__ = (
         "_arrays",
+        "_both",
         "_flags",
         "_rate",
         "_step",
@@ -46,6 +47,8 @@ class Limiter:
         self._target, self._rate = np.zeros((2, joints))
         self._step = np.zeros((2, joints))
         self._arrays = np.zeros((10, joints))
+        self._both = np.zeros((3, 2, joints))
+        """There and back."""
         self._flags = np.zeros((3, joints), dtype=np.bool_)
 
     def begin(self, position: Floats) -> None:
@@ -65,12 +68,16 @@ class Limiter:
         """Follow `reference` (rad), which moves at `rate` (rad/s), for a period."""
         target, speed = self._target, self._rate
         position, velocity = self._step
-        passed, outside, _ = self._flags
-        np.clip(reference, self.lower, self.upper, out=target)
-        np.clip(rate, -self.speed, self.speed, out=speed)
+        passed, outside = self._flags[:2]
+        np.minimum(reference, self.upper, out=target)
+        np.maximum(target, self.lower, out=target)
+        np.negative(self.speed, out=speed)
+        np.maximum(rate, speed, out=speed)
+        np.minimum(speed, self.speed, out=speed)
         speed *= np.equal(target, reference, out=passed)  # a limit does not move
-        self._approach(target, speed, period_s)
         self._reachable(target, speed, period_s)
+        if np.count_nonzero(passed) < passed.size:
+            self._approach(target, speed, period_s)
         np.copyto(position, target, where=passed)
         np.copyto(velocity, speed, where=passed)
         self._outside(position, velocity)
@@ -92,7 +99,7 @@ class Limiter:
         The farthest way in it, from v to r', is w h - ((w - v)**2 + (w - r')**2) / (2 A), with the highest
         velocity between w = min((v + r' + A h) / 2, V); the farthest way back is the same with other signs.
         """
-        way, change, w, part = self._arrays[:4]
+        way, change = self._arrays[:2]
         passed, _, fits = self._flags
         np.subtract(target, self.position, out=way)
         np.subtract(speed, self.velocity, out=change)
@@ -100,28 +107,30 @@ class Limiter:
         change /= period_s
         np.subtract(change, self.acceleration, out=change)
         np.less_equal(change, 1e-9, out=passed)
-        for sign in (1.0, -1.0):
-            np.add(self.velocity, speed, out=w)
-            w *= sign
-            np.multiply(self.acceleration, period_s, out=part)
-            w += part
-            w *= 0.5
-            np.minimum(w, self.speed, out=w)
-            np.multiply(self.velocity, sign, out=part)
-            part -= w
-            part *= part
-            np.multiply(speed, sign, out=change)
-            change -= w
-            change *= change
-            part += change
-            part /= self.acceleration
-            part *= -0.5
-            w *= period_s
-            w += part
-            w += 1e-12  # rad, far below any servo's resolution: the rounding of the way
-            np.multiply(way, sign, out=part)
-            np.less_equal(part, w, out=fits)
-            passed &= fits
+        w, part, there = self._both
+        np.add(self.velocity, speed, out=there[0])
+        np.negative(there[0], out=there[1])
+        np.multiply(self.acceleration, period_s, out=change)
+        np.add(there, change, out=w)
+        w *= 0.5
+        np.minimum(w, self.speed, out=w)
+        # ((w - v)^2 + (w - r')^2) / 2 = w^2 - w (v + r') + (v^2 + r'^2) / 2
+        np.subtract(w, there, out=part)
+        part *= w
+        np.multiply(self.velocity, self.velocity, out=change)
+        np.multiply(speed, speed, out=there[0])
+        change += there[0]
+        change *= 0.5
+        part += change
+        part /= self.acceleration
+        w *= period_s
+        w -= part
+        w += 1e-12  # rad, far below any servo's resolution: the rounding of the way
+        np.less_equal(way, w[0], out=fits)
+        passed &= fits
+        np.negative(way, out=way)
+        np.less_equal(way, w[1], out=fits)
+        passed &= fits
 
     def _outside(self, position: Floats, velocity: Floats) -> None:
         """Set in the second flags where the joint could not stop before its limit."""
@@ -187,10 +196,10 @@ class Limiter:
         second += self._step[0]
         second *= -0.5
         second += d
-        nothing = self._flags[0]
+        nothing = self._flags[2]
         np.less_equal(second, 0.0, out=nothing)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            second /= peak  # a target that is as fast as the joint may be is never caught up with
+        # a target that is as fast as the joint may be is never caught up with
+        second /= np.maximum(peak, 1e-200, out=peak)
         np.copyto(second, 0.0, where=nothing)
 
     def _follow(self, target: Floats, speed: Floats, period_s: float) -> None:
@@ -200,7 +209,7 @@ class Limiter:
         most = self.acceleration
         np.add(first, second, out=position)
         position += third
-        done = self._flags[0]
+        done = self._flags[2]
         np.less_equal(position, period_s, out=done)
         np.minimum(first, period_s, out=first)
         np.subtract(period_s, first, out=position)

@@ -159,7 +159,8 @@ class Pid:
         output += self.integral
         output += step
         # what is beyond a limit is taken off the step, as far as the step led there
-        np.clip(output, self.lower, self.upper, out=room)
+        np.minimum(output, self.upper, out=room)
+        np.maximum(room, self.lower, out=room)
         np.subtract(output, room, out=integral)
         np.copyto(output, room)
         np.minimum(step, 0.0, out=room)

@@ -141,3 +141,12 @@ def test_the_broadcaster_publishes_each_update(stage):
         robot.update(time)
     assert robot.published == 3
     assert np.isnan(robot.context.commands.position).all()
+
+
+def test_into_another_controller_a_servos_speed_is_no_velocity(stage):
+    """Beside a servo's position it is a magnitude: as a reference, the joint would be sent on by it."""
+    for into, expected in (((), [0.5, 0.5]), (("lower",), [np.nan, np.nan])):
+        robot = stage(JointGroupPosVelController, TWO, into=into)
+        robot.context.goals.velocity[:] = 0.5
+        robot.controller.on_activate(0)
+        np.testing.assert_array_equal(robot.context.commands.velocity, expected)

@@ -59,7 +59,7 @@ def test_from_rest_to_rest_it_is_the_trapezoid_of_least_time_to_the_digit(way, s
     assert stepped(law, 0.3 + way, left * (1 + 1e-9) + 1e-12) == (0.3 + way, 0.0)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(
     way=st.floats(-3, 3).filter(lambda way: abs(way) > 1e-3),
     periods=st.lists(st.floats(0.001, 0.05), min_size=1, max_size=20),
@@ -89,7 +89,7 @@ def test_it_turns_round_when_it_is_too_fast_to_stop_before_the_target(velocity):
     assert side == pytest.approx(max(stop, 0.05) if stop > 0.05 else min(stop, 0.0), abs=1e-4)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(
     references=st.lists(
         st.tuples(st.floats(-4, 4), st.floats(-6, 6), st.integers(1, 30), st.floats(0.001, 0.05)),

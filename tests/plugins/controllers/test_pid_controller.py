@@ -274,3 +274,18 @@ class TextByJoint(ParametersModel):
 
 def test_a_live_mapping_is_one_of_numbers():
     assert live_mistake(TextByJoint) == "inner"
+
+
+def test_its_state_is_published_fifty_times_a_second(stage):
+    robot = started(stage, gains={"p": 2.0, "i": 1.0})
+    robot.send(0.0, "positions", positions=[0.5, 0.0])
+    for step in range(200):
+        robot.controller.update(step * 5_000_000, 5_000_000)
+    assert len(robot.messages) == 50
+    topic, state = robot.messages[-1]
+    assert topic == "state"
+    parts = state.proportional + state.integral + state.derivative + state.feed_forward
+    np.testing.assert_allclose(parts, state.output)
+    np.testing.assert_allclose(state.output, robot.context.commands.effort)
+    np.testing.assert_allclose(state.reference - state.measurement, state.error)
+    np.testing.assert_allclose(state.error, [0.2, 0.2])
