@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -106,6 +108,64 @@ def test_an_own_message_is_read_by_rosbags_field_by_field() -> None:
         {"name": "two", "ratio": 0.2},
         {"name": "three", "ratio": 0.3},
     ]
+
+
+@dataclass
+class Inner:
+    good: bool
+    amount: float
+    level: Annotated[int, Number("uint8")]
+    short: Annotated[int, Number("int16")]
+
+
+@dataclass
+class Middle:
+    text: str
+    inner: Inner
+    numbers: tuple[float, ...]
+
+
+@dataclass
+class Outer:
+    first: str
+    level: Annotated[int, Number("uint8")]
+    one: Middle
+    count: int
+    two: Middle
+    more: tuple[Inner, ...]
+
+
+INNER = st.builds(Inner, st.booleans(), st.floats(), st.integers(0, 255), st.integers(-(2**15), 2**15 - 1))
+TEXT = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=9)
+MIDDLE = st.builds(Middle, TEXT, INNER, st.lists(st.floats(), max_size=3).map(tuple))
+OUTER = st.builds(
+    Outer,
+    TEXT,
+    st.integers(0, 255),
+    MIDDLE,
+    st.integers(-(2**63), 2**63 - 1),
+    MIDDLE,
+    st.lists(INNER, max_size=3).map(tuple),
+)
+
+
+@settings(max_examples=100, deadline=None)
+@given(OUTER)
+def test_nested_numbers_lie_where_rosbags_expects_them_behind_texts_of_any_length(message: Outer) -> None:
+    declared = declared_message(Outer, "mine")
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(declared.type.text, declared.type.name))
+    data = declared.pack(message, (0, 0))
+    found: Any = store.deserialize_cdr(data, declared.type.name)
+    assert bytes(store.serialize_cdr(found, declared.type.name)) == data
+    for theirs, ours in ((found.one, message.one), (found.two, message.two)):
+        assert (theirs.text, theirs.inner.level, theirs.inner.short) == (
+            ours.text, ours.inner.level, ours.inner.short,
+        )  # fmt: skip
+        np.testing.assert_array_equal(theirs.inner.amount, ours.inner.amount)
+        np.testing.assert_array_equal(theirs.numbers, ours.numbers)
+    assert (found.first, found.level, found.count) == (message.first, message.level, message.count)
+    assert [one.short for one in found.more] == [one.short for one in message.more]
 
 
 @pytest.mark.parametrize(

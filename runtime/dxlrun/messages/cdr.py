@@ -10,9 +10,9 @@ both decode what comes out of here in the tests.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import lru_cache
-from typing import TypeAlias
+from typing import TypeAlias, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,8 @@ Value: TypeAlias = "int | float | str | Numbers | Sequence[Value] | Mapping[str,
 
 _HEAD = len(ENCAPSULATION)
 _LENGTH = struct.Struct("<I")
+_WIDEST = 8
+"""Bytes of the widest number: to no more is anything aligned."""
 
 Write: TypeAlias = "Callable[[bytearray, Value], None]"
 Read: TypeAlias = "Callable[[memoryview, int], tuple[Value, int]]"
@@ -35,20 +37,21 @@ Read: TypeAlias = "Callable[[memoryview, int], tuple[Value, int]]"
 class Codec:
     """Packs and unpacks one message; made once from its definition.
 
-    The numbers that a message begins with lie at fixed places: they are packed in one go.
+    Nested messages lie in their place, so a message is a row of values: `leaves`. Numbers that follow each
+    other are packed in one go.
     """
 
-    __slots__ = ("_definitions", "_lead", "_lead_count", "_read", "_rest", "fields", "message")
+    __slots__ = ("_definitions", "_read", "_steps", "fields", "leaves", "message")
 
     def __init__(self, message: MessageType) -> None:
         self.message = message
-        definitions = parse(message)
+        self._definitions = definitions = parse(message)
         top = short_name(message.name)
         self.fields: tuple[str, ...] = tuple(field.name for field in definitions[top])
-        self._lead, self._lead_count = _lead(definitions[top])
-        rest = definitions[top][self._lead_count :]
-        self._rest: list[Write] = [_field(field, definitions)[0] for field in rest]
-        self._definitions = definitions
+        found = list(_leaves(top, definitions, ""))
+        self.leaves: tuple[str, ...] = tuple(place for place, _ in found)
+        """Places of all values: `header.stamp.sec`."""
+        self._steps = tuple(_steps([field for _, field in found], definitions))
         _, self._read = _nested(top, definitions)
 
     def pack(self, *values: Value) -> bytes:
@@ -57,13 +60,21 @@ class Codec:
         Sequences of numbers are numpy arrays of the right type, or bytes. Raises struct.error or ValueError
         when a value does not fit its field.
         """
-        if len(values) != len(self.fields):
-            raise ValueError(f"{self.message.name} has the fields {', '.join(self.fields)}")
-        count = self._lead_count
+        row: list[Value] = []
+        _flatten(values, short_name(self.message.name), self._definitions, row)
+        return self.pack_row(row)
+
+    def pack_row(self, row: Sequence[Value]) -> bytes:
+        """Return the message with these values, in the order of its `leaves`; as many. Raises as `pack`."""
         buffer = bytearray(ENCAPSULATION)
-        buffer += self._lead.pack(*values[:count])
-        for write, value in zip(self._rest, values[count:], strict=True):
-            write(buffer, value)
+        at = 0
+        for write, count in self._steps:
+            if count:
+                write(buffer, row[at : at + count])
+                at += count
+            else:
+                write(buffer, row[at])
+                at += 1
         return bytes(buffer)
 
     def pack_field(self, name: str, value: Value) -> bytes:
@@ -89,18 +100,56 @@ class Codec:
         return value
 
 
-def _lead(fields: Sequence[MessageField]) -> tuple[struct.Struct, int]:
-    """Return the layout of the numbers that a message begins with, padding included, and their count."""
-    form, at, count = "<", 0, 0
+def _leaves(name: str, definitions: Definitions, place: str) -> Iterator[tuple[str, MessageField]]:
+    """Yield the fields of a message with those of nested messages in their place."""
+    for field in definitions[name]:
+        if field.kind in definitions and not field.sequence and not field.length:
+            yield from _leaves(field.kind, definitions, f"{place}{field.name}.")
+        else:
+            yield f"{place}{field.name}", field
+
+
+def _flatten(values: Value, name: str, definitions: Definitions, row: list[Value]) -> None:
+    fields = definitions[name]
+    if not isinstance(values, tuple) or len(values) != len(fields):
+        raise ValueError(f"{name} has the fields {', '.join(field.name for field in fields)}")
+    for field, value in zip(fields, values, strict=True):
+        if field.kind in definitions and not field.sequence and not field.length:
+            _flatten(value, field.kind, definitions, row)
+        else:
+            row.append(value)
+
+
+def _steps(fields: Sequence[MessageField], definitions: Definitions) -> Iterator[tuple[Write, int]]:
+    """Yield how values are written, and how many numbers are written in one go; 0: one value."""
+    numbers = ""
     for field in fields:
-        if field.sequence or field.length or field.kind not in PRIMITIVES:
-            break
-        code = PRIMITIVES[field.kind]
-        size = struct.calcsize("<" + code)
-        form += f"{-at % size}x{code}"
-        at += -at % size + size
-        count += 1
-    return struct.Struct(form), count
+        if field.kind in PRIMITIVES and not field.sequence and not field.length:
+            numbers += PRIMITIVES[field.kind]
+            continue
+        if numbers:
+            yield _run(numbers), len(numbers)
+            numbers = ""
+        yield _field(field, definitions)[0], 0
+    if numbers:
+        yield _run(numbers), len(numbers)
+
+
+def _run(codes: str) -> Write:
+    """Numbers behind each other: their padding depends on where the first one lies."""
+    layouts = []
+    for start in range(_WIDEST):
+        form, at = "<", start
+        for code in codes:
+            size = struct.calcsize("<" + code)
+            form += f"{-at % size}x{code}"
+            at += -at % size + size
+        layouts.append(struct.Struct(form).pack)
+
+    def write(buffer: bytearray, values: Value) -> None:
+        buffer += layouts[(len(buffer) - _HEAD) % _WIDEST](*cast("Sequence[Value]", values))
+
+    return write
 
 
 def _align(buffer: bytearray, size: int) -> None:

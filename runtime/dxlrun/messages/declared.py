@@ -14,8 +14,9 @@ from __future__ import annotations
 import dataclasses
 import re
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Annotated, TypeAlias, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -79,6 +80,11 @@ class DeclaredMessage:
     """True with a field `header` whose stamp is set when it is packed."""
     _codec: Codec
     _plain: tuple[tuple[str, Plain | None], ...]
+    """Of each field how it becomes plain; None: it is."""
+    _row: Callable[[object], tuple[Value, ...]]
+    """Returns all values that a message is made of."""
+    _converted: tuple[tuple[int, Plain], ...]
+    """Those of them that become plain."""
 
     def pack(self, message: object, stamp: tuple[int, int]) -> bytes:
         """Return a message as CDR; `stamp`: seconds and nanoseconds for its header.
@@ -87,14 +93,15 @@ class DeclaredMessage:
         """
         if not isinstance(message, self.cls):
             raise WrongMessage(f"takes {self.cls.__name__}, not {type(message).__name__}")
-        values: list[Value] = []
         try:
-            for name, plain in self._plain:
-                value = getattr(message, name)
-                values.append(value if plain is None else plain(value))
+            values: Sequence[Value] = self._row(message)
             if self.stamped:
-                values[0] = (stamp, cast("tuple[object, str]", values[0])[1])
-            return self._codec.pack(*values)
+                values = [*stamp, *values[2:]]
+            if self._converted:
+                values = list(values)
+                for index, plain in self._converted:
+                    values[index] = plain(values[index])
+            return self._codec.pack_row(values)
         except (ValueError, TypeError, AttributeError, OverflowError, struct.error):
             raise WrongMessage(self._fault(message)) from None
 
@@ -117,7 +124,17 @@ def declared_message(cls: object, package: str) -> DeclaredMessage:
     kind = message_type(name, reader.definitions)
     own = reader.definitions[short_name(name)]
     stamped = own[0].name == "header" and own[0].kind == short_name(HEADER) and not own[0].sequence
-    return DeclaredMessage(cast("type", cls), kind, stamped, Codec(kind), reader.plain[short_name(name)])
+    codec, plain = Codec(kind), reader.plain[short_name(name)]
+    row: Callable[[object], tuple[Value, ...]] = attrgetter(*codec.leaves)
+    if len(codec.leaves) == 1:
+        row = _alone(codec.leaves[0])
+    converted = tuple(reader.conversions(short_name(name)))
+    return DeclaredMessage(cast("type", cls), kind, stamped, codec, plain, row, converted)
+
+
+def _alone(place: str) -> Callable[[object], tuple[Value, ...]]:
+    value = attrgetter(place)
+    return lambda message: (value(message),)
 
 
 def package_of(distribution: str) -> str:
@@ -153,6 +170,28 @@ class _Annotations:
             self.definitions[short] = tuple(field for field, _ in pairs)
             self.plain[short] = tuple((field.name, plain) for field, plain in pairs)
         return name
+
+    def conversions(self, name: str) -> list[tuple[int, Plain]]:
+        """Return which of the values of a message, nested ones in their place, become plain, and how."""
+        found: list[tuple[int, Plain]] = []
+        count = 0
+        for field, (_, plain) in zip(self.definitions[name], self.plain[name], strict=True):
+            if field.kind in self.definitions and not field.sequence:
+                inner = self.conversions(field.kind)
+                found += [(count + index, convert) for index, convert in inner]
+                count += self._values(field.kind)
+                continue
+            if plain is not None:
+                found.append((count, plain))
+            count += 1
+        return found
+
+    def _values(self, name: str) -> int:
+        fields = self.definitions[name]
+        nested = (field.kind in self.definitions and not field.sequence for field in fields)
+        return sum(
+            self._values(field.kind) if inner else 1 for field, inner in zip(fields, nested, strict=True)
+        )
 
     def _name(self, cls: type) -> str:
         given: object = getattr(cls, "ros_type", None)
