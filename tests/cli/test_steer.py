@@ -165,7 +165,7 @@ def test_send_moves_the_joints_that_are_named_with_units(dxlrun, torso: RemoteRo
 def test_a_register_is_set_while_the_robot_runs(dxlrun, torso: RemoteRobot) -> None:
     last = torso.events()["last"]
     said = dxlrun("set", "head_yaw_joint", "ccw_compliance_slope", "64", "--debug")
-    assert said == (0, "bioloid_torso: ccw_compliance_slope of head_yaw_joint is 64\n", "")
+    assert said == (0, "bioloid_torso: ccw_compliance_slope of head_yaw_joint is 32 -> 64\n", "")
     printed = [event["text"] for event in torso.events(last)["events"] if event["name"] == "register_written"]
     assert printed == ["CCW Compliance Slope (29) was 32 and is 64"]
     assert dxlrun("set", "head_yaw_joint", "ccw_compliance_slope", "64").code == 0
@@ -247,6 +247,53 @@ def test_a_motion_is_played_into_a_robot_that_runs(dxlrun, torso: RemoteRobot, t
         2,
         [f"{file}:3:17: controller head is not active; `dxlrun switch --activate head` activates it"],
     )
+
+
+def test_a_joint_is_limp_and_holds_again_while_the_robot_runs(dxlrun, torso: RemoteRobot) -> None:
+    commanded = "head commands head_yaw_joint; deactivate it first, or add --release"
+    assert dxlrun("torque", "off", "head_yaw_joint") == (1, "", f"dxlrun: {commanded}\n")
+    limp = "bioloid_torso: head_yaw_joint is limp\n"
+    assert dxlrun("torque", "off", "head_yaw_joint", "--release") == (0, limp, "")
+    assert torso.get("head_yaw_joint")["torque"] == "released"
+    assert torso.get("head_pitch_joint")["torque"] == "on"
+    assert not controllers(torso)["head"]["active"]
+    said = dxlrun("switch", "--activate", "head")
+    assert (said.code, said.out) == (1, "")
+    assert "head_yaw_joint has no torque; `dxlrun torque on head_yaw_joint` gives it" in said.err
+    said = dxlrun("get", "head_yaw_joint")
+    assert (said.code, said.err) == (0, "")
+    assert re.search(r"torque +released", said.out)
+    assert dxlrun("torque", "on", "head").out == "bioloid_torso: head has torque\n"
+    assert torso.get("head_yaw_joint")["torque"] == "on"
+    torso.switch(["head"])
+
+
+def test_items_are_read_and_what_cannot_be_is_said(dxlrun, torso: RemoteRobot) -> None:
+    said = dxlrun("get", "head_yaw_joint", "temperature_limit")
+    assert said == (0, "bioloid_torso: Temperature Limit (11) of head_yaw_joint is 70 (70 degC)\n", "")
+    found = json.loads(dxlrun("get", "head_yaw_joint", "return_delay_time", "--json").out)
+    assert (found["title"], found["area"], found["value"]) == (
+        "Return Delay Time (5)",
+        "EEPROM",
+        found["value"],
+    )
+    assert dxlrun("get", "head_yaw_joint", "nonsense").code == 2
+    assert "did you mean head_yaw_joint?" in dxlrun("get", "head_yaw").err
+    said = dxlrun("reboot", "head_yaw_joint", "--release")
+    assert (said.code, said.out) == (1, "")
+    assert "knows no reboot instruction" in said.err
+    assert dxlrun("torque", "off").code == 2
+    assert dxlrun("torque", "maybe", "head").code == 2
+    assert controllers(torso)["head"]["active"]
+
+
+def test_a_snapshot_of_the_robot(dxlrun, torso: RemoteRobot) -> None:
+    said = dxlrun("watch", "--once")
+    assert (said.code, said.err) == (0, "")
+    assert "left_elbow_joint" in said.out
+    assert "whole_body_posvel" in said.out
+    line = json.loads(dxlrun("watch", "--json", "--once").out)
+    assert line["joints"]["left_elbow_joint"]["torque"] == "on"
 
 
 def test_send_takes_a_file(dxlrun, torso: RemoteRobot, tmp_path: Path) -> None:
@@ -465,7 +512,7 @@ def test_the_commands_of_the_page_work_in_their_order(
     (tmp_path / "robots").symlink_to(ROOT / "robots")
     started, *lines = re.findall(r"^    dxlrun (.+)$", PAGE, re.MULTILINE)
     assert started == "robots/bioloid_torso.yaml"
-    assert {line.split()[0] for line in lines} == set(COMMANDS_WHILE_IT_RUNS)
+    assert {line.split()[0] for line in lines} == set(COMMANDS_WHILE_IT_RUNS) - {"reboot"}  # Protocol 2.0
     for line in lines:
         said = dxlrun(*shlex.split(line))
         assert (said.code, said.err) == (0, ""), line

@@ -269,7 +269,7 @@ STORMS = int(os.environ.get("DXLRUN_LIFE_STORMS", "12"))
 
 @pytest.mark.parametrize("protocol", [1.0, 2.0])
 @pytest.mark.parametrize("seed", range(STORMS))
-def test_whatever_happens_in_whatever_order_only_legal_transitions_follow(
+def test_whatever_happens_in_whatever_order_only_legal_transitions_follow(  # noqa: C901  what may happen
     make_plan, make_rig, seed, protocol
 ):
     """And no goal goes to a servo whose torque was not read as on since the last doubt."""
@@ -291,6 +291,17 @@ def test_whatever_happens_in_whatever_order_only_legal_transitions_follow(
         for row in let_go:
             rig.hardware.switch_torque(row, False)
 
+    answers: list[list[str]] = []
+
+    def request():
+        row = chance.randrange(3)
+        answers.append([])
+        if chance.random() < 0.7:
+            let_go.discard(row)
+            rig.hardware.switch_torque(row, True, answers[-1].append)
+        else:
+            rig.hardware.reboot(row, answers[-1].append)
+
     happenings = (
         lambda: chance.choice(line.servos).silence(chance.random() < 0.5),
         lambda: chance.choice(line.servos).reset(),
@@ -301,10 +312,11 @@ def test_whatever_happens_in_whatever_order_only_legal_transitions_follow(
         lambda: rig.clock.wait_until(rig.clock.now_ns() + 300_000_000),
         pull,
         let_one_go,
+        request,
     )
     for _ in range(60):
         # the rarer, the worse
-        chance.choices(happenings, (9, 2, 2, 1, 6, 3, 2, 2, 1))[0]()
+        chance.choices(happenings, (9, 2, 2, 1, 6, 3, 2, 2, 1, 3))[0]()
         for _ in range(chance.randrange(1, 12)):
             begun = len(rig.into_bus())
             rig.hardware.read()
@@ -318,6 +330,12 @@ def test_whatever_happens_in_whatever_order_only_legal_transitions_follow(
             rig.clock.wait_until(rig.clock.now_ns() + 5_000_000)
             for index in let_go:
                 assert story.life.states[index] in (ServoState.RELEASED, ServoState.OFFLINE)
+    line.plug_in()
+    for servo in line.servos:
+        servo.silence(False)
+    for _ in range(800):
+        rig.cycle()
+    assert all(len(answer) == 1 for answer in answers), "each request is answered once"
 
 
 def goals_in(packet, protocol):

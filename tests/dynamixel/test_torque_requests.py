@@ -24,6 +24,7 @@ class Arm:
         limits = {"lower": -2.5, "upper": 2.5}
         returning = change.pop("returning", False)
         limp = change.pop("limp", ())
+        take_over = change.pop("take_over", False)
         plan = make_plan(IDS, name="arm", return_delay_ns=0, **(model | limits | change))
         servos = tuple(
             replace(servo, torque_on_return=returning, torque_at_start=servo.servo_id not in limp)
@@ -31,7 +32,7 @@ class Arm:
         )
         self.plan = replace(plan, servos=servos, watchdog_ticks=watchdog)
         self.protocol = protocol
-        self.rig = make_rig(self.plan)
+        self.rig = make_rig(self.plan, take_over=take_over)
         self.answers = {}
         self.asked = 0
 
@@ -151,6 +152,26 @@ def test_torque_on_holds_a_joint_where_a_person_has_put_it(make, protocol, split
     assert arm.state is ServoState.TORQUED
     written = [address for servo, address, _ in arm.writes(begun) if servo == 12]
     assert written[-1] == arm.plan.servos[1].torque_address, "its goal came behind its torque"
+
+
+def test_the_bus_watchdog_is_armed_when_torque_is_on_again(make):
+    arm = make(watchdog=10).start()
+    assert arm.told(arm.switch(False)) == ""
+    arm.rig.clock.wait_until(arm.rig.clock.now_ns() + 400_000_000)  # the others are stopped, and revived
+    arm.follow(20)
+    assert arm.told(arm.switch(True)) == ""
+    assert [servo.registers["bus_watchdog"] for servo in arm.rig.buses[0].servos] == [10] * 3
+    arm.follow(30)
+    assert arm.shown == [Torque.ON] * 3
+
+
+def test_a_joint_that_the_file_wants_limp_loses_the_torque_that_it_has(make):
+    arm = make(limp=(12,), take_over=True)
+    for servo in arm.rig.buses[0].servos:
+        servo.poke("torque_enable", 1)
+    arm.start()
+    assert arm.rig.torque() == [True, False, True]
+    assert (12, 0) in arm.torque_bytes()
 
 
 def test_off_and_on_twice_is_off_and_on(make):

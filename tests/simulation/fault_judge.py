@@ -1,16 +1,17 @@
 """Judge of a run with faults: what failures.md promises, held against the simulated buses' own ledger.
 
 1 every byte sent is a legal instruction; 2 no goal outside the limits, no step over the maximum; 3 no
-torque-on without a look at the servo first; 4 each recorded sample is what that servo sent in that cycle;
-5 the log has every byte; 6 each accepted command has a known client and is in the log; 7 each fault that
-no run bears in silence leaves an event of its servo or bus, and no event is without a cause; 8 no servo
-that is reached keeps torque.
+torque-on without a look at the servo first, and neither torque nor goals for a joint that a client let go;
+4 each recorded sample is what that servo sent in that cycle; 5 the log has every byte; 6 each accepted
+command has a known client and is in the log; 7 each fault that no run bears in silence leaves an event of
+its servo or bus, and no event is without a cause; 8 no servo that is reached keeps torque.
 
 The packets are taken apart by fault_wire.py, which has its own addresses and units and nothing of the host's.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -32,6 +33,7 @@ from dxlrun.analysis.bus import joints_of
 from dxlrun.analysis.ledger.faults import answered, uncaused
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.errors import DxlrunError
+from dxlrun.log.client_commands import client_commands
 from dxlrun.log.reader import Log
 from dxlrun.run.channels.events import EventCode
 from dxlrun.run.channels.packets import PacketKind
@@ -55,6 +57,8 @@ BUMP = 0.1
 """rad: so near to where the servo is lies the goal with which it gets its torque again."""
 ROUNDING = 1e-9
 """rad, between two orders of the same arithmetic; a tick of an XM430 is 1.5e-3."""
+UNDER_WAY_NS = 500 * MS
+"""What idle time had begun for a servo when a request came has ended by then."""
 IDENTITY = 6
 """An item that begins before this address identifies a servo: model number, firmware, ID."""
 
@@ -142,6 +146,7 @@ class Trial:
             replies = list(states(mine, bus))
             goals_are_within_limits(sent, bus, self.robot)
             no_servo_wakes_without_a_look(sent, witness, bus, log)
+            no_joint_wakes_that_was_let_go(sent, bus, log)
             if not self.refusal:
                 samples_are_what_was_sent(replies, witness, bus, log)
             the_log_is_the_wire(mine, log, number)
@@ -184,11 +189,12 @@ def no_servo_wakes_without_a_look(
         return
     by_id = {servo.servo_id: servo for servo in bus.servos}
     goals = list(written(sent, bus, "goal_position"))
+    wanted = torque_requests(log)
     for t_ns, servo_id, shaft_rad in witness.found:
         if t_ns <= started[0] + 2 * MS:
             continue
         servo = by_id[servo_id]
-        assert servo.torque_on_return, (t_ns, servo.joint)
+        assert servo.torque_on_return or was_requested(wanted, servo.joint, t_ns), (t_ns, servo.joint)
         looks = [
             one
             for one in sent
@@ -202,7 +208,53 @@ def no_servo_wakes_without_a_look(
         assert abs(where - servo.direction * (shaft_rad - servo.reference)) < BUMP, (t_ns, servo.joint)
     asked = {(t_ns, servo.servo_id) for t_ns, servo, on in written(sent, bus, "torque_enable") if on}
     for t_ns, servo_id in asked:
-        assert t_ns <= started[0] or by_id[servo_id].torque_on_return, (t_ns, servo_id)
+        servo = by_id[servo_id]
+        may = servo.torque_on_return or was_requested(wanted, servo.joint, t_ns)
+        assert t_ns <= started[0] or may, (t_ns, servo_id)
+
+
+@dataclass(frozen=True)
+class TorqueRequest:
+    """A request of a client that the loop accepted: torque off or on, or a reboot, which may give it back."""
+
+    t_ns: int
+    joint: str
+    off: bool
+
+
+def torque_requests(log: Log) -> list[TorqueRequest]:
+    """Return what clients requested of each joint's torque, in order."""
+    found = []
+    for one in client_commands(log):
+        command = one.command
+        if command.for_loop and command.kind in {"torque", "reboot"} and not one.refusal:
+            data = json.loads(command.data)
+            off = command.kind == "torque" and not data["on"]
+            found += [TorqueRequest(command.t_ns, joint, off) for joint in data["joints"]]
+    return found
+
+
+def was_requested(requests: Sequence[TorqueRequest], joint: str, t_ns: int) -> bool:
+    """Return whether a client may have given a joint torque by now."""
+    return any(one.joint == joint and not one.off and one.t_ns <= t_ns for one in requests)
+
+
+def no_joint_wakes_that_was_let_go(sent: Sequence[Instruction], bus: BusPlan, log: Log) -> None:
+    """From torque off on until the next torque on, no goal, and no torque but what was on its way.
+
+    What had begun in idle time when the request came ends first: a change of a mode, torque on.
+    """
+    requests = torque_requests(log)
+    goals = [(t_ns, servo.joint) for t_ns, servo, _ in written(sent, bus, "goal_position")]
+    torque = [(t_ns, servo.joint) for t_ns, servo, on in written(sent, bus, "torque_enable") if on]
+    for number, one in enumerate(requests):
+        if not one.off:
+            continue
+        later = [two.t_ns for two in requests[number + 1 :] if two.joint == one.joint and not two.off]
+        until = min(later, default=1 << 62)
+        after = one.t_ns + UNDER_WAY_NS
+        woken = [t_ns for t_ns, joint in [*goals, *torque] if joint == one.joint and after < t_ns < until]
+        assert not woken, (one, woken)
 
 
 # Invariant 4: each recorded sample equals what that servo sent in that cycle

@@ -12,8 +12,9 @@ from typing import Literal, NamedTuple
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.simulation import LedgerEntry
 
-PING, READ, WRITE, SYNC_WRITE, SYNC_READ, FAST_SYNC_READ, BULK_READ = 0x01, 0x02, 0x03, 0x83, 0x82, 0x8A, 0x92
-HOST_SAYS = frozenset((PING, READ, WRITE, SYNC_WRITE, SYNC_READ, FAST_SYNC_READ, BULK_READ))
+PING, READ, WRITE, REBOOT = 0x01, 0x02, 0x03, 0x08
+SYNC_WRITE, SYNC_READ, FAST_SYNC_READ, BULK_READ = 0x83, 0x82, 0x8A, 0x92
+HOST_SAYS = frozenset((PING, READ, WRITE, REBOOT, SYNC_WRITE, SYNC_READ, FAST_SYNC_READ, BULK_READ))
 BROADCAST, STATUS = 254, 0x55
 HEADER = b"\xff\xff\xfd\x00"
 Item = Literal["torque_enable", "goal_position", "present_position"]

@@ -12,6 +12,7 @@ torque on. The full campaign before a release, 30 s of the robots' time each:
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import random
@@ -22,7 +23,7 @@ import numpy as np
 import pytest
 
 from dxlrun.log.reader import read_log
-from dxlrun.run.channels.answers import Done
+from dxlrun.run.channels.answers import Answer, Code, Refusal, Waiting
 from dxlrun.run.channels.commands import Command
 from dxlrun.simulation.faults.fault import KINDS
 from dxlrun.testing import VirtualRobot, simulated_robot
@@ -99,6 +100,11 @@ def built(name: str, directory: Path, policies: str = "", duration_s: float = DU
     return simulated_robot(path, duration_s=duration_s, log=log)
 
 
+def ended(answer: Answer) -> bool:
+    """Return whether the run's end refused a command, which is not logged then."""
+    return isinstance(answer, Refusal) and answer.code is Code.RUN_ENDING
+
+
 def commanded(robot: VirtualRobot) -> dict[int, bytes]:
     """Let a client send goals to every joint ten times a second; return them by number."""
     sent: dict[int, bytes] = {}
@@ -112,20 +118,55 @@ def commanded(robot: VirtualRobot) -> dict[int, bytes]:
     return sent
 
 
+FIRST_REQUEST = 100_000
+"""Number of the first request for joints."""
+
+
+def requested(robot: VirtualRobot, storm: str) -> int:
+    """Let another client switch torque, reboot servos and activate what was released; return how often."""
+    chance = random.Random(storm)
+    joints = [joint.name for joint in robot.plan.loop.joints]
+    controllers = [one.name for one in robot.plan.loop.controllers if one.command]
+    count = chance.choice((0, 3, round(2 * DURATION_S)))
+    for number in range(count):
+        some = chance.sample(joints, chance.choice((1, 1, 2, len(joints))))
+        kind, data = chance.choice(
+            (
+                ("torque", {"joints": some, "on": False, "release": chance.random() < 0.9}),
+                ("torque", {"joints": some, "on": True}),
+                ("torque", {"joints": some, "on": True}),
+                ("reboot", {"joints": some[:2], "release": chance.random() < 0.7}),
+                ("switch", {"activate": [chance.choice(controllers)], "deactivate": []}),
+            )
+        )
+        command = Command(FIRST_REQUEST + number, "", kind, json.dumps(data).encode(), "berta")
+        at_ns = chance.randrange(300, round(DURATION_S * 1000)) * 1_000_000
+        robot.buses[0].at(at_ns, lambda command=command: robot.inbox.waiting.append(command))
+    return count
+
+
 @pytest.mark.campaign
 @pytest.mark.parametrize(("name", "storm"), storms())
 def test_a_storm_breaks_no_promise(name: str, storm: str, tmp_path: Path, judge: Any) -> None:
     print(storm)
     robot = built(name, tmp_path)
     sent = {} if name == "torso" else commanded(robot)
+    requested(robot, storm)
     trial = judge.Trial.of(robot, [storm])
     started = trial.run()
     log = read_log(tmp_path / "run.mcap")
     trial.judge(log)
-    accepted = {number for number, answer in robot.inbox.answers.items() if isinstance(answer, Done)}
+    answers = {number: answer for number, answer in robot.inbox.answers.items() if number in sent}
+    accepted = {number for number, answer in answers.items() if not ended(answer)}
+    assert not any(isinstance(answer, Waiting) for answer in robot.inbox.answers.values())
     logged = [command for command in log.commands if command.origin == CLIENT]
     assert [one.data for one in logged] == [sent[number] for number in sorted(accepted)]
-    assert {one.origin for one in log.commands} <= {CLIENT, "loop", *(str(p) for p in TORSO)} or not sent
+    assert {one.origin for one in log.commands} <= {
+        CLIENT,
+        "berta",
+        "loop",
+        *(str(p) for p in TORSO),
+    } or not sent
     assert not started or not sent or accepted
 
 

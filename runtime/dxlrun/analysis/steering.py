@@ -32,6 +32,8 @@ class _Data(msgspec.Struct):
     joint: str = ""
     item: str = ""
     value: int = 0
+    joints: tuple[str, ...] = ()
+    on: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,6 +231,9 @@ def _words(command: TakenCommand) -> str:
         "load": data.name,
         "unload": data.controller,
         "register": f"{data.item} of {data.joint} = {data.value}",
+        "get": f"{data.item} of {data.joint}",
+        "torque": f"{'on' if data.on else 'off'}: {', '.join(data.joints)}",
+        "reboot": ", ".join(data.joints),
         "policy": data.policy,
     }
     return f"{command.kind} {known.get(command.kind, '')}".strip()

@@ -47,6 +47,9 @@ _KINDS = {
     "load": "controller loaded",
     "unload": "controller unloaded",
     "register": "register written",
+    "get": "register read",
+    "torque": "torque request",
+    "reboot": "reboot request",
     "stop": "stop",
 }
 _MANY = {
@@ -55,6 +58,7 @@ _MANY = {
     "controller loaded": "controllers loaded",
     "controller unloaded": "controllers unloaded",
     "register written": "registers written",
+    "register read": "registers read",
 }
 
 

@@ -115,7 +115,7 @@ class JointRequests:
         self.expected: dict[int, int] = {}
         """Rows of servos that reboot by request -> until when that is no loss, ns of the clock."""
 
-    def execute(self, command: Command, time_ns: int) -> Answer | None:
+    def execute(self, command: Command, time_ns: int) -> Refusal | None:
         """Execute a command of JOINT_KINDS; None: it is answered later. Raises what msgspec does."""
         number, data = command.number, command.data
         match command.kind:
@@ -128,8 +128,8 @@ class JointRequests:
             case _:
                 return self.reboot(number, msgspec.json.decode(data, type=RebootRequest), time_ns)
 
-    def torque(self, number: int, request: TorqueRequest, time_ns: int) -> Answer:
-        """Switch the torque of joints on or off, of all of them or of none."""
+    def torque(self, number: int, request: TorqueRequest, time_ns: int) -> Refusal | None:
+        """Switch the torque of joints on or off, of all of them or of none; None: it is answered later."""
         rows = self._known(request.joints)
         if isinstance(rows, Refusal):
             return rows
@@ -142,22 +142,24 @@ class JointRequests:
                 return refusal
             self._manager.released.update(rows.values())
         pending = self._pending[number] = _Pending(Code.TORQUE_NOT_SWITCHED, len(rows))
+        self._answer(number, Waiting(()))
         for joint, row in rows.items():
             self._hardware.switch_torque(row, request.on, partial(self._done, number, pending, joint))
-        return Waiting(())
+        return None
 
-    def reboot(self, number: int, request: RebootRequest, time_ns: int) -> Answer:
-        """Reboot the servos of joints, of all of them or of none."""
+    def reboot(self, number: int, request: RebootRequest, time_ns: int) -> Refusal | None:
+        """Reboot the servos of joints, of all of them or of none; None: it is answered later."""
         rows = self._known(request.joints)
         if isinstance(rows, Refusal):
             return rows
         if refusal := self._refuse_lost(rows) or self._release(rows, request.release, time_ns):
             return refusal
         pending = self._pending[number] = _Pending(Code.NOT_REBOOTED, len(rows))
+        self._answer(number, Waiting(()))
         for joint, row in rows.items():
             self.expected[row] = self._record.woken_ns + REBOOT_NS
             self._hardware.reboot(row, partial(self._done, number, pending, joint))
-        return Waiting(())
+        return None
 
     def register(self, number: int, request: Register) -> Refusal | None:
         """Have a RAM item of a joint's servo written; None: it is answered later."""

@@ -50,7 +50,9 @@ class Watched:
         self.info, self.states = self.robot.info(), self.robot.states()
         found = self.robot.events(self._last)
         self._last = cast("int", found["last"])
-        self.events = (self.events + cast("list[_FIELDS]", found["events"]))[-_LONGEST_EVENTS:]
+        self.events += cast("list[_FIELDS]", found["events"])
+        self.events.sort(key=lambda event: cast("float", event["time"]))  # those of the guardian come later
+        del self.events[:-_LONGEST_EVENTS]
         cycle, now = cast("int", self.states["cycle"]), cast("float", self.states["time"])
         self.latest = max(self.latest, cast("float", self.states["late"]))
         if not self._cycle[1]:
@@ -236,7 +238,7 @@ def _number(value: object, factor: float, digits: int, unit: str = "") -> str:
     if not isinstance(value, int | float):
         return ""
     text = f"{value * factor:.{digits}f}"
-    return f"{'0' if float(text) == 0 and not digits else text}{unit}"
+    return f"{text.lstrip('-') if float(text) == 0 else text}{unit}"
 
 
 def controllers(watched: Watched) -> Table:

@@ -338,7 +338,7 @@ class Servos:
         """Give goals again to a servo with torque, and none to one without."""
         reply = yield from self._read(self._plan.torque_reads[index])
         if not reply.answered or self._life.states[index] not in IN_DOUBT:
-            return  # lost or latched meanwhile: its return decides, or nothing gives it goals any more
+            return  # lost or released meanwhile: its return decides, or nothing gives it goals any more
         enabled = reply.parameters[0]
         if enabled == 1:
             self._life.on(index, ServoEvent.TORQUE_ON)

@@ -1,0 +1,183 @@
+"""`dxlrun watch`: what it shows of a robot, on every size of terminal, and how it ends."""
+
+from __future__ import annotations
+
+import io
+import json
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from dxlrun import DxlrunError
+from dxlrun.cli.steering import watch
+from dxlrun.cli.steering.steer import Chosen
+from dxlrun.output.table import Sentence
+
+
+class Robot:
+    """A robot with so many joints, which ends after some looks."""
+
+    name = "humanoid"
+
+    def __init__(self, joints: int = 20, looks: int = 1000) -> None:
+        self.names = [f"left_shoulder_joint_{number}" for number in range(joints)]
+        self.looks = looks
+        self.asked = 0
+
+    def __enter__(self) -> Robot:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def info(self) -> dict[str, Any]:
+        one = {"held": False, "rate": 50.0, "joints": self.names, "command": ["position"]}
+        controllers = [
+            {"name": "arm_pid", "active": True, "into": [], **one},
+            {"name": "arm", "active": True, "into": ["arm_pid"], **one},
+            {"name": "spare", "active": False, "into": [], **one},
+        ]
+        units = dict.fromkeys(self.names, "A")
+        known = {"rate": 50.0, "paused": False, "cycles": 7, "skipped": 2, "joints": self.names}
+        return {**known, "effort_units": units, "controllers": controllers}
+
+    def states(self) -> dict[str, Any]:
+        self.asked += 1
+        if self.asked > self.looks:
+            raise DxlrunError(f"{self.name} no longer answers: gone")
+        row = {
+            "position": 0.5,
+            "velocity": -1e-9,
+            "effort": 0.123,
+            "valid": True,
+            "age": 0.0,
+            "goal_position": 0.6,
+            "goal_velocity": None,
+            "goal_effort": None,
+            "goal_pwm": None,
+            "temperature": 41.0,
+            "voltage": 11.8,
+            "hardware_error": 0,
+            "mode": "position",
+            "torque": "on",
+        }
+        rows = {name: dict(row) for name in self.names}
+        rows[self.names[1]] |= {"torque": "released"}
+        rows[self.names[2]] |= {"torque": "off", "hardware_error": 0x20}
+        rows[self.names[3]] |= {"torque": "lost", "valid": False, "temperature": None, "position": None}
+        rows[self.names[4]] |= {"valid": False, "goal_position": None, "goal_velocity": 1.0}
+        number = 50 * self.asked
+        times = {"cycle": number, "time": 100.0 + self.asked, "late": 0.0001 * self.asked}
+        return {**times, "updates": {"arm": 25e-6, "arm_pid": 0.0, "spare": 0.0}, "joints": rows}
+
+    def events(self, after: int) -> dict[str, Any]:
+        one = {"name": "gate", "source": "arm", "text": "something\nhappened " + "x" * 200}
+        number = after + 1
+        return {"events": [{"number": number, "time": 100.0, "severity": 40, **one}], "last": number}
+
+
+@pytest.fixture
+def shown(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
+    """Run `watch` on a robot; return its exit code and what it printed."""
+
+    def run(
+        robot: Robot, *, runs: bool = False, as_json: bool = False, once: bool = False
+    ) -> tuple[int, str]:
+        monkeypatch.setattr(watch, "robot_of", lambda *_: robot)
+        monkeypatch.setattr(watch, "_ended", lambda _: not runs)
+        monkeypatch.setattr(watch, "REFRESH_S", 0.0)
+        code = watch.watch(once=once, chosen=Chosen(as_json=as_json))
+        return code, capsys.readouterr().out
+
+    return run
+
+
+def frame(width: int, height: int, joints: int = 20, looks: int = 3) -> list[str]:
+    """Return the lines of a view."""
+    watched = watch.Watched(Robot(joints))  # type: ignore[arg-type]  # a stand-in
+    for _ in range(looks):
+        watched.look()
+    console = Console(file=io.StringIO(), width=width, height=height, force_terminal=False)
+    console.print(watch.view(watched, width, height))
+    return console.file.getvalue().splitlines()  # type: ignore[attr-defined]  # it is a StringIO
+
+
+def test_twenty_joints_fit_into_a_small_terminal() -> None:
+    lines = frame(80, 24)
+    assert len(lines) <= 24
+    assert max(map(len, lines)) <= 80
+    assert lines[0].startswith("humanoid: 50 Hz (50.0), cycle 150, late 0.30 ms (max 0.30), 2 skipped")
+    rows = [line for line in lines if line.startswith("left_shoulder")]
+    assert len(rows) == 20
+    assert [row.split()[-1] for row in rows[:2]] == ["on", "released"]
+    assert rows[2].endswith(("off error 0x20", "off error 0x…", "off error…", "off er…"))
+    assert "active: arm_pid, arm" in lines[22]
+    assert "s ago, arm: something happened" in lines[23]
+
+
+@pytest.mark.parametrize("width", [40, 80, 200])
+@pytest.mark.parametrize("height", [10, 24, 60])
+def test_no_size_breaks_it(width: int, height: int) -> None:
+    lines = frame(width, height, joints=6)
+    assert max(map(len, lines)) <= width
+    assert len(lines) <= max(height, 8)
+
+
+def test_a_large_terminal_has_controllers_and_events() -> None:
+    text = "\n".join(frame(120, 50))
+    assert "arm_pid" in text
+    assert "25 us" in text
+    assert text.count("something happened") == 3
+
+
+def test_a_pipe_gets_one_snapshot(shown: Any) -> None:
+    robot = Robot(6)
+    code, said = shown(robot)
+    assert (code, robot.asked) == (0, 1)
+    assert "humanoid: 50 Hz, cycle 50" in said
+    for text in (
+        "34.4",
+        "28.6",
+        "0.12 A",
+        "57.3/s",
+        "off error 0x20",
+        "lost",
+        "on silent",
+        "arm_pid",
+        "spare",
+    ):
+        assert text in said, text
+    assert "-0.0" not in said
+    assert "\x1b" not in said
+
+
+def test_json_is_one_object_a_line_until_the_run_ends(shown: Any) -> None:
+    code, said = shown(Robot(6, looks=4), as_json=True)
+    lines = [json.loads(line) for line in said.splitlines()]
+    assert (code, len(lines)) == (0, 4)
+    assert [line["cycle"] for line in lines] == [50, 100, 150, 200]
+    assert [len(line["events"]) for line in lines] == [1] * 4
+    assert lines[2]["measured_rate"] == pytest.approx(50.0)
+    assert shown(Robot(6), as_json=True, once=True)[1].count("\n") == 1
+
+
+def test_a_robot_that_is_there_and_does_not_answer_is_an_error(shown: Any) -> None:
+    with pytest.raises(DxlrunError, match="no longer answers"):
+        shown(Robot(6, looks=2), runs=True, as_json=True)
+
+
+def test_an_interrupt_is_its_end(shown: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(_: float) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(watch.time, "sleep", interrupt)
+    assert shown(Robot(6), as_json=True)[0] == 0
+
+
+def test_the_newest_event_stands_last() -> None:
+    watched = watch.Watched(Robot())  # type: ignore[arg-type]  # a stand-in
+    watched.look()
+    watched.events = [{"time": at, "severity": 20, "source": "loop", "text": str(at)} for at in (1.0, 2.0)]
+    assert watch.event_lines(watched, 0) == []
+    assert watch.event_lines(watched, 1) == [Sentence(" 99.0 s ago, loop: 2.0", "plain")]
