@@ -177,7 +177,10 @@ def test_a_client_waits_for_the_end_of_a_goal(arm):
         await asyncio.sleep(0)
         assert not any(one.done() for one in waiting)
         report(arm, 1, "reached")
-        return [await one for one in waiting]
+        for _ in range(20):
+            await asyncio.sleep(0)
+        assert all(one.done() for one in waiting), "they wait for their time, not for the goal"
+        return [one.result() for one in waiting]
 
     for status, goal in asyncio.run(waits()):
         assert (status, goal["status"]) == (200, "reached")

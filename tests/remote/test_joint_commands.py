@@ -141,6 +141,14 @@ WRONG = [
     ("positions", "positions", {"positions": ["0 deg", "0 deg"]}, "&in=2", 422, "in is for joints by name"),
     ("positions", "positions", {"positions": ["0 deg"]}, "", 422, "1 positions for 2 joints"),
     ("positions", "posvel", {"pan": "0 deg"}, "", 404, "positions takes no command posvel"),
+    (
+        "trajectory",
+        "position",
+        {"tilt": "80 deg"},
+        "&in=9",
+        422,
+        "tilt is sent to 80 deg in point 1, outside",
+    ),
     ("pwm", "pwm", {"pan": 1.5}, "", 422, "pwm"),
     ("pwm", "pwm", {"pan": True}, "", 422, "pan is 'True', but must be a finite number"),
 ]

@@ -193,8 +193,9 @@ def _ended(robot: RemoteRobot, numbers: Sequence[int], *, hidden: bool) -> list[
             slowest = min(running, key=lambda state: state.progress)
             draw(f"{slowest.controller} {slowest.kind}", slowest.progress)
             states[slowest.number] = robot.goal_state(slowest.number, _PROGRESS_S)
-            for state in running[:-1]:
-                states[state.number] = robot.goal_state(state.number)
+            for state in running:
+                if state is not slowest:
+                    states[state.number] = robot.goal_state(state.number)
     return list(states.values())
 
 
