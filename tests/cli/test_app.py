@@ -81,7 +81,7 @@ def test_nothing_to_do_shows_the_help_and_is_wrong_input(dxlrun):
     [
         (["swich"], "'swich' is neither a command nor a robot file; did you mean switch?"),
         (["chekc"], "'chekc' is neither a command nor a robot file; did you mean check?"),
-        (["dance"], "'dance' is neither a command nor a robot file; a robot is run by `dxlrun ROBOT.yaml`"),
+        (["juggle"], "'juggle' is neither a command nor a robot file; a robot is run by `dxlrun ROBOT.yaml`"),
         (["missing/robot.yaml"], "there is no robot file missing/robot.yaml; check the path"),
         (["."], ". is a directory"),
         (["check"], "requires an argument"),

@@ -30,7 +30,7 @@ DONE = {"done": True, "cycle": 0}
 IN_LIMITS = {"done": True, "clamped": 0, "clamped_joints": []}
 GO = "/controllers/left/commands/go"
 SET_POINT = "/controllers/left/set-points/go"
-NUMBERS = {"seconds", "rate", "controller_rate", "lowest", "highest"}
+NUMBERS = {"seconds", "velocity", "rate", "controller_rate", "lowest", "highest"}
 
 
 def chunk(data, more=True):
