@@ -109,7 +109,7 @@ BROKEN = {
     "cannot be imported (SyntaxError": "def",
     "cannot be imported (SystemExit: 3)": "import sys; sys.exit(3)",
     "does not declare its contract": GOOD.replace("@hookimpl\ndef dxlrun_contract", "def contract"),
-    "was written for contract 7, this dxlrun has contract 1": GOOD.replace("return 1", "return 7"),
+    "was written for contract 7, this dxlrun has contract 2": GOOD.replace("return 1", "return 7"),
     "implements dxlrun_controllers(robot), but the hook is dxlrun_controllers()": GOOD.replace(
         "def dxlrun_controllers()", "def dxlrun_controllers(robot)"
     ),

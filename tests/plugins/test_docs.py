@@ -1,4 +1,4 @@
-"""docs/controllers.md, typed as it stands: its files, its commands, its tests, and what it says of errors."""
+"""docs/controllers.md, typed as it stands: its commands, its excerpts, and what it says of errors."""
 
 from __future__ import annotations
 
@@ -11,69 +11,89 @@ from typing import Any
 import pytest
 
 from dxlrun import CONTRACT_VERSION
+from dxlrun.cli import main
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs/controllers.md").read_text()
-FILES = dict(re.findall(r"`([\w.]+\.(?:toml|py|yaml))`:\n\n```\w+\n(.*?)```", PAGE, re.DOTALL))
-BLOCKS = re.findall(r"```\w+\n(.*?)```", PAGE, re.DOTALL)
+BLOCKS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 COMMANDS = [
     line.strip() for line in PAGE.splitlines() if line.startswith("    ") and not line.startswith("     ")
 ]
 Shell = Callable[..., Any]
 pytestmark = pytest.mark.timeout(400)
-"""Each builds and installs packages, with what they depend on from an index."""
+"""Some build and install packages, with what they depend on from an index."""
 
 
 @pytest.fixture
 def package(tmp_path: Path) -> Path:
-    """The directory of somebody who has copied the page's files."""
-    for name, text in FILES.items():
-        (tmp_path / name).write_text(text)
-    return tmp_path
+    """A directory with the package that the page begins with."""
+    assert main(["new-plugin", "my_robotics", "--directory", str(tmp_path / "my_robotics")]) == 0
+    return tmp_path / "my_robotics"
 
 
-def test_the_page_has_these_files_an_excerpt_and_sketches() -> None:
-    assert list(FILES) == ["pyproject.toml", "my_robotics.py", "robot.yaml", "test_wave.py"]
-    others = [block for block in BLOCKS if block not in FILES.values()]
-    example = (ROOT / "plugins/example/src/dxlrun_easing/controller.py").read_text()
-    (excerpt,) = (block for block in others if block in example)
-    for sketch in others:
-        if sketch != excerpt:
+def test_its_excerpts_are_in_the_package_and_its_sketches_are_python(package: Path) -> None:
+    texts = [path.read_text() for path in package.rglob("*.py")]
+    excerpts = [block for block in BLOCKS if any(block in text for text in texts)]
+    assert len(excerpts) == 5
+    for sketch in BLOCKS:
+        if sketch not in excerpts:
             compile(dedent(sketch), "controllers.md", "exec")
 
 
-def test_its_commands_end_well_in_their_order(fresh: Shell, package: Path) -> None:
-    lines = [line for line in COMMANDS if line.startswith(("pip", "dxlrun", "python"))]
-    assert len(lines) == 6
+def test_each_file_of_its_table_is_in_the_package(package: Path) -> None:
+    section = PAGE.partition("## Ten minutes")[2].partition("\n## ")[0]
+    named = re.findall(r"`([\w/.]+\.\w+)`", "".join(re.findall(r"^\| (`.*?) \|", section, re.MULTILINE)))
+    assert len(named) == 6
+    for name in named:
+        assert list(package.rglob(name)), name
+
+
+def test_its_commands_end_well_in_their_order(fresh: Shell, tmp_path: Path) -> None:
+    lines = [line for line in COMMANDS if line.startswith(("pip", "dxlrun", "python", "cd"))]
+    assert lines[:2] == ["dxlrun new-plugin my_robotics", "cd my_robotics"]
+    assert len(lines) == 8
+    place, said = tmp_path, ""
     for number, line in enumerate(lines):
-        told = fresh(line, package, isolated=number == 0)
+        if line.startswith("cd "):
+            place /= line.removeprefix("cd ")
+            continue
+        told = fresh(line, place, isolated=number == 2)
         assert told.returncode == 0, line + told.stdout + told.stderr
-    assert [path.name for path in (package / "dist").iterdir()] == ["my_robotics-0.1.0-py3-none-any.whl"]
-    assert "arms" in fresh("dxlrun check robot.yaml", package).stdout
-    fresh("pip uninstall --yes my-robotics", package)
+        said += told.stdout
+    assert re.search(r"my_robotics_controller +my-robotics 0\.1\.0 ", said)
+    assert [path.name for path in (place / "dist").iterdir()] == ["my_robotics-0.1.0-py3-none-any.whl"]
+    source = place / "src/my_robotics/controller.py"
+    (line,) = (one for one in source.read_text().splitlines(keepends=True) if "np.multiply" in one)
+    source.write_text(source.read_text().replace(line, ""))
+    assert (
+        fresh("python -m pytest -q && dxlrun example.yaml --virtual --play nod.yaml", place).returncode == 0
+    )
+    fresh("pip uninstall --yes my-robotics", place)
 
 
 def test_an_editable_install_finds_new_code_but_no_new_entry_point(fresh: Shell, package: Path) -> None:
     install = next(line for line in COMMANDS if line.startswith("pip install -e"))
     assert fresh(install, package).returncode == 0
-    source, project = package / "my_robotics.py", package / "pyproject.toml"
-    source.write_text(FILES["my_robotics.py"].replace('"wave"', '"swing"'))
-    robot = package / "robot.yaml"
-    robot.write_text(FILES["robot.yaml"].replace("type: wave", "type: swing"))
-    assert fresh("dxlrun check robot.yaml", package).returncode == 0
-    (package / "my_second.py").write_text(FILES["my_robotics.py"].replace('"wave"', '"second"'))
-    project.write_text(FILES["pyproject.toml"] + 'my_second = "my_second"\n')
-    robot.write_text(FILES["robot.yaml"].replace("type: wave", "type: second"))
-    told = fresh("dxlrun check robot.yaml", package)
+    source, project = package / "src/my_robotics/plugin.py", package / "pyproject.toml"
+    text, entries, robot = source.read_text(), project.read_text(), package / "example.yaml"
+    source.write_text(text.replace('"my_robotics_controller"', '"swing"'))
+    written = robot.read_text()
+    robot.write_text(written.replace("my_robotics_controller", "swing"))
+    assert fresh("dxlrun check example.yaml", package).returncode == 0
+    (package / "src/my_robotics/second.py").write_text(text.replace('"my_robotics_controller"', '"second"'))
+    point = 'my_robotics = "my_robotics.plugin"\n'
+    project.write_text(entries.replace(point, point + 'my_second = "my_robotics.second"\n'))
+    robot.write_text(written.replace("my_robotics_controller", "second"))
+    told = fresh("dxlrun check example.yaml", package)
     assert (told.returncode, "no plug-in offers the controller type second" in told.stderr) == (2, True)
     assert fresh(install, package).returncode == 0
-    assert fresh("dxlrun check robot.yaml", package).returncode == 0
+    assert fresh("dxlrun check example.yaml", package).returncode == 0
     fresh("pip uninstall --yes my-robotics", package)
 
 
-def test_the_contract_of_the_page_is_the_contract() -> None:
-    assert f"This one has contract {CONTRACT_VERSION}." in PAGE
-    assert f"return {CONTRACT_VERSION}\n" in FILES["my_robotics.py"]
+def test_the_contract_of_the_page_is_the_contract(package: Path) -> None:
+    assert f"This one has contract {CONTRACT_VERSION}:" in PAGE
+    assert f"return {CONTRACT_VERSION}\n" in (package / "src/my_robotics/plugin.py").read_text()
 
 
 def test_each_sentence_of_the_table_is_one_that_dxlrun_prints() -> None:

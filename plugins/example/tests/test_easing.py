@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 
 from dxlrun import InputError
 from dxlrun.testing import plan_of, read_log, simulated_robot
@@ -27,6 +28,15 @@ def test_it_arrives_and_is_never_faster_than_the_file_says(tmp_path: Path) -> No
     steps = np.abs(np.diff(goals, axis=0))
     assert steps.max() == pytest.approx(TOP_STEP)
     assert len(goals) == 200
+
+
+def test_its_topic_is_in_the_log_once_a_cycle(tmp_path: Path) -> None:
+    log = tmp_path / "state.mcap"
+    simulated_robot(HERE / "example.yaml", duration_s=0.5, log=log).run()
+    with log.open("rb") as stream:
+        messages = list(make_reader(stream).iter_messages(topics=["/head/state"]))
+    assert len(messages) == 25
+    assert {schema.name for schema, _, _ in messages if schema} == {"dxlrun_easing/msg/EasingState"}
 
 
 def test_without_a_command_it_holds() -> None:

@@ -21,6 +21,8 @@ COMMANDS = {
     "sim": "sim:sim",
     "schema": "examples:schema",
     "models": "models:models",
+    "plugins": "plugins:plugins",
+    "new-plugin": "plugins:new_plugin",
     "scan": "scan:scan",
     "servo": "servo:servo",
     "doctor": "machine:doctor",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 import numpy as np
@@ -11,11 +12,13 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from dxlrun import (
+    LIVE,
     AngularVelocity,
     CommandModel,
     Context,
     Controller,
     Duration,
+    Floats,
     Interfaces,
     ParametersModel,
 )
@@ -28,8 +31,8 @@ class EasingParameters(ParametersModel):
     """The joints, in the order in which commands name them."""
     time_constant: Annotated[Duration, Field(gt=0)] = 200_000_000
     """ns; in each of it, two thirds of what is left of the way are done"""
-    speed: Annotated[AngularVelocity, Field(gt=0)] = math.pi / 2
-    """rad/s; never faster than this"""
+    speed: Annotated[AngularVelocity, Field(gt=0), LIVE] = math.pi / 2
+    """rad/s; never faster than this; `dxlrun parameters` changes it in a run"""
 
 
 class PositionsCommand(CommandModel):
@@ -39,11 +42,20 @@ class PositionsCommand(CommandModel):
     """rad, shape (joints,)"""
 
 
+@dataclass(frozen=True, slots=True)
+class EasingState:
+    """Message of the topic `state`."""
+
+    left: Floats
+    """rad, shape (joints,): what is left of the way"""
+
+
 class Easing(Controller[EasingParameters]):
     """Leads joints to commanded positions along an exponential with a top speed."""
 
     Parameters = EasingParameters
     Commands: ClassVar[Mapping[str, type[CommandModel]]] = {"positions": PositionsCommand}
+    Topics: ClassVar[Mapping[str, type]] = {"state": EasingState}
 
     @classmethod
     def interfaces(cls, parameters: EasingParameters, joints: tuple[str, ...]) -> Interfaces:
@@ -65,6 +77,7 @@ class Easing(Controller[EasingParameters]):
         super().on_configure(context)
         self._goal = np.zeros(len(context.joints))
         self._step = np.zeros(len(context.joints))
+        self._left = np.zeros(len(context.joints))
 
     def on_activate(self, time_ns: int) -> None:
         """Stay where the joints are: at what was last sent, or where nothing was sent, at what is read."""
@@ -87,3 +100,5 @@ class Easing(Controller[EasingParameters]):
         np.multiply(self._step, share, out=self._step)
         np.clip(self._step, -longest, longest, out=self._step)
         np.add(position, self._step, out=position)
+        np.subtract(self._goal, position, out=self._left)
+        self.context.publish("state", EasingState(self._left))

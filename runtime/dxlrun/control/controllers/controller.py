@@ -15,8 +15,9 @@ from pydantic import BaseModel, ConfigDict
 from dxlrun.description.modes import CommandName
 from dxlrun.run.channels.cycle import Commands, Floats, States
 
-CONTRACT_VERSION = 1
-"""Grows when a controller written for the version before would misbehave."""
+CONTRACT_VERSION = 2
+"""Grows when what a controller may use grows, or one written for the version before would misbehave: 2 has
+references, reads, topics, goals and live parameters; controllers for 1 work."""
 
 
 class ParametersModel(BaseModel):

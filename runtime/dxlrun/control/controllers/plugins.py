@@ -81,6 +81,22 @@ class Offer:
     """Its publisher: `name version`."""
 
 
+@dataclass(frozen=True, slots=True)
+class LoadedPlugIn:
+    """A plug-in that can be used."""
+
+    name: str
+    """Of its entry point."""
+    distribution: str
+    """Its publisher: `name version`."""
+    contract: int
+    """The one that it was written for."""
+    offers: tuple[Offer, ...]
+    servo_models: tuple[str, ...]
+    overrun: bool
+    """It decides about late cycles."""
+
+
 def _any_threads(name: str) -> None:
     """Do nothing: processes without a loop may have threads."""
 
@@ -96,6 +112,8 @@ class PlugIns:
     plug-ins offer, by the type's name."""
     overrun_hooks: tuple[OverrunHook, ...] = ()
     """They decide what becomes of a late cycle, in this order."""
+    loaded: tuple[LoadedPlugIn, ...] = ()
+    """The plug-ins themselves, in the order in which they were loaded; not those that are `broken`."""
     after_each: Callable[[str], None] = _any_threads
     """Called with a name after foreign code prepared something; it may raise PlugInError."""
 
@@ -130,7 +148,9 @@ class PlugIns:
 class _Offered:
     """What one plug-in brings."""
 
+    contract: int = 0
     offers: tuple[Offer, ...] = ()
+    servo_models: tuple[str, ...] = ()
     overrun: Decide | None = None
 
 
@@ -144,6 +164,7 @@ def load_plugins(after_each: Callable[[str], None] = _any_threads) -> PlugIns:
     offers: dict[str, Offer] = {}
     broken: dict[str, str] = {}
     hooks: list[OverrunHook] = []
+    loaded: list[LoadedPlugIn] = []
     ambiguous: dict[str, str] = {}
     # the order must not depend on the file system: two runs load the same plug-ins in the same order
     found_points = [(_publisher(each), each.name, each) for each in entry_points(group=GROUP)]
@@ -153,6 +174,10 @@ def load_plugins(after_each: Callable[[str], None] = _any_threads) -> PlugIns:
         except PlugInError as error:
             broken[_free_key(entry_point.name, publisher, broken)] = str(error)
             found = _Offered()
+        else:
+            models, overrun = found.servo_models, found.overrun is not None
+            name, contract = entry_point.name, found.contract
+            loaded.append(LoadedPlugIn(name, publisher, contract, found.offers, models, overrun))
         if found.overrun is not None:
             hooks.append(OverrunHook(f"{entry_point.name} ({publisher})", found.overrun))
         after_each(f"{entry_point.name} ({publisher})")
@@ -164,7 +189,7 @@ def load_plugins(after_each: Callable[[str], None] = _any_threads) -> PlugIns:
                     f"{offer.type}; neither is used: uninstall one of them, or ask an author for another name"
                 )
     usable = {name: offer for name, offer in offers.items() if name not in ambiguous}
-    return PlugIns(usable, broken | ambiguous, tuple(hooks), after_each)
+    return PlugIns(usable, broken | ambiguous, tuple(hooks), tuple(loaded), after_each)
 
 
 def _publisher(entry_point: EntryPoint) -> str:
@@ -214,21 +239,21 @@ def _load(entry_point: EntryPoint, publisher: str) -> _Offered:
         raise refuse(f"raised in a hook ({_one_line(error)})", "report it to its author") from error
     if not contracts:
         raise refuse("does not declare its contract", "it must implement the hook dxlrun_contract")
-    if contracts != [CONTRACT_VERSION]:
+    contract = contracts[0]
+    if not (type(contract) is int and 1 <= contract <= CONTRACT_VERSION):
         raise refuse(
-            f"was written for contract {contracts[0]!r}, this dxlrun has contract {CONTRACT_VERSION}",
+            f"was written for contract {contract!r}, this dxlrun has contract {CONTRACT_VERSION}",
             "install a version of it that fits",
         )
     offers = tuple(
-        _offer(name, controller, publisher, refuse)
+        _offer(name, controller, publisher, contract, refuse)
         for mapping in mappings
         for name, controller in _items(mapping, refuse)
     )
     if twofold := _twofold_message(offers):
         raise refuse(f"has two messages {twofold}", "give one of the two classes another name")
-    for models in servo_models:
-        _add_servo_models(models, refuse)
-    return _Offered(offers, _overrun(manager))
+    added = tuple(name for models in servo_models for name in _add_servo_models(models, refuse))
+    return _Offered(contract, offers, added, _overrun(manager))
 
 
 def _overrun(manager: pluggy.PluginManager) -> Decide | None:
@@ -244,23 +269,26 @@ def _call(
     return function(**{name: given[name] for name in names})
 
 
-def _add_servo_models(models: object, refuse: Callable[[str, str], PlugInError]) -> None:
-    """Make the control tables of a plug-in known to this process."""
+def _add_servo_models(models: object, refuse: Callable[[str, str], PlugInError]) -> list[str]:
+    """Make the control tables of a plug-in known to this process; return the names of the models."""
     if not isinstance(models, Sequence) or isinstance(models, str | bytes):
         raise refuse(
             "does not return a list from dxlrun_servo_models", "return TOML texts, or paths of TOML files"
         )
+    names = []
     for model in models:
         if not isinstance(model, str | Path):
             raise refuse(f"offers the servo model {model!r}", "it must be a TOML text or the path of a file")
         where = f"({model}) " if isinstance(model, Path) else ""
         try:
-            add_control_table(model if isinstance(model, str) else model.read_text("utf-8"))
+            table = add_control_table(model if isinstance(model, str) else model.read_text("utf-8"))
         except (OSError, ValueError) as error:
             raise refuse(
                 f"offers a servo model {where}that cannot be used ({_one_line(error)})",
                 "report it to its author",
             ) from error
+        names.append(table.model)
+    return names
 
 
 def _items(mapping: object, refuse: Callable[[str, str], PlugInError]) -> list[tuple[object, object]]:
@@ -270,11 +298,15 @@ def _items(mapping: object, refuse: Callable[[str, str], PlugInError]) -> list[t
 
 
 def _offer(
-    name: object, controller: object, publisher: str, refuse: Callable[[str, str], PlugInError]
+    name: object,
+    controller: object,
+    publisher: str,
+    contract: int,
+    refuse: Callable[[str, str], PlugInError],
 ) -> Offer:
     if not isinstance(name, str):
         raise refuse(f"offers a controller under {name!r}", "the type must be a string")
-    breach = controller_breach(controller)
+    breach = controller_breach(controller, contract)
     if breach is not None:
         what, fix = breach
         shown = controller.__qualname__ if isinstance(controller, type) else repr(controller)
@@ -306,8 +338,8 @@ def hook_breach(plugin: object, manager: pluggy.PluginManager) -> Breach | None:
     return None
 
 
-def controller_breach(controller: object) -> Breach | None:
-    """Check a class that is offered as a controller."""
+def controller_breach(controller: object, contract: int = CONTRACT_VERSION) -> Breach | None:
+    """Check a class that is offered as a controller, by the contract that its package was written for."""
     if not (isinstance(controller, type) and issubclass(controller, Controller)):
         return "which is no controller", "derive a class from dxlrun.Controller"
     missing = sorted(getattr(controller, "__abstractmethods__", ()))
@@ -320,7 +352,7 @@ def controller_breach(controller: object) -> Breach | None:
                 f"{name}{_arguments(getattr(Controller, name))}",
                 "give it these arguments",
             )
-    return _declaration_breach(controller)
+    return _declaration_breach(controller, contract)
 
 
 def interfaces_breach(interfaces: object, *, chained: bool = False) -> Breach | None:
@@ -366,7 +398,7 @@ def _names_breach(interfaces: Interfaces) -> Breach | None:
     return None
 
 
-def _declaration_breach(controller: ControllerClass) -> Breach | None:
+def _declaration_breach(controller: ControllerClass, contract: int) -> Breach | None:
     if not _is_model(controller.Parameters, ParametersModel):
         return "whose Parameters is no model of parameters", "derive it from dxlrun.ParametersModel"
     if mistaken := live_mistake(controller.Parameters):
@@ -381,14 +413,15 @@ def _declaration_breach(controller: ControllerClass) -> Breach | None:
         return "whose Commands is no mapping of names to models", "write {name: class of dxlrun.CommandModel}"
     if breach := _goals_breach(controller, commands):
         return breach
-    return _publishes_breach(controller) or _topics_breach(controller)
+    return _publishes_breach(controller, contract) or _topics_breach(controller)
 
 
-def _publishes_breach(controller: ControllerClass) -> Breach | None:
+def _publishes_breach(controller: ControllerClass, contract: int) -> Breach | None:
     publishes: object = controller.publishes
     if not isinstance(publishes, tuple) or not all(isinstance(topic, str) for topic in publishes):
         return "whose publishes is no tuple of topics", 'write publishes = ("/joint_states",)'
-    if unknown := [topic for topic in publishes if topic not in DERIVED_TOPICS]:
+    # a package for contract 1 could name any topic, which then went unheard, as it does now
+    if contract > 1 and (unknown := [topic for topic in publishes if topic not in DERIVED_TOPICS]):
         return (
             f"whose publishes has {unknown[0]}, which is not made of the robot's cycles",
             f"declare it in Topics with the class of its messages; publishes has {', '.join(DERIVED_TOPICS)}",

@@ -1,0 +1,240 @@
+"""`dxlrun plugins` and `dxlrun new-plugin`: packages that extend dxlrun, and the beginning of another."""
+
+from __future__ import annotations
+
+import keyword
+import re
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dxlrun.cli.inputs import Flag, JsonFlag
+from dxlrun.errors import DxlrunError, InputError
+from dxlrun.output.table import Column, Table
+from dxlrun.output.terminal import show, show_json
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+    from dxlrun.control.controllers.plugins import LoadedPlugIn, Offer
+
+_NAME = re.compile(r"[a-z][a-z0-9]*([-_][a-z0-9]+)*")
+_LONGEST_NAME = 60
+_TEMPLATE = "easing"
+_LEFT_OUT = ("LICENSE",)
+_NOT_COPIED = ("__pycache__", ".pytest_cache", "logs", "dist", "build")
+_OWNED = re.compile(r"^(license|license-files|authors) = .*\n", re.MULTILINE)
+"""Lines of pyproject.toml that are the author's to write."""
+_LICENCE = re.compile(r"\n## Licence\n.*", re.DOTALL)
+
+
+@dataclass(frozen=True, slots=True)
+class ControllerShown:
+    """A controller that a plug-in offers."""
+
+    type: str
+    commands: tuple[str, ...]
+    """Those that are no goals."""
+    goals: tuple[str, ...]
+    topics: tuple[str, ...]
+    references: tuple[str, ...]
+    """Interfaces that others can command, as its parameters are by default; some decide on them."""
+    live: tuple[str, ...]
+    """Parameters that can be changed in a run."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlugInShown:
+    """A plug-in, usable or not."""
+
+    name: str
+    distribution: str
+    contract: int | None
+    controllers: tuple[ControllerShown, ...] = ()
+    servo_models: tuple[str, ...] = ()
+    overrun: bool = False
+    broken: str = ""
+    """Why it cannot be used; empty: it can."""
+
+
+def plugins(*, as_json: JsonFlag = False, debug: Flag = False) -> int:
+    """List the plug-ins that are installed, and what each of them offers.
+
+    Parameters
+    ----------
+    as_json
+        Print the result as JSON.
+    debug
+        Print the traceback of an error.
+    """
+    from dxlrun.control.controllers.plugins import load_plugins
+
+    found = load_plugins()
+    rows = [_shown(one) for one in found.loaded]
+    rows += [PlugInShown(name, "", None, broken=reason) for name, reason in found.broken.items()]
+    if as_json:
+        show_json(rows)
+    else:
+        show(_table(rows), *(f"broken: {row.broken}" for row in rows if row.broken))
+    return 0
+
+
+def _shown(plugin: LoadedPlugIn) -> PlugInShown:
+    return PlugInShown(
+        name=plugin.name,
+        distribution=plugin.distribution,
+        contract=plugin.contract,
+        controllers=tuple(_controller(offer) for offer in plugin.offers),
+        servo_models=plugin.servo_models,
+        overrun=plugin.overrun,
+    )
+
+
+def _controller(offer: Offer) -> ControllerShown:
+    kind = offer.controller
+    return ControllerShown(
+        type=offer.type,
+        commands=tuple(name for name in kind.Commands if name not in kind.Goals),
+        goals=tuple(name for name in kind.Commands if name in kind.Goals),
+        topics=tuple(kind.Topics) + tuple(kind.publishes),
+        references=_references(offer),
+        live=tuple(_live(kind.Parameters)),
+    )
+
+
+def _live(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
+    from pydantic import BaseModel
+
+    from dxlrun.control.controllers.controller import LIVE
+
+    for name, field in model.model_fields.items():
+        if LIVE in field.metadata:
+            yield prefix + name
+        elif isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            yield from _live(field.annotation, f"{prefix}{name}.")
+
+
+def _references(offer: Offer) -> tuple[str, ...]:
+    """Return what a controller exports on one joint by the defaults of its parameters, if they have any."""
+    try:
+        given: dict[str, Any] = {"joints": ("joint",)}  # a model of foreign code: what it has is not known
+        parameters = offer.controller.Parameters.model_construct(**given)
+        return tuple(offer.controller.interfaces(parameters, ("joint",)).reference)
+    except Exception:  # foreign code, and parameters without a default: it decides when it is used
+        return ()
+
+
+def _table(rows: list[PlugInShown]) -> Table:
+    columns = [
+        *(Column(name, "name") for name in ("plug-in", "from")),
+        Column("contract"),
+        *(Column(name, "text") for name in ("offers", "commands", "goals", "topics", "references")),
+    ]
+    return Table.of("Plug-ins", columns, [line for row in rows if not row.broken for line in _lines(row)])
+
+
+def _lines(row: PlugInShown) -> Iterator[tuple[str | float | None, ...]]:
+    """Yield a line for each thing that a plug-in offers; the first one names the plug-in."""
+    offered = [
+        *((one.type, one.commands, one.goals, one.topics, one.references) for one in row.controllers),
+        *((f"servo model {name}", (), (), (), ()) for name in row.servo_models),
+        *([("decisions about late cycles", (), (), (), ())] if row.overrun else []),
+    ]
+    for index, (name, *parts) in enumerate(offered or [("nothing", (), (), (), ())]):
+        own = (row.name, row.distribution, row.contract) if index == 0 else ("", "", None)
+        yield (*own, name, *(", ".join(part) for part in parts))
+
+
+def new_plugin(
+    name: str, /, *, directory: Path | None = None, as_json: JsonFlag = False, debug: Flag = False
+) -> int:
+    """Make a package with a controller of your own, a robot file that uses it, and a test.
+
+    Parameters
+    ----------
+    name
+        Name of the package, such as my_robotics.
+    directory
+        Where it is made; without it, in a new directory of its name.
+    as_json
+        Print the result as JSON.
+    debug
+        Print the traceback of an error.
+    """
+    module = _module(name)
+    place = Path(name) if directory is None else directory
+    if place.exists() or place.is_symlink():
+        raise InputError(f"{place} is there already, and stays; choose another --directory")
+    files = dict(_files(_template(), module))
+    try:
+        for path, text in files.items():
+            target = place / path
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{error.filename} cannot be written: {error.strerror}") from error
+    made = [str(place / path) for path in files]
+    if as_json:
+        show_json({"directory": str(place), "files": made})
+        return 0
+    show(
+        *made,
+        f"next: cd {place} && pip install -e '.[test]' && python -m pytest",
+    )
+    return 0
+
+
+def _module(name: str) -> str:
+    """Return the module's name of a package; raises InputError for what cannot be one."""
+    module = name.replace("-", "_")
+    if not _NAME.fullmatch(name) or len(name) > _LONGEST_NAME:
+        raise InputError(
+            f"{name[:80]!r} is no name of a package; write small letters and digits, a letter first, - or _ "
+            f"between them, at most {_LONGEST_NAME}: my_robotics"
+        )
+    if keyword.iskeyword(module) or module in sys.stdlib_module_names or _known(module):
+        raise InputError(f"{module} is a module that Python knows already; choose another name: my_{module}")
+    return module
+
+
+def _known(module: str) -> bool:
+    try:
+        return find_spec(module) is not None
+    except (ImportError, ValueError):
+        return False
+
+
+def _template() -> Path:
+    """Return where the template is: in the installed package, or in the clone that it is edited in."""
+    package = Path(__file__).parents[1]
+    for place in (package / "plugin_template", package.parents[1] / "plugins" / "example"):
+        if place.is_dir():
+            return place
+    raise DxlrunError("this installation of dxlrun has no template of a plug-in; install it anew")
+
+
+def _files(template: Path, module: str) -> Iterator[tuple[Path, str]]:
+    """Yield paths and texts of a package: those of the template, with names of its own."""
+    renamed: Mapping[str, str] = {
+        f"dxlrun_{_TEMPLATE}": module,
+        f"dxlrun-{_TEMPLATE}": module.replace("_", "-"),
+        f"{_TEMPLATE}_position_controller": f"{module}_controller",
+        f"{_TEMPLATE}_example": f"{module}_example",
+        f"\n{_TEMPLATE} = ": f"\n{module} = ",
+        f"test_{_TEMPLATE}": f"test_{module}",
+    }
+    for path in sorted(template.rglob("*")):
+        relative = path.relative_to(template)
+        if not path.is_file() or relative.name in _LEFT_OUT or set(relative.parts) & set(_NOT_COPIED):
+            continue
+        where, text = str(relative), path.read_text(encoding="utf-8")
+        for old, new in renamed.items():
+            where, text = where.replace(old, new), text.replace(old, new)
+        if relative.name == "pyproject.toml":
+            text = _OWNED.sub("", text)
+        elif relative.name == "README.md":
+            text = _LICENCE.sub("", text)
+        yield Path(where), text

@@ -1,0 +1,213 @@
+"""`dxlrun new-plugin` and `dxlrun plugins`: what is made, what is refused, and what is shown."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dxlrun.cli import main
+from dxlrun.cli.plugins import _NOT_COPIED
+
+TEMPLATE = Path(__file__).parents[2] / "plugins" / "example"
+PLUGIN = """
+from dxlrun import Controller, Interfaces, hookimpl
+
+class Mine(Controller):
+    @classmethod
+    def interfaces(cls, parameters, joints):
+        return Interfaces(joints, ("position",), reference=("position",))
+    def update(self, time_ns, period_ns):
+        pass
+
+@hookimpl
+def dxlrun_contract():
+    return CONTRACT
+
+@hookimpl
+def dxlrun_controllers():
+    return {"mine": Mine}
+
+@hookimpl
+def dxlrun_overrun(cycle):
+    return None
+"""
+Shell = Callable[..., Any]
+Said = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def said(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Said:
+    """Return a function that runs a command in an empty directory: its exit code, output and errors."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
+
+    def run(*words: str) -> tuple[int, str, str]:
+        code = main(list(words))
+        out, err = capsys.readouterr()
+        return code, out, err
+
+    return run
+
+
+@pytest.fixture
+def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str, str], None]]:
+    """Return a function that installs a plug-in, as pip would leave it."""
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def put(name: str, source: str) -> None:
+        (tmp_path / f"{name}.py").write_text(source)
+        info = tmp_path / f"{name}-1.5.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.5\n")
+        (info / "entry_points.txt").write_text(f"[dxlrun]\n{name} = {name}\n")
+
+    yield put
+    for name in ("first_one", "broken_one"):
+        sys.modules.pop(name, None)
+
+
+def test_the_package_has_names_of_its_own_and_no_licence(said: Said, tmp_path: Path) -> None:
+    code, out, err = said("new-plugin", "arm-waves")
+    assert (code, err) == (0, "")
+    made = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()}
+    assert made == set(out.split("\n")[:-2])
+    assert {"arm-waves/src/arm_waves/plugin.py", "arm-waves/tests/test_arm_waves.py"} <= made
+    assert not any("LICENSE" in name for name in made)
+    assert out.endswith("next: cd arm-waves && pip install -e '.[test]' && python -m pytest\n")
+    for name in made:
+        text = (tmp_path / name).read_text()
+        assert "dxlrun_easing" not in text + name
+        assert "dxlrun-easing" not in text
+        assert "icence" not in text
+        assert "license" not in text
+        assert "authors" not in text
+    plugin = (tmp_path / "arm-waves/src/arm_waves/plugin.py").read_text()
+    assert '{"arm_waves_controller": Easing}' in plugin
+
+
+def test_each_file_of_the_template_is_made_but_the_licence(said: Said, tmp_path: Path) -> None:
+    code, out, _ = said("new-plugin", "arm_waves", "--directory", "here/there", "--json")
+    assert (code, json.loads(out)["directory"], len(json.loads(out)["files"])) == (0, "here/there", 9)
+    made = [path for path in (tmp_path / "here/there").rglob("*") if path.is_file()]
+    ours = [path for path in TEMPLATE.rglob("*") if path.is_file() and not set(path.parts) & set(_NOT_COPIED)]
+    assert len(made) == len(ours) - 1 == 9
+
+
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        ("Arms", "dxlrun: 'Arms' is no name of a package; write small letters and digits, a letter first, "),
+        ("7arms", "dxlrun: '7arms' is no name of a package; "),
+        ("my arms", "dxlrun: 'my arms' is no name of a package; "),
+        ("../arms", "dxlrun: '../arms' is no name of a package; "),
+        ("arms_", "dxlrun: 'arms_' is no name of a package; "),
+        ("a" * 61, "is no name of a package; "),
+        ("", "dxlrun: '' is no name of a package; "),
+        ("json", "dxlrun: json is a module that Python knows already; choose another name: my_json\n"),
+        ("numpy", "dxlrun: numpy is a module that Python knows already; choose another name: my_numpy\n"),
+        ("dxlrun", "dxlrun: dxlrun is a module that Python knows already; choose another name: my_dxlrun\n"),
+        ("lambda", "dxlrun: lambda is a module that Python knows already; choose another name: my_lambda\n"),
+    ],
+)
+def test_a_name_that_is_none_is_refused_in_a_sentence(
+    said: Said, tmp_path: Path, name: str, sentence: str
+) -> None:
+    code, out, err = said("new-plugin", name)
+    assert (code, out) == (2, "")
+    assert sentence in err
+    assert err.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_there_already_stays(said: Said, tmp_path: Path) -> None:
+    (tmp_path / "arms").mkdir()
+    (tmp_path / "file").write_text("mine")
+    (tmp_path / "dangling").symlink_to("nowhere")
+    for words in (["arms"], ["arms", "--directory", "file"], ["arms", "--directory", "dangling"]):
+        code, _, err = said("new-plugin", *words)
+        assert code == 2
+        assert err == f"dxlrun: {words[-1]} is there already, and stays; choose another --directory\n"
+    assert (list((tmp_path / "arms").iterdir()), (tmp_path / "file").read_text()) == ([], "mine")
+
+
+def test_a_place_that_cannot_be_written_is_one_sentence(said: Said, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("mine")
+    code, _, err = said("new-plugin", "arms", "--directory", "file/arms")
+    assert (code, err.count("\n")) == (2, 1)
+    assert "cannot be written: Not a directory" in err
+
+
+def test_plugins_are_listed_with_what_they_offer(said: Said, install: Callable[[str, str], None]) -> None:
+    install("first_one", PLUGIN.replace("CONTRACT", "1"))
+    install("broken_one", PLUGIN.replace("CONTRACT", "3"))
+    code, out, err = said("plugins")
+    assert (code, err) == (0, "")
+    lines = [line.split() for line in out.splitlines()]
+    assert ["first_one", "first_one", "1.5", "1", "mine", "position"] in lines
+    assert ["decisions", "about", "late", "cycles"] in lines
+    assert ["joint_trajectory_controller", "trajectory"] in [line[:2] for line in lines]
+    assert (
+        "broken: plug-in broken_one of broken_one 1.5 was written for contract 3, "
+        "this dxlrun has contract 2; install a version of it that fits"
+    ) in out
+
+
+def test_the_list_for_programs(said: Said, install: Callable[[str, str], None]) -> None:
+    install("first_one", PLUGIN.replace("CONTRACT", "2"))
+    install("broken_one", "import no_such_thing")
+    code, out, _ = said("plugins", "--json")
+    found = {one["name"]: one for one in json.loads(out)}
+    assert code == 0
+    assert found["first_one"] == {
+        "name": "first_one",
+        "distribution": "first_one 1.5",
+        "contract": 2,
+        "controllers": [
+            {
+                "type": "mine",
+                "commands": [],
+                "goals": [],
+                "topics": [],
+                "references": ["position"],
+                "live": [],
+            }
+        ],
+        "servo_models": [],
+        "overrun": True,
+        "broken": "",
+    }
+    assert "No module named 'no_such_thing'" in found["broken_one"]["broken"]
+    standard = {one["type"]: one for one in found["standard_controllers"]["controllers"]}
+    assert standard["joint_trajectory_controller"]["goals"] == ["trajectory"]
+    assert standard["joint_state_broadcaster"]["topics"] == ["/joint_states"]
+    assert standard["diff_drive_controller"]["live"]
+
+
+@pytest.mark.timeout(400)
+def test_a_new_package_is_built_installed_tested_and_used_by_a_robot_file(
+    fresh: Shell, tmp_path: Path
+) -> None:
+    made = fresh("dxlrun new-plugin arm-waves", tmp_path)
+    assert (made.returncode, made.stderr) == (0, "")
+    place = tmp_path / "arm-waves"
+    built = fresh(
+        "pip wheel --quiet --no-deps --wheel-dir dist . && pip install --quiet --no-deps dist/*.whl", place
+    )
+    assert built.returncode == 0, built.stderr
+    shutil.rmtree(place / "src")  # what is imported comes from the wheel
+    for line, words in (
+        ("python -m pytest -q -p no:cacheprovider", " passed"),
+        ("dxlrun check example.yaml", "arm-waves 0.1.0"),
+        ("dxlrun example.yaml --virtual --play nod.yaml", "arm_waves_example: "),
+        ("dxlrun plugins", "arm_waves_controller"),
+    ):
+        told = fresh(line, place)
+        assert (told.returncode, told.stderr) == (0, ""), line + told.stdout
+        assert words in told.stdout
+    fresh("pip uninstall --yes --quiet arm-waves", place)
