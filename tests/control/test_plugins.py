@@ -89,6 +89,16 @@ def with_topics(topics):
     return TOPICS.replace("    def update", f"    Topics = {topics}\n    def update")
 
 
+def test_a_package_for_the_first_contract_works_also_with_a_topic_that_was_never_logged(install):
+    source = GOOD.replace("    def update", "    publishes = ('/state',)\n    def update").replace(
+        "TYPE", "old"
+    )
+    install("my-robotics", "my_plugin", source)
+    found = load_plugins()
+    assert (found.broken, "old" in found.controllers) == ({}, True)
+    assert [one.contract for one in found.loaded if one.name == "my_plugin_entry"] == [1]
+
+
 BROKEN = {
     "offers Mine as TYPE, whose Topics is no mapping of names to messages": with_topics("('state',)"),
     "whose Topics has 'my state', which is no name of a topic": with_topics("{'my state': State}"),
@@ -104,12 +114,16 @@ BROKEN = {
     ),
     "whose publishes has /state, which is not made of the robot's cycles; declare it in Topics": GOOD.replace(
         "    def update", "    publishes = ('/state',)\n    def update"
-    ),
+    ).replace("return 1", "return 2"),
     "cannot be imported (ModuleNotFoundError: No module named 'no_such_thing')": "import no_such_thing",
     "cannot be imported (SyntaxError": "def",
     "cannot be imported (SystemExit: 3)": "import sys; sys.exit(3)",
     "does not declare its contract": GOOD.replace("@hookimpl\ndef dxlrun_contract", "def contract"),
     "was written for contract 7, this dxlrun has contract 2": GOOD.replace("return 1", "return 7"),
+    "was written for contract 3, this dxlrun has contract 2": GOOD.replace("return 1", "return 3"),
+    "was written for contract 0, this dxlrun has contract 2": GOOD.replace("return 1", "return 0"),
+    "was written for contract True, this dxlrun has contract 2": GOOD.replace("return 1", "return True"),
+    "was written for contract '2', this dxlrun has contract 2": GOOD.replace("return 1", "return '2'"),
     "implements dxlrun_controllers(robot), but the hook is dxlrun_controllers()": GOOD.replace(
         "def dxlrun_controllers()", "def dxlrun_controllers(robot)"
     ),
