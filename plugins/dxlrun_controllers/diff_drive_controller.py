@@ -34,7 +34,7 @@ from dxlrun import (
 )
 from dxlrun.messages import Header, Odometry
 from dxlrun_controllers.joints import JointNames, or_number
-from dxlrun_controllers.odometry import Pose, WheelAngles
+from dxlrun_controllers.laws.odometry import Pose, WheelAngles
 
 
 class LinearLimits(ParametersModel):

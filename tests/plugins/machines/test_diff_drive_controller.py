@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dxlrun_controllers.diff_drive_controller import AngularLimits, DiffDriveController, LinearLimits, Ramp
-from dxlrun_controllers.odometry import Pose, WheelAngles
+from dxlrun_controllers.laws.odometry import Pose, WheelAngles
 
 SEPARATION, RADIUS = 0.16, 0.033
 BASE = {"left": ["l"], "right": ["r"], "separation": "160 mm", "radius": "33 mm"}
