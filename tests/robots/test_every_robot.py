@@ -23,7 +23,8 @@ def test_every_robot_compiles_and_has_motions(path: Path, command_of: Callable[[
     compiled = compile_files(path, {}, [])
 
     assert [w.what for w in compiled.warnings if not w.what.startswith(ODD_TWIN)] == []
-    assert path in {command_of(motion).robot for motion in MOTIONS}
+    # motions of poses are in the robot file
+    assert path in {command_of(motion).robot for motion in MOTIONS} or path.stem == "bioloid_torso_keyframes"
 
 
 @pytest.mark.parametrize("path", MOTIONS, ids=lambda path: path.stem)

@@ -110,3 +110,45 @@ def test_a_trajectory_leads_a_pid_that_commands_currents(steered: Callable[..., 
         t = np.arange(len(position)) / 400
         rest = (t > 3.0) & (t < 3.05)
         assert position[rest] == pytest.approx(top, abs=0.08)
+
+
+def test_motions_of_poses_are_played_by_their_names(steered: Callable[..., Any], asking: Any) -> None:
+    asks = [
+        asking(0.5, "motions", "play", {"motion": "wave", "speed": 1.5, "repeat": 2}),
+        asking(6.0, "motions", "play", {"motion": "bow"}),
+        asking(6.5, "", "cancel", {"controller": "motions"}),
+        asking(7.5, "motions", "play", {"motion": "stand"}),
+        asking(7.6, "motions", "play", {"motion": "stand", "speed": 2.0}),
+    ]
+    run = steered(ROBOTS / "bioloid_torso_keyframes.yaml", 10.0, asks)
+
+    assert [outcome for outcome, _ in results(run)] == ["reached", "cancelled", "preempted", "reached"]
+    goals = run.log.cycles["goal_position"]
+    at = {name: run.log.joints.index(name) for name in ("left_elbow_joint", "head_pitch_joint")}
+    elbow = np.degrees(goals[:, at["left_elbow_joint"]])
+    assert (elbow[110:200].max(), elbow[110:200].min()) == (
+        pytest.approx(10, abs=1),
+        pytest.approx(-50, abs=1),
+    )
+    assert elbow[-1] == pytest.approx(-20, abs=0.5)
+    nod = goals[300:370, at["head_pitch_joint"]]
+    change = np.diff(nod, n=2)[26:] * 50**2  # from the cancel on
+    assert np.abs(change).max() < 20.5  # rad/s^2
+    assert 10 < np.degrees(nod.max()) < 49
+
+
+def test_a_trajectory_of_the_whole_body_goes_through_three_parts(steered: Callable[..., Any]) -> None:
+    run = steered(
+        ROBOTS / "bioloid_torso_whole_body.yaml",
+        5.0,
+        play=[ROBOTS / "motions" / "whole_body_trajectory.yaml"],
+    )
+
+    cycles = run.log.cycles
+    row = run.log.joints.index("head_yaw_joint")
+    t = np.arange(len(cycles)) / 50 - 1.0  # it leads the joints to the first point in a second
+    moving = t > 0
+    wanted = 0.5 * (np.sin(2 * t) - np.sin(4 * t))
+    command = cycles["command_position"][:, row]
+    assert np.abs(command - wanted)[moving].max() < 0.06  # what the part adds at most, and a cycle
+    assert np.abs(command - wanted)[moving].max() > 0.01  # it does add something

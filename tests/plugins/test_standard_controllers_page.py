@@ -1,0 +1,86 @@
+"""docs/standard-controllers.md: its keys are all there are, its snippets are accepted, its script runs."""
+
+from __future__ import annotations
+
+import re
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+import dxlrun
+from dxlrun_controllers.plugin import dxlrun_controllers
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs/standard-controllers.md").read_text()
+SECTIONS = dict(re.findall(r"^## (\w+)\n(.*?)(?=^## |\Z)", PAGE, re.DOTALL | re.MULTILINE))
+TYPES = {name: section for name, section in SECTIONS.items() if name in dxlrun_controllers()}
+RUNTIME_KEYS = {"type", "active", "rate", "fallback", "into"}
+
+
+def test_there_are_sections() -> None:
+    assert {"diff_drive_controller", "gripper_controller", "keyframe_player", "leader_follower"} <= set(TYPES)
+
+
+@pytest.mark.parametrize("name", TYPES)
+def test_a_section_has_every_key_and_no_other(name: str) -> None:
+    table = re.search(r"\| key \| value \|.*?\n\n", TYPES[name], re.DOTALL)
+    if table is None:
+        pytest.skip("no table of keys")
+    firsts = [row.split(" | ")[0] for row in table[0].splitlines()[2:]]
+    written = {key for first in firsts if " of " not in first for key in re.findall(r"`(\w+)`", first)}
+    assert written - RUNTIME_KEYS == set(dxlrun_controllers()[name].Parameters.model_fields)
+
+
+@pytest.mark.parametrize("name", TYPES)
+def test_snippets_are_accepted(name: str) -> None:
+    for block in re.findall(r"```yaml\n(.*?)```", TYPES[name], re.DOTALL):
+        for entry in yaml.safe_load(block).values():
+            kind = dxlrun_controllers()[entry["type"]]
+            kind.Parameters.model_validate({key: entry[key] for key in entry if key not in RUNTIME_KEYS})
+
+
+class Robot:
+    """A running robot of which the script asks; after five looks the person at it presses Ctrl-C."""
+
+    def __init__(self) -> None:
+        self.sent: list[list[float]] = []
+        self.looks = 0
+
+    def __enter__(self) -> Robot:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def states(self) -> dict[str, Any]:
+        self.looks += 1
+        if self.looks > 5:
+            raise KeyboardInterrupt
+        age = 0.3 if self.looks == 3 else 0.01
+        names = ("left_shoulder", "left_elbow")
+        return {"joints": {name: {"position": 0.1 * self.looks, "age": age} for name in names}}
+
+    def stream(self, controller: str, kind: str, lease: float) -> Robot:
+        assert (controller, kind) == ("follow", "positions")
+        return self
+
+    def send(self, command: dict[str, list[float]]) -> None:
+        self.sent.append(command["positions"])
+
+
+def test_the_mirroring_script_sends_fresh_positions_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    (script,) = re.findall(r"```python\n(.*?)```", SECTIONS["leader_follower"], re.DOTALL)
+    robots = {"leader": Robot(), "follower": Robot()}
+    monkeypatch.setattr(dxlrun, "connect", robots.__getitem__)
+    monkeypatch.setattr(time, "sleep", lambda _: None)
+    with pytest.raises(KeyboardInterrupt):
+        exec(script, {})  # noqa: S102  # the page's own
+    assert [positions[0] for positions in robots["follower"].sent] == pytest.approx([0.1, 0.2, 0.4, 0.5])
+
+
+def test_every_robot_is_in_the_table_of_examples() -> None:
+    named = set(re.findall(r"\(\.\./robots/(\w+)\.yaml\)", PAGE))
+    assert named == {path.stem for path in (ROOT / "robots").glob("*.yaml")}
