@@ -229,3 +229,8 @@ def test_any_graph_is_placed_with_each_edge_a_step_to_the_right(above: list[set[
     assert text.count("▶") == len({edge.target for edge in edges})
     assert not set(text) & set("╴╵╶╷"), "a line ends in nothing"
     ET.fromstring(graph_svg(graph))  # noqa: S314  our own text
+
+
+def test_what_is_read_of_the_same_joints_is_one_node(dxlrun: Dxlrun) -> None:
+    drawn = dxlrun("check", ROBOTS / "leader_follower.yaml", "--graph").out
+    assert "position + velocity + age ├" in drawn

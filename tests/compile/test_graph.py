@@ -170,6 +170,15 @@ ONE = [
         "top needs top -> a and top -> b together, and both command shoulder",
         "take these joints out of one of the two",
     ),
+    (
+        """\
+  top: {type: part, joints: [elbow, wrist], command: [position], into: §[a, b]}
+  a: {type: part, joints: [elbow, shoulder], command: [position], exports: [position]}
+  b: {type: part, joints: [wrist, shoulder], command: [position], exports: [position]}
+""",
+        "top needs top -> a and top -> b together, and both command shoulder",
+        "let one end in the other",
+    ),
     # fallbacks
     (
         PAIR.replace("exports:", "fallback: §back, exports:")

@@ -26,6 +26,9 @@ from hypothesis import given as given_
 from hypothesis import strategies as st
 
 from dxlrun.compile import compile_files
+from dxlrun.control.controllers.claims import takeover_step
+from dxlrun.control.controllers.graph import above
+from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.errors import InputError
 from dxlrun.run.virtual_run import VirtualRobot
 
@@ -466,12 +469,26 @@ def goals_of(robot: VirtualRobot) -> dict[tuple[str, str], list[int]]:
     return found
 
 
+def require_takeovers(plans: tuple[ControllerPlan, ...]) -> None:
+    """Require of an accepted file that each fallback of what is active from the start can take over."""
+    known = {plan.name: plan for plan in plans}
+    active = {name: plan for name, plan in known.items() if plan.active}
+    for name, plan in active.items():
+        if plan.fallback:
+            taken = [*above(plans, name), name]
+            staying = {each: one for each, one in active.items() if each not in taken}
+            assert takeover_step(plan.fallback, taken, known, staying, {}, {name}), (
+                f"{plan.fallback} of {name}"
+            )
+
+
 # The campaign
 
 
 def judge_run(graph: Graph, path: Path, own: dict[str, int], read: dict[str, list[np.ndarray]]) -> None:
     """Run a graph, and compare each cycle's commands and what is on the wire with the model."""
     plan = compile_files(path, {}, (), CYCLES * 10**9 // RATE).plan
+    require_takeovers(plan.loop.controllers)
     robot, model = VirtualRobot(plan), Model(graph, own)
     places = {one.name: place for place, one in enumerate(graph)}
 

@@ -89,26 +89,28 @@ class ControllerGraph(BaseModel):
         drawn only for those that command nothing.
         """
         commanding: dict[str, list[str]] = {}
-        sources: dict[tuple[str, str], dict[str, list[str]]] = {}
+        reads: dict[tuple[str, str, str], list[str]] = {}
+        """Joints by reader, owner and interface; the owner is empty for states."""
         for edge in self.edges:
             if edge.kind == "command":
                 commanding.setdefault(edge.joint, []).append(edge.source)
             elif edge.kind == "read":
                 owner = "" if edge.source == edge.joint else f"{edge.source}/"
-                sources.setdefault((owner, edge.interfaces[0]), {}).setdefault(edge.target, []).append(
-                    edge.joint
-                )
+                reads.setdefault((edge.target, owner, edge.interfaces[0]), []).append(edge.joint)
         for plan in self.controllers:
             if plan.joints and not (plan.command or plan.reference):
-                sources.setdefault(("", "states"), {})[plan.name] = list(plan.joints)
+                reads[plan.name, "", "states"] = list(plan.joints)
+        sources: dict[tuple[str, str, tuple[str, ...]], list[str]] = {}
+        for (reader, owner, interface), joints in reads.items():
+            sources.setdefault((reader, owner, tuple(joints)), []).append(interface)
         nodes: dict[str, Node] = {}
         edges: dict[Edge, None] = {}
-        for (owner, interface), readers in sources.items():
-            for reader, joints in readers.items():
-                name = f"{interface} of {owner}{' '.join(joints)}"
-                lines = tuple(owner + line for line in listed(self._together(joints)))
-                nodes[name] = Node(name, "source", lines, interface)
-                edges[Edge(name, reader)] = None
+        for (reader, owner, read), interfaces in sources.items():
+            out = " + ".join(interfaces)
+            name = f"{out} of {owner}{' '.join(read)}"
+            lines = tuple(owner + line for line in listed(self._together(read)))
+            nodes[name] = Node(name, "source", lines, out)
+            edges[Edge(name, reader)] = None
         for plan in self.controllers:
             about = f"{plan.type}, {rate / max(plan.every, 1):g} Hz"
             out = " + ".join(plan.command)
