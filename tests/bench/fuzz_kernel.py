@@ -183,8 +183,8 @@ class Side:
         self.hardware.parsed = self._parsed
         for servos in self.hardware._servos:
             for servo in range(len(servos.torqued)):
-                servos._life.on(servo, ServoEvent.ENGAGED)
-                servos._life.on(servo, ServoEvent.TORQUE_ON)
+                servos.life.on(servo, ServoEvent.ENGAGED)
+                servos.life.on(servo, ServoEvent.TORQUE_ON)
         self.began = self.ended = 0
         """Cycles that the kernel began, and that it read to their end."""
 
@@ -215,19 +215,17 @@ class Side:
                 servos.goals.set_mode(servo, mode)
                 self.states.mode[row] = mode
             case 2:
-                if not servos._life.offline(servo):
-                    servos._life.on(
-                        servo, ServoEvent.DOUBT if servos.torqued[servo] else ServoEvent.TORQUE_ON
-                    )
+                if not servos.life.offline(servo):
+                    servos.life.on(servo, ServoEvent.DOUBT if servos.torqued[servo] else ServoEvent.TORQUE_ON)
             case 3:
                 servos.ceiling[servo] = rng.choice((math.nan, 0.0, 0.5, 3.0))
             case 4:
                 servos.goals.weaken(rng.choice((0.0, 0.3, 1.0)))
             case 5:
-                if servos._life.offline(servo):
-                    servos._life.on(servo, ServoEvent.RETURNED)
+                if servos.life.offline(servo):
+                    servos.life.on(servo, ServoEvent.RETURNED)
                 else:
-                    servos._life.lose(servo, NEVER)
+                    servos.life.lose(servo, NEVER)
             case _:
                 if rng.random() < 0.2:
                     self.lines.ports[number].lost = True
@@ -242,8 +240,8 @@ class Side:
         for index in lost:
             _, servos = hardware._lines[index]
             for servo in range(len(IDS)):
-                servos._life.on(servo, ServoEvent.RETURNED)
-                servos._life.on(servo, ServoEvent.TORQUE_ON)
+                servos.life.on(servo, ServoEvent.RETURNED)
+                servos.life.on(servo, ServoEvent.TORQUE_ON)
         return len(lost)
 
     def answer(self, replies):

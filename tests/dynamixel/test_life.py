@@ -108,7 +108,7 @@ class Story:
         self.plan = replace(plan, watchdog_ticks=10 if protocol == 2.0 else 0)
         self.rig = make_rig(self.plan)
         self.servo = self.rig.buses[0].servo(12)
-        self.life = self.rig.hardware._servos[0]._life
+        self.life = self.rig.hardware._servos[0].life
 
     @property
     def state(self):

@@ -46,7 +46,7 @@ class Arm:
 
     @property
     def state(self):
-        return self.rig.hardware._servos[0]._life.states[1]
+        return self.rig.hardware._servos[0].life.states[1]
 
     @property
     def shown(self):

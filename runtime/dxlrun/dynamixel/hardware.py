@@ -162,7 +162,7 @@ class DynamixelHardware:
         now_ns = self._clock.now_ns()
         for servos in self._servos:
             servos.watchdogs.sent(now_ns)
-            if servos.torque_changed:
+            if servos.life.torque_changed:
                 servos.show_torque(self._states.torque)
         if self._states.mode.tobytes() != self._samples.modes:
             self._samples.follow_modes()

@@ -58,7 +58,6 @@ class Servos:
         "_events",
         "_every_fresh",
         "_idle",
-        "_life",
         "_line_lost",
         "_noise_at_ns",
         "_noise_seen",
@@ -77,6 +76,7 @@ class Servos:
         "_unrequested_seen",
         "desired",
         "goals",
+        "life",
         "reads",
         "requests",
         "watchdogs",
@@ -105,16 +105,17 @@ class Servos:
         """Builds the sync write."""
         self.reads = CyclicReads(plan, samples)
         """The job that reads every servo once."""
-        self._life = Life(plan, self.reads, events, idle.now_ns)
-        self._reboots = Reboots(plan, idle, self._life)
-        self.desired = DesiredState(plan, idle, self.goals, self._life, self._reboots, states.mode, events)
+        self.life = Life(plan, self.reads, events, idle.now_ns)
+        """The state of each servo."""
+        self._reboots = Reboots(plan, idle, self.life)
+        self.desired = DesiredState(plan, idle, self.goals, self.life, self._reboots, states.mode, events)
         """Modes and registers that the servos shall have."""
-        self.watchdogs = WatchdogMonitor(plan, idle, self._life, self.desired, events)
+        self.watchdogs = WatchdogMonitor(plan, idle, self.life, self.desired, events)
         """Whether the Bus Watchdogs receive enough instructions."""
-        self._offline = Offline(plan, idle, self._life, self._reboots, self.desired)
-        self.requests = Requests(plan, idle, self._life, self._reboots, self.desired, self._offline)
+        self._offline = Offline(plan, idle, self.life, self._reboots, self.desired)
+        self.requests = Requests(plan, idle, self.life, self._reboots, self.desired, self._offline)
         """Torque and reboots that clients request."""
-        self._slow = SlowReads(plan, idle, self._life, self._reboots, states)
+        self._slow = SlowReads(plan, idle, self.life, self._reboots, states)
         self._reported_errors = [0] * count  # error byte of each servo
         self._alerts: list[int] = []  # servos with an alert whose hardware error was not read yet
         self._alert_cycles = 0
@@ -130,12 +131,12 @@ class Servos:
     @property
     def torqued(self) -> NDArray[np.bool_]:
         """Shape (servos,): the servos that get goals."""
-        return self._life.torqued
+        return self.life.torqued
 
     @property
     def ceiling(self) -> Floats:
         """The highest speed of each servo toward a position, rad/s; NaN: none."""
-        return self._life.ceiling
+        return self.life.ceiling
 
     @property
     def silent(self) -> list[str]:
@@ -148,13 +149,13 @@ class Servos:
     def engaged(self) -> None:
         """Take every servo for one that holds where it stands, or is limp, as the start-up has read back."""
         for index, servo in enumerate(self._plan.servos):
-            self._life.on(index, ServoEvent.ENGAGED if servo.torque_at_start else ServoEvent.RELEASE)
+            self.life.on(index, ServoEvent.ENGAGED if servo.torque_at_start else ServoEvent.RELEASE)
 
     def confirmed(self) -> None:
         """Let every servo with torque get goals: it was read again behind the first states."""
         for index, servo in enumerate(self._plan.servos):
             if servo.torque_at_start:
-                self._life.on(index, ServoEvent.TORQUE_ON)
+                self.life.on(index, ServoEvent.TORQUE_ON)
             self.desired.entered(index, servo.start_mode)
 
     def watch(self) -> Program[list[str]]:
@@ -169,17 +170,12 @@ class Servos:
     def withhold_goals(self) -> None:
         """Send no goals any more: torque is being switched off."""
         for index in range(len(self._rows)):
-            self._life.on(index, ServoEvent.DOUBT)
-
-    @property
-    def torque_changed(self) -> bool:
-        """True when `show_torque` would show something else than before."""
-        return self._life.torque_changed
+            self.life.on(index, ServoEvent.DOUBT)
 
     def show_torque(self, torque: NDArray[np.uint8]) -> None:
         """Fill the rows of these servos with whether they have torque, shape (joints,), a Torque each."""
-        torque[self._rows] = self._life.torque
-        self._life.torque_changed = False
+        torque[self._rows] = self.life.torque
+        self.life.torque_changed = False
 
     # The line
 
@@ -193,7 +189,7 @@ class Servos:
         """Report that the line is back: its servos were without a host, and maybe without power."""
         self._line_lost = False
         for index in range(len(self._rows)):
-            self._life.lose(index)
+            self.life.lose(index)
         text = f"bus {self._plan.name} is back; its servos count as rebooted"
         self._events.emit(EventCode.PORT_BACK, Severity.WARNING, self._plan.name, text)
 
@@ -224,15 +220,15 @@ class Servos:
 
     def prepare_goals(self, goals: Commands, states: States) -> None:
         """Let the returning servos that have caught up follow their goals as fast as these say."""
-        if ServoState.RETURNING not in self._life.states:
+        if ServoState.RETURNING not in self.life.states:
             return
         for index, row in enumerate(self._rows):
             off = abs(goals.position[row] - states.position[row])
-            if self._life.states[index] is ServoState.RETURNING and off < CAUGHT_UP:
-                self._life.on(index, ServoEvent.CAUGHT_UP)
+            if self.life.states[index] is ServoState.RETURNING and off < CAUGHT_UP:
+                self.life.on(index, ServoEvent.CAUGHT_UP)
 
     def _count_losses(self, now_ns: int) -> None:
-        reads, life, missed = self.reads, self._life, self.reads.missed
+        reads, life, missed = self.reads, self.life, self.reads.missed
         for index, fresh in enumerate(self._samples.fresh.tolist()):
             if life.offline(index):
                 continue
@@ -272,13 +268,13 @@ class Servos:
             self._reported_errors[index] = error
             severity = Severity.ERROR if error else Severity.INFO
             text = f"reports {self._dialect.describe_error(error)}"
-            self._life.report(EventCode.SERVO_ERROR, severity, index, text)
+            self.life.report(EventCode.SERVO_ERROR, severity, index, text)
 
     # Idle time
 
     def abandon(self) -> None:
         """Answer what clients requested and waits for too long, while the line is gone."""
-        if not self._life.calm:
+        if not self.life.calm:
             self._offline.expire()
 
     def look(self) -> None:
@@ -288,7 +284,7 @@ class Servos:
         down, and torque enable of one that waits for its goals. Only a servo that answers is read.
         """
         self._report_noise(self._idle.now_ns())
-        if not self._life.calm:
+        if not self.life.calm:
             self._offline.look()
         self._slow.look()
         if not self._reading and (due := self._due()) is not None:
@@ -312,10 +308,10 @@ class Servos:
             if limit is not None and fresh[index]:
                 read = plan_line(self._plan).read(servos[index].servo_id, limit.address, limit.size)
                 return index, limit.name, self._read_torque_limit(index, read, limit.name)
-        if not self._life.calm:
+        if not self.life.calm:
             for offset in range(1, len(servos) + 1):
                 index = (self._read_last + offset) % len(servos)
-                if self._life.states[index] in IN_DOUBT and fresh[index]:
+                if self.life.states[index] in IN_DOUBT and fresh[index]:
                     return index, "torque enable", self._read_torque(index)
         return None
 
@@ -337,18 +333,18 @@ class Servos:
     def _read_torque(self, index: int) -> Program[None]:
         """Give goals again to a servo with torque, and none to one without."""
         reply = yield from self._read(self._plan.torque_reads[index])
-        if not reply.answered or self._life.states[index] not in IN_DOUBT:
+        if not reply.answered or self.life.states[index] not in IN_DOUBT:
             return  # lost or released meanwhile: its return decides, or nothing gives it goals any more
         enabled = reply.parameters[0]
         if enabled == 1:
-            self._life.on(index, ServoEvent.TORQUE_ON)
+            self.life.on(index, ServoEvent.TORQUE_ON)
             return
         alert = self._dialect.ALERT
         if alert and (self._shown[self._rows[index]] or self._reported_errors[index] & alert):
-            self._life.on(index, ServoEvent.TORQUE_OFF)  # a shutdown, whose reason was reported
+            self.life.on(index, ServoEvent.TORQUE_OFF)  # a shutdown, whose reason was reported
         else:
-            self._life.lose(index).limp_reported = True  # it may have started anew
-        self._life.report_limp(index, enabled)
+            self.life.lose(index).limp_reported = True  # it may have started anew
+        self.life.report_limp(index, enabled)
 
     def _read_torque_limit(self, index: int, read: Transaction, name: str) -> Program[None]:
         """Give no more goals to a servo of Protocol 1.0 that shut down: its torque enable stays 1."""
@@ -356,10 +352,10 @@ class Servos:
         if not reply.answered:
             return
         self._strained.remove(index)
-        if not any(reply.parameters) and not self._life.offline(index):
-            self._life.on(index, ServoEvent.TORQUE_OFF)
+        if not any(reply.parameters) and not self.life.offline(index):
+            self.life.on(index, ServoEvent.TORQUE_OFF)
             text = f"has {name} = 0: it shut down, and gets no goals until the next run"
-            self._life.report(EventCode.SERVO_LIMP, Severity.ERROR, index, text)
+            self.life.report(EventCode.SERVO_LIMP, Severity.ERROR, index, text)
 
     def _read_hardware_error(self, index: int, read: Transaction) -> Program[None]:
         """Report a hardware error that is new; its shutdown may have cut the torque."""
@@ -371,7 +367,7 @@ class Servos:
         if error == self._shown[self._rows[index]]:
             return
         self._shown[self._rows[index]] = error
-        self._life.on(index, ServoEvent.DOUBT)
+        self.life.on(index, ServoEvent.DOUBT)
         address = self._plan.servos[index].hardware_error_address
         text = f"has Hardware Error Status ({address}) = {error}: {describe_hardware_error(error)}"
-        self._life.report(EventCode.SERVO_ERROR, Severity.ERROR, index, text)
+        self.life.report(EventCode.SERVO_ERROR, Severity.ERROR, index, text)
