@@ -11,7 +11,7 @@ import pytest
 from dxlrun import Floats
 from dxlrun.messages import Header
 from dxlrun.messages.declared import declared_message
-from dxlrun.remote.topics import KEPT_BYTES, KEPT_MESSAGES, MOST_PER_ANSWER, LiveTopic
+from dxlrun.remote.topics import ANSWER_BYTES, KEPT_BYTES, KEPT_MESSAGES, MOST_PER_ANSWER, LiveTopic
 from dxlrun.run.channels.events import EventCode, Severity
 from dxlrun.run.channels.messages import Topic, TopicMessage
 
@@ -105,6 +105,17 @@ def test_long_messages_are_kept_within_their_bytes():
     assert live.count == 100
     assert kept.lost >= 100 - KEPT_BYTES // 60_000
     assert sum(map(len, [one.data for one in live._kept])) <= KEPT_BYTES
+
+
+def test_an_answer_has_no_more_bytes_than_it_may():
+    live = LiveTopic(TOPIC)
+    data = DECLARED.pack(State(Header(), np.zeros(0), "x" * 60_000), (0, 0))
+    for index in range(10):
+        live.keep(TopicMessage(index, 0, data))
+    first = live.after(0)
+    assert [one.number for one in first.messages] == list(range(1, first.last + 1))
+    assert first.last <= ANSWER_BYTES // 60_000 + 1
+    assert live.after(first.last).messages[0].number == first.last + 1
 
 
 def test_a_request_waits_for_the_next_message(desk, number):
