@@ -116,6 +116,20 @@ def test_repeated_and_followed_by_others(mounted):
     np.testing.assert_allclose(robot.commands.position, [0.1, 0.3])
 
 
+def test_the_rest_of_a_period_counts_in_the_next_motion_at_its_speed(mounted):
+    robot = begun(
+        mounted,
+        player(
+            one={"steps": [step(time="510 ms", pose={"a": 0.5})], "next": "two"},
+            two={"steps": [step(time="1 s", pose={"a": -0.5}, interpolation="linear")], "speed": 2.0},
+        ),
+    )
+    robot.ask("play", motion="one")
+    t, a, _ = play(robot, 0.9).T
+    second = t > 0.51
+    np.testing.assert_allclose(a[second], 0.5 - 2.0 * (t[second] - 0.51), atol=1e-12)
+
+
 def test_the_first_pose_is_approached_softly(mounted):
     robot = begun(
         mounted, player(far={"steps": [step(time="10 ms", pose={"a": 2.0})]}) | {"approach": "1 rad/s"}
