@@ -9,9 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.control.halt import HALT_NS, STILL, STILL_NS
 from dxlrun.log.reader import Log, read_log
 from dxlrun.log.replay import replay_log
+from dxlrun.remote.preparation import Preparation
 from dxlrun.run.channels.answers import Code, Done, Refusal
 from dxlrun.run.channels.commands import LOOP, Command
 from dxlrun.run.channels.events import EventCode
@@ -205,3 +207,78 @@ def test_goals_that_still_decelerate_are_waited_for_also_where_the_joint_is_slow
     assert answer.halted is not None
     assert answer.halted.seconds == pytest.approx(0.4 + STILL_NS * 1e-9, abs=0.05)
     assert np.ptp(log.cycles["goal_position"][at(log, 1.6 + answer.halted.seconds) :, RAMPED]) == 0
+
+
+ENDING = (
+    ROBOT.replace("loop: {rate: 100}", "loop: {rate: 100}\nposes: {home: {ramped: 0 deg}}")
+    + "policies: {on_exit: [{pose: home, speed: 90 deg/s}, hold], exit_timeout: 6 s}\n"
+)
+
+
+def test_a_run_that_ends_holding_brakes_within_the_limits_on_its_way_to_a_pose(tmp_path: Path) -> None:
+    robot, log = ran(tmp_path, {1.2: GO}, seconds=1.5, text=ENDING)
+    goals = log.cycles["goal_position"][:, RAMPED]
+    assert goals.max() > 0.4
+    assert goals[-1] == pytest.approx(0.0, abs=1e-6)
+    assert goals.min() > -1e-6, "the pose was overshot"
+    assert np.abs(np.diff(goals, 2)).max() <= 10.0 * DT * DT * (1 + 1e-6)
+    speeds = [value * RAD_S_PER_TICK for when, value in written(robot, 3, GOAL_VELOCITY) if when > 1.2]
+    assert np.abs(np.diff(speeds)).max() <= 8.0 * DT + 1.1 * RAD_S_PER_TICK
+    assert (max(speeds) > 2.0, speeds[-1]) == (True, 0.0)
+
+
+def test_a_run_that_ends_holding_waits_until_its_joints_have_come_to_rest(tmp_path: Path) -> None:
+    text = ROBOT + "policies: {on_exit: hold, exit_timeout: 6 s}\n"
+    robot, log = ran(tmp_path, {1.2: GO}, seconds=1.5, text=text)
+    goals = log.cycles["goal_position"][:, RAMPED]
+    assert np.ptp(goals[-5:]) == 0.0
+    assert np.abs(np.diff(goals, 2)).max() <= 10.0 * DT * DT * (1 + 1e-6)
+    speeds = [value * RAD_S_PER_TICK for when, value in written(robot, 3, GOAL_VELOCITY) if when > 1.2]
+    assert np.abs(np.diff(speeds)).max() <= 8.0 * DT + 1.1 * RAD_S_PER_TICK
+    assert (max(speeds) > 2.0, speeds[-1]) == (True, 0.0)
+
+
+CHAIN = """\
+name: chain
+buses:
+  main: {port: sim, protocol: 2.0, baud_rate: 1_000_000}
+loop: {rate: 100}
+joints:
+  arm: {bus: main, id: 1, model: XM430-W350, reference: 180 deg, direction: 1,
+        limits: {acceleration: 10 rad/s^2}}
+controllers:
+  joint_state_broadcaster: {type: joint_state_broadcaster}
+  pid: {type: pid_controller, joints: [arm], reference: position, command_interface: velocity,
+        gains: {p: 5.0}}
+  arm: {type: joint_trajectory_controller, joints: [arm], into: [pid]}
+"""
+
+
+def test_a_chain_is_halted_whole_and_its_goal_ends_as_aborted(tmp_path: Path) -> None:
+    (tmp_path / "robot.yaml").write_text(CHAIN)
+    robot = simulated_robot(tmp_path / "robot.yaml", duration_s=3.0, log=tmp_path / "run.mcap")
+    plan = next(one for one in robot.plan.loop.controllers if one.name == "arm")
+    point = b'{"points": [{"time": 2.0, "positions": [1.0]}]}'
+    prepared = Preparation({joint.name: joint for joint in robot.plan.loop.joints}, load_plugins()).command(
+        plan, "trajectory", point, units=False
+    )
+    move, stop = Command(next(NUMBERS), "arm", "trajectory", prepared.data, "anna"), loop("halt")
+    robot.buses[0].at(1_200_000_000, lambda: robot.inbox.waiting.append(move))
+    robot.buses[0].at(1_900_000_000, lambda: robot.inbox.waiting.append(stop))
+    assert robot.run().detail == ""
+    answer = robot.inbox.answers[stop.number]
+    assert isinstance(answer, Done)
+    assert answer.halted is not None
+    log = read_log(tmp_path / "run.mcap")
+    events = [(event.code, event.source) for event in log.events]
+    assert events.index((EventCode.CONTROLLER_DEACTIVATED, "arm")) < events.index(
+        (EventCode.CONTROLLER_DEACTIVATED, "pid")
+    )
+    (ended,) = [event.text for event in log.events if event.code == EventCode.GOAL_ENDED]
+    assert "aborted" in ended
+    halted_at = at(log, 1.9 + answer.halted.seconds)
+    assert not np.any(log.cycles["active"][halted_at:] & 0b110)
+    assert 0.05 < log.cycles["position"][-1, 0] < 0.9
+    speeds = [value * RAD_S_PER_TICK for when, value in written(robot, 1, GOAL_VELOCITY) if when > 1.2]
+    assert np.abs(np.diff(speeds)).max() <= 10.0 * DT + 1.1 * RAD_S_PER_TICK
+    assert replay_log(tmp_path / "run.mcap").sentence.endswith("0 differences")

@@ -144,7 +144,7 @@ class Ramps:
         velocity = own + np.copysign(braking_speed(np.abs(behind), dt, limit), behind)
         highest = np.fmin(most, np.fmax(np.fmax(toward, SLOWEST), np.abs(own)))
         highest = np.where(np.isnan(toward), most, highest)
-        velocity = np.clip(velocity, -highest, highest)
+        velocity = np.minimum(np.maximum(velocity, -highest), highest)
         change = limit * dt
         velocity = np.minimum(np.maximum(velocity, self.moving - change), self.moving + change)
         above, below = np.fmax(self._upper - goal, 0.0), np.fmax(goal - self._lower, 0.0)

@@ -206,8 +206,8 @@ class Gate:
         if ramps.passes(goal, wanted, dt):
             return moved
         # not held to the step limit yet: the goal must know how far it is to go to begin to brake in time
-        given = np.clip(self._commanded[0], np.fmin(self._lower, goal), np.fmax(self._upper, goal))
-        np.copyto(wanted, given, where=moved)
+        given = np.maximum(self._commanded[0], np.fmin(self._lower, goal))
+        np.copyto(wanted, np.minimum(given, np.fmax(self._upper, goal), out=given), where=moved)
         toward = np.where(moved, inside[1], np.nan)
         stepped = ramps.steer(goal, wanted, np.minimum(speed, self._own_speed), toward, dt)
         rows = ramps.limited & self._led
@@ -233,10 +233,13 @@ class Gate:
         self._flag(finite & (position < lower), Clamp.LOWER)
         self._flag(finite & (position > upper), Clamp.UPPER)
         held = finite & (highest < self._own_speed) & ~self._ramps.limited
-        self._flag(held & (self._inside[0] != np.clip(position, lower, upper)), Clamp.STEP)
+        if np.count_nonzero(held):
+            kept = np.minimum(np.maximum(position, lower), upper)
+            self._flag(held & (self._inside[0] != kept), Clamp.STEP)
 
     def _flag(self, rows: NDArray[np.bool_] | _Rows, bit: Clamp) -> None:
-        self._record.clamped[rows] |= np.uint8(bit)
+        if np.count_nonzero(rows) or rows.dtype != np.bool_:
+            self._record.clamped[rows] |= np.uint8(bit)
 
     def _report(self, begun: NDArray[np.uint8]) -> None:
         for column, (bit, what) in enumerate(_WHAT.items()):
