@@ -409,6 +409,16 @@ def test_a_fallback_does_not_take_servos_from_a_lower_end_that_another_one_uses(
     assert story.active(3) == ["lower", "right"]
 
 
+def test_all_in_between_leave_with_the_lower_end_whose_servos_the_fallback_claims(story):
+    story.add("top", into=("middle",), fallback="still")
+    story.add("middle", into=("bottom",), reference=("position",))
+    story.add("bottom", reference=("position",))
+    story.add("still", active=False)
+    story.run(8, c3=story.breaks("top"))
+    assert (story.result.reason, story.active(3)) == ("ended", ["still"])
+    assert [name for name, step in story.called if step == "deactivate"][:2] == ["middle", "bottom"]
+
+
 def test_a_middle_one_that_fails_is_replaced_at_the_bottom(story):
     story.add("top", into=("middle",))
     story.add("middle", into=("bottom",), reference=("position",), fallback="hold")
