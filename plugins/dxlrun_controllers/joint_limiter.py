@@ -27,8 +27,8 @@ from dxlrun_controllers.laws.limiting import Limiter
 class LimiterLimits(ParametersModel):
     """Limits of the joints, each one value for all or a mapping by joint."""
 
-    acceleration: PerJoint[Annotated[AngularAcceleration, Field(gt=0)]]
-    """Of a mapping, every joint has to be in it."""
+    acceleration: PerJoint[Annotated[AngularAcceleration, Field(gt=0)]] | None = None
+    """The joint's own limit if that is lower, or none is given; one of the two there must be."""
     velocity: PerJoint[Annotated[AngularVelocity, Field(gt=0)]] | None = None
     """The joint's own limit if that is lower, or none is given."""
     lower: PerJoint[Angle] | None = None
@@ -41,7 +41,7 @@ class LimiterParameters(JointsParameters):
 
     command_interface: Literal["position", "posvel"] = "position"
     """`posvel` commands the velocity too: its magnitude to servos, with its sign to another controller."""
-    limits: LimiterLimits
+    limits: LimiterLimits = LimiterLimits()
 
 
 class JointLimiter(Controller[LimiterParameters]):
@@ -74,12 +74,14 @@ class JointLimiter(Controller[LimiterParameters]):
         """Make room for everything that the loop needs."""
         super().on_configure(context)
         joints, own, limits = context.joints, context.limits, self.parameters.limits
-        if isinstance(limits.acceleration, Mapping) and len(limits.acceleration) < len(joints):
-            missing = [joint for joint in joints if joint not in limits.acceleration]
-            raise ValueError(f"limits.acceleration has no {', '.join(missing)}")
+        acceleration = np.fmin(row_of(limits.acceleration, joints), own.acceleration)
+        missing = [joint for joint, most in zip(joints, acceleration, strict=True) if not np.isfinite(most)]
+        if missing:
+            raise ValueError(
+                f"{', '.join(missing)} has no limit of the acceleration: add limits.acceleration"
+            )
         self._limiter = limiter = Limiter(len(joints))
-        np.copyto(limiter.acceleration, row_of(limits.acceleration, joints))
-        np.fmin(limiter.acceleration, getattr(own, "acceleration", np.inf), out=limiter.acceleration)
+        np.copyto(limiter.acceleration, acceleration)
         np.minimum(row_of(limits.velocity, joints), finite_or(own.velocity, np.inf), out=limiter.speed)
         np.maximum(row_of(limits.lower, joints, -np.inf), finite_or(own.lower, -np.inf), out=limiter.lower)
         np.minimum(row_of(limits.upper, joints), finite_or(own.upper, np.inf), out=limiter.upper)

@@ -151,8 +151,8 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._goal_tolerance = row_of(parameters.tolerances.goal, joints)
         self._checks_path = parameters.tolerances.path is not None
         self._lower, self._upper = finite_or(limits.lower, -np.inf), finite_or(limits.upper, np.inf)
-        own = row_of(parameters.deceleration, joints, DECELERATION)
-        self._deceleration = np.fmin(own, getattr(limits, "acceleration", own))
+        own = row_of(parameters.deceleration, joints, np.nan)
+        self._deceleration = finite_or(np.fmin(own, limits.acceleration), DECELERATION)
         speed = finite_or(limits.velocity, np.inf)
         self._speed_limit = speed
         self._closing = np.minimum(speed, CLOSING_SPEED)

@@ -222,11 +222,18 @@ def test_a_joint_that_was_not_heard_begins_where_it_is_heard(stage):
 def test_a_wrong_command_and_wrong_limits_are_refused(stage):
     with pytest.raises(ValueError, match=r"1 positions for 2 joints \(a, b\)"):
         started(stage).prepare("positions", positions=[1.0])
-    with pytest.raises(ValueError, match="acceleration has no b"):
+    with pytest.raises(ValueError, match="b has no limit of the acceleration: add limits"):
         stage(JointLimiter, TWO | {"limits": {"acceleration": {"a": "8 rad/s^2"}}})
     for wrong, sentence in (
-        ({"limits": {}}, "acceleration"),
+        ({"limits": {"acceleration": "0 rad/s^2"}}, "greater than 0"),
         ({"limits": LIMITS | {"lower": {"c": "0 rad"}}}, "limits.lower names c"),
     ):
         with pytest.raises(ValidationError, match=sentence):
             JointLimiter.Parameters.model_validate(TWO | wrong)
+
+
+def test_the_acceleration_limit_of_the_joint_is_kept_too(stage):
+    assert JointLimiter.Parameters.model_validate({"joints": ["a", "b"]}).limits.acceleration is None
+    for written, expected in (({}, [3.0, 3.0]), ({"limits": {"acceleration": "2 rad/s^2"}}, [2.0, 2.0])):
+        robot = started(stage, {"joints": ["a", "b"], **written}, limits={"acceleration": 3.0})
+        assert robot.controller._limiter.acceleration.tolist() == expected

@@ -588,3 +588,30 @@ def test_a_speed_that_changes_in_a_run_bends_the_time_smoothly_whatever_the_peri
     robot.update(8.0)
     robot.update(9.0)
     assert [ended[0] for ended in robot.goal.ended] == [Outcome.REACHED]
+
+
+def test_while_the_speed_changes_the_desired_acceleration_is_that_of_the_desired_velocity(stage):
+    robot = started(stage, ONE | {"command_interface": "posvel"}, into=("lower",))
+    robot.send(0.0, "trajectory", points=points(np.linspace(0, 10, 2000)))
+    robot.update(2.0)
+    robot.change(2.0, speed=0.2)
+    seen = []
+    for step in range(600):
+        robot.update(2.0 + step * 1e-3)
+        seen.append([row[0] for row in robot.controller._desired.arrays])
+    position, velocity, acceleration = np.array(seen).T
+    assert np.abs(np.gradient(position, 1e-3) - velocity)[1:-1].max() < 5e-3
+    differences = np.abs(np.gradient(velocity, 1e-3) - acceleration)[1:-1]
+    assert np.median(differences) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("written", "limit", "expected"),
+    [({}, np.nan, DECELERATION), ({}, 35.0, 35.0), ({"deceleration": "4 rad/s^2"}, 3.0, 3.0)],
+)
+def test_joints_stop_within_their_own_acceleration_limit(stage, written, limit, expected):
+    robot = started(stage, ONE | written, limits={"acceleration": limit})
+    robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [2.3]}])
+    robot.update(0.5)
+    robot.cancel(0.5)
+    assert robot.update(5.0)[0] == pytest.approx(1.3 + 4 / 2 / expected)

@@ -74,6 +74,7 @@ class JointLimits:
     upper: Floats
     velocity: Floats
     effort: Floats
+    acceleration: Floats
 
 
 @unique

@@ -106,6 +106,7 @@ class Managed:
                 upper=_row([joint.upper if joint.bounded else np.inf for joint in joints]),
                 velocity=_row([joint.velocity for joint in joints]),
                 effort=_row([joint.effort for joint in joints]),
+                acceleration=_row([joint.acceleration for joint in joints]),
             ),
             states=self._inputs.states,
             goals=self._inputs.goals,
