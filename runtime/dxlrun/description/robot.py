@@ -171,7 +171,11 @@ class JointSimulation(Form):
     )
 
 
-OnOff = Annotated[bool, BeforeValidator(_on_or_off), WithJsonSchema({"enum": ["on", "off", True, False]})]
+OnOff = Annotated[
+    bool,
+    BeforeValidator(_on_or_off),
+    WithJsonSchema({"anyOf": [{"type": "string", "enum": ["on", "off"]}, {"type": "boolean"}]}),
+]
 
 Register = Annotated[int | str, BeforeValidator(_register), WithJsonSchema({"type": ["integer", "string"]})]
 """A raw integer, or a quantity with its unit as text: its item's unit is in the control table."""
