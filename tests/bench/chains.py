@@ -143,6 +143,7 @@ def measure(cycles: int) -> Cost:
             record.states.position[:] = 1e-3 * np.sin(cycle * 0.01)
             if record.reference.size and one.active in (("middle",), ("bottom",)):
                 record.reference[:] = 0.1 + 1e-5 * cycle
+            record.wake(cycle, time_ns, 1 + time_ns, PERIOD_NS)
             one.begin()
             begin = now()
             one.update(cycle, time_ns)

@@ -12,6 +12,7 @@ def test_the_chain_that_is_measured_moves_from_top_to_bottom() -> None:
     assert manager.active == chains.NAMES
     seen = []
     for cycle in range(60):
+        record.wake(cycle, 0, 1 + cycle, chains.PERIOD_NS)
         manager.begin()
         assert manager.update(cycle, cycle * chains.PERIOD_NS * 10) is None
         seen.append((record.reference.copy(), record.commands.effort.copy()))
