@@ -141,15 +141,18 @@ class Ramps:
         own = (wanted - self._target) / dt  # the velocity of the commands, unless they jump
         own = np.where(np.abs(own) <= most, own, 0.0)
         behind = wanted - goal - own * dt
-        velocity = own + np.copysign(braking_speed(np.abs(behind), dt, limit), behind)
+        ways = self._seen  # behind the commands, to the upper and to the lower limit
+        np.abs(behind, ways[0])
+        np.fmax(np.subtract(self._upper, goal, ways[1]), 0.0, out=ways[1])
+        np.fmax(np.subtract(goal, self._lower, ways[2]), 0.0, out=ways[2])
+        nearing, up, down = braking_speed(ways, dt, limit)
+        velocity = own + np.copysign(nearing, behind)
         highest = np.fmin(most, np.fmax(np.fmax(toward, SLOWEST), np.abs(own)))
         highest = np.where(np.isnan(toward), most, highest)
         velocity = np.minimum(np.maximum(velocity, -highest), highest)
         change = limit * dt
         velocity = np.minimum(np.maximum(velocity, self.moving - change), self.moving + change)
-        above, below = np.fmax(self._upper - goal, 0.0), np.fmax(goal - self._lower, 0.0)
-        velocity = np.maximum(velocity, -braking_speed(below, dt, limit))
-        velocity = np.minimum(velocity, braking_speed(above, dt, limit))
+        velocity = np.minimum(np.maximum(velocity, -down), up)
         np.copyto(self.moving, velocity)
         np.copyto(self._target, wanted)
         stepped: Floats = goal + velocity * dt

@@ -242,7 +242,10 @@ class Gate:
             self._record.clamped[rows] |= np.uint8(bit)
 
     def _report(self, begun: NDArray[np.uint8]) -> None:
+        found = int(np.bitwise_or.reduce(self._record.clamped))
         for column, (bit, what) in enumerate(_WHAT.items()):
+            if not found & bit:
+                continue
             self.counts[:, column] += (self._record.clamped & np.uint8(bit)) != 0
             for row in np.flatnonzero(begun & np.uint8(bit)).tolist():
                 name = self._plan.joints[row].name
