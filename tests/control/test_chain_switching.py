@@ -8,6 +8,7 @@ from msgspec import to_builtins
 
 from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.description.modes import Mode
+from dxlrun.errors import ControllerFault
 from dxlrun.run.channels.answers import Code, Done, Waiting
 from dxlrun.run.channels.cycle import Clamp
 from dxlrun.run.channels.events import EventCode
@@ -451,6 +452,61 @@ def test_a_fault_in_a_command_takes_the_same_way(story):
     story.raises["upper", "command"] = RuntimeError("no")
     story.run(8, c3=lambda: story.robot.post("upper", "p", b""))
     assert (story.result.reason, story.active(3)) == ("ended", ["still"])
+
+
+def test_a_fallback_of_a_lower_end_that_fails_as_it_is_taken_over_comes_after_all_have_entered(make_robot):
+    """Its fallback claims a servo of another one that enters in the same switch: that one has it."""
+    story = Story(make_robot(joints=3))
+    story.add("lower", joints=("j0", "j1"), reference=("position",), fallback="greedy")
+    story.add("upper", joints=("j0", "j1"), into=("lower",), active=False)
+    story.add("beside", joints=("j2",), active=False)
+    story.add("greedy", active=False)
+
+    def fails_to_follow():
+        def follow(time_ns):
+            raise ControllerFault("controller lower raised in on_cancel")
+
+        story.robot.manager._named["lower"].follow = follow
+        story.switch(["upper", "beside"])()
+
+    story.run(8, c3=fails_to_follow)
+    assert story.active(3) == ["beside"]
+    assert story.result.reason == "fault"
+
+
+def test_a_fallback_comes_after_all_that_enter_in_this_cycle_also_by_other_switches(story):
+    story.add("left", command=("effort",), joints=("j0",), active=False, fallback="greedy")
+    story.add("right", command=("effort",), joints=("j1",), active=False)
+    story.add("greedy", command=("effort",), active=False)
+    story.raises["left", "activate"] = RuntimeError("no")
+
+    def both():
+        story.switch(["left"])()
+        story.switch(["right"])()
+
+    run_with_modes(story, 12, Modes(story.robot, 3), c2=both)
+    assert story.answer(1)[0] == Code.CONTROLLER_FAULT
+    assert ("greedy", "activate") not in story.called
+    assert story.result.reason == "fault"
+
+
+def test_one_that_fails_while_it_waits_for_modes_is_not_activated(story):
+    effort_chain(story)
+
+    def parameters():
+        managed = story.robot.manager._named["lower"]
+
+        def on_parameters(time_ns):
+            raise RuntimeError("broken")
+
+        managed._controller.on_parameters = on_parameters
+        story.robot.ask("parameters", controller="lower", values={})
+
+    run_with_modes(story, 12, Modes(story.robot, 4), c2=story.switch(["upper"], ["direct"]), c4=parameters)
+    assert story.answer(1)[0] == Code.CONTROLLER_FAULT
+    assert story.answer(2)[0] == Code.CONTROLLER_FAULT
+    assert not {("lower", "activate"), ("upper", "activate")} & set(story.called)
+    assert story.result.reason == "fault"
 
 
 def test_two_fallbacks_that_fail_in_turn_end_the_run(story):

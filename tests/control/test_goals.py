@@ -551,6 +551,34 @@ def test_a_deactivated_controller_gets_nothing_more_of_a_motion(played):
     assert played.statuses == [(1, "accepted"), (1, "aborted")]
 
 
+def test_a_motion_ends_when_one_above_takes_its_controller_over(played):
+    """The controller's own `on_cancel` knows nothing of it: a motion is the runtime's goal."""
+    robot = played.robot
+    robot._controllers.clear()
+    one = {"joints": ("j1",), "command": ("position",)}
+    robot.add("lower", played.mover, reference=("position",), **one)
+    robot.script("upper", lambda *_: None, into=("lower",), active=False, **one)
+    part = ("lower", "nudge", (0, 1, 4), ([1.0], [2.0], [3.0]), 6)
+    played.at = {2: [played.play(part)], 4: [played.ask("switch", activate=["upper"])]}
+    played.run(9)
+    assert (played.reports[-1][0], played.reports[-1][1].status) == (4, "cancelled")
+    assert robot.manager._motions == {}
+    assert not played.steps("cancel")
+
+
+def test_a_goal_beside_a_stream_that_runs_out_is_aborted(steered):
+    """Its controller is held from then on, so it could not end the goal itself."""
+
+    def stream():
+        steered.robot.post("arm", "nudge", np.array([0.0]).tobytes(), lease_ns=2 * PERIOD_NS)
+
+    steered.at = {2: [steered.move(100)], 3: [stream], 9: [steered.ask("cancel", controller="arm")]}
+    steered.run(12)
+    assert steered.statuses == [(1, "accepted"), (1, "aborted")]
+    assert steered.reports[-1][1].text == "the stream of commands ended"
+    assert refused(steered, 3)[0] is Code.NO_GOAL
+
+
 def test_a_controller_that_fails_in_a_motion_is_taken_out(played):
     played.at = {2: [played.play(("leg", "go", (0, 1, 2), ([1.0], [13.0], [3.0]), 3), ARM)]}
     assert played.run(9).reason == "fault"

@@ -225,7 +225,13 @@ class Managed:
         self._call(ControllerMethod.ON_GOAL, f" ({goal.kind})", on_goal, goal, data, time_ns)
 
     def cancel(self, goal: RunningGoal, time_ns: int) -> None:
-        """Let the controller bring its goal to an end. Raises ControllerFault."""
+        """Let the controller bring its goal to an end. Raises ControllerFault.
+
+        One that the runtime leads ends at once: the controller keeps what it was given last.
+        """
+        if not self.takes_goal(goal.kind):
+            goal.end(Outcome.CANCELLED)
+            return
         goal.cancelling = True
         self._inputs.gather()
         self._call(ControllerMethod.ON_CANCEL, "", self._controller.on_cancel, goal, time_ns)
@@ -237,7 +243,12 @@ class Managed:
         self._call(ControllerMethod.ON_PARAMETERS, "", self._controller.on_parameters, time_ns)
 
     def hold(self) -> None:
-        """Take its commands out of the robot's, and update it no more, until the next command."""
+        """Take its commands out of the robot's, and update it no more, until the next command.
+
+        A goal that it has still would never end: it is aborted.
+        """
+        if (goal := self.goal) is not None:
+            goal.end(Outcome.ABORTED, "the stream of commands ended")
         self._held = True
         self._withdraw()
 

@@ -263,10 +263,6 @@ class Manager:
             return goal
         if goal.cancelling:
             return Refusal(Code.CANCELLED_ALREADY, {"goal": goal.number, "controller": goal.controller})
-        motion = self._motions.get(goal.controller)
-        if motion is not None and motion.goal is goal:
-            goal.end(Outcome.CANCELLED)  # its controller keeps what it was given last
-            return None
         managed = self._named[goal.controller]
         try:
             managed.cancel(goal, time_ns)
@@ -291,7 +287,7 @@ class Manager:
         except ValueError as error:
             return Refusal(Code.INVALID, {"problem": f"{controller}: {error}"})
         except ControllerFault as fault:
-            if managed.active:
+            if managed.active or managed in self._modes.entering:
                 self._switching.end(managed, fault, time_ns)
             else:
                 self._switching.take_out(managed, fault)  # it has no joints that a fallback would take over

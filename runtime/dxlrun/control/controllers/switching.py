@@ -15,6 +15,10 @@ from dxlrun.errors import ControllerFault
 from dxlrun.run.channels.answers import Code, CommandOutcome, Refusal, Waiting
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
 
+_Failed = tuple[tuple[Managed, ...], str]
+"""A controller that broke its contract, those that left with it, and why; not the fault itself, which holds
+a frame: the collector is off, so such a circle would stay."""
+
 
 class Switching:
     """Activates and deactivates controllers; a chain enters from below and leaves from above, in one step.
@@ -62,8 +66,9 @@ class Switching:
     def admit(self, time_ns: int) -> None:
         """Activate controllers whose modes are there now; give up those that waited too long."""
         ready, late = self._modes.due(time_ns)
+        failed: list[_Failed] = []
         for group in ready:
-            self._end_switch(group.number, self._activate_all(group.entering, time_ns))
+            self._end_switch(group.number, self._activate_all(group.entering, time_ns, failed))
         for group in late:
             problem = self._modes.problem(group)
             self._give_up(
@@ -71,21 +76,30 @@ class Switching:
                 Refusal(Code.MODE_NOT_ENTERED, {"controller": group.names, "problem": problem}),
                 problem,
             )
+        self._fall_back_all(failed, time_ns)
 
     def end(self, managed: Managed, fault: ControllerFault, time_ns: int) -> None:
         """Take a controller that broke its contract out of the robot, and let a fallback take over.
 
-        Those above it leave too. Its own fallback comes first, then theirs, the nearest first.
+        Those above it leave too. Its own fallback comes first, then theirs, the nearest first. One that waits
+        for modes waits no more, and the command that asked for it is refused.
         """
+        self._fall_back(self._take_out_with_uppers(managed, fault, time_ns), str(fault), time_ns)
+
+    def _take_out_with_uppers(
+        self, managed: Managed, fault: ControllerFault, time_ns: int
+    ) -> tuple[Managed, ...]:
+        """Take out one that broke its contract, and those above it; return them, the nearest first."""
         uppers = [self.named[name] for name in nearest_above(managed.plan.name, self._engaged())]
         self.take_out(managed, fault)
+        self._drop_group(managed, str(fault))
         why = f"{managed.plan.name}, whose references it commands, broke its contract"
         for upper in reversed(uppers):
             if upper.active:
                 self._deactivate(upper, time_ns, why)
             else:
                 self._drop_group(upper, why)
-        self._fall_back([managed, *uppers], str(fault), time_ns)
+        return (managed, *uppers)
 
     def take_out(self, managed: Managed, fault: ControllerFault) -> None:
         """Take a controller that broke its contract out of the robot, and nothing else."""
@@ -139,20 +153,25 @@ class Switching:
         entering = [self.named[name] for name in names]
         self._modes.changed()
         if self._modes.ready(entering):
-            return self._activate_all(entering, time_ns)
+            failed: list[_Failed] = []
+            refusal = self._activate_all(entering, time_ns, failed)
+            self._fall_back_all(failed, time_ns)
+            return refusal
         self._modes.await_modes(entering, time_ns, number, why)
         for managed in entering:
             self._log(EventCode.MODE, managed, "waits until its joints are in their modes")
         return Waiting(tuple(names))
 
-    def _activate_all(self, entering: Sequence[Managed], time_ns: int) -> Refusal | None:
-        """Activate controllers whose claims were checked together, then the fallbacks of those that failed:
-        a fallback that came first could have a joint that belongs to one of the others.
+    def _activate_all(
+        self, entering: Sequence[Managed], time_ns: int, failed: list[_Failed]
+    ) -> Refusal | None:
+        """Activate controllers whose claims were checked together; add what fails to `failed`.
 
-        Returns the first fault; the other controllers are active all the same, but for those above it.
+        Their fallbacks come when all have entered: one that came before could have a joint that belongs to
+        another. Returns the first fault; the other controllers are active all the same, but for those above.
         """
-        # no faults in it, which hold this frame: the collector is off, so such a circle would stay
-        failed: list[tuple[Managed, str]] = []
+        begun = len(failed)
+        plans = [managed.plan for managed in entering]
         for managed in entering:
             missing = [name for name in managed.plan.into if name not in self.active]
             if missing:
@@ -163,23 +182,27 @@ class Switching:
                 managed.activate(time_ns)
             except ControllerFault as fault:
                 self.take_out(managed, fault)
-                failed.append((managed, str(fault)))
+                uppers = [self.named[name] for name in nearest_above(managed.plan.name, plans)]
+                failed.append(((managed, *uppers), str(fault)))
             else:
                 self._log(EventCode.CONTROLLER_ACTIVATED, managed, "active")
-                self._command_lowers(managed, time_ns)
-        plans = [managed.plan for managed in entering]
-        for managed, why in failed:
-            uppers = [self.named[name] for name in nearest_above(managed.plan.name, plans)]
-            self._fall_back([managed, *uppers], why, time_ns)
-        return refused_by(*failed[0]) if failed else None
+                self._command_lowers(managed, time_ns, failed)
+        if len(failed) == begun:
+            return None
+        taken, why = failed[begun]
+        return refused_by(taken[0], why)
 
-    def _command_lowers(self, upper: Managed, time_ns: int) -> None:
+    def _command_lowers(self, upper: Managed, time_ns: int, failed: list[_Failed]) -> None:
         """End what clients had those below do: from now on this one commands them."""
         for lower in (self.named[name] for name in upper.plan.into):
             try:
                 lower.follow(time_ns)
             except ControllerFault as fault:
-                self.end(lower, fault, time_ns)
+                failed.append((self._take_out_with_uppers(lower, fault, time_ns), str(fault)))
+
+    def _fall_back_all(self, failed: Sequence[_Failed], time_ns: int) -> None:
+        for taken, why in failed:
+            self._fall_back(taken, why, time_ns)
 
     def _report_left_out(self, managed: Managed, why: str) -> None:
         name = managed.plan.name
