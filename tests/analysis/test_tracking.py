@@ -48,7 +48,9 @@ def make(tmp_path: Path) -> Make:
         }
         attachments = {"plan.json": json.dumps(plan).encode()}
         path = tmp_path / f"run_{len(list(tmp_path.iterdir()))}.mcap"
-        log = LogWriter(path, LogHeader("torso", ("neck",), ("main",), (), round(DT * 1e9), 0, attachments))
+        log = LogWriter(
+            path, LogHeader("torso", ("neck",), ("main",), (), round(DT * 1e9), 0, attachments=attachments)
+        )
         record = CycleRecord(CycleLayout(("neck",), []))
         for number, (goal, position) in enumerate(zip(goals, positions, strict=True)):
             record.cycle, record.scheduled_ns = number, 10**9 + number * round(DT * 1e9)
