@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from dxlrun.control.policy_plan import SLOW_SPEED
+from dxlrun.description.modes import Mode
 from dxlrun.run.channels.answers import Code, Done, Refusal, Waiting
 from dxlrun.run.channels.cycle import Torque
 from dxlrun.run.channels.events import EventCode
@@ -62,7 +63,7 @@ def story(make_robot):
 
         robot.hardware.idle = idle
         robot.record.states.torque[:] = Torque.ON
-        robot.loop.run()
+        robot.result = robot.loop.run()
         return robot
 
     return run
@@ -156,7 +157,10 @@ def test_a_controller_is_not_activated_on_a_limp_joint(story, torque):
     switch = asks("switch", activate=["other"], deactivate=[])
     robot = story(5, {1: asked, 2: switch} if torque is not Torque.ON else {1: both(asked, switch)})
     hint = "`dxlrun torque on j2` gives it"
-    assert robot.answer(robot.number) == (Code.JOINT_LIMP, {"joint": ("j2",), "hint": hint})
+    assert robot.answer(robot.number) == (
+        Code.JOINT_LIMP,
+        {"joint": ("j2",), "servo": ("j2",), "hint": hint},
+    )
     assert robot.refusals[robot.number] == "j2 has no torque; `dxlrun torque on j2` gives it"
 
 
@@ -257,20 +261,28 @@ def test_a_register_is_read(story):
 def test_a_servo_that_reboots_by_request_is_not_lost_and_one_that_stays_away_is(story):
     """The policy for lost servos would hold its controllers, or end the run."""
 
-    def away(robot):
-        robot.record.states.valid[2] = False
-        robot.record.states.age_ns[2] = 10**9
+    def away(torque):
+        def leave(robot):
+            robot.record.states.valid[2] = False
+            robot.record.states.age_ns[2] = 10**9
+            robot.record.states.torque[2] = torque
+
+        return leave
 
     def back(robot):
         robot.record.states.valid[2] = True
+        robot.record.states.torque[2] = Torque.ON
 
-    robot = story(30, {1: asks("reboot", joints=["j2"]), 2: away, 12: back, 15: away})
-    assert not robot.loop.joints.expected
-    assert robot.loop._lost.rows == {2}
-    robot = story(14, {1: asks("reboot", joints=["j2"]), 2: away})
-    assert robot.loop._lost.rows == frozenset()
-    robot = story(240, {1: asks("reboot", joints=["j2"]), 2: away})
-    assert robot.loop._lost.rows == {2}
+    def story_of(cycles, at):
+        robot = story(cycles, {1: asks("reboot", joints=["j2"])} | at)
+        return robot.loop._lost.rows, robot.result.invalid
+
+    boots, lost = away(Torque.REBOOTING), away(Torque.LOST)
+    assert story_of(14, {2: boots}) == (frozenset(), (0, 0, 0))
+    assert story_of(14, {2: boots, 12: back}) == (frozenset(), (0, 0, 0))
+    assert story_of(30, {2: boots, 12: back, 15: lost}) == ({2}, (0, 0, 15))
+    assert story_of(30, {2: boots, 12: lost}) == ({2}, (0, 0, 18))  # given up
+    assert story_of(14, {2: lost}) == ({2}, (0, 0, 12))  # it was not this that was requested
 
 
 def test_the_goal_of_a_limp_joint_follows_it_and_its_first_goals_with_torque_are_slow(story):
@@ -292,3 +304,84 @@ def test_the_goal_of_a_limp_joint_follows_it_and_its_first_goals_with_torque_are
     np.testing.assert_allclose(goals[6:8], 0.95)  # where it was when it got its torque
     assert (np.abs(np.diff(goals[7:])) < SLOW_SPEED * 0.02 + 1e-9).all()
     assert goals[-1] < 0.95
+
+
+def test_a_commanded_joint_that_gets_torque_begins_where_it_is(story):
+    """Its controller goes on meanwhile, and nothing is said of commands that a limp joint cannot follow."""
+
+    def moved(robot):
+        robot.record.states.torque[1] = Torque.OFF
+        robot.hardware.read = lambda: None
+        robot.record.states.position[1] = 0.9
+
+    def torque(robot):
+        assert robot.servos.what == [(1, "on")]
+        robot.record.states.torque[1] = Torque.ON
+
+    robot = story(12, {3: moved, 5: asks("torque", joints=["j1"], on=True), 8: torque})
+    goals = np.array([position[1] for position, _ in robot.hardware.written])
+    np.testing.assert_allclose(goals[3:8], 0.9)
+    assert goals[8] == pytest.approx(0.9, abs=SLOW_SPEED * 0.02 + 1e-9)
+    assert (np.abs(np.diff(goals[7:])) < SLOW_SPEED * 0.02 + 1e-9).all()
+    assert goals[-1] < 0.9
+    begun = [cycle["cycle"] for cycle in robot.sink.cycles if cycle["clamped"][1]]
+    assert not set(begun) & set(range(3, 8))
+
+
+@pytest.mark.parametrize("mode", [Mode.VELOCITY, Mode.EFFORT, Mode.PWM, Mode.UNKNOWN])
+@pytest.mark.parametrize("release", [False, True])
+def test_torque_is_refused_where_a_command_would_be_followed_at_once(story, mode, release):
+    def limp(robot):
+        robot.record.states.torque[1] = Torque.OFF
+        robot.record.states.mode[1] = mode
+
+    robot = story(6, {2: both(limp, asks("torque", joints=["j2", "j1"], on=True, release=release))})
+    if release:
+        assert robot.servos.what == [(2, "on"), (1, "on")]
+        assert [cycle["active"] for cycle in robot.sink.cycles] == [1, 1, 0, 0, 0, 0]
+    else:
+        assert robot.servos.asked == []
+        assert robot.answer(robot.number) == (
+            Code.JOINT_COMMANDED,
+            {"joint": ("j1",), "controller": ("arm",)},
+        )
+
+
+def test_joints_with_torque_are_no_reason_to_refuse_it(story):
+    def driven(robot):
+        robot.record.states.mode[:] = Mode.EFFORT
+
+    robot = story(5, {2: both(driven, asks("torque", joints=["j0", "j1", "j2"], on=True))})
+    assert robot.servos.what == [(0, "on"), (1, "on"), (2, "on")]
+
+
+def fails(controller, step, time_ns, data):
+    if step == "update" and time_ns > 50_000_000:
+        raise RuntimeError("broken")
+
+
+@pytest.mark.parametrize("torque", [Torque.ON, Torque.OFF, Torque.RELEASED])
+def test_a_fallback_does_not_take_over_a_limp_joint(story, torque):
+    def prepare(robot):
+        robot.script("first", fails, joints=("j2",), fallback="other")
+
+    def limp(robot):
+        robot.record.states.torque[2] = torque
+
+    robot = story(12, {1: limp}, prepare)
+    refused = [text for _, text in robot.events.of(EventCode.COMMAND_REFUSED)]
+    if torque is Torque.ON:
+        assert refused == []
+        assert robot.result.reason == "stopped"
+    else:
+        assert refused == ["other does not take over: j2 has no torque; `dxlrun torque on j2` gives it"]
+        assert robot.result.reason == "fault"
+        assert "first" in robot.result.detail
+
+
+def test_a_long_list_is_cut_in_the_sentence_and_whole_in_its_fields():
+    joints = tuple(f"j{row}" for row in range(20))
+    refusal = Refusal(Code.UNKNOWN_JOINT, {"joint": joints})
+    assert refusal.text == "there is no joint j0, j1, j2, j3 and 16 more"
+    assert refusal.fields["joint"] == joints
+    assert Refusal(Code.UNKNOWN_JOINT, {"joint": joints[:5]}).text == "there is no joint j0, j1, j2, j3, j4"

@@ -10,12 +10,18 @@ import msgspec
 import numpy as np
 import pytest
 
+from dxlrun.analysis.tally import totals_of
+from dxlrun.analysis.tracking import tracking
+from dxlrun.analysis.verdict import judge
+from dxlrun.control.policy_plan import SLOW_SPEED
 from dxlrun.errors import InputError
 from dxlrun.log.reader import Log, read_log
 from dxlrun.log.replay import replay_log
 from dxlrun.run.channels.answers import Answer, Done, Refusal
 from dxlrun.run.channels.commands import Command
 from dxlrun.run.channels.cycle import Torque
+from dxlrun.simulation.faults.fault import parse_fault
+from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.testing import VirtualRobot, simulated_robot
 
 MS = 1_000_000
@@ -112,7 +118,7 @@ def test_a_tripped_servo_is_rebooted_and_gets_torque_in_the_run(run: Callable[..
     assert one.answer(commanded).text == "arm commands elbow; deactivate it first, or add --release"  # type: ignore[union-attr]  # a refusal
     assert [isinstance(one.answer(number), Done) for number in (reboot, on, switch)] == [True] * 3
     assert one.torque(log, 1)[-1] is Torque.ON
-    assert Torque.LOST in one.torque(log, 1)
+    assert Torque.REBOOTING in one.torque(log, 1)
     assert one.torque(log, 0) == [Torque.ON]
     assert not [event for event in log.events if event.name == "servo_lost"]
 
@@ -144,7 +150,9 @@ def test_a_joint_that_starts_limp_never_has_torque_until_it_is_asked_for(run: Ca
     log = one.run()
     assert at == [0]
     assert 1 in given
-    assert one.answer(switch).text == "elbow has no torque; `dxlrun torque on elbow` gives it"  # type: ignore[union-attr]  # a refusal
+    assert (
+        one.answer(switch).text == "elbow (ID 2 on bus main) has no torque; `dxlrun torque on elbow` gives it"
+    )  # type: ignore[union-attr]  # a refusal
     assert isinstance(one.answer(on), Done)
     assert isinstance(one.answer(again), Done)
     assert one.torque(log, 1)[0] is Torque.RELEASED
@@ -207,3 +215,66 @@ def test_all_joints_off_and_on_again_and_again(run: Callable[..., Run]) -> None:
     assert isinstance(one.answer(numbers[-1]), Done)
     assert isinstance(one.answer(numbers[3]), Done)
     assert all(one.torque(log, row)[-1] is Torque.ON for row in range(3))
+
+
+@pytest.mark.parametrize("requested", [True, False])
+def test_a_requested_reboot_is_no_fault_of_the_run(run: Callable[..., Run], requested: bool) -> None:
+    """One that nothing requested counts: its invalid states too."""
+    one = run(duration_s=1.5)
+    if requested:
+        one.ask(400, "reboot", joints=["wrist"], release=True)
+    else:
+        one.at(400, one.robot.buses[0].servo(3).reboot)
+    log = one.run()
+    away = int(np.count_nonzero(~log.cycles["valid"][:, 2]))
+    assert away > 10
+    totals = totals_of(one.path)
+    verdict = judge(totals)
+    result = one.robot.result
+    assert result is not None
+    assert result.invalid == totals.invalid == tuple(joint.invalid for joint in tracking(log))
+    if requested:
+        assert (verdict.good, totals.invalid[2] <= 2) == (True, True), verdict
+        assert Torque.LOST not in one.torque(log, 2)
+    else:
+        assert totals.invalid[2] == away
+        assert not verdict.good
+        assert "wrist" in verdict.sentences[0]
+
+
+def test_a_reboot_that_never_ends_is_a_loss(run: Callable[..., Run]) -> None:
+    one = run(duration_s=5.0)
+    script = FaultScript([parse_fault("silence servo=3 at=410ms for=10s")])
+    script.attach(one.robot.buses)
+    reboot = one.ask(400, "reboot", joints=["wrist"], release=True)
+    log = one.run()
+    answer = one.answer(reboot)
+    assert isinstance(answer, Refusal)
+    assert answer.text.startswith("wrist (ID 3 on bus main) did not come back within 3 s after its reboot")
+    assert one.torque(log, 2)[:3] == [Torque.ON, Torque.REBOOTING, Torque.LOST]
+    totals = totals_of(one.path)
+    assert 140 < totals.invalid[2] < 180  # of the end, not of the three seconds before
+    assert not judge(totals).good
+
+
+def test_torque_comes_back_softly_while_a_controller_goes_on(run: Callable[..., Run]) -> None:
+    """A servo that rebooted is moved by hand and gets torque: the first goal is where it stands."""
+    one = run(duration_s=2.5)
+    bus = one.robot.buses[0]
+    servo = bus.servo(2)
+    one.at(400, servo.reboot)
+    one.at(1200, lambda: servo.turn_by_hand(2.5))
+    on = one.ask(1400, "torque", joints=["elbow"], on=True)
+    log = one.run()
+    assert isinstance(one.answer(on), Done)
+    assert one.torque(log, 1)[-1] is Torque.ON
+    arm = [name for name, *_ in [(plan.name,) for plan in log.controllers]].index("arm")
+    assert (log.cycles["active"] >> np.uint64(arm) & np.uint64(1)).all()
+    given = log.cycles["torque"][:, 1] == Torque.ON
+    late = given & (log.cycles["cycle"] > 100)
+    first = int(np.flatnonzero(late)[0])
+    goal, stands = log.cycles["goal_position"][:, 1], 2.5 - np.pi
+    assert abs(goal[first] - stands) < 0.02
+    assert np.abs(np.diff(goal[first:])).max() <= SLOW_SPEED * 0.01 + 1e-9
+    assert np.abs(np.diff(log.cycles["position"][first:, 1])).max() < 0.02
+    assert abs(goal[-1]) < abs(stands)  # and goes where its controller commands

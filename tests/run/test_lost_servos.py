@@ -264,12 +264,12 @@ MISSED, HEARD = False, True
 def test_a_joint_is_lost_after_three_misses_in_a_row_and_some_time(
     cycles: list[tuple[bool, int]], lost: list[bool]
 ) -> None:
-    look, states, found = LostServos(2, {}), States.empty(2), []
+    look, states, found = LostServos(2), States.empty(2), []
     states.valid[:] = True
     before = frozenset[int]()
     for heard, age_ms in cycles:
         states.valid[1], states.age_ns[1] = heard, age_ms * 1_000_000 if age_ms > 0 else age_ms
-        assert look.look(states, 0) is (look.rows != before)
+        assert look.look(states) is (look.rows != before)
         before = look.rows
         found.append(1 in look.rows)
         assert 0 not in look.rows
@@ -278,11 +278,11 @@ def test_a_joint_is_lost_after_three_misses_in_a_row_and_some_time(
 
 def test_a_group_is_let_go_once_however_long_its_servo_stays_away() -> None:
     arm = GroupPolicy("arm", frozenset({0, 1}), "limp")
-    plan, look, states = PolicyPlan(groups=(arm,)), LostServos(3, {}), States.empty(3)
+    plan, look, states = PolicyPlan(groups=(arm,)), LostServos(3), States.empty(3)
     states.valid[2] = True
     states.age_ns[:] = 100_000_000
     told = []
     for _ in range(5):
-        look.look(states, 0)
+        look.look(states)
         told.append(look.judge(plan))
     assert told == [({}, [])] * 2 + [({}, [arm])] + [({}, [])] * 2

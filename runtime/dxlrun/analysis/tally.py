@@ -14,6 +14,7 @@ from dxlrun.analysis.bus import BusTraffic, ServoTraffic, Traffic
 from dxlrun.analysis.latency import Latency, Periods, Punctuality, Slowest, on_virtual_time
 from dxlrun.analysis.plan import plan_of
 from dxlrun.analysis.steering import Act, Pause, SteeringHistory
+from dxlrun.analysis.tracking import missing_states
 from dxlrun.control.loop_plan import TOLERATED_SKIPS
 from dxlrun.log.reader import UNREADABLE, Log, scan_log
 from dxlrun.log.schemas import FAILURES_NAME, SUMMARY_NAME
@@ -53,7 +54,7 @@ class RunTotals:
     real_time: RealTime = RealTime()
     joints: tuple[str, ...] = ()
     invalid: tuple[int, ...] = ()
-    """Cycles in which the state of each joint was not valid."""
+    """Cycles in which the state of each joint was not valid; those of a requested reboot do not count."""
     servos: tuple[ServoTraffic, ...] = ()
     buses: tuple[BusTraffic, ...] = ()
     events: tuple[EventGroup, ...] = ()
@@ -86,7 +87,7 @@ class Tally:
         self._punctuality.take(log)
         self._traffic.take(log)
         self._steering.take(log)
-        invalid = np.count_nonzero(~log.cycles["valid"], axis=0)
+        invalid = np.count_nonzero(missing_states(log.cycles), axis=0)
         self._invalid = invalid if self._invalid is None else self._invalid + invalid
         for event in log.events:
             self._events.add(event)

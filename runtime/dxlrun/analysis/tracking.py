@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from dxlrun.analysis.plan import LoggedJoint, LoggedServo, plan_of
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.log.reader import Log
-from dxlrun.run.channels.cycle import Floats
+from dxlrun.run.channels.cycle import Floats, Torque
 
 _REST_S = 0.3
 """A reachable trajectory that does not change for so long is at rest: its joint is to settle."""
@@ -39,7 +39,7 @@ class JointTracking:
 
     name: str
     invalid: int
-    """Cycles without an intact reply."""
+    """Cycles without an intact reply; those of a requested reboot do not count."""
     oldest_ms: float
     """Greatest age of a state."""
     clamped: int
@@ -73,6 +73,15 @@ class _Limits:
     """rad/s; a speed of 0 would be none"""
 
 
+def missing_states(cycles: NDArray[np.void]) -> NDArray[np.bool_]:
+    """Return which states of cycles are not valid, shape (cycles, joints).
+
+    Those of a servo that reboots because a client requested it are not missing.
+    """
+    missing: NDArray[np.bool_] = ~cycles["valid"] & (cycles["torque"] != Torque.REBOOTING)
+    return missing
+
+
 def tracking(log: Log) -> tuple[JointTracking, ...]:
     """Return freshness and tracking of each joint; rows in the order of the log."""
     limits = _limits(log)
@@ -97,7 +106,7 @@ def _joint(log: Log, row: int, name: str, limits: _Limits) -> JointTracking:
     settled = [settling for settling, _ in rests if settling is not None]
     return JointTracking(
         name=name,
-        invalid=int(np.count_nonzero(~valid)),
+        invalid=int(np.count_nonzero(missing_states(cycles)[:, row])),
         oldest_ms=max(0.0, float(ages.max(initial=0)) / 1e6),
         clamped=int(np.count_nonzero(cycles["clamped"][:, row])),
         rms_rad=float(np.sqrt(np.mean(known**2))) if len(known) else None,

@@ -5,7 +5,8 @@ exit code is 1 where a run was not good. The most severe finding comes first. A 
 
 - a line or a servo was lost, a servo rebooted or lost its torque, the loop never ran a cycle, or another
   process of the run failed;
-- a joint's state was invalid in more than 1 % of the cycles, and in three at least;
+- a joint's state was invalid in more than 1 % of the cycles, and in three at least; those of a reboot that a
+  client requested do not count;
 - more periods were skipped than the robot file tolerates (`loop: {tolerated_skips: ...}`), of two seconds at
   least;
 - an error was logged, a servo reported one, or the log is not whole.

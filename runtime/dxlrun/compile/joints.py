@@ -98,6 +98,7 @@ def compile_joints(
                 top_speed=table.top_speed or None,
                 top_effort=_top_effort(table, continuous=joint.continuous),
                 acceleration=joint.limits.acceleration,
+                servo=f"ID {joint.id} on bus {joint.bus}",
             )
             _check_acceleration(description, plan, problems)
             compiled[name] = CompiledJoint(plan, joint, table, reach, registers)

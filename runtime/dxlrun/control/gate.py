@@ -142,7 +142,7 @@ class Gate:
         """Move `goals` toward `commands` in place; `dt_ns` is the time since the cycle before."""
         clamped, speed = self._record.clamped, self._speed
         if self._any_limp or self._record.states.torque.tobytes() != self._torque:
-            self._follow(commands, goals)
+            self._follow(goals)
         np.bitwise_and(clamped, _NOT_FINITE, clamped)  # what the manager found
         if self._longest_slow_ns > 0:
             speed = np.where(self._slow_ns > 0, self._slow, self._speed)
@@ -152,14 +152,17 @@ class Gate:
             self._lead(commands, goals, speed, dt_ns)
         if self._drive.any:
             self._drive.apply(commands, goals, self._record.states, speed, dt_ns)
+        if self._any_limp:
+            clamped[self._limp] &= _NOT_FINITE  # what is commanded meanwhile is not followed
+            self._stay(self._limp, goals)
         if np.count_nonzero(clamped):  # a tenth of the time of any()
             self._report(clamped & ~self._before)
         np.copyto(self._before, clamped)
 
-    def _follow(self, commands: Commands, goals: Commands) -> None:
-        """Let the goals of limp joints that no controller commands be where these stand.
+    def _follow(self, goals: Commands) -> None:
+        """Let the goals of limp joints be where these stand, whatever is commanded.
 
-        So a joint that gets torque again holds where it is, and follows its next commands slowly.
+        So a joint that gets torque again holds where it is, and follows its commands slowly from there on.
         """
         states, limp = self._record.states, self._limp
         if (torque := states.torque.tobytes()) != self._torque:
@@ -168,9 +171,14 @@ class Gate:
             self._any_limp = bool(self._limp.any())
             self.ease_in(np.flatnonzero(before & ~self._limp).tolist())
             limp = before | self._limp  # those that have it again too, as they moved until now
-        limp = limp & self._led & np.isnan(commands.position) & np.isfinite(states.position)
-        np.copyto(goals.position, states.position, where=limp)
+        self._stay(limp, goals)
+
+    def _stay(self, limp: NDArray[np.bool_], goals: Commands) -> None:
+        position = self._record.states.position
+        limp = limp & self._led & np.isfinite(position)
+        np.copyto(goals.position, position, where=limp)
         goals.velocity[limp] = np.nan
+        self._ramps.rest(limp, goals.position)
 
     def _lead(self, commands: Commands, goals: Commands, speed: Floats, dt_ns: int) -> None:
         """Fill position and speed of the joints that are led to positions.

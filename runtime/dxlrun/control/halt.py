@@ -10,7 +10,7 @@ from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.loop_plan import JointPlan
 from dxlrun.description.modes import Mode
 from dxlrun.run.channels.answers import Answer, Code, Done, Halted, Refusal, Waiting
-from dxlrun.run.channels.cycle import LIMP, CycleRecord, Torque
+from dxlrun.run.channels.cycle import LIMP, OFFLINE, CycleRecord
 
 STILL = 0.1
 """rad/s; a slower joint stands still: servos report what they turn in steps of 0.024 rad/s (XM430) or less,
@@ -20,7 +20,7 @@ STILL_NS = 100_000_000
 HALT_NS = 5_000_000_000
 """A halt is answered after this time at the latest, as joints may change their modes for so long."""
 _HOLDING = (Mode.POSITION, Mode.VELOCITY)
-_FREE = (*LIMP, Torque.LOST)
+_FREE = (*LIMP, *OFFLINE)
 """Joints that do not count: what moves them is not the run, or not known."""
 
 

@@ -15,13 +15,10 @@ import msgspec
 
 from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.loop_plan import JointPlan
+from dxlrun.description.modes import Mode
 from dxlrun.run.channels.answers import Answer, Code, Done, Refusal, Waiting
 from dxlrun.run.channels.commands import Command
-from dxlrun.run.channels.cycle import LIMP, CycleRecord, Torque
-
-REBOOT_NS = 4_000_000_000
-"""So long a servo that reboots at a client's request does not count as lost [i]: the hardware gives up after
-three seconds."""
+from dxlrun.run.channels.cycle import LIMP, OFFLINE, CycleRecord, Torque
 
 
 class JointHardware(Protocol):
@@ -50,7 +47,8 @@ class TorqueRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     joints: tuple[str, ...]
     on: bool
     release: bool = False
-    """Deactivate the controllers that command the joints, in the same cycle."""
+    """Deactivate the controllers that command the joints, in the same cycle; those of positions may stay when
+    torque is switched on."""
 
 
 class RebootRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -76,6 +74,8 @@ class Register(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The integer on the wire, signed where the item is."""
 
 
+_LED = (Mode.POSITION, Mode.EFFORT_POSITION)
+
 JOINT_KINDS = ("register", "get", "torque", "reboot")
 """Commands for the loop that are about joints."""
 
@@ -95,7 +95,7 @@ class _Pending:
 class JointRequests:
     """Decides on requests for joints, hands them to the hardware, and answers them."""
 
-    __slots__ = ("_answer", "_hardware", "_manager", "_pending", "_record", "_rows", "expected")
+    __slots__ = ("_answer", "_hardware", "_joints", "_manager", "_pending", "_record", "_rows")
 
     def __init__(
         self,
@@ -107,13 +107,12 @@ class JointRequests:
     ) -> None:
         """`answer` sends a client an answer, by the number of its command."""
         self._rows = {joint.name: row for row, joint in enumerate(joints)}
+        self._joints = joints
         self._hardware = hardware
         self._manager = manager
         self._record = record
         self._answer = answer
         self._pending: dict[int, _Pending] = {}
-        self.expected: dict[int, int] = {}
-        """Rows of servos that reboot by request -> until when that is no loss, ns of the clock."""
 
     def execute(self, command: Command, time_ns: int) -> Refusal | None:
         """Execute a command of JOINT_KINDS; None: it is answered later. Raises what msgspec does."""
@@ -136,6 +135,8 @@ class JointRequests:
         if request.on:
             if refusal := self._refuse_lost(rows) or self._refuse_broken(rows):
                 return refusal
+            if refusal := self._release(self._abrupt(rows), request.release, time_ns):
+                return refusal
             self._manager.released.difference_update(rows.values())
         else:
             if refusal := self._release(rows, request.release, time_ns):
@@ -157,7 +158,6 @@ class JointRequests:
         pending = self._pending[number] = _Pending(Code.NOT_REBOOTED, len(rows))
         self._answer(number, Waiting(()))
         for joint, row in rows.items():
-            self.expected[row] = self._record.woken_ns + REBOOT_NS
             self._hardware.reboot(row, partial(self._done, number, pending, joint))
         return None
 
@@ -195,8 +195,12 @@ class JointRequests:
 
     def _refuse_lost(self, rows: dict[str, int]) -> Refusal | None:
         torque = self._record.states.torque
-        lost = tuple(joint for joint, row in rows.items() if torque[row] == Torque.LOST)
-        return Refusal(Code.JOINT_LOST, {"joint": lost}) if lost else None
+        lost = tuple(joint for joint, row in rows.items() if torque[row] in OFFLINE)
+        if not lost:
+            return None
+        reboots = all(torque[rows[joint]] == Torque.REBOOTING for joint in lost)
+        hint = "it reboots as requested: try again when it is back" if reboots else "check cable and power"
+        return Refusal(Code.JOINT_LOST, {"joint": lost, "servo": self._labels(lost), "hint": hint})
 
     def _refuse_broken(self, rows: dict[str, int]) -> Refusal | None:
         """Refuse torque for joints whose servos cut it after a hardware error."""
@@ -207,7 +211,20 @@ class JointRequests:
         if not broken:
             return None
         hint = f"find the cause, then `dxlrun reboot {' '.join(broken)}` (Protocol 1.0: power off and on)"
-        return Refusal(Code.HARDWARE_ERROR, {"joint": broken, "hint": hint})
+        return Refusal(Code.HARDWARE_ERROR, {"joint": broken, "servo": self._labels(broken), "hint": hint})
+
+    def _labels(self, joints: Sequence[str]) -> tuple[str, ...]:
+        return tuple(self._joints[self._rows[joint]].label for joint in joints)
+
+    def _abrupt(self, rows: dict[str, int]) -> dict[str, int]:
+        """Return the limp joints that would follow a controller's commands at once when they get torque.
+
+        Goal positions begin where a joint stands, and move slowly from there; a velocity or an effort that is
+        commanded has no such beginning.
+        """
+        states = self._record.states
+        limp = {joint: row for joint, row in rows.items() if states.torque[row] in LIMP}
+        return {joint: row for joint, row in limp.items() if states.mode[row] not in _LED}
 
     def _release(self, rows: dict[str, int], release: bool, time_ns: int) -> Refusal | None:
         """Deactivate the controllers that command joints, or refuse because of them."""

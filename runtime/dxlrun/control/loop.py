@@ -23,7 +23,7 @@ from dxlrun.control.steering import Steering
 from dxlrun.errors import PortError, counted
 from dxlrun.run.channels.answers import Answer, Code, Refusal
 from dxlrun.run.channels.commands import LOOP, CommandSink, Inbox, NoCommands, NoInbox, TakenCommand
-from dxlrun.run.channels.cycle import LOST_AGE_NS, LOST_CYCLES, CycleRecord, States
+from dxlrun.run.channels.cycle import LOST_AGE_NS, LOST_CYCLES, CycleRecord, States, Torque
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
 
 MOST_RATE = 100_000.0
@@ -145,7 +145,7 @@ class LoopResult:
     last: Last = "limp"
     """How the policy leaves the robot; done by the code that started the hardware."""
     invalid: tuple[int, ...] = ()
-    """Cycles in which the state of each joint was not valid."""
+    """Cycles in which the state of each joint was not valid; those of a requested reboot do not count."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -190,8 +190,9 @@ class Loop:
     """The controllers' time in the last cycle."""
     _woken_ns: int = field(default=0, init=False)
     _cycles: int = field(default=0, init=False)
-    _valid: NDArray[np.int64] = field(init=False)
-    """Cycles in which each joint's state was valid."""
+    _invalid: NDArray[np.int64] = field(init=False)
+    """Cycles in which each joint's state was not valid, those of a requested reboot left out."""
+    _all_valid: bytes = field(init=False)
     _skipped: int = field(default=0, init=False)
     _late: bool = field(default=False, init=False)
     _lost: LostServos = field(init=False)
@@ -201,9 +202,10 @@ class Loop:
     def __post_init__(self) -> None:
         self.schedule = Schedule(self.plan.period_ns)
         self._overruns = Overruns(self.plan.overrun, self.overrun_hooks, self.events)
-        self._valid = np.zeros(len(self.plan.joints), np.int64)
+        self._invalid = np.zeros(len(self.plan.joints), np.int64)
+        self._all_valid = bytes([True]) * len(self.plan.joints)
         self.joints = JointRequests(self.plan.joints, self.hardware, self.manager, self.record, self._answer)
-        self._lost = LostServos(len(self.plan.joints), self.joints.expected)
+        self._lost = LostServos(len(self.plan.joints))
         halt = Halt(self.plan.joints, self.manager, self.record, self._answer)
         self.steering = Steering(
             self.inbox, self, self.manager, self.joints, halt, self.record, self.events, self.commands
@@ -241,8 +243,7 @@ class Loop:
             reason, detail = "fault", detail or sentence
         last = self._wind_up(policy)
         self._log_end(reason, detail)
-        invalid = tuple((self._cycles - self._valid).tolist())
-        return LoopResult(self._cycles, self._skipped, reason, detail, last, invalid)
+        return LoopResult(self._cycles, self._skipped, reason, detail, last, tuple(self._invalid.tolist()))
 
     # What clients may ask for, through Steering
 
@@ -348,7 +349,7 @@ class Loop:
             self.steering.refuse()
             self._motion.command()
         else:
-            if self._lost.look(record.states, woken_ns):
+            if self._lost.look(record.states):
                 self._miss()
             time_ns = schedule.time_ns(woken_ns)
             if (
@@ -370,7 +371,9 @@ class Loop:
         record.set_times(read_ns, updated_ns, now_ns())
         self.sink.append(record)
         self._cycles += 1
-        self._valid += record.states.valid
+        states = record.states
+        if states.valid.tobytes() != self._all_valid:
+            self._invalid += ~states.valid & (states.torque != Torque.REBOOTING)
         self.beat()
 
     def _miss(self) -> None:
@@ -569,31 +572,26 @@ def _unanswered(problem: str) -> None:
 
 
 class LostServos:
-    """Counts the replies that each joint missed in a row."""
+    """Counts the replies that each joint missed in a row; a servo that reboots by request misses none."""
 
-    __slots__ = ("_all", "_expected", "_limp", "_missed", "rows")
+    __slots__ = ("_all", "_limp", "_missed", "rows")
 
-    def __init__(self, joints: int, expected: dict[int, int]) -> None:
-        """`expected`: rows of servos that reboot by request, until when, ns; those that are back leave it."""
-        self._expected = expected
+    def __init__(self, joints: int) -> None:
         self.rows: frozenset[int] = frozenset()
         """Rows of the joints that are lost now."""
         self._limp: set[str] = set()  # names of groups that a lost servo has left without torque
         self._missed = np.zeros(joints, dtype=np.int64)
         self._all = bytes([True]) * joints
 
-    def look(self, states: States, now_ns: int) -> bool:
-        """Take the states of a cycle that began at `now_ns`; return whether `rows` is another one now."""
+    def look(self, states: States) -> bool:
+        """Take the states of a cycle; return whether `rows` is another one now."""
         valid, age_ns = states.valid, states.age_ns
         if valid.tobytes() == self._all and not np.count_nonzero(self._missed):
             return False
-        for row, until_ns in tuple(self._expected.items()):
-            if now_ns >= until_ns or (valid[row] and self._missed[row]):
-                del self._expected[row]
         self._missed += 1
-        self._missed[valid] = 0
+        self._missed[valid | (states.torque == Torque.REBOOTING)] = 0
         lost = (self._missed >= LOST_CYCLES) & ((age_ns >= LOST_AGE_NS) | (age_ns < 0))
-        rows = frozenset(np.flatnonzero(lost).tolist()) - self._expected.keys()
+        rows = frozenset(np.flatnonzero(lost).tolist())
         changed = rows != self.rows
         self.rows = rows
         return changed

@@ -62,6 +62,13 @@ class JointPlan:
     """The highest goal that the servo has, in the unit of `effort`; None: it has none, or it is not known."""
     acceleration: float | None = None
     """rad/s^2, by which goals may become faster and slower; None: no limit in the file"""
+    servo: str = ""
+    """ID and bus, for sentences; empty: a log of the time before it"""
+
+    @property
+    def label(self) -> str:
+        """The joint with its servo, as sentences name it."""
+        return f"{self.name} ({self.servo})" if self.servo else self.name
 
     @property
     def highest_speed(self) -> float:

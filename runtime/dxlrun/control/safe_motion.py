@@ -141,15 +141,12 @@ class SafeMotion:
         record = self.record
         goal, commands = record.goals.position, record.commands
         target: Floats = np.array([np.nan if one is None else one for one in step.targets])
-        named = np.isfinite(target)
+        # the goal of a limp joint is where it stands, and goes nowhere
+        named = np.isfinite(target) & ~np.isin(record.states.torque, LIMP)
         if not np.any(named & (np.abs(target - goal) > 1e-9)):
             self._there_ns = now_ns if self._there_ns < 0 else self._there_ns
             states = record.states
-            away = (
-                named
-                & ~np.isin(states.torque, LIMP)
-                & ~(states.valid & (np.abs(target - states.position) <= ARRIVED))
-            )
+            away = named & ~(states.valid & (np.abs(target - states.position) <= ARRIVED))
             lasted_ns = now_ns - self._there_ns
             return lasted_ns >= SETTLE_NS or (lasted_ns >= STAND_NS and not away.any())
         reach = self._reach * (step.speed * max(record.period_ns, 1) * 1e-9)

@@ -147,7 +147,8 @@ def _cycle_text() -> str:
         "# hardware_error: bits of Hardware Error Status, or states of Protocol 1.0's ERR. mode: 0 not",
         "# known, 1 position, 2 velocity, 3 effort, 4 pwm, 5 position with an effort limit.",
         "# reference: in the order of the metadata's references. torque: 0 not known, 1 on, 2 in doubt,",
-        "# 3 off, 4 switched off on request, 5 lost. Records + skipped = elapsed periods.",
+        "# 3 off, 4 switched off on request, 5 lost, 6 reboots on request.",
+        "# Records + skipped = elapsed periods.",
     ]
     lines += [f"{kind} {name}" for name, kind in SCALARS]
     lines += [f"{kind}[] {name}" for name, kind, _ in SEQUENCES]

@@ -22,7 +22,7 @@ from dxlrun.control.controllers.switching import Switching, refused_by
 from dxlrun.control.controllers.topics import TopicLog
 from dxlrun.control.loop_plan import ControllerPlan, LoopPlan, ScheduledCommand
 from dxlrun.errors import ControllerFault, PlugInError
-from dxlrun.run.channels.answers import Code, CommandOutcome, Field, Refusal, Waiting
+from dxlrun.run.channels.answers import MOST_NAMED, Code, CommandOutcome, Field, Refusal, Waiting
 from dxlrun.run.channels.commands import CommandSink, NoCommands, TakenCommand
 from dxlrun.run.channels.cycle import LIMP, MOST_CONTROLLERS, CycleRecord
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
@@ -70,7 +70,7 @@ class Manager:
         self._modes = ModeSwitch(plan.joints, record.states.mode, set_modes)
         self.released: set[int] = set()
         """Rows of joints whose torque clients switched off; the states show it a cycle later."""
-        self._switching = Switching(self._modes, events)
+        self._switching = Switching(self._modes, events, self._refuse_limp)
         self._named = self._switching.named
         self.ended_switches = self._switching.ended
         """Switches that waited and have ended: the command's number, and why not; for the loop to answer."""
@@ -365,19 +365,18 @@ class Manager:
     def _refuse_limp(self, entering: Sequence[str]) -> Refusal | None:
         """Refuse controllers for joints without torque: they would command what cannot move."""
         torque = self._record.states.torque
-        limp = tuple(
-            dict.fromkeys(
-                self._plan.joints[row].name
-                for managed in (self._named[name] for name in entering)
-                if managed.plan.command and not managed.plan.into
-                for row in managed.rows.tolist()
-                if row in self.released or torque[row] in LIMP
-            )
-        )
+        limp: dict[str, str] = {}
+        names: list[str] = []
+        for managed in (self._named[name] for name in entering):
+            if managed.plan.commands_servos:
+                rows = [row for row in managed.rows.tolist() if row in self.released or torque[row] in LIMP]
+                limp.update((self._plan.joints[row].name, self._plan.joints[row].label) for row in rows)
+                names += [managed.plan.name] if rows else []
         if not limp:
             return None
-        hint = f"`dxlrun torque on {' '.join(limp)}` gives it"
-        return Refusal(Code.JOINT_LIMP, {"joint": limp, "hint": hint})
+        named = list(limp) if len(limp) <= MOST_NAMED else names  # a controller stands for its joints
+        hint = f"`dxlrun torque on {' '.join(named)}` gives it"
+        return Refusal(Code.JOINT_LIMP, {"joint": tuple(limp), "servo": tuple(limp.values()), "hint": hint})
 
     def load(  # noqa: PLR0911  one return a reason
         self, plan: ControllerPlan

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import msgspec
 
@@ -27,15 +27,22 @@ class Switching:
     one took over.
     """
 
-    __slots__ = ("_events", "_modes", "ended", "fault", "named")
+    __slots__ = ("_events", "_modes", "_refuse_limp", "ended", "fault", "named")
 
-    def __init__(self, modes: ModeSwitch, events: EventSink) -> None:
+    def __init__(
+        self,
+        modes: ModeSwitch,
+        events: EventSink,
+        refuse_limp: Callable[[Sequence[str]], Refusal | None],
+    ) -> None:
+        """`refuse_limp` refuses controllers that would command joints without torque."""
         self.fault: str | None = None
         self.named: dict[str, Managed] = {}
         """The controllers that are loaded."""
         self.ended: list[tuple[int, Refusal | None]] = []
         """Switches that waited and have ended: the command's number, and why not; for the loop to answer."""
         self._modes = modes
+        self._refuse_limp = refuse_limp
         self._events = events
 
     @property
@@ -239,17 +246,25 @@ class Switching:
             self._log(EventCode.CONTROLLER_DEACTIVATED, managed, "inactive")
 
     def _fall_back(self, taken: Sequence[Managed], why: str, time_ns: int) -> None:
-        """Let the first fallback of these take over that can; none that broke its own contract before: two
-        that fall back on each other would do so for ever."""
+        """Let the first fallback of these take over that can, else the policy for faults applies.
+
+        None can that broke its own contract before: two that fall back on each other would do so for ever.
+        Nor one for joints without torque.
+        """
         names = [managed.plan.name for managed in taken]
         failed = {name for name, managed in self.named.items() if managed.failed}
         for fallback in (managed.plan.fallback for managed in taken):
             if fallback not in self.named:
                 continue
             step = takeover_step(fallback, names, self.known, self.active, self.waiting, failed)
-            if step is not None:
+            if step is None:
+                continue
+            refusal = self._refuse_limp(step.enter)
+            if refusal is None:
                 self.take(step, time_ns, None, why)
                 return
+            text = f"{fallback} does not take over: {refusal.text}"
+            self.report_refusal(fallback, text, CommandOutcome("switch", "", refusal))
         self.fault = self.fault or why
 
     def _log(self, code: EventCode, managed: Managed, text: str) -> None:

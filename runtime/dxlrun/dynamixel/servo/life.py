@@ -266,8 +266,7 @@ class Life:
         self.states[index] = after
         self.torqued[index] = after in GETS_GOALS
         if after is not before:
-            self.torque[index] = _SHOWN[after]
-            self.torque_changed = True
+            self._show(index, _SHOWN[after])
         self.ceiling[index] = RETURN_SPEED if after in _SLOW else np.nan
         loss = self.losses[index]
         if event is ServoEvent.LOST:
@@ -287,6 +286,22 @@ class Life:
         assert loss is not None  # noqa: S101  a servo that is lost has one
         loss.probe_at_ns += probe_after_ns
         return loss
+
+    def reboot(self, index: int, request: RequestedReboot, probe_after_ns: int) -> Loss:
+        """Take a servo that reboots by request out of the exchange, until it is back or `answered`."""
+        loss = self.lose(index, probe_after_ns)
+        loss.reboot = request
+        self._show(index, Torque.REBOOTING)
+        return loss
+
+    def answered(self, index: int) -> None:
+        """Show a servo whose requested reboot is over and that is still OFFLINE as lost."""
+        if self.states[index] is ServoState.OFFLINE:
+            self._show(index, Torque.LOST)
+
+    def _show(self, index: int, torque: Torque) -> None:
+        self.torque[index] = torque
+        self.torque_changed = True
 
     def _loss(self, before: ServoState, earlier: Loss | None) -> Loss:
         """Return what is known of a servo that is lost, in a state or once more."""

@@ -187,6 +187,7 @@ class Offline:
         """Answer the client that requested a reboot, if one did, once."""
         request, loss.reboot = loss.reboot, None
         if request is not None:
+            self._life.answered(index)
             request.done(f"{self._plan.label(self._plan.servos[index])} {problem}" if problem else "")
 
 

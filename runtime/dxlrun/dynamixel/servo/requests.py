@@ -152,8 +152,8 @@ class Requests:
             done(f"{self._name(index)} refuses to reboot: {why}")
         elif not life.offline(index):
             # an acknowledgement may be lost: its clock will tell whether it started anew
-            loss = life.lose(index, FIRST_PROBE_NS)
-            loss.reboot = RequestedReboot(had_torque, self._idle.now_ns() + REBOOT_NS, done)
+            request = RequestedReboot(had_torque, self._idle.now_ns() + REBOOT_NS, done)
+            loss = life.reboot(index, request, FIRST_PROBE_NS)
             loss.rebooted = self._reboots.read(index) is None
         else:
             done(f"{self._name(index)} was lost while it was rebooted")

@@ -14,6 +14,8 @@ from typing import TypeAlias
 import msgspec
 
 Field: TypeAlias = str | int | float | tuple[str, ...]
+MOST_NAMED = 4
+"""Names of a list in a sentence; a program has all of them."""
 
 
 @unique
@@ -100,9 +102,9 @@ class Code(StrEnum):
         "joint_commanded",
         "{controller} commands {joint}; deactivate it first, or add --release",
     )
-    JOINT_LIMP = "joint_limp", "{joint} has no torque"
-    JOINT_LOST = "joint_lost", "{joint} does not answer: check cable and power"
-    HARDWARE_ERROR = "hardware_error", "{joint} has a hardware error, and cannot get torque"
+    JOINT_LIMP = "joint_limp", "{servo} has no torque"
+    JOINT_LOST = "joint_lost", "{servo} does not answer"
+    HARDWARE_ERROR = "hardware_error", "{servo} has a hardware error, and gets no torque"
     STILL_MOVING = (
         "still_moving",
         "no controller commands any more, but {joint} does not stand still after {seconds:.1f} s: "
@@ -180,8 +182,7 @@ class Refusal(msgspec.Struct, frozen=True, tag="refused"):
     def text(self) -> str:
         """The reason in one sentence."""
         shown = {
-            name: ", ".join(value) if isinstance(value, tuple) else value
-            for name, value in self.fields.items()
+            name: _listed(value) if isinstance(value, tuple) else value for name, value in self.fields.items()
         }
         sentence = self.code.text.format_map(shown)
         hint = "" if "{hint}" in self.code.text else shown.get("hint", "")
@@ -197,6 +198,14 @@ class CommandOutcome(msgspec.Struct, frozen=True):
     kind: str
     origin: str
     refusal: Refusal | None = None
+
+
+def _listed(names: tuple[str, ...]) -> str:
+    """Return names in a sentence: all of a few, else the first ones and how many more there are."""
+    beyond = len(names) - MOST_NAMED
+    if beyond < 2:  # a name is no longer than "1 more"
+        return ", ".join(names)
+    return f"{', '.join(names[:MOST_NAMED])} and {beyond} more"
 
 
 def _writable(value: Field) -> Field:

@@ -85,11 +85,15 @@ class Torque(IntEnum):
     RELEASED = 4
     """It has none, because a client, a policy or the robot file switched it off."""
     LOST = 5
-    """It is not known: the servo is lost, or reboots."""
+    """It is not known: the servo is lost."""
+    REBOOTING = 6
+    """The servo reboots because a client requested it: that it is silent is no loss."""
 
 
 LIMP = (Torque.OFF, Torque.RELEASED)
 """Joints that move freely."""
+OFFLINE = (Torque.LOST, Torque.REBOOTING)
+"""Joints whose servos are not read."""
 
 
 @dataclass(frozen=True, slots=True)
