@@ -259,7 +259,10 @@ def test_a_joint_is_limp_and_holds_again_while_the_robot_runs(dxlrun, torso: Rem
     assert not controllers(torso)["head"]["active"]
     said = dxlrun("switch", "--activate", "head")
     assert (said.code, said.out) == (1, "")
-    assert "head_yaw_joint has no torque; `dxlrun torque on head_yaw_joint` gives it" in said.err
+    assert (
+        "head_yaw_joint (ID 21 on bus main) has no torque; `dxlrun torque on head_yaw_joint` gives it"
+        in said.err
+    )
     said = dxlrun("get", "head_yaw_joint")
     assert (said.code, said.err) == (0, "")
     assert re.search(r"torque +released", said.out)
