@@ -593,3 +593,55 @@ def test_the_page_gives_the_limits_that_are_kept():
     assert f"more than {link.KEPT_TEXT >> 20} MiB together" in page
     assert f"A process may keep {server.MOST_OF_PROCESS} connections, all together" in page
     assert f"all together {server.MOST_CONNECTIONS}." in page
+
+
+# Hostile bodies
+
+DEEP = b'{"positions":' + b'{"a":' * 900 + b"1" + b"}" * 901
+HUGE = b"9" * 400
+
+
+@pytest.mark.parametrize("query", ["", "?units=true"])
+@pytest.mark.parametrize("kind", ["go", "positions", "position"])
+@pytest.mark.parametrize(
+    "body",
+    [
+        DEEP,
+        b'{"pan":' + b"[" * 500 + b"]" * 500 + b"}",
+        b'{"pan":' + HUGE + b"}",
+        b'{"pan":-' + HUGE + b"}",
+        b'{"pan":1e400}',
+        b'{"positions":[' + HUGE + b"]}",
+        b'{"positions":[1e400]}',
+    ],
+)
+def test_what_is_too_deep_or_too_large_for_a_number_is_wrong_input(desk, kind, query, body):
+    status, answer = desk.ask("POST", f"/controllers/left/commands/{kind}{query}", body)
+    assert status in {404, 422}, answer
+    assert desk.taken == []
+
+
+def test_a_body_that_is_too_deep_is_named_so(desk):
+    status, answer = desk.ask("POST", "/controllers/left/commands/positions?units=true", DEEP)
+    assert (status, answer["code"], answer["refused"]) == (422, "invalid", "the body is nested too deeply")
+
+
+def test_of_thousands_of_wrong_names_an_answer_has_some(desk):
+    names = [f"nope{number}" for number in range(40_000)]
+    for path, body in (
+        ("/switch", {"activate": names}),
+        ("/torque", {"joints": names, "on": False}),
+        ("/controllers/left/commands/positions?units=true", {"positions": names}),
+        ("/controllers/left/commands/position?units=true", {"positions": names}),
+    ):
+        _, answer = desk.ask("POST", path, body, client=(path, 0))
+        assert answer["code"] in {"unknown_controller", "unknown_joint", "wrong_quantity"}
+        assert len(json.dumps(answer)) < 10_000
+    assert desk.taken == []
+
+
+@pytest.mark.parametrize("key", ["activate", "deactivate"])
+def test_a_switch_that_names_one_thousands_of_times_does_not_reach_the_loop(desk, key):
+    status, answer = desk.ask("POST", "/switch", {key: ["left"] * 20_000})
+    assert (status, answer["code"], answer["fields"]) == (422, "named_twice", {"controller": ["left"]})
+    assert desk.taken == []

@@ -106,9 +106,9 @@ def test_the_answer_to_a_goal_has_its_number_and_the_goal_is_known_at_once(arm):
 
 def test_a_result_is_kept_and_listed(arm):
     report(arm, 1, "accepted")
-    arm.link.goals.take_feedback({"goal": 1, "status": "running", "progress": 0.25, "error": 0.01})
-    arm.link.goals.take_feedback({"goal": 1, "status": "running", "progress": "half"})
-    arm.link.goals.take_feedback({"goal": 7, "status": "running", "progress": 0.5})
+    arm.link.goals.take_message({"goal": 1, "status": "running", "progress": 0.25, "error": 0.01}, 1.0)
+    arm.link.goals.take_message({"goal": 1, "status": "running", "progress": "half"}, 1.0)
+    arm.link.goals.take_message({"goal": 7, "status": "running", "progress": 0.5}, 1.0)
     assert arm.ask("GET", "/goals")[1]["running"][0]["progress"] == 0.25
     report(arm, 1, "missed", text="too slow", joint="pan", error=0.02)
     report(arm, 2, "accepted")
@@ -314,3 +314,80 @@ def test_a_controller_that_is_loaded_anew_has_the_parameters_of_its_entry(arm):
     arm.ask("DELETE", "/controllers/more")
     arm.ask("POST", "/controllers", entry)
     assert steps() == 3
+
+
+# What does not arrive
+
+
+def published(arm, **fields):
+    TopicLog(arm.record, arm.messages).open("/goals", LoopStatus).publish(LoopStatus(**fields))
+    arm.link.collect()
+
+
+def statuses(arm):
+    _, found = arm.ask("GET", "/goals")
+    return {goal["goal"]: goal["status"] for goal in (*found["running"], *found["ended"])}
+
+
+def test_an_end_whose_event_is_lost_is_known_from_the_topic(arm):
+    report(arm, 1, "accepted")
+    published(arm, goal=1, controller="left", status="missed", error=0.02, joint="pan", text="too slow")
+    _, goal = arm.ask("GET", "/goals/1")
+    assert (goal["status"], goal["joint"], goal["text"]) == ("missed", "pan", "too slow")
+    assert goal["ended"] is not None
+    report(arm, 1, "accepted")  # what comes late changes nothing
+    assert statuses(arm) == {1: "missed"}
+
+
+def test_a_goal_whose_beginning_was_lost_is_known_from_the_topic(arm):
+    published(arm, goal=3, controller="left", kind="go", origin="anna", status="accepted")
+    _, goal = arm.ask("GET", "/goals/3")
+    assert (goal["status"], goal["controller"], goal["kind"], goal["origin"]) == (
+        "running",
+        "left",
+        "go",
+        "anna",
+    )
+
+
+def test_a_goal_whose_end_is_lost_has_ended_when_its_controller_has_the_next(arm):
+    report(arm, 1, "accepted")
+    report(arm, 2, "accepted", controller="right")
+    report(arm, 3, "accepted")
+    assert statuses(arm) == {1: "preempted", 2: "running", 3: "running"}
+    assert "the log has it" in arm.ask("GET", "/goals/1")[1]["text"]
+
+
+@pytest.mark.parametrize(
+    ("path", "refusal", "status"),
+    [
+        ("/goals/1/cancel", Refusal(Code.GOAL_ENDED, {"goal": 1, "outcome": "reached"}), "reached"),
+        ("/goals/1/cancel", Refusal(Code.GOAL_ENDED, {"goal": 1, "outcome": "long ago"}), "aborted"),
+        ("/controllers/left/cancel", Refusal(Code.NO_GOAL, {"controller": "left"}), "aborted"),
+        ("/goals/1/cancel", Refusal(Code.CANCELLED_ALREADY, {"goal": 1}), "running"),
+    ],
+)
+def test_a_goal_whose_end_is_lost_has_ended_when_the_loop_says_so(arm, path, refusal, status):
+    report(arm, 1, "accepted")
+    assert arm.ask("POST", path, refusal=refusal)[0] == 409
+    assert statuses(arm) == {1: status}
+
+
+def test_after_lost_events_a_goal_of_a_controller_that_is_not_active_has_ended(arm):
+    report(arm, 1, "accepted")
+    report(arm, 2, "accepted", controller="right")
+    for _ in range(3000):
+        arm.events.emit(EventCode.RECORDER, Severity.INFO, "x", "x" * 400)
+    arm.record.active = 0b001
+    while arm.record.woken_ns < 8_000_000_000:  # later than the goals' beginnings
+        arm.finish_cycle()
+    arm.link.collect()
+    assert statuses(arm) == {1: "running", 2: "aborted"}
+
+
+def test_without_lost_events_a_goal_runs_until_its_end_is_reported(arm):
+    report(arm, 1, "accepted")
+    arm.record.active = 0
+    arm.finish_cycle()
+    arm.link.collect()
+    assert statuses(arm) == {1: "running"}

@@ -2,7 +2,10 @@
 
 """Motions for a robot that runs: what is refused and where, the way to the first poses, and the speed."""
 
+import asyncio
 import json
+import time
+from contextlib import suppress
 from itertools import pairwise
 
 import numpy as np
@@ -10,6 +13,7 @@ import pytest
 
 from dxlrun.control.controllers.plugins import Offer, PlugIns
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan
+from dxlrun.remote import gateway
 from dxlrun.remote.preparation import Preparation
 from dxlrun.run.channels.answers import Done
 from dxlrun_controllers import group
@@ -193,7 +197,7 @@ def test_all_mistakes_come_together(head):
 def test_a_speed_that_is_none_is_refused(head, speed):
     status, answer, taken = play(head, NOD, speed)
     assert (status, taken) == (422, [])
-    assert "speed is a factor above 0, at most 10" in answer["refused"]
+    assert "speed is a factor from 0.01 to 10" in answer["refused"]
 
 
 def test_a_joint_that_has_not_answered_yet_is_named(head):
@@ -208,3 +212,46 @@ def test_a_motion_that_is_too_long_is_refused(head):
     text = HEAD % "positions" + "    duration: 9 s\n    samples: 20000\n    joints: {pan: {position: 0.2}}\n"
     status, answer, taken = play(head, text)
     assert (status, answer["code"], taken) == (413, "too_long", [])
+
+
+# While a motion is checked
+
+
+def brood(*_):
+    while True:
+        with suppress(Exception):
+            time.sleep(0.01)
+
+
+def test_a_motion_that_takes_long_to_check_keeps_no_stop_waiting(head, monkeypatch):
+    monkeypatch.setattr(gateway, "play", brood)
+    monkeypatch.setattr(gateway, "MOTION_S", 1.0)
+
+    async def stop_meanwhile():
+        body = {"text": NOD}
+        playing = asyncio.ensure_future(head._ask_and_answer(None, ("POST", "/play", body), {}))
+        await asyncio.sleep(0)
+        stopped = await head.request("POST", "/stop")
+        return stopped, playing.done(), await playing
+
+    (status, _), ended, (slow, answer) = asyncio.run(stop_meanwhile())
+    assert (status, ended) == (200, False)
+    assert (slow, answer["code"]) == (422, "too_slow")
+    assert [command.kind for command in head.taken] == ["stop"]
+
+
+def test_a_motion_is_not_played_for_a_client_that_has_hung_up_meanwhile(head):
+    body = json.dumps({"text": NOD}).encode()
+    chunks = [{"type": "http.request", "body": body}, {"type": "http.disconnect"}]
+    assert head.ask("POST", "/play", chunks=chunks)[0] == 400
+    chunks = [{"type": "http.request", "body": body}]
+    assert head.ask("POST", "/play", chunks=chunks)[0] == 200
+    assert [command.kind for command in head.taken] == ["play"]
+
+
+def test_a_failure_in_the_check_of_a_motion_is_that_of_one_request(head, monkeypatch):
+    monkeypatch.setattr(gateway, "play", lambda *_: {}["no"])
+    status, answer, _ = play(head, NOD)
+    assert (status, answer["code"], answer["fields"]["problem"]) == (500, "gateway_failed", "KeyError: 'no'")
+    monkeypatch.undo()
+    assert play(head, NOD)[0] == 200

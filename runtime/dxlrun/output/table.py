@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
-from dxlrun.output.graph import Graph
+if TYPE_CHECKING:
+    from dxlrun.output.graph import Graph
 
 Tone = Literal["plain", "good", "warning", "error"]
 
@@ -80,7 +81,7 @@ class Sentence:
     tone: Tone = "plain"
 
 
-Part = Table | Graph | Sentence | str
+Part: TypeAlias = "Table | Graph | Sentence | str"
 """What is shown; a string is a plain line."""
 
 

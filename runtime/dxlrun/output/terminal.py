@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from typing import IO, TYPE_CHECKING, cast
 
-from dxlrun.output.graph import Graph
 from dxlrun.output.json import json_text, problems_json
 from dxlrun.output.table import Part, Sentence, Table, Tone
 
@@ -24,6 +23,7 @@ if TYPE_CHECKING:
     from rich.text import Text
 
     from dxlrun.errors import Problem
+    from dxlrun.output.graph import Graph
 
 STYLES: dict[Tone, str] = {"plain": "", "good": "green", "warning": "yellow", "error": "red"}
 _PIPE = 200
@@ -54,11 +54,11 @@ def show(*parts: Part, console: Console | None = None, folded: bool = False) -> 
         if isinstance(part, Table):
             if part.rows:
                 _show_table(part, console)
-        elif isinstance(part, Graph):
-            _show_graph(part, console)
-        else:
+        elif isinstance(part, str | Sentence):
             line = Sentence(part) if isinstance(part, str) else part
             console.print(Text(line.text, style=STYLES[line.tone]), soft_wrap=not folded)
+        else:
+            _show_graph(part, console)
     console.file.flush()  # a reader behind a pipe waits for it
 
 

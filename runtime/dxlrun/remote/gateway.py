@@ -32,7 +32,8 @@ import asyncio
 import math
 import time
 import traceback
-from collections.abc import Awaitable, Callable
+from collections import Counter
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -45,11 +46,13 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 from starlette.routing import Route
 
+from dxlrun.control.controllers.controller import Outcome
 from dxlrun.control.joint_requests import RebootRequest, TorqueRequest
 from dxlrun.control.steering import Cancel, Rate, Switch, Unload
 from dxlrun.description.motion import motion_of
 from dxlrun.errors import InputError
-from dxlrun.remote.goals import GoalStatus
+from dxlrun.remote.computation import computed
+from dxlrun.remote.goals import LOST, GoalStatus
 from dxlrun.remote.joint_commands import joint_command
 from dxlrun.remote.joints import (
     effort_units,
@@ -62,7 +65,7 @@ from dxlrun.remote.joints import (
     read_register,
 )
 from dxlrun.remote.link import Link, Loaded
-from dxlrun.remote.motions import MOST_SPEED, Running, play
+from dxlrun.remote.motions import LEAST_SPEED, MOST_SPEED, Played, Running, play
 from dxlrun.remote.parameters import Change, Written, changed, parameters_of
 from dxlrun.remote.preparation import (
     Preparation,
@@ -96,6 +99,8 @@ _ENDING_S = 0.5
 """How long the results of goals may take when the run ends."""
 LONGEST_WAY_S = 3600.0
 """To a point that is named by its joints."""
+MOTION_S = 8.0
+"""How long the check of a motion may take, while other clients are served; a client waits 10 s."""
 LONGEST_FILE = 200
 MOST_MISTAKES = 20
 """Of a motion, in an answer."""
@@ -191,6 +196,7 @@ class GatewayApp:
         self._set_points = Allowance(MOST_SET_POINTS, now)
         self._looks = Allowance(MOST_LOOKS, now)
         self._changing = asyncio.Lock()
+        self._playing = asyncio.Lock()
 
     def app(self) -> Starlette:
         """Return the ASGI application."""
@@ -322,7 +328,6 @@ class GatewayApp:
 
     async def goals(self, request: Request) -> Response:
         """Return the goals that run, and the last that ended."""
-        self._link.take_feedback()
         book = self._link.goals
         return _json({"running": list(book.running.values()), "ended": list(book.ended.values())})
 
@@ -337,7 +342,6 @@ class GatewayApp:
                 raise refused(Code.RUN_ENDING, {})
         if wanted:
             await link.goals.wait(chosen, wanted)
-        link.take_feedback()
         return _json(status)
 
     def _goal_status(self, chosen: int) -> GoalStatus:
@@ -357,31 +361,66 @@ class GatewayApp:
             name = self._known(request).plan.name
             wanted = Cancel(controller=name)
             goals = [goal.goal for goal in self._link.goals.running.values() if goal.controller == name]
-        done = await self._link.for_loop("cancel", wanted, origin(request))
+        try:
+            done = await self._link.for_loop("cancel", wanted, origin(request))
+        except RefusedRequest as error:
+            self._note_ended(goals, error.refusal)
+            raise
         return _json({"done": True, "cycle": done.cycle, "goal": goals[0] if goals else None})
+
+    def _note_ended(self, goals: Sequence[int], refusal: Refusal) -> None:
+        """Note what a refused cancel shows of goals whose reports were lost on their way here."""
+        record = self._link.newest()
+        if record is not None and refusal.code in (Code.GOAL_ENDED, Code.NO_GOAL):
+            outcome = refusal.fields.get("outcome", Outcome.ABORTED)
+            known = outcome if outcome in tuple(Outcome) else Outcome.ABORTED
+            for goal in goals:
+                self._link.goals.end(goal, str(known), LOST, record.woken_ns * 1e-9)
 
     async def play(self, request: Request) -> Response:
         """Play a motion file: all its controllers begin in one cycle; answer with their goals."""
         given = await typed(request, NewMotion, '{"text": "name: wave ...", "speed": 0.5}')
-        if not 0 < given.speed <= MOST_SPEED:
-            raise invalid(f"speed is a factor above 0, at most {MOST_SPEED:g}, not {given.speed:g}")
-        record = self._link.newest()
-        if record is None:
+        if not LEAST_SPEED <= given.speed <= MOST_SPEED:
+            raise invalid(f"speed is a factor from {LEAST_SPEED:g} to {MOST_SPEED:g}, not {given.speed:g}")
+        if self._link.newest() is None:
             raise refused(Code.NO_CYCLE, {})
-        controllers = {
-            name: self._preparation.compiled(replace(one.plan, active=self._link.active(one)))
-            for name, one in self._link.controllers.items()
-        }
         file = given.file[:LONGEST_FILE]
-        running = Running(controllers, self._preparation.joints, record)
-        try:
-            with bounded(file):
-                played = play(motion_of(given.text, Path(file)), running, given.speed)
-        except InputError as error:
-            raise refused(Code.WRONG_MOTION, _mistaken(error)) from error
+        async with self._playing:  # one at a time: each may need a core and some 100 MB
+            if await request.is_disconnected():
+                raise ClientDisconnect
+            found = await computed(partial(self._played, given, file), MOTION_S)
+        if found is None:
+            raise refused(Code.TOO_SLOW, {"controller": file, "seconds": MOTION_S})
+        played = msgspec.msgpack.decode(found, type=Played | Refusal)
+        if isinstance(played, Refusal):
+            raise RefusedRequest(played)
+        if await request.is_disconnected():  # it could not be cancelled by its number
+            raise ClientDisconnect
         done = await self._link.command(LOOP, "play", played.data, f"{origin(request)}: {file}")
         answer = {"done": True, "cycle": done.cycle, "goals": done.goals, "seconds": played.seconds}
         return _json(answer)
+
+    def _played(self, given: NewMotion, file: str) -> bytes:
+        """Return a motion ready for the loop, or why it is none: a Played or a Refusal as MessagePack."""
+        answer: Played | Refusal
+        try:
+            motion = motion_of(given.text, Path(file))
+            record = self._link.newest()  # after the reading of the file, which may have taken long
+            if record is None:
+                raise refused(Code.NO_CYCLE, {})
+            controllers = {
+                name: self._preparation.compiled(replace(one.plan, active=self._link.active(one)))
+                for name, one in self._link.controllers.items()
+            }
+            answer = play(motion, Running(controllers, self._preparation.joints, record), given.speed)
+        except InputError as error:
+            answer = Refusal(Code.WRONG_MOTION, _mistaken(error))
+        except RefusedRequest as error:
+            answer = error.refusal
+        except Exception as error:  # as of each request
+            traceback.print_exc()
+            answer = Refusal(Code.GATEWAY_FAILED, {"problem": f"{type(error).__name__}: {error}"})
+        return msgspec.msgpack.encode(answer)
 
     async def parameters(self, request: Request) -> Response:
         """Return a controller's parameters, or change live ones, all of them in one cycle."""
@@ -447,6 +486,9 @@ class GatewayApp:
         known = tuple(self._link.controllers)
         if unknown := [name for name in (*switch.activate, *switch.deactivate) if name not in known]:
             raise unknown_controllers(unknown, known)
+        for names in (switch.activate, switch.deactivate):  # here: the loop must not go through thousands
+            if twice := tuple(name for name, count in Counter(names).items() if count > 1):
+                raise refused(Code.NAMED_TWICE, {"controller": twice})
         done = await self._link.for_loop("switch", switch, origin(request))
         await self._link.recorded(done.cycle)  # so that a set-point that follows finds them active
         return _done(done)
@@ -563,6 +605,8 @@ def _answered(handler: Handler, allowance: Allowance | None) -> Handler:
             return _refused(error.refusal)
         except ClientDisconnect:
             return Response(status_code=400)  # no client reads it
+        except RecursionError:  # only a body can be so deep
+            return _refused(Refusal(Code.INVALID, {"problem": "the body is nested too deeply"}))
         except Exception as error:  # the last resort: one request fails, and the gateway serves the next
             traceback.print_exc()
             return _refused(Refusal(Code.GATEWAY_FAILED, {"problem": f"{type(error).__name__}: {error}"}))

@@ -14,6 +14,8 @@ from dxlrun.run.channels.events import Event, EventCode, GoalReport
 
 KEPT_GOALS = 100
 """So many of those that ended are kept for clients."""
+LOST = "its result did not reach the gateway; the log has it"
+"""Text of a goal that is known to have ended by what came after it."""
 
 
 class GoalStatus(msgspec.Struct):
@@ -36,17 +38,26 @@ class GoalStatus(msgspec.Struct):
     ended: float | None = None
 
 
-class _Feedback(msgspec.Struct):
+class _Message(msgspec.Struct):
+    """Of the topic /goals, see `control.controllers.goals.GoalStatus`."""
+
     goal: int
     status: str
+    controller: str = ""
+    kind: str = ""
+    origin: str = ""
     progress: float = 0.0
     error: float | None = None
+    joint: str = ""
+    text: str = ""
 
 
 @dataclass(slots=True)
 class GoalBook:
     """All goals that clients can ask for; one asyncio loop."""
 
+    last: int = 0
+    """Number of the newest one."""
     running: dict[int, GoalStatus] = field(default_factory=dict)
     ended: dict[int, GoalStatus] = field(default_factory=dict)
     _waiting: dict[int, asyncio.Event] = field(default_factory=dict)
@@ -55,13 +66,35 @@ class GoalBook:
         """Note what an event reports of a goal; raises ValueError when its data are none."""
         if event.code not in (EventCode.GOAL_ACCEPTED, EventCode.GOAL_ENDED):
             return
-        report = msgspec.json.decode(event.data, type=GoalReport)
-        number, time_s = report.goal, event.t_ns * 1e-9
-        status = self.running.get(number) or GoalStatus(
-            number, report.controller, report.kind, report.origin, accepted=time_s
-        )
-        if event.code == EventCode.GOAL_ACCEPTED:
-            self.running[number] = status
+        self._take(msgspec.json.decode(event.data, type=GoalReport), event.t_ns * 1e-9)
+
+    def take_message(self, message: object, time_s: float) -> None:
+        """Note a message of the topic /goals, as JSON has it: progress, or what a lost event had."""
+        with suppress(msgspec.ValidationError):
+            found = msgspec.convert(message, _Message)
+            status = self.running.get(found.goal)
+            if found.status != "running":
+                self._take(found, time_s)
+            elif status is not None:
+                status.progress, status.error = found.progress, found.error
+
+    def end(self, number: int, outcome: str, text: str, time_s: float) -> None:
+        """Note the end of a goal whose report was lost; nothing where it has one."""
+        status = self.running.get(number)
+        if status is not None:
+            self._take(_Message(number, outcome, status.controller, text=text), time_s)
+
+    def _take(self, report: GoalReport | _Message, time_s: float) -> None:
+        number = report.goal
+        if number > self.last:  # else its beginning, or all of it, is known already
+            self.last = number
+            for before in [one.goal for one in self.running.values() if one.controller == report.controller]:
+                self.end(before, Outcome.PREEMPTED, LOST, time_s)  # a controller has one at a time
+            self.running[number] = GoalStatus(
+                number, report.controller, report.kind, report.origin, accepted=time_s
+            )
+        status = self.running.get(number)
+        if status is None or report.status == "accepted":
             return
         self.running.pop(number, None)
         status.status, status.text, status.joint = report.status, report.text, report.joint
@@ -74,23 +107,14 @@ class GoalBook:
         if (waiting := self._waiting.pop(number, None)) is not None:
             waiting.set()
 
-    def take_feedback(self, message: object) -> None:
-        """Note the progress of a goal that runs, from a message of the topic /goals, as JSON has it."""
-        with suppress(msgspec.ValidationError):
-            found = msgspec.convert(message, _Feedback)
-            status = self.running.get(found.goal)
-            if status is not None and found.status == "running":
-                status.progress, status.error = found.progress, found.error
-
     def status(self, number: int) -> GoalStatus | Refusal:
         """Return a goal, or why there is none of this number."""
         found = self.running.get(number) or self.ended.get(number)
         if found is not None:
             return found
-        newest = max((*self.running, *self.ended), default=0)
-        if 0 < number <= newest:
+        if 0 < number <= self.last:
             return Refusal(Code.GOAL_ENDED, {"goal": number, "outcome": "long ago"})
-        return Refusal(Code.UNKNOWN_GOAL, {"goal": number, "last": newest})
+        return Refusal(Code.UNKNOWN_GOAL, {"goal": number, "last": self.last})
 
     async def wait(self, number: int, timeout_s: float) -> None:
         """Return when a goal that runs has ended, or after so long."""

@@ -89,7 +89,8 @@ def _numbers(
     """Return the values in SI units; raises RefusedRequest."""
     si = plain_quantities(named, field) if units else named
     for joint, value in si.items():
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        # the largest integer of JSON may be beyond all floats
+        if isinstance(value, bool) or not isinstance(value, int | float) or not -1e300 < value < 1e300:
             raise invalid(
                 f"{kind} of {plan.name}: {joint} is {str(value)[:40]!r}, but must be a finite number"
             )

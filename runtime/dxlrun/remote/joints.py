@@ -23,6 +23,8 @@ ALL = "all"
 """Every joint of the robot."""
 _LONGEST = 80
 """Characters of a name in a refusal."""
+_MOST_NAMES = 5
+"""In a refusal."""
 
 
 class JointState(TypedDict):
@@ -92,6 +94,7 @@ def named_joints(plan: Plan, controllers: Iterable[ControllerPlan], names: Seque
     joints = tuple(one.name for one in plan.loop.joints)
     groups = {one.name: one.joints for one in controllers if one.command} | {ALL: joints}
     unknown = tuple(name[:_LONGEST] for name in names if name not in joints and name not in groups)
+    unknown = unknown[:_MOST_NAMES]
     if unknown or not names:
         hint = suggestion(unknown[0], (*joints, *groups)) if unknown else "name one, a controller, or all"
         raise refused(Code.UNKNOWN_JOINT, {"joint": unknown or "without a name", "hint": hint})

@@ -12,10 +12,11 @@ from dataclasses import dataclass
 import msgspec
 
 from dxlrun.compile.plan import Plan
+from dxlrun.control.controllers.controller import Outcome
 from dxlrun.control.controllers.goals import GOALS_TOPIC
 from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.log.schemas import EVENT_TOPIC, JOINT_STATES_TOPIC
-from dxlrun.remote.goals import GoalBook
+from dxlrun.remote.goals import LOST, GoalBook
 from dxlrun.remote.job import Descriptors
 from dxlrun.remote.preparation import RefusedRequest
 from dxlrun.remote.topics import LiveTopics, Messages, TopicState, events_after, joint_states
@@ -25,7 +26,7 @@ from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
 from dxlrun.run.channels.events import Event, EventCode, decode_event
 from dxlrun.run.channels.heartbeat import Heartbeat, Phase
 from dxlrun.run.channels.mailbox import LONGEST_SET_POINT, Answers, MailboxWriter
-from dxlrun.run.channels.ring import Record, RecordKind, RingReader
+from dxlrun.run.channels.ring import Gap, Record, RecordKind, RingReader
 
 ANSWER_S = 2.0
 """A loop that does not answer in this time, and two of its periods, is not waited for any longer."""
@@ -220,21 +221,36 @@ class Link:
             if number in self._pending:  # else it answers a set-point of a stream
                 self._resolve(number, answer)
         self.topics.collect()
+        idle: frozenset[str] = frozenset()
+        idle_s = 0.0
         for ring in self._event_rings:
             while (record := ring.read()) is not None:
+                if isinstance(record, Gap) and ring is self._event_rings[0]:
+                    # what the loop has reported until now is still in its ring, and read below
+                    idle_s, idle = self._idle()
                 # the log reports gaps; packets and commands are for it alone
                 if isinstance(record, Record) and record.kind == RecordKind.EVENT:
                     with suppress(ValueError):
                         self._keep(decode_event(record.payload))
+        self._take_goals()
+        for goal in [one for one in self.goals.running.values() if one.controller in idle]:
+            if goal.accepted < idle_s:
+                self.goals.end(goal.goal, Outcome.ABORTED, LOST, idle_s)
 
-    def take_feedback(self) -> None:
-        """Note the progress of goals that has been published since the last call."""
+    def _idle(self) -> tuple[float, frozenset[str]]:
+        """Return the controllers that are not active, so have no goal, and when that was, s."""
+        record = self.newest()
+        idle = (one.plan.name for one in self.controllers.values() if not self.active(one))
+        return (0.0, frozenset()) if record is None else (record.woken_ns * 1e-9, frozenset(idle))
+
+    def _take_goals(self) -> None:
+        """Note what has been published of goals since the last call."""
         topic = self.topics.topics.get(GOALS_TOPIC)
         while topic is not None and self._feedback < topic.count:
             found = topic.after(self._feedback)
             self._feedback = max(found.last, self._feedback + 1)
             for message in found.messages:
-                self.goals.take_feedback(message.message)
+                self.goals.take_message(message.message, message.time)
 
     def _resolve(self, number: int, answer: Answer) -> None:
         pending = self._pending[number]

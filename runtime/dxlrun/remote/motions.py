@@ -34,8 +34,8 @@ from dxlrun.run.channels.cycle import CycleRecord
 
 SOFT_SPEED = 0.5
 """rad/s on the way to the first pose; or the joint's limit, if that is lower."""
-MOST_SPEED = 10.0
-"""Largest factor on a motion's speed."""
+LEAST_SPEED, MOST_SPEED = 0.01, 10.0
+"""Factors on a motion's speed."""
 _STILL = 0.005
 """rad; a joint that is nearer to its first position is there."""
 _LEAST_NS = 200_000_000
@@ -64,8 +64,7 @@ class Running:
         return goal if math.isfinite(goal) else float(self.record.states.position[row])
 
 
-@dataclass(frozen=True, slots=True)
-class Played:
+class Played(msgspec.Struct, frozen=True, tag="played"):
     """A motion, ready for the loop."""
 
     data: bytes

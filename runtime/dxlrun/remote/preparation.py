@@ -36,6 +36,8 @@ BUDGET_S = 5.0
 """How long a plug-in may compute for one request, while every other client waits, `stop` too."""
 _MOST_MISTAKES = 5
 _LONGEST_SENTENCE = 300
+_MOST_QUANTITIES = 20
+"""Mistaken ones that an answer names."""
 _NAME: TypeAdapter[str] = TypeAdapter(Name)
 _GROUP_FIELDS = frozenset({"positions", "velocities", "efforts", "pwm"})
 """What the commands of the group controllers have."""
@@ -345,7 +347,7 @@ def in_si(body: bytes, what: str) -> bytes:
     mistaken: list[tuple[str, str]] = []
     plain = _plain(data, (), mistaken)
     if mistaken:
-        paths, problems = zip(*mistaken, strict=True)
+        paths, problems = zip(*mistaken[:_MOST_QUANTITIES], strict=True)
         raise refused(
             Code.WRONG_QUANTITY, {"problem": "; ".join(problems), "paths": paths, "problems": problems}
         )
@@ -365,8 +367,8 @@ def plain_quantities(values: Mapping[str, object], field: str) -> dict[str, obje
         except ValueError as error:
             mistaken[joint] = f"{joint}: {error}"
     if mistaken:
-        problems = tuple(mistaken.values())
-        paths = tuple(f"/{joint}" for joint in mistaken)
+        problems = tuple(mistaken.values())[:_MOST_QUANTITIES]
+        paths = tuple(f"/{joint}" for joint in mistaken)[:_MOST_QUANTITIES]
         raise refused(
             Code.WRONG_QUANTITY, {"problem": "; ".join(problems), "paths": paths, "problems": problems}
         )
@@ -404,7 +406,7 @@ def mistakes(error: ValidationError, what: str, model: type[BaseModel]) -> str:
 
 def unknown_controllers(names: Sequence[str], known: Sequence[str]) -> RefusedRequest:
     """Return the refusal of controllers that there are not, with the names that may be meant."""
-    shown = tuple(name[:80] for name in names)
+    shown = tuple(name[:80] for name in names[:_MOST_MISTAKES])
     hints = [suggestion(name, known) for name in shown]
     if len(shown) > 1:
         hints = [f"{name}: {hint}" for name, hint in zip(shown, hints, strict=True)]

@@ -27,6 +27,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from dxlrun.compile.plan import Plan, from_json
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.errors import DxlrunError
+from dxlrun.remote.computation import PR_SET_PDEATHSIG
 from dxlrun.remote.gateway import GatewayApp
 from dxlrun.remote.job import GatewayJob
 from dxlrun.remote.link import Link
@@ -42,7 +43,6 @@ SILENCE_S = 30.0
 """After so long without a byte from the other side, whatever it waits for, a connection is closed."""
 
 _CREDENTIALS = struct.Struct("3i")
-_PR_SET_PDEATHSIG = 1
 
 
 def main() -> None:
@@ -50,7 +50,7 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     sys.stdout = sys.stderr = process.Printed(sys.stderr.fileno())
     # a plug-in's endless `prepare` must not outlive the run
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     job = msgspec.json.decode(process.whole(int(sys.argv[2])), type=GatewayJob)
     control = socket.socket(fileno=int(sys.argv[4]))
     channel = MessageChannel(control, Decoder(Finish))  # carries nothing here: the gateway ends with it

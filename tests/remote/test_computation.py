@@ -1,0 +1,79 @@
+"""Work in a copy of the gateway's process: what comes back, and what happens when nothing does."""
+
+import asyncio
+import os
+import socket
+import time
+from contextlib import suppress
+
+import pytest
+
+from dxlrun.remote.computation import computed
+
+
+def brood():
+    while True:
+        with suppress(BaseException):
+            time.sleep(0.01)
+
+
+def test_the_result_comes_back_whole():
+    work = bytes(range(256)) * 4096
+    assert asyncio.run(computed(lambda: work, 10.0)) == work
+    assert asyncio.run(computed(lambda: b"", 10.0)) == b""
+
+
+def test_what_takes_too_long_is_ended_also_where_it_catches_everything():
+    assert asyncio.run(computed(brood, 0.05)) is None
+
+
+def fail():
+    raise SystemExit(0)
+
+
+@pytest.mark.parametrize("work", [fail, lambda: os._exit(3), lambda: bytes(-1)])
+def test_what_fails_has_no_result(work):
+    assert asyncio.run(computed(work, 10.0)) is None
+
+
+def test_other_work_goes_on_meanwhile():
+    async def both():
+        computing = asyncio.ensure_future(computed(brood, 0.2))
+        count = 0
+        while not computing.done():
+            await asyncio.sleep(0.001)
+            count += 1
+        return count
+
+    assert asyncio.run(both()) > 3
+
+
+def test_a_copy_that_is_not_needed_any_more_is_ended_and_leaves_no_process():
+    async def cancelled():
+        computing = asyncio.ensure_future(computed(brood, 60.0))
+        await asyncio.sleep(0.01)
+        computing.cancel()
+        with suppress(asyncio.CancelledError):
+            await computing
+
+    asyncio.run(cancelled())
+    with pytest.raises(ChildProcessError):
+        os.waitpid(-1, os.WNOHANG)
+
+
+def test_a_connection_that_is_closed_meanwhile_is_closed():
+    ours, theirs = socket.socketpair()
+    theirs.settimeout(10)
+
+    async def hang_up():
+        computing = asyncio.ensure_future(computed(brood, 60.0))
+        await asyncio.sleep(0.1)
+        ours.close()
+        received = await asyncio.to_thread(theirs.recv, 1)
+        computing.cancel()
+        with suppress(asyncio.CancelledError):
+            await computing
+        return received
+
+    with theirs:
+        assert asyncio.run(hang_up()) == b""
