@@ -166,7 +166,8 @@ class GripperController(Controller[GripperParameters]):
         self._goal: Goal | None = None
         self._target = self._way = 0.0
         self._began_ns = self._published_ns = 0
-        self._still_ns = -1
+        self._still, self._still_ns, self._heard_ns = np.nan, 0, 0
+        """Where the gripper has been since, nearer than it may go in `stall_time`; and the last reply."""
         self._cancelled = self._stalled = False
 
     def on_activate(self, time_ns: int) -> None:
@@ -197,7 +198,7 @@ class GripperController(Controller[GripperParameters]):
         commands.position.fill(angle)
         if not np.isnan(effort):
             commands.effort.fill(effort)
-        self._goal, self._target, self._began_ns, self._still_ns = goal, angle, time_ns, -1
+        self._goal, self._target, self._began_ns, self._still = goal, angle, time_ns, np.nan
         self._way = abs(angle - float(self.context.states.position[0]))
 
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
@@ -220,12 +221,12 @@ class GripperController(Controller[GripperParameters]):
         """Watch the gripper until it has reached its goal, stands still short of it, or takes too long."""
         states = self.context.states
         if self._goal is not None:
-            still = bool(states.valid[0]) and abs(states.velocity[0]) <= self.parameters.stall_speed
             if self._cancelled:
+                still = bool(states.valid[0]) and abs(states.velocity[0]) <= self.parameters.stall_speed
                 if still or time_ns - self._began_ns >= REST_NS:
                     self._end(Outcome.CANCELLED, "stopped")
             else:
-                self._watch(self._goal, time_ns, still)
+                self._watch(self._goal, time_ns)
         if time_ns - self._published_ns >= STATE_NS:
             self._published_ns = max(self._published_ns + STATE_NS, time_ns - STATE_NS)
             moving = self._goal is not None
@@ -233,22 +234,18 @@ class GripperController(Controller[GripperParameters]):
             message = GripperState(position, self._width(position), effort, moving, self._stalled)
             self.context.publish("state", message)
 
-    def _watch(self, goal: Goal, time_ns: int, still: bool) -> None:
+    def _watch(self, goal: Goal, time_ns: int) -> None:
         """Look at a goal that is pursued; without a reply nothing is known but the time."""
         if not self.context.states.valid[0]:
-            self._still_ns = -1
             if time_ns - self._began_ns >= self.parameters.timeout:
                 self._end(Outcome.MISSED, "no reply of its servo")
             return
-        error = abs(self._target - float(self.context.states.position[0]))
+        position = float(self.context.states.position[0])
+        error = abs(self._target - position)
         if error <= self.parameters.tolerance:
             self._end(Outcome.REACHED, "reached")
             return
-        if not still:
-            self._still_ns = -1
-        elif self._still_ns < 0:
-            self._still_ns = time_ns
-        elif time_ns - self._still_ns >= self.parameters.stall_time:
+        if self._stands_still(position, time_ns):
             self._stalled = True
             if self.parameters.effort is None:
                 self._stay()
@@ -258,6 +255,19 @@ class GripperController(Controller[GripperParameters]):
             self._end(Outcome.MISSED, f"not there after {self.parameters.timeout * 1e-9:g} s")
             return
         goal.feedback(max(0.0, 1.0 - error / self._way) if self._way else 0.0, error)
+
+    def _stands_still(self, position: float, time_ns: int) -> bool:
+        """Check whether it was slower than `stall_speed` for `stall_time`, by its way.
+
+        A measured velocity is noisy near 0, and a lost reply must not begin the time anew; a silence as long
+        does.
+        """
+        parameters = self.parameters
+        silent_ns, self._heard_ns = time_ns - self._heard_ns, time_ns
+        reach = parameters.stall_speed * parameters.stall_time * 1e-9
+        if silent_ns > parameters.stall_time or not abs(position - self._still) < reach:
+            self._still, self._still_ns = position, time_ns
+        return time_ns - self._still_ns >= parameters.stall_time
 
     def _stay(self) -> None:
         """Command the angle that was measured, within the limits; without one, the goal of before counts."""

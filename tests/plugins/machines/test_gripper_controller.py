@@ -89,7 +89,7 @@ def test_a_pause_on_the_way_is_no_stall(mounted):
     robot = begun(mounted)
     goal = robot.ask("grip", position=0.6)
     for n in range(60):
-        robot.states.velocity[0] = 0.0 if n % 9 else 1.0  # 0.16 s of rest at most
+        robot.states.position[0] = n // 9 * 0.05  # 0.16 s of rest at most
         robot.step()
     assert goal.outcome is None
 
@@ -97,12 +97,43 @@ def test_a_pause_on_the_way_is_no_stall(mounted):
 def test_what_neither_arrives_nor_stalls_is_missed(mounted):
     robot = begun(mounted, GRIPPER | {"timeout": "1 s"})
     goal = robot.ask("grip", position=0.6)
-    robot.states.velocity[0] = 0.3
-    for _ in range(60):
+    for n in range(60):  # turned to and fro
+        robot.states.position[0] = 0.03 * (n // 5 % 2)
         robot.step()
     assert goal.outcome is Outcome.MISSED
-    assert goal.text == "not there after 1 s at 0 rad, 39.94 mm"
-    assert goal.error == pytest.approx(0.6)
+    assert goal.text == "not there after 1 s at 0.03 rad, 39.03 mm"
+    assert goal.error == pytest.approx(0.57)
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), lost=st.floats(0, 0.4))
+def test_an_object_is_felt_under_noise_and_lost_replies(mounted, seed, lost):
+    robot = begun(mounted)
+    goal, noise = robot.ask("grip", position=0.6), np.random.default_rng(seed)
+    for _ in range(60):
+        robot.states.position[0] = min(robot.time_ns * 2e-9, 0.3) + 0.0015 * noise.integers(-1, 2)
+        robot.states.velocity[0] = noise.normal(scale=0.2)  # four times the speed of a stall
+        robot.states.valid[0] = noise.random() >= lost
+        robot.step()
+        if goal.outcome is not None:
+            break
+    assert goal.text.startswith("stalled, holds something at ")
+    assert 0.33 <= robot.time_ns * 1e-9 <= 0.65
+
+
+def test_after_a_long_silence_the_time_of_a_stall_begins_anew(mounted):
+    robot = begun(mounted)
+    goal = robot.ask("grip", position=0.6)
+    robot.step()
+    robot.states.valid[0] = False
+    for _ in range(15):
+        robot.step()
+    robot.states.valid[0] = True
+    for _ in range(10):
+        robot.step()
+    assert goal.outcome is None
+    robot.step()
+    assert goal.text.startswith("stalled")
 
 
 def test_a_silent_servo_is_no_stall_but_missed(mounted):
