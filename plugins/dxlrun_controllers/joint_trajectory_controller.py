@@ -25,17 +25,20 @@ from dxlrun import (
     Outcome,
     ParametersModel,
 )
-from dxlrun_controllers.joints import JointsParameters, PerJoint, finite_or, hold, row_of
+from dxlrun_controllers.joints import (
+    CLOSING_SPEED,
+    JointsParameters,
+    PerJoint,
+    finite_or,
+    hold,
+    row_of,
+    take_where_heard,
+)
 from dxlrun_controllers.laws.pid import feed_velocities_forward
-from dxlrun_controllers.laws.spline import SplineSample, Stop, Trajectory
+from dxlrun_controllers.laws.spline import DECELERATION, SplineSample, Stop, Trajectory
 from dxlrun_controllers.laws.tracking import Tracking, TrackingGains
 from dxlrun_controllers.trajectory_command import TrajectoryCommand, flat_trajectory
 
-CLOSING_SPEED: Final = 0.5
-"""rad/s, posvel at the end of a trajectory: with its speed of 0 a servo that lags would creep the rest of its
-way at one tick (0.012 rad/s)."""
-DECELERATION: Final = 20.0
-"""rad/s^2, of joints that have no limit of their own: an XM430 is at rest from its top speed in 0.25 s."""
 SPEED_SLOPE: Final = 2.0
 """1/s, how fast the speed of a trajectory changes: from 1 to 0 in 0.5 s, so no velocity ever jumps."""
 FEEDBACK_NS: Final = 100_000_000
@@ -140,7 +143,6 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._unknown = False
         self._phase = _Phase.RESTING
         self._goal: Goal | None = None
-        self._cancelling = False
         self._start_ns = self._base_ns = self._stop_ns = self._end_ns = self._feedback_ns = 0
         self._timeout_ns = np.inf
         self._base_s = 0.0
@@ -197,7 +199,8 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._goal = None
         if self._phase is not _Phase.MOVING:
             still = self._phase is not _Phase.STOPPING
-            self._rate, self._slope = self._speed if still or self._speed > _STILL else 1.0, 0.0
+            self._rate = self._speed if still or self._speed > _STILL else 1.0
+            self._slope = 0.0 if self._rate == self._speed else -SPEED_SLOPE
         self._know_where(time_ns)
         if np.isnan(self._desired.position).any():
             row = int(np.isnan(self._desired.position).argmax())
@@ -213,7 +216,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             self._timeout_ns = float(more[0]) * 1e9
         np.logical_not(self._moved, out=self._resting)
         self._some_rest, self._rest_still = bool(self._resting.any()), False
-        self._goal, self._cancelling = goal, False
+        self._goal = goal
         self._start_ns = self._base_ns = self._stop_ns = time_ns
         self._feedback_ns = time_ns + FEEDBACK_NS
         self._base_s = 0.0
@@ -222,19 +225,19 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
 
     def on_cancel(self, goal: Goal, time_ns: int) -> None:
         """Bring the joints to rest from their desired velocity; the goal ends when they are."""
-        self._cancelling = True
         self._stop_from(time_ns)
 
     def _know_where(self, time_ns: int) -> None:
         """Set the desired state of now, and in `_path` the same with the derivatives of the path."""
         desired, path = self._desired, self._path
         if self._unknown:
-            self._hold_where_heard()
+            self._unknown = take_where_heard(self._desired.position, self.context.states)
         if self._phase is _Phase.MOVING:
             self._sample(time_ns, derivatives=True)
         elif self._phase is _Phase.STOPPING:
             self._stop.sample((time_ns - self._stop_ns) * 1e-9, desired)
-        self._bring_others_to_rest(time_ns)
+        if self._some_rest:
+            self._bring_others_to_rest(time_ns)
         np.copyto(path.position, desired.position)
         if self._rate > _STILL:
             np.divide(desired.velocity, self._rate, out=path.velocity)
@@ -278,8 +281,9 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         elif self._phase is _Phase.SETTLING:
             self._settle(time_ns)
         elif self._unknown:
-            self._hold_where_heard()
-        self._bring_others_to_rest(time_ns)
+            self._unknown = take_where_heard(self._desired.position, self.context.states)
+        if self._some_rest:
+            self._bring_others_to_rest(time_ns)
         self._command(period_ns)
 
     def _move(self, time_ns: int) -> None:
@@ -363,13 +367,10 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         if elapsed >= self._stop.duration_s:
             self._phase = _Phase.RESTING
             self._close_in()
-            if self._cancelling:
-                self._end(Outcome.CANCELLED, time_ns)
+            self._end(Outcome.CANCELLED, time_ns)  # any other end came before the stop
 
     def _bring_others_to_rest(self, time_ns: int) -> None:
         """Set the desired state of the joints that the goal does not move."""
-        if not self._some_rest:
-            return
         others, elapsed = self._others, (time_ns - self._stop_ns) * 1e-9
         if not self._rest_still:
             self._stop.sample(elapsed, others)
@@ -378,13 +379,6 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             np.copyto(row, other, where=self._resting)
         if self._rest_still and self._phase is _Phase.RESTING:
             self._some_rest = False
-
-    def _hold_where_heard(self) -> None:
-        """Take positions that were not known at the activation, as soon as they are."""
-        silent, position = self._silent, self._desired.position
-        np.isnan(position, out=silent)
-        np.copyto(position, self.context.states.position, where=silent)
-        self._unknown = bool(np.isnan(position).any())
 
     def _rest(self, position: Floats) -> None:
         """Make `position`, at rest, the desired state."""

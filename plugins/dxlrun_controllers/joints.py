@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Self, TypeVar
+from typing import Annotated, Final, Self, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, Discriminator, Field, Tag, TypeAdapter, model_validator
 
-from dxlrun import Context, Floats, ParametersModel
+from dxlrun import Context, Floats, ParametersModel, States
 
 JointNames = Annotated[tuple[str, ...], Field(min_length=1)]
 NotNegative = Annotated[float, Field(ge=0)]
 Positive = Annotated[float, Field(gt=0)]
 
 T = TypeVar("T")
+
+CLOSING_SPEED: Final = 0.5
+"""rad/s, posvel: the least speed for the rest of the way of a servo that lags; with the speed 0 of an end it
+would creep there at one tick (0.012 rad/s)."""
 
 
 def or_number(adapter: TypeAdapter[float]) -> BeforeValidator:
@@ -95,3 +99,10 @@ def hold(context: Context) -> None:
     np.copyto(commands.position, context.states.position, where=np.isnan(goals.position))
     if not context.into:  # for another controller it would be a velocity with its sign
         np.copyto(commands.velocity, goals.velocity)
+
+
+def take_where_heard(position: Floats, states: States) -> bool:
+    """Write the measured positions over NaN, of joints that had not answered; return whether some still have
+    not."""
+    np.copyto(position, states.position, where=np.isnan(position))
+    return bool(np.isnan(position).any())

@@ -19,7 +19,6 @@ from pydantic import Field, model_validator
 from dxlrun import (
     LIVE,
     Angle,
-    AngularAcceleration,
     AngularVelocity,
     CommandModel,
     Context,
@@ -31,11 +30,9 @@ from dxlrun import (
     Outcome,
     ParametersModel,
 )
-from dxlrun_controllers.joints import JointNames, finite_or, hold
-from dxlrun_controllers.laws.spline import CUBIC, LINEAR, SplineSample, evaluate, solve
+from dxlrun_controllers.joints import CLOSING_SPEED, JointNames, finite_or, hold, take_where_heard
+from dxlrun_controllers.laws.spline import CUBIC, DECELERATION, LINEAR, SplineSample, Stop, evaluate, solve
 
-CLOSING_SPEED = 0.5
-"""rad/s, posvel: the least speed toward a pose, for the rest of the way of a servo that lags."""
 HIGHEST_RATE = 10.0
 """Of a motion's own time over the loop's: so few steps at most are passed in a period."""
 PEAK = 1.5
@@ -79,8 +76,6 @@ class KeyframeParameters(ParametersModel):
     """`posvel` commands the speed beside the position; where a step names torques, efforts are too."""
     approach: Annotated[AngularVelocity, Field(gt=0)] = 1.0
     """rad/s; on the way to the first pose of a goal no joint is faster, the way takes longer instead"""
-    deceleration: Annotated[AngularAcceleration, Field(gt=0)] = 20.0
-    """rad/s^2, of each joint after a cancel"""
     tolerance: Annotated[Angle, Field(gt=0)] | None = None
     """How far a joint may be off at the end; left out: a goal is reached when its time is over."""
     settle: Duration = 500_000_000
@@ -153,7 +148,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
     """Plays one motion at a time; the last pose is held.
 
     A motion begins where the joints were sent last, with their speed of then; a new goal takes over like
-    that, too. After a cancel each joint decelerates to a stop.
+    that, too. After a cancel each joint decelerates to a stop, by its limit of the acceleration.
     """
 
     Parameters = KeyframeParameters
@@ -196,11 +191,12 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         self._piece = np.zeros((CUBIC, count))
         self._ends = np.zeros((2, 2, count))
         """Position and velocity at the beginning and at the end of a step."""
-        self._stop, self._stop_s = np.zeros((2, count)), np.zeros(count)
+        self._stop = Stop(count)
+        self._deceleration = finite_or(context.limits.acceleration, DECELERATION)
         self._scratch = np.zeros(count)
         self._order = CUBIC
         self._goal: Goal | None = None
-        self._playing = self._stopping = False
+        self._playing = self._stopping = self._unknown = False
         self._rate = 1.0
         self._settle_ns = -1
 
@@ -210,6 +206,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         np.copyto(self._now.position, self.context.commands.position)
         self._now.velocity.fill(0.0)
         self._goal, self._playing, self._stopping, self._settle_ns = None, False, False, -1
+        self._unknown = True
 
     def on_deactivate(self, time_ns: int) -> None:
         """Leave the goal: the runtime ends it."""
@@ -217,6 +214,12 @@ class KeyframePlayer(Controller[KeyframeParameters]):
 
     def on_goal(self, goal: Goal, data: NDArray[np.float64], time_ns: int) -> None:
         """Begin a motion where the joints are sent, with their speed."""
+        if self._unknown:
+            self._hold_where_heard()
+        if self._unknown:
+            joint = self.context.joints[int(np.isnan(self._now.position).argmax())]
+            goal.end(Outcome.ABORTED, f"joint {joint} has not answered yet", joint)
+            return
         self._now.velocity *= self._rate if self._playing or self._stopping else 0.0
         self._goal, self._playing, self._stopping, self._settle_ns = goal, True, False, -1
         self._todo, self._goal_speed = self._pages[int(data[0])], float(data[1])
@@ -235,12 +238,9 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         if not self._playing:  # at the end, waiting for its servos
             self._finish(Outcome.CANCELLED, "stopped at the end")
             return
-        velocity = self._now.velocity
-        velocity *= self._rate
+        self._now.velocity *= self._rate
         self._rate = 1.0
-        np.copyto(self._stop[0], self._now.position)
-        np.copyto(self._stop[1], velocity)
-        np.divide(np.abs(velocity), self.parameters.deceleration, out=self._stop_s)
+        self._stop.load(self._now, self._deceleration, self._lower, self._upper)
         self._playing, self._stopping, self._time_s = False, True, 0.0
 
     def update(self, time_ns: int, period_ns: int) -> None:
@@ -252,6 +252,13 @@ class KeyframePlayer(Controller[KeyframeParameters]):
             self._decelerate(dt)
         elif self._settle_ns >= 0:
             self._settle(time_ns)
+        elif self._unknown:
+            self._hold_where_heard()
+
+    def _hold_where_heard(self) -> None:
+        """Hold joints that had not answered at the activation where they are heard first."""
+        self._unknown = take_where_heard(self._now.position, self.context.states)
+        np.copyto(self.context.commands.position, self._now.position)
 
     # Playing
 
@@ -302,7 +309,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
                 np.abs(np.subtract(end[0], start[0], out=self._scratch), out=self._scratch).max()
             )
             needed = PEAK * farthest / self.parameters.approach * self._rate
-            if needed > self._step_s:  # NaN: a joint that has never answered is not there to be approached
+            if needed > self._step_s:
                 self._total_s += (needed - self._step_s) / page.speed
                 self._step_s = needed
         self._order = LINEAR if frame.linear and not softly else CUBIC
@@ -331,17 +338,10 @@ class KeyframePlayer(Controller[KeyframeParameters]):
 
     def _decelerate(self, dt: float) -> None:
         self._time_s += dt
-        (start, velocity), now, elapsed = self._stop, self._now, self._scratch
-        np.minimum(self._stop_s, self._time_s, out=elapsed)
-        change = np.copysign(self.parameters.deceleration, velocity)
-        np.clip(
-            start + (velocity - change * elapsed / 2) * elapsed, self._lower, self._upper, out=now.position
-        )
-        np.subtract(velocity, change * elapsed, out=now.velocity)
+        self._stop.sample(self._time_s, self._now)
         self._command()
-        if self._time_s >= self._stop_s.max():
+        if self._time_s >= self._stop.duration_s:
             self._stopping = False
-            now.velocity.fill(0.0)
             self._finish(Outcome.CANCELLED, f"stopped in step {self._frame + 1} of {self._name()}")
 
     def _command(self) -> None:

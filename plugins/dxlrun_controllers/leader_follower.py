@@ -21,10 +21,7 @@ from dxlrun import (
     ParametersModel,
 )
 from dxlrun_controllers.group import PositionsCommand
-from dxlrun_controllers.joints import check_size, finite_or, hold
-
-CLOSING_SPEED = 0.5
-"""rad/s, posvel: the least speed toward a position, for the rest of the way of a servo that lags."""
+from dxlrun_controllers.joints import CLOSING_SPEED, check_size, finite_or, hold, take_where_heard
 
 
 class Pair(ParametersModel):
@@ -121,12 +118,13 @@ class LeaderFollower(Controller[LeaderFollowerParameters]):
         self._posvel = self.parameters.command_interface == "posvel"
         self._commanded_ns = -1
         self._updated_ns = 0
-        self._following = self._reported = False
+        self._following = self._reported = self._unknown = False
 
     def on_activate(self, time_ns: int) -> None:
         """Hold where the joints are."""
         hold(self.context)
         self._in_step.fill(False)
+        self._unknown = True
         self._commanded_ns = -1
         self._updated_ns = time_ns
         self._following = self._reported = False
@@ -142,6 +140,8 @@ class LeaderFollower(Controller[LeaderFollowerParameters]):
             hold(self.context)
             self._in_step.fill(False)
         self._updated_ns = time_ns
+        if self._unknown:
+            self._unknown = take_where_heard(self.context.commands.position, self.context.states)
         age_s = self._age_s(time_ns)
         if not age_s <= self.parameters.timeout * 1e-9:
             self._rest(age_s)

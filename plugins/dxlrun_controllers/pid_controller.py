@@ -104,7 +104,8 @@ class PidController(Controller[PidParameters]):
       the measured rate counts: the difference of the measured velocities.
     - The output stays inside the joint's own limit of what is commanded (effort, velocity, position, full
       voltage), so the law knows when the last gate would cut it, and its integral does not wind up.
-    - A joint without a new measurement keeps its last command, see `Pid`; one that was never measured gets
+    - A joint without a new measurement keeps its last command, see `Pid`, with `position` its last
+      correction of the reference; one that was never measured gets
       none of its own (0; no position).
 
     Behaves like pid_controller of ros2_controllers (control.ros.org, pid_controller) where that has the
@@ -233,7 +234,9 @@ class PidController(Controller[PidParameters]):
         np.subtract(self._lower, reference, out=pid.lower)
         np.maximum(pid.lower, self._least, out=pid.lower)
         correction = pid.update(self._error, self._rate, self._bias, self._measured, period_s)
-        np.add(reference, correction, out=self._output, where=self._measured)
+        # a joint without a measurement keeps its correction, not the reference of then
+        np.isfinite(reference, out=self._free)
+        np.add(reference, correction, out=self._output, where=self._free)
 
     def _refer(self) -> None:
         """Set the reference, its error, the error's rate, and the feed-forward."""

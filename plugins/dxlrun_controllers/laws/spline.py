@@ -8,6 +8,7 @@ without growing memory, and scipy takes two seconds to import; the tests compare
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 
@@ -15,6 +16,8 @@ from dxlrun import Floats
 
 LINEAR, CUBIC, QUINTIC = 2, 4, 6
 """Number of coefficients of a piece."""
+DECELERATION: Final = 20.0
+"""rad/s^2, of joints that have no limit of their own: an XM430 is at rest from its top speed in 0.25 s."""
 
 _HEAD = 4
 
@@ -211,7 +214,6 @@ class Stop:
         """Begin to stop from position and velocity of `now`; limits shape (joints,), rad/s^2 and rad."""
         speed = np.abs(now.velocity)
         room = np.where(now.velocity > 0, upper - now.position, now.position - lower)
-        np.maximum(room, 0.0, out=room)
         needed = np.divide(speed * speed, 2.0 * room, out=np.full_like(room, np.inf), where=room > 0)
         np.maximum(needed, deceleration, out=needed)
         np.divide(speed, needed, out=self._duration)

@@ -53,8 +53,8 @@ class Tracking:
     def begin(self, desired: SplineSample) -> None:
         """Begin with the output that was last sent, or with 0."""
         self._aim(desired)
-        self._pid.reset(finite_or(self._sent, 0.0), self._error, self._bias)
-        self._output.fill(0.0)
+        np.copyto(self._output, finite_or(self._sent, 0.0))
+        self._pid.reset(self._output, self._error, self._bias)
 
     def update(self, desired: SplineSample, period_s: float) -> None:
         """Command by the law, after `period_s`."""

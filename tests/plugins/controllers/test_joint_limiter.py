@@ -185,6 +185,27 @@ def test_references_go_before_commands_and_when_they_end_the_joint_comes_to_rest
     assert robot.context.commands.position[1] == -0.2
 
 
+def test_activated_again_it_is_at_rest_and_goes_to_its_commands(stage):
+    robot = started(stage, TWO | {"command_interface": "posvel"}, into=("lower",))
+    robot.context.references.position[:] = 9.0
+    for step in range(20):
+        robot.update(step * 0.02)
+    robot.context.references.position[:] = np.nan
+    robot.context.goals.position[:] = 0.1, 0.2
+    robot.controller.on_activate(1_000_000_000)
+    robot.send(1.0, "positions", positions=[0.1, 0.9])
+    np.testing.assert_allclose(robot.update(1.0), [0.1, 0.2 + 8.0 * 0.02**2 / 2])
+    np.testing.assert_allclose(robot.context.commands.velocity, [0.0, 8.0 * 0.02])
+
+
+def test_a_reference_beyond_a_limit_does_not_move_the_limit():
+    law = limiter(1.4, upper=1.5)
+    assert stepped(law, 1.52, 0.1, 1.0)[0] <= 1.5
+    for _ in range(9):
+        found = stepped(law, 1.7, 0.1, 1.0)
+    assert found == (1.5, 0.0)
+
+
 def test_beside_a_servos_position_the_velocity_is_a_magnitude_and_the_highest_at_rest(stage):
     robot = started(stage, TWO | {"command_interface": "posvel"})
     robot.send(0.0, "positions", positions=[-1.7, -0.2])

@@ -276,6 +276,52 @@ def test_velocity_and_effort_follow_by_pid_and_feed_forward(stage, interface):
     assert np.isnan(robot.context.commands.position).all()
 
 
+@pytest.mark.parametrize("interface", ["velocity", "effort"])
+def test_a_law_goes_on_with_what_was_sent_keeps_it_without_a_reply_and_ends_at_its_limit(stage, interface):
+    limits = {"velocity": 1.0, "effort": 1.2}
+    parameters = ONE | {"command_interface": interface, "gains": {"p": 1.0, "i": 50.0, "friction": 0.5}}
+    robot = stage(JointTrajectoryController, parameters, limits=limits)
+    getattr(robot.context.goals, interface)[:] = 0.7
+    robot.context.states.velocity[:] = 0.0
+    robot.controller.on_activate(0)
+    command = getattr(robot.context.commands, interface)
+    assert command[0] == 0.7
+    robot.controller.update(20_000_000, 20_000_000)
+    assert command[0] == pytest.approx(0.7)
+    robot.context.states.valid[:] = False
+    robot.context.states.position[:] = 0.1
+    robot.controller.update(40_000_000, 20_000_000)
+    assert command[0] == pytest.approx(0.7)
+    robot.context.states.valid[:] = True
+    robot.controller.update(60_000_000, 20_000_000)
+    assert command[0] == limits[interface]  # 0.2 rad for 40 ms are 0.4, and p makes 0.2
+    robot.context.states.position[:] = 9.0
+    robot.controller.update(80_000_000, 20_000_000)
+    assert command[0] == -limits[interface]
+
+
+def test_friction_is_that_of_the_desired_motion(stage):
+    parameters = ONE | {"command_interface": "effort", "gains": {"friction": 0.5}}
+    robot = started(stage, parameters)
+    robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3]}])
+    robot.context.states.velocity[:] = -1.0
+    robot.controller.update(500_000_000, 20_000_000)
+    assert robot.context.commands.effort[0] == 0.5
+
+
+def test_activated_again_it_has_forgotten_what_it_was_doing(stage):
+    robot = started(stage, TWO)
+    robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3, 0.8]}])
+    robot.update(0.5)
+    robot.send(0.5, "trajectory", joints=["b"], points=[{"time": 9, "positions": [0.8]}])
+    robot.update(0.51)
+    robot.controller.on_deactivate(510_000_000)
+    robot.context.goals.position[:] = robot.context.states.position[:] = 0.1, 0.2
+    robot.controller.on_activate(2_000_000_000)
+    for time in (2.0, 2.5, 9.0):
+        np.testing.assert_array_equal(robot.update(time), [0.1, 0.2])
+
+
 def test_at_rest_an_effort_holds_the_joint_against_its_load(stage):
     robot = started(stage, ONE | {"command_interface": "effort", "gains": {"p": 2.0}})
     robot.context.states.velocity[:] = 0.0
@@ -518,9 +564,10 @@ def test_however_it_is_cancelled_it_stops_within_its_deceleration_and_its_limits
     share=st.floats(0.02, 1.1),
     speed=st.sampled_from([1.0, 0.4, 1.7]),
     cancelled=st.booleans(),
+    changed=st.sampled_from([None, 0.0, 2.5]),
 )
 def test_whenever_a_goal_takes_over_position_velocity_and_acceleration_go_on(  # noqa: PLR0917
-    stage, first, second, fields, share, speed, cancelled
+    stage, first, second, fields, share, speed, cancelled, changed
 ):
     robot = started(stage, TWO | {"command_interface": "posvel", "speed": speed}, into=("lower",))
     points = timed(first, fields[0])
@@ -530,6 +577,9 @@ def test_whenever_a_goal_takes_over_position_velocity_and_acceleration_go_on(  #
         robot.update(at - 0.02)
         if not robot.goal.ended:
             robot.cancel(at - 0.01)
+    if changed is not None:
+        robot.update(at - 0.006)
+        robot.change(at - 0.005, speed=changed)
     robot.update(at)
     before = [row.copy() for row in robot.controller._desired.arrays]
     robot.send(at, "trajectory", points=timed(second, fields[1]))

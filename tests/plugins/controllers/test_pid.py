@@ -183,6 +183,16 @@ def test_a_reset_goes_on_with_the_output_that_there_is():
     assert pid.integral[0] == 0.0
     pid.reset(np.array([99.0]), np.array([0.25]), NONE)
     assert pid.integral[0] == 3.0
+    pid.reset(np.array([-99.0]), np.array([0.25]), NONE)
+    assert pid.integral[0] == -3.0
     pid.i[:] = 0.0
     pid.reset(np.array([1.0]), np.array([0.25]), NONE)
     assert stepped(pid, 0.25) == pytest.approx(0.5)  # no integral: no bias that nothing removes
+
+
+def test_a_reset_forgets_the_filtered_rate_and_the_time_of_a_silence():
+    pid = law(i=1.0, d=1.0, filter_s=0.05)
+    stepped(pid, 1.0, rate=4.0)
+    stepped(pid, np.nan, 7.0, measured=~ALL)
+    pid.reset(NONE, NONE, NONE)
+    assert stepped(pid, 1.0, 0.05) == pytest.approx(0.05)  # neither 7 s of the integral nor the rate of 4

@@ -136,6 +136,35 @@ def test_a_position_command_corrects_what_the_servo_leaves_and_stays_in_the_limi
     assert commanded(robot, "position")[0] < 0.5  # it did not wind up
 
 
+def test_activated_again_it_has_forgotten_its_reference_and_its_slope(stage):
+    robot = started(stage, reference="velocity", gains={"d": 1.0})
+    robot.context.references.velocity[:] = 1.0
+    robot.context.states.velocity[:] = 0.5
+    commanded(robot)
+    robot.context.references.velocity[:] = np.nan
+    robot.controller.on_activate(0)
+    robot.send(0.0, "velocities", velocities=[0.5, 0.5])
+    robot.context.states.velocity[:] = 3.0
+    np.testing.assert_array_equal(commanded(robot), 0.0)  # no rate of a velocity of long ago
+    robot.controller.parameters = robot.controller.parameters.model_copy(
+        update={"gains": robot.controller.parameters.gains.model_copy(update={"p": 1.0})}
+    )
+    robot.controller.on_parameters(0)
+    np.testing.assert_array_equal(commanded(robot), -2.5)  # the command stands: no reference has ended
+
+
+def test_a_lost_reply_keeps_the_correction_and_not_the_reference(stage):
+    robot = started(stage, command_interface="position", gains={"p": 0.5})
+    references, states = robot.context.references, robot.context.states
+    references.position[:] = 1.0
+    np.testing.assert_allclose(commanded(robot, "position"), [1.0 + 0.5 * 0.7, 1.0 + 0.5 * 1.2])
+    states.valid[0], references.position[:] = False, 1.2
+    states.position[0] = np.nan
+    assert commanded(robot, "position")[0] == pytest.approx(1.2 + 0.5 * 0.7)
+    references.position[:] = np.nan  # ended, and where the joint is then is not known
+    assert commanded(robot, "position")[0] == pytest.approx(1.2 + 0.5 * 0.7)
+
+
 def test_a_correction_that_was_there_before_goes_on(stage):
     robot = stage(PidController, TWO | {"command_interface": "position", "gains": {"i": 1.0}})
     robot.context.states.velocity[:] = 0.0

@@ -96,6 +96,14 @@ def test_the_bridge_leads_from_now_to_the_first_point(order, start_in):
     assert trajectory.duration_s == start_in + 1.5
 
 
+def test_a_trajectory_that_is_loaded_over_another_begins_with_its_own_pieces():
+    times, played = np.array([0.0, 1.0, 2.0]), Trajectory(1)
+    for height in (1.0, 5.0):
+        points = height * np.array([[[0.0], [0.0], [0.0]], [[1.0], [0.0], [0.0]], [[3.0], [0.0], [0.0]]])
+        played.load(flatten(LINEAR, times, points, 0.0), SplineSample(1))
+        assert sampled(played, [0.5], 1)[0, 0, 0] == height / 2
+
+
 def test_a_first_point_now_is_wanted_now():
     points = np.array([[[1.0], [0.0], [0.0]], [[2.0], [0.0], [0.0]]])
     trajectory = loaded(LINEAR, np.array([0.0, 1.0]), points)

@@ -141,6 +141,41 @@ def test_the_first_pose_is_approached_softly(mounted):
     assert t[np.searchsorted(a, 2.0 - 1e-9)] == pytest.approx(3.0, abs=0.03)
 
 
+def test_a_joint_that_has_not_answered_ends_a_goal_and_begins_where_it_is_heard(mounted):
+    robot = mounted(KeyframePlayer, player(far={"steps": [step(time="10 ms", pose={"a": 2.0})]}))
+    robot.states.position[:] = np.nan, 0.3
+    robot.activate()
+    refused = robot.ask("play", motion="far")
+    assert (refused.outcome, refused.text, refused.joint) == (
+        Outcome.ABORTED,
+        "joint a has not answered yet",
+        "a",
+    )
+    robot.step()
+    assert np.isnan(robot.commands.position[0])
+    robot.states.position[0] = -0.4
+    robot.step()
+    np.testing.assert_array_equal(robot.commands.position, [-0.4, 0.3])
+    robot.states.position[0] = -0.5  # it is held where it was heard first
+    robot.step()
+    assert robot.commands.position[0] == -0.4
+    robot.ask("play", motion="far")
+    speeds = np.diff(play(robot, 1.0)[:, 1]) / 0.02
+    assert 1.0 < speeds.max() <= 10.0 + 1e-9
+
+
+def test_a_cancel_just_before_a_limit_brakes_harder_and_stays_inside(mounted):
+    robot = begun(mounted, limits={"upper": 0.3, "acceleration": 0.5})
+    goal = robot.ask("play", motion="wave")
+    play(robot, 0.24)
+    robot.cancel()
+    path = play(robot, 3.0)[:, 1]
+    assert goal.outcome is Outcome.CANCELLED
+    assert path.max() <= 0.3 + 1e-12
+    assert np.diff(path).min() >= -1e-12
+    assert np.diff(path, 2).max() <= 1e-12  # one deceleration, no stop at the limit
+
+
 def test_a_new_goal_takes_over_with_the_speed_of_before(mounted):
     robot = begun(mounted)
     first = robot.ask("play", motion="wave", speed=0.5)
@@ -156,7 +191,7 @@ def test_a_new_goal_takes_over_with_the_speed_of_before(mounted):
 @settings(max_examples=50, deadline=None)
 @given(at=st.integers(1, 48), deceleration=st.floats(1, 50), speed=st.floats(0.3, 3))
 def test_a_cancel_decelerates_each_joint_within_its_limit(mounted, at, deceleration, speed):
-    robot = begun(mounted, PLAYER | {"deceleration": f"{deceleration} rad/s^2", "approach": "1000 rad/s"})
+    robot = begun(mounted, PLAYER | {"approach": "1000 rad/s"}, limits={"acceleration": deceleration})
     goal = robot.ask("play", motion="wave", speed=speed)
     path = [play(robot, at * 0.02)]
     if goal.outcome is not None:

@@ -63,6 +63,19 @@ def test_in_step_a_command_is_made_of_the_state_of_its_own_cycle(mounted, path):
             np.testing.assert_allclose(robot.commands.position, [-0.5 * position + 0.2, 0.1])
 
 
+def test_a_follower_that_had_not_answered_starts_softly_where_it_is_heard(mounted):
+    robot = mounted(LeaderFollower, {"pairs": [{"joint": "a", "leader": "b"}], "speed": "1 rad/s"})
+    robot.states.position[:] = np.nan
+    robot.activate()
+    robot.context.reads[:] = 1.0, 0.0, 0.0
+    robot.step()
+    assert np.isnan(robot.commands.position[0])
+    robot.states.position[:] = 0.5
+    for n in range(1, 4):
+        robot.step()
+        assert robot.commands.position[0] == pytest.approx(0.5 + 0.02 * n)
+
+
 def test_limits_of_the_followers_hold(mounted):
     robot = mounted(LeaderFollower, PAIR, limits={"lower": -0.1, "upper": 0.1})
     robot.activate()
