@@ -258,3 +258,10 @@ def test_the_acceleration_limit_of_the_joint_is_kept_too(stage):
     for written, expected in (({}, [3.0, 3.0]), ({"limits": {"acceleration": "2 rad/s^2"}}, [2.0, 2.0])):
         robot = started(stage, {"joints": ["a", "b"], **written}, limits={"acceleration": 3.0})
         assert robot.controller._limiter.acceleration.tolist() == expected
+
+
+def test_a_velocity_without_a_position_is_no_reference(stage):
+    robot = started(stage)
+    robot.context.references.velocity[:] = 1.0
+    for step in range(5):
+        np.testing.assert_array_equal(robot.update(step * 0.02), [0.3, -0.2])

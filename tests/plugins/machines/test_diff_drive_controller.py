@@ -365,3 +365,37 @@ def test_after_a_long_time_turns_are_not_guessed():
 def test_wrong_parameters_are_refused(wrong, where):
     with pytest.raises(ValueError, match=where):
         DiffDriveController.Parameters.model_validate(BASE | wrong)
+
+
+def test_activated_again_it_stands_and_its_way_meanwhile_is_not_known(mounted):
+    robot = mounted(DiffDriveController, BASE | {"linear": {"acceleration": "1 m/s^2"}}, period_s=0.01)
+    robot.activate()
+    robot.send("velocity", linear=0.5)
+    for _ in range(20):
+        robot.step()
+    robot.sent.values[:] = np.nan  # other modes
+    robot.states.position[:] = 1.0
+    robot.activate()
+    robot.step()
+    np.testing.assert_array_equal(robot.commands.velocity, 0.0)
+    assert robot.controller._pose.x == 0.0
+
+
+def test_the_smaller_wheel_decides_how_fast_the_base_may_be(mounted):
+    robot = mounted(DiffDriveController, BASE | {"left_radius_multiplier": 0.5}, limits={"velocity": 4.0})
+    robot.activate()
+    robot.send("velocity", linear=99.0)
+    for _ in range(5):
+        robot.step()
+    assert np.abs(robot.commands.velocity).max() == pytest.approx(4.0)
+
+
+def test_after_it_was_held_it_begins_without_the_acceleration_of_before(mounted):
+    robot = mounted(DiffDriveController, BASE | {"linear": {"acceleration": "1 m/s^2", "jerk": "2 m/s^3"}})
+    robot.activate()
+    robot.send("velocity", linear=0.5)
+    for _ in range(20):
+        robot.step()
+    robot.sent.velocity[:] = 0.0
+    robot.step()
+    assert twist(robot)[0] == pytest.approx(2 * 0.02**2)

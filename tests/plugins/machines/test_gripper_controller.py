@@ -248,3 +248,30 @@ def test_a_goal_that_makes_no_sense_is_refused_in_words(mounted, parameters, com
 def test_wrong_parameters_are_refused(wrong, sentence):
     with pytest.raises(ValueError, match=sentence):
         GripperController.Parameters.model_validate(GRIPPER | wrong)
+
+
+def test_what_a_goal_left_behind_ends_with_the_next_and_at_the_activation(mounted):
+    robot = begun(mounted)
+    robot.ask("grip", position=0.6)
+    run(robot, 0.1)
+    robot.cancel()
+    goal = robot.ask("grip", position=0.6)
+    run(robot, 1.0, blocked_at=0.3)
+    assert goal.text.startswith("stalled")  # the cancel was that of the goal before
+    robot.send("positions", positions=[0.0])
+    robot.step(periods=5)
+    assert not robot.messages[-1][1].stalled
+    goal = robot.ask("grip", position=0.6)
+    run(robot, 1.0, blocked_at=0.3)
+    assert goal.text.startswith("stalled")
+    robot.activate()
+    robot.step(periods=5)
+    assert not robot.messages[-1][1].stalled
+
+
+def test_a_cancel_beyond_a_limit_stays_at_the_limit(mounted):
+    robot = begun(mounted)
+    robot.ask("grip", position=0.6)
+    robot.states.position[0] = 0.7
+    robot.cancel()
+    assert robot.commands.position[0] == LIMITS["upper"]

@@ -313,3 +313,24 @@ def test_an_unknown_motion_is_refused_with_those_that_exist(mounted):
 def test_motions_that_make_no_sense_are_refused_in_words(motions, sentence):
     with pytest.raises(ValueError, match=sentence):
         KeyframePlayer.Parameters.model_validate(PLAYER | {"motions": motions})
+
+
+def test_activated_again_it_holds(mounted):
+    robot = begun(mounted)
+    robot.ask("play", motion="wave")
+    play(robot, 0.3)
+    robot.controller.on_deactivate(robot.time_ns)
+    robot.sent.position[:] = robot.states.position[:] = 0.1, 0.2
+    robot.activate()
+    np.testing.assert_array_equal(play(robot, 1.0)[:, 1:], [[0.1, 0.2]] * 50)
+
+
+@pytest.mark.parametrize("speed", [0.5, 2.0])
+def test_a_cancel_begins_with_the_speed_of_the_joints_and_not_of_the_motion(mounted, speed):
+    robot = begun(mounted, limits={"acceleration": 1.0})
+    robot.ask("play", motion="wave", speed=speed)
+    path = play(robot, 0.2)[:, 1]
+    robot.cancel()
+    path = np.append(path, play(robot, 0.1)[:, 1])
+    speeds = np.diff(path) / 0.02
+    assert abs(speeds[9] - speeds[8]) < 0.15 * speeds[8]

@@ -187,3 +187,20 @@ def test_commands_that_do_not_fit_are_refused_in_words(mounted):
         mounted(LeaderFollower, PAIR).prepare("positions", positions=[0.1])
     with pytest.raises(ValueError, match=r"1 positions for 2 joints \(f, g\)"):
         mounted(LeaderFollower, STREAM).prepare("positions", positions=[0.1])
+
+
+def test_activated_again_it_starts_softly_and_has_forgotten_old_positions(mounted):
+    robot = mounted(LeaderFollower, PAIR)
+    robot.activate()
+    lead(robot, 0.0)
+    robot.step()
+    robot.activate()
+    lead(robot, 1.0)
+    robot.step()
+    assert robot.commands.position[0] == pytest.approx(0.02)
+    robot = mounted(LeaderFollower, STREAM)
+    robot.activate()
+    robot.send("positions", positions=[1.0, 1.0])
+    robot.activate()
+    robot.step()
+    np.testing.assert_array_equal(robot.commands.position, 0.0)
