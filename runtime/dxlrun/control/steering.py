@@ -133,16 +133,16 @@ class Steering:
         """Execute what has come, and end streams whose lease ran out; return the commands for controllers."""
         count = 0
         self.halt.watch()
-        for command in self.inbox.take():
+        for place, command in enumerate(self.inbox.take(), 1):
             self._log(command)
             execute = self._for_loop if command.controller == LOOP else self._for_controller
             answer = execute(command, time_ns)
             if isinstance(answer, Refusal):
-                self._report_refusal(command, answer)
+                self._report_refusal(command, answer, place)
             elif command.controller == LOOP:
                 shown = command.data.partition(b"\n")[0].decode(errors="replace")
                 text = f"{command.kind} {shown}".strip()
-                data = msgspec.json.encode(CommandOutcome(command.kind, command.origin))
+                data = msgspec.json.encode(CommandOutcome(command.kind, command.origin, place=place))
                 text = f"{text} from {command.origin}"
                 self.events.emit(EventCode.STEERED, Severity.INFO, "loop", text, data)
             else:
@@ -172,10 +172,10 @@ class Steering:
             self.inbox.answer(number, refusal or Done(self.record.cycle))
         ended.clear()
 
-    def _report_refusal(self, command: Command, refusal: Refusal) -> None:
+    def _report_refusal(self, command: Command, refusal: Refusal, place: int) -> None:
         source = command.controller or "loop"
         text = f"{command.kind} from {command.origin} refused: {refusal.text}"
-        data = msgspec.json.encode(CommandOutcome(command.kind, command.origin, refusal))
+        data = msgspec.json.encode(CommandOutcome(command.kind, command.origin, refusal, place))
         self.events.emit(EventCode.COMMAND_REFUSED, Severity.WARNING, source, text, data)
 
     def _log(self, command: Command) -> None:

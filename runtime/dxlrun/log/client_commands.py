@@ -31,10 +31,13 @@ def client_commands(log: Log) -> tuple[ClientCommand, ...]:
     """Return every command that came from outside, in the order of the cycles."""
     answers = _answers(log)
     last = policy_begun(log)
-    found = []
+    found: list[ClientCommand] = []
+    place = 0
     for command in log.commands:
         if command.planned < 0 and command is not last:
-            found.append(ClientCommand(command, _refusal(command, answers.get(command.cycle, deque()))))
+            place = place + 1 if found and found[-1].command.cycle == command.cycle else 1
+            refusal = _refusal(command, place, answers.get(command.cycle, deque()))
+            found.append(ClientCommand(command, refusal))
     return tuple(found)
 
 
@@ -78,13 +81,15 @@ def _answers(log: Log) -> dict[int, deque[Event]]:
     return answers
 
 
-def _refusal(command: TakenCommand, answers: deque[Event]) -> str:
+def _refusal(command: TakenCommand, place: int, answers: deque[Event]) -> str:
     """Take the answer to a command out of those of its cycle; a controller's is there only if it refused."""
     source = command.controller or _LOOP
     for event in answers:
         outcome = _outcome(event, command)
         if event.source != source or (outcome.kind, outcome.origin) != (command.kind, command.origin):
             continue
+        if outcome.place not in (0, place):
+            continue  # of another one with the same kind and origin, in this cycle
         answers.remove(event)
         return outcome.refusal.text if outcome.refusal else ""
     return ""

@@ -254,6 +254,12 @@ def test_motions_are_played_again_with_the_same_numbers(
     assert "/goals" in str(report.first), report
 
 
+def test_of_two_equal_commands_in_one_cycle_only_the_second_is_refused(steer: Callable[..., Path]) -> None:
+    equal = send("hand", "positions", [0.1], 0)
+    log = whole(steer({4: [equal, switch([], ["hand"]), equal]}))
+    assert [bool(one.refusal) for one in client_commands(log)][:3] == [False, False, True]
+
+
 @pytest.mark.campaign
 @settings(
     max_examples=int(os.environ.get("DXLRUN_STEERED_GRAPHS", "5")),

@@ -198,6 +198,8 @@ class CommandOutcome(msgspec.Struct, frozen=True):
     kind: str
     origin: str
     refusal: Refusal | None = None
+    place: int = 0
+    """Of the command among those from outside that its cycle took, from 1; 0: none of them, or not known."""
 
 
 def _listed(names: tuple[str, ...]) -> str:
