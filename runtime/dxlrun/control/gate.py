@@ -150,8 +150,10 @@ class Gate:
             self._longest_slow_ns -= dt_ns
         if self._any_led:
             self._lead(commands, goals, speed, dt_ns)
-        if self._drive.any:
+        if self._drive.driven:
             self._drive.apply(commands, goals, self._record.states, speed, dt_ns)
+        if self._drive.limited:
+            self._drive.limit(commands.effort, goals.effort)
         if self._any_limp:
             clamped[self._limp] &= _NOT_FINITE  # what is commanded meanwhile is not followed
             self._stay(self._limp, goals)
@@ -309,17 +311,20 @@ class DriveGate:
         "_rows",
         "_speed",
         "_upper",
-        "any",
+        "driven",
+        "limited",
     )
 
     def __init__(self, joints: Sequence[JointPlan], flag: Callable[[_Rows, Clamp], None]) -> None:
         """`flag` notes what was done to the commands of some rows."""
-        self.any = False
-        """True when a joint is in a mode that concerns this gate."""
+        self.driven = False
+        """True when a joint is in mode VELOCITY, EFFORT or PWM."""
+        self.limited = False
+        """True when one is in mode EFFORT_POSITION."""
         self._flag = flag
         self._lower = np.array([joint.lower for joint in joints], dtype=np.float64)
         self._upper = np.array([joint.upper for joint in joints], dtype=np.float64)
-        self._effort = np.array([joint.highest_effort for joint in joints])
+        self._effort = _finite(joint.highest_effort for joint in joints)  # so that infinity is beyond
         self._speed = np.array([joint.highest_speed for joint in joints])
         self._free = np.array([not joint.bounded for joint in joints], dtype=np.bool_)
         self._acceleration = np.array([_or_inf(joint.acceleration) for joint in joints])
@@ -332,7 +337,8 @@ class DriveGate:
         """Take the joints' modes, shape (joints,)."""
         self._rows = {mode: np.flatnonzero(modes == mode) for mode in _DRIVEN}
         self._limiting = np.flatnonzero(modes == Mode.EFFORT_POSITION)
-        self.any = bool(self._limiting.size or any(rows.size for rows in self._rows.values()))
+        self.driven = any(rows.size for rows in self._rows.values())
+        self.limited = bool(self._limiting.size)
 
     def apply(self, commands: Commands, goals: Commands, states: States, speed: Floats, dt_ns: int) -> None:
         """Fill the goals of these joints; `speed`, rad/s, is the highest of each joint in this cycle."""
@@ -353,8 +359,6 @@ class DriveGate:
                 if mode == Mode.VELOCITY and self._accelerates:
                     values = self._ramped(rows, commanded[rows], values, goal[rows], dt_ns)
                 goal[rows] = self._inward(rows, values, states.position[rows], mode, dt_ns)
-        if self._limiting.size:
-            self._limit(commands.effort, goals.effort)
 
     def _bounded(self, rows: _Rows, commanded: Floats, most: Floats, clamp: Clamp) -> Floats:
         """Return finite values of at most this magnitude."""
@@ -395,12 +399,14 @@ class DriveGate:
         self._flag(rows[(values > up) | (values < -down)], Clamp.OUTWARD)
         return np.minimum(np.maximum(values, -down), up)
 
-    def _limit(self, commanded: Floats, goal: Floats) -> None:
+    def limit(self, commanded: Floats, goal: Floats) -> None:
+        """Fill the limits of the efforts of joints in mode EFFORT_POSITION."""
         rows = self._limiting
-        values = np.abs(commanded[rows])
-        self._flag(rows[np.isinf(values)], Clamp.NOT_FINITE)
-        given = np.isfinite(values)
-        rows, values = rows[given], values[given]
-        most = self._effort[rows]
-        self._flag(rows[values > most], Clamp.EFFORT)
+        values, most = np.abs(commanded[rows]), self._effort[rows]
+        if np.count_nonzero(beyond := values > most):  # infinity too
+            infinite = np.isinf(values)
+            self._flag(rows[infinite], Clamp.NOT_FINITE)
+            self._flag(rows[beyond & ~infinite], Clamp.EFFORT)
+            values[infinite] = np.nan
+        np.copyto(values, goal[rows], where=np.isnan(values))
         goal[rows] = np.minimum(values, most)

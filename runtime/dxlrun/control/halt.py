@@ -39,10 +39,10 @@ class Halt:
         "_began_ns",
         "_joints",
         "_manager",
-        "_numbers",
         "_record",
         "_still_ns",
         "_stops",
+        "waiting",
     )
 
     def __init__(
@@ -58,7 +58,7 @@ class Halt:
         self._manager = manager
         self._record = record
         self._answer = answer
-        self._numbers: list[int] = []
+        self.waiting: list[int] = []
         """Commands that wait for the joints to stand still."""
         self._began_ns = self._still_ns = 0
         self._before = b""
@@ -68,16 +68,15 @@ class Halt:
         refusal = self._manager.switch((), self._manager.commanding(self._joints), time_ns)
         if isinstance(refusal, Refusal):
             return refusal
-        self._numbers.append(number)
+        self.waiting.append(number)
         self._began_ns = self._still_ns = self._record.woken_ns
         self._before = b""
         self.watch()
         return Waiting(())
 
     def watch(self) -> None:
-        """Look at the joints after a read; answer when they have stood still for a while, or time is over."""
-        if not self._numbers:
-            return
+        """Look at the joints after a read while commands wait; answer when they have stood still for
+        a while, or time is over."""
         record, now_ns = self._record, self._record.woken_ns
         states, goals = record.states, record.goals
         count = ~np.isin(states.torque, _FREE)
@@ -114,6 +113,6 @@ class Halt:
         self._end(Refusal(Code.RUN_ENDING))
 
     def _end(self, answer: Answer) -> None:
-        for number in self._numbers:
+        for number in self.waiting:
             self._answer(number, answer)
-        self._numbers.clear()
+        self.waiting.clear()

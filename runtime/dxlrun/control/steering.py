@@ -132,7 +132,8 @@ class Steering:
     def take(self, time_ns: int) -> int:
         """Execute what has come, and end streams whose lease ran out; return the commands for controllers."""
         count = 0
-        self.halt.watch()
+        if self.halt.waiting:
+            self.halt.watch()
         for place, command in enumerate(self.inbox.take(), 1):
             self._log(command)
             execute = self._for_loop if command.controller == LOOP else self._for_controller
