@@ -454,3 +454,31 @@ def test_a_servo_that_refuses_torque_is_limp_and_named(make):
     assert problem.startswith("arm_12_joint (ID 12 on bus arm) was given goal")
     arm.follow(1)
     assert arm.shown[1] is Torque.RELEASED
+
+
+@pytest.mark.parametrize("released", [True, False])
+def test_a_lost_servo_changes_its_mode_when_it_is_back_and_gets_no_torque_if_released(
+    make_plan, make_rig, released
+):
+    """Its watchdog stopped it meanwhile, so it would refuse a goal in the new mode before it is cleared."""
+    arm = Arm(make_plan, make_rig, watchdog=10).start()
+    arm.cycles(20)
+    arm.servo.silence(True)
+    arm.cycles(20)
+    assert arm.state is ServoState.OFFLINE
+    if released:
+        arm.switch(on=False)
+    modes = np.zeros(3, dtype=np.uint8)
+    modes[1] = Mode.VELOCITY
+    arm.rig.hardware.set_modes(modes)
+    arm.cycles(5)
+    given = []
+    arm.servo.registers.watch(
+        ("torque_enable",), lambda: given.append(int(arm.servo.registers["torque_enable"]))
+    )
+    given.clear()  # what it has now
+    arm.servo.silence(False)
+    arm.cycles(150)
+    assert arm.rig.states.mode[1] == Mode.VELOCITY
+    assert arm.shown[1] is (Torque.RELEASED if released else Torque.ON)
+    assert not (released and any(given))

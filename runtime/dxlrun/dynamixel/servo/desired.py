@@ -121,8 +121,13 @@ class DesiredState:
     def _change_mode(self, index: int) -> Program[None]:
         """Change into the newest mode that is requested, and report what came of it.
 
-        A servo that reboots meanwhile gets no torque back by that: it is lost, and returns by the policy.
+        A servo that reboots meanwhile gets no torque back by that: it is lost, and returns by the policy. One
+        that is lost already is left alone: its watchdog may have stopped it, and then it would refuse the
+        goal that it needs to hold in another mode. Its return brings it into the newest mode.
         """
+        if self._life.offline(index):
+            self._changing[index] = False
+            return
         plan, servo, mode = self._plan, self._plan.servos[index], self._modes[index]
         rebooted = yield from self._reboots.tick(index)
         problem = modes.STARTED_ANEW if rebooted else ""

@@ -137,6 +137,9 @@ class Offline:
             loss = self._life.losses[index]
             if loss is not None and loss.had_torque and enabled.answered and not enabled.parameters[0]:
                 self._reboots.count(index)
+        if (loss := self._life.losses[index]) is not None and loss.released:
+            # before its mode: a change of it leaves the torque as it was
+            yield from retry(plan_line(plan).write(servo.servo_id, servo.torque_address, b"\0"))
         yield from watchdog.disarm(plan, servo)
         torque, mode = self._may_get_torque(index), self._desired.mode(index)
         if torque and servo.continuous and servo.mode_plan(mode).goals[-1].position is not None:
@@ -173,7 +176,7 @@ class Offline:
         elif holds and not self._plan.split:
             # the next states of a split bus were requested without it: there its torque is read again first
             life.on(index, ServoEvent.TORQUE_ON)
-        if not (rejoined.torqued or loss.limp_reported):
+        if not (rejoined.torqued or loss.limp_reported or loss.released):
             life.report_limp(index, 0)
         problem = "" if loss.rebooted else "answers, but did not start anew"
         if loss.reboot is not None and loss.reboot.had_torque and not (rejoined.torqued or loss.released):
