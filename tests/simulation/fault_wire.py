@@ -17,7 +17,7 @@ SYNC_WRITE, SYNC_READ, FAST_SYNC_READ, BULK_READ = 0x83, 0x82, 0x8A, 0x92
 HOST_SAYS = frozenset((PING, READ, WRITE, REBOOT, SYNC_WRITE, SYNC_READ, FAST_SYNC_READ, BULK_READ))
 BROADCAST, STATUS = 254, 0x55
 HEADER = b"\xff\xff\xfd\x00"
-Item = Literal["torque_enable", "goal_position", "present_position"]
+Item = Literal["torque_enable", "goal_position", "present_position", "goal_current", "operating_mode"]
 
 
 class Facts(NamedTuple):
@@ -34,7 +34,13 @@ FACTS: Mapping[str, Facts] = {
     ),
     "XM430-W350": Facts(
         math.tau / 4096,
-        {"torque_enable": (64, 1), "goal_position": (116, 4), "present_position": (132, 4)},
+        {
+            "torque_enable": (64, 1),
+            "goal_position": (116, 4),
+            "present_position": (132, 4),
+            "goal_current": (102, 2),
+            "operating_mode": (11, 1),
+        },
     ),
 }
 

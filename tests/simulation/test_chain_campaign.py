@@ -1,0 +1,299 @@
+"""Campaign: storms of faults on a robot with a chain of controllers, steered meanwhile, on virtual time.
+
+A trajectory commands a limiter, which commands two of the three joints of a PID on efforts; another
+controller commands the third. Clients send goals, cancel, switch, and request torque and reboots, and
+controllers fail.
+Judged by the simulated bus' ledger beside the log, see fault_judge.py. CI runs 6 storms from a fixed seed:
+
+    DXLRUN_CHAINED_STORMS=100 python -m pytest tests/simulation/test_chain_campaign.py -q
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dxlrun.control.controllers.plugins import load_plugins
+from dxlrun.dynamixel.plan.bus_plan import BusPlan
+from dxlrun.log.reader import Log, read_log
+from dxlrun.run.channels.answers import Waiting
+from dxlrun.run.channels.commands import Command
+from dxlrun.run.channels.events import EventCode
+from dxlrun.simulation.faults.fault import KINDS
+from dxlrun.testing import VirtualRobot, simulated_robot
+
+MS = 1_000_000
+SYNC_WRITE = 0x83
+COUNT = int(os.environ.get("DXLRUN_CHAINED_STORMS", "6"))
+SEED = os.environ.get("DXLRUN_STORM_SEED", "1")
+DURATION_S = 5.0 if "DXLRUN_CHAINED_STORMS" in os.environ else 3.0
+JOINT = (
+    "  {name}: {{bus: main, id: {number}, model: XM430-W350, reference: 180 deg, "
+    "direction: {direction}, {limits}}}\n"
+)
+LIMITS = "limits: {position: [-1.2 rad, 1.2 rad], velocity: 4 rad/s, effort: 1 A}"
+REACH = 1.2
+JOINTS = ("shoulder", "elbow", "wrist", "hand")
+HEAD = """\
+name: chained
+loop: {rate: 50}
+buses:
+  main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, return_delay_time: 100 us, read: READ}
+joints:
+"""
+CONTROLLERS = """\
+controllers:
+  pid: {type: pid_controller, joints: [shoulder, elbow, wrist], command_interface: effort,
+        gains: {p: 2.0, i: 0.5, d: 0.1}, fallback: standby}
+  smooth: {type: joint_limiter, joints: [shoulder, elbow], into: pid,
+           limits: {velocity: 2 rad/s, acceleration: 8 rad/s^2}}
+  arm: {type: joint_trajectory_controller, joints: [shoulder, elbow], into: smooth}
+  turn: {type: joint_group_position_controller, joints: [wrist], into: [pid]}
+  grip: {type: joint_group_position_controller, joints: [hand], fallback: relax}
+  relax: {type: joint_group_position_controller, joints: [hand], active: false}
+  standby: {type: joint_group_position_controller, joints: [shoulder, elbow, wrist], active: false}
+"""
+NAMES = ("pid", "smooth", "arm", "turn", "grip", "relax", "standby")
+INTO = {"smooth": "pid", "arm": "smooth", "turn": "pid"}
+COMMANDS_SERVOS = {"pid": (0, 1, 2), "standby": (0, 1, 2), "grip": (3,), "relax": (3,)}
+POLICIES = (
+    "",
+    "policies: {on_lost_servo: hold, on_returned_servo: hold}\n",
+    "policies: {on_returned_servo: hold, on_fault: limp}\n",
+)
+LASTING = ",".join(name for name in KINDS if name not in {"storm", "unplug"})
+FORBIDDEN = 200 * MS
+"""What idle time had begun for a servo when a request came has ended by then."""
+
+
+def storms() -> list[Any]:
+    chance = random.Random(f"chains {SEED}")
+    drawn = []
+    for _ in range(COUNT):
+        seed, faults = chance.randrange(10**6), chance.randint(1, 8)
+        kinds = chance.choice(("", f" kinds={LASTING}", " kinds=reboot,lose,silence,overload"))
+        within = round((DURATION_S - 1) * 1000)
+        drawn.append(
+            pytest.param(f"storm seed={seed} faults={faults} within={within}ms{kinds} at=300ms", id=f"{seed}")
+        )
+    return drawn
+
+
+def built(directory: Path, chance: random.Random) -> VirtualRobot:
+    text = HEAD.replace("READ", chance.choice(("together", "together", "split")))
+    for number, name in enumerate(JOINTS, 1):
+        text += JOINT.format(name=name, number=number, direction=1 if number % 2 else -1, limits=LIMITS)
+    path = directory / "chained.yaml"
+    path.write_text(text + CONTROLLERS + chance.choice(POLICIES))
+    return simulated_robot(path, duration_s=DURATION_S, log=directory / "run.mcap")
+
+
+class Clients:
+    """Requests of every kind at random times, and controllers that fail."""
+
+    def __init__(self, robot: VirtualRobot, chance: random.Random) -> None:
+        self.robot, self.chance, self.number = robot, chance, 0
+        for _ in range(chance.choice((5, 20, round(10 * DURATION_S)))):
+            self.at(
+                *chance.choice(
+                    (
+                        self.goal,
+                        self.goal,
+                        self.torque,
+                        self.torque,
+                        self.reboot,
+                        self.switch,
+                        self.switch,
+                        self.cancel,
+                        self.stream,
+                        self.halt,
+                    )
+                )()
+            )
+        for _ in range(chance.choice((0, 0, 1, 2))):
+            self.fail(chance.choice(("pid", "smooth", "arm", "turn", "grip", "standby")))
+
+    def at(self, controller: str, kind: str, data: bytes) -> None:
+        self.number += 1
+        command = Command(self.number, controller, kind, data, "anna")
+        at_ns = self.chance.randrange(300, round(DURATION_S * 1000)) * MS
+        self.robot.buses[0].at(at_ns, lambda: self.robot.inbox.waiting.append(command))
+
+    def goal(self) -> tuple[str, str, bytes]:
+        offered = load_plugins().controllers["joint_trajectory_controller"].controller
+        parameters = offered.Parameters.model_validate({"joints": ("shoulder", "elbow")})
+        end = [self.chance.uniform(-1, 1) for _ in range(2)]
+        points = {"points": [{"time": self.chance.choice((0.3, 1.0)), "positions": end}]}
+        command = offered.Commands["trajectory"].model_validate(points)
+        return "arm", "trajectory", np.asarray(offered.prepare("trajectory", command, parameters)).tobytes()
+
+    def stream(self) -> tuple[str, str, bytes]:
+        name, count = self.chance.choice((("turn", 1), ("grip", 1), ("relax", 1), ("standby", 3)))
+        return name, "positions", np.array([self.chance.uniform(-1, 1) for _ in range(count)]).tobytes()
+
+    def torque(self) -> tuple[str, str, bytes]:
+        on = self.chance.random() < 0.6
+        joints = self.chance.sample(JOINTS, self.chance.choice((1, 2, 4)))
+        return (
+            "",
+            "torque",
+            json.dumps({"joints": joints, "on": on, "release": self.chance.random() < 0.6}).encode(),
+        )
+
+    def reboot(self) -> tuple[str, str, bytes]:
+        joints = self.chance.sample(JOINTS, self.chance.choice((1, 2)))
+        return "", "reboot", json.dumps({"joints": joints, "release": self.chance.random() < 0.7}).encode()
+
+    def switch(self) -> tuple[str, str, bytes]:
+        activate, deactivate = self.chance.choice((
+            (["arm"], []), (["turn"], []), (["arm", "turn"], []), (["arm", "turn"], ["standby"]),
+            (["standby"], ["arm", "smooth", "turn", "pid"]), (["standby"], []), ([], ["arm"]),
+            ([], ["smooth"]),
+            (["grip"], []), (["relax"], ["grip"]), (["grip"], ["relax"]), (["pid"], []),
+        ))  # fmt: skip
+        return "", "switch", json.dumps({"activate": activate, "deactivate": deactivate}).encode()
+
+    def cancel(self) -> tuple[str, str, bytes]:
+        return "", "cancel", b'{"controller": "arm"}'
+
+    def halt(self) -> tuple[str, str, bytes]:
+        return "", "halt", b""
+
+    def fail(self, name: str) -> None:
+        def breaks(*_: object) -> None:
+            raise RuntimeError("a fault of the storm")
+
+        def fail() -> None:
+            loop = self.robot.robot.loop
+            loop.manager._named[name]._controller.update = breaks
+
+        self.robot.buses[0].at(self.chance.randrange(400, round(DURATION_S * 1000)) * MS, fail)
+
+
+def active_in(log: Log) -> list[set[str]]:
+    return [{name for bit, name in enumerate(NAMES) if int(mask) >> bit & 1} for mask in log.cycles["active"]]
+
+
+def chains_are_whole(log: Log) -> None:
+    """No upper one without its lower one, and no joint with two commanders, in any cycle."""
+    for cycle, active in enumerate(active_in(log)):
+        assert not [name for name in active if name in INTO and INTO[name] not in active], (cycle, active)
+        rows = [row for name in active for row in COMMANDS_SERVOS.get(name, ())]
+        assert len(rows) == len(set(rows)), (cycle, active)
+
+
+def those_above_leave_with_what_failed(log: Log) -> None:
+    """In the cycle of a fault the whole chain above is out, and the fallback in, or the run ends."""
+    for event in log.events:
+        if event.code != EventCode.CONTROLLER_FAULT:
+            continue
+        after = int(np.searchsorted(log.cycles["woken_ns"], event.t_ns, side="right")) - 1
+        if not 0 <= after < len(log.cycles) - 1:
+            continue
+        active = active_in(log)[after]
+        above = {event.source}
+        for name in ("smooth", "arm", "turn"):
+            if INTO[name] in above:
+                above.add(name)
+        assert not above & active, (event.source, active)
+
+
+def servos_get_the_goals_of_one_commander(sent: Sequence[Any], bus: BusPlan, log: Log, judge: Any) -> None:
+    """By the wire: a servo gets one goal a cycle; a current only of the PID, a position only without it."""
+    woken, done = log.cycles["updated_ns"], log.cycles["written_ns"]
+    active = active_in(log)
+    seen: set[tuple[int, int, str]] = set()
+    count = 0
+    cyclic = [one for one in sent if one.instruction == SYNC_WRITE]  # those of idle time are for one servo
+    for item in ("goal_position", "goal_current"):
+        for t_ns, servo, raw in judge.written(cyclic, bus, item):
+            cycle = int(np.searchsorted(woken, t_ns, side="right")) - 1
+            if cycle < 0 or t_ns > done[cycle]:
+                continue  # of the start
+            count += 1
+            assert (cycle, servo.servo_id, item) not in seen
+            seen.add((cycle, servo.servo_id, item))
+            leads = "pid" in active[cycle] and servo.row < 3
+            if item == "goal_current":
+                assert leads or raw == 0, (cycle, servo.joint, raw)
+            else:
+                assert not leads, (cycle, servo.joint)
+            limp = log.cycles["torque"][cycle][servo.row] in {3, 4, 5, 6}
+            assert not limp, (cycle, servo.joint)
+    assert count or len(log.cycles) < 100
+
+
+def joints_begin_softly(sent: Sequence[Any], witness: Any, bus: BusPlan, log: Log, judge: Any) -> None:
+    """Whenever torque comes on, the goal is where the servo stands; a current is none."""
+    by_id = {servo.servo_id: servo for servo in bus.servos}
+    goals = {
+        item: list(judge.written(sent, bus, item))
+        for item in ("goal_position", "goal_current", "operating_mode")
+    }
+
+    def last(item: str, servo: Any, t_ns: int) -> int | None:
+        values = [raw for at, one, raw in goals[item] if one is servo and at <= t_ns]
+        return values[-1] if values else None
+
+    for t_ns, servo_id, shaft_rad in witness.found:
+        servo = by_id[servo_id]
+        mode = last("operating_mode", servo, t_ns)
+        if mode == 0:
+            assert last("goal_current", servo, t_ns) == 0, (t_ns, servo.joint)
+            continue
+        goal = last("goal_position", servo, t_ns)
+        if goal is not None:
+            where = judge.angle(servo, goal)
+            stands = servo.direction * (shaft_rad - servo.reference)
+            stands = min(max(stands, -REACH), REACH)  # one that left its limits goes back to them
+            assert abs(where - stands) < judge.BUMP, (t_ns, servo.joint, where, stands)
+
+
+def nothing_for_released_joints(sent: Sequence[Any], bus: BusPlan, log: Log, judge: Any) -> None:
+    """From torque off to the next torque on: no goal of any kind and no torque."""
+    requests = judge.torque_requests(log)
+    wire = [
+        (t_ns, servo.joint, item)
+        for item in ("goal_position", "goal_current", "torque_enable")
+        for t_ns, servo, raw in judge.written(sent, bus, item)
+        if item != "torque_enable" or raw
+    ]
+    for number, one in enumerate(requests):
+        if one.off:
+            later = [two.t_ns for two in requests[number + 1 :] if two.joint == one.joint and not two.off]
+            until, after = min(later, default=1 << 62), one.t_ns + FORBIDDEN
+            found = [each for each in wire if each[1] == one.joint and after < each[0] < until]
+            assert not found, (one, found)
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("storm", storms())
+def test_a_storm_breaks_no_chain(storm: str, tmp_path: Path, judge: Any) -> None:
+    print(storm)
+    chance = random.Random(storm)
+    robot = built(tmp_path, chance)
+    Clients(robot, chance)
+    trial = judge.Trial.of(robot, [storm])
+    assert trial.run()
+    log = read_log(tmp_path / "run.mcap")
+    entries, (bus,) = robot.ledger.entries, robot.plan.buses
+    sent, (witness,) = list(judge.instructions(entries, bus)), trial.witnesses
+    judge.goals_are_within_limits(sent, bus, robot)
+    judge.samples_are_what_was_sent(list(judge.states(entries, bus)), witness, bus, log)
+    judge.the_log_is_the_wire(entries, log, 0)
+    judge.everybody_who_hears_is_limp(robot, 0, robot.failures)
+    judge.faults_and_events_answer_each_other(entries, log)
+    chains_are_whole(log)
+    those_above_leave_with_what_failed(log)
+    servos_get_the_goals_of_one_commander(sent, bus, log, judge)
+    nothing_for_released_joints(sent, bus, log, judge)
+    joints_begin_softly(sent, witness, bus, log, judge)
+    assert not any(isinstance(answer, Waiting) for answer in robot.inbox.answers.values())
+    assert not any("Traceback" in event.text and "storm" not in event.text for event in log.events)
