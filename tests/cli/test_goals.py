@@ -30,6 +30,8 @@ class Robot:
         self.requests: list[tuple[Any, ...]] = []
         self.refusals: dict[int, Refused] = {}
         self.goal: int | None = 3
+        self.interrupted: dict[int, list[GoalState | BaseException]] | None = None
+        """Goals that begin while Ctrl-C comes before the answer."""
 
     def __enter__(self) -> Robot:
         return self
@@ -41,14 +43,21 @@ class Robot:
         self, controller: str, kind: str, command: Any, *, units: bool, seconds: float | None
     ) -> Executed:
         self.requests.append(("send", controller, kind, command, seconds))
+        self.begin()
         goals = () if self.goal is None else (RemoteGoal(self, self.goal),)  # type: ignore[arg-type]
         return Executed(7, goals)
 
     def play(self, motion: Path, speed: float) -> Executed:
         self.requests.append(("play", str(motion), speed))
+        self.begin()
         if 0 in self.refusals:
             raise self.refusals[0]
         return Executed(7, (RemoteGoal(self, 3), RemoteGoal(self, 4)))  # type: ignore[arg-type]
+
+    def begin(self) -> None:
+        if self.interrupted is not None:
+            self.script |= self.interrupted
+            raise KeyboardInterrupt
 
     def goals(self) -> list[GoalState]:
         return [
@@ -138,6 +147,34 @@ def test_ctrl_c_cancels_the_goal_and_waits_until_the_joints_rest(dxlrun: Dxlrun,
     assert said.code == 130
     assert said.errors == ["dxlrun: goal 3 of arm cancelled after 1.50 s", "interrupted"]
     assert robot.requests[1:] == [("cancel", 3), ("wait", 3)]
+
+
+@pytest.mark.parametrize("verb", ["send", "play"])
+def test_ctrl_c_before_the_answer_cancels_the_goals_that_have_begun_and_no_others(
+    dxlrun: Dxlrun, robot: Robot, tmp_path: Path, verb: str
+) -> None:
+    ended = replace(REACHED, status="cancelled")
+    own = replace(RUNNING, number=3, origin=f"dxlrun {verb}: wave.yaml")
+    robot.script = {2: [replace(own, number=2)]}
+    robot.interrupted = {
+        3: [own, replace(ended, number=3)],
+        4: [replace(own, number=4, origin="anna")],
+        5: [replace(own, number=5), replace(ended, number=5)],
+    }
+    (tmp_path / "wave.yaml").write_text("name: wave")
+    words = [*SEND, "--wait"] if verb == "send" else ["play", str(tmp_path / "wave.yaml")]
+    said = dxlrun(*words)
+    assert said.code == 130
+    assert [one for one in robot.requests if one[0] == "cancel"] == [("cancel", 3), ("cancel", 5)]
+    assert "goal 3 of arm cancelled" in said.err
+
+
+def test_ctrl_c_before_the_answer_cancels_nothing_where_the_goal_is_not_waited_for(
+    dxlrun: Dxlrun, robot: Robot
+) -> None:
+    robot.interrupted = {3: [replace(RUNNING, origin="dxlrun send")]}
+    assert dxlrun(*SEND).code == 130
+    assert len(robot.requests) == 1
 
 
 def test_ctrl_c_of_a_goal_that_has_ended_meanwhile_has_its_result(dxlrun: Dxlrun, robot: Robot) -> None:

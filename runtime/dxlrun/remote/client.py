@@ -518,9 +518,12 @@ class RemoteRobot:
     # Inside
 
     def _ends(self) -> bool:
-        """Return whether the gateway is gone, or goes within a second: it ends with the run."""
+        """Return whether the run has ended, or ends within a second: its gateway removes its socket then.
+
+        Of a gateway that was killed it is left, or it listens still.
+        """
         until = time.monotonic() + _ENDING_S
-        while alive(self._path):
+        while self._path.exists():
             if time.monotonic() > until:
                 return False
             time.sleep(0.02)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping
 from contextlib import suppress
+from itertools import islice
 
 import msgspec
 import numpy as np
@@ -144,7 +145,8 @@ def events_after(events: deque[tuple[int, Event]], number: int | None) -> Messag
     last = events[-1][0] if events else 0
     begin = last if number is None else number + 1
     first = events[0][0] if events else 1
-    chosen = [(n, event) for n, event in events if n >= begin][:MOST_PER_ANSWER]
+    start = max(0, begin - first)  # they are numbered without a gap
+    chosen = list(islice(events, start, start + MOST_PER_ANSWER)) if begin <= last else []
     found = [Message(n, event.t_ns * 1e-9, _event(event)) for n, event in chosen]
     lost = 0 if number is None else max(0, first - number - 1)
     return Messages(EVENT_TOPIC, EVENT.name, (), found, found[-1].number if found else last, lost)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
 REST_S = 10.0
 """How long a cancelled goal may take until its joints are at rest."""
 _PROGRESS_S = 0.1
+_BEGIN_S = 0.5
+"""How long a goal may take to begin that was sent and not answered."""
 
 
 def send(
@@ -63,7 +66,8 @@ def send(
         raise InputError(f"--in: {error}") from None
     with robot_of(chosen, "send") as robot:
         try:
-            done = robot.send(controller, kind, written.data, units=True, seconds=seconds)
+            with begun_or_cancelled(robot, "send", waited=wait):
+                done = robot.send(controller, kind, written.data, units=True, seconds=seconds)
         except Refused as refused:
             raise written.located(refused) from None
         if not wait:
@@ -136,7 +140,8 @@ def play(motion: Path, /, *, speed: float = 1.0, no_wait: Flag = False, chosen: 
         raise InputError(f"there is no motion file {motion}; check the path")
     with robot_of(chosen, "play") as robot:
         try:
-            done = robot.play(motion, speed)
+            with begun_or_cancelled(robot, "play", waited=not no_wait):
+                done = robot.play(motion, speed)
         except Refused as refused:
             raise _located(refused, motion) from None
         numbers = [goal.number for goal in done.goals]
@@ -156,6 +161,28 @@ def _located(refused: Refused, motion: Path) -> DxlrunError:
         line, column = map(int, place.split(":"))
         found.append(Problem(Mark(str(motion), line, column), problem, fix))
     return InputError(found)
+
+
+@contextmanager
+def begun_or_cancelled(robot: RemoteRobot, verb: str, *, waited: bool) -> Iterator[None]:
+    """Where goals are waited for: on Ctrl-C before their numbers are known, cancel those that begin."""
+    last = max((state.number for state in robot.goals()), default=0) if waited else 0
+    try:
+        yield
+    except KeyboardInterrupt:
+        if waited:
+            until = time.monotonic() + _BEGIN_S
+            own: list[int] = []
+            while not own and time.monotonic() < until:
+                time.sleep(_PROGRESS_S)
+                own = [
+                    state.number
+                    for state in robot.goals()
+                    if state.number > last and state.origin.startswith(f"dxlrun {verb}")
+                ]
+            for state in cancelled(robot, own):
+                print_warning(f"dxlrun: {sentence(state)}")
+        raise
 
 
 def follow(robot: RemoteRobot, chosen: Chosen, done: Executed, numbers: Sequence[int]) -> int:
