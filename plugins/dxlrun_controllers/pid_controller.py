@@ -191,7 +191,6 @@ class PidController(Controller[PidParameters]):
         """Hold the joints where they are; what was commanded before stays the output, but for the mode."""
         goals, pid = self.context.goals, self._pid
         self._setpoint.fill(np.nan if self._by_position else 0.0)
-        self._chained.fill(False)
         self._state_ns = time_ns
         self._slope.reset()
         self._refer()

@@ -204,6 +204,7 @@ def test_a_reference_beyond_a_limit_does_not_move_the_limit():
     for _ in range(9):
         found = stepped(law, 1.7, 0.1, 1.0)
     assert found == (1.5, 0.0)
+    assert stepped(law, 1.6, 0.1, -1.0) == (1.5, 0.0)  # it comes back, and is not there yet
 
 
 def test_beside_a_servos_position_the_velocity_is_a_magnitude_and_the_highest_at_rest(stage):

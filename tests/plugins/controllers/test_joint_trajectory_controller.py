@@ -591,6 +591,21 @@ def test_whenever_a_goal_takes_over_position_velocity_and_acceleration_go_on(  #
         np.testing.assert_allclose(after[2], before[2], atol=1e-8)
 
 
+def test_a_goal_that_comes_in_a_stop_while_the_speed_is_0_begins_with_the_velocity_of_then(stage):
+    parameters = ONE | {"command_interface": "posvel", "deceleration": "2 rad/s^2"}
+    robot = started(stage, parameters, into=("lower",))
+    robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3]}])
+    robot.update(0.5)
+    robot.cancel(0.5)
+    robot.change(0.6, speed=0.0)
+    robot.update(0.7)
+    robot.send(0.7, "trajectory", points=[{"time": 1, "positions": [1.3]}])
+    _, speed = observed(robot, 0.7, 1.0)
+    assert speed[0, 0] == pytest.approx(1.0 - 2 * 0.2)
+    assert np.abs(np.diff(speed, axis=0)).max() < 0.02
+    assert speed[-1, 0] == 0.0
+
+
 def test_a_linear_trajectory_is_joined_without_a_jump_of_its_velocity_at_both_ends(stage):
     robot = started(stage, ONE | {"command_interface": "posvel"}, into=("lower",))
     robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3]}])

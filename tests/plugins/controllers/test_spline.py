@@ -96,6 +96,13 @@ def test_the_bridge_leads_from_now_to_the_first_point(order, start_in):
     assert trajectory.duration_s == start_in + 1.5
 
 
+def test_a_bridge_from_a_motion_that_is_about_to_begin_keeps_its_velocity_of_none():
+    now = SplineSample(1)
+    now.acceleration[:] = 0.9
+    trajectory = loaded(LINEAR, np.array([1.0]), np.array([[[1.0], [0.0], [0.0]]]), 0.0, now)
+    np.testing.assert_allclose(sampled(trajectory, [0.0], 1)[0, :, 0], [0.0, 0.0, 0.9])
+
+
 def test_a_trajectory_that_is_loaded_over_another_begins_with_its_own_pieces():
     times, played = np.array([0.0, 1.0, 2.0]), Trajectory(1)
     for height in (1.0, 5.0):
