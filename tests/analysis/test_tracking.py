@@ -120,6 +120,12 @@ def test_lag_is_the_delay_on_the_way(make: Make) -> None:
     assert joint.rest_rad == pytest.approx(0.0, abs=1e-9)
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_joint_that_rests_wherever_its_goals_are_known_has_no_lag(make: Make) -> None:
+    goals = np.concatenate((np.full(60, 0.0), np.full(80, np.nan), np.full(60, 1.0)))  # an effort in between
+    assert only(make(goals, np.nan_to_num(goals))).lag_ms is None
+
+
 def test_a_stream_that_the_servo_can_follow_is_its_own_way(make: Make) -> None:
     t = np.arange(500) * DT
     goals, late = 0.4 * np.sin(2 * t), 0.4 * np.sin(2 * (t - DT - 0.03))

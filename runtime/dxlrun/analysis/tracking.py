@@ -197,6 +197,8 @@ def _lag_ms(times: Floats, way: Floats, error: Floats, limits: _Limits) -> float
     if not used.any() or np.ptp(way[used]) < _MOVED_TICKS * limits.tick:
         return None
     moving = velocity[used]
+    if not moving.any():  # it jumps between two trajectories, and rests where both neighbours are known
+        return None
     return float(-(error[used] @ moving) / (moving @ moving)) * 1e3
 
 
