@@ -164,6 +164,16 @@ def test_a_narrow_terminal_gets_a_list() -> None:
     assert max(map(len, graph_text(GRAPH, 120).splitlines())) > 60
 
 
+def test_a_list_is_broken_between_words() -> None:
+    joints = Node("joints", "joints", ("left_shoulder_joint, left_elbow_joint, left_wrist_joint",))
+    graph = Graph("wide", (Node("arm", "controller", ("arm",), "position"), joints), (Edge("arm", "joints"),))
+    assert graph_text(graph, 50).splitlines() == [
+        "arm",
+        "  position ─▶ left_shoulder_joint,",
+        "      left_elbow_joint, left_wrist_joint",
+    ]
+
+
 def test_a_terminal_without_these_characters_gets_others() -> None:
     for width in (60, 120):
         assert graph_text(GRAPH, width, ascii_only=True).isascii()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterator, Sequence
 
 from dxlrun.output.graph import Graph, Node, Placed, placed
@@ -19,7 +20,7 @@ def graph_text(graph: Graph, width: int, *, ascii_only: bool = False) -> str:
     """Return the lines of a graph that fit into a width: a drawing, else a list of what leads where."""
     lines = _Drawing(placed(graph)).lines() if graph.nodes else []
     if any(len(line) > width for line in lines):
-        lines = list(_list(graph))
+        lines = [short for line in _list(graph) for short in _wrapped(line, width)]
     text = "\n".join(line.rstrip() for line in lines)
     return text.translate(_ASCII) if ascii_only else text
 
@@ -134,6 +135,12 @@ class _Drawing:
 
 def _even(number: int) -> int:
     return number + number % 2
+
+
+def _wrapped(line: str, width: int) -> list[str]:
+    """Break a line of the list between words; what follows stands below what the line leads to."""
+    indent = " " * 6
+    return textwrap.wrap(line, max(width, 20), subsequent_indent=indent, break_on_hyphens=False) or [line]
 
 
 def _list(graph: Graph) -> Iterator[str]:
