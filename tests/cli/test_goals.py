@@ -94,6 +94,8 @@ class Robot:
                 "range": "",
                 "description": "",
             },
+            {"name": "timeout", "value": "5000000 ns", "live": False, "range": "", "description": ""},
+            {"name": "settle", "value": "0 ns", "live": False, "range": "", "description": ""},
             {"name": "joints", "value": ["a", "b"], "live": False, "range": "", "description": ""},
             {"name": "careful", "value": False, "live": True, "range": "", "description": ""},
         ]
@@ -240,6 +242,8 @@ def test_parameters_are_a_table(dxlrun: Dxlrun, robot: Robot) -> None:
     assert [line.split() for line in said.out.splitlines()[2:]] == [
         ["gains.p", "1", "live", "at", "least", "0"],
         ["speed", "0.349066", "rad/s", "live"],
+        ["timeout", "5", "ms", "fixed"],
+        ["settle", "0", "s", "fixed"],
         ["joints", "[a,", "b]", "fixed"],
         ["careful", "false", "live"],
     ]

@@ -250,7 +250,7 @@ def test_a_motion_is_played_into_a_robot_that_runs(dxlrun, torso: RemoteRobot, t
 
 
 def test_a_joint_is_limp_and_holds_again_while_the_robot_runs(dxlrun, torso: RemoteRobot) -> None:
-    commanded = "head commands head_yaw_joint; deactivate it first, or add --release"
+    commanded = "head_yaw_joint: commanded by head; deactivate that first, or add --release"
     assert dxlrun("torque", "off", "head_yaw_joint") == (1, "", f"dxlrun: {commanded}\n")
     limp = "bioloid_torso: head_yaw_joint is limp\n"
     assert dxlrun("torque", "off", "head_yaw_joint", "--release") == (0, limp, "")
@@ -334,7 +334,7 @@ def test_a_command_is_one_request(dxlrun, torso: RemoteRobot, monkeypatch: pytes
         ("send joint_state_broadcaster go", "joint_state_broadcaster takes no command go; there is none"),
         ("send head posvel positions=[30,0]", "positions[0]: 30 has no unit; write an angle with its unit"),
         ("send head posvel positions=[30deg,0deg]", "posvel of head has no velocities; add"),
-        ("send head posvel positions=[1deg] force=.nan", "this cannot be sent"),
+        ("send head posvel positions=[1deg] force=.nan", "force is nan, but must be a finite number"),
         ("send head posvel positions=[1deg] velocities=[1rpm]", "1 positions for 2 joints"),
         (
             "switch --activate hed --deactivate left_arn",

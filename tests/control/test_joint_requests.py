@@ -109,7 +109,7 @@ def test_a_joint_that_is_commanded_is_refused_without_release(story):
     robot = story(4, {1: asks("torque", joints=["j2", "j1"], on=False)})
     assert robot.servos.asked == []
     assert robot.answer(robot.number) == (Code.JOINT_COMMANDED, {"joint": ("j1",), "controller": ("arm",)})
-    assert robot.refusals[robot.number] == "arm commands j1; deactivate it first, or add --release"
+    assert robot.refusals[robot.number] == "j1: commanded by arm; deactivate that first, or add --release"
     assert robot.manager.active == ()  # at the end; it was active until then
     assert [text for _, text in robot.events.of(EventCode.CONTROLLER_DEACTIVATED)] == ["inactive"]
 

@@ -104,7 +104,12 @@ def test_a_clients_name_may_be_any_text(place):
 @pytest.mark.parametrize(
     ("command", "sentence"),
     [
-        ({"positions": [float("nan")]}, "this cannot be sent: .*not JSON compliant"),
+        (
+            {"positions": [0.0, float("nan")]},
+            r"positions\[1\] is nan, but must be a finite number; correct it",
+        ),
+        ({"points": [{"time": float("inf")}]}, r"points\[0\].time is inf, but must be a finite number"),
+        ({"positions": np.array([1.0, np.inf])}, r"positions\[1\] is inf, but must be"),
         ({"positions": {1, 2}}, "this cannot be sent: set is not JSON"),
         ({"positions": "a" * MOST_BYTES}, "bytes are too many, at most 1048576"),
     ],

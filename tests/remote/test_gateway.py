@@ -477,6 +477,15 @@ def test_a_controller_that_is_unloaded_while_a_set_point_arrives_gets_none_of_it
     assert list(desk.mailbox.take()) == []
 
 
+def test_a_switch_names_the_controllers_that_are_activated_below_those_named(desk):
+    above = desk.link.controllers["right"]
+    above.plan = replace(above.plan, into=("left", "spare"))  # left is active already
+    answer = desk.ask("POST", "/switch", {"activate": ["right"], "deactivate": ["right"]})
+    assert answer == (200, DONE | {"below": ["spare"]})
+    answer = desk.ask("POST", "/switch", {"activate": ["right", "spare"], "deactivate": ["right"]})
+    assert answer == (200, DONE)
+
+
 def test_a_switch_whose_modes_never_come_is_given_up(desk, monkeypatch):
     monkeypatch.setattr(link, "ENTER_S", 0.01)
     status, content = desk.ask("POST", "/switch", {"activate": ["spare"]}, refusal=Waiting(("spare",)))
@@ -635,7 +644,8 @@ def test_of_thousands_of_wrong_names_an_answer_has_some(desk):
         ("/controllers/left/commands/position?units=true", {"positions": names}),
     ):
         _, answer = desk.ask("POST", path, body, client=(path, 0))
-        assert answer["code"] in {"unknown_controller", "unknown_joint", "wrong_quantity"}
+        codes = {"unknown_controller", "unknown_joint", "unknown_command", "wrong_quantity"}
+        assert answer["code"] in codes
         assert len(json.dumps(answer)) < 10_000
     assert desk.taken == []
 

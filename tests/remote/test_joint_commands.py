@@ -134,6 +134,7 @@ WRONG = [
     ("positions", "position", {"pan": "soon"}, "", 422, "pan: 'soon' is not an angle"),
     ("positions", "velocity", {"pan": "1 rad/s"}, "", 404, "joints of positions take position"),
     ("whole", "velocity", {"pan": "1 rad/s"}, "", 404, "joints of whole take position"),
+    ("whole", "positions", {"positions": ["0 deg", "0 deg"]}, "", 404, "whole takes no command positions"),
     ("positions", "position", {"pan": "80 deg"}, "", 422, "pan is sent to 80 deg, outside its limits"),
     ("posvel", "velocity", {"tilt": "1 rad/s"}, "", 422, "tilt is asked for 1 rad/s, more than 0.25 rad/s"),
     ("positions", "position", {"pan": "0 deg"}, "&in=2", 422, "positions takes no time"),

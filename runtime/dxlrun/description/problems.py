@@ -55,7 +55,7 @@ def sentences_of(error: ValidationError, what: str, model: type[BaseModel], most
     errors = error.errors(include_url=False)[:most]
     places: dict[KeyPath, Mark] = {}
     for details in errors:
-        location = details["loc"]
+        location = [part for part in details["loc"] if not str(part).startswith("<")]  # which of a union
         places |= {(what, *location[:end]): Mark(what) for end in range(len(location) + 1)}
     problems = _problems(errors, Marks(what, places, places), (what,), model)
     return [f"{problem.what}; {problem.fix}" for problem in problems]

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import http.client
 import json
+import math
 import os
 import select
 import socket
@@ -63,6 +64,10 @@ class Executed:
     """The goals that the command began."""
     old: int | None = None
     """What a register had before; None: it is no register, or not known."""
+    value: int | None = None
+    """What a register has now."""
+    below: tuple[str, ...] = ()
+    """Controllers that a switch activated too, because those above them were named."""
 
     @property
     def goal(self) -> RemoteGoal | None:
@@ -546,13 +551,15 @@ class RemoteRobot:
         return self._executed(self._ask("POST", path, content))
 
     def _executed(self, answer: Mapping[str, object]) -> Executed:
-        cycle, old = answer.get("cycle"), answer.get("old")
+        cycle, old, value, below = (answer.get(key) for key in ("cycle", "old", "value", "below"))
         goals = answer.get("goals", [answer.get("goal")])
         numbers = [one for one in goals if isinstance(one, int)] if isinstance(goals, list) else []
         return Executed(
             cycle if isinstance(cycle, int) else -1,
             tuple(RemoteGoal(self, number) for number in numbers),
             old if isinstance(old, int) else None,
+            value if isinstance(value, int) else None,
+            tuple(map(str, below)) if isinstance(below, list) else (),
         )
 
     def _ask(self, method: str, path: str, content: Mapping[str, object] | None = None) -> dict[str, object]:
@@ -630,12 +637,11 @@ def _json(content: Mapping[str, object]) -> bytes:
     try:
         body = json.dumps(content, default=_plain, allow_nan=False).encode()
     except (TypeError, ValueError, RecursionError) as error:
-        raise Refused(
-            f"this cannot be sent: {error}; use numbers, texts, lists and mappings",
-            code="invalid",
-            fields={"problem": str(error)},
-            wrong_input=True,
-        ) from error
+        where = None if isinstance(error, RecursionError) else _not_finite(content)
+        problem = f"this cannot be sent: {error}; use numbers, texts, lists and mappings"
+        if where is not None:
+            problem = f"{where[0]} is {where[1]}, but must be a finite number; correct it"
+        raise Refused(problem, code="invalid", fields={"problem": problem}, wrong_input=True) from error
     if len(body) > MOST_BYTES:
         raise Refused(
             f"{len(body)} bytes are too many, at most {MOST_BYTES} are taken at once",
@@ -644,6 +650,20 @@ def _json(content: Mapping[str, object]) -> bytes:
             wrong_input=True,
         )
     return body
+
+
+def _not_finite(content: object, where: str = "") -> tuple[str, float] | None:
+    """Return where the first infinite number or NaN of a body is, and the number: `positions[1]`."""
+    if isinstance(content, float):
+        return None if math.isfinite(content) else (where or "a value", content)
+    if isinstance(content, Mapping):
+        inner = [(f"{where}.{key}" if where else str(key), value) for key, value in content.items()]
+    elif isinstance(content, str | bytes) or not isinstance(content, Sequence):
+        lists = getattr(content, "tolist", None)
+        return None if lists is None else _not_finite(lists(), where)
+    else:
+        inner = [(f"{where}[{index}]", value) for index, value in enumerate(content)]
+    return next((found for at, value in inner if (found := _not_finite(value, at))), None)
 
 
 def _plain(value: object) -> object:

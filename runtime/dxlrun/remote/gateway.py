@@ -489,9 +489,25 @@ class GatewayApp:
         for names in (switch.activate, switch.deactivate):  # here: the loop must not go through thousands
             if twice := tuple(name for name, count in Counter(names).items() if count > 1):
                 raise refused(Code.NAMED_TWICE, {"controller": twice})
+        below = self._below(switch.activate)
         done = await self._link.for_loop("switch", switch, origin(request))
         await self._link.recorded(done.cycle)  # so that a set-point that follows finds them active
-        return _done(done)
+        return _json({"done": True, "cycle": done.cycle} | ({"below": below} if below else {}))
+
+    def _below(self, names: Sequence[str]) -> list[str]:
+        """Return the inactive controllers that those named command, which are activated with them."""
+        found: list[str] = []
+        left, seen = list(names), set(names)
+        while left:
+            for lower in self._link.controllers[left.pop()].plan.into:
+                loaded = self._link.controllers.get(lower)
+                if loaded is None or lower in seen:
+                    continue
+                seen.add(lower)
+                left.append(lower)
+                if not self._link.active(loaded):
+                    found.append(lower)
+        return found
 
     async def register(self, request: Request) -> Response:
         """Have a RAM item of a joint's servo written, and answer when it was read back."""

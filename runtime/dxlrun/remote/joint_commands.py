@@ -58,6 +58,8 @@ def joint_command(
     strangers = [name for name in named if name not in plan.joints]
     if kind in commands and (strangers or not named):
         return None
+    if strangers and set(named) <= set(_FIELDS.values()):  # fields of a command, refused by its name
+        return None
     if not named:
         raise invalid(f"{kind} of {plan.name} names no joint; write for example {plan.joints[0]}=20deg")
     if strangers:

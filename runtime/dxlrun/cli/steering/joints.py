@@ -117,7 +117,10 @@ def set_register(joint: str, item: str, value: str, /, *, chosen: Chosen = ONLY_
     with robot_of(chosen, "set") as robot:
         done = robot.set_register(joint, item, given)
         before = "" if done.old is None else f"{done.old} -> "
-        return report_done(robot, chosen, done, f"{robot.name}: {item} of {joint} is {before}{given}")
+        meaning = "" if given == done.value else f" ({given})"
+        return report_done(
+            robot, chosen, done, f"{robot.name}: {item} of {joint} is {before}{done.value}{meaning}"
+        )
 
 
 def facts(state: Mapping[str, object]) -> list[tuple[str, str]]:

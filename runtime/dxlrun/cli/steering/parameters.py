@@ -7,6 +7,8 @@ from dxlrun.errors import InputError
 from dxlrun.output.table import Column, Table
 from dxlrun.output.terminal import show, show_json_line
 
+_DURATIONS = ("s", 1e9), ("ms", 1e6), ("us", 1e3)
+
 
 def parameters(controller: str, /, *words: Words, chosen: Chosen = ONLY_ONE) -> int:
     """Show the parameters of a controller, or change live ones: `dxlrun parameters arm gains.p=4.0`.
@@ -28,8 +30,10 @@ def parameters(controller: str, /, *words: Words, chosen: Chosen = ONLY_ONE) -> 
             rows = robot.parameter_table(controller)
             if chosen.as_json:
                 show_json_line({"robot": robot.name, "controller": controller, "parameters": rows})
-            else:
+            elif rows:
                 show(_table(rows))
+            else:
+                show(f"{robot.name}: {controller} has no parameters")
             return 0
         changed = robot.set_parameters(controller, values)
         if chosen.as_json:
@@ -87,6 +91,10 @@ def written(value: object) -> str:
         return ""
     number, _, unit = str(value).partition(" ")
     try:
-        return f"{float(number):.6g} {unit}".strip()
+        size = float(number)
     except ValueError:
         return str(value)
+    if unit == "ns":
+        size, unit = next(((size / ns, short) for short, ns in _DURATIONS if size >= ns), (size, "ns"))
+        unit = unit if size else "s"
+    return f"{size:.6g} {unit}".strip()

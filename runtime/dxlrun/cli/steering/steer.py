@@ -104,7 +104,7 @@ def switch(*, activate: Names = (), deactivate: Names = (), chosen: Chosen = ONL
     with robot_of(chosen, "switch") as robot:
         done = robot.switch(activate, deactivate)
         groups = {
-            "activated": [name for name in activate if name not in deactivate],
+            "activated": [*(name for name in activate if name not in deactivate), *done.below],
             "deactivated": [name for name in deactivate if name not in activate],
             "restarted": [name for name in activate if name in deactivate],
         }
@@ -223,7 +223,11 @@ def robot_of(chosen: Chosen, verb: str) -> RemoteRobot:
 def report_done(robot: RemoteRobot, chosen: Chosen, done: Executed | None, sentence: str) -> int:
     """Print that a request was executed; return the exit code."""
     if chosen.as_json:
-        cycle = {} if done is None else {"cycle": done.cycle}
+        cycle: dict[str, object] = {} if done is None else {"cycle": done.cycle}
+        if done is not None and done.value is not None:
+            cycle |= {"value": done.value} if done.old is None else {"old": done.old, "value": done.value}
+        if done is not None and done.below:
+            cycle |= {"below": list(done.below)}
         numbers = [] if done is None else [goal.number for goal in done.goals]
         goals = {"goals": numbers} if len(numbers) > 1 else dict(zip(("goal",), numbers, strict=False))
         show_json_line({"robot": robot.name, "done": True} | cycle | goals)

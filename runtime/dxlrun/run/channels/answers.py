@@ -100,7 +100,7 @@ class Code(StrEnum):
     REGISTER_NOT_READ = "register_not_read", "{problem}"
     JOINT_COMMANDED = (
         "joint_commanded",
-        "{controller} commands {joint}; deactivate it first, or add --release",
+        "{joint}: commanded by {controller}; deactivate that first, or add --release",
     )
     JOINT_LIMP = "joint_limp", "{servo} has no torque"
     JOINT_LOST = "joint_lost", "{servo} does not answer"
