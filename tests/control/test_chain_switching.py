@@ -490,23 +490,38 @@ def test_a_fallback_comes_after_all_that_enter_in_this_cycle_also_by_other_switc
     assert story.result.reason == "fault"
 
 
-def test_one_that_fails_while_it_waits_for_modes_is_not_activated(story):
-    effort_chain(story)
+def parameters_break(story, name):
+    """Return a request of live parameters that a controller raises at."""
 
-    def parameters():
-        managed = story.robot.manager._named["lower"]
-
+    def request():
         def on_parameters(time_ns):
             raise RuntimeError("broken")
 
-        managed._controller.on_parameters = on_parameters
-        story.robot.ask("parameters", controller="lower", values={})
+        story.robot.manager._named[name]._controller.on_parameters = on_parameters
+        story.robot.ask("parameters", controller=name, values={})
 
-    run_with_modes(story, 12, Modes(story.robot, 4), c2=story.switch(["upper"], ["direct"]), c4=parameters)
+    return request
+
+
+@pytest.mark.parametrize("enters", ["lower", "upper"])
+def test_one_that_fails_while_it_waits_for_modes_is_not_activated(story, enters):
+    """Alone, and with one above it."""
+    effort_chain(story)
+    switch, breaks = story.switch([enters], ["direct"]), parameters_break(story, "lower")
+    run_with_modes(story, 12, Modes(story.robot, 4), c2=switch, c4=breaks)
     assert story.answer(1)[0] == Code.CONTROLLER_FAULT
     assert story.answer(2)[0] == Code.CONTROLLER_FAULT
     assert not {("lower", "activate"), ("upper", "activate")} & set(story.called)
     assert story.result.reason == "fault"
+
+
+def test_an_inactive_one_that_fails_takes_no_command_from_the_one_that_has_its_joints(story):
+    story.add("slow", every=4)
+    story.add("spare", active=False)
+    story.commands["slow"] = 0.3
+    story.run(8, c6=parameters_break(story, "spare"))
+    assert story.answer(1)[0] == Code.CONTROLLER_FAULT
+    assert [cycle["position"][0] for cycle in story.robot.sink.cycles] == [0.3] * 8
 
 
 def test_two_fallbacks_that_fail_in_turn_end_the_run(story):

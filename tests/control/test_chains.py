@@ -207,6 +207,15 @@ def test_a_reference_that_no_controller_exports_cannot_be_commanded(robot):
         robot.build()
 
 
+def test_a_reference_that_two_of_those_below_export_cannot_be_commanded(robot):
+    one = {"joints": ("j0",), "command": ("position",)}
+    for name in ("left", "right"):
+        robot.script(name, follows, reference=("position",), active=name == "left", **one)
+    robot.script("upper", commands(position=0.3), into=("left", "right"), **one)
+    with pytest.raises(ControllerFault, match="j0/position, which more than one of left, right exports"):
+        robot.build()
+
+
 def test_a_slower_controller_above_leaves_its_reference_in_between(robot):
     robot.script("lower", follows, command=("position",), reference=("position",))
 
