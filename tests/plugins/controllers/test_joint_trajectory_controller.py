@@ -600,6 +600,8 @@ def test_a_goal_that_comes_in_a_stop_while_the_speed_is_0_begins_with_the_veloci
     robot.change(0.6, speed=0.0)
     robot.update(0.7)
     robot.send(0.7, "trajectory", points=[{"time": 1, "positions": [1.3]}])
+    robot.update(0.7)
+    assert robot.controller._desired.acceleration[0] == pytest.approx(-2.0)
     _, speed = observed(robot, 0.7, 1.0)
     assert speed[0, 0] == pytest.approx(1.0 - 2 * 0.2)
     assert np.abs(np.diff(speed, axis=0)).max() < 0.02
