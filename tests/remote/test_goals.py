@@ -391,3 +391,25 @@ def test_without_lost_events_a_goal_runs_until_its_end_is_reported(arm):
     arm.finish_cycle()
     arm.link.collect()
     assert statuses(arm) == {1: "running"}
+
+
+def test_of_a_change_the_range_of_what_is_wrong_is_named_and_no_other(arm):
+    _, answer = arm.ask("POST", PARAMETERS, {"values": {"gains.p": 40, "steps": 3}})
+    assert answer["refused"].endswith("(gains.p: at least 0, at most 10)")
+    _, answer = arm.ask("POST", PARAMETERS, {"values": {"gains.p": 4, "steps": 1.5}})
+    assert "gains.p" not in answer["refused"]
+
+
+class Derived(ArmParameters):
+    half: Annotated[float, dxlrun.LIVE] = 0.5
+
+    @model_validator(mode="before")
+    @classmethod
+    def _halved(cls, values):
+        return {**values, "half": values.get("steps", 3) / 2}
+
+
+def test_a_live_parameter_that_follows_from_another_changes_with_it(arm, monkeypatch):
+    monkeypatch.setattr(Arm, "Parameters", Derived)
+    assert arm.ask("POST", PARAMETERS, {"values": {"steps": 8}})[0] == 200
+    assert json.loads(arm.taken[-1].data)["values"] == {"steps": 8, "half": 4.0}
