@@ -100,17 +100,17 @@ class Ramps:
         self.moving[rows] = 0.0
         self._target[rows] = self._left[rows] = goal[rows]
 
-    def passes(self, goal: Floats, wanted: Floats, dt: float) -> bool:
-        """Return whether every goal may go to its wanted position at once, and take these steps if so.
+    def passes(self, goal: Floats, desired: Floats, dt: float) -> bool:
+        """Return whether every goal may go to its desired position at once, and take these steps if so.
 
-        `wanted`, rad, is the last goal where nothing is commanded. Three comparisons, over all joints at
+        `desired`, rad, is the last goal where nothing is commanded. Three comparisons, over all joints at
         once: the change of velocity; the velocity beside that of the commands, which must vanish when they
         stop; where the goal comes to rest if it brakes from now on.
         """
         seen, bounds, step, one = self._seen, self._bounds, self._step, self._one
         square = dt * dt
         np.multiply(self._scale, square, bounds[:2])
-        np.subtract(wanted, goal, step)
+        np.subtract(desired, goal, step)
         np.multiply(self.moving, dt, one)
         np.subtract(step, one, seen[0])
         np.subtract(self._target, goal, seen[1])
@@ -118,29 +118,29 @@ class Ramps:
         one *= step
         one *= self._per_step
         one /= square
-        one += wanted
+        one += desired
         np.subtract(one, self._middle, seen[2])
         np.abs(seen, seen)
         if np.count_nonzero(np.greater(seen, bounds, self._beyond)):
             return False
         np.divide(step, dt, self.moving)
-        np.copyto(self._target, wanted)
-        np.copyto(self._left, wanted)
+        np.copyto(self._target, desired)
+        np.copyto(self._left, desired)
         return True
 
-    def steer(self, goal: Floats, wanted: Floats, most: Floats, toward: Floats, dt: float) -> Floats:
-        """Return the next goals, rad: toward what is wanted as fast as the limits allow.
+    def steer(self, goal: Floats, desired: Floats, most: Floats, toward: Floats, dt: float) -> Floats:
+        """Return the next goals, rad: toward the desired ones as fast as the limits allow.
 
-        `wanted` is within the position limits, and the last goal where nothing is commanded; `most` is the
+        `desired` is within the position limits, and the last goal where nothing is commanded; `most` is the
         highest speed of each joint, `toward` the commanded one, NaN: none. Rows of joints without an
         acceleration limit have no meaning.
         """
         limit = self._acceleration
         anew = goal != self._left
         self.rest(anew, goal)
-        own = (wanted - self._target) / dt  # the velocity of the commands, unless they jump
+        own = (desired - self._target) / dt  # the velocity of the commands, unless they jump
         own = np.where(np.abs(own) <= most, own, 0.0)
-        behind = wanted - goal - own * dt
+        behind = desired - goal - own * dt
         ways = self._seen  # behind the commands, to the upper and to the lower limit
         np.abs(behind, ways[0])
         np.fmax(np.subtract(self._upper, goal, ways[1]), 0.0, out=ways[1])
@@ -154,7 +154,7 @@ class Ramps:
         velocity = np.minimum(np.maximum(velocity, self.moving - change), self.moving + change)
         velocity = np.minimum(np.maximum(velocity, -down), up)
         np.copyto(self.moving, velocity)
-        np.copyto(self._target, wanted)
+        np.copyto(self._target, desired)
         stepped: Floats = goal + velocity * dt
         # a sum that rounds past a limit is the limit; a goal that began outside of them stays where it is
         np.minimum(np.maximum(stepped, np.fmin(self._lower, goal)), np.fmax(self._upper, goal), out=stepped)

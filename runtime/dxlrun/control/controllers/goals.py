@@ -109,7 +109,7 @@ class RunningGoal:
         self.kind = kind
         self.origin = origin
         self.cancelling = False
-        """True when its controller was told to bring it to an end."""
+        """True from its cancel on."""
         self.outcome: Outcome | None = None
         """None while it runs."""
         self.progress = 0.0

@@ -1,4 +1,4 @@
-"""The controller graph: who commands whose references, and the order of updates that follows from it.
+"""The controller graph: which controllers command which references, and the order of updates.
 
 An edge goes from the controller that is updated first. `into`: the upper end of a chain before the lower one.
 `reads` of a reference: all that command the reference before the one that reads it.
