@@ -75,6 +75,17 @@ def test_a_switch_happens_in_one_cycle_or_not_at_all(watched):
     assert robot.events.of(EventCode.STEERED)[0][1].endswith("from anna")
 
 
+def test_the_event_of_a_long_command_shows_only_its_begin(watched):
+    robot = watched.robot
+    watched.at[2] = [lambda: robot.ask("pause"), lambda: robot.ask("load", **loaded(name="extra" * 30))]
+    watched.run(5)
+    paused, text = [text for _, text in robot.events.of(EventCode.STEERED)]
+    assert paused == "pause from anna"
+    assert text.startswith('load {"name":')
+    assert text.endswith(" ... from anna")
+    assert len(text) < 150
+
+
 @pytest.mark.parametrize(
     ("switch", "code", "why"),
     [

@@ -110,6 +110,10 @@ KINDS = (
 """Commands for the loop; `load` carries a ControllerPlan, `halt`, `pause`, `resume` and `stop` nothing."""
 
 
+LONGEST_SHOWN = 120
+"""Characters of a command's data in the event that reports it."""
+
+
 @dataclass(slots=True)
 class Steering:
     """Executes the commands of an inbox, logs them, and answers them.
@@ -142,6 +146,8 @@ class Steering:
                 self._report_refusal(command, answer, place)
             elif command.controller == LOOP:
                 shown = command.data.partition(b"\n")[0].decode(errors="replace")
+                if len(shown) > LONGEST_SHOWN:
+                    shown = f"{shown[:LONGEST_SHOWN]} ..."  # all of it is among the log's commands
                 text = f"{command.kind} {shown}".strip()
                 data = msgspec.json.encode(CommandOutcome(command.kind, command.origin, place=place))
                 text = f"{text} from {command.origin}"
