@@ -47,6 +47,15 @@ Plain: TypeAlias = "Callable[[object], Value]"
 """Returns a value of a field as `Codec.pack` takes it."""
 
 
+def _unaliased(annotation: object) -> object:
+    """Return what a `type` alias stands for (Python 3.12); NDArray is one since numpy 2.5."""
+    alias = get_origin(annotation) or annotation
+    if not hasattr(alias, "__value__"):
+        return annotation
+    arguments = get_args(annotation)
+    return alias.__value__[arguments] if arguments else alias.__value__
+
+
 class WrongMessage(ValueError):
     """A class that is no message, with how to fix it; or a value that does not fit its message."""
 
@@ -229,6 +238,7 @@ class _Annotations:
     ) -> tuple[str, bool, int, Plain | None] | None:
         """Return type, whether it is a sequence, fixed length, and how a value becomes plain; None: none."""
         base, *marks = get_args(annotation) if get_origin(annotation) is Annotated else (annotation,)
+        base = _unaliased(base)
         number = next((mark.kind for mark in marks if isinstance(mark, Number)), None)
         length = next((mark.length for mark in marks if isinstance(mark, Length)), 0)
         if isinstance(base, type) and dataclasses.is_dataclass(base) and not marks:
