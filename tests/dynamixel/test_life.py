@@ -170,10 +170,21 @@ class Story:
             self.rig.cycle()
 
     def doubt(self):
-        if self.state is ServoState.OFFLINE:
-            self.rig.hardware.set_modes(np.array([0, Mode.VELOCITY, 0], np.uint8))
+        if self.state is not ServoState.OFFLINE:
+            for _ in range(30):
+                self.miss()
+            return
+        self.servo.silence(False)  # lost while it changes its mode
+        self.until(ServoState.TORQUED)
+        hardware, clock = self.rig.hardware, self.rig.clock
+        hardware.set_modes(np.array([0, Mode.VELOCITY, 0], np.uint8))
+        self.servo.silence()
         for _ in range(30):
-            self.miss()
+            deadline_ns = clock.now_ns() + self.rig.period_ns
+            hardware.read()
+            hardware.write()
+            hardware.idle(deadline_ns - 1_000_000)
+            clock.wait_until(deadline_ns)
 
     def watchdog(self):
         if self.state is ServoState.LIMP:
