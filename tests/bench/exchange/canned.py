@@ -50,7 +50,9 @@ class CannedResponder:
         Returns the steps. Raises ProcessFault when its exchanges never become alike.
         """
         self._do(port, "rehearse")
-        host.start() if first else host.recover()
+        if first:
+            host.start()
+        host.recover()  # a servo that just got torque has no goals yet
         before: Steps = ()
         alike = 0
         for _ in range(_MOST_REHEARSALS):

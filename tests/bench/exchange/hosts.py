@@ -21,6 +21,7 @@ from dxlrun.control.loop import StopFlag
 from dxlrun.dynamixel.port.ports import ReplyPolling, SerialPort, SerialPorts
 from dxlrun.run.assembly import Sinks, assemble
 from dxlrun.run.channels.commands import NoCommands
+from dxlrun.run.channels.cycle import Torque
 from dxlrun.run.channels.events import EventCode, Severity
 from dxlrun.run.channels.packets import (
     LONGEST_BATCH,
@@ -34,6 +35,7 @@ from dxlrun.run.channels.ring import Gap, Handover, RingReader, RingWriter, crea
 from exchange.case import Case, Registers
 from exchange.peers import Rustypot, Sdk
 
+_MOST_RECOVERIES = 20
 _IDLE_NS = 50_000_000
 _TICKS = 2
 """By so much two goals in turn differ: a goal that does not change need not be written."""
@@ -118,6 +120,7 @@ class Ours:
         )
         self._hardware = robot.hardware
         self._valid = robot.record.states.valid
+        self._torque = robot.record.states.torque
         self._everybody = b"\1" * len(self._valid)
         self._goal = robot.record.goals.position
         self._goals = self._goal.copy(), self._goal.copy()
@@ -140,9 +143,12 @@ class Ours:
         return self._valid.tobytes() == self._everybody  # as cheap as what the peers return
 
     def recover(self) -> None:
-        """Exchange, and use idle time for a servo that did not answer."""
-        self.exchange()
-        self._hardware.idle(time.monotonic_ns() + _IDLE_NS)
+        """Exchange, and use idle time for servos that did not answer, until all get goals again."""
+        for _ in range(_MOST_RECOVERIES):
+            self.exchange()
+            self._hardware.idle(time.monotonic_ns() + _IDLE_NS)
+            if (self._torque == Torque.ON).all():
+                return
 
     def sent(self) -> Sent:
         """Return what the log would say of instructions; nothing when more was written than a ring holds."""
