@@ -245,6 +245,19 @@ ONE = [
 ]  # fmt: skip
 
 
+def test_a_clash_of_others_is_no_mistake_of_a_fallback(problems_in: Find) -> None:
+    (problem,) = problems_in(
+        ROBOT
+        + """\
+  one: {type: part, joints: [wrist], command: [position]}
+  two: {type: part, joints: [wrist], command: [position]}
+  up: {type: part, joints: [shoulder], command: [position], fallback: back}
+  back: {type: part, joints: [shoulder], command: [position], active: false}
+"""
+    )
+    assert problem.what.startswith("two and one are both active and both claim wrist")
+
+
 @pytest.mark.parametrize(("controllers", "what", "fix"), ONE, ids=[what[:60] for _, what, _ in ONE])
 def test_one_mistake_is_one_problem_with_its_place(problems_in: Find, controllers: str, what: str, fix: str):
     text, at = marked(ROBOT + controllers)

@@ -70,9 +70,10 @@ def test_every_circle_is_drawn_at_once() -> None:
 
 def test_what_is_above_and_below_goes_through_others() -> None:
     nodes = [Node("pid"), Node("arm", ("limiter",)), Node("limiter", ("pid", "gone")), Node("head")]
-    assert above(nodes, "pid") == ("arm", "limiter")
-    assert below(nodes, "arm") == ("pid", "limiter")
-    assert above(nodes, "arm") == below(nodes, "pid") == above(nodes, "gone") == ()
+    assert above(nodes, "pid") == ("limiter", "arm")
+    assert below(nodes, "arm") == ("limiter", "pid")
+    assert above(nodes, "gone") == ("limiter", "arm")  # also of one that is not among them
+    assert above(nodes, "arm") == below(nodes, "pid") == above(nodes, "head") == ()
 
 
 NAMES = "abcdef"

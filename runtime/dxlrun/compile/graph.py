@@ -14,7 +14,7 @@ from typing import Literal, TypeAlias
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from pydantic_core import InitErrorDetails
 
-from dxlrun.control.controllers.claims import Conflict, conflicts
+from dxlrun.control.controllers.claims import Conflict, conflicts, only_under, takeover_step
 from dxlrun.control.controllers.graph import above, below, circles, drawn, update_order
 from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.description import KeyPath
@@ -438,18 +438,16 @@ class _Checks:
             yield from self._taking_over(plan, other, at)
 
     def _taking_over(self, plan: ControllerPlan, fallback: ControllerPlan, at: KeyPath) -> Iterator[Mistake]:
-        """Compare the claims of a fallback, and of all below it, with those that stay active beside them."""
-        plans = self._plans
-        entering = {fallback.name, *below(plans, fallback.name)}
-        leaving = {plan.name, *above(plans, plan.name)}
-        staying = {one.name for one in plans if one.active} - leaving - self._incomplete
-        free = {
-            lower
-            for lower in below(plans, plan.name)
-            if not staying & set(above(plans, lower)) and lower not in entering
-        }
-        after = [one for one in plans if one.name in staying - free - entering]
-        after += [one for one in plans if one.name in entering]
+        """Let it take over as in a run, from what is active at the start; name the claims that prevent it."""
+        known = {one.name: one for one in self._plans if one.name not in self._incomplete}
+        taken = [name for name in (plan.name, *above(self._plans, plan.name)) if name in known]
+        active = {name: one for name, one in known.items() if one.active and name not in taken}
+        if takeover_step(fallback.name, taken, known, active, {}, {plan.name}):
+            return
+        entering = {fallback.name, *below(self._plans, fallback.name)}
+        free = only_under(taken, known, active) - entering  # they would leave
+        kept = [one for name, one in active.items() if name not in free | entering]
+        after = [*kept, *(one for name, one in known.items() if name in entering)]
         clashes = [one for one in conflicts(after) if one.other in entering and one.holder not in entering]
         for holder, other in dict.fromkeys((one.holder, one.other) for one in clashes):
             through = "" if other == fallback.name else f" through {other}"

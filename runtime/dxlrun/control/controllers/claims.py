@@ -209,7 +209,7 @@ def takeover_step(  # noqa: PLR0917  the states in which controllers are
     engaged = {**active, **waiting}
     if fallback in engaged:
         return None
-    free = _only_under(taken, known, engaged)
+    free = only_under(taken, known, engaged)
     enter = lowers_first([fallback], known, engaged)
     found = conflicts([*engaged.values(), *(known[name] for name in enter)])
     leave = {conflict.holder for conflict in found}
@@ -223,7 +223,7 @@ def takeover_step(  # noqa: PLR0917  the states in which controllers are
     return Step(uppers_first([name for name in engaged if name in leave], known), enter)
 
 
-def _only_under(taken: Sequence[str], known: Plans, engaged: Plans) -> set[str]:
+def only_under(taken: Sequence[str], known: Plans, engaged: Plans) -> set[str]:
     """Return the controllers below these that no other one which goes on uses."""
     plans = tuple(known.values())
     free = {lower for name in taken for lower in below(plans, name)} & engaged.keys()

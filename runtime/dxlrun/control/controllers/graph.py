@@ -117,13 +117,16 @@ def drawn(circle: Circle) -> str:
 
 
 def above(nodes: Sequence[Node], name: str) -> tuple[str, ...]:
-    """Return the controllers that command a controller's references, through others too."""
-    return _reached(nodes, name, [(edge.after, edge.before) for edge in _chains(nodes)])
+    """Return the controllers that command a controller's references, through others too, the nearest first.
+
+    The controller itself need not be among the nodes.
+    """
+    return _reached(nodes, name, {(lower, node.name) for node in nodes for lower in node.into})
 
 
 def below(nodes: Sequence[Node], name: str) -> tuple[str, ...]:
-    """Return the controllers whose references a controller commands, through others too."""
-    return _reached(nodes, name, [(edge.before, edge.after) for edge in _chains(nodes)])
+    """Return the controllers below one, whose references it commands, through others too, nearest first."""
+    return _reached(nodes, name, {(node.name, lower) for node in nodes for lower in node.into})
 
 
 def _chains(nodes: Sequence[Node]) -> Iterator[Edge]:
@@ -131,13 +134,17 @@ def _chains(nodes: Sequence[Node]) -> Iterator[Edge]:
     return (Edge(node.name, lower) for node in nodes for lower in node.into if lower in known)
 
 
-def _reached(nodes: Sequence[Node], start: str, steps: Sequence[tuple[str, str]]) -> tuple[str, ...]:
-    reached: set[str] = set()
-    newest = {start}
+def _reached(nodes: Sequence[Node], start: str, steps: Collection[tuple[str, str]]) -> tuple[str, ...]:
+    found: list[str] = []
+    newest = [start]
     while newest:
-        newest = {end for begin, end in steps if begin in newest} - reached
-        reached |= newest
-    return tuple(node.name for node in nodes if node.name in reached)
+        newest = [
+            node.name
+            for node in nodes
+            if node.name not in found and any((one, node.name) in steps for one in newest)
+        ]
+        found += newest
+    return tuple(found)
 
 
 def lowers_first(
@@ -173,20 +180,6 @@ def uppers_first(names: Collection[str], known: Mapping[str, Node]) -> tuple[str
 def commander(name: str, engaged: Iterable[Node]) -> str:
     """Return the first controller that commands references of this one; empty: none does."""
     return next((plan.name for plan in engaged if name in plan.into), "")
-
-
-def nearest_above(name: str, engaged: Sequence[Node]) -> tuple[str, ...]:
-    """Return the controllers above one, through others too, the nearest first."""
-    found: list[str] = []
-    newest: list[str] = [name]
-    while newest:
-        newest = [
-            plan.name
-            for plan in engaged
-            if plan.name not in found and any(one in plan.into for one in newest)
-        ]
-        found += newest
-    return tuple(found)
 
 
 def _sorter(nodes: Sequence[Node], found: Iterable[Edge]) -> TopologicalSorter[str]:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import msgspec
 
 from dxlrun.control.controllers.claims import Step, switch_step, takeover_step
-from dxlrun.control.controllers.graph import lowers_first, nearest_above, uppers_first
+from dxlrun.control.controllers.graph import above, lowers_first, uppers_first
 from dxlrun.control.controllers.managed import Managed
 from dxlrun.control.controllers.mode_switch import Group, ModeSwitch
 from dxlrun.control.loop_plan import ControllerPlan
@@ -97,7 +97,7 @@ class Switching:
         self, managed: Managed, fault: ControllerFault, time_ns: int
     ) -> tuple[Managed, ...]:
         """Take out one that broke its contract, and those above it; return them, the nearest first."""
-        uppers = [self.named[name] for name in nearest_above(managed.plan.name, self._engaged())]
+        uppers = [self.named[name] for name in above(self._engaged(), managed.plan.name)]
         self.take_out(managed, fault)
         self._drop_group(managed, str(fault))
         why = f"{managed.plan.name}, whose references it commands, broke its contract"
@@ -189,7 +189,7 @@ class Switching:
                 managed.activate(time_ns)
             except ControllerFault as fault:
                 self.take_out(managed, fault)
-                uppers = [self.named[name] for name in nearest_above(managed.plan.name, plans)]
+                uppers = [self.named[name] for name in above(plans, managed.plan.name)]
                 failed.append(((managed, *uppers), str(fault)))
             else:
                 self._log(EventCode.CONTROLLER_ACTIVATED, managed, "active")
