@@ -239,12 +239,11 @@ def _set(one: OneServo, asked: Asked) -> None:
         raise InputError(str(error)) from None
     item = one.table.items[name].title
     (found,) = one.differences([target])
-    if not found.differs:
+    if found.found is None or not found.differs:
         asked.done.append(f"{item} is {target.value} already")
         if not target.eeprom:  # a goal that is there already is not pursued while its Bus Watchdog is tripped
             asked.done += one.write([target])
         return
-    assert found.found is not None  # noqa: S101  implied by `differs`
     change = f"{item} is {shown(one.table.items[name], found.found)} and becomes {target.value}"
     if target.eeprom:
         one.writable([target])

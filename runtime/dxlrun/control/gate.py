@@ -96,7 +96,7 @@ class Gate:
         self._low, self._high = self._least[0], self._most[0]
         self._speeds, self._position_given = self._commanded[1], self._given[0]
         self._step, self._reach = np.empty(count), np.empty(count)
-        self._wanted = np.empty(count)
+        self._desired = np.empty(count)
         self._take_modes()
 
     def begin(self) -> None:
@@ -210,18 +210,18 @@ class Gate:
 
     def _ramp(self, goal: Floats, moved: NDArray[np.bool_], speed: Floats, dt: float) -> NDArray[np.bool_]:
         """Let the goals change their velocity within the acceleration limits; return which move."""
-        wanted, inside, ramps = self._wanted, self._inside, self._ramps
-        np.copyto(wanted, goal)
-        np.copyto(wanted, inside[0], where=moved)
-        if ramps.passes(goal, wanted, dt):
+        desired, inside, ramps = self._desired, self._inside, self._ramps
+        np.copyto(desired, goal)
+        np.copyto(desired, inside[0], where=moved)
+        if ramps.passes(goal, desired, dt):
             return moved
         # not held to the step limit yet: the goal must know how far it is to go to begin to brake in time
         given = np.maximum(self._commanded[0], np.fmin(self._lower, goal))
-        np.copyto(wanted, np.minimum(given, np.fmax(self._upper, goal), out=given), where=moved)
+        np.copyto(desired, np.minimum(given, np.fmax(self._upper, goal), out=given), where=moved)
         toward = np.where(moved, inside[1], np.nan)
-        stepped = ramps.steer(goal, wanted, np.minimum(speed, self._own_speed), toward, dt)
+        stepped = ramps.steer(goal, desired, np.minimum(speed, self._own_speed), toward, dt)
         rows = ramps.limited & self._led
-        held = rows & moved & (np.abs(stepped - wanted) > _SEEN)
+        held = rows & moved & (np.abs(stepped - desired) > _SEEN)
         self._flag(held, Clamp.STEP)
         np.copyto(inside[0], stepped, where=rows)
         np.copyto(inside[1], self._record.goals.velocity, where=rows & ~moved)

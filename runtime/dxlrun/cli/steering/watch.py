@@ -18,7 +18,8 @@ from dxlrun.output.table import Cell, Column, Sentence, Table, Tone
 from dxlrun.output.terminal import STYLES, out, show, show_json_line
 
 if TYPE_CHECKING:
-    from rich.console import Group
+    from rich.console import Group, RenderableType
+    from rich.text import Text
 
     from dxlrun.remote.client import RemoteRobot
 
@@ -206,9 +207,8 @@ def headline(watched: Watched) -> Sentence:
 
 def joints(watched: Watched) -> Table:
     """Return a row for each joint: goal, position, velocity, effort, temperature, voltage, what is wrong."""
-    names = (("joint", "name"), ("goal", "number"), ("deg", "number"), ("deg/s", "number"))
-    more = (("effort", "number"), ("deg C", "number"), ("V", "number"), ("torque", "name"))
-    columns = [Column(name, kind) for name, kind in (*names, *more)]  # type: ignore[arg-type]  # two of its words
+    numbers = (Column(name) for name in ("goal", "deg", "deg/s", "effort", "deg C", "V"))
+    columns = [Column("joint", "name"), *numbers, Column("torque", "name")]
     units = cast("Mapping[str, str]", watched.info.get("effort_units", {}))
     rows = cast("Mapping[str, _FIELDS]", watched.states["joints"])
     return Table.of("", columns, (_joint(name, row, units.get(name, "")) for name, row in rows.items()))
@@ -290,7 +290,7 @@ def view(watched: Watched, width: int, height: int) -> Group:
 
     head, rows, other = headline(watched), joints(watched), controllers(watched)
     left = height - 2 - len(rows.rows)
-    parts: list[object] = [_line(head, width), _compact(rows)]
+    parts: list[RenderableType] = [_line(head, width), _compact(rows)]
     if left >= len(other.rows) + 2:
         parts.append(_compact(other))
         left -= len(other.rows) + 1
@@ -299,10 +299,10 @@ def view(watched: Watched, width: int, height: int) -> Group:
         parts.append(_line(Sentence(f"active: {', '.join(active)}"), width))
         left -= 1
     parts += [_line(one, width) for one in event_lines(watched, left)]
-    return Group(*parts)  # type: ignore[arg-type]  # texts and tables
+    return Group(*parts)
 
 
-def _line(sentence: Sentence, width: int) -> object:
+def _line(sentence: Sentence, width: int) -> Text:
     from rich.text import Text
 
     text = Text(sentence.text, style=STYLES[sentence.tone], no_wrap=True, overflow="ellipsis")
@@ -310,7 +310,7 @@ def _line(sentence: Sentence, width: int) -> object:
     return text
 
 
-def _compact(table: Table) -> object:
+def _compact(table: Table) -> RenderableType:
     """Return a table without rules, cut at the right where there is no room."""
     from rich.table import Table as RichTable
     from rich.text import Text
