@@ -27,7 +27,7 @@ buses:
     baud_rate: 1_000_000
     return_delay_time: 100 us
     adapter: {latency: 1 ms}
-loop: {rate: 100}
+loop: {rate: 100, tolerated_skips: 100 %}
 joints:
   pan: {bus: main, id: 3, model: AX-12A, reference: 150 deg, direction: 1}
 controllers:
