@@ -18,9 +18,9 @@ from dxlrun_controllers.group import (
 )
 from dxlrun_controllers.joint_limiter import JointLimiter
 from dxlrun_controllers.joint_state_broadcaster import JointStateBroadcaster
-from dxlrun_controllers.joint_trajectory_controller import JointTrajectoryController
-from dxlrun_controllers.keyframe_player import KeyframePlayer
 from dxlrun_controllers.leader_follower import LeaderFollower
+from dxlrun_controllers.motions.joint_trajectory_controller import JointTrajectoryController
+from dxlrun_controllers.motions.keyframe_player import KeyframePlayer
 from dxlrun_controllers.pid_controller import PidController
 
 

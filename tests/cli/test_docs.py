@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.cli import sim
 from dxlrun.cli.inputs import COMMANDS, COMMANDS_WHILE_IT_RUNS
+from dxlrun.cli.sim import sim
 from dxlrun.cli.steering.written import Written
 from dxlrun.compile import compile_files
 from dxlrun.control.controllers.plugins import load_plugins

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.cli import sim
+from dxlrun.cli.sim import sim
 from dxlrun.run.simulation_front import Look, Served
 from dxlrun.simulation import SimulationConfig
 from dxlrun.simulation.faults.fault import KINDS

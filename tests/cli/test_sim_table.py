@@ -11,7 +11,7 @@ from io import StringIO
 import pytest
 from rich.console import Console
 
-from dxlrun.cli.sim_views import Shown, TableView, page
+from dxlrun.cli.sim.sim_views import Shown, TableView, page
 from dxlrun.run.simulation_front import Look, ServoLook, TypedLines
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.cli.sim import link_of_each
-from dxlrun.cli.sim_inputs import AdapterOptions, read_faults, servo_bus, with_adapter
-from dxlrun.cli.sim_views import PlainView, Shown, ending
+from dxlrun.cli.sim.sim import link_of_each
+from dxlrun.cli.sim.sim_inputs import AdapterOptions, read_faults, servo_bus, with_adapter
+from dxlrun.cli.sim.sim_views import PlainView, Shown, ending
 from dxlrun.errors import InputError
 from dxlrun.run.simulation_front import Look, ServoLook
 from dxlrun.simulation import BusConfig, ServoConfig

@@ -18,7 +18,7 @@ from dxlrun_controllers.group import (
     PosVelCommand,
     VelocitiesCommand,
 )
-from dxlrun_controllers.trajectory_command import TrajectoryCommand
+from dxlrun_controllers.motions.trajectory_command import TrajectoryCommand
 
 FREE = JointPlan("free", -2.0, 2.0, None, top_speed=8.0, top_effort=3.0)
 BOUND = JointPlan("bound", -1.0, 1.0, 2.0, 0.5, top_speed=8.0, top_effort=3.0)

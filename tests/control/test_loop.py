@@ -150,7 +150,7 @@ def test_the_loop_makes_no_garbage_and_no_growth(make_robot):
     """20,000 cycles of the standard controllers: nothing is collected, nothing piles up."""
     from dxlrun_controllers.group import JointGroupPosVelController
     from dxlrun_controllers.joint_state_broadcaster import JointStateBroadcaster
-    from dxlrun_controllers.joint_trajectory_controller import (
+    from dxlrun_controllers.motions.joint_trajectory_controller import (
         JointTrajectoryController,
         TrajectoryParameters,
     )

@@ -11,7 +11,7 @@ from dxlrun.control.controllers.plugins import Offer, PlugIns
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan
 from dxlrun.remote.preparation import Preparation
 from dxlrun_controllers import group
-from dxlrun_controllers.joint_trajectory_controller import JointTrajectoryController
+from dxlrun_controllers.motions.joint_trajectory_controller import JointTrajectoryController
 
 JOINTS = (
     JointPlan("pan", -1.0, 1.0, 2.0, effort=0.5),

@@ -17,7 +17,7 @@ from dxlrun.remote import gateway
 from dxlrun.remote.preparation import Preparation
 from dxlrun.run.channels.answers import Done
 from dxlrun_controllers import group
-from dxlrun_controllers.joint_trajectory_controller import JointTrajectoryController
+from dxlrun_controllers.motions.joint_trajectory_controller import JointTrajectoryController
 
 JOINTS = (JointPlan("pan", -1.0, 1.0, 2.0), JointPlan("tilt", -1.0, 1.0, 2.0))
 TYPES = {

@@ -18,7 +18,7 @@ COMMANDS = {
     "check": "check:check",
     "analyze": "logs:analyze",
     "replay": "logs:replay",
-    "sim": "sim:sim",
+    "sim": "sim.sim:sim",
     "schema": "examples:schema",
     "models": "models:models",
     "plugins": "plugins:plugins",

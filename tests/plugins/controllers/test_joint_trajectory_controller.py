@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from dxlrun import Outcome
-from dxlrun_controllers.joint_trajectory_controller import (
+from dxlrun_controllers.motions.joint_trajectory_controller import (
     CLOSING_SPEED,
     DECELERATION,
     SPEED_SLOPE,

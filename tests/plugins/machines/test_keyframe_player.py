@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dxlrun import Outcome
-from dxlrun_controllers.keyframe_player import KeyframePlayer
+from dxlrun_controllers.motions.keyframe_player import KeyframePlayer
 
 
 def step(time="500 ms", pause="0 s", **more):

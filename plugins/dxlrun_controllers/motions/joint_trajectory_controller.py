@@ -37,7 +37,7 @@ from dxlrun_controllers.joints import (
 from dxlrun_controllers.laws.pid import feed_velocities_forward
 from dxlrun_controllers.laws.spline import DECELERATION, SplineSample, Stop, Trajectory
 from dxlrun_controllers.laws.tracking import Tracking, TrackingGains
-from dxlrun_controllers.trajectory_command import TrajectoryCommand, flat_trajectory
+from dxlrun_controllers.motions.trajectory_command import TrajectoryCommand, flat_trajectory
 
 SPEED_SLOPE: Final = 2.0
 """1/s, how fast the speed of a trajectory changes: from 1 to 0 in 0.5 s, so no velocity ever jumps."""

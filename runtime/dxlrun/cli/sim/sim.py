@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from dxlrun.cli.inputs import Assignment, Flag, JsonFlag, check_ledger, compiled
-from dxlrun.cli.sim_inputs import (
+from dxlrun.cli.sim.sim_inputs import (
     Absent,
     AdapterOptions,
     Mistakes,
@@ -27,7 +27,7 @@ from dxlrun.output.terminal import out, print_error, print_warning, show
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from dxlrun.cli.sim_views import Shown
+    from dxlrun.cli.sim.sim_views import Shown
     from dxlrun.run.simulation_front import FrontOptions, Served
     from dxlrun.simulation import BusConfig, SimulationConfig, UrdfBodies
     from dxlrun.simulation.faults.fault import Fault
@@ -116,7 +116,7 @@ def sim(
     adapter = AdapterOptions(latency_ns, split, echo, absent)
     buses = tuple(with_adapter(bus, adapter, seed) for bus in simulated.buses)
     check_simulated(buses, planned, seed)
-    from dxlrun.cli.sim_views import Shown, ending
+    from dxlrun.cli.sim.sim_views import Shown, ending
     from dxlrun.run.channels.process import spare_core
     from dxlrun.run.simulation_front import FrontOptions
     from dxlrun.simulation import SimulationConfig
@@ -238,7 +238,7 @@ def link_of_each(buses: Sequence[BusConfig], link: Path | None) -> dict[str, Pat
 
 def _serve(config: SimulationConfig, options: FrontOptions, shown: Shown, *, as_json: bool) -> Served:
     """Serve it with the output that suits stdout: JSON, lines in a pipe, or a table on a terminal."""
-    from dxlrun.cli.sim_views import JsonView, PlainView
+    from dxlrun.cli.sim.sim_views import JsonView, PlainView
     from dxlrun.run.simulation_front import TypedLines, serve
 
     typed = TypedLines(sys.stdin.fileno())
@@ -246,7 +246,7 @@ def _serve(config: SimulationConfig, options: FrontOptions, shown: Shown, *, as_
         return serve(config, options, JsonView(shown), typed)
     if not sys.stdout.isatty() or not typed.in_foreground:
         return serve(config, options, PlainView(shown), typed)
-    from dxlrun.cli.sim_views import TableView
+    from dxlrun.cli.sim.sim_views import TableView
 
     view = TableView(shown, out())
     with view.showing():

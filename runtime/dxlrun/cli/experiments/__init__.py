@@ -1,0 +1,1 @@
+"""Commands that measure: latency, experiment, characterize, identify, sweep."""

@@ -1,0 +1,1 @@
+"""`dxlrun sim`: simulated servos for other programs."""

@@ -1,0 +1,1 @@
+"""Experiments: measure the machine, the loop and the servos; one package an experiment."""
