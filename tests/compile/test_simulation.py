@@ -43,6 +43,13 @@ def test_what_a_servo_moves_reaches_the_simulated_servo(compile_text: Compile, s
     assert bus.servos[1].load == Load()
 
 
+def test_how_slow_a_servo_is_reaches_the_simulated_servo(compile_text: Compile, simulated: str) -> None:
+    plan = compile_text(_joint(simulated, "{response_delay: 20 ms, write_time: 1 ms}")).plan
+    (bus,) = simulated_buses(from_json(to_json(plan)))
+    assert (bus.servos[0].response_delay_ns, bus.servos[0].write_time_ns) == (20_000_000, 1_000_000)
+    assert (bus.servos[1].response_delay_ns, bus.servos[1].write_time_ns) == (0, 0)
+
+
 def test_a_weight_hangs_down_where_the_joint_is_zero_if_nothing_else_is_said(
     compile_text: Compile, simulated: str
 ) -> None:

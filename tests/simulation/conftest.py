@@ -180,11 +180,21 @@ def build_line(
     start_ns: int = 0,
     load: Load | None = None,
     firmware: int | None = None,
+    write_time_ns: int = 0,
 ) -> Line:
     clock = VirtualClock(start_ns)
     ledger = Ledger()
     servos = tuple(
-        ServoConfig(servo_id, model, position, return_delay_ns, load or Load(), firmware) for servo_id in ids
+        ServoConfig(
+            servo_id,
+            model,
+            position,
+            return_delay_ns,
+            load or Load(),
+            firmware,
+            write_time_ns=write_time_ns,
+        )
+        for servo_id in ids
     )
     bus = SimulatedBus(BusConfig("main", baud_rate, servos, protocol), ledger, start_ns)
     return kind(clock, bus, ledger, VirtualPorts(clock, (bus,)))

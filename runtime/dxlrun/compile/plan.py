@@ -27,6 +27,16 @@ class LoadPlan:
 
 
 @dataclass(frozen=True, slots=True)
+class ServoTimesPlan:
+    """How slow a simulated servo is, beside its return delay."""
+
+    response_delay_ns: int = 0
+    """Between an instruction and its effect on the motor."""
+    write_time_ns: int = 0
+    """After a write, in which it receives nothing."""
+
+
+@dataclass(frozen=True, slots=True)
 class AdapterPlan:
     """How a simulated bus and its adapter behave beside the servos."""
 
@@ -44,6 +54,8 @@ class SimulationPlan:
     """By joint; one that is missing moves nothing but itself."""
     adapters: dict[str, AdapterPlan] = field(default_factory=dict)
     """By bus."""
+    times: dict[str, ServoTimesPlan] = field(default_factory=dict)
+    """By joint; one that is missing is as quick as a servo can be."""
     physics: Literal["independent", "mujoco"] = "independent"
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from dxlrun.compile.buses import SIMULATED
 from dxlrun.compile.joints import CompiledJoint
-from dxlrun.compile.plan import AdapterPlan, LoadPlan, Plan, SimulationPlan
+from dxlrun.compile.plan import AdapterPlan, LoadPlan, Plan, ServoTimesPlan, SimulationPlan
 from dxlrun.compile.problems import Problems
 from dxlrun.description import Description
 from dxlrun.description.bus import Bus
@@ -41,8 +41,14 @@ def compile_simulation(
             for name, bus in description.robot.buses.items()
             if (adapter := _adapter(bus)) != AdapterPlan()
         },
+        times={name: times for name, joint in joints.items() if (times := _times(joint)) != ServoTimesPlan()},
         physics=description.robot.simulation.physics,
     )
+
+
+def _times(joint: CompiledJoint) -> ServoTimesPlan:
+    keys = joint.described.simulation
+    return ServoTimesPlan(keys.response_delay, keys.write_time)
 
 
 def _adapter(bus: Bus) -> AdapterPlan:
@@ -160,7 +166,7 @@ def _simulated_bus(plan: Plan, bus: BusPlan) -> BusConfig:
     from dxlrun.simulation import AdapterConfig, BusConfig, Load, ServoConfig  # not above: no check needs it
 
     adapter = plan.simulation.adapters.get(bus.name, AdapterPlan())
-    loads = plan.simulation.loads
+    loads, slow = plan.simulation.loads, plan.simulation.times
     return BusConfig(
         name=bus.name,
         baud_rate=bus.baud_rate,
@@ -171,9 +177,12 @@ def _simulated_bus(plan: Plan, bus: BusPlan) -> BusConfig:
                 servo.reference,
                 bus.return_delay_ns,
                 load=Load(load.inertia, load.friction, load.gravity, load.gravity_angle),
+                response_delay_ns=times.response_delay_ns,
+                write_time_ns=times.write_time_ns,
             )
             for servo in bus.servos
             for load in (loads.get(servo.joint, LoadPlan()),)
+            for times in (slow.get(servo.joint, ServoTimesPlan()),)
         ),
         protocol=bus.protocol,
         control_tables=added_control_tables(servo.model for servo in bus.servos),

@@ -30,6 +30,9 @@ from dxlrun.description.units import (
     Torque,
 )
 
+LONGEST_RESPONSE_DELAY_NS, LONGEST_WRITE_TIME_NS = 1_000_000_000, 100_000_000
+"""Of simulated servos; real ones are quicker by far."""
+
 
 def _whole(value: object) -> object:
     # True and 1.0 are equal to 1 in Python, but not what a person means by a direction
@@ -153,7 +156,7 @@ class Limits(Form):
 
 
 class JointSimulation(Form):
-    """What a simulated servo moves; a servo on a real port does not use it."""
+    """What a simulated servo moves, and how slow it is; a servo on a real port does not use it."""
 
     inertia: Annotated[Inertia, Field(gt=0)] | None = Field(
         default=None, description="Moment of inertia of what it moves.", examples=["0.01 kg m^2"]
@@ -168,6 +171,16 @@ class JointSimulation(Form):
         default=None,
         description="Angle of the joint where the weight hangs straight down.",
         examples=["0 deg"],
+    )
+    response_delay: Annotated[Duration, Field(le=LONGEST_RESPONSE_DELAY_NS)] = Field(
+        default=0,
+        description="Time between an instruction to the servo and its effect on the motor.",
+        examples=["20 ms"],
+    )
+    write_time: Annotated[Duration, Field(le=LONGEST_WRITE_TIME_NS)] = Field(
+        default=0,
+        description="Time after a write in which the servo receives nothing.",
+        examples=["1 ms"],
     )
 
 

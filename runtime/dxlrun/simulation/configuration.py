@@ -46,6 +46,18 @@ class ServoConfig:
 
     None: one that has all that the model's table names.
     """
+    response_delay_ns: int = 0
+    """Between the end of an instruction and its effect on the motor; torque off takes none.
+
+    An AX-12+ was measured to need 17 to 50 ms from a goal to its first motion, its inertia included
+    (J. A. Smith, J. Jivraj, "Analysis of Robotis Dynamixel AX-12+ Actuator Latencies").
+    """
+    write_time_ns: int = 0
+    """After the end of an instruction that writes, in which the servo receives nothing.
+
+    An AX-12 needs 24 us and 6 us a byte, several ms where it writes its EEPROM (Xevel, "Dynamixel protocol
+    notes").
+    """
 
 
 @dataclass(frozen=True, slots=True)

@@ -314,7 +314,7 @@ class Protocol2Servo(SimulatedServo):
         """Start again; the servo is deaf until it has."""
         self.note(f"servo {self.servo_id}: reboot")
         self.power_up()
-        self._boot_until(self.shaft.now_ns + self.boot_ns)
+        self._receive_nothing_until(self.shaft.now_ns + self.boot_ns)
 
     def power_up(self) -> None:
         """Start: RAM is as it is at power-up, and so is the angle, but for the turns of the Y series."""

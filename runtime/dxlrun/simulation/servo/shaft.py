@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from typing import ClassVar
 
 from dxlrun.simulation.configuration import Load
@@ -34,6 +35,10 @@ class Shaft(ABC):
         self.now_ns = mechanics.grid_ns
         self._last: ServoCommand | None = None
         self._goes_to_goal = False
+        self.response_delay_ns = 0
+        """Until what is commanded acts; torque off acts at once."""
+        self._withdrawn = 0
+        """How often what had not acted yet was withdrawn"""
 
     @property
     def angle(self) -> float:
@@ -70,6 +75,7 @@ class Shaft(ABC):
     def rest_at(self, angle: float) -> None:
         """Put the shaft somewhere, at rest; what is commanded counts from the next `plan`."""
         self.mechanics.place(self.index, angle)
+        self._withdrawn += 1
         self._last = None
         self._goes_to_goal = False
 
@@ -86,7 +92,7 @@ class Shaft(ABC):
             return
         if self._goes_to_goal and self.aims.issuperset(written):
             if (trajectory := self._new_trajectory()) is not None:
-                self.mechanics.aim(self.index, *trajectory)
+                self._act(partial(self.mechanics.aim, self.index, *trajectory))
             return
         command = self._command() if self.torque_on else LIMP
         self._goes_to_goal = command.limit > 0.0 and self._controls_position
@@ -95,7 +101,24 @@ class Shaft(ABC):
             command = command._replace(goal=goal, speed=speed, acceleration=acceleration)
         if command != self._last:
             self._last = command
-            self.mechanics.command(self.index, command)
+            if command.limit == 0.0:
+                self._withdrawn += 1
+                self.mechanics.command(self.index, command)
+            else:
+                self._act(partial(self.mechanics.command, self.index, command))
+
+    def _act(self, action: Callable[[], None]) -> None:
+        """Do something to the mechanics after the response delay, at the nearest point of its grid."""
+        if not self.response_delay_ns:
+            action()
+            return
+        withdrawn = self._withdrawn
+
+        def act() -> None:
+            if withdrawn == self._withdrawn:
+                action()
+
+        self.mechanics.call_at(self.now_ns + self.response_delay_ns - STEP_NS // 2, act)
 
     def power_up(self) -> None:
         """Come to rest within one turn, and take the angle as the goal [i]."""

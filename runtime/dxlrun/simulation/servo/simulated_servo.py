@@ -95,7 +95,9 @@ class SimulatedServo(ABC):
         """
         self._silent = False
         self._deaf_until_ns = shaft.now_ns
-        """Until then it boots and receives nothing."""
+        """Until then it boots, or works on a write, and receives nothing."""
+        self.write_time_ns = 0
+        """How long it receives nothing after an instruction that writes."""
         self._speaks = True
         """False when it is set to another protocol."""
         self._delay_ns = 0
@@ -251,6 +253,8 @@ class SimulatedServo(ABC):
         for run in runs:
             if error := self._refusal(run):
                 return error
+        if self.write_time_ns:
+            self._receive_nothing_until(max(self._deaf_until_ns, self._received_ns + self.write_time_ns))
         for run in runs:
             names = run.cells.names
             memory.write(run)
@@ -378,9 +382,9 @@ class SimulatedServo(ABC):
     def cut_power(self, until_ns: int) -> None:
         """Cut its power until a time: RAM is lost, and it neither moves nor receives anything before."""
         self.reset()
-        self._boot_until(max(self._deaf_until_ns, until_ns))
+        self._receive_nothing_until(max(self._deaf_until_ns, until_ns))
 
-    def _boot_until(self, t_ns: int) -> None:
+    def _receive_nothing_until(self, t_ns: int) -> None:
         self._deaf_until_ns = t_ns
         self.registers.version += 1
 
