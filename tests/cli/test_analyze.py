@@ -60,7 +60,7 @@ def test_without_matplotlib_one_sentence_has_the_command_that_installs_it(
     log.write_bytes(b"a log")
     found = importlib.util.find_spec
     monkeypatch.setattr(
-        "dxlrun.cli.logs.find_spec", lambda name: None if name == "matplotlib" else found(name)
+        "dxlrun.cli.inputs.find_spec", lambda name: None if name == "matplotlib" else found(name)
     )
 
     said = dxlrun("analyze", log, "--report", tmp_path / "report.html")

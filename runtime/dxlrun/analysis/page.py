@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from xml.etree import ElementTree as ET
-
 from dxlrun.analysis.figures.drawing import Drawing
 from dxlrun.analysis.figures.events import events_drawing, reply_drawing
 from dxlrun.analysis.figures.joints import joint_drawings
@@ -25,12 +22,19 @@ from dxlrun.analysis.report import (
     tone_of,
 )
 from dxlrun.log.reader import Log
-from dxlrun.output.html import Element, clean, figure, paragraph, section, table_element
-from dxlrun.output.json import json_text
+from dxlrun.output.html import (
+    Element,
+    document,
+    figure,
+    footer,
+    header,
+    paragraph,
+    section,
+    table_element,
+)
 from dxlrun.output.table import Cell, Column, Table, microseconds
 from dxlrun.run.channels.events import Severity
 
-_STYLE_SHEET = Path(__file__).with_name("page.css")
 _MOST_EVENTS = 100
 
 
@@ -39,44 +43,29 @@ def page(log: Log, report: Report) -> str:
 
     Takes matplotlib. Raises LogError when a packet of the log cannot be read.
     """
-    html = Element("html", {"lang": "en"})
-    head = ET.SubElement(html, "head")
-    ET.SubElement(head, "meta", {"charset": "utf-8"})
-    ET.SubElement(head, "meta", {"name": "viewport", "content": "width=device-width, initial-scale=1"})
-    ET.SubElement(head, "meta", {"name": "color-scheme", "content": "light dark"})
-    ET.SubElement(head, "title").text = clean(
-        f"{report.robot}, {began(log) or log.path.name}: report of a run"
-    )
-    ET.SubElement(head, "style").text = _STYLE_SHEET.read_text(encoding="utf-8")
-    numbers = ET.SubElement(head, "script", {"type": "application/json", "id": "report"})
-    numbers.text = json_text(report).replace("<", "\\u003c")  # no text in it ends the element
-    body = ET.SubElement(html, "body")
-    body.append(_header(log, report))
-    main = ET.SubElement(body, "main")
-    sections = _sections(log, report)
-    body.insert(1, _contents(sections))
-    main.extend(sections)
-    body.append(_footer(log))
-    return "<!DOCTYPE html>\n" + ET.tostring(html, encoding="unicode", method="html") + "\n"
-
-
-def _header(log: Log, report: Report) -> Element:
-    header = Element("header")
-    ET.SubElement(header, "h1").text = clean(report.robot)
     when = began(log)
-    header.append(paragraph(f"Report of the run of {when}" if when else "Report of a run", "when"))
-    good = report.verdict.good
-    box = ET.SubElement(
-        header, "section", {"class": f"verdict {'good' if good else 'look'}", "id": "verdict"}
+    return document(
+        f"{report.robot}, {when or log.path.name}: report of a run",
+        _header(report, when),
+        _sections(log, report),
+        _footer(log),
+        report,
     )
-    ET.SubElement(box, "h2").text = f"Verdict: {report.verdict.word}"
-    for sentence in report.verdict.sentences:
-        box.append(paragraph(sentence))
-    header.append(_key_numbers(report))
-    return header
 
 
-def _key_numbers(report: Report) -> Element:
+def _header(report: Report, when: str) -> Element:
+    verdict = report.verdict
+    return header(
+        report.robot,
+        f"Report of the run of {when}" if when else "Report of a run",
+        f"Verdict: {verdict.word}",
+        verdict.sentences,
+        verdict.good,
+        _key_numbers(report),
+    )
+
+
+def _key_numbers(report: Report) -> list[tuple[str, str]]:
     """Return the numbers that a reader compares between runs."""
     account, late = report.periods, report.latency
     numbers = [
@@ -91,24 +80,11 @@ def _key_numbers(report: Report) -> Element:
     if report.servos:
         lost, asked = sum(s.lost for s in report.servos), sum(s.asked for s in report.servos)
         numbers.append(("replies lost", f"{lost} of {asked}"))
-    strip = Element("dl", {"class": "key"})
-    for name, value in numbers:
-        group = ET.SubElement(strip, "div")
-        ET.SubElement(group, "dt").text = name
-        ET.SubElement(group, "dd").text = value
-    return strip
-
-
-def _contents(sections: list[Element]) -> Element:
-    nav = Element("nav", {"aria-label": "contents"})
-    for part in sections:
-        link = ET.SubElement(nav, "a", {"href": f"#{part.get('id')}"})
-        link.text = part.findtext("h2")
-    return nav
+    return numbers
 
 
 def _sections(log: Log, report: Report) -> list[Element]:
-    found = [
+    return [
         section("run", "The run", [table_element(table) for table in facts(log, report)]),
         _latency(log, report),
         _budget(log, report),
@@ -117,7 +93,6 @@ def _sections(log: Log, report: Report) -> list[Element]:
         _steering(report),
         _events(log, report),
     ]
-    return [part for part in found if len(part) > 1]
 
 
 def _latency(log: Log, report: Report) -> Element:
@@ -210,12 +185,8 @@ def _figure(drawing: Drawing) -> Element:
 
 
 def _footer(log: Log) -> Element:
-    footer = Element("footer")
     version = log.metadata.get("versions", {}).get("dxlrun", "of an unknown version")
-    footer.append(
-        paragraph(
-            f"Made by dxlrun analyze from {log.path.name}, which dxlrun {version} recorded. The numbers "
-            "of this page are in it as JSON, in the element with the identifier report."
-        )
+    return footer(
+        f"Made by dxlrun analyze from {log.path.name}, which dxlrun {version} recorded. The numbers of this "
+        "page are in it as JSON, in the element with the identifier report."
     )
-    return footer

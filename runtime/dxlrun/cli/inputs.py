@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -113,6 +114,26 @@ def check_ledger(ledger: Path) -> None:
     except OSError as error:
         reason = error.strerror or error
         raise InputError(f"--ledger {ledger} cannot be written ({reason}); choose another file") from None
+
+
+def check_report(target: Path) -> None:
+    """Raise InputError with what is wrong with the file of a page, before anything is measured."""
+    if target.suffix.lower() not in {".html", ".htm"}:
+        raise InputError(f"a report is an HTML file, so its name ends in .html, not as {target} does")
+    if not target.parent.is_dir():
+        raise InputError(f"there is no directory {target.parent} for the report; make it first")
+    if find_spec("matplotlib") is None:
+        raise InputError(
+            "a report needs matplotlib for its plots; `pip install 'dxlrun[report]'` installs it"
+        )
+
+
+def write_report(target: Path, page: str) -> None:
+    """Write a page. Raises InputError where that fails."""
+    try:
+        target.write_text(page, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"the report {target} cannot be written: {error.strerror or error}") from error
 
 
 def _known_file(robot: Path) -> None:

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import Assignment, Flag, JsonFlag, parse_assignments
+from dxlrun.cli.inputs import (
+    Assignment,
+    Flag,
+    JsonFlag,
+    check_report,
+    parse_assignments,
+    write_report,
+)
 from dxlrun.errors import InputError, LogError
 from dxlrun.output.terminal import print_error, print_warning, show, show_json
 
 if TYPE_CHECKING:
-    from dxlrun.analysis.report import Report
-    from dxlrun.log.reader import Log
     from dxlrun.log.replay import ReplayDifference, ReplayReport
     from dxlrun.output.table import Part
 
@@ -63,7 +67,7 @@ def analyze(
     if missing:
         raise InputError("\n".join(missing))
     if report is not None:
-        _check_target(report)
+        check_report(report)
     if len(logs) > 1:
         return _analyze_each(logs, as_json=as_json)
     log = logs[0] if logs else newest_log()
@@ -77,7 +81,9 @@ def analyze(
     read = read_log(log)
     result = analysis.analyze(read)
     if report is not None:
-        _write(read, result, report)
+        from dxlrun.analysis.page import page
+
+        write_report(report, page(read, result))
     if as_json:
         show_json(result)
         return 0 if result.verdict.good else 1
@@ -150,28 +156,6 @@ def _compare(log: Path, ledger: Path, *, as_json: bool) -> int:
     else:
         show(*parts(result))
     return 0 if result.good else 1
-
-
-def _check_target(target: Path) -> None:
-    """Raise InputError with what is wrong with a report's file, before the log is read."""
-    if target.suffix.lower() not in {".html", ".htm"}:
-        raise InputError(f"a report is an HTML file, so its name ends in .html, not as {target} does")
-    if not target.parent.is_dir():
-        raise InputError(f"there is no directory {target.parent} for the report; make it first")
-    if find_spec("matplotlib") is None:
-        raise InputError(
-            "a report needs matplotlib for its plots; `pip install 'dxlrun[report]'` installs it"
-        )
-
-
-def _write(log: Log, result: Report, target: Path) -> None:
-    from dxlrun.analysis.page import page
-
-    text = page(log, result)
-    try:
-        target.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"the report {target} cannot be written: {error.strerror or error}") from error
 
 
 def replay(

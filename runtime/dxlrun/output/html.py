@@ -1,14 +1,95 @@
-"""HTML elements, built as a tree, so that a page is well-formed and every text is escaped."""
+"""HTML pages, built as a tree, so that a page is well-formed and every text is escaped.
+
+A page has style and numbers inside and loads nothing from anywhere; its figures are SVG in the colours that
+`page.css` defines.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from pathlib import Path
 from xml.etree import ElementTree as ET
 from xml.etree.ElementTree import Element
 
+from dxlrun.output.json import json_text
 from dxlrun.output.table import Table
 
-__all__ = ["Element", "clean", "figure", "paragraph", "section", "table_element"]
+__all__ = [
+    "Element",
+    "clean",
+    "document",
+    "figure",
+    "footer",
+    "header",
+    "paragraph",
+    "section",
+    "table_element",
+]
+
+_STYLE_SHEET = Path(__file__).with_name("page.css")
+
+
+def document(title: str, top: Element, sections: Sequence[Element], end: Element, numbers: object) -> str:
+    """Return a page: a header, the contents, the sections that have a part, a footer.
+
+    `numbers` are in it as JSON, in the element with the identifier `report`.
+    """
+    html = Element("html", {"lang": "en"})
+    head = ET.SubElement(html, "head")
+    ET.SubElement(head, "meta", {"charset": "utf-8"})
+    ET.SubElement(head, "meta", {"name": "viewport", "content": "width=device-width, initial-scale=1"})
+    ET.SubElement(head, "meta", {"name": "color-scheme", "content": "light dark"})
+    ET.SubElement(head, "title").text = clean(title)
+    ET.SubElement(head, "style").text = _STYLE_SHEET.read_text(encoding="utf-8")
+    script = ET.SubElement(head, "script", {"type": "application/json", "id": "report"})
+    script.text = json_text(numbers).replace("<", "\\u003c")  # no text in it ends the element
+    body = ET.SubElement(html, "body")
+    body.append(top)
+    full = [part for part in sections if len(part) > 1]
+    body.append(_contents(full))
+    ET.SubElement(body, "main").extend(full)
+    body.append(end)
+    return "<!DOCTYPE html>\n" + ET.tostring(html, encoding="unicode", method="html") + "\n"
+
+
+def header(  # noqa: PLR0917  what stands there, from top to bottom
+    title: str,
+    subtitle: str,
+    verdict: str,
+    sentences: Iterable[str],
+    good: bool,
+    key_numbers: Iterable[tuple[str, str]],
+) -> Element:
+    """Return the top of a page: its title, the result in sentences, a few numbers that readers compare."""
+    element = Element("header")
+    ET.SubElement(element, "h1").text = clean(title)
+    element.append(paragraph(subtitle, "when"))
+    kind = f"verdict {'good' if good else 'look'}"
+    box = ET.SubElement(element, "section", {"class": kind, "id": "verdict"})
+    ET.SubElement(box, "h2").text = clean(verdict)
+    for sentence in sentences:
+        box.append(paragraph(sentence))
+    strip = ET.SubElement(element, "dl", {"class": "key"})
+    for name, value in key_numbers:
+        group = ET.SubElement(strip, "div")
+        ET.SubElement(group, "dt").text = clean(name)
+        ET.SubElement(group, "dd").text = clean(value)
+    return element
+
+
+def footer(text: str) -> Element:
+    """Return the end of a page: where it comes from."""
+    element = Element("footer")
+    element.append(paragraph(text))
+    return element
+
+
+def _contents(sections: Sequence[Element]) -> Element:
+    nav = Element("nav", {"aria-label": "contents"})
+    for part in sections:
+        link = ET.SubElement(nav, "a", {"href": f"#{part.get('id')}"})
+        link.text = part.findtext("h2")
+    return nav
 
 
 def section(name: str, title: str, parts: Iterable[Element]) -> Element:
