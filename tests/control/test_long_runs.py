@@ -10,7 +10,7 @@ import sys
 
 import pytest
 
-from dxlrun.control.loop import MOST_CAUGHT_UP
+from dxlrun.control.schedule import MOST_CAUGHT_UP
 
 CYCLES = int(os.environ.get("DXLRUN_CYCLES", "12000"))
 RATES = (25.0, 50.0, 100.0, 200.0)

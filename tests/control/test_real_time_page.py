@@ -10,8 +10,8 @@ import pluggy
 from dxlrun.control import realtime
 from dxlrun.control.controllers.hookspecs import GROUP, HookSpecs
 from dxlrun.control.controllers.plugins import hook_breach
-from dxlrun.control.loop import MOST_CAUGHT_UP
 from dxlrun.control.loop_plan import OverrunPolicy
+from dxlrun.control.schedule import MOST_CAUGHT_UP
 from dxlrun.description.robot import Scheduler
 
 PAGE = (Path(__file__).parents[2] / "docs" / "real-time.md").read_text()

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.analysis.plan import plan_of
 from dxlrun.log.reader import Log
 from dxlrun.run.channels.ring import RING_SECONDS
 
@@ -124,11 +125,21 @@ def cycle_periods_ns(log: Log) -> NDArray[np.int64]:
 
     A change of the rate holds from the cycle that took it. Where cycles are lost it is a mean over them.
     """
-    numbers, due = log.cycles["cycle"], log.cycles["scheduled_ns"]
-    if len(numbers) < 2:
-        return np.full(len(numbers), log.period_ns, dtype=np.int64)
-    between = np.diff(due) // np.maximum(np.diff(numbers), 1)
+    if len(log.cycles) < 2:
+        return np.full(len(log.cycles), log.period_ns, dtype=np.int64)
+    between = _between_ns(log, log.cycles)
     return np.append(between, between[-1])
+
+
+def _between_ns(log: Log, cycles: NDArray[np.void]) -> NDArray[np.int64]:
+    """Return the period from each cycle to the next, ns, shape (cycles - 1,).
+
+    A sequential schedule counts it from when a cycle began, not from its deadline.
+    """
+    due = cycles["scheduled_ns"]
+    counted_from = cycles["woken_ns"] if plan_of(log).loop.schedule == "sequential" else due
+    between: NDArray[np.int64] = (due[1:] - counted_from[:-1]) // np.maximum(np.diff(cycles["cycle"]), 1)
+    return between
 
 
 def durations(log: Log) -> tuple[Duration, ...]:
@@ -210,8 +221,7 @@ class Punctuality:
             return
         self._held = cycles[-1:].copy()
         if len(cycles) > 1:
-            between = np.diff(cycles["scheduled_ns"]) // np.maximum(np.diff(cycles["cycle"]), 1)
-            self._count(cycles[:-1], between)
+            self._count(cycles[:-1], _between_ns(log, cycles))
 
     def _count(self, cycles: NDArray[np.void], each: NDArray[np.int64]) -> None:
         numbers, skipped = cycles["cycle"], cycles["skipped"]

@@ -6,7 +6,7 @@ import math
 
 import msgspec
 
-from dxlrun.control.loop_plan import TOLERATED_SKIPS
+from dxlrun.control.loop_plan import TOLERATED_SKIPS, ScheduleName
 from dxlrun.log.reader import UNREADABLE, Log
 
 
@@ -53,6 +53,7 @@ class LoggedLoop(msgspec.Struct):
     """The loop of the plan."""
 
     tolerated_skips: float = TOLERATED_SKIPS
+    schedule: ScheduleName = "absolute"
     joints: list[LoggedJoint] = []
 
 

@@ -1,4 +1,4 @@
-"""Loop: read, update, gate, write, on an absolute schedule t_d[i] = t_0 + i * T."""
+"""Loop: read, update, gate, write, when the schedule has a cycle due."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from dxlrun.control.joint_requests import JointRequests
 from dxlrun.control.loop_plan import ControllerPlan, LoopPlan, OverrunPolicy
 from dxlrun.control.policy_plan import GroupPolicy, Last, PolicyName, PolicyPlan
 from dxlrun.control.safe_motion import SafeMotion
+from dxlrun.control.schedule import Schedule, schedule_of
 from dxlrun.control.steering import Steering
 from dxlrun.errors import PortError, counted
 from dxlrun.run.channels.answers import Answer, Code, Refusal
@@ -33,9 +34,6 @@ LEAST_RATE = 1.0
 and the guardian's limit follows the rate."""
 PAUSED_CYCLE_NS = 200_000_000
 """How long a cycle may take while the loop is paused: a controller may be loaded in it."""
-
-MOST_CAUGHT_UP = 5
-"""Deadlines that `catch_up` makes up for in a row, what is more is skipped; the guardian waits as long."""
 
 
 @dataclass(slots=True)
@@ -152,8 +150,9 @@ class LoopResult:
 class Loop:
     """One robot's control loop; hardware is started before and stopped after it by whoever built it.
 
-    Cycle n is due by the Schedule, which keeps its phase. Controllers get the time of the wake-up since the
-    first deadline, pauses left out, and the true time since the cycle before, at most PERIOD_CAP periods.
+    Cycle n is due by the Schedule, which also has the controllers' time: that of the wake-up since the first
+    deadline, pauses left out. Controllers get the true time since the cycle before too, at most PERIOD_CAP
+    periods.
     Commands from the inbox are taken after the wake-up, a bounded number of them.
     """
 
@@ -200,7 +199,7 @@ class Loop:
     _motion: SafeMotion | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
-        self.schedule = Schedule(self.plan.period_ns)
+        self.schedule = schedule_of(self.plan)
         self._overruns = Overruns(self.plan.overrun, self.overrun_hooks, self.events)
         self._invalid = np.zeros(len(self.plan.joints), np.int64)
         self._all_valid = bytes([True]) * len(self.plan.joints)
@@ -233,7 +232,8 @@ class Loop:
             reason, detail = "fault", str(error)
         finally:
             # behind the last cycle of a pause, the period until the next one is left out already
-            self.manager.deactivate(max(self._time_ns, self.schedule.time_ns(self.clock.now_ns())))
+            now_ns = self.clock.now_ns()
+            self.manager.deactivate(max(self._time_ns, self.schedule.time_ns(self._cycle, now_ns)))
             self.steering.end()
         if reason != "fault" and self.manager.fault is not None:
             reason, detail = "fault", self.manager.fault
@@ -316,9 +316,9 @@ class Loop:
 
     def _cycle_until_end(self) -> tuple[Literal["ended", "stopped", "fault"], str]:
         """Run cycles; return why they ended, and a sentence for a fault."""
-        end_ns, schedule = self.plan.end_ns, self.schedule
+        end_ns = self.plan.end_ns
         while self.manager.fault is None:
-            if end_ns is not None and schedule.time_ns(schedule.deadline_ns(self._cycle)) >= end_ns:
+            if end_ns is not None and self._due_ns(self._cycle) >= end_ns:
                 return "ended", ""
             if self.stop.requested:
                 return "stopped", ""
@@ -335,6 +335,7 @@ class Loop:
         deadline_ns = schedule.deadline_ns(cycle)
         self.hardware.idle(deadline_ns)
         woken_ns = self.clock.wait_until(deadline_ns)
+        schedule.begin(cycle, woken_ns)
         dt_ns = min(woken_ns - self._woken_ns, PERIOD_CAP * schedule.period_ns)
         self._woken_ns = woken_ns
         record.wake(cycle, deadline_ns, woken_ns, dt_ns)
@@ -351,7 +352,7 @@ class Loop:
         else:
             if self._lost.look(record.states):
                 self._miss()
-            time_ns = schedule.time_ns(woken_ns)
+            time_ns = schedule.time_ns(cycle, woken_ns)
             if (
                 time_ns < self._time_ns
             ):  # it never goes back: a cycle that was late when a pause began catches up
@@ -439,7 +440,7 @@ class Loop:
         following = schedule.following(cycle, now_ns, policy)
         if self.plan.end_ns is not None and not self._motion and not self._stood:
             # nothing is skipped behind the end
-            left_ns = self.plan.end_ns - schedule.time_ns(schedule.deadline_ns(cycle))
+            left_ns = self.plan.end_ns - self._due_ns(cycle)
             following = min(following, cycle + max(1, -(-left_ns // schedule.period_ns)))
         skipped = following - cycle - 1
         if self._stood:
@@ -463,6 +464,10 @@ class Loop:
         self._late = late
         return bool(skipped) and policy == "stop"
 
+    def _due_ns(self, cycle: int) -> int:
+        """Return the controllers' time at which a cycle is due."""
+        return self.schedule.time_ns(cycle, self.schedule.deadline_ns(cycle))
+
     def _log_start(self) -> None:
         """Log what the controllers are activated with."""
         record = self.record
@@ -478,55 +483,6 @@ class Loop:
         skipped = counted(self._skipped, "period", "periods")
         text = f"loop {reason} after {cycles}, {skipped} skipped"
         self.events.emit(EventCode.LOOP_STOPPED, severity, "loop", f"{text}: {detail}" if detail else text)
-
-
-@dataclass(slots=True)
-class Schedule:
-    """When each cycle is due, on a grid that keeps its phase; times in ns of the loop's clock.
-
-    Cycle n is due at origin + (n - first) * period. A change of the period begins a new grid at a deadline of
-    the old one.
-    """
-
-    period_ns: int
-    start_ns: int = 0
-    """The first deadline."""
-    paused_ns: int = 0
-    """For how long the controllers' time stood still."""
-    _origin_ns: int = field(default=0, init=False)
-    _first: int = field(default=0, init=False)
-
-    def start(self, now_ns: int) -> None:
-        """Make the first deadline one period from now."""
-        self.start_ns = self._origin_ns = now_ns + self.period_ns
-        self._first = 0
-        self.paused_ns = 0
-
-    def deadline_ns(self, cycle: int) -> int:
-        """Return when a cycle is due."""
-        return self._origin_ns + (cycle - self._first) * self.period_ns
-
-    def time_ns(self, now_ns: int) -> int:
-        """Return the controllers' time: since the first deadline, pauses left out."""
-        return now_ns - self.start_ns - self.paused_ns
-
-    def change(self, cycle: int, period_ns: int) -> None:
-        """Let the cycles after `cycle` follow in another period, from its deadline on."""
-        self._origin_ns = self.deadline_ns(cycle)
-        self._first = cycle
-        self.period_ns = period_ns
-
-    def following(self, cycle: int, now_ns: int, policy: OverrunPolicy) -> int:
-        """Return the cycle to run after `cycle` that ended at `now_ns`.
-
-        `skip`: the first whose deadline has not passed, so that two cycles never follow each other in a
-        burst. `catch_up`: the next one, as long as at most MOST_CAUGHT_UP are due. `stop`: as `skip`.
-        """
-        passed = now_ns - self._origin_ns
-        first = self._first + -(-passed // self.period_ns)
-        if policy == "catch_up":
-            first -= MOST_CAUGHT_UP
-        return max(cycle + 1, first)
 
 
 class Overruns:

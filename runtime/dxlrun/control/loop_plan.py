@@ -16,6 +16,9 @@ programs want, skipped 2.6 %."""
 Policy = Literal["other", "fifo", "round_robin"]
 OverrunPolicy = Literal["skip", "catch_up", "stop"]
 """What becomes of deadlines that passed while a cycle was late."""
+ScheduleName = Literal["absolute", "sequential"]
+"""When cycles are due, see `control/schedule.py`. `sequential` has no key in the robot file: it is the
+yardstick of `dxlrun experiment tracking`."""
 
 MOST_SHARE = 2
 """One part in so many of the period is the most that the clock is polled: the rest is left to others."""
@@ -167,6 +170,7 @@ class LoopPlan:
     slowest_period_ns: int = 0
     """The longest period in which no Bus Watchdog stops its servos; 0: any."""
     policies: PolicyPlan = field(default_factory=PolicyPlan)
+    schedule: ScheduleName = "absolute"
 
     @property
     def references(self) -> tuple[str, ...]:

@@ -93,7 +93,11 @@ def recorded(log: Log) -> RecordedInputs:
             f"{path}: the log begins with cycle {int(cycles['cycle'][0])}: what the controllers did before "
             "is lost, so nothing can be compared"
         )
-    _check_times(log, start_ns, plan.loop.period_ns)
+    if plan.loop.schedule == "absolute":
+        _check_times(log, start_ns, plan.loop.period_ns)
+    else:
+        _check_sequence(log, start_ns, plan.loop.period_ns)
+    _check_commands(log)
     usable, stopped = _until_gap(log)
     usable, ends, stopped = _until_policy(log, usable, stopped)
     remarks = () if log.complete else log.damage
@@ -197,12 +201,23 @@ def _check_times(log: Log, start_ns: int, period_ns: int) -> None:
     uneven[unknown] = False
     wrong = (woken < due) | (cycles["read_ns"] < woken) | uneven
     wrong[1:] |= passed[1:] <= 0
-    _check_commands(log)
+    _refuse_wrong(log, wrong)
+
+
+def _check_sequence(log: Log, start_ns: int, period_ns: int) -> None:
+    """Refuse times that no sequential schedule can have had: one period after the cycle before began."""
+    cycles = log.cycles
+    number, due, woken = cycles["cycle"], cycles["scheduled_ns"], cycles["woken_ns"]
+    before = np.roll(woken, 1)
+    before[0] = start_ns - period_ns
+    lost = np.diff(number, prepend=-1) != 1  # when the lost ones began is not known
+    _refuse_wrong(log, (woken < due) | (cycles["read_ns"] < woken) | (due != before + period_ns) & ~lost)
+
+
+def _refuse_wrong(log: Log, wrong: NDArray[np.bool_]) -> None:
     if wrong.any():
-        raise LogError(
-            f"{log.path}: the times of cycle {int(number[int(np.argmax(wrong))])} contradict its number: "
-            "the log is damaged"
-        )
+        cycle = int(log.cycles["cycle"][int(np.argmax(wrong))])
+        raise LogError(f"{log.path}: the times of cycle {cycle} contradict its number: the log is damaged")
 
 
 def _check_commands(log: Log) -> None:

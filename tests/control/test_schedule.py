@@ -1,0 +1,125 @@
+"""The sequential schedule, yardstick of `dxlrun experiment tracking`: its delays add up; a robot's do not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from dxlrun.control.loop_plan import ScheduleName
+
+PERIOD_NS = 20_000_000
+DELAYS = st.lists(st.just(0) | st.integers(0, 5 * PERIOD_NS), min_size=1, max_size=60)
+
+
+@dataclass
+class Ran:
+    """What a loop did whose wake-ups, or whose work, were late by given times."""
+
+    number: np.ndarray
+    due_ns: np.ndarray
+    woken_ns: np.ndarray
+    times_ns: np.ndarray
+    """The controllers'."""
+    start_ns: int
+    """When the first cycle was due."""
+    skipped: int
+
+    @property
+    def delays_ns(self) -> np.ndarray:
+        return self.woken_ns - self.due_ns
+
+    @property
+    def behind_ns(self) -> np.ndarray:
+        """How long after start + n * T each cycle began."""
+        return self.woken_ns - self.start_ns - self.number * PERIOD_NS
+
+
+def ran(robot: Any, schedule: ScheduleName, periods: int, late: list[int], work: list[int] = ()) -> Ran:
+    times: list[int] = []
+    lateness, working = iter(late), iter(work)
+
+    def act(self: Any, step: str, time_ns: int, _: Any) -> None:
+        if step == "update":
+            times.append(time_ns)
+
+    robot.script("motion", act)
+    robot.build(end_ns=periods * PERIOD_NS, schedule=schedule)
+    robot.hardware.work_ns = lambda: next(working, 0)
+    clock = robot.clock
+
+    class LateClock:
+        now_ns = clock.now_ns
+
+        def wait_until(self, deadline_ns: int) -> int:
+            return int(clock.wait_until(max(deadline_ns, clock.now_ns()) + next(lateness, 0)))
+
+    robot.loop.clock = LateClock()
+    start_ns = clock.now_ns() + PERIOD_NS
+    result = robot.loop.run()
+    assert result.reason == "ended"
+    columns = ([one[name] for one in robot.sink.cycles] for name in ("cycle", "scheduled_ns", "woken_ns"))
+    return Ran(*(np.array(column, np.int64) for column in (*columns, times)), start_ns, result.skipped)
+
+
+@given(late=DELAYS, work=DELAYS)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+def test_the_sequential_sender_is_behind_by_the_sum_of_its_start_delays(
+    make_robot: Any, late: list[int], work: list[int]
+) -> None:
+    periods = len(late)
+    one = ran(make_robot(), "sequential", periods, late, work)
+    assert one.number.tolist() == list(range(periods))  # no pose is left out
+    assert one.times_ns.tolist() == [n * PERIOD_NS for n in range(periods)]  # by number, not by the clock
+    assert one.behind_ns.tolist() == np.cumsum(one.delays_ns).tolist()
+    if not any(work):
+        assert one.delays_ns.tolist() == late
+
+
+@given(late=DELAYS, work=DELAYS)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+def test_the_loop_is_behind_by_the_delay_of_that_cycle_alone(
+    make_robot: Any, late: list[int], work: list[int]
+) -> None:
+    periods = len(late)
+    one = ran(make_robot(), "absolute", periods, late, work)
+    assert one.behind_ns.tolist() == one.delays_ns.tolist()
+    assert one.times_ns.tolist() == (one.woken_ns - one.start_ns).tolist()
+    assert len(one.number) + one.skipped == periods
+
+
+@pytest.mark.parametrize(("schedule", "behind"), [("sequential", 7 * PERIOD_NS // 2), ("absolute", 0)])
+def test_a_motion_of_a_hundred_periods_with_three_delays_ends(
+    robot: Any, schedule: ScheduleName, behind: int
+) -> None:
+    late = [0] * 100
+    late[10], late[50], late[90] = PERIOD_NS // 2, 2 * PERIOD_NS, PERIOD_NS
+    one = ran(robot, schedule, 100, late)
+    assert one.behind_ns[-1] == behind
+
+
+def test_the_sequential_sender_can_be_paused_and_its_rate_changed(robot: Any) -> None:
+    """Nothing of the loop goes without: a pause stops the controllers' time, a rate is taken at once."""
+    steps = {4: "pause", 8: "resume", 12: "rate"}
+    seen: list[tuple[int, int, int]] = []
+    times: list[int] = []
+    robot.script("motion", lambda self, step, time_ns, _: times.append(time_ns) if step == "update" else None)
+    robot.build(end_ns=16 * PERIOD_NS, schedule="sequential")
+
+    def append(record: Any) -> None:
+        seen.append((record.cycle, record.scheduled_ns, record.woken_ns))
+        if kind := steps.get(record.cycle):
+            robot.ask(kind, **({"rate": 100.0} if kind == "rate" else {}))
+
+    robot.sink.append = append
+    assert robot.loop.run().reason == "ended"
+    assert times[:5] == [n * PERIOD_NS for n in range(5)]
+    assert set(np.diff(times)) == {PERIOD_NS, PERIOD_NS // 2}  # the pause of four cycles is left out
+    assert times[-1] == 16 * PERIOD_NS - PERIOD_NS // 2
+    number, due, woken = np.array(seen).T
+    assert number.tolist() == list(range(len(seen)))
+    assert set((due[1:] - woken[:-1]).tolist()) == {PERIOD_NS, PERIOD_NS // 2}
