@@ -24,7 +24,7 @@ from dxlrun.compile.problems import Problems, independent_errors, left_out_names
 from dxlrun.compile.simulation import compile_simulation
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.control.loop_plan import MOST_SHARE, LoopPlan, SchedulerPlan
-from dxlrun.description.reading import Description, Survey, survey_robot
+from dxlrun.description.reading import Description, Replacement, Survey, survey_robot
 from dxlrun.description.robot import Loop
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.errors import InputError, Problem
@@ -72,17 +72,19 @@ def compile_files(
     motions: Sequence[Path],
     duration_ns: int | None = None,
     ask: Ask | None = None,
+    *,
+    replacements: Sequence[Replacement] = (),
 ) -> Compiled:
     """Read robot file and motion files and compile them; raises InputError with the problems of all files.
 
-    Only when nothing is wrong, the models of servos on real ports with `model: auto` are read by `ask`, if
-    it is given.
+    `replacements` stand in for values of the robot file. Only when nothing is wrong, the models of servos on
+    real ports with `model: auto` are read by `ask`, if it is given.
     """
     read: list[MotionDescription] = []
     survey = Survey(None, ())
     problems: list[Problem] = []
     try:
-        survey = survey_robot(robot, arguments)
+        survey = survey_robot(robot, arguments, replacements)
         problems += survey.problems
     except InputError as error:
         problems += _placed(error)

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from dxlrun.description.problems import problems_of
     from dxlrun.description.reading import (
         Description,
+        Replacement,
         Survey,
         read_robot,
         survey_robot,
@@ -24,6 +25,7 @@ __all__ = [
     "Marks",
     "Motion",
     "MotionDescription",
+    "Replacement",
     "Robot",
     "Survey",
     "problems_of",
@@ -39,6 +41,7 @@ _HOMES = {
     "Marks": "document",
     "Motion": "motion",
     "MotionDescription": "motion",
+    "Replacement": "reading",
     "Robot": "robot",
     "Survey": "reading",
     "problems_of": "problems",

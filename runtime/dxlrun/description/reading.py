@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
 from pydantic import ValidationError
 
 from dxlrun.description.arguments import COMMAND_LINE, Arguments
-from dxlrun.description.document import KeyPath, Marks
+from dxlrun.description.document import Grown, KeyPath, Marks
 from dxlrun.description.including import merged, read_sources
 from dxlrun.description.problems import places_of, problems_of
 from dxlrun.description.robot import Robot
@@ -47,6 +47,15 @@ class Survey:
     """The same with other guesses, where there are any: what is wrong with both does not depend on them."""
 
 
+@dataclass(frozen=True, slots=True)
+class Replacement:
+    """A value that stands in for what a robot file has at a place, or puts something there."""
+
+    path: KeyPath
+    value: object
+    """As the file would have it: `5 rad/s^2`, 0.5, true."""
+
+
 def read_robot(path: Path, arguments: Mapping[str, str]) -> Description:
     """Read a robot file with the values of `name:=value`; raises InputError with all problems of its form."""
     survey = survey_robot(path, arguments)
@@ -55,8 +64,10 @@ def read_robot(path: Path, arguments: Mapping[str, str]) -> Description:
     return survey.description
 
 
-def survey_robot(path: Path, arguments: Mapping[str, str]) -> Survey:
-    """Read as much of a robot file as its form allows.
+def survey_robot(
+    path: Path, arguments: Mapping[str, str], replacements: Sequence[Replacement] = ()
+) -> Survey:
+    """Read as much of a robot file as its form allows, with some of its values replaced.
 
     Raises InputError only when it, or a file that it includes, cannot be read or is no YAML at all.
     """
@@ -64,6 +75,8 @@ def survey_robot(path: Path, arguments: Mapping[str, str]) -> Survey:
     declared = merged(source.declared for source in sources)  # without arguments, to learn which there are
     run = Arguments(declared.data.get("arguments"), arguments, declared.marks)
     grown = merged(source.grown(run.fill) for source in sources)
+    for replacement in replacements:
+        grown = _with(grown, replacement)
     problems = [*run.problems, *grown.problems]
     data = grown.data
     for key in Robot.read_before:
@@ -86,6 +99,32 @@ def survey_robot(path: Path, arguments: Mapping[str, str]) -> Survey:
             found.append(Description(robot, grown.marks, path, text, run.texts, left_out, included))
     first, last = (found[0], found[-1]) if found else (None, None)
     return Survey(first, tuple(_in_order(problems)), last if last != first else None)
+
+
+def _with(grown: Grown, replacement: Replacement) -> Grown:
+    """Return a document with a value at a place; what is wrong with the value is reported there.
+
+    A place that the file does not have has the mark of the nearest one above it.
+    """
+    path, marks = replacement.path, grown.marks
+    data = _put(grown.data, path, replacement.value)
+    assert isinstance(data, dict)  # noqa: S101 (the top of a document is a mapping)
+    ways = [path[:end] for end in range(1, len(path) + 1)]
+    values = {**marks.values, **{way: marks.value(*way) for way in ways}}
+    keys = {**marks.keys, **{way: marks.key(*way) for way in ways}}
+    origins = {way: origin for way, origin in marks.origins.items() if way != path}
+    placed = Marks(marks.file, values, keys, origins)
+    return replace(grown, data=data, marks=placed, unknown=grown.unknown - {path})
+
+
+def _put(at: object, path: KeyPath, value: object) -> object:
+    """Return a tree with a value at a path, whose mappings are made where they are missing."""
+    if not path:
+        return value
+    if isinstance(at, list):
+        return [_put(item, path[1:], value) if index == path[0] else item for index, item in enumerate(at)]
+    below = at if isinstance(at, dict) else {}
+    return {**below, path[0]: _put(below.get(path[0]), path[1:], value)}
 
 
 def _validated(data: dict[str, object]) -> tuple[Robot | None, ValidationError | None]:

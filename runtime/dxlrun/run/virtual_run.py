@@ -6,7 +6,7 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -23,10 +23,10 @@ from dxlrun.log.log_writer import LogWriter
 from dxlrun.run.assembly import Sinks, assemble
 from dxlrun.run.channels.commands import CommandRing, NoCommands, QueueInbox
 from dxlrun.run.channels.cycle import CycleRecord
-from dxlrun.run.channels.events import EventCode, EventGroup, EventRing, Severity
+from dxlrun.run.channels.events import Event, EventCode, EventGroup, EventRing, Severity, decode_event
 from dxlrun.run.channels.messages import MessageRing, NoMessages
 from dxlrun.run.channels.packets import NoPackets, PacketBatch
-from dxlrun.run.channels.ring import Handover
+from dxlrun.run.channels.ring import Handover, Payload, RecordKind
 from dxlrun.run.run_log import discard_log, incomplete_log, log_header, new_log
 from dxlrun.run.run_summary import Progress, RunOptions, RunSummary
 from dxlrun.simulation import Ledger
@@ -38,13 +38,20 @@ from dxlrun.simulation.virtual_ports import VirtualPorts
 class VirtualRobot:
     """A robot and its simulated servos on virtual time; two of them from one plan do exactly the same.
 
-    `log`: where the log goes, None for no log. `ledger`: where the simulated buses enter what they see, None
-    for one in memory; it is closed with the log. Every bus of the plan is simulated, whatever its port.
+    `log`: where the log goes, None for no log; `events` then takes what happens. `ledger`: where the
+    simulated buses enter what they see, None for one in memory; it is closed with the log. Every bus of the
+    plan is simulated, whatever its port.
     Raises InputError when the plan has a bus that is not `sim`.
     """
 
     def __init__(
-        self, plan: Plan, *, log: Path | None = None, take_over: bool = False, ledger: Ledger | None = None
+        self,
+        plan: Plan,
+        *,
+        log: Path | None = None,
+        take_over: bool = False,
+        ledger: Ledger | None = None,
+        events: Callable[[Event], None] | None = None,
     ) -> None:
         real = [bus.name for bus in plan.buses if bus.port != "sim"]
         if real:
@@ -72,7 +79,7 @@ class VirtualRobot:
         self.log_error: str | None = None
         """Why the log is not whole."""
         self._writer = LogWriter(log, log_header(plan, 0, virtual=True)) if log else None
-        to_log = Handover(self._writer.take if self._writer else lambda kind, payload: None)
+        to_log = Handover(self._writer.take if self._writer else _only_events(events))
         self._events = EventRing(to_log, self.clock)
         self.sinks = Sinks(
             to_log,
@@ -139,6 +146,16 @@ class VirtualRobot:
                 self.messages, self.log_error = summary.messages, summary.error
             self.ledger.close()
         return self.result
+
+
+def _only_events(take: Callable[[Event], None] | None) -> Callable[[RecordKind, Payload], None]:
+    """Return what takes the records of a run without a log."""
+
+    def handed_over(kind: RecordKind, payload: Payload) -> None:
+        if take is not None and kind == RecordKind.EVENT:
+            take(decode_event(payload))
+
+    return handed_over
 
 
 @contextmanager
