@@ -186,7 +186,7 @@ def test_an_x_servo_sags_by_its_p_gain(make_line2: Any) -> None:
     line.set("torque_enable", 1)
     line.set("goal_position", round(2.0 / math.tau * 4096))
     line.wait(2)
-    sag = 2.0 - line.servo().position
+    sag = line.get("goal_position") / 4096 * math.tau - line.servo().position
     # 800 / 128 of 885 PWM units for a tick of 4096 a turn, 4.1 Nm at 885
     torque = sag * 800 / 128 / 885 * 4096 / math.tau * 4.1
     assert held("XM430-W350", torque, math.cos(sag))
@@ -234,7 +234,7 @@ def test_every_model_settles_where_it_should_without_much_overshoot() -> None:
         motor = motor_of(table)
         assert abs(torque) <= 1.001 * motor.friction / (1 - motor.load_friction)
         # so much friction leaves where gains are weakest, those of YM070
-        rest = math.radians(1.3) + margin * table.rad_per_tick
+        rest = math.radians(2.3) + margin * table.rad_per_tick
         assert servo.position == pytest.approx(goal * table.rad_per_tick, abs=rest)
         assert top < goal * table.rad_per_tick + 0.25 * 0.5, table.model  # most: the quick XL330-M077
         assert servo.registers.get("moving") == 0

@@ -14,9 +14,10 @@ import numpy.typing as npt
 import pytest
 
 from dxlrun.dynamixel.control_table import all_tables, control_table
-from dxlrun.simulation import ServoConfig
+from dxlrun.simulation import Load, ServoConfig
 from dxlrun.simulation.motion.mechanics import Mechanics
 from dxlrun.simulation.motion.motor import motor_of
+from dxlrun.simulation.motion.plant import IndependentJoints, PlantJoint
 from dxlrun.simulation.servo.making import make_servo
 from dxlrun.simulation.servo.shaft import critical_d
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
@@ -272,3 +273,19 @@ def test_the_gain_that_does_not_overshoot_is_the_critical_one(p: float) -> None:
     speed = motor.stall_torque / motor.damping
     # T x'' + (1 + D w) x' + P w x = 0 has one root twice
     assert (1 + critical_d(p, motor) * speed) ** 2 == pytest.approx(4 * motor.time_constant * p * speed)
+
+
+@pytest.mark.parametrize(("model", "protocol"), [("MX-64", 1.0), ("MX-106", 1.0), ("XL330-M288", 2.0)])
+def test_simulated_motors_take_up_speed_with_their_own_time_constant(model: str, protocol: float) -> None:
+    motor = dataclasses.replace(
+        motor_of(control_table(model, protocol)), friction=0.0, load_friction=0.0, viscous_friction=0.0
+    )
+    for load in (Load(), Load(inertia=0.01)):
+        plant = IndependentJoints([PlantJoint(motor, load, 0.0)])
+        dt_s = STEP_NS * 1e-9
+        steps = round(2 * motor.time_constant / dt_s)
+        for _ in range(steps):
+            plant.step(np.array([motor.stall_torque]), np.array([motor.damping]), dt_s)
+        constant = (motor.inertia + load.inertia) / motor.damping
+        exact = motor.stall_torque / motor.damping * -math.expm1(-steps * dt_s / constant)
+        assert plant.velocity[0] == pytest.approx(exact, rel=0.003)

@@ -91,6 +91,10 @@ class MujocoPlant:
         self._friction, self._bias = model.dof_frictionloss, data.qfrc_bias
         self._own_friction = model.dof_frictionloss[self._numbers]
         self._load_friction = np.array([joints[row].motor.load_friction for row in rows])
+        self._armature = model.dof_armature[self._numbers]
+        own = [joints[row].motor.damping + joints[row].motor.viscous_friction for row in rows]
+        self._motor_damping = np.array(own)
+        self._dt_s = 0.0
 
     def step(self, drive: Floats, damping: Floats, dt_s: float) -> None:
         """Let a time pass in which each servo drives with `drive - damping * velocity`; Nm and Nm s/rad."""
@@ -111,7 +115,8 @@ class MujocoPlant:
 
     def _step_bodies(self, drive: Floats, damping: Floats, dt_s: float) -> None:
         rows, numbers, direction = self._rows, self._numbers, self._direction
-        self._model.opt.timestep = dt_s
+        if dt_s != self._dt_s:
+            self._set_step(dt_s)
         # MuJoCo's own integrator takes damping at the end of the step, as independent joints do
         self._damping[numbers] = self._own_damping + damping[rows]
         torque = direction * (drive[rows] - damping[rows] * self.velocity[rows])
@@ -124,6 +129,12 @@ class MujocoPlant:
         self._step(self._model, self._data)
         self.angle[rows] = self._reference + direction * self._turn[numbers]
         self.velocity[rows] = direction * self._speed[numbers]
+
+    def _set_step(self, dt_s: float) -> None:
+        """Take the inertia by which a step brakes as the motor does; see `IndependentJoints`."""
+        self._dt_s = self._model.opt.timestep = dt_s
+        armature = np.maximum(self._armature - self._motor_damping * dt_s / 2, self._armature / 2)
+        self._model.dof_armature[self._numbers] = armature
 
 
 def _make_movable(root: Element, turned: Set[str]) -> None:
