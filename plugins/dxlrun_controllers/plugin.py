@@ -21,6 +21,7 @@ from dxlrun_controllers.joint_state_broadcaster import JointStateBroadcaster
 from dxlrun_controllers.leader_follower import LeaderFollower
 from dxlrun_controllers.motions.joint_trajectory_controller import JointTrajectoryController
 from dxlrun_controllers.motions.keyframe_player import KeyframePlayer
+from dxlrun_controllers.motions.sample_player import SamplePlayer
 from dxlrun_controllers.pid_controller import PidController
 
 
@@ -49,4 +50,5 @@ def dxlrun_controllers() -> Mapping[str, type[Controller[Any]]]:
         "keyframe_player": KeyframePlayer,
         "leader_follower": LeaderFollower,
         "pid_controller": PidController,
+        "sample_player": SamplePlayer,
     }

@@ -87,8 +87,12 @@ class _Found:
     finished: bool = False
     room: int = 0
     """Bytes that the chunks which follow may have when they are decompressed."""
+    packets: bool = True
+    """Packets are read."""
     after: Callable[[_Found], None] = lambda found: None
     """Called behind each chunk."""
+    end: int = 0
+    """The byte behind the last whole record."""
 
 
 @dataclass(frozen=True)
@@ -177,6 +181,25 @@ def scan_log(path: str | Path, take: Callable[[Log], None]) -> Log:
 
     found = _opened(path, _Found(after=slice_of))
     return _log_of(path, replace(found, messages={}))
+
+
+class LogFollower:
+    """A log that is being written: what came since the last look. Packets are left out.
+
+    Raises LogError as read_log, at each look.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self._path = Path(path)
+        self._found = _Found(packets=False)
+
+    def new(self) -> Log:
+        """Return what the file has in addition, as a log of its own."""
+        found = self._found
+        found.messages.clear()
+        found.damage.clear()
+        _opened(self._path, found)
+        return _log_of(self._path, replace(found, messages=dict(found.messages), damage=[]))
 
 
 def _opened(path: Path, found: _Found) -> _Found:
@@ -325,10 +348,13 @@ def _events(messages: list[bytes]) -> tuple[Event, ...]:
 
 
 def _walk(stream: IO[bytes], size: int, found: _Found) -> None:
-    """Go through the file from its start, record by record, until its end or to what cannot be read."""
+    """Go through the file, record by record, until its end or to what cannot be read.
+
+    It begins behind the last record that was read before: at the start of the file the first time.
+    """
     found.room = _LARGEST_CHUNK + _MOST_EXPANDED * size
-    stream.seek(0)
-    reader = StreamReader(stream, emit_chunks=True, record_size_limit=size)
+    stream.seek(found.end)
+    reader = StreamReader(stream, skip_magic=found.end > 0, emit_chunks=True, record_size_limit=size)
     records: Iterator[McapRecord] = reader.records
     while True:
         try:
@@ -342,6 +368,7 @@ def _walk(stream: IO[bytes], size: int, found: _Found) -> None:
             found.finished = True  # the footer and the magic bytes behind it were read
             return
         _take(record, found)
+        found.end = stream.tell()
 
 
 def _take(record: McapRecord, found: _Found) -> None:
@@ -369,7 +396,7 @@ def _open_schema(identifier: int, name: str, data: bytes, found: _Found) -> None
 
 def _open_channel(identifier: int, schema: int, topic: str, found: _Found) -> None:
     found.channels[identifier] = topic
-    if topic in _FOR_OTHERS:
+    if topic in _FOR_OTHERS or (topic.startswith(schemas.BUS_PREFIX) and not found.packets):
         found.needless.add(identifier)
     elif topic not in _OWN and not topic.startswith(schemas.BUS_PREFIX):
         found.published[identifier] = schema

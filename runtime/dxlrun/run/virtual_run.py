@@ -39,8 +39,9 @@ class VirtualRobot:
     """A robot and its simulated servos on virtual time; two of them from one plan do exactly the same.
 
     `log`: where the log goes, None for no log; `events` then takes what happens. `ledger`: where the
-    simulated buses enter what they see, None for one in memory; it is closed with the log. Every bus of the
-    plan is simulated, whatever its port.
+    simulated buses enter what they see, None for one in memory; it is closed with the log. `watch` is called
+    with each record, in the cycle that leaves it, as a recorder would get it. Every bus of the plan is
+    simulated, whatever its port.
     Raises InputError when the plan has a bus that is not `sim`.
     """
 
@@ -52,6 +53,7 @@ class VirtualRobot:
         take_over: bool = False,
         ledger: Ledger | None = None,
         events: Callable[[Event], None] | None = None,
+        watch: Callable[[RecordKind, Payload], None] = lambda kind, payload: None,
     ) -> None:
         real = [bus.name for bus in plan.buses if bus.port != "sim"]
         if real:
@@ -79,7 +81,13 @@ class VirtualRobot:
         self.log_error: str | None = None
         """Why the log is not whole."""
         self._writer = LogWriter(log, log_header(plan, 0, virtual=True)) if log else None
-        to_log = Handover(self._writer.take if self._writer else _only_events(events))
+        write = self._writer.take if self._writer else _only_events(events)
+
+        def take(kind: RecordKind, payload: Payload) -> None:
+            write(kind, payload)
+            watch(kind, payload)
+
+        to_log = Handover(take)
         self._events = EventRing(to_log, self.clock)
         self.sinks = Sinks(
             to_log,

@@ -1,0 +1,345 @@
+"""sample_player: plays a table of goals, one row a period, and gives up when a joint leaves its bounds.
+
+For measurements: what is commanded is the table and nothing else, whatever the joints answer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import Enum, auto, unique
+from typing import Annotated, ClassVar, Final, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from dxlrun import (
+    Angle,
+    CommandModel,
+    Context,
+    Controller,
+    Duration,
+    Floats,
+    Goal,
+    Interfaces,
+    Outcome,
+    ParametersModel,
+)
+from dxlrun_controllers.joints import JointsParameters, PerJoint, Positive, finite_or, hold, row_of
+from dxlrun_controllers.laws.spline import DECELERATION, SplineSample, Stop
+
+MOST_PIECES: Final = 256
+"""Of one table: the `rows` commands before its goal, and the goal's own rows."""
+
+
+class Bounds(ParametersModel):
+    """What ends a goal as aborted; what is left out is not checked."""
+
+    range: dict[str, tuple[Angle, Angle]] = Field(default_factory=dict)
+    """Lowest and highest position by joint, rad; rows beyond it are refused."""
+    temperature: Annotated[float, Field(gt=0)] | None = None
+    """The highest, deg C."""
+    effort: PerJoint[Positive] | None = None
+    """The highest measured, Nm, A or the fraction of maximum; its magnitude counts."""
+    age: Annotated[Duration, Field(gt=0)] | None = None
+    """The greatest age of a joint's state."""
+
+
+class SampleParameters(JointsParameters):
+    """Keys of a sample_player in the robot file."""
+
+    command_interface: Literal["position", "posvel", "velocity", "effort", "pwm"] = "position"
+    """What the rows command: one number a joint; of posvel the positions, and behind them the speeds."""
+    bounds: Bounds = Bounds()
+
+    @model_validator(mode="after")
+    def _ranges_grow(self) -> Self:
+        for joint, (lower, upper) in self.bounds.range.items():
+            if not lower < upper:
+                raise ValueError(
+                    f"the range of {joint} ends at {upper:g} rad, where it begins at {lower:g} rad"
+                )
+        return self
+
+    @property
+    def width(self) -> int:
+        """How many numbers a row has."""
+        return len(self.joints) * (2 if self.command_interface == "posvel" else 1)
+
+
+Rows = tuple[tuple[float, ...], ...]
+
+
+class RowsCommand(CommandModel):
+    """The first rows of a long table: the next goal plays them, as they were sent in turn, before its own."""
+
+    rows: Rows
+    """Shape (rows, joints), of posvel (rows, 2 joints); in the unit of the command interface"""
+
+
+class SamplesCommand(CommandModel):
+    """A goal: play rows, one a period."""
+
+    period: Annotated[float, Field(gt=0, le=3600)]
+    """s; the time decides which row is due: a late cycle leaves rows out, it delays none"""
+    rows: Rows
+    """As of `rows`; they follow those."""
+    settle: Annotated[float, Field(ge=0, le=3600)] = 0.0
+    """s for which the last row is commanded still, after its period, before the goal is reached"""
+
+
+@unique
+class _Phase(Enum):
+    RESTING = auto()
+    PLAYING = auto()
+    STOPPING = auto()
+
+
+class SamplePlayer(Controller[SampleParameters]):
+    """Plays one table at a time, from the cycle that takes the goal on.
+
+    At its end the joints stay where the last row sends them; velocities decelerate to 0, efforts and PWM
+    become 0 at once. The same after a cancel and beyond a bound, but there joints that are commanded by
+    position come to rest from where they are and how fast they go.
+    """
+
+    Parameters = SampleParameters
+    Commands: ClassVar[Mapping[str, type[CommandModel]]] = {"rows": RowsCommand, "samples": SamplesCommand}
+    Goals: ClassVar[frozenset[str]] = frozenset({"samples"})
+
+    @classmethod
+    def interfaces(cls, parameters: SampleParameters, joints: tuple[str, ...]) -> Interfaces:
+        """Claim the command interface of the parameters' joints."""
+        if parameters.command_interface == "posvel":
+            return Interfaces(parameters.joints, ("position", "velocity"))
+        return Interfaces(parameters.joints, (parameters.command_interface,))
+
+    @classmethod
+    def prepare(cls, kind: str, command: CommandModel, parameters: SampleParameters) -> NDArray[np.float64]:
+        """Return the rows one after the other; of `samples` with period and settling time, s, in front.
+
+        Raises ValueError for a row of another size, or beyond the range of its joint.
+        """
+        if not isinstance(command, RowsCommand | SamplesCommand):
+            return super().prepare(kind, command, parameters)
+        rows = _checked(command.rows, parameters).ravel()
+        if isinstance(command, RowsCommand):
+            return rows
+        return np.concatenate([[command.period, command.settle], rows])
+
+    def on_configure(self, context: Context) -> None:
+        """Make room for everything that the loop needs."""
+        super().on_configure(context)
+        count, bounds, limits = len(context.joints), self.parameters.bounds, context.limits
+        self._interface = self.parameters.command_interface
+        self._width = self.parameters.width
+        self._pieces: list[Floats | None] = [None] * MOST_PIECES
+        """The table, piece after piece; those that came before their goal are for the next one."""
+        self._count = self._piece = self._first = 0
+        """How many pieces there are; the one that is played, and the table's row with which it begins."""
+        self._total = 0
+        """Rows of the table."""
+        self._phase = _Phase.RESTING
+        self._goal: Goal | None = None
+        self._start_ns = self._settled_ns = self._stop_ns = 0
+        self._period_ns = 1.0
+        self._lower, self._upper = np.full((2, count), np.inf)
+        np.negative(self._upper, out=self._lower)
+        for index, joint in enumerate(context.joints):
+            self._lower[index], self._upper[index] = bounds.range.get(joint, (-np.inf, np.inf))
+        self._hottest = np.inf if bounds.temperature is None else bounds.temperature
+        self._strongest = row_of(bounds.effort, context.joints)
+        self._oldest_ns = np.inf if bounds.age is None else float(bounds.age)
+        self._out, self._part = np.zeros((2, count), dtype=np.bool_)
+        self._magnitude = np.zeros(count)
+        self._still = SplineSample(count)
+        self._stop = Stop(count)
+        self._deceleration = finite_or(limits.acceleration, DECELERATION)
+        self._rest_lower, self._rest_upper = np.full((2, count), np.inf)
+        np.negative(self._rest_upper, out=self._rest_lower)
+        if self._interface in ("position", "posvel"):
+            np.maximum(self._lower, finite_or(limits.lower, -np.inf), out=self._rest_lower)
+            np.minimum(self._upper, finite_or(limits.upper, np.inf), out=self._rest_upper)
+        commands = context.commands
+        by_name = {"velocity": commands.velocity, "effort": commands.effort, "pwm": commands.pwm}
+        self._primary = by_name.get(self._interface, commands.position)
+        """What a row's first numbers command."""
+
+    # Life
+
+    def on_activate(self, time_ns: int) -> None:
+        """Hold where the joints are; velocities, efforts and PWM begin with 0."""
+        self._phase, self._goal, self._count = _Phase.RESTING, None, 0
+        if self._primary is self.context.commands.position:
+            hold(self.context)
+        else:
+            self._primary.fill(0.0)
+
+    def on_deactivate(self, time_ns: int) -> None:
+        """Forget the goal, which the runtime has ended, and rows that wait for one."""
+        self._phase, self._goal, self._count = _Phase.RESTING, None, 0
+
+    # Commands
+
+    def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
+        """Keep rows for the next goal; a table that is played ends."""
+        if self._phase is _Phase.PLAYING:
+            self._end(Outcome.ABORTED, "rows of another table came")
+            self._begin_stop(time_ns)
+        self._keep(data)
+
+    def on_goal(self, goal: Goal, data: NDArray[np.float64], time_ns: int) -> None:
+        """Play the rows that were kept, and those of the goal."""
+        if self._phase is _Phase.PLAYING:  # that one has ended as preempted, its rows with it
+            self._count = 0
+        self._keep(data[2:])
+        if self._count > MOST_PIECES:
+            self._count = 0
+            goal.end(Outcome.ABORTED, f"its table came in more than {MOST_PIECES} pieces")
+            self._begin_stop(time_ns)
+            return
+        self._total = sum(len(piece) for piece in self._pieces[: self._count] if piece is not None)
+        self._total //= self._width
+        self._piece = self._first = 0
+        self._goal, self._phase = goal, _Phase.PLAYING
+        self._start_ns, self._period_ns = time_ns, float(data[0]) * 1e9
+        self._settled_ns = time_ns + round(self._total * self._period_ns + float(data[1]) * 1e9)
+
+    def on_cancel(self, goal: Goal, time_ns: int) -> None:
+        """Bring the joints to rest; the goal ends when they are."""
+        self._begin_stop(time_ns)
+
+    def _keep(self, rows: Floats) -> None:
+        """Keep rows behind the others; of too many only the count grows, and their goal is aborted."""
+        if self._count < MOST_PIECES:
+            self._pieces[self._count] = rows
+        self._count += 1
+
+    # In a cycle
+
+    def update(self, time_ns: int, period_ns: int) -> None:
+        """Command the row that is due, what brings the joints to rest, or what was commanded last."""
+        if self._phase is _Phase.PLAYING:
+            self._play(time_ns, period_ns)
+        elif self._phase is _Phase.STOPPING:
+            self._slow_down(time_ns)
+
+    def _play(self, time_ns: int, period_ns: int) -> None:
+        breach = self._breach()
+        if breach is not None:
+            row, text = breach
+            self._end(Outcome.ABORTED, text, row)
+            self._begin_stop(time_ns)
+            return
+        elapsed_ns = time_ns - self._start_ns
+        # wake-ups scatter around their deadlines: a row is due half a cycle before its time, at most
+        early_ns = min(self._period_ns, period_ns) / 2
+        if time_ns + early_ns >= self._settled_ns:
+            self._end(Outcome.REACHED)
+            self._begin_stop(time_ns, over=True)
+            return
+        index = min(int((elapsed_ns + early_ns) / self._period_ns), self._total - 1)
+        piece = self._pieces[self._piece]
+        while piece is not None and index >= self._first + len(piece) // self._width:
+            self._first += len(piece) // self._width
+            self._piece += 1
+            piece = self._pieces[self._piece]
+        if piece is None:
+            return
+        at = (index - self._first) * self._width
+        joints = len(self._primary)
+        np.copyto(self._primary, piece[at : at + joints])
+        if self._width > joints:
+            np.copyto(self.context.commands.velocity, piece[at + joints : at + self._width])
+        if self._goal is not None:
+            self._goal.feedback(min(1.0, elapsed_ns / max(1, self._settled_ns - self._start_ns)))
+
+    def _slow_down(self, time_ns: int) -> None:
+        elapsed = (time_ns - self._stop_ns) * 1e-9
+        self._stop.sample(elapsed, self._still)
+        np.copyto(
+            self._primary, self._still.velocity if self._interface == "velocity" else self._still.position
+        )
+        if elapsed >= self._stop.duration_s:
+            self._phase = _Phase.RESTING
+            self._end(Outcome.CANCELLED)  # any other end came before the stop
+
+    # The end
+
+    def _breach(self) -> tuple[int, str] | None:
+        """Return the first joint that is beyond a bound, and how; None: none is."""
+        states, out, part = self.context.states, self._out, self._part
+        np.less(states.position, self._lower, out=out)
+        np.greater(states.position, self._upper, out=part)
+        out |= part
+        out &= states.valid
+        if np.count_nonzero(out):
+            row = int(out.argmax())
+            bounds = f"{self._lower[row]:.4g} to {self._upper[row]:.4g} rad"
+            return row, f"is at {states.position[row]:.4g} rad, outside of its range of {bounds}"
+        np.greater(states.temperature, self._hottest, out=out)
+        if np.count_nonzero(out):
+            row = int(out.argmax())
+            return row, f"has {states.temperature[row]:g} deg C, more than {self._hottest:g}"
+        np.abs(states.effort, out=self._magnitude)
+        np.greater(self._magnitude, self._strongest, out=out)
+        out &= states.valid
+        if np.count_nonzero(out):
+            row = int(out.argmax())
+            most = f"{self._strongest[row]:.4g}"
+            return row, f"exerts {self._magnitude[row]:.4g}, more than {most}"
+        np.greater(states.age_ns, self._oldest_ns, out=out)
+        if np.count_nonzero(out):
+            row = int(out.argmax())
+            return row, f"has not answered for {states.age_ns[row] * 1e-6:.0f} ms"
+        return None
+
+    def _end(self, outcome: Outcome, text: str = "", row: int = -1) -> None:
+        """End the goal, if there is one; `row` is the joint that is the reason."""
+        goal, self._goal = self._goal, None
+        if goal is None:
+            return
+        joint = self.context.joints[row] if row >= 0 else ""
+        goal.end(outcome, f"joint {joint} {text}" if joint else text, joint)
+
+    def _begin_stop(self, time_ns: int, *, over: bool = False) -> None:
+        """Let the joints come to rest; `over`: those commanded by position are sent to rest already."""
+        if self._phase is _Phase.PLAYING:
+            self._count = 0
+        self._phase, self._stop_ns = _Phase.STOPPING, time_ns
+        still, states, goals = self._still, self.context.states, self.context.goals
+        still.position.fill(0.0)
+        still.velocity.fill(0.0)
+        if self._interface == "velocity":
+            np.copyto(still.velocity, goals.velocity, where=np.isfinite(goals.velocity))
+        elif self._interface in ("position", "posvel"):
+            np.copyto(still.position, self._primary)
+            if not over:
+                np.copyto(still.position, states.position, where=states.valid)
+                np.copyto(still.velocity, states.velocity, where=states.valid)
+        self._stop.load(still, self._deceleration, self._rest_lower, self._rest_upper)
+        self._slow_down(time_ns)
+
+
+def _checked(rows: Rows, parameters: SampleParameters) -> Floats:
+    """Return rows as an array, shape (rows, width). Raises ValueError for the first that is wrong."""
+    width, joints = parameters.width, parameters.joints
+    if not rows:
+        raise ValueError("there is no row; give at least one")
+    for number, row in enumerate(rows, 1):
+        if len(row) != width:
+            speeds = " and as many speeds" if width > len(joints) else ""
+            names = ", ".join(joints)
+            raise ValueError(f"{len(row)} numbers in row {number} for {len(joints)} joints ({names}){speeds}")
+    table = np.array(rows, dtype=np.float64)
+    if parameters.command_interface in ("position", "posvel"):
+        for column, joint in enumerate(joints):
+            lower, upper = parameters.bounds.range.get(joint, (-np.inf, np.inf))
+            beyond = (table[:, column] < lower) | (table[:, column] > upper)
+            if beyond.any():
+                number = int(beyond.argmax())
+                raise ValueError(
+                    f"row {number + 1} sends {joint} to {table[number, column]:.4g} rad, outside of its "
+                    f"range of {lower:.4g} to {upper:.4g} rad"
+                )
+    return table

@@ -1,0 +1,144 @@
+"""Choice: which joints take part in an experiment, and within which range each may move."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+
+from dxlrun.control.loop_plan import JointPlan
+from dxlrun.description.units import angle
+from dxlrun.errors import InputError, suggestion
+from dxlrun.experiments.guided.experiment import PLAYER, Joint, Situation
+from dxlrun.experiments.guided.rig import TORQUED, JointNow, Rig, RunningController
+
+DEFAULT_REACH = math.radians(30)
+"""To each side of where a joint is, where no range is given and its limits allow it."""
+LEAST_WIDTH = math.radians(2)
+"""A narrower range is no room to move."""
+_SLACK = 1e-9
+
+
+def parse_ranges(words: Sequence[str]) -> dict[str, tuple[float, float]]:
+    """Return the ranges of `JOINT=-30deg..30deg`, rad. Raises InputError with every mistake."""
+    ranges: dict[str, tuple[float, float]] = {}
+    mistakes: list[str] = []
+    for word in words:
+        joint, sign, text = word.partition("=")
+        low, dots, high = text.partition("..")
+        if not (joint and sign and dots):
+            mistakes.append(f"--range {word}: write JOINT=LOWEST..HIGHEST, such as elbow=-30deg..30deg")
+            continue
+        if joint in ranges:
+            mistakes.append(f"--range {joint} is given twice; give it once")
+            continue
+        try:
+            lower, upper = angle(low), angle(high)
+        except ValueError as error:
+            mistakes.append(f"--range {word}: {error}")
+            continue
+        ranges[joint] = (lower, upper)
+        if upper - lower < LEAST_WIDTH:
+            mistakes.append(
+                f"--range {word}: the range must grow, by {math.degrees(LEAST_WIDTH):g} deg at least"
+            )
+    if mistakes:
+        raise InputError("\n".join(mistakes))
+    return ranges
+
+
+def check_names(names: Sequence[str], ranges: Mapping[str, object], known: Sequence[str]) -> None:
+    """Raise InputError with everything that is wrong with the joints of a command line."""
+    mistakes = []
+    if not names:
+        mistakes.append(f"name the joints that may move: {', '.join(known)}")
+    mistakes += [
+        f"{name} is not one of the robot's joints; {suggestion(name, tuple(known))}"
+        for name in dict.fromkeys((*names, *ranges))
+        if name not in known
+    ]
+    mistakes += [f"joint {name} is named twice; name it once" for name, n in Counter(names).items() if n > 1]
+    mistakes += [
+        f"--range {name}: that joint takes no part in the experiment; name it too"
+        for name in ranges
+        if name in known and name not in names
+    ]
+    if mistakes:
+        raise InputError("\n".join(mistakes))
+
+
+def situation_of(rig: Rig, names: Sequence[str], ranges: Mapping[str, tuple[float, float]]) -> Situation:
+    """Return what an experiment begins with. Raises InputError with everything that speaks against it."""
+    plans = {joint.name: joint for joint in rig.plan.loop.joints}
+    check_names(names, ranges, tuple(plans))
+    servos = {servo.joint: servo for bus in rig.plan.buses for servo in bus.servos}
+    controllers, now = rig.controllers(), rig.joints()
+    mistakes = list(_taken(rig, names, controllers))
+    joints = []
+    for name in names:
+        try:
+            lower, upper, chosen = _range_of(plans[name], now[name], ranges.get(name))
+        except ValueError as error:
+            mistakes.append(str(error))
+            continue
+        joints.append(Joint(name, lower, upper, chosen, now[name].position, plans[name], servos[name]))
+    if mistakes:
+        raise InputError("\n".join(mistakes))
+    return Situation(tuple(joints), rig.rate, rig.plan, rig.virtual)
+
+
+def _taken(rig: Rig, names: Sequence[str], controllers: Sequence[RunningController]) -> list[str]:
+    """Return what other commands of the run speak against an experiment, a sentence each."""
+    robot = rig.plan.robot
+    if rig.paused:
+        return [f"{robot} is paused; let it go on first: dxlrun resume --robot {robot}"]
+    if other := [one.name for one in controllers if one.name.startswith(f"{PLAYER}_")]:
+        return [
+            f"another experiment works on {robot} ({other[0]} is loaded); wait for its end, or unload what "
+            f"one that was killed left: dxlrun unload {other[0]} --robot {robot}"
+        ]
+    if rig.own:
+        return []
+    return [
+        f"joint {name} is commanded by {one.name}; free it first: "
+        f"dxlrun switch --deactivate {one.name} --robot {robot}"
+        for name in names
+        for one in controllers
+        if one.active and name in one.joints
+    ]
+
+
+def _range_of(plan: JointPlan, now: JointNow, given: tuple[float, float] | None) -> tuple[float, float, str]:
+    """Return the range of a joint, rad, and how it was chosen. Raises ValueError where there is none."""
+    name, position = plan.name, now.position
+    if now.torque not in TORQUED:
+        raise ValueError(
+            f"joint {plan.label} has no torque ({now.torque}), so it cannot be moved; switch it on first: "
+            f"dxlrun torque {name} on"
+        )
+    if math.isnan(position):
+        raise ValueError(f"joint {plan.label} has not answered yet")
+    lower, upper = (plan.lower, plan.upper) if plan.bounded else (-math.inf, math.inf)
+    limits = f"{math.degrees(lower):.4g} to {math.degrees(upper):.4g} deg"
+    at = f"{math.degrees(position):.4g} deg"
+    if given is not None:
+        if given[0] < lower - _SLACK or given[1] > upper + _SLACK:
+            shown = f"{math.degrees(given[0]):.4g}..{math.degrees(given[1]):.4g} deg"
+            raise ValueError(f"--range {name}={shown} is beyond the joint's limits of {limits}; stay inside")
+        if not given[0] <= position <= given[1]:
+            raise ValueError(
+                f"joint {name} is at {at}, outside of its --range; lead it inside first, or choose another"
+            )
+        return *given, "--range"
+    if not math.isfinite(lower) or not math.isfinite(upper) or plan.continuous:
+        raise ValueError(
+            f"joint {name} has no position limits, so its range must be given: "
+            f"--range {name}=-30deg..30deg (it is at {at})"
+        )
+    low, high = max(lower, position - DEFAULT_REACH), min(upper, position + DEFAULT_REACH)
+    if high - low < LEAST_WIDTH:
+        raise ValueError(f"joint {name} is at {at}, outside of its limits of {limits}; lead it inside first")
+    if not low <= position <= high:
+        raise ValueError(f"joint {name} is at {at}, outside of its limits of {limits}; lead it inside first")
+    reach = math.degrees(DEFAULT_REACH)
+    return low, high, f"{reach:g} deg to each side of where it is, within its limits of {limits}"
